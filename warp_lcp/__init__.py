@@ -1,0 +1,36 @@
+"""Matrix-free solvers for large linear complementarity problems, as NVIDIA Warp kernels on CPU and CUDA."""
+
+from importlib.metadata import PackageNotFoundError, version
+
+from warp_lcp.operators import AIR, FLUID, SOLID, DenseOperator, GridPoisson, Operator
+from warp_lcp.problem import LCP
+from warp_lcp.residual import NaturalResidual
+from warp_lcp.result import Record, SolveResult, SolveStatus
+from warp_lcp.solve import Precision, Step, solve
+from warp_lcp.solvers import MinimumMapNewton, ProjectedSOR
+from warp_lcp.stopping import StoppingCriteria
+
+try:
+    __version__ = version("warp-lcp")
+except PackageNotFoundError:  # a source tree that was never installed
+    __version__ = "0+unknown"
+
+__all__ = [
+    "AIR",
+    "FLUID",
+    "LCP",
+    "SOLID",
+    "DenseOperator",
+    "GridPoisson",
+    "MinimumMapNewton",
+    "NaturalResidual",
+    "Operator",
+    "Precision",
+    "ProjectedSOR",
+    "Record",
+    "SolveResult",
+    "SolveStatus",
+    "Step",
+    "StoppingCriteria",
+    "solve",
+]

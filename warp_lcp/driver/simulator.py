@@ -1,0 +1,111 @@
+"""What the driver asks of a simulator, and how it finds one: the entry-point group `warp_lcp.simulators`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from warp_lcp.driver.scene import Scene
+
+GROUP = "warp_lcp.simulators"
+
+
+class StepFailed(RuntimeError):
+    """The step's solve missed its criteria. The state is as before the step, so a smaller dt may be tried."""
+
+
+class SimulationFailed(RuntimeError):
+    """The run cannot go on, for example because a field is not finite. The message names step, field and cell."""
+
+
+@dataclass(frozen=True)
+class Points:
+    """A frame of vertices. `points` [m], shape (n, 3); `fields` of shape (n,) or (n, 3)."""
+
+    name: str
+    points: np.ndarray
+    fields: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Cells:
+    """A frame of equal axis-aligned cells. `index` (n, 3): integer x, y, z of each cell, whose low corner lies at index * spacing [m].
+
+    `dimension` 2 makes quadrilaterals in the plane z = 0, 3 makes voxels. `fields` have shape (n,) or (n, 3).
+    """
+
+    name: str
+    index: np.ndarray
+    spacing: float
+    dimension: int
+    fields: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+class Simulation(Protocol):
+    """A simulation in progress: state on a device and the rule for one step."""
+
+    time: float  # [s]
+    step_count: int
+
+    def stable_dt(self) -> float:
+        """Return the largest time step [s] that the scene's CFL number allows now, not yet clipped to dt_min, dt_max or a frame's time."""
+
+    def step(self, dt: float) -> dict[str, float | int | str | None]:
+        """Advance by dt [s] and return a row of the log.
+
+        Raises:
+            StepFailed: the solve missed its criteria and the state is unchanged.
+            SimulationFailed: the run cannot go on.
+        """
+
+    def columns(self) -> tuple[str, ...]:
+        """Return the names of the log's columns that `step` fills, in order, after `step`, `time`, `dt` and before `seconds`."""
+
+    def frame(self) -> list[Points | Cells]:
+        """Return what a frame shows, as host arrays."""
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return everything that `restore` needs to continue bit for bit on the CPU, as host arrays without pickles."""
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue from `state`.
+
+        Raises:
+            ValueError: the arrays do not belong to this scene.
+        """
+
+    def notes(self) -> list[str]:
+        """Return warnings and facts worth a line at the start of a run (say, a mesh outside the domain)."""
+
+
+@runtime_checkable
+class Simulator(Protocol):
+    """A plug-in: a kind of material and the scenes that describe it."""
+
+    name: str
+    summary: str
+    scene_model: type[Any]  # a subclass of warp_lcp.driver.scene.Scene
+
+    def create(self, scene: Scene, *, device: str, folder: Path) -> Simulation:
+        """Build a simulation of `scene`. Files that the scene names are relative to `folder`.
+
+        Raises:
+            ValueError: the scene cannot be simulated; the message names the key and what is allowed.
+        """
+
+
+def simulators() -> dict[str, Simulator]:
+    """Return the installed simulators by name."""
+    found = {}
+    for entry in entry_points(group=GROUP):
+        simulator = entry.load()
+        if not isinstance(simulator, Simulator):
+            raise TypeError(f"entry point {entry.name!r} of {GROUP} is not a simulator: {simulator!r}")
+        found[entry.name] = simulator
+    return found

@@ -1,0 +1,115 @@
+"""How an operator stores its fields while a solver works on them: flat, with ghost cells where its stencil wants them.
+
+A user's field has the operator's shape; a *stored* field is a flat array of `size` elements. Solvers see stored fields only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+Array = Any  # a numpy array or a wp.array
+
+
+class Layout:
+    """Fields stored as they are."""
+
+    def __init__(self, shape: tuple[int, ...], device: wp.Device) -> None:
+        self.shape, self.device = tuple(shape), device
+        self.stored_shape = self.shape
+
+    @property
+    def size(self) -> int:
+        """Elements of a stored field."""
+        return int(np.prod(self.stored_shape))
+
+    def zeros(self, dtype: Any) -> wp.array[Any]:
+        """Return a stored field of zeros."""
+        return wp.zeros(self.size, dtype=dtype, device=self.device)
+
+    def holds(self, field: Array, dtype: Any) -> bool:
+        """Return whether `field` is a device array that is stored already, so that it can be used without a copy."""
+        return (
+            isinstance(field, wp.array)
+            and field.dtype is dtype
+            and field.device == self.device
+            and tuple(field.shape) in (self.stored_shape, (self.size,))
+            and field.is_contiguous
+        )
+
+    def load(self, field: Array, dtype: Any, name: str = "field") -> wp.array[Any]:
+        """Return `field` as a stored field; no copy is made if it is one already.
+
+        Raises:
+            ValueError: its shape is neither the operator's nor the stored one.
+        """
+        if self.holds(field, dtype):
+            return field.flatten()
+        host = field.numpy() if isinstance(field, wp.array) else np.asarray(field)
+        if host.shape == self.shape:
+            host = self._store_host(host)
+        elif host.shape not in (self.stored_shape, (self.size,)):
+            raise ValueError(f"{name} has shape {host.shape}: expected {self.shape}")
+        return wp.array(np.ascontiguousarray(host).ravel(), dtype=dtype, device=self.device)
+
+    def unload(self, stored: wp.array[Any]) -> wp.array[Any]:
+        """Return a stored field as a contiguous field of the operator's shape; a copy unless both are the same."""
+        return stored.reshape(self.shape)
+
+    def _store_host(self, host: np.ndarray) -> np.ndarray:
+        return host
+
+
+@dataclass(frozen=True)
+class Padding:
+    """Counts of cells (nz, ny, nx) and of stored cells, which include one ghost cell on every side."""
+
+    counts: tuple[int, int, int]
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Stored cells (nz + 2, ny + 2, nx + 2)."""
+        nz, ny, nx = self.counts
+        return nz + 2, ny + 2, nx + 2
+
+    @property
+    def plane(self) -> int:
+        """Elements from plane to plane."""
+        return self.shape[1] * self.shape[2]
+
+    @property
+    def row(self) -> int:
+        """Elements from row to row."""
+        return self.shape[2]
+
+    @property
+    def size(self) -> int:
+        """Elements of a stored field."""
+        return self.shape[0] * self.plane
+
+
+class PaddedLayout(Layout):
+    """Grid fields (nz, ny, nx) or (ny, nx) stored with one layer of ghost cells, so that a stencil needs no bounds tests."""
+
+    def __init__(self, shape: tuple[int, ...], device: wp.Device) -> None:
+        super().__init__(shape, device)
+        nz, ny, nx = shape if len(shape) == 3 else (1, *shape)
+        self.padding = Padding((nz, ny, nx))
+        self.stored_shape = self.padding.shape
+
+    def unload(self, stored: wp.array[Any]) -> wp.array[Any]:
+        """Return a stored field as a contiguous field of the operator's shape."""
+        inner = stored.reshape(self.stored_shape)[1:-1, 1:-1, 1:-1]
+        return inner.contiguous().reshape(self.shape)
+
+    def _store_host(self, host: np.ndarray) -> np.ndarray:
+        return np.pad(host.reshape(self.padding.counts), 1)
+
+
+def layout_of(operator: Any) -> Layout:
+    """Return the layout of an operator's fields; plain arrays unless it says otherwise."""
+    found = getattr(operator, "layout", None)
+    return found if isinstance(found, Layout) else Layout(operator.shape, operator.device)

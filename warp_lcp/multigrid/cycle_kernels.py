@@ -1,0 +1,126 @@
+"""Kernels of a multigrid cycle on 7-point stencils: sweeps, residual and restriction in one, correction. Native rows, one source.
+
+A thread takes a grain of a row: the whole row on the CPU, a cell (of the coarser grid, for transfers) on CUDA.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from warp_lcp.native import C_TYPES, simd
+from warp_lcp.operators.stencil_kernels import NEIGHBORS, StencilShape, row_start, stencil_head
+
+
+@functools.cache
+def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
+    """Return the kernels of a level whose diagonal has type d_type, all else type `real`."""
+    form = "variable" if variable else "uniform"
+    name = f"warp_lcp.cycle.{form}_{d_type.__name__}_{real.__name__}"
+    d_array, field = wp.array(dtype=d_type), wp.array(dtype=real)
+    head, neighbors = stencil_head(variable, C_TYPES[real]), NEIGHBORS[variable]
+
+    def sweep(update: str) -> str:
+        """Source of a sweep whose new value is `update`, plain or clipped."""
+        value = f"const T e = unit*(T)d[k], u = {update}, v = e != 0 ? u : (T)0;"
+        return simd(
+            head
+            + f"""T* y = y_.data + p; const T* x = x_.data + p; const T* b = b_.data + p;
+        if (projected) {{
+            const T* lo = l_.data + p; const T* hi = u_.data + p;
+            SIMD for (int k = 0; k < n; ++k) {{ {value} const T w = v < lo[k] ? lo[k] : v; y[k] = w > hi[k] ? hi[k] : w; }}
+        }} else {{
+            SIMD for (int k = 0; k < n; ++k) {{ {value} y[k] = v; }}
+        }}"""
+        )
+
+    @wp.func_native(sweep(f"x[k] + omega*((b[k] + {neighbors}) / (e != 0 ? e : (T)1) - x[k])"))
+    def sweep_row(
+        A: StencilShape, d_: d_array, wx_: field, wy_: field, wz_: field, y_: field, x_: field, b_: field, l_: field, u_: field,
+        p: wp.int64, n: int, omega: real, projected: bool,
+    ): ...  # fmt: skip
+
+    @wp.func_native(sweep("omega*b[k] / (e != 0 ? e : (T)1)"))
+    def first_sweep_row(
+        A: StencilShape, d_: d_array, wx_: field, wy_: field, wz_: field, y_: field, x_: field, b_: field, l_: field, u_: field,
+        p: wp.int64, n: int, omega: real, projected: bool,
+    ): ...  # fmt: skip
+
+    @wp.func_native(
+        simd(
+            f"""typedef {C_TYPES[real]} T; const long long p0 = p; T* coarse = c_.data + c; T r[256];
+        for (int begin = 0; begin < n; begin += 128) {{
+            const int m = n - begin < 128 ? n - begin : 128;
+            SIMD for (int k = 0; k < 2*m; ++k) r[k] = 0;
+            for (int row = 0; row < 4; ++row) {{
+                if (((row >> 1) && one_plane) || ((row & 1) && one_row)) continue;
+                const long long p = p0 + 2*begin + (row >> 1)*A.s1 + (row & 1)*A.s2;
+                {head.replace(f"typedef {C_TYPES[real]} T;", "")}
+                const T* x = x_.data + p; const T* b = b_.data + p;
+                SIMD for (int k = 0; k < 2*m; ++k) {{
+                    const T e = unit*(T)d[k], v = b[k] - e*x[k] + {neighbors}; r[k] += e != 0 ? v : (T)0; }}
+            }}
+            SIMD for (int k = 0; k < m; ++k) coarse[begin + k] = r[2*k] + r[2*k+1];
+        }}"""
+        )
+    )
+    def restrict_row(
+        A: StencilShape, d_: d_array, wx_: field, wy_: field, wz_: field, c_: field, c: wp.int64, x_: field, b_: field, p: wp.int64,
+        n: int, one_plane: bool, one_row: bool,
+    ): ...  # fmt: skip
+
+    @wp.func_native(
+        simd(
+            head
+            + """T* x = x_.data + p; const T* xc = c_.data + c;
+        if (projected) {
+            const T* lo = l_.data + p; const T* hi = u_.data + p;
+            SIMD for (int k = 0; k < n; ++k) {
+                const T v = d[k] != 0 ? x[k] + scale*xc[k >> 1] : (T)0, w = v < lo[k] ? lo[k] : v; x[k] = w > hi[k] ? hi[k] : w; }
+        } else {
+            SIMD for (int k = 0; k < n / 2; ++k) {
+                const T v = scale*xc[k]; x[2*k] += d[2*k] != 0 ? v : (T)0; x[2*k+1] += d[2*k+1] != 0 ? v : (T)0; }
+            if (n % 2) x[n-1] += d[n-1] != 0 ? scale*xc[n/2] : (T)0;
+        }"""
+        )
+    )
+    def correct_row(
+        A: StencilShape, d_: d_array, wx_: field, wy_: field, wz_: field, x_: field, p: wp.int64, c_: field, c: wp.int64, l_: field,
+        u_: field, n: int, scale: real, projected: bool,
+    ): ...  # fmt: skip
+
+    @wp.kernel(enable_backward=False, module=name)
+    def sweep_kernel(
+        A: StencilShape, d: d_array, wx: field, wy: field, wz: field, grain: int, from_zero: bool, y: field, x: field, b: field, lower: field,
+        upper: field, omega: real, projected: bool,
+    ):  # fmt: skip
+        k, j, c = wp.tid()
+        p = row_start(A, k, j, c, grain)
+        n = wp.min(grain, A.nx - c * grain)
+        if from_zero:
+            first_sweep_row(A, d, wx, wy, wz, y, x, b, lower, upper, p, n, omega, projected)
+        else:
+            sweep_row(A, d, wx, wy, wz, y, x, b, lower, upper, p, n, omega, projected)
+
+    @wp.kernel(enable_backward=False, module=name)
+    def restrict_kernel(
+        A: StencilShape, d: d_array, wx: field, wy: field, wz: field, grain: int, C: StencilShape, n0: int, n1: int, x: field, b: field,
+        coarse: field,
+    ):  # fmt: skip
+        k, j, c = wp.tid()
+        n = wp.min(grain, C.nx - c * grain)
+        p = wp.int64(2 * k + 1) * A.s1 + wp.int64(2 * j + 1) * A.s2 + wp.int64(1 + 2 * c * grain)
+        restrict_row(A, d, wx, wy, wz, coarse, row_start(C, k, j, c, grain), x, b, p, n, 2 * k + 2 > n0, 2 * j + 2 > n1)
+
+    @wp.kernel(enable_backward=False, module=name)
+    def correct_kernel(
+        A: StencilShape, d: d_array, wx: field, wy: field, wz: field, grain: int, C: StencilShape, x: field, coarse: field, lower: field,
+        upper: field, scale: real, projected: bool,
+    ):  # fmt: skip
+        k, j, c = wp.tid()
+        n = wp.min(2 * grain, A.nx - 2 * c * grain)
+        p = row_start(A, k, j, 2 * c, grain)
+        correct_row(A, d, wx, wy, wz, x, p, coarse, row_start(C, k // 2, j // 2, c, grain), lower, upper, n, scale, projected)
+
+    return SimpleNamespace(sweep=sweep_kernel, restrict=restrict_kernel, correct=correct_kernel)

@@ -1,0 +1,211 @@
+"""A Galerkin hierarchy of a grid stencil, and its linear and projected (monotone) cycles."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from warp_lcp.layout import Padding
+from warp_lcp.multigrid import coarsen_kernels as kernels
+from warp_lcp.multigrid.coarsen_kernels import UNBOUNDED
+from warp_lcp.multigrid.cycle_kernels import cycle_kernels
+from warp_lcp.native import grain
+from warp_lcp.operators.stencil import Stencil
+from warp_lcp.vectors import convert
+
+
+@dataclass(frozen=True, kw_only=True)
+class CycleSettings:
+    """How a cycle goes. The defaults are the best measured on 7-point stencils with piecewise-constant aggregates.
+
+    Args:
+        gamma: coarse cycles a level; 1 is a V-cycle, 2 a W-cycle.
+        over_correction: factor on coarse corrections: piecewise-constant aggregates are too stiff by about two.
+        interval: bounds of the spectrum of D^-1 A that the two Chebyshev-Jacobi sweeps damp.
+        coarsest_cpu: the most cells of the coarsest level, which is inverted densely.
+        coarsest_cuda: the same where one thread of a GPU factors it.
+        projected_sweeps: pairs of sweeps that stand for a solve on the coarsest level of a projected cycle.
+    """
+
+    gamma: int = 2
+    over_correction: float = 1.8
+    interval: tuple[float, float] = (0.5, 2.0)
+    coarsest_cpu: int = 64
+    coarsest_cuda: int = 16
+    projected_sweeps: int = 8
+
+    @property
+    def weights(self) -> tuple[float, float]:
+        """Relaxation weights: reciprocals of the Chebyshev points of the interval."""
+        a, b = self.interval
+        points = [0.5 * (a + b) + 0.5 * (b - a) * math.cos(math.pi * (2 * i + 1) / 4) for i in range(2)]
+        return 1 / points[0], 1 / points[1]
+
+
+class Level:
+    """One grid: its stencil, iterate x, right-hand side b, a second buffer t, and bounds of x if cycles are projected."""
+
+    def __init__(self, stencil: Stencil, real: Any, *, bounded: bool) -> None:
+        self.stencil, self.real = stencil, real
+        field: Callable[[], wp.array[Any]] = lambda: wp.zeros(stencil.padding.size, dtype=real, device=stencil.device)  # noqa: E731
+        self.x, self.b, self.t = field(), field(), field()
+        self.lower, self.upper = (field(), field()) if bounded else (self.x, self.x)
+        self.kernels = cycle_kernels(stencil.weights is not None, stencil.d.dtype, real)
+        nothing = wp.empty(0, dtype=real, device=stencil.device)
+        self.operands = [stencil.shape, stencil.d, *(stencil.weights or (nothing,) * 3)]
+
+    @property
+    def grids(self) -> list[wp.array[Any]]:
+        """The diagonal and the weights as three-dimensional arrays; empty ones for uniform weights."""
+        shape, s = self.stencil.padding.shape, self.stencil
+        empty = wp.empty((0, 0, 0), dtype=self.real, device=s.device)
+        return [s.d.reshape(shape), *((w.reshape(shape) for w in s.weights) if s.weights else (empty,) * 3)]
+
+    def sweep(self, y: wp.array[Any], x: wp.array[Any], omega: float, *, projected: bool, from_zero: bool = False) -> None:
+        """Y = x + omega D^-1 (b - A x), clipped to the bounds if projected; x is taken for 0 if from_zero."""
+        s = self.stencil
+        if not from_zero:
+            s.wrap(x)
+        inputs = [*self.operands, s.grain, from_zero, y, x, self.b, self.lower, self.upper, omega, projected]
+        wp.launch(self.kernels.sweep, s.threads, inputs, device=s.device)
+
+
+class Hierarchy:
+    """Multigrid for (P A P + P D P) e = r on a grid.
+
+    The finest level shares A's weights; its diagonal is the caller's to fill (0 takes a cell out), followed by `rebuild`. `cycle` and
+    `monotone_cycle` read the right-hand side from `b` and write `x`. Nothing is allocated and nothing is read back by them, so that they
+    can be captured in a graph.
+
+    Args:
+        stencil: the operator on all unknowns.
+        real: type of the corrections.
+        bounded: whether projected cycles are wanted; they need bounds on every level.
+        settings: how cycles go.
+    """
+
+    def __init__(self, stencil: Stencil, real: Any, *, bounded: bool, settings: CycleSettings | None = None) -> None:
+        self.settings, self.real, self._source = settings or CycleSettings(), real, stencil
+        self.device = stencil.device
+        d_type = wp.uint8 if stencil.d.dtype is wp.uint8 else real
+        weights = stencil.weights
+        if weights is not None and weights[0].dtype is not real:
+            weights = tuple(wp.zeros(w.size, dtype=real, device=w.device) for w in weights)  # type: ignore[assignment]
+        d = wp.zeros(stencil.d.size, dtype=d_type, device=self.device)
+        unit = stencil.unit if d_type is wp.uint8 else 1.0
+        finest = Stencil(stencil.padding, d, weights, stencil.coefficients, unit, stencil.periodic)
+        self.levels = [Level(finest, real, bounded=bounded)]
+        most = self.settings.coarsest_cuda if self.device.is_cuda else self.settings.coarsest_cpu
+        while math.prod(self.levels[-1].stencil.padding.counts) > most:
+            self.levels.append(self._coarser(self.levels[-1], bounded=bounded))
+        m = math.prod(self.levels[-1].stencil.padding.counts)
+        self._matrix, self._inverse = (wp.zeros((m, m), dtype=wp.float64, device=self.device) for _ in range(2))
+        self.refresh_weights()
+
+    @property
+    def finest(self) -> Level:
+        """The level of the operator itself."""
+        return self.levels[0]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that the levels hold, shared weights of the finest one not counted."""
+        return sum(sum(a.capacity for a in {id(v): v for v in (lv.x, lv.b, lv.t, lv.lower, lv.upper)}.values()) for lv in self.levels)
+
+    def refresh_weights(self) -> None:
+        """Take the operator's weights again after they changed in place."""
+        ours, theirs = self.finest.stencil.weights, self._source.weights
+        for w, source in zip(ours or (), theirs or (), strict=True):
+            if w is not source:
+                convert(source, w)
+
+    def rebuild(self) -> None:
+        """Coarsen from the finest diagonal down, and factor the coarsest level."""
+        for fine, coarse in zip(self.levels, self.levels[1:], strict=False):
+            s, c = fine.stencil, coarse.stencil
+            inputs = [s.shape, *fine.grids, wp.vec3i(*s.padding.counts), wp.vec3i(*map(int, s.periodic)), *coarse.grids]
+            wp.launch(kernels.coarsen_kernel, c.padding.counts, inputs, device=self.device)
+            for w in c.weights or ():
+                c.wrap(w)
+        last, s = self.levels[-1], self.levels[-1].stencil
+        inputs = [s.shape, *last.grids, wp.vec3i(*s.padding.counts), wp.vec3i(*map(int, s.periodic)), self._matrix]
+        wp.launch(kernels.factor_kernel, 1, inputs, device=self.device)
+        wp.launch(kernels.invert_kernel, self._matrix.shape[0], [self._matrix, self._inverse], device=self.device)
+
+    def cycle(self, level: int = 0, *, from_zero: bool = True) -> None:
+        """One linear cycle: a symmetric positive (semi-)definite approximation of the inverse."""
+        L = self.levels[level]
+        if level == len(self.levels) - 1:
+            counts, shape = L.stencil.padding.counts, L.stencil.padding.shape
+            inputs = [self._inverse, wp.vec3i(*counts), L.b.reshape(shape), L.x.reshape(shape)]
+            wp.launch(kernels.solve_coarsest_kernel, math.prod(counts), inputs, device=self.device)
+            return
+        self._pair(L, from_zero=from_zero, projected=False)
+        self._restrict(level)
+        for visit in range(self.settings.gamma if level + 2 < len(self.levels) else 1):
+            self.cycle(level + 1, from_zero=visit == 0)
+        self._correct(level, projected=False)
+        self._pair(L, reverse=True, projected=False)
+
+    def monotone_cycle(self, level: int = 0, *, from_zero: bool = True) -> None:
+        """One projected cycle on all levels: every sweep is clipped, coarse bounds keep the finer iterate within its own.
+
+        It moves whole aggregates on and off their bounds, where an active-set method moves the boundary by about a layer of cells a step.
+        """
+        L = self.levels[level]
+        if level == len(self.levels) - 1:
+            for sweep in range(self.settings.projected_sweeps):
+                self._pair(L, from_zero=from_zero and sweep == 0, projected=True)
+                self._pair(L, reverse=True, projected=True)
+            return
+        C, shape = self.levels[level + 1], L.stencil.padding.shape
+        self._pair(L, from_zero=from_zero, projected=True)
+        self._restrict(level)
+        coarse = C.stencil.padding
+        fields = [f.reshape(shape) for f in (L.stencil.d, L.x, L.lower, L.upper)]
+        scale = self.real(self.settings.over_correction)
+        bounds = [wp.vec3i(*L.stencil.padding.counts), scale, C.lower.reshape(coarse.shape), C.upper.reshape(coarse.shape)]
+        wp.launch(kernels.bounds_kernel, coarse.counts, [*fields, *bounds], device=self.device)
+        for visit in range(self.settings.gamma if level + 2 < len(self.levels) else 1):
+            self.monotone_cycle(level + 1, from_zero=visit == 0)
+        self._correct(level, projected=True)
+        self._pair(L, reverse=True, projected=True)
+
+    def _pair(self, L: Level, *, projected: bool, from_zero: bool = False, reverse: bool = False) -> None:
+        """Two Chebyshev-Jacobi sweeps; the reverse pair after the correction keeps the cycle symmetric."""
+        first, second = reversed(self.settings.weights) if reverse else self.settings.weights
+        L.sweep(L.t, L.x, first, projected=projected, from_zero=from_zero)
+        L.sweep(L.x, L.t, second, projected=projected)
+
+    def _restrict(self, level: int) -> None:
+        L, C = self.levels[level], self.levels[level + 1]
+        L.stencil.wrap(L.x)
+        counts = C.stencil.padding.counts
+        g = grain(counts[2], self.device)
+        n0, n1, _ = L.stencil.padding.counts
+        inputs = [*L.operands, g, C.stencil.shape, n0, n1, L.x, L.b, C.b]
+        wp.launch(L.kernels.restrict, (counts[0], counts[1], -(-counts[2] // g)), inputs, device=self.device)
+
+    def _correct(self, level: int, *, projected: bool) -> None:
+        L, C = self.levels[level], self.levels[level + 1]
+        nz, ny, _ = L.stencil.padding.counts
+        coarse = C.stencil.padding.counts[2]
+        g = grain(coarse, self.device)
+        inputs = [*L.operands, g, C.stencil.shape, L.x, C.x, L.lower, L.upper, self.settings.over_correction, projected]
+        wp.launch(L.kernels.correct, (nz, ny, -(-coarse // g)), inputs, device=self.device)
+
+    def _coarser(self, fine: Level, *, bounded: bool) -> Level:
+        s = fine.stencil
+        counts = tuple(-(-n // 2) for n in s.padding.counts)
+        padding = Padding(counts)  # type: ignore[arg-type]
+        new = [wp.zeros(padding.size, dtype=self.real, device=self.device) for _ in range(4)]
+        periodic = tuple(p and n > 1 for p, n in zip(s.periodic, reversed(counts), strict=True))
+        stencil = Stencil(padding, new[0], (new[1], new[2], new[3]), (0.0, 0.0, 0.0), 1.0, periodic)  # type: ignore[arg-type]
+        return Level(stencil, self.real, bounded=bounded)
+
+
+__all__ = ["UNBOUNDED", "CycleSettings", "Hierarchy", "Level"]

@@ -1,0 +1,7 @@
+"""Operators: A of y = A x + b, never assembled."""
+
+from warp_lcp.operators.dense import DenseOperator
+from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID, GridPoisson
+from warp_lcp.operators.protocol import Operator
+
+__all__ = ["AIR", "FLUID", "SOLID", "DenseOperator", "GridPoisson", "Operator"]

@@ -1,0 +1,101 @@
+"""Floating components: FLUID cells that neither AIR nor a shift holds, on which A is singular with the constants as null space."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.operators import components_kernels as kernels
+from warp_lcp.operators.grid_poisson_kernels import FLUID
+
+if TYPE_CHECKING:
+    from warp_lcp.operators.grid_poisson import GridPoisson
+
+
+class FloatingComponents:
+    """The floating components of an operator, numbered from 0, and what keeps a solve on them well posed.
+
+    Summing y = A x + b over such a component leaves the sum of b: without bounds a solution exists only if that is 0, with lower bounds
+    alone only if it is >= 0, with upper bounds alone only if it is <= 0.
+    """
+
+    def __init__(self, label: np.ndarray, device: wp.Device) -> None:
+        self.device, self._host = device, label
+        self.count = int(label.max()) + 1
+        self.sizes = np.bincount(label[label >= 0], minlength=self.count).astype(np.float64)
+        self._label = wp.array(label, dtype=wp.int32, device=device)
+        self._sizes = wp.array(self.sizes, dtype=wp.float64, device=device)
+        self._sums = wp.zeros(self.count, dtype=wp.float64, device=device)
+        self._held = wp.zeros(self.count, dtype=wp.int32, device=device)
+
+    def unattainable(self, b: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any]) -> float:
+        """Return a norm that the natural residual cannot go below; 0 if b is compatible everywhere.
+
+        Args:
+            b: stored field, float64, units of y.
+            lower: stored lower bounds.
+            upper: stored upper bounds.
+        """
+        inside = self._host >= 0
+        label = self._host[inside]
+        rest = np.bincount(label, b.numpy()[inside], self.count)
+        scale = np.bincount(label, np.abs(b.numpy()[inside]), self.count)
+        below = np.bincount(label, np.isfinite(lower.numpy()[inside]), self.count) > 0
+        above = np.bincount(label, np.isfinite(upper.numpy()[inside]), self.count) > 0
+        rest[(below & (rest > 0)) | (above & (rest < 0))] = 0
+        rest[np.abs(rest) <= 4 * np.finfo(np.float64).eps * scale * np.sqrt(self.sizes)] = 0  # the rounding of a sum
+        return float(np.sqrt(np.sum(rest**2 / self.sizes)))
+
+    def project(self, r: wp.array[Any], free: wp.array[Any]) -> None:
+        """Take the mean off r on every component whose unknowns are all free: the right-hand sides a singular block can meet."""
+        self._sums.zero_()
+        self._held.zero_()
+        n = r.size
+        wp.launch(kernels.component_sums_kernel, n, [self._label, free, r, self._sums, self._held], device=self.device)
+        wp.launch(kernels.remove_means_kernel, n, [self._label, self._sums, self._held, self._sizes, r], device=self.device)
+
+    def settle(self, x: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any]) -> None:
+        """Choose the constants that the last `project` left open: mean 0 without bounds, else x touches its nearer bound.
+
+        Only components that were free as a whole move.
+        """
+        below, above = (wp.full(self.count, np.inf, dtype=wp.float64, device=self.device) for _ in range(2))
+        wp.launch(kernels.smallest_gap_kernel, x.size, [self._label, x, lower, upper, below, above], device=self.device)
+        gap_below, gap_above = below.numpy(), above.numpy()
+        inside = self._host >= 0
+        mean = np.bincount(self._host[inside], x.numpy()[inside], self.count) / self.sizes
+        constant = np.where(np.isfinite(gap_below), -gap_below, np.where(np.isfinite(gap_above), gap_above, -mean))
+        constants = wp.array(constant, dtype=wp.float64, device=self.device)
+        wp.launch(kernels.shift_components_kernel, x.size, [self._label, self._held, constants, x], device=self.device)
+
+
+def floating_components(A: GridPoisson) -> FloatingComponents | None:
+    """Return the floating components of A, or None if there are none."""
+    padded, counts, device = A.layout.stored_shape, A.layout.padding.counts, A.device
+    parent = wp.empty(A.layout.size, dtype=wp.int32, device=device)
+    grounded = wp.zeros(A.layout.size, dtype=wp.uint8, device=device)
+    count = wp.zeros(1, dtype=wp.int32, device=device)
+    faces = A.faces
+    wp.launch(kernels.singletons_kernel, parent.size, [parent], device=device)
+    wp.launch(kernels.unite_kernel, counts, [A.cells_around, *faces, wp.vec3d(*A.uniform), wp.vec3i(*counts), parent], device=device)
+    wp.launch(kernels.ground_kernel, counts, [A.cells_around, *faces, wp.vec3d(*A.uniform), A.shift, parent, grounded], device=device)
+    wp.launch(kernels.count_floating_kernel, parent.size, [A.cells.flatten(), parent, grounded, count], device=device)
+    if count.numpy()[0] == 0:
+        return None
+    roots = _roots(parent.numpy())
+    interior = np.zeros(padded, dtype=bool)
+    interior[1:-1, 1:-1, 1:-1] = A.cells.numpy()[1:-1, 1:-1, 1:-1] == FLUID
+    floating = interior.ravel() & (grounded.numpy()[roots] == 0)
+    label = np.full(parent.size, -1, dtype=np.int32)
+    label[floating] = np.unique(roots[floating], return_inverse=True)[1]
+    return FloatingComponents(label, device)
+
+
+def _roots(parent: np.ndarray) -> np.ndarray:
+    """Follow parents to their roots."""
+    roots = parent[parent]
+    while not np.array_equal(roots, roots[roots]):
+        roots = roots[roots]
+    return roots

@@ -1,0 +1,117 @@
+"""A dense matrix as an operator: small problems, oracles and tests."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.layout import Layout
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.dense")
+def product_kernel(a: wp.array2d(dtype=Any), x: wp.array(dtype=Any), transposed: bool, y: wp.array(dtype=Any)):
+    """Y = A x or A' x, a row a thread."""
+    i = wp.tid()
+    s = x.dtype(0)
+    for j in range(x.shape[0]):
+        if transposed:
+            s += x.dtype(a[j, i]) * x[j]
+        else:
+            s += x.dtype(a[i, j]) * x[j]
+    y[i] = s
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.dense")
+def relax_kernel(
+    a: wp.array2d(dtype=Any),
+    b: wp.array(dtype=Any),
+    lower: wp.array(dtype=Any),
+    upper: wp.array(dtype=Any),
+    omega: wp.float64,
+    forward: bool,
+    x: wp.array(dtype=Any),
+):
+    """One sweep of projected SOR in row order, by one thread: each row sees the rows before it."""
+    n = x.shape[0]
+    for row in range(n):
+        i = row
+        if not forward:
+            i = n - 1 - row
+        d = x.dtype(a[i, i])
+        if d != x.dtype(0):
+            s = b[i]
+            for j in range(n):
+                s += x.dtype(a[i, j]) * x[j]
+            x[i] = wp.clamp(x[i] - x.dtype(omega) * s / d, lower[i], upper[i])
+
+
+for _A in (wp.float32, wp.float64):
+    for _X in (wp.float32, wp.float64):
+        _M, _V = wp.array2d(dtype=_A), wp.array(dtype=_X)
+        wp.overload(product_kernel, [_M, _V, bool, _V])
+        wp.overload(relax_kernel, [_M, _V, _V, _V, wp.float64, bool, _V])
+
+
+class DenseOperator:
+    """A x with a dense square matrix A.
+
+    Args:
+        matrix: A, numpy array (n, n), finite.
+        device: Warp device; the default device if None.
+        dtype: storage of A, wp.float64 or wp.float32.
+
+    Raises:
+        ValueError: the matrix is not square, empty or not finite.
+    """
+
+    def __init__(self, matrix: Any, *, device: Any = None, dtype: Any = wp.float64) -> None:
+        if dtype not in (wp.float32, wp.float64):
+            raise ValueError(f"dtype = {dtype}: must be wp.float32 or wp.float64")
+        host = np.asarray(matrix, dtype=np.float64)
+        if host.ndim != 2 or host.shape[0] != host.shape[1] or host.size == 0:
+            raise ValueError(f"matrix has shape {host.shape}: expected (n, n) with n >= 1")
+        if not np.isfinite(host).all():
+            raise ValueError("matrix holds a value that is not finite")
+        self.device, self.dtype, self.shape = wp.get_device(device), dtype, (host.shape[0],)
+        self.layout = Layout(self.shape, self.device)
+        self.matrix = wp.array(host, dtype=dtype, device=self.device)
+        self.symmetric = bool(np.array_equal(host, host.T))
+
+    @property
+    def unknowns(self) -> int:
+        """Number of rows."""
+        return self.shape[0]
+
+    def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+        """Return A x, x of shape (n,) and type wp.float32 or wp.float64."""
+        return self._product(x, out, transposed=False)
+
+    def apply_transpose(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+        """Return A' x."""
+        return self._product(x, out, transposed=True)
+
+    def diagonal(self) -> wp.array[Any]:
+        """Return the diagonal of A, shape (n,)."""
+        return wp.array(np.diag(self.matrix.numpy()).copy(), dtype=self.dtype, device=self.device)
+
+    def masked(self, free: Any, shift: Any = None) -> DenseOperator:
+        """Return P A P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift)."""
+        p = self.layout.load(free, wp.uint8, "free").numpy() != 0
+        matrix = self.matrix.numpy() * np.outer(p, p)
+        if shift is not None:
+            matrix = matrix + np.diag(self.layout.load(shift, self.dtype, "shift").numpy() * p)
+        return DenseOperator(matrix, device=self.device, dtype=self.dtype)
+
+    def relax(self, x: Any, b: Any, lower: Any, upper: Any, omega: float, *, forward: bool = True) -> None:
+        """Sweep x once in row order (forward) or backwards, each unknown projected onto its bounds."""
+        inputs = [self.matrix, b, lower, upper, wp.float64(omega), forward, x]
+        wp.launch(relax_kernel, 1, inputs, device=self.device)
+
+    def _product(self, x: wp.array[Any], out: wp.array[Any] | None, *, transposed: bool) -> wp.array[Any]:
+        if tuple(x.shape) != self.shape:
+            raise ValueError(f"x has shape {tuple(x.shape)}: expected {self.shape}")
+        out = wp.zeros_like(x) if out is None else out
+        wp.launch(product_kernel, self.shape[0], [self.matrix, x, transposed, out], device=self.device)
+        return out

@@ -1,0 +1,254 @@
+"""The Poisson operator of a grid of cells, matrix-free: what pressure solves, obstacle problems and density corrections share."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.operators import grid_poisson_kernels as kernels
+from warp_lcp.operators.grid_poisson_kernels import AIR, FLUID, SOLID
+from warp_lcp.layout import PaddedLayout
+from warp_lcp.operators.components import FloatingComponents, floating_components
+from warp_lcp.operators.stencil import Stencil, wrap
+
+__all__ = ["AIR", "FLUID", "SOLID", "GridPoisson"]
+
+Face = Any  # a number or an array
+AXES = "xyz"
+
+
+class GridPoisson:
+    """Negative Laplacian on the FLUID cells of a grid ([Book] 1.3.1), with general face coefficients.
+
+    (A x)_i = sum over i's open faces of c_f (x_i - x_neighbor) + shift_i x_i, with x = 0 in AIR and in SOLID. A face with SOLID on a side
+    is closed; outside the array is SOLID unless the axis is periodic. Numbers as coefficients keep the fast kernels: equal ones and no
+    shift need one byte a cell.
+
+    Args:
+        cells: integers AIR = 0, FLUID = 1, SOLID = 2, shape (nz, ny, nx) or (ny, nx); numpy or wp.array. Unknowns live on FLUID cells,
+            fields have the shape of `cells`.
+        face_x: c_f >= 0 of the faces normal to x: a number or an array (nz, ny, nx + 1), or (ny, nx + 1) in 2-D.
+        face_y: likewise, (nz, ny + 1, nx).
+        face_z: likewise, (nz + 1, ny, nx); 2-D has none.
+        shift: None, a number or an array of the shape of `cells`, >= 0.
+        periodic: whether x, y, z wrap around.
+        device: Warp device; that of `cells` or the default device if None.
+        dtype: storage of coefficients, wp.float32 or wp.float64.
+
+    Attributes:
+        cells: cell types with one layer of SOLID ghost cells, shape (nz + 2, ny + 2, nx + 2).
+        cells_around: the same with ghost cells of periodic axes filled; `cells` itself where no axis is periodic.
+        stencil: the diagonal and the weights on that padded grid.
+
+    Raises:
+        ValueError: an argument has a wrong shape, type or sign, or is not finite; the message names it.
+    """
+
+    symmetric = True
+
+    def __init__(
+        self,
+        cells: Any,
+        *,
+        face_x: Face = 1.0,
+        face_y: Face = 1.0,
+        face_z: Face = 1.0,
+        shift: Any = None,
+        periodic: tuple[bool, ...] = (False, False, False),
+        device: Any = None,
+        dtype: Any = wp.float32,
+    ) -> None:
+        if dtype not in (wp.float32, wp.float64):
+            raise ValueError(f"dtype = {dtype}: must be wp.float32 or wp.float64")
+        host = _checked_cells(cells)
+        self.device = wp.get_device(device if device is not None else cells.device if isinstance(cells, wp.array) else None)
+        self.dtype, self.shape = dtype, host.shape
+        self.layout = PaddedLayout(host.shape, self.device)
+        counts = self.layout.padding.counts
+        flags = (*(bool(p) for p in periodic), False, False, False)[:3]
+        self.periodic = tuple(flag and n > 1 for flag, n in zip(flags, reversed(counts), strict=True))
+        faces = [face_x, face_y, face_z if host.ndim == 3 else 1.0]
+        self.uniform = tuple(float(f) if np.ndim(f) == 0 else 0.0 for f in faces)
+        self.faces = [self._stored_face(f, axis) for axis, f in enumerate(faces)]
+        self.shift = self._stored_shift(shift)
+        self.cells = wp.zeros(self.layout.stored_shape, dtype=wp.int8, device=self.device)
+        self.cells_around = wp.zeros_like(self.cells) if any(self.periodic) else self.cells
+        self.stencil = self._empty_stencil()
+        self._mask: wp.array[Any] | None = None
+        self._refill(wp.array(np.pad(host.reshape(counts), 1).astype(np.int8), device=self.device))
+
+    def update(self, cells: wp.array[Any]) -> None:
+        """Take new cell types in place, without allocating.
+
+        Args:
+            cells: wp.int8 array on the operator's device, of its shape (3-D) or of the padded shape (nz + 2, ny + 2, nx + 2), whose
+                outer layer is ignored.
+
+        Raises:
+            ValueError: type, device or shape differ.
+        """
+        padded, counts = self.layout.stored_shape, self.layout.padding.counts
+        if not isinstance(cells, wp.array) or cells.dtype is not wp.int8 or cells.device != self.device:
+            raise ValueError(f"cells: expected a wp.int8 array on {self.device}")
+        if tuple(cells.shape) == self.shape != padded:
+            wp.copy(self.cells[1:-1, 1:-1, 1:-1], cells.reshape(counts))
+            cells = self.cells
+        elif tuple(cells.shape) != padded:
+            raise ValueError(f"cells has shape {tuple(cells.shape)}: expected {self.shape} or {padded}")
+        self._refill(cells)
+
+    def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+        """Return A x.
+
+        Args:
+            x: field of type wp.float32 or wp.float64, of the operator's shape or stored (flat, padded, 0 off the FLUID cells).
+            out: field like x that receives the product; made if None.
+        """
+        if tuple(x.shape) == (self.layout.size,):
+            out = wp.zeros_like(x) if out is None else out
+            self.stencil.product(x, out)
+            return out
+        stored = self.layout.load(x, x.dtype, "x")
+        inside = self.cells.numpy().ravel() == FLUID if self._mask is None else self._mask.numpy() != 0
+        stored = wp.array(np.where(inside, stored.numpy(), 0), dtype=x.dtype, device=self.device)
+        product = self.layout.unload(self.apply(stored))
+        if out is None:
+            return product
+        wp.copy(out, product)
+        return out
+
+    apply_transpose = apply  # A is symmetric
+
+    def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
+        """Out = A x + b in one pass; stored fields of one type."""
+        self.stencil.product(x, out, plus=b)
+
+    def relax(self, x: Any, b: Any, lower: Any, upper: Any, omega: float, *, forward: bool = True) -> None:
+        """Sweep stored fields once, red cells then black ones (forward) or the reverse, each unknown projected onto its bounds."""
+        self.stencil.relax(x, b, lower, upper, omega, forward=forward)
+
+    def floating_components(self) -> FloatingComponents | None:
+        """Return the components on which A is singular, or None if there are none."""
+        return floating_components(self)
+
+    def diagonal(self) -> wp.array[Any]:
+        """Return the diagonal of A, a field of the operator's shape and type; 0 off the FLUID cells."""
+        d = self.stencil.d.numpy().astype(np.float64) * self.stencil.unit
+        inner = d.reshape(self.layout.stored_shape)[1:-1, 1:-1, 1:-1]
+        return wp.array(inner.reshape(self.shape), dtype=self.dtype, device=self.device)
+
+    def masked(self, free: Any, shift: Any = None) -> GridPoisson:
+        """Return the principal system P A P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift), shift >= 0."""
+        wanted = self.layout.load(free, wp.uint8, "free").numpy() != 0
+        mask = wp.array((wanted & (self.cells.numpy().ravel() == FLUID)).astype(np.uint8), device=self.device)
+        twin = copy.copy(self)
+        twin._mask = mask
+        d = self.stencil.d
+        if shift is None:
+            new = wp.zeros_like(d)
+            wp.launch(kernels.mask_diagonal_kernel, d.size, [d, mask, new], device=self.device)
+        else:
+            new = self.layout.zeros(self.dtype)
+            inputs = [d, wp.float64(self.stencil.unit), mask, self.layout.load(shift, self.dtype, "shift"), new]
+            wp.launch(kernels.mask_and_shift_kernel, d.size, inputs, device=self.device)
+        twin.stencil = self.stencil.with_diagonal(new)
+        return twin
+
+    @property
+    def unknowns(self) -> int:
+        """Number of FLUID cells."""
+        return int(np.count_nonzero(self.cells.numpy()[1:-1, 1:-1, 1:-1] == FLUID))
+
+    def _stored_face(self, face: Face, axis: int) -> wp.array[Any]:
+        """Return the coefficients of lower faces as a padded array, or an empty array for a number."""
+        name = f"face_{AXES[axis]}"
+        if np.ndim(face) == 0 and not isinstance(face, wp.array):
+            _check_coefficients(np.asarray(face, dtype=np.float64), name)
+            return wp.empty((0, 0, 0), dtype=self.dtype, device=self.device)
+        host = face.numpy() if isinstance(face, wp.array) else np.asarray(face, dtype=np.float64)
+        expected = list(self.shape)
+        expected[-1 - axis] += 1
+        if host.shape != tuple(expected):
+            raise ValueError(f"{name} has shape {host.shape}: expected {tuple(expected)} for cells of shape {self.shape}")
+        _check_coefficients(host, name)
+        if self.periodic[axis] and not np.array_equal(host.take(0, -1 - axis), host.take(-1, -1 - axis)):
+            raise ValueError(f"{name}: the first and the last faces of a periodic axis are the same ones, but their coefficients differ")
+        counts = [*self.layout.padding.counts]
+        counts[2 - axis] += 1
+        padding = [(1, 0) if a == 2 - axis else (1, 1) for a in range(3)]
+        return wp.array(np.pad(host.reshape(counts), padding), dtype=self.dtype, device=self.device)
+
+    def _stored_shift(self, shift: Any) -> wp.array[Any]:
+        if shift is None:
+            return wp.empty((0, 0, 0), dtype=self.dtype, device=self.device)
+        host = shift.numpy() if isinstance(shift, wp.array) else np.asarray(shift, dtype=np.float64)
+        host = np.full(self.shape, host) if host.ndim == 0 else host
+        if host.shape != self.shape:
+            raise ValueError(f"shift has shape {host.shape}: expected {self.shape}")
+        _check_coefficients(host, "shift")
+        return wp.array(np.pad(host.reshape(self.layout.padding.counts), 1), dtype=self.dtype, device=self.device)
+
+    @property
+    def _counts_faces(self) -> bool:
+        """Whether the diagonal is a number of open faces times one coefficient."""
+        used = [c for c, n in zip(self.uniform, reversed(self.layout.padding.counts), strict=True) if c > 0 and n > 1]
+        return not self._has_arrays and self.shift.size == 0 and len(set(used)) <= 1
+
+    @property
+    def _has_arrays(self) -> bool:
+        return any(f.size > 0 for f in self.faces)
+
+    def _empty_stencil(self) -> Stencil:
+        layout = self.layout
+        weights = None
+        if self._has_arrays:
+            weights = (layout.zeros(self.dtype), layout.zeros(self.dtype), layout.zeros(self.dtype))
+        unit = max(self.uniform) or 1.0
+        if self._counts_faces:
+            used = [c for c, n in zip(self.uniform, reversed(layout.padding.counts), strict=True) if n > 1]
+            unit = max(used, default=1.0) or 1.0
+            return Stencil(layout.padding, layout.zeros(wp.uint8), None, self.uniform, unit, self.periodic)
+        return Stencil(layout.padding, layout.zeros(self.dtype), weights, self.uniform, 1.0, self.periodic)
+
+    def _refill(self, cells: wp.array[Any]) -> None:
+        """Take padded cell types and compute diagonal and weights."""
+        counts, padded = self.layout.padding.counts, self.layout.stored_shape
+        bounds = [wp.vec3i(1, 1, 1), wp.vec3i(*(n + 1 for n in counts))]
+        wp.launch(kernels.copy_cells_kernel, padded, [cells, self.cells, *bounds], device=self.device)
+        if self.cells_around is not self.cells:
+            wp.copy(self.cells_around, self.cells)
+            wrap(self.cells_around, self.periodic, counts)
+        d = self.stencil.d.reshape(padded)
+        if self._counts_faces:
+            axes = wp.vec3i(*(int(c > 0) for c in self.uniform))
+            wp.launch(kernels.count_faces_kernel, counts, [self.cells_around, axes, d], device=self.device)
+            return
+        inputs = [self.cells_around, *self.faces, wp.vec3d(*self.uniform), self.shift, d]
+        wp.launch(kernels.diagonal_kernel, counts, inputs, device=self.device)
+        for axis, w in enumerate(self.stencil.weights or ()):
+            extent = [n + int(a == 2 - axis) for a, n in enumerate(counts)]
+            step = wp.vec3i(*(int(a == 2 - axis) for a in range(3)))
+            inputs = [self.cells_around, self.faces[axis], wp.float64(self.uniform[axis]), step, w.reshape(padded)]
+            wp.launch(kernels.weights_kernel, extent, inputs, device=self.device)
+
+
+def _checked_cells(cells: Any) -> np.ndarray:
+    """Return cell types as a host array."""
+    host = cells.numpy() if isinstance(cells, wp.array) else np.asarray(cells)
+    if host.ndim not in (2, 3) or host.size == 0:
+        raise ValueError(f"cells has shape {host.shape}: expected (nz, ny, nx) or (ny, nx) with at least one cell")
+    if not np.issubdtype(host.dtype, np.integer):
+        raise ValueError(f"cells has type {host.dtype}: expected integers AIR = {AIR}, FLUID = {FLUID}, SOLID = {SOLID}")
+    if host.min() < AIR or host.max() > SOLID:
+        raise ValueError(f"cells has values from {host.min()} to {host.max()}: allowed are AIR = {AIR}, FLUID = {FLUID}, SOLID = {SOLID}")
+    return host
+
+
+def _check_coefficients(values: np.ndarray, name: str) -> None:
+    if not np.isfinite(values).all():
+        raise ValueError(f"{name} holds a value that is not finite")
+    if (values < 0).any():
+        raise ValueError(f"{name} holds a negative value ({values.min()}): coefficients must be >= 0")

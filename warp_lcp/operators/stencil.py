@@ -1,0 +1,83 @@
+"""The 7-point stencil on a padded grid: arrays, sizes and launches. An operator and each level of its multigrid are one of these."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from warp_lcp.native import grain
+from warp_lcp.layout import Padding
+from warp_lcp.operators.stencil_kernels import StencilShape, product_kernels, wrap_kernel
+
+
+@dataclass
+class Stencil:
+    """A x = unit d x - sum of w x_neighbor on the cells with d != 0.
+
+    Args:
+        padding: counts of cells and of stored cells.
+        d: diagonal in units of `unit`, flat stored field; 0 where there is no unknown. A count of faces (wp.uint8) or a float.
+        weights: weight of the lower face of each cell along x, y, z (flat stored fields), or None for one weight an axis.
+        coefficients: the weights along x, y, z where `weights` is None.
+        unit: value of one unit of d.
+        periodic: whether x, y, z wrap around; ghost cells are then filled before each product.
+    """
+
+    padding: Padding
+    d: wp.array[Any]
+    weights: tuple[wp.array[Any], wp.array[Any], wp.array[Any]] | None
+    coefficients: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    unit: float = 1.0
+    periodic: tuple[bool, bool, bool] = (False, False, False)
+
+    def __post_init__(self) -> None:
+        """Lay out the kernel's view of the sizes."""
+        nz, ny, nx = self.padding.counts
+        self.device = self.d.device
+        self.shape = StencilShape()
+        self.shape.nx, self.shape.s1, self.shape.s2, self.shape.unit = nx, self.padding.plane, self.padding.row, self.unit
+        self.shape.cx, self.shape.cy, self.shape.cz = self.coefficients
+        self.grain = grain(nx, self.device)
+        self.threads = (nz, ny, -(-nx // self.grain))
+        self.operands = [self.shape, self.d, *(self.weights or [wp.empty(0, dtype=wp.float32, device=self.device)] * 3), self.grain]
+
+    @property
+    def storage(self) -> tuple[bool, Any, Any]:
+        """Form and types that choose the kernels: variable weights?, type of d, type of the weights."""
+        return self.weights is not None, self.d.dtype, self.weights[0].dtype if self.weights else wp.float32
+
+    def with_diagonal(self, d: wp.array[Any]) -> Stencil:
+        """Return the stencil with another diagonal (a mask makes it 0) and the same weights."""
+        unit = self.unit if d.dtype is self.d.dtype else 1.0
+        return Stencil(self.padding, d, self.weights, self.coefficients, unit, self.periodic)
+
+    def wrap(self, x: wp.array[Any]) -> None:
+        """Fill x's ghost cells along periodic axes."""
+        if any(self.periodic):
+            wrap(x.reshape(self.padding.shape), self.periodic, self.padding.counts)
+
+    def product(self, x: wp.array[Any], out: wp.array[Any], plus: wp.array[Any] | None = None) -> None:
+        """Out = A x, or A x + plus. All of one float type; rows that are no unknowns give 0 (or plus)."""
+        self.wrap(x)
+        kernel = product_kernels(*self.storage, x.dtype).product
+        inputs = [*self.operands, x, x if plus is None else plus, plus is not None, out]
+        wp.launch(kernel, self.threads, inputs, device=self.device)
+
+    def relax(
+        self, x: wp.array[Any], b: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any], omega: float, *, forward: bool = True
+    ) -> None:
+        """Sweep x once, red cells then black ones (forward) or black then red, each cell projected onto its bounds."""
+        kernel = product_kernels(*self.storage, x.dtype).relax
+        for color in (0, 1) if forward else (1, 0):
+            self.wrap(x)
+            wp.launch(kernel, self.threads, [*self.operands, x, b, lower, upper, omega, color], device=self.device)
+
+
+def wrap(field: wp.array[Any], periodic: tuple[bool, ...], counts: tuple[int, int, int]) -> None:
+    """Fill the ghost cells of a padded field (nz + 2, ny + 2, nx + 2) along its periodic axes x, y, z."""
+    for axis, n in enumerate(reversed(counts)):
+        if periodic[axis]:
+            others = [field.shape[a] for a in range(3) if a != 2 - axis]
+            wp.launch(wrap_kernel, others, [field, axis, n], device=field.device)

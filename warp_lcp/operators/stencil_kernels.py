@@ -1,0 +1,128 @@
+"""Kernels of the 7-point stencil on a padded grid: one native row function each, for all storage types.
+
+(A x)_i = d_i x_i - sum of w_f x_neighbor, for d_i != 0; rows with d_i = 0 are no unknowns and give 0. Fields are 0 in cells that are no
+unknowns, so a neighbor needs no test. Two forms of one source: `uniform` has a weight an axis (and d may be a count of open faces in one
+byte, d_scale its unit), `variable` has an array of lower faces an axis.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from warp_lcp.native import C_TYPES, simd
+
+NEIGHBORS = {
+    False: "(cx*(x[k-1] + x[k+1]) + cy*(x[k-s2] + x[k+s2]) + cz*(x[k-s1] + x[k+s1]))",
+    True: "(wx[k]*x[k-1] + wx[k+1]*x[k+1] + wy[k]*x[k-s2] + wy[k+s2]*x[k+s2] + wz[k]*x[k-s1] + wz[k+s1]*x[k+s1])",
+}
+
+
+def stencil_head(variable: bool, real: str) -> str:
+    """Return declarations of d, the weights, the strides s1 and s2 for a row that begins at element p."""
+    head = f"typedef {real} T; const long long s1 = A.s1, s2 = A.s2; const T unit = (T)A.unit; const auto* d = d_.data + p;"
+    if variable:
+        return head + "const auto* wx = wx_.data + p; const auto* wy = wy_.data + p; const auto* wz = wz_.data + p;"
+    return head + "const T cx = (T)A.cx, cy = (T)A.cy, cz = (T)A.cz;"
+
+
+@wp.struct
+class StencilShape:
+    """Sizes and uniform coefficients of a stencil."""
+
+    nx: int
+    s1: wp.int64  # elements from plane to plane
+    s2: wp.int64  # elements from row to row
+    unit: wp.float64  # what one unit of d is worth
+    cx: wp.float64
+    cy: wp.float64
+    cz: wp.float64
+
+
+@wp.func
+def row_start(A: StencilShape, k: int, j: int, c: int, grain: int):
+    """Element at which chunk c of row (k, j) begins; k, j count interior cells from 0."""
+    return wp.int64(k + 1) * A.s1 + wp.int64(j + 1) * A.s2 + wp.int64(1 + c * grain)
+
+
+@functools.cache
+def product_kernels(variable: bool, d_type: Any, w_type: Any, x_type: Any) -> SimpleNamespace:
+    """Return `product` (y = A x + b or A x) and `relax` (one color of projected SOR)."""
+    form = "variable" if variable else "uniform"
+    name = f"warp_lcp.stencil.{form}_{d_type.__name__}_{w_type.__name__}_{x_type.__name__}"
+    d_array, w_array, x_array = wp.array(dtype=d_type), wp.array(dtype=w_type), wp.array(dtype=x_type)
+    head, neighbors = stencil_head(variable, C_TYPES[x_type]), NEIGHBORS[variable]
+
+    @wp.func_native(
+        simd(
+            head
+            + f"""const T* x = x_.data + p; T* y = y_.data + p;
+        if (shifted) {{
+            const T* b = b_.data + p;
+            SIMD for (int k = 0; k < n; ++k) {{ const T e = unit*(T)d[k], v = e*x[k] - {neighbors}; y[k] = (e != 0 ? v : (T)0) + b[k]; }}
+        }} else {{
+            SIMD for (int k = 0; k < n; ++k) {{ const T e = unit*(T)d[k], v = e*x[k] - {neighbors}; y[k] = e != 0 ? v : (T)0; }}
+        }}"""
+        )
+    )
+    def product_row(
+        A: StencilShape, d_: d_array, wx_: w_array, wy_: w_array, wz_: w_array, x_: x_array, b_: x_array, y_: x_array, p: wp.int64, n: int,
+        shifted: bool,
+    ): ...  # fmt: skip
+
+    @wp.func_native(
+        simd(
+            head
+            + f"""T* x = x_.data + p; const T* b = b_.data + p; const T* lower = l_.data + p; const T* upper = u_.data + p;
+        for (int k = first; k < n; k += 2) {{
+            const T e = unit*(T)d[k];
+            if (e != 0) {{
+                T v = x[k] - omega*(b[k] + e*x[k] - {neighbors}) / e;
+                v = v > lower[k] ? v : lower[k]; x[k] = v < upper[k] ? v : upper[k]; }}
+        }}"""
+        )
+    )
+    def relax_row(
+        A: StencilShape, d_: d_array, wx_: w_array, wy_: w_array, wz_: w_array, x_: x_array, b_: x_array, l_: x_array, u_: x_array,
+        p: wp.int64, n: int, first: int, omega: x_type,
+    ): ...  # fmt: skip
+
+    @wp.kernel(enable_backward=False, module=name)
+    def product(
+        A: StencilShape, d: d_array, wx: w_array, wy: w_array, wz: w_array, grain: int, x: x_array, b: x_array, shifted: bool, y: x_array
+    ):
+        k, j, c = wp.tid()
+        n = wp.min(grain, A.nx - c * grain)
+        product_row(A, d, wx, wy, wz, x, b, y, row_start(A, k, j, c, grain), n, shifted)
+
+    @wp.kernel(enable_backward=False, module=name)
+    def relax(
+        A: StencilShape, d: d_array, wx: w_array, wy: w_array, wz: w_array, grain: int, x: x_array, b: x_array, lower: x_array,
+        upper: x_array, omega: x_type, color: int,
+    ):  # fmt: skip
+        k, j, c = wp.tid()
+        n = wp.min(grain, A.nx - c * grain)
+        first = (k + j + c * grain + color) % 2
+        relax_row(A, d, wx, wy, wz, x, b, lower, upper, row_start(A, k, j, c, grain), n, first, omega)
+
+    return SimpleNamespace(product=product, relax=relax)
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.stencil")
+def wrap_kernel(x: wp.array3d(dtype=Any), axis: int, n: int):
+    """Ghost cells of a periodic axis take the values of the cells at the other end."""
+    a, b = wp.tid()
+    if axis == 0:
+        x[a, b, 0] = x[a, b, n]
+        x[a, b, n + 1] = x[a, b, 1]
+    elif axis == 1:
+        x[a, 0, b] = x[a, n, b]
+        x[a, n + 1, b] = x[a, 1, b]
+    else:
+        x[0, a, b] = x[n, a, b]
+        x[n + 1, a, b] = x[1, a, b]
+
+
+for _type in (wp.int8, wp.float32, wp.float64):
+    wp.overload(wrap_kernel, [wp.array3d(dtype=_type), int, int])

@@ -1,0 +1,224 @@
+"""The one outer loop: start, criteria, status, history, best iterate. Methods only step."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, Protocol
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.layout import Array
+from warp_lcp.problem import LCP
+from warp_lcp.residual import NaturalResidual
+from warp_lcp.result import Record, SolveResult, SolveStatus
+from warp_lcp.stopping import StoppingCriteria
+
+EPS = float(np.finfo(np.float64).eps)
+FLOOR_MARGIN = 8.0  # a stagnated residual within this multiple of the rounding estimate is called the precision's floor
+
+
+class Precision(Enum):
+    """Types of iterate and corrections: `mixed` keeps the iterate in float64 and computes corrections in float32."""
+
+    MIXED = "mixed"
+    SINGLE = "single"
+    DOUBLE = "double"
+
+    @property
+    def iterate(self) -> Any:
+        """Type of the iterate."""
+        return wp.float32 if self is Precision.SINGLE else wp.float64
+
+    @property
+    def correction(self) -> Any:
+        """Type of corrections."""
+        return wp.float64 if self is Precision.DOUBLE else wp.float32
+
+    @property
+    def epsilon(self) -> float:
+        """Rounding unit of the iterate."""
+        return float(np.finfo(np.float32 if self is Precision.SINGLE else np.float64).eps)
+
+
+@dataclass(frozen=True)
+class Step:
+    """What one step of a method did.
+
+    Args:
+        name: a word of the method.
+        linear_iterations: iterations on the finest grid.
+        active: unknowns held at a bound, None where the method has no active set.
+        failure: the status with which the method gives up, None to go on.
+    """
+
+    name: str
+    linear_iterations: int = 1
+    active: int | None = None
+    failure: SolveStatus | None = None
+
+
+class Workspace(Protocol):
+    """What a method allocates once for a problem; can be used again when b, the bounds or the cells change in place."""
+
+    x: wp.array[Any]
+    residual: NaturalResidual
+    precision: Precision
+
+    def start(self, *, warm: bool, tolerance: float) -> None:
+        """Forget the last solve. `warm`: x is a guess better than clip(0, l, u); `tolerance`: the residual norm that is asked for."""
+
+
+class Solver(Protocol):
+    """A method is its settings; its memory is a Workspace."""
+
+    def init(self, problem: LCP) -> Any:
+        """Return a workspace for the problem.
+
+        Raises:
+            ValueError: the method's assumptions on A do not hold.
+        """
+
+    def step(self, problem: LCP, work: Any, x: wp.array[Any]) -> Step:
+        """Move x once. `work.residual` is current at x; leave `work.residual.current` False unless it is at the new x."""
+
+
+def solve(
+    problem: LCP,
+    solver: Solver,
+    *,
+    stopping: StoppingCriteria | None = None,
+    x0: Array | None = None,
+    workspace: Workspace | None = None,
+    callback: Callable[[Record], None] | None = None,
+) -> SolveResult:
+    """Solve a problem by a method.
+
+    Args:
+        problem: the LCP.
+        solver: the method, say `MinimumMapNewton()`.
+        stopping: the criteria; defaults to `StoppingCriteria()`.
+        x0: a guess, field of the problem's shape, projected onto the bounds; clip(0, l, u) if None.
+        workspace: what `solver.init(problem)` returned, to use its memory again.
+        callback: called with each Record as it is made.
+
+    Returns:
+        The best iterate, its status and recomputed residual, the history. The result's x is the caller's to keep, unless the problem
+        works in place: then it is the workspace's own iterate, overwritten by the next solve with that workspace.
+
+    Raises:
+        ValueError: x0 has a wrong shape or is not finite, or the method cannot take this A.
+    """
+    return _Loop(problem, solver, stopping or StoppingCriteria(), workspace or solver.init(problem), callback).run(x0)
+
+
+class _Loop:
+    """The state of one solve."""
+
+    def __init__(
+        self, problem: LCP, solver: Solver, stopping: StoppingCriteria, work: Workspace, callback: Callable[[Record], None] | None
+    ) -> None:
+        self.problem, self.solver, self.stopping, self.work, self.callback = problem, solver, stopping, work, callback
+        self.residual, self.history = work.residual, list[Record]()
+        self.begun = time.perf_counter()
+        self.linear = 0
+        self.best, self.best_iteration, self.best_norm = wp.zeros_like(work.x), 0, math.inf
+
+    def run(self, x0: Array | None) -> SolveResult:
+        x, residual = self.work.x, self.residual
+        residual.start(x, keep=False)
+        self.reference = residual.evaluate(x)
+        self.tolerance = self.stopping.tolerance(self.reference)
+        if self.reference <= 4 * EPS * residual.norm_of_b():
+            self._record(0, Step("start", 0))
+            self._keep(0)
+            return self._finish(SolveStatus.CONVERGED, 0)
+        floating = getattr(self.problem.A, "floating_components", lambda: None)()
+        self.work.floating = floating  # type: ignore[attr-defined]
+        lost = floating.unattainable(self.problem.b, self.problem.lower, self.problem.upper) if floating else 0.0
+        if x0 is not None and math.isfinite(self.reference):
+            self._load(x0)
+        self._record(0, Step("start", 0))
+        self._keep(0)
+        if lost > self.tolerance:
+            return self._finish(SolveStatus.INFEASIBLE, 0)
+        self.work.start(warm=x0 is not None, tolerance=self.tolerance)
+        return self._iterate()
+
+    def _iterate(self) -> SolveResult:
+        iteration, status = 0, self._status(0, None)
+        while status is None:
+            self.residual.current = False
+            step = self.solver.step(self.problem, self.work, self.work.x)
+            if not self.residual.current:
+                self.residual.evaluate(self.work.x)
+            iteration += 1
+            self.linear += step.linear_iterations
+            self._record(iteration, step)
+            if self.residual.norm < self.best_norm:
+                self._keep(iteration)
+            status = self._status(iteration, step.failure)
+        return self._finish(status, iteration)
+
+    def _load(self, x0: Array) -> None:
+        """Take a guess into the iterate."""
+        stored = self.problem.layout.load(x0, wp.float64, "x0")
+        if stored.ptr != self.work.x.ptr:
+            wp.copy(self.work.x, stored)
+        self.residual.start(self.work.x, keep=True)
+        if not math.isfinite(self.residual.evaluate(self.work.x)):
+            raise ValueError("x0 gives a residual that is not finite")
+
+    def _status(self, iteration: int, failure: SolveStatus | None) -> SolveStatus | None:
+        """Return how the solve ends now, None if it goes on."""
+        norm, stopping = self.residual.norm, self.stopping
+        if not math.isfinite(norm):
+            return SolveStatus.NON_FINITE
+        if norm <= self.tolerance:
+            return SolveStatus.CONVERGED
+        if failure is not None:
+            return self._floor_or(failure)
+        if norm > stopping.divergence * max(self.history[0].residual, self.reference):
+            return SolveStatus.DIVERGED
+        if iteration >= stopping.max_iterations:
+            return SolveStatus.MAX_ITERATIONS
+        if iteration - self.best_iteration >= stopping.patience:
+            return self._floor_or(SolveStatus.STAGNATED)
+        return None
+
+    def _floor_or(self, status: SolveStatus) -> SolveStatus:
+        """Return FLOOR where the residual is what rounding leaves, else the status."""
+        floor = FLOOR_MARGIN * self.residual.rounding_floor(self.best, self.work.precision.epsilon)
+        return SolveStatus.FLOOR if self.best_norm <= floor else status
+
+    def _record(self, iteration: int, step: Step) -> None:
+        seconds = time.perf_counter() - self.begun
+        record = Record(iteration, self.residual.norm, self.linear, step.active, step.name, seconds)
+        self.history.append(record)
+        if self.callback is not None:
+            self.callback(record)
+
+    def _keep(self, iteration: int) -> None:
+        """Remember the iterate as the best one."""
+        wp.copy(self.best, self.work.x)
+        self.best_iteration, self.best_norm = iteration, self.residual.norm
+
+    def _finish(self, status: SolveStatus, iterations: int) -> SolveResult:
+        if self.best_iteration != iterations or not math.isfinite(self.residual.norm):
+            wp.copy(self.work.x, self.best)
+            self.residual.evaluate(self.work.x)
+        norm = self.residual.norm
+        relative = norm / self.reference if self.reference > 0 else 0.0
+        layout, x = self.problem.layout, self.work.x
+        if self.problem.in_place:
+            out = x.reshape(layout.stored_shape)
+        else:
+            out = layout.unload(x)
+            out = wp.clone(out) if out.ptr == x.ptr else out
+        if self.work.precision.iterate is not wp.float64:
+            out = wp.array(out.numpy(), dtype=self.work.precision.iterate, device=layout.device)
+        return SolveResult(out, status, iterations, self.linear, norm, relative, self.history)

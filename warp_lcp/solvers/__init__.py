@@ -1,0 +1,6 @@
+"""Methods, one a file."""
+
+from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
+from warp_lcp.solvers.psor import ProjectedSOR
+
+__all__ = ["MinimumMapNewton", "ProjectedSOR"]
