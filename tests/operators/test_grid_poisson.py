@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import warp as wp
+from oracle import assemble
 
 import warp_lcp as wl
-from oracle import assemble
 
 SHAPES = [(5, 4, 6), (6, 7), (1, 3, 4), (3, 1), (2, 2, 2), (1, 1, 1)]
 PERIODIC = [(False, False, False), (True, False, False), (True, True, True)]
@@ -40,9 +40,7 @@ def test_apply_and_diagonal_equal_the_dense_matrix(shape, kind, periodic, dtype,
     rng = np.random.default_rng(5)
     cells = rng.integers(0, 3, shape)
     faces, shift = faces_of(kind, shape, periodic, rng)
-    A = wl.GridPoisson(
-        cells, face_x=faces[0], face_y=faces[1], face_z=faces[2], shift=shift, periodic=periodic, device=device, dtype=dtype
-    )
+    A = wl.GridPoisson(cells, face_x=faces[0], face_y=faces[1], face_z=faces[2], shift=shift, periodic=periodic, device=device, dtype=dtype)
     dense = assemble(cells, faces, shift, periodic)
     x = rng.standard_normal(shape)
     y = A.apply(wp.array(x, dtype=wp.float64, device=device)).numpy()

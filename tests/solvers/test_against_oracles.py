@@ -5,9 +5,9 @@ import pytest
 import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from oracle import assemble, boxed, lemke, natural_residual
 
 import warp_lcp as wl
-from oracle import assemble, boxed, lemke, natural_residual
 
 METHODS = {
     "newton": wl.MinimumMapNewton(),
@@ -48,7 +48,9 @@ def test_grid_planted(name, shape, arrays, device):
     rng = np.random.default_rng(23)
     cells = rng.choice(3, shape, p=[0.15, 0.75, 0.1])
     cells.ravel()[0] = wl.AIR
-    faces = [rng.uniform(0.2, 1.0, [s + (q == len(shape) - 1 - a) for q, s in enumerate(shape)]) if arrays else 1.0 for a in range(len(shape))]
+    faces = [
+        rng.uniform(0.2, 1.0, [s + (q == len(shape) - 1 - a) for q, s in enumerate(shape)]) if arrays else 1.0 for a in range(len(shape))
+    ]
     dense = assemble(cells, faces)
     fluid = cells.ravel() == wl.FLUID
     A = wl.GridPoisson(cells, **{f"face_{c}": f for c, f in zip("xyz", faces, strict=False)}, device=device, dtype=wp.float64)

@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Kernels that build coarser levels: the Galerkin product with piecewise-constant 2 x 2 x 2 aggregates, and bounds of corrections.
 
 Piecewise-constant aggregation keeps the 7-point stencil on every level and copes with any mask: the weight between two aggregates is the

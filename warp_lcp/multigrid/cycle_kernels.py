@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Kernels of a multigrid cycle on 7-point stencils: sweeps, residual and restriction in one, correction. Native rows, one source.
 
 A thread takes a grain of a row: the whole row on the CPU, a cell (of the coarser grid, for transfers) on CUDA.
@@ -92,8 +93,8 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
 
     @wp.kernel(enable_backward=False, module=name)
     def sweep_kernel(
-        A: StencilShape, d: d_array, wx: field, wy: field, wz: field, grain: int, from_zero: bool, y: field, x: field, b: field, lower: field,
-        upper: field, omega: real, projected: bool,
+        A: StencilShape, d: d_array, wx: field, wy: field, wz: field, grain: int, from_zero: bool, y: field, x: field, b: field,
+        lower: field, upper: field, omega: real, projected: bool,
     ):  # fmt: skip
         k, j, c = wp.tid()
         p = row_start(A, k, j, c, grain)

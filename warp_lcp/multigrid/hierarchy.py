@@ -94,7 +94,7 @@ class Hierarchy:
         d_type = wp.uint8 if stencil.d.dtype is wp.uint8 else real
         weights = stencil.weights
         if weights is not None and weights[0].dtype is not real:
-            weights = tuple(wp.zeros(w.size, dtype=real, device=w.device) for w in weights)  # type: ignore[assignment]
+            weights = tuple(wp.zeros(w.size, dtype=real, device=w.device) for w in weights)
         d = wp.zeros(stencil.d.size, dtype=d_type, device=self.device)
         unit = stencil.unit if d_type is wp.uint8 else 1.0
         finest = Stencil(stencil.padding, d, weights, stencil.coefficients, unit, stencil.periodic)

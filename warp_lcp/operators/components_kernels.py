@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Kernels that find connected components without a Dirichlet neighbor: union-find by atomic minima, the same on CPU and CUDA."""
 
 from typing import Any

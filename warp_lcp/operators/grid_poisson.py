@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.operators import grid_poisson_kernels as kernels
-from warp_lcp.operators.grid_poisson_kernels import AIR, FLUID, SOLID
 from warp_lcp.layout import PaddedLayout
+from warp_lcp.operators import grid_poisson_kernels as kernels
 from warp_lcp.operators.components import FloatingComponents, floating_components
+from warp_lcp.operators.grid_poisson_kernels import AIR, FLUID, SOLID
 from warp_lcp.operators.stencil import Stencil, wrap
 
 __all__ = ["AIR", "FLUID", "SOLID", "GridPoisson"]
@@ -69,9 +69,10 @@ class GridPoisson:
         self.layout = PaddedLayout(host.shape, self.device)
         counts = self.layout.padding.counts
         flags = (*(bool(p) for p in periodic), False, False, False)[:3]
-        self.periodic = tuple(flag and n > 1 for flag, n in zip(flags, reversed(counts), strict=True))
+        self.periodic = (flags[0] and counts[2] > 1, flags[1] and counts[1] > 1, flags[2] and counts[0] > 1)
         faces = [face_x, face_y, face_z if host.ndim == 3 else 1.0]
-        self.uniform = tuple(float(f) if np.ndim(f) == 0 else 0.0 for f in faces)
+        numbers = [float(f) if np.ndim(f) == 0 and not isinstance(f, wp.array) else 0.0 for f in faces]
+        self.uniform = (numbers[0], numbers[1], numbers[2])
         self.faces = [self._stored_face(f, axis) for axis, f in enumerate(faces)]
         self.shift = self._stored_shift(shift)
         self.cells = wp.zeros(self.layout.stored_shape, dtype=wp.int8, device=self.device)

@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Kernels that turn cell types and face coefficients into the diagonal and the weights of a stencil."""
 
 from typing import Any

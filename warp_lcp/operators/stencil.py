@@ -7,8 +7,8 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.native import grain
 from warp_lcp.layout import Padding
+from warp_lcp.native import grain
 from warp_lcp.operators.stencil_kernels import StencilShape, product_kernels, wrap_kernel
 
 

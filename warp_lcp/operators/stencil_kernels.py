@@ -1,3 +1,4 @@
+# mypy: ignore-errors
 """Kernels of the 7-point stencil on a padded grid: one native row function each, for all storage types.
 
 (A x)_i = d_i x_i - sum of w_f x_neighbor, for d_i != 0; rows with d_i = 0 are no unknowns and give 0. Fields are 0 in cells that are no

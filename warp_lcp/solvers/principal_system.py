@@ -18,6 +18,7 @@ from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.operators.grid_poisson_kernels import mask_diagonal_kernel
 from warp_lcp.problem import LCP
+from warp_lcp.solvers.principal_system_kernels import divide_kernel, mask_kernel
 
 
 class PrincipalSystem(Protocol):
@@ -117,24 +118,6 @@ def _solve_or_least_squares(block: np.ndarray, r: np.ndarray) -> np.ndarray:
     return scipy.linalg.lapack.dgetrs(factors, pivots, r)[0]
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.principal_system")
-def mask_kernel(free: wp.array(dtype=wp.uint8), x: wp.array(dtype=wp.float64)):  # type: ignore[valid-type]
-    """Zero off the free set."""
-    i = wp.tid()
-    if free[i] == wp.uint8(0):
-        x[i] = wp.float64(0.0)
-
-
-@wp.kernel(enable_backward=False, module="warp_lcp.principal_system")
-def divide_kernel(r: wp.array(dtype=wp.float64), d: wp.array(dtype=wp.float64), z: wp.array(dtype=wp.float64)):  # type: ignore[valid-type]
-    """Z = r / d, r where d is 0."""
-    i = wp.tid()
-    v = r[i]
-    if d[i] != wp.float64(0.0):
-        v = r[i] / d[i]
-    z[i] = v
-
-
 class DiagonalSystem:
     """Conjugate gradients preconditioned by the diagonal, for any symmetric operator, in float64."""
 
@@ -179,5 +162,7 @@ def principal_system(problem: LCP, real: Any, *, bounded: bool, settings: CycleS
     if isinstance(A, DenseOperator):
         return DenseSystem(A)
     if not A.symmetric:
-        raise ValueError(f"{type(A).__name__} is not symmetric: conjugate gradients need a symmetric A (dense matrices are factored instead)")
+        raise ValueError(
+            f"{type(A).__name__} is not symmetric: conjugate gradients need a symmetric A (dense matrices are factored instead)"
+        )
     return DiagonalSystem(problem)

@@ -99,4 +99,6 @@ class SweepWorkspace:
         stuck = inside & (d == 0) & (((b < 0) & np.isinf(upper)) | ((b > 0) & np.isinf(lower)))
         if stuck.any():
             row = int(np.flatnonzero(stuck)[0])
-            raise ValueError(f"A has a zero on the diagonal where b asks for an unbounded move (row {row}, b = {b[row]}): no sweep can solve it")
+            raise ValueError(
+                f"A has a zero on the diagonal where b asks for an unbounded move (row {row}, b = {b[row]}): no sweep can solve it"
+            )

@@ -1,0 +1,133 @@
+"""Galerkin coarsening against dense triple products; cycles: symmetry, definiteness, bounds; conjugate gradients."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warp_lcp as wl
+from oracle import assemble
+from warp_lcp.krylov import ConjugateGradient
+from warp_lcp.multigrid import CycleSettings, Hierarchy
+from warp_lcp.operators.grid_poisson_kernels import mask_diagonal_kernel
+
+CASES = [((6, 5, 7), (False,) * 3), ((9, 8), (False,) * 3), ((4, 6, 5), (True, True, True)), ((2, 3, 2), (True, True, True)), ((1, 7), (True, False))]
+
+
+def masked_hierarchy(cells, free, periodic, device, settings=None, real=wp.float64, bounded=False, **faces):
+    A = wl.GridPoisson(cells, periodic=periodic, device=device, dtype=wp.float64, **faces)
+    hierarchy = Hierarchy(A.stencil, real, bounded=bounded, settings=settings)
+    mask = A.layout.load(free.astype(np.uint8) * (cells == wl.FLUID).astype(np.uint8), wp.uint8)
+    d = A.stencil.d
+    wp.launch(mask_diagonal_kernel, d.size, [d, mask, hierarchy.finest.stencil.d], device=device)
+    hierarchy.rebuild()
+    return A, hierarchy
+
+
+def level_matrix(stencil):
+    """Dense matrix of a level, column by column through its own product."""
+    counts, shape = stencil.padding.counts, stencil.padding.shape
+    columns = []
+    for i in range(int(np.prod(counts))):
+        e = np.zeros(counts)
+        e.ravel()[i] = 1
+        e *= stencil.d.numpy().reshape(shape)[1:-1, 1:-1, 1:-1] != 0
+        x = wp.array(np.pad(e, 1).ravel(), dtype=wp.float64, device=stencil.device)
+        y = wp.zeros_like(x)
+        stencil.product(x, y)
+        columns.append(y.numpy().reshape(shape)[1:-1, 1:-1, 1:-1].ravel())
+    return np.array(columns).T
+
+
+def aggregation(counts):
+    """Piecewise-constant prolongation onto cells (nz, ny, nx)."""
+    coarse = [-(-n // 2) for n in counts]
+    P = np.zeros((int(np.prod(counts)), int(np.prod(coarse))))
+    for row, index in enumerate(np.ndindex(*counts)):
+        P[row, np.ravel_multi_index([i // 2 for i in index], coarse)] = 1
+    return P
+
+
+@pytest.mark.parametrize("arrays", [False, True])
+@pytest.mark.parametrize(("shape", "periodic"), CASES)
+def test_coarse_levels_are_galerkin_products(shape, periodic, arrays, device):
+    rng = np.random.default_rng(47)
+    cells = rng.choice(3, shape, p=[0.15, 0.75, 0.1])
+    free = rng.random(shape) < 0.8
+    faces = {}
+    if arrays:
+        face = rng.uniform(0.1, 1.0, (*shape[:-1], shape[-1] + 1))
+        face[..., -1] = face[..., 0]
+        faces["face_x"] = face
+    settings = CycleSettings(coarsest_cpu=1, coarsest_cuda=1)
+    _, hierarchy = masked_hierarchy(cells, free, periodic, device, settings, **faces)
+    p = (free & (cells == wl.FLUID)).ravel()
+    expected = assemble(cells, [faces.get("face_x", 1.0), 1.0, 1.0], periodic=periodic) * np.outer(p, p)
+    for fine, coarse in zip(hierarchy.levels, hierarchy.levels[1:], strict=False):
+        P = aggregation(fine.stencil.padding.counts)
+        expected = P.T @ expected @ P
+        np.testing.assert_allclose(level_matrix(coarse.stencil), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("gamma", [1, 2])
+def test_cycle_is_symmetric_positive_definite(gamma, device):
+    rng = np.random.default_rng(53)
+    cells = rng.choice(3, (9, 10, 8), p=[0.1, 0.8, 0.1])
+    _, hierarchy = masked_hierarchy(cells, np.ones(cells.shape), (False,) * 3, device, CycleSettings(gamma=gamma))
+    inside = np.pad(cells == wl.FLUID, 1).ravel()
+
+    def cycle(r):
+        hierarchy.finest.b.assign(r)
+        hierarchy.cycle()
+        return hierarchy.finest.x.numpy().copy()
+
+    r, s = (rng.standard_normal(inside.size) * inside for _ in range(2))
+    Mr, Ms = cycle(r), cycle(s)
+    assert np.dot(s, Mr) == pytest.approx(np.dot(r, Ms), rel=1e-12)
+    assert np.dot(r, Mr) > 0
+    assert not Mr[~inside].any()
+
+
+@pytest.mark.parametrize("periodic", [(False,) * 3, (True, False, False)])
+def test_monotone_cycle_keeps_bounds_and_lowers_the_energy(periodic, device):
+    rng = np.random.default_rng(59)
+    cells = rng.choice(3, (8, 12, 10), p=[0.1, 0.85, 0.05])
+    A, hierarchy = masked_hierarchy(cells, np.ones(cells.shape), periodic, device, bounded=True)
+    inside = np.pad(cells == wl.FLUID, 1).ravel()
+    finest = hierarchy.finest
+    r = rng.standard_normal(inside.size) * inside
+    lower, upper = -rng.uniform(0, 0.3, inside.size) * inside, rng.uniform(0, 0.3, inside.size) * inside
+    for field, values in ((finest.b, r), (finest.lower, lower), (finest.upper, upper)):
+        field.assign(values)
+    hierarchy.monotone_cycle()
+    x = finest.x.numpy().copy() * inside
+    assert (x >= lower).all()
+    assert (x <= upper).all()
+    assert (x[inside] == lower[inside]).any()
+    y = A.apply(A.layout.load(x, wp.float64)).numpy()
+    assert 0.5 * np.dot(x, y) - np.dot(r, x) < 0
+
+
+def test_conjugate_gradients_solve_the_masked_system(device):
+    rng = np.random.default_rng(61)
+    cells = rng.choice(3, (7, 9, 8), p=[0.1, 0.8, 0.1])
+    free = rng.random(cells.shape) < 0.7
+    _, hierarchy = masked_hierarchy(cells, free, (False,) * 3, device)
+
+    class Cycle:
+        r, z = hierarchy.finest.b, hierarchy.finest.x
+
+        def apply(self):
+            hierarchy.cycle()
+
+    krylov = ConjugateGradient(hierarchy.finest.stencil.product, Cycle())
+    p = (free & (cells == wl.FLUID)).ravel()
+    b = rng.standard_normal(cells.size) * p
+    for _ in range(2):  # the second solve replays the captured iteration
+        hierarchy.finest.b.assign(np.pad(b.reshape(cells.shape), 1).ravel())
+        iterations, norm = krylov.solve(1e-10, 60)
+        assert iterations < 40
+        assert norm <= 1e-10
+        x = krylov.x.numpy().reshape(hierarchy.finest.stencil.padding.shape)[1:-1, 1:-1, 1:-1].ravel()
+        A = assemble(cells)[np.ix_(p, p)]
+        np.testing.assert_allclose(x[p], np.linalg.solve(A, b[p]), atol=1e-8)
+        assert not x[~p].any()

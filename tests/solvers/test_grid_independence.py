@@ -1,0 +1,63 @@
+"""Iteration budgets of the pressure LCP on the splash scene, cold and warm."""
+
+import numpy as np
+import pytest
+
+import warp_lcp as wl
+from scenes import splash
+
+BOUNDS = ["none", "walls", "everywhere"]
+
+
+def solve(n, bounds, **options):
+    cells, b, wall = splash(n)
+    lower = {"none": -np.inf, "walls": np.where(wall, 0.0, -np.inf), "everywhere": 0.0}[bounds]
+    problem = wl.LCP(wl.GridPoisson(cells, device="cpu"), b, lower)
+    return problem, wl.solve(problem, wl.MinimumMapNewton(**options))
+
+
+def newton_steps(result):
+    return sum(record.step == "newton" for record in result.history)
+
+
+@pytest.mark.parametrize("bounds", BOUNDS)
+def test_cold_budget_at_32_and_64(bounds):
+    (_, small), (_, large) = solve(32, bounds), solve(64, bounds)
+    for result in (small, large):
+        assert result, result.status
+        assert newton_steps(result) <= 7
+        assert result.linear_iterations <= 12
+    assert large.linear_iterations <= small.linear_iterations + 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bounds", BOUNDS)
+def test_cold_budget_grows_by_at_most_two_to_128(bounds):
+    (_, small), (_, large) = solve(64, bounds), solve(128, bounds)
+    assert small
+    assert large
+    assert newton_steps(large) <= min(7, newton_steps(small) + 2)
+    assert large.linear_iterations <= min(14, small.linear_iterations + 2)
+
+
+@pytest.mark.parametrize("bounds", ["walls", "everywhere"])
+def test_warm_start_after_a_small_change(bounds):
+    problem, first = solve(48, bounds)
+    rng = np.random.default_rng(67)
+    b = problem.layout.unload(problem.b).numpy()
+    changed = wl.LCP(problem.A, b * (1 + 0.02 * rng.standard_normal(b.shape)), problem.layout.unload(problem.lower))
+    again = wl.solve(changed, wl.MinimumMapNewton(), x0=first.x, stopping=wl.StoppingCriteria(rtol=1e-4))
+    assert again, again.status
+    assert again.linear_iterations <= 8
+
+
+@pytest.mark.parametrize("bounds", ["walls", "everywhere"])
+def test_solution_does_not_depend_on_the_monotone_cycles(bounds):
+    tight = wl.StoppingCriteria(rtol=1e-10)
+    cells, b, wall = splash(24)
+    problem = wl.LCP(wl.GridPoisson(cells, device="cpu"), b, np.where(wall, 0.0, -np.inf) if bounds == "walls" else 0.0)
+    results = [wl.solve(problem, wl.MinimumMapNewton(monotone_cycles=k), stopping=tight) for k in (0, 2)]
+    assert all(results)
+    np.testing.assert_allclose(results[0].x.numpy(), results[1].x.numpy(), atol=1e-8 * np.abs(results[0].x.numpy()).max())
+    sweeps = wl.solve(problem, wl.ProjectedSOR(omega=1.8), stopping=wl.StoppingCriteria(rtol=1e-8, max_iterations=5000))
+    np.testing.assert_allclose(sweeps.x.numpy(), results[1].x.numpy(), atol=1e-5 * np.abs(results[0].x.numpy()).max())

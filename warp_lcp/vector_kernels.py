@@ -1,0 +1,78 @@
+# mypy: ignore-errors
+"""Kernels on flat fields, and how their native loops are written."""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from warp_lcp.native import simd
+
+EACH = """
+#ifdef __CUDA_ARCH__
+for (long long i = start; i < end; i += stride)
+#else
+SIMD for (long long i = start; i < end; ++i)
+#endif
+"""
+
+
+def flat(source: str) -> str:
+    """Return the body of a native function over a span: `EACH {...}` visits its elements i."""
+    return simd(source.replace("EACH", EACH))
+
+
+@wp.func
+def span_start(t: int, chunk: int):
+    """First element of thread t's span."""
+    first = wp.int64(t)
+    if chunk > 0:
+        first = wp.int64(t) * wp.int64(chunk)
+    return first
+
+
+@wp.func
+def span_end(t: int, chunk: int, n: int):
+    """One past the last element of thread t's span."""
+    last = wp.int64(n)
+    if chunk > 0:
+        last = wp.min(wp.int64(n), wp.int64(t + 1) * wp.int64(chunk))
+    return last
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.vectors")
+def add_up_kernel(partials: wp.array(dtype=wp.float64), n: int, threads: int, out: wp.array(dtype=wp.float64), slot: int):
+    """out[slot] = sum of partials, by one block, in an order that does not change from run to run."""
+    t = wp.tid()
+    s = wp.float64(0.0)
+    for i in range(t, n, threads):
+        s += partials[i]
+    total = wp.tile_sum(wp.tile(s))
+    if t == 0:
+        out[slot] = total[0]
+
+
+@functools.cache
+def kernels(a_type: Any, b_type: Any) -> SimpleNamespace:
+    """Return the kernels for fields a and b of these types."""
+    name = f"warp_lcp.vectors.{a_type.__name__}_{b_type.__name__}"
+    a_array, b_array = wp.array(dtype=a_type), wp.array(dtype=b_type)
+
+    @wp.func_native(flat("double s = 0; EACH { s += (double)a.data[i] * (double)b.data[i]; } return s;"))
+    def dot_span(a: a_array, b: b_array, start: wp.int64, end: wp.int64, stride: wp.int64) -> wp.float64: ...
+
+    @wp.func_native(flat("EACH { b.data[i] = a.data[i]; }"))
+    def convert_span(a: a_array, b: b_array, start: wp.int64, end: wp.int64, stride: wp.int64): ...
+
+    @wp.kernel(enable_backward=False, module=name)
+    def dot(a: a_array, b: b_array, n: int, chunk: int, stride: wp.int64, partials: wp.array(dtype=wp.float64)):
+        t = wp.tid()
+        partials[t] = dot_span(a, b, span_start(t, chunk), span_end(t, chunk, n), stride)
+
+    @wp.kernel(enable_backward=False, module=name)
+    def convert(a: a_array, b: b_array, n: int, chunk: int, stride: wp.int64):
+        t = wp.tid()
+        convert_span(a, b, span_start(t, chunk), span_end(t, chunk, n), stride)
+
+    return SimpleNamespace(dot=dot, convert=convert)
