@@ -3,10 +3,12 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 
-.PHONY: demo test slow clean
+OUT ?= out/dam-break
+
+.PHONY: demo test slow wheel-check clean
 
 demo: $(VENV)/.run
-	$(BIN)/warp-lcp run dam-break --out out/dam-break --force
+	$(BIN)/warp-lcp run dam-break --out $(OUT) --force $(DEMO_ARGS)
 
 test: $(VENV)/.dev
 	$(BIN)/ruff check .
@@ -17,6 +19,14 @@ test: $(VENV)/.dev
 
 slow: $(VENV)/.dev
 	$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)
+
+# A wheel holds everything a run needs: install it alone and run a built-in scene away from the source tree.
+wheel-check: $(VENV)/.run
+	rm -rf build/wheel-check
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir build/wheel-check .
+	$(PYTHON) -m venv build/wheel-check/venv
+	build/wheel-check/venv/bin/python -m pip install --quiet build/wheel-check/*.whl
+	cd build/wheel-check && venv/bin/warp-lcp run ceiling-drop --out run --set time.duration=0.05
 
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)

@@ -10,6 +10,7 @@ import warp as wp
 import fluids
 import warp_lcp as wl
 
+
 def use_every_kernel():
     """Instantiate the kernels that are made on demand by solving small problems in every precision."""
     cells = np.ones((4, 4, 4), dtype=int)

@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
+from oracle import lemke
 
 
 def poisson(n=16, seed=7, device="cpu", **options):
@@ -107,6 +108,17 @@ def test_in_place_problem_follows_changed_cells_and_b():
     np.testing.assert_allclose(result.x.numpy()[1, 1:-1, 1:-1], expected.x.numpy(), atol=1e-5)
 
 
+def test_the_workspace_s_own_iterate_may_be_the_guess():
+    A, _ = poisson()
+    b = wp.array(np.random.default_rng(7).standard_normal(A.layout.stored_shape), dtype=wp.float64, device="cpu")
+    problem, solver = wl.LCP(A, b), wl.MinimumMapNewton()
+    work = solver.init(problem)
+    first = wl.solve(problem, solver, workspace=work, stopping=wl.StoppingCriteria(rtol=1e-8))
+    again = wl.solve(problem, solver, workspace=work, x0=first.x, stopping=wl.StoppingCriteria(rtol=1e-7))
+    assert again.iterations == 0
+    assert bool(again)
+
+
 def test_own_operator_through_the_protocol():
     rng = np.random.default_rng(19)
     n, A = 40, Ring(40)
@@ -115,8 +127,6 @@ def test_own_operator_through_the_protocol():
     assert isinstance(A, wl.Operator)
     result = wl.solve(wl.LCP(A, b), wl.MinimumMapNewton(), stopping=wl.StoppingCriteria(rtol=1e-10))
     assert result, result.status
-    from oracle import lemke
-
     np.testing.assert_allclose(result.x.numpy(), lemke(dense, b), atol=1e-8)
 
 

@@ -68,6 +68,7 @@ class Workspace(Protocol):
     x: wp.array[Any]
     residual: NaturalResidual
     precision: Precision
+    floating: Any  # the operator's floating components, set by the loop before `start`; None if there are none
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the last solve. `warm`: x is a guess better than clip(0, l, u); `tolerance`: the residual norm that is asked for."""
@@ -130,6 +131,7 @@ class _Loop:
 
     def run(self, x0: Array | None) -> SolveResult:
         x, residual = self.work.x, self.residual
+        guess = None if x0 is None else self._guess(x0)
         residual.start(x, keep=False)
         self.reference = residual.evaluate(x)
         self.tolerance = self.stopping.tolerance(self.reference)
@@ -138,15 +140,15 @@ class _Loop:
             self._keep(0)
             return self._finish(SolveStatus.CONVERGED, 0)
         floating = getattr(self.problem.A, "floating_components", lambda: None)()
-        self.work.floating = floating  # type: ignore[attr-defined]
+        self.work.floating = floating
         lost = floating.unattainable(self.problem.b, self.problem.lower, self.problem.upper) if floating else 0.0
-        if x0 is not None and math.isfinite(self.reference):
-            self._load(x0)
+        if guess is not None and math.isfinite(self.reference):
+            self._take(guess)
         self._record(0, Step("start", 0))
         self._keep(0)
         if lost > self.tolerance:
             return self._finish(SolveStatus.INFEASIBLE, 0)
-        self.work.start(warm=x0 is not None, tolerance=self.tolerance)
+        self.work.start(warm=guess is not None, tolerance=self.tolerance)
         return self._iterate()
 
     def _iterate(self) -> SolveResult:
@@ -164,11 +166,14 @@ class _Loop:
             status = self._status(iteration, step.failure)
         return self._finish(status, iteration)
 
-    def _load(self, x0: Array) -> None:
-        """Take a guess into the iterate."""
+    def _guess(self, x0: Array) -> wp.array[Any]:
+        """Return a guess as a stored field that is not the iterate itself."""
         stored = self.problem.layout.load(x0, wp.float64, "x0")
-        if stored.ptr != self.work.x.ptr:
-            wp.copy(self.work.x, stored)
+        return wp.clone(stored) if stored.ptr == self.work.x.ptr else stored
+
+    def _take(self, guess: wp.array[Any]) -> None:
+        """Start from a guess."""
+        wp.copy(self.work.x, guess)
         self.residual.start(self.work.x, keep=True)
         if not math.isfinite(self.residual.evaluate(self.work.x)):
             raise ValueError("x0 gives a residual that is not finite")

@@ -10,7 +10,13 @@ from warp_lcp.krylov import ConjugateGradient
 from warp_lcp.multigrid import CycleSettings, Hierarchy
 from warp_lcp.operators.grid_poisson_kernels import mask_diagonal_kernel
 
-CASES = [((6, 5, 7), (False,) * 3), ((9, 8), (False,) * 3), ((4, 6, 5), (True, True, True)), ((2, 3, 2), (True, True, True)), ((1, 7), (True, False))]
+CASES = [
+    ((6, 5, 7), (False,) * 3),
+    ((9, 8), (False,) * 3),
+    ((4, 6, 5), (True, True, True)),
+    ((2, 3, 2), (True, True, True)),
+    ((1, 7), (True, False)),
+]
 
 
 def masked_hierarchy(cells, free, periodic, device, settings=None, real=wp.float64, bounded=False, **faces):

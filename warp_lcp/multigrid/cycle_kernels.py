@@ -10,7 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.native import C_TYPES, simd
+from warp_lcp.native import BLOCK, C_TYPES, simd
 from warp_lcp.operators.stencil_kernels import NEIGHBORS, StencilShape, row_start, stencil_head
 
 
@@ -50,9 +50,10 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
 
     @wp.func_native(
         simd(
-            f"""typedef {C_TYPES[real]} T; const long long p0 = p; T* coarse = c_.data + c; T r[256];
-        for (int begin = 0; begin < n; begin += 128) {{
-            const int m = n - begin < 128 ? n - begin : 128;
+            BLOCK
+            + f"""typedef {C_TYPES[real]} T; const long long p0 = p; T* coarse = c_.data + c; T r[2*M];
+        for (int begin = 0; begin < n; begin += M) {{
+            const int m = n - begin < M ? n - begin : (int)M;
             SIMD for (int k = 0; k < 2*m; ++k) r[k] = 0;
             for (int row = 0; row < 4; ++row) {{
                 if (((row >> 1) && one_plane) || ((row & 1) && one_row)) continue;

@@ -127,8 +127,9 @@ class Hierarchy:
         """Coarsen from the finest diagonal down, and factor the coarsest level."""
         for fine, coarse in zip(self.levels, self.levels[1:], strict=False):
             s, c = fine.stencil, coarse.stencil
-            inputs = [s.shape, *fine.grids, wp.vec3i(*s.padding.counts), wp.vec3i(*map(int, s.periodic)), *coarse.grids]
-            wp.launch(kernels.coarsen_kernel, c.padding.counts, inputs, device=self.device)
+            sizes = [wp.vec3i(*s.padding.counts), wp.vec3i(*map(int, s.periodic)), c.shape, c.grain]
+            kernel = kernels.coarsen_kernels(s.weights is not None, s.d.dtype, self.real)
+            wp.launch(kernel, c.threads, [*fine.operands, *sizes, c.d, *(c.weights or ())], device=self.device)
             for w in c.weights or ():
                 c.wrap(w)
         last, s = self.levels[-1], self.levels[-1].stencil

@@ -74,6 +74,7 @@ class SweepWorkspace:
         self.problem, self.precision = problem, precision
         self.x = problem.layout.zeros(wp.float64)
         self.residual = NaturalResidual(problem)
+        self.floating: Any = None
         self._rounded = problem.layout.zeros(wp.float32) if precision is Precision.SINGLE else None
 
     def start(self, *, warm: bool, tolerance: float) -> None:

@@ -1,0 +1,107 @@
+"""Checkpoints: exact, verified, and refused with a reason."""
+
+import errno
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from warp_lcp.driver.atomic import replacing, write_text
+from warp_lcp.driver.checkpoint import Checkpoint, CheckpointError, CheckpointFolder
+
+STATE = {"position": np.random.default_rng(977).random((30, 3)), "count": np.array(7), "name": np.array("apic"), "none": np.empty((0, 3))}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> CheckpointFolder:
+    folder = CheckpointFolder(tmp_path / "checkpoints", "fingerprint")
+    folder.write(Checkpoint(12, 0.1 + 0.2, STATE))
+    return folder
+
+
+def test_round_trip_is_exact(folder):
+    read = folder.read(12)
+    assert (read.step, read.time) == (12, 0.1 + 0.2)
+    assert read.state.keys() == STATE.keys()
+    for name, array in STATE.items():
+        assert read.state[name].dtype == array.dtype
+        np.testing.assert_array_equal(read.state[name], array)
+
+
+def test_objects_need_a_pickle_and_are_refused(folder):
+    with pytest.raises(ValueError, match="need a pickle: x"):
+        folder.write(Checkpoint(13, 0.0, {"x": np.array([{}])}))
+    assert folder.steps() == [12]
+
+
+def test_pruning_keeps_the_newest(folder):
+    for step in (14, 16, 1_000_000):
+        folder.write(Checkpoint(step, 0.0, STATE))
+    folder.prune()
+    assert folder.steps() == [1_000_000, 16]
+
+
+def damage(path: Path, how: str) -> None:
+    data = path.read_bytes()
+    if how == "truncated":
+        path.write_bytes(data[: len(data) // 2])
+    elif how == "empty":
+        path.write_bytes(b"")
+    elif how == "text":
+        path.write_text("not a checkpoint")
+    elif how == "flipped":
+        at = data.index(STATE["position"].tobytes()) + 5
+        path.write_bytes(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :])
+    else:
+        arrays = dict(np.load(path))
+        if how == "foreign key":
+            arrays["surprise"] = np.zeros(1)
+        elif how == "lost key":
+            del arrays["state/count"]
+        elif how == "no meta":
+            del arrays["meta"]
+        elif how == "other scene":
+            arrays["meta"] = np.array(str(arrays["meta"]).replace("fingerprint", "another"))
+        elif how == "other format":
+            arrays["meta"] = np.array(str(arrays["meta"]).replace('"format": 1', '"format": 99'))
+        np.savez(path, **arrays)
+
+
+@pytest.mark.parametrize(
+    ("how", "reason"),
+    [
+        ("truncated", "cut short, damaged or not a checkpoint"),
+        ("empty", "cut short, damaged or not a checkpoint"),
+        ("text", "cut short, damaged or not a checkpoint"),
+        ("flipped", "cut short, damaged or not a checkpoint"),
+        ("no meta", "cut short, damaged or not a checkpoint"),
+        ("foreign key", "holds arrays that no run writes: surprise"),
+        ("lost key", "its checksum does not fit"),
+        ("other scene", "belongs to another scene"),
+        ("other format", "written in format 99, this version reads format 1"),
+    ],
+)
+def test_damage_is_found_and_the_one_before_is_used(folder, how, reason):
+    folder.write(Checkpoint(20, 0.5, STATE))
+    damage(folder.path(20), how)
+    with pytest.raises(CheckpointError, match=reason):
+        folder.read(20)
+    newest, refused = folder.newest()
+    assert newest is not None
+    assert newest.step == 12
+    assert len(refused) == 1
+    assert "step_000020.npz" in refused[0]
+
+
+def test_no_checkpoint_at_all(tmp_path):
+    assert CheckpointFolder(tmp_path / "none", "x").newest() == (None, [])
+
+
+def test_a_failed_write_leaves_the_file_as_it_was(tmp_path):
+    path = tmp_path / "a.txt"
+    write_text(path, "before")
+    with pytest.raises(OSError, match="No space"), replacing(path) as temporary:
+        temporary.write_text("half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert path.read_text() == "before"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]

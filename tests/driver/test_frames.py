@@ -1,0 +1,101 @@
+"""Frames, read back by meshio and by VTK."""
+
+import xml.etree.ElementTree as ET
+
+import meshio
+import numpy as np
+import pytest
+
+from warp_lcp.driver.frames import FrameFolder, frame_bytes, write_vtu
+from warp_lcp.driver.simulator import Cells, Points
+
+RNG = np.random.default_rng(5807)
+
+
+def some_points(count: int = 20) -> Points:
+    fields = {
+        "velocity": RNG.random((count, 3)).astype(np.float32),
+        "flag": RNG.random(count) < 0.5,
+        "half": RNG.random(count).astype(np.float16),
+        "kind": np.arange(count, dtype=np.int8),
+    }
+    return Points("particles", RNG.random((count, 3)).astype(np.float32), fields)
+
+
+def some_cells(dimension: int) -> Cells:
+    index = np.array([[3, 2, 1], [4, 2, 1], [4, 3, 1], [9, 9, 1]]) * [1, 1, dimension == 3]
+    return Cells("grid", index, 0.25, dimension, {"pressure": np.arange(4.0), "wall": np.array([True, False, True, False])})
+
+
+def test_points_round_trip(tmp_path):
+    points = some_points()
+    write_vtu(tmp_path / "a.vtu", points)
+    mesh = meshio.read(tmp_path / "a.vtu")
+    assert mesh.points.dtype == np.float32
+    np.testing.assert_array_equal(mesh.points, points.points)
+    np.testing.assert_array_equal(mesh.cells_dict["vertex"].ravel(), np.arange(20))
+    for name, dtype in [("velocity", np.float32), ("flag", np.uint8), ("half", np.float32), ("kind", np.int8)]:
+        assert mesh.point_data[name].dtype == dtype
+        np.testing.assert_array_equal(mesh.point_data[name], points.fields[name])
+
+
+@pytest.mark.parametrize(("dimension", "kind", "corners"), [(2, "quad", 12), (3, "hexahedron", 24)])
+def test_cells_share_corners(tmp_path, dimension, kind, corners):
+    cells = some_cells(dimension)
+    write_vtu(tmp_path / "a.vtu", cells)
+    mesh = meshio.read(tmp_path / "a.vtu")
+    assert len(mesh.points) == corners  # three cells in an L: 8 corners a layer, and 4 of the one apart
+    np.testing.assert_allclose(mesh.points[mesh.cells_dict[kind][:, 0]], cells.index * 0.25)
+    middle = np.array([0.5, 0.5, 0.5 if dimension == 3 else 0.0])
+    np.testing.assert_allclose(mesh.points[mesh.cells_dict[kind]].mean(axis=1), (cells.index + middle) * 0.25)
+    np.testing.assert_array_equal(mesh.cell_data["pressure"][0], np.arange(4.0))
+    np.testing.assert_array_equal(mesh.cell_data["wall"][0], [1, 0, 1, 0])
+
+
+@pytest.mark.parametrize(
+    "part", [some_points(), some_points(0), some_cells(2), some_cells(3), Cells("grid", np.empty((0, 3), int), 1.0, 3)]
+)
+def test_vtk_opens_every_frame(tmp_path, part):
+    pyvista = pytest.importorskip("pyvista")
+    write_vtu(tmp_path / "a.vtu", part)
+    grid = pyvista.read(tmp_path / "a.vtu")
+    size = len(part.points if isinstance(part, Points) else part.index)
+    assert grid.n_cells == size
+    data = grid.point_data if isinstance(part, Points) else grid.cell_data
+    assert set(data.keys()) == part.fields.keys()
+    if isinstance(part, Cells) and size:
+        measure = "Area" if part.dimension == 2 else "Volume"
+        np.testing.assert_allclose(grid.compute_cell_sizes()[measure], 0.25**part.dimension)  # positive: VTK's corner order
+
+
+def test_a_field_of_another_length_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="'speed' has 3 entries for 2 points or cells"):
+        write_vtu(tmp_path / "a.vtu", Points("particles", np.zeros((2, 3)), {"speed": np.zeros(3)}))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_estimate_is_near_the_files(tmp_path):
+    points, cells = some_points(5000), Cells("grid", np.argwhere(np.ones((12, 12, 12))), 0.1, 3, {"pressure": np.zeros(1728)})
+    for part in (points, cells):
+        write_vtu(tmp_path / "a.vtu", part)
+        size = (tmp_path / "a.vtu").stat().st_size
+        assert size * 0.95 < frame_bytes([part]) < size * 1.5
+
+
+def entries(path):
+    return [(float(e.get("timestep")), e.get("file")) for e in ET.parse(path).iter("DataSet")]
+
+
+def test_collections_grow_and_resume(tmp_path):
+    folder = FrameFolder(tmp_path)
+    for index in range(4):
+        folder.write(index, index / 3, [some_points(3)])
+    assert entries(tmp_path / "particles.pvd") == [(k / 3, f"frames/particles_{k:06d}.vtu") for k in range(4)]
+    (tmp_path / "frames" / "notes.vtu").write_text("not a frame")
+    resumed = FrameFolder(tmp_path)
+    resumed.resume([0.0, 1 / 3])
+    assert len(entries(tmp_path / "particles.pvd")) == 2
+    assert sorted(p.name for p in (tmp_path / "frames").iterdir()) == ["notes.vtu", "particles_000000.vtu", "particles_000001.vtu"]
+    resumed.write(2, 2 / 3, [some_points(3)])
+    assert [time for time, _ in entries(tmp_path / "particles.pvd")] == [0.0, 1 / 3, 2 / 3]
+    assert all((tmp_path / file).is_file() for _, file in entries(tmp_path / "particles.pvd"))

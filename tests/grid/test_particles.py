@@ -1,0 +1,120 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from warp_lcp.grid.particles import Particles, lattice, seed
+from warp_lcp.grid.staggered import StaggeredGrid
+
+FLAT = StaggeredGrid((7, 5, 1), 0.2, 2)
+SOLID = StaggeredGrid((7, 5, 4), 0.2, 3)
+
+
+def random_particles(grid: StaggeredGrid, n: int, random_seed: int, *, affine: bool = True) -> Particles:
+    rng = np.random.default_rng(random_seed)
+    position = rng.random((n, 3)) * np.array(grid.counts) * grid.spacing
+    position[:, grid.dimension :] = 0.0
+    particles = Particles(grid, position, rng.normal(size=(n, 3)), affine=affine)
+    for gradient in particles.affine:
+        gradient.assign(rng.normal(size=(n, 3)).astype(np.float32))
+    return particles
+
+
+@pytest.mark.parametrize("grid", [FLAT, SOLID], ids=["2d", "3d"])
+@settings(max_examples=20, deadline=None)
+@given(n=st.integers(1, 3000), random_seed=st.integers(0, 10**6))
+def test_sort_orders_by_cell_and_keeps_particles_whole(grid: StaggeredGrid, n: int, random_seed: int) -> None:
+    particles = random_particles(grid, n, random_seed)
+    before = {name: array.numpy().copy() for name, array in particles.arrays().items()}
+    particles.sort()
+    cells = particles.cells_of(before["position"])
+    key = ((cells[:, 2] + 1) * (grid.counts[1] + 2) + cells[:, 1] + 1) * (grid.counts[0] + 2) + cells[:, 0] + 1
+    order = np.argsort(key, kind="stable")
+    assert (particles.key.numpy()[:n] == key[order]).all()
+    assert set(before) == {"position", "velocity"} | {f"affine_{c}" for c in range(grid.dimension)}
+    for name, array in particles.arrays().items():
+        assert (array.numpy() == before[name][order]).all()
+
+
+def test_sorting_twice_changes_nothing() -> None:
+    particles = random_particles(SOLID, 2000, 77)
+    particles.sort()
+    once = {name: array.numpy().copy() for name, array in particles.arrays().items()}
+    particles.sort()
+    for name, array in particles.arrays().items():
+        assert (array.numpy() == once[name]).all()
+
+
+def test_totals_are_the_sums_and_repeatable() -> None:
+    particles = random_particles(SOLID, 5000, 901, affine=False)
+    x, v = particles.position.numpy().astype(np.float64), particles.velocity.numpy().astype(np.float64)
+    totals = particles.totals()
+    assert totals.mean_square_speed == pytest.approx((v**2).sum(axis=1).mean(), rel=1e-6)
+    assert totals.center == pytest.approx(x.mean(axis=0), rel=1e-6)
+    assert totals.low == pytest.approx(x.min(axis=0))
+    assert totals.high == pytest.approx(x.max(axis=0))
+    assert totals.max_speed == pytest.approx(np.linalg.norm(v, axis=1).max(), rel=1e-6)
+    assert totals.finite
+    again = particles.totals()
+    assert again.mean_square_speed == totals.mean_square_speed
+    assert (again.center == totals.center).all()
+
+
+def test_values_that_are_not_finite_are_counted() -> None:
+    particles = random_particles(FLAT, 700, 15)
+    x, v = particles.position.numpy().copy(), particles.velocity.numpy().copy()
+    x[[3, 400], 1] = np.nan, np.inf
+    v[[5, 6, 690], 0] = np.nan, np.inf, -np.inf
+    particles.position.assign(x)
+    particles.velocity.assign(v)
+    totals = particles.totals()
+    assert (totals.bad_positions, totals.bad_velocities) == (2, 3)
+    assert not totals.finite
+
+
+def test_empty_or_mismatched_particles_are_refused() -> None:
+    with pytest.raises(ValueError, match="n > 0"):
+        Particles(FLAT, np.zeros((0, 3)), np.zeros((0, 3)), affine=True)
+    with pytest.raises(ValueError, match="velocity"):
+        Particles(FLAT, np.zeros((2, 3)), np.zeros((2, 2)), affine=True)
+
+
+@pytest.mark.parametrize("grid", [FLAT, SOLID], ids=["2d", "3d"])
+@pytest.mark.parametrize("per_axis", [1, 2, 3])
+def test_the_lattice_fills_every_cell_alike(grid: StaggeredGrid, per_axis: int) -> None:
+    points = lattice(grid, per_axis, 0.25, np.random.default_rng(6), 0)
+    ideal = lattice(grid, per_axis, 0.0, np.random.default_rng(6), 0)
+    spacing = grid.spacing / per_axis
+    counts = np.zeros(grid.counts[:2], int)
+    cells = (points / grid.spacing).astype(int)
+    np.add.at(counts, (cells[:, 0], cells[:, 1]), 1)
+    assert (counts == per_axis**grid.dimension).all()
+    assert np.abs(points - ideal).max() <= 0.125 * spacing
+    assert np.abs(points - ideal)[:, : grid.dimension].max(axis=0).min() > 0.1 * spacing
+    if grid.dimension == 2:
+        assert (points[:, 2] == 0.0).all()
+
+
+@pytest.mark.parametrize("grid", [FLAT, SOLID], ids=["2d", "3d"])
+def test_seeds_stay_out_of_solids_and_are_not_doubled(grid: StaggeredGrid) -> None:
+    nx, ny, nz = grid.counts
+    open_cells = np.random.default_rng(31).random((nz, ny, nx)) < 0.7
+    regions = [lambda p: p[:, 0] < 0.7, lambda p: p[:, 0] < 1.0]
+    position, owner = seed(grid, regions, open_cells, per_axis=2, jitter=0.25, random_seed=8)
+    cells = (position / grid.spacing).astype(int)
+    assert open_cells[cells[:, 2], cells[:, 1], cells[:, 0]].all()
+    assert (owner == (position[:, 0] >= 0.7)).all()
+    assert len(position) == np.unique(position, axis=0).shape[0]
+    assert open_cells[:, :, :5].sum() * 2**grid.dimension == len(position)
+    again, _ = seed(grid, regions, open_cells, per_axis=2, jitter=0.25, random_seed=8)
+    other, _ = seed(grid, regions, open_cells, per_axis=2, jitter=0.25, random_seed=9)
+    assert (again == position).all()
+    assert not np.array_equal(other, position)
+
+
+def test_bad_seeding_is_refused() -> None:
+    open_cells = np.ones((1, 5, 7), bool)
+    with pytest.raises(ValueError, match="jitter"):
+        seed(FLAT, [], open_cells, per_axis=2, jitter=1.5, random_seed=3)
+    with pytest.raises(ValueError, match="per_axis"):
+        seed(FLAT, [], open_cells, per_axis=0, jitter=0.5, random_seed=3)

@@ -1,0 +1,219 @@
+"""Particle-grid transfers: what they reproduce, conserve and lose. validation.md 6."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import warp as wp
+
+from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
+
+REALS = {"float32": (wp.float32, wp.vec3, np.float32, 1e-5), "float64": (wp.float64, wp.vec3d, np.float64, 1e-12)}
+GRIDS = {"2d": StaggeredGrid((9, 7, 1), 0.125, 2), "3d": StaggeredGrid((8, 7, 6), 0.125, 3)}
+
+
+@dataclass
+class Cloud:
+    """Particles away from the walls, and what they are transferred to."""
+
+    grid: StaggeredGrid
+    position: wp.array
+    velocity: wp.array
+    affine: list[wp.array]
+    fields: list[wp.array]
+    weights: list[wp.array]
+
+    def to_faces(self) -> None:
+        particles_to_faces(self.grid, self.position, self.velocity, self.affine, self.fields, self.weights)
+
+    def to_particles(self, **options) -> None:
+        faces_to_particles(self.grid, self.fields, self.position, self.velocity, self.affine, **options)
+
+
+def cloud(grid: StaggeredGrid, real: str, *, affine: bool, n: int = 300, random_seed: int = 4711) -> Cloud:
+    scalar, vector, numpy_type, _ = REALS[real]
+    rng = np.random.default_rng(random_seed)
+    size = np.array(grid.counts) * grid.spacing
+    position = (0.2 + 0.6 * rng.random((n, 3))) * size
+    position[:, grid.dimension :] = 0.0
+
+    def vectors(values: np.ndarray) -> wp.array:
+        values = values.copy()
+        values[:, grid.dimension :] = 0.0
+        return wp.array(values.astype(numpy_type), dtype=vector, device="cpu")
+
+    gradients = [vectors(rng.normal(size=(n, 3))) for _ in range(grid.dimension)] if affine else []
+    return Cloud(
+        grid, vectors(position), vectors(rng.normal(size=(n, 3)) + 0.4), gradients, grid.faces(scalar), grid.faces(scalar)
+    )  # fmt: skip
+
+
+def node_points(grid: StaggeredGrid, axis: int) -> np.ndarray:
+    """Return where the nodes of a component lie [m], shape (*grid.shape, 3); z = 0 in 2-D."""
+    k, j, i = np.meshgrid(*(np.arange(n) for n in grid.shape), indexing="ij")
+    points = np.stack([i, j, k], axis=-1) - 0.5
+    points[..., axis] -= 0.5
+    points *= grid.spacing
+    if grid.dimension == 2:
+        points[..., 2] = 0.0
+    return points
+
+
+def momentum(c: Cloud) -> np.ndarray:
+    return c.velocity.numpy().astype(np.float64).sum(axis=0)
+
+
+def angular_momentum(c: Cloud) -> np.ndarray:
+    """Sum over particles and components of the spread momentum: the affine part carries its share, f (1 - f) dx^2 along each axis."""
+    x, v = c.position.numpy().astype(np.float64), c.velocity.numpy().astype(np.float64)
+    total = np.cross(x, v).sum(axis=0)
+    dx = c.grid.spacing
+    for axis, gradient in enumerate(c.affine):
+        y = x / dx + 0.5
+        y[:, axis] += 0.5
+        f = y - np.floor(y)
+        spread = (f * (1.0 - f) * dx**2) * gradient.numpy().astype(np.float64)
+        if c.grid.dimension == 2:
+            spread[:, 2] = 0.0
+        total += np.cross(spread, np.eye(3)[axis]).sum(axis=0)
+    return total
+
+
+def grid_momenta(c: Cloud) -> tuple[np.ndarray, np.ndarray]:
+    linear, angular = np.zeros(3), np.zeros(3)
+    for axis, (field, weight) in enumerate(zip(c.fields, c.weights, strict=True)):
+        p = field.numpy().astype(np.float64) * weight.numpy().astype(np.float64)
+        linear[axis] = p.sum()
+        angular += np.cross(node_points(c.grid, axis), np.eye(3)[axis] * p[..., None]).sum(axis=(0, 1, 2))
+    return linear, angular
+
+
+@pytest.mark.parametrize("real", REALS)
+@pytest.mark.parametrize("dimension", GRIDS)
+def test_apic_conserves_linear_and_angular_momentum(dimension: str, real: str) -> None:
+    c = cloud(GRIDS[dimension], real, affine=True)
+    # relative to what could cancel; arms are about 1 m
+    tolerance = REALS[real][3] * float(np.linalg.norm(c.velocity.numpy(), axis=1).sum())
+    before = momentum(c), angular_momentum(c)
+    c.to_faces()
+    on_grid = grid_momenta(c)
+    c.to_particles()
+    after = momentum(c), angular_momentum(c)
+    for found in (on_grid, after):
+        assert found[0] == pytest.approx(before[0], abs=tolerance)
+        assert found[1] == pytest.approx(before[1], abs=tolerance)
+
+
+@pytest.mark.parametrize("dimension", GRIDS)
+def test_pic_conserves_linear_and_loses_angular_momentum(dimension: str) -> None:
+    losses = {}
+    for affine in (False, True):
+        c = cloud(GRIDS[dimension], "float64", affine=affine)
+        x = c.position.numpy()
+        spin = np.cross([0.0, 0.0, 1.0], x - x.mean(axis=0))
+        c.velocity.assign(spin)
+        for axis, gradient in enumerate(c.affine):
+            gradient.assign(np.tile(np.cross([0.0, 0.0, 1.0], np.eye(3)).T[axis], (len(x), 1)))
+        linear, before = momentum(c), angular_momentum(c)[2]
+        c.to_faces()
+        c.to_particles()
+        assert momentum(c) == pytest.approx(linear, abs=1e-10)
+        losses[affine] = 1.0 - angular_momentum(c)[2] / before
+    assert losses[False] > 0.01
+    assert abs(losses[True]) < 1e-10
+
+
+@pytest.mark.parametrize("dimension", GRIDS)
+def test_apic_reproduces_a_linear_field(dimension: str) -> None:
+    grid = GRIDS[dimension]
+    c = cloud(grid, "float64", affine=True)
+    rng = np.random.default_rng(57)
+    slope, offset = rng.normal(size=(3, 3)), rng.normal(size=3)
+    slope[:, grid.dimension :] = 0.0
+    for axis, field in enumerate(c.fields):
+        field.assign(node_points(grid, axis) @ slope[axis] + offset[axis])
+    c.to_particles()
+    expected = c.position.numpy() @ slope.T + offset
+    axes = slice(grid.dimension)
+    assert c.velocity.numpy()[:, axes] == pytest.approx(expected[:, axes], abs=1e-10)
+    for axis, gradient in enumerate(c.affine):
+        assert gradient.numpy() == pytest.approx(np.tile(slope[axis], (len(expected), 1)), abs=1e-9)
+    c.to_faces()
+    for axis, (field, weight) in enumerate(zip(c.fields, c.weights, strict=True)):
+        used = weight.numpy() > 1e-9
+        assert field.numpy()[used] == pytest.approx((node_points(grid, axis) @ slope[axis] + offset[axis])[used], abs=1e-8)
+
+
+@pytest.mark.parametrize("dimension", GRIDS)
+def test_scatter_is_the_adjoint_of_gather(dimension: str) -> None:
+    grid = GRIDS[dimension]
+    c = cloud(grid, "float64", affine=False)
+    v = c.velocity.numpy().copy()
+    c.to_faces()
+    momenta = [f.numpy() * w.numpy() for f, w in zip(c.fields, c.weights, strict=True)]
+    rng = np.random.default_rng(20)
+    tests = [rng.normal(size=grid.shape) for _ in c.fields]
+    for field, values in zip(c.fields, tests, strict=True):
+        field.assign(values)
+    c.to_particles()
+    gathered = c.velocity.numpy()
+    for axis in range(grid.dimension):
+        assert (momenta[axis] * tests[axis]).sum() == pytest.approx((v[:, axis] * gathered[:, axis]).sum(), rel=1e-12)
+
+
+def test_the_weights_of_a_particle_sum_to_one() -> None:
+    for grid in GRIDS.values():
+        c = cloud(grid, "float32", affine=False)
+        c.to_faces()
+        for weight in c.weights:
+            assert weight.numpy().sum() == pytest.approx(len(c.position), rel=1e-5)
+
+
+def test_a_plane_of_particles_touches_its_own_plane_only() -> None:
+    c = cloud(GRIDS["2d"], "float32", affine=True)
+    c.to_faces()
+    for field, weight in zip(c.fields, c.weights, strict=True):
+        assert (weight.numpy()[[0, 2]] == 0).all()
+        assert (field.numpy()[[0, 2]] == 0).all()
+
+
+def test_flip_keeps_what_the_grid_did_not_change() -> None:
+    grid = GRIDS["3d"]
+    c = cloud(grid, "float32", affine=False)
+    v = c.velocity.numpy().copy()
+    c.to_faces()
+    saved = [wp.clone(field) for field in c.fields]
+    for field in c.fields:
+        field.assign(field.numpy() + 0.25)
+    c.to_particles(saved=saved, flip=1.0)
+    assert c.velocity.numpy() == pytest.approx(v + 0.25, abs=1e-5)
+    pic = cloud(grid, "float32", affine=False)
+    faces_to_particles(grid, c.fields, pic.position, pic.velocity, [])
+    blend = cloud(grid, "float32", affine=False)
+    faces_to_particles(grid, c.fields, blend.position, blend.velocity, [], saved=saved, flip=0.4)
+    assert blend.velocity.numpy() == pytest.approx(0.6 * pic.velocity.numpy() + 0.4 * c.velocity.numpy(), abs=1e-5)
+
+
+def test_a_particle_on_a_cell_boundary_gives_weight_to_both_faces_of_its_cell() -> None:
+    grid = GRIDS["2d"]
+    position = wp.array([[2 * grid.spacing, 3 * grid.spacing, 0.0]], dtype=wp.vec3, device="cpu")
+    velocity = wp.array([[1.0, 2.0, 0.0]], dtype=wp.vec3, device="cpu")
+    fields, weights = grid.faces(), grid.faces()
+    particles_to_faces(grid, position, velocity, [], fields, weights)
+    assert (weights[0].numpy()[1, 3:5, 3:5].max(axis=0) > 0).all()
+    assert (weights[1].numpy()[1, 4:6, 2:4].max(axis=1) > 0).all()
+    assert fields[0].numpy()[1, 4, 4] == pytest.approx(1.0)
+    assert fields[1].numpy()[1, 5, 3] == pytest.approx(2.0)
+
+
+def test_a_window_that_holds_the_particles_changes_nothing() -> None:
+    grid = GRIDS["3d"]
+    c = cloud(grid, "float32", affine=True)
+    c.to_faces()
+    everywhere = [field.numpy().copy() for field in c.fields]
+    cells = np.floor(c.position.numpy() / grid.spacing).astype(int) + 1
+    window = grid.window(cells.min(axis=0), cells.max(axis=0), grow=1)
+    particles_to_faces(grid, c.position, c.velocity, c.affine, c.fields, c.weights, window=window)
+    for field, expected in zip(c.fields, everywhere, strict=True):
+        assert (field.numpy() == expected).all()

@@ -1,0 +1,1 @@
+"""Scene files, the run loop, frames, logs, checkpoints and the command line."""

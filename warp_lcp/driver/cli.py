@@ -1,0 +1,167 @@
+"""The command line: `warp-lcp run | check | scenes | schema | info`."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, NoReturn
+
+import typer
+import warp as wp
+from rich.console import Console
+
+from warp_lcp.driver.devices import DeviceError, choose_device, cuda_driver, devices
+from warp_lcp.driver.progress import Bar, Lines
+from warp_lcp.driver.run import run_scene
+from warp_lcp.driver.run_folder import OutputError, RunRecord
+from warp_lcp.driver.scene_file import built_in_scenes, check_shapes, installed_simulators, load_scene
+from warp_lcp.driver.table import SceneError, nearest
+from warp_lcp.driver.versions import shadowing_distributions, versions
+
+FAILED = 1
+WRONG_INPUT = 2
+
+app = typer.Typer(
+    name="warp-lcp",
+    help="Simulate scenes with complementarity solvers. Exit codes: 0 done, 1 the run failed or was stopped, 2 the input is wrong.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+SceneArgument = Annotated[
+    str, typer.Argument(metavar="SCENE", help="A scene file, or the name of a built-in scene (see `warp-lcp scenes`).")
+]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Override a key of the scene; may be repeated. Arrays: liquid.0.max=[1,1]."),
+]
+
+
+def main() -> None:
+    """Run the command line."""
+    app()
+
+
+@app.callback()
+def quiet() -> None:
+    """Keep Warp's own messages off the terminal; the command line speaks for itself."""
+    wp.config.log_level = wp.LOG_ERROR
+
+
+@app.command()
+def run(
+    scene: SceneArgument,
+    out: Annotated[Path | None, typer.Option(help="The run's folder; out/NAME unless given.", show_default=False)] = None,
+    device: Annotated[str | None, typer.Option(help="cpu or cuda:N; a GPU where there is one unless given.", show_default=False)] = None,
+    frames: Annotated[int | None, typer.Option(min=0, metavar="N", help="End after frame N.", show_default=False)] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the run in the folder from its newest checkpoint.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Delete the run in the folder first.")] = False,
+    overrides: SetOption = None,
+) -> None:
+    """Simulate a scene into a folder that ParaView opens."""
+    with _wrong_input():
+        if resume and force:
+            raise OutputError("--resume continues a run and --force deletes it: choose one")
+        loaded = load_scene(scene, overrides or ())
+        chosen = choose_device(device)
+        folder = out or Path("out") / loaded.scene.name
+        console = Console(stderr=True)
+        console.print(f"{loaded.scene.name} on {chosen}, into {folder}", markup=False, highlight=False, soft_wrap=True)
+        with _interruptible(console) as stop, Bar(console) if console.is_terminal else Lines(console) as observer:
+            record = run_scene(loaded, folder, device=chosen, observer=observer, last_frame=frames, resume=resume, force=force, stop=stop)
+    _report(record, folder)
+
+
+@app.command()
+def check(scene: SceneArgument, overrides: SetOption = None) -> None:
+    """Say whether a scene is valid, and what a run of it would do."""
+    with _wrong_input():
+        loaded = load_scene(scene, overrides or ())
+        check_shapes(loaded, scene)
+    _print_pairs([("scene", loaded.scene.name), ("simulator", loaded.scene.simulator), *loaded.plan()])
+
+
+@app.command()
+def scenes() -> None:
+    """List the built-in scenes."""
+    with _wrong_input():
+        _print_pairs([(name, load_scene(name).scene.description) for name in built_in_scenes()])
+
+
+@app.command()
+def schema(simulator: Annotated[str, typer.Option(help="Whose scenes.")] = "fluids") -> None:
+    """Print the JSON schema of scene files, for editors and other programs."""
+    with _wrong_input():
+        installed = installed_simulators()
+    if simulator not in installed:
+        _end(f"--simulator {simulator}: no such simulator; {nearest(simulator, installed)}", WRONG_INPUT)
+    typer.echo(json.dumps(installed[simulator].scene_model.model_json_schema(by_alias=True), indent=2))
+
+
+@app.command()
+def info() -> None:
+    """Print versions, devices and simulators."""
+    lines = list(versions().items())
+    lines += [(f"device {alias}", text) for alias, text in devices().items()]
+    lines += [("CUDA driver", cuda_driver()), ("kernel cache", str(wp.config.kernel_cache_dir))]
+    _print_pairs(lines)
+    for other in shadowing_distributions():
+        typer.echo(f"warning: the distribution {other} installs a package that has a simulator's name; uninstall it", err=True)
+    with _wrong_input():
+        _print_pairs([(f"simulator {name}", simulator.summary) for name, simulator in installed_simulators().items()])
+
+
+def _print_pairs(pairs: list[tuple[str, str]]) -> None:
+    for word, line in pairs:
+        typer.echo(f"{word:<20}  {line}")
+
+
+@contextmanager
+def _wrong_input() -> Iterator[None]:
+    try:
+        yield
+    except (SceneError, OutputError, DeviceError) as error:
+        _end(str(error), WRONG_INPUT)
+
+
+@contextmanager
+def _interruptible(console: Console) -> Iterator[Callable[[], bool]]:
+    """Give a function that says whether Ctrl-C was pressed; a second Ctrl-C does not wait for the step's end."""
+    pressed = False
+
+    def press(number: int, frame: FrameType | None) -> None:
+        nonlocal pressed
+        pressed = True
+        signal.signal(signal.SIGINT, previous)
+        console.print("stopping after this step; press Ctrl-C again to end now", highlight=False)
+
+    previous = signal.signal(signal.SIGINT, press)
+    try:
+        yield lambda: pressed
+    finally:
+        signal.signal(signal.SIGINT, previous)
+
+
+def _report(record: RunRecord, folder: Path) -> None:
+    """Say how a run ended."""
+    taken = f"{record.steps} steps, {record.time:.6g} s simulated in {record.seconds:.1f} s"
+    if record.status == "finished":
+        typer.echo(f"finished: {record.reason}; {taken}; ParaView opens the .pvd files in {folder}")
+        return
+    message = f"{record.status}: {record.reason}\n{taken}; frames 0 to {record.frames} are in {folder}"
+    newest = max(folder.glob("checkpoints/step_*.npz"), default=None)
+    if newest is None:
+        _end(f"{message}; there is no checkpoint yet", FAILED)
+    again = f"warp-lcp run {folder / 'scene.toml'} --out {folder} --device {record.device} --resume"
+    _end(f"{message}\nlast checkpoint: {newest}\ncontinue with: {again}", FAILED)
+
+
+def _end(message: str, code: int) -> NoReturn:
+    sys.stderr.write(f"{message}\n")
+    raise typer.Exit(code)

@@ -1,0 +1,253 @@
+"""The run loop: frames at their exact times, steps that are tried again, checkpoints, and an honest end."""
+
+from __future__ import annotations
+
+import errno
+import math
+import time as clock
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+from warp_lcp.driver.checkpoint import KEPT, Checkpoint
+from warp_lcp.driver.frames import frame_bytes
+from warp_lcp.driver.log import Log, Value
+from warp_lcp.driver.progress import Observer
+from warp_lcp.driver.run_folder import OutputError, RunFolder, RunRecord
+from warp_lcp.driver.scene import Scene, Time
+from warp_lcp.driver.simulator import Cells, Points, Simulation, SimulationFailed, StepFailed, simulators
+from warp_lcp.driver.table import Problem, SceneError
+
+RETRIES = 6  # halvings of dt: a step 64 times shorter that still fails has another cause than its length
+SAME_TIME = 1e-9  # of a frame's interval: what rounding leaves between a step's end and the frame it was cut for
+SPACE_MARGIN = 1.1
+
+
+def run_scene(
+    scene: Scene,
+    out: Path,
+    *,
+    device: str,
+    observer: Observer,
+    last_frame: int | None = None,
+    resume: bool = False,
+    force: bool = False,
+    stop: Callable[[], bool] = lambda: False,
+) -> RunRecord:
+    """Simulate a scene into a folder.
+
+    Args:
+        scene: what to simulate.
+        out: the run's folder.
+        device: a Warp device, such as `cuda:0`.
+        observer: learns of every step.
+        last_frame: end after this frame; the scene's last one without it.
+        resume: continue the run in the folder.
+        force: delete the run in the folder.
+        stop: asked after every step; True ends the run with a checkpoint.
+
+    Returns:
+        How the run ended, as in run.json.
+
+    Raises:
+        OutputError: the folder cannot take the run.
+        SceneError: the scene cannot be simulated.
+    """
+    folder = RunFolder(out, scene)
+    record = RunRecord(scene.scene.name, scene.scene.simulator, device)
+    checkpoint: Checkpoint | None = None
+    if resume:
+        checkpoint, record.warnings = folder.resume()
+    else:
+        folder.check_new(force=force)
+    try:
+        simulation = simulators()[scene.scene.simulator].create(scene, device=device, folder=Path.cwd())
+        if checkpoint:
+            simulation.restore(checkpoint.state)
+    except ValueError as error:
+        raise SceneError(scene.scene.name, [Problem("", str(error))]) from error
+    record.warnings += simulation.notes()
+    for note in record.warnings:
+        observer.note(note)
+    return _Run(scene, simulation, folder, record, observer).execute(last_frame, stop, resumed=checkpoint is not None)
+
+
+def plan_dt(stable: float, remaining: float, time: Time) -> float:
+    """Return the next step [s]: within the scene's bounds, ending on the frame's time, never leaving a sliver before it.
+
+    It depends on nothing but the state, so a run that was interrupted takes the same steps. The last two steps before a frame are
+    equal; they may be shorter than dt_min.
+
+    Args:
+        stable: what the CFL number allows [s].
+        remaining: the time to the next frame [s].
+        time: the scene's bounds.
+    """
+    dt = min(max(stable, time.dt_min), time.dt_max)
+    if remaining <= dt:
+        return remaining
+    return remaining / 2 if remaining < 2 * dt else dt
+
+
+class _Run:
+    """A simulation on its way through its frames."""
+
+    def __init__(self, scene: Scene, simulation: Simulation, folder: RunFolder, record: RunRecord, observer: Observer) -> None:
+        self.time = scene.time
+        self.output = scene.output
+        self.simulation = simulation
+        self.folder = folder
+        self.record = record
+        self.observer = observer
+        self._begun = clock.perf_counter()
+        self._below_dt_min = False
+        self._checkpointed: int | None = None  # the newest checkpoint's step
+
+    def execute(self, last_frame: int | None, stop: Callable[[], bool], *, resumed: bool) -> RunRecord:
+        """Run to the last frame, and write in run.json how that ended, whatever happened."""
+        count = self.time.frame_count
+        last = count if last_frame is None else min(last_frame, count)
+        start = self._frame()
+        self._check_space(last, start)
+        try:
+            with closing(self._resume() if resumed else self._start(last, start)) as log:
+                self.observer.start(self.simulation.time, self.time.frame_time(last))
+                stopped = self._advance(log, last, stop)
+            self._write_checkpoint()
+            self.record.status = "stopped" if stopped else "finished"
+            self.record.reason = "interrupted" if stopped else f"frame {last} of {count} reached"
+        except (StepFailed, SimulationFailed) as error:
+            self._fail(str(error))
+            if isinstance(error, StepFailed):  # the state is as before the step
+                self._try_to(self._write_checkpoint)
+        except OSError as error:
+            full = "the disk is full: " if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
+            self._fail(f"{full}{error}; what was written before is intact")
+        finally:
+            if self.record.status == "running":
+                self._fail("the program ended unexpectedly")
+            self._try_to(self._write_record)
+        return self.record
+
+    def _check_space(self, last: int, frame: list[Points | Cells]) -> None:
+        frames = max(0, last - self._frames_done() + 1)
+        state = sum(array.nbytes for array in self.simulation.state().values())
+        self.folder.check_space(int(SPACE_MARGIN * (frame_bytes(frame) * frames + (KEPT + 2) * state)))  # final and temporary ones too
+
+    def _start(self, last: int, frame: list[Points | Cells]) -> Log:
+        """Write what there is before the first step."""
+        self.folder.start(self.record)
+        log = Log(self.folder.log, self._columns())
+        self._write_frame(0, last, frame)
+        return log
+
+    def _resume(self) -> Log:
+        """Take back what an interrupted run wrote after its checkpoint."""
+        self.record.resumed_from_step = self.simulation.step_count
+        self.record.frames = self._frames_done()
+        self._write_record()
+        self.folder.frames.resume([self.time.frame_time(index) for index in range(self.record.frames + 1)])
+        try:
+            return Log(self.folder.log, self._columns(), after_step=self.simulation.step_count)
+        except ValueError as error:
+            raise OutputError(str(error)) from error
+
+    def _columns(self) -> tuple[str, ...]:
+        return ("step", "time", "dt", *self.simulation.columns(), "retries", "seconds")
+
+    def _advance(self, log: Log, last: int, stop: Callable[[], bool]) -> bool:
+        """Step until the last frame is written; return whether the user stopped the run before."""
+        frame = self._frames_done() + 1
+        while frame <= last:
+            row = self._step(self.time.frame_time(frame) - self.simulation.time)
+            log.append(row)
+            self.observer.step(row)
+            if self._frames_done() >= frame:
+                self._write_frame(frame, last, self._frame())
+                frame += 1
+            if self.simulation.step_count % self.output.checkpoint_every == 0:
+                self._write_checkpoint()
+                self.folder.checkpoints.prune()
+            if stop() and frame <= last:
+                return True
+        return False
+
+    def _step(self, remaining: float) -> dict[str, Value]:
+        """Take a step, or a shorter one where it fails."""
+        begun = clock.perf_counter()
+        stable = self.simulation.stable_dt()
+        number = self.simulation.step_count + 1
+        if math.isnan(stable):
+            raise SimulationFailed(f"step {number}: the stable time step is not a number")
+        if stable < self.time.dt_min and not self._below_dt_min:
+            self._below_dt_min = True  # once is enough: the log's column cfl has the rest
+            self._warn(f"step {number}: the CFL number asks for dt = {stable:.3g} s, below time.dt_min; steps are longer than it allows")
+        dt = plan_dt(stable, remaining, self.time)
+        retries = 0
+        while True:
+            try:
+                values = self.simulation.step(dt)
+                break
+            except StepFailed as error:
+                if retries == RETRIES or dt / 2 < self.time.dt_min:
+                    raise StepFailed(
+                        f"step {number} at t = {self.simulation.time:.6g} s, dt = {dt:.3g} s, retries {retries}: {error}"
+                    ) from error
+                retries += 1
+                dt /= 2
+        seconds = clock.perf_counter() - begun
+        return {
+            "step": self.simulation.step_count,
+            "time": self.simulation.time,
+            "dt": dt,
+            **values,
+            "retries": retries,
+            "seconds": seconds,
+        }
+
+    def _frames_done(self) -> int:
+        """Return the number of the newest frame whose time is reached; it follows from the time alone."""
+        interval = 1.0 / self.time.frames_per_second
+        reached = self.simulation.time + SAME_TIME * interval
+        frame = min(int(reached / interval), self.time.frame_count)
+        if frame > 0 and self.time.frame_time(frame) > reached:
+            frame -= 1
+        elif frame < self.time.frame_count and self.time.frame_time(frame + 1) <= reached:
+            frame += 1
+        return frame
+
+    def _frame(self) -> list[Points | Cells]:
+        """Return what the scene wants to see of the simulation now."""
+        wanted = {Points: self.output.particles, Cells: self.output.grid}
+        return [part for part in self.simulation.frame() if wanted[type(part)]] if any(wanted.values()) else []
+
+    def _write_frame(self, index: int, last: int, frame: list[Points | Cells]) -> None:
+        self.folder.frames.write(index, self.time.frame_time(index), frame)
+        self.record.frames = index
+        self.observer.frame(index, last)
+
+    def _write_checkpoint(self) -> None:
+        step = self.simulation.step_count
+        if self._checkpointed != step:
+            self.folder.checkpoints.write(Checkpoint(step, self.simulation.time, self.simulation.state()))
+            self._checkpointed = step
+
+    def _write_record(self) -> None:
+        self.record.steps, self.record.time = self.simulation.step_count, self.simulation.time
+        self.record.seconds = round(clock.perf_counter() - self._begun, 3)
+        self.folder.write_record(self.record)
+
+    def _fail(self, reason: str) -> None:
+        self.record.status = "failed"
+        self.record.reason = reason
+
+    def _try_to(self, write: Callable[[], None]) -> None:
+        """Write after a failure; a disk that refuses that too is worth a warning, not another error."""
+        try:
+            write()
+        except OSError as error:
+            self._warn(f"could not be written: {error}")
+
+    def _warn(self, text: str) -> None:
+        self.record.warnings.append(text)
+        self.observer.note(f"warning: {text}")

@@ -1,0 +1,186 @@
+"""What every scene has, whatever it is made of. Simulators subclass `Scene` with their materials and models."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from warp_lcp.driver.shapes import Liquid, Shape, Solid, Vector, Wall
+from warp_lcp.driver.table import ANY_VALUE, Complaint, Problem, SceneError, Table, refuse, validate
+
+__all__ = ["Complaint", "Liquid", "Problem", "Scene", "SceneError", "Shape", "Solid", "Table", "Vector", "Wall", "validate"]
+
+Length = Annotated[float, Field(gt=0)]
+
+WHOLE_CELLS = 1e-6  # how far a side may be from a whole number of cells, relative
+
+
+class About(Table):
+    """[scene]: what the file is."""
+
+    simulator: str = Field(description="the plug-in that runs the scene, such as fluids")
+    name: str = Field(default="", description="a short name; the file's unless given")
+    description: str = Field(default="", description="a sentence about what there is to see")
+
+
+class Time(Table):
+    """[time]: how long, how often to look, how large the steps may be."""
+
+    duration: float = Field(gt=0, description="the simulated time [s]")
+    frames_per_second: float = Field(default=30.0, gt=0, description="frames per simulated second [1/s]")
+    cfl: float = Field(default=2.0, gt=0, description="a Courant number, usually 1 to 4")
+    dt_max: float = Field(default=0.02, gt=0, description="the longest step [s]")
+    dt_min: float = Field(default=1e-6, gt=0, description="the shortest step that the CFL number or a retry may ask for [s]")
+
+    @property
+    def frame_count(self) -> int:
+        """Return the number of the last frame; frame 0 is the start."""
+        return max(1, math.ceil(self.duration * self.frames_per_second * (1.0 - 1e-9)))
+
+    def frame_time(self, frame: int) -> float:
+        """Return the time [s] of a frame. The last one is the end of the run, be that a multiple of the frame interval or not."""
+        return min(frame / self.frames_per_second, self.duration)
+
+
+class Domain(Table):
+    """[domain]: the box that everything happens in, and its grid."""
+
+    later: ClassVar = {"open": ANY_VALUE, "friction": ANY_VALUE, "periodic": frozenset({True})}
+    size: list[Length] = Field(min_length=2, max_length=3, description="the sides of the domain [m], [x, y] or [x, y, z]")
+    resolution: int = Field(ge=2, le=4096, description="cells along the longest side")
+    wall: Wall = Field(default="separating", description="whether liquid may let go of the domain's walls")
+    periodic: list[Literal[False]] | None = Field(default=None, description="false along every axis")
+
+
+class Physics(Table):
+    """[physics]: the constants of the world."""
+
+    gravity: Vector = Field(description="an acceleration [m/s^2]; 9.81 down along y unless given")
+    density: float = Field(default=1000.0, gt=0, description="of the material [kg/m^3]")
+
+
+class Solver(Table):
+    """[solver]: the method for the complementarity problem of every step, and how far it goes."""
+
+    later: ClassVar = {"preset": ANY_VALUE}
+    method: Literal["minimum-map-newton", "psor"] = Field(default="minimum-map-newton", description="psor is simple and slow")
+    tolerance: float = Field(default=1e-4, gt=0, lt=1, description="the relative residual to reach")
+    precision: Literal["mixed", "single", "double"] = Field(default="mixed", description="of the method's arithmetic")
+    max_iterations: int = Field(default=100, ge=1, description="iterations before the step counts as failed")
+
+
+class Output(Table):
+    """[output]: what the run's folder gets."""
+
+    later: ClassVar = {"surface": frozenset({True})}
+    particles: bool = Field(default=True, description="write a frame of particles")
+    grid: bool = Field(default=True, description="write a frame of cells")
+    surface: Literal[False] = Field(default=False, description="write the liquid's surface")
+    checkpoint_every: int = Field(default=50, ge=1, description="steps between checkpoints")
+
+
+class Scene(Table):
+    """A scene file, read and checked. SI units; y is up; a domain of two sides is the x-y plane."""
+
+    later: ClassVar = {"density_correction": ANY_VALUE, "sand": ANY_VALUE}
+    scene: About
+    time: Time
+    domain: Domain
+    physics: Physics
+    solver: Solver = Field(default_factory=Solver)
+    solid: list[Solid] = Field(default_factory=list)
+    output: Output = Field(default_factory=Output)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _gravity_is_down(cls, data: Any) -> Any:
+        """Fill in gravity, whose default needs the number of dimensions."""
+        domain, physics = (data.get("domain"), data.get("physics", {})) if isinstance(data, dict) else (None, None)
+        size = domain.get("size") if isinstance(domain, dict) else None
+        if isinstance(physics, dict):
+            gravity = [0.0, -9.81, 0.0] if isinstance(size, list) and len(size) == 3 else [0.0, -9.81]
+            return {**data, "physics": {"gravity": gravity, **physics}}
+        return data
+
+    @model_validator(mode="after")
+    def _check_across_tables(self) -> Self:
+        refuse(type(self).__name__, self.complaints())
+        return self
+
+    @property
+    def dimension(self) -> int:
+        """Return 2 or 3."""
+        return len(self.domain.size)
+
+    @property
+    def spacing(self) -> float:
+        """Return the side of a cell [m]."""
+        return max(self.domain.size) / self.domain.resolution
+
+    @property
+    def cell_counts(self) -> tuple[int, int, int]:
+        """Return the cells along x, y and z; one along z in 2-D."""
+        x, y, z = [round(side / self.spacing) for side in [*self.domain.size, self.spacing][:3]]
+        return x, y, z
+
+    def complaints(self) -> list[Complaint]:
+        """Return what is wrong across keys. Subclasses add theirs to `super().complaints()`."""
+        found = self._grid_complaints()
+        if len(self.physics.gravity) != self.dimension:
+            message = f"must have {self.dimension} entries, as domain.size has"
+            found.append(Complaint(("physics", "gravity"), self.physics.gravity, message))
+        if self.time.dt_min > self.time.dt_max:
+            found.append(Complaint(("time", "dt_min"), self.time.dt_min, f"must not exceed time.dt_max = {self.time.dt_max}"))
+        return found + self.shape_complaints("solid", self.solid)
+
+    def shape_complaints(self, key: str, shapes: Sequence[Shape], *, inside: bool = False) -> list[Complaint]:
+        """Return what is wrong with an array of shapes.
+
+        Args:
+            key: the array's name in the file, such as `liquid`.
+            shapes: its entries.
+            inside: also refuse an entry that lies wholly outside the domain.
+        """
+        found = []
+        for index, shape in enumerate(shapes):
+            own = shape.complaints(self.dimension)
+            if inside and not own and self.enclosed_volume(shape) == 0.0:
+                own = [Complaint((), None, f"lies outside the domain, which reaches from the origin to {self.domain.size} m")]
+            found += [Complaint((key, index, *complaint.place), complaint.value, complaint.message) for complaint in own]
+        return found
+
+    def enclosed_volume(self, shape: Shape) -> float:
+        """Return an upper bound of a shape's volume in the domain [m^3; m^2 in 2-D]: that of the box around it."""
+        size = np.array(self.domain.size)
+        bounds = shape.bounds(self.dimension)
+        if bounds is None:
+            return float(size.prod())
+        low, high = (corner[: self.dimension] for corner in bounds)
+        return float(np.maximum(np.minimum(high, size) - np.maximum(low, 0.0), 0.0).prod())
+
+    def plan(self) -> list[tuple[str, str]]:
+        """Return what a run would do, as pairs of a word and a line. Subclasses append theirs, such as particles and memory."""
+        cells = self.cell_counts[: self.dimension]
+        return [
+            ("grid", f"{' x '.join(map(str, cells))} = {math.prod(cells):,} cells of {self.spacing:.6g} m"),
+            ("walls", ", ".join([self.domain.wall, *(f"solid {i} {s.wall}" for i, s in enumerate(self.solid) if s.wall)])),
+            ("time", f"{self.time.duration:g} s in steps of at most {self.time.dt_max:g} s, CFL {self.time.cfl:g}"),
+            ("frames", f"{self.time.frame_count + 1} at {self.time.frames_per_second:g} per second"),
+            ("solver", f"{self.solver.method} to {self.solver.tolerance:g}, {self.solver.precision} precision"),
+        ]
+
+    def _grid_complaints(self) -> list[Complaint]:
+        found = []
+        for axis, side in enumerate(self.domain.size):
+            cells = side / self.spacing
+            if round(cells) < 1 or abs(cells - round(cells)) > WHOLE_CELLS * cells:
+                sides = [f"{n * self.spacing:.8g}" for n in (math.floor(cells), math.ceil(cells)) if n > 0]
+                message = f"must be a whole number of cells of {self.spacing:.6g} m; the nearest: {' and '.join(sides)}"
+                found.append(Complaint(("domain", "size", axis), side, message))
+        if self.domain.periodic is not None and len(self.domain.periodic) != self.dimension:
+            found.append(Complaint(("domain", "periodic"), self.domain.periodic, f"must have {self.dimension} entries"))
+        return found

@@ -1,0 +1,227 @@
+"""The shapes of a scene file: where solids stand and where material starts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+
+import numpy as np
+from pydantic import BeforeValidator, Field
+
+from warp_lcp.driver.table import ANY_VALUE, Complaint, Table
+
+if TYPE_CHECKING:
+    from warp_lcp.grid.solids import Geometry, Placement
+
+BUILTIN = "builtin:"  # how the name of a mesh that the project generates begins
+
+Wall = Literal["separating", "free-slip"]
+Vector = Annotated[list[float], Field(min_length=2, max_length=3)]
+
+
+def _as_list(value: object) -> object:
+    return [value] if isinstance(value, (int, float)) and not isinstance(value, bool) else value
+
+
+Angles = Annotated[list[float], Field(min_length=1, max_length=3), BeforeValidator(_as_list, json_schema_input_type=float | list[float])]
+
+
+class Shape(Table):
+    """A region of space, placed by p = rotation (scale q) + translation.
+
+    `rotate` is in degrees: one angle in 2-D, angles about the fixed axes x, y, z (in that order) in 3-D. `invert` swaps inside and outside.
+    """
+
+    translate: Vector | None = Field(default=None, description="a shift [m]")
+    rotate: Angles | None = Field(default=None, description="degrees: one angle in 2-D, [x, y, z] in 3-D")
+    scale: float = Field(default=1.0, gt=0, description="a factor, the same along every axis")
+    invert: bool = Field(default=False, description="true: everything but the shape")
+
+    def to_geometry(self, folder: Path, dimension: int) -> Geometry:
+        """Return the shape as a signed distance.
+
+        Args:
+            folder: where the files are that the shape names.
+            dimension: 2 or 3.
+
+        Raises:
+            ValueError: a file cannot be read or does not enclose a volume.
+        """
+        raise NotImplementedError
+
+    def placement(self, dimension: int) -> Placement:
+        """Return scale, rotation and translation in a scene of 2 or 3 dimensions."""
+        from warp_lcp.grid.solids import Placement
+
+        zeros = [0.0] * dimension
+        return Placement.from_degrees(self.scale, self.rotate or zeros[: 1 if dimension == 2 else 3], self.translate or zeros, dimension)
+
+    def bounds(self, dimension: int) -> np.ndarray | None:
+        """Return the low and high corner [m] of a box around the shape, shape (2, 3).
+
+        None when the shape has no limits, or only its file knows them.
+        """
+        return self.to_geometry(Path(), dimension).bounds()
+
+    def complaints(self, dimension: int) -> list[Complaint]:
+        """Return what is wrong with the shape in a scene of 2 or 3 dimensions."""
+        wanted = {name: dimension for name, value in self if isinstance(value, list)}
+        if "rotate" in wanted:
+            wanted["rotate"] = 1 if dimension == 2 else 3
+        return [
+            Complaint((type(self).model_fields[name].alias or name,), value, f"must have {count} entries in {dimension}-D")
+            for name, count in wanted.items()
+            if len(value := getattr(self, name)) != count
+        ]
+
+
+class Box(Shape):
+    """A box between two corners."""
+
+    shape: Literal["box"] = "box"
+    min: Vector = Field(description="the low corner [m]")
+    max: Vector = Field(description="the high corner [m]")
+
+    def to_geometry(self, folder: Path, dimension: int) -> Geometry:
+        """Return the box; in 2-D it extends along z without limit."""
+        from warp_lcp.grid import solids
+
+        return solids.Box(lower=self.min, upper=self.max, placement=self.placement(dimension), invert=self.invert)
+
+    def complaints(self, dimension: int) -> list[Complaint]:
+        """Return what is wrong with the box in a scene of 2 or 3 dimensions."""
+        found = super().complaints(dimension)
+        if not found and any(low >= high for low, high in zip(self.min, self.max, strict=True)):
+            found.append(Complaint(("max",), self.max, f"must be greater than min = {self.min} along every axis"))
+        return found
+
+
+class Sphere(Shape):
+    """A ball; a disc in 2-D."""
+
+    shape: Literal["sphere"] = "sphere"
+    center: Vector = Field(description="a point [m]")
+    radius: float = Field(gt=0, description="a length [m]")
+
+    def to_geometry(self, folder: Path, dimension: int) -> Geometry:
+        """Return the ball."""
+        from warp_lcp.grid import solids
+
+        return solids.Sphere(center=self.center, radius=self.radius, placement=self.placement(dimension), invert=self.invert)
+
+
+class Capsule(Shape):
+    """All points within a radius of a segment."""
+
+    shape: Literal["capsule"] = "capsule"
+    start: Vector = Field(alias="from", description="one end of the axis [m]")
+    end: Vector = Field(alias="to", description="the other end of the axis [m]")
+    radius: float = Field(gt=0, description="a length [m]")
+
+    def to_geometry(self, folder: Path, dimension: int) -> Geometry:
+        """Return the capsule."""
+        from warp_lcp.grid import solids
+
+        return solids.Capsule(start=self.start, end=self.end, radius=self.radius, placement=self.placement(dimension), invert=self.invert)
+
+    def complaints(self, dimension: int) -> list[Complaint]:
+        """Return what is wrong with the capsule in a scene of 2 or 3 dimensions."""
+        found = super().complaints(dimension)
+        if self.start == self.end:
+            found.append(Complaint(("to",), self.end, 'must differ from "from"; use a sphere otherwise'))
+        return found
+
+
+class Plane(Shape):
+    """The half space on the side of a plane that its normal points away from."""
+
+    shape: Literal["plane"] = "plane"
+    point: Vector = Field(description="a point of the plane [m]")
+    normal: Vector = Field(description="points out of the material; its length does not matter")
+
+    def to_geometry(self, folder: Path, dimension: int) -> Geometry:
+        """Return the half space."""
+        from warp_lcp.grid import solids
+
+        return solids.Plane(point=self.point, normal=self.normal, placement=self.placement(dimension), invert=self.invert)
+
+    def complaints(self, dimension: int) -> list[Complaint]:
+        """Return what is wrong with the plane in a scene of 2 or 3 dimensions."""
+        found = super().complaints(dimension)
+        if not any(self.normal):
+            found.append(Complaint(("normal",), self.normal, "must not be zero"))
+        return found
+
+
+class Mesh(Shape):
+    """The inside of a closed surface of triangles; in 2-D, of its cut by the plane z = 0."""
+
+    shape: Literal["mesh"] = "mesh"
+    file: str = Field(min_length=1, description=f"an OBJ, STL or PLY file, or a mesh that warp-lcp makes, such as {BUILTIN}torus")
+
+    def to_geometry(self, folder: Path, dimension: int) -> Geometry:
+        """Return the inside of the mesh."""
+        from warp_lcp.grid import solids
+
+        return solids.TriangleMesh.from_file(self.file, folder=folder, placement=self.placement(dimension), invert=self.invert)
+
+    def bounds(self, dimension: int) -> np.ndarray | None:
+        """Return None: only the file knows."""
+        return None
+
+
+class SolidProperties(Table):
+    """What a solid has besides its shape."""
+
+    later: ClassVar = {"friction": ANY_VALUE, "motion": ANY_VALUE, "mass": ANY_VALUE}
+    wall: Wall | None = Field(default=None, description="whether liquid may let go of it; domain.wall unless given")
+
+
+class LiquidProperties(Table):
+    """What a liquid has besides its shape."""
+
+    velocity: Vector | None = Field(default=None, description="at the start [m/s]; at rest unless given")
+
+
+class SolidBox(SolidProperties, Box):
+    """A solid box."""
+
+
+class SolidSphere(SolidProperties, Sphere):
+    """A solid ball."""
+
+
+class SolidCapsule(SolidProperties, Capsule):
+    """A solid capsule."""
+
+
+class SolidPlane(SolidProperties, Plane):
+    """A solid half space."""
+
+
+class SolidMesh(SolidProperties, Mesh):
+    """A solid inside a surface of triangles."""
+
+
+class LiquidBox(LiquidProperties, Box):
+    """A box of liquid."""
+
+
+class LiquidSphere(LiquidProperties, Sphere):
+    """A ball of liquid."""
+
+
+class LiquidCapsule(LiquidProperties, Capsule):
+    """A capsule of liquid."""
+
+
+class LiquidPlane(LiquidProperties, Plane):
+    """A half space of liquid."""
+
+
+class LiquidMesh(LiquidProperties, Mesh):
+    """Liquid inside a surface of triangles."""
+
+
+Solid = Annotated[SolidBox | SolidSphere | SolidCapsule | SolidPlane | SolidMesh, Field(discriminator="shape")]
+Liquid = Annotated[LiquidBox | LiquidSphere | LiquidCapsule | LiquidPlane | LiquidMesh, Field(discriminator="shape")]

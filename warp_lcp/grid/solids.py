@@ -1,0 +1,409 @@
+"""Solids and regions of material as signed distances on the device: box, sphere, capsule, plane and triangle mesh.
+
+A 2-D scene is the plane z = 0 of these shapes: its callers pass points with z = 0. Boxes given with two coordinates extend without limit in
+z, spheres and capsules lie at z = 0 (discs and stadiums there), and a mesh is cut by the plane z = 0: the sign is that of the cut, the
+distance is the one to the surface in space, never more than the one to the cut.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Protocol, runtime_checkable
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.grid.solids_kernels import box_distance, capsule_distance, mesh_distance, plane_distance, sphere_distance
+from warp_lcp.grid.triangle_mesh import ClosedSurface, load_surface
+
+Vector = Sequence[float] | np.ndarray
+
+
+@runtime_checkable
+class Geometry(Protocol):
+    """A region of space with a signed distance, negative inside."""
+
+    def signed_distance(self, points: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.float32)) -> None:
+        """Write the distance [m] of `points` [m], shape (m,), to the surface into `out`, shape (m,); 2-D callers pass z = 0."""
+
+    def bounds(self) -> np.ndarray | None:
+        """Return the low and the high corner [m] of a box around the region, shape (2, 3), or None when the region has no limits."""
+
+
+def _vector(name: str, value: Vector) -> tuple[float, ...]:
+    """Return `value` as two or three finite numbers."""
+    numbers = tuple(float(v) for v in value)
+    if len(numbers) not in (2, 3):
+        raise ValueError(f"{name} needs 2 or 3 numbers, not {len(numbers)}")
+    if not np.isfinite(numbers).all():
+        raise ValueError(f"{name} must be finite, not {list(numbers)}")
+    return numbers
+
+
+def _positive(name: str, value: float) -> float:
+    """Return `value` as a positive finite number."""
+    if not (np.isfinite(value) and value > 0.0):
+        raise ValueError(f"{name} must be a positive number, not {value}")
+    return float(value)
+
+
+def _in_space(vector: Vector) -> np.ndarray:
+    """Return a point or direction of two or three coordinates in space, z = 0 in 2-D."""
+    return np.array([*vector, 0.0][:3])
+
+
+def _rotation_about(axis: int, degrees: float) -> np.ndarray:
+    """Return the matrix that turns counterclockwise about a coordinate axis."""
+    angle = np.deg2rad(degrees)
+    quarters = degrees / 90.0  # whole quarter turns stay exact, so that a turned box keeps its faces on the grid's
+    cosine, sine = np.cos(angle), np.sin(angle)
+    if quarters == int(quarters):
+        cosine, sine = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(quarters) % 4]
+    i, j = ((1, 2), (2, 0), (0, 1))[axis]
+    matrix = np.eye(3)
+    matrix[i, i] = matrix[j, j] = cosine
+    matrix[j, i], matrix[i, j] = sine, -sine
+    return matrix
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Placement:
+    """Map a shape's own coordinates q to the domain's: p = scale * rotation @ q + translation.
+
+    Args:
+        scale: uniform factor, > 0.
+        rotation: proper rotation matrix, shape (3, 3).
+        translation: [m], shape (3,).
+
+    Raises:
+        ValueError: a value is not finite, the scale is not positive, or the matrix is not a rotation.
+    """
+
+    scale: float = 1.0
+    rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
+    translation: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+    def __post_init__(self) -> None:
+        """Check the values and store them as float64."""
+        object.__setattr__(self, "scale", _positive("scale", self.scale))
+        rotation = np.array(self.rotation, dtype=np.float64)
+        translation = np.array(self.translation, dtype=np.float64)
+        if rotation.shape != (3, 3):
+            raise ValueError(f"rotation must be a 3 x 3 matrix, not of shape {rotation.shape}")
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0.0:
+            raise ValueError("rotation must be a proper rotation matrix (orthogonal, determinant 1)")
+        if translation.shape != (3,) or not np.isfinite(translation).all():
+            raise ValueError(f"translation must be 3 finite numbers, not {translation.tolist()}")
+        for name, array in (("rotation", rotation), ("translation", translation)):
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+
+    @classmethod
+    def from_degrees(cls, scale: float, rotate: float | Vector, translate: Vector, dimension: int) -> Placement:
+        """Build the placement that a scene describes.
+
+        Args:
+            scale: uniform factor, > 0.
+            rotate: angles [degrees] about x, then y, then z in 3-D; one angle (or a sequence of one), about z, in 2-D.
+            translate: [m], `dimension` numbers.
+            dimension: 2 or 3.
+
+        Raises:
+            ValueError: a value is not finite, or there are too few or too many.
+        """
+        angles = [float(angle) for angle in np.atleast_1d(np.asarray(rotate, dtype=np.float64))]
+        wanted = {2: 1, 3: 3}.get(dimension)
+        if wanted is None:
+            raise ValueError(f"dimension must be 2 or 3, not {dimension}")
+        if len(angles) != wanted or not np.isfinite(angles).all():
+            meaning = "one finite angle in degrees, about z" if dimension == 2 else "three finite angles in degrees, about x, y and z"
+            raise ValueError(f"rotate needs {meaning}, not {rotate}")
+        if len(translate) != dimension:
+            raise ValueError(f"translate needs {dimension} numbers, not {len(translate)}")
+        if dimension == 2:
+            angles = [0.0, 0.0, *angles]
+        x, y, z = (_rotation_about(axis, angle) for axis, angle in enumerate(angles))
+        return cls(scale=scale, rotation=z @ y @ x, translation=_in_space(_vector("translate", translate)))
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        """Return `points`, shape (m, 3), of the shape's coordinates in the domain's [m]."""
+        return self.scale * np.asarray(points) @ self.rotation.T + self.translation
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Shape:
+    """What the shapes share: their placement, inversion and the launch of their kernel."""
+
+    placement: Placement = field(default_factory=Placement)
+    invert: bool = False
+
+    kernel: ClassVar[Any]
+
+    def signed_distance(self, points: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.float32)) -> None:
+        """Write the Euclidean distance to the surface, negative inside (outside when inverted).
+
+        Args:
+            points: [m], shape (m,), on any device; a 2-D caller passes z = 0.
+            out: [m], shape (m,), on the same device.
+
+        Raises:
+            ValueError: the arrays differ in length.
+        """
+        if points.shape != out.shape:
+            raise ValueError(f"out has shape {out.shape}, points have {points.shape}")
+        placement = self.placement
+        translation = placement.translation + placement.scale * placement.rotation @ self._origin()
+        sign = -1.0 if self.invert else 1.0
+        common = [points, wp.mat33(placement.rotation.T), wp.vec3(*translation), placement.scale * self._unit(), sign]
+        wp.launch(self.kernel, dim=points.shape[0], inputs=[*common, *self._parameters(points.device)], outputs=[out], device=points.device)
+
+    def bounds(self) -> np.ndarray | None:
+        """Return the low and the high corner [m] of a box around the region, shape (2, 3); None when it is unlimited or inverted."""
+        if self.invert:
+            return None
+        corners, margin = self._hull()
+        if not len(corners):
+            return None
+        placed = self.placement.apply(corners)
+        margin *= self.placement.scale
+        return np.stack([placed.min(axis=0) - margin, placed.max(axis=0) + margin])
+
+    def _origin(self) -> np.ndarray:
+        """Return the point, in the shape's coordinates, from which its kernel counts."""
+        return np.zeros(3)
+
+    def _unit(self) -> float:
+        """Return the length, in the shape's coordinates, that its kernel counts as 1."""
+        return 1.0
+
+    def _parameters(self, device: wp.Device) -> list[Any]:
+        """Return the kernel's arguments after the placement."""
+        raise NotImplementedError
+
+    def _hull(self) -> tuple[np.ndarray, float]:
+        """Return points, shape (m, 3), and a margin around them that cover the shape; no points when nothing does."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Box(_Shape):
+    """A box between two corners; without limit in z when they have two coordinates.
+
+    Args:
+        lower: low corner [m], 2 or 3 numbers.
+        upper: high corner [m], as many.
+        placement: where it stands.
+        invert: make it everything but the box.
+
+    Raises:
+        ValueError: a corner is not finite, or lower < upper does not hold everywhere.
+    """
+
+    lower: Vector
+    upper: Vector
+
+    kernel: ClassVar[Any] = box_distance
+
+    def __post_init__(self) -> None:
+        """Check the corners."""
+        lower, upper = _vector("min", self.lower), _vector("max", self.upper)
+        if len(lower) != len(upper):
+            raise ValueError(f"a box's min has {len(lower)} numbers and its max {len(upper)}")
+        if not all(a < b for a, b in zip(lower, upper, strict=True)):
+            raise ValueError(f"a box's min must be less than its max in every direction, not {list(lower)} and {list(upper)}")
+        object.__setattr__(self, "lower", lower)
+        object.__setattr__(self, "upper", upper)
+
+    def _origin(self) -> np.ndarray:
+        return 0.5 * (_in_space(self.lower) + _in_space(self.upper))
+
+    def _half(self) -> np.ndarray:
+        half = 0.5 * (np.asarray(self.upper) - np.asarray(self.lower))
+        return np.array([*half, np.inf][:3])
+
+    def _parameters(self, device: wp.Device) -> list[Any]:
+        return [wp.vec3(*self._half())]
+
+    def bounds(self) -> np.ndarray | None:
+        """Return the low and the high corner [m] of a box around it, shape (2, 3): infinite in z in 2-D; None when inverted."""
+        result = super().bounds()
+        if result is not None and len(self.lower) == 2:
+            result[:, 2] = -np.inf, np.inf
+        return result
+
+    def _hull(self) -> tuple[np.ndarray, float]:
+        half = np.where(np.isfinite(self._half()), self._half(), 0.0)
+        signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), axis=-1).reshape(-1, 3)
+        return self._origin() + signs * half, 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sphere(_Shape):
+    """A sphere, in 2-D a disc.
+
+    Args:
+        center: [m], 2 or 3 numbers.
+        radius: [m], > 0.
+        placement: where it stands.
+        invert: make it everything but the sphere.
+
+    Raises:
+        ValueError: a value is not finite or the radius is not positive.
+    """
+
+    center: Vector
+    radius: float
+
+    kernel: ClassVar[Any] = sphere_distance
+
+    def __post_init__(self) -> None:
+        """Check center and radius."""
+        object.__setattr__(self, "center", _vector("center", self.center))
+        object.__setattr__(self, "radius", _positive("radius", self.radius))
+
+    def _origin(self) -> np.ndarray:
+        return _in_space(self.center)
+
+    def _parameters(self, device: wp.Device) -> list[Any]:
+        return [self.radius]
+
+    def _hull(self) -> tuple[np.ndarray, float]:
+        return self._origin()[None], self.radius
+
+
+@dataclass(frozen=True, kw_only=True)
+class Capsule(_Shape):
+    """All points within a radius of a segment.
+
+    Args:
+        start: one end of the segment [m], 2 or 3 numbers.
+        end: the other end [m], as many.
+        radius: [m], > 0.
+        placement: where it stands.
+        invert: make it everything but the capsule.
+
+    Raises:
+        ValueError: a value is not finite, the radius is not positive, or the ends coincide.
+    """
+
+    start: Vector
+    end: Vector
+    radius: float
+
+    kernel: ClassVar[Any] = capsule_distance
+
+    def __post_init__(self) -> None:
+        """Check ends and radius."""
+        start, end = _vector("from", self.start), _vector("to", self.end)
+        if len(start) != len(end):
+            raise ValueError(f"a capsule's from has {len(start)} numbers and its to {len(end)}")
+        if start == end:
+            raise ValueError(f"a capsule's ends coincide at {list(start)}: use a sphere")
+        object.__setattr__(self, "start", start)
+        object.__setattr__(self, "end", end)
+        object.__setattr__(self, "radius", _positive("radius", self.radius))
+
+    def _origin(self) -> np.ndarray:
+        return _in_space(self.start)
+
+    def _parameters(self, device: wp.Device) -> list[Any]:
+        return [wp.vec3(*(_in_space(self.end) - _in_space(self.start))), self.radius]
+
+    def _hull(self) -> tuple[np.ndarray, float]:
+        return np.stack([_in_space(self.start), _in_space(self.end)]), self.radius
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plane(_Shape):
+    """The half-space on the side of a plane opposite its normal.
+
+    Args:
+        point: a point of the plane [m], 2 or 3 numbers.
+        normal: direction out of the material, as many numbers, of any length but 0.
+        placement: where it stands.
+        invert: put the material on the normal's side.
+
+    Raises:
+        ValueError: a value is not finite or the normal is zero.
+    """
+
+    point: Vector
+    normal: Vector
+
+    kernel: ClassVar[Any] = plane_distance
+
+    def __post_init__(self) -> None:
+        """Check the point, and give the normal unit length."""
+        point, normal = _vector("point", self.point), _vector("normal", self.normal)
+        if len(point) != len(normal):
+            raise ValueError(f"a plane's point has {len(point)} numbers and its normal {len(normal)}")
+        largest = max(abs(v) for v in normal)
+        if largest == 0.0:
+            raise ValueError("a plane's normal must not be zero")
+        unit = np.asarray(normal) / largest  # first, so that the length neither overflows nor underflows
+        object.__setattr__(self, "point", point)
+        object.__setattr__(self, "normal", tuple((unit / np.linalg.norm(unit)).tolist()))
+
+    def _origin(self) -> np.ndarray:
+        return _in_space(self.point)
+
+    def _parameters(self, device: wp.Device) -> list[Any]:
+        return [wp.vec3(*_in_space(self.normal))]
+
+    def _hull(self) -> tuple[np.ndarray, float]:
+        return np.empty((0, 3)), 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class TriangleMesh(_Shape):
+    """The inside of a closed triangle surface.
+
+    The distance is the one to the closest triangle; the sign comes from the winding number, summed over the triangles.
+
+    Args:
+        surface: the checked surface, in the mesh's own coordinates.
+        placement: where it stands.
+        invert: make it everything but the inside.
+    """
+
+    surface: ClosedSurface
+
+    kernel: ClassVar[Any] = mesh_distance
+
+    @classmethod
+    def from_file(cls, file: str, *, folder: Path | None = None, placement: Placement | None = None, invert: bool = False) -> TriangleMesh:
+        """Read an OBJ, STL or PLY file, or take a surface that the project generates (`builtin:torus`, `builtin:knot`).
+
+        Args:
+            file: path, relative to `folder`, or `builtin:` and a name.
+            folder: where relative paths start; the working directory without it.
+            placement: where it stands.
+            invert: make it everything but the inside.
+
+        Raises:
+            ValueError: the file is missing or not a closed surface; the message names the file and what to do.
+        """
+        return cls(surface=load_surface(file, folder), placement=placement or Placement(), invert=invert)
+
+    @property
+    def volume(self) -> float:
+        """Volume inside the surface as placed [m^3]."""
+        return self.surface.volume * self.placement.scale**3
+
+    def thin_fraction(self, thickness: float, device: wp.Device) -> float:
+        """Return the share of the surface's area behind which the solid is thinner than `thickness` [m]."""
+        return self.surface.thin_fraction(thickness / self.placement.scale, device)
+
+    def _origin(self) -> np.ndarray:
+        return self.surface.center
+
+    def _unit(self) -> float:
+        return self.surface.size
+
+    def _parameters(self, device: wp.Device) -> list[Any]:
+        return [self.surface.on_device(device).id]
+
+    def _hull(self) -> tuple[np.ndarray, float]:
+        return self.surface.vertices, 0.0

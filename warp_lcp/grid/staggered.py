@@ -1,0 +1,177 @@
+"""The staggered grid: where cells and faces lie, their fields, and launches over a part of them.
+
+A grid of nx x ny x nz cells is stored with one ring of ghost cells, shape (nz + 2, ny + 2, nx + 2), x fastest; a 2-D grid is nz = 1 and
+only its plane k = 1 is used. Face fields have the shape of the cells: element (k, j, i) of component 0 (x), 1 (y) or 2 (z) lies on the
+lower x, y or z face of cell (k, j, i). Grid coordinates are X = x / dx + 1 with x [m] the distance from the low corner of the domain, so
+that a point lies in cell floor(X). In 2-D, z is ignored.
+"""
+
+import typing
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.native import grain
+
+
+@wp.struct
+class CellRange:
+    """A box of cells as kernels see it; a thread takes `grain` cells of a row."""
+
+    k: int
+    j: int
+    i: int
+    end: int  # one past the last i
+    grain: int
+
+
+@wp.func
+@typing.no_type_check
+def inside(coordinate: float, count: int):
+    """Return a grid coordinate brought into the domain [1, count + 1]; a NaN becomes 1."""
+    x = coordinate
+    if not (x > 1.0):
+        x = 1.0
+    if x > float(count) + 1.0:
+        x = float(count) + 1.0
+    return x
+
+
+@wp.func
+@typing.no_type_check
+def cell_index(coordinate: float, count: int):
+    """Return the interior cell 1..count that a grid coordinate lies in."""
+    return wp.min(int(inside(coordinate, count)), count)
+
+
+@dataclass(frozen=True)
+class Window:
+    """A box of stored cells, low <= (k, j, i) < high, over which kernels are launched.
+
+    Args:
+        low: first (k, j, i), ring included.
+        high: one past the last (k, j, i).
+        device: where kernels run.
+    """
+
+    low: tuple[int, int, int]
+    high: tuple[int, int, int]
+    device: wp.Device
+
+    @cached_property
+    def cells(self) -> typing.Any:
+        """The CellRange that kernels take as their first argument."""
+        box = CellRange()
+        box.k, box.j, box.i = self.low
+        box.end = self.high[2]
+        box.grain = grain(self.high[2] - self.low[2], self.device)
+        return box
+
+    @property
+    def rows(self) -> tuple[int, int]:
+        """Planes and rows of the box."""
+        return self.high[0] - self.low[0], self.high[1] - self.low[1]
+
+    def launch(self, kernel: wp.Kernel, inputs: list[typing.Any]) -> None:
+        """Launch kernel(cells, *inputs) with threads (plane, row, chunk of a row)."""
+        chunks = -(-(self.high[2] - self.low[2]) // self.cells.grain)
+        wp.launch(kernel, (*self.rows, chunks), [self.cells, *inputs], device=self.device)
+
+    def launch_rows(self, kernel: wp.Kernel, inputs: list[typing.Any]) -> None:
+        """Launch kernel(cells, *inputs) with one thread a row (plane, row), for sums that are the same on every run."""
+        wp.launch(kernel, self.rows, [self.cells, *inputs], device=self.device)
+
+
+@dataclass(frozen=True)
+class StaggeredGrid:
+    """Say how many cells of which size there are, and make fields for them.
+
+    Args:
+        counts: cells (nx, ny, nz); nz = 1 in 2-D.
+        spacing: edge of a cell dx [m].
+        dimension: 2 or 3.
+        device: a Warp device or its name.
+
+    Raises:
+        ValueError: a count is not positive, nz is not 1 in 2-D, or the spacing is not positive.
+    """
+
+    counts: tuple[int, int, int]
+    spacing: float
+    dimension: int
+    device: typing.Any = "cpu"
+
+    def __post_init__(self) -> None:
+        """Check the arguments and resolve the device."""
+        if self.dimension not in (2, 3):
+            raise ValueError(f"dimension = {self.dimension}: must be 2 or 3")
+        if min(self.counts) < 1 or (self.dimension == 2 and self.counts[2] != 1):
+            raise ValueError(f"counts = {self.counts}: must be at least 1 cell (nx, ny, nz), and nz = 1 in 2-D")
+        if not (np.isfinite(self.spacing) and self.spacing > 0):
+            raise ValueError(f"spacing = {self.spacing}: must be a positive length [m]")
+        object.__setattr__(self, "device", wp.get_device(self.device))
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Shape (nz + 2, ny + 2, nx + 2) of every field."""
+        nx, ny, nz = self.counts
+        return nz + 2, ny + 2, nx + 2
+
+    @property
+    def size(self) -> int:
+        """Elements of a field."""
+        return int(np.prod(self.shape))
+
+    @property
+    def planes(self) -> int:
+        """Nodes along z that a tent function spans: 1 in 2-D, 2 in 3-D."""
+        return self.dimension - 1
+
+    @property
+    def cell_volume(self) -> float:
+        """Volume of a cell [m^3]; in 2-D the area [m^2], the volume per meter of depth."""
+        return self.spacing**self.dimension
+
+    def field(self, dtype: typing.Any = wp.float32) -> wp.array:
+        """Return a field of zeros, one value a stored cell."""
+        return wp.zeros(self.shape, dtype=dtype, device=self.device)
+
+    def faces(self, dtype: typing.Any = wp.float32) -> list[wp.array]:
+        """Return a field of zeros for each component: [u, v] in 2-D, [u, v, w] in 3-D."""
+        return [self.field(dtype) for _ in range(self.dimension)]
+
+    def to_grid(self, points: np.ndarray) -> np.ndarray:
+        """Return the grid coordinates of points [m], shape (n, 3)."""
+        return np.asarray(points, dtype=np.float64) / self.spacing + 1.0
+
+    def to_world(self, coordinates: np.ndarray) -> np.ndarray:
+        """Return the points [m] at grid coordinates, shape (n, 3)."""
+        return (np.asarray(coordinates, dtype=np.float64) - 1.0) * self.spacing
+
+    def interior(self, host: np.ndarray) -> np.ndarray:
+        """Return the view (nz, ny, nx) of a host field without its ring."""
+        return host[1:-1, 1:-1, 1:-1]
+
+    @cached_property
+    def everywhere(self) -> Window:
+        """All stored cells, ring included; in 2-D those of the plane in use."""
+        return self.window((1, 1, 1), self.counts, grow=1)
+
+    @cached_property
+    def domain(self) -> Window:
+        """All cells without the ring."""
+        return self.window((1, 1, 1), self.counts)
+
+    def window(self, low: typing.Sequence[int], high: typing.Sequence[int], grow: int = 0) -> Window:
+        """Return the box of cells from low to high (x, y, z, both included), grown by some cells and clipped to what is stored."""
+        first, last = [], []
+        for axis in (2, 1, 0):
+            if axis == 2 and self.dimension == 2:
+                first.append(1)
+                last.append(2)
+                continue
+            first.append(max(int(low[axis]) - grow, 0))
+            last.append(min(int(high[axis]) + grow + 1, self.counts[axis] + 2))
+        return Window((first[0], first[1], first[2]), (last[0], last[1], last[2]), self.device)

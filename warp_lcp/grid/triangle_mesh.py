@@ -1,0 +1,301 @@
+"""Closed triangle surfaces: read or generated, checked and repaired until inside and outside are defined."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from warp_lcp.grid.builtin_mesh import BUILTIN
+from warp_lcp.grid.mesh_file import read_triangles
+from warp_lcp.grid.solids_kernels import mesh_thickness
+
+BUILTIN_PREFIX = "builtin:"
+WELD = 1e-6  # of the mesh's diagonal: coarser than float32 coordinates, far finer than a cell
+FLAT = 1e-12  # twice the area over the longest edge squared, below which a triangle has none
+NO_VOLUME = 1e-9  # of the mesh's diagonal cubed
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ClosedSurface:
+    """A triangle surface whose every edge is used as often in one direction as in the other, oriented outward.
+
+    Build one with `read_mesh`, `builtin_mesh` or `close_surface`, which check that.
+
+    Args:
+        name: what messages call it.
+        vertices: in the mesh's own units, float64 of shape (n, 3).
+        triangles: vertex indices, int32 of shape (m, 3), counterclockwise seen from outside.
+        warnings: what had to be repaired, a line each.
+    """
+
+    name: str
+    vertices: np.ndarray
+    triangles: np.ndarray
+    warnings: tuple[str, ...] = ()
+    _meshes: dict[str, wp.Mesh] = field(default_factory=dict, init=False, repr=False)
+
+    @cached_property
+    def volume(self) -> float:
+        """Volume inside, in the mesh's units cubed."""
+        return float(_cone_volumes(self.vertices - self.center, self.triangles).sum())
+
+    @cached_property
+    def center(self) -> np.ndarray:
+        """Center of the mesh's bounding box, shape (3,)."""
+        return 0.5 * (self.vertices.min(axis=0) + self.vertices.max(axis=0))
+
+    @cached_property
+    def size(self) -> float:
+        """Half the diagonal of the mesh's bounding box."""
+        return 0.5 * _diagonal(self.vertices)
+
+    def on_device(self, device: wp.Device) -> wp.Mesh:
+        """Return the mesh as Warp queries it, in coordinates (vertex - center) / size; made once a device."""
+        mesh = self._meshes.get(str(device))
+        if mesh is None:
+            points = wp.array((self.vertices - self.center) / self.size, dtype=wp.vec3, device=device)
+            indices = wp.array(self.triangles.ravel(), dtype=wp.int32, device=device)
+            mesh = wp.Mesh(points, indices, support_winding_number=True)
+            self._meshes[str(device)] = mesh
+        return mesh
+
+    def thin_fraction(self, thickness: float, device: wp.Device) -> float:
+        """Return the share of the surface's area behind which the solid is thinner than `thickness` (in the mesh's units)."""
+        faces = len(self.triangles)
+        out = wp.empty(faces, dtype=wp.float32, device=device)
+        reach = thickness / self.size
+        wp.launch(mesh_thickness, dim=faces, inputs=[self.on_device(device).id, reach], outputs=[out], device=device)
+        area = np.linalg.norm(_double_areas(self.vertices, self.triangles), axis=1)
+        return float(area[out.numpy() < np.float32(reach)].sum() / area.sum())
+
+
+def load_surface(file: str, folder: Path | None = None) -> ClosedSurface:
+    """Return the surface that a scene names: a path relative to `folder`, or `builtin:` and a name.
+
+    Raises:
+        ValueError: there is no such file or builtin mesh, or it is not a closed surface.
+    """
+    if file.startswith(BUILTIN_PREFIX):
+        return builtin_mesh(file.removeprefix(BUILTIN_PREFIX))
+    return read_mesh((folder or Path()) / Path(file).expanduser())
+
+
+def builtin_mesh(name: str) -> ClosedSurface:
+    """Generate a closed surface around the origin, of extent 1: `torus` (axis z) or `knot` (a trefoil).
+
+    Raises:
+        ValueError: the name is unknown; the message lists those there are.
+    """
+    if name not in BUILTIN:
+        raise ValueError(
+            f"there is no mesh {BUILTIN_PREFIX}{name}; choose from {', '.join(BUILTIN_PREFIX + known for known in sorted(BUILTIN))}"
+        )
+    vertices, triangles = BUILTIN[name]()
+    return close_surface(vertices, triangles, BUILTIN_PREFIX + name)
+
+
+def read_mesh(path: str | Path) -> ClosedSurface:
+    """Read a closed surface from an OBJ, STL or PLY file; polygons are cut into triangles, equal vertices merged.
+
+    Raises:
+        ValueError: the file is missing, unreadable, empty or not a closed surface; the message names it and says what to do.
+    """
+    vertices, triangles = read_triangles(Path(path))
+    return close_surface(vertices, triangles, str(path))
+
+
+def close_surface(vertices: np.ndarray, triangles: np.ndarray, name: str) -> ClosedSurface:
+    """Check that triangles enclose a volume; repair orientation, duplicates and degenerate triangles.
+
+    Args:
+        vertices: shape (n, 3), in any unit.
+        triangles: vertex indices, shape (m, 3).
+        name: what messages call the mesh.
+
+    Raises:
+        ValueError: not finite, without triangles, not closed, not orientable, or without volume.
+    """
+    vertices = np.asarray(vertices, dtype=np.float64)
+    triangles = np.asarray(triangles, dtype=np.int64)
+    bad = int((~np.isfinite(vertices).all(axis=1)).sum())
+    if bad:
+        raise ValueError(
+            f"{name}: {bad} of {len(vertices)} vertices {'is' if bad == 1 else 'are'} not finite (NaN or infinite coordinates)"
+        )
+    if not len(triangles):
+        raise ValueError(f"{name}: the mesh has no triangles")
+    vertices, triangles = weld(vertices, triangles)
+    warnings = []
+    corners = np.sort(triangles, axis=1)
+    keep = (corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2])
+    degenerate = int((~keep).sum())
+    triangles = triangles[keep]
+    if not len(triangles):
+        raise ValueError(f"{name}: all {degenerate} triangles are degenerate (without area)")
+    triangles, repeated = _drop_repeated(triangles)
+    if repeated:
+        warnings.append(f"{name}: dropped {repeated} repeated triangles")
+    _check_closed(triangles, name)
+    triangles, flipped = _orient(vertices, triangles, name)
+    warnings += flipped
+    # Only now: a triangle without area may be what closes the seam between a long edge and the halves that meet it.
+    flat = _flat(vertices, triangles)
+    degenerate += int(flat.sum())
+    if degenerate:
+        warnings.append(f"{name}: dropped {degenerate} degenerate triangles (without area)")
+    surface = ClosedSurface(name=name, vertices=vertices, triangles=triangles[~flat].astype(np.int32), warnings=tuple(warnings))
+    if not flat.all() and surface.volume > NO_VOLUME * _diagonal(vertices) ** 3:
+        return surface
+    raise ValueError(f"{name}: the surface encloses no volume (is it flat, or every triangle there twice, once in each orientation?)")
+
+
+def weld(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Merge vertices closer than 1e-6 of the mesh's diagonal, and leave out those that no triangle uses."""
+    used, flat = np.unique(triangles, return_inverse=True)
+    exact, same = np.unique(vertices[used], axis=0, return_inverse=True)
+    pairs = cKDTree(exact).query_pairs(WELD * _diagonal(exact), output_type="ndarray")
+    links = coo_array((np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(len(exact), len(exact)))
+    count, label = connected_components(links, directed=False)
+    merged = np.empty((count, 3))
+    merged[label[::-1]] = exact[::-1]  # the first of each group stays
+    return merged, label[same.ravel()][flat].reshape(-1, 3)
+
+
+def _diagonal(vertices: np.ndarray) -> float:
+    return float(np.linalg.norm(vertices.max(axis=0) - vertices.min(axis=0)))
+
+
+def _double_areas(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Return the normals of the triangles, twice their area long, shape (m, 3)."""
+    a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
+    return np.cross(b - a, c - a)
+
+
+def _flat(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Mark the triangles without area, shape (m,)."""
+    corners = vertices[triangles]
+    longest = ((corners - np.roll(corners, 1, axis=1)) ** 2).sum(axis=2).max(axis=1)
+    return np.linalg.norm(_double_areas(vertices, triangles), axis=1) <= FLAT * longest
+
+
+def _cone_volumes(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Return the signed volumes of the tetrahedra between the origin and each triangle, shape (m,)."""
+    a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
+    return np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0
+
+
+def _drop_repeated(triangles: np.ndarray) -> tuple[np.ndarray, int]:
+    """Keep one of the triangles that have the same corners in the same orientation."""
+    first = triangles.argmin(axis=1)[:, None]
+    turned = np.take_along_axis(triangles, (first + np.arange(3)) % 3, axis=1)
+    _, index = np.unique(turned, axis=0, return_index=True)
+    return triangles[np.sort(index)], len(triangles) - len(index)
+
+
+def _edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return each side's edge number and direction, shape (3 m,) with side s of triangle t at 3 t + s, and each edge's number of sides."""
+    sides = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1).reshape(-1, 2)
+    forward = sides[:, 0] < sides[:, 1]
+    _, edge, uses = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True)
+    return edge.ravel(), forward, uses
+
+
+def _check_closed(triangles: np.ndarray, name: str) -> None:
+    _, _, uses = _edges(triangles)
+    odd = int((uses % 2).sum())
+    if odd:
+        raise ValueError(
+            f"{name}: the surface is not closed: {odd} of its {len(uses)} edges are open, so inside and outside are undefined and liquid "
+            "would leak through. Fill the holes (in Blender: Mesh > Clean Up > Merge by Distance, Fill Holes; in MeshLab: Close Holes)"
+        )
+
+
+def _orient(vertices: np.ndarray, triangles: np.ndarray, name: str) -> tuple[np.ndarray, list[str]]:
+    """Turn triangles until neighbors agree and every part faces outward (an inner wall of a hollow part: into the hollow)."""
+    warnings = []
+    edge, forward, uses = _edges(triangles)
+    balance = np.bincount(edge, weights=np.where(forward, 1.0, -1.0))
+    if balance.any():
+        turn = _disagreeing(triangles, edge, forward, uses, name)
+        triangles = np.where(turn[:, None], triangles[:, ::-1], triangles)
+        edge, forward, uses = _edges(triangles)
+        tangled = int(np.count_nonzero(np.bincount(edge, weights=np.where(forward, 1.0, -1.0))))
+        if tangled:
+            raise ValueError(
+                f"{name}: at {tangled} edges more than two triangles meet without a consistent orientation, so inside and outside are "
+                "undefined. Separate the parts that touch there, or repair the mesh (in MeshLab: Repair non Manifold Edges)"
+            )
+        warnings.append(f"{name}: turned {int(turn.sum())} of {len(triangles)} triangles that disagreed with their neighbors' orientation")
+    parts, part = _parts(edge, forward, uses)
+    volume = np.bincount(part, weights=_cone_volumes(vertices - vertices.mean(axis=0), triangles), minlength=parts)
+    turn = np.zeros(parts, dtype=bool)
+    if volume.sum() < 0.0:
+        turn[:] = True
+    outward = np.where(turn, -volume, volume)
+    for p in np.flatnonzero(outward < 0.0):  # a hollow is one only where there is something around it
+        others = part != p
+        corners = vertices[np.where(turn[part[others]][:, None], triangles[others][:, ::-1], triangles[others])]
+        turn[p] ^= winding_number(vertices[triangles[part == p][0, 0]], corners) < 0.5
+    if turn.any():
+        what = "the mesh was" if turn.all() else f"{int(turn.sum())} of its {parts} parts were"
+        warnings.append(f"{name}: {what} inside out; turned")
+        triangles = np.where(turn[part][:, None], triangles[:, ::-1], triangles)
+    return triangles, warnings
+
+
+def _parts(edge: np.ndarray, forward: np.ndarray, uses: np.ndarray) -> tuple[int, np.ndarray]:
+    """Number the closed parts of a balanced surface: their number and each triangle's part, shape (m,)."""
+    owner = np.arange(edge.size) // 3
+    order = np.argsort(edge, kind="stable")
+
+    def components(edges: np.ndarray) -> tuple[int, np.ndarray]:
+        neighbors = (edge[order[1:]] == edge[order[:-1]]) & edges[edge[order[1:]]]
+        rows, columns = owner[order[1:]][neighbors], owner[order[:-1]][neighbors]
+        links = coo_array((np.ones(rows.size, dtype=bool), (rows, columns)), shape=(owner[-1] + 1, owner[-1] + 1))
+        return connected_components(links, directed=False)
+
+    parts, part = components(uses == 2)
+    # Where more than two triangles meet, parts are one only if none is balanced there by itself (they do more than touch).
+    meetings, meeting = np.unique(edge * parts + part[owner], return_inverse=True)
+    unbalanced = meetings[np.bincount(meeting.ravel(), weights=np.where(forward, 1.0, -1.0)) != 0.0] // parts
+    return components((uses == 2) | np.isin(np.arange(uses.size), unbalanced))
+
+
+def _disagreeing(triangles: np.ndarray, edge: np.ndarray, forward: np.ndarray, uses: np.ndarray, name: str) -> np.ndarray:
+    """Mark the fewest triangles, shape (m,), whose turning makes all neighbors across edges of two triangles agree.
+
+    Every triangle t appears as t (kept) and t + m (turned). Neighbors that agree are linked like with like, others crosswise: the connected
+    parts of this double cover are the consistent choices, and a triangle linked with its own turned self lies on a one-sided surface.
+    """
+    m = len(triangles)
+    order = np.argsort(edge, kind="stable")
+    order = order[uses[edge[order]] == 2].reshape(-1, 2)
+    t, s = order[:, 0] // 3, order[:, 1] // 3
+    crosswise = m * (forward[order[:, 0]] == forward[order[:, 1]])
+    rows, columns = np.concatenate([t, t + m]), np.concatenate([s + crosswise, s + m - crosswise])
+    _, label = connected_components(coo_array((np.ones(rows.size, dtype=bool), (rows, columns)), shape=(2 * m, 2 * m)), directed=False)
+    kept, turned = label[:m], label[m:]
+    if (kept == turned).any():
+        raise ValueError(f"{name}: the surface has one side only (like a Klein bottle), so inside and outside are undefined")
+    group, bit = np.minimum(kept, turned), kept > turned
+    majority = 2 * np.bincount(group, weights=bit) > np.bincount(group)
+    return bit ^ majority[group]
+
+
+def winding_number(point: np.ndarray, corners: np.ndarray) -> float:
+    """Return how often triangles, `corners` of shape (m, 3, 3), surround a point: the sum of their solid angles over 4 pi.
+
+    By van Oosterom and Strackee's formula, the tangent of half a solid angle is a.(b x c) / (|a||b||c| + (a.b)|c| + (b.c)|a| + (c.a)|b|).
+    """
+    a, b, c = np.moveaxis(corners - point, 1, 0)
+    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
+    ab, bc, ca = (np.einsum("ij,ij->i", *pair) for pair in ((a, b), (b, c), (c, a)))
+    triple = np.einsum("ij,ij->i", a, np.cross(b, c))
+    return float(np.arctan2(triple, la * lb * lc + ab * lc + bc * la + ca * lb).sum() / (2.0 * np.pi))

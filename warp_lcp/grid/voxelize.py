@@ -1,0 +1,215 @@
+"""Which cells of the grid are solid, and which points lie inside a region."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.grid.solids import Geometry, TriangleMesh
+from warp_lcp.grid.solids_kernels import cell_centers, claim_cells
+
+OPEN = -1
+DOMAIN_WALL = 0
+CHUNK = 1 << 20  # points at a time: 16 MB of positions and distances
+STRAY = 0.5  # of a cell: a mesh may reach this far out of the domain before anyone is told
+THIN_SHARE = 0.01  # of a mesh's surface, from which thin parts are worth a warning
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlacedSolid:
+    """A solid of a scene.
+
+    Args:
+        geometry: the region it fills.
+        separating: whether liquid may leave its wall (otherwise it slides along it only).
+        name: what messages call it, for example `solid[2] (sphere)`.
+    """
+
+    geometry: Geometry
+    separating: bool
+    name: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class VoxelSolids:
+    """Solids as whole cells.
+
+    Args:
+        index: int32 of shape (nz + 2, ny + 2, nx + 2): -1 in open cells, 0 in the domain's wall (the ring), 1 + s in cells of solid s.
+        separating: uint8 of shape (1 + solids,), on the device: 1 where the wall of that index lets liquid leave.
+        names: of those indices, the first "domain".
+        covered: number of cells whose center lies in each solid (whichever claimed it), without the domain; shape (solids,).
+        notes: warnings worth a line at the start of a run.
+    """
+
+    index: wp.array3d(dtype=wp.int32)
+    separating: wp.array(dtype=wp.uint8)
+    names: tuple[str, ...]
+    covered: tuple[int, ...]
+    notes: tuple[str, ...]
+
+
+def voxelize(
+    counts: tuple[int, int, int],
+    spacing: float,
+    dimension: int,
+    solids: Sequence[PlacedSolid],
+    *,
+    wall_separating: bool,
+    device: wp.Device | str,
+) -> VoxelSolids:
+    """Give every cell whose center lies inside a solid to the first such solid.
+
+    Args:
+        counts: number of cells (nx, ny, nz), nz = 1 in 2-D.
+        spacing: side of a cell [m].
+        dimension: 2 or 3.
+        solids: in the order of their claims.
+        wall_separating: whether liquid may leave the domain's wall.
+        device: where the arrays live.
+
+    Raises:
+        ValueError: a solid lies wholly outside the domain, or the solids leave no open cell.
+    """
+    nx, ny, nz = counts
+    if dimension == 2 and nz != 1:
+        raise ValueError(f"a 2-D grid has one layer of cells, not {nz}")
+    device = wp.get_device(device)
+    host = np.full((nz + 2, ny + 2, nx + 2), DOMAIN_WALL, dtype=np.int32)
+    host[1:-1, 1:-1, 1:-1] = OPEN
+    index = wp.array(host, dtype=wp.int32, device=device)
+    covered = wp.zeros(1 + len(solids), dtype=wp.int32, device=device)
+    notes: list[str] = []
+    for number, solid in enumerate(solids, start=1):
+        notes += placement_notes(solid.geometry, solid.name, counts, spacing, dimension)
+        notes += _thin_notes(solid, spacing, device)
+        _claim(index, covered, solid.geometry, number, spacing, dimension)
+    claimed = covered.numpy()[1:]
+    notes += [
+        f"{solid.name} is too small for the grid: no center of a cell of {spacing:.4g} m lies inside it"
+        for solid, cells in zip(solids, claimed, strict=True)
+        if not cells
+    ]
+    if solids and not (index.numpy() == OPEN).any():
+        raise ValueError(
+            "the solids fill the whole domain: no open cell is left (is one inverted, or a plane's normal the wrong way round?)"
+        )
+    return VoxelSolids(
+        index=index,
+        separating=wp.array([wall_separating, *(solid.separating for solid in solids)], dtype=wp.uint8, device=device),
+        names=("domain", *(solid.name for solid in solids)),
+        covered=tuple(int(cells) for cells in claimed),
+        notes=tuple(notes),
+    )
+
+
+def placement_notes(geometry: Geometry, name: str, counts: tuple[int, int, int], spacing: float, dimension: int) -> list[str]:
+    """Return warnings about a region: what its mesh needed repaired, and that a mesh sticks out of the domain.
+
+    Args:
+        geometry: a solid, or the liquid's start.
+        name: what messages call it.
+        counts: number of cells (nx, ny, nz), nz = 1 in 2-D.
+        spacing: side of a cell [m].
+        dimension: 2 or 3.
+
+    Raises:
+        ValueError: the region lies wholly outside the domain.
+    """
+    notes = [f"{name}: {warning}" for warning in geometry.surface.warnings] if isinstance(geometry, TriangleMesh) else []
+    bounds = geometry.bounds()
+    if bounds is None:
+        return notes
+    low, high = bounds
+    if dimension == 2 and (low[2] > 0.0 or high[2] < 0.0):
+        raise ValueError(
+            f"{name} spans z = [{low[2]:.4g}, {high[2]:.4g}] m and misses the plane z = 0, which is a 2-D scene's; check its translation"
+        )
+    low, high = low[:dimension], high[:dimension]
+    size = spacing * np.array(counts[:dimension])
+    if (high <= 0.0).any() or (low >= size).any():
+        spans = " x ".join(f"[{a:.4g}, {b:.4g}]" for a, b in zip(low, high, strict=True))
+        domain = " x ".join(f"[0, {extent:.4g}]" for extent in size)
+        raise ValueError(
+            f"{name} lies wholly outside the domain: it spans {spans} m, the domain {domain} m; check its scale and translation"
+        )
+    stray = max(float((-low).max()), float((high - size).max()))
+    if isinstance(geometry, TriangleMesh) and stray > STRAY * spacing:
+        notes.append(f"{name} reaches {stray:.4g} m out of the domain; what is out there has no effect")
+    return notes
+
+
+def _thin_notes(solid: PlacedSolid, spacing: float, device: wp.Device) -> list[str]:
+    """Return a warning when a mesh has walls that the cells may miss."""
+    if not isinstance(solid.geometry, TriangleMesh) or solid.geometry.invert:
+        return []
+    thin = solid.geometry.thin_fraction(spacing, device)
+    if thin <= THIN_SHARE:
+        return []
+    return [f"{solid.name} is thinner than a cell of {spacing:.4g} m under {thin:.0%} of its surface: liquid may pass there"]
+
+
+def inside(geometries: Sequence[Geometry], points: np.ndarray, *, device: wp.Device | str) -> np.ndarray:
+    """Tell which points lie inside at least one of the geometries.
+
+    Args:
+        geometries: the regions; none contain nothing.
+        points: [m], shape (m, 3); z = 0 in 2-D.
+        device: where distances are evaluated, `CHUNK` points at a time.
+
+    Returns:
+        bool of shape (m,).
+
+    Raises:
+        ValueError: the points do not have three coordinates.
+    """
+    points = np.asarray(points)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"points must have shape (m, 3), not {points.shape}")
+    result = np.zeros(len(points), dtype=bool)
+    for geometry in geometries:
+        bounds = geometry.bounds()
+        near = ~result
+        if bounds is not None:
+            near &= ((points >= bounds[0]) & (points <= bounds[1])).all(axis=1)
+        wanted = np.flatnonzero(near)
+        for first in range(0, len(wanted), CHUNK):
+            part = wanted[first : first + CHUNK]
+            positions = wp.array(points[part], dtype=wp.vec3, device=device)
+            distance = wp.empty(len(part), dtype=wp.float32, device=device)
+            geometry.signed_distance(positions, distance)
+            result[part] = distance.numpy() < 0.0
+    return result
+
+
+def _claim(
+    index: wp.array3d(dtype=wp.int32), covered: wp.array(dtype=wp.int32), geometry: Geometry, number: int, spacing: float, dimension: int
+) -> None:
+    """Give the open cells inside a geometry to solid `number`, a few layers of its bounds at a time."""
+    low, high = _cell_range(index.shape, geometry.bounds(), spacing, dimension)
+    across = high[:2] - low[:2]
+    layers = max(1, CHUNK // int(across.prod()))
+    for bottom in range(int(low[2]), int(high[2]), layers):
+        top = min(bottom + layers, int(high[2]))
+        size = int(across.prod()) * (top - bottom)
+        block = [int(low[0]), int(low[1]), bottom, int(across[0]), int(across[1])]
+        points = wp.empty(size, dtype=wp.vec3, device=index.device)
+        distance = wp.empty(size, dtype=wp.float32, device=index.device)
+        wp.launch(cell_centers, dim=size, inputs=[*block, spacing, dimension == 2], outputs=[points], device=index.device)
+        geometry.signed_distance(points, distance)
+        wp.launch(claim_cells, dim=size, inputs=[*block, distance, number, index, covered], device=index.device)
+
+
+def _cell_range(shape: tuple[int, ...], bounds: np.ndarray | None, spacing: float, dimension: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first and one past the last interior cell (x, y, z) that bounds [m] can touch, with a cell to spare."""
+    end = np.array(shape[::-1]) - 1
+    low, high = np.ones(3, dtype=np.int64), end.copy()
+    if bounds is not None:
+        touched = np.clip(bounds / spacing + 1.0, 0.0, end)
+        axes = slice(dimension)
+        low[axes] = np.clip(np.floor(touched[0]) - 1, 1, end)[axes].astype(np.int64)
+        high[axes] = np.clip(np.floor(touched[1]) + 2, 1, end)[axes].astype(np.int64)
+    return low, high
