@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import warp as wp
-from oracle import assemble
 
 import warp_lcp as wl
+from oracle import assemble
 
 SHAPES = [(5, 4, 6), (6, 7), (1, 3, 4), (3, 1), (2, 2, 2), (1, 1, 1)]
 PERIODIC = [(False, False, False), (True, False, False), (True, True, True)]

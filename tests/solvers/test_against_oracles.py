@@ -5,9 +5,9 @@ import pytest
 import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from oracle import assemble, boxed, lemke, natural_residual
 
 import warp_lcp as wl
+from oracle import assemble, boxed, lemke, natural_residual
 
 METHODS = {
     "newton": wl.MinimumMapNewton(),

@@ -9,6 +9,7 @@ import warp as wp
 
 from warp_lcp.operators import components_kernels as kernels
 from warp_lcp.operators.grid_poisson_kernels import FLUID
+from warp_lcp.operators.stencil_kernels import StencilShape
 
 if TYPE_CHECKING:
     from warp_lcp.operators.grid_poisson import GridPoisson
@@ -19,10 +20,14 @@ class FloatingComponents:
 
     Summing y = A x + b over such a component leaves the sum of b: without bounds a solution exists only if that is 0, with lower bounds
     alone only if it is >= 0, with upper bounds alone only if it is <= 0.
+
+    Args:
+        label: component of each stored cell, -1 where there is none.
+        device: where fields live.
     """
 
     def __init__(self, label: np.ndarray, device: wp.Device) -> None:
-        self.device, self._host = device, label
+        self.device, self.label = device, label
         self.count = int(label.max()) + 1
         self.sizes = np.bincount(label[label >= 0], minlength=self.count).astype(np.float64)
         self._label = wp.array(label, dtype=wp.int32, device=device)
@@ -38,8 +43,8 @@ class FloatingComponents:
             lower: stored lower bounds.
             upper: stored upper bounds.
         """
-        inside = self._host >= 0
-        label = self._host[inside]
+        inside = self.label >= 0
+        label = self.label[inside]
         rest = np.bincount(label, b.numpy()[inside], self.count)
         scale = np.bincount(label, np.abs(b.numpy()[inside]), self.count)
         below = np.bincount(label, np.isfinite(lower.numpy()[inside]), self.count) > 0
@@ -64,33 +69,55 @@ class FloatingComponents:
         below, above = (wp.full(self.count, np.inf, dtype=wp.float64, device=self.device) for _ in range(2))
         wp.launch(kernels.smallest_gap_kernel, x.size, [self._label, x, lower, upper, below, above], device=self.device)
         gap_below, gap_above = below.numpy(), above.numpy()
-        inside = self._host >= 0
-        mean = np.bincount(self._host[inside], x.numpy()[inside], self.count) / self.sizes
+        inside = self.label >= 0
+        mean = np.bincount(self.label[inside], x.numpy()[inside], self.count) / self.sizes
         constant = np.where(np.isfinite(gap_below), -gap_below, np.where(np.isfinite(gap_above), gap_above, -mean))
         constants = wp.array(constant, dtype=wp.float64, device=self.device)
         wp.launch(kernels.shift_components_kernel, x.size, [self._label, self._held, constants, x], device=self.device)
 
 
-def floating_components(A: GridPoisson) -> FloatingComponents | None:
-    """Return the floating components of A, or None if there are none."""
-    padded, counts, device = A.layout.stored_shape, A.layout.padding.counts, A.device
-    parent = wp.empty(A.layout.size, dtype=wp.int32, device=device)
-    grounded = wp.zeros(A.layout.size, dtype=wp.uint8, device=device)
-    count = wp.zeros(1, dtype=wp.int32, device=device)
-    faces = A.faces
-    wp.launch(kernels.singletons_kernel, parent.size, [parent], device=device)
-    wp.launch(kernels.unite_kernel, counts, [A.cells_around, *faces, wp.vec3d(*A.uniform), wp.vec3i(*counts), parent], device=device)
-    wp.launch(kernels.ground_kernel, counts, [A.cells_around, *faces, wp.vec3d(*A.uniform), A.shift, parent, grounded], device=device)
-    wp.launch(kernels.count_floating_kernel, parent.size, [A.cells.flatten(), parent, grounded, count], device=device)
-    if count.numpy()[0] == 0:
-        return None
-    roots = _roots(parent.numpy())
-    interior = np.zeros(padded, dtype=bool)
-    interior[1:-1, 1:-1, 1:-1] = A.cells.numpy()[1:-1, 1:-1, 1:-1] == FLUID
-    floating = interior.ravel() & (grounded.numpy()[roots] == 0)
-    label = np.full(parent.size, -1, dtype=np.int32)
-    label[floating] = np.unique(roots[floating], return_inverse=True)[1]
-    return FloatingComponents(label, device)
+class ComponentFinder:
+    """Finds floating components; its memory serves every call.
+
+    Args:
+        A: the operator; its cells may change between calls.
+    """
+
+    def __init__(self, A: GridPoisson) -> None:
+        self._A, device = A, A.device
+        self._parent = wp.zeros(A.layout.size, dtype=wp.int32, device=device)
+        self._grounded = wp.zeros(A.layout.size, dtype=wp.uint8, device=device)
+        self._count = wp.zeros(1, dtype=wp.int32, device=device)
+        self._shape = StencilShape()
+        self._shape.nx, self._shape.s1, self._shape.s2 = A.stencil.shape.nx, A.stencil.shape.s1, A.stencil.shape.s2
+        self._shape.cx, self._shape.cy, self._shape.cz = A.uniform
+        self._kernels = kernels.component_kernels(A.dtype)
+
+    def find(self) -> FloatingComponents | None:
+        """Return the floating components, or None if there are none."""
+        A, parent, grounded, s = self._A, self._parent, self._grounded, self._A.stencil
+        cells, faces = A.cells_around.flatten(), [f.flatten() for f in A.faces]
+        self._count.zero_()
+        sizes = wp.vec3i(*A.layout.padding.counts)
+        for kernel, inputs in (
+            (self._kernels.singletons, [parent, grounded, s.grain]),
+            (self._kernels.unite, [cells, *faces, parent, sizes, s.grain]),
+            (self._kernels.ground, [cells, *faces, A.shift.flatten(), parent, grounded, s.grain]),
+            (self._kernels.count_floating, [cells, parent, grounded, s.grain, self._count]),
+        ):
+            wp.launch(kernel, s.threads, [self._shape, *inputs], device=A.device)
+        return self._label() if self._count.numpy()[0] else None
+
+    def _label(self) -> FloatingComponents:
+        """Number the components that nothing holds; rare, so on the host."""
+        A = self._A
+        roots = _roots(self._parent.numpy())
+        interior = np.zeros(A.layout.stored_shape, dtype=bool)
+        interior[1:-1, 1:-1, 1:-1] = A.cells.numpy()[1:-1, 1:-1, 1:-1] == FLUID
+        floating = interior.ravel() & (self._grounded.numpy()[roots] == 0)
+        label = np.full(roots.size, -1, dtype=np.int32)
+        label[floating] = np.unique(roots[floating], return_inverse=True)[1]
+        return FloatingComponents(label, A.device)
 
 
 def _roots(parent: np.ndarray) -> np.ndarray:

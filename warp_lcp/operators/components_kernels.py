@@ -1,133 +1,129 @@
 # mypy: ignore-errors
 """Kernels that find connected components without a Dirichlet neighbor: union-find by atomic minima, the same on CPU and CUDA."""
 
+import functools
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
-from warp_lcp.operators.grid_poisson_kernels import AIR, FLUID, coefficient
-
-_AIR = wp.constant(wp.int8(AIR))
-_FLUID = wp.constant(wp.int8(FLUID))
+from warp_lcp.operators.stencil_kernels import StencilShape, row_start
 
 options = {"enable_backward": False, "module": "warp_lcp.components"}
 
 
-@wp.func
-def find(parent: wp.array(dtype=wp.int32), i: int):
-    """Root of i: parents always have smaller indices."""
-    r = int(i)
-    while parent[r] != r:
-        r = parent[r]
-    return r
+FIND = """
+    auto find = [&](int i) { while (P[i] != i) i = P[i]; return i; };"""
+COEFFICIENTS = """
+    const signed char* c = cells.data + p; int* P = parent.data; const long long s1 = A.s1, s2 = A.s2;
+    const auto* fx = face_x.data + p; const auto* fy = face_y.data + p; const auto* fz = face_z.data + p;
+    auto x = [&](long long k) { return face_x.data ? fx[k] > 0 : A.cx > 0; };
+    auto y = [&](long long k) { return face_y.data ? fy[k] > 0 : A.cy > 0; };
+    auto z = [&](long long k) { return face_z.data ? fz[k] > 0 : A.cz > 0; };"""
+
+UNITE = (
+    COEFFICIENTS
+    + FIND
+    + """
+    auto unite = [&](int i, int j) {
+        int a = find(i), b = find(j);
+        while (a != b) {
+            if (a < b) { const int t = a; a = b; b = t; }
+            const int old = wp::atomic_min(P + a, b);
+            if (old == a) return;
+            a = find(old); b = find(b); } };
+    for (int k = 0; k < n; ++k) {
+        if (c[k] != 1) continue;
+        const int i = (int)(p + k);
+        const bool edge = first && k == 0, left = c[k-1] == 1 && x(k);
+        if (left) unite(i, edge ? i + (int)wrap_x : i - 1);
+        const bool row = left && !edge;  // the cell to the left has been joined to its lower neighbors: those joined to ours need no more
+        if (c[k-s2] == 1 && y(k) && !(row && c[k-1-s2] == 1 && y(k-1) && x(k-s2))) unite(i, i + (int)wrap_y);
+        if (c[k-s1] == 1 && z(k) && !(row && c[k-1-s1] == 1 && z(k-1) && x(k-s1))) unite(i, i + (int)wrap_z); }
+"""
+)
+GROUND = (
+    COEFFICIENTS
+    + FIND
+    + """
+    const auto* held = shift.data + p;
+    for (int k = 0; k < n; ++k) {
+        if (c[k] != 1) continue;
+        bool hit = (c[k-1] == 0 && x(k)) || (c[k+1] == 0 && x(k+1)) || (c[k-s2] == 0 && y(k)) || (c[k+s2] == 0 && y(k+s2))
+            || (c[k-s1] == 0 && z(k)) || (c[k+s1] == 0 && z(k+s1));
+        if (shift.data) hit = hit || held[k] > 0;
+        if (hit) grounded.data[find((int)(p + k))] = 1; }
+"""
+)
+COUNT = """
+    const signed char* c = cells.data + p; const int* P = parent.data + p; const unsigned char* g = grounded.data + p; int floating = 0;
+    for (int k = 0; k < n; ++k) floating += (c[k] == 1) & (P[k] == (int)(p + k)) & (g[k] == 0);
+    return floating;
+"""
 
 
-@wp.func
-def unite(parent: wp.array(dtype=wp.int32), i: int, j: int):
-    """Join the trees of i and j; the smaller root stays one. A lost race is seen in the old value and tried again."""
-    a = find(parent, i)
-    b = find(parent, j)
-    while a != b:
-        if a < b:
-            t = a
-            a = b
-            b = t
-        old = wp.atomic_min(parent, a, b)
-        if old == a:
-            b = a  # done: a was a root and hangs below b now
-        else:
-            a = find(parent, old)
-            b = find(parent, b)
+@functools.cache
+def component_kernels(real: Any) -> SimpleNamespace:
+    """Return the kernels for coefficients of type real: `singletons`, `unite`, `ground`, launched in this order, and `count_floating`.
 
+    A row of cells a thread on the CPU, a cell a thread on CUDA. Parents always have smaller numbers, so that trees are the same whatever
+    the order of the threads; a lost race is seen in the value that the atomic minimum returns, and tried again.
+    """
+    name = f"warp_lcp.components.{real.__name__}"
+    field, i32, i8, u8 = wp.array(dtype=real), wp.array(dtype=wp.int32), wp.array(dtype=wp.int8), wp.array(dtype=wp.uint8)
 
-@wp.kernel(**options)
-def singletons_kernel(parent: wp.array(dtype=wp.int32)):
-    """Each cell is a tree of its own."""
-    i = wp.tid()
-    parent[i] = i
+    @wp.func_native(UNITE)
+    def unite_row(
+        A: StencilShape, cells: i8, face_x: field, face_y: field, face_z: field, parent: i32, p: wp.int64, n: int, first: bool,
+        wrap_x: wp.int64, wrap_y: wp.int64, wrap_z: wp.int64,
+    ): ...  # fmt: skip
 
+    @wp.func_native(GROUND)
+    def ground_row(
+        A: StencilShape, cells: i8, face_x: field, face_y: field, face_z: field, shift: field, parent: i32, grounded: u8, p: wp.int64,
+        n: int,
+    ): ...  # fmt: skip
 
-@wp.kernel(**options)
-def unite_kernel(
-    cells: wp.array3d(dtype=wp.int8),
-    face_x: wp.array3d(dtype=Any),
-    face_y: wp.array3d(dtype=Any),
-    face_z: wp.array3d(dtype=Any),
-    uniform: wp.vec3d,
-    n: wp.vec3i,
-    parent: wp.array(dtype=wp.int32),
-):
-    """Join FLUID cells across faces with a coefficient; ghost cells of periodic axes stand for the cells at the other end."""
-    k, j, i = wp.tid()
-    k += 1
-    j += 1
-    i += 1
-    if cells[k, j, i] != _FLUID:
-        return
-    ny2 = n[1] + 2
-    nx2 = n[2] + 2
-    p = (k * ny2 + j) * nx2 + i
-    if cells[k, j, i - 1] == _FLUID and coefficient(face_x, uniform[0], k, j, i) > wp.float64(0.0):
-        q = p - 1
-        if i == 1:
-            q = p + n[2] - 1
-        unite(parent, p, q)
-    if cells[k, j - 1, i] == _FLUID and coefficient(face_y, uniform[1], k, j, i) > wp.float64(0.0):
-        q = p - nx2
-        if j == 1:
-            q = p + (n[1] - 1) * nx2
-        unite(parent, p, q)
-    if cells[k - 1, j, i] == _FLUID and coefficient(face_z, uniform[2], k, j, i) > wp.float64(0.0):
-        q = p - ny2 * nx2
-        if k == 1:
-            q = p + (n[0] - 1) * ny2 * nx2
-        unite(parent, p, q)
+    @wp.func_native(COUNT)
+    def count_row(cells: i8, parent: i32, grounded: u8, p: wp.int64, n: int) -> int: ...
 
+    @wp.func_native("for (int k = 0; k < n; ++k) { parent.data[p + k] = (int)(p + k); grounded.data[p + k] = 0; }\n")
+    def singleton_row(parent: i32, grounded: u8, p: wp.int64, n: int): ...
 
-@wp.kernel(**options)
-def ground_kernel(
-    cells: wp.array3d(dtype=wp.int8),
-    face_x: wp.array3d(dtype=Any),
-    face_y: wp.array3d(dtype=Any),
-    face_z: wp.array3d(dtype=Any),
-    uniform: wp.vec3d,
-    shift: wp.array3d(dtype=Any),
-    parent: wp.array(dtype=wp.int32),
-    grounded: wp.array(dtype=wp.uint8),
-):
-    """Flatten the trees and mark roots of components that touch AIR through a face with a coefficient, or have a shift."""
-    k, j, i = wp.tid()
-    k += 1
-    j += 1
-    i += 1
-    p = (k * cells.shape[1] + j) * cells.shape[2] + i
-    if cells[k, j, i] != _FLUID:
-        return
-    root = find(parent, p)
-    zero = wp.float64(0.0)
-    hit = cells[k, j, i - 1] == _AIR and coefficient(face_x, uniform[0], k, j, i) > zero
-    hit = hit or (cells[k, j, i + 1] == _AIR and coefficient(face_x, uniform[0], k, j, i + 1) > zero)
-    hit = hit or (cells[k, j - 1, i] == _AIR and coefficient(face_y, uniform[1], k, j, i) > zero)
-    hit = hit or (cells[k, j + 1, i] == _AIR and coefficient(face_y, uniform[1], k, j + 1, i) > zero)
-    hit = hit or (cells[k - 1, j, i] == _AIR and coefficient(face_z, uniform[2], k, j, i) > zero)
-    hit = hit or (cells[k + 1, j, i] == _AIR and coefficient(face_z, uniform[2], k + 1, j, i) > zero)
-    if shift.shape[0] > 0:
-        hit = hit or wp.float64(shift[k, j, i]) > zero
-    if hit:
-        grounded[root] = wp.uint8(1)
+    @wp.kernel(enable_backward=False, module=name)
+    def singletons(A: StencilShape, parent: i32, grounded: u8, grain: int):
+        k, j, c = wp.tid()
+        singleton_row(parent, grounded, row_start(A, k, j, c, grain), wp.min(grain, A.nx - c * grain))
 
+    @wp.kernel(enable_backward=False, module=name)
+    def unite(A: StencilShape, cells: i8, face_x: field, face_y: field, face_z: field, parent: i32, size: wp.vec3i, grain: int):
+        k, j, c = wp.tid()
+        wrap_x = wp.int64(A.nx - 1)  # from the first cell of a periodic row to its neighbor below, which is the last
+        wrap_y = -A.s2
+        wrap_z = -A.s1
+        if j == 0:
+            wrap_y = wp.int64(size[1] - 1) * A.s2
+        if k == 0:
+            wrap_z = wp.int64(size[0] - 1) * A.s1
+        n = wp.min(grain, A.nx - c * grain)
+        unite_row(A, cells, face_x, face_y, face_z, parent, row_start(A, k, j, c, grain), n, c == 0, wrap_x, wrap_y, wrap_z)
 
-@wp.kernel(**options)
-def count_floating_kernel(
-    cells: wp.array(dtype=wp.int8),
-    parent: wp.array(dtype=wp.int32),
-    grounded: wp.array(dtype=wp.uint8),
-    count: wp.array(dtype=wp.int32),
-):
-    """Count components that no AIR and no shift holds."""
-    p = wp.tid()
-    if cells[p] == _FLUID and parent[p] == p and grounded[p] == wp.uint8(0):
-        wp.atomic_add(count, 0, 1)
+    @wp.kernel(enable_backward=False, module=name)
+    def ground(
+        A: StencilShape, cells: i8, face_x: field, face_y: field, face_z: field, shift: field, parent: i32, grounded: u8, grain: int
+    ):
+        k, j, c = wp.tid()
+        n = wp.min(grain, A.nx - c * grain)
+        ground_row(A, cells, face_x, face_y, face_z, shift, parent, grounded, row_start(A, k, j, c, grain), n)
+
+    @wp.kernel(enable_backward=False, module=name)
+    def count_floating(A: StencilShape, cells: i8, parent: i32, grounded: u8, grain: int, count: i32):
+        k, j, c = wp.tid()
+        found = count_row(cells, parent, grounded, row_start(A, k, j, c, grain), wp.min(grain, A.nx - c * grain))
+        if found > 0:
+            wp.atomic_add(count, 0, found)
+
+    return SimpleNamespace(singletons=singletons, unite=unite, ground=ground, count_floating=count_floating)
 
 
 @wp.kernel(**options)
@@ -194,9 +190,6 @@ def shift_components_kernel(
 
 
 for _T in (wp.float32, wp.float64):
-    _F, _L = wp.array3d(dtype=_T), wp.array(dtype=wp.int32)
-    _C, _S = wp.array3d(dtype=wp.int8), wp.array(dtype=wp.float64)
-    wp.overload(unite_kernel, [_C, _F, _F, _F, wp.vec3d, wp.vec3i, _L])
-    wp.overload(ground_kernel, [_C, _F, _F, _F, wp.vec3d, _F, _L, wp.array(dtype=wp.uint8)])
+    _L, _S = wp.array(dtype=wp.int32), wp.array(dtype=wp.float64)
     wp.overload(component_sums_kernel, [_L, wp.array(dtype=wp.uint8), wp.array(dtype=_T), _S, _L])
     wp.overload(remove_means_kernel, [_L, _S, _L, _S, wp.array(dtype=_T)])

@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_lcp.layout import PaddedLayout
 from warp_lcp.operators import grid_poisson_kernels as kernels
-from warp_lcp.operators.components import FloatingComponents, floating_components
+from warp_lcp.operators.components import ComponentFinder, FloatingComponents
 from warp_lcp.operators.grid_poisson_kernels import AIR, FLUID, SOLID
 from warp_lcp.operators.stencil import Stencil, wrap
 
@@ -75,10 +75,11 @@ class GridPoisson:
         self.uniform = (numbers[0], numbers[1], numbers[2])
         self.faces = [self._stored_face(f, axis) for axis, f in enumerate(faces)]
         self.shift = self._stored_shift(shift)
-        self.cells = wp.zeros(self.layout.stored_shape, dtype=wp.int8, device=self.device)
+        self.cells = wp.full(self.layout.stored_shape, SOLID, dtype=wp.int8, device=self.device)
         self.cells_around = wp.zeros_like(self.cells) if any(self.periodic) else self.cells
         self.stencil = self._empty_stencil()
         self._mask: wp.array[Any] | None = None
+        self._finder: ComponentFinder | None = None
         self._refill(wp.array(np.pad(host.reshape(counts), 1).astype(np.int8), device=self.device))
 
     def update(self, cells: wp.array[Any]) -> None:
@@ -133,7 +134,9 @@ class GridPoisson:
 
     def floating_components(self) -> FloatingComponents | None:
         """Return the components on which A is singular, or None if there are none."""
-        return floating_components(self)
+        if self._finder is None:
+            self._finder = ComponentFinder(self)
+        return self._finder.find()
 
     def diagonal(self) -> wp.array[Any]:
         """Return the diagonal of A, a field of the operator's shape and type; 0 off the FLUID cells."""
@@ -146,7 +149,7 @@ class GridPoisson:
         wanted = self.layout.load(free, wp.uint8, "free").numpy() != 0
         mask = wp.array((wanted & (self.cells.numpy().ravel() == FLUID)).astype(np.uint8), device=self.device)
         twin = copy.copy(self)
-        twin._mask = mask
+        twin._mask, twin._finder = mask, None
         d = self.stencil.d
         if shift is None:
             new = wp.zeros_like(d)
@@ -217,15 +220,18 @@ class GridPoisson:
     def _refill(self, cells: wp.array[Any]) -> None:
         """Take padded cell types and compute diagonal and weights."""
         counts, padded = self.layout.padding.counts, self.layout.stored_shape
-        bounds = [wp.vec3i(1, 1, 1), wp.vec3i(*(n + 1 for n in counts))]
-        wp.launch(kernels.copy_cells_kernel, padded, [cells, self.cells, *bounds], device=self.device)
+        s = self.stencil
+        if cells is not self.cells:
+            inputs = [s.shape, cells.flatten(), self.cells.flatten(), s.grain]
+            wp.launch(kernels.copy_cells_kernel, s.threads, inputs, device=self.device)
         if self.cells_around is not self.cells:
             wp.copy(self.cells_around, self.cells)
             wrap(self.cells_around, self.periodic, counts)
         d = self.stencil.d.reshape(padded)
         if self._counts_faces:
             axes = wp.vec3i(*(int(c > 0) for c in self.uniform))
-            wp.launch(kernels.count_faces_kernel, counts, [self.cells_around, axes, d], device=self.device)
+            inputs = [s.shape, self.cells_around.flatten(), axes, s.d, s.grain]
+            wp.launch(kernels.count_faces_kernel, s.threads, inputs, device=self.device)
             return
         inputs = [self.cells_around, *self.faces, wp.vec3d(*self.uniform), self.shift, d]
         wp.launch(kernels.diagonal_kernel, counts, inputs, device=self.device)

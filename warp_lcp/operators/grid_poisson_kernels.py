@@ -5,6 +5,9 @@ from typing import Any
 
 import warp as wp
 
+from warp_lcp.native import simd
+from warp_lcp.operators.stencil_kernels import StencilShape, row_start
+
 AIR = 0
 FLUID = 1
 SOLID = 2
@@ -16,39 +19,52 @@ _SOLID = wp.constant(wp.int8(SOLID))
 options = {"enable_backward": False, "module": "warp_lcp.grid_poisson"}
 
 
+@wp.func_native(simd("const signed char* c = cells.data + p; signed char* o = out.data + p; SIMD for (int k = 0; k < n; ++k) o[k] = c[k];"))
+def copy_row(cells: wp.array(dtype=wp.int8), out: wp.array(dtype=wp.int8), p: wp.int64, n: int): ...
+
+
+@wp.func_native(
+    simd(
+        """const signed char* c = cells.data + p; unsigned char* o = d.data + p;
+    const unsigned char x = along_x, y = along_y, z = along_z;
+    SIMD for (int k = 0; k < n; ++k) {
+        const unsigned char v = x*(unsigned char)((c[k-1] != 2) + (c[k+1] != 2)) + y*(unsigned char)((c[k-s2] != 2) + (c[k+s2] != 2))
+            + z*(unsigned char)((c[k-s1] != 2) + (c[k+s1] != 2));
+        o[k] = c[k] == 1 ? v : (unsigned char)0; }"""
+    )
+)
+def count_faces_row(
+    cells: wp.array(dtype=wp.int8),
+    d: wp.array(dtype=wp.uint8),
+    p: wp.int64,
+    s1: wp.int64,
+    s2: wp.int64,
+    n: int,
+    along_x: int,
+    along_y: int,
+    along_z: int,
+): ...
+
+
 @wp.kernel(**options)
-def copy_cells_kernel(cells: wp.array3d(dtype=wp.int8), out: wp.array3d(dtype=wp.int8), low: wp.vec3i, high: wp.vec3i):
-    """Interior cells are copied, ghost cells become SOLID."""
-    k, j, i = wp.tid()
-    inside = k >= low[0] and k < high[0] and j >= low[1] and j < high[1] and i >= low[2] and i < high[2]
-    if inside:
-        out[k, j, i] = cells[k, j, i]
-    else:
-        out[k, j, i] = _SOLID
+def copy_cells_kernel(A: StencilShape, cells: wp.array(dtype=wp.int8), out: wp.array(dtype=wp.int8), grain: int):
+    """Interior cells are copied; ghost cells keep what they are, SOLID."""
+    k, j, c = wp.tid()
+    copy_row(cells, out, row_start(A, k, j, c, grain), wp.min(grain, A.nx - c * grain))
+
+
+@wp.kernel(**options)
+def count_faces_kernel(A: StencilShape, cells: wp.array(dtype=wp.int8), axes: wp.vec3i, d: wp.array(dtype=wp.uint8), grain: int):
+    """Diagonal of unit coefficients: the number of open faces of a FLUID cell along the axes that count."""
+    k, j, c = wp.tid()
+    n = wp.min(grain, A.nx - c * grain)
+    count_faces_row(cells, d, row_start(A, k, j, c, grain), A.s1, A.s2, n, axes[0], axes[1], axes[2])
 
 
 @wp.func
 def joins(cells: wp.array3d(dtype=wp.int8), k: int, j: int, i: int, dk: int, dj: int, di: int):
     """Whether the face between a cell and its lower neighbor joins two FLUID cells."""
     return cells[k, j, i] == _FLUID and cells[k - dk, j - dj, i - di] == _FLUID
-
-
-@wp.kernel(**options)
-def count_faces_kernel(cells: wp.array3d(dtype=wp.int8), axes: wp.vec3i, d: wp.array3d(dtype=wp.uint8)):
-    """Diagonal of unit coefficients: the number of open faces of a FLUID cell along the axes that count."""
-    k, j, i = wp.tid()
-    k += 1
-    j += 1
-    i += 1
-    n = int(0)
-    if cells[k, j, i] == _FLUID:
-        if axes[0] != 0:
-            n += int(cells[k, j, i - 1] != _SOLID) + int(cells[k, j, i + 1] != _SOLID)
-        if axes[1] != 0:
-            n += int(cells[k, j - 1, i] != _SOLID) + int(cells[k, j + 1, i] != _SOLID)
-        if axes[2] != 0:
-            n += int(cells[k - 1, j, i] != _SOLID) + int(cells[k + 1, j, i] != _SOLID)
-    d[k, j, i] = wp.uint8(n)
 
 
 @wp.func
