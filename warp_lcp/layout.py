@@ -49,18 +49,20 @@ class Layout:
         if self.holds(field, dtype):
             return field.flatten()
         host = field.numpy() if isinstance(field, wp.array) else np.asarray(field)
-        if host.shape == self.shape:
-            host = self._store_host(host)
-        elif host.shape not in (self.stored_shape, (self.size,)):
+        if host.shape not in (self.shape, self.stored_shape, (self.size,)):
             raise ValueError(f"{name} has shape {host.shape}: expected {self.shape}")
-        return wp.array(np.ascontiguousarray(host).ravel(), dtype=dtype, device=self.device)
+        stored = np.zeros(self.stored_shape, dtype=wp.dtype_to_numpy(dtype))
+        target = self._inner(stored) if host.shape == self.shape else stored
+        target[...] = host.reshape(target.shape)
+        return wp.array(stored.ravel(), dtype=dtype, device=self.device, copy=self.device.is_cuda)
 
     def unload(self, stored: wp.array[Any]) -> wp.array[Any]:
         """Return a stored field as a contiguous field of the operator's shape; a copy unless both are the same."""
         return stored.reshape(self.shape)
 
-    def _store_host(self, host: np.ndarray) -> np.ndarray:
-        return host
+    def _inner(self, stored: np.ndarray) -> np.ndarray:
+        """Return the part of a stored field that the operator's shape stands for."""
+        return stored
 
 
 @dataclass(frozen=True)
@@ -105,8 +107,8 @@ class PaddedLayout(Layout):
         inner = stored.reshape(self.stored_shape)[1:-1, 1:-1, 1:-1]
         return inner.contiguous().reshape(self.shape)
 
-    def _store_host(self, host: np.ndarray) -> np.ndarray:
-        return np.pad(host.reshape(self.padding.counts), 1)
+    def _inner(self, stored: np.ndarray) -> np.ndarray:
+        return stored[1:-1, 1:-1, 1:-1]
 
 
 def layout_of(operator: Any) -> Layout:

@@ -34,15 +34,14 @@ class Spans:
     threads: int
     chunk: int
     stride: int
-    block: int
 
     @staticmethod
     def of(n: int, device: wp.Device) -> Spans:
         """Return the spans for n elements on a device."""
         if device.is_cuda:
             threads = min(n, CUDA_THREADS)
-            return Spans(n, threads, 0, threads, min(CUDA_BLOCK, threads))
-        return Spans(n, -(-n // CPU_CHUNK), CPU_CHUNK, 1, 1)
+            return Spans(n, threads, 0, threads)
+        return Spans(n, -(-n // CPU_CHUNK), CPU_CHUNK, 1)
 
 
 def grain(n: int, device: wp.Device) -> int:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.layout import Array, layout_of
+from warp_lcp.native import Spans
+from warp_lcp.problem_kernels import check_kernel
 
 if TYPE_CHECKING:
     from warp_lcp.operators.protocol import Operator
@@ -38,8 +41,8 @@ class LCP:
         if getattr(A, "unknowns", self.layout.size) == 0:
             raise ValueError("A has no unknowns: the problem is empty")
         self.in_place = isinstance(b, wp.array) and self.layout.holds(b, wp.float64) and tuple(b.shape) != tuple(A.shape)
-        self.b = self._field(b, "b")
-        self.lower, self.upper = self._field(lower, "lower"), self._field(upper, "upper")
+        self.b = self.layout.load(b, wp.float64, "b")
+        self._bounds = self._bound(lower, "lower"), self._bound(upper, "upper")
         self.unknown = _unknown(A, self.layout)
         self._check()
 
@@ -48,25 +51,52 @@ class LCP:
         """The device of the problem's arrays."""
         return self.layout.device
 
-    def _field(self, values: Any, name: str) -> wp.array[Any]:
-        """Return a number or a field as a stored field, float64."""
-        if not isinstance(values, wp.array):
-            host = np.asarray(values, dtype=np.float64)
-            values = np.full(self.layout.shape, host) if host.ndim == 0 else host
-        return self.layout.load(values, wp.float64, name)
+    @property
+    def bounded(self) -> bool:
+        """Whether a bound may be finite."""
+        return any(field.size > 0 or np.isfinite(value) for field, value in self._bounds)
+
+    @property
+    def bounds(self) -> list[Any]:
+        """Lower and upper bound as kernels take them: a stored field or an empty array, and the number that then counts, for each."""
+        return [*self._bounds[0], *self._bounds[1]]
+
+    @cached_property
+    def lower(self) -> wp.array[Any]:
+        """l as a stored field, float64."""
+        return self._as_field(*self._bounds[0])
+
+    @cached_property
+    def upper(self) -> wp.array[Any]:
+        """u as a stored field, float64."""
+        return self._as_field(*self._bounds[1])
+
+    def _as_field(self, field: wp.array[Any], value: float) -> wp.array[Any]:
+        return field if field.size else wp.full(self.layout.size, value, dtype=wp.float64, device=self.device)
+
+    def _bound(self, values: Any, name: str) -> tuple[wp.array[Any], float]:
+        """Return a field and a number of which one counts."""
+        if isinstance(values, wp.array) or np.ndim(values) > 0:
+            return self.layout.load(values, wp.float64, name), 0.0
+        return wp.empty(0, dtype=wp.float64, device=self.device), float(values)
 
     def _check(self) -> None:
-        inside = self.unknown.numpy() == 1
-        b, lower, upper = (f.numpy()[inside] for f in (self.b, self.lower, self.upper))
-        if not np.isfinite(b).all():
-            raise ValueError(f"b holds {np.count_nonzero(~np.isfinite(b))} values that are not finite")
-        for name, bound, wrong in (("lower", lower, np.inf), ("upper", upper, -np.inf)):
-            if np.isnan(bound).any():
-                raise ValueError(f"{name} holds {np.count_nonzero(np.isnan(bound))} NaN")
-            if (bound == wrong).any():
+        """Refuse data that no method could use."""
+        spans = Spans.of(self.layout.size, self.device)
+        counts = wp.zeros((6, spans.threads), dtype=wp.float64, device=self.device)
+        inputs = [self.b, *self.bounds, self.unknown, spans.n, spans.chunk, spans.stride, spans.threads, counts.flatten()]
+        wp.launch(check_kernel, spans.threads, inputs, device=self.device)
+        bad_b, nan_lower, nan_upper, crossed, no_lower, no_upper = counts.numpy().sum(axis=1).astype(int)
+        if bad_b:
+            raise ValueError(f"b holds {bad_b} values that are not finite")
+        for name, count in (("lower", nan_lower), ("upper", nan_upper)):
+            if count:
+                raise ValueError(f"{name} holds {count} NaN")
+        for name, count, wrong in (("lower", no_lower, "inf"), ("upper", no_upper, "-inf")):
+            if count:
                 raise ValueError(f"{name} holds {wrong}: no x could meet it")
-        if (lower > upper).any():
-            raise ValueError(f"lower > upper in {np.count_nonzero(lower > upper)} unknowns")
+        if crossed:
+            raise ValueError(f"lower > upper in {crossed} unknowns")
 
 
 def _unknown(A: Any, layout: Any) -> wp.array[Any]:

@@ -40,7 +40,7 @@ class NaturalResidual:
         """Compute y and return the norm of the natural residual at x (stored, float64)."""
         p = self.problem
         self.affine(x)
-        before = [x, self.y, self.diagonal, self.unit, p.lower, p.upper, p.unknown]
+        before = [x, self.y, self.diagonal, self.unit, *p.bounds, p.unknown]
         spans, partials = self._reduction.spans, self._reduction.partials
         launch_spans(kernels(self.diagonal.dtype).natural, spans, before, [partials], p.device)
         self._reduction.add_up(0)
@@ -60,7 +60,7 @@ class NaturalResidual:
     def start(self, x: wp.array[Any], *, keep: bool) -> None:
         """Set x to clip(x, l, u), or to clip(0, l, u), and to 0 where there is no unknown."""
         p = self.problem
-        wp.launch(start_kernel, x.size, [x, p.lower, p.upper, p.unknown, keep], device=p.device)
+        launch_spans(start_kernel, self._reduction.spans, [x, *p.bounds, p.unknown, keep], [], p.device)
         self.current = False
 
     def norm_of_b(self) -> float:

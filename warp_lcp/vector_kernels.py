@@ -18,6 +18,15 @@ SIMD for (long long i = start; i < end; ++i)
 """
 
 
+BOUNDED = """
+    auto with_bounds = [&](auto body) {
+        auto low = [&](long long i) { return l_.data[i]; }; auto high = [&](long long i) { return u_.data[i]; };
+        auto least = [&](long long i) { return l_value; }; auto most = [&](long long i) { return u_value; };
+        if (l_.data && u_.data) body(low, high); else if (l_.data) body(low, most); else if (u_.data) body(least, high);
+        else body(least, most); };
+"""  # calls body(lower, upper) with functions of the element, fields or numbers, so that a loop over them tests neither
+
+
 def flat(source: str) -> str:
     """Return the body of a native function over a span: `EACH {...}` visits its elements i."""
     return simd(source.replace("EACH", EACH))
@@ -43,14 +52,15 @@ def span_end(t: int, chunk: int, n: int):
 
 @wp.kernel(enable_backward=False, module="warp_lcp.vectors")
 def add_up_kernel(partials: wp.array(dtype=wp.float64), n: int, threads: int, out: wp.array(dtype=wp.float64), slot: int):
-    """out[slot] = sum of partials, by one block, in an order that does not change from run to run."""
+    """out[slot + c] = sum of column c of the partials, one block a column, in an order that does not change from run to run."""
     t = wp.tid()
+    column = t // threads
     s = wp.float64(0.0)
-    for i in range(t, n, threads):
-        s += partials[i]
+    for i in range(t - column * threads, n, threads):
+        s += partials[column * n + i]
     total = wp.tile_sum(wp.tile(s))
-    if t == 0:
-        out[slot] = total[0]
+    if t == column * threads:
+        out[slot + column] = total[0]
 
 
 @functools.cache

@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.native import Spans
+from warp_lcp.native import CUDA_BLOCK, Spans
 from warp_lcp.vector_kernels import add_up_kernel, kernels
 
 
@@ -20,17 +20,20 @@ class Reduction:
         n: elements of a field.
         device: where they live.
         scalars: device array that receives the sums, shape (slots,), float64.
+        columns: the most sums that one pass makes.
+        threads: threads of that pass; those of a flat kernel unless given.
     """
 
-    def __init__(self, n: int, device: wp.Device, scalars: wp.array[wp.float64]) -> None:
-        self.spans, self.scalars = Spans.of(n, device), scalars
-        self.partials = wp.zeros(self.spans.threads, dtype=wp.float64, device=device)
+    def __init__(self, n: int, device: wp.Device, scalars: wp.array[wp.float64], *, columns: int = 1, threads: int | None = None) -> None:
+        self.spans, self.scalars, self.columns = Spans.of(n, device), scalars, columns
+        self.threads = threads or self.spans.threads
+        self.block = min(CUDA_BLOCK, self.threads) if device.is_cuda else 1
+        self.partials = wp.zeros(columns * self.threads, dtype=wp.float64, device=device)
 
-    def add_up(self, slot: int) -> None:
-        """Write the sum of the partial sums to scalars[slot]."""
-        s = self.spans
-        inputs = [self.partials, s.threads, s.block, self.scalars, slot]
-        wp.launch(add_up_kernel, s.block, inputs, device=self.partials.device, block_dim=s.block)
+    def add_up(self, slot: int, columns: int = 1) -> None:
+        """Write the sums of the first columns of partial sums to scalars[slot], scalars[slot + 1], ..."""
+        inputs = [self.partials, self.threads, self.block, self.scalars, slot]
+        wp.launch(add_up_kernel, columns * self.block, inputs, device=self.partials.device, block_dim=self.block)
 
     def dot(self, a: wp.array[Any], b: wp.array[Any], slot: int) -> None:
         """Write a.b to scalars[slot]."""

@@ -5,7 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from warp_lcp import AIR, FLUID, SOLID
-from warp_lcp.grid.advection import MARGIN, advect
+from warp_lcp.grid.advection import advect
+from warp_lcp.grid.particles import MARGIN
 from warp_lcp.grid.staggered import StaggeredGrid
 
 FLAT = StaggeredGrid((8, 6, 1), 0.1, 2)

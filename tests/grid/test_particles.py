@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from warp_lcp.grid.particles import Particles, lattice, seed
+from warp_lcp.grid.particles import MARGIN, Particles, lattice, seed
 from warp_lcp.grid.staggered import StaggeredGrid
 
 FLAT = StaggeredGrid((7, 5, 1), 0.2, 2)
@@ -110,6 +110,13 @@ def test_seeds_stay_out_of_solids_and_are_not_doubled(grid: StaggeredGrid) -> No
     other, _ = seed(grid, regions, open_cells, per_axis=2, jitter=0.25, random_seed=9)
     assert (again == position).all()
     assert not np.array_equal(other, position)
+
+
+def test_the_widest_jitter_leaves_no_particle_on_the_edge() -> None:
+    position, _ = seed(FLAT, [lambda p: p[:, 0] >= 0], np.ones((1, 5, 7), bool), per_axis=4, jitter=1.0, random_seed=5)
+    size = np.array(FLAT.counts) * FLAT.spacing
+    assert position[:, :2].min() > 0.5 * MARGIN * FLAT.spacing
+    assert (position[:, :2].max(axis=0) < size[:2] - 0.5 * MARGIN * FLAT.spacing).all()
 
 
 def test_bad_seeding_is_refused() -> None:

@@ -9,10 +9,9 @@ import typing
 
 import warp as wp
 
+from warp_lcp.grid.particles import MARGIN
 from warp_lcp.grid.staggered import StaggeredGrid, cell_index, inside
 from warp_lcp.operators.grid_poisson import SOLID
-
-MARGIN = 1e-3  # how far from a closed face a particle stays, in cells: well above the rounding of float32 positions in 10^3 cells
 
 
 @wp.func

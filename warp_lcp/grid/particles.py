@@ -11,6 +11,7 @@ import warp as wp
 
 from warp_lcp.grid.staggered import StaggeredGrid, cell_index
 
+MARGIN = 1e-3  # how far from a wall particles stay, in cells: well above the rounding of float32 positions in 10^3 cells
 CHUNK = 256  # the fewest particles that one thread adds up
 THREADS = 1024  # the most threads of a sum, each a partial result that the host reads
 COLUMNS = 13  # of a partial result, see `total_kernel`
@@ -253,7 +254,7 @@ def seed(
         random_seed: of the displacements; they do not depend on the regions.
 
     Returns:
-        Positions [m], shape (n, 3), and the region of each, shape (n,).
+        Positions [m], float32, shape (n, 3), and the region of each, shape (n,).
 
     Raises:
         ValueError: `per_axis` or `jitter` is out of range.
@@ -263,10 +264,13 @@ def seed(
     if not 0.0 <= jitter <= 1.0:
         raise ValueError(f"jitter = {jitter}: must be between 0 and 1")
     rng = np.random.default_rng(random_seed)
+    axes, margin = slice(grid.dimension), MARGIN * grid.spacing
+    size = np.array(grid.counts) * grid.spacing
     positions, owners = [], []
     for plane in range(grid.counts[2]):
-        points = lattice(grid, per_axis, jitter, rng, plane)
-        cells = np.minimum((points / grid.spacing).astype(int), np.array(grid.counts) - 1)
+        points = lattice(grid, per_axis, jitter, rng, plane).astype(np.float32)
+        np.clip(points[:, axes], margin, size[axes] - margin, out=points[:, axes])
+        cells = np.minimum((points.astype(np.float64) / grid.spacing).astype(int), np.array(grid.counts) - 1)
         free = open_cells[plane, cells[:, 1], cells[:, 0]]
         points = points[free]
         owner = np.full(len(points), -1)
@@ -275,4 +279,4 @@ def seed(
                 owner[(owner < 0) & region(points)] = number
         positions.append(points[owner >= 0])
         owners.append(owner[owner >= 0])
-    return np.concatenate(positions).astype(np.float32), np.concatenate(owners)
+    return np.concatenate(positions), np.concatenate(owners)

@@ -30,7 +30,9 @@ def kernels(real: typing.Any) -> SimpleNamespace:
     @typing.no_type_check
     def node_coordinates(x: vec3, inverse_dx: real, axis: int, planes: int):
         """Coordinates among the nodes of a component: node (k, j, i) of component x lies at grid coordinates (i, j + 1/2, k + 1/2)."""
-        y = x * inverse_dx + vec3(real(0.5), real(0.5), real(0.5))
+        # first the grid coordinate, rounded as where particles are sorted: both must agree on the cell
+        y = x * inverse_dx + vec3(real(1.0), real(1.0), real(1.0))
+        y = y - vec3(real(0.5), real(0.5), real(0.5))
         y[axis] = y[axis] + real(0.5)
         if planes == 1:
             y[2] = real(1.0)  # 2-D: the plane in use, no interpolation along z

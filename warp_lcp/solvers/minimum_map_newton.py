@@ -18,7 +18,7 @@ from warp_lcp.solvers.minimum_map_newton_kernels import all_free_kernel, kernels
 from warp_lcp.solvers.principal_system import GridSystem, principal_system
 from warp_lcp.vectors import Reduction, convert, launch_spans
 
-MOVED, ACTIVE, FREE_NORM = range(3)  # slots of the device scalars
+MOVED, ACTIVE, FREE_NORM = range(3)  # slots of the device scalars; ACTIVE follows MOVED
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,17 +82,13 @@ class NewtonWorkspace:
     def __init__(self, problem: LCP, settings: MinimumMapNewton) -> None:
         self.problem, self.settings, self.precision = problem, settings, Precision(settings.precision)
         layout = problem.layout
-        inside = problem.unknown.numpy() == 1
-        self.bounded = problem.in_place or bool(
-            np.isfinite(problem.lower.numpy()[inside]).any() or np.isfinite(problem.upper.numpy()[inside]).any()
-        )
+        self.bounded = problem.bounded
         self.x, self.trial = layout.zeros(wp.float64), layout.zeros(wp.float64)
         self.residual = NaturalResidual(problem)
         self.system = principal_system(problem, self.precision.correction, bounded=self.bounded, settings=settings.cycle)
         self.free = layout.zeros(wp.uint8)
         self._scalars = wp.zeros(3, dtype=wp.float64, device=problem.device)
-        self._reduction = Reduction(layout.size, problem.device, self._scalars)
-        self._active_parts = wp.zeros_like(self._reduction.partials)
+        self._reduction = Reduction(layout.size, problem.device, self._scalars, columns=2)
         self._kernels = kernels(self.residual.diagonal.dtype, self.system.r.dtype)
         self._rounded = layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
         self.floating: Any = None
@@ -132,10 +128,9 @@ class NewtonWorkspace:
         p, residual = self.problem, self.residual
         self.norms = [*self.norms, residual.norm][-self.settings.memory :]
         before = [x, residual.y, residual.diagonal, residual.unit, p.lower, p.upper, p.unknown, self.free]
-        launch_spans(self._kernels.classify, self._reduction.spans, before, [self._reduction.partials, self._active_parts], p.device)
-        self._reduction.add_up(MOVED)
-        self._reduction.partials.assign(self._active_parts)
-        self._reduction.add_up(ACTIVE)
+        reduction = self._reduction
+        launch_spans(self._kernels.classify, reduction.spans, before, [reduction.threads, reduction.partials], p.device)
+        reduction.add_up(MOVED, columns=2)
         moved, active = (int(v) for v in self._scalars.numpy()[:2])
         residual.affine(x)  # the held unknowns have moved to their bounds
         if moved or self.stale:

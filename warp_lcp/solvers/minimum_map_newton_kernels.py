@@ -77,12 +77,12 @@ def kernels(d_type: Any, real: Any) -> SimpleNamespace:
     @wp.kernel(enable_backward=False, module=name)
     def classify(
         x: f64, y: f64, d: d_array, unit: wp.float64, lower: f64, upper: f64, unknown: i8, free: u8, n: int, chunk: int, stride: wp.int64,
-        moved: f64, active: f64,
+        threads: int, sums: f64,
     ):  # fmt: skip
         t = wp.tid()
         v = classify_span(x, y, d, unit, lower, upper, unknown, free, span_start(t, chunk), span_end(t, chunk, n), stride)
-        moved[t] = v[0]
-        active[t] = v[1]
+        sums[t] = v[0]
+        sums[threads + t] = v[1]
 
     @wp.kernel(enable_backward=False, module=name)
     def free_square(y: f64, free: u8, n: int, chunk: int, stride: wp.int64, out: f64):
