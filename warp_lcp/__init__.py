@@ -7,7 +7,7 @@ from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import Record, SolveResult, SolveStatus
 from warp_lcp.solve import Precision, Step, solve
-from warp_lcp.solvers import MinimumMapNewton, ProjectedSOR
+from warp_lcp.solvers import MinimumMapNewton, ProjectedMultigrid, ProjectedSOR
 from warp_lcp.stopping import StoppingCriteria
 
 try:
@@ -26,6 +26,7 @@ __all__ = [
     "NaturalResidual",
     "Operator",
     "Precision",
+    "ProjectedMultigrid",
     "ProjectedSOR",
     "Record",
     "SolveResult",

@@ -6,6 +6,7 @@ rescaled; it vanishes exactly at solutions.
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -28,13 +29,17 @@ class NaturalResidual:
     def __init__(self, problem: LCP) -> None:
         self.problem = problem
         layout = problem.layout
-        self.y = layout.zeros(wp.float64)
         self.norm, self.current = 0.0, False
         stencil = getattr(problem.A, "stencil", None)
         self.diagonal = stencil.d if stencil else layout.load(problem.A.diagonal(), problem.A.dtype)
         self.unit = float(stencil.unit) if stencil else 1.0
         self._sums = wp.zeros(2, dtype=wp.float64, device=layout.device)
         self._reduction = Reduction(layout.size, layout.device, self._sums)
+
+    @cached_property
+    def y(self) -> wp.array[Any]:
+        """Memory of y, made when it is first asked for."""
+        return self.problem.layout.zeros(wp.float64)
 
     def evaluate(self, x: wp.array[Any]) -> float:
         """Compute y and return the norm of the natural residual at x (stored, float64)."""

@@ -73,6 +73,58 @@ class Workspace(Protocol):
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the last solve. `warm`: x is a guess better than clip(0, l, u); `tolerance`: the residual norm that is asked for."""
 
+    def keep(self) -> None:
+        """Remember x as the best iterate."""
+
+    def restore(self) -> None:
+        """Make x the best iterate again."""
+
+
+class IterateInPlace:
+    """Keeps the best iterate by copying it; for methods that move x in place."""
+
+    x: wp.array[Any]
+    _best: wp.array[Any] | None = None
+
+    def keep(self) -> None:
+        """Remember x."""
+        if self._best is None:
+            self._best = wp.clone(self.x)
+        else:
+            wp.copy(self._best, self.x)
+
+    def restore(self) -> None:
+        """Take x back."""
+        if self._best is not None:
+            wp.copy(self.x, self._best)
+
+
+class IterateInBuffers:
+    """Keeps the best iterate by not overwriting it; for methods that write each iterate to `fresh()` and then call `advance`."""
+
+    def __init__(self, first: wp.array[Any]) -> None:
+        self.x, self._best, self._buffers = first, first, [first]
+
+    def fresh(self) -> wp.array[Any]:
+        """Return a buffer that holds neither the iterate nor the best one; the third is made only when it is needed."""
+        for buffer in self._buffers:
+            if buffer is not self.x and buffer is not self._best:
+                return buffer
+        self._buffers.append(wp.zeros_like(self.x))
+        return self._buffers[-1]
+
+    def advance(self, x: wp.array[Any]) -> None:
+        """Take a buffer as the iterate."""
+        self.x = x
+
+    def keep(self) -> None:
+        """Remember x."""
+        self._best = self.x
+
+    def restore(self) -> None:
+        """Take x back."""
+        self.x = self._best
+
 
 class Solver(Protocol):
     """A method is its settings; its memory is a Workspace."""
@@ -127,7 +179,7 @@ class _Loop:
         self.residual, self.history = work.residual, list[Record]()
         self.begun = time.perf_counter()
         self.linear = 0
-        self.best, self.best_iteration, self.best_norm = wp.zeros_like(work.x), 0, math.inf
+        self.best_iteration, self.best_norm = 0, math.inf
 
     def run(self, x0: Array | None) -> SolveResult:
         x, residual = self.work.x, self.residual
@@ -197,7 +249,7 @@ class _Loop:
 
     def _floor_or(self, status: SolveStatus) -> SolveStatus:
         """Return FLOOR where the residual is what rounding leaves, else the status."""
-        floor = FLOOR_MARGIN * self.residual.rounding_floor(self.best, self.work.precision.epsilon)
+        floor = FLOOR_MARGIN * self.residual.rounding_floor(self.work.x, self.work.precision.epsilon)
         return SolveStatus.FLOOR if self.best_norm <= floor else status
 
     def _record(self, iteration: int, step: Step) -> None:
@@ -209,12 +261,12 @@ class _Loop:
 
     def _keep(self, iteration: int) -> None:
         """Remember the iterate as the best one."""
-        wp.copy(self.best, self.work.x)
+        self.work.keep()
         self.best_iteration, self.best_norm = iteration, self.residual.norm
 
     def _finish(self, status: SolveStatus, iterations: int) -> SolveResult:
         if self.best_iteration != iterations or not math.isfinite(self.residual.norm):
-            wp.copy(self.work.x, self.best)
+            self.work.restore()
             self.residual.evaluate(self.work.x)
         norm = self.residual.norm
         relative = norm / self.reference if self.reference > 0 else 0.0

@@ -1,4 +1,4 @@
-"""The command line: `warp-lcp run | check | scenes | schema | info`."""
+"""The command line: `warp-lcp run | render | check | scenes | schema | info`."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from rich.console import Console
 
 from warp_lcp.driver.devices import DeviceError, choose_device, cuda_driver, devices
 from warp_lcp.driver.progress import Bar, Lines
+from warp_lcp.driver.recording import Color, RenderError
+from warp_lcp.driver.render import parse_size, render_run
 from warp_lcp.driver.run import run_scene
 from warp_lcp.driver.run_folder import OutputError, RunRecord
 from warp_lcp.driver.scene_file import built_in_scenes, check_shapes, installed_simulators, load_scene
@@ -79,6 +81,27 @@ def run(
 
 
 @app.command()
+def render(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a run.")],
+    frame: Annotated[
+        list[int] | None, typer.Option(metavar="N", help="Draw frame N, counted from the end if negative; may be repeated.")
+    ] = None,
+    size: Annotated[str, typer.Option(metavar="WxH", help="Pixels of an image; a sheet may be less high.")] = "1280x720",
+    out: Annotated[Path | None, typer.Option(help="The images' folder; DIR/images unless given.", show_default=False)] = None,
+    color: Annotated[Color, typer.Option(help="What colors the particles, on one scale for the whole run.")] = Color.SPEED,
+    sheet: Annotated[bool, typer.Option("--sheet", help="Draw the frames, or six of them, side by side into sheet.png.")] = False,
+) -> None:
+    """Draw a run's frames as PNG images (needs pyvista: the extra `render`)."""
+    images = []
+    devices()  # starts Warp, which samples 2-D solids, without its native messages
+    with _wrong_input(), Console(stderr=True).status("drawing") as status:
+        for image in render_run(folder, frames=frame or (), size=parse_size(size), out=out, color=color, sheet=sheet):
+            images.append(image)
+            status.update(f"drew {image.name}")
+    typer.echo(f"{images[0]}" if len(images) == 1 else f"{len(images)} images, {images[0]} to {images[-1].name}")
+
+
+@app.command()
 def check(scene: SceneArgument, overrides: SetOption = None) -> None:
     """Say whether a scene is valid, and what a run of it would do."""
     with _wrong_input():
@@ -126,7 +149,7 @@ def _print_pairs(pairs: list[tuple[str, str]]) -> None:
 def _wrong_input() -> Iterator[None]:
     try:
         yield
-    except (SceneError, OutputError, DeviceError) as error:
+    except (SceneError, OutputError, DeviceError, RenderError) as error:
         _end(str(error), WRONG_INPUT)
 
 

@@ -18,7 +18,7 @@ from warp_lcp.driver.scene_file import check_shapes, load_scene
 SCALE_FRAMES = 16  # evenly spaced frames that fix the color scale of a run
 SCALE_VALUES = 50_000  # about how many values of each
 ROUND_NUMBERS = np.array([1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0])
-WATER = np.array([[9, 44, 104], [20, 92, 170], [48, 150, 216], [120, 202, 236], [200, 236, 248]])
+WATER = np.array([[14, 62, 138], [22, 106, 190], [58, 160, 224], [130, 208, 240], [206, 240, 250]])
 VIRIDIS = np.array([[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]])
 
 
@@ -118,11 +118,11 @@ class Recording:
         return points[finite], values[finite]
 
     def scale(self) -> Scale:
-        """Return the colors for the whole run: up to what 99 of 100 particles stay below, rounded up; the few above take the last color."""
+        """Return the colors for the whole run: up to what 98 of 100 particles stay below, rounded up; the few above take the last color."""
         if self.color is Color.PLAIN:
             return Scale("", -1.0, 1.0, WATER)
         samples = [self.read(number)[1] for number in spread(self.numbers, SCALE_FRAMES)]
-        low, high = np.percentile(np.concatenate([[0.0], *(values[:: len(values) // SCALE_VALUES + 1] for values in samples)]), [1.0, 99.0])
+        low, high = np.percentile(np.concatenate([[0.0], *(values[:: len(values) // SCALE_VALUES + 1] for values in samples)]), [2.0, 98.0])
         high = _round_up(high)
         low = -_round_up(-low) if low < -0.01 * high else 0.0  # liquid that a wall holds has pressure below 0
         return Scale("pressure [Pa]", low, high, VIRIDIS) if self.color is Color.PRESSURE else Scale("speed [m/s]", low, high, WATER)

@@ -55,7 +55,7 @@ class Stage:
         self.plotter = pyvista.Plotter(off_screen=True, window_size=[SAMPLES * side for side in size], lighting="none")
         self.plotter.render_window.SetMultiSamples(0)  # three times as fast in software, and SAMPLES smooths edges already
         self.plotter.set_background("white")
-        for position, kind, intensity in [(LIGHT, "scene light", 0.75), (np.array([0.0, 0.0, 1.0]), "headlight", 0.4)]:
+        for position, kind, intensity in [(LIGHT, "scene light", 0.6), (np.array([0.0, 0.0, 1.0]), "headlight", 0.3)]:
             light = pyvista.Light(position=tuple(position), focal_point=(0, 0, 0), light_type=kind, intensity=intensity)
             self.plotter.add_light(light)
         if self.flat:
@@ -116,7 +116,8 @@ class Stage:
             plane["distance"] = np.minimum(nearest, 1e3 * step)
             self._add(plane.clip_scalar(scalars="distance", value=0.0), color=SOLID, lighting=False)
             if nearest.max() > 0.0:
-                self._add(plane.contour([0.0], scalars="distance"), color=EDGE, line_width=1.5 * SAMPLES, lighting=False)
+                line = plane.contour([0.0], scalars="distance").translate((0.0, 0.0, -0.5 * behind))
+                self._add(line, color=EDGE, line_width=1.5 * SAMPLES, lighting=False)
         corners = np.array([[0, 0, 0], [width, 0, 0], [width, height, 0], [0, height, 0], [0, 0, 0]], dtype=np.float64)
         self._add(pyvista.lines_from_points(corners), color=EDGE, line_width=2 * SAMPLES, lighting=False)
 
@@ -131,7 +132,7 @@ class Stage:
                 self._add(mesh, color=SOLID, opacity=0.25, culling="front", smooth_shading=True, split_sharp_edges=True)
                 self._add(mesh.extract_feature_edges(30.0), color=EDGE, line_width=SAMPLES, lighting=False)
             elif mesh.n_points:
-                self._add(mesh, color=SOLID, ambient=0.35, smooth_shading=True, split_sharp_edges=True)
+                self._add(mesh, color=SOLID, ambient=0.38, smooth_shading=True, split_sharp_edges=True)
         below = -1e-3 * y
         self._add(pyvista.Rectangle([[0.0, below, 0.0], [x, below, 0.0], [x, below, z]]), color=FLOOR, lighting=False)
         edges = pyvista.Box((0.0, x, 0.0, y, 0.0, z)).extract_all_edges()
@@ -230,5 +231,6 @@ def shaded(points: np.ndarray, colors: np.ndarray, spacing: float) -> np.ndarray
     flatness = np.clip(steepness / 0.8, 0.0, 1.0)  # 0 inside and for drops, 1 at a surface
     facing = (normal @ LIGHT)[:, None]
     light = 0.72 + 0.22 * facing + 0.14 * np.maximum(facing, 0.0)
-    glint = 70.0 * np.maximum(normal @ GLINT, 0.0)[:, None] ** 40
-    return cast(np.ndarray, np.clip(colors * (1.0 - flatness * SHADE * (1.0 - light)) + flatness * glint, 0.0, 255.0))
+    glint = 0.35 * np.maximum(normal @ GLINT, 0.0)[:, None] ** 40
+    lit = np.clip(colors * (1.0 - flatness * SHADE * (1.0 - light)), 0.0, 255.0)
+    return cast(np.ndarray, lit + flatness * glint * (255.0 - lit))

@@ -16,7 +16,6 @@ from warp_lcp.operators.stencil_kernels import StencilShape, row_start
 options = {"enable_backward": False, "module": "warp_lcp.coarsen"}
 
 UNBOUNDED = 1e30  # stands for an infinite bound of a correction; corrections are of order one
-_UNBOUNDED = wp.constant(UNBOUNDED)
 ROUNDING = wp.constant(wp.float64(1e-6))  # a diagonal this much smaller than its cells' sum is a singular aggregate's rounding
 
 
@@ -110,36 +109,6 @@ def coarsen_kernels(variable: bool, d_type: Any, real: Any) -> Any:
         )  # fmt: skip
 
     return coarsen
-
-
-@wp.kernel(**options)
-def bounds_kernel(
-    d: wp.array3d(dtype=Any),
-    x: wp.array3d(dtype=Any),
-    lower: wp.array3d(dtype=Any),
-    upper: wp.array3d(dtype=Any),
-    n: wp.vec3i,
-    scale: Any,
-    lower_c: wp.array3d(dtype=Any),
-    upper_c: wp.array3d(dtype=Any),
-):
-    """Bounds of a coarse correction: the tightest of its cells' gaps, divided by the over-correction; 0 is always allowed."""
-    kc, jc, ic = wp.tid()
-    zero = lower.dtype(0)
-    lo = lower.dtype(-_UNBOUNDED)
-    hi = lower.dtype(_UNBOUNDED)
-    for a in range(2):
-        for b in range(2):
-            for c in range(2):
-                k = 2 * kc + 1 + a
-                j = 2 * jc + 1 + b
-                i = 2 * ic + 1 + c
-                if k <= n[0] and j <= n[1] and i <= n[2]:
-                    if d[k, j, i] != d.dtype(0):
-                        lo = wp.max(lo, wp.min((lower[k, j, i] - x[k, j, i]) / scale, zero))
-                        hi = wp.min(hi, wp.max((upper[k, j, i] - x[k, j, i]) / scale, zero))
-    lower_c[kc + 1, jc + 1, ic + 1] = lo
-    upper_c[kc + 1, jc + 1, ic + 1] = hi
 
 
 @wp.kernel(**options)
@@ -251,7 +220,6 @@ def _overload() -> None:
         f = wp.array3d(dtype=real)
         for d_type in (wp.uint8, real):
             d = wp.array3d(dtype=d_type)
-            wp.overload(bounds_kernel, [d, f, f, f, wp.vec3i, real, f, f])
             wp.overload(factor_kernel, [StencilShape, d, f, f, f, wp.vec3i, wp.vec3i, wp.array2d(dtype=wp.float64)])
         wp.overload(solve_coarsest_kernel, [wp.array2d(dtype=wp.float64), wp.vec3i, f, f])
 

@@ -92,6 +92,46 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         u_: field, n: int, scale: real, projected: bool,
     ): ...  # fmt: skip
 
+    @wp.func_native(
+        simd(
+            BLOCK
+            + f"""typedef {C_TYPES[real]} T; T* lower = lc_.data + c; T* upper = uc_.data + c; T lo[2*M], hi[2*M]; const T big = (T)1e30;
+        for (int begin = 0; begin < n; begin += M) {{
+            const int m = n - begin < M ? n - begin : (int)M;
+            SIMD for (int k = 0; k < 2*m; ++k) {{ lo[k] = -big; hi[k] = big; }}
+            for (int row = 0; row < 4; ++row) {{
+                if (((row >> 1) && one_plane) || ((row & 1) && one_row)) continue;
+                const long long q = p + 2*begin + (row >> 1)*A.s1 + (row & 1)*A.s2;
+                const auto* d = d_.data + q; const T* x = x_.data + q; const T* l = l_.data + q; const T* u = u_.data + q;
+                SIMD for (int k = 0; k < 2*m; ++k) {{
+                    const T a0 = (l[k] - x[k])*inverse, b0 = (u[k] - x[k])*inverse, a1 = a0 > 0 ? (T)0 : a0, b1 = b0 < 0 ? (T)0 : b0;
+                    const T a = d[k] != 0 ? a1 : -big, b = d[k] != 0 ? b1 : big;
+                    lo[k] = a > lo[k] ? a : lo[k]; hi[k] = b < hi[k] ? b : hi[k]; }}
+            }}
+            SIMD for (int k = 0; k < m; ++k) {{
+                lower[begin + k] = lo[2*k] > lo[2*k+1] ? lo[2*k] : lo[2*k+1]; upper[begin + k] = hi[2*k] < hi[2*k+1] ? hi[2*k] : hi[2*k+1]; }}
+        }}"""
+        )
+    )
+    def bounds_row(
+        A: StencilShape, d_: d_array, x_: field, l_: field, u_: field, lc_: field, uc_: field, c: wp.int64, p: wp.int64, n: int,
+        inverse: real, one_plane: bool, one_row: bool,
+    ): ...  # fmt: skip
+
+    @wp.kernel(enable_backward=False, module=name)
+    def bounds_kernel(
+        A: StencilShape, d: d_array, grain: int, C: StencilShape, n0: int, n1: int, x: field, lower: field, upper: field,
+        scale: real, lower_c: field, upper_c: field,
+    ):  # fmt: skip
+        """Bounds of a coarse correction: the tightest of its cells' gaps, divided by the over-correction; 0 is always allowed."""
+        k, j, c = wp.tid()
+        n = wp.min(grain, C.nx - c * grain)
+        p = wp.int64(2 * k + 1) * A.s1 + wp.int64(2 * j + 1) * A.s2 + wp.int64(1 + 2 * c * grain)
+        o = row_start(C, k, j, c, grain)
+        last_plane = 2 * k + 2 > n0
+        last_row = 2 * j + 2 > n1
+        bounds_row(A, d, x, lower, upper, lower_c, upper_c, o, p, n, real(1.0) / scale, last_plane, last_row)
+
     @wp.kernel(enable_backward=False, module=name)
     def sweep_kernel(
         A: StencilShape, d: d_array, wx: field, wy: field, wz: field, grain: int, from_zero: bool, y: field, x: field, b: field,
@@ -125,4 +165,4 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         p = row_start(A, k, j, 2 * c, grain)
         correct_row(A, d, wx, wy, wz, x, p, coarse, row_start(C, k // 2, j // 2, c, grain), lower, upper, n, scale, projected)
 
-    return SimpleNamespace(sweep=sweep_kernel, restrict=restrict_kernel, correct=correct_kernel)
+    return SimpleNamespace(sweep=sweep_kernel, restrict=restrict_kernel, correct=correct_kernel, bounds=bounds_kernel)

@@ -13,7 +13,6 @@ from warp_lcp.layout import Padding
 from warp_lcp.multigrid import coarsen_kernels as kernels
 from warp_lcp.multigrid.coarsen_kernels import UNBOUNDED
 from warp_lcp.multigrid.cycle_kernels import cycle_kernels
-from warp_lcp.native import grain
 from warp_lcp.operators.stencil import Stencil
 from warp_lcp.vectors import convert
 
@@ -163,14 +162,13 @@ class Hierarchy:
                 self._pair(L, from_zero=from_zero and sweep == 0, projected=True)
                 self._pair(L, reverse=True, projected=True)
             return
-        C, shape = self.levels[level + 1], L.stencil.padding.shape
+        C = self.levels[level + 1]
         self._pair(L, from_zero=from_zero, projected=True)
         self._restrict(level)
-        coarse = C.stencil.padding
-        fields = [f.reshape(shape) for f in (L.stencil.d, L.x, L.lower, L.upper)]
-        scale = self.real(self.settings.over_correction)
-        bounds = [wp.vec3i(*L.stencil.padding.counts), scale, C.lower.reshape(coarse.shape), C.upper.reshape(coarse.shape)]
-        wp.launch(kernels.bounds_kernel, coarse.counts, [*fields, *bounds], device=self.device)
+        (n0, n1, _), coarse = L.stencil.padding.counts, C.stencil
+        fields = [L.x, L.lower, L.upper, self.settings.over_correction, C.lower, C.upper]
+        inputs = [L.stencil.shape, L.stencil.d, coarse.grain, coarse.shape, n0, n1, *fields]
+        wp.launch(L.kernels.bounds, coarse.threads, inputs, device=self.device)
         for visit in range(self.settings.gamma if level + 2 < len(self.levels) else 1):
             self.monotone_cycle(level + 1, from_zero=visit == 0)
         self._correct(level, projected=True)
@@ -185,19 +183,15 @@ class Hierarchy:
     def _restrict(self, level: int) -> None:
         L, C = self.levels[level], self.levels[level + 1]
         L.stencil.wrap(L.x)
-        counts = C.stencil.padding.counts
-        g = grain(counts[2], self.device)
         n0, n1, _ = L.stencil.padding.counts
-        inputs = [*L.operands, g, C.stencil.shape, n0, n1, L.x, L.b, C.b]
-        wp.launch(L.kernels.restrict, (counts[0], counts[1], -(-counts[2] // g)), inputs, device=self.device)
+        inputs = [*L.operands, C.stencil.grain, C.stencil.shape, n0, n1, L.x, L.b, C.b]
+        wp.launch(L.kernels.restrict, C.stencil.threads, inputs, device=self.device)
 
     def _correct(self, level: int, *, projected: bool) -> None:
         L, C = self.levels[level], self.levels[level + 1]
         nz, ny, _ = L.stencil.padding.counts
-        coarse = C.stencil.padding.counts[2]
-        g = grain(coarse, self.device)
-        inputs = [*L.operands, g, C.stencil.shape, L.x, C.x, L.lower, L.upper, self.settings.over_correction, projected]
-        wp.launch(L.kernels.correct, (nz, ny, -(-coarse // g)), inputs, device=self.device)
+        inputs = [*L.operands, C.stencil.grain, C.stencil.shape, L.x, C.x, L.lower, L.upper, self.settings.over_correction, projected]
+        wp.launch(L.kernels.correct, (nz, ny, C.stencil.threads[2]), inputs, device=self.device)
 
     def _coarser(self, fine: Level, *, bounded: bool) -> Level:
         s = fine.stencil

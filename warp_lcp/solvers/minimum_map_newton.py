@@ -13,7 +13,7 @@ from warp_lcp.multigrid.hierarchy import CycleSettings
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
-from warp_lcp.solve import Precision, Step
+from warp_lcp.solve import IterateInPlace, Precision, Step
 from warp_lcp.solvers.minimum_map_newton_kernels import all_free_kernel, kernels
 from warp_lcp.solvers.principal_system import GridSystem, principal_system
 from warp_lcp.vectors import Reduction, convert, launch_spans
@@ -76,7 +76,7 @@ class MinimumMapNewton:
         return work.newton_step(x)
 
 
-class NewtonWorkspace:
+class NewtonWorkspace(IterateInPlace):
     """Memory of the method for one problem."""
 
     def __init__(self, problem: LCP, settings: MinimumMapNewton) -> None:

@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
-from warp_lcp.solve import Precision, Step
+from warp_lcp.solve import IterateInPlace, Precision, Step
 from warp_lcp.vectors import convert
 
 
@@ -67,7 +67,7 @@ class ProjectedSOR:
         return Step("sweep", 2 if self.direction == "symmetric" else 1)
 
 
-class SweepWorkspace:
+class SweepWorkspace(IterateInPlace):
     """Memory of a method that needs the iterate and its residual only."""
 
     def __init__(self, problem: LCP, precision: Precision) -> None:

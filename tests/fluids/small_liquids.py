@@ -1,0 +1,49 @@
+"""Scenes of a little liquid, and how to run them."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fluids import SIMULATOR, LiquidScene, LiquidSimulation
+
+GRAVITY = 9.81
+STEPS = 2000
+
+
+def scene(*, size: list[float], resolution: int, liquid: list[dict[str, Any]], **tables: Any) -> LiquidScene:
+    """Return a scene; `wall` and `cfl` are short for domain.wall and time.cfl, the rest are tables."""
+    data: dict[str, Any] = {
+        "scene": {"simulator": "fluids"},
+        "time": {"duration": 10.0, "cfl": tables.pop("cfl", 2.0)},
+        "domain": {"size": size, "resolution": resolution, "wall": tables.pop("wall", "separating")},
+        "liquid": liquid,
+    }
+    return LiquidScene.model_validate(data | tables)
+
+
+def box(low: list[float], high: list[float], **more: Any) -> dict[str, Any]:
+    """Return a box of liquid or a solid one."""
+    return {"shape": "box", "min": low, "max": high, **more}
+
+
+def create(model: LiquidScene, wall_velocity: np.ndarray | None = None, device: str = "cpu") -> LiquidSimulation:
+    """Return a simulation."""
+    return SIMULATOR.create(model, device=device, folder=Path(), wall_velocity=wall_velocity)
+
+
+def dam(dimension: int = 2, device: str = "cpu", **tables: Any) -> LiquidSimulation:
+    """Return a small dam break."""
+    size, low, high = [1.0, 0.5, 0.25], [0.0, 0.0, 0.0], [0.375, 0.375, 0.25]
+    liquid = [box(low[:dimension], high[:dimension])]
+    return create(scene(size=size[:dimension], resolution=16, liquid=liquid, **tables), device=device)
+
+
+def advance(simulation: LiquidSimulation, until: float, dt_max: float = 0.02) -> list[dict[str, Any]]:
+    """Step to a time and return the rows of the log."""
+    rows: list[dict[str, Any]] = []
+    while simulation.time < until - 1e-9:
+        assert len(rows) < STEPS, "the time step has become too small to get anywhere"
+        dt = min(simulation.stable_dt(), dt_max, until - simulation.time)
+        rows.append({"dt": dt, **simulation.step(dt)})
+    return rows

@@ -1,0 +1,74 @@
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+from small_liquids import box, create, scene
+
+import fluids
+from fluids import LiquidScene
+from warp_lcp.driver.scene import Scene
+
+LIQUID = [box([0.0, 0.0], [0.5, 0.25])]
+
+
+def small(**tables: Any) -> LiquidScene:
+    return scene(size=[1.0, 0.5], resolution=16, liquid=tables.pop("liquid", LIQUID), **tables)
+
+
+def test_defaults() -> None:
+    model = small()
+    assert fluids.SIMULATOR.scene_model is LiquidScene
+    assert issubclass(LiquidScene, Scene)
+    assert model.pressure.model == "incompressible"
+    particles = model.particles
+    assert (particles.per_axis, particles.transfer, particles.flip_ratio, particles.jitter) == (2, "apic", 0.95, 0.25)
+    assert isinstance(particles.seed, int)
+
+
+@pytest.mark.parametrize(
+    ("tables", "place"),
+    [
+        ({"pressure": {"model": "unilateral"}}, "pressure"),
+        ({"particles": {"per_axis": 0}}, "per_axis"),
+        ({"particles": {"per_axis": 1.5}}, "per_axis"),
+        ({"particles": {"transfer": "mpm"}}, "transfer"),
+        ({"particles": {"flip_ratio": 1.5}}, "flip_ratio"),
+        ({"particles": {"jitter": -0.1}}, "jitter"),
+        ({"particles": {"count": 3}}, "count"),
+        ({"liquid": []}, "liquid"),
+        ({"liquid": [box([2.0, 0.0], [3.0, 1.0])]}, "liquid"),
+        ({"liquid": [box([0.0, 0.0], [0.5, 0.25], velocity=[1.0, 2.0, 3.0])]}, "velocity"),
+    ],
+)
+def test_what_a_scene_may_not_say(tables: dict[str, Any], place: str) -> None:
+    with pytest.raises(ValidationError) as caught:
+        small(**tables)
+    assert any(place in str(part) for error in caught.value.errors() for part in error["loc"])
+
+
+def test_the_plan_counts_particles() -> None:
+    model = small()
+    assert model.particle_estimate() == create(model).particles.count == 8 * 4 * 4
+    plan = dict(model.plan())
+    assert plan["particles"] == "at most 128, 4 a cell, apic"
+    assert plan["memory"].endswith("MB")
+    overlapping = small(liquid=[*LIQUID, box([0.0, 0.0], [1.0, 0.5]), box([0.0, 0.0], [1.0, 0.5])])
+    assert overlapping.particle_estimate() == 16 * 8 * 4
+
+
+@pytest.mark.parametrize("per_axis", [1, 2, 3])
+def test_the_mass_does_not_depend_on_the_sampling(per_axis: int) -> None:
+    simulation = create(small(particles={"per_axis": per_axis}, physics={"density": 500.0, "gravity": [0.0, -9.81]}))
+    row = simulation.step(0.001)
+    assert row["particles"] == 8 * 4 * per_axis**2
+    assert row["mass"] == pytest.approx(500.0 * 0.5 * 0.25)
+
+
+def test_sand_is_refused_for_now() -> None:
+    import granular
+
+    assert granular.SIMULATOR.name == "granular"
+    assert granular.SIMULATOR.scene_model is Scene
+    with pytest.raises(ValueError, match="granular is not available yet in this version"):
+        granular.SIMULATOR.create(small(), device="cpu", folder=Path())
