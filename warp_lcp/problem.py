@@ -63,12 +63,12 @@ class LCP:
 
     @cached_property
     def lower(self) -> wp.array[Any]:
-        """l as a stored field, float64."""
+        """L as a stored field, float64."""
         return self._as_field(*self._bounds[0])
 
     @cached_property
     def upper(self) -> wp.array[Any]:
-        """u as a stored field, float64."""
+        """U as a stored field, float64."""
         return self._as_field(*self._bounds[1])
 
     def _as_field(self, field: wp.array[Any], value: float) -> wp.array[Any]:

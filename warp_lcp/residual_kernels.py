@@ -73,7 +73,8 @@ def masked_square_kernel(b: f64, unknown: i8, n: int, chunk: int, stride: wp.int
     )
 )
 def start_span(
-    x_: f64, l_: f64, l_value: wp.float64, u_: f64, u_value: wp.float64, m_: i8, keep: bool, start: wp.int64, end: wp.int64, stride: wp.int64
+    x_: f64, l_: f64, l_value: wp.float64, u_: f64, u_value: wp.float64, m_: i8, keep: bool, start: wp.int64,
+    end: wp.int64, stride: wp.int64,
 ): ...  # fmt: skip
 
 

@@ -93,7 +93,8 @@ class Stage:
         self.plotter.close()
 
     def _add(self, mesh: Any, **looks: Any) -> None:
-        self.plotter.add_mesh(mesh, reset_camera=False, render=False, show_scalar_bar=False, **looks)
+        if mesh.n_points:
+            self.plotter.add_mesh(mesh, reset_camera=False, render=False, show_scalar_bar=False, **looks)
 
     def _add_flat_solids(self) -> None:
         """Fill where the signed distance to a solid is negative, a little behind the particles; a line around it and the domain."""
@@ -131,7 +132,7 @@ class Stage:
             if shape.invert and not isinstance(shape, Plane):
                 self._add(mesh, color=SOLID, opacity=0.25, culling="front", smooth_shading=True, split_sharp_edges=True)
                 self._add(mesh.extract_feature_edges(30.0), color=EDGE, line_width=SAMPLES, lighting=False)
-            elif mesh.n_points:
+            else:
                 self._add(mesh, color=SOLID, ambient=0.38, smooth_shading=True, split_sharp_edges=True)
         below = -1e-3 * y
         self._add(pyvista.Rectangle([[0.0, below, 0.0], [x, below, 0.0], [x, below, z]]), color=FLOOR, lighting=False)
@@ -221,7 +222,7 @@ def shaded(points: np.ndarray, colors: np.ndarray, spacing: float) -> np.ndarray
     """
     low, extent = points.min(axis=0), np.ptp(points, axis=0)
     spacing = max(spacing, (float(np.prod(extent + 6 * spacing)) / SHADING_CELLS) ** (1 / 3))
-    at = (points - low) / spacing + 3.0
+    at = (points - low) / spacing + 3.25  # a lattice of two particles a cell then lies well inside the bins
     density, _ = np.histogramdd(at, bins=[range(math.ceil(side) + 1) for side in at.max(axis=0) + 3.0])
     density = gaussian_filter(np.minimum(density, 8.0), 1.2)
     slopes = np.gradient(density)

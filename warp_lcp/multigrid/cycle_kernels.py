@@ -109,7 +109,8 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
                     lo[k] = a > lo[k] ? a : lo[k]; hi[k] = b < hi[k] ? b : hi[k]; }}
             }}
             SIMD for (int k = 0; k < m; ++k) {{
-                lower[begin + k] = lo[2*k] > lo[2*k+1] ? lo[2*k] : lo[2*k+1]; upper[begin + k] = hi[2*k] < hi[2*k+1] ? hi[2*k] : hi[2*k+1]; }}
+                lower[begin + k] = lo[2*k] > lo[2*k+1] ? lo[2*k] : lo[2*k+1];
+                upper[begin + k] = hi[2*k] < hi[2*k+1] ? hi[2*k] : hi[2*k+1]; }}
         }}"""
         )
     )

@@ -80,4 +80,4 @@ def wrap(field: wp.array[Any], periodic: tuple[bool, ...], counts: tuple[int, in
     for axis, n in enumerate(reversed(counts)):
         if periodic[axis]:
             others = [field.shape[a] for a in range(3) if a != 2 - axis]
-            wp.launch(wrap_kernel, others, [field, axis, n], device=field.device)
+            wp.launch(wrap_kernel(field.dtype), others, [field, axis, n], device=field.device)

@@ -110,20 +110,25 @@ def product_kernels(variable: bool, d_type: Any, w_type: Any, x_type: Any) -> Si
     return SimpleNamespace(product=product, relax=relax)
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.stencil")
-def wrap_kernel(x: wp.array3d(dtype=Any), axis: int, n: int):
-    """Ghost cells of a periodic axis take the values of the cells at the other end."""
-    a, b = wp.tid()
-    if axis == 0:
-        x[a, b, 0] = x[a, b, n]
-        x[a, b, n + 1] = x[a, b, 1]
-    elif axis == 1:
-        x[a, 0, b] = x[a, n, b]
-        x[a, n + 1, b] = x[a, 1, b]
-    else:
-        x[0, a, b] = x[n, a, b]
-        x[n + 1, a, b] = x[1, a, b]
+@functools.cache
+def wrap_kernel(dtype: Any) -> Any:
+    """Return the kernel that fills ghost cells of a periodic axis with the values of the cells at the other end.
 
+    One kernel a type, each in a module of its own: a captured CPU graph confuses overloads of one generic kernel.
+    """
+    field = wp.array3d(dtype=dtype)
 
-for _type in (wp.int8, wp.float32, wp.float64):
-    wp.overload(wrap_kernel, [wp.array3d(dtype=_type), int, int])
+    @wp.kernel(enable_backward=False, module=f"warp_lcp.stencil.wrap_{dtype.__name__}")
+    def wrap(x: field, axis: int, n: int):
+        a, b = wp.tid()
+        if axis == 0:
+            x[a, b, 0] = x[a, b, n]
+            x[a, b, n + 1] = x[a, b, 1]
+        elif axis == 1:
+            x[a, 0, b] = x[a, n, b]
+            x[a, n + 1, b] = x[a, 1, b]
+        else:
+            x[0, a, b] = x[n, a, b]
+            x[n + 1, a, b] = x[1, a, b]
+
+    return wrap

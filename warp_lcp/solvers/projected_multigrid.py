@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -204,7 +205,7 @@ class MultigridWorkspace(IterateInBuffers):
                 self.hierarchy.finest.stencil.product(self._p, self._ap)
         x, out = self.x, self.fresh()
         if self.floating is None and self._rounded is None:
-            self._replay((x.ptr, out.ptr), lambda: (self._correct(x, out), self.residual.assess(out)))
+            self._replay((x.ptr, out.ptr), lambda: self._advance_to(x, out))
         else:
             self._correct(x, out)
             if self.floating is not None:
@@ -218,6 +219,11 @@ class MultigridWorkspace(IterateInBuffers):
             self._project()
         self._count_rises(last)
         return Step("truncated cycle", 1, active)
+
+    def _advance_to(self, x: wp.array[Any], out: wp.array[Any]) -> None:
+        """Step from x to out and assess it."""
+        self._correct(x, out)
+        self.residual.assess(out)
 
     def _correct(self, x: wp.array[Any], out: wp.array[Any]) -> None:
         """Cycle, measure, step from x to out."""
@@ -257,7 +263,7 @@ class MultigridWorkspace(IterateInBuffers):
         wp.launch(kernels.free_mask_kernel, free.size, [free, self._mask], device=self.A.device)
         self.floating.project(self.hierarchy.finest.b, self._mask)
 
-    def _replay(self, key: Any, launch: Any) -> None:
+    def _replay(self, key: Any, launch: Callable[[], None]) -> None:
         """Run launches as a captured graph; those of a kind are launched once before, so that every kernel is loaded."""
         graph = self._graphs.get(key)
         if graph is None:

@@ -209,7 +209,7 @@ def flat_kernels(free_type: Any, real: Any) -> SimpleNamespace:
 
 @wp.kernel(enable_backward=False, module="warp_lcp.projected_multigrid")
 def plan_step_kernel(scalars: f64):
-    """beta and the step length from the measured products: the new direction is conjugate to the last one, the step minimizes along it."""
+    """Beta and the step length from the measured products: the new direction is conjugate to the last one, the step minimizes along it."""
     zero = wp.float64(0.0)
     beta = zero
     if scalars[CARRY] != zero and scalars[PAP] > zero:
