@@ -1,5 +1,7 @@
 """The outer loop: criteria, statuses, history, starts, in-place problems."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import warp as wp
@@ -13,6 +15,11 @@ def poisson(n=16, seed=7, device="cpu", **options):
     cells = np.ones((n, n), dtype=int)
     cells[-1] = wl.AIR
     return wl.GridPoisson(cells, device=device, **options), np.random.default_rng(seed).standard_normal((n, n))
+
+
+@pytest.fixture(params=[wl.MinimumMapNewton(), wl.ProjectedMultigrid()], ids=["newton", "multigrid"])
+def method(request):
+    return request.param
 
 
 class Ring:
@@ -64,11 +71,11 @@ def test_history_counts_and_limits_are_exact():
     assert result.history[-1].residual == result.residual
 
 
-def test_warm_start_from_the_solution_takes_no_step():
+def test_warm_start_from_the_solution_takes_no_step(method):
     A, b = poisson()
     problem = wl.LCP(A, b)
-    first = wl.solve(problem, wl.MinimumMapNewton(), stopping=wl.StoppingCriteria(rtol=1e-8))
-    again = wl.solve(problem, wl.MinimumMapNewton(), x0=first.x, stopping=wl.StoppingCriteria(rtol=1e-7))
+    first = wl.solve(problem, method, stopping=wl.StoppingCriteria(rtol=1e-8))
+    again = wl.solve(problem, method, x0=first.x, stopping=wl.StoppingCriteria(rtol=1e-7))
     assert first.iterations > 1
     assert (again.iterations, again.status) == (0, wl.SolveStatus.CONVERGED)
 
@@ -81,9 +88,9 @@ def test_zero_is_the_answer_in_zero_iterations():
     assert not result.x.numpy().any()
 
 
-def test_reused_workspace_gives_the_same_answer_bit_for_bit():
+def test_reused_workspace_gives_the_same_answer_bit_for_bit(method):
     A, b = poisson()
-    problem, solver = wl.LCP(A, b), wl.MinimumMapNewton()
+    problem, solver = wl.LCP(A, b), method
     work = solver.init(problem)
     first = wl.solve(problem, solver, workspace=work)
     second = wl.solve(problem, solver, workspace=work)
@@ -91,12 +98,12 @@ def test_reused_workspace_gives_the_same_answer_bit_for_bit():
     assert first.linear_iterations == second.linear_iterations
 
 
-def test_in_place_problem_follows_changed_cells_and_b():
+def test_in_place_problem_follows_changed_cells_and_b(method):
     A, b = poisson()
     shape = A.layout.stored_shape
     fields = [wp.zeros(shape, dtype=wp.float64, device="cpu") for _ in range(3)]
     fields[2].fill_(np.inf)
-    problem, solver = wl.LCP(A, *fields), wl.MinimumMapNewton()
+    problem, solver = wl.LCP(A, *fields), method
     work = solver.init(problem)
     cells = np.ones((16, 16), dtype=np.int8)
     cells[10:] = wl.AIR
@@ -108,10 +115,10 @@ def test_in_place_problem_follows_changed_cells_and_b():
     np.testing.assert_allclose(result.x.numpy()[1, 1:-1, 1:-1], expected.x.numpy(), atol=1e-5)
 
 
-def test_the_workspace_s_own_iterate_may_be_the_guess():
+def test_the_workspace_s_own_iterate_may_be_the_guess(method):
     A, _ = poisson()
     b = wp.array(np.random.default_rng(7).standard_normal(A.layout.stored_shape), dtype=wp.float64, device="cpu")
-    problem, solver = wl.LCP(A, b), wl.MinimumMapNewton()
+    problem, solver = wl.LCP(A, b), method
     work = solver.init(problem)
     first = wl.solve(problem, solver, workspace=work, stopping=wl.StoppingCriteria(rtol=1e-8))
     again = wl.solve(problem, solver, workspace=work, x0=first.x, stopping=wl.StoppingCriteria(rtol=1e-7))
@@ -187,16 +194,16 @@ def test_newton_settings_are_checked(bad):
 class TestStatuses:
     """Each status is reached once on purpose."""
 
-    def test_floor(self):
+    def test_floor(self, method):
         A, b = poisson()
-        result = wl.solve(wl.LCP(A, b), wl.MinimumMapNewton(precision="single"), stopping=wl.StoppingCriteria(rtol=1e-12, patience=8))
+        result = wl.solve(wl.LCP(A, b), replace(method, precision="single"), stopping=wl.StoppingCriteria(rtol=1e-12, patience=8))
         assert result.status is wl.SolveStatus.FLOOR
         assert result.x.dtype is wp.float32
         assert 1e-9 < result.relative_residual < 1e-4
 
-    def test_mixed_precision_goes_below_the_single_floor(self):
+    def test_mixed_precision_goes_below_the_single_floor(self, method):
         A, b = poisson()
-        assert wl.solve(wl.LCP(A, b), wl.MinimumMapNewton(), stopping=wl.StoppingCriteria(rtol=1e-11))
+        assert wl.solve(wl.LCP(A, b), method, stopping=wl.StoppingCriteria(rtol=1e-11))
 
     def test_stagnated(self):
         A, b = poisson(32)
@@ -223,46 +230,55 @@ class TestStatuses:
         result = wl.solve(wl.LCP(wl.DenseOperator(A, device="cpu"), -np.ones(2)), wl.MinimumMapNewton())
         assert result.status in (wl.SolveStatus.NON_DESCENT, wl.SolveStatus.STAGNATED)
 
-    def test_infeasible_closed_pool(self, device):
+    def test_infeasible_closed_pool(self, device, method):
         cells = np.full((6, 6), wl.SOLID)
         cells[1:-1, 1:-1] = wl.FLUID
         A, b = wl.GridPoisson(cells, device=device), np.random.default_rng(13).standard_normal((6, 6))
-        result = wl.solve(wl.LCP(A, b, lower=-np.inf), wl.MinimumMapNewton())
+        result = wl.solve(wl.LCP(A, b, lower=-np.inf), method)
         assert result.status is wl.SolveStatus.INFEASIBLE
         assert not result
 
-    def test_compatible_closed_pool_is_solved_with_mean_zero(self, device):
+    def test_compatible_closed_pool_is_solved_with_mean_zero(self, device, method):
         cells = np.full((6, 7), wl.SOLID)
         cells[1:-1, 1:-1] = wl.FLUID
         A, b = wl.GridPoisson(cells, device=device), np.random.default_rng(13).standard_normal((6, 7))
         fluid = cells == wl.FLUID
         b -= b[fluid].mean()
-        result = wl.solve(wl.LCP(A, b, lower=-np.inf), wl.MinimumMapNewton(), stopping=wl.StoppingCriteria(rtol=1e-9))
+        result = wl.solve(wl.LCP(A, b, lower=-np.inf), method, stopping=wl.StoppingCriteria(rtol=1e-9))
         assert result, result.status
         assert abs(result.x.numpy()[fluid].mean()) < 1e-9
 
     @pytest.mark.parametrize(("sign", "status"), [(1, wl.SolveStatus.CONVERGED), (-1, wl.SolveStatus.INFEASIBLE)])
-    def test_closed_pool_with_lower_bounds_needs_outflow(self, sign, status, device):
+    def test_closed_pool_with_lower_bounds_needs_outflow(self, sign, status, device, method):
         cells = np.ones((5, 5), dtype=int)
         A = wl.GridPoisson(cells, device=device)
         b = np.random.default_rng(37).standard_normal((5, 5))
         b += sign - b.mean()
-        assert wl.solve(wl.LCP(A, b), wl.MinimumMapNewton()).status is status
+        assert wl.solve(wl.LCP(A, b), method).status is status
 
-    def test_closed_pool_with_lower_bounds_and_no_net_outflow(self, device):
+    def test_closed_pool_with_lower_bounds_and_no_net_outflow(self, device, method):
         A = wl.GridPoisson(np.ones((5, 8), dtype=int), device=device)
         b = np.random.default_rng(41).standard_normal((5, 8))
         b -= b.mean()
-        result = wl.solve(wl.LCP(A, b), wl.MinimumMapNewton(), stopping=wl.StoppingCriteria(rtol=1e-8))
+        result = wl.solve(wl.LCP(A, b), method, stopping=wl.StoppingCriteria(rtol=1e-8))
         assert result, result.status
         assert result.x.numpy().min() == pytest.approx(0, abs=1e-7)
 
-    def test_hidden_closed_pocket_beside_an_open_pool(self, device):
+    def test_isolated_cells_take_the_bound_that_b_asks_for(self, device, method):
+        cells = np.full((3, 9), wl.SOLID)
+        cells[1, 1:8:2] = wl.FLUID
+        b = np.zeros((3, 9))
+        b[1, [1, 3, 5]] = [-1.0, 2.0, 0.0]
+        result = wl.solve(wl.LCP(wl.GridPoisson(cells, device=device), b, -3.0, 4.0), method)
+        assert result, result.status
+        np.testing.assert_allclose(result.x.numpy()[1, [1, 3, 5, 7]], [4.0, -3.0, 0.0, 0.0])
+
+    def test_hidden_closed_pocket_beside_an_open_pool(self, device, method):
         cells = np.ones((9, 9), dtype=int)
         cells[3:6, 3:6] = wl.SOLID
         cells[4, 4] = wl.FLUID
         cells[-1] = wl.AIR
         A, b = wl.GridPoisson(cells, device=device), np.random.default_rng(43).standard_normal((9, 9))
-        assert wl.solve(wl.LCP(A, b, lower=-np.inf), wl.MinimumMapNewton()).status is wl.SolveStatus.INFEASIBLE
+        assert wl.solve(wl.LCP(A, b, lower=-np.inf), method).status is wl.SolveStatus.INFEASIBLE
         b[4, 4] = 0
-        assert wl.solve(wl.LCP(A, b, lower=-np.inf), wl.MinimumMapNewton())
+        assert wl.solve(wl.LCP(A, b, lower=-np.inf), method)

@@ -59,7 +59,8 @@ class LCP:
     @property
     def bounds(self) -> list[Any]:
         """Lower and upper bound as kernels take them: a stored field or an empty array, and the number that then counts, for each."""
-        return [*self._bounds[0], *self._bounds[1]]
+        (lower, least), (upper, most) = self._bounds
+        return [lower, wp.float64(least), upper, wp.float64(most)]
 
     @cached_property
     def lower(self) -> wp.array[Any]:

@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.problem import LCP
-from warp_lcp.residual_kernels import add_kernel, kernels, masked_square_kernel, start_kernel
+from warp_lcp.residual_kernels import add_kernel, kernels, masked_square_kernel, settle_isolated_kernel, start_kernel
 from warp_lcp.vectors import Reduction, launch_spans
 
 
@@ -66,6 +66,12 @@ class NaturalResidual:
         """Set x to clip(x, l, u), or to clip(0, l, u), and to 0 where there is no unknown."""
         p = self.problem
         launch_spans(start_kernel, self._reduction.spans, [x, *p.bounds, p.unknown, keep], [], p.device)
+        self.current = False
+
+    def settle_isolated(self, x: wp.array[Any]) -> None:
+        """Set x where A's row is empty, so that y = b, to the bound that b's sign asks for; methods move coupled unknowns only."""
+        p = self.problem
+        wp.launch(settle_isolated_kernel, x.size, [self.diagonal, p.b, *p.bounds, p.unknown, x], device=p.device)
         self.current = False
 
     def norm_of_b(self) -> float:

@@ -196,6 +196,9 @@ class _Loop:
         lost = floating.unattainable(self.problem.b, self.problem.lower, self.problem.upper) if floating else 0.0
         if guess is not None and math.isfinite(self.reference):
             self._take(guess)
+        if floating is not None:
+            residual.settle_isolated(self.work.x)
+            residual.evaluate(self.work.x)
         self._record(0, Step("start", 0))
         self._keep(0)
         if lost > self.tolerance:

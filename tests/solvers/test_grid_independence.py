@@ -9,44 +9,50 @@ from scenes import splash
 BOUNDS = ["none", "walls", "everywhere"]
 
 
-def solve(n, bounds, **options):
+METHODS = {"newton": wl.MinimumMapNewton(), "multigrid": wl.ProjectedMultigrid()}
+
+
+def solve(n, bounds, name):
     cells, b, wall = splash(n)
     lower = {"none": -np.inf, "walls": np.where(wall, 0.0, -np.inf), "everywhere": 0.0}[bounds]
     problem = wl.LCP(wl.GridPoisson(cells, device="cpu"), b, lower)
-    return problem, wl.solve(problem, wl.MinimumMapNewton(**options))
+    return problem, wl.solve(problem, METHODS[name])
 
 
 def newton_steps(result):
     return sum(record.step == "newton" for record in result.history)
 
 
+@pytest.mark.parametrize("name", METHODS)
 @pytest.mark.parametrize("bounds", BOUNDS)
-def test_cold_budget_at_32_and_64(bounds):
-    (_, small), (_, large) = solve(32, bounds), solve(64, bounds)
+def test_cold_budget_at_32_and_64(bounds, name):
+    (_, small), (_, large) = solve(32, bounds, name), solve(64, bounds, name)
     for result in (small, large):
         assert result, result.status
         assert newton_steps(result) <= 7
-        assert result.linear_iterations <= 12
+        assert result.linear_iterations <= (12 if name == "newton" else 10)
     assert large.linear_iterations <= small.linear_iterations + 2
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", METHODS)
 @pytest.mark.parametrize("bounds", BOUNDS)
-def test_cold_budget_grows_by_at_most_two_to_128(bounds):
-    (_, small), (_, large) = solve(64, bounds), solve(128, bounds)
+def test_cold_budget_grows_by_at_most_two_to_128(bounds, name):
+    (_, small), (_, large) = solve(64, bounds, name), solve(128, bounds, name)
     assert small
     assert large
     assert newton_steps(large) <= min(7, newton_steps(small) + 2)
     assert large.linear_iterations <= min(14, small.linear_iterations + 2)
 
 
+@pytest.mark.parametrize("name", METHODS)
 @pytest.mark.parametrize("bounds", ["walls", "everywhere"])
-def test_warm_start_after_a_small_change(bounds):
-    problem, first = solve(48, bounds)
+def test_warm_start_after_a_small_change(bounds, name):
+    problem, first = solve(48, bounds, name)
     rng = np.random.default_rng(67)
     b = problem.layout.unload(problem.b).numpy()
     changed = wl.LCP(problem.A, b * (1 + 0.02 * rng.standard_normal(b.shape)), problem.layout.unload(problem.lower))
-    again = wl.solve(changed, wl.MinimumMapNewton(), x0=first.x, stopping=wl.StoppingCriteria(rtol=1e-4))
+    again = wl.solve(changed, METHODS[name], x0=first.x, stopping=wl.StoppingCriteria(rtol=1e-4))
     assert again, again.status
     assert again.linear_iterations <= 8
 
@@ -56,8 +62,10 @@ def test_solution_does_not_depend_on_the_monotone_cycles(bounds):
     tight = wl.StoppingCriteria(rtol=1e-10)
     cells, b, wall = splash(24)
     problem = wl.LCP(wl.GridPoisson(cells, device="cpu"), b, np.where(wall, 0.0, -np.inf) if bounds == "walls" else 0.0)
-    results = [wl.solve(problem, wl.MinimumMapNewton(monotone_cycles=k), stopping=tight) for k in (0, 2)]
+    methods = [make(monotone_cycles=k) for make in (wl.MinimumMapNewton, wl.ProjectedMultigrid) for k in (0, 2)]
+    results = [wl.solve(problem, method, stopping=tight) for method in methods]
     assert all(results)
-    np.testing.assert_allclose(results[0].x.numpy(), results[1].x.numpy(), atol=1e-8 * np.abs(results[0].x.numpy()).max())
+    for result in results[1:]:
+        np.testing.assert_allclose(result.x.numpy(), results[0].x.numpy(), atol=1e-8 * np.abs(results[0].x.numpy()).max())
     sweeps = wl.solve(problem, wl.ProjectedSOR(omega=1.8), stopping=wl.StoppingCriteria(rtol=1e-8, max_iterations=5000))
     np.testing.assert_allclose(sweeps.x.numpy(), results[1].x.numpy(), atol=1e-5 * np.abs(results[0].x.numpy()).max())

@@ -156,9 +156,6 @@ class MultigridWorkspace(IterateInBuffers):
             self.hierarchy.refresh_weights()
             self.residual.stale = True
         if self.floating is not None:
-            p = self.problem
-            inputs = [self.residual.diagonal, p.b, *p.bounds, p.unknown, self.x]
-            wp.launch(kernels.settle_isolated_kernel, self.x.size, inputs, device=p.device)
             self._classify_next()
             self.residual.evaluate(self.x)
             self._project()

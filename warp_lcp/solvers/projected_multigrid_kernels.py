@@ -246,29 +246,5 @@ def free_mask_kernel(free: wp.array(dtype=Any), mask: wp.array(dtype=wp.uint8)):
         mask[i] = wp.uint8(1)
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.projected_multigrid")
-def settle_isolated_kernel(
-    d: wp.array(dtype=Any), b: f64, lower: f64, lower_value: wp.float64, upper: f64, upper_value: wp.float64,
-    unknown: wp.array(dtype=wp.int8), x: f64,
-):  # fmt: skip
-    """Unknowns with an empty row: y = b, so x is the bound that b's sign asks for."""
-    i = wp.tid()
-    if unknown[i] == wp.int8(1):
-        if d[i] == d.dtype(0):
-            bound = lower_value
-            if b[i] < wp.float64(0.0):
-                bound = upper_value
-                if upper.shape[0] > 0:
-                    bound = upper[i]
-            elif lower.shape[0] > 0:
-                bound = lower[i]
-            if b[i] != wp.float64(0.0) and wp.abs(bound) < wp.float64(1.0e300):
-                x[i] = bound
-
-
 for _T in (wp.uint8, wp.float32, wp.float64):
     wp.overload(free_mask_kernel, [wp.array(dtype=_T), wp.array(dtype=wp.uint8)])
-    wp.overload(
-        settle_isolated_kernel,
-        [wp.array(dtype=_T), f64, f64, wp.float64, f64, wp.float64, wp.array(dtype=wp.int8), f64],
-    )
