@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 SAMPLES = 2  # per pixel and direction: images are drawn larger and averaged down, since splats have no other anti-aliasing
 OUTLINE_POINTS = 1500  # along the longest side, where 2-D solids are sampled: about a drawn pixel
 SHADING_CELLS = 4e6  # of the density that shades a liquid, to bound its memory
-SOLID, EDGE, FLOOR = "#bfc3c8", "#6b7075", "#f1f2f3"
+FLAT_SOLID, SOLID, EDGE, FLOOR = "#bfc3c8", "#cdd1d5", "#6b7075", "#f1f2f3"
 
 VIEW_ANGLE = 25.0  # degrees, over the height of an image
 MARGIN = 1.04
@@ -55,7 +55,7 @@ class Stage:
         self.plotter = pyvista.Plotter(off_screen=True, window_size=[SAMPLES * side for side in size], lighting="none")
         self.plotter.render_window.SetMultiSamples(0)  # three times as fast in software, and SAMPLES smooths edges already
         self.plotter.set_background("white")
-        for position, kind, intensity in [(LIGHT, "scene light", 0.6), (np.array([0.0, 0.0, 1.0]), "headlight", 0.3)]:
+        for position, kind, intensity in [(LIGHT, "scene light", 0.45), (np.array([0.0, 0.0, 1.0]), "headlight", 0.25)]:
             light = pyvista.Light(position=tuple(position), focal_point=(0, 0, 0), light_type=kind, intensity=intensity)
             self.plotter.add_light(light)
         if self.flat:
@@ -115,7 +115,7 @@ class Stage:
         if nearest.min() < 0.0:
             plane.origin = (0.0, 0.0, behind)
             plane["distance"] = np.minimum(nearest, 1e3 * step)
-            self._add(plane.clip_scalar(scalars="distance", value=0.0), color=SOLID, lighting=False)
+            self._add(plane.clip_scalar(scalars="distance", value=0.0), color=FLAT_SOLID, lighting=False)
             if nearest.max() > 0.0:
                 line = plane.contour([0.0], scalars="distance").translate((0.0, 0.0, -0.5 * behind))
                 self._add(line, color=EDGE, line_width=1.5 * SAMPLES, lighting=False)
@@ -130,10 +130,10 @@ class Stage:
         for shape in self.scene.solid:
             mesh = surface(shape, self.size)
             if shape.invert and not isinstance(shape, Plane):
-                self._add(mesh, color=SOLID, opacity=0.25, culling="front", smooth_shading=True, split_sharp_edges=True)
+                self._add(mesh, color=SOLID, ambient=0.3, opacity=0.3, culling="front", smooth_shading=True, split_sharp_edges=True)
                 self._add(mesh.extract_feature_edges(30.0), color=EDGE, line_width=SAMPLES, lighting=False)
             else:
-                self._add(mesh, color=SOLID, ambient=0.38, smooth_shading=True, split_sharp_edges=True)
+                self._add(mesh, color=SOLID, ambient=0.5, smooth_shading=True, split_sharp_edges=True)
         below = -1e-3 * y
         self._add(pyvista.Rectangle([[0.0, below, 0.0], [x, below, 0.0], [x, below, z]]), color=FLOOR, lighting=False)
         edges = pyvista.Box((0.0, x, 0.0, y, 0.0, z)).extract_all_edges()
