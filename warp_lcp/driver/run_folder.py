@@ -23,7 +23,8 @@ Status = Literal["running", "finished", "stopped", "failed"]
 
 RECORD = "run.json"
 OWN_FILES = re.compile(r"scene\.toml|run\.json|log\.csv|[a-z][a-z_]*\.pvd")
-OWN_FOLDERS = {"frames": FRAME_FILE, "checkpoints": CHECKPOINT_FILE}
+IMAGE_FILE = re.compile(r"(?:frame_\d{6,}|sheet)\.png")
+OWN_FOLDERS = {"frames": FRAME_FILE, "checkpoints": CHECKPOINT_FILE, "images": IMAGE_FILE}
 
 
 class OutputError(ValueError):
