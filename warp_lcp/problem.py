@@ -34,6 +34,15 @@ class LCP:
 
     Raises:
         ValueError: a NaN, a wrong shape, l > u, l = inf, u = -inf, or no unknown; the message names the argument.
+
+    Example:
+        >>> import numpy as np, warp_lcp as wl
+        >>> A = wl.DenseOperator(np.array([[2.0, -1.0], [-1.0, 2.0]]), device="cpu")
+        >>> result = wl.solve(wl.LCP(A, np.array([0.5, -2.5])), wl.MinimumMapNewton())
+        >>> print(result.status.name, result.x.numpy())
+        CONVERGED [0.5 1.5]
+        >>> print(wl.solve(wl.LCP(A, np.array([2.0, -3.0])), wl.MinimumMapNewton()).x.numpy())
+        [0.  1.5]
     """
 
     def __init__(self, A: Operator, b: Array, lower: Any = 0.0, upper: Any = np.inf) -> None:

@@ -19,6 +19,14 @@ class StoppingCriteria:
 
     Raises:
         ValueError: an argument is outside its range.
+
+    Example:
+        >>> StoppingCriteria(rtol=1e-3, atol=1e-2).tolerance(5.0)
+        0.01
+        >>> StoppingCriteria(rtol=2)
+        Traceback (most recent call last):
+        ...
+        ValueError: rtol = 2: must be in [0, 1)
     """
 
     rtol: float = 1e-6

@@ -45,6 +45,14 @@ class GridPoisson:
 
     Raises:
         ValueError: an argument has a wrong shape, type or sign, or is not finite; the message names it.
+
+    Example:
+        >>> import numpy as np, warp_lcp as wl
+        >>> A = wl.GridPoisson(np.array([[wl.FLUID, wl.FLUID, wl.AIR]]), device="cpu")
+        >>> print(A.diagonal().numpy())
+        [[1. 2. 0.]]
+        >>> print(A.apply(wp.array([[1.0, 3.0, 9.0]], dtype=wp.float64, device="cpu")).numpy())
+        [[-2.  5.  0.]]
     """
 
     symmetric = True
