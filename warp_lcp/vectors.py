@@ -10,6 +10,7 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.native import CUDA_BLOCK, Spans
+from warp_lcp.program import Launch
 from warp_lcp.vector_kernels import add_up_kernel, kernels
 
 
@@ -30,20 +31,22 @@ class Reduction:
         self.block = min(CUDA_BLOCK, self.threads) if device.is_cuda else 1
         self.partials = wp.zeros(columns * self.threads, dtype=wp.float64, device=device)
 
-    def add_up(self, slot: int, columns: int = 1) -> None:
+    def add_up(self, slot: int, columns: int = 1, *, launch: Launch = wp.launch) -> None:
         """Write the sums of the first columns of partial sums to scalars[slot], scalars[slot + 1], ..."""
         inputs = [self.partials, self.threads, self.block, self.scalars, slot]
-        wp.launch(add_up_kernel, columns * self.block, inputs, device=self.partials.device, block_dim=self.block)
+        launch(add_up_kernel, columns * self.block, inputs, device=self.partials.device, block_dim=self.block)
 
-    def dot(self, a: wp.array[Any], b: wp.array[Any], slot: int) -> None:
+    def dot(self, a: wp.array[Any], b: wp.array[Any], slot: int, *, launch: Launch = wp.launch) -> None:
         """Write a.b to scalars[slot]."""
-        launch_spans(kernels(a.dtype, b.dtype).dot, self.spans, [a, b], [self.partials], a.device)
-        self.add_up(slot)
+        launch_spans(kernels(a.dtype, b.dtype).dot, self.spans, [a, b], [self.partials], a.device, launch=launch)
+        self.add_up(slot, launch=launch)
 
 
-def launch_spans(kernel: wp.Kernel, spans: Spans, before: list[Any], after: list[Any], device: wp.Device) -> None:
+def launch_spans(
+    kernel: wp.Kernel, spans: Spans, before: list[Any], after: list[Any], device: wp.Device, *, launch: Launch = wp.launch
+) -> None:
     """Launch a kernel (*before, n, chunk, stride, *after) with one thread a span."""
-    wp.launch(kernel, spans.threads, [*before, spans.n, spans.chunk, spans.stride, *after], device=device)
+    launch(kernel, spans.threads, [*before, spans.n, spans.chunk, spans.stride, *after], device=device)
 
 
 def convert(a: wp.array[Any], b: wp.array[Any]) -> None:

@@ -83,7 +83,7 @@ def test_cycle_is_symmetric_positive_definite(gamma, device):
 
     def cycle(r):
         hierarchy.finest.b.assign(r)
-        hierarchy.cycle()
+        hierarchy.cycle.run()
         return hierarchy.finest.x.numpy().copy()
 
     r, s = (rng.standard_normal(inside.size) * inside for _ in range(2))
@@ -104,7 +104,7 @@ def test_monotone_cycle_keeps_bounds_and_lowers_the_energy(periodic, device):
     lower, upper = -rng.uniform(0, 0.3, inside.size) * inside, rng.uniform(0, 0.3, inside.size) * inside
     for field, values in ((finest.b, r), (finest.lower, lower), (finest.upper, upper)):
         field.assign(values)
-    hierarchy.monotone_cycle()
+    hierarchy.monotone_cycle.run()
     x = finest.x.numpy().copy() * inside
     assert (x >= lower).all()
     assert (x <= upper).all()
@@ -121,9 +121,10 @@ def test_conjugate_gradients_solve_the_masked_system(device):
 
     class Cycle:
         r, z = hierarchy.finest.b, hierarchy.finest.x
+        program = hierarchy.cycle
 
         def apply(self):
-            hierarchy.cycle()
+            self.program.run()
 
     krylov = ConjugateGradient(hierarchy.finest.stencil.product, Cycle())
     p = (free & (cells == wl.FLUID)).ravel()

@@ -1,15 +1,22 @@
-"""Preconditioned conjugate gradients with scalars that stay on the device; one captured graph an iteration."""
+"""Preconditioned conjugate gradients with scalars that stay on the device; one program an iteration."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.krylov.conjugate_gradient_kernels import PQ, RR, RZ, kernels, remember_kernel
+from warp_lcp.program import Launch, Program
 from warp_lcp.vectors import Reduction, launch_spans
+
+
+class LinearMap(Protocol):
+    """q = A p on stored fields, launched through `launch` if it is kernel launches only."""
+
+    def __call__(self, p: wp.array[Any], q: wp.array[Any], /, *, launch: Launch = ...) -> None:
+        """Write q."""
 
 
 class Preconditioner(Protocol):
@@ -22,29 +29,31 @@ class Preconditioner(Protocol):
         """Write z."""
 
 
+class RecordedPreconditioner(Preconditioner, Protocol):
+    """A preconditioner that is a program."""
+
+    program: Program
+
+
 class ConjugateGradient:
     """Solve A x = r for a symmetric positive (semi-)definite A.
 
-    The right-hand side is the preconditioner's field `r`, which becomes the residual; the solution is `x`. An iteration is launched
-    kernels only, captured once and replayed; the host reads one scalar after each, the residual's norm.
+    The right-hand side is the preconditioner's field `r`, which becomes the residual; the solution is `x`. The host reads one scalar
+    after each iteration, the residual's norm.
 
     Args:
-        product: writes A p to q, called as product(p, q).
-        preconditioner: M.
-        capture: whether A and M are kernel launches only, so that an iteration may be captured.
+        product: A.
+        preconditioner: M. If it is recorded (has a `program`), so must A be, and an iteration is one program.
     """
 
-    def __init__(
-        self, product: Callable[[wp.array[Any], wp.array[Any]], None], preconditioner: Preconditioner, *, capture: bool = True
-    ) -> None:
-        self._capture = capture
+    def __init__(self, product: LinearMap, preconditioner: Preconditioner) -> None:
         self._product, self._preconditioner = product, preconditioner
         r = preconditioner.r
         self.device, self.x, self._p, self._q = r.device, wp.zeros_like(r), wp.zeros_like(r), wp.zeros_like(r)
         self._scalars = wp.zeros(4, dtype=wp.float64, device=r.device)
         self._reduction = Reduction(r.size, r.device, self._scalars)
         self._kernels = kernels(r.dtype)
-        self._graph: Any = None
+        self._program: Program | None = None
 
     def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
         """Iterate from x = 0 until ||r|| <= tolerance.
@@ -67,24 +76,25 @@ class ConjugateGradient:
         return max_iterations, norm
 
     def _iterate(self) -> None:
-        """Replay an iteration; the first one runs as it is, so that every kernel is loaded before the capture."""
-        if self._graph is None:
-            self._launch()
-            if not self._capture:
-                return
-            with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
-                self._launch()
-            self._graph = capture.graph
+        cycle = getattr(self._preconditioner, "program", None)
+        if cycle is None:
+            self._preconditioner.apply()
+            self._advance(wp.launch)
             return
-        wp.capture_launch(self._graph)
+        if self._program is None:
+            self._program = Program(self.device)
+            self._program.extend(cycle)
+            self._advance(self._program.launch)
+        self._program.run()
 
-    def _launch(self) -> None:
+    def _advance(self, launch: Launch) -> None:
+        """Launch what follows the preconditioner."""
         spans, partials, r, z = self._reduction.spans, self._reduction.partials, self._preconditioner.r, self._preconditioner.z
-        self._preconditioner.apply()
-        self._reduction.dot(r, z, RZ)
-        launch_spans(self._kernels.direction, spans, [z, self._p, self._scalars], [], self.device)
-        self._product(self._p, self._q)
-        self._reduction.dot(self._p, self._q, PQ)
-        launch_spans(self._kernels.update, spans, [self._p, self._q, self.x, r, self._scalars], [partials], self.device)
-        self._reduction.add_up(RR)
-        wp.launch(remember_kernel, 1, [self._scalars], device=self.device)
+        self._reduction.dot(r, z, int(RZ), launch=launch)
+        launch_spans(self._kernels.direction, spans, [z, self._p, self._scalars], [], self.device, launch=launch)
+        self._product(self._p, self._q, launch=launch)
+        self._reduction.dot(self._p, self._q, int(PQ), launch=launch)
+        update = [self._p, self._q, self.x, r, self._scalars]
+        launch_spans(self._kernels.update, spans, update, [partials], self.device, launch=launch)
+        self._reduction.add_up(int(RR), launch=launch)
+        launch(remember_kernel, 1, [self._scalars], device=self.device)

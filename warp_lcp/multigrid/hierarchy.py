@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import warp as wp
@@ -14,6 +15,7 @@ from warp_lcp.multigrid import coarsen_kernels as kernels
 from warp_lcp.multigrid.coarsen_kernels import UNBOUNDED
 from warp_lcp.multigrid.cycle_kernels import cycle_kernels
 from warp_lcp.operators.stencil import Stencil
+from warp_lcp.program import Launch, Program
 from warp_lcp.vectors import convert
 
 
@@ -64,21 +66,23 @@ class Level:
         empty = wp.empty((0, 0, 0), dtype=self.real, device=s.device)
         return [s.d.reshape(shape), *((w.reshape(shape) for w in s.weights) if s.weights else (empty,) * 3)]
 
-    def sweep(self, y: wp.array[Any], x: wp.array[Any], omega: float, *, projected: bool, from_zero: bool = False) -> None:
+    def sweep(
+        self, y: wp.array[Any], x: wp.array[Any], omega: float, *, projected: bool, from_zero: bool = False, launch: Launch = wp.launch
+    ) -> None:
         """Y = x + omega D^-1 (b - A x), clipped to the bounds if projected; x is taken for 0 if from_zero."""
         s = self.stencil
         if not from_zero:
-            s.wrap(x)
+            s.wrap(x, launch=launch)
         inputs = [*self.operands, s.grain, from_zero, y, x, self.b, self.lower, self.upper, omega, projected]
-        wp.launch(self.kernels.sweep, s.threads, inputs, device=s.device)
+        launch(self.kernels.sweep, s.threads, inputs, device=s.device)
 
 
 class Hierarchy:
     """Multigrid for (P A P + P D P) e = r on a grid.
 
     The finest level shares A's weights; its diagonal is the caller's to fill (0 takes a cell out), followed by `rebuild`. `cycle` and
-    `monotone_cycle` read the right-hand side from `b` and write `x`. Nothing is allocated and nothing is read back by them, so that they
-    can be captured in a graph.
+    `monotone_cycle` are programs that read the right-hand side from the finest `b` and write its `x`; they allocate nothing and read
+    nothing back.
 
     Args:
         stencil: the operator on all unknowns.
@@ -124,74 +128,93 @@ class Hierarchy:
 
     def rebuild(self) -> None:
         """Coarsen from the finest diagonal down, and factor the coarsest level."""
+        self._coarsening.run()
+
+    @cached_property
+    def _coarsening(self) -> Program:
+        program = Program(self.device)
         for fine, coarse in zip(self.levels, self.levels[1:], strict=False):
             s, c = fine.stencil, coarse.stencil
             sizes = [wp.vec3i(*s.padding.counts), wp.vec3i(*map(int, s.periodic)), c.shape, c.grain]
             kernel = kernels.coarsen_kernels(s.weights is not None, s.d.dtype, self.real)
-            wp.launch(kernel, c.threads, [*fine.operands, *sizes, c.d, *(c.weights or ())], device=self.device)
+            program.launch(kernel, c.threads, [*fine.operands, *sizes, c.d, *(c.weights or ())], device=self.device)
             for w in c.weights or ():
-                c.wrap(w)
+                c.wrap(w, launch=program.launch)
         last, s = self.levels[-1], self.levels[-1].stencil
         inputs = [s.shape, *last.grids, wp.vec3i(*s.padding.counts), wp.vec3i(*map(int, s.periodic)), self._matrix]
-        wp.launch(kernels.factor_kernel, 1, inputs, device=self.device)
-        wp.launch(kernels.invert_kernel, self._matrix.shape[0], [self._matrix, self._inverse], device=self.device)
+        program.launch(kernels.factor_kernel, 1, inputs, device=self.device)
+        program.launch(kernels.invert_kernel, self._matrix.shape[0], [self._matrix, self._inverse], device=self.device)
+        return program
 
-    def cycle(self, level: int = 0, *, from_zero: bool = True) -> None:
+    @cached_property
+    def cycle(self) -> Program:
         """One linear cycle: a symmetric positive (semi-)definite approximation of the inverse."""
-        L = self.levels[level]
-        if level == len(self.levels) - 1:
-            counts, shape = L.stencil.padding.counts, L.stencil.padding.shape
-            inputs = [self._inverse, wp.vec3i(*counts), L.b.reshape(shape), L.x.reshape(shape)]
-            wp.launch(kernels.solve_coarsest_kernel, math.prod(counts), inputs, device=self.device)
-            return
-        self._pair(L, from_zero=from_zero, projected=False)
-        self._restrict(level)
-        for visit in range(self.settings.gamma if level + 2 < len(self.levels) else 1):
-            self.cycle(level + 1, from_zero=visit == 0)
-        self._correct(level, projected=False)
-        self._pair(L, reverse=True, projected=False)
+        program = Program(self.device)
+        self._descend(0, program.launch, projected=False, from_zero=True)
+        return program
 
-    def monotone_cycle(self, level: int = 0, *, from_zero: bool = True) -> None:
+    @cached_property
+    def monotone_cycle(self) -> Program:
         """One projected cycle on all levels: every sweep is clipped, coarse bounds keep the finer iterate within its own.
 
         It moves whole aggregates on and off their bounds, where an active-set method moves the boundary by about a layer of cells a step.
         """
-        L = self.levels[level]
-        if level == len(self.levels) - 1:
-            for sweep in range(self.settings.projected_sweeps):
-                self._pair(L, from_zero=from_zero and sweep == 0, projected=True)
-                self._pair(L, reverse=True, projected=True)
-            return
-        C = self.levels[level + 1]
-        self._pair(L, from_zero=from_zero, projected=True)
-        self._restrict(level)
-        (n0, n1, _), coarse = L.stencil.padding.counts, C.stencil
-        fields = [L.x, L.lower, L.upper, self.settings.over_correction, C.lower, C.upper]
-        inputs = [L.stencil.shape, L.stencil.d, coarse.grain, coarse.shape, n0, n1, *fields]
-        wp.launch(L.kernels.bounds, coarse.threads, inputs, device=self.device)
-        for visit in range(self.settings.gamma if level + 2 < len(self.levels) else 1):
-            self.monotone_cycle(level + 1, from_zero=visit == 0)
-        self._correct(level, projected=True)
-        self._pair(L, reverse=True, projected=True)
+        program = Program(self.device)
+        self._descend(0, program.launch, projected=True, from_zero=True)
+        return program
 
-    def _pair(self, L: Level, *, projected: bool, from_zero: bool = False, reverse: bool = False) -> None:
+    def _descend(self, level: int, launch: Launch, *, projected: bool, from_zero: bool) -> None:
+        """Launch a cycle on a level and those below it."""
+        if level == len(self.levels) - 1:
+            self._solve_coarsest(launch, projected=projected, from_zero=from_zero)
+            return
+        L = self.levels[level]
+        self._pair(L, launch, from_zero=from_zero, projected=projected)
+        self._restrict(level, launch)
+        if projected:
+            self._restrict_bounds(level, launch)
+        for visit in range(self.settings.gamma if level + 2 < len(self.levels) else 1):
+            self._descend(level + 1, launch, projected=projected, from_zero=visit == 0)
+        self._correct(level, launch, projected=projected)
+        self._pair(L, launch, reverse=True, projected=projected)
+
+    def _solve_coarsest(self, launch: Launch, *, projected: bool, from_zero: bool) -> None:
+        """Multiply by the inverse; projected sweeps stand for that where there are bounds."""
+        L = self.levels[-1]
+        if projected:
+            for sweep in range(self.settings.projected_sweeps):
+                self._pair(L, launch, from_zero=from_zero and sweep == 0, projected=True)
+                self._pair(L, launch, reverse=True, projected=True)
+            return
+        counts, shape = L.stencil.padding.counts, L.stencil.padding.shape
+        inputs = [self._inverse, wp.vec3i(*counts), L.b.reshape(shape), L.x.reshape(shape)]
+        launch(kernels.solve_coarsest_kernel, math.prod(counts), inputs, device=self.device)
+
+    def _pair(self, L: Level, launch: Launch, *, projected: bool, from_zero: bool = False, reverse: bool = False) -> None:
         """Two Chebyshev-Jacobi sweeps; the reverse pair after the correction keeps the cycle symmetric."""
         first, second = reversed(self.settings.weights) if reverse else self.settings.weights
-        L.sweep(L.t, L.x, first, projected=projected, from_zero=from_zero)
-        L.sweep(L.x, L.t, second, projected=projected)
+        L.sweep(L.t, L.x, first, projected=projected, from_zero=from_zero, launch=launch)
+        L.sweep(L.x, L.t, second, projected=projected, launch=launch)
 
-    def _restrict(self, level: int) -> None:
+    def _restrict(self, level: int, launch: Launch) -> None:
         L, C = self.levels[level], self.levels[level + 1]
-        L.stencil.wrap(L.x)
+        L.stencil.wrap(L.x, launch=launch)
         n0, n1, _ = L.stencil.padding.counts
         inputs = [*L.operands, C.stencil.grain, C.stencil.shape, n0, n1, L.x, L.b, C.b]
-        wp.launch(L.kernels.restrict, C.stencil.threads, inputs, device=self.device)
+        launch(L.kernels.restrict, C.stencil.threads, inputs, device=self.device)
 
-    def _correct(self, level: int, *, projected: bool) -> None:
+    def _restrict_bounds(self, level: int, launch: Launch) -> None:
+        L, C = self.levels[level], self.levels[level + 1]
+        n0, n1, _ = L.stencil.padding.counts
+        fields = [L.x, L.lower, L.upper, self.settings.over_correction, C.lower, C.upper]
+        inputs = [L.stencil.shape, L.stencil.d, C.stencil.grain, C.stencil.shape, n0, n1, *fields]
+        launch(L.kernels.bounds, C.stencil.threads, inputs, device=self.device)
+
+    def _correct(self, level: int, launch: Launch, *, projected: bool) -> None:
         L, C = self.levels[level], self.levels[level + 1]
         nz, ny, _ = L.stencil.padding.counts
         inputs = [*L.operands, C.stencil.grain, C.stencil.shape, L.x, C.x, L.lower, L.upper, self.settings.over_correction, projected]
-        wp.launch(L.kernels.correct, (nz, ny, C.stencil.threads[2]), inputs, device=self.device)
+        launch(L.kernels.correct, (nz, ny, C.stencil.threads[2]), inputs, device=self.device)
 
     def _coarser(self, fine: Level, *, bounded: bool) -> Level:
         s = fine.stencil

@@ -10,6 +10,7 @@ import warp as wp
 from warp_lcp.layout import Padding
 from warp_lcp.native import grain
 from warp_lcp.operators.stencil_kernels import StencilShape, product_kernels, wrap_kernel
+from warp_lcp.program import Launch
 
 
 @dataclass
@@ -53,17 +54,17 @@ class Stencil:
         unit = self.unit if d.dtype is self.d.dtype else 1.0
         return Stencil(self.padding, d, self.weights, self.coefficients, unit, self.periodic)
 
-    def wrap(self, x: wp.array[Any]) -> None:
+    def wrap(self, x: wp.array[Any], *, launch: Launch = wp.launch) -> None:
         """Fill x's ghost cells along periodic axes."""
         if any(self.periodic):
-            wrap(x.reshape(self.padding.shape), self.periodic, self.padding.counts)
+            wrap(x.reshape(self.padding.shape), self.periodic, self.padding.counts, launch=launch)
 
-    def product(self, x: wp.array[Any], out: wp.array[Any], plus: wp.array[Any] | None = None) -> None:
+    def product(self, x: wp.array[Any], out: wp.array[Any], plus: wp.array[Any] | None = None, *, launch: Launch = wp.launch) -> None:
         """Out = A x, or A x + plus. All of one float type; rows that are no unknowns give 0 (or plus)."""
-        self.wrap(x)
+        self.wrap(x, launch=launch)
         kernel = product_kernels(*self.storage, x.dtype).product
         inputs = [*self.operands, x, x if plus is None else plus, plus is not None, out]
-        wp.launch(kernel, self.threads, inputs, device=self.device)
+        launch(kernel, self.threads, inputs, device=self.device)
 
     def relax(
         self, x: wp.array[Any], b: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any], omega: float, *, forward: bool = True
@@ -75,9 +76,9 @@ class Stencil:
             wp.launch(kernel, self.threads, [*self.operands, x, b, lower, upper, omega, color], device=self.device)
 
 
-def wrap(field: wp.array[Any], periodic: tuple[bool, ...], counts: tuple[int, int, int]) -> None:
+def wrap(field: wp.array[Any], periodic: tuple[bool, ...], counts: tuple[int, int, int], *, launch: Launch = wp.launch) -> None:
     """Fill the ghost cells of a padded field (nz + 2, ny + 2, nx + 2) along its periodic axes x, y, z."""
     for axis, n in enumerate(reversed(counts)):
         if periodic[axis]:
             others = [field.shape[a] for a in range(3) if a != 2 - axis]
-            wp.launch(wrap_kernel(field.dtype), others, [field, axis, n], device=field.device)
+            launch(wrap_kernel(field.dtype), others, [field, axis, n], device=field.device)

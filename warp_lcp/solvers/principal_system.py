@@ -18,6 +18,7 @@ from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.operators.grid_poisson_kernels import mask_diagonal_kernel
 from warp_lcp.problem import LCP
+from warp_lcp.program import Launch, Program
 from warp_lcp.solvers.principal_system_kernels import divide_kernel, mask_kernel
 
 
@@ -51,7 +52,6 @@ class GridSystem:
         self.r, self.z = self.hierarchy.finest.b, self.hierarchy.finest.x
         self._krylov = ConjugateGradient(self.hierarchy.finest.stencil.product, self)
         self.e = self._krylov.x
-        self._monotone: Any = None
 
     def refresh(self) -> None:
         """Take the weights again."""
@@ -67,19 +67,18 @@ class GridSystem:
         """Iterate."""
         return self._krylov.solve(tolerance, max_iterations)
 
-    def apply(self) -> None:
+    @property
+    def program(self) -> Program:
         """Precondition: z = one cycle on r."""
-        self.hierarchy.cycle()
+        return self.hierarchy.cycle
+
+    def apply(self) -> None:
+        """Precondition."""
+        self.program.run()
 
     def monotone_cycle(self) -> None:
         """One projected cycle on r within the finest level's bounds; the correction is `z`."""
-        if self._monotone is None:
-            self.hierarchy.monotone_cycle()
-            with wp.ScopedCapture(device=self._A.device, force_module_load=False) as capture:
-                self.hierarchy.monotone_cycle()
-            self._monotone = capture.graph
-            return
-        wp.capture_launch(self._monotone)
+        self.hierarchy.monotone_cycle.run()
 
 
 class DenseSystem:
@@ -124,7 +123,7 @@ class DiagonalSystem:
     def __init__(self, problem: LCP) -> None:
         self._A, self._layout = problem.A, problem.layout
         self.r, self.z = self._layout.zeros(wp.float64), self._layout.zeros(wp.float64)
-        self._krylov = ConjugateGradient(self._product, self, capture=False)
+        self._krylov = ConjugateGradient(self._product, self)
         self.e = self._krylov.x
         self.refresh()
 
@@ -144,7 +143,7 @@ class DiagonalSystem:
         """Precondition: z = r / d."""
         wp.launch(divide_kernel, self.r.size, [self.r, self._d, self.z], device=self._layout.device)
 
-    def _product(self, p: wp.array[Any], q: wp.array[Any]) -> None:
+    def _product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
         shape = self._layout.stored_shape
         self._A.apply(p.reshape(shape), q.reshape(shape))
         wp.launch(mask_kernel, q.size, [self._free, q], device=self._layout.device)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,6 +11,7 @@ import warp as wp
 from warp_lcp.multigrid.hierarchy import CycleSettings, Hierarchy
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
+from warp_lcp.program import Launch, Program
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.solve import IterateInBuffers, Precision, Step
 from warp_lcp.solvers import projected_multigrid_kernels as kernels
@@ -104,16 +104,16 @@ class AssessedResidual(NaturalResidual):
         self.assess(x)
         return self.read()
 
-    def assess(self, x: wp.array[Any]) -> None:
+    def assess(self, x: wp.array[Any], *, launch: Launch = wp.launch) -> None:
         """Launch the evaluation."""
         p, s, finest = self.problem, self._A.stencil, self._finest
-        s.wrap(x)
+        s.wrap(x, launch=launch)
         inputs = [
             *s.operands, *self.launch_shape, x, p.b, *p.bounds, p.unknown, finest.stencil.d, finest.b, self.scalars, self.classify,
             self.sums.partials,
         ]  # fmt: skip
-        wp.launch(self.row_kernels.assess, s.threads, inputs, device=p.device)
-        self.sums.add_up(int(kernels.NORM), columns=3)
+        launch(self.row_kernels.assess, s.threads, inputs, device=p.device)
+        self.sums.add_up(int(kernels.NORM), columns=3, launch=launch)
 
     def read(self) -> float:
         """Read what the evaluation found."""
@@ -141,8 +141,7 @@ class MultigridWorkspace(IterateInBuffers):
         self._flat = kernels.flat_kernels(self.hierarchy.finest.stencil.d.dtype, real)
         self._spans = self.residual._reduction.spans
         self._rounded = problem.layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
-        self._graphs: dict[Any, Any] = {}
-        self._loaded: set[str] = set()
+        self._programs: dict[tuple[int, int], Program] = {}  # a truncated cycle from one buffer to another
         self._mask: wp.array[Any] | None = None
         self.floating: Any = None
         self._cycles_left, self._rises, self._carried = 0, 0, False
@@ -180,7 +179,7 @@ class MultigridWorkspace(IterateInBuffers):
         self._rebuild()
         before = [self.x, *p.bounds, p.unknown, finest.lower, finest.upper, self.residual.scalars]
         launch_spans(self._flat.gaps, self._spans, before, [], p.device)
-        self._replay("monotone", self.hierarchy.monotone_cycle)
+        self.hierarchy.monotone_cycle.run()
         out = self.fresh()
         launch_spans(self._flat.add, self._spans, [self.x, finest.x, *p.bounds, out, self.residual.scalars], [], p.device)
         wp.launch(kernels.rescale_kernel, 1, [self.residual.scalars], device=p.device)
@@ -202,8 +201,9 @@ class MultigridWorkspace(IterateInBuffers):
                 self.hierarchy.finest.stencil.product(self._p, self._ap)
         x, out = self.x, self.fresh()
         if self.floating is None and self._rounded is None:
-            self._replay((x.ptr, out.ptr), lambda: self._advance_to(x, out))
+            self._program(x, out).run()
         else:
+            self.hierarchy.cycle.run()
             self._correct(x, out)
             if self.floating is not None:
                 self.floating.settle(out, p.lower, p.upper)
@@ -217,23 +217,28 @@ class MultigridWorkspace(IterateInBuffers):
         self._count_rises(last)
         return Step("truncated cycle", 1, active)
 
-    def _advance_to(self, x: wp.array[Any], out: wp.array[Any]) -> None:
-        """Step from x to out and assess it."""
-        self._correct(x, out)
-        self.residual.assess(out)
+    def _program(self, x: wp.array[Any], out: wp.array[Any]) -> Program:
+        """Return the launches that step from x to out and assess it."""
+        program = self._programs.get((x.ptr, out.ptr))
+        if program is None:
+            program = self._programs[x.ptr, out.ptr] = Program(self.A.device)
+            program.extend(self.hierarchy.cycle)
+            self.residual.classify = True
+            self._correct(x, out, launch=program.launch)
+            self.residual.assess(out, launch=program.launch)
+        return program
 
-    def _correct(self, x: wp.array[Any], out: wp.array[Any]) -> None:
-        """Cycle, measure, step from x to out."""
+    def _correct(self, x: wp.array[Any], out: wp.array[Any], *, launch: Launch = wp.launch) -> None:
+        """Measure the cycle's correction, step from x to out."""
         p, residual, finest, device = self.problem, self.residual, self.hierarchy.finest, self.A.device
-        self.hierarchy.cycle()
-        finest.stencil.wrap(finest.x)
+        finest.stencil.wrap(finest.x, launch=launch)
         fields = [finest.x, self._p, self._ap, finest.b, finest.t, residual.sums.partials]
         inputs = [*finest.operands, finest.stencil.grain, *residual.launch_shape, *fields]
-        wp.launch(residual.row_kernels.measure, finest.stencil.threads, inputs, device=device)
-        residual.sums.add_up(int(kernels.ZAZ), columns=5)
-        wp.launch(kernels.plan_step_kernel, 1, [residual.scalars], device=device)
+        launch(residual.row_kernels.measure, finest.stencil.threads, inputs, device=device)
+        residual.sums.add_up(int(kernels.ZAZ), columns=5, launch=launch)
+        launch(kernels.plan_step_kernel, 1, [residual.scalars], device=device)
         before = [x, finest.x, finest.t, self._p, self._ap, *p.bounds, out, residual.scalars]
-        launch_spans(self._flat.update, self._spans, before, [], device)
+        launch_spans(self._flat.update, self._spans, before, [], device, launch=launch)
 
     def _rebuild(self) -> None:
         if self.residual.stale:
@@ -259,20 +264,6 @@ class MultigridWorkspace(IterateInBuffers):
             self._mask = self.problem.layout.zeros(wp.uint8)
         wp.launch(kernels.free_mask_kernel, free.size, [free, self._mask], device=self.A.device)
         self.floating.project(self.hierarchy.finest.b, self._mask)
-
-    def _replay(self, key: Any, launch: Callable[[], None]) -> None:
-        """Run launches as a captured graph; those of a kind are launched once before, so that every kernel is loaded."""
-        graph = self._graphs.get(key)
-        if graph is None:
-            kind = key if isinstance(key, str) else "cycle"
-            if kind not in self._loaded:
-                self._loaded.add(kind)
-                launch()
-                return
-            with wp.ScopedCapture(device=self.A.device, force_module_load=False) as capture:
-                launch()
-            graph = self._graphs[key] = capture.graph
-        wp.capture_launch(graph)
 
     def _round(self, x: wp.array[Any]) -> None:
         if self._rounded is not None:
