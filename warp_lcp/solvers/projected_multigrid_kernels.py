@@ -7,13 +7,13 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.native import C_TYPES, simd
+from warp_lcp.native import BLOCK, C_TYPES, simd
 from warp_lcp.operators.stencil_kernels import NEIGHBORS, StencilShape, row_start, stencil_head
 from warp_lcp.vector_kernels import BOUNDED, flat, span_end, span_start
 
 # Slots of the device scalars. NORM, MOVED and ACTIVE are sums of one pass, and so are ZAZ ... GP.
 NORM = wp.constant(0)  # squared norm of the natural residual
-MOVED = wp.constant(1)  # cells that entered or left the free set
+MOVED = wp.constant(1)  # not 0 if the free set has changed
 ACTIVE = wp.constant(2)  # unknowns held at a bound
 ZAZ = wp.constant(3)
 ZAP = wp.constant(4)
@@ -44,20 +44,26 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
 
     @wp.func_native(
         simd(
-            BOUNDED.replace("l_.data[i]", "l_.data[p + i]").replace("u_.data[i]", "u_.data[p + i]")
+            BLOCK
+            + BOUNDED.replace("l_.data[i]", "l_.data[p + i]").replace("u_.data[i]", "u_.data[p + i]")
             + stencil_head(variable, "double")
-            + f"""const T* x = x_.data + p; const T* b = b_.data + p; auto* g = g_.data + p; auto* free = free_.data + p;
-        const auto* m = m_.data + p; T s = 0; int moved = 0, active = 0;
+            + f"""typedef {C_TYPES[free_type]} F; F* free = free_.data + p;
+        const T* x = x_.data + p; const T* b = b_.data + p; auto* g = g_.data + p;
+        const auto* m = m_.data + p; T s = 0; int moved = 0, active = 0; unsigned char hold[M];
         with_bounds([&](auto lower, auto upper) {{
-            SIMD for (int k = 0; k < n; ++k) {{
-                const T e = unit*(T)d[k], v = e*x[k] - {NEIGHBORS[variable]}, y = (e != 0 ? v : (T)0) + b[k], f = e != 0 ? e : (T)1;
-                const T l = lower(k), u = upper(k), below = f*(x[k] - l), above = f*(x[k] - u);
-                const T least = below < y ? below : y, r0 = above > least ? above : least;
-                const bool in = m[k] == 1, held = in & classify & (((x[k] <= l) & (y >= 0)) | ((x[k] >= u) & (y <= 0)));
-                const T r = in ? r0 : (T)0;
-                s += r*r; active += held;
-                const auto now = (in & !held) ? d[k] : 0;
-                moved += free[k] != now; free[k] = now; g[k] = now != 0 ? -y*inverse : (T)0; }} }});
+            for (int begin = 0; begin < n; begin += M) {{
+                const int end = n - begin < M ? n : begin + (int)M; unsigned char changed = 0, count = 0;
+                SIMD for (int k = begin; k < end; ++k) {{
+                    const T e = unit*(T)d[k], v = e*x[k] - {NEIGHBORS[variable]}, y = (e != 0 ? v : (T)0) + b[k], f = e != 0 ? e : (T)1;
+                    const T l = lower(k), u = upper(k), below = f*(x[k] - l), above = f*(x[k] - u);
+                    const T least = below < y ? below : y, r0 = above > least ? above : least;
+                    const bool in = m[k] == 1, held = classify & (((x[k] <= l) & (y >= 0)) | ((x[k] >= u) & (y <= 0)));
+                    const T r = in ? r0 : (T)0;
+                    s += r*r; hold[k - begin] = held; g[k] = ((e != 0) & !held) ? -y*inverse : (T)0; }}
+                SIMD for (int k = begin; k < end; ++k) {{  // bytes only, where the diagonal is one
+                    const F now = hold[k - begin] ? (F)0 : (F)d[k]; const unsigned char one = free[k] != now, two = hold[k - begin] & m[k];
+                    changed |= one; count += two; free[k] = now; }}
+                moved += changed; active += count; }} }});
         out.data[t] = s; out.data[threads + t] = moved; out.data[2*threads + t] = active;"""
         )
     )
@@ -212,12 +218,15 @@ def plan_step_kernel(scalars: f64):
     """Beta and the step length from the measured products: the new direction is conjugate to the last one, the step minimizes along it."""
     zero = wp.float64(0.0)
     beta = zero
-    if scalars[CARRY] != zero and scalars[PAP] > zero:
+    curvature = scalars[ZAZ]
+    gain = scalars[GZ]
+    if scalars[CARRY] != zero and scalars[PAP] > zero:  # without a direction to carry, p and its products are meaningless
         beta = -scalars[ZAP] / scalars[PAP]
-    curvature = scalars[ZAZ] + beta * (wp.float64(2.0) * scalars[ZAP] + beta * scalars[PAP])
+        curvature += beta * (wp.float64(2.0) * scalars[ZAP] + beta * scalars[PAP])
+        gain += beta * scalars[GP]
     length = zero
     if curvature > zero:
-        length = (scalars[GZ] + beta * scalars[GP]) / curvature
+        length = gain / curvature
     scalars[BETA] = beta
     scalars[STEP] = length * scalars[SIZE]
     scalars[CARRY] = wp.float64(1.0)
