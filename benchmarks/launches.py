@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 
 SEED = 20150611
+COEFFICIENTS = ("wx", "wy", "wz", "face_x", "face_y", "face_z", "shift")  # absent where they are numbers
 
 
 @dataclass
@@ -40,35 +41,22 @@ class Launch:
 
     @property
     def name(self) -> str:
-        """Area and name of the kernel, types, and the flags that are set: `cycle.sweep uniform_uint8_float32 from_zero`."""
+        """Area and name of the kernel, types, flags that are set, fields that are absent: `cycle.sweep uniform_uint8_float32 from_zero`."""
         _, _, rest = self.kernel.module.name.partition(".")
         area, _, types = rest.partition(".")
         called = self.kernel.func.__name__.removesuffix("_kernel")
-        return " ".join(part for part in (f"{area}.{called}", types, *self.flags) if part)
-
-    @property
-    def labels(self) -> list[str]:
-        """Names of the kernel's arguments."""
-        return [a.label for a in self.kernel.adj.args]
-
-    @property
-    def flags(self) -> list[str]:
-        """Boolean arguments that are set."""
-        return [label for label, value in zip(self.labels, self.arguments, strict=True) if value is True]
+        absent = [f"-{label}" for label, a in self._given() if isinstance(a, wp.array) and a.size == 0 and label not in COEFFICIENTS]
+        flags = [label for label, value in self._given() if value is True]
+        return " ".join(part for part in (f"{area}.{called}", types, *flags, *absent) if part)
 
     @property
     def arrays(self) -> dict[str, wp.array[Any]]:
         """Arrays of numbers among the arguments; of those that are the same memory, the first."""
         found: dict[int, tuple[str, wp.array[Any]]] = {}
-        for label, value in zip(self.labels, self.arguments, strict=True):
+        for label, value in self._given():
             if isinstance(value, wp.array) and value.size > 0 and value.dtype in (wp.float32, wp.float64, wp.uint8, wp.int8):
                 found.setdefault(value.ptr, (label, value))
         return dict(found.values())
-
-    @property
-    def key(self) -> tuple[Any, ...]:
-        """What tells launches apart that do different work on fields of one size."""
-        return (self.name, *((label, a.size) for label, a in self.arrays.items()))
 
     def run(self) -> None:
         """Launch it again."""
@@ -76,6 +64,9 @@ class Launch:
             inputs = {"inputs": self.arguments, "device": self.device, "block_dim": self.block_dim}
             self._command = _plain_launch(self.kernel, self.dim, record_cmd=True, **inputs)
         self._command.launch()
+
+    def _given(self) -> list[tuple[str, Any]]:
+        return list(zip((a.label for a in self.kernel.adj.args), self.arguments, strict=True))
 
 
 @dataclass(frozen=True)
@@ -124,11 +115,11 @@ def listen() -> Iterator[list[Launch]]:
 
 def distinct(heard: list[Launch], smallest: int) -> list[Launch]:
     """Return one launch of each kind that touches a field of at least `smallest` elements, with counts."""
-    kinds: dict[tuple[Any, ...], Launch] = {}
+    kinds: dict[str, Launch] = {}
     for launch in heard:
         if max((a.size for a in launch.arrays.values()), default=0) < smallest:
             continue
-        kept = kinds.setdefault(launch.key, launch)
+        kept = kinds.setdefault(launch.name, launch)
         kept.count += kept is not launch
     return list(kinds.values())
 
@@ -145,7 +136,9 @@ def traffic(launch: Launch, sizes: dict[int, int]) -> Traffic:
     """
     arrays, random = launch.arrays, np.random.default_rng(SEED)
     before = {label: a.numpy().copy() for label, a in arrays.items()}
-    saved = {label: _other_values(random, values) if values.dtype.kind == "f" else values for label, values in before.items()}
+    floats = [label for label, values in before.items() if values.dtype.kind == "f"]
+    saved = before | {label: _other_values(random, before[label]) for label in floats}
+    saved |= {label: 1.5 + 0.5 * np.tanh(saved[label]) for label in floats if arrays[label].size not in sizes}  # scalars: lengths, norms
     _restore(arrays, saved)
     launch.run()
     expected = {label: a.numpy().copy() for label, a in arrays.items()}

@@ -11,6 +11,23 @@ SHORTEST_SAMPLE = 2e-3  # [s]: a sample repeats shorter work up to this, clock a
 
 
 @dataclass(frozen=True)
+class Options:
+    """What a suite is asked for.
+
+    Args:
+        device: Warp device.
+        sizes: cells along a side; empty for the suite's own.
+        repeat: samples of each timing.
+        say: takes a line about progress.
+    """
+
+    device: str
+    sizes: tuple[int, ...]
+    repeat: int
+    say: Callable[[str], object]
+
+
+@dataclass(frozen=True)
 class Figure:
     """A measured or counted number.
 

@@ -18,7 +18,7 @@ from fluids.scene import LiquidScene
 from fluids.wall import extend_velocity
 from warp_lcp.driver.scene import Scene, Solver
 from warp_lcp.driver.simulator import Cells, Points, SimulationFailed, StepFailed
-from warp_lcp.grid.advection import advect
+from warp_lcp.grid.advection import advect, clearance
 from warp_lcp.grid.particles import MARGIN, Particles, ParticleTotals, seed
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid, Window
@@ -88,6 +88,7 @@ class LiquidSimulation:
             grid, solids, _method(settings), tolerance=settings.tolerance, max_iterations=settings.max_iterations,
             wall_velocity=wall_velocity,
         )  # fmt: skip
+        self._clearance = clearance(grid, self.projection.kind)
         self.layers = math.ceil(scene.time.cfl) + 2
         particles.sort()
         self.projection.mark(particles.key, particles.count)
@@ -112,9 +113,11 @@ class LiquidSimulation:
             raise ValueError(f"dt = {dt}: must be a positive time [s]")
         particles, grid, velocity = self.particles, self.grid, self.velocity
         before = self._checked_totals("at the start of")
-        particles.sort()
+        particles.arrange(self.step_count)
         window = self._window(before)
-        particles_to_faces(grid, particles.position, particles.velocity, particles.affine, velocity, self.weights, window=window)
+        particles_to_faces(
+            grid, particles.position, particles.velocity, particles.affine, velocity, self.weights, window=window, offsets=particles.offsets
+        )
         for field, saved in zip(velocity, self._saved or (), strict=False):
             wp.copy(saved, field)
         accelerate(window, velocity, self.weights, self.gravity * dt)
@@ -124,7 +127,7 @@ class LiquidSimulation:
         flip = self.scene.particles.flip_ratio if self._saved else 0.0
         faces_to_particles(grid, velocity, particles.position, particles.velocity, particles.affine, saved=self._saved, flip=flip)
         self._stopped.zero_()
-        advect(grid, velocity, p.kind, dt, particles.position, self._stopped)
+        advect(grid, velocity, self._clearance, dt, particles.position, self._stopped)
         after = self._checked_totals("after")
         self.time += dt
         self.step_count += 1
@@ -280,9 +283,8 @@ class LiquidSimulation:
 
 def _method(settings: Solver) -> Any:
     """Return the solver that a scene names."""
-    if settings.method == "psor":
-        return wl.ProjectedSOR(precision=settings.precision)
-    return wl.MinimumMapNewton(precision=settings.precision)
+    methods = {"projected-multigrid": wl.ProjectedMultigrid, "minimum-map-newton": wl.MinimumMapNewton, "psor": wl.ProjectedSOR}
+    return methods[settings.method](precision=settings.precision)
 
 
 def _region(geometry: Geometry, device: wp.Device) -> Callable[[np.ndarray], np.ndarray]:

@@ -40,7 +40,7 @@ def test_defaults_and_derived_numbers():
     assert (scene.dimension, scene.cell_counts, scene.spacing) == (2, (64, 32, 1), 0.025)
     assert scene.physics.gravity == [0.0, -9.81]
     assert scene.time.frame_count == 30
-    assert (scene.solver.method, scene.domain.wall, scene.output.checkpoint_every) == ("minimum-map-newton", "separating", 50)
+    assert (scene.solver.method, scene.domain.wall, scene.output.checkpoint_every) == ("projected-multigrid", "separating", 50)
 
 
 def test_three_dimensions():

@@ -59,7 +59,7 @@ def test_the_log_holds_what_the_particles_have() -> None:
     assert row["center_of_mass_y"] == pytest.approx(x[:, 1].mean(), rel=1e-6)
     assert row["max_speed"] == pytest.approx(np.linalg.norm(v, axis=1).max(), rel=1e-6)
     assert row["cfl"] == pytest.approx(row["max_speed"] * row["dt"] / simulation.grid.spacing)
-    assert row["solver"] == "minimum-map-newton"
+    assert row["solver"] == "projected-multigrid"
     assert row["solve_iterations"] >= 0
     assert row["linear_iterations"] >= row["solve_iterations"]
 

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from warp_lcp import AIR, FLUID, SOLID
-from warp_lcp.grid.advection import advect
+from warp_lcp.grid.advection import advect, clearance
 from warp_lcp.grid.particles import MARGIN
 from warp_lcp.grid.staggered import StaggeredGrid
 
@@ -23,7 +23,7 @@ def cells_of(grid: StaggeredGrid, solid: np.ndarray | None = None) -> wp.array:
 def move(grid: StaggeredGrid, fields: list[wp.array], cells: wp.array, dt: float, points: np.ndarray) -> tuple[np.ndarray, int]:
     position = wp.array(np.asarray(points, dtype=np.float32), dtype=wp.vec3, device="cpu")
     stopped = wp.zeros(1, dtype=wp.int32, device="cpu")
-    advect(grid, fields, cells, dt, position, stopped)
+    advect(grid, fields, clearance(grid, cells), dt, position, stopped)
     return position.numpy(), int(stopped.numpy()[0])
 
 

@@ -29,7 +29,7 @@ def masked_hierarchy(cells, free, periodic, device, settings=None, real=wp.float
     return A, hierarchy
 
 
-def level_matrix(stencil):
+def level_matrix(stencil, real=wp.float64):
     """Dense matrix of a level, column by column through its own product."""
     counts, shape = stencil.padding.counts, stencil.padding.shape
     columns = []
@@ -37,7 +37,7 @@ def level_matrix(stencil):
         e = np.zeros(counts)
         e.ravel()[i] = 1
         e *= stencil.d.numpy().reshape(shape)[1:-1, 1:-1, 1:-1] != 0
-        x = wp.array(np.pad(e, 1).ravel(), dtype=wp.float64, device=stencil.device)
+        x = wp.array(np.pad(e, 1).ravel(), dtype=real, device=stencil.device)
         y = wp.zeros_like(x)
         stencil.product(x, y)
         columns.append(y.numpy().reshape(shape)[1:-1, 1:-1, 1:-1].ravel())
@@ -64,7 +64,7 @@ def test_coarse_levels_are_galerkin_products(shape, periodic, arrays, device):
         face = rng.uniform(0.1, 1.0, (*shape[:-1], shape[-1] + 1))
         face[..., -1] = face[..., 0]
         faces["face_x"] = face
-    settings = CycleSettings(coarsest_cpu=1, coarsest_cuda=1)
+    settings = CycleSettings(coarsest_cpu=1, coarsest_cuda=1, excess=1.0, semi=0.0)
     _, hierarchy = masked_hierarchy(cells, free, periodic, device, settings, **faces)
     p = (free & (cells == wl.FLUID)).ravel()
     expected = assemble(cells, [faces.get("face_x", 1.0), 1.0, 1.0], periodic=periodic) * np.outer(p, p)
@@ -72,6 +72,30 @@ def test_coarse_levels_are_galerkin_products(shape, periodic, arrays, device):
         P = aggregation(fine.stencil.padding.counts)
         expected = P.T @ expected @ P
         np.testing.assert_allclose(level_matrix(coarse.stencil), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("strength", [(1.0, 1.0, 100.0), (100.0, 1.0, 100.0), (1.0, 1.0, 1.0)])
+def test_only_strong_axes_are_coarsened_until_the_others_have_caught_up(strength, device):
+    cells = np.full((16, 16, 16), wl.FLUID)
+    A = wl.GridPoisson(cells, **{f"face_{a}": c for a, c in zip("xyz", strength, strict=True)}, device=device)
+    hierarchy = Hierarchy(A.stencil, wp.float32, bounded=False)
+    factors = [(lv.aggregates.fx, lv.aggregates.fy, lv.aggregates.fz) for lv in hierarchy.levels[1:]]
+    strong = max(strength)
+    assert factors[0] == tuple(2 if s == strong else 1 for s in strength)
+    assert np.prod(hierarchy.levels[-1].stencil.padding.counts) <= 64
+
+
+@pytest.mark.parametrize("strength", [(1.0, 1.0, 100.0), (1.0, 100.0, 1.0), (100.0, 1.0, 100.0), (1e-3, 1.0, 1.0)])
+def test_the_row_sums_of_coarse_levels_are_never_negative(strength, device):
+    """Diagonals are sums of positive numbers: taking inner faces off them in float32 would leave an indefinite level."""
+    cells = np.random.default_rng(73).choice(3, (24, 24, 24), p=[0.02, 0.9, 0.08])
+    A = wl.GridPoisson(cells, **{f"face_{a}": c for a, c in zip("xyz", strength, strict=True)}, device=device)
+    hierarchy = Hierarchy(A.stencil, wp.float32, bounded=False)
+    wp.copy(hierarchy.finest.stencil.d, A.stencil.d)
+    hierarchy.rebuild()
+    for level in hierarchy.levels[1:]:
+        matrix = level_matrix(level.stencil, wp.float32)
+        assert (matrix.sum(axis=1) >= -1e-6 * np.diag(matrix)).all()
 
 
 @pytest.mark.parametrize("gamma", [1, 2])

@@ -69,3 +69,23 @@ def test_solution_does_not_depend_on_the_monotone_cycles(bounds):
         np.testing.assert_allclose(result.x.numpy(), results[0].x.numpy(), atol=1e-8 * np.abs(results[0].x.numpy()).max())
     sweeps = wl.solve(problem, wl.ProjectedSOR(omega=1.8), stopping=wl.StoppingCriteria(rtol=1e-8, max_iterations=5000))
     np.testing.assert_allclose(sweeps.x.numpy(), results[1].x.numpy(), atol=1e-5 * np.abs(results[0].x.numpy()).max())
+
+
+@pytest.mark.parametrize("strength", [(1.0, 1.0, 100.0), (1.0, 100.0, 1.0), (100.0, 1.0, 1.0), (1.0, 100.0, 100.0), (1.0, 10.0, 1000.0)])
+@pytest.mark.parametrize("bounds", BOUNDS)
+def test_anisotropy_costs_at_most_twice_the_isotropic_iterations(bounds, strength):
+    cells, b, wall = splash(32)
+    lower = {"none": -np.inf, "walls": np.where(wall, 0.0, -np.inf), "everywhere": 0.0}[bounds]
+    faces = {f"face_{a}": c for a, c in zip("xyz", strength, strict=True)}
+    results = [wl.solve(wl.LCP(wl.GridPoisson(cells, **f, device="cpu"), b, lower), wl.ProjectedMultigrid()) for f in ({}, faces)]
+    assert all(results)
+    assert results[1].iterations <= 2 * results[0].iterations
+
+
+def test_convergence_to_ten_digits():
+    cells, b, wall = splash(32)
+    for lower in (-np.inf, np.where(wall, 0.0, -np.inf), 0.0):
+        problem = wl.LCP(wl.GridPoisson(cells, device="cpu"), b, lower)
+        result = wl.solve(problem, wl.ProjectedMultigrid(), stopping=wl.StoppingCriteria(rtol=1e-10))
+        assert result, result.status
+        assert result.iterations <= 16

@@ -67,7 +67,9 @@ class Solver(Table):
     """[solver]: the method for the complementarity problem of every step, and how far it goes."""
 
     later: ClassVar = {"preset": ANY_VALUE}
-    method: Literal["minimum-map-newton", "psor"] = Field(default="minimum-map-newton", description="psor is simple and slow")
+    method: Literal["projected-multigrid", "minimum-map-newton", "psor"] = Field(
+        default="projected-multigrid", description="projected-multigrid is the fastest, psor simple and slow"
+    )
     tolerance: float = Field(default=1e-4, gt=0, lt=1, description="the relative residual to reach")
     precision: Literal["mixed", "single", "double"] = Field(default="mixed", description="of the method's arithmetic")
     max_iterations: int = Field(default=100, ge=1, description="iterations before the step counts as failed")

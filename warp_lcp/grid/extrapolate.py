@@ -5,9 +5,61 @@ import typing
 import warp as wp
 
 from warp_lcp.grid.staggered import CellRange, Window
+from warp_lcp.native import BLOCK, simd
 
 BLOCKED = -1  # not to be filled
 UNKNOWN = 0  # to be filled; positive: known since that layer, 1 from the start
+
+# Faces first <= i < last of a row. A pass over the marks finds what to fill, so that rows without any cost a byte a face: with one thread
+# a face the extrapolation of a step took 57 ns a particle, in this form it takes 6.
+FILL_ROW = """
+    const int nz = known_.shape[0], ny = known_.shape[1], nx = known_.shape[2];
+    const long long s2 = nx, s1 = s2*ny, row = k*s1 + j*s2;
+    signed char* known = (signed char*)known_.data + row; float* field = field_.data + row;
+    // where there is no neighboring row the row itself stands in for it, and no mark is low enough to be a source
+    const long long a = j > 0 ? -s2 : 0, b = j + 1 < ny ? s2 : 0, c = k > 0 ? -s1 : 0, d = k + 1 < nz ? s1 : 0;
+    const signed char now = (signed char)layer;
+    const signed char la = a ? now : 0, lb = b ? now : 0, lc = c ? now : 0, ld = d ? now : 0;
+    auto source = [](signed char mark, signed char limit) { return (unsigned char)((mark > 0) & (mark <= limit)); };
+    auto wanted = [&](long long i, signed char low, signed char high) {
+        return (unsigned char)((known[i] == fill) & (source(known[i - (low > 0)], low) | source(known[i + (high > 0)], high)
+            | source(known[i + a], la) | source(known[i + b], lb) | source(known[i + c], lc) | source(known[i + d], ld)));
+    };
+    auto mean = [&](long long i, signed char low, signed char high) {
+        const int x0 = source(known[i - (low > 0)], low), x1 = source(known[i + (high > 0)], high), y0 = source(known[i + a], la);
+        const int y1 = source(known[i + b], lb), z0 = source(known[i + c], lc), z1 = source(known[i + d], ld);
+        const float total = (x0 ? field[i - (low > 0)] : 0.0f) + (x1 ? field[i + (high > 0)] : 0.0f) + (y0 ? field[i + a] : 0.0f)
+            + (y1 ? field[i + b] : 0.0f) + (z0 ? field[i + c] : 0.0f) + (z1 ? field[i + d] : 0.0f);
+        return total/(float)(x0 + x1 + y0 + y1 + z0 + z1);
+    };
+    auto fill_one = [&](long long i) {
+        const signed char low = i > 0 ? now : 0, high = i + 1 < nx ? now : 0;
+        if (wanted(i, low, high)) { field[i] = mean(i, low, high); known[i] = now + 1; }
+    };
+    #ifdef __CUDA_ARCH__
+    for (int i = first; i < last; ++i) fill_one(i);
+    #else
+    if (first == 0) fill_one(0);
+    const int from = first > 0 ? first : 1, end = last < nx ? last : nx - 1;
+    for (int start = from; start < end; start += M) {
+        const int n = end - start < M ? end - start : M;
+        unsigned char fills[M], any = 0;
+        SIMD for (int m = 0; m < n; ++m) { const unsigned char w = wanted(start + m, now, now); fills[m] = w; any |= w; }
+        if (!any) continue;
+        SIMD for (int m = 0; m < n; ++m) {
+            const float value = mean(start + m, now, now);
+            field[start + m] = fills[m] ? value : field[start + m];
+        }
+        SIMD for (int m = 0; m < n; ++m) known[start + m] = fills[m] ? (signed char)(now + 1) : known[start + m];
+    }
+    if (last == nx && nx > 1) fill_one(nx - 1);
+    #endif
+"""
+
+
+@wp.func_native(simd(BLOCK + FILL_ROW))
+@typing.no_type_check
+def fill_row(known_: wp.array3d(dtype=wp.int8), field_: wp.array3d(dtype=wp.float32), layer: int, fill: int, k: int, j: int, first: int, last: int): ...  # noqa: D103,E501 # fmt: skip
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.extrapolate")
@@ -18,30 +70,8 @@ def layer_kernel(cells: CellRange, known: wp.array3d(dtype=wp.int8), field: wp.a
     In place without a race: a face that another thread fills in this launch is marked `fill` or layer + 1 and is not read either way.
     """
     plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
     first = cells.i + chunk * cells.grain
-    nz = known.shape[0]
-    ny = known.shape[1]
-    nx = known.shape[2]
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        if int(known[k, j, i]) == fill:
-            total = float(0.0)
-            count = float(0.0)
-            for n in range(6):
-                side = 2 * (n & 1) - 1
-                axis = n >> 1
-                a = i + wp.where(axis == 0, side, 0)
-                b = j + wp.where(axis == 1, side, 0)
-                c = k + wp.where(axis == 2, side, 0)
-                if a >= 0 and a < nx and b >= 0 and b < ny and c >= 0 and c < nz:
-                    mark = int(known[c, b, a])
-                    if mark > 0 and mark <= layer:
-                        total += field[c, b, a]
-                        count += 1.0
-            if count > 0.0:
-                field[k, j, i] = total / count
-                known[k, j, i] = wp.int8(layer + 1)
+    fill_row(known, field, layer, fill, cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end))
 
 
 def extrapolate(window: Window, known: wp.array, field: wp.array, layers: int, *, start: int = 1, fill: int = UNKNOWN) -> None:

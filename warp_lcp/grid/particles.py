@@ -1,7 +1,4 @@
-"""Particles sorted by cell: positions, velocities and the gradients that APIC carries.
-
-In cell order a scatter of momentum costs a seventh of what it costs in random order, a gather a quarter; sorting pays every step.
-"""
+"""Particles in about the order of their cells: positions, velocities and the gradients that APIC carries."""
 
 import typing
 from dataclasses import dataclass
@@ -9,89 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warp_lcp.grid.staggered import StaggeredGrid, cell_index
+from warp_lcp.grid import particles_kernels as kernels
+from warp_lcp.grid.advection_kernels import MARGIN
+from warp_lcp.grid.particle_loops import launch
+from warp_lcp.grid.staggered import StaggeredGrid
 
-MARGIN = 1e-3  # how far from a wall particles stay, in cells: well above the rounding of float32 positions in 10^3 cells
 CHUNK = 256  # the fewest particles that one thread adds up
 THREADS = 1024  # the most threads of a sum, each a partial result that the host reads
-COLUMNS = 13  # of a partial result, see `total_kernel`
-
-
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")
-@typing.no_type_check
-def key_kernel(
-    position: wp.array(dtype=wp.vec3),
-    inverse_dx: float,
-    nx: int,
-    ny: int,
-    nz: int,
-    key: wp.array(dtype=wp.int32),
-    order: wp.array(dtype=wp.int32),
-):
-    """Number the stored cell that each particle lies in; in 2-D nz = 1 and its plane is k = 1 whatever z is."""
-    p = wp.tid()
-    x = position[p] * inverse_dx
-    i = cell_index(x[0] + 1.0, nx)
-    j = cell_index(x[1] + 1.0, ny)
-    k = cell_index(x[2] + 1.0, nz)
-    key[p] = (k * (ny + 2) + j) * (nx + 2) + i
-    order[p] = p
-
-
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")
-@typing.no_type_check
-def reorder_kernel(order: wp.array(dtype=wp.int32), source: wp.array(dtype=wp.vec3), target: wp.array(dtype=wp.vec3)):
-    """Take the particles in a new order."""
-    p = wp.tid()
-    target[p] = source[order[p]]
-
-
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")
-@typing.no_type_check
-def total_kernel(
-    position: wp.array(dtype=wp.vec3),
-    velocity: wp.array(dtype=wp.vec3),
-    count: int,
-    chunk: int,
-    out: wp.array2d(dtype=wp.float64),
-):
-    """Add up a chunk of particles: [0] |v|^2, [1-3] x, [4-6] lowest x, [7-9] highest x, [10] largest |v|^2, [11-12] bad x and v."""
-    t = wp.tid()
-    squares = wp.float64(0.0)
-    sx = wp.float64(0.0)
-    sy = wp.float64(0.0)
-    sz = wp.float64(0.0)
-    first = position[t * chunk]
-    low = first
-    high = first
-    fastest = float(0.0)
-    bad_positions = float(0.0)
-    bad_velocities = float(0.0)
-    for p in range(t * chunk, wp.min((t + 1) * chunk, count)):
-        x = position[p]
-        v = velocity[p]
-        speed = wp.dot(v, v)
-        squares += wp.float64(speed)
-        sx += wp.float64(x[0])
-        sy += wp.float64(x[1])
-        sz += wp.float64(x[2])
-        low = wp.min(low, x)
-        high = wp.max(high, x)
-        fastest = wp.max(fastest, speed)
-        if not wp.isfinite(speed):
-            bad_velocities += 1.0
-        if not wp.isfinite(x[0] + x[1] + x[2]):
-            bad_positions += 1.0
-    out[t, 0] = squares
-    out[t, 1] = sx
-    out[t, 2] = sy
-    out[t, 3] = sz
-    for a in range(3):
-        out[t, 4 + a] = wp.float64(low[a])
-        out[t, 7 + a] = wp.float64(high[a])
-    out[t, 10] = wp.float64(fastest)
-    out[t, 11] = wp.float64(bad_positions)
-    out[t, 12] = wp.float64(bad_velocities)
+GROWTH = 1.5  # of the storage when it is full: n appended particles are copied 2 n times at most, a third of it lies idle at most
+SORT_EVERY = 8  # steps between sorts where nothing needs the order: the transfers get no slower in 16 steps at CFL 2, a sort costs 25 ns
 
 
 @dataclass(frozen=True)
@@ -124,68 +47,147 @@ class ParticleTotals:
         return self.bad_positions == 0 and self.bad_velocities == 0
 
 
+class Column:
+    """A vector for each particle, in storage that may have room for more.
+
+    Attributes:
+        store: wp.vec3, shape (capacity,).
+        view: the part in use, shape (count,).
+    """
+
+    def __init__(self, capacity: int, count: int, device: wp.Device) -> None:
+        """Allocate zeros."""
+        self.store = wp.zeros(capacity, dtype=wp.vec3, device=device)
+        self.view = self.store[:count]
+
+
 class Particles:
-    """Hold a fixed number of particles in arrays that are sorted by cell in place.
+    """Hold particles in arrays that are sorted by cell in place.
 
     Args:
         grid: the grid whose cells order the particles.
         position: [m], shape (n, 3), n > 0; z = 0 in 2-D.
         velocity: [m/s], shape (n, 3).
         affine: also carry the gradient of each velocity component [1/s].
+        indexed: sort every step and know where each cell's particles begin, for transfers that gather; those that need it on CUDA are
+            the default there.
 
     Attributes:
-        position: [m], wp.vec3, shape (n,).
-        velocity: [m/s], wp.vec3, shape (n,).
-        affine: gradient of each component [1/s], wp.vec3, shape (n,) each; empty without `affine`.
-        key: number of the stored cell of each particle at the last sort, shape (2 n,), the first n in use.
+        count: particles.
+        key: number of the stored cell of each particle when last numbered or sorted, shape (2 capacity,), the first `count` in use.
+        offsets: first particle of each stored cell, int32, shape (cells + 1,), at the last sort; None unless `indexed`.
 
     Raises:
         ValueError: the shapes do not match or there is no particle.
     """
 
-    def __init__(self, grid: StaggeredGrid, position: np.ndarray, velocity: np.ndarray, *, affine: bool) -> None:
+    def __init__(
+        self, grid: StaggeredGrid, position: np.ndarray, velocity: np.ndarray, *, affine: bool, indexed: bool | None = None
+    ) -> None:
         """Copy the particles to the device."""
-        n = len(position)
-        if n == 0 or position.shape != (n, 3) or velocity.shape != (n, 3):
-            raise ValueError(f"position {position.shape} and velocity {velocity.shape}: must both be (n, 3) with n > 0")
-        self.grid, self.count = grid, n
-        self.position = self._vectors(position)
-        self.velocity = self._vectors(velocity)
-        self.affine = [self._vectors() for _ in range(grid.dimension)] if affine else []
-        self.key = wp.zeros(2 * n, dtype=wp.int32, device=grid.device)
-        self._order = wp.zeros(2 * n, dtype=wp.int32, device=grid.device)
-        self._spare = self._vectors()
-        self._chunk = max(CHUNK, -(-n // THREADS))
-        self._partials = wp.zeros((-(-n // self._chunk), COLUMNS), dtype=wp.float64, device=grid.device)
+        _check_shapes(position, velocity)
+        if len(position) == 0:
+            raise ValueError("position has shape (0, 3): must be (n, 3) with n > 0")
+        self.grid, self.count, self._capacity = grid, 0, 0
+        indexed = grid.device.is_cuda if indexed is None else indexed
+        self.offsets = wp.zeros(grid.size + 1, dtype=wp.int32, device=grid.device) if indexed else None
+        self._names = ["position", "velocity", *(f"affine_{c}" for c in range(grid.dimension if affine else 0))]
+        self._partials = wp.zeros((THREADS, kernels.COLUMNS), dtype=wp.float64, device=grid.device)
+        self._columns: dict[str, Column] = {}
+        self.append(position, velocity)
 
-    def _vectors(self, host: np.ndarray | None = None) -> wp.array:
-        if host is None:
-            return wp.zeros(self.count, dtype=wp.vec3, device=self.grid.device)
-        return wp.array(np.ascontiguousarray(host, dtype=np.float32), dtype=wp.vec3, device=self.grid.device)
+    @property
+    def capacity(self) -> int:
+        """Particles that fit before the storage grows."""
+        return self._capacity
+
+    @property
+    def position(self) -> wp.array:
+        """[m], wp.vec3, shape (count,)."""
+        return self._columns["position"].view
+
+    @property
+    def velocity(self) -> wp.array:
+        """[m/s], wp.vec3, shape (count,)."""
+        return self._columns["velocity"].view
+
+    @property
+    def affine(self) -> list[wp.array]:
+        """Gradient of each component [1/s], wp.vec3, shape (count,) each; empty without `affine`."""
+        return [self._columns[name].view for name in self._names[2:]]
+
+    def append(self, position: np.ndarray, velocity: np.ndarray) -> None:
+        """Add particles behind the others, without a gradient; they are out of order until the next sort.
+
+        Args:
+            position: [m], shape (n, 3).
+            velocity: [m/s], shape (n, 3).
+
+        Raises:
+            ValueError: the shapes do not match.
+        """
+        _check_shapes(position, velocity)
+        before, self.count = self.count, self.count + len(position)
+        if self.count > self._capacity:
+            self._grow(before)
+        for column in (*self._columns.values(), self._spare):
+            column.view = column.store[: self.count]
+        for name, host in (("position", position), ("velocity", velocity)):
+            if len(host):
+                self._columns[name].view[before:].assign(np.ascontiguousarray(host, dtype=np.float32))
+        for gradient in self.affine:
+            gradient[before:].zero_()  # sorting may have left anything behind the particles in use
+
+    def _grow(self, before: int) -> None:
+        """Make room for `count` particles and more, and keep those there were `before`."""
+        device = self.grid.device
+        self._capacity = max(self.count, int(GROWTH * self._capacity))
+        for name in self._names:
+            column = Column(self._capacity, self.count, device)
+            if before:
+                wp.copy(column.store, self._columns[name].store, count=before)
+            self._columns[name] = column
+        self._spare = Column(self._capacity, self.count, device)
+        self.key = wp.zeros(2 * self._capacity, dtype=wp.int32, device=device)
+        self._order = wp.zeros(2 * self._capacity, dtype=wp.int32, device=device)
+
+    def arrange(self, step: int) -> None:
+        """Number the particles by cell, and sort them in every SORT_EVERY-th step, or in each where the order is needed.
+
+        It depends on nothing but the step, so that a run that was interrupted does the same.
+
+        Args:
+            step: number of the step.
+        """
+        if self.offsets is not None or step % SORT_EVERY == 0:
+            self.sort()
+        else:
+            self.number()
+
+    def number(self) -> None:
+        """Find the cell of each particle."""
+        grid = self.grid
+        launch(kernels.number_kernel, self.count, [1.0 / grid.spacing, *grid.counts, self.position, self.key], grid.device)
 
     def sort(self) -> None:
         """Bring the particles into the order of their cells; equal cells keep their order, so that a run is repeatable."""
         grid = self.grid
-        nx, ny, nz = grid.counts
-        inputs = [self.position, 1.0 / grid.spacing, nx, ny, nz, self.key, self._order]
-        wp.launch(key_kernel, self.count, inputs, device=grid.device)
+        self.number()
+        wp.launch(kernels.count_up_kernel, self.count, [self._order], device=grid.device)
         wp.utils.radix_sort_pairs(self.key, self._order, self.count, end_bit=grid.size.bit_length())
-        self.position = self._reordered(self.position)
-        self.velocity = self._reordered(self.velocity)
-        for c in range(len(self.affine)):
-            self.affine[c] = self._reordered(self.affine[c])
-
-    def _reordered(self, source: wp.array) -> wp.array:
-        target = self._spare
-        wp.launch(reorder_kernel, self.count, [self._order, source, target], device=self.grid.device)
-        self._spare = source
-        return target
+        for name, column in self._columns.items():
+            wp.launch(kernels.reorder_kernel, self.count, [self._order, column.view, self._spare.view], device=grid.device)
+            self._columns[name], self._spare = self._spare, column
+        if self.offsets is not None:
+            wp.launch(kernels.offset_kernel, grid.size + 1, [self.key, self.count, self.offsets], device=grid.device)
 
     def totals(self) -> ParticleTotals:
         """Return sums over the particles as they are now; the same bits on every run."""
-        inputs = [self.position, self.velocity, self.count, self._chunk, self._partials]
-        wp.launch(total_kernel, self._partials.shape[0], inputs, device=self.grid.device)
-        part = self._partials.numpy()
+        chunk = max(CHUNK, -(-self.count // THREADS))
+        rows = -(-self.count // chunk)
+        inputs = [self.count, chunk, self.position, self.velocity, self._partials]
+        wp.launch(kernels.total_kernel, rows, inputs, device=self.grid.device)
+        part = self._partials.numpy()[:rows]
         with np.errstate(invalid="ignore"):  # sums of values that are not finite: counted in the last two columns
             total = part.sum(axis=0)
         return ParticleTotals(
@@ -206,8 +208,12 @@ class Particles:
 
     def arrays(self) -> dict[str, wp.array]:
         """Return the particles' arrays by name."""
-        named = {"position": self.position, "velocity": self.velocity}
-        return named | {f"affine_{c}": gradient for c, gradient in enumerate(self.affine)}
+        return {name: column.view for name, column in self._columns.items()}
+
+
+def _check_shapes(position: np.ndarray, velocity: np.ndarray) -> None:
+    if position.shape != (len(position), 3) or velocity.shape != position.shape:
+        raise ValueError(f"position {position.shape} and velocity {velocity.shape}: must both be (n, 3)")
 
 
 def lattice(grid: StaggeredGrid, per_axis: int, jitter: float, rng: np.random.Generator, plane: int) -> np.ndarray:

@@ -10,6 +10,7 @@ from typing import Any
 
 import warp as wp
 
+from warp_lcp.multigrid.cycle_kernels import Aggregates, first_cell, one_plane, one_row
 from warp_lcp.native import BLOCK, C_TYPES, simd
 from warp_lcp.operators.stencil_kernels import StencilShape, row_start
 
@@ -28,85 +29,146 @@ def lower_weight(w: wp.array3d(dtype=Any), uniform: wp.float64, k: int, j: int, 
     return c
 
 
+@wp.struct
+class Wraps:
+    """Offsets from a row of the finer level to the rows around it; 0 where there is none. Wrapped ones on periodic axes."""
+
+    below_x: wp.int64  # of the first cell
+    above_x: wp.int64  # of the last cell
+    below_y: wp.int64
+    above_y: wp.int64
+    below_z: wp.int64
+    above_z: wp.int64
+
+
+@wp.func
+def below(first: bool, periodic: int, step: wp.int64, n: int):
+    """Offset to the row or plane below."""
+    o = -step
+    if first:
+        o = wp.int64(0)
+        if periodic != 0:
+            o = wp.int64(n - 1) * step
+    return o
+
+
+@wp.func
+def above(last: bool, periodic: int, step: wp.int64, n: int):
+    """Offset to the row or plane above."""
+    o = step
+    if last:
+        o = wp.int64(0)
+        if periodic != 0:
+            o = wp.int64(1 - n) * step
+    return o
+
+
 @functools.cache
 def coarsen_kernels(variable: bool, d_type: Any, real: Any) -> Any:
-    """Return the kernel that makes one coarse row a thread on the CPU, one aggregate a thread on CUDA."""
+    """Return the kernel that makes one coarse row a thread on the CPU, one aggregate a thread on CUDA.
+
+    A cell's excess is its diagonal less its faces to other unknowns: what AIR, held unknowns and the shift contribute. An aggregate's
+    diagonal is the sum of its cells' excesses plus its outer faces, a sum of positive numbers: taking inner faces off the diagonals would
+    cancel. Weights along axes that are not aggregated are not too stiff, so they are multiplied by `stiffen`, the over-correction that the
+    prolongation applies to all; the excess, whose held neighbors are one cell and not one aggregate away, by `held`.
+    """
     name = f"warp_lcp.coarsen.{'variable' if variable else 'uniform'}_{d_type.__name__}_{real.__name__}"
     d_array, field = wp.array(dtype=d_type), wp.array(dtype=real)
 
-    def weight(axis: str) -> str:
-        return f"(T)w{axis}_.data[p + k]" if variable else f"(T)A.c{axis}"
+    def faces(axis: str, side: str, shift: str) -> str:
+        """Weights of a row's faces to the row at offset `at`, into the buffer f; the face itself is stored `shift` after the cell."""
+        weight = f"(T)w{axis}_.data[p + k + {shift}]" if variable else f"(T)A.c{axis}"
+        return f"""{{ const long long at = {side}_{axis}; const bool outer = outer_{side}_{axis};
+                    if (at != 0) {{
+                        SIMD for (int k = 0; k < fx*m; ++k) {{
+                            const T w = {weight}, f = (d_.data[p + k] != 0) & (d_.data[p + at + k] != 0) ? w : (T)0;
+                            e[k] -= f; {side[0]}{axis}[k] += outer ? f : (T)0; }}
+                    }} }}"""
 
-    def along(axis: str) -> str:
-        """Faces towards the row below along y or z: inside the aggregate for its upper rows, between aggregates for the lower."""
-        return f"""if (has_{axis}) {{
-                    const long long q = p + to_{axis}; T* sum = inside_{axis} ? inner : outer_{axis};
-                    SIMD for (int k = 0; k < 2*m; ++k) {{
-                        const T w = {weight(axis)}; sum[k] += (d_.data[p + k] != 0) & (d_.data[q + k] != 0) ? w : (T)0; }}
-                }}"""
+    wx_at = "(T)wx_.data[p + k]" if variable else "(T)A.cx"
+    wx_above = "(T)wx_.data[p + k + 1]" if variable else "(T)A.cx"
 
     @wp.func_native(
         simd(
             BLOCK
-            + f"""typedef {C_TYPES[real]} T; const T unit = (T)A.unit;
-        T total[2*M], inner[2*M], outer_y[2*M], outer_z[2*M], x[2*M + 1];
+            + f"""typedef {C_TYPES[real]} T; const T unit = (T)A.unit; const int last_cell = A.nx - 1 - fx*start;
+        T excess[2*M], bx[2*M], ax[2*M], by[2*M], ay[2*M], bz[2*M], az[2*M], e[2*M];
         for (int begin = 0; begin < n; begin += M) {{
             const int m = n - begin < M ? n - begin : (int)M;
-            SIMD for (int k = 0; k < 2*m; ++k) {{ total[k] = 0; inner[k] = 0; outer_y[k] = 0; outer_z[k] = 0; x[k] = 0; }}
+            SIMD for (int k = 0; k < fx*m; ++k) {{
+                excess[k] = 0; bx[k] = 0; ax[k] = 0; by[k] = 0; ay[k] = 0; bz[k] = 0; az[k] = 0; }}
             for (int row = 0; row < 4; ++row) {{
                 const bool upper_z = row >> 1, upper_y = row & 1;
                 if ((upper_z && one_plane) || (upper_y && one_row)) continue;
-                const long long p = p0 + 2*begin + (upper_z ? A.s1 : 0) + (upper_y ? A.s2 : 0);
-                SIMD for (int k = 0; k < 2*m; ++k) total[k] += unit*(T)d_.data[p + k];
-                SIMD for (int k = 0; k < 2*m; ++k) {{
-                    const T w = {weight("x")}; x[k] += (d_.data[p + k] != 0) & (d_.data[p + k - 1] != 0) ? w : (T)0; }}
-                if (begin == 0 && first && wrap_x != 0) {{
-                    const int k = 0; x[0] += (d_.data[p] != 0) & (d_.data[p + wrap_x] != 0) ? {weight("x")} : (T)0; }}
-                const bool inside_y = upper_y || wrap_y == A.s2, has_y = upper_y || wrap_y != 0;
-                const bool inside_z = upper_z || wrap_z == A.s1, has_z = upper_z || wrap_z != 0;
-                const long long to_y = upper_y ? -A.s2 : wrap_y, to_z = upper_z ? -A.s1 : wrap_z;
-                {along("y")}
-                {along("z")}
+                const long long p = p0 + fx*begin + (upper_z ? A.s1 : 0) + (upper_y ? A.s2 : 0);
+                const long long below_y = upper_y ? -A.s2 : W.below_y, below_z = upper_z ? -A.s1 : W.below_z;
+                const long long above_y = upper_y || one_row ? W.above_y : A.s2, above_z = upper_z || one_plane ? W.above_z : A.s1;
+                const bool whole_y = !one_row && W.below_y == A.s2, whole_z = !one_plane && W.below_z == A.s1;  // periodic, two rows
+                const bool outer_below_y = !upper_y && !whole_y, outer_above_y = (upper_y || one_row) && !whole_y;
+                const bool outer_below_z = !upper_z && !whole_z, outer_above_z = (upper_z || one_plane) && !whole_z;
+                SIMD for (int k = 0; k < fx*m; ++k) e[k] = unit*(T)d_.data[p + k];
+                SIMD for (int k = 0; k < fx*m; ++k) {{
+                    const bool here = d_.data[p + k] != 0;
+                    const T w = {wx_at}, v = {wx_above};
+                    const T f = here & (d_.data[p + k - 1] != 0) ? w : (T)0, g = here & (d_.data[p + k + 1] != 0) ? v : (T)0;
+                    e[k] -= f + g; bx[k] += f; ax[k] += g; }}
+                if (start + begin == 0 && W.below_x != 0) {{
+                    const int k = 0; const T f = (d_.data[p] != 0) & (d_.data[p + W.below_x] != 0) ? {wx_at} : (T)0;
+                    e[k] -= f; bx[k] += f; }}
+                const int z = last_cell - fx*begin;
+                if (z < fx*m && W.above_x != 0) {{
+                    const int k = z; const T f = (d_.data[p + k] != 0) & (d_.data[p + k + W.above_x] != 0) ? {wx_above} : (T)0;
+                    e[k] -= f; ax[k] += f; }}
+                {faces("y", "below", "0")}
+                {faces("y", "above", "A.s2")}
+                {faces("z", "below", "0")}
+                {faces("z", "above", "A.s1")}
+                SIMD for (int k = 0; k < fx*m; ++k) {{
+                    const T own = unit*(T)d_.data[p + k], v = e[k]; excess[k] += v > (T)1e-6*own ? v : (T)0; }}
             }}
-            const bool only = first && begin == 0 && wrap_x == 1;
+            const T sx = fx == 2 ? (T)1 : stiffen, sy = fy == 2 ? (T)1 : stiffen, sz = fz == 2 ? (T)1 : stiffen;
+            const T se = fx*fy*fz == 8 ? held : stiffen;
+            const bool whole_x = fx == 2 && W.below_x == 1;  // a periodic row of two cells is one aggregate
             for (int k = 0; k < m; ++k) {{
-                const T within = inner[2*k] + inner[2*k + 1] + x[2*k + 1] + (only ? x[0] : (T)0), all = total[2*k] + total[2*k + 1];
-                const T v = all - 2*within; const long long o = c + begin + k;
-                dc_.data[o] = v < (T)1e-6*all ? (T)0 : v; wxc_.data[o] = only ? (T)0 : x[2*k];
-                wyc_.data[o] = outer_y[2*k] + outer_y[2*k + 1]; wzc_.data[o] = outer_z[2*k] + outer_z[2*k + 1]; }}
+                const int a = fx*k, b = fx == 2 ? a + 1 : a; const bool two = fx == 2; const long long o = c + begin + k;
+                const T low_x = whole_x ? (T)0 : sx*bx[a], high_x = whole_x ? (T)0 : sx*(two && fx*(start + begin + k) + 1 >= A.nx ? ax[a] : ax[b]);
+                const T low_y = sy*(by[a] + (two ? by[b] : (T)0)), high_y = sy*(ay[a] + (two ? ay[b] : (T)0));
+                const T low_z = sz*(bz[a] + (two ? bz[b] : (T)0)), high_z = sz*(az[a] + (two ? az[b] : (T)0));
+                dc_.data[o] = se*(excess[a] + (two ? excess[b] : (T)0)) + low_x + high_x + low_y + high_y + low_z + high_z;
+                wxc_.data[o] = low_x; wyc_.data[o] = low_y; wzc_.data[o] = low_z; }}
         }}"""
         )
     )
     def coarsen_row(
         A: StencilShape, d_: d_array, wx_: field, wy_: field, wz_: field, p0: wp.int64, dc_: field, wxc_: field, wyc_: field, wzc_: field,
-        c: wp.int64, n: int, first: bool, one_plane: bool, one_row: bool, wrap_x: wp.int64, wrap_y: wp.int64, wrap_z: wp.int64,
+        c: wp.int64, n: int, start: int, fx: int, fy: int, fz: int, one_plane: bool, one_row: bool, W: Wraps, stiffen: real, held: real,
     ): ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module=name)
     def coarsen(
-        A: StencilShape, d: d_array, wx: field, wy: field, wz: field, n: wp.vec3i, periodic: wp.vec3i, C: StencilShape, grain: int,
-        dc: field, wxc: field, wyc: field, wzc: field,
+        A: StencilShape, d: d_array, wx: field, wy: field, wz: field, n: wp.vec3i, periodic: wp.vec3i, C: StencilShape, G: Aggregates,
+        grain: int, stiffen: real, held: real, dc: field, wxc: field, wyc: field, wzc: field,
     ):  # fmt: skip
         k, j, c = wp.tid()
-        wrap_x = wp.int64(0)  # offset from a first cell, row or plane to the one below it: 0 where there is none
-        wrap_y = -A.s2
-        wrap_z = -A.s1
-        if periodic[0] != 0 and c == 0:
-            wrap_x = wp.int64(n[2] - 1)
-        if j == 0:
-            wrap_y = wp.int64(0)
-            if periodic[1] != 0:
-                wrap_y = wp.int64(n[1] - 1) * A.s2
-        if k == 0:
-            wrap_z = wp.int64(0)
-            if periodic[2] != 0:
-                wrap_z = wp.int64(n[0] - 1) * A.s1
-        p = wp.int64(2 * k + 1) * A.s1 + wp.int64(2 * j + 1) * A.s2 + wp.int64(1 + 2 * c * grain)
-        o = row_start(C, k, j, c, grain)
+        plane = one_plane(G, k)
+        row = one_row(G, j)
+        last_k = G.fz * k
+        if not plane:
+            last_k += 1
+        last_j = G.fy * j
+        if not row:
+            last_j += 1
+        W = Wraps()
+        W.below_x = below(True, periodic[0], wp.int64(1), n[2])
+        W.above_x = above(True, periodic[0], wp.int64(1), n[2])
+        W.below_y = below(j == 0, periodic[1], A.s2, n[1])
+        W.above_y = above(last_j == n[1] - 1, periodic[1], A.s2, n[1])
+        W.below_z = below(k == 0, periodic[2], A.s1, n[0])
+        W.above_z = above(last_k == n[0] - 1, periodic[2], A.s1, n[0])
         m = wp.min(grain, C.nx - c * grain)
-        coarsen_row(
-            A, d, wx, wy, wz, p, dc, wxc, wyc, wzc, o, m, c == 0, 2 * k + 2 > n[0], 2 * j + 2 > n[1], wrap_x, wrap_y, wrap_z
-        )  # fmt: skip
+        p = first_cell(A, G, k, j, c, grain)
+        o = row_start(C, k, j, c, grain)
+        coarsen_row(A, d, wx, wy, wz, p, dc, wxc, wyc, wzc, o, m, c * grain, G.fx, G.fy, G.fz, plane, row, W, stiffen, held)
 
     return coarsen
 

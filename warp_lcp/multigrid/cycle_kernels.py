@@ -14,6 +14,35 @@ from warp_lcp.native import BLOCK, C_TYPES, simd
 from warp_lcp.operators.stencil_kernels import NEIGHBORS, StencilShape, row_start, stencil_head
 
 
+@wp.struct
+class Aggregates:
+    """Cells of the finer level along each axis of an aggregate, 1 or 2, and that level's counts."""
+
+    fx: int
+    fy: int
+    fz: int
+    ny: int
+    nz: int
+
+
+@wp.func
+def first_cell(A: StencilShape, G: Aggregates, k: int, j: int, c: int, grain: int):
+    """Element of the finer level at which chunk c of coarse row (k, j) begins."""
+    return wp.int64(G.fz * k + 1) * A.s1 + wp.int64(G.fy * j + 1) * A.s2 + wp.int64(1 + G.fx * c * grain)
+
+
+@wp.func
+def one_plane(G: Aggregates, k: int):
+    """Whether an aggregate of plane k has one layer of cells along z."""
+    return G.fz == 1 or 2 * k + 2 > G.nz
+
+
+@wp.func
+def one_row(G: Aggregates, j: int):
+    """Whether an aggregate of row j has one layer of cells along y."""
+    return G.fy == 1 or 2 * j + 2 > G.ny
+
+
 @functools.cache
 def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
     """Return the kernels of a level whose diagonal has type d_type, all else type `real`."""
@@ -54,22 +83,23 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
             + f"""typedef {C_TYPES[real]} T; const long long p0 = p; T* coarse = c_.data + c; T r[2*M];
         for (int begin = 0; begin < n; begin += M) {{
             const int m = n - begin < M ? n - begin : (int)M;
-            SIMD for (int k = 0; k < 2*m; ++k) r[k] = 0;
+            SIMD for (int k = 0; k < fx*m; ++k) r[k] = 0;
             for (int row = 0; row < 4; ++row) {{
                 if (((row >> 1) && one_plane) || ((row & 1) && one_row)) continue;
-                const long long p = p0 + 2*begin + (row >> 1)*A.s1 + (row & 1)*A.s2;
+                const long long p = p0 + fx*begin + (row >> 1)*A.s1 + (row & 1)*A.s2;
                 {head.replace(f"typedef {C_TYPES[real]} T;", "")}
                 const T* x = x_.data + p; const T* b = b_.data + p;
-                SIMD for (int k = 0; k < 2*m; ++k) {{
+                SIMD for (int k = 0; k < fx*m; ++k) {{
                     const T e = unit*(T)d[k], v = b[k] - e*x[k] + {neighbors}; r[k] += e != 0 ? v : (T)0; }}
             }}
-            SIMD for (int k = 0; k < m; ++k) coarse[begin + k] = r[2*k] + r[2*k+1];
+            if (fx == 1) {{ SIMD for (int k = 0; k < m; ++k) coarse[begin + k] = r[k]; }}
+            else {{ SIMD for (int k = 0; k < m; ++k) coarse[begin + k] = r[2*k] + r[2*k+1]; }}
         }}"""
         )
     )
     def restrict_row(
         A: StencilShape, d_: d_array, wx_: field, wy_: field, wz_: field, c_: field, c: wp.int64, x_: field, b_: field, p: wp.int64,
-        n: int, one_plane: bool, one_row: bool,
+        n: int, fx: int, one_plane: bool, one_row: bool,
     ): ...  # fmt: skip
 
     @wp.func_native(
@@ -79,7 +109,9 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         if (projected) {
             const T* lo = l_.data + p; const T* hi = u_.data + p;
             SIMD for (int k = 0; k < n; ++k) {
-                const T v = d[k] != 0 ? x[k] + scale*xc[k >> 1] : (T)0, w = v < lo[k] ? lo[k] : v; x[k] = w > hi[k] ? hi[k] : w; }
+                const T v = d[k] != 0 ? x[k] + scale*xc[k >> shift] : (T)0, w = v < lo[k] ? lo[k] : v; x[k] = w > hi[k] ? hi[k] : w; }
+        } else if (shift == 0) {
+            SIMD for (int k = 0; k < n; ++k) x[k] += d[k] != 0 ? scale*xc[k] : (T)0;
         } else {
             SIMD for (int k = 0; k < n / 2; ++k) {
                 const T v = scale*xc[k]; x[2*k] += d[2*k] != 0 ? v : (T)0; x[2*k+1] += d[2*k+1] != 0 ? v : (T)0; }
@@ -89,7 +121,7 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
     )
     def correct_row(
         A: StencilShape, d_: d_array, wx_: field, wy_: field, wz_: field, x_: field, p: wp.int64, c_: field, c: wp.int64, l_: field,
-        u_: field, n: int, scale: real, projected: bool,
+        u_: field, n: int, shift: int, scale: real, projected: bool,
     ): ...  # fmt: skip
 
     @wp.func_native(
@@ -98,40 +130,39 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
             + f"""typedef {C_TYPES[real]} T; T* lower = lc_.data + c; T* upper = uc_.data + c; T lo[2*M], hi[2*M]; const T big = (T)1e30;
         for (int begin = 0; begin < n; begin += M) {{
             const int m = n - begin < M ? n - begin : (int)M;
-            SIMD for (int k = 0; k < 2*m; ++k) {{ lo[k] = -big; hi[k] = big; }}
+            SIMD for (int k = 0; k < fx*m; ++k) {{ lo[k] = -big; hi[k] = big; }}
             for (int row = 0; row < 4; ++row) {{
                 if (((row >> 1) && one_plane) || ((row & 1) && one_row)) continue;
-                const long long q = p + 2*begin + (row >> 1)*A.s1 + (row & 1)*A.s2;
+                const long long q = p + fx*begin + (row >> 1)*A.s1 + (row & 1)*A.s2;
                 const auto* d = d_.data + q; const T* x = x_.data + q; const T* l = l_.data + q; const T* u = u_.data + q;
-                SIMD for (int k = 0; k < 2*m; ++k) {{
+                SIMD for (int k = 0; k < fx*m; ++k) {{
                     const T a0 = (l[k] - x[k])*inverse, b0 = (u[k] - x[k])*inverse, a1 = a0 > 0 ? (T)0 : a0, b1 = b0 < 0 ? (T)0 : b0;
                     const T a = d[k] != 0 ? a1 : -big, b = d[k] != 0 ? b1 : big;
                     lo[k] = a > lo[k] ? a : lo[k]; hi[k] = b < hi[k] ? b : hi[k]; }}
             }}
-            SIMD for (int k = 0; k < m; ++k) {{
+            if (fx == 1) {{ SIMD for (int k = 0; k < m; ++k) {{ lower[begin + k] = lo[k]; upper[begin + k] = hi[k]; }} }}
+            else {{ SIMD for (int k = 0; k < m; ++k) {{
                 lower[begin + k] = lo[2*k] > lo[2*k+1] ? lo[2*k] : lo[2*k+1];
-                upper[begin + k] = hi[2*k] < hi[2*k+1] ? hi[2*k] : hi[2*k+1]; }}
+                upper[begin + k] = hi[2*k] < hi[2*k+1] ? hi[2*k] : hi[2*k+1]; }} }}
         }}"""
         )
     )
     def bounds_row(
         A: StencilShape, d_: d_array, x_: field, l_: field, u_: field, lc_: field, uc_: field, c: wp.int64, p: wp.int64, n: int,
-        inverse: real, one_plane: bool, one_row: bool,
+        inverse: real, fx: int, one_plane: bool, one_row: bool,
     ): ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module=name)
     def bounds_kernel(
-        A: StencilShape, d: d_array, grain: int, C: StencilShape, n0: int, n1: int, x: field, lower: field, upper: field,
-        scale: real, lower_c: field, upper_c: field,
+        A: StencilShape, d: d_array, grain: int, C: StencilShape, G: Aggregates, x: field, lower: field, upper: field, scale: real,
+        lower_c: field, upper_c: field,
     ):  # fmt: skip
         """Bounds of a coarse correction: the tightest of its cells' gaps, divided by the over-correction; 0 is always allowed."""
         k, j, c = wp.tid()
         n = wp.min(grain, C.nx - c * grain)
-        p = wp.int64(2 * k + 1) * A.s1 + wp.int64(2 * j + 1) * A.s2 + wp.int64(1 + 2 * c * grain)
+        p = first_cell(A, G, k, j, c, grain)
         o = row_start(C, k, j, c, grain)
-        last_plane = 2 * k + 2 > n0
-        last_row = 2 * j + 2 > n1
-        bounds_row(A, d, x, lower, upper, lower_c, upper_c, o, p, n, real(1.0) / scale, last_plane, last_row)
+        bounds_row(A, d, x, lower, upper, lower_c, upper_c, o, p, n, real(1.0) / scale, G.fx, one_plane(G, k), one_row(G, j))
 
     @wp.kernel(enable_backward=False, module=name)
     def sweep_kernel(
@@ -148,22 +179,23 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
 
     @wp.kernel(enable_backward=False, module=name)
     def restrict_kernel(
-        A: StencilShape, d: d_array, wx: field, wy: field, wz: field, grain: int, C: StencilShape, n0: int, n1: int, x: field, b: field,
+        A: StencilShape, d: d_array, wx: field, wy: field, wz: field, grain: int, C: StencilShape, G: Aggregates, x: field, b: field,
         coarse: field,
     ):  # fmt: skip
         k, j, c = wp.tid()
         n = wp.min(grain, C.nx - c * grain)
-        p = wp.int64(2 * k + 1) * A.s1 + wp.int64(2 * j + 1) * A.s2 + wp.int64(1 + 2 * c * grain)
-        restrict_row(A, d, wx, wy, wz, coarse, row_start(C, k, j, c, grain), x, b, p, n, 2 * k + 2 > n0, 2 * j + 2 > n1)
+        p = first_cell(A, G, k, j, c, grain)
+        restrict_row(A, d, wx, wy, wz, coarse, row_start(C, k, j, c, grain), x, b, p, n, G.fx, one_plane(G, k), one_row(G, j))
 
     @wp.kernel(enable_backward=False, module=name)
     def correct_kernel(
-        A: StencilShape, d: d_array, wx: field, wy: field, wz: field, grain: int, C: StencilShape, x: field, coarse: field, lower: field,
-        upper: field, scale: real, projected: bool,
+        A: StencilShape, d: d_array, wx: field, wy: field, wz: field, grain: int, C: StencilShape, G: Aggregates, x: field,
+        coarse: field, lower: field, upper: field, scale: real, projected: bool,
     ):  # fmt: skip
         k, j, c = wp.tid()
-        n = wp.min(2 * grain, A.nx - 2 * c * grain)
-        p = row_start(A, k, j, 2 * c, grain)
-        correct_row(A, d, wx, wy, wz, x, p, coarse, row_start(C, k // 2, j // 2, c, grain), lower, upper, n, scale, projected)
+        n = wp.min(G.fx * grain, A.nx - G.fx * c * grain)
+        p = row_start(A, k, j, G.fx * c, grain)
+        o = row_start(C, k // G.fz, j // G.fy, c, grain)
+        correct_row(A, d, wx, wy, wz, x, p, coarse, o, lower, upper, n, G.fx - 1, scale, projected)
 
     return SimpleNamespace(sweep=sweep_kernel, restrict=restrict_kernel, correct=correct_kernel, bounds=bounds_kernel)

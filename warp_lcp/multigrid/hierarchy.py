@@ -8,16 +8,16 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from warp_lcp.layout import Padding
 from warp_lcp.multigrid import coarsen_kernels as kernels
 from warp_lcp.multigrid.coarsen_kernels import UNBOUNDED
-from warp_lcp.multigrid.cycle_kernels import cycle_kernels
+from warp_lcp.multigrid.cycle_kernels import Aggregates, cycle_kernels
 from warp_lcp.operators.stencil import Stencil
 from warp_lcp.program import Launch, Program
 from warp_lcp.vectors import convert
-
 
 Pair = tuple[wp.array[Any], wp.array[Any]]
 
@@ -29,17 +29,24 @@ class CycleSettings:
     Args:
         gamma: coarse cycles a level; 1 is a V-cycle, 2 a W-cycle.
         over_correction: factor on coarse corrections: piecewise-constant aggregates are too stiff by about two.
+        excess: factor on what AIR and held unknowns add to an aggregate's diagonal: they are nearer than the next aggregate, so the
+            over-correction applies to them in part only.
         interval: bounds of the spectrum of D^-1 A that the two Chebyshev-Jacobi sweeps damp.
         coarsest_cpu: the most cells of the coarsest level, which is inverted densely.
         coarsest_cuda: the same where one thread of a GPU factors it.
+        most_visits: levels are visited at most so often in a cycle; where only some axes are coarsened there are many levels.
+        semi: axes whose mean weight is below this share of the strongest one's are not coarsened until they have caught up.
         projected_sweeps: pairs of sweeps that stand for a solve on the coarsest level of a projected cycle.
     """
 
     gamma: int = 2
     over_correction: float = 1.8
+    excess: float = 1.5
     interval: tuple[float, float] = (0.5, 2.0)
     coarsest_cpu: int = 64
     coarsest_cuda: int = 16
+    semi: float = 0.3
+    most_visits: int = 64
     projected_sweeps: int = 8
 
     @property
@@ -60,6 +67,8 @@ class Level:
         self.lower, self.upper = (bounds or (field(), field())) if bounded else (self.x, self.x)
         self.kernels = cycle_kernels(stencil.weights is not None, stencil.d.dtype, real)
         nothing = wp.empty(0, dtype=real, device=stencil.device)
+        self.aggregates: Aggregates | None = None  # how the finer level's cells make up this one's
+        self.visits, self.total_visits = 1, 1  # by the next finer level's cycle, and by one cycle of the finest
         self.operands = [stencil.shape, stencil.d, *(stencil.weights or (nothing,) * 3)]
 
     @property
@@ -107,6 +116,7 @@ class Hierarchy:
         d = wp.zeros(stencil.d.size, dtype=d_type, device=self.device)
         unit = stencil.unit if d_type is wp.uint8 else 1.0
         finest = Stencil(stencil.padding, d, weights, stencil.coefficients, unit, stencil.periodic)
+        self._strength = mean_weights(stencil)
         self.levels = [Level(finest, real, bounded=bounded, bounds=bounds)]
         most = self.settings.coarsest_cuda if self.device.is_cuda else self.settings.coarsest_cpu
         while math.prod(self.levels[-1].stencil.padding.counts) > most:
@@ -141,7 +151,8 @@ class Hierarchy:
         program = Program(self.device)
         for fine, coarse in zip(self.levels, self.levels[1:], strict=False):
             s, c = fine.stencil, coarse.stencil
-            sizes = [wp.vec3i(*s.padding.counts), wp.vec3i(*map(int, s.periodic)), c.shape, c.grain]
+            sizes = [wp.vec3i(*s.padding.counts), wp.vec3i(*map(int, s.periodic)), c.shape, coarse.aggregates, c.grain]
+            sizes += [self.settings.over_correction, self.settings.excess]
             kernel = kernels.coarsen_kernels(s.weights is not None, s.d.dtype, self.real)
             program.launch(kernel, c.threads, [*fine.operands, *sizes, c.d, *(c.weights or ())], device=self.device)
             for w in c.weights or ():
@@ -179,7 +190,7 @@ class Hierarchy:
         self._restrict(level, launch)
         if projected:
             self._restrict_bounds(level, launch)
-        for visit in range(self.settings.gamma if level + 2 < len(self.levels) else 1):
+        for visit in range(self.levels[level + 1].visits if level + 2 < len(self.levels) else 1):
             self._descend(level + 1, launch, projected=projected, from_zero=visit == 0)
         self._correct(level, launch, projected=projected)
         self._pair(L, launch, reverse=True, projected=projected)
@@ -205,31 +216,56 @@ class Hierarchy:
     def _restrict(self, level: int, launch: Launch) -> None:
         L, C = self.levels[level], self.levels[level + 1]
         L.stencil.wrap(L.x, launch=launch)
-        n0, n1, _ = L.stencil.padding.counts
-        inputs = [*L.operands, C.stencil.grain, C.stencil.shape, n0, n1, L.x, L.b, C.b]
+        inputs = [*L.operands, C.stencil.grain, C.stencil.shape, C.aggregates, L.x, L.b, C.b]
         launch(L.kernels.restrict, C.stencil.threads, inputs, device=self.device)
 
     def _restrict_bounds(self, level: int, launch: Launch) -> None:
         L, C = self.levels[level], self.levels[level + 1]
-        n0, n1, _ = L.stencil.padding.counts
         fields = [L.x, L.lower, L.upper, self.settings.over_correction, C.lower, C.upper]
-        inputs = [L.stencil.shape, L.stencil.d, C.stencil.grain, C.stencil.shape, n0, n1, *fields]
+        inputs = [L.stencil.shape, L.stencil.d, C.stencil.grain, C.stencil.shape, C.aggregates, *fields]
         launch(L.kernels.bounds, C.stencil.threads, inputs, device=self.device)
 
     def _correct(self, level: int, launch: Launch, *, projected: bool) -> None:
         L, C = self.levels[level], self.levels[level + 1]
         nz, ny, _ = L.stencil.padding.counts
-        inputs = [*L.operands, C.stencil.grain, C.stencil.shape, L.x, C.x, L.lower, L.upper, self.settings.over_correction, projected]
+        fields = [L.x, C.x, L.lower, L.upper, self.settings.over_correction, projected]
+        inputs = [*L.operands, C.stencil.grain, C.stencil.shape, C.aggregates, *fields]
         launch(L.kernels.correct, (nz, ny, C.stencil.threads[2]), inputs, device=self.device)
 
     def _coarser(self, fine: Level, *, bounded: bool) -> Level:
-        s = fine.stencil
-        counts = tuple(-(-n // 2) for n in s.padding.counts)
-        padding = Padding(counts)  # type: ignore[arg-type]
+        """Return the next level: aggregates of two cells along every axis, or along the strong ones only where axes differ much."""
+        s, counts = fine.stencil, fine.stencil.padding.counts
+        factors = self._factors(counts)
+        padding = Padding(tuple(-(-n // f) for n, f in zip(counts, reversed(factors), strict=True)))  # type: ignore[arg-type]
+        for axis in range(3):  # a coarse face is as many finer ones as the other axes were aggregated by
+            self._strength[axis] *= math.prod(factors) / factors[axis]
         new = [wp.zeros(padding.size, dtype=self.real, device=self.device) for _ in range(4)]
-        periodic = tuple(p and n > 1 for p, n in zip(s.periodic, reversed(counts), strict=True))
+        periodic = tuple(p and n > 1 for p, n in zip(s.periodic, reversed(padding.counts), strict=True))
         stencil = Stencil(padding, new[0], (new[1], new[2], new[3]), (0.0, 0.0, 0.0), 1.0, periodic)  # type: ignore[arg-type]
-        return Level(stencil, self.real, bounded=bounded)
+        level = Level(stencil, self.real, bounded=bounded)
+        G = level.aggregates = Aggregates()
+        G.fx, G.fy, G.fz, G.ny, G.nz = *factors, counts[1], counts[0]
+        level.total_visits = fine.total_visits
+        if fine.total_visits * self.settings.gamma <= self.settings.most_visits:
+            level.visits, level.total_visits = self.settings.gamma, fine.total_visits * self.settings.gamma
+        return level
+
+    def _factors(self, counts: tuple[int, int, int]) -> tuple[int, int, int]:
+        """Return by how many cells x, y and z are aggregated."""
+        long = [n > 1 for n in reversed(counts)]
+        strongest = max(w for w, more in zip(self._strength, long, strict=True) if more)
+        chosen = [more and w >= self.settings.semi * strongest for w, more in zip(self._strength, long, strict=True)]
+        # an axis of one cell may be aggregated with its ghost: it changes nothing, and keeps isotropic grids in one form
+        return tuple(1 if more and not take else 2 for more, take in zip(long, chosen, strict=True))  # type: ignore[return-value]
+
+
+def mean_weights(stencil: Stencil) -> list[float]:
+    """Return the mean weight of the faces along x, y and z."""
+    if stencil.weights is None:
+        return list(stencil.coefficients)
+    sums = [float(w.numpy().sum(dtype=np.float64)) for w in stencil.weights]
+    faces = [max(int(np.count_nonzero(w.numpy())), 1) for w in stencil.weights]
+    return [s / n for s, n in zip(sums, faces, strict=True)]
 
 
 __all__ = ["UNBOUNDED", "CycleSettings", "Hierarchy", "Level"]

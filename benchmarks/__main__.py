@@ -1,0 +1,36 @@
+"""The process that measures: `python -m benchmarks SUITE --device cpu --out DIR`; `warp-lcp bench` starts it."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from pathlib import Path
+
+import warp as wp
+
+from benchmarks import launches
+from benchmarks.timing import Options
+
+
+def main() -> None:
+    """Measure a suite and write its files."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks")
+    parser.add_argument("suite", choices=["kernels", "solvers", "run"])
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--size", type=int, action="append", default=[])
+    parser.add_argument("--repeat", type=int, default=5)
+    given = parser.parse_args()
+    wp.config.log_level = wp.LOG_ERROR
+    launches.install()  # before anything imports warp_lcp
+    suite, report = importlib.import_module(f"benchmarks.{given.suite}"), importlib.import_module("benchmarks.report")
+    options = Options(given.device, tuple(given.size), given.repeat, lambda text: sys.stderr.write(f"{text}\n"))
+    given.out.mkdir(parents=True, exist_ok=True)
+    results = suite.measure(options, given.out)
+    for line in report.write(given.suite, suite.TITLE, results, options, given.out):
+        options.say(line)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,69 @@
+# mypy: ignore-errors
+"""Peers of the 7-point product: a plain Warp kernel with one thread a cell, and Numba."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from benchmarks.machine import present
+
+f32_3d, u8_3d = wp.array3d(dtype=wp.float32), wp.array3d(dtype=wp.uint8)
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.benchmarks.plain")
+def plain_kernel(d: u8_3d, x: f32_3d, y: f32_3d):
+    """Y = A x with d open faces a cell, 0 where there is no unknown; one thread a cell."""
+    i, j, k = wp.tid()
+    i += 1
+    j += 1
+    k += 1
+    v = float(0.0)
+    if d[i, j, k] != wp.uint8(0):
+        v = float(d[i, j, k]) * x[i, j, k]
+        v -= x[i - 1, j, k] + x[i + 1, j, k] + x[i, j - 1, k] + x[i, j + 1, k] + x[i, j, k - 1] + x[i, j, k + 1]
+    y[i, j, k] = v
+
+
+def plain_product(d: np.ndarray, x: np.ndarray, device: str) -> Callable[[], None]:
+    """Return the plain Warp product on copies of padded fields."""
+    n = [s - 2 for s in x.shape]
+    fields = [wp.array(d, dtype=wp.uint8, device=device), wp.array(x, dtype=wp.float32, device=device)]
+    y = wp.zeros(x.shape, dtype=wp.float32, device=device)
+
+    def run() -> None:
+        wp.launch(plain_kernel, n, [*fields, y], device=device)
+        wp.synchronize_device(device)
+
+    return run
+
+
+def numba_products(d: np.ndarray, x: np.ndarray) -> dict[str, Callable[[], None]]:
+    """Return Numba's products on padded fields: of the same stencil, and with a constant diagonal of 6; {} where Numba is missing."""
+    if not present("numba"):
+        return {}
+    import numba
+
+    @numba.njit(fastmath=True)
+    def masked(d: Any, x: Any, y: Any) -> None:
+        for i in range(1, x.shape[0] - 1):
+            for j in range(1, x.shape[1] - 1):
+                for k in range(1, x.shape[2] - 1):
+                    e = np.float32(d[i, j, k])
+                    v = e * x[i, j, k] - (
+                        x[i - 1, j, k] + x[i + 1, j, k] + x[i, j - 1, k] + x[i, j + 1, k] + x[i, j, k - 1] + x[i, j, k + 1]
+                    )
+                    y[i, j, k] = v if e != 0 else np.float32(0)
+
+    @numba.njit(fastmath=True)
+    def constant(x: Any, y: Any) -> None:
+        for i in range(1, x.shape[0] - 1):
+            for j in range(1, x.shape[1] - 1):
+                for k in range(1, x.shape[2] - 1):
+                    y[i, j, k] = np.float32(6) * x[i, j, k] - (
+                        x[i - 1, j, k] + x[i + 1, j, k] + x[i, j - 1, k] + x[i, j + 1, k] + x[i, j, k - 1] + x[i, j, k + 1]
+                    )
+
+    y = np.zeros_like(x)
+    return {"Numba product": lambda: masked(d, x, y), "Numba product, constant diagonal": lambda: constant(x, y)}

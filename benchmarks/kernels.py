@@ -1,0 +1,140 @@
+"""Every kernel that a solve launches on the finest grid, by itself: cells and bytes a second against what copying memory reaches.
+
+The kernels are those that solves of a full basin launch (`benchmarks.launches` listens), so that the list follows the code. The bytes are
+those of the fields that a kernel reads and writes, each counted once a direction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+import warp_lcp as wl
+from benchmarks.kernel_peers import numba_products, plain_product
+from benchmarks.launches import Launch, distinct, listen, stored_sizes, traffic
+from benchmarks.machine import COPIED, machine
+from benchmarks.problems import Splash, basin
+from benchmarks.record import Bars, Record, Results, Table
+from benchmarks.timing import Figure, Options, in_turns, ratios
+
+TITLE = "Kernels of the grid engine on the finest grid"
+SIZES = (128, 256)
+PRODUCT = "stencil.product, float32"
+# kernels that run once in a while: for a new operator, problem or set of cells
+SET_UP = (
+    "grid_poisson.copy_cells", "grid_poisson.count_faces", "grid_poisson.diagonal", "grid_poisson.weights", "components", "problem",
+    "residual.start", "residual.masked_square", "residual.settle",
+)  # fmt: skip
+SERIAL = ("stencil.relax",)  # in place and in two colors: bound by store forwarding, not by memory
+FORMS = ("unit", "faces")
+
+
+def measure(options: Options, out: Path) -> Results:
+    """Measure all kernels at the sizes asked for."""
+    sizes = options.sizes or SIZES
+    records = [machine(options.device, elements=min(COPIED, 64 * max(sizes) ** 3), repeat=options.repeat)]
+    for n in sizes:
+        for form in FORMS:
+            options.say(f"kernels at {n}^3, {form}")
+            records += _measure_form(n, form, options)
+    shown = [r for r in records if r.value("cells")]
+    tables = [_table(n, [r for r in shown if r.value("cells") == n**3]) for n in sizes]
+    largest = [r for r in shown if r.value("cells") == max(sizes) ** 3 and r.facts["role"] != "set-up"]
+    percent = {f"{r.name} ({r.facts['form']})"[:80]: 100 * v for r in largest if (v := r.value("of_copy")) is not None}
+    chart = Bars("copy", f"Bytes a second at {max(sizes)}^3, float32, of measured copying", "% of copy bandwidth", percent, limit=50)
+    return Results(records, [_weakest(largest), *tables], [chart])
+
+
+def _measure_form(n: int, form: str, options: Options) -> list[Record]:
+    """Hear the kernels of one form of coefficients, then measure them in turns with a copy and the peers."""
+    scene, device = basin(n), wp.get_device(options.device)
+    if form == "faces":
+        scene = Splash(
+            n, scene.cells, scene.b, scene.wall, {f"face_{a}": np.ones([n + (i == j) for j in range(3)]) for i, a in enumerate("zyx")}
+        )
+    heard, product = _hear(scene, options.device)
+    sizes = stored_sizes((n, n, n))
+    moved = {key: traffic(launch, sizes) for key, launch in heard.items()}
+    a, b = (wp.zeros(min(COPIED, 64 * n**3), dtype=wp.float32, device=device) for _ in range(2))
+
+    def synchronized(run: Callable[[], None]) -> Callable[[], None]:
+        if not device.is_cuda:
+            return run
+        return lambda: (run(), wp.synchronize_device(device))[1]
+
+    work = {key: synchronized(launch.run) for key, launch in heard.items()}
+    work["copy"] = synchronized(lambda: wp.copy(b, a))
+    peers = _peers(product, n, options.device) if form == "unit" else {}
+    times = in_turns(work | peers, options.repeat)
+    records = []
+    for key, launch in heard.items():
+        role = "set-up" if launch.name.startswith(SET_UP) else "serial" if launch.name.startswith(SERIAL) else "hot"
+        name = PRODUCT if launch is product else launch.name
+        figures = _figures(times[key], n, moved[key].bytes, 8 * a.size, times["copy"]) | {"launches": Figure(launch.count)}
+        if launch is product:
+            figures |= {f"over {peer}": ratios(times[peer], times[key]) for peer in peers}
+        fields = {"reads": sorted(moved[key].reads), "writes": sorted(moved[key].writes)}
+        records.append(Record(f"{n}^3 {form}: {name}", figures, {"form": form, "role": role, **fields}))
+    for peer in peers:
+        bytes_moved = n**3 * (8 if "constant" in peer else 9)
+        figures = _figures(times[peer], n, bytes_moved, 8 * a.size, times["copy"])
+        records.append(Record(f"{n}^3 {form}: {peer}", figures, {"form": form, "role": "peer"}))
+    return sorted(records, key=lambda r: -(r.value("seconds") or 0) * (r.value("launches") or 0))
+
+
+def _hear(scene: Splash, device: str) -> tuple[dict[str, Launch], Launch]:
+    """Return the kernels that solves of the scene launch, by a unique label, and the float32 product among them."""
+    solvers = (wl.ProjectedMultigrid(), 5), (wl.MinimumMapNewton(), 4), (wl.ProjectedSOR(), 1)
+    heard: list[Launch] = []
+    for solver, most in solvers:
+        for bounds in ("walls", "linear") if isinstance(solver, wl.ProjectedMultigrid) else ("walls",):
+            with listen() as new:
+                problem = scene.problem(bounds, device)
+                wl.solve(problem, solver, stopping=wl.StoppingCriteria(rtol=0, max_iterations=most))
+            heard += distinct(new, scene.n**3)
+    x = wp.array(np.random.default_rng(7).random(problem.layout.size, np.float32), device=device)
+    with listen() as new:
+        problem.A.stencil.product(x, wp.zeros_like(x))
+    kinds: dict[str, Launch] = {}
+    for launch in [*heard, new[0]]:
+        kinds.setdefault(launch.name, launch)
+    return kinds, kinds[new[0].name]
+
+
+def _peers(product: Launch, n: int, device: str) -> dict[str, Callable[[], None]]:
+    """Return the peers of the product on the same fields."""
+    fields, shape = product.arrays, (n + 2,) * 3
+    d, x = fields["d"].numpy().reshape(shape), fields["x"].numpy().reshape(shape)
+    return {"Warp, one thread a cell": plain_product(d, x, device), **numba_products(d, x)}
+
+
+def _figures(times: list[float], n: int, moved: int, copied: int, copying: list[float]) -> dict[str, Figure]:
+    """Return rates of a kernel that moves `moved` bytes, and their share of a copy of `copied` bytes in the same rounds."""
+    figures = {"cells": Figure(n**3), "seconds": Figure.of(times, "s"), "rate": Figure.of([n**3 / t / 1e6 for t in times], "Mcell/s")}
+    if moved:
+        figures["bytes_per_cell"] = Figure(moved / n**3, "B")
+        figures["bandwidth"] = Figure.of([moved / t / 1e9 for t in times], "GB/s")
+        figures["of_copy"] = Figure.of([moved / t / (copied / c) for t, c in zip(times, copying, strict=True)])
+    return figures
+
+
+def _table(n: int, records: list[Record]) -> Table:
+    columns = ["kernel", "coefficients", "role", "ms", "Mcell/s", "B/cell", "GB/s", "% of copy", "range"]
+    rows = []
+    for r in records:
+        of = r.figures.get("of_copy")
+        share = ["", ""] if of is None else [f"{100 * of.value:.0f}", f"{100 * (of.low or 0):.0f} to {100 * (of.high or 0):.0f}"]
+        numbers = [1e3 * (r.value("seconds") or 0), r.value("rate"), r.value("bytes_per_cell"), r.value("bandwidth")]
+        cells = [("" if v is None else f"{v:.{d}f}") for v, d in zip(numbers, (2, 0, 1, 1), strict=True)]
+        rows.append([r.name.partition(": ")[2], r.facts["form"], r.facts["role"], *cells, *share])
+    return Table(f"{n}^3", columns, rows, "Roles: hot kernels run in every iteration, set-up ones once a problem or set of cells.")
+
+
+def _weakest(records: list[Record]) -> Table:
+    """Return the hot kernels below half of the copy bandwidth."""
+    below = [r for r in records if r.facts["role"] == "hot" and (r.value("of_copy") or 1) < 0.5]
+    rows = [[r.name, f"{100 * (r.value('of_copy') or 0):.0f} %"] for r in below] or [["none", ""]]
+    return Table("Hot kernels below 50 % of copy bandwidth at the largest size", ["kernel", "of copy"], rows)

@@ -1,0 +1,71 @@
+"""Where and when something was measured: hardware, versions, peers."""
+
+from __future__ import annotations
+
+import datetime
+import os
+import platform
+import re
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+from benchmarks.record import MACHINE, Record
+from benchmarks.timing import Figure, in_turns
+from warp_lcp.driver.versions import versions
+
+PEERS = ("pyamg", "scipy", "numba", "matplotlib")
+COPIED = 1 << 26  # float32 elements of the arrays that are copied: 256 MiB, beyond any cache
+
+
+def machine(device: str, *, elements: int = COPIED, repeat: int = 5) -> Record:
+    """Return the record of the machine, with its measured copy bandwidth (bytes read and bytes written)."""
+    chosen = wp.get_device(device)
+    hardware = {
+        "cpu": cpu_model(),
+        "cores": os.cpu_count(),
+        "memory": f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB",
+        "device": f"{chosen.alias} {chosen.name}" if chosen.is_cuda else chosen.alias,
+        "load": f"{os.getloadavg()[0]:.1f}",
+    }
+    facts = {
+        "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        "hardware": hardware,
+        "versions": versions(),
+        "peers": {name: _version(name) for name in PEERS},
+    }
+    return Record(MACHINE, copy_bandwidth(device, elements, repeat), facts)
+
+
+def copy_bandwidth(device: str, elements: int, repeat: int) -> dict[str, Figure]:
+    """Return GB/s of `wp.copy` and of NumPy's copy."""
+    a, b = (wp.zeros(elements, dtype=wp.float32, device=device) for _ in range(2))
+    x, y = np.zeros(elements, np.float32), np.ones(elements, np.float32)
+
+    def warp_copy() -> None:
+        wp.copy(b, a)
+        wp.synchronize_device(device)
+
+    times = in_turns({"copy": warp_copy, "numpy_copy": lambda: np.copyto(y, x)}, repeat)
+    return {name: Figure.of([8e-9 * elements / t for t in taken], "GB/s") for name, taken in times.items()}
+
+
+def cpu_model() -> str:
+    """Return the processor's name."""
+    path = Path("/proc/cpuinfo")
+    names = re.findall(r"model name\s*:\s*(.+)", path.read_text(encoding="utf-8")) if path.exists() else []
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def present(name: str) -> bool:
+    """Return whether a peer is installed."""
+    return _version(name) != "missing"
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "missing"

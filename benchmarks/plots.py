@@ -1,0 +1,60 @@
+"""Charts of results as PNG files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from benchmarks.machine import present
+from benchmarks.record import Bars, Lines
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+COLOR, LIMIT = "#3a6ea5", "#b3432b"
+
+
+def draw(charts: Sequence[Bars | Lines], out: Path, prefix: str) -> list[Path]:
+    """Write a PNG file for each chart; none where Matplotlib is missing."""
+    if not present("matplotlib"):
+        return []
+    from matplotlib.figure import Figure as Canvas
+
+    images = []
+    for chart in charts:
+        height = max(2.5, 0.24 * len(chart.values)) if isinstance(chart, Bars) else 4.5
+        canvas: Any = Canvas(figsize=(8, height + 0.8), dpi=110, layout="constrained")
+        axes = canvas.add_subplot()
+        if isinstance(chart, Bars):
+            _bars(axes, chart)
+        else:
+            _lines(axes, chart)
+        axes.set_title(chart.title, fontsize=10)
+        images.append(out / f"{prefix}-{chart.name}.png")
+        canvas.savefig(images[-1])
+    return images
+
+
+def _bars(axes: Axes, chart: Bars) -> None:
+    labels = list(chart.values)[::-1]
+    axes.barh(labels, [chart.values[label] for label in labels], color=COLOR)
+    if chart.limit is not None:
+        axes.axvline(chart.limit, color=LIMIT, linewidth=1)
+    if chart.logarithmic:
+        axes.set_xscale("log")
+    axes.set_xlabel(chart.unit)
+    axes.tick_params(axis="y", labelsize=7)
+    axes.margins(y=0.01)
+
+
+def _lines(axes: Axes, chart: Lines) -> None:
+    for label, (x, y) in chart.curves.items():
+        axes.plot(x, y, marker=".", label=label)
+    axes.set_yscale("log")
+    if chart.logarithmic_x:
+        axes.set_xscale("log")
+    axes.set_xlabel(chart.x_label)
+    axes.set_ylabel(chart.y_label)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=7)

@@ -1,0 +1,20 @@
+"""Write what a suite found: SUITE.json, SUITE.md and SUITE-*.png."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from benchmarks.machine import present
+from benchmarks.plots import draw
+from benchmarks.record import MACHINE, Results, write_json, write_markdown
+from benchmarks.timing import Options
+
+
+def write(name: str, title: str, results: Results, options: Options, out: Path) -> list[str]:
+    """Write the files and return remarks for the user."""
+    machine = next(r for r in results.records if r.name == MACHINE)
+    write_json(out / f"{name}.json", results.records)
+    images = draw(results.charts, out, name)
+    write_markdown(out / f"{name}.md", title, machine, results.tables, images)
+    missing = [] if present("matplotlib") else ["no plots: Matplotlib is missing (pip install 'warp-lcp[peers]')"]
+    return [*missing, f"wrote {out / name}.json, {name}.md and {len(images)} plots"]

@@ -1,0 +1,68 @@
+"""A suite as the command line sees it. It measures in a process of its own, whose libraries are told to use one thread first."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.compare import comparison
+
+# before NumPy is imported: PyAMG's set-up takes 20 times as long when two BLAS threads fight over two cores
+ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+
+
+@dataclass(frozen=True)
+class Suite:
+    """A set of measurements.
+
+    Args:
+        name: what the command line calls it; the files are NAME.json, NAME.md and NAME-*.png.
+        summary: what it measures.
+    """
+
+    name: str
+    summary: str
+
+    def run(self, *, device: str, out: Path, sizes: tuple[int, ...] = (), repeat: int = 5) -> list[Path]:
+        """Measure and write the files.
+
+        Args:
+            device: Warp device.
+            out: folder of the files.
+            sizes: cells along a side; the suite's own without any.
+            repeat: samples of each timing.
+
+        Returns:
+            The files.
+
+        Raises:
+            ValueError: a size or the number of samples is out of range.
+            RuntimeError: a measurement failed; what it said is on the error stream.
+        """
+        if repeat < 1:
+            raise ValueError(f"repeat = {repeat}: must be >= 1")
+        if min(sizes, default=8) < 8:
+            raise ValueError(f"size = {min(sizes)}: must be >= 8 cells a side")
+        arguments = [self.name, "--device", device, "--out", str(out), "--repeat", str(repeat)]
+        for size in sizes:
+            arguments += ["--size", str(size)]
+        process = subprocess.run([sys.executable, "-m", "benchmarks", *arguments], env={**os.environ, **ONE_THREAD}, check=False)
+        if process.returncode != 0:
+            raise RuntimeError(f"the suite {self.name} ended with exit code {process.returncode}")
+        return sorted(p for p in out.glob(f"{self.name}*") if p.suffix in (".json", ".md", ".png"))
+
+    def compare(self, old: Path, new: Path) -> str:
+        """Return a table of new figures over old ones with the bounds that their ranges give.
+
+        Raises:
+            ValueError: a file is no result of a suite.
+        """
+        return comparison(old, new)
+
+
+KERNELS = Suite("kernels", "each hot kernel on the finest grid against this machine's copy bandwidth, Numba and a plain Warp kernel")
+SOLVERS = Suite("solvers", "linear and LCP solves: set-up, iterations, time to a tolerance, memory; against PyAMG and SciPy")
+RUN = Suite("run", "steps per second of built-in scenes, and what the particles cost")

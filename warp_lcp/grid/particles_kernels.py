@@ -1,0 +1,107 @@
+# mypy: ignore-errors
+"""Kernels that number particles by cell, reorder them and add them up."""
+
+import warp as wp
+
+from warp_lcp.grid.particle_loops import particle_loop
+
+COLUMNS = 13  # of a partial result, see `total_some`
+
+NUMBER = """
+    typedef float T;
+    const T* position = (const T*)x_.data; int* key = key_.data;
+    GRID_COORDINATE
+    auto cell_of = [](T x, int count) { x = x > 1 ? x : (T)1; const T e = count; return (int)(x < e ? x : e); };
+    SIMD for (int p = first; p < last; ++p) {
+        const long long q = 3*(long long)p;
+        const int i = cell_of(grid_coordinate(position[q]), nx), j = cell_of(grid_coordinate(position[q + 1]), ny);
+        const int k = nz > 1 ? cell_of(grid_coordinate(position[q + 2]), nz) : 1;
+        key[p] = (k*(ny + 2) + j)*(nx + 2) + i;
+    }
+"""
+
+TOTAL = """
+    #ifdef __CUDA_ARCH__
+    enum { LANES = 1 };
+    #else
+    enum { LANES = 16 };
+    #endif
+    typedef float T;
+    const T* position = (const T*)x_.data; const T* velocity = (const T*)v_.data; double* out = out_.data + 13*row;
+    double squares[LANES], sum[3][LANES]; T low[3][LANES], high[3][LANES], fastest[LANES]; int bad_x[LANES], bad_v[LANES];
+    for (int m = 0; m < LANES; ++m) {
+        squares[m] = 0; fastest[m] = 0; bad_x[m] = 0; bad_v[m] = 0;
+        for (int d = 0; d < 3; ++d) { sum[d][m] = 0; low[d][m] = high[d][m] = position[3*(long long)first + d]; }
+    }
+    for (int start = first; start < last; start += LANES) {
+        const int n = last - start < LANES ? last - start : (int)LANES;
+        const T* X = position + 3*(long long)start; const T* V = velocity + 3*(long long)start;
+        SIMD for (int m = 0; m < n; ++m) {
+            const T x = X[3*m], y = X[3*m + 1], z = X[3*m + 2], u = V[3*m], v = V[3*m + 1], w = V[3*m + 2];
+            const T speed = u*u + v*v + w*w, reach = x*x + y*y + z*z;
+            squares[m] += (double)speed; sum[0][m] += (double)x; sum[1][m] += (double)y; sum[2][m] += (double)z;
+            low[0][m] = x < low[0][m] ? x : low[0][m]; high[0][m] = x > high[0][m] ? x : high[0][m];
+            low[1][m] = y < low[1][m] ? y : low[1][m]; high[1][m] = y > high[1][m] ? y : high[1][m];
+            low[2][m] = z < low[2][m] ? z : low[2][m]; high[2][m] = z > high[2][m] ? z : high[2][m];
+            fastest[m] = speed > fastest[m] ? speed : fastest[m];
+            bad_v[m] += !(speed <= (T)3.4028234e38); bad_x[m] += !(reach <= (T)3.4028234e38);
+        }
+    }
+    for (int m = 1; m < LANES; ++m) {
+        squares[0] += squares[m]; bad_x[0] += bad_x[m]; bad_v[0] += bad_v[m];
+        fastest[0] = fastest[m] > fastest[0] ? fastest[m] : fastest[0];
+        for (int d = 0; d < 3; ++d) {
+            sum[d][0] += sum[d][m];
+            low[d][0] = low[d][m] < low[d][0] ? low[d][m] : low[d][0]; high[d][0] = high[d][m] > high[d][0] ? high[d][m] : high[d][0];
+        }
+    }
+    out[0] = squares[0]; out[10] = fastest[0]; out[11] = bad_x[0]; out[12] = bad_v[0];
+    for (int d = 0; d < 3; ++d) { out[1 + d] = sum[d][0]; out[4 + d] = low[d][0]; out[7 + d] = high[d][0]; }
+"""
+
+
+@wp.func_native(particle_loop(NUMBER))
+def number_some(inverse_dx: float, nx: int, ny: int, nz: int, x_: wp.array(dtype=wp.vec3), key_: wp.array(dtype=wp.int32), first: int, last: int): ...  # noqa: E501 # fmt: skip
+
+
+@wp.func_native(particle_loop(TOTAL))
+def total_some(x_: wp.array(dtype=wp.vec3), v_: wp.array(dtype=wp.vec3), out_: wp.array2d(dtype=wp.float64), row: int, first: int, last: int): ...  # noqa: E501 # fmt: skip
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")
+def number_kernel(
+    count: int, grain: int, inverse_dx: float, nx: int, ny: int, nz: int, position: wp.array(dtype=wp.vec3), key: wp.array(dtype=wp.int32)
+):
+    """Number the stored cell that each particle lies in; in 2-D nz = 1 and its plane is k = 1 whatever z is."""
+    first = wp.tid() * grain
+    number_some(inverse_dx, nx, ny, nz, position, key, first, wp.min(first + grain, count))
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")
+def count_up_kernel(order: wp.array(dtype=wp.int32)):
+    """Write 0, 1, 2, ..."""
+    p = wp.tid()
+    order[p] = p
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")
+def offset_kernel(key: wp.array(dtype=wp.int32), count: int, offsets: wp.array(dtype=wp.int32)):
+    """Find the first particle of each cell, or of the next one that has any, among sorted keys."""
+    cell = wp.tid()
+    offsets[cell] = wp.lower_bound(key, 0, count, cell)
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")
+def reorder_kernel(order: wp.array(dtype=wp.int32), source: wp.array(dtype=wp.vec3), target: wp.array(dtype=wp.vec3)):
+    """Take the particles in a new order."""
+    p = wp.tid()
+    target[p] = source[order[p]]
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")
+def total_kernel(
+    count: int, chunk: int, position: wp.array(dtype=wp.vec3), velocity: wp.array(dtype=wp.vec3), out: wp.array2d(dtype=wp.float64)
+):
+    """Add up a chunk of particles: [0] |v|^2, [1-3] x, [4-6] lowest x, [7-9] highest x, [10] largest |v|^2, [11-12] bad x and v."""
+    t = wp.tid()
+    total_some(position, velocity, out, t, t * chunk, wp.min((t + 1) * chunk, count))
