@@ -63,7 +63,12 @@ def _measure_form(n: int, form: str, options: Options) -> list[Record]:
     def synchronized(run: Callable[[], None]) -> Callable[[], None]:
         if not device.is_cuda:
             return run
-        return lambda: (run(), wp.synchronize_device(device))[1]
+
+        def waited() -> None:
+            run()
+            wp.synchronize_device(device)
+
+        return waited
 
     work = {key: synchronized(launch.run) for key, launch in heard.items()}
     work["copy"] = synchronized(lambda: wp.copy(b, a))
@@ -95,9 +100,10 @@ def _hear(scene: Splash, device: str) -> tuple[dict[str, Launch], Launch]:
                 problem = scene.problem(bounds, device)
                 wl.solve(problem, solver, stopping=wl.StoppingCriteria(rtol=0, max_iterations=most))
             heard += distinct(new, scene.n**3)
-    x = wp.array(np.random.default_rng(7).random(problem.layout.size, np.float32), device=device)
+    A = wl.GridPoisson(scene.cells, device=device, **scene.faces)
+    x = wp.array(np.random.default_rng(7).random(A.layout.size, np.float32), device=device)
     with listen() as new:
-        problem.A.stencil.product(x, wp.zeros_like(x))
+        A.stencil.product(x, wp.zeros_like(x))
     kinds: dict[str, Launch] = {}
     for launch in [*heard, new[0]]:
         kinds.setdefault(launch.name, launch)

@@ -34,7 +34,9 @@ class Splash:
 
     def lower(self, bounds: str) -> float | np.ndarray:
         """Return the lower bound: -inf (linear), 0 on wall cells (walls) or 0 (everywhere)."""
-        return {"linear": -np.inf, "walls": np.where(self.wall, 0.0, -np.inf), "everywhere": 0.0}[bounds]
+        if bounds == "walls":
+            return np.where(self.wall, 0.0, -np.inf)
+        return {"linear": -np.inf, "everywhere": 0.0}[bounds]
 
     def problem(self, bounds: str, device: str, b: Any = None) -> wl.LCP:
         """Build the operator and the problem."""

@@ -107,34 +107,43 @@ class PressureProjection:
             self._ready = True
             wp.copy(self.shown, self.kind)
 
-    def solve(self, velocity: Sequence[wp.array], dt: float, speed: float) -> tuple[wl.SolveResult, wl.StoppingCriteria, int]:
-        """Solve for x without changing velocity or pressure.
-
-        The first guess is the last pressure. The absolute tolerance is the rounding noise of b, so that a liquid at rest or in free fall
-        is not iterated on it.
+    def prepare(self, velocity: Sequence[wp.array], dt: float) -> int:
+        """Set up the problem of the marked cells and return the number of unknowns. The first guess is the last pressure.
 
         Args:
             velocity: u* of each component [m/s].
             dt: time step [s].
-            speed: scale of u* [m/s].
-
-        Returns:
-            The result, the criteria it was held to, and the number of unknowns.
         """
-        grid = self.grid
         ratio = dt / self._dt if self._dt > 0.0 else 0.0
-        grid.domain.launch(
+        self.grid.domain.launch(
             kernels.prepare_kernel,
             [
-                *self._components(velocity), self.kind, self.solids.index, self.solids.separating, self.wall_velocity, grid.planes,
+                *self._components(velocity), self.kind, self.solids.index, self.solids.separating, self.wall_velocity, self.grid.planes,
                 self.pressure, ratio, self._b, self._lower, self._start,
             ],
         )  # fmt: skip
-        unknowns = self.unknowns()
         self._operator.update(self.kind)
+        return self.unknowns()
+
+    def solve(self, speed: float, unknowns: int) -> tuple[wl.SolveResult, wl.StoppingCriteria]:
+        """Solve the prepared problem for x without changing velocity or pressure.
+
+        The absolute tolerance is the rounding noise of b, so that a liquid at rest or in free fall is not iterated on it.
+
+        Args:
+            speed: scale of u* [m/s].
+            unknowns: of `prepare`.
+
+        Returns:
+            The result and the criteria it was held to.
+        """
         criteria = wl.StoppingCriteria(rtol=self.tolerance, atol=ROUNDING * speed * unknowns**0.5, max_iterations=self.max_iterations)
         result = wl.solve(self._problem, self.solver, stopping=criteria, x0=self._start, workspace=self._work)
-        return result, criteria, unknowns
+        return result, criteria
+
+    def fields(self) -> list[wp.array]:
+        """Return the fields of the problem: its cells, right-hand side, lower bound and first guess."""
+        return [self.kind, self._b, self._lower, self._start]
 
     def project(
         self, velocity: Sequence[wp.array], dt: float, window: Window, result: wl.SolveResult, criteria: wl.StoppingCriteria, unknowns: int
@@ -147,7 +156,7 @@ class PressureProjection:
             window: cells that hold all FLUID cells, with one to spare on each side.
             result: of `solve`.
             criteria: of `solve`.
-            unknowns: of `solve`.
+            unknowns: of `prepare`.
         """
         convert(result.x.flatten(), self.pressure.flatten())
         wp.copy(self.shown, self.kind)

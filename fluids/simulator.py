@@ -16,6 +16,7 @@ from fluids.pressure import PressureProjection, Projection
 from fluids.pressure_kernels import RELEASED, TOUCHES_NOTHING
 from fluids.scene import LiquidScene
 from fluids.wall import extend_velocity
+from warp_lcp.driver.profile import NoStopwatch, Stopwatch
 from warp_lcp.driver.scene import Scene, Solver
 from warp_lcp.driver.simulator import Cells, Points, SimulationFailed, StepFailed
 from warp_lcp.grid.advection import advect, clearance
@@ -62,6 +63,7 @@ class LiquidSimulation:
         projection: the pressure's fields.
         time: [s].
         step_count: steps done.
+        watch: what the stages of a step are measured with.
     """
 
     def __init__(
@@ -77,6 +79,7 @@ class LiquidSimulation:
         """Allocate the fields and find the liquid's cells."""
         self.scene, self.grid, self.solids, self.particles = scene, grid, solids, particles
         self.time, self.step_count = 0.0, 0
+        self.watch: Stopwatch = NoStopwatch()
         self._notes = list(notes or [])
         self.gravity = np.array([*scene.physics.gravity, 0.0][:3])
         self.particle_mass = scene.physics.density * grid.cell_volume / scene.particles.per_axis**grid.dimension  # [kg], 2-D: [kg/m]
@@ -96,7 +99,9 @@ class LiquidSimulation:
     def stable_dt(self) -> float:
         """Return CFL dx / (v_max + sqrt(CFL g dx)) [s]: gravity's own speed counts, so that a liquid at rest does not take off."""
         cfl, dx = self.scene.time.cfl, self.grid.spacing
-        speed = self.particles.totals().max_speed + math.sqrt(cfl * float(np.linalg.norm(self.gravity)) * dx)
+        with self.watch.stage("diagnostics", self.particles.position, self.particles.velocity):
+            totals = self.particles.totals()
+        speed = totals.max_speed + math.sqrt(cfl * float(np.linalg.norm(self.gravity)) * dx)
         return cfl * dx / speed if speed > 0.0 else math.inf
 
     def step(self, dt: float) -> dict[str, float | int | str | None]:
@@ -111,23 +116,27 @@ class LiquidSimulation:
         """
         if not (math.isfinite(dt) and dt > 0.0):
             raise ValueError(f"dt = {dt}: must be a positive time [s]")
-        particles, grid, velocity = self.particles, self.grid, self.velocity
         before = self._checked_totals("at the start of")
-        particles.arrange(self.step_count)
+        particles, watch = self.particles, self.watch
+        with watch.stage("sort", *particles.arrays().values()):
+            particles.arrange(self.step_count)
         window = self._window(before)
-        particles_to_faces(
-            grid, particles.position, particles.velocity, particles.affine, velocity, self.weights, window=window, offsets=particles.offsets
-        )
-        for field, saved in zip(velocity, self._saved or (), strict=False):
-            wp.copy(saved, field)
-        accelerate(window, velocity, self.weights, self.gravity * dt)
+        with watch.stage("particles-to-grid", *particles.arrays().values(), *self.velocity, *self.weights):
+            self._transfer(window, dt)
         projected = self._project(window, dt, before.max_speed + dt * float(np.linalg.norm(self.gravity)))
         p, s = self.projection, self.solids
-        extend_velocity(window, velocity, self.weights, p.known, p.kind, p.contact, s.index, s.separating, p.wall_velocity, self.layers)
-        flip = self.scene.particles.flip_ratio if self._saved else 0.0
-        faces_to_particles(grid, velocity, particles.position, particles.velocity, particles.affine, saved=self._saved, flip=flip)
-        self._stopped.zero_()
-        advect(grid, velocity, self._clearance, dt, particles.position, self._stopped)
+        with watch.stage("extrapolation", *self.velocity, *self.weights, *p.known, p.kind, p.contact, s.index):
+            extend_velocity(
+                window, self.velocity, self.weights, p.known, p.kind, p.contact, s.index, s.separating, p.wall_velocity, self.layers
+            )
+        with watch.stage("grid-to-particles", *particles.arrays().values(), *self.velocity):
+            flip = self.scene.particles.flip_ratio if self._saved else 0.0
+            faces_to_particles(
+                self.grid, self.velocity, particles.position, particles.velocity, particles.affine, saved=self._saved, flip=flip
+            )
+        with watch.stage("advection", particles.position, *self.velocity, self._clearance):
+            self._stopped.zero_()
+            advect(self.grid, self.velocity, self._clearance, dt, particles.position, self._stopped)
         after = self._checked_totals("after")
         self.time += dt
         self.step_count += 1
@@ -200,11 +209,25 @@ class LiquidSimulation:
         low, high = (self.particles.cells_of(corner[None])[0] + 1 for corner in (totals.low, totals.high))
         return self.grid.window(low, high, grow=self.layers + 2)
 
+    def _transfer(self, window: Window, dt: float) -> None:
+        """Bring the particles' velocities to the faces, and let gravity act on them."""
+        particles, grid = self.particles, self.grid
+        particles_to_faces(
+            grid, particles.position, particles.velocity, particles.affine, self.velocity, self.weights, window=window,
+            offsets=particles.offsets,
+        )  # fmt: skip
+        for field, saved in zip(self.velocity, self._saved or (), strict=False):
+            wp.copy(saved, field)
+        accelerate(window, self.velocity, self.weights, self.gravity * dt)
+
     def _project(self, window: Window, dt: float, speed: float) -> Projection:
         """Solve for the pressure and project the velocity."""
-        projection = self.projection
-        projection.mark(self.particles.key, self.particles.count)
-        result, criteria, unknowns = projection.solve(self.velocity, dt, speed)
+        projection, watch = self.projection, self.watch
+        with watch.stage("pressure set-up", self.particles.key, *self.velocity, *projection.fields()):
+            projection.mark(self.particles.key, self.particles.count)
+            unknowns = projection.prepare(self.velocity, dt)
+        with watch.stage("pressure solve", *projection.fields()):
+            result, criteria = projection.solve(speed, unknowns)
         if not result:
             if result.status is wl.SolveStatus.NON_FINITE:
                 self._explain_not_finite()
@@ -212,7 +235,8 @@ class LiquidSimulation:
                 f"step {self.step_count}: the pressure solve ended with {result.status.name} after {result.iterations} iterations at a "
                 f"relative residual of {result.relative_residual:.2e} (tolerance {self.projection.tolerance:.1e}): {result.status.value}"
             )
-        return projection.project(self.velocity, dt, window, result, criteria, unknowns)
+        with watch.stage("projection", *self.velocity, *projection.known, projection.pressure, projection.kind, projection.contact):
+            return projection.project(self.velocity, dt, window, result, criteria, unknowns)
 
     def _explain_not_finite(self) -> None:
         cells = self.projection.not_finite()
@@ -228,7 +252,8 @@ class LiquidSimulation:
         Raises:
             SimulationFailed: a value is not finite or a particle lies outside the domain.
         """
-        totals = self.particles.totals()
+        with self.watch.stage("diagnostics", self.particles.position, self.particles.velocity):
+            totals = self.particles.totals()
         axes = slice(self.grid.dimension)
         size = np.array(self.grid.counts) * self.grid.spacing
         end = size - 0.5 * MARGIN * self.grid.spacing  # a tent at the very end would reach beyond what is stored

@@ -20,10 +20,13 @@ C_TYPES = {wp.uint8: "unsigned char", wp.float32: "float", wp.float64: "double"}
 
 
 def simd(source: str) -> str:
-    """Return the body of a native function: `SIMD for` becomes a vectorized loop, sums may be taken in any order."""
-    pragma = "\n#ifndef __CUDA_ARCH__\n#pragma clang loop vectorize(assume_safety) vectorize_width(16) interleave_count(1)\n#endif\n"
+    """Return the body of a native function: `SIMD for` becomes a vectorized loop, sums may be taken in any order.
+
+    `SIMD8 for` takes half as many elements at a time, which is faster where most of them are doubles.
+    """
+    pragma = "\n#ifndef __CUDA_ARCH__\n#pragma clang loop vectorize(assume_safety) vectorize_width({}) interleave_count(1)\n#endif\n"
     head = "\n#ifndef __CUDA_ARCH__\n#pragma clang fp reassociate(on) contract(fast)\n#endif\n"
-    return head + source.replace("SIMD ", pragma) + "\n"
+    return head + source.replace("SIMD8 ", pragma.format(8)).replace("SIMD ", pragma.format(16)) + "\n"
 
 
 @dataclass(frozen=True)

@@ -155,7 +155,7 @@ def test_a_failed_solve_leaves_the_state_as_it_was(steps: int) -> None:
     for _ in range(steps):
         simulation.step(0.02)
         twin.step(0.02)
-    twin.particles.sort()  # the one thing that a failed step may do
+    twin.particles.arrange(steps)  # the one thing that a failed step may do
     before, frame = twin.state(), twin.frame()
     simulation.projection.max_iterations = 0
     for _ in range(2):

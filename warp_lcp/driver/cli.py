@@ -1,4 +1,4 @@
-"""The command line: `warp-lcp run | render | check | scenes | schema | info`."""
+"""The command line: `warp-lcp run | render | check | scenes | schema | bench | info`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ import typer
 import warp as wp
 from rich.console import Console
 
+from warp_lcp.driver.benchmark import benchmarks
 from warp_lcp.driver.devices import DeviceError, choose_device, cuda_driver, devices
+from warp_lcp.driver.profile import Profile
 from warp_lcp.driver.progress import Bar, Lines
 from warp_lcp.driver.recording import Color, RenderError
 from warp_lcp.driver.render import parse_size, render_run
@@ -64,6 +66,7 @@ def run(
     frames: Annotated[int | None, typer.Option(min=0, metavar="N", help="End after frame N.", show_default=False)] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the run in the folder from its newest checkpoint.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Delete the run in the folder first.")] = False,
+    profile: Annotated[bool, typer.Option("--profile", help="Measure where the time goes; also into profile.json.")] = False,
     overrides: SetOption = None,
 ) -> None:
     """Simulate a scene into a folder that ParaView opens."""
@@ -76,7 +79,12 @@ def run(
         console = Console(stderr=True)
         console.print(f"{loaded.scene.name} on {chosen}, into {folder}", markup=False, highlight=False, soft_wrap=True)
         with _interruptible(console) as stop, Bar(console) if console.is_terminal else Lines(console) as observer:
-            record = run_scene(loaded, folder, device=chosen, observer=observer, last_frame=frames, resume=resume, force=force, stop=stop)
+            watch = Profile(chosen) if profile else None
+            record = run_scene(
+                loaded, folder, device=chosen, observer=observer, last_frame=frames, resume=resume, force=force, stop=stop, profile=watch
+            )
+    if watch:
+        typer.echo("\n".join(watch.table(record.steps - (record.resumed_from_step or 0), record.seconds)))
     _report(record, folder)
 
 
@@ -125,6 +133,36 @@ def schema(simulator: Annotated[str, typer.Option(help="Whose scenes.")] = "flui
     if simulator not in installed:
         _end(f"--simulator {simulator}: no such simulator; {nearest(simulator, installed)}", WRONG_INPUT)
     typer.echo(json.dumps(installed[simulator].scene_model.model_json_schema(by_alias=True), indent=2))
+
+
+@app.command()
+def bench(
+    suite: Annotated[str, typer.Argument(metavar="SUITE", help="What to measure: kernels, solvers or run.")],
+    device: Annotated[str, typer.Option(help="cpu or cuda:N.")] = "cpu",
+    out: Annotated[Path, typer.Option(help="The folder of SUITE.json, SUITE.md and the plots.")] = Path("out/bench"),
+    size: Annotated[list[int] | None, typer.Option(metavar="N", help="Cells along a side; may be repeated.", show_default=False)] = None,
+    repeat: Annotated[int, typer.Option(min=1, metavar="K", help="Samples of each timing.")] = 5,
+    compare: Annotated[
+        tuple[Path, Path] | None,
+        typer.Option(metavar="A.json B.json", help="Compare two results instead of measuring.", show_default=False),
+    ] = None,
+) -> None:
+    """Measure this machine, or compare two results."""
+    installed = benchmarks()
+    if suite not in installed:
+        _end(f"{suite}: no such suite; {nearest(suite, installed)}", WRONG_INPUT)
+    with _wrong_input():
+        chosen = choose_device(device)
+    try:
+        if compare is not None:
+            typer.echo(installed[suite].compare(*compare))
+            return
+        files = installed[suite].run(device=chosen, out=out, sizes=tuple(size or ()), repeat=repeat)
+    except ValueError as error:
+        _end(str(error), WRONG_INPUT)
+    except RuntimeError as error:
+        _end(str(error), FAILED)
+    typer.echo("\n".join(map(str, files)))
 
 
 @app.command()

@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import base64
 import re
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from types import TracebackType
+from typing import Self
 
-import meshio
 import numpy as np
 
 from warp_lcp.driver.atomic import replacing, write_text
+from warp_lcp.driver.profile import NoStopwatch, Stopwatch
 from warp_lcp.driver.simulator import Cells, Points
 
 FRAME_FILE = re.compile(r"(?P<name>[a-z][a-z_]*)_(?P<index>\d{6,})\.vtu")
 
 # Corners of a cell in VTK's order for quadrilaterals (the first four) and hexahedra, as x, y, z.
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
-BASE64 = 4 / 3  # what meshio's encoding adds to the bytes
+BASE64 = 4 / 3  # what the encoding adds to the bytes
+VTK_TYPES = {1: 1, 4: 9, 8: 12}  # vertex, quadrilateral and hexahedron by their corners
+WAITING = 2  # frames in memory, the one being written included
 
 
 class FrameFolder:
@@ -27,7 +35,7 @@ class FrameFolder:
         self.frames = folder / "frames"
         self._times: dict[str, list[tuple[float, str]]] = {}
 
-    def write(self, index: int, time: float, frame: list[Points | Cells]) -> None:
+    def write(self, index: int, time: float, frame: list[Points | Cells]) -> list[Path]:
         """Write a frame and add it to the collections.
 
         Args:
@@ -35,16 +43,22 @@ class FrameFolder:
             time: of the frame [s].
             frame: what it shows.
 
+        Returns:
+            Its files.
+
         Raises:
             OSError: a file cannot be written; the earlier ones are intact.
         """
         self.frames.mkdir(exist_ok=True)
+        files = []
         for part in frame:
             file = self.frames / f"{part.name}_{index:06d}.vtu"
             write_vtu(file, part)
             times = self._times.setdefault(part.name, [])
             times.append((time, f"frames/{file.name}"))
             write_text(self.folder / f"{part.name}.pvd", collection(times))
+            files.append(file)
+        return files
 
     def resume(self, times: list[float]) -> None:
         """Continue after the frames of `times`: later files are deleted, the collections are those of the frames that are there.
@@ -69,6 +83,75 @@ class FrameFolder:
             write_text(self.folder / f"{name}.pvd", collection(entries))
 
 
+class FrameWriter:
+    """Write frames on a thread of its own while the simulation goes on; at most WAITING frames are in memory.
+
+    What goes wrong there is raised by every later call of `put`, `check` or `flush`, and no later frame is written. Leaving the `with` block
+    waits for the frames that were put, whatever ended the block, and raises only if nothing else did.
+    """
+
+    def __init__(self, folder: FrameFolder, watch: Stopwatch | None = None) -> None:
+        """Begin without frames."""
+        self.newest: int | None = None  # the number of the newest frame that this writer brought to disk
+        self._folder = folder
+        self._watch = watch or NoStopwatch()
+        self._pending: deque[Future[None]] = deque()
+        self._failed = False
+        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="frames")
+
+    def put(self, index: int, time: float, frame: list[Points | Cells]) -> None:
+        """Hand over a frame, whose arrays nobody changes any more; wait if there are too many already.
+
+        Raises:
+            OSError: an earlier frame could not be written.
+        """
+        while len(self._pending) >= WAITING:
+            self._finish()
+        self._pending.append(self._thread.submit(self._write, index, time, frame))
+
+    def check(self) -> None:
+        """Raise what went wrong so far, without waiting.
+
+        Raises:
+            OSError: a frame could not be written.
+        """
+        while self._pending and self._pending[0].done():
+            self._finish()
+
+    def flush(self) -> None:
+        """Wait until every frame is on disk.
+
+        Raises:
+            OSError: a frame could not be written.
+        """
+        while self._pending:
+            self._finish()
+
+    def __enter__(self) -> Self:
+        """Return the writer itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """End the thread."""
+        self._thread.shutdown()
+        if kind is None:
+            self.flush()
+
+    def _finish(self) -> None:
+        """Wait for the oldest frame; one that failed stays the oldest, so that it is raised again."""
+        self._pending[0].result()
+        self._pending.popleft()
+
+    def _write(self, index: int, time: float, frame: list[Points | Cells]) -> None:
+        if self._failed:  # a run that ends at this frame must not leave a later one
+            return
+        self._failed = True
+        with self._watch.beside("frames, written"):
+            files = self._folder.write(index, time, frame)
+        self._watch.wrote("frames, written", *files)
+        self._failed, self.newest = False, index
+
+
 def write_vtu(path: Path, part: Points | Cells) -> None:
     """Write a part of a frame as a VTU file: binary, uncompressed (compression takes three times as long as writing), atomically.
 
@@ -80,20 +163,14 @@ def write_vtu(path: Path, part: Points | Cells) -> None:
         OSError: the file cannot be written.
         ValueError: a field has another length than the points or cells.
     """
-    fields = {name: _writable(name, values, _size(part)) for name, values in part.fields.items()}
-    if _size(part) == 0:
-        write_text(path, _empty_vtu(fields, cells=isinstance(part, Cells)))  # meshio refuses empty meshes
-        return
+    size = _size(part)
+    fields = {name: _writable(name, values, size) for name, values in part.fields.items()}
     if isinstance(part, Points):
-        points = np.ascontiguousarray(part.points)
-        vertices = np.arange(len(points), dtype=np.int32)[:, None]
-        mesh = meshio.Mesh(points, [("vertex", vertices)], point_data=fields)
+        points, corners = _writable("points", part.points, size), np.arange(size, dtype=np.int32)[:, None]
     else:
         points, corners = _corners(part)
-        kind = "quad" if part.dimension == 2 else "hexahedron"
-        mesh = meshio.Mesh(points, [(kind, corners)], cell_data={name: [values] for name, values in fields.items()})
-    with replacing(path) as temporary:
-        meshio.vtu.write(str(temporary), mesh, compression=None, header_type="UInt64")
+    with replacing(path) as temporary, open(temporary, "wb") as file:
+        file.writelines(_vtu(points, corners, fields, "PointData" if isinstance(part, Points) else "CellData"))
 
 
 def frame_bytes(frame: list[Points | Cells]) -> int:
@@ -134,6 +211,8 @@ def _writable(name: str, values: np.ndarray, size: int) -> np.ndarray:
 
 def _corners(cells: Cells) -> tuple[np.ndarray, np.ndarray]:
     """Return the corner points [m] (float32, shape (m, 3)) and each cell's corners among them, shape (n, 4) or (n, 8)."""
+    if len(cells.index) == 0:
+        return np.zeros((0, 3), dtype=np.float32), np.zeros((0, 2**cells.dimension), dtype=np.int32)
     low = cells.index.min(axis=0)
     shape = cells.index.max(axis=0) - low + 2
     corners = cells.index[:, None, :] - low + CORNERS[: 2**cells.dimension]
@@ -147,20 +226,32 @@ def _corners(cells: Cells) -> tuple[np.ndarray, np.ndarray]:
     return (lattice * cells.spacing).astype(np.float32), number[flat]
 
 
-def _empty_vtu(fields: dict[str, np.ndarray], *, cells: bool) -> str:
-    """Return a VTU file without points or cells that still names its fields, so that a viewer finds them in every frame."""
-
-    def array(name: str, kind: str, components: int = 1) -> str:
-        return f'<DataArray type="{kind}" Name="{name}" NumberOfComponents="{components}" format="ascii"></DataArray>'
-
-    data = "".join(array(name, _vtu_type(values.dtype), *values.shape[1:]) for name, values in fields.items())
-    tag = "CellData" if cells else "PointData"
-    return (
-        '<?xml version="1.0"?>\n<VTKFile type="UnstructuredGrid" version="0.1" byte_order="LittleEndian"><UnstructuredGrid>\n'
-        f'<Piece NumberOfPoints="0" NumberOfCells="0">\n<Points>{array("Points", "Float32", 3)}</Points>\n'
-        f"<Cells>{array('connectivity', 'Int32')}{array('offsets', 'Int32')}{array('types', 'UInt8')}</Cells>\n"
-        f"<{tag}>{data}</{tag}>\n</Piece></UnstructuredGrid></VTKFile>\n"
+def _vtu(points: np.ndarray, corners: np.ndarray, fields: dict[str, np.ndarray], where: str) -> Iterator[bytes]:
+    """Yield the parts of a VTU file. One without points still names its fields, so that a viewer finds them in every frame."""
+    count, each = corners.shape
+    kinds = np.full(count, VTK_TYPES[each], dtype=np.uint8)
+    yield (
+        b'<?xml version="1.0"?>\n<VTKFile type="UnstructuredGrid" version="0.1" byte_order="LittleEndian" header_type="UInt64">\n'
+        b"<UnstructuredGrid>\n"
     )
+    yield f'<Piece NumberOfPoints="{len(points)}" NumberOfCells="{count}">\n<Points>\n'.encode()
+    yield from _data_array("Points", points)
+    yield b"</Points>\n<Cells>\n"
+    yield from _data_array("connectivity", corners.reshape(-1))
+    yield from _data_array("offsets", np.arange(each, each * count + 1, each, dtype=np.int32))
+    yield from _data_array("types", kinds)
+    yield f"</Cells>\n<{where}>\n".encode()
+    for name, values in fields.items():
+        yield from _data_array(name, values)
+    yield f"</{where}>\n</Piece>\n</UnstructuredGrid>\n</VTKFile>\n".encode()
+
+
+def _data_array(name: str, values: np.ndarray) -> Iterator[bytes]:
+    little = values.astype(values.dtype.newbyteorder("<"), copy=False)
+    components = f' NumberOfComponents="{values.shape[1]}"' if values.ndim == 2 else ""
+    yield f'<DataArray type="{_vtu_type(values.dtype)}" Name="{name}"{components} format="binary">'.encode()
+    yield base64.b64encode(np.uint64(little.nbytes).astype("<u8").tobytes() + little.tobytes())
+    yield b"</DataArray>\n"
 
 
 def _vtu_type(dtype: np.dtype) -> str:

@@ -31,7 +31,7 @@ class Observer(Protocol):
         """Take a step's row of the log."""
 
     def frame(self, index: int, last: int) -> None:
-        """Learn that a frame was written."""
+        """Learn that a frame is taken; its files follow."""
 
 
 class TimeLeft:

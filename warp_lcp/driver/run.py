@@ -10,12 +10,13 @@ from contextlib import closing
 from pathlib import Path
 
 from warp_lcp.driver.checkpoint import KEPT, Checkpoint
-from warp_lcp.driver.frames import frame_bytes
+from warp_lcp.driver.frames import FrameWriter, frame_bytes
 from warp_lcp.driver.log import Log, Value
+from warp_lcp.driver.profile import NoStopwatch, Profile, Stopwatch
 from warp_lcp.driver.progress import Observer
 from warp_lcp.driver.run_folder import OutputError, RunFolder, RunRecord
 from warp_lcp.driver.scene import Scene, Time
-from warp_lcp.driver.simulator import Cells, Points, Simulation, SimulationFailed, StepFailed, simulators
+from warp_lcp.driver.simulator import Cells, Points, Profiled, Simulation, SimulationFailed, StepFailed, simulators
 from warp_lcp.driver.table import Problem, SceneError
 
 RETRIES = 6  # halvings of dt: a step 64 times shorter that still fails has another cause than its length
@@ -33,6 +34,7 @@ def run_scene(
     resume: bool = False,
     force: bool = False,
     stop: Callable[[], bool] = lambda: False,
+    profile: Profile | None = None,
 ) -> RunRecord:
     """Simulate a scene into a folder.
 
@@ -45,6 +47,7 @@ def run_scene(
         resume: continue the run in the folder.
         force: delete the run in the folder.
         stop: asked after every step; True ends the run with a checkpoint.
+        profile: measures the run's stages; written to profile.json at the end.
 
     Returns:
         How the run ended, as in run.json.
@@ -69,7 +72,7 @@ def run_scene(
     record.warnings += simulation.notes()
     for note in record.warnings:
         observer.note(note)
-    return _Run(scene, simulation, folder, record, observer).execute(last_frame, stop, resumed=checkpoint is not None)
+    return _Run(scene, simulation, folder, record, observer, profile).execute(last_frame, stop, resumed=checkpoint is not None)
 
 
 def plan_dt(stable: float, remaining: float, time: Time) -> float:
@@ -92,14 +95,22 @@ def plan_dt(stable: float, remaining: float, time: Time) -> float:
 class _Run:
     """A simulation on its way through its frames."""
 
-    def __init__(self, scene: Scene, simulation: Simulation, folder: RunFolder, record: RunRecord, observer: Observer) -> None:
+    def __init__(
+        self, scene: Scene, simulation: Simulation, folder: RunFolder, record: RunRecord, observer: Observer, profile: Profile | None
+    ) -> None:
         self.time = scene.time
         self.output = scene.output
         self.simulation = simulation
         self.folder = folder
         self.record = record
         self.observer = observer
+        self.profile = profile
+        self.watch: Stopwatch = profile or NoStopwatch()
+        if isinstance(simulation, Profiled):
+            simulation.watch = self.watch
+        self.writer = FrameWriter(folder.frames, self.watch)
         self._begun = clock.perf_counter()
+        self._first_step = 0
         self._below_dt_min = False
         self._checkpointed: int | None = None  # the newest checkpoint's step
 
@@ -110,7 +121,7 @@ class _Run:
         start = self._frame()
         self._check_space(last, start)
         try:
-            with closing(self._resume() if resumed else self._start(last, start)) as log:
+            with self.writer, closing(self._resume() if resumed else self._start(last, start)) as log:
                 self.observer.start(self.simulation.time, self.time.frame_time(last))
                 stopped = self._advance(log, last, stop)
             self._write_checkpoint()
@@ -118,6 +129,7 @@ class _Run:
             self.record.reason = "interrupted" if stopped else f"frame {last} of {count} reached"
         except (StepFailed, SimulationFailed) as error:
             self._fail(str(error))
+            self._try_to(self.writer.flush)
             if isinstance(error, StepFailed):  # the state is as before the step
                 self._try_to(self._write_checkpoint)
         except OSError as error:
@@ -127,6 +139,8 @@ class _Run:
             if self.record.status == "running":
                 self._fail("the program ended unexpectedly")
             self._try_to(self._write_record)
+            if self.profile:
+                self._try_to(self._write_profile)
         return self.record
 
     def _check_space(self, last: int, frame: list[Points | Cells]) -> None:
@@ -146,6 +160,7 @@ class _Run:
         self.record.resumed_from_step = self.simulation.step_count
         self.record.frames = self._frames_done()
         self._write_record()
+        self._first_step = self.simulation.step_count
         self.folder.frames.resume([self.time.frame_time(index) for index in range(self.record.frames + 1)])
         try:
             return Log(self.folder.log, self._columns(), after_step=self.simulation.step_count)
@@ -162,6 +177,7 @@ class _Run:
             row = self._step(self.time.frame_time(frame) - self.simulation.time)
             log.append(row)
             self.observer.step(row)
+            self.writer.check()
             if self._frames_done() >= frame:
                 self._write_frame(frame, last, self._frame())
                 frame += 1
@@ -219,20 +235,31 @@ class _Run:
     def _frame(self) -> list[Points | Cells]:
         """Return what the scene wants to see of the simulation now."""
         wanted = {Points: self.output.particles, Cells: self.output.grid}
-        return [part for part in self.simulation.frame() if wanted[type(part)]] if any(wanted.values()) else []
+        with self.watch.stage("frames"):
+            return [part for part in self.simulation.frame() if wanted[type(part)]] if any(wanted.values()) else []
 
     def _write_frame(self, index: int, last: int, frame: list[Points | Cells]) -> None:
-        self.folder.frames.write(index, self.time.frame_time(index), frame)
-        self.record.frames = index
+        with self.watch.stage("frames"):
+            self.writer.put(index, self.time.frame_time(index), frame)
         self.observer.frame(index, last)
 
     def _write_checkpoint(self) -> None:
         step = self.simulation.step_count
-        if self._checkpointed != step:
-            self.folder.checkpoints.write(Checkpoint(step, self.simulation.time, self.simulation.state()))
-            self._checkpointed = step
+        if self._checkpointed == step:
+            return
+        with self.watch.stage("checkpoints"):
+            self.writer.flush()  # a run that continues from here expects its frames
+            file = self.folder.checkpoints.write(Checkpoint(step, self.simulation.time, self.simulation.state()))
+        self.watch.wrote("checkpoints", file)
+        self._checkpointed = step
+
+    def _write_profile(self) -> None:
+        assert self.profile is not None
+        self.profile.write(self.folder.path, self.simulation.step_count - self._first_step, self.record.seconds)
 
     def _write_record(self) -> None:
+        if self.writer.newest is not None:
+            self.record.frames = self.writer.newest
         self.record.steps, self.record.time = self.simulation.step_count, self.simulation.time
         self.record.seconds = round(clock.perf_counter() - self._begun, 3)
         self.folder.write_record(self.record)

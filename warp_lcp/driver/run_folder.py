@@ -22,7 +22,7 @@ from warp_lcp.driver.versions import versions
 Status = Literal["running", "finished", "stopped", "failed"]
 
 RECORD = "run.json"
-OWN_FILES = re.compile(r"scene\.toml|run\.json|log\.csv|[a-z][a-z_]*\.pvd")
+OWN_FILES = re.compile(r"scene\.toml|run\.json|profile\.json|log\.csv|[a-z][a-z_]*\.pvd")
 IMAGE_FILE = re.compile(r"(?:frame_\d{6,}|sheet)\.png")
 OWN_FOLDERS = {"frames": FRAME_FILE, "checkpoints": CHECKPOINT_FILE, "images": IMAGE_FILE}
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 
 if TYPE_CHECKING:
+    from warp_lcp.driver.profile import Stopwatch
     from warp_lcp.driver.scene import Scene
 
 GROUP = "warp_lcp.simulators"
@@ -82,6 +83,17 @@ class Simulation(Protocol):
 
     def notes(self) -> list[str]:
         """Return warnings and facts worth a line at the start of a run (say, a mesh outside the domain)."""
+
+
+@runtime_checkable
+class Profiled(Protocol):
+    """What a Simulation may also be: one that says what its step spends its time on.
+
+    It wraps the stages of its step in `with self.watch.stage(name, *arrays)`. A run that is profiled sets `watch` before the first step;
+    until then it is a `warp_lcp.driver.profile.NoStopwatch`.
+    """
+
+    watch: Stopwatch
 
 
 @runtime_checkable

@@ -75,28 +75,35 @@ def coarsen_kernels(variable: bool, d_type: Any, real: Any) -> Any:
     name = f"warp_lcp.coarsen.{'variable' if variable else 'uniform'}_{d_type.__name__}_{real.__name__}"
     d_array, field = wp.array(dtype=d_type), wp.array(dtype=real)
 
+    # equal weights: faces are counted in bytes and scaled at the end
+    counts = d_type is wp.uint8
+    buffer, diagonal = ("unsigned char", "d_.data[p + k]") if counts else (C_TYPES[real], "(T)A.unit*(T)d_.data[p + k]")
+    kept = "v" if counts else f"v > (B)1e-6*({diagonal}) ? v : (B)0"
+
+    def weight(axis: str, shift: str) -> str:
+        """Weight of a face stored `shift` after the cell."""
+        if variable:
+            return f"(B)w{axis}_.data[p + k + {shift}]"
+        return f"(B)(A.c{axis} > 0)" if counts else f"(B)A.c{axis}"
+
     def faces(axis: str, side: str, shift: str) -> str:
-        """Weights of a row's faces to the row at offset `at`, into the buffer f; the face itself is stored `shift` after the cell."""
-        weight = f"(T)w{axis}_.data[p + k + {shift}]" if variable else f"(T)A.c{axis}"
+        """Weights of a row's faces to the row at offset `at`: off the excess, and onto the outer faces."""
         return f"""{{ const long long at = {side}_{axis}; const bool outer = outer_{side}_{axis};
                     if (at != 0) {{
+                        const auto* here = d_.data + p; const auto* there = here + at; B* sum = outer ? {side[0]}{axis} : none;
                         SIMD for (int k = 0; k < fx*m; ++k) {{
-                            const T w = {weight}, f = (d_.data[p + k] != 0) & (d_.data[p + at + k] != 0) ? w : (T)0;
-                            e[k] -= f; {side[0]}{axis}[k] += outer ? f : (T)0; }}
+                            const B w = {weight(axis, shift)}, f = (here[k] != 0) & (there[k] != 0) ? w : (B)0; e[k] -= f; sum[k] += f; }}
                     }} }}"""
-
-    wx_at = "(T)wx_.data[p + k]" if variable else "(T)A.cx"
-    wx_above = "(T)wx_.data[p + k + 1]" if variable else "(T)A.cx"
 
     @wp.func_native(
         simd(
             BLOCK
-            + f"""typedef {C_TYPES[real]} T; const T unit = (T)A.unit; const int last_cell = A.nx - 1 - fx*start;
-        T excess[2*M], bx[2*M], ax[2*M], by[2*M], ay[2*M], bz[2*M], az[2*M], e[2*M];
+            + f"""typedef {C_TYPES[real]} T; typedef {buffer} B; const int last_cell = A.nx - 1 - fx*start;
+        B excess[2*M], bx[2*M], ax[2*M], by[2*M], ay[2*M], bz[2*M], az[2*M], e[2*M], none[2*M];
         for (int begin = 0; begin < n; begin += M) {{
             const int m = n - begin < M ? n - begin : (int)M;
             SIMD for (int k = 0; k < fx*m; ++k) {{
-                excess[k] = 0; bx[k] = 0; ax[k] = 0; by[k] = 0; ay[k] = 0; bz[k] = 0; az[k] = 0; }}
+                excess[k] = 0; bx[k] = 0; ax[k] = 0; by[k] = 0; ay[k] = 0; bz[k] = 0; az[k] = 0; none[k] = 0; }}
             for (int row = 0; row < 4; ++row) {{
                 const bool upper_z = row >> 1, upper_y = row & 1;
                 if ((upper_z && one_plane) || (upper_y && one_row)) continue;
@@ -106,36 +113,42 @@ def coarsen_kernels(variable: bool, d_type: Any, real: Any) -> Any:
                 const bool whole_y = !one_row && W.below_y == A.s2, whole_z = !one_plane && W.below_z == A.s1;  // periodic, two rows
                 const bool outer_below_y = !upper_y && !whole_y, outer_above_y = (upper_y || one_row) && !whole_y;
                 const bool outer_below_z = !upper_z && !whole_z, outer_above_z = (upper_z || one_plane) && !whole_z;
-                SIMD for (int k = 0; k < fx*m; ++k) e[k] = unit*(T)d_.data[p + k];
+                const auto* d = d_.data + p;
                 SIMD for (int k = 0; k < fx*m; ++k) {{
-                    const bool here = d_.data[p + k] != 0;
-                    const T w = {wx_at}, v = {wx_above};
-                    const T f = here & (d_.data[p + k - 1] != 0) ? w : (T)0, g = here & (d_.data[p + k + 1] != 0) ? v : (T)0;
-                    e[k] -= f + g; bx[k] += f; ax[k] += g; }}
+                    const B w = {weight("x", "0")}, v = {weight("x", "1")};
+                    const B f = (d[k] != 0) & (d[k-1] != 0) ? w : (B)0, g = (d[k] != 0) & (d[k+1] != 0) ? v : (B)0;
+                    e[k] = (B)({diagonal}) - f - g; bx[k] += f; ax[k] += g; }}
                 if (start + begin == 0 && W.below_x != 0) {{
-                    const int k = 0; const T f = (d_.data[p] != 0) & (d_.data[p + W.below_x] != 0) ? {wx_at} : (T)0;
-                    e[k] -= f; bx[k] += f; }}
+                    const int k = 0; const B f = (d[k] != 0) & (d[k + W.below_x] != 0) ? {weight("x", "0")} : (B)0; e[k] -= f; bx[k] += f; }}
                 const int z = last_cell - fx*begin;
                 if (z < fx*m && W.above_x != 0) {{
-                    const int k = z; const T f = (d_.data[p + k] != 0) & (d_.data[p + k + W.above_x] != 0) ? {wx_above} : (T)0;
-                    e[k] -= f; ax[k] += f; }}
+                    const int k = z; const B f = (d[k] != 0) & (d[k + W.above_x] != 0) ? {weight("x", "1")} : (B)0; e[k] -= f; ax[k] += f; }}
                 {faces("y", "below", "0")}
                 {faces("y", "above", "A.s2")}
                 {faces("z", "below", "0")}
                 {faces("z", "above", "A.s1")}
-                SIMD for (int k = 0; k < fx*m; ++k) {{
-                    const T own = unit*(T)d_.data[p + k], v = e[k]; excess[k] += v > (T)1e-6*own ? v : (T)0; }}
+                SIMD for (int k = 0; k < fx*m; ++k) {{ const B v = e[k]; excess[k] += {kept}; }}
             }}
-            const T sx = fx == 2 ? (T)1 : stiffen, sy = fy == 2 ? (T)1 : stiffen, sz = fz == 2 ? (T)1 : stiffen;
-            const T se = fx*fy*fz == 8 ? held : stiffen;
+            const T scale = {"(T)A.unit" if counts else "(T)1"}, se = scale*(fx*fy*fz == 8 ? held : stiffen);
             const bool whole_x = fx == 2 && W.below_x == 1;  // a periodic row of two cells is one aggregate
-            for (int k = 0; k < m; ++k) {{
-                const int a = fx*k, b = fx == 2 ? a + 1 : a; const bool two = fx == 2; const long long o = c + begin + k;
-                const T low_x = whole_x ? (T)0 : sx*bx[a], high_x = whole_x ? (T)0 : sx*(two && fx*(start + begin + k) + 1 >= A.nx ? ax[a] : ax[b]);
-                const T low_y = sy*(by[a] + (two ? by[b] : (T)0)), high_y = sy*(ay[a] + (two ? ay[b] : (T)0));
-                const T low_z = sz*(bz[a] + (two ? bz[b] : (T)0)), high_z = sz*(az[a] + (two ? az[b] : (T)0));
-                dc_.data[o] = se*(excess[a] + (two ? excess[b] : (T)0)) + low_x + high_x + low_y + high_y + low_z + high_z;
-                wxc_.data[o] = low_x; wyc_.data[o] = low_y; wzc_.data[o] = low_z; }}
+            const T sx = whole_x ? (T)0 : fx == 2 ? scale : scale*stiffen;
+            const T sy = fy == 2 ? scale : scale*stiffen, sz = fz == 2 ? scale : scale*stiffen;
+            T* dc = dc_.data + c + begin; T* wxc = wxc_.data + c + begin; T* wyc = wyc_.data + c + begin; T* wzc = wzc_.data + c + begin;
+            if (fx == 2) {{
+                SIMD for (int k = 0; k < m; ++k) {{
+                    const int a = 2*k, b = a + 1;
+                    const T x = sx*(T)bx[a], y = sy*((T)by[a] + (T)by[b]), z = sz*((T)bz[a] + (T)bz[b]);
+                    wxc[k] = x; wyc[k] = y; wzc[k] = z;
+                    const T above = sx*(T)ax[b] + sy*((T)ay[a] + (T)ay[b]) + sz*((T)az[a] + (T)az[b]);
+                    dc[k] = se*((T)excess[a] + (T)excess[b]) + x + y + z + above; }}
+                const int odd = last_cell - 2*begin;  // the last cell of an odd row is an aggregate: its upper face is an outer one
+                if (odd < 2*m && odd % 2 == 0) dc[odd / 2] += sx*(T)ax[odd];
+            }} else {{
+                SIMD for (int k = 0; k < m; ++k) {{
+                    const T x = sx*(T)bx[k], y = sy*(T)by[k], z = sz*(T)bz[k];
+                    wxc[k] = x; wyc[k] = y; wzc[k] = z;
+                    dc[k] = se*(T)excess[k] + x + y + z + sx*(T)ax[k] + sy*(T)ay[k] + sz*(T)az[k]; }}
+            }}
         }}"""
         )
     )

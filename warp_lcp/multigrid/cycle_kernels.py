@@ -198,4 +198,59 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         o = row_start(C, k // G.fz, j // G.fy, c, grain)
         correct_row(A, d, wx, wy, wz, x, p, coarse, o, lower, upper, n, G.fx - 1, scale, projected)
 
-    return SimpleNamespace(sweep=sweep_kernel, restrict=restrict_kernel, correct=correct_kernel, bounds=bounds_kernel)
+    @wp.kernel(enable_backward=False, module=name)
+    def descend_kernel(
+        A: StencilShape, d: d_array, wx: field, wy: field, wz: field, C: StencilShape, G: Aggregates, planes: int, rows: int,
+        from_zero: bool, x: field, b: field, t: field, lower: field, upper: field, coarse: field, first: real, second: real,
+        projected: bool,
+    ):  # fmt: skip
+        """Two sweeps, residual and restriction by one CPU thread, each a plane behind the one before: the leg streams memory once."""
+        k = int(0)
+        for s in range(G.nz + 1):
+            if s < G.nz:
+                for j in range(G.ny):
+                    p = row_start(A, s, j, 0, 0)
+                    if from_zero:
+                        first_sweep_row(A, d, wx, wy, wz, t, x, b, lower, upper, p, A.nx, first, projected)
+                    else:
+                        sweep_row(A, d, wx, wy, wz, t, x, b, lower, upper, p, A.nx, first, projected)
+            i = s - 1
+            if i >= 0:
+                for j in range(G.ny):
+                    sweep_row(A, d, wx, wy, wz, x, t, b, lower, upper, row_start(A, i, j, 0, 0), A.nx, second, projected)
+            while k < planes and (G.fz * (k + 1) <= i or i == G.nz - 1):
+                for j in range(rows):
+                    p = first_cell(A, G, k, j, 0, 0)
+                    o = row_start(C, k, j, 0, 0)
+                    restrict_row(A, d, wx, wy, wz, coarse, o, x, b, p, C.nx, G.fx, one_plane(G, k), one_row(G, j))
+                k += 1
+
+    @wp.kernel(enable_backward=False, module=name)
+    def ascend_kernel(
+        A: StencilShape, d: d_array, wx: field, wy: field, wz: field, C: StencilShape, G: Aggregates, x: field, b: field, t: field,
+        lower: field, upper: field, coarse: field, first: real, second: real, scale: real, projected: bool,
+    ):  # fmt: skip
+        """Correction and two sweeps by one CPU thread, each a plane behind the one before."""
+        for s in range(G.nz + 2):
+            if s < G.nz:
+                for j in range(G.ny):
+                    o = row_start(C, s // G.fz, j // G.fy, 0, 0)
+                    p = row_start(A, s, j, 0, 0)
+                    correct_row(A, d, wx, wy, wz, x, p, coarse, o, lower, upper, A.nx, G.fx - 1, scale, projected)
+            i = s - 1
+            if i >= 0 and i < G.nz:
+                for j in range(G.ny):
+                    sweep_row(A, d, wx, wy, wz, t, x, b, lower, upper, row_start(A, i, j, 0, 0), A.nx, first, projected)
+            i = s - 2
+            if i >= 0:
+                for j in range(G.ny):
+                    sweep_row(A, d, wx, wy, wz, x, t, b, lower, upper, row_start(A, i, j, 0, 0), A.nx, second, projected)
+
+    return SimpleNamespace(
+        sweep=sweep_kernel,
+        restrict=restrict_kernel,
+        correct=correct_kernel,
+        bounds=bounds_kernel,
+        descend=descend_kernel,
+        ascend=ascend_kernel,
+    )

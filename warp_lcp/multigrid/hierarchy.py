@@ -186,14 +186,36 @@ class Hierarchy:
             self._solve_coarsest(launch, projected=projected, from_zero=from_zero)
             return
         L = self.levels[level]
-        self._pair(L, launch, from_zero=from_zero, projected=projected)
-        self._restrict(level, launch)
+        fused = self.device.is_cpu and not any(L.stencil.periodic)
+        if fused:
+            self._descending_leg(level, launch, projected=projected, from_zero=from_zero)
+        else:
+            self._pair(L, launch, from_zero=from_zero, projected=projected)
+            self._restrict(level, launch)
         if projected:
             self._restrict_bounds(level, launch)
         for visit in range(self.levels[level + 1].visits if level + 2 < len(self.levels) else 1):
             self._descend(level + 1, launch, projected=projected, from_zero=visit == 0)
-        self._correct(level, launch, projected=projected)
-        self._pair(L, launch, reverse=True, projected=projected)
+        if fused:
+            self._ascending_leg(level, launch, projected=projected)
+        else:
+            self._correct(level, launch, projected=projected)
+            self._pair(L, launch, reverse=True, projected=projected)
+
+    def _descending_leg(self, level: int, launch: Launch, *, projected: bool, from_zero: bool) -> None:
+        """Sweeps, residual and restriction in one launch of one CPU thread."""
+        L, C = self.levels[level], self.levels[level + 1]
+        planes, rows, _ = C.stencil.padding.counts
+        fields = [L.x, L.b, L.t, L.lower, L.upper, C.b, *self.settings.weights, projected]
+        inputs = [*L.operands, C.stencil.shape, C.aggregates, planes, rows, from_zero, *fields]
+        launch(L.kernels.descend, 1, inputs, device=self.device)
+
+    def _ascending_leg(self, level: int, launch: Launch, *, projected: bool) -> None:
+        """Correction and sweeps in one launch of one CPU thread."""
+        L, C = self.levels[level], self.levels[level + 1]
+        first, second = reversed(self.settings.weights)
+        fields = [L.x, L.b, L.t, L.lower, L.upper, C.x, first, second, self.settings.over_correction, projected]
+        launch(L.kernels.ascend, 1, [*L.operands, C.stencil.shape, C.aggregates, *fields], device=self.device)
 
     def _solve_coarsest(self, launch: Launch, *, projected: bool, from_zero: bool) -> None:
         """Multiply by the inverse; projected sweeps stand for that where there are bounds."""

@@ -50,20 +50,31 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
             + f"""typedef {C_TYPES[free_type]} F; F* free = free_.data + p;
         const T* x = x_.data + p; const T* b = b_.data + p; auto* g = g_.data + p;
         const auto* m = m_.data + p; T s = 0; int moved = 0, active = 0; unsigned char hold[M];
-        with_bounds([&](auto lower, auto upper) {{
-            for (int begin = 0; begin < n; begin += M) {{
-                const int end = n - begin < M ? n : begin + (int)M; unsigned char changed = 0, count = 0;
-                SIMD for (int k = begin; k < end; ++k) {{
-                    const T e = unit*(T)d[k], v = e*x[k] - {NEIGHBORS[variable]}, y = (e != 0 ? v : (T)0) + b[k], f = e != 0 ? e : (T)1;
-                    const T l = lower(k), u = upper(k), below = f*(x[k] - l), above = f*(x[k] - u);
-                    const T least = below < y ? below : y, r0 = above > least ? above : least;
-                    const bool in = m[k] == 1, held = classify & (((x[k] <= l) & (y >= 0)) | ((x[k] >= u) & (y <= 0)));
-                    const T r = in ? r0 : (T)0;
-                    s += r*r; hold[k - begin] = held; g[k] = ((e != 0) & !held) ? -y*inverse : (T)0; }}
-                SIMD for (int k = begin; k < end; ++k) {{  // bytes only, where the diagonal is one
-                    const F now = hold[k - begin] ? (F)0 : (F)d[k]; const unsigned char one = free[k] != now, two = hold[k - begin] & m[k];
-                    changed |= one; count += two; free[k] = now; }}
-                moved += changed; active += count; }} }});
+        const bool free_all = !l_.data && !u_.data && l_value == -(T)INFINITY && u_value == (T)INFINITY;
+        for (int begin = 0; begin < n; begin += M) {{
+            const int end = n - begin < M ? n : begin + (int)M; T y[M];
+            SIMD8 for (int k = begin; k < end; ++k) {{
+                const T e = unit*(T)d[k], v = e*x[k] - {NEIGHBORS[variable]}; y[k - begin] = (e != 0 ? v : (T)0) + b[k]; }}
+            if (free_all) {{
+                unsigned char changed = 0;
+                SIMD8 for (int k = begin; k < end; ++k) {{
+                    const T v = y[k - begin], r = m[k] == 1 ? v : (T)0; s += r*r; g[k] = d[k] != 0 ? -v*inverse : (T)0; }}
+                SIMD for (int k = begin; k < end; ++k) {{ const F now = (F)d[k]; changed |= (unsigned char)(free[k] != now); free[k] = now; }}
+                moved += changed;
+                continue;
+            }}
+            unsigned char changed = 0, count = 0;
+            with_bounds([&](auto lower, auto upper) {{
+                SIMD8 for (int k = begin; k < end; ++k) {{
+                    const T e = unit*(T)d[k], f = e != 0 ? e : (T)1, l = lower(k), u = upper(k), v = y[k - begin];
+                    const T below = f*(x[k] - l), above = f*(x[k] - u), least = below < v ? below : v, r0 = above > least ? above : least;
+                    const bool held = classify & (((x[k] <= l) & (v >= 0)) | ((x[k] >= u) & (v <= 0)));
+                    const T r = m[k] == 1 ? r0 : (T)0;
+                    s += r*r; hold[k - begin] = held; g[k] = ((e != 0) & !held) ? -v*inverse : (T)0; }} }});
+            SIMD for (int k = begin; k < end; ++k) {{  // bytes only, where the diagonal is one
+                const F now = hold[k - begin] ? (F)0 : (F)d[k]; const unsigned char one = free[k] != now, two = hold[k - begin] & m[k];
+                changed |= one; count += two; free[k] = now; }}
+            moved += changed; active += count; }}
         out.data[t] = s; out.data[threads + t] = moved; out.data[2*threads + t] = active;"""
         )
     )
@@ -119,7 +130,7 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
 
 @functools.cache
 def flat_kernels(free_type: Any, real: Any) -> SimpleNamespace:
-    """Return the kernels on flat fields: `update`, `mask`, `gaps`, `add`."""
+    """Return the kernels on flat fields: `update`, `gaps`, `add`."""
     name = f"warp_lcp.projected_multigrid.{free_type.__name__}_{real.__name__}"
     free_array, field, i8 = wp.array(dtype=free_type), wp.array(dtype=real), wp.array(dtype=wp.int8)
 
@@ -138,9 +149,6 @@ def flat_kernels(free_type: Any, real: Any) -> SimpleNamespace:
         x_: f64, z_: field, az_: field, p_: field, ap_: field, l_: f64, l_value: wp.float64, u_: f64, u_value: wp.float64, o_: f64,
         beta: real, step: wp.float64, start: wp.int64, end: wp.int64, stride: wp.int64,
     ): ...  # fmt: skip
-
-    @wp.func_native(flat("auto* q = p_.data; const auto* f = f_.data; EACH { q[i] = f[i] != 0 ? q[i] : 0; }"))
-    def mask_span(p_: field, f_: free_array, start: wp.int64, end: wp.int64, stride: wp.int64): ...
 
     @wp.func_native(
         flat(
@@ -185,11 +193,6 @@ def flat_kernels(free_type: Any, real: Any) -> SimpleNamespace:
         update_span(x, z, az, p, ap, lower, lower_value, upper, upper_value, out, beta, scalars[STEP], start, end, stride)
 
     @wp.kernel(enable_backward=False, module=name)
-    def mask(p: field, free: free_array, n: int, chunk: int, stride: wp.int64):
-        t = wp.tid()
-        mask_span(p, free, span_start(t, chunk), span_end(t, chunk, n), stride)
-
-    @wp.kernel(enable_backward=False, module=name)
     def gaps(
         x: f64, lower: f64, lower_value: wp.float64, upper: f64, upper_value: wp.float64, unknown: i8, lo: field, hi: field, scalars: f64,
         n: int, chunk: int, stride: wp.int64,
@@ -210,7 +213,7 @@ def flat_kernels(free_type: Any, real: Any) -> SimpleNamespace:
         end = span_end(t, chunk, n)
         add_span(x, z, lower, lower_value, upper, upper_value, out, scalars[SIZE], start, end, stride)
 
-    return SimpleNamespace(update=update, mask=mask, gaps=gaps, add=add)
+    return SimpleNamespace(update=update, gaps=gaps, add=add)
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.projected_multigrid")

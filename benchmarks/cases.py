@@ -1,0 +1,171 @@
+"""One case of the suite `solvers`: a scene, bounds, a method, and everything that is measured of it."""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+import warp_lcp as wl
+from benchmarks.memory import array_bytes, forget_peak, resident_bytes
+from benchmarks.problems import Splash, warm_changes
+from benchmarks.timing import Figure
+
+RTOL = 1e-6
+TOLERANCES = (1e-4, 1e-6, 1e-8)
+MIDST = 3  # iterations after which a method has made all of its buffers
+
+
+@dataclass
+class Case:
+    """A solve that is measured again and again.
+
+    Args:
+        form: coefficients: `unit`, `faces`, `cells 1:100`, `arrays 1:100`.
+        scene: the scene.
+        bounds: which unknowns have p >= 0.
+        solver: settings of the method.
+        device: Warp device.
+        full: whether reuse, warm starts, memory and time to tolerances are measured too.
+    """
+
+    form: str
+    scene: Splash
+    bounds: str
+    solver: Any
+    device: str
+    full: bool = True
+    samples: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    counts: dict[str, float] = field(default_factory=dict)
+    history: list[wl.Record] = field(default_factory=list)
+    _warm: Iterator[tuple[float, int]] | None = None
+
+    @property
+    def name(self) -> str:
+        """Unique among the cases."""
+        return f"{self.scene.n}^3 {self.form} {self.bounds} {type(self.solver).__name__}"
+
+    @property
+    def cells(self) -> int:
+        """Cells of the grid, of all types."""
+        return int(self.scene.cells.size)
+
+    def cold(self, *, keep: bool) -> None:
+        """Build operator, problem and workspace from host arrays and solve: a user's first solve. All in one sample."""
+        times = [time.perf_counter()]
+        A = wl.GridPoisson(self.scene.cells, device=self.device, **self.scene.faces)
+        times.append(time.perf_counter())
+        problem = wl.LCP(A, self.scene.b, self.scene.lower(self.bounds))
+        times.append(time.perf_counter())
+        work = self.solver.init(problem)
+        times.append(time.perf_counter())
+        result = wl.solve(problem, self.solver, stopping=wl.StoppingCriteria(rtol=RTOL), workspace=work)
+        wp.synchronize_device(self.device)
+        times.append(time.perf_counter())
+        self.counts |= {
+            "iterations": result.iterations,
+            "linear_iterations": result.linear_iterations,
+            "residual": result.relative_residual,
+            "converged": float(bool(result)),
+        }
+        if keep:
+            parts = ("operator", "problem", "workspace", "solve")
+            for part, (begun, end) in zip(parts, pairwise(times), strict=True):
+                self.samples[part].append(end - begun)
+            self.samples["setup"].append(times[3] - times[0])
+            self.samples["total"].append(times[4] - times[0])
+
+    def again(self, *, keep: bool) -> None:
+        """Solve with a workspace that has solved before: cold; by the method's bare loop; and warm after b changed by 1 %."""
+        if self._warm is None:
+            self._warm = self._solves()
+        for label in ("reuse", "bare", "warm"):
+            seconds, iterations = next(self._warm)
+            self.counts[f"{label}_iterations"] = iterations
+            if keep:
+                self.samples[label].append(seconds)
+
+    def _solves(self) -> Iterator[tuple[float, int]]:
+        """Yield seconds and iterations of a cold solve, the bare loop, a warm solve, and so on, in place and with one workspace."""
+        problem, b = self._in_place()
+        work, fields = self.solver.init(problem), [self._stored(v) for v in warm_changes(self.scene)]
+        start, stopping, turn = wp.zeros_like(b), wl.StoppingCriteria(rtol=RTOL), 0
+        while True:
+            begun = time.perf_counter()
+            result = wl.solve(problem, self.solver, stopping=stopping, workspace=work)
+            wp.synchronize_device(self.device)
+            yield time.perf_counter() - begun, result.iterations
+            wp.copy(start, result.x)
+            yield self._bare(problem, work, result.iterations), result.iterations
+            turn += 1
+            wp.copy(b, fields[turn % 2])
+            begun = time.perf_counter()
+            result = wl.solve(problem, self.solver, stopping=stopping, x0=start, workspace=work)
+            wp.synchronize_device(self.device)
+            yield time.perf_counter() - begun, result.iterations
+
+    def _bare(self, problem: wl.LCP, work: Any, steps: int) -> float:
+        """Return the seconds of the method's own steps, without statuses, history, best iterate or search for singular components."""
+        begun = time.perf_counter()
+        residual = work.residual
+        residual.start(work.x, keep=False)
+        tolerance = RTOL * residual.evaluate(work.x)
+        work.start(warm=False, tolerance=tolerance)
+        for _ in range(steps):
+            residual.current = False
+            self.solver.step(problem, work, work.x)
+            if not residual.current:
+                residual.evaluate(work.x)
+        wp.synchronize_device(self.device)
+        return time.perf_counter() - begun
+
+    def memory(self) -> None:
+        """Count the bytes of operator, problem and workspace, b and the bounds included: in the midst of a solve in place, and after it."""
+        gc.collect()
+        before, resident, most = array_bytes(), resident_bytes(), list[int]()
+        forget_peak()
+        problem, _ = self._in_place()
+        work = self.solver.init(problem)
+
+        def look(record: wl.Record) -> None:
+            if record.iteration == MIDST:
+                most.append(array_bytes())
+
+        wl.solve(problem, self.solver, stopping=wl.StoppingCriteria(rtol=RTOL), workspace=work, callback=look)
+        most.append(array_bytes())
+        self.counts["bytes_per_cell"] = (max(most) - before) / self.cells
+        self.counts["resident_per_cell"] = max(0, resident_bytes(peak=True) - resident) / self.cells
+
+    def to_tolerances(self) -> None:
+        """Solve cold to the tightest tolerance and keep the history; set-up is added later."""
+        problem = self.scene.problem(self.bounds, self.device)
+        work = self.solver.init(problem)
+        result = wl.solve(problem, self.solver, stopping=wl.StoppingCriteria(rtol=TOLERANCES[-1]), workspace=work)
+        self.history, reference = result.history, result.residual / result.relative_residual if result.relative_residual else 1.0
+        for tolerance in TOLERANCES:
+            reached = [r for r in self.history if r.residual <= tolerance * reference]
+            if reached:
+                self.samples[f"to_{tolerance:.0e}"].append(reached[0].seconds)
+
+    def figures(self) -> dict[str, Figure]:
+        """Return what was measured."""
+        figures = {name: Figure.of(times, "s") for name, times in self.samples.items()}
+        figures |= {name: Figure(value, "B" if "per_cell" in name else "") for name, value in self.counts.items()}
+        if self.samples["bare"]:
+            figures["loop_over_bare"] = Figure.of([a / b for a, b in zip(self.samples["reuse"], self.samples["bare"], strict=True)])
+        return figures
+
+    def _in_place(self) -> tuple[wl.LCP, wp.array[Any]]:
+        """Return the problem with b in the stored layout, as a time-stepping code has it, and b."""
+        b = self._stored(self.scene.b)
+        return self.scene.problem(self.bounds, self.device, b), b
+
+    def _stored(self, values: np.ndarray) -> wp.array[Any]:
+        return wp.array(np.pad(values, 1), dtype=wp.float64, device=self.device)

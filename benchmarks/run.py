@@ -1,0 +1,227 @@
+"""Steps per second of built-in scenes, where the time goes, and what particles and walls cost there."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+import fluids.simulator
+import warp_lcp as wl
+from benchmarks.machine import machine
+from benchmarks.record import Bars, Record, Results, Table
+from benchmarks.stopwatch import timed
+from benchmarks.timing import Figure, Options
+from warp_lcp.driver.run import run_scene
+from warp_lcp.driver.scene_file import load_scene
+from warp_lcp.driver.simulator import simulators
+
+TITLE = "Runs of built-in scenes"
+SCENES = {"dam-break-2d": 0.3, "dam-break": 0.2}  # [s] simulated
+PARTICLES = 128  # cells along the longest side of the scene whose particles are timed
+PARTICLE_STEPS = 12
+WALL_TIME = 0.6  # [s] simulated of the scene in which solves with and without walls are compared: the splash lies in it
+STAGES = {
+    "to grid": (fluids.simulator, "particles_to_faces"),
+    "to particles": (fluids.simulator, "faces_to_particles"),
+    "advection": (fluids.simulator, "advect"),
+    "extrapolation": (fluids.simulator, "extend_velocity"),
+    "solve": (wl, "solve"),
+}
+
+
+class Watch:
+    """Takes the rows of a run's log."""
+
+    def __init__(self) -> None:
+        self.rows: list[Mapping[str, Any]] = []
+
+    def note(self, text: str) -> None:
+        """Take a remark."""
+
+    def start(self, time: float, end: float) -> None:
+        """Learn the time [s] that the run begins and ends at."""
+
+    def step(self, row: Mapping[str, Any]) -> None:
+        """Take a step's row."""
+        self.rows.append(row)
+
+    def frame(self, index: int, last: int) -> None:
+        """Learn that a frame was written."""
+
+
+def measure(options: Options, out: Path) -> Results:
+    """Run the scenes in turns, then compare walls and time the particles."""
+    records = [machine(options.device, elements=1 << 22, repeat=options.repeat)]
+    size = max(options.sizes, default=0)
+    samples: dict[str, list[dict[str, float]]] = {name: [] for name in SCENES}
+    for turn in range(options.repeat + 1):  # the first one loads kernels
+        options.say(f"scenes, round {turn} of {options.repeat}")
+        for name, duration in SCENES.items():
+            sample = _run(name, duration, size, options.device)
+            if turn > 0:
+                samples[name].append(sample)
+    scenes = [_scene_record(name, taken) for name, taken in samples.items()]
+    options.say("walls in a running scene")
+    walls = _walls(size, options)
+    options.say("particles")
+    particles = _particles(size or PARTICLES, options)
+    records += [*scenes, walls, particles]
+    chart = Bars(
+        "stages",
+        "Share of a step",
+        "%",
+        {f"{r.name}: {k[6:]}": 100 * f.value for r in scenes for k, f in r.figures.items() if k[:6] == "share "},
+    )
+    return Results(records, [_table(scenes), _figures_table([walls, particles])], [chart])
+
+
+def _overrides(duration: float, size: int) -> list[str]:
+    return [f"time.duration={duration}", *([f"domain.resolution={size}"] if size else [])]
+
+
+def _run(name: str, duration: float, size: int, device: str) -> dict[str, float]:
+    """Run a scene into a temporary folder; return its steps and seconds by stage."""
+    scene, watch = load_scene(name, _overrides(duration, size)), Watch()
+    with tempfile.TemporaryDirectory() as folder, timed(device, STAGES) as seconds:
+        begun = time.perf_counter()
+        record = run_scene(scene, Path(folder) / "run", device=device, observer=watch, force=True)
+        total = time.perf_counter() - begun
+    if record.status != "finished":
+        raise RuntimeError(f"{name}: {record.status}: {record.reason}")
+    steps = sum(row["seconds"] for row in watch.rows)
+    stages = {stage: sum(seconds[stage]) for stage in STAGES}
+    linear = sum(row["linear_iterations"] or 0 for row in watch.rows)
+    rest = steps - sum(stages.values())
+    return {
+        "steps": len(watch.rows),
+        "in steps": steps,
+        "total": total,
+        "linear": linear,
+        **stages,
+        "rest of steps": rest,
+        "output": total - steps,
+    }
+
+
+def _scene_record(name: str, samples: Sequence[dict[str, float]]) -> Record:
+    figures = {
+        "steps": Figure(samples[0]["steps"]),
+        "linear_iterations_per_step": Figure(samples[0]["linear"] / samples[0]["steps"]),
+        "steps_per_second": Figure.of([s["steps"] / s["total"] for s in samples], "1/s"),
+        "seconds_per_step": Figure.of([s["in steps"] / s["steps"] for s in samples], "s"),
+    }
+    stages = [*STAGES, "rest of steps", "output"]
+    figures |= {f"share {stage}": Figure.of([s[stage] / s["total"] for s in samples]) for stage in stages}
+    return Record(name, figures)
+
+
+class BothSolves:
+    """In the place of `wl.solve`: solves as asked, and the same problem without bounds, each warm from its own last solution."""
+
+    def __init__(self, plain: Any, device: str) -> None:
+        self.plain, self.device = plain, device
+        self.bounded: list[float] = []
+        self.linear: list[float] = []
+        self.iterations = [0, 0]
+        self._problem: wl.LCP | None = None
+        self._work: Any = None
+        self._last: tuple[np.ndarray, np.ndarray] | None = None
+
+    def __call__(self, problem: wl.LCP, solver: Any, **options: Any) -> wl.SolveResult:
+        """Solve both and keep the seconds."""
+        if self._problem is None:
+            self._problem = wl.LCP(problem.A, problem.b.reshape(problem.layout.stored_shape), -np.inf, np.inf)
+            self._work = solver.init(self._problem)
+        start = self._start(options["x0"])
+        result = self._timed(self.bounded, problem, solver, options)
+        free = self._timed(self.linear, self._problem, solver, options | {"x0": start, "workspace": self._work})
+        self.iterations = [self.iterations[0] + result.linear_iterations, self.iterations[1] + free.linear_iterations]
+        self._last = result.x.numpy().copy(), free.x.numpy().copy()
+        return result
+
+    def _timed(self, seconds: list[float], problem: wl.LCP, solver: Any, options: dict[str, Any]) -> wl.SolveResult:
+        begun = time.perf_counter()
+        result: wl.SolveResult = self.plain(problem, solver, **options)
+        wp.synchronize_device(self.device)
+        seconds.append(time.perf_counter() - begun)
+        return result
+
+    def _start(self, x0: wp.array[Any]) -> wp.array[Any]:
+        """Scale the last linear solution as the scene scaled its own: by the ratio of time steps."""
+        if self._last is None:
+            return wp.clone(x0)
+        guess, (bounded, free) = x0.numpy(), self._last
+        both = (guess != 0) & (bounded.reshape(guess.shape) != 0)
+        ratio = float(np.median(guess[both] / bounded.reshape(guess.shape)[both])) if both.any() else 0.0
+        return wp.array(ratio * free.reshape(guess.shape) * (guess != 0), dtype=wp.float64, device=x0.device)
+
+
+@contextmanager
+def _solving_both(device: str) -> Any:
+    both = BothSolves(wl.solve, device)
+    wl.solve = both
+    try:
+        yield both
+    finally:
+        wl.solve = both.plain
+
+
+def _walls(size: int, options: Options) -> Record:
+    """Solve every step of the running dam break with separating walls and without bounds."""
+    scene, watch = (
+        load_scene("dam-break", [*_overrides(WALL_TIME, size), "solver.method=projected-multigrid", "solver.tolerance=1e-6"]),
+        Watch(),
+    )
+    with tempfile.TemporaryDirectory() as folder, _solving_both(options.device) as both:
+        run_scene(scene, Path(folder) / "run", device=options.device, observer=watch, force=True)
+    parts = np.array_split(np.arange(1, len(both.linear)), options.repeat)  # the first step is cold
+    ratio = [sum(both.bounded[i] for i in part) / sum(both.linear[i] for i in part) for part in parts if len(part)]
+    steps = len(both.linear)
+    figures = {
+        "solve_over_linear": Figure.of(ratio),
+        "steps": Figure(steps),
+        "iterations_per_step": Figure(both.iterations[0] / steps),
+        "linear_iterations_per_step": Figure(both.iterations[1] / steps),
+        "released_cells": Figure(float(np.mean([row["active"] or 0 for row in watch.rows]))),
+    }
+    return Record("dam-break, 3-D: walls", figures)
+
+
+def _particles(size: int, options: Options) -> Record:
+    """Step a dam break and time what its particles cost."""
+    scene = load_scene("dam-break", [f"domain.resolution={size}"])
+    simulation: Any = simulators()[scene.scene.simulator].create(scene, device=options.device, folder=Path.cwd())
+    count = simulation.particles.count
+    with timed(options.device, STAGES) as seconds:
+        for _ in range(PARTICLE_STEPS + 1):
+            simulation.step(min(simulation.stable_dt(), scene.time.dt_max))
+    there, back = seconds["to grid"][1:], seconds["to particles"][1:]
+    figures = {"particles": Figure(count)}
+    figures |= {label: Figure.of([1e9 * t / count for t in times], "ns") for label, times in (("to_grid", there), ("to_particles", back))}
+    figures["round_trip"] = Figure.of([1e9 * (a + b) / count for a, b in zip(there, back, strict=True)], "ns")
+    figures["advection"] = Figure.of([1e9 * t / count for t in seconds["advection"][1:]], "ns")
+    return Record("particles, 3-D", figures)
+
+
+def _table(scenes: Sequence[Record]) -> Table:
+    shares = [*STAGES, "rest of steps", "output"]
+    columns = ["scene", "steps", "steps/s", "ms a step", "linear iterations a step", *(f"{s} [%]" for s in shares)]
+    rows = []
+    for r in scenes:
+        numbers = [f"{r.value('steps'):.0f}", str(r.figures["steps_per_second"]), f"{1e3 * (r.value('seconds_per_step') or 0):.2f}"]
+        percent = [f"{100 * (r.value(f'share {s}') or 0):.1f}" for s in shares]
+        rows.append([r.name, *numbers, f"{r.value('linear_iterations_per_step'):.1f}", *percent])
+    remark = "steps/s: of the whole run, frames, checkpoints and start included. Simulated: "
+    return Table("Scenes", columns, rows, remark + ", ".join(f"{t} s of {name}" for name, t in SCENES.items()) + ".")
+
+
+def _figures_table(records: Sequence[Record]) -> Table:
+    rows = [[r.name, name.replace("_", " "), str(figure)] for r in records for name, figure in r.figures.items()]
+    return Table("Walls and particles", ["what", "figure", "measured"], rows)

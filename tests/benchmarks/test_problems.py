@@ -1,0 +1,56 @@
+"""The measured problems are the ones that the tests solve, and the assembled matrix is the operator."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+import scenes
+import warp_lcp as wl
+from benchmarks.problems import BOUNDS, anisotropic, basin, cut_cells, splash, warm_changes
+
+
+def test_splash_is_the_scene_of_the_tests():
+    cells, b, wall = scenes.splash(20)
+    scene = splash(20)
+    assert np.array_equal(scene.cells, cells)
+    assert np.array_equal(scene.wall, wall)
+    assert np.allclose(scene.b, b, atol=1e-14)
+
+
+def test_matrix_is_the_operator():
+    scene = splash(12)
+    fluid = scene.cells == wl.FLUID
+    x = np.zeros(fluid.shape)
+    x[fluid] = np.random.default_rng(31).standard_normal(fluid.sum())
+    product = wl.GridPoisson(scene.cells, device="cpu").apply(wp.array(x, dtype=wp.float64, device="cpu")).numpy()
+    assert np.allclose(scene.matrix() @ x[fluid], product[fluid], atol=1e-12)
+    with pytest.raises(ValueError, match="unit coefficients"):
+        cut_cells(scene).matrix()
+
+
+def test_bounds():
+    scene = splash(12)
+    assert [np.isfinite(scene.lower(bounds)).sum() for bounds in BOUNDS] == [0, scene.wall.sum(), 1]
+
+
+def test_cut_cells_are_open_in_part_near_the_sphere_only():
+    faces = cut_cells(splash(16)).faces
+    assert faces["face_x"].shape == (16, 16, 17)
+    assert {f.min() for f in faces.values()} == {0.1}
+    assert all(0.8 < np.mean(f == 1.0) < 1.0 for f in faces.values())
+
+
+def test_anisotropic_coefficients():
+    A = wl.GridPoisson(splash(12).cells, device="cpu", **anisotropic(splash(12), 7.0).faces)
+    assert A.uniform == (7.0, 1.0, 1.0)
+
+
+def test_warm_change_is_of_the_size_asked_for():
+    first, second = warm_changes(splash(12), 0.03)
+    assert np.linalg.norm(second - first) / np.linalg.norm(first) == pytest.approx(0.03)
+
+
+def test_basin_is_full_and_not_singular():
+    scene = basin(10)
+    assert (scene.cells == wl.FLUID).sum() == 900
+    assert wl.GridPoisson(scene.cells, device="cpu").floating_components() is None

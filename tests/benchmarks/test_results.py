@@ -1,0 +1,139 @@
+"""Figures, files, comparisons, targets."""
+
+import json
+
+import pytest
+import warp as wp
+
+from benchmarks import machine, plots
+from benchmarks.compare import bounds, comparison
+from benchmarks.memory import array_bytes, resident_bytes
+from benchmarks.record import Bars, Lines, Record, Table, read_json, write_json, write_markdown
+from benchmarks.stopwatch import timed
+from benchmarks.targets import Target, targets
+from benchmarks.timing import Figure, in_turns, ratios
+
+
+def record(name, *samples, **facts):
+    return Record(name, {"total": Figure.of(samples, "s")}, facts)
+
+
+def test_figures():
+    figure = Figure.of([3.0, 1.0, 2.0], "s")
+    assert (figure.value, figure.low, figure.high, figure.samples) == (2.0, 1.0, 3.0, 3)
+    assert Figure.from_dict(figure.as_dict()) == figure
+    assert Figure.from_dict(Figure(7).as_dict()) == Figure(7)
+    assert str(figure) == "2 s (1 to 3)"
+    assert ratios([2.0, 6.0], [1.0, 2.0]).value == 2.5
+
+
+def test_in_turns_takes_one_sample_of_each_a_round():
+    order = []
+
+    def work(name):
+        def run():
+            order.append(name)
+            begin = 0
+            for i in range(60_000):  # longer than the shortest sample
+                begin += i
+
+        return run
+
+    times = in_turns({"a": work("a"), "b": work("b")}, 3)
+    assert {name: len(taken) for name, taken in times.items()} == {"a": 3, "b": 3}
+    assert order[-1] == "b"
+    assert all(t > 0 for taken in times.values() for t in taken)
+
+
+def test_files_keep_records(tmp_path):
+    path = tmp_path / "x.json"
+    write_json(path, [record("one", 1.0, 2.0, n=64), record("two", 3.0)])
+    kept = json.loads(path.read_text())
+    assert [r["name"] for r in kept] == ["one", "two"]
+    assert kept[0]["figures"]["total"] == {"value": 1.5, "unit": "s", "min": 1.0, "max": 2.0, "samples": 2}
+    assert read_json(path)["one"].facts == {"n": 64}
+
+
+@pytest.mark.parametrize("content", ["", "{}", "[1]", '[{"name": "x"}]', '[{"name": "x", "figures": {"a": {}}}]'])
+def test_other_files_are_refused(tmp_path, content):
+    path = tmp_path / "x.json"
+    path.write_text(content)
+    if content == "{}":
+        assert read_json(path) == {}
+        return
+    with pytest.raises(ValueError, match="no results of a benchmark"):
+        read_json(path)
+
+
+def test_comparison_tells_change_from_noise(tmp_path):
+    old, new = tmp_path / "old.json", tmp_path / "new.json"
+    write_json(old, [record("same", 1.0, 1.1, 1.2), record("slower", 1.0, 1.1, 1.2), record("faster", 1.0, 1.1, 1.2), record("gone", 1.0)])
+    write_json(new, [record("same", 1.1, 1.15, 1.3), record("slower", 2.0, 2.2, 2.4), record("faster", 0.5, 0.6, 0.7), record("new", 1.0)])
+    lines = {line.split()[0]: line for line in comparison(old, new).splitlines()}
+    assert lines["same"].endswith("within noise")
+    assert lines["slower"].endswith("more")
+    assert "2.000  [1.667, 2.400]" in lines["slower"]
+    assert lines["faster"].endswith("less")
+    assert {"gone", "new"}.isdisjoint(lines)
+    assert bounds(Figure(2.0), Figure(3.0)) == (1.5, 1.5)
+    write_json(new, [record("new", 1.0)])
+    with pytest.raises(ValueError, match="no figure in common"):
+        comparison(old, new)
+
+
+def test_report_and_charts(tmp_path):
+    charts = [
+        Bars("b", "bars", "s", {"one": 1.0, "two": 20.0}, limit=5.0, logarithmic=True),
+        Lines("l", "lines", "x", "y", {"c": ([1, 2], [1e-3, 1e-5])}),
+    ]
+    images = plots.draw(charts, tmp_path, "x")
+    assert [image.name for image in images] == ["x-b.png", "x-l.png"]
+    assert all(image.read_bytes().startswith(b"\x89PNG") for image in images)
+    where = Record("machine", {}, {"date": "today", "hardware": {"cpu": "Z80"}})
+    write_markdown(tmp_path / "x.md", "Title", where, [Table("T", ["a", "b"], [["1", "2|3"]], "Remark.")], images)
+    text = (tmp_path / "x.md").read_text()
+    assert "# Title\n" in text
+    assert "- hardware: cpu Z80" in text
+    assert "| 1 | 2/3 |" in text
+    assert "![x-b](x-b.png)" in text
+
+
+def test_no_charts_without_matplotlib(tmp_path, monkeypatch):
+    monkeypatch.setattr(plots, "present", lambda name: False)
+    assert plots.draw([Bars("b", "bars", "s", {"one": 1.0})], tmp_path, "x") == []
+    assert not machine.present("no-such-distribution")
+
+
+def test_targets():
+    assert Target("x", 2, Figure(1.5)).met
+    assert not Target("x", 2, Figure(1.5), at_least=True).met
+    assert Target("x", 2, None).row() == ["x", "<= 2", "not measured here", ""]
+    assert Target("x", 40, Figure.of([30.0, 41.0, 43.0]), " x", True).row() == ["x", ">= 40 x", "41 x (30 to 43)", "yes"]
+
+
+def test_table_of_targets_reads_other_suites(tmp_path):
+    solve = Record("128^3 unit linear ProjectedMultigrid", {"iterations": Figure(9), "pyamg_over_this": Figure(50.0)}, {"n": 128})
+    assert all(row[2] == "not measured here" for row in targets([solve], tmp_path).rows if "round trip" in row[0])
+    write_json(tmp_path / "run.json", [Record("particles, 3-D", {"round_trip": Figure(200.0, "ns")})])
+    rows = {row[0]: row[1:] for row in targets([solve], tmp_path).rows}
+    assert rows["particle-grid-particle round trip, sorted, 3-D"] == ["<= 150 ns", "200 ns", "no"]
+    assert rows["linear solve against PyAMG, set-up included"] == [">= 40 x", "50 x", "yes"]
+
+
+def test_array_bytes_count_memory_once():
+    before = array_bytes()
+    a = wp.zeros(1000, dtype=wp.float64, device="cpu")
+    views = [a[10:20], a.reshape((10, 100)), a.flatten()]
+    assert array_bytes() - before == 8000
+    del a, views
+    assert array_bytes() == before
+    assert resident_bytes() > 1 << 20
+
+
+def test_stopwatch_puts_functions_back():
+    plain = json.dumps
+    with timed("cpu", {"dump": (json, "dumps")}) as seconds:
+        assert json.dumps([1]) == "[1]"
+        json.dumps([2])
+    assert len(seconds["dump"]) == 2
+    assert json.dumps is plain

@@ -1,0 +1,96 @@
+"""The suites through the command line, at sizes that take seconds."""
+
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from warp_lcp.driver import cli
+from warp_lcp.driver.benchmark import benchmarks
+
+
+def call(*arguments):
+    return CliRunner().invoke(cli.app, ["bench", *map(str, arguments)])
+
+
+def measured(tmp_path, suite, *options):
+    result = call(suite, "--device", "cpu", "--out", tmp_path, "--repeat", 1, *options)
+    assert result.exit_code == 0, result.stderr
+    assert f"{tmp_path / suite}.json" in result.stdout
+    assert (tmp_path / f"{suite}.md").read_text().startswith("# ")
+    assert list(tmp_path.glob(f"{suite}-*.png"))
+    records = {r["name"]: r for r in json.loads((tmp_path / f"{suite}.json").read_text())}
+    machine = records.pop("machine")
+    assert machine["hardware"]["cpu"]
+    assert machine["versions"]["warp-lang"]
+    assert machine["peers"]["pyamg"]
+    assert machine["date"]
+    assert machine["figures"]["copy"]["value"] > 0
+    assert all(figure["value"] >= 0 for r in records.values() for figure in r["figures"].values())
+    return records
+
+
+def test_suites_are_installed():
+    assert sorted(benchmarks()) == ["kernels", "run", "solvers"]
+    assert all(suite.name == name and suite.summary for name, suite in benchmarks().items())
+
+
+def test_kernels(tmp_path):
+    records = measured(tmp_path, "kernels", "--size", 16)
+    hot = [r for r in records.values() if r["role"] == "hot"]
+    assert len(hot) > 20
+    product = records["16^3 unit: stencil.product, float32"]
+    assert (product["reads"], product["writes"]) == (["d", "x"], ["y"])
+    assert product["figures"]["bytes_per_cell"]["value"] == 9
+    faces = records["16^3 faces: stencil.product, float32"]
+    assert faces["figures"]["bytes_per_cell"]["value"] == 24
+    assert {"rate", "bandwidth", "of_copy", "over Warp, one thread a cell"} <= product["figures"].keys()
+
+
+def test_solvers(tmp_path):
+    records = measured(tmp_path, "solvers", "--size", 16)
+    case = records["16^3 unit walls ProjectedMultigrid"]["figures"]
+    expected = {"setup", "solve", "total", "reuse", "warm", "iterations", "to_1e-04", "to_1e-06", "to_1e-08", "bytes_per_cell"}
+    assert expected <= case.keys()
+    assert case["converged"]["value"] == 1
+    assert case["residual"]["value"] <= 1e-6
+    assert records["16^3 unit linear PyAMG SA-CG"]["figures"]["residual"]["value"] <= 2e-6
+    assert "16^3 arrays 1:100 walls ProjectedMultigrid" in records
+    assert "| figure | target | measured | met? |" in (tmp_path / "solvers.md").read_text()
+    again = call("solvers", "--compare", tmp_path / "solvers.json", tmp_path / "solvers.json")
+    assert again.exit_code == 0
+    assert "[1.000, 1.000]    within noise" in again.stdout
+
+
+def test_run(tmp_path):
+    records = measured(tmp_path, "run", "--size", 16)
+    scene = records["dam-break"]["figures"]
+    assert scene["steps"]["value"] > 3
+    assert sum(figure["value"] for name, figure in scene.items() if name.startswith("share")) == pytest.approx(1)
+    assert records["particles, 3-D"]["figures"]["round_trip"]["value"] > 0
+    assert records["dam-break, 3-D: walls"]["figures"]["solve_over_linear"]["value"] > 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["kernals"], "did you mean 'kernels'?"),
+        (["kernels", "--device", "cuda:77"], "--device cuda:77: there is no such device"),
+        (["kernels", "--size", "4"], "size = 4: must be >= 8"),
+        (["kernels", "--repeat", "0"], "--repeat"),
+        (["kernels", "--compare", "a.json"], "--compare"),
+        (["kernels", "--compare", "a.json", "b.json"], "a.json: no results of a benchmark"),
+        ([], "SUITE"),
+    ],
+)
+def test_wrong_input_exits_with_2(arguments, expected):
+    result = call(*arguments)
+    assert result.exit_code == 2
+    assert expected in result.stderr
+
+
+def test_a_suite_that_fails_exits_with_1(tmp_path):
+    (tmp_path / "file").touch()
+    result = call("kernels", "--out", tmp_path / "file")
+    assert result.exit_code == 1
+    assert "the suite kernels ended with exit code 1" in result.stderr

@@ -1,0 +1,43 @@
+"""What the driver asks of a suite of benchmarks, and how it finds one: the entry-point group `warp_lcp.benchmarks`."""
+
+from __future__ import annotations
+
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+GROUP = "warp_lcp.benchmarks"
+
+
+@runtime_checkable
+class Benchmark(Protocol):
+    """A suite of measurements."""
+
+    name: str
+    summary: str
+
+    def run(self, *, device: str, out: Path, sizes: tuple[int, ...] = (), repeat: int = 5) -> list[Path]:
+        """Measure, and return the files written to `out`: NAME.json, NAME.md and plots.
+
+        Raises:
+            ValueError: an option is out of range.
+            RuntimeError: a measurement failed.
+        """
+
+    def compare(self, old: Path, new: Path) -> str:
+        """Return a table of the figures in two results with the bounds of noise.
+
+        Raises:
+            ValueError: a file is no result of a suite.
+        """
+
+
+def benchmarks() -> dict[str, Benchmark]:
+    """Return the installed suites by name."""
+    found = {}
+    for entry in entry_points(group=GROUP):
+        suite = entry.load()
+        if not isinstance(suite, Benchmark):
+            raise TypeError(f"entry point {entry.name!r} of {GROUP} is not a suite of benchmarks: {suite!r}")
+        found[entry.name] = suite
+    return found
