@@ -30,6 +30,17 @@ def test_run(scene_file, out):
     assert json.loads((out / "run.json").read_text())["status"] == "finished"
 
 
+def test_a_profile_is_shown_and_written(scene_file, out):
+    result = call("run", scene_file, "--out", out, "--device", "cpu", "--frames", 2, "--profile")
+    assert result.exit_code == 0
+    shown = [line.split()[0] for line in result.stdout.splitlines()]
+    assert shown[0] == "stage"
+    assert {"frames", "(frames,", "checkpoints", "rest", "all", "finished:"} == set(shown[1:])
+    assert json.loads((out / "profile.json").read_text())["steps"] == json.loads((out / "run.json").read_text())["steps"]
+    assert call("run", scene_file, "--out", out, "--device", "cpu", "--frames", 2, "--force").exit_code == 0
+    assert not (out / "profile.json").exists()
+
+
 def test_the_folder_is_named_after_the_scene(scene_file, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert call("run", scene_file, "--frames", 1, "--device", "cpu").exit_code == 0

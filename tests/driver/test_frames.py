@@ -1,12 +1,13 @@
 """Frames, read back by meshio and by VTK."""
 
+import threading
 import xml.etree.ElementTree as ET
 
 import meshio
 import numpy as np
 import pytest
 
-from warp_lcp.driver.frames import FrameFolder, frame_bytes, write_vtu
+from warp_lcp.driver.frames import WAITING, FrameFolder, FrameWriter, frame_bytes, write_vtu
 from warp_lcp.driver.simulator import Cells, Points
 
 RNG = np.random.default_rng(5807)
@@ -99,3 +100,76 @@ def test_collections_grow_and_resume(tmp_path):
     resumed.write(2, 2 / 3, [some_points(3)])
     assert [time for time, _ in entries(tmp_path / "particles.pvd")] == [0.0, 1 / 3, 2 / 3]
     assert all((tmp_path / file).is_file() for _, file in entries(tmp_path / "particles.pvd"))
+
+
+class SlowFolder(FrameFolder):
+    """Frames that wait to be let through, and one that fails."""
+
+    def __init__(self, folder, fails: int = -1) -> None:
+        super().__init__(folder)
+        self.fails = fails
+        self.gate = threading.Semaphore(0)
+        self.threads: set[int] = set()
+
+    def write(self, index, time, frame):
+        assert self.gate.acquire(timeout=10)
+        self.threads.add(threading.get_ident())
+        if index == self.fails:
+            raise OSError("no more")
+        return super().write(index, time, frame)
+
+
+def written(path) -> list[int]:
+    return sorted(int(file.stem[-6:]) for file in path.glob("frames/*.vtu"))
+
+
+def test_a_writer_s_frames_are_written_in_order_on_one_other_thread(tmp_path):
+    folder = SlowFolder(tmp_path)
+    with FrameWriter(folder) as writer:
+        for index in range(WAITING):
+            writer.put(index, float(index), [some_points(3)])
+        assert (writer.newest, written(tmp_path)) == (None, [])  # `put` has not waited
+        writer.check()
+        folder.gate.release(WAITING)
+        writer.flush()
+        assert (writer.newest, written(tmp_path)) == (WAITING - 1, list(range(WAITING)))
+        folder.gate.release()
+        writer.put(WAITING, float(WAITING), [some_points(3)])
+    assert written(tmp_path) == list(range(WAITING + 1))  # leaving waits
+    assert [time for time, _ in entries(tmp_path / "particles.pvd")] == [float(k) for k in range(WAITING + 1)]
+    assert len(folder.threads) == 1
+    assert threading.get_ident() not in folder.threads
+
+
+def test_a_writer_holds_few_frames(tmp_path):
+    folder = SlowFolder(tmp_path)
+    with FrameWriter(folder) as writer:
+        for index in range(WAITING):
+            writer.put(index, float(index), [some_points(3)])
+        release = threading.Timer(0.2, folder.gate.release)
+        release.start()
+        writer.put(WAITING, float(WAITING), [some_points(3)])
+        assert writer.newest is not None  # it has waited for one to be written
+        folder.gate.release(WAITING)
+    release.join()
+
+
+def test_a_writer_s_error_comes_back_every_time_and_no_later_frame_is_written(tmp_path):
+    folder = SlowFolder(tmp_path, fails=1)
+    folder.gate.release(10)
+    writer = FrameWriter(folder)
+    with pytest.raises(OSError, match="no more"), writer:
+        for index in range(3):
+            writer.put(index, float(index), [some_points(3)])
+    for call in (writer.check, writer.flush, lambda: writer.put(3, 3.0, [])):
+        with pytest.raises(OSError, match="no more"):
+            call()
+    assert (writer.newest, written(tmp_path)) == (0, [0])
+
+
+def test_another_error_is_not_hidden_by_the_writer_s(tmp_path):
+    folder = SlowFolder(tmp_path, fails=0)
+    folder.gate.release(10)
+    with pytest.raises(RuntimeError, match="first"), FrameWriter(folder) as writer:
+        writer.put(0, 0.0, [some_points(3)])
+        raise RuntimeError("first")

@@ -4,6 +4,7 @@ import csv
 import errno
 import json
 import shutil
+import time
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ import pytest
 from rich.console import Console
 
 from warp_lcp.driver import frames as frames_module
+from warp_lcp.driver.frames import FrameFolder
+from warp_lcp.driver.profile import NoStopwatch, Profile
 from warp_lcp.driver.progress import Lines
 from warp_lcp.driver.run import plan_dt, run_scene
 from warp_lcp.driver.run_folder import OutputError, RunRecord
@@ -278,6 +281,98 @@ def test_a_full_disk_ends_the_run_with_earlier_files_intact(scene_file, tmp_path
     assert record(out)["status"] == "failed"
     assert sorted(path.name for path in (out / "frames").glob("particles*")) == [f"particles_{k:06d}.vtu" for k in range(4)]
     monkeypatch.undo()
+
+
+def slow_frames(monkeypatch: pytest.MonkeyPatch, seconds: float, fails: int = -1) -> None:
+    """Make frames take their time, and one of them fail."""
+    write = FrameFolder.write
+
+    def slow(self: FrameFolder, index: int, *arguments: Any) -> list[Path]:
+        time.sleep(seconds)
+        if index == fails:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(self, index, *arguments)
+
+    monkeypatch.setattr(FrameFolder, "write", slow)
+
+
+def test_no_checkpoint_is_ahead_of_its_frames(dots, scene_file, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    slow_frames(monkeypatch, 0.01)
+    ahead = []
+
+    def look(simulation: Any, dt: float) -> None:
+        steps = sorted(out.glob("checkpoints/*.npz"))
+        if steps:
+            time_reached = float(np.load(steps[-1])["state/time"])
+            ahead.append(int(time_reached * 20 + 1e-6) - (len(list(out.glob("frames/particles_*.vtu"))) - 1))
+
+    dots.before_step = look
+    result = go(scene_file, out)
+    assert (result.status, result.frames) == ("finished", 10)
+    assert len(ahead) > 10
+    assert max(ahead) <= 0
+
+
+def test_a_frame_that_fails_late_ends_the_run_without_a_checkpoint_after_it(dots, scene_file, tmp_path, monkeypatch):
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    go(scene_file, whole)
+    slow_frames(monkeypatch, 0.01, fails=3)
+    result = go(scene_file, out)
+    assert (result.status, result.frames) == ("failed", 2)
+    assert result.reason.startswith("the disk is full")
+    assert sorted(path.name for path in out.glob("frames/particles*")) == [f"particles_{k:06d}.vtu" for k in range(3)]
+    monkeypatch.undo()
+    monkeypatch.setattr(
+        "warp_lcp.driver.simulator.entry_points", lambda group: [type("Entry", (), {"name": "dots", "load": lambda _: dots})()]
+    )
+    assert go(scene_file, out, resume=True).status == "finished"
+    assert contents(out) == contents(whole)
+
+
+def test_a_step_that_fails_after_a_frame_did_writes_no_checkpoint(dots, scene_file, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    slow_frames(monkeypatch, 0.2, fails=1)
+    dots.before_step = fail_on(6)  # soon after frame 1, and before it is found that it cannot be written
+    result = go(scene_file, out, "output.checkpoint_every=50")
+    assert result.status == "failed"
+    assert "no at 6" in result.reason
+    assert any("No space left" in warning for warning in result.warnings)
+    assert not list(out.glob("checkpoints/*"))
+
+
+def test_a_profile_counts_every_stage(scene_file, tmp_path):
+    out, profile = tmp_path / "out", Profile("cpu")
+    result = go(scene_file, out, profile=profile)
+    written = json.loads((out / "profile.json").read_text())
+    assert (written["device"], written["steps"], written["seconds"]) == ("cpu", result.steps, result.seconds)
+    stages = {stage["stage"]: stage for stage in written["stages"]}
+    assert stages["frames, written"]["calls"] == 11
+    assert stages["frames, written"]["beside"]
+    assert stages["frames, written"]["bytes"] == sum(path.stat().st_size for path in out.glob("frames/*.vtu"))
+    assert stages["checkpoints"]["calls"] == result.steps // 4 + (result.steps % 4 > 0)
+    assert stages["checkpoints"]["bytes"] > 0
+    assert sum(stage["seconds"] for stage in stages.values() if not stage["beside"]) <= result.seconds
+
+
+def test_only_a_profiled_run_measures(dots, scene_file, tmp_path, monkeypatch):
+    seen = []
+    dots.before_step = lambda simulation, dt: seen.append(simulation.watch)
+    create = type(dots).create
+
+    def watched(self: Any, *arguments: Any, **options: Any) -> Any:
+        simulation = create(self, *arguments, **options)
+        simulation.watch = None
+        return simulation
+
+    monkeypatch.setattr(type(dots), "create", watched)
+    profile = Profile("cpu")
+    go(scene_file, tmp_path / "out", last_frame=1)
+    assert {type(watch) for watch in seen} == {NoStopwatch}
+    assert not (tmp_path / "out" / "profile.json").exists()
+    seen.clear()
+    go(scene_file, tmp_path / "other", last_frame=1, profile=profile)
+    assert set(map(id, seen)) == {id(profile)}
 
 
 def test_a_run_that_will_not_fit_does_not_begin(scene_file, tmp_path, monkeypatch):

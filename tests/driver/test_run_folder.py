@@ -7,7 +7,7 @@ import pytest
 from warp_lcp.driver.run_folder import OutputError, RunFolder, RunRecord, fingerprint
 from warp_lcp.driver.scene_file import load_scene
 
-RUN_FILES = ["run.json", "scene.toml", "log.csv", "particles.pvd", "frames/grid_000003.vtu", "checkpoints/step_000050.npz"]
+RUN_FILES = ["run.json", "scene.toml", "log.csv", "profile.json", "particles.pvd", "frames/grid_000003.vtu", "checkpoints/step_000050.npz"]
 
 
 @pytest.fixture

@@ -1,3 +1,4 @@
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -5,7 +6,8 @@ import pytest
 from small_liquids import GRAVITY, advance, box, create, dam, scene
 
 from fluids import SIMULATOR, LiquidSimulation
-from warp_lcp.driver.simulator import Cells, Points, SimulationFailed, Simulator, StepFailed, simulators
+from warp_lcp.driver.simulator import Cells, Points, Profiled, SimulationFailed, Simulator, StepFailed, simulators
+from warp_lcp.grid.particles import Particles
 
 DIMENSIONS = [2, 3]
 
@@ -267,6 +269,46 @@ def test_the_simple_solver_gives_the_same_liquid() -> None:
     rows = [advance(simulation, 0.1, 0.01) for simulation in (a, b)]
     assert rows[0][-1]["solver"] == "psor"
     assert rows[0][-1]["kinetic_energy"] == pytest.approx(rows[1][-1]["kinetic_energy"], rel=1e-4)
+
+
+@pytest.mark.parametrize("dimension", DIMENSIONS)
+def test_gathering_transfers_give_the_same_liquid(dimension: int) -> None:
+    """What a GPU does, on the CPU."""
+    scattered, gathered = dam(dimension), dam(dimension)
+    p = gathered.particles
+    gathered.particles = Particles(p.grid, p.position.numpy(), p.velocity.numpy(), affine=True, indexed=True)
+    rows = [advance(simulation, 0.2, 0.01)[-1] for simulation in (scattered, gathered)]
+    for name in ("kinetic_energy", "potential_energy", "center_of_mass_y", "volume"):
+        assert rows[1][name] == pytest.approx(rows[0][name], rel=1e-3)
+
+
+@pytest.mark.parametrize("method", ["projected-multigrid", "minimum-map-newton"])
+def test_the_grid_methods_give_the_same_liquid(method: str) -> None:
+    a, b = (dam(3, solver={"method": name, "tolerance": 1e-7}) for name in (method, "psor"))
+    b.projection.max_iterations = 5000
+    rows = [advance(simulation, 0.05, 0.01) for simulation in (a, b)]
+    assert rows[0][-1]["solver"] == method
+    assert rows[0][-1]["kinetic_energy"] == pytest.approx(rows[1][-1]["kinetic_energy"], rel=1e-4)
+
+
+def test_a_step_marks_its_stages() -> None:
+    class Names:
+        def __init__(self) -> None:
+            self.found: list[str] = []
+
+        def stage(self, name: str, *arrays: object) -> nullcontext[None]:
+            assert arrays
+            self.found.append(name)
+            return nullcontext()
+
+    plain, watched = dam(), dam()
+    assert isinstance(watched, Profiled)
+    watched.watch = Names()
+    assert watched.step(0.01) == plain.step(0.01)
+    assert watched.watch.found == [
+        "diagnostics", "sort", "particles-to-grid", "pressure set-up", "pressure solve", "projection", "extrapolation", "grid-to-particles",
+        "advection", "diagnostics",
+    ]  # fmt: skip
 
 
 def test_a_piston_drives_the_liquid_of_a_scene() -> None:

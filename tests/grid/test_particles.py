@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from warp_lcp.grid.particles import MARGIN, Particles, lattice, seed
+from warp_lcp.grid.particles import MARGIN, SORT_EVERY, Particles, lattice, seed
 from warp_lcp.grid.staggered import StaggeredGrid
 
 FLAT = StaggeredGrid((7, 5, 1), 0.2, 2)
@@ -45,6 +45,65 @@ def test_sorting_twice_changes_nothing() -> None:
         assert (array.numpy() == once[name]).all()
 
 
+def keys(particles: Particles) -> np.ndarray:
+    return particles.key.numpy()[: particles.count].copy()
+
+
+@pytest.mark.parametrize("grid", [FLAT, SOLID], ids=["2d", "3d"])
+def test_numbers_are_the_cells_whatever_the_order(grid: StaggeredGrid) -> None:
+    particles = random_particles(grid, 3000, 27)
+    before = particles.position.numpy().copy()
+    particles.number()
+    cells = particles.cells_of(before)
+    assert (keys(particles) == ((cells[:, 2] + 1) * (grid.counts[1] + 2) + cells[:, 1] + 1) * (grid.counts[0] + 2) + cells[:, 0] + 1).all()
+    assert (particles.position.numpy() == before).all()
+
+
+def test_the_order_is_restored_every_few_steps_or_in_each() -> None:
+    for indexed in (False, True):
+        particles = random_particles(SOLID, 500, 41)
+        particles = Particles(SOLID, particles.position.numpy(), particles.velocity.numpy(), affine=False, indexed=indexed)
+        for step in range(2 * SORT_EVERY + 1):
+            particles.position.assign(np.random.default_rng(step).permutation(particles.position.numpy()))
+            particles.arrange(step)
+            in_order = (np.diff(keys(particles)) >= 0).all()
+            assert in_order == (indexed or step % SORT_EVERY == 0)
+
+
+@pytest.mark.parametrize("grid", [FLAT, SOLID], ids=["2d", "3d"])
+def test_offsets_tell_where_the_particles_of_a_cell_begin(grid: StaggeredGrid) -> None:
+    position = np.random.default_rng(99).random((60, 3)) * np.array(grid.counts) * grid.spacing
+    particles = Particles(grid, position, np.zeros((60, 3)), affine=False, indexed=True)
+    particles.sort()
+    counts = np.bincount(keys(particles), minlength=grid.size)
+    assert (particles.offsets.numpy() == np.concatenate([[0], np.cumsum(counts)])).all()
+
+
+def test_appended_particles_come_behind_and_storage_grows_geometrically() -> None:
+    rng = np.random.default_rng(3001)
+    particles = random_particles(SOLID, 100, 12)
+    rest = {name: array.numpy().copy() for name, array in particles.arrays().items()}
+    capacities = [particles.capacity]
+    for _ in range(200):
+        more = rng.random((7, 3)).astype(np.float32)
+        particles.append(more, -more)
+        rest = {n: np.concatenate([a, {"position": more, "velocity": -more}.get(n, np.zeros((7, 3)))]) for n, a in rest.items()}
+        capacities.append(particles.capacity)
+    assert particles.count == 1500
+    for name, array in particles.arrays().items():
+        assert array.shape == (1500,)
+        assert (array.numpy() == rest[name]).all()
+    grown = np.unique(capacities)
+    assert len(grown) < 10
+    assert (grown[1:] >= 1.5 * grown[:-1] - 1).all()
+    particles.sort()
+    particles.append(np.ones((1, 3)), np.ones((1, 3)))
+    assert particles.totals().count == 1501
+    assert all((gradient.numpy()[-1] == 0.0).all() for gradient in particles.affine)
+    with pytest.raises(ValueError, match="velocity"):
+        particles.append(np.ones((1, 3)), np.ones((2, 3)))
+
+
 def test_totals_are_the_sums_and_repeatable() -> None:
     particles = random_particles(SOLID, 5000, 901, affine=False)
     x, v = particles.position.numpy().astype(np.float64), particles.velocity.numpy().astype(np.float64)
@@ -77,6 +136,8 @@ def test_empty_or_mismatched_particles_are_refused() -> None:
         Particles(FLAT, np.zeros((0, 3)), np.zeros((0, 3)), affine=True)
     with pytest.raises(ValueError, match="velocity"):
         Particles(FLAT, np.zeros((2, 3)), np.zeros((2, 2)), affine=True)
+    with pytest.raises(ValueError, match="position"):
+        Particles(FLAT, np.zeros(3), np.zeros(3), affine=True)
 
 
 @pytest.mark.parametrize("grid", [FLAT, SOLID], ids=["2d", "3d"])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
 
@@ -217,3 +218,54 @@ def test_a_window_that_holds_the_particles_changes_nothing() -> None:
     particles_to_faces(grid, c.position, c.velocity, c.affine, c.fields, c.weights, window=window)
     for field, expected in zip(c.fields, everywhere, strict=True):
         assert (field.numpy() == expected).all()
+
+
+def sorted_cloud(grid: StaggeredGrid, *, affine: bool, n: int = 4000) -> Particles:
+    """Return sorted particles all over the domain, some of them exactly on boundaries between cells."""
+    rng = np.random.default_rng(613)
+    size = np.array(grid.counts) * grid.spacing
+    position = np.clip(rng.random((n, 3)) * size, 1e-3 * grid.spacing, size - 1e-3 * grid.spacing)
+    on_a_face = np.round(position[: n // 8] / grid.spacing) * grid.spacing
+    position[: n // 8] = np.where((on_a_face > 0) & (on_a_face < size), on_a_face, position[: n // 8])
+    velocity = rng.normal(size=(n, 3))
+    for values in (position, velocity):
+        values[:, grid.dimension :] = 0.0
+    particles = Particles(grid, position, velocity, affine=affine, indexed=True)
+    for gradient in particles.affine:
+        gradient.assign(rng.normal(size=(n, 3)).astype(np.float32))
+    particles.sort()
+    return particles
+
+
+def transfer(p: Particles, offsets: wp.array | None, **options) -> list[np.ndarray]:
+    fields, weights = p.grid.faces(), p.grid.faces()
+    particles_to_faces(p.grid, p.position, p.velocity, p.affine, fields, weights, offsets=offsets, **options)
+    return [array.numpy() for array in (*fields, *weights)]
+
+
+@pytest.mark.parametrize("affine", [True, False])
+@pytest.mark.parametrize("dimension", GRIDS)
+def test_faces_gather_what_particles_scatter(dimension: str, affine: bool) -> None:
+    p = sorted_cloud(GRIDS[dimension], affine=affine)
+    scattered, gathered = transfer(p, None), transfer(p, p.offsets)
+    for a, b in zip(scattered, gathered, strict=True):
+        assert b == pytest.approx(a, abs=2e-5 * float(np.abs(a).max()))
+        assert ((a != 0) == (b != 0)).all()
+
+
+def test_gathering_is_confined_to_the_window() -> None:
+    p = sorted_cloud(GRIDS["3d"], affine=True)
+    window = p.grid.window((2, 2, 2), (5, 4, 3))
+    inside = tuple(slice(a, b) for a, b in zip(window.low, window.high, strict=True))
+    for a, b in zip(transfer(p, p.offsets), transfer(p, p.offsets, window=window), strict=True):
+        assert (b[inside] == a[inside]).all()
+        b[inside] = 0.0
+        assert (b == 0.0).all()
+
+
+@pytest.mark.cuda
+def test_a_gpu_gathers_the_same_bits_every_time() -> None:
+    p = sorted_cloud(StaggeredGrid((8, 7, 6), 0.125, 3, "cuda:0"), affine=True)
+    once = transfer(p, p.offsets)
+    for _ in range(5):
+        assert all((a == b).all() for a, b in zip(transfer(p, p.offsets), once, strict=True))

@@ -86,8 +86,8 @@ class FrameFolder:
 class FrameWriter:
     """Write frames on a thread of its own while the simulation goes on; at most WAITING frames are in memory.
 
-    What goes wrong there is raised by every later call of `put`, `check` or `flush`, and no later frame is written. Leaving the `with` block
-    waits for the frames that were put, whatever ended the block, and raises only if nothing else did.
+    What goes wrong there is raised by every later call of `put`, `check` or `flush`, and no later frame is written. Leaving the `with`
+    block waits for the frames that were put, whatever ended the block, and raises only if nothing else did.
     """
 
     def __init__(self, folder: FrameFolder, watch: Stopwatch | None = None) -> None:

@@ -69,7 +69,7 @@ class Simulation(Protocol):
         """Return the names of the log's columns that `step` fills, in order, after `step`, `time`, `dt` and before `seconds`."""
 
     def frame(self) -> list[Points | Cells]:
-        """Return what a frame shows, as host arrays."""
+        """Return what a frame shows, as host arrays that no later step changes: they are written while the simulation goes on."""
 
     def state(self) -> dict[str, np.ndarray]:
         """Return everything that `restore` needs to continue bit for bit on the CPU, as host arrays without pickles."""

@@ -117,7 +117,8 @@ ADVECT = """
     int stopped = 0;
     for (int start = first; start < last; start += M) {
         const int n = last - start < M ? last - start : M;
-        for (int d = 0; d < 3; ++d) { SIMD for (int m = 0; m < n; ++m) from[d][m] = grid_coordinate(position[3*(long long)(start + m) + d]); }
+        T* x = position + 3*(long long)start;
+        for (int d = 0; d < 3; ++d) { SIMD for (int m = 0; m < n; ++m) from[d][m] = grid_coordinate(x[3*m + d]); }
         sample(from, k1, n);
         move((T)0.5*h, k1, 0, k1, 0, k1, n);
         sample(to, k2, n);
@@ -126,7 +127,7 @@ ADVECT = """
         move((T)2/9*h, k1, (T)3/9*h, k2, (T)4/9*h, k3, n);
         for (int m = 0; m < n; ++m) stopped += hit[m];
         for (int d = 0; d < 3; ++d) {
-            SIMD for (int m = 0; m < n; ++m) position[3*(long long)(start + m) + d] = d <= planes ? (to[d][m] - 1)*dx : (T)0;
+            SIMD for (int m = 0; m < n; ++m) x[3*m + d] = d <= planes ? (to[d][m] - 1)*dx : (T)0;
         }
     }
     return stopped;

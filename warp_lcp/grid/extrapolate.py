@@ -59,7 +59,9 @@ FILL_ROW = """
 
 @wp.func_native(simd(BLOCK + FILL_ROW))
 @typing.no_type_check
-def fill_row(known_: wp.array3d(dtype=wp.int8), field_: wp.array3d(dtype=wp.float32), layer: int, fill: int, k: int, j: int, first: int, last: int): ...  # noqa: D103,E501 # fmt: skip
+def fill_row(  # noqa: D103
+    known_: wp.array3d(dtype=wp.int8), field_: wp.array3d(dtype=wp.float32), layer: int, fill: int, k: int, j: int, first: int, last: int
+): ...
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.extrapolate")

@@ -61,11 +61,15 @@ TOTAL = """
 
 
 @wp.func_native(particle_loop(NUMBER))
-def number_some(inverse_dx: float, nx: int, ny: int, nz: int, x_: wp.array(dtype=wp.vec3), key_: wp.array(dtype=wp.int32), first: int, last: int): ...  # noqa: E501 # fmt: skip
+def number_some(
+    inverse_dx: float, nx: int, ny: int, nz: int, x_: wp.array(dtype=wp.vec3), key_: wp.array(dtype=wp.int32), first: int, last: int
+): ...
 
 
 @wp.func_native(particle_loop(TOTAL))
-def total_some(x_: wp.array(dtype=wp.vec3), v_: wp.array(dtype=wp.vec3), out_: wp.array2d(dtype=wp.float64), row: int, first: int, last: int): ...  # noqa: E501 # fmt: skip
+def total_some(
+    x_: wp.array(dtype=wp.vec3), v_: wp.array(dtype=wp.vec3), out_: wp.array2d(dtype=wp.float64), row: int, first: int, last: int
+): ...
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")
@@ -88,7 +92,10 @@ def count_up_kernel(order: wp.array(dtype=wp.int32)):
 def offset_kernel(key: wp.array(dtype=wp.int32), count: int, offsets: wp.array(dtype=wp.int32)):
     """Find the first particle of each cell, or of the next one that has any, among sorted keys."""
     cell = wp.tid()
-    offsets[cell] = wp.lower_bound(key, 0, count, cell)
+    if cell > key[count - 1]:  # lower_bound would return the last particle
+        offsets[cell] = count
+    else:
+        offsets[cell] = wp.lower_bound(key, 0, count, cell)
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")

@@ -63,6 +63,7 @@ class ConjugateGradient:
         """
         self.x.zero_()
         self._p.zero_()
+        self._q.zero_()  # A writes its own rows only
         self._scalars.zero_()
         norm, best = np.inf, np.inf
         for iteration in range(1, max_iterations + 1):

@@ -12,7 +12,7 @@ import warp as wp
 
 from warp_lcp.multigrid.cycle_kernels import Aggregates, first_cell, one_plane, one_row
 from warp_lcp.native import BLOCK, C_TYPES, simd
-from warp_lcp.operators.stencil_kernels import StencilShape, row_start
+from warp_lcp.operators.stencil_kernels import StencilShape, row_count, row_first, row_start
 
 options = {"enable_backward": False, "module": "warp_lcp.coarsen"}
 
@@ -119,10 +119,12 @@ def coarsen_kernels(variable: bool, d_type: Any, real: Any) -> Any:
                     const B f = (d[k] != 0) & (d[k-1] != 0) ? w : (B)0, g = (d[k] != 0) & (d[k+1] != 0) ? v : (B)0;
                     e[k] = (B)({diagonal}) - f - g; bx[k] += f; ax[k] += g; }}
                 if (start + begin == 0 && W.below_x != 0) {{
-                    const int k = 0; const B f = (d[k] != 0) & (d[k + W.below_x] != 0) ? {weight("x", "0")} : (B)0; e[k] -= f; bx[k] += f; }}
+                    const int k = 0;
+                    const B f = (d[k] != 0) & (d[k + W.below_x] != 0) ? {weight("x", "0")} : (B)0; e[k] -= f; bx[k] += f; }}
                 const int z = last_cell - fx*begin;
                 if (z < fx*m && W.above_x != 0) {{
-                    const int k = z; const B f = (d[k] != 0) & (d[k + W.above_x] != 0) ? {weight("x", "1")} : (B)0; e[k] -= f; ax[k] += f; }}
+                    const int k = z;
+                    const B f = (d[k] != 0) & (d[k + W.above_x] != 0) ? {weight("x", "1")} : (B)0; e[k] -= f; ax[k] += f; }}
                 {faces("y", "below", "0")}
                 {faces("y", "above", "A.s2")}
                 {faces("z", "below", "0")}
@@ -178,10 +180,12 @@ def coarsen_kernels(variable: bool, d_type: Any, real: Any) -> Any:
         W.above_y = above(last_j == n[1] - 1, periodic[1], A.s2, n[1])
         W.below_z = below(k == 0, periodic[2], A.s1, n[0])
         W.above_z = above(last_k == n[0] - 1, periodic[2], A.s1, n[0])
-        m = wp.min(grain, C.nx - c * grain)
-        p = first_cell(A, G, k, j, c, grain)
+        m = row_count(C, k, j, c, grain)
+        p = first_cell(A, C, G, k, j, c, grain)
         o = row_start(C, k, j, c, grain)
-        coarsen_row(A, d, wx, wy, wz, p, dc, wxc, wyc, wzc, o, m, c * grain, G.fx, G.fy, G.fz, plane, row, W, stiffen, held)
+        coarsen_row(
+            A, d, wx, wy, wz, p, dc, wxc, wyc, wzc, o, m, row_first(C, k, j, c, grain), G.fx, G.fy, G.fz, plane, row, W, stiffen, held
+        )
 
     return coarsen
 

@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.native import BLOCK, C_TYPES, simd
-from warp_lcp.operators.stencil_kernels import NEIGHBORS, StencilShape, row_start, stencil_head
+from warp_lcp.operators.stencil_kernels import NEIGHBORS, StencilShape, row_count, row_first, row_start, stencil_head
 
 
 @wp.struct
@@ -26,9 +26,16 @@ class Aggregates:
 
 
 @wp.func
-def first_cell(A: StencilShape, G: Aggregates, k: int, j: int, c: int, grain: int):
-    """Element of the finer level at which chunk c of coarse row (k, j) begins."""
-    return wp.int64(G.fz * k + 1) * A.s1 + wp.int64(G.fy * j + 1) * A.s2 + wp.int64(1 + G.fx * c * grain)
+def first_cell(A: StencilShape, C: StencilShape, G: Aggregates, k: int, j: int, c: int, grain: int):
+    """Element of the finer level A at which chunk c of row (k, j) of the coarser level C begins."""
+    return wp.int64(G.fz * k + 1) * A.s1 + wp.int64(G.fy * j + 1) * A.s2 + wp.int64(1 + G.fx * row_first(C, k, j, c, grain))
+
+
+@wp.func
+def coarse_start(A: StencilShape, C: StencilShape, G: Aggregates, k: int, j: int, c: int, grain: int):
+    """Element of the coarser level C that holds the first cell of chunk c of row (k, j) of the finer level A."""
+    o = wp.int64(k // G.fz + 1) * C.s1 + wp.int64(j // G.fy + 1) * C.s2
+    return o + wp.int64(1 + row_first(A, k, j, c, grain) // G.fx)
 
 
 @wp.func
@@ -159,8 +166,8 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
     ):  # fmt: skip
         """Bounds of a coarse correction: the tightest of its cells' gaps, divided by the over-correction; 0 is always allowed."""
         k, j, c = wp.tid()
-        n = wp.min(grain, C.nx - c * grain)
-        p = first_cell(A, G, k, j, c, grain)
+        n = row_count(C, k, j, c, grain)
+        p = first_cell(A, C, G, k, j, c, grain)
         o = row_start(C, k, j, c, grain)
         bounds_row(A, d, x, lower, upper, lower_c, upper_c, o, p, n, real(1.0) / scale, G.fx, one_plane(G, k), one_row(G, j))
 
@@ -171,7 +178,7 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
     ):  # fmt: skip
         k, j, c = wp.tid()
         p = row_start(A, k, j, c, grain)
-        n = wp.min(grain, A.nx - c * grain)
+        n = row_count(A, k, j, c, grain)
         if from_zero:
             first_sweep_row(A, d, wx, wy, wz, y, x, b, lower, upper, p, n, omega, projected)
         else:
@@ -183,8 +190,8 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         coarse: field,
     ):  # fmt: skip
         k, j, c = wp.tid()
-        n = wp.min(grain, C.nx - c * grain)
-        p = first_cell(A, G, k, j, c, grain)
+        n = row_count(C, k, j, c, grain)
+        p = first_cell(A, C, G, k, j, c, grain)
         restrict_row(A, d, wx, wy, wz, coarse, row_start(C, k, j, c, grain), x, b, p, n, G.fx, one_plane(G, k), one_row(G, j))
 
     @wp.kernel(enable_backward=False, module=name)
@@ -193,9 +200,9 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         coarse: field, lower: field, upper: field, scale: real, projected: bool,
     ):  # fmt: skip
         k, j, c = wp.tid()
-        n = wp.min(G.fx * grain, A.nx - G.fx * c * grain)
-        p = row_start(A, k, j, G.fx * c, grain)
-        o = row_start(C, k // G.fz, j // G.fy, c, grain)
+        n = row_count(A, k, j, c, G.fx * grain)
+        p = row_start(A, k, j, c, G.fx * grain)
+        o = coarse_start(A, C, G, k, j, c, G.fx * grain)
         correct_row(A, d, wx, wy, wz, x, p, coarse, o, lower, upper, n, G.fx - 1, scale, projected)
 
     @wp.kernel(enable_backward=False, module=name)
@@ -209,20 +216,23 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         for s in range(G.nz + 1):
             if s < G.nz:
                 for j in range(G.ny):
-                    p = row_start(A, s, j, 0, 0)
+                    p = row_start(A, s, j, 0, A.nx)
+                    n = row_count(A, s, j, 0, A.nx)
                     if from_zero:
-                        first_sweep_row(A, d, wx, wy, wz, t, x, b, lower, upper, p, A.nx, first, projected)
+                        first_sweep_row(A, d, wx, wy, wz, t, x, b, lower, upper, p, n, first, projected)
                     else:
-                        sweep_row(A, d, wx, wy, wz, t, x, b, lower, upper, p, A.nx, first, projected)
+                        sweep_row(A, d, wx, wy, wz, t, x, b, lower, upper, p, n, first, projected)
             i = s - 1
             if i >= 0:
                 for j in range(G.ny):
-                    sweep_row(A, d, wx, wy, wz, x, t, b, lower, upper, row_start(A, i, j, 0, 0), A.nx, second, projected)
+                    n = row_count(A, i, j, 0, A.nx)
+                    sweep_row(A, d, wx, wy, wz, x, t, b, lower, upper, row_start(A, i, j, 0, A.nx), n, second, projected)
             while k < planes and (G.fz * (k + 1) <= i or i == G.nz - 1):
                 for j in range(rows):
-                    p = first_cell(A, G, k, j, 0, 0)
-                    o = row_start(C, k, j, 0, 0)
-                    restrict_row(A, d, wx, wy, wz, coarse, o, x, b, p, C.nx, G.fx, one_plane(G, k), one_row(G, j))
+                    p = first_cell(A, C, G, k, j, 0, C.nx)
+                    o = row_start(C, k, j, 0, C.nx)
+                    n = row_count(C, k, j, 0, C.nx)
+                    restrict_row(A, d, wx, wy, wz, coarse, o, x, b, p, n, G.fx, one_plane(G, k), one_row(G, j))
                 k += 1
 
     @wp.kernel(enable_backward=False, module=name)
@@ -234,17 +244,20 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         for s in range(G.nz + 2):
             if s < G.nz:
                 for j in range(G.ny):
-                    o = row_start(C, s // G.fz, j // G.fy, 0, 0)
-                    p = row_start(A, s, j, 0, 0)
-                    correct_row(A, d, wx, wy, wz, x, p, coarse, o, lower, upper, A.nx, G.fx - 1, scale, projected)
+                    o = coarse_start(A, C, G, s, j, 0, A.nx)
+                    p = row_start(A, s, j, 0, A.nx)
+                    n = row_count(A, s, j, 0, A.nx)
+                    correct_row(A, d, wx, wy, wz, x, p, coarse, o, lower, upper, n, G.fx - 1, scale, projected)
             i = s - 1
             if i >= 0 and i < G.nz:
                 for j in range(G.ny):
-                    sweep_row(A, d, wx, wy, wz, t, x, b, lower, upper, row_start(A, i, j, 0, 0), A.nx, first, projected)
+                    n = row_count(A, i, j, 0, A.nx)
+                    sweep_row(A, d, wx, wy, wz, t, x, b, lower, upper, row_start(A, i, j, 0, A.nx), n, first, projected)
             i = s - 2
             if i >= 0:
                 for j in range(G.ny):
-                    sweep_row(A, d, wx, wy, wz, x, t, b, lower, upper, row_start(A, i, j, 0, 0), A.nx, second, projected)
+                    n = row_count(A, i, j, 0, A.nx)
+                    sweep_row(A, d, wx, wy, wz, x, t, b, lower, upper, row_start(A, i, j, 0, A.nx), n, second, projected)
 
     return SimpleNamespace(
         sweep=sweep_kernel,

@@ -16,6 +16,7 @@ from warp_lcp.multigrid import coarsen_kernels as kernels
 from warp_lcp.multigrid.coarsen_kernels import UNBOUNDED
 from warp_lcp.multigrid.cycle_kernels import Aggregates, cycle_kernels
 from warp_lcp.operators.stencil import Stencil
+from warp_lcp.operators.stencil_kernels import coarsen_spans_kernel
 from warp_lcp.program import Launch, Program
 from warp_lcp.vectors import convert
 
@@ -115,7 +116,7 @@ class Hierarchy:
             weights = tuple(wp.zeros(w.size, dtype=real, device=w.device) for w in weights)
         d = wp.zeros(stencil.d.size, dtype=d_type, device=self.device)
         unit = stencil.unit if d_type is wp.uint8 else 1.0
-        finest = Stencil(stencil.padding, d, weights, stencil.coefficients, unit, stencil.periodic)
+        finest = Stencil(stencil.padding, d, weights, stencil.coefficients, unit, stencil.periodic, stencil.spans)
         self._strength = mean_weights(stencil)
         self.levels = [Level(finest, real, bounded=bounded, bounds=bounds)]
         most = self.settings.coarsest_cuda if self.device.is_cuda else self.settings.coarsest_cpu
@@ -123,7 +124,7 @@ class Hierarchy:
             self.levels.append(self._coarser(self.levels[-1], bounded=bounded))
         m = math.prod(self.levels[-1].stencil.padding.counts)
         self._matrix, self._inverse = (wp.zeros((m, m), dtype=wp.float64, device=self.device) for _ in range(2))
-        self.refresh_weights()
+        self.refresh()
 
     @property
     def finest(self) -> Level:
@@ -135,8 +136,19 @@ class Hierarchy:
         """Bytes that the levels hold, shared weights of the finest one not counted."""
         return sum(sum(a.capacity for a in {id(v): v for v in (lv.x, lv.b, lv.t, lv.lower, lv.upper)}.values()) for lv in self.levels)
 
-    def refresh_weights(self) -> None:
-        """Take the operator's weights again after they changed in place."""
+    def refresh(self) -> None:
+        """Take the operator's rows and weights again after they changed in place, and clear what lies outside the new rows."""
+        for fine, coarse in zip(self.levels, self.levels[1:], strict=False):
+            f, c, G = fine.stencil, coarse.stencil, coarse.aggregates
+            if f.spans is not None and G is not None:
+                inputs = [f.spans, wp.vec3i(G.fz, G.fy, G.fx), c.padding.counts[2], c.spans]
+                wp.launch(coarsen_spans_kernel, c.padding.counts[:2], inputs, device=self.device)
+        for level in self.levels:
+            for field in (level.x, level.b, level.t, level.stencil.d):
+                field.zero_()
+        for level in self.levels[1:]:
+            for field in level.stencil.weights or ():
+                field.zero_()
         ours, theirs = self.finest.stencil.weights, self._source.weights
         for w, source in zip(ours or (), theirs or (), strict=True):
             if w is not source:
@@ -263,7 +275,9 @@ class Hierarchy:
             self._strength[axis] *= math.prod(factors) / factors[axis]
         new = [wp.zeros(padding.size, dtype=self.real, device=self.device) for _ in range(4)]
         periodic = tuple(p and n > 1 for p, n in zip(s.periodic, reversed(padding.counts), strict=True))
-        stencil = Stencil(padding, new[0], (new[1], new[2], new[3]), (0.0, 0.0, 0.0), 1.0, periodic)  # type: ignore[arg-type]
+        spans = None if s.spans is None else wp.zeros(padding.counts[:2], dtype=wp.vec2i, device=self.device)
+        weights = (new[1], new[2], new[3])
+        stencil = Stencil(padding, new[0], weights, (0.0, 0.0, 0.0), 1.0, periodic, spans)  # type: ignore[arg-type]
         level = Level(stencil, self.real, bounded=bounded)
         G = level.aggregates = Aggregates()
         G.fx, G.fy, G.fz, G.ny, G.nz = *factors, counts[1], counts[0]

@@ -91,6 +91,7 @@ class ComponentFinder:
         self._shape = StencilShape()
         self._shape.nx, self._shape.s1, self._shape.s2 = A.stencil.shape.nx, A.stencil.shape.s1, A.stencil.shape.s2
         self._shape.cx, self._shape.cy, self._shape.cz = A.uniform
+        self._shape.spans = A.stencil.spans
         self._kernels = kernels.component_kernels(A.dtype)
 
     def find(self) -> FloatingComponents | None:

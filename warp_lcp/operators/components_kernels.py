@@ -7,10 +7,10 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.operators.stencil_kernels import StencilShape, row_start
+from warp_lcp.native import BLOCK, simd
+from warp_lcp.operators.stencil_kernels import StencilShape, row_count, row_first, row_start
 
 options = {"enable_backward": False, "module": "warp_lcp.components"}
-
 
 FIND = """
     auto find = [&](int i) { while (P[i] != i) i = P[i]; return i; };"""
@@ -21,8 +21,9 @@ COEFFICIENTS = """
     auto y = [&](long long k) { return face_y.data ? fy[k] > 0 : A.cy > 0; };
     auto z = [&](long long k) { return face_z.data ? fz[k] > 0 : A.cz > 0; };"""
 
-UNITE = (
-    COEFFICIENTS
+UNITE = simd(
+    BLOCK
+    + COEFFICIENTS
     + FIND
     + """
     auto unite = [&](int i, int j) {
@@ -32,21 +33,58 @@ UNITE = (
             const int old = wp::atomic_min(P + a, b);
             if (old == a) return;
             a = find(old); b = find(b); } };
-    for (int k = 0; k < n; ++k) {
-        if (c[k] != 1) continue;
-        const int i = (int)(p + k);
-        const bool edge = first && k == 0, left = c[k-1] == 1 && x(k);
-        if (left) unite(i, edge ? i + (int)wrap_x : i - 1);
-        const bool row = left && !edge;  // the cell to the left has been joined to its lower neighbors: those joined to ours need no more
-        if (c[k-s2] == 1 && y(k) && !(row && c[k-1-s2] == 1 && y(k-1) && x(k-s2))) unite(i, i + (int)wrap_y);
-        if (c[k-s1] == 1 && z(k) && !(row && c[k-1-s1] == 1 && z(k-1) && x(k-s1))) unite(i, i + (int)wrap_z); }
+    // what to join is found in bytes, many cells at a time: 1 the cell to the left, 2 the one below along y, 4 along z; the cell to the
+    // left has been joined to its own lower neighbors, and those joined to ours need no more
+    const unsigned char ax = A.cx > 0, ay = A.cy > 0, az = A.cz > 0; const bool uniform = !face_x.data && !face_y.data && !face_z.data;
+    unsigned char join[M];
+    for (int begin = 0; begin < n; begin += M) {
+        const int m = n - begin < M ? n - begin : (int)M; const signed char* e = c + begin;
+        if (uniform) {
+            SIMD for (int k = 0; k < m; ++k) {
+                const unsigned char in = e[k] == 1, left = ax & (e[k-1] == 1), y = ay & (e[k-s2] == 1), z = az & (e[k-s1] == 1);
+                const unsigned char y_done = left & (e[k-1-s2] == 1), z_done = left & (e[k-1-s1] == 1);
+                join[k] = in ? (unsigned char)(left | (y & !y_done) << 1 | (z & !z_done) << 2) : (unsigned char)0; }
+        } else {
+            for (int k = begin; k < begin + m; ++k) {
+                const bool in = c[k] == 1, left = c[k-1] == 1 && x(k);
+                const bool y_done = left && c[k-1-s2] == 1 && y(k-1) && x(k-s2), z_done = left && c[k-1-s1] == 1 && z(k-1) && x(k-s1);
+                const bool y_here = c[k-s2] == 1 && y(k) && !y_done, z_here = c[k-s1] == 1 && z(k) && !z_done;
+                join[k - begin] = in ? (unsigned char)(left | y_here << 1 | z_here << 2) : (unsigned char)0; }
+        }
+        if (first && begin == 0 && join[0] & 1) {  // the neighbor to the left of a first cell is the last one: no chain to rely on
+            const int k = 0; join[0] = 1 | (c[k-s2] == 1 && y(k)) << 1 | (c[k-s1] == 1 && z(k)) << 2; }
+        for (int k = 0; k < m; ++k) {
+            const unsigned char j = join[k]; const int i = (int)(p + begin + k);
+            if (!j) continue;
+            if (j & 1) {
+                const bool edge = first && begin + k == 0;
+#ifdef __CUDA_ARCH__
+                unite(i, edge ? i + (int)wrap_x : i - 1);
+#else
+                if (!edge && P[i] == i) P[i] = P[i-1]; else unite(i, edge ? i + (int)wrap_x : i - 1);
+#endif
+            }
+            if (j & 2) unite(i, i + (int)wrap_y);
+            if (j & 4) unite(i, i + (int)wrap_z); } }
 """
 )
-GROUND = (
-    COEFFICIENTS
+GROUND = simd(
+    BLOCK
+    + COEFFICIENTS
     + FIND
     + """
     const auto* held = shift.data + p;
+    if (!face_x.data && !face_y.data && !face_z.data && !shift.data) {
+        const unsigned char ax = A.cx > 0, ay = A.cy > 0, az = A.cz > 0; unsigned char hit[M];
+        for (int begin = 0; begin < n; begin += M) {
+            const int m = n - begin < M ? n - begin : (int)M; const signed char* e = c + begin; unsigned char any = 0;
+            SIMD for (int k = 0; k < m; ++k) {
+                const unsigned char h = (ax & ((e[k-1] == 0) | (e[k+1] == 0))) | (ay & ((e[k-s2] == 0) | (e[k+s2] == 0)))
+                    | (az & ((e[k-s1] == 0) | (e[k+s1] == 0)));
+                hit[k] = e[k] == 1 ? h : (unsigned char)0; any |= hit[k]; }
+            for (int k = 0; any && k < m; ++k) if (hit[k]) grounded.data[find((int)(p + begin + k))] = 1; }
+        return;
+    }
     for (int k = 0; k < n; ++k) {
         if (c[k] != 1) continue;
         bool hit = (c[k-1] == 0 && x(k)) || (c[k+1] == 0 && x(k+1)) || (c[k-s2] == 0 && y(k)) || (c[k+s2] == 0 && y(k+s2))
@@ -55,11 +93,12 @@ GROUND = (
         if (hit) grounded.data[find((int)(p + k))] = 1; }
 """
 )
-COUNT = """
+COUNT = simd("""
     const signed char* c = cells.data + p; const int* P = parent.data + p; const unsigned char* g = grounded.data + p; int floating = 0;
-    for (int k = 0; k < n; ++k) floating += (c[k] == 1) & (P[k] == (int)(p + k)) & (g[k] == 0);
+    const int q = (int)p;
+    SIMD for (int k = 0; k < n; ++k) floating += (c[k] == 1) & (P[k] == q + k) & (g[k] == 0);
     return floating;
-"""
+""")
 
 
 @functools.cache
@@ -93,7 +132,7 @@ def component_kernels(real: Any) -> SimpleNamespace:
     @wp.kernel(enable_backward=False, module=name)
     def singletons(A: StencilShape, parent: i32, grounded: u8, grain: int):
         k, j, c = wp.tid()
-        singleton_row(parent, grounded, row_start(A, k, j, c, grain), wp.min(grain, A.nx - c * grain))
+        singleton_row(parent, grounded, row_start(A, k, j, c, grain), row_count(A, k, j, c, grain))
 
     @wp.kernel(enable_backward=False, module=name)
     def unite(A: StencilShape, cells: i8, face_x: field, face_y: field, face_z: field, parent: i32, size: wp.vec3i, grain: int):
@@ -105,21 +144,34 @@ def component_kernels(real: Any) -> SimpleNamespace:
             wrap_y = wp.int64(size[1] - 1) * A.s2
         if k == 0:
             wrap_z = wp.int64(size[0] - 1) * A.s1
-        n = wp.min(grain, A.nx - c * grain)
-        unite_row(A, cells, face_x, face_y, face_z, parent, row_start(A, k, j, c, grain), n, c == 0, wrap_x, wrap_y, wrap_z)
+        n = row_count(A, k, j, c, grain)
+        unite_row(
+            A,
+            cells,
+            face_x,
+            face_y,
+            face_z,
+            parent,
+            row_start(A, k, j, c, grain),
+            n,
+            row_first(A, k, j, c, grain) == 0,
+            wrap_x,
+            wrap_y,
+            wrap_z,
+        )
 
     @wp.kernel(enable_backward=False, module=name)
     def ground(
         A: StencilShape, cells: i8, face_x: field, face_y: field, face_z: field, shift: field, parent: i32, grounded: u8, grain: int
     ):
         k, j, c = wp.tid()
-        n = wp.min(grain, A.nx - c * grain)
+        n = row_count(A, k, j, c, grain)
         ground_row(A, cells, face_x, face_y, face_z, shift, parent, grounded, row_start(A, k, j, c, grain), n)
 
     @wp.kernel(enable_backward=False, module=name)
     def count_floating(A: StencilShape, cells: i8, parent: i32, grounded: u8, grain: int, count: i32):
         k, j, c = wp.tid()
-        found = count_row(cells, parent, grounded, row_start(A, k, j, c, grain), wp.min(grain, A.nx - c * grain))
+        found = count_row(cells, parent, grounded, row_start(A, k, j, c, grain), row_count(A, k, j, c, grain))
         if found > 0:
             wp.atomic_add(count, 0, found)
 

@@ -13,6 +13,7 @@ from warp_lcp.operators import grid_poisson_kernels as kernels
 from warp_lcp.operators.components import ComponentFinder, FloatingComponents
 from warp_lcp.operators.grid_poisson_kernels import AIR, FLUID, SOLID
 from warp_lcp.operators.stencil import Stencil, wrap
+from warp_lcp.operators.stencil_kernels import StencilShape, find_spans_kernel
 
 __all__ = ["AIR", "FLUID", "SOLID", "GridPoisson"]
 
@@ -42,6 +43,7 @@ class GridPoisson:
         cells: cell types with one layer of SOLID ghost cells, shape (nz + 2, ny + 2, nx + 2).
         cells_around: the same with ghost cells of periodic axes filled; `cells` itself where no axis is periodic.
         stencil: the diagonal and the weights on that padded grid.
+        version: how often the cells have been taken; memory that holds something outside the rows' spans is cleared when it changes.
 
     Raises:
         ValueError: an argument has a wrong shape, type or sign, or is not finite; the message names it.
@@ -85,7 +87,12 @@ class GridPoisson:
         self.shift = self._stored_shift(shift)
         self.cells = wp.full(self.layout.stored_shape, SOLID, dtype=wp.int8, device=self.device)
         self.cells_around = wp.zeros_like(self.cells) if any(self.periodic) else self.cells
+        self._spans = wp.zeros((counts[0], counts[1]), dtype=wp.vec2i, device=self.device)
+        self.version = 0
         self.stencil = self._empty_stencil()
+        self._whole_rows = StencilShape()
+        whole, some = self._whole_rows, self.stencil.shape
+        whole.nx, whole.s1, whole.s2 = some.nx, some.s1, some.s2
         self._mask: wp.array[Any] | None = None
         self._finder: ComponentFinder | None = None
         self._refill(wp.array(np.pad(host.reshape(counts), 1).astype(np.int8), device=self.device))
@@ -118,7 +125,10 @@ class GridPoisson:
             out: field like x that receives the product; made if None.
         """
         if tuple(x.shape) == (self.layout.size,):
-            out = wp.zeros_like(x) if out is None else out
+            if out is None:
+                out = wp.zeros_like(x)
+            else:
+                out.zero_()
             self.stencil.product(x, out)
             return out
         stored = self.layout.load(x, x.dtype, "x")
@@ -222,23 +232,25 @@ class GridPoisson:
         if self._counts_faces:
             used = [c for c, n in zip(self.uniform, reversed(layout.padding.counts), strict=True) if n > 1]
             unit = max(used, default=1.0) or 1.0
-            return Stencil(layout.padding, layout.zeros(wp.uint8), None, self.uniform, unit, self.periodic)
-        return Stencil(layout.padding, layout.zeros(self.dtype), weights, self.uniform, 1.0, self.periodic)
+            return Stencil(layout.padding, layout.zeros(wp.uint8), None, self.uniform, unit, self.periodic, self._spans)
+        return Stencil(layout.padding, layout.zeros(self.dtype), weights, self.uniform, 1.0, self.periodic, self._spans)
 
     def _refill(self, cells: wp.array[Any]) -> None:
         """Take padded cell types and compute diagonal and weights."""
         counts, padded = self.layout.padding.counts, self.layout.stored_shape
         s = self.stencil
         if cells is not self.cells:
-            inputs = [s.shape, cells.flatten(), self.cells.flatten(), s.grain]
+            inputs = [self._whole_rows, cells.flatten(), self.cells.flatten(), s.grain]
             wp.launch(kernels.copy_cells_kernel, s.threads, inputs, device=self.device)
+        wp.launch(find_spans_kernel, counts[:2], [self.cells, counts[2], self._spans], device=self.device)
+        self.version += 1
         if self.cells_around is not self.cells:
             wp.copy(self.cells_around, self.cells)
             wrap(self.cells_around, self.periodic, counts)
         d = self.stencil.d.reshape(padded)
         if self._counts_faces:
             axes = wp.vec3i(*(int(c > 0) for c in self.uniform))
-            inputs = [s.shape, self.cells_around.flatten(), axes, s.d, s.grain]
+            inputs = [self._whole_rows, self.cells_around.flatten(), axes, s.d, s.grain]
             wp.launch(kernels.count_faces_kernel, s.threads, inputs, device=self.device)
             return
         inputs = [self.cells_around, *self.faces, wp.vec3d(*self.uniform), self.shift, d]

@@ -24,6 +24,8 @@ class Stencil:
         coefficients: the weights along x, y, z where `weights` is None.
         unit: value of one unit of d.
         periodic: whether x, y, z wrap around; ghost cells are then filled before each product.
+        spans: first and one past the last cell of each row that may hold unknowns, shape (nz, ny), wp.vec2i; fields must be 0 outside.
+            None: whole rows.
     """
 
     padding: Padding
@@ -32,6 +34,7 @@ class Stencil:
     coefficients: tuple[float, float, float] = (1.0, 1.0, 1.0)
     unit: float = 1.0
     periodic: tuple[bool, bool, bool] = (False, False, False)
+    spans: wp.array[Any] | None = None
 
     def __post_init__(self) -> None:
         """Lay out the kernel's view of the sizes."""
@@ -40,6 +43,8 @@ class Stencil:
         self.shape = StencilShape()
         self.shape.nx, self.shape.s1, self.shape.s2, self.shape.unit = nx, self.padding.plane, self.padding.row, self.unit
         self.shape.cx, self.shape.cy, self.shape.cz = self.coefficients
+        if self.spans is not None:
+            self.shape.spans = self.spans
         self.grain = grain(nx, self.device)
         self.threads = (nz, ny, -(-nx // self.grain))
         self.operands = [self.shape, self.d, *(self.weights or [wp.empty(0, dtype=wp.float32, device=self.device)] * 3), self.grain]
@@ -52,7 +57,7 @@ class Stencil:
     def with_diagonal(self, d: wp.array[Any]) -> Stencil:
         """Return the stencil with another diagonal (a mask makes it 0) and the same weights."""
         unit = self.unit if d.dtype is self.d.dtype else 1.0
-        return Stencil(self.padding, d, self.weights, self.coefficients, unit, self.periodic)
+        return Stencil(self.padding, d, self.weights, self.coefficients, unit, self.periodic, self.spans)
 
     def wrap(self, x: wp.array[Any], *, launch: Launch = wp.launch) -> None:
         """Fill x's ghost cells along periodic axes."""

@@ -39,12 +39,31 @@ class StencilShape:
     cx: wp.float64
     cy: wp.float64
     cz: wp.float64
+    spans: wp.array2d(dtype=wp.vec2i)  # first and one past the last cell of each row (k, j) that may hold unknowns; null: all
+
+
+@wp.func
+def row_first(A: StencilShape, k: int, j: int, c: int, grain: int):
+    """First cell, from 0, that chunk c of row (k, j) takes: no earlier than the row's span begins."""
+    first = c * grain
+    if A.spans:
+        first = wp.max(first, A.spans[k, j][0])
+    return first
+
+
+@wp.func
+def row_count(A: StencilShape, k: int, j: int, c: int, grain: int):
+    """Cells that chunk c of row (k, j) takes, counted from its first."""
+    last = wp.min(A.nx, (c + 1) * grain)
+    if A.spans:
+        last = wp.min(last, A.spans[k, j][1])
+    return wp.max(last - row_first(A, k, j, c, grain), 0)
 
 
 @wp.func
 def row_start(A: StencilShape, k: int, j: int, c: int, grain: int):
     """Element at which chunk c of row (k, j) begins; k, j count interior cells from 0."""
-    return wp.int64(k + 1) * A.s1 + wp.int64(j + 1) * A.s2 + wp.int64(1 + c * grain)
+    return wp.int64(k + 1) * A.s1 + wp.int64(j + 1) * A.s2 + wp.int64(1 + row_first(A, k, j, c, grain))
 
 
 @functools.cache
@@ -94,7 +113,7 @@ def product_kernels(variable: bool, d_type: Any, w_type: Any, x_type: Any) -> Si
         A: StencilShape, d: d_array, wx: w_array, wy: w_array, wz: w_array, grain: int, x: x_array, b: x_array, shifted: bool, y: x_array
     ):
         k, j, c = wp.tid()
-        n = wp.min(grain, A.nx - c * grain)
+        n = row_count(A, k, j, c, grain)
         product_row(A, d, wx, wy, wz, x, b, y, row_start(A, k, j, c, grain), n, shifted)
 
     @wp.kernel(enable_backward=False, module=name)
@@ -103,8 +122,8 @@ def product_kernels(variable: bool, d_type: Any, w_type: Any, x_type: Any) -> Si
         upper: x_array, omega: x_type, color: int,
     ):  # fmt: skip
         k, j, c = wp.tid()
-        n = wp.min(grain, A.nx - c * grain)
-        first = (k + j + c * grain + color) % 2
+        n = row_count(A, k, j, c, grain)
+        first = (k + j + row_first(A, k, j, c, grain) + color) % 2
         relax_row(A, d, wx, wy, wz, x, b, lower, upper, row_start(A, k, j, c, grain), n, first, omega)
 
     return SimpleNamespace(product=product, relax=relax)
@@ -132,3 +151,44 @@ def wrap_kernel(dtype: Any) -> Any:
             x[n + 1, a, b] = x[1, a, b]
 
     return wrap
+
+
+SPAN_CELLS = wp.constant(16)  # spans begin at multiples of this, so that rows stay whole vectors and aggregates whole
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.stencil")
+def find_spans_kernel(cells: wp.array3d(dtype=wp.int8), n: int, spans: wp.array2d(dtype=wp.vec2i)):
+    """The span of a row is what lies between its first and its last FLUID cell, both included, grown to whole vectors."""
+    k, j = wp.tid()
+    first = int(0)
+    while first < n and cells[k + 1, j + 1, first + 1] != wp.int8(1):
+        first += 1
+    last = int(n)
+    while last > first and cells[k + 1, j + 1, last] != wp.int8(1):
+        last -= 1
+    first = first // SPAN_CELLS * SPAN_CELLS
+    if last <= first:
+        first = 0
+        last = 0
+    spans[k, j] = wp.vec2i(first, wp.min(n, (last + SPAN_CELLS - 1) // SPAN_CELLS * SPAN_CELLS))
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.stencil")
+def coarsen_spans_kernel(fine: wp.array2d(dtype=wp.vec2i), factors: wp.vec3i, n: int, spans: wp.array2d(dtype=wp.vec2i)):
+    """A coarse row's span covers those of its rows; factors = cells an aggregate along z, y, x."""
+    k, j = wp.tid()
+    first = int(n)
+    last = int(0)
+    for a in range(factors[0]):
+        for b in range(factors[1]):
+            z = factors[0] * k + a
+            y = factors[1] * j + b
+            if z < fine.shape[0] and y < fine.shape[1]:
+                if fine[z, y][1] > fine[z, y][0]:
+                    first = wp.min(first, fine[z, y][0] // factors[2])
+                    last = wp.max(last, (fine[z, y][1] + factors[2] - 1) // factors[2])
+    first = first // SPAN_CELLS * SPAN_CELLS
+    if last <= first:
+        first = 0
+        last = 0
+    spans[k, j] = wp.vec2i(first, wp.min(n, (last + SPAN_CELLS - 1) // SPAN_CELLS * SPAN_CELLS))

@@ -48,14 +48,17 @@ class GridSystem:
 
     def __init__(self, A: GridPoisson, real: Any, *, bounded: bool, settings: CycleSettings | None = None) -> None:
         self._A = A
+        self._version = A.version
         self.hierarchy = Hierarchy(A.stencil, real, bounded=bounded, settings=settings)
         self.r, self.z = self.hierarchy.finest.b, self.hierarchy.finest.x
         self._krylov = ConjugateGradient(self.hierarchy.finest.stencil.product, self)
         self.e = self._krylov.x
 
     def refresh(self) -> None:
-        """Take the weights again."""
-        self.hierarchy.refresh_weights()
+        """Take the rows and the weights again if the operator has changed."""
+        if self._version != self._A.version:
+            self._version = self._A.version
+            self.hierarchy.refresh()
 
     def restrict(self, free: wp.array[Any]) -> None:
         """Mask the finest diagonal and coarsen."""

@@ -25,8 +25,8 @@ class ProjectedMultigrid:
     Cold, the first steps are projected (monotone) cycles, which move whole aggregates on and off their bounds. Then each step evaluates
     y = A x + b in float64, takes the unknowns that sit at a bound with y of the right sign out of the hierarchy (they are *truncated*),
     preconditions -y by one linear cycle on the rest, makes the correction conjugate to the last direction while that set stays the same,
-    and projects the step onto the bounds. There are no inner tolerances: without bounds this is preconditioned conjugate gradients with a true residual, and the same
-    code is the linear solver. If the residual rises `patience` times running, a monotone cycle follows.
+    and projects the step onto the bounds. There are no inner tolerances: without bounds this is preconditioned conjugate gradients with a
+    true residual, and the same code is the linear solver. If the residual rises `patience` times running, a monotone cycle follows.
 
     Args:
         precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate rounded to float32 as well.
@@ -78,7 +78,7 @@ class AssessedResidual(NaturalResidual):
 
     def __init__(self, problem: LCP, A: GridPoisson, hierarchy: Hierarchy) -> None:
         super().__init__(problem)
-        self._A, self._finest = A, hierarchy.finest
+        self._A, self._finest, self._hierarchy, self._version = A, hierarchy.finest, hierarchy, A.version
         s = A.stencil
         self.threads = int(np.prod(s.threads))
         self.scalars = wp.zeros(kernels.SLOTS, dtype=wp.float64, device=A.device)
@@ -89,6 +89,9 @@ class AssessedResidual(NaturalResidual):
 
     def start(self, x: wp.array[Any], *, keep: bool) -> None:
         """Set x to clip(x, l, u) or clip(0, l, u); a guess is classified, a cold start is not."""
+        if self._version != self._A.version:
+            self._version, self.stale = self._A.version, True
+            self._hierarchy.refresh()
         super().start(x, keep=keep)
         self.classify = keep
         if not keep:
@@ -152,9 +155,6 @@ class MultigridWorkspace(IterateInBuffers):
         self._cycles_left = self.settings.monotone_cycles if self.bounded and not warm else 0
         self._rises = 0
         self._forget()
-        if self.A.stencil.weights is not None:
-            self.hierarchy.refresh_weights()
-            self.residual.stale = True
         if self.floating is not None:
             self._classify_next()
             self.residual.evaluate(self.x)

@@ -8,7 +8,7 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.native import BLOCK, C_TYPES, simd
-from warp_lcp.operators.stencil_kernels import NEIGHBORS, StencilShape, row_start, stencil_head
+from warp_lcp.operators.stencil_kernels import NEIGHBORS, StencilShape, row_count, row_start, stencil_head
 from warp_lcp.vector_kernels import BOUNDED, flat, span_end, span_start
 
 # Slots of the device scalars. NORM, MOVED and ACTIVE are sums of one pass, and so are ZAZ ... GP.
@@ -59,7 +59,8 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
                 unsigned char changed = 0;
                 SIMD8 for (int k = begin; k < end; ++k) {{
                     const T v = y[k - begin], r = m[k] == 1 ? v : (T)0; s += r*r; g[k] = d[k] != 0 ? -v*inverse : (T)0; }}
-                SIMD for (int k = begin; k < end; ++k) {{ const F now = (F)d[k]; changed |= (unsigned char)(free[k] != now); free[k] = now; }}
+                SIMD for (int k = begin; k < end; ++k) {{
+                    const F now = (F)d[k]; changed |= (unsigned char)(free[k] != now); free[k] = now; }}
                 moved += changed;
                 continue;
             }}
@@ -108,7 +109,7 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
         scalars: f64, classify: bool, out: f64,
     ):  # fmt: skip
         k, j, c = wp.tid()
-        n = wp.min(grain, A.nx - c * grain)
+        n = row_count(A, k, j, c, grain)
         p = row_start(A, k, j, c, grain)
         inverse = wp.float64(1.0) / scalars[SIZE]
         assess_row(
@@ -122,7 +123,7 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
         p: field, ap: field, g: field, az: field, out: f64,
     ):  # fmt: skip
         k, j, c = wp.tid()
-        n = wp.min(grain, A.nx - c * grain)
+        n = row_count(A, k, j, c, grain)
         measure_row(A, d, wx, wy, wz, z, p, ap, g, az, row_start(A, k, j, c, grain), n, (k * rows + j) * chunks + c, threads, out)
 
     return SimpleNamespace(assess=assess, measure=measure)
@@ -132,7 +133,7 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
 def flat_kernels(free_type: Any, real: Any) -> SimpleNamespace:
     """Return the kernels on flat fields: `update`, `gaps`, `add`."""
     name = f"warp_lcp.projected_multigrid.{free_type.__name__}_{real.__name__}"
-    free_array, field, i8 = wp.array(dtype=free_type), wp.array(dtype=real), wp.array(dtype=wp.int8)
+    field, i8 = wp.array(dtype=real), wp.array(dtype=wp.int8)
 
     @wp.func_native(
         flat(
