@@ -14,7 +14,8 @@ import warp as wp
 CPU_CHUNK = 8192  # elements of a flat field a CPU thread takes: its operands stay in the L2 cache between fused loops
 CUDA_THREADS = 1 << 16  # threads of a flat reduction, several waves of a large GPU
 BLOCK = "\n#ifdef __CUDA_ARCH__\nenum { M = 1 };\n#else\nenum { M = 128 };\n#endif\n"  # cells that a row function buffers at a time
-CUDA_BLOCK = 256  # threads that add up the partial sums
+CUDA_BLOCK = 256  # threads that add up partial sums
+CUDA_SEGMENTS = 256  # blocks that do so first where there are very many
 
 C_TYPES = {wp.uint8: "unsigned char", wp.float32: "float", wp.float64: "double"}
 

@@ -51,16 +51,21 @@ def span_end(t: int, chunk: int, n: int):
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.vectors")
-def add_up_kernel(partials: wp.array(dtype=wp.float64), n: int, threads: int, out: wp.array(dtype=wp.float64), slot: int):
-    """out[slot + c] = sum of column c of the partials, one block a column, in an order that does not change from run to run."""
+def add_up_kernel(partials: wp.array(dtype=wp.float64), n: int, threads: int, segments: int, out: wp.array(dtype=wp.float64), slot: int):
+    """out[slot + column * segments + segment] = the sum of every `segments`-th block of a column of n partials, by one block of threads.
+
+    The order of the additions does not change from run to run.
+    """
     t = wp.tid()
-    column = t // threads
+    block = t // threads
+    column = block // segments
+    segment = block - column * segments
     s = wp.float64(0.0)
-    for i in range(t - column * threads, n, threads):
+    for i in range(segment * threads + t - block * threads, n, threads * segments):
         s += partials[column * n + i]
     total = wp.tile_sum(wp.tile(s))
-    if t == column * threads:
-        out[slot + column] = total[0]
+    if t == block * threads:
+        out[slot + block] = total[0]
 
 
 @functools.cache

@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.native import CUDA_BLOCK, Spans
+from warp_lcp.native import CUDA_BLOCK, CUDA_SEGMENTS, Spans
 from warp_lcp.program import Launch
 from warp_lcp.vector_kernels import add_up_kernel, kernels
 
@@ -30,11 +30,19 @@ class Reduction:
         self.threads = threads or self.spans.threads
         self.block = min(CUDA_BLOCK, self.threads) if device.is_cuda else 1
         self.partials = wp.zeros(columns * self.threads, dtype=wp.float64, device=device)
+        # one block of a GPU would take long over millions of partial sums: many blocks add them up first
+        self._segments = CUDA_SEGMENTS if device.is_cuda and self.threads > CUDA_SEGMENTS * CUDA_BLOCK else 1
+        self._folded = wp.zeros(columns * self._segments, dtype=wp.float64, device=device)
 
     def add_up(self, slot: int, columns: int = 1, *, launch: Launch = wp.launch) -> None:
         """Write the sums of the first columns of partial sums to scalars[slot], scalars[slot + 1], ..."""
-        inputs = [self.partials, self.threads, self.block, self.scalars, slot]
-        launch(add_up_kernel, columns * self.block, inputs, device=self.partials.device, block_dim=self.block)
+        source, n, device = self.partials, self.threads, self.partials.device
+        if self._segments > 1:
+            inputs = [source, n, self.block, self._segments, self._folded, 0]
+            launch(add_up_kernel, columns * self._segments * self.block, inputs, device=device, block_dim=self.block)
+            source, n = self._folded, self._segments
+        inputs = [source, n, self.block, 1, self.scalars, slot]
+        launch(add_up_kernel, columns * self.block, inputs, device=device, block_dim=self.block)
 
     def dot(self, a: wp.array[Any], b: wp.array[Any], slot: int, *, launch: Launch = wp.launch) -> None:
         """Write a.b to scalars[slot]."""

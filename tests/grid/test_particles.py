@@ -98,6 +98,7 @@ def test_appended_particles_come_behind_and_storage_grows_geometrically() -> Non
     assert (grown[1:] >= 1.5 * grown[:-1] - 1).all()
     particles.sort()
     particles.append(np.ones((1, 3)), np.ones((1, 3)))
+    particles.append(np.ones((0, 3)), np.ones((0, 3)))
     assert particles.totals().count == 1501
     assert all((gradient.numpy()[-1] == 0.0).all() for gradient in particles.affine)
     with pytest.raises(ValueError, match="velocity"):
@@ -129,6 +130,15 @@ def test_values_that_are_not_finite_are_counted() -> None:
     totals = particles.totals()
     assert (totals.bad_positions, totals.bad_velocities) == (2, 3)
     assert not totals.finite
+
+
+def test_values_as_large_as_can_be_are_finite() -> None:
+    particles = random_particles(FLAT, 40, 16)
+    x = particles.position.numpy().copy()
+    x[7] = 3e38, -3e38, 3e38
+    particles.position.assign(x)
+    assert particles.totals().finite
+    assert particles.totals().high[0] == pytest.approx(3e38)
 
 
 def test_empty_or_mismatched_particles_are_refused() -> None:

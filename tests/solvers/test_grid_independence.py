@@ -5,6 +5,9 @@ import pytest
 
 import warp_lcp as wl
 from scenes import splash
+from warp_lcp import program
+from warp_lcp.multigrid import Hierarchy
+from warp_lcp.solvers import projected_multigrid
 
 BOUNDS = ["none", "walls", "everywhere"]
 
@@ -89,3 +92,19 @@ def test_convergence_to_ten_digits():
         result = wl.solve(problem, wl.ProjectedMultigrid(), stopping=wl.StoppingCriteria(rtol=1e-10))
         assert result, result.status
         assert result.iterations <= 16
+
+
+@pytest.mark.parametrize("bounds", ["none", "walls"])
+def test_every_way_to_launch_gives_the_same_iterates(bounds, monkeypatch):
+    """Fused legs, sums over slabs of planes and captured graphs change no iteration; the sums alone may round otherwise."""
+    _, plain = solve(24, bounds, "multigrid")
+    monkeypatch.setattr(Hierarchy, "_fuses", lambda self, level: False)
+    _, unfused = solve(24, bounds, "multigrid")
+    np.testing.assert_array_equal(unfused.x.numpy(), plain.x.numpy())
+    monkeypatch.setitem(projected_multigrid.PLANES_A_THREAD, "cpu", 5)
+    _, slabs = solve(24, bounds, "multigrid")
+    monkeypatch.setattr(program, "CPU_RUNS_BEFORE_CAPTURE", 1)
+    _, captured = solve(24, bounds, "multigrid")
+    np.testing.assert_array_equal(captured.x.numpy(), slabs.x.numpy())
+    assert slabs.iterations == captured.iterations == plain.iterations
+    np.testing.assert_allclose(slabs.x.numpy(), plain.x.numpy(), atol=1e-6 * np.abs(plain.x.numpy()).max())

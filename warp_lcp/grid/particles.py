@@ -127,14 +127,15 @@ class Particles:
             ValueError: the shapes do not match.
         """
         _check_shapes(position, velocity)
+        if len(position) == 0:
+            return
         before, self.count = self.count, self.count + len(position)
         if self.count > self._capacity:
             self._grow(before)
         for column in (*self._columns.values(), self._spare):
             column.view = column.store[: self.count]
         for name, host in (("position", position), ("velocity", velocity)):
-            if len(host):
-                self._columns[name].view[before:].assign(np.ascontiguousarray(host, dtype=np.float32))
+            self._columns[name].view[before:].assign(np.ascontiguousarray(host, dtype=np.float32))
         for gradient in self.affine:
             gradient[before:].zero_()  # sorting may have left anything behind the particles in use
 

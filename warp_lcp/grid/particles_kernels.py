@@ -38,13 +38,15 @@ TOTAL = """
         const T* X = position + 3*(long long)start; const T* V = velocity + 3*(long long)start;
         SIMD for (int m = 0; m < n; ++m) {
             const T x = X[3*m], y = X[3*m + 1], z = X[3*m + 2], u = V[3*m], v = V[3*m + 1], w = V[3*m + 2];
-            const T speed = u*u + v*v + w*w, reach = x*x + y*y + z*z;
+            const T speed = u*u + v*v + w*w, most = (T)3.4028234e38;
             squares[m] += (double)speed; sum[0][m] += (double)x; sum[1][m] += (double)y; sum[2][m] += (double)z;
             low[0][m] = x < low[0][m] ? x : low[0][m]; high[0][m] = x > high[0][m] ? x : high[0][m];
             low[1][m] = y < low[1][m] ? y : low[1][m]; high[1][m] = y > high[1][m] ? y : high[1][m];
             low[2][m] = z < low[2][m] ? z : low[2][m]; high[2][m] = z > high[2][m] ? z : high[2][m];
             fastest[m] = speed > fastest[m] ? speed : fastest[m];
-            bad_v[m] += !(speed <= (T)3.4028234e38); bad_x[m] += !(reach <= (T)3.4028234e38);
+            bad_v[m] += !(speed <= most);
+            const int fine = (int)(x <= most) & (int)(x >= -most) & (int)(y <= most) & (int)(y >= -most);
+            bad_x[m] += !(fine & (int)(z <= most) & (int)(z >= -most));
         }
     }
     for (int m = 1; m < LANES; ++m) {

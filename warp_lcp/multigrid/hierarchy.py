@@ -198,7 +198,7 @@ class Hierarchy:
             self._solve_coarsest(launch, projected=projected, from_zero=from_zero)
             return
         L = self.levels[level]
-        fused = self.device.is_cpu and not any(L.stencil.periodic)
+        fused = self._fuses(L)
         if fused:
             self._descending_leg(level, launch, projected=projected, from_zero=from_zero)
         else:
@@ -213,6 +213,10 @@ class Hierarchy:
         else:
             self._correct(level, launch, projected=projected)
             self._pair(L, launch, reverse=True, projected=projected)
+
+    def _fuses(self, L: Level) -> bool:
+        """Whether a leg of the cycle is one launch: on the CPU, where one thread does it all, unless ghost cells must be filled between."""
+        return self.device.is_cpu and not any(L.stencil.periodic)
 
     def _descending_leg(self, level: int, launch: Launch, *, projected: bool, from_zero: bool) -> None:
         """Sweeps, residual and restriction in one launch of one CPU thread."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,6 +17,9 @@ from warp_lcp.residual import NaturalResidual
 from warp_lcp.solve import IterateInBuffers, Precision, Step
 from warp_lcp.solvers import projected_multigrid_kernels as kernels
 from warp_lcp.vectors import Reduction, convert, launch_spans
+
+# planes that a thread sums over: on CUDA, a place for the sums of every cell would cost more memory than the rest of the method
+PLANES_A_THREAD = {"cpu": 1, "cuda": 16}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,10 +84,13 @@ class AssessedResidual(NaturalResidual):
         super().__init__(problem)
         self._A, self._finest, self._hierarchy, self._version = A, hierarchy.finest, hierarchy, A.version
         s = A.stencil
-        self.threads = int(np.prod(s.threads))
+        planes, rows, chunks = s.threads
+        slab = PLANES_A_THREAD["cuda" if A.device.is_cuda else "cpu"]
+        self.threads = (-(-planes // slab), rows, chunks)
+        R = self.row_sums = kernels.RowSums()
+        R.planes, R.all_planes, R.rows, R.chunks, R.threads = slab, planes, rows, chunks, math.prod(self.threads)
         self.scalars = wp.zeros(kernels.SLOTS, dtype=wp.float64, device=A.device)
-        self.sums = Reduction(problem.layout.size, A.device, self.scalars, columns=5, threads=self.threads)
-        self.launch_shape = [s.threads[1], s.threads[2], self.threads]
+        self.sums = Reduction(problem.layout.size, A.device, self.scalars, columns=5, threads=R.threads)
         self.row_kernels = kernels.row_kernels(*s.storage, self._finest.stencil.d.dtype, hierarchy.real)
         self.classify, self.stale, self.active, self._norm_of_b = False, True, 0, 0.0
 
@@ -112,10 +119,10 @@ class AssessedResidual(NaturalResidual):
         p, s, finest = self.problem, self._A.stencil, self._finest
         s.wrap(x, launch=launch)
         inputs = [
-            *s.operands, *self.launch_shape, x, p.b, *p.bounds, p.unknown, finest.stencil.d, finest.b, self.scalars, self.classify,
+            *s.operands, self.row_sums, x, p.b, *p.bounds, p.unknown, finest.stencil.d, finest.b, self.scalars, self.classify,
             self.sums.partials,
         ]  # fmt: skip
-        launch(self.row_kernels.assess, s.threads, inputs, device=p.device)
+        launch(self.row_kernels.assess, self.threads, inputs, device=p.device)
         self.sums.add_up(int(kernels.NORM), columns=3, launch=launch)
 
     def read(self) -> float:
@@ -232,8 +239,8 @@ class MultigridWorkspace(IterateInBuffers):
         p, residual, finest, device = self.problem, self.residual, self.hierarchy.finest, self.A.device
         finest.stencil.wrap(finest.x, launch=launch)
         fields = [finest.x, self._p, self._ap, finest.b, finest.t, residual.sums.partials]
-        inputs = [*finest.operands, finest.stencil.grain, *residual.launch_shape, *fields]
-        launch(residual.row_kernels.measure, finest.stencil.threads, inputs, device=device)
+        inputs = [*finest.operands, finest.stencil.grain, residual.row_sums, *fields]
+        launch(residual.row_kernels.measure, residual.threads, inputs, device=device)
         residual.sums.add_up(int(kernels.ZAZ), columns=5, launch=launch)
         launch(kernels.plan_step_kernel, 1, [residual.scalars], device=device)
         before = [x, finest.x, finest.t, self._p, self._ap, *p.bounds, out, residual.scalars]

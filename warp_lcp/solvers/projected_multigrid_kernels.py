@@ -29,6 +29,17 @@ SLOTS = 12
 f64 = wp.array(dtype=wp.float64)
 
 
+@wp.struct
+class RowSums:
+    """How the threads of a pass share its rows: each takes a chunk of a row in a slab of planes, and has a place for its sums."""
+
+    planes: int
+    all_planes: int
+    rows: int
+    chunks: int
+    threads: int
+
+
 @functools.cache
 def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: Any) -> SimpleNamespace:
     """Return the kernels that apply the stencil.
@@ -76,13 +87,14 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
                 const F now = hold[k - begin] ? (F)0 : (F)d[k]; const unsigned char one = free[k] != now, two = hold[k - begin] & m[k];
                 changed |= one; count += two; free[k] = now; }}
             moved += changed; active += count; }}
-        out.data[t] = s; out.data[threads + t] = moved; out.data[2*threads + t] = active;"""
+        const double all[3] = {{s, (double)moved, (double)active}}; double* sums = out.data + t;
+        for (int c = 0; c < 3; ++c) sums[c*threads] = more ? all[c] + sums[c*threads] : all[c];"""
         )
     )
     def assess_row(
         A: StencilShape, d_: d_array, wx_: w_array, wy_: w_array, wz_: w_array, x_: f64, b_: f64, l_: f64, l_value: wp.float64, u_: f64,
         u_value: wp.float64, m_: i8, free_: free_array, g_: field, inverse: wp.float64, classify: bool, p: wp.int64, n: int, t: int,
-        threads: int, out: f64,
+        threads: int, more: bool, out: f64,
     ): ...  # fmt: skip
 
     @wp.func_native(
@@ -93,38 +105,43 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
         SIMD for (int k = 0; k < n; ++k) {{
             const T e = unit*(T)d[k], v = e*x[k] - {NEIGHBORS[variable]}, w = e != 0 ? v : (T)0;
             az[k] = w; zaz += x[k]*w; zap += x[k]*aq[k]; pap += q[k]*aq[k]; gz += g[k]*x[k]; gp += g[k]*q[k]; }}
-        out.data[t] = zaz; out.data[threads + t] = zap; out.data[2*threads + t] = pap; out.data[3*threads + t] = gz;
-        out.data[4*threads + t] = gp;"""
+        const double all[5] = {{zaz, zap, pap, gz, gp}}; double* sums = out.data + t;
+        for (int c = 0; c < 5; ++c) sums[c*threads] = more ? all[c] + sums[c*threads] : all[c];"""
         )
     )
     def measure_row(
         A: StencilShape, d_: free_array, wx_: field, wy_: field, wz_: field, z_: field, p_: field, ap_: field, g_: field, az_: field,
-        p: wp.int64, n: int, t: int, threads: int, out: f64,
+        p: wp.int64, n: int, t: int, threads: int, more: bool, out: f64,
     ): ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module=name)
     def assess(
-        A: StencilShape, d: d_array, wx: w_array, wy: w_array, wz: w_array, grain: int, rows: int, chunks: int, threads: int, x: f64,
-        b: f64, lower: f64, lower_value: wp.float64, upper: f64, upper_value: wp.float64, unknown: i8, free: free_array, g: field,
-        scalars: f64, classify: bool, out: f64,
+        A: StencilShape, d: d_array, wx: w_array, wy: w_array, wz: w_array, grain: int, R: RowSums, x: f64, b: f64, lower: f64,
+        lower_value: wp.float64, upper: f64, upper_value: wp.float64, unknown: i8, free: free_array, g: field, scalars: f64,
+        classify: bool, out: f64,
     ):  # fmt: skip
-        k, j, c = wp.tid()
-        n = row_count(A, k, j, c, grain)
-        p = row_start(A, k, j, c, grain)
+        slab, j, c = wp.tid()
         inverse = wp.float64(1.0) / scalars[SIZE]
-        assess_row(
-            A, d, wx, wy, wz, x, b, lower, lower_value, upper, upper_value, unknown, free, g, inverse, classify, p, n,
-            (k * rows + j) * chunks + c, threads, out,
-        )  # fmt: skip
+        t = (slab * R.rows + j) * R.chunks + c
+        for k in range(slab * R.planes, wp.min((slab + 1) * R.planes, R.all_planes)):
+            n = row_count(A, k, j, c, grain)
+            p = row_start(A, k, j, c, grain)
+            assess_row(
+                A, d, wx, wy, wz, x, b, lower, lower_value, upper, upper_value, unknown, free, g, inverse, classify, p, n, t,
+                R.threads, k > slab * R.planes, out,
+            )  # fmt: skip
 
     @wp.kernel(enable_backward=False, module=name)
     def measure(
-        A: StencilShape, d: free_array, wx: field, wy: field, wz: field, grain: int, rows: int, chunks: int, threads: int, z: field,
-        p: field, ap: field, g: field, az: field, out: f64,
+        A: StencilShape, d: free_array, wx: field, wy: field, wz: field, grain: int, R: RowSums, z: field, p: field, ap: field, g: field,
+        az: field, out: f64,
     ):  # fmt: skip
-        k, j, c = wp.tid()
-        n = row_count(A, k, j, c, grain)
-        measure_row(A, d, wx, wy, wz, z, p, ap, g, az, row_start(A, k, j, c, grain), n, (k * rows + j) * chunks + c, threads, out)
+        slab, j, c = wp.tid()
+        t = (slab * R.rows + j) * R.chunks + c
+        for k in range(slab * R.planes, wp.min((slab + 1) * R.planes, R.all_planes)):
+            n = row_count(A, k, j, c, grain)
+            o = row_start(A, k, j, c, grain)
+            measure_row(A, d, wx, wy, wz, z, p, ap, g, az, o, n, t, R.threads, k > slab * R.planes, out)
 
     return SimpleNamespace(assess=assess, measure=measure)
 
