@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import time
 from collections import defaultdict
 from collections.abc import Iterator
@@ -128,9 +127,8 @@ class Case:
 
     def memory(self) -> None:
         """Count the bytes of operator, problem and workspace, b and the bounds included: in the midst of a solve in place, and after it."""
-        gc.collect()
-        before, resident, most = array_bytes(), resident_bytes(), list[int]()
         forget_peak()
+        before, resident, most = array_bytes(), resident_bytes(), list[int]()
         problem, _ = self._in_place()
         work = self.solver.init(problem)
 

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from statistics import median
 
 import numpy as np
 import warp as wp
 
 import warp_lcp as wl
 from benchmarks.kernel_peers import numba_products, plain_product
-from benchmarks.launches import Launch, distinct, listen, stored_sizes, traffic
+from benchmarks.launches import Launch, Traffic, distinct, listen, stored_sizes, traffic
 from benchmarks.machine import COPIED, machine
 from benchmarks.problems import Splash, basin
 from benchmarks.record import Bars, Record, Results, Table
@@ -30,6 +31,8 @@ SET_UP = (
 )  # fmt: skip
 SERIAL = ("stencil.relax",)  # in place and in two colors: bound by store forwarding, not by memory
 FORMS = ("unit", "faces")
+SMALL = 32  # cells a side of the grid on which it is found what a kernel reads and writes
+COPIES = 3
 
 
 def measure(options: Options, out: Path) -> Results:
@@ -49,45 +52,65 @@ def measure(options: Options, out: Path) -> Results:
 
 
 def _measure_form(n: int, form: str, options: Options) -> list[Record]:
-    """Hear the kernels of one form of coefficients, then measure them in turns with a copy and the peers."""
-    scene, device = basin(n), wp.get_device(options.device)
-    if form == "faces":
-        scene = Splash(
-            n, scene.cells, scene.b, scene.wall, {f"face_{a}": np.ones([n + (i == j) for j in range(3)]) for i, a in enumerate("zyx")}
-        )
-    heard, product = _hear(scene, options.device)
-    sizes = stored_sizes((n, n, n))
-    moved = {key: traffic(launch, sizes) for key, launch in heard.items()}
+    """Hear the kernels of one form of coefficients, then measure them in turns with copies and the peers."""
+    device = options.device
+    heard, product = _hear(_basin(n, form), device)
+    moved = _bytes_per_cell(n, form, device, heard)
     a, b = (wp.zeros(min(COPIED, 64 * n**3), dtype=wp.float32, device=device) for _ in range(2))
-
-    def synchronized(run: Callable[[], None]) -> Callable[[], None]:
-        if not device.is_cuda:
-            return run
-
-        def waited() -> None:
-            run()
-            wp.synchronize_device(device)
-
-        return waited
-
-    work = {key: synchronized(launch.run) for key, launch in heard.items()}
-    work["copy"] = synchronized(lambda: wp.copy(b, a))
-    peers = _peers(product, n, options.device) if form == "unit" else {}
+    kernels = [(name, _synchronized(launch.run, device)) for name, launch in heard.items()]
+    peers = _peers(product, n, device) if form == "unit" else {}
+    work: dict[str, Callable[[], None]] = {}
+    for third in range(COPIES):  # spread over a round, which takes seconds at 256^3
+        work[f"copy {third}"] = _synchronized(lambda: wp.copy(b, a), device)
+        work |= dict(kernels[third::COPIES])
     times = in_turns(work | peers, options.repeat)
+    copying = [8 * a.size / median(taken) for taken in zip(*(times[f"copy {third}"] for third in range(COPIES)), strict=True)]
     records = []
     for key, launch in heard.items():
         role = "set-up" if launch.name.startswith(SET_UP) else "serial" if launch.name.startswith(SERIAL) else "hot"
         name = PRODUCT if launch is product else launch.name
-        figures = _figures(times[key], n, moved[key].bytes, 8 * a.size, times["copy"]) | {"launches": Figure(launch.count)}
+        found, per_cell = moved[key]
+        figures = _figures(times[key], n, per_cell, copying) | {"launches": Figure(launch.count)}
         if launch is product:
             figures |= {f"over {peer}": ratios(times[peer], times[key]) for peer in peers}
-        fields = {"reads": sorted(moved[key].reads), "writes": sorted(moved[key].writes)}
+        fields = {"reads": sorted(found.reads), "writes": sorted(found.writes)}
         records.append(Record(f"{n}^3 {form}: {name}", figures, {"form": form, "role": role, **fields}))
     for peer in peers:
-        bytes_moved = n**3 * (8 if "constant" in peer else 9)
-        figures = _figures(times[peer], n, bytes_moved, 8 * a.size, times["copy"])
+        figures = _figures(times[peer], n, 8 if "constant" in peer else 9, copying)
         records.append(Record(f"{n}^3 {form}: {peer}", figures, {"form": form, "role": "peer"}))
     return sorted(records, key=lambda r: -(r.value("seconds") or 0) * (r.value("launches") or 0))
+
+
+def _basin(n: int, form: str) -> Splash:
+    scene = basin(n)
+    if form == "unit":
+        return scene
+    ones = {f"face_{a}": np.ones([n + (i == j) for j in range(3)]) for i, a in enumerate("zyx")}
+    return Splash(n, scene.cells, scene.b, scene.wall, ones)
+
+
+def _synchronized(run: Callable[[], None], device: str) -> Callable[[], None]:
+    """Return `run` with a wait for the device behind it; as it is on the CPU."""
+    if not wp.get_device(device).is_cuda:
+        return run
+
+    def waited() -> None:
+        run()
+        wp.synchronize_device(device)
+
+    return waited
+
+
+def _bytes_per_cell(n: int, form: str, device: str, heard: dict[str, Launch]) -> dict[str, tuple[Traffic, float]]:
+    """Return what each kernel moves, found with the same kernel on a small grid where there is one: 256^3 takes minutes."""
+    small = min(n, SMALL)
+    alike = heard if small == n else _hear(_basin(small, form), device)[0]
+    found = {}
+    for name, launch in heard.items():
+        m, one = (small, alike[name]) if name in alike else (n, launch)
+        moved = traffic(one, stored_sizes((m, m, m)))
+        found[name] = moved, moved.bytes / m**3
+    return found
 
 
 def _hear(scene: Splash, device: str) -> tuple[dict[str, Launch], Launch]:
@@ -117,13 +140,14 @@ def _peers(product: Launch, n: int, device: str) -> dict[str, Callable[[], None]
     return {"Warp, one thread a cell": plain_product(d, x, device), **numba_products(d, x)}
 
 
-def _figures(times: list[float], n: int, moved: int, copied: int, copying: list[float]) -> dict[str, Figure]:
-    """Return rates of a kernel that moves `moved` bytes, and their share of a copy of `copied` bytes in the same rounds."""
+def _figures(times: list[float], n: int, per_cell: float, copying: list[float]) -> dict[str, Figure]:
+    """Return rates of a kernel that moves `per_cell` bytes, and their share of what copying moved a second in the same rounds."""
     figures = {"cells": Figure(n**3), "seconds": Figure.of(times, "s"), "rate": Figure.of([n**3 / t / 1e6 for t in times], "Mcell/s")}
-    if moved:
-        figures["bytes_per_cell"] = Figure(moved / n**3, "B")
+    if per_cell:
+        moved = per_cell * n**3
+        figures["bytes_per_cell"] = Figure(per_cell, "B")
         figures["bandwidth"] = Figure.of([moved / t / 1e9 for t in times], "GB/s")
-        figures["of_copy"] = Figure.of([moved / t / (copied / c) for t, c in zip(times, copying, strict=True)])
+        figures["of_copy"] = Figure.of([moved / t / c for t, c in zip(times, copying, strict=True)])
     return figures
 
 

@@ -1,10 +1,12 @@
 """Figures, files, comparisons, targets."""
 
 import json
+from pathlib import Path
 
 import pytest
 import warp as wp
 
+import benchmarks
 from benchmarks import machine, plots
 from benchmarks.compare import bounds, comparison
 from benchmarks.memory import array_bytes, resident_bytes
@@ -137,3 +139,9 @@ def test_stopwatch_puts_functions_back():
         json.dumps([2])
     assert len(seconds["dump"]) == 2
     assert json.dumps is plain
+
+
+def test_kept_results_can_be_read():
+    kept = sorted(Path(benchmarks.__file__).parent.glob("results/*/*.json"))
+    assert all("machine" in read_json(path) and path.with_suffix(".md").is_file() for path in kept)
+    assert all(read_json(path)["machine"].facts["hardware"]["cpu"] for path in kept)

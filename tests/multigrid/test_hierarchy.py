@@ -8,7 +8,7 @@ import warp_lcp as wl
 from oracle import assemble
 from warp_lcp.krylov import ConjugateGradient
 from warp_lcp.multigrid import CycleSettings, Hierarchy
-from warp_lcp.operators.grid_poisson_kernels import mask_diagonal_kernel
+from warp_lcp.operators.grid_poisson import mask_diagonal
 
 CASES = [
     ((6, 5, 7), (False,) * 3),
@@ -23,8 +23,7 @@ def masked_hierarchy(cells, free, periodic, device, settings=None, real=wp.float
     A = wl.GridPoisson(cells, periodic=periodic, device=device, dtype=wp.float64, **faces)
     hierarchy = Hierarchy(A.stencil, real, bounded=bounded, settings=settings)
     mask = A.layout.load(free.astype(np.uint8) * (cells == wl.FLUID).astype(np.uint8), wp.uint8)
-    d = A.stencil.d
-    wp.launch(mask_diagonal_kernel, d.size, [d, mask, hierarchy.finest.stencil.d], device=device)
+    mask_diagonal(A.stencil.d, mask, hierarchy.finest.stencil.d)
     hierarchy.rebuild()
     return A, hierarchy
 

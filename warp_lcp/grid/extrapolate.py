@@ -11,7 +11,7 @@ BLOCKED = -1  # not to be filled
 UNKNOWN = 0  # to be filled; positive: known since that layer, 1 from the start
 
 # Faces first <= i < last of a row. A pass over the marks finds what to fill, so that rows without any cost a byte a face: with one thread
-# a face the extrapolation of a step took 57 ns a particle, in this form it takes 6.
+# a row in plain Warp a liquid of 276,000 cells spent 23 ms a step on its extrapolation, in this form it spends 8.
 FILL_ROW = """
     const int nz = known_.shape[0], ny = known_.shape[1], nx = known_.shape[2];
     const long long s2 = nx, s1 = s2*ny, row = k*s1 + j*s2;

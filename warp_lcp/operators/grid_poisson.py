@@ -9,11 +9,13 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.layout import PaddedLayout
+from warp_lcp.native import Spans
 from warp_lcp.operators import grid_poisson_kernels as kernels
 from warp_lcp.operators.components import ComponentFinder, FloatingComponents
 from warp_lcp.operators.grid_poisson_kernels import AIR, FLUID, SOLID
 from warp_lcp.operators.stencil import Stencil, wrap
 from warp_lcp.operators.stencil_kernels import StencilShape, find_spans_kernel
+from warp_lcp.vectors import launch_spans
 
 __all__ = ["AIR", "FLUID", "SOLID", "GridPoisson"]
 
@@ -171,7 +173,7 @@ class GridPoisson:
         d = self.stencil.d
         if shift is None:
             new = wp.zeros_like(d)
-            wp.launch(kernels.mask_diagonal_kernel, d.size, [d, mask, new], device=self.device)
+            mask_diagonal(d, mask, new)
         else:
             new = self.layout.zeros(self.dtype)
             inputs = [d, wp.float64(self.stencil.unit), mask, self.layout.load(shift, self.dtype, "shift"), new]
@@ -279,3 +281,8 @@ def _check_coefficients(values: np.ndarray, name: str) -> None:
         raise ValueError(f"{name} holds a value that is not finite")
     if (values < 0).any():
         raise ValueError(f"{name} holds a negative value ({values.min()}): coefficients must be >= 0")
+
+
+def mask_diagonal(d: wp.array[Any], free: wp.array[Any], out: wp.array[Any]) -> None:
+    """Copy a stored diagonal where the stored uint8 field `free` is not 0, write 0 elsewhere."""
+    launch_spans(kernels.mask_diagonal_kernel(d.dtype, out.dtype), Spans.of(d.size, d.device), [d, free, out], [], d.device)

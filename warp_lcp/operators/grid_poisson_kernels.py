@@ -1,12 +1,14 @@
 # mypy: ignore-errors
 """Kernels that turn cell types and face coefficients into the diagonal and the weights of a stencil."""
 
+import functools
 from typing import Any
 
 import warp as wp
 
-from warp_lcp.native import simd
+from warp_lcp.native import C_TYPES, simd
 from warp_lcp.operators.stencil_kernels import StencilShape, row_start
+from warp_lcp.vector_kernels import flat, span_end, span_start
 
 AIR = 0
 FLUID = 1
@@ -131,14 +133,22 @@ for _T in (wp.float32, wp.float64):
     wp.overload(weights_kernel, [wp.array3d(dtype=wp.int8), _A, wp.float64, wp.vec3i, _A])
 
 
-@wp.kernel(**options)
-def mask_diagonal_kernel(d: wp.array(dtype=Any), free: wp.array(dtype=wp.uint8), out: wp.array(dtype=Any)):
-    """The diagonal on the free set, 0 elsewhere."""
-    i = wp.tid()
-    v = out.dtype(0)
-    if free[i] != wp.uint8(0):
-        v = out.dtype(d[i])
-    out[i] = v
+@functools.cache
+def mask_diagonal_kernel(d_type: Any, out_type: Any) -> Any:
+    """Return the kernel that copies the diagonal on the free set and writes 0 elsewhere."""
+    name = f"warp_lcp.grid_poisson.mask_{d_type.__name__}_{out_type.__name__}"
+    d_array, out_array, u8 = wp.array(dtype=d_type), wp.array(dtype=out_type), wp.array(dtype=wp.uint8)
+    target = C_TYPES[out_type]
+
+    @wp.func_native(flat(f"EACH {{ out.data[i] = free.data[i] != 0 ? ({target})d.data[i] : ({target})0; }}"))
+    def mask_span(d: d_array, free: u8, out: out_array, start: wp.int64, end: wp.int64, stride: wp.int64): ...
+
+    @wp.kernel(enable_backward=False, module=name)
+    def mask_diagonal(d: d_array, free: u8, out: out_array, n: int, chunk: int, stride: wp.int64):
+        t = wp.tid()
+        mask_span(d, free, out, span_start(t, chunk), span_end(t, chunk, n), stride)
+
+    return mask_diagonal
 
 
 @wp.kernel(**options)
@@ -154,8 +164,6 @@ def mask_and_shift_kernel(
 
 
 _U8 = wp.array(dtype=wp.uint8)
-for _D, _T in ((wp.uint8, wp.uint8), (wp.float32, wp.float32), (wp.float64, wp.float64), (wp.float64, wp.float32)):
-    wp.overload(mask_diagonal_kernel, [wp.array(dtype=_D), _U8, wp.array(dtype=_T)])
 for _D in (wp.uint8, wp.float32, wp.float64):
     for _T in (wp.float32, wp.float64):
         wp.overload(mask_and_shift_kernel, [wp.array(dtype=_D), wp.float64, _U8, wp.array(dtype=_T), wp.array(dtype=_T)])

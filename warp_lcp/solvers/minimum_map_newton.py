@@ -108,7 +108,7 @@ class NewtonWorkspace(IterateInPlace):
         """Projected cycle on all unknowns from x."""
         p, system = self.problem, self.system
         assert isinstance(system, GridSystem)
-        wp.launch(all_free_kernel, x.size, [p.unknown, self.free], device=p.device)
+        self._flat(all_free_kernel, [p.unknown, self.free])
         if self.stale:
             system.restrict(self.free)
         self.stale = True  # the next Newton step takes cells out again

@@ -107,10 +107,12 @@ def kernels(d_type: Any, real: Any) -> SimpleNamespace:
     return SimpleNamespace(classify=classify, free_square=free_square, right_side=right_side, gaps=gaps, correct=correct)
 
 
+@wp.func_native(flat("EACH { free.data[i] = unknown.data[i] == 1; }"))
+def all_free_span(unknown: wp.array(dtype=wp.int8), free: wp.array(dtype=wp.uint8), start: wp.int64, end: wp.int64, stride: wp.int64): ...
+
+
 @wp.kernel(enable_backward=False, module="warp_lcp.minimum_map_newton")
-def all_free_kernel(unknown: wp.array(dtype=wp.int8), free: wp.array(dtype=wp.uint8)):
+def all_free_kernel(unknown: wp.array(dtype=wp.int8), free: wp.array(dtype=wp.uint8), n: int, chunk: int, stride: wp.int64):
     """Every unknown is free."""
-    i = wp.tid()
-    free[i] = wp.uint8(0)
-    if unknown[i] == wp.int8(1):
-        free[i] = wp.uint8(1)
+    t = wp.tid()
+    all_free_span(unknown, free, span_start(t, chunk), span_end(t, chunk, n), stride)

@@ -15,8 +15,7 @@ import warp as wp
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.multigrid.hierarchy import CycleSettings, Hierarchy
 from warp_lcp.operators.dense import DenseOperator
-from warp_lcp.operators.grid_poisson import GridPoisson
-from warp_lcp.operators.grid_poisson_kernels import mask_diagonal_kernel
+from warp_lcp.operators.grid_poisson import GridPoisson, mask_diagonal
 from warp_lcp.problem import LCP
 from warp_lcp.program import Launch, Program
 from warp_lcp.solvers.principal_system_kernels import divide_kernel, mask_kernel
@@ -62,8 +61,7 @@ class GridSystem:
 
     def restrict(self, free: wp.array[Any]) -> None:
         """Mask the finest diagonal and coarsen."""
-        d = self._A.stencil.d
-        wp.launch(mask_diagonal_kernel, d.size, [d, free, self.hierarchy.finest.stencil.d], device=self._A.device)
+        mask_diagonal(self._A.stencil.d, free, self.hierarchy.finest.stencil.d)
         self.hierarchy.rebuild()
 
     def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
