@@ -46,7 +46,7 @@ def measure(options: Options, out: Path) -> Results:
     shown = [r for r in records if r.value("cells")]
     tables = [_table(n, [r for r in shown if r.value("cells") == n**3]) for n in sizes]
     largest = [r for r in shown if r.value("cells") == max(sizes) ** 3 and r.facts["role"] != "set-up"]
-    percent = {f"{r.name} ({r.facts['form']})"[:80]: 100 * v for r in largest if (v := r.value("of_copy")) is not None}
+    percent = {r.name.partition("^3 ")[2]: 100 * v for r in largest if (v := r.value("of_copy")) is not None}
     chart = Bars("copy", f"Bytes a second at {max(sizes)}^3, float32, of measured copying", "% of copy bandwidth", percent, limit=50)
     return Results(records, [_weakest(largest), *tables], [chart])
 

@@ -23,14 +23,15 @@ def draw(charts: Sequence[Bars | Lines], out: Path, prefix: str) -> list[Path]:
 
     images = []
     for chart in charts:
-        height = max(2.5, 0.24 * len(chart.values)) if isinstance(chart, Bars) else 4.5
-        canvas: Any = Canvas(figsize=(8, height + 0.8), dpi=110, layout="constrained")
+        height = max(2.5, 0.18 * len(chart.values)) if isinstance(chart, Bars) else 4.5
+        width = 11 if isinstance(chart, Bars) else 8
+        canvas: Any = Canvas(figsize=(width, height + 0.8), dpi=90, layout="constrained")
         axes = canvas.add_subplot()
         if isinstance(chart, Bars):
             _bars(axes, chart)
         else:
             _lines(axes, chart)
-        axes.set_title(chart.title, fontsize=10)
+        canvas.suptitle(chart.title, fontsize=10)
         images.append(out / f"{prefix}-{chart.name}.png")
         canvas.savefig(images[-1])
     return images

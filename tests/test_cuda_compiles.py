@@ -9,6 +9,16 @@ import warp as wp
 
 import fluids
 import warp_lcp as wl
+from warp_lcp.grid import transfer_kernels
+
+
+METHODS = [
+    wl.MinimumMapNewton(),
+    wl.MinimumMapNewton(precision="double"),
+    wl.ProjectedMultigrid(),
+    wl.ProjectedMultigrid(precision="double"),
+    wl.ProjectedSOR(),
+]
 
 
 def use_every_kernel():
@@ -19,12 +29,14 @@ def use_every_kernel():
     for dtype in (wp.float32, wp.float64):
         for faces in ({}, {"face_x": 2.0}, {"face_x": face}):
             problem = wl.LCP(wl.GridPoisson(cells, device="cpu", dtype=dtype, **faces), -np.ones(cells.shape))
-            for solver in (wl.MinimumMapNewton(), wl.MinimumMapNewton(precision="double"), wl.ProjectedSOR()):
+            for solver in METHODS:
                 assert wl.solve(problem, solver, stopping=wl.StoppingCriteria(rtol=1e-4))
+    for real in (wp.float32, wp.float64):
+        transfer_kernels.kernels(real)
     wl.solve(wl.LCP(wl.DenseOperator(np.eye(3), device="cpu"), -np.ones(3)), wl.MinimumMapNewton(precision="single"))
 
 
-def test_all_kernels_compile_for_sm_90(tmp_path):
+def test_all_kernels_compile_for_sm_80_and_sm_90(tmp_path):
     for package in (wl, fluids):
         for found in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
             importlib.import_module(found.name)
@@ -35,6 +47,6 @@ def test_all_kernels_compile_for_sm_90(tmp_path):
     assert len(names) > 15
     for name in names:
         try:
-            wp.compile_aot_module(name, device=None, arch=90, module_dir=tmp_path / name, use_ptx=True)
+            wp.compile_aot_module(name, device=None, arch=[80, 90], module_dir=tmp_path / name, use_ptx=True)
         except (RuntimeError, OSError) as error:
-            pytest.fail(f"{name} does not compile for sm_90: {error}")
+            pytest.fail(f"{name} does not compile: {error}")
