@@ -259,6 +259,28 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
                     n = row_count(A, i, j, 0, A.nx)
                     sweep_row(A, d, wx, wy, wz, x, t, b, lower, upper, row_start(A, i, j, 0, A.nx), n, second, projected)
 
+    @wp.kernel(enable_backward=False, module=name)
+    def relax_kernel(
+        A: StencilShape, d: d_array, wx: field, wy: field, wz: field, planes: int, rows: int, pairs: int, from_zero: bool, x: field,
+        b: field, t: field, lower: field, upper: field, first: real, second: real,
+    ):  # fmt: skip
+        """Pairs of projected sweeps, each followed by its reverse, by one CPU thread: a small level in one launch."""
+        for s in range(4 * pairs):
+            omega = first
+            if s % 4 == 1 or s % 4 == 2:
+                omega = second
+            for i in range(planes * rows):
+                k = i // rows
+                j = i - k * rows
+                p = row_start(A, k, j, 0, A.nx)
+                n = row_count(A, k, j, 0, A.nx)
+                if s == 0 and from_zero:
+                    first_sweep_row(A, d, wx, wy, wz, t, x, b, lower, upper, p, n, omega, True)
+                elif s % 2 == 0:
+                    sweep_row(A, d, wx, wy, wz, t, x, b, lower, upper, p, n, omega, True)
+                else:
+                    sweep_row(A, d, wx, wy, wz, x, t, b, lower, upper, p, n, omega, True)
+
     return SimpleNamespace(
         sweep=sweep_kernel,
         restrict=restrict_kernel,
@@ -266,4 +288,5 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         bounds=bounds_kernel,
         descend=descend_kernel,
         ascend=ascend_kernel,
+        relax=relax_kernel,
     )

@@ -236,6 +236,12 @@ class Hierarchy:
     def _solve_coarsest(self, launch: Launch, *, projected: bool, from_zero: bool) -> None:
         """Multiply by the inverse; projected sweeps stand for that where there are bounds."""
         L = self.levels[-1]
+        if projected and self._fuses(L):
+            planes, rows, _ = L.stencil.padding.counts
+            fields = [L.x, L.b, L.t, L.lower, L.upper, *self.settings.weights]
+            inputs = [*L.operands, planes, rows, self.settings.projected_sweeps, from_zero, *fields]
+            launch(L.kernels.relax, 1, inputs, device=self.device)
+            return
         if projected:
             for sweep in range(self.settings.projected_sweeps):
                 self._pair(L, launch, from_zero=from_zero and sweep == 0, projected=True)
