@@ -26,20 +26,18 @@ def plain_kernel(d: u8_3d, x: f32_3d, y: f32_3d):
     y[i, j, k] = v
 
 
-def plain_product(d: np.ndarray, x: np.ndarray, device: str) -> Callable[[], None]:
-    """Return the plain Warp product on copies of padded fields."""
+def plain_product(d: wp.array, x: wp.array, y: wp.array, device: str) -> Callable[[], None]:
+    """Return the plain Warp product on padded fields (nz + 2, ny + 2, nx + 2)."""
     n = [s - 2 for s in x.shape]
-    fields = [wp.array(d, dtype=wp.uint8, device=device), wp.array(x, dtype=wp.float32, device=device)]
-    y = wp.zeros(x.shape, dtype=wp.float32, device=device)
 
     def run() -> None:
-        wp.launch(plain_kernel, n, [*fields, y], device=device)
+        wp.launch(plain_kernel, n, [d, x, y], device=device)
         wp.synchronize_device(device)
 
     return run
 
 
-def numba_products(d: np.ndarray, x: np.ndarray) -> dict[str, Callable[[], None]]:
+def numba_products(d: np.ndarray, x: np.ndarray, y: np.ndarray) -> dict[str, Callable[[], None]]:
     """Return Numba's products on padded fields: of the same stencil, and with a constant diagonal of 6; {} where Numba is missing."""
     if not present("numba"):
         return {}
@@ -65,5 +63,4 @@ def numba_products(d: np.ndarray, x: np.ndarray) -> dict[str, Callable[[], None]
                         x[i - 1, j, k] + x[i + 1, j, k] + x[i, j - 1, k] + x[i, j + 1, k] + x[i, j, k - 1] + x[i, j, k + 1]
                     )
 
-    y = np.zeros_like(x)
     return {"Numba product": lambda: masked(d, x, y), "Numba product, constant diagonal": lambda: constant(x, y)}

@@ -70,7 +70,10 @@ class Figure:
 
 
 def in_turns(work: Mapping[str, Callable[[], None]], repeat: int) -> dict[str, list[float]]:
-    """Return the seconds of each piece of work, `repeat` samples each, one of each in every round. Run before once, unmeasured."""
+    """Return the seconds of each piece of work, `repeat` samples each, one of each in every round.
+
+    An unmeasured run comes before each sample, so that what fits into the caches is there for all, whatever ran before.
+    """
     times: dict[str, list[float]] = {name: [] for name in work}
     runs = {}
     for name, run in work.items():
@@ -78,6 +81,7 @@ def in_turns(work: Mapping[str, Callable[[], None]], repeat: int) -> dict[str, l
         runs[name] = max(1, min(1000, int(SHORTEST_SAMPLE / max(seconds(run), 1e-7))))
     for _ in range(repeat):
         for name, run in work.items():
+            run()
             begun = time.perf_counter()
             for _ in range(runs[name]):
                 run()

@@ -191,7 +191,8 @@ class _Loop:
             self._record(0, Step("start", 0))
             self._keep(0)
             return self._finish(SolveStatus.CONVERGED, 0)
-        floating = getattr(self.problem.A, "floating_components", lambda: None)()
+        find = getattr(self.problem.A, "floating_components", lambda scratch: None)
+        floating = find(getattr(self.work, "scratch", None))
         self.work.floating = floating
         lost = floating.unattainable(self.problem.b, self.problem.lower, self.problem.upper) if floating else 0.0
         if guess is not None and math.isfinite(self.reference):

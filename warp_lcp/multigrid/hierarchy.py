@@ -28,14 +28,14 @@ class CycleSettings:
     """How a cycle goes. The defaults are the best measured on 7-point stencils with piecewise-constant aggregates.
 
     Args:
-        gamma: coarse cycles a level; 1 is a V-cycle, 2 a W-cycle.
+        gamma: coarse cycles a level; 1 is a V-cycle, 2 a W-cycle. Where one axis is coarsened at a time, every second level
+            is visited once.
         over_correction: factor on coarse corrections: piecewise-constant aggregates are too stiff by about two.
         excess: factor on what AIR and held unknowns add to an aggregate's diagonal: they are nearer than the next aggregate, so the
             over-correction applies to them in part only.
         interval: bounds of the spectrum of D^-1 A that the two Chebyshev-Jacobi sweeps damp.
         coarsest_cpu: the most cells of the coarsest level, which is inverted densely.
         coarsest_cuda: the same where one thread of a GPU factors it.
-        most_visits: levels are visited at most so often in a cycle; where only some axes are coarsened there are many levels.
         semi: axes whose mean weight is below this share of the strongest one's are not coarsened until they have caught up.
         projected_sweeps: pairs of sweeps that stand for a solve on the coarsest level of a projected cycle.
     """
@@ -47,7 +47,6 @@ class CycleSettings:
     coarsest_cpu: int = 64
     coarsest_cuda: int = 16
     semi: float = 0.3
-    most_visits: int = 64
     projected_sweeps: int = 8
 
     @property
@@ -69,7 +68,7 @@ class Level:
         self.kernels = cycle_kernels(stencil.weights is not None, stencil.d.dtype, real)
         nothing = wp.empty(0, dtype=real, device=stencil.device)
         self.aggregates: Aggregates | None = None  # how the finer level's cells make up this one's
-        self.visits, self.total_visits = 1, 1  # by the next finer level's cycle, and by one cycle of the finest
+        self.visits, self.shrunk = 1, 1.0  # by a cycle of the next finer level; by how much since a level that was visited more
         self.operands = [stencil.shape, stencil.d, *(stencil.weights or (nothing,) * 3)]
 
     @property
@@ -291,9 +290,10 @@ class Hierarchy:
         level = Level(stencil, self.real, bounded=bounded)
         G = level.aggregates = Aggregates()
         G.fx, G.fy, G.fz, G.ny, G.nz = *factors, counts[1], counts[0]
-        level.total_visits = fine.total_visits
-        if fine.total_visits * self.settings.gamma <= self.settings.most_visits:
-            level.visits, level.total_visits = self.settings.gamma, fine.total_visits * self.settings.gamma
+        # visiting levels of half the cells twice would cost as much on each of them: only every second one is
+        level.shrunk = fine.shrunk * math.prod(counts) / math.prod(padding.counts)
+        if level.shrunk >= 3:
+            level.visits, level.shrunk = self.settings.gamma, 1.0
         return level
 
     def _factors(self, counts: tuple[int, int, int]) -> tuple[int, int, int]:

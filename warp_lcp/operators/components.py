@@ -85,7 +85,7 @@ class ComponentFinder:
 
     def __init__(self, A: GridPoisson) -> None:
         self._A, device = A, A.device
-        self._parent = wp.zeros(A.layout.size, dtype=wp.int32, device=device)
+        self._own: wp.array[Any] | None = None
         self._grounded = wp.zeros(A.layout.size, dtype=wp.uint8, device=device)
         self._count = wp.zeros(1, dtype=wp.int32, device=device)
         self._shape = StencilShape()
@@ -94,9 +94,13 @@ class ComponentFinder:
         self._shape.spans = A.stencil.spans
         self._kernels = kernels.component_kernels(A.dtype)
 
-    def find(self) -> FloatingComponents | None:
-        """Return the floating components, or None if there are none."""
-        A, parent, grounded, s = self._A, self._parent, self._grounded, self._A.stencil
+    def find(self, scratch: wp.array[Any] | None = None) -> FloatingComponents | None:
+        """Return the floating components, or None if there are none; `scratch` as in GridPoisson.floating_components."""
+        A, grounded, s = self._A, self._grounded, self._A.stencil
+        if scratch is not None:
+            parent = scratch.view(wp.int32)
+        else:
+            parent = self._own = wp.zeros(A.layout.size, dtype=wp.int32, device=A.device) if self._own is None else self._own
         cells, faces = A.cells_around.flatten(), [f.flatten() for f in A.faces]
         self._count.zero_()
         sizes = wp.vec3i(*A.layout.padding.counts)
@@ -107,15 +111,16 @@ class ComponentFinder:
             (self._kernels.count_floating, [cells, parent, grounded, s.grain, self._count]),
         ):
             wp.launch(kernel, s.threads, [self._shape, *inputs], device=A.device)
-        return self._label() if self._count.numpy()[0] else None
+        return self._label(parent.numpy()) if self._count.numpy()[0] else None
 
-    def _label(self) -> FloatingComponents:
+    def _label(self, parent: np.ndarray) -> FloatingComponents:
         """Number the components that nothing holds; rare, so on the host."""
         A = self._A
-        roots = _roots(self._parent.numpy())
         interior = np.zeros(A.layout.stored_shape, dtype=bool)
         interior[1:-1, 1:-1, 1:-1] = A.cells.numpy()[1:-1, 1:-1, 1:-1] == FLUID
-        floating = interior.ravel() & (self._grounded.numpy()[roots] == 0)
+        inside = interior.ravel()
+        roots = _roots(np.where(inside, parent, np.arange(parent.size, dtype=np.int32)))
+        floating = inside & (self._grounded.numpy()[roots] == 0)
         label = np.full(roots.size, -1, dtype=np.int32)
         label[floating] = np.unique(roots[floating], return_inverse=True)[1]
         return FloatingComponents(label, A.device)

@@ -95,6 +95,8 @@ class GridPoisson:
         self._whole_rows = StencilShape()
         whole, some = self._whole_rows, self.stencil.shape
         whole.nx, whole.s1, whole.s2 = some.nx, some.s1, some.s2
+        beyond = self._rows_and_ghosts = StencilShape()
+        beyond.nx, beyond.s1, beyond.s2 = some.nx + 1, some.s1, some.s2
         self._mask: wp.array[Any] | None = None
         self._finder: ComponentFinder | None = None
         self._refill(wp.array(np.pad(host.reshape(counts), 1).astype(np.int8), device=self.device))
@@ -152,11 +154,15 @@ class GridPoisson:
         """Sweep stored fields once, red cells then black ones (forward) or the reverse, each unknown projected onto its bounds."""
         self.stencil.relax(x, b, lower, upper, omega, forward=forward)
 
-    def floating_components(self) -> FloatingComponents | None:
-        """Return the components on which A is singular, or None if there are none."""
+    def floating_components(self, scratch: wp.array[Any] | None = None) -> FloatingComponents | None:
+        """Return the components on which A is singular, or None if there are none.
+
+        Args:
+            scratch: stored field of 4-byte elements that may be overwritten on the rows' spans; saves as much memory.
+        """
         if self._finder is None:
             self._finder = ComponentFinder(self)
-        return self._finder.find()
+        return self._finder.find(scratch)
 
     def diagonal(self) -> wp.array[Any]:
         """Return the diagonal of A, a field of the operator's shape and type; 0 off the FLUID cells."""
@@ -239,8 +245,7 @@ class GridPoisson:
 
     def _refill(self, cells: wp.array[Any]) -> None:
         """Take padded cell types and compute diagonal and weights."""
-        counts, padded = self.layout.padding.counts, self.layout.stored_shape
-        s = self.stencil
+        counts, s = self.layout.padding.counts, self.stencil
         if cells is not self.cells:
             inputs = [self._whole_rows, cells.flatten(), self.cells.flatten(), s.grain]
             wp.launch(kernels.copy_cells_kernel, s.threads, inputs, device=self.device)
@@ -249,19 +254,21 @@ class GridPoisson:
         if self.cells_around is not self.cells:
             wp.copy(self.cells_around, self.cells)
             wrap(self.cells_around, self.periodic, counts)
-        d = self.stencil.d.reshape(padded)
         if self._counts_faces:
             axes = wp.vec3i(*(int(c > 0) for c in self.uniform))
             inputs = [self._whole_rows, self.cells_around.flatten(), axes, s.d, s.grain]
             wp.launch(kernels.count_faces_kernel, s.threads, inputs, device=self.device)
             return
-        inputs = [self.cells_around, *self.faces, wp.vec3d(*self.uniform), self.shift, d]
-        wp.launch(kernels.diagonal_kernel, counts, inputs, device=self.device)
-        for axis, w in enumerate(self.stencil.weights or ()):
-            extent = [n + int(a == 2 - axis) for a, n in enumerate(counts)]
-            step = wp.vec3i(*(int(a == 2 - axis) for a in range(3)))
-            inputs = [self.cells_around, self.faces[axis], wp.float64(self.uniform[axis]), step, w.reshape(padded)]
-            wp.launch(kernels.weights_kernel, extent, inputs, device=self.device)
+        arrays = tuple(f.size > 0 for f in self.faces)
+        made = kernels.coefficient_kernels(arrays, self.shift.size > 0, self.dtype)
+        before = [self.cells_around.flatten(), *(f.flatten() for f in self.faces), wp.vec3d(*self.uniform)]
+        inputs = [self._whole_rows, *before, self.shift.flatten(), s.d, s.grain]
+        wp.launch(made.diagonal, s.threads, inputs, device=self.device)
+        if s.weights is not None:
+            planes, rows, _ = counts
+            beyond = 1 if self.device.is_cuda else 0
+            inputs = [self._rows_and_ghosts, *before, *s.weights, s.grain + (1 - beyond)]
+            wp.launch(made.weights, (planes + 1, rows + 1, s.threads[2] + beyond), inputs, device=self.device)
 
 
 def _checked_cells(cells: Any) -> np.ndarray:

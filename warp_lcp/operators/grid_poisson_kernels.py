@@ -2,21 +2,18 @@
 """Kernels that turn cell types and face coefficients into the diagonal and the weights of a stencil."""
 
 import functools
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
 from warp_lcp.native import C_TYPES, simd
-from warp_lcp.operators.stencil_kernels import StencilShape, row_start
+from warp_lcp.operators.stencil_kernels import StencilShape, row_count, row_start
 from warp_lcp.vector_kernels import flat, span_end, span_start
 
 AIR = 0
 FLUID = 1
 SOLID = 2
-
-_AIR = wp.constant(wp.int8(AIR))
-_FLUID = wp.constant(wp.int8(FLUID))
-_SOLID = wp.constant(wp.int8(SOLID))
 
 options = {"enable_backward": False, "module": "warp_lcp.grid_poisson"}
 
@@ -63,74 +60,67 @@ def count_faces_kernel(A: StencilShape, cells: wp.array(dtype=wp.int8), axes: wp
     count_faces_row(cells, d, row_start(A, k, j, c, grain), A.s1, A.s2, n, axes[0], axes[1], axes[2])
 
 
-@wp.func
-def joins(cells: wp.array3d(dtype=wp.int8), k: int, j: int, i: int, dk: int, dj: int, di: int):
-    """Whether the face between a cell and its lower neighbor joins two FLUID cells."""
-    return cells[k, j, i] == _FLUID and cells[k - dk, j - dj, i - di] == _FLUID
+@functools.cache
+def coefficient_kernels(arrays: tuple[bool, bool, bool], shifted: bool, real: Any) -> SimpleNamespace:
+    """Return `diagonal` and `weights` for coefficients that are arrays along these axes and numbers along the others.
 
+    The diagonal is the sum of the coefficients over a FLUID cell's open faces, plus the shift. The weight of a lower face is its
+    coefficient where it joins two FLUID cells, else 0; the ghost cells above the last ones have lower faces too.
+    """
+    name = f"warp_lcp.grid_poisson.{''.join('na'[a] for a in arrays)}_{shifted}_{real.__name__}"
+    field, i8, T = wp.array(dtype=real), wp.array(dtype=wp.int8), C_TYPES[real]
+    axes = "xyz"
+    steps = dict(zip(axes, ("1", "s2", "s1"), strict=True))
+    head = "const signed char* c = cells.data + p; const long long s1 = A.s1, s2 = A.s2;"
+    head += "".join(f"const {T}* f{a} = face_{a}.data + p; const {T} n{a} = ({T})uniform_{a};" for a in axes)
 
-@wp.func
-def coefficient(face: wp.array3d(dtype=Any), uniform: wp.float64, k: int, j: int, i: int):
-    """Return a face's coefficient: from the array if there is one, else the uniform number."""
-    c = uniform
-    if face.shape[0] > 0:
-        c = wp.float64(face[k, j, i])
-    return c
+    def face(axis: str, at: str) -> str:
+        return f"f{axis}[{at}]" if arrays[axes.index(axis)] else f"n{axis}"
 
+    total = " + ".join(
+        f"(c[k-{steps[a]}] != 2 ? {face(a, 'k')} : ({T})0) + (c[k+{steps[a]}] != 2 ? {face(a, f'k+{steps[a]}')} : ({T})0)" for a in axes
+    )
+    extra = " + shift.data[p + k]" if shifted else ""
+    joined = "".join(f"w{a}.data[p + k] = (c[k] == 1) & (c[k-{steps[a]}] == 1) ? {face(a, 'k')} : ({T})0;" for a in axes)
 
-@wp.kernel(**options)
-def diagonal_kernel(
-    cells: wp.array3d(dtype=wp.int8),
-    face_x: wp.array3d(dtype=Any),
-    face_y: wp.array3d(dtype=Any),
-    face_z: wp.array3d(dtype=Any),
-    uniform: wp.vec3d,
-    shift: wp.array3d(dtype=Any),
-    d: wp.array3d(dtype=Any),
-):
-    """Diagonal of general coefficients: their sum over a FLUID cell's open faces, plus the shift."""
-    k, j, i = wp.tid()
-    k += 1
-    j += 1
-    i += 1
-    s = wp.float64(0.0)
-    if cells[k, j, i] == _FLUID:
-        if cells[k, j, i - 1] != _SOLID:
-            s += coefficient(face_x, uniform[0], k, j, i)
-        if cells[k, j, i + 1] != _SOLID:
-            s += coefficient(face_x, uniform[0], k, j, i + 1)
-        if cells[k, j - 1, i] != _SOLID:
-            s += coefficient(face_y, uniform[1], k, j, i)
-        if cells[k, j + 1, i] != _SOLID:
-            s += coefficient(face_y, uniform[1], k, j + 1, i)
-        if cells[k - 1, j, i] != _SOLID:
-            s += coefficient(face_z, uniform[2], k, j, i)
-        if cells[k + 1, j, i] != _SOLID:
-            s += coefficient(face_z, uniform[2], k + 1, j, i)
-        if shift.shape[0] > 0:
-            s += wp.float64(shift[k, j, i])
-    d[k, j, i] = d.dtype(s)
+    @wp.func_native(
+        simd(
+            head
+            + f"""{T}* o = d.data + p;
+        SIMD for (int k = 0; k < n; ++k) {{ const {T} v = {total}{extra}; o[k] = c[k] == 1 ? v : ({T})0; }}"""
+        )
+    )
+    def diagonal_row(
+        A: StencilShape, cells: i8, face_x: field, face_y: field, face_z: field, uniform_x: wp.float64, uniform_y: wp.float64,
+        uniform_z: wp.float64, shift: field, d: field, p: wp.int64, n: int,
+    ): ...  # fmt: skip
 
+    @wp.func_native(simd(head + f"SIMD for (int k = 0; k < n; ++k) {{ {joined} }}"))
+    def weights_row(
+        A: StencilShape, cells: i8, face_x: field, face_y: field, face_z: field, uniform_x: wp.float64, uniform_y: wp.float64,
+        uniform_z: wp.float64, wx: field, wy: field, wz: field, p: wp.int64, n: int,
+    ): ...  # fmt: skip
 
-@wp.kernel(**options)
-def weights_kernel(
-    cells: wp.array3d(dtype=wp.int8), face: wp.array3d(dtype=Any), uniform: wp.float64, step: wp.vec3i, w: wp.array3d(dtype=Any)
-):
-    """Weight of a lower face: its coefficient where it joins two FLUID cells, else 0. The last layer of ghosts has lower faces too."""
-    k, j, i = wp.tid()
-    k += 1
-    j += 1
-    i += 1
-    c = wp.float64(0.0)
-    if joins(cells, k, j, i, step[0], step[1], step[2]):
-        c = coefficient(face, uniform, k, j, i)
-    w[k, j, i] = w.dtype(c)
+    @wp.kernel(enable_backward=False, module=name)
+    def diagonal(
+        A: StencilShape, cells: i8, face_x: field, face_y: field, face_z: field, uniform: wp.vec3d, shift: field, d: field, grain: int
+    ):
+        k, j, c = wp.tid()
+        p = row_start(A, k, j, c, grain)
+        n = row_count(A, k, j, c, grain)
+        diagonal_row(A, cells, face_x, face_y, face_z, uniform[0], uniform[1], uniform[2], shift, d, p, n)
 
+    @wp.kernel(enable_backward=False, module=name)
+    def weights(
+        A: StencilShape, cells: i8, face_x: field, face_y: field, face_z: field, uniform: wp.vec3d, wx: field, wy: field, wz: field,
+        grain: int,
+    ):  # fmt: skip
+        k, j, c = wp.tid()
+        p = row_start(A, k, j, c, grain)
+        n = row_count(A, k, j, c, grain)
+        weights_row(A, cells, face_x, face_y, face_z, uniform[0], uniform[1], uniform[2], wx, wy, wz, p, n)
 
-for _T in (wp.float32, wp.float64):
-    _A = wp.array3d(dtype=_T)
-    wp.overload(diagonal_kernel, [wp.array3d(dtype=wp.int8), _A, _A, _A, wp.vec3d, _A, _A])
-    wp.overload(weights_kernel, [wp.array3d(dtype=wp.int8), _A, wp.float64, wp.vec3i, _A])
+    return SimpleNamespace(diagonal=diagonal, weights=weights)
 
 
 @functools.cache

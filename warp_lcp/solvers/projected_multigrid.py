@@ -154,6 +154,7 @@ class MultigridWorkspace(IterateInBuffers):
         self._rounded = problem.layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
         self._programs: dict[tuple[int, int], Program] = {}  # a truncated cycle from one buffer to another
         self._mask: wp.array[Any] | None = None
+        self.scratch = self.hierarchy.finest.t if real is wp.float32 else None  # free between cycles
         self.floating: Any = None
         self._cycles_left, self._rises = 0, 0
 
