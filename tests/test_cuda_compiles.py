@@ -11,7 +11,6 @@ import fluids
 import warp_lcp as wl
 from warp_lcp.grid import transfer_kernels
 
-
 METHODS = [
     wl.MinimumMapNewton(),
     wl.MinimumMapNewton(precision="double"),

@@ -4,12 +4,18 @@ import numpy as np
 import pytest
 
 import warp_lcp as wl
-from scenes import splash
+from benchmarks import problems
 from warp_lcp import program
 from warp_lcp.multigrid import Hierarchy
 from warp_lcp.solvers import projected_multigrid
 
 BOUNDS = ["none", "walls", "everywhere"]
+
+
+def splash(n):
+    """Return cell types, b and wall cells of the splash."""
+    scene = problems.splash(n)
+    return scene.cells, scene.b, scene.wall
 
 
 METHODS = {"newton": wl.MinimumMapNewton(), "multigrid": wl.ProjectedMultigrid()}
