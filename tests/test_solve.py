@@ -289,7 +289,7 @@ def test_a_blob_that_moves_through_a_reused_workspace(method, arrays, device):
     """Rows are worked on between their first and last liquid cells only: what the last blob left outside must not be seen."""
     rng = np.random.default_rng(79)
     shape = (6, 40, 90)
-    z, y, x = np.meshgrid(*(np.arange(n) for n in shape), indexing="ij")
+    _, y, x = np.meshgrid(*(np.arange(n) for n in shape), indexing="ij")
     faces = {"face_x": rng.uniform(0.5, 1.0, (6, 40, 91))} if arrays else {}
     blobs = [((x - cx) ** 2 + (y - cy) ** 2 < r**2) for cx, cy, r in [(20, 20, 12), (70, 12, 9), (45, 30, 8), (20, 20, 5)]]
     A = wl.GridPoisson(np.where(blobs[0], wl.FLUID, wl.AIR), **faces, device=device)
