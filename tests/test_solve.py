@@ -137,6 +137,17 @@ def test_own_operator_through_the_protocol():
     np.testing.assert_allclose(result.x.numpy(), lemke(dense, b), atol=1e-8)
 
 
+def test_without_a_method_the_fastest_is_taken():
+    A, b = poisson()
+    dense = wl.LCP(wl.DenseOperator(np.eye(3), device="cpu"), -np.ones(3))
+    assert isinstance(wl.default_method(wl.LCP(A, b)), wl.ProjectedMultigrid)
+    assert isinstance(wl.default_method(dense), wl.MinimumMapNewton)
+    assert wl.solve(wl.LCP(A, b)).history[1].step == "monotone cycle"
+    assert wl.solve(dense)
+    with pytest.raises(ValueError, match="name the solver"):
+        wl.solve(dense, workspace=wl.MinimumMapNewton().init(dense))
+
+
 def test_methods_refuse_what_they_cannot_take():
     with pytest.raises(ValueError, match="not symmetric"):
         wl.solve(wl.LCP(Ring(5, symmetric=False), np.ones(5)), wl.MinimumMapNewton())

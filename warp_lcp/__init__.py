@@ -6,8 +6,8 @@ from warp_lcp.operators import AIR, FLUID, SOLID, DenseOperator, GridPoisson, Op
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import Record, SolveResult, SolveStatus
-from warp_lcp.solve import Precision, Step, solve
-from warp_lcp.solvers import MinimumMapNewton, ProjectedMultigrid, ProjectedSOR
+from warp_lcp.solve import Precision, Step
+from warp_lcp.solvers import MinimumMapNewton, ProjectedMultigrid, ProjectedSOR, default_method, solve
 from warp_lcp.stopping import StoppingCriteria
 
 try:
@@ -33,5 +33,6 @@ __all__ = [
     "SolveStatus",
     "Step",
     "StoppingCriteria",
+    "default_method",
     "solve",
 ]

@@ -149,23 +149,7 @@ def solve(
     workspace: Workspace | None = None,
     callback: Callable[[Record], None] | None = None,
 ) -> SolveResult:
-    """Solve a problem by a method.
-
-    Args:
-        problem: the LCP.
-        solver: the method, say `MinimumMapNewton()`.
-        stopping: the criteria; defaults to `StoppingCriteria()`.
-        x0: a guess, field of the problem's shape, projected onto the bounds; clip(0, l, u) if None.
-        workspace: what `solver.init(problem)` returned, to use its memory again.
-        callback: called with each Record as it is made.
-
-    Returns:
-        The best iterate, its status and recomputed residual, the history. The result's x is the caller's to keep, unless the problem
-        works in place: then it is the workspace's own iterate, overwritten by the next solve with that workspace.
-
-    Raises:
-        ValueError: x0 has a wrong shape or is not finite, or the method cannot take this A.
-    """
+    """Solve a problem by a method; what `wl.solve` documents, for callers that bring the method themselves."""
     return _Loop(problem, solver, stopping or StoppingCriteria(), workspace or solver.init(problem), callback).run(x0)
 
 

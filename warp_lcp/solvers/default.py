@@ -1,0 +1,52 @@
+"""The method for those who name none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from warp_lcp.layout import Array
+from warp_lcp.operators.grid_poisson import GridPoisson
+from warp_lcp.problem import LCP
+from warp_lcp.result import Record, SolveResult
+from warp_lcp.solve import Solver, Workspace
+from warp_lcp.solve import solve as solve_by
+from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
+from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
+from warp_lcp.stopping import StoppingCriteria
+
+
+def default_method(problem: LCP) -> Solver:
+    """Return the fastest method measured for the problem's operator: ProjectedMultigrid on grids, MinimumMapNewton on others."""
+    return ProjectedMultigrid() if isinstance(problem.A, GridPoisson) else MinimumMapNewton()
+
+
+def solve(
+    problem: LCP,
+    solver: Solver | None = None,
+    *,
+    stopping: StoppingCriteria | None = None,
+    x0: Array | None = None,
+    workspace: Workspace | None = None,
+    callback: Callable[[Record], None] | None = None,
+) -> SolveResult:
+    """Solve a problem by a method.
+
+    Args:
+        problem: the LCP.
+        solver: the method, say `MinimumMapNewton()`; `default_method(problem)` if None.
+        stopping: the criteria; defaults to `StoppingCriteria()`.
+        x0: a guess, field of the problem's shape, projected onto the bounds; clip(0, l, u) if None.
+        workspace: what `solver.init(problem)` returned, to use its memory again.
+        callback: called with each Record as it is made.
+
+    Returns:
+        The best iterate, its status and recomputed residual, the history. The result's x is the caller's to keep, unless the problem
+        works in place: then it is the workspace's own iterate, overwritten by the next solve with that workspace.
+
+    Raises:
+        ValueError: x0 has a wrong shape or is not finite, a workspace comes without its solver, or the method cannot take this A.
+    """
+    if solver is None and workspace is not None:
+        raise ValueError("workspace: name the solver that made it")
+    solver = solver or default_method(problem)
+    return solve_by(problem, solver, stopping=stopping, x0=x0, workspace=workspace, callback=callback)
