@@ -166,7 +166,7 @@ class BothSolves:
 @contextmanager
 def _solving_both(device: str) -> Any:
     both = BothSolves(wl.solve, device)
-    wl.solve = both
+    wl.solve = both  # type: ignore[assignment]
     try:
         yield both
     finally:
