@@ -57,7 +57,7 @@ def _measure_form(n: int, form: str, options: Options) -> list[Record]:
     device = options.device
     heard, product = _hear(_basin(n, form), device)
     moved = _bytes_per_cell(n, form, device, heard)
-    a, b = (wp.zeros(min(COPIED, 64 * n**3), dtype=wp.float32, device=device) for _ in range(2))
+    a, b = (wp.full(min(COPIED, 64 * n**3), 1.0, dtype=wp.float32, device=device) for _ in range(2))
     kernels = [(name, _synchronized(launch.run, device)) for name, launch in heard.items()]
     peers = _peers(product, n, device) if form == "unit" else {}
     work: dict[str, Callable[[], None]] = {}
@@ -84,6 +84,10 @@ def _measure_form(n: int, form: str, options: Options) -> list[Record]:
     for peer in peers:
         figures = _figures(apart[peer], n, 8 if "constant" in peer else 9, own)
         records.append(Record(f"{n}^3 {form}: {peer}", figures, {"form": form, "role": "peer"}))
+    finder = wl.GridPoisson(_basin(n, form).cells, device=device, **_basin(n, form).faces)
+    search = in_turns({"search": finder.floating_components}, options.repeat)["search"]
+    name = f"{n}^3 {form}: search for floating components, all kernels"
+    records.append(Record(name, _figures(search, n, 0.0, copying) | {"launches": Figure(1)}, {"form": form, "role": "set-up"}))
     return sorted(records, key=lambda r: -(r.value("seconds") or 0) * (r.value("launches") or 0))
 
 

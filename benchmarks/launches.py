@@ -58,6 +58,10 @@ class Launch:
                 found.setdefault(value.ptr, (label, value))
         return dict(found.values())
 
+    def indexed(self, smallest: int) -> bool:
+        """Return whether it has a field of integers of at least `smallest` elements."""
+        return any(isinstance(a, wp.array) and a.dtype is wp.int32 and a.size >= smallest for _, a in self._given())
+
     def run(self) -> None:
         """Launch it again."""
         if self._command is None:
@@ -114,10 +118,13 @@ def listen() -> Iterator[list[Launch]]:
 
 
 def distinct(heard: list[Launch], smallest: int) -> list[Launch]:
-    """Return one launch of each kind that touches a field of at least `smallest` elements, with counts."""
+    """Return one launch of each kind that touches a field of at least `smallest` elements, with counts.
+
+    Kernels with a field of integers are left out: they follow these as indices, which other kernels may have overwritten meanwhile.
+    """
     kinds: dict[str, Launch] = {}
     for launch in heard:
-        if max((a.size for a in launch.arrays.values()), default=0) < smallest:
+        if max((a.size for a in launch.arrays.values()), default=0) < smallest or launch.indexed(smallest):
             continue
         kept = kinds.setdefault(launch.name, launch)
         kept.count += kept is not launch

@@ -10,6 +10,7 @@ from typing import Any
 
 from benchmarks.timing import Figure
 
+SOURCE = "source digest"  # fact of that record: which state of the code was measured
 MACHINE = "machine"  # name of the record that says where and when the others were measured
 
 

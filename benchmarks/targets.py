@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.record import Record, Table, read_json
+from benchmarks.record import MACHINE, SOURCE, Record, Table, read_json
 from benchmarks.timing import Figure
 
 ENGINE = "ProjectedMultigrid"
@@ -46,10 +46,13 @@ def targets(records: Sequence[Record], out: Path) -> Table:
 
     Solves are judged at 128^3 if that was measured, else at the largest size.
     """
-    found = {r.name: r for r in records}
+    found, remarks = {r.name: r for r in records}, list[str]()
     for other in ("kernels", "run"):
         if (out / f"{other}.json").is_file():
-            found |= read_json(out / f"{other}.json")
+            theirs = read_json(out / f"{other}.json")
+            if MACHINE in found and theirs.get(MACHINE, Record(MACHINE)).facts.get(SOURCE) != found[MACHINE].facts.get(SOURCE):
+                remarks.append(f"Figures of the suite {other} are of another state of the code than those of the solves.")
+            found = theirs | found
     sizes = sorted({r.facts["n"] for r in records if "n" in r.facts})
     n = 128 if 128 in sizes else sizes[-1]
     failed = Figure(sum(r.value("converged") == 0 for r in records))
@@ -63,7 +66,7 @@ def targets(records: Sequence[Record], out: Path) -> Table:
             *_memory_and_host(found, n),
         ]
     ]
-    return Table(f"Figures to reach (solves at {n}^3)", ["figure", "target", "measured", "met?"], rows)
+    return Table(f"Figures to reach (solves at {n}^3)", ["figure", "target", "measured", "met?"], rows, " ".join(remarks))
 
 
 def _get(found: dict[str, Record], record: str, figure: str) -> Figure | None:

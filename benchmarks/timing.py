@@ -69,7 +69,7 @@ class Figure:
         return text if self.low is None or self.samples == 1 else f"{text} ({self.low:.4g} to {self.high:.4g})"
 
 
-def in_turns(work: Mapping[str, Callable[[], None]], repeat: int) -> dict[str, list[float]]:
+def in_turns(work: Mapping[str, Callable[[], object]], repeat: int) -> dict[str, list[float]]:
     """Return the seconds of each piece of work, `repeat` samples each, one of each in every round.
 
     An unmeasured run comes before each sample, so that what fits into the caches is there for all, whatever ran before.

@@ -51,6 +51,21 @@ def test_distinct_counts_and_drops_small_fields():
     assert [(launch.name, launch.count) for launch in distinct(heard, N)] == [("launches.saxpy", 2), ("launches.saxpy twice", 1)]
 
 
+@wp.kernel(enable_backward=False, module="test.launches")
+def gather_kernel(x: FIELD, index: wp.array(dtype=wp.int32), y: FIELD):
+    i = wp.tid()
+    y[i] = x[index[i]]
+
+
+def test_kernels_that_follow_indices_are_left_out():
+    x, y = (wp.zeros(N, dtype=wp.float32, device="cpu") for _ in range(2))
+    index = wp.zeros(N, dtype=wp.int32, device="cpu")
+    launch = Launch(gather_kernel, N, [x, index, y], wp.get_device("cpu"), 256)
+    assert launch.indexed(N)
+    assert not launch.indexed(N + 1)
+    assert distinct([launch, saxpy()], N)[0].name == "launches.saxpy"
+
+
 def test_listening(monkeypatch):
     monkeypatch.setattr(wp, "launch", wp.launch)  # put back afterwards
     launches.install()

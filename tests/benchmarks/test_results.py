@@ -122,6 +122,13 @@ def test_table_of_targets_reads_other_suites(tmp_path):
     assert rows["linear solve against PyAMG, set-up included"] == [">= 40 x", "50 x", "yes"]
 
 
+def test_table_of_targets_tells_that_the_code_differs(tmp_path):
+    solve = Record("64^3 unit linear ProjectedMultigrid", {"iterations": Figure(9)}, {"n": 64})
+    for digest, remark in (("a", ""), ("b", "Figures of the suite kernels are of another state of the code than those of the solves.")):
+        write_json(tmp_path / "kernels.json", [Record("machine", {}, {"source digest": digest})])
+        assert targets([Record("machine", {}, {"source digest": "a"}), solve], tmp_path).remark == remark
+
+
 def test_array_bytes_count_memory_once():
     before = array_bytes()
     a = wp.zeros(1000, dtype=wp.float64, device="cpu")
