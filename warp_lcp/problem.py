@@ -90,13 +90,21 @@ class LCP:
             return self.layout.load(values, wp.float64, name), 0.0
         return wp.empty(0, dtype=wp.float64, device=self.device), float(values)
 
-    def _check(self) -> None:
-        """Refuse data that no method could use."""
+    def not_finite(self, field: wp.array[Any]) -> int:
+        """Return how many unknowns of a stored field are not finite."""
+        return self._faults(field)[0]
+
+    def _faults(self, field: wp.array[Any]) -> list[int]:
+        """Count values of a stored field that are not finite, NaN in l and in u, crossed bounds, l = inf, u = -inf."""
         spans = Spans.of(self.layout.size, self.device)
         counts = wp.zeros((6, spans.threads), dtype=wp.float64, device=self.device)
-        inputs = [self.b, *self.bounds, self.unknown, spans.n, spans.chunk, spans.stride, spans.threads, counts.flatten()]
+        inputs = [field, *self.bounds, self.unknown, spans.n, spans.chunk, spans.stride, spans.threads, counts.flatten()]
         wp.launch(check_kernel, spans.threads, inputs, device=self.device)
-        bad_b, nan_lower, nan_upper, crossed, no_lower, no_upper = counts.numpy().sum(axis=1).astype(int)
+        return [int(n) for n in counts.numpy().sum(axis=1)]
+
+    def _check(self) -> None:
+        """Refuse data that no method could use."""
+        bad_b, nan_lower, nan_upper, crossed, no_lower, no_upper = self._faults(self.b)
         if bad_b:
             raise ValueError(f"b holds {bad_b} values that are not finite")
         for name, count in (("lower", nan_lower), ("upper", nan_upper)):

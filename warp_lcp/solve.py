@@ -65,6 +65,7 @@ class Step:
 class Workspace(Protocol):
     """What a method allocates once for a problem; can be used again when b, the bounds or the cells change in place."""
 
+    problem: LCP
     x: wp.array[Any]
     residual: NaturalResidual
     precision: Precision
@@ -72,6 +73,9 @@ class Workspace(Protocol):
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the last solve. `warm`: x is a guess better than clip(0, l, u); `tolerance`: the residual norm that is asked for."""
+
+    def round_iterate(self) -> None:
+        """Round x to its precision."""
 
     def keep(self) -> None:
         """Remember x as the best iterate."""
@@ -159,6 +163,8 @@ class _Loop:
     def __init__(
         self, problem: LCP, solver: Solver, stopping: StoppingCriteria, work: Workspace, callback: Callable[[Record], None] | None
     ) -> None:
+        if work.problem is not problem:
+            raise ValueError("workspace was made for another problem: problems that change in place keep theirs")
         self.problem, self.solver, self.stopping, self.work, self.callback = problem, solver, stopping, work, callback
         self.residual, self.history = work.residual, list[Record]()
         self.begun = time.perf_counter()
@@ -169,8 +175,13 @@ class _Loop:
         x, residual = self.work.x, self.residual
         guess = None if x0 is None else self._guess(x0)
         residual.start(x, keep=False)
+        self.work.round_iterate()
         self.reference = residual.evaluate(x)
         self.tolerance = self.stopping.tolerance(self.reference)
+        if not math.isfinite(self.reference) or not math.isfinite(residual.norm_of_b()):
+            self._record(0, Step("start", 0))
+            self._keep(0)
+            return self._finish(SolveStatus.NON_FINITE, 0)
         if self.reference <= 4 * EPS * residual.norm_of_b():
             self._record(0, Step("start", 0))
             self._keep(0)
@@ -179,7 +190,7 @@ class _Loop:
         floating = find(getattr(self.work, "scratch", None))
         self.work.floating = floating
         lost = floating.unattainable(self.problem.b, self.problem.lower, self.problem.upper) if floating else 0.0
-        if guess is not None and math.isfinite(self.reference):
+        if guess is not None:
             self._take(guess)
         if floating is not None:
             residual.settle_isolated(self.work.x)
@@ -209,12 +220,15 @@ class _Loop:
     def _guess(self, x0: Array) -> wp.array[Any]:
         """Return a guess as a stored field that is not the iterate itself."""
         stored = self.problem.layout.load(x0, wp.float64, "x0")
+        if self.problem.not_finite(stored):
+            raise ValueError(f"x0 holds {self.problem.not_finite(stored)} values that are not finite")
         return wp.clone(stored) if stored.ptr == self.work.x.ptr else stored
 
     def _take(self, guess: wp.array[Any]) -> None:
         """Start from a guess."""
         wp.copy(self.work.x, guess)
         self.residual.start(self.work.x, keep=True)
+        self.work.round_iterate()
         if not math.isfinite(self.residual.evaluate(self.work.x)):
             raise ValueError("x0 gives a residual that is not finite")
 

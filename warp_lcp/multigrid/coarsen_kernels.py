@@ -17,7 +17,6 @@ from warp_lcp.operators.stencil_kernels import StencilShape, row_count, row_firs
 options = {"enable_backward": False, "module": "warp_lcp.coarsen"}
 
 UNBOUNDED = 1e30  # stands for an infinite bound of a correction; corrections are of order one
-ROUNDING = wp.constant(wp.float64(1e-6))  # a diagonal this much smaller than its cells' sum is a singular aggregate's rounding
 
 
 @wp.func
@@ -78,7 +77,8 @@ def coarsen_kernels(variable: bool, d_type: Any, real: Any) -> Any:
     # equal weights: faces are counted in bytes and scaled at the end
     counts = d_type is wp.uint8
     buffer, diagonal = ("unsigned char", "d_.data[p + k]") if counts else (C_TYPES[real], "(T)A.unit*(T)d_.data[p + k]")
-    kept = "v" if counts else f"v > (B)1e-6*({diagonal}) ? v : (B)0"
+    least = "1e-6" if real is wp.float32 else "1e-14"  # of a diagonal: an excess below it is what rounding left
+    kept = "v" if counts else f"v > (B){least}*({diagonal}) ? v : (B)0"
 
     def weight(axis: str, shift: str) -> str:
         """Weight of a face stored `shift` after the cell."""
@@ -92,7 +92,7 @@ def coarsen_kernels(variable: bool, d_type: Any, real: Any) -> Any:
                     if (at != 0) {{
                         const auto* here = d_.data + p; const auto* there = here + at; B* sum = outer ? {side[0]}{axis} : none;
                         SIMD for (int k = 0; k < fx*m; ++k) {{
-                            const B w = {weight(axis, shift)}, f = (here[k] != 0) & (there[k] != 0) ? w : (B)0; e[k] -= f; sum[k] += f; }}
+                            const B w = {weight(axis, shift)}, f = ((here[k] != 0) & (there[k] != 0)) ? w : (B)0; e[k] -= f; sum[k] += f; }}
                     }} }}"""
 
     @wp.func_native(
@@ -116,15 +116,15 @@ def coarsen_kernels(variable: bool, d_type: Any, real: Any) -> Any:
                 const auto* d = d_.data + p;
                 SIMD for (int k = 0; k < fx*m; ++k) {{
                     const B w = {weight("x", "0")}, v = {weight("x", "1")};
-                    const B f = (d[k] != 0) & (d[k-1] != 0) ? w : (B)0, g = (d[k] != 0) & (d[k+1] != 0) ? v : (B)0;
+                    const B f = ((d[k] != 0) & (d[k-1] != 0)) ? w : (B)0, g = ((d[k] != 0) & (d[k+1] != 0)) ? v : (B)0;
                     e[k] = (B)({diagonal}) - f - g; bx[k] += f; ax[k] += g; }}
                 if (start + begin == 0 && W.below_x != 0) {{
                     const int k = 0;
-                    const B f = (d[k] != 0) & (d[k + W.below_x] != 0) ? {weight("x", "0")} : (B)0; e[k] -= f; bx[k] += f; }}
+                    const B f = ((d[k] != 0) & (d[k + W.below_x] != 0)) ? {weight("x", "0")} : (B)0; e[k] -= f; bx[k] += f; }}
                 const int z = last_cell - fx*begin;
                 if (z < fx*m && W.above_x != 0) {{
                     const int k = z;
-                    const B f = (d[k] != 0) & (d[k + W.above_x] != 0) ? {weight("x", "1")} : (B)0; e[k] -= f; ax[k] += f; }}
+                    const B f = ((d[k] != 0) & (d[k + W.above_x] != 0)) ? {weight("x", "1")} : (B)0; e[k] -= f; ax[k] += f; }}
                 {faces("y", "below", "0")}
                 {faces("y", "above", "A.s2")}
                 {faces("z", "below", "0")}
@@ -199,9 +199,13 @@ def factor_kernel(
     wz: wp.array3d(dtype=Any),
     n: wp.vec3i,
     periodic: wp.vec3i,
+    rounding: wp.float64,
     matrix: wp.array2d(dtype=wp.float64),
 ):
-    """Assemble the coarsest level and factor it in place, L D L', by one thread; a vanishing pivot pins its unknown at 0."""
+    """Assemble the coarsest level and factor it in place, L D L', by one thread.
+
+    A pivot below `rounding` times its diagonal is a singular component's rounding: its unknown is pinned at 0.
+    """
     m = n[0] * n[1] * n[2]
     for r in range(m):
         for c in range(r + 1):
@@ -240,7 +244,7 @@ def factor_kernel(
         pivot = matrix[c, c]
         for s in range(c):
             pivot -= matrix[c, s] * matrix[c, s] * matrix[s, s]
-        if pivot <= ROUNDING * matrix[c, c]:
+        if pivot <= rounding * matrix[c, c]:
             pivot = wp.float64(0.0)
         matrix[c, c] = pivot
         for r in range(c + 1, m):
@@ -299,7 +303,7 @@ def _overload() -> None:
         f = wp.array3d(dtype=real)
         for d_type in (wp.uint8, real):
             d = wp.array3d(dtype=d_type)
-            wp.overload(factor_kernel, [StencilShape, d, f, f, f, wp.vec3i, wp.vec3i, wp.array2d(dtype=wp.float64)])
+            wp.overload(factor_kernel, [StencilShape, d, f, f, f, wp.vec3i, wp.vec3i, wp.float64, wp.array2d(dtype=wp.float64)])
         wp.overload(solve_coarsest_kernel, [wp.array2d(dtype=wp.float64), wp.vec3i, f, f])
 
 

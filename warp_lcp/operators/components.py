@@ -34,6 +34,7 @@ class FloatingComponents:
         self._sizes = wp.array(self.sizes, dtype=wp.float64, device=device)
         self._sums = wp.zeros(self.count, dtype=wp.float64, device=device)
         self._held = wp.zeros(self.count, dtype=wp.int32, device=device)
+        self._net: np.ndarray = np.zeros(self.count)
 
     def unattainable(self, b: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any]) -> float:
         """Return a norm that the natural residual cannot go below; 0 if b is compatible everywhere.
@@ -45,7 +46,8 @@ class FloatingComponents:
         """
         inside = self.label >= 0
         label = self.label[inside]
-        rest = np.bincount(label, b.numpy()[inside], self.count)
+        rest = np.bincount(label, b.numpy()[inside], self.count).astype(np.float64)
+        self._net = rest.copy()
         scale = np.bincount(label, np.abs(b.numpy()[inside]), self.count)
         below = np.bincount(label, np.isfinite(lower.numpy()[inside]), self.count) > 0
         above = np.bincount(label, np.isfinite(upper.numpy()[inside]), self.count) > 0
@@ -62,16 +64,19 @@ class FloatingComponents:
         wp.launch(kernels.remove_means_kernel, n, [self._label, self._sums, self._held, self._sizes, r], device=self.device)
 
     def settle(self, x: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any]) -> None:
-        """Choose the constants that the last `project` left open: mean 0 without bounds, else x touches its nearer bound.
+        """Choose the constants that the last `project` left open.
 
-        Only components that were free as a whole move.
+        The mean is 0 without bounds; else x touches the bound that the sum of b pushes it to. Only components that were free as a
+        whole move.
         """
         below, above = (wp.full(self.count, np.inf, dtype=wp.float64, device=self.device) for _ in range(2))
         wp.launch(kernels.smallest_gap_kernel, x.size, [self._label, x, lower, upper, below, above], device=self.device)
         gap_below, gap_above = below.numpy(), above.numpy()
         inside = self.label >= 0
         mean = np.bincount(self.label[inside], x.numpy()[inside], self.count) / self.sizes
-        constant = np.where(np.isfinite(gap_below), -gap_below, np.where(np.isfinite(gap_above), gap_above, -mean))
+        # what is left of b pushes x down where it is positive, up where it is negative: the bound on that side is the one to touch
+        up = np.isfinite(gap_above) & ((self._net < 0) | ~np.isfinite(gap_below))
+        constant = np.where(up, gap_above, np.where(np.isfinite(gap_below), -gap_below, -mean))
         constants = wp.array(constant, dtype=wp.float64, device=self.device)
         wp.launch(kernels.shift_components_kernel, x.size, [self._label, self._held, constants, x], device=self.device)
 

@@ -233,6 +233,8 @@ class GridPoisson:
 
     def _empty_stencil(self) -> Stencil:
         layout = self.layout
+        means = [_mean_coefficient(f, c) for f, c in zip(self.faces, self.uniform, strict=True)]
+        strength = (means[0], means[1], means[2])
         weights = None
         if self._has_arrays:
             weights = (layout.zeros(self.dtype), layout.zeros(self.dtype), layout.zeros(self.dtype))
@@ -240,8 +242,8 @@ class GridPoisson:
         if self._counts_faces:
             used = [c for c, n in zip(self.uniform, reversed(layout.padding.counts), strict=True) if n > 1]
             unit = max(used, default=1.0) or 1.0
-            return Stencil(layout.padding, layout.zeros(wp.uint8), None, self.uniform, unit, self.periodic, self._spans)
-        return Stencil(layout.padding, layout.zeros(self.dtype), weights, self.uniform, 1.0, self.periodic, self._spans)
+            return Stencil(layout.padding, layout.zeros(wp.uint8), None, self.uniform, unit, self.periodic, self._spans, strength)
+        return Stencil(layout.padding, layout.zeros(self.dtype), weights, self.uniform, 1.0, self.periodic, self._spans, strength)
 
     def _refill(self, cells: wp.array[Any]) -> None:
         """Take padded cell types and compute diagonal and weights."""
@@ -269,6 +271,12 @@ class GridPoisson:
             beyond = 1 if self.device.is_cuda else 0
             inputs = [self._rows_and_ghosts, *before, *s.weights, s.grain + (1 - beyond)]
             wp.launch(made.weights, (planes + 1, rows + 1, s.threads[2] + beyond), inputs, device=self.device)
+
+
+def _mean_coefficient(face: wp.array[Any], uniform: float) -> float:
+    """Return the mean of the coefficients that are not 0."""
+    values = face.numpy()
+    return float(values.sum(dtype=np.float64) / max(np.count_nonzero(values), 1)) if face.size else uniform
 
 
 def _checked_cells(cells: Any) -> np.ndarray:

@@ -81,7 +81,7 @@ def coefficient_kernels(arrays: tuple[bool, bool, bool], shifted: bool, real: An
         f"(c[k-{steps[a]}] != 2 ? {face(a, 'k')} : ({T})0) + (c[k+{steps[a]}] != 2 ? {face(a, f'k+{steps[a]}')} : ({T})0)" for a in axes
     )
     extra = " + shift.data[p + k]" if shifted else ""
-    joined = "".join(f"w{a}.data[p + k] = (c[k] == 1) & (c[k-{steps[a]}] == 1) ? {face(a, 'k')} : ({T})0;" for a in axes)
+    joined = "".join(f"w{a}.data[p + k] = ((c[k] == 1) & (c[k-{steps[a]}] == 1)) ? {face(a, 'k')} : ({T})0;" for a in axes)
 
     @wp.func_native(
         simd(

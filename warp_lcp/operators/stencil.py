@@ -26,6 +26,7 @@ class Stencil:
         periodic: whether x, y, z wrap around; ghost cells are then filled before each product.
         spans: first and one past the last cell of each row that may hold unknowns, shape (nz, ny), wp.vec2i; fields must be 0 outside.
             None: whole rows.
+        strength: mean coefficient of all faces along x, y, z; None: that of the weights as they are.
     """
 
     padding: Padding
@@ -35,6 +36,7 @@ class Stencil:
     unit: float = 1.0
     periodic: tuple[bool, bool, bool] = (False, False, False)
     spans: wp.array[Any] | None = None
+    strength: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
         """Lay out the kernel's view of the sizes."""
@@ -57,7 +59,7 @@ class Stencil:
     def with_diagonal(self, d: wp.array[Any]) -> Stencil:
         """Return the stencil with another diagonal (a mask makes it 0) and the same weights."""
         unit = self.unit if d.dtype is self.d.dtype else 1.0
-        return Stencil(self.padding, d, self.weights, self.coefficients, unit, self.periodic, self.spans)
+        return Stencil(self.padding, d, self.weights, self.coefficients, unit, self.periodic, self.spans, self.strength)
 
     def wrap(self, x: wp.array[Any], *, launch: Launch = wp.launch) -> None:
         """Fill x's ghost cells along periodic axes."""

@@ -188,6 +188,10 @@ class NewtonWorkspace(IterateInPlace):
     def _flat(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
         launch_spans(kernel, self._reduction.spans, inputs, [], self.problem.device)
 
+    def round_iterate(self) -> None:
+        """Round x to its precision."""
+        self._round(self.x)
+
     def _round(self, x: wp.array[Any]) -> None:
         if self._rounded is not None:
             convert(x, self._rounded)

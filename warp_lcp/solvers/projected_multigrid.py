@@ -163,23 +163,29 @@ class MultigridWorkspace(IterateInBuffers):
         self._cycles_left = self.settings.monotone_cycles if self.bounded and not warm else 0
         self._rises = 0
         self._forget()
+        size = float(self.residual.scalars.numpy()[int(kernels.SIZE)])
+        rescale = not 1e-6 < self.residual.norm / size < 1e6  # corrections in float32 would overflow, or vanish
+        if rescale:
+            self.residual.set(kernels.SIZE, self.residual.norm)
         if self.floating is not None:
             self._classify_next()
             self.residual.evaluate(self.x)
             self._project()
+        elif rescale:
+            self._classify_next()
+            self.residual.evaluate(self.x)
         elif self._cycles_left == 0 and not self.residual.classify and self.bounded:
             self.residual.classify = True
             self.residual.evaluate(self.x)
 
     def wants_monotone_cycle(self) -> bool:
         """Return whether the next step is a projected cycle."""
-        if self._rises >= self.settings.patience:
+        if self._rises >= self.settings.patience and self.bounded:  # conjugate gradients alone may rise
             self._rises = 0
             self._forget()
-            if self.bounded:
-                self._cycles_left = 1
-                self.residual.classify = False
-                self.residual.evaluate(self.x)
+            self._cycles_left = 1
+            self.residual.classify = False
+            self.residual.evaluate(self.x)
         return self._cycles_left > 0
 
     def monotone_step(self) -> Step:
@@ -270,6 +276,10 @@ class MultigridWorkspace(IterateInBuffers):
             self._mask = self.problem.layout.zeros(wp.uint8)
         wp.launch(kernels.free_mask_kernel, free.size, [free, self._mask], device=self.A.device)
         self.floating.project(self.hierarchy.finest.b, self._mask)
+
+    def round_iterate(self) -> None:
+        """Round x to its precision."""
+        self._round(self.x)
 
     def _round(self, x: wp.array[Any]) -> None:
         if self._rounded is not None:

@@ -156,9 +156,10 @@ def flat_kernels(free_type: Any, real: Any) -> SimpleNamespace:
         flat(
             BOUNDED
             + """const double* x = x_.data; double* o = o_.data; const auto *z = z_.data, *az = az_.data; auto *q = p_.data, *aq = ap_.data;
+        const bool fresh = beta == 0;  // then q may hold anything, a NaN too
         with_bounds([&](auto lower, auto upper) {
             EACH {
-                const auto s = z[i] + beta*q[i], as = az[i] + beta*aq[i];
+                const auto s = fresh ? z[i] : z[i] + beta*q[i], as = fresh ? az[i] : az[i] + beta*aq[i];
                 const double l = lower(i), u = upper(i), v = x[i] + step*(double)s, w = v < l ? l : v, c = w > u ? u : w;
                 q[i] = s; aq[i] = as; o[i] = s == 0 ? x[i] : c; } });"""
         )
@@ -242,9 +243,12 @@ def plan_step_kernel(scalars: f64):
     curvature = scalars[ZAZ]
     gain = scalars[GZ]
     if scalars[CARRY] != zero and scalars[PAP] > zero:  # without a direction to carry, p and its products are meaningless
-        beta = -scalars[ZAP] / scalars[PAP]
-        curvature += beta * (wp.float64(2.0) * scalars[ZAP] + beta * scalars[PAP])
-        gain += beta * scalars[GP]
+        ratio = -scalars[ZAP] / scalars[PAP]
+        rest = curvature + ratio * (wp.float64(2.0) * scalars[ZAP] + ratio * scalars[PAP])
+        if rest > wp.float64(1.0e-3) * curvature:  # else z is nearly the last direction, and what is left of it cancellation
+            beta = ratio
+            curvature = rest
+            gain += beta * scalars[GP]
     length = zero
     if curvature > zero:
         length = gain / curvature
