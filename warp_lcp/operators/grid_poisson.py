@@ -39,7 +39,9 @@ class GridPoisson:
         shift: None, a number or an array of the shape of `cells`, >= 0.
         periodic: whether x, y, z wrap around.
         device: Warp device; that of `cells` or the default device if None.
-        dtype: storage of coefficients, wp.float32 or wp.float64.
+        dtype: storage of coefficients, wp.float32 or wp.float64. In float32 unequal coefficients and their sums are rounded, so that the
+            problem solved is another one by about 1e-7 of the diagonal: for tolerances near that, and for closed domains with such
+            coefficients, take wp.float64. Equal coefficients without a shift are not rounded.
 
     Attributes:
         cells: cell types with one layer of SOLID ghost cells, shape (nz + 2, ny + 2, nx + 2).
