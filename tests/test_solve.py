@@ -7,7 +7,8 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
-from oracle import lemke
+from oracle import lemke, natural_residual
+from warp_lcp.solve import IterateInBuffers
 
 
 def poisson(n=16, seed=7, device="cpu", **options):
@@ -202,6 +203,20 @@ def test_newton_settings_are_checked(bad):
         wl.MinimumMapNewton(**bad)
 
 
+def test_buffers_never_overwrite_the_best_iterate():
+    iterate = IterateInBuffers(wp.zeros(1, dtype=wp.float64, device="cpu"))
+    iterate.keep()
+    for value in range(1, 6):
+        out = iterate.fresh()
+        out.fill_(value)
+        iterate.advance(out)
+        if value == 2:
+            iterate.keep()
+    assert iterate.x.numpy()[0] == 5
+    iterate.restore()
+    assert iterate.x.numpy()[0] == 2
+
+
 class TestStatuses:
     """Each status is reached once on purpose."""
 
@@ -226,7 +241,9 @@ class TestStatuses:
         problem = wl.LCP(wl.DenseOperator(A, device="cpu"), np.array([-1.0, -2.0]), lower=-np.inf)
         result = wl.solve(problem, wl.ProjectedSOR(omega=1.0), stopping=wl.StoppingCriteria(max_iterations=1000))
         assert result.status is wl.SolveStatus.DIVERGED
-        assert np.isfinite(result.x.numpy()).all()
+        assert result.residual == min(record.residual for record in result.history)  # the best iterate comes back, not the last
+        infinite = np.full(2, np.inf)
+        assert natural_residual(A, problem.b.numpy(), -infinite, infinite, result.x.numpy()) == pytest.approx(result.residual)
 
     def test_non_finite(self):
         A, b = poisson()

@@ -26,9 +26,6 @@ class Silent:
     def frame(self, index, last):
         assert index <= last
 
-    def finish(self):
-        pass
-
 
 OVERRIDES = ["domain.resolution=32", "time.duration=0.3", "output.checkpoint_every=5"]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
@@ -37,6 +38,7 @@ class Shape(Table):
     scale: float = Field(default=1.0, gt=0, description="a factor, the same along every axis")
     invert: bool = Field(default=False, description="true: everything but the shape")
 
+    @abstractmethod
     def to_geometry(self, folder: Path, dimension: int) -> Geometry:
         """Return the shape as a signed distance.
 
@@ -47,7 +49,6 @@ class Shape(Table):
         Raises:
             ValueError: a file cannot be read or does not enclose a volume.
         """
-        raise NotImplementedError
 
     def placement(self, dimension: int) -> Placement:
         """Return scale, rotation and translation in a scene of 2 or 3 dimensions."""

@@ -7,6 +7,7 @@ distance is the one to the surface in space, never more than the one to the cut.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -133,7 +134,7 @@ class Placement:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Shape:
+class _Shape(ABC):
     """What the shapes share: their placement, inversion and the launch of their kernel."""
 
     placement: Placement = field(default_factory=Placement)
@@ -178,13 +179,13 @@ class _Shape:
         """Return the length, in the shape's coordinates, that its kernel counts as 1."""
         return 1.0
 
+    @abstractmethod
     def _parameters(self, device: wp.Device) -> list[Any]:
         """Return the kernel's arguments after the placement."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _hull(self) -> tuple[np.ndarray, float]:
         """Return points, shape (m, 3), and a margin around them that cover the shape; no points when nothing does."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -78,7 +78,7 @@ class FloatingComponents:
         up = np.isfinite(gap_above) & ((self._net < 0) | ~np.isfinite(gap_below))
         constant = np.where(up, gap_above, np.where(np.isfinite(gap_below), -gap_below, -mean))
         constants = wp.array(constant, dtype=wp.float64, device=self.device)
-        wp.launch(kernels.shift_components_kernel, x.size, [self._label, self._held, constants, x], device=self.device)
+        wp.launch(kernels.shift_components_kernel, x.size, [self._label, self._held, constants, lower, upper, x], device=self.device)
 
 
 class ComponentFinder:

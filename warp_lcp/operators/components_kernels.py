@@ -231,14 +231,19 @@ def smallest_gap_kernel(
 
 @wp.kernel(**options)
 def shift_components_kernel(
-    label: wp.array(dtype=wp.int32), held: wp.array(dtype=wp.int32), constant: wp.array(dtype=wp.float64), x: wp.array(dtype=wp.float64)
+    label: wp.array(dtype=wp.int32),
+    held: wp.array(dtype=wp.int32),
+    constant: wp.array(dtype=wp.float64),
+    lower: wp.array(dtype=wp.float64),
+    upper: wp.array(dtype=wp.float64),
+    x: wp.array(dtype=wp.float64),
 ):
-    """Add each component's constant, where the component is free as a whole."""
+    """Add each component's constant, where the component is free as a whole; the sum's rounding stays within the bounds."""
     i = wp.tid()
     c = label[i]
     if c >= 0:
         if held[c] == 0:
-            x[i] = x[i] + constant[c]
+            x[i] = wp.clamp(x[i] + constant[c], lower[i], upper[i])
 
 
 for _T in (wp.float32, wp.float64):
