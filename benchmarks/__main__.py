@@ -16,7 +16,7 @@ from benchmarks.timing import Options
 def main() -> None:
     """Measure a suite and write its files."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks")
-    parser.add_argument("suite", choices=["kernels", "solvers", "run"])
+    parser.add_argument("suite", choices=["kernels", "solvers", "run", "validation"])
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--size", type=int, action="append", default=[])
@@ -30,6 +30,10 @@ def main() -> None:
     results = suite.measure(options, given.out)
     for line in report.write(given.suite, suite.TITLE, results, options, given.out):
         options.say(line)
+    for line in results.failures:
+        options.say(f"not as it must be: {line}")
+    if results.failures:
+        sys.exit(1)
 
 
 if __name__ == "__main__":

@@ -7,15 +7,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.machine import present
-from benchmarks.record import Bars, Lines
+from benchmarks.record import Bars, Chart, Lines
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 COLOR, LIMIT = "#3a6ea5", "#b3432b"
+MARKERS = 100  # points of a curve from which on they are not marked
 
 
-def draw(charts: Sequence[Bars | Lines], out: Path, prefix: str) -> list[Path]:
+def draw(charts: Sequence[Chart], out: Path, prefix: str) -> list[Path]:
     """Write a PNG file for each chart; none where Matplotlib is missing."""
     if not present("matplotlib"):
         return []
@@ -51,8 +52,12 @@ def _bars(axes: Axes, chart: Bars) -> None:
 
 def _lines(axes: Axes, chart: Lines) -> None:
     for label, (x, y) in chart.curves.items():
-        axes.plot(x, y, marker=".", label=label)
-    axes.set_yscale("log")
+        if label in chart.marked:
+            axes.plot(x, y, marker="o", linestyle="none", fillstyle="none", color="black", label=label)
+        else:
+            axes.plot(x, y, marker="." if len(x) < MARKERS else "", label=label)
+    if chart.logarithmic_y:
+        axes.set_yscale("log")
     if chart.logarithmic_x:
         axes.set_xscale("log")
     axes.set_xlabel(chart.x_label)

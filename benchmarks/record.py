@@ -58,7 +58,7 @@ class Bars:
 
 @dataclass(frozen=True)
 class Lines:
-    """Curves over positive x and y, both logarithmic unless said otherwise."""
+    """Curves over x and y, both logarithmic unless said otherwise; those in `marked` are drawn as points."""
 
     name: str
     title: str
@@ -66,15 +66,28 @@ class Lines:
     y_label: str
     curves: Mapping[str, tuple[Sequence[float], Sequence[float]]]
     logarithmic_x: bool = True
+    logarithmic_y: bool = True
+    marked: frozenset[str] = frozenset()
+
+
+Chart = Bars | Lines
 
 
 @dataclass(frozen=True)
 class Results:
-    """All that a suite found."""
+    """All that a suite found.
+
+    Args:
+        records: for the file.
+        tables: for the report.
+        charts: to draw.
+        failures: what is not as it must be, a line each; the suite then ends with an error.
+    """
 
     records: list[Record]
     tables: list[Table]
-    charts: list[Bars | Lines] = field(default_factory=list)
+    charts: list[Chart] = field(default_factory=list)
+    failures: list[str] = field(default_factory=list)
 
 
 def write_json(path: Path, records: Sequence[Record]) -> None:

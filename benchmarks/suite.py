@@ -21,10 +21,12 @@ class Suite:
     Args:
         name: what the command line calls it; the files are NAME.json, NAME.md and NAME-*.png.
         summary: what it measures.
+        resizable: whether it can be asked for other sizes.
     """
 
     name: str
     summary: str
+    resizable: bool = True
 
     def run(self, *, device: str, out: Path, sizes: tuple[int, ...] = (), repeat: int = 5) -> list[Path]:
         """Measure and write the files.
@@ -40,8 +42,10 @@ class Suite:
 
         Raises:
             ValueError: a size or the number of samples is out of range.
-            RuntimeError: a measurement failed; what it said is on the error stream.
+            RuntimeError: a measurement failed or a check did; what it said is on the error stream, and the files are there in the latter case.
         """
+        if sizes and not self.resizable:
+            raise ValueError(f"size = {sizes[0]}: the suite {self.name} has its own resolutions")
         if repeat < 1:
             raise ValueError(f"repeat = {repeat}: must be >= 1")
         if min(sizes, default=8) < 8:
@@ -66,3 +70,6 @@ class Suite:
 KERNELS = Suite("kernels", "each hot kernel on the finest grid against this machine's copy bandwidth, Numba and a plain Warp kernel")
 SOLVERS = Suite("solvers", "linear and LCP solves: set-up, iterations, time to a tolerance, memory; against PyAMG and SciPy")
 RUN = Suite("run", "steps per second of built-in scenes, and what the particles cost")
+VALIDATION = Suite(
+    "validation", "liquids against known answers: rest, sloshing, ceiling, dam break, transfers, slopes; with negative controls", False
+)

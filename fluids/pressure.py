@@ -11,8 +11,8 @@ import warp as wp
 
 import warp_lcp as wl
 from fluids import pressure_kernels as kernels
+from fluids.boundary import Boundary
 from warp_lcp.grid.staggered import StaggeredGrid, Window
-from warp_lcp.grid.voxelize import VoxelSolids
 from warp_lcp.operators.grid_poisson import FLUID
 from warp_lcp.vectors import convert
 
@@ -25,87 +25,73 @@ class Projection:
     """What a projection found.
 
     Attributes:
-        result: of the solve; `result.x` is dt p / (rho dx) [m/s].
+        result: of the solve; `result.x` is dt p / (rho dx) [m/s]. None: no cell holds liquid, there was nothing to solve.
         unknowns: FLUID cells.
         released: wall cells that let go.
         max_outflow: largest |y| of the other FLUID cells, recomputed from the projected velocities [m/s].
     """
 
-    result: wl.SolveResult
+    result: wl.SolveResult | None
     unknowns: int
     released: int
     max_outflow: float
 
 
 class PressureProjection:
-    """Mark the liquid's cells, solve for the pressure, project the velocity.
+    """Solve for the pressure of the liquid's cells and project the velocity.
 
-    With x = dt p / (rho dx) [m/s] on every FLUID cell and s_f = +-1 outward,
+    With x = dt p / (rho dx) [m/s] on every FLUID cell, s_f = +-1 outward, a_f the open fraction of a face, u_s the solid's velocity and
+    theta_f the distance to the free surface in cells where air is beyond the face, else 1 [Batty, Bertails & Bridson 2007],
 
-        y_i = b_i + sum over open faces of (x_i - x_neighbor),   b_i = sum over faces of s_f u*_f,   x = 0 in AIR,
+        y_i = b_i + sum over faces of (a_f / theta_f) (x_i - x_neighbor),   b_i = sum of s_f [a_f u*_f + (1 - a_f) u_s,f],   x = 0 in AIR,
 
-    is the net outflow after u = u* - (x_right - x_left). On a closed face the solid's own velocity stands for u*. FLUID cells with a
-    face on a separating wall have 0 <= x complementary to y >= 0, the others y = 0.
+    is the net outflow after u = u* - (x_right - x_left) / theta. FLUID cells with a face that is not open on a separating wall have
+    0 <= x complementary to y >= 0, the others y = 0. Whole cells have a = 0 or 1, a surface on the cells' faces theta = 1: without
+    solids that cut cells the matrix keeps unit weights, and the surface adds a_f (1 / theta_f - 1) to the diagonal.
 
     Args:
         grid: the grid.
-        solids: which cells are solid, and whose walls separate.
+        boundary: solids and walls.
         solver: settings of the method, for example `wl.MinimumMapNewton()`.
         tolerance: relative residual at which a solve is done.
         max_iterations: of the method a solve may take.
-        wall_velocity: velocity [m/s] of the domain's wall and of each solid, shape (1 + solids, 3), constant; None: all stand still.
+        phi: float32 distance to the free surface at cell centers [cells], < 0 exactly in FLUID cells; None: it lies on the cells' faces.
 
     Attributes:
-        kind: int8 of AIR, FLUID, SOLID as last marked.
+        kind: int8 of AIR, FLUID, SOLID, which the caller marks.
         shown: `kind` of the last projection, which pressure and contact belong to; as first marked before it.
         pressure: last accepted x [m/s], float64.
         contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED.
         known: int8, one field a component: which faces the last projection made valid, see `warp_lcp.grid.extrapolate`.
-        wall_velocity: wp.vec3, shape (1 + solids,), or None.
-
-    Raises:
-        ValueError: `wall_velocity` has another shape.
     """
 
     def __init__(
         self,
         grid: StaggeredGrid,
-        solids: VoxelSolids,
+        boundary: Boundary,
         solver: Any,
         *,
         tolerance: float,
         max_iterations: int = 100,
-        wall_velocity: np.ndarray | None = None,
+        phi: wp.array | None = None,
     ) -> None:
         """Allocate the fields."""
-        self.grid, self.solids, self.solver = grid, solids, solver
+        self.grid, self.boundary, self.solver, self._phi = grid, boundary, solver, phi
         self.tolerance, self.max_iterations = tolerance, max_iterations
-        self.wall_velocity = None
-        if wall_velocity is not None:
-            if np.shape(wall_velocity) != (len(solids.separating), 3):
-                raise ValueError(f"wall_velocity has shape {np.shape(wall_velocity)}: expected ({len(solids.separating)}, 3)")
-            self.wall_velocity = wp.array(np.asarray(wall_velocity, dtype=np.float32), dtype=wp.vec3, device=grid.device)
+        self._kernels = kernels.pressure_kernels(bool(boundary.open), bool(boundary.velocity), phi is not None)
         self.kind, self.shown, self.contact = grid.field(wp.int8), grid.field(wp.int8), grid.field(wp.uint8)
         self.pressure, self.known = grid.field(wp.float64), grid.faces(wp.int8)
-        self._base = grid.field(wp.int8)
-        Window((0, 0, 0), grid.shape, grid.device).launch(kernels.base_kernel, [solids.index, self._base])
-        wp.copy(self.kind, self._base)
+        wp.copy(self.kind, boundary.base)
         self._b, self._lower, self._start = (grid.field(wp.float64) for _ in range(3))
         self._lower.fill_(-np.inf)
+        self._shift = grid.field() if phi is not None else None
         self._sums = wp.zeros((*grid.shape[:2], 2), dtype=wp.float64, device=grid.device)
-        self._ready = False  # the problem is built when the first liquid is marked: an empty one is refused
+        self._problem: wl.LCP | None = None  # built when there is liquid: an empty problem is refused
         self._dt = 0.0
 
-    def mark(self, key: wp.array, count: int) -> None:
-        """Make FLUID the cells numbered by the first `count` entries of `key`, AIR the other open ones."""
-        wp.copy(self.kind, self._base)
-        wp.launch(kernels.mark_kernel, count, [key, self.kind.flatten()], device=self.grid.device)
-        if not self._ready:
-            self._operator = wl.GridPoisson(self.grid.interior(self.kind.numpy()), device=self.grid.device)
-            self._problem = wl.LCP(self._operator, self._b, self._lower, np.inf)
-            self._work = self.solver.init(self._problem)
-            self._ready = True
-            wp.copy(self.shown, self.kind)
+    def show(self) -> None:
+        """Show `kind` in frames though nothing has been projected yet."""
+        wp.copy(self.shown, self.kind)
 
     def prepare(self, velocity: Sequence[wp.array], dt: float) -> int:
         """Set up the problem of the marked cells and return the number of unknowns. The first guess is the last pressure.
@@ -114,16 +100,36 @@ class PressureProjection:
             velocity: u* of each component [m/s].
             dt: time step [s].
         """
+        unknowns = self.unknowns()
+        if self._problem is None and unknowns > 0:
+            self._make_problem()
+        if self._problem is None:
+            return 0
         ratio = dt / self._dt if self._dt > 0.0 else 0.0
-        self.grid.domain.launch(
-            kernels.prepare_kernel,
-            [
-                *self._components(velocity), self.kind, self.solids.index, self.solids.separating, self.wall_velocity, self.grid.planes,
-                self.pressure, ratio, self._b, self._lower, self._start,
-            ],
-        )  # fmt: skip
+        fields = [self.pressure, ratio, self._b, self._lower, self._start, self._shift]
+        inputs = [*_three(velocity), self.kind, self.boundary.touch, *self._faces(), *fields]
+        self.grid.domain.launch(self._kernels.prepare, inputs)
         self._operator.update(self.kind)
-        return self.unknowns()
+        return unknowns
+
+    def leave(self, dt: float) -> Projection:
+        """Take a step without liquid cells: all is spray."""
+        for field in (self.pressure, self.contact, *self.known):
+            field.zero_()
+        self.show()
+        self._dt = dt
+        return Projection(None, 0, 0, 0.0)
+
+    def _make_problem(self) -> None:
+        faces = {f"face_{axis}": field for axis, field in zip("xyz", self.boundary.open, strict=False)}
+        cells = self.grid.interior(self.kind.numpy())
+        self._operator = wl.GridPoisson(cells, shift=self._shift, device=self.grid.device, **faces)
+        self._problem = wl.LCP(self._operator, self._b, self._lower, np.inf)
+        self._work = self.solver.init(self._problem)
+
+    def _faces(self) -> list[Any]:
+        """Return what the kernels take of solids and surface."""
+        return [*_three(self.boundary.open), *_three(self.boundary.velocity), self._phi, self.grid.planes]
 
     def solve(self, speed: float, unknowns: int) -> tuple[wl.SolveResult, wl.StoppingCriteria]:
         """Solve the prepared problem for x without changing velocity or pressure.
@@ -138,6 +144,7 @@ class PressureProjection:
             The result and the criteria it was held to.
         """
         criteria = wl.StoppingCriteria(rtol=self.tolerance, atol=ROUNDING * speed * unknowns**0.5, max_iterations=self.max_iterations)
+        assert self._problem is not None, "prepare comes first"
         result = wl.solve(self._problem, self.solver, stopping=criteria, x0=self._start, workspace=self._work)
         return result, criteria
 
@@ -163,17 +170,13 @@ class PressureProjection:
         self._dt = dt
         for axis, field in enumerate(velocity):
             self.known[axis].zero_()
-            window.launch(kernels.subtract_gradient_kernel, [axis, self.pressure, self.kind, field, self.known[axis]])
+            window.launch(self._kernels.subtract_gradient, [axis, self.pressure, self.kind, *self._faces(), field, self.known[axis]])
         reference = result.residual / result.relative_residual if result.relative_residual > 0.0 else 0.0
         # the criteria bound a 2-norm; what a cell may carry of it is the root mean square
         threshold = RELEASE_FACTOR * criteria.tolerance(reference) / max(unknowns, 1) ** 0.5
-        self.grid.domain.launch_rows(
-            kernels.contact_kernel,
-            [
-                *self._components(velocity), self.kind, self.solids.index, self.wall_velocity, self.grid.planes, self.pressure,
-                self._lower, threshold, self.contact, self._sums,
-            ],
-        )  # fmt: skip
+        fields = [self.pressure, threshold, self.contact, self._sums]
+        inputs = [*_three(velocity), self.kind, self.boundary.touch, *self._faces(), *fields]
+        self.grid.domain.launch_rows(self._kernels.contact, inputs)
         sums = self._row_sums()
         return Projection(result, unknowns, int(sums[..., 0].sum()), float(sums[..., 1].max()))
 
@@ -212,10 +215,12 @@ class PressureProjection:
         scale = density * self.grid.spacing / self._dt if self._dt > 0.0 else 0.0
         return self.pressure.numpy() * scale
 
-    def _components(self, velocity: Sequence[wp.array]) -> list[wp.array | None]:
-        return [*velocity, None][:3]
-
     def _row_sums(self) -> np.ndarray:
         """Return the sums of the rows in use."""
         low, high = self.grid.domain.low, self.grid.domain.high
         return self._sums.numpy()[low[0] : high[0], low[1] : high[1]]
+
+
+def _three(fields: Sequence[wp.array]) -> list[wp.array | None]:
+    """Return three fields, None where there are fewer."""
+    return [*fields, None, None, None][:3]

@@ -1,224 +1,213 @@
-"""Kernels of the pressure problem on whole cells.
+# mypy: ignore-errors
+"""Kernels of the pressure problem.
 
-`index` is -1 in open cells and the number of the wall (0: the domain, 1 + s: solid s) in the others. A face with a wall on one side is
-closed, and the wall's own velocity passes it.
+A face is open, closed, or open in part. In whole cells the cells say which: a face with SOLID on a side is closed. Cut cells have the
+open fraction a_f of every face. What passes a face is a_f u_f + (1 - a_f) u_s,f with u_s the solid's velocity, which no array means is 0.
+Where the free surface lies between cells, phi (< 0 in liquid, in cells) says where: a FLUID cell sees the air at a distance of theta cells.
 """
 
-import typing
+import functools
+from types import SimpleNamespace
 
 import warp as wp
 
 from warp_lcp.grid.staggered import CellRange
+from warp_lcp.native import simd
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 
 TOUCHES_NOTHING = 0  # no solid face
 HELD = 1  # a wall cell whose liquid stays on its walls
 RELEASED = 2  # a wall cell whose liquid is leaving
 
-_AIR = wp.constant(wp.int8(AIR))
-_FLUID = wp.constant(wp.int8(FLUID))
-_SOLID = wp.constant(wp.int8(SOLID))
+TOUCHES = 1  # bits of `touch`: a face of the cell is not open,
+LETS_GO = 2  # and one of those belongs to a wall that separates
 
-options: dict[str, typing.Any] = {"enable_backward": False, "module": "fluids.pressure"}
+THETA_MIN = 1e-3  # the nearest that air comes to a FLUID cell's center, in cells
 
+# Row k, j of the fields. In 2-D the third axis repeats the first with a step of 0, so that what enters also leaves.
+ROW = """
+    const long long s2 = kind_.shape[2], s1 = s2*kind_.shape[1], row = k*s1 + j*s2, sz = planes == 2 ? s1 : 0;
+    const signed char* kind = (const signed char*)kind_.data + row;
+    const float* a[3] = {open_x.data + (CUT ? row : 0), open_y.data + (CUT ? row : 0), open_z.data + (CUT ? row : 0)};
+    const float* solid[3] = {solid_x.data + (MOVING ? row : 0), solid_y.data + (MOVING ? row : 0), solid_z.data + (MOVING ? row : 0)};
+    const float* phi = phi_.data + (GHOST ? row : 0);
+    if (planes != 2) { a[2] = a[0]; solid[2] = solid[0]; }
+"""
 
-@wp.func
-@typing.no_type_check
-def wall_velocity(wall: int, axis: int, walls: wp.array(dtype=wp.vec3)):
-    """Return one component of a wall's velocity; walls without velocities stand still."""
-    if walls:
-        return walls[wall][axis]
-    return 0.0
+# The open fraction of a cell's lower face, what the solid adds to what passes it, and the reciprocal of theta between two cells.
+FACE = """
+    auto fraction = [&](int axis, long long i, long long s) {
+        return CUT ? a[axis][CUT ? i : 0] : (((kind[i] == SOLID) | (kind[i - s] == SOLID)) ? 0.0f : 1.0f);
+    };
+    auto passes = [&](const float* u, int axis, long long i, long long s) {
+        const double open = fraction(axis, i, s);
+        return open*u[i] + (MOVING ? (1.0 - open)*solid[axis][MOVING ? i : 0] : 0.0);
+    };
+    auto inverse_theta = [&](long long i, long long n) {  // FLUID i, AIR n
+        const float inverse = GHOST ? 1.0f - phi[GHOST ? n : 0]/phi[GHOST ? i : 0] : 1.0f;
+        return inverse < (float)(1.0/THETA_MIN) ? inverse : (float)(1.0/THETA_MIN);
+    };
+    auto outflow = [&](const float* u, const float* v, const float* w, long long i) {
+        return passes(u, 0, i + 1, 1) - passes(u, 0, i, 1) + passes(v, 1, i + s2, s2) - passes(v, 1, i, s2)
+            + passes(w, 2, i + sz, sz) - passes(w, 2, i, sz);
+    };
+"""
 
+PREPARE = """
+    const float* u = u_.data + row; const float* v = v_.data + row; const float* w = planes == 2 ? w_.data + row : u;
+    const unsigned char* touch = touch_.data + row; const double* last = last_.data + row;
+    double* b = b_.data + row; double* lower = lower_.data + row; double* start = start_.data + row;
+    SIMD8 for (int i = first; i < last_cell; ++i) {
+        const int fluid = kind[i] == FLUID;
+        const double y = outflow(u, v, w, i), bound = (touch[i] & LETS_GO) ? 0.0 : -INFINITY, x = last[i]*ratio;
+        b[i] = fluid ? y : 0.0;
+        lower[i] = fluid ? bound : -INFINITY;
+        start[i] = fluid ? (x < bound ? bound : x) : 0.0;
+    }
+    if (GHOST) {  // a FLUID cell that sees the air nearer than a cell away: what its diagonal has more
+        float* shift = shift_.data + row;
+        auto nearer = [&](int axis, long long face, long long s, long long i, long long n) {
+            return kind[n] == AIR ? fraction(axis, face, s)*(inverse_theta(i, n) - 1.0f) : 0.0f;
+        };
+        SIMD for (int i = first; i < last_cell; ++i) {
+            const float more = nearer(0, i + 1, 1, i, i + 1) + nearer(0, i, 1, i, i - 1) + nearer(1, i + s2, s2, i, i + s2)
+                + nearer(1, i, s2, i, i - s2) + nearer(2, i + sz, sz, i, i + sz) + nearer(2, i, sz, i, i - sz);
+            shift[i] = kind[i] == FLUID ? more : 0.0f;
+        }
+    }
+"""
 
-@wp.func
-@typing.no_type_check
-def flux(
-    field: wp.array3d(dtype=wp.float32),
-    index: wp.array3d(dtype=wp.int32),
-    walls: wp.array(dtype=wp.vec3),
-    axis: int,
-    k: int,
-    j: int,
-    i: int,
-):
-    """Return what passes the lower face of a cell along an axis [m/s]; at least one of its two cells is open."""
-    below = index[k - wp.where(axis == 2, 1, 0), j - wp.where(axis == 1, 1, 0), i - wp.where(axis == 0, 1, 0)]
-    wall = wp.max(below, index[k, j, i])
-    if wall >= 0:
-        return wp.float64(wall_velocity(wall, axis, walls))
-    return wp.float64(field[k, j, i])
+SUBTRACT = """
+    const long long s = axis == 0 ? 1 : (axis == 1 ? s2 : s1);
+    const double* x = x_.data + row; float* field = field_.data + row; signed char* known = (signed char*)known_.data + row;
+    const int edge = (axis == 1 && j == 0) || (axis == 2 && k == 0) ? last : (axis == 0 && first == 0 ? 1 : first);
+    for (int i = first; i < edge; ++i) known[i] = -1;  // the ring's own lower faces lie in the wall
+    SIMD8 for (int i = edge; i < last; ++i) {
+        const int here = kind[i], below = kind[i - s], wet = (here == FLUID) | (below == FLUID);
+        const float open = fraction(axis, i, s);
+        const float inverse = !GHOST ? 1.0f : (here == AIR ? inverse_theta(i - s, i) : (below == AIR ? inverse_theta(i, i - s) : 1.0f));
+        const int projected = wet & (open > 0.0f);
+        field[i] -= projected ? (float)(x[i] - x[i - s])*inverse : 0.0f;
+        const int hidden = CUT ? 0 : (here == SOLID) & (below == SOLID);
+        known[i] = projected ? 1 : (hidden ? -1 : 0);
+    }
+"""
 
+CONTACT = """
+    const float* u = u_.data + row; const float* v = v_.data + row; const float* w = planes == 2 ? w_.data + row : u;
+    const unsigned char* touch = touch_.data + row; const double* x = x_.data + row; unsigned char* contact = contact_.data + row;
+    int released = 0; double worst = 0.0;
+    SIMD8 for (int i = first; i < last; ++i) {
+        const double y = outflow(u, v, w, i), size = y < 0.0 ? -y : y;
+        const int fluid = kind[i] == FLUID, leaves = fluid & ((touch[i] & LETS_GO) != 0) & (x[i] <= 0.0) & (y > threshold);
+        contact[i] = leaves ? RELEASED : ((fluid & (touch[i] & TOUCHES)) ? HELD : 0);
+        released += leaves;
+        const double rest = (fluid & !leaves) ? size : 0.0;
+        worst = worst < rest ? rest : worst;
+    }
+    double* sums = sums_.data + 2*(k*kind_.shape[1] + j);
+    sums[0] = released; sums[1] = worst;
+"""
 
-@wp.func
-@typing.no_type_check
-def outflow(
-    u: wp.array3d(dtype=wp.float32),
-    v: wp.array3d(dtype=wp.float32),
-    w: wp.array3d(dtype=wp.float32),
-    index: wp.array3d(dtype=wp.int32),
-    walls: wp.array(dtype=wp.vec3),
-    k: int,
-    j: int,
-    i: int,
-    planes: int,
-):
-    """Return the sum of s_f u_f over the faces of an open cell, s_f = +-1 outward [m/s]."""
-    y = flux(u, index, walls, 0, k, j, i + 1) - flux(u, index, walls, 0, k, j, i)
-    y += flux(v, index, walls, 1, k, j + 1, i) - flux(v, index, walls, 1, k, j, i)
-    if planes == 2:
-        y += flux(w, index, walls, 2, k + 1, j, i) - flux(w, index, walls, 2, k, j, i)
-    return y
+COUNT = """
+    const signed char* kind = (const signed char*)kind_.data + ((long long)k*kind_.shape[1] + j)*kind_.shape[2];
+    int n = 0;
+    SIMD for (int i = first; i < last; ++i) n += kind[i] == FLUID;
+    return n;
+"""
 
-
-@wp.func
-@typing.no_type_check
-def neighbor(index: wp.array3d(dtype=wp.int32), k: int, j: int, i: int, n: int):
-    """Return the index of neighbor n = 0..5 (-x +x -y +y -z +z) of a cell."""
-    side = 2 * (n & 1) - 1
-    axis = n >> 1
-    return index[k + wp.where(axis == 2, side, 0), j + wp.where(axis == 1, side, 0), i + wp.where(axis == 0, side, 0)]
-
-
-@wp.kernel(**options)
-@typing.no_type_check
-def base_kernel(cells: CellRange, index: wp.array3d(dtype=wp.int32), base: wp.array3d(dtype=wp.int8)):
-    """Cells without liquid: SOLID where there is a wall, AIR elsewhere."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        base[k, j, i] = wp.where(index[k, j, i] >= 0, _SOLID, _AIR)
-
-
-@wp.kernel(**options)
-@typing.no_type_check
-def mark_kernel(key: wp.array(dtype=wp.int32), kind: wp.array(dtype=wp.int8)):
-    """A cell that holds a particle is FLUID."""
-    cell = key[wp.tid()]
-    if kind[cell] == _AIR:
-        kind[cell] = _FLUID
-
-
-@wp.kernel(**options)
-@typing.no_type_check
-def prepare_kernel(
-    cells: CellRange,
-    u: wp.array3d(dtype=wp.float32),
-    v: wp.array3d(dtype=wp.float32),
-    w: wp.array3d(dtype=wp.float32),
-    kind: wp.array3d(dtype=wp.int8),
-    index: wp.array3d(dtype=wp.int32),
-    separating: wp.array(dtype=wp.uint8),
-    walls: wp.array(dtype=wp.vec3),
-    planes: int,
-    last: wp.array3d(dtype=wp.float64),
-    ratio: wp.float64,
-    b: wp.array3d(dtype=wp.float64),
-    lower: wp.array3d(dtype=wp.float64),
-    start: wp.array3d(dtype=wp.float64),
-):
-    """Right-hand side b, lower bound and first guess of every cell."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        y = wp.float64(0.0)
-        x = wp.float64(0.0)
-        bound = -wp.float64(wp.inf)
-        if kind[k, j, i] == _FLUID:
-            y = outflow(u, v, w, index, walls, k, j, i, planes)
-            x = last[k, j, i] * ratio
-            for n in range(2 * planes + 2):
-                wall = neighbor(index, k, j, i, n)
-                if wall >= 0:
-                    if separating[wall] != wp.uint8(0):  # nested: `and` would read both operands
-                        bound = wp.float64(0.0)
-        b[k, j, i] = y
-        lower[k, j, i] = bound
-        start[k, j, i] = wp.max(x, bound)
+_CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR, "TOUCHES": TOUCHES, "LETS_GO": LETS_GO, "RELEASED": RELEASED, "HELD": HELD}
+_F32, _F64, _I8, _U8 = (wp.array3d(dtype=t) for t in (wp.float32, wp.float64, wp.int8, wp.uint8))
 
 
-@wp.kernel(**options)
-@typing.no_type_check
-def count_kernel(cells: CellRange, kind: wp.array3d(dtype=wp.int8), sums: wp.array3d(dtype=wp.float64)):
+def _source(body: str, *, cut: bool = False, moving: bool = False, ghost: bool = False) -> str:
+    """Return a native function's body with its constants."""
+    values = _CONSTANTS | {"CUT": int(cut), "MOVING": int(moving), "GHOST": int(ghost)}
+    names = "".join(f"constexpr int {name} = {value}; " for name, value in values.items())
+    return simd(names + f"constexpr double THETA_MIN = {THETA_MIN};" + body)
+
+
+@functools.cache
+def pressure_kernels(cut: bool, moving: bool, ghost: bool) -> SimpleNamespace:
+    """Return `prepare`, `subtract_gradient` and `contact`.
+
+    Args:
+        cut: whether faces have open fractions.
+        moving: whether solids have velocities.
+        ghost: whether the free surface lies between cells.
+    """
+    module = "fluids.pressure" + "_cut" * cut + "_moving" * moving + "_ghost" * ghost
+    flags = {"cut": cut, "moving": moving, "ghost": ghost}
+
+    @wp.func_native(_source(ROW + FACE + PREPARE, **flags))
+    def prepare_row(
+        u_: _F32, v_: _F32, w_: _F32, kind_: _I8, touch_: _U8, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32, solid_y: _F32,
+        solid_z: _F32, phi_: _F32, planes: int, last_: _F64, ratio: wp.float64, b_: _F64, lower_: _F64, start_: _F64, shift_: _F32,
+        k: int, j: int, first: int, last_cell: int,
+    ): ...  # fmt: skip
+
+    @wp.func_native(_source(ROW + FACE + SUBTRACT, **flags))
+    def subtract_row(
+        axis: int, x_: _F64, kind_: _I8, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32, solid_y: _F32, solid_z: _F32, phi_: _F32,
+        planes: int, field_: _F32, known_: _I8, k: int, j: int, first: int, last: int,
+    ): ...  # fmt: skip
+
+    @wp.func_native(_source(ROW + FACE + CONTACT, **flags))
+    def contact_row(
+        u_: _F32, v_: _F32, w_: _F32, kind_: _I8, touch_: _U8, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32, solid_y: _F32,
+        solid_z: _F32, phi_: _F32, planes: int, x_: _F64, threshold: wp.float64, contact_: _U8, sums_: _F64,
+        k: int, j: int, first: int, last: int,
+    ): ...  # fmt: skip
+
+    @wp.kernel(enable_backward=False, module=module)
+    def prepare(
+        cells: CellRange, u: _F32, v: _F32, w: _F32, kind: _I8, touch: _U8, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32,
+        solid_y: _F32, solid_z: _F32, phi: _F32, planes: int, last: _F64, ratio: wp.float64, b: _F64, lower: _F64, start: _F64, shift: _F32,
+    ):  # fmt: skip
+        """Right-hand side b, lower bound, first guess and what the free surface adds to the diagonal of every cell."""
+        plane, row, chunk = wp.tid()
+        first = cells.i + chunk * cells.grain
+        prepare_row(
+            u, v, w, kind, touch, open_x, open_y, open_z, solid_x, solid_y, solid_z, phi, planes, last, ratio, b, lower, start, shift,
+            cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end),
+        )  # fmt: skip
+
+    @wp.kernel(enable_backward=False, module=module)
+    def subtract_gradient(
+        cells: CellRange, axis: int, x: _F64, kind: _I8, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32, solid_y: _F32,
+        solid_z: _F32, phi: _F32, planes: int, field: _F32, known: _I8,
+    ):  # fmt: skip
+        """Project the open faces that touch FLUID and mark them 1; other faces become 0, or -1 inside solids of whole cells."""
+        plane, row, chunk = wp.tid()
+        first = cells.i + chunk * cells.grain
+        subtract_row(
+            axis, x, kind, open_x, open_y, open_z, solid_x, solid_y, solid_z, phi, planes, field, known,
+            cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end),
+        )  # fmt: skip
+
+    @wp.kernel(enable_backward=False, module=module)
+    def contact(
+        cells: CellRange, u: _F32, v: _F32, w: _F32, kind: _I8, touch: _U8, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32,
+        solid_y: _F32, solid_z: _F32, phi: _F32, planes: int, x: _F64, threshold: wp.float64, contact_: _U8, sums: _F64,
+    ):  # fmt: skip
+        """Find the released cells; a row's sums are [0] their number and [1] the largest |outflow| of the other FLUID cells [m/s]."""
+        plane, row = wp.tid()
+        contact_row(
+            u, v, w, kind, touch, open_x, open_y, open_z, solid_x, solid_y, solid_z, phi, planes, x, threshold, contact_, sums,
+            cells.k + plane, cells.j + row, cells.i, cells.end,
+        )  # fmt: skip
+
+    return SimpleNamespace(prepare=prepare, subtract_gradient=subtract_gradient, contact=contact)
+
+
+@wp.func_native(_source(COUNT))
+def count_row(kind_: _I8, k: int, j: int, first: int, last: int) -> int: ...
+
+
+@wp.kernel(enable_backward=False, module="fluids.pressure")
+def count_kernel(cells: CellRange, kind: _I8, sums: _F64):
     """Count the FLUID cells of a row."""
     plane, row = wp.tid()
     k = cells.k + plane
     j = cells.j + row
-    n = int(0)
-    for i in range(cells.i, cells.end):
-        n += wp.where(kind[k, j, i] == _FLUID, 1, 0)
-    sums[k, j, 0] = wp.float64(n)
-
-
-@wp.kernel(**options)
-@typing.no_type_check
-def subtract_gradient_kernel(
-    cells: CellRange,
-    axis: int,
-    x: wp.array3d(dtype=wp.float64),
-    kind: wp.array3d(dtype=wp.int8),
-    field: wp.array3d(dtype=wp.float32),
-    known: wp.array3d(dtype=wp.int8),
-):
-    """Project the open faces that touch FLUID and mark them 1; other faces become 0, or -1 inside solids."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    c = wp.max(k - wp.where(axis == 2, 1, 0), 0)  # the ring's own lower faces have no cell below: they count as inside the wall
-    b = wp.max(j - wp.where(axis == 1, 1, 0), 0)
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        a = wp.max(i - wp.where(axis == 0, 1, 0), 0)
-        here = kind[k, j, i]
-        below = kind[c, b, a]
-        mark = int(0)
-        if here == _SOLID and below == _SOLID:
-            mark = -1
-        elif here != _SOLID and below != _SOLID and (here == _FLUID or below == _FLUID):
-            mark = 1
-            field[k, j, i] = field[k, j, i] - float(x[k, j, i] - x[c, b, a])
-        known[k, j, i] = wp.int8(mark)
-
-
-@wp.kernel(**options)
-@typing.no_type_check
-def contact_kernel(
-    cells: CellRange,
-    u: wp.array3d(dtype=wp.float32),
-    v: wp.array3d(dtype=wp.float32),
-    w: wp.array3d(dtype=wp.float32),
-    kind: wp.array3d(dtype=wp.int8),
-    index: wp.array3d(dtype=wp.int32),
-    walls: wp.array(dtype=wp.vec3),
-    planes: int,
-    x: wp.array3d(dtype=wp.float64),
-    lower: wp.array3d(dtype=wp.float64),
-    threshold: wp.float64,
-    contact: wp.array3d(dtype=wp.uint8),
-    sums: wp.array3d(dtype=wp.float64),
-):
-    """Find the released cells; a row's sums are [0] their number and [1] the largest |outflow| of the other FLUID cells [m/s]."""
-    plane, row = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    released = int(0)
-    worst = wp.float64(0.0)
-    for i in range(cells.i, cells.end):
-        state = int(TOUCHES_NOTHING)
-        if kind[k, j, i] == _FLUID:
-            y = outflow(u, v, w, index, walls, k, j, i, planes)
-            for n in range(2 * planes + 2):
-                if neighbor(index, k, j, i, n) >= 0:
-                    state = HELD
-            if lower[k, j, i] == wp.float64(0.0) and x[k, j, i] <= wp.float64(0.0) and y > threshold:
-                state = RELEASED
-                released += 1
-            else:
-                worst = wp.max(worst, wp.abs(y))
-        contact[k, j, i] = wp.uint8(state)
-    sums[k, j, 0] = wp.float64(released)
-    sums[k, j, 1] = worst
+    sums[k, j, 0] = wp.float64(count_row(kind, k, j, cells.i, cells.end))

@@ -11,20 +11,20 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
+from fluids.boundary import Boundary, WholeCells
 from fluids.gravity import accelerate
 from fluids.pressure import PressureProjection, Projection
 from fluids.pressure_kernels import RELEASED, TOUCHES_NOTHING
 from fluids.scene import LiquidScene
-from fluids.wall import extend_velocity
+from fluids.surface import FreeSurface, GhostFluidSurface, WholeCellSurface
 from warp_lcp.driver.profile import NoStopwatch, Stopwatch
 from warp_lcp.driver.scene import Scene, Solver
 from warp_lcp.driver.simulator import Cells, Points, SimulationFailed, StepFailed
-from warp_lcp.grid.advection import advect, clearance
 from warp_lcp.grid.particles import MARGIN, Particles, ParticleTotals, seed
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
-from warp_lcp.grid.voxelize import OPEN, PlacedSolid, VoxelSolids, inside, placement_notes, voxelize
+from warp_lcp.grid.voxelize import PlacedSolid, inside, placement_notes, voxelize
 
 COLUMNS = (
     "particles",
@@ -52,9 +52,8 @@ class LiquidSimulation:
     Args:
         scene: what to simulate.
         grid: its grid.
-        solids: its solids and the domain's walls.
+        boundary: its solids and the domain's walls.
         particles: the liquid at the start.
-        wall_velocity: velocity [m/s] of the domain's wall and of each solid, shape (1 + solids, 3); None: all stand still.
         notes: facts for the start of a run.
 
     Attributes:
@@ -70,14 +69,13 @@ class LiquidSimulation:
         self,
         scene: LiquidScene,
         grid: StaggeredGrid,
-        solids: VoxelSolids,
+        boundary: Boundary,
         particles: Particles,
         *,
-        wall_velocity: np.ndarray | None = None,
         notes: list[str] | None = None,
     ) -> None:
         """Allocate the fields and find the liquid's cells."""
-        self.scene, self.grid, self.solids, self.particles = scene, grid, solids, particles
+        self.scene, self.grid, self.boundary, self.particles = scene, grid, boundary, particles
         self.time, self.step_count = 0.0, 0
         self.watch: Stopwatch = NoStopwatch()
         self._notes = list(notes or [])
@@ -85,16 +83,15 @@ class LiquidSimulation:
         self.particle_mass = scene.physics.density * grid.cell_volume / scene.particles.per_axis**grid.dimension  # [kg], 2-D: [kg/m]
         self.velocity, self.weights = grid.faces(), grid.faces()
         self._saved = grid.faces() if scene.particles.transfer == "flip" else None
-        self._stopped = wp.zeros(1, dtype=wp.int32, device=grid.device)
+        self.surface = _surface(scene, grid, boundary)
         settings = scene.solver
         self.projection = PressureProjection(
-            grid, solids, _method(settings), tolerance=settings.tolerance, max_iterations=settings.max_iterations,
-            wall_velocity=wall_velocity,
-        )  # fmt: skip
-        self._clearance = clearance(grid, self.projection.kind)
+            grid, boundary, _method(settings), tolerance=settings.tolerance, max_iterations=settings.max_iterations, phi=self.surface.phi
+        )
         self.layers = math.ceil(scene.time.cfl) + 2
         particles.sort()
-        self.projection.mark(particles.key, particles.count)
+        self.surface.mark(particles, grid.everywhere, self.projection.kind)
+        self.projection.show()
 
     def stable_dt(self) -> float:
         """Return CFL dx / (v_max + sqrt(CFL g dx)) [s]: gravity's own speed counts, so that a liquid at rest does not take off."""
@@ -124,33 +121,30 @@ class LiquidSimulation:
         with watch.stage("particles-to-grid", *particles.arrays().values(), *self.velocity, *self.weights):
             self._transfer(window, dt)
         projected = self._project(window, dt, before.max_speed + dt * float(np.linalg.norm(self.gravity)))
-        p, s = self.projection, self.solids
-        with watch.stage("extrapolation", *self.velocity, *self.weights, *p.known, p.kind, p.contact, s.index):
-            extend_velocity(
-                window, self.velocity, self.weights, p.known, p.kind, p.contact, s.index, s.separating, p.wall_velocity, self.layers
-            )
+        p, wall = self.projection, self.boundary
+        with watch.stage("extrapolation", *self.velocity, *self.weights, *p.known, p.kind, p.contact, *wall.open):
+            wall.extend(window, self.velocity, self.weights, p.known, p.kind, p.contact, self.layers)
         with watch.stage("grid-to-particles", *particles.arrays().values(), *self.velocity):
             flip = self.scene.particles.flip_ratio if self._saved else 0.0
             faces_to_particles(
                 self.grid, self.velocity, particles.position, particles.velocity, particles.affine, saved=self._saved, flip=flip
             )
-        with watch.stage("advection", particles.position, *self.velocity, self._clearance):
-            self._stopped.zero_()
-            advect(self.grid, self.velocity, self._clearance, dt, particles.position, self._stopped)
+        with watch.stage("advection", particles.position, *self.velocity):
+            moved = wall.advect(self.velocity, dt, self.time + dt, particles.position)
         after = self._checked_totals("after")
         self.time += dt
         self.step_count += 1
-        return self._row(dt, after, projected)
+        return self._row(dt, after, projected, moved)
 
     def columns(self) -> tuple[str, ...]:
         """Return the names of the log's columns.
 
         SI units; in 2-D mass, energies and volume are per meter of depth. Energies are the particles' own; potential_energy is 0 at the
         origin. solve_residual is relative to the right-hand side's, which in free fall is rounding noise that is not iterated on: it may
-        then be up to 1. volume counts FLUID cells. active: wall cells that let go; max_divergence [1/s]: of the other FLUID cells after the
-        projection; stopped: particles that met a wall.
+        then be up to 1. volume counts FLUID cells, or lies inside the surface where that is finer than cells. active: wall cells that let go; max_divergence [1/s]: of the other FLUID cells after the
+        projection; stopped: particles that met a wall; pushed: those that a moving solid swept along.
         """
-        return COLUMNS
+        return (*COLUMNS, "pushed") if self.boundary.moves else COLUMNS
 
     def frame(self) -> list[Points | Cells]:
         """Return the particles (velocity, speed) and the liquid's cells of the last solve (pressure [Pa], wall and released flags)."""
@@ -191,12 +185,13 @@ class LiquidSimulation:
                 raise ValueError(f"the state's {name} is {found}: this scene has {wanted}")
             if given.dtype.kind == "f" and not np.isfinite(given).all():
                 raise ValueError(f"the state's {name} holds values that are not finite")
-        if not np.array_equal(state["cells"] == wl.SOLID, expected["cells"] == wl.SOLID):
+        if not self.boundary.moves and not np.array_equal(state["cells"] == wl.SOLID, expected["cells"] == wl.SOLID):
             raise ValueError("the state's solids are not this scene's")
         for name, array in self.particles.arrays().items():
             array.assign(state[name])
         self.projection.restore({name: np.asarray(state[name]) for name in ("pressure", "pressure_dt", "cells", "contact")})
         self.time, self.step_count = float(state["time"]), int(state["step_count"])
+        self.boundary.place(self.time)
 
     def notes(self) -> list[str]:
         """Return warnings and facts worth a line at the start of a run."""
@@ -223,9 +218,14 @@ class LiquidSimulation:
     def _project(self, window: Window, dt: float, speed: float) -> Projection:
         """Solve for the pressure and project the velocity."""
         projection, watch = self.projection, self.watch
-        with watch.stage("pressure set-up", self.particles.key, *self.velocity, *projection.fields()):
-            projection.mark(self.particles.key, self.particles.count)
+        with watch.stage("surface", self.particles.key, projection.kind):
+            self.surface.mark(self.particles, window, projection.kind)
+            self.surface.complete(window, self.velocity, self.weights, projection.known)
+        with watch.stage("pressure set-up", *self.velocity, *projection.fields()):
+            self.boundary.begin_step(self.time, dt)
             unknowns = projection.prepare(self.velocity, dt)
+        if unknowns == 0:
+            return projection.leave(dt)
         with watch.stage("pressure solve", *projection.fields()):
             result, criteria = projection.solve(speed, unknowns)
         if not result:
@@ -277,10 +277,10 @@ class LiquidSimulation:
         k, j, i = np.unravel_index(int(self.particles.key.numpy()[particle]), self.grid.shape)
         return int(i) - 1, int(j) - 1, int(k) - 1
 
-    def _row(self, dt: float, totals: ParticleTotals, projected: Projection) -> dict[str, float | int | str | None]:
+    def _row(self, dt: float, totals: ParticleTotals, projected: Projection, moved: tuple[int, int]) -> dict[str, float | int | str | None]:
         mass = totals.count * self.particle_mass
         result = projected.result
-        return {
+        row: dict[str, float | int | str | None] = {
             "particles": totals.count,
             "mass": mass,
             "kinetic_energy": 0.5 * mass * totals.mean_square_speed,
@@ -288,16 +288,21 @@ class LiquidSimulation:
             "center_of_mass_y": float(totals.center[1]),
             "max_speed": totals.max_speed,
             "cfl": totals.max_speed * dt / self.grid.spacing,
-            "solver": self.scene.solver.method,
-            "solve_status": result.status.name,
-            "solve_iterations": result.iterations,
-            "linear_iterations": result.linear_iterations,
-            "solve_residual": result.relative_residual,
             "active": projected.released,
             "max_divergence": projected.max_outflow / self.grid.spacing,
-            "volume": projected.unknowns * self.grid.cell_volume,
-            "stopped": int(self._stopped.numpy()[0]),
+            "volume": self.surface.volume(projected.unknowns),
+            "stopped": moved[0],
+            "pushed": moved[1],
         }
+        if result is not None:
+            row |= {
+                "solver": self.scene.solver.method,
+                "solve_status": result.status.name,
+                "solve_iterations": result.iterations,
+                "linear_iterations": result.linear_iterations,
+                "solve_residual": result.relative_residual,
+            }
+        return {name: row.get(name) for name in self.columns()}
 
     def _signature(self) -> np.ndarray:
         """Return numbers that tell this scene's arrays from another's."""
@@ -312,20 +317,43 @@ def _method(settings: Solver) -> Any:
     return methods[settings.method](precision=settings.precision)
 
 
-def _region(geometry: Geometry, device: wp.Device) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function that tells which points lie in a geometry."""
-    return lambda points: inside([geometry], points, device=device)
+def _surface(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary) -> FreeSurface:
+    """Return the free surface that a scene asks for."""
+    count = scene.particles.per_axis**grid.dimension
+    if scene.pressure.surface == "ghost-fluid":
+        return GhostFluidSurface(grid, boundary, particles_a_cell=count, smoothing=scene.pressure.smoothing)
+    return WholeCellSurface(grid, boundary, particles_a_cell=count)
 
 
-def _seed(scene: LiquidScene, grid: StaggeredGrid, solids: VoxelSolids, folder: Path) -> tuple[Particles, list[str]]:
+def _region(geometry: Geometry, boundary: Boundary, device: wp.Device) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a function that tells which points lie in a geometry and outside solids."""
+    return lambda points: inside([geometry], points, device=device) & boundary.admits(points)
+
+
+def _boundary(scene: LiquidScene, grid: StaggeredGrid, folder: Path, wall_velocity: np.ndarray | None) -> tuple[Boundary, tuple[str, ...]]:
+    """Return solids and walls as the scene asks for them, and warnings."""
+    placed = [
+        PlacedSolid(
+            geometry=solid.to_geometry(folder, scene.dimension),
+            separating=(solid.wall or scene.domain.wall) == "separating",
+            name=f"solid[{number}] ({solid.shape})",
+        )
+        for number, solid in enumerate(scene.solid)
+    ]
+    separating = scene.domain.wall == "separating"
+    solids = voxelize(grid.counts, grid.spacing, grid.dimension, placed, wall_separating=separating, device=grid.device)
+    return WholeCells(grid, solids, wall_velocity), solids.notes
+
+
+def _seed(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, folder: Path) -> tuple[Particles, list[str]]:
     """Return the particles of all liquids, and warnings."""
     geometries = [liquid.to_geometry(folder, scene.dimension) for liquid in scene.liquid]
-    regions = [_region(geometry, grid.device) for geometry in geometries]
+    regions = [_region(geometry, boundary, grid.device) for geometry in geometries]
     notes: list[str] = []
     for number, (liquid, geometry) in enumerate(zip(scene.liquid, geometries, strict=True)):
         notes += placement_notes(geometry, f"liquid[{number}] ({liquid.shape})", grid.counts, grid.spacing, grid.dimension)
     settings = scene.particles
-    open_cells = grid.interior(solids.index.numpy()) == OPEN
+    open_cells = grid.interior(boundary.base.numpy()) != wl.SOLID
     position, owner = seed(
         grid, regions, open_cells, per_axis=settings.per_axis, jitter=settings.jitter, random_seed=settings.seed
     )  # fmt: skip
@@ -363,15 +391,6 @@ class FluidsSimulator:
         if not isinstance(scene, LiquidScene):
             raise ValueError("scene.simulator: fluids needs a scene of liquid")
         grid = StaggeredGrid(scene.cell_counts, scene.spacing, scene.dimension, device)
-        placed = [
-            PlacedSolid(
-                geometry=solid.to_geometry(folder, scene.dimension),
-                separating=(solid.wall or scene.domain.wall) == "separating",
-                name=f"solid[{number}] ({solid.shape})",
-            )
-            for number, solid in enumerate(scene.solid)
-        ]
-        separating = scene.domain.wall == "separating"
-        solids = voxelize(grid.counts, grid.spacing, grid.dimension, placed, wall_separating=separating, device=grid.device)
-        particles, notes = _seed(scene, grid, solids, folder)
-        return LiquidSimulation(scene, grid, solids, particles, wall_velocity=wall_velocity, notes=[*solids.notes, *notes])
+        boundary, warnings = _boundary(scene, grid, folder, wall_velocity)
+        particles, notes = _seed(scene, grid, boundary, folder)
+        return LiquidSimulation(scene, grid, boundary, particles, notes=[*warnings, *notes])

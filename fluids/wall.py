@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import warp as wp
 
-from fluids.pressure_kernels import RELEASED, wall_velocity
+from fluids.pressure_kernels import RELEASED
 from warp_lcp.grid.extrapolate import BLOCKED, extrapolate
 from warp_lcp.grid.staggered import CellRange, Window
 from warp_lcp.grid.transfer import TINY_WEIGHT
@@ -56,7 +56,7 @@ def closed_face_kernel(
     contact: wp.array3d(dtype=wp.uint8),
     index: wp.array3d(dtype=wp.int32),
     separating: wp.array(dtype=wp.uint8),
-    walls: wp.array(dtype=wp.vec3),
+    solid: wp.array3d(dtype=wp.float32),
     field: wp.array3d(dtype=wp.float32),
 ):
     """Closed faces take the wall's normal velocity, or lose only the velocity into the wall."""
@@ -79,7 +79,9 @@ def closed_face_kernel(
                 outward = -1.0
                 liquid = kind[c, b, a] == _FLUID
                 leaving = int(contact[c, b, a]) == RELEASED
-            target = wall_velocity(wall, axis, walls)
+            target = float(0.0)
+            if solid:
+                target = solid[k, j, i]
             held = liquid and (separating[wall] == wp.uint8(0) or not leaving)
             if held or outward * (field[k, j, i] - target) < 0.0:
                 field[k, j, i] = target
@@ -94,7 +96,7 @@ def extend_velocity(
     contact: wp.array,
     index: wp.array,
     separating: wp.array,
-    wall_velocity: wp.array | None,
+    solid_velocity: Sequence[wp.array],
     layers: int,
 ) -> None:
     """Continue the projected velocity into air and walls.
@@ -108,13 +110,14 @@ def extend_velocity(
         contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED.
         index: int32: -1 in open cells, the wall's number elsewhere.
         separating: uint8 a wall.
-        wall_velocity: wp.vec3 a wall [m/s], or None if all stand still.
+        solid_velocity: of the solids on each component's faces [m/s], or empty if all stand still.
         layers: how far into the air, in faces.
     """
     for axis, (field, weight, marks) in enumerate(zip(velocity, weights, known, strict=True)):
         extrapolate(window, marks, field, 1)
         window.launch(keep_spray_kernel, [axis, kind, weight, marks])
         extrapolate(window, marks, field, layers)
-        window.launch(closed_face_kernel, [axis, kind, contact, index, separating, wall_velocity, field])
+        solid = solid_velocity[axis] if solid_velocity else None
+        window.launch(closed_face_kernel, [axis, kind, contact, index, separating, solid, field])
         # a particle's tent reaches faces inside a solid beside its cell, and in 3-D beside those
         extrapolate(window, marks, field, len(velocity) - 1, start=layers + 1, fill=BLOCKED)

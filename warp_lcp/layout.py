@@ -49,12 +49,20 @@ class Layout:
         if self.holds(field, dtype):
             return field.flatten()
         host = field.numpy() if isinstance(field, wp.array) else np.asarray(field)
-        if host.shape not in (self.shape, self.stored_shape, (self.size,)):
+        if not self.fits(host):
             raise ValueError(f"{name} has shape {host.shape}: expected {self.shape}")
         stored = np.zeros(self.stored_shape, dtype=wp.dtype_to_numpy(dtype))
-        target = self._inner(stored) if host.shape == self.shape else stored
+        target = self.target(stored, host)
         target[...] = host.reshape(target.shape)
         return wp.array(stored.ravel(), dtype=dtype, device=self.device, copy=self.device.is_cuda)
+
+    def fits(self, host: np.ndarray) -> bool:
+        """Return whether an array has the operator's shape or a stored one."""
+        return host.shape in (self.shape, self.stored_shape, (self.size,))
+
+    def target(self, stored: np.ndarray, host: np.ndarray) -> np.ndarray:
+        """Return the part of a stored field that an array which fits it fills, reshaped to that part's shape."""
+        return self._inner(stored) if host.shape == self.shape else stored
 
     def unload(self, stored: wp.array[Any]) -> wp.array[Any]:
         """Return a stored field as a contiguous field of the operator's shape; a copy unless both are the same."""

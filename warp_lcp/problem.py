@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.bounds import INFINITE, Bounds
 from warp_lcp.layout import Array, layout_of
 from warp_lcp.native import Spans
 from warp_lcp.problem_kernels import check_kernel
@@ -51,7 +52,7 @@ class LCP:
             raise ValueError("A has no unknowns: the problem is empty")
         self.in_place = isinstance(b, wp.array) and self.layout.holds(b, wp.float64) and tuple(b.shape) != tuple(A.shape)
         self.b = self.layout.load(b, wp.float64, "b")
-        self._bounds = self._bound(lower, "lower"), self._bound(upper, "upper")
+        self.bounds = Bounds(self.layout, lower, upper)
         self.unknown = _unknown(A, self.layout)
         self._check()
 
@@ -63,48 +64,33 @@ class LCP:
     @property
     def bounded(self) -> bool:
         """Whether a bound may be finite."""
-        return any(field.size > 0 or np.isfinite(value) for field, value in self._bounds)
-
-    @property
-    def bounds(self) -> list[Any]:
-        """Lower and upper bound as kernels take them: a stored field or an empty array, and the number that then counts, for each."""
-        (lower, least), (upper, most) = self._bounds
-        return [lower, wp.float64(least), upper, wp.float64(most)]
+        return any(self.bounds.may_bind)
 
     @cached_property
     def lower(self) -> wp.array[Any]:
         """L as a stored field, float64."""
-        return self._as_field(*self._bounds[0])
+        return self.bounds.as_field(0)
 
     @cached_property
     def upper(self) -> wp.array[Any]:
         """U as a stored field, float64."""
-        return self._as_field(*self._bounds[1])
-
-    def _as_field(self, field: wp.array[Any], value: float) -> wp.array[Any]:
-        return field if field.size else wp.full(self.layout.size, value, dtype=wp.float64, device=self.device)
-
-    def _bound(self, values: Any, name: str) -> tuple[wp.array[Any], float]:
-        """Return a field and a number of which one counts."""
-        if isinstance(values, wp.array) or np.ndim(values) > 0:
-            return self.layout.load(values, wp.float64, name), 0.0
-        return wp.empty(0, dtype=wp.float64, device=self.device), float(values)
+        return self.bounds.as_field(1)
 
     def not_finite(self, field: wp.array[Any]) -> int:
         """Return how many unknowns of a stored field are not finite."""
-        return self._faults(field)[0]
+        return self._faults(field, Bounds(self.layout, *INFINITE))[0]
 
-    def _faults(self, field: wp.array[Any]) -> list[int]:
+    def _faults(self, field: wp.array[Any], bounds: Bounds) -> list[int]:
         """Count values of a stored field that are not finite, NaN in l and in u, crossed bounds, l = inf, u = -inf."""
         spans = Spans.of(self.layout.size, self.device)
         counts = wp.zeros((6, spans.threads), dtype=wp.float64, device=self.device)
-        inputs = [field, *self.bounds, self.unknown, spans.n, spans.chunk, spans.stride, spans.threads, counts.flatten()]
+        inputs = [field, *bounds.operands, self.unknown, spans.n, spans.chunk, spans.stride, spans.threads, counts.flatten()]
         wp.launch(check_kernel, spans.threads, inputs, device=self.device)
         return [int(n) for n in counts.numpy().sum(axis=1)]
 
     def _check(self) -> None:
         """Refuse data that no method could use."""
-        bad_b, nan_lower, nan_upper, crossed, no_lower, no_upper = self._faults(self.b)
+        bad_b, nan_lower, nan_upper, crossed, no_lower, no_upper = self._faults(self.b, self.bounds)
         if bad_b:
             raise ValueError(f"b holds {bad_b} values that are not finite")
         for name, count in (("lower", nan_lower), ("upper", nan_upper)):

@@ -3,10 +3,10 @@
 
 import warp as wp
 
-from warp_lcp.vector_kernels import BOUNDED, flat, span_end, span_start
+from warp_lcp.vector_kernels import CODED, flat, span_end, span_start
 
 CHECK = flat(
-    BOUNDED
+    CODED
     + """
     double bad = 0, nan_l = 0, nan_u = 0, crossed = 0, no_l = 0, no_u = 0; const double* b = b_.data; const auto* m = m_.data;
     const double inf = (double)INFINITY;
@@ -27,6 +27,7 @@ def check_span(
     l_value: wp.float64,
     u_: wp.array(dtype=wp.float64),
     u_value: wp.float64,
+    code_: wp.array(dtype=wp.uint8),
     m_: wp.array(dtype=wp.int8),
     start: wp.int64,
     end: wp.int64,
@@ -44,6 +45,7 @@ def check_kernel(
     lower_value: wp.float64,
     upper: wp.array(dtype=wp.float64),
     upper_value: wp.float64,
+    code: wp.array(dtype=wp.uint8),
     unknown: wp.array(dtype=wp.int8),
     n: int,
     chunk: int,
@@ -54,4 +56,5 @@ def check_kernel(
     """Count non-finite b, NaN bounds, crossed bounds, l = inf and u = -inf among the unknowns, by threads."""
     t = wp.tid()
     start = span_start(t, chunk)
-    check_span(b, lower, lower_value, upper, upper_value, unknown, start, span_end(t, chunk, n), stride, threads, t, out)
+    end = span_end(t, chunk, n)
+    check_span(b, lower, lower_value, upper, upper_value, code, unknown, start, end, stride, threads, t, out)

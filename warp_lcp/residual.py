@@ -45,7 +45,7 @@ class NaturalResidual:
         """Compute y and return the norm of the natural residual at x (stored, float64)."""
         p = self.problem
         self.affine(x)
-        before = [x, self.y, self.diagonal, self.unit, *p.bounds, p.unknown]
+        before = [x, self.y, self.diagonal, self.unit, *p.bounds.operands, p.unknown]
         spans, partials = self._reduction.spans, self._reduction.partials
         launch_spans(kernels(self.diagonal.dtype).natural, spans, before, [partials], p.device)
         self._reduction.add_up(0)
@@ -65,13 +65,13 @@ class NaturalResidual:
     def start(self, x: wp.array[Any], *, keep: bool) -> None:
         """Set x to clip(x, l, u), or to clip(0, l, u), and to 0 where there is no unknown."""
         p = self.problem
-        launch_spans(start_kernel, self._reduction.spans, [x, *p.bounds, p.unknown, keep], [], p.device)
+        launch_spans(start_kernel, self._reduction.spans, [x, *p.bounds.operands, p.unknown, keep], [], p.device)
         self.current = False
 
     def settle_isolated(self, x: wp.array[Any]) -> None:
         """Set x where A's row is empty, so that y = b, to the bound that b's sign asks for; methods move coupled unknowns only."""
         p = self.problem
-        wp.launch(settle_isolated_kernel, x.size, [self.diagonal, p.b, *p.bounds, p.unknown, x], device=p.device)
+        wp.launch(settle_isolated_kernel, x.size, [self.diagonal, p.b, p.lower, p.upper, p.unknown, x], device=p.device)
         self.current = False
 
     def norm_of_b(self) -> float:

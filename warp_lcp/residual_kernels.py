@@ -7,10 +7,10 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.vector_kernels import BOUNDED, flat, span_end, span_start
+from warp_lcp.vector_kernels import CODED, flat, span_end, span_start
 
 f64 = wp.array(dtype=wp.float64)
-i8 = wp.array(dtype=wp.int8)
+i8, u8 = wp.array(dtype=wp.int8), wp.array(dtype=wp.uint8)
 
 # r = d (x - clip(x - y/d, l, u)) = max(d (x - u), min(d (x - l), y)): no division, and a NaN in y stays one
 NATURAL = """const double a_ = unit*(double)d[i], b_ = a_ < 0 ? -a_ : a_, e = b_ == 0 ? 1.0 : b_;
@@ -26,26 +26,26 @@ def kernels(d_type: Any) -> SimpleNamespace:
 
     @wp.func_native(
         flat(
-            BOUNDED
+            CODED
             + f"""const double *x = x_.data, *y = y_.data; const auto* d = d_.data; const auto* m = m_.data; double s = 0;
         with_bounds([&](auto lower, auto upper) {{ EACH {{ {NATURAL} s += r*r; }} }});
         return s;"""
         )
     )
     def natural_span(
-        x_: f64, y_: f64, d_: d_array, unit: wp.float64, l_: f64, l_value: wp.float64, u_: f64, u_value: wp.float64, m_: i8,
+        x_: f64, y_: f64, d_: d_array, unit: wp.float64, l_: f64, l_value: wp.float64, u_: f64, u_value: wp.float64, code_: u8, m_: i8,
         start: wp.int64, end: wp.int64, stride: wp.int64,
     ) -> wp.float64: ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module=name)
     def natural(
         x: f64, y: f64, d: d_array, unit: wp.float64, lower: f64, lower_value: wp.float64, upper: f64, upper_value: wp.float64,
-        unknown: i8, n: int, chunk: int, stride: wp.int64, out: f64,
+        code: u8, unknown: i8, n: int, chunk: int, stride: wp.int64, out: f64,
     ):  # fmt: skip
         t = wp.tid()
         start = span_start(t, chunk)
         end = span_end(t, chunk, n)
-        out[t] = natural_span(x, y, d, unit, lower, lower_value, upper, upper_value, unknown, start, end, stride)
+        out[t] = natural_span(x, y, d, unit, lower, lower_value, upper, upper_value, code, unknown, start, end, stride)
 
     return SimpleNamespace(natural=natural)
 
@@ -65,7 +65,7 @@ def masked_square_kernel(b: f64, unknown: i8, n: int, chunk: int, stride: wp.int
 
 @wp.func_native(
     flat(
-        BOUNDED
+        CODED
         + """double* x = x_.data; const auto* m = m_.data;
     with_bounds([&](auto lower, auto upper) {
         EACH { const double v = keep ? x[i] : 0.0, l = lower(i), u = upper(i), w = v < l ? l : v, c = w > u ? u : w;
@@ -73,19 +73,20 @@ def masked_square_kernel(b: f64, unknown: i8, n: int, chunk: int, stride: wp.int
     )
 )
 def start_span(
-    x_: f64, l_: f64, l_value: wp.float64, u_: f64, u_value: wp.float64, m_: i8, keep: bool, start: wp.int64,
+    x_: f64, l_: f64, l_value: wp.float64, u_: f64, u_value: wp.float64, code_: u8, m_: i8, keep: bool, start: wp.int64,
     end: wp.int64, stride: wp.int64,
 ): ...  # fmt: skip
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.residual")
 def start_kernel(
-    x: f64, lower: f64, lower_value: wp.float64, upper: f64, upper_value: wp.float64, unknown: i8, keep: bool, n: int, chunk: int,
-    stride: wp.int64,
+    x: f64, lower: f64, lower_value: wp.float64, upper: f64, upper_value: wp.float64, code: u8, unknown: i8, keep: bool, n: int,
+    chunk: int, stride: wp.int64,
 ):  # fmt: skip
     """clip(x, l, u), or clip(0, l, u), on the unknowns; 0 elsewhere."""
     t = wp.tid()
-    start_span(x, lower, lower_value, upper, upper_value, unknown, keep, span_start(t, chunk), span_end(t, chunk, n), stride)
+    start = span_start(t, chunk)
+    start_span(x, lower, lower_value, upper, upper_value, code, unknown, keep, start, span_end(t, chunk, n), stride)
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.residual")
@@ -96,24 +97,17 @@ def add_kernel(b: f64, y: f64):
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.residual")
-def settle_isolated_kernel(
-    d: wp.array(dtype=Any), b: f64, lower: f64, lower_value: wp.float64, upper: f64, upper_value: wp.float64,
-    unknown: wp.array(dtype=wp.int8), x: f64,
-):  # fmt: skip
+def settle_isolated_kernel(d: wp.array(dtype=Any), b: f64, lower: f64, upper: f64, unknown: wp.array(dtype=wp.int8), x: f64):
     """Unknowns with an empty row: y = b, so x is the bound that b's sign asks for."""
     i = wp.tid()
     if unknown[i] == wp.int8(1):
         if d[i] == d.dtype(0):
-            bound = lower_value
+            bound = lower[i]
             if b[i] < wp.float64(0.0):
-                bound = upper_value
-                if upper.shape[0] > 0:
-                    bound = upper[i]
-            elif lower.shape[0] > 0:
-                bound = lower[i]
+                bound = upper[i]
             if b[i] != wp.float64(0.0) and wp.abs(bound) < wp.float64(1.0e300):
                 x[i] = bound
 
 
 for _T in (wp.uint8, wp.float32, wp.float64):
-    wp.overload(settle_isolated_kernel, [wp.array(dtype=_T), f64, f64, wp.float64, f64, wp.float64, i8, f64])
+    wp.overload(settle_isolated_kernel, [wp.array(dtype=_T), f64, f64, f64, i8, f64])

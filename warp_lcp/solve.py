@@ -174,6 +174,7 @@ class _Loop:
     def run(self, x0: Array | None) -> SolveResult:
         x, residual = self.work.x, self.residual
         guess = None if x0 is None else self._guess(x0)
+        self.problem.bounds.refresh()
         residual.start(x, keep=False)
         self.work.round_iterate()
         self.reference = residual.evaluate(x)

@@ -26,6 +26,13 @@ BOUNDED = """
         else body(least, most); };
 """  # calls body(lower, upper) with functions of the element, fields or numbers, so that a loop over them tests neither
 
+CODED = BOUNDED.replace(
+    "if (l_.data && u_.data)",
+    """auto coded_low = [&](long long i) { return code_.data[i] & 1 ? l_value : -(double)INFINITY; };
+        auto coded_high = [&](long long i) { return code_.data[i] & 2 ? u_value : (double)INFINITY; };
+        if (code_.data) body(coded_low, coded_high); else if (l_.data && u_.data)""",
+)  # the same for bounds that may be coded, see `warp_lcp.bounds`
+
 
 def flat(source: str) -> str:
     """Return the body of a native function over a span: `EACH {...}` visits its elements i."""

@@ -14,7 +14,9 @@ from warp_lcp.driver.recording import Color, Recording, RenderError, Scale, _rou
 from warp_lcp.driver.render import INSTALL, Page, parse_size, render_run
 from warp_lcp.driver.scene_file import dump_scene, load_scene
 from warp_lcp.driver.simulator import Cells, Points
-from warp_lcp.driver.stage import MARGIN, shaded, surface
+from warp_lcp.driver.scenery import Outline
+from warp_lcp.driver.stage import MARGIN, shaded
+from warp_lcp.grid.motion import Pose
 
 RNG = np.random.default_rng(9127)
 WHITE = 255
@@ -30,11 +32,11 @@ def pyvista():
 def make_run(dots, tmp_path):
     """Write the folder of a run by hand: a list of frames, each the points [m] and velocities [m/s] of its particles."""
 
-    def make(frames, text: str = "", size=(1.0, 1.0), grid: bool = True) -> Path:
+    def make(frames, text: str = "", size=(1.0, 1.0), grid: bool = True, solids: str = "voxel") -> Path:
         source = tmp_path / "source.toml"
         source.write_text(
             '[scene]\nsimulator = "dots"\nname = "drops"\n[time]\nduration = 1.0\nframes_per_second = 20\n'
-            f"[domain]\nsize = {list(size)}\nresolution = 10\n{text}"
+            f'[domain]\nsize = {list(size)}\nresolution = 10\nsolids = "{solids}"\n{text}'
         )
         folder = tmp_path / "run"
         folder.mkdir()
@@ -252,17 +254,22 @@ SOLIDS = {
 ROOM = (1.0, 1.0, 1.0)
 
 
+TURN = 'motion = { kind = "rotation", rate = 90.0, center = [0.5, 0.5, 0.5], axis = [0.2, 1.0, 0.3] }\n'
+
+
+@pytest.mark.parametrize("time", [0.0, 0.37])
 @pytest.mark.parametrize("invert", [False, True])
 @pytest.mark.parametrize("name", SOLIDS)
-def test_surfaces_lie_where_the_solver_has_them(pyvista, make_run, name, invert):
-    folder = make_run([], f"[[solid]]\n{SOLIDS[name]}\ninvert = {str(invert).lower()}\n", size=ROOM)
-    shape = load_scene(folder / "scene.toml").solid[0]
-    mesh = surface(shape, np.array(ROOM))
+def test_surfaces_lie_where_the_solver_has_them(pyvista, make_run, name, invert, time):
+    text = f"[[solid]]\n{SOLIDS[name]}\ninvert = {str(invert).lower()}\n{TURN}"
+    shape = load_scene(make_run([], text, size=ROOM, solids="cut-cell") / "scene.toml").solid[0]
+    pose = shape.motion.to_motion(3).pose(time)
+    mesh = Outline(shape).inside(np.array(ROOM), pose)
     points = np.asarray(mesh.points)
     inside = (np.abs(points - 0.5) < 0.5 - 1e-6).all(axis=1)
     assert inside.any() or name == "plane"  # its corners lie on the walls
     distance = wp.empty(len(points), dtype=wp.float32, device="cpu")
-    shape.to_geometry(Path(), 3).signed_distance(wp.array(points, dtype=wp.vec3, device="cpu"), distance)
+    shape.to_geometry(Path(), 3).moved(pose).signed_distance(wp.array(points, dtype=wp.vec3, device="cpu"), distance)
     assert np.abs(distance.numpy()[inside]).max(initial=0.0) < 2e-3
     if not invert:
         assert distance.numpy().max() < 2e-3  # what closes the surface at the walls is inside the solid
@@ -277,6 +284,41 @@ def test_solids_in_a_room_are_gray(pyvista, make_run):
     folder = make_run([([0.9, 0.9, 0.9], [1.0, 0.0, 0.0])], "".join(f"[[solid]]\n{SOLIDS[name]}\n" for name in SOLIDS), size=ROOM)
     image = draw(folder)[0][25:]
     assert ((np.ptp(image, axis=-1) < 16) & (image < 215).all(axis=-1)).mean() > 0.1
+
+
+def test_a_flat_solid_stands_where_it_is_at_the_time_of_a_frame(pyvista, make_run):
+    """A disc of radius 0.1 m moves by 4 m/s until 0.1 s: frames at 0, 0.05 and 0.2 s find it at x = 0.2, 0.4 and 0.6 m."""
+    motion = '{ kind = "translation", velocity = [4.0, -1.0], stop = 0.1 }'
+    wall = '[[solid]]\nshape = "box"\nmin = [0.9, 0.0]\nmax = [1.0, 1.0]\n'
+    disc = f'[[solid]]\nshape = "sphere"\ncenter = [0.2, 0.6]\nradius = 0.1\nmotion = {motion}\n'
+    folder = make_run([([0.05, 0.05, 0.0], [1.0, 0.0, 0.0])] * 5, disc + wall, solids="cut-cell")
+    page = Page(Recording(folder, Color.SPEED), (400, 300), 1)
+    pixel = MARGIN / page.tile[1]  # [m]
+    low = 0.5 * (np.array(page.tile) * pixel - 1.0)  # [m] from the image's left and lower edge to the domain's corner
+    for frame, expected in ((0, [0.2, 0.6]), (1, [0.4, 0.55]), (4, [0.6, 0.5]), (0, [0.2, 0.6])):
+        image = np.asarray(page.draw([frame]), dtype=int)[page.line :]
+        gray = (np.ptp(image, axis=-1) < 16) & (image[..., 0] > 150) & (image[..., 0] < 230)
+        rows, columns = np.nonzero(gray)
+        x, y = (columns + 0.5) * pixel - low[0], (page.tile[1] - rows - 0.5) * pixel - low[1]
+        ours = (x > 0.05) & (x < 0.85) & (y > 0.05) & (y < 0.95)
+        np.testing.assert_allclose([x[ours].mean(), y[ours].mean()], expected, atol=pixel)
+        assert ours.sum() * pixel**2 == pytest.approx(np.pi * 0.1**2, rel=0.1)  # and nothing is left where it was
+        assert (x[~ours] > 0.9).mean() > 0.8  # the wall stands
+    page.stage.close()
+
+
+def test_a_solid_in_a_room_is_drawn_anew_in_every_frame(pyvista, make_run):
+    motion = '{ kind = "translation", velocity = [0.0, 8.0, 0.0] }'
+    text = f"[[solid]]\n{SOLIDS['sphere']}\nmotion = {motion}\n[[solid]]\n{SOLIDS['box']}\n"
+    folder = make_run([([0.9, 0.9, 0.9], [1.0, 0.0, 0.0])] * 4, text, size=ROOM, solids="cut-cell")
+    page = Page(Recording(folder, Color.PLAIN), (400, 300), 1)
+    images = [np.asarray(page.draw([frame]), dtype=int)[page.line :] for frame in (0, 1, 3, 0)]
+    page.stage.close()
+    assert (images[0] != images[1]).any()
+    np.testing.assert_array_equal(images[0], images[3])
+    gray = [((np.ptp(image, axis=-1) < 16) & (image < 215).all(axis=-1)).sum() for image in images]
+    assert gray[2] < 0.7 * gray[0]  # by 0.15 s the ball has left through the ceiling, the box is still there
+    assert gray[2] > 500
 
 
 def test_containers_do_not_hide_what_is_in_them(pyvista, make_run):

@@ -106,7 +106,6 @@ def test_unknown_keys_suggest(changes, expected):
         ({"domain.periodic": [True, False]}, "domain.periodic[0] = true"),
         ({"solver.preset": "standard"}, "solver.preset"),
         ({"output.surface": True}, "output.surface = true"),
-        ({"solid": [{**BOX, "motion": {}}]}, "solid[0].motion"),
         ({"solid": [{**BOX, "mass": 1.0}]}, "solid[0].mass"),
         ({"solid": [{**BOX, "friction": 1.0}]}, "solid[0].friction"),
     ],

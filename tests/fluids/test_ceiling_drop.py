@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 from small_liquids import GRAVITY, STEPS, box, create, scene
 
-import fluids.simulator
+import fluids.boundary
 from fluids import LiquidSimulation
 
 
@@ -62,12 +62,12 @@ def test_free_slip_walls_hold_it_by_suction(dimension: int) -> None:
 
 def test_a_wall_that_keeps_its_velocity_fails_the_last_particle_only(monkeypatch: pytest.MonkeyPatch) -> None:
     """The negative control of the release: the mean looks right, the last particle lags."""
-    extend = fluids.simulator.extend_velocity
+    extend = fluids.boundary.extend_velocity
 
     def hold(window: Any, velocity: Any, weights: Any, known: Any, kind: wp.array, contact: wp.array, *rest: Any) -> None:
         extend(window, velocity, weights, known, kind, wp.zeros_like(contact), *rest)
 
-    monkeypatch.setattr(fluids.simulator, "extend_velocity", hold)
+    monkeypatch.setattr(fluids.boundary, "extend_velocity", hold)
     fallen, expected, _ = drop(block(2), 0.25)
     assert abs(fallen.mean() - expected) < 0.7
     assert expected - fallen.min() > 1.0

@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
+from fluids.boundary import WholeCells
 from fluids.pressure import PressureProjection
 from fluids.pressure_kernels import HELD, RELEASED, TOUCHES_NOTHING
 from warp_lcp.grid.staggered import StaggeredGrid
@@ -16,7 +17,9 @@ NX, NY = 6, 7
 class Tank:
     """A 2-D tank with liquid in given cells; the column i = 0 can be a piston (solid 1)."""
 
-    def __init__(self, liquid: np.ndarray, *, separating: bool = True, piston: float | None = None, tolerance: float = 1e-8) -> None:
+    def __init__(
+        self, liquid: np.ndarray, *, separating: bool | tuple[bool, bool] = True, piston: float | None = None, tolerance: float = 1e-8
+    ) -> None:
         self.grid = StaggeredGrid((NX, NY, 1), 0.1, 2, "cpu")
         index = np.zeros(self.grid.shape, np.int32)
         index[1:-1, 1:-1, 1:-1] = OPEN
@@ -24,16 +27,16 @@ class Tank:
         if piston is not None:
             index[1, 1:-1, 1] = 1
             velocity = np.array([[0.0, 0.0, 0.0], [piston, 0.0, 0.0]])
-        flags = wp.array([separating, separating], dtype=wp.uint8, device="cpu")
+        flags = wp.array(np.broadcast_to(separating, 2).astype(np.uint8), device="cpu")
         names = ("domain", "solid[0] (box)")
         solids = VoxelSolids(index=wp.array(index, device="cpu"), separating=flags, names=names, covered=(0,), notes=())
-        self.projection = PressureProjection(
-            self.grid, solids, wl.MinimumMapNewton(), tolerance=tolerance, max_iterations=50, wall_velocity=velocity
-        )  # fmt: skip
+        self.boundary = WholeCells(self.grid, solids, velocity)
+        self.projection = PressureProjection(self.grid, self.boundary, wl.MinimumMapNewton(), tolerance=tolerance, max_iterations=50)
         stored = np.zeros(self.grid.shape, bool)
         stored[1, 1:-1, 1:-1] = liquid
-        key = np.flatnonzero(stored).astype(np.int32)
-        self.projection.mark(wp.array(key, device="cpu"), len(key))
+        kind = self.boundary.base.numpy()
+        kind[stored & (kind == wl.AIR)] = wl.FLUID
+        self.projection.kind.assign(kind)
         self.velocity = self.grid.faces()
 
     def project(self, dt: float = 0.01):
@@ -133,11 +136,10 @@ def test_a_full_box_with_a_retracting_piston_needs_a_separating_wall() -> None:
 
 def test_a_wall_cell_is_judged_by_each_of_its_walls() -> None:
     """A separating piston beside a free-slip floor: the corner cell is bounded."""
-    tank = Tank(liquid(slice(0, 1), slice(1, 2)), piston=-0.3)
-    tank.projection.solids.separating.assign(np.array([0, 1], np.uint8))
+    cell = liquid(slice(0, 1), slice(1, 2))
+    tank = Tank(cell, separating=(False, True), piston=-0.3)
     assert tank.project().released == 1
-    tank = Tank(liquid(slice(0, 1), slice(1, 2)), piston=-0.3)
-    tank.projection.solids.separating.assign(np.array([0, 0], np.uint8))
+    tank = Tank(cell, separating=False, piston=-0.3)
     assert tank.project().released == 0
     assert tank.x[0, 1] == pytest.approx(-0.15, abs=1e-6)
 
@@ -175,4 +177,4 @@ def test_noise_of_a_uniform_fall_is_not_iterated_on() -> None:
 def test_wall_velocities_of_another_number_of_walls_are_refused() -> None:
     tank = Tank(liquid(slice(0, 4)))
     with pytest.raises(ValueError, match="wall_velocity"):
-        PressureProjection(tank.grid, tank.projection.solids, wl.MinimumMapNewton(), tolerance=1e-4, wall_velocity=np.zeros((3, 3)))
+        WholeCells(tank.grid, tank.boundary.solids, np.zeros((3, 3)))

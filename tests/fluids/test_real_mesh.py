@@ -15,7 +15,7 @@ def test_a_dam_breaks_over_spot(wall: str) -> None:
     cow = {"shape": "mesh", "file": str(SPOT), "scale": 0.35, "rotate": [0, -90, 0], "translate": [0.9, 0.25, 0.5]}
     liquid = [box([0.0, 0.0, 0.0], [0.5, 0.9, 1.0])]
     simulation = create(scene(size=[1.5, 1.25, 1.0], resolution=24, liquid=liquid, solid=[cow], wall=wall))
-    solid_cells = int((simulation.grid.interior(simulation.solids.index.numpy()) == 1).sum())
+    solid_cells = int((simulation.grid.interior(simulation.boundary.solids.index.numpy()) == 1).sum())
     assert solid_cells * simulation.grid.cell_volume == pytest.approx(0.718 * 0.35**3, rel=0.2)
     rows = advance(simulation, 0.6)
     assert {row["solve_status"] for row in rows} == {"CONVERGED"}
@@ -23,7 +23,7 @@ def test_a_dam_breaks_over_spot(wall: str) -> None:
     assert rows[0]["mass"] == rows[-1]["mass"]
     energy = [row["kinetic_energy"] + row["potential_energy"] for row in rows]
     assert energy[-1] < 1.02 * energy[0]
-    cells = simulation.solids.index.numpy()
+    cells = simulation.boundary.solids.index.numpy()
     x, y, z = (np.floor(simulation.particles.position.numpy() / simulation.grid.spacing).astype(int) + 1).T
     assert (cells[z, y, x] == -1).all()  # no particle is inside the cow or the walls
     assert simulation.particles.position.numpy()[:, 0].max() > 1.3  # the wave has passed it

@@ -29,11 +29,13 @@ class Air:
             self.known[axis].assign(marks)
             self.velocity[axis].assign((projected * velocity[axis]).astype(np.float32))
 
-    def extend(self, layers: int = 4, wall_velocity: wp.array | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def extend(self, layers: int = 4, wall_velocity: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+        solid = GRID.faces() if wall_velocity is not None else []
+        for field in solid[1:]:
+            field.fill_(wall_velocity)
         extend_velocity(
-            GRID.everywhere, self.velocity, self.weights, self.known, self.kind, self.contact, self.index, self.separating, wall_velocity,
-            layers,
-        )  # fmt: skip
+            GRID.everywhere, self.velocity, self.weights, self.known, self.kind, self.contact, self.index, self.separating, solid, layers
+        )
         u, v = (field.numpy()[1] for field in self.velocity)
         return u, v
 
@@ -81,14 +83,14 @@ def test_a_held_cell_follows_a_moving_wall_both_ways() -> None:
     for wall in (0.25, -0.25):
         air = Air(cells(*TOP), (0.0, 0.1))
         air.contact.fill_(HELD)
-        _, v = air.extend(wall_velocity=wp.array([[0.0, wall, 0.0]], dtype=wp.vec3, device="cpu"))
+        _, v = air.extend(wall_velocity=wall)
         assert v[CEILING, 1:-1] == pytest.approx(wall)
 
 
 def test_a_released_cell_is_pushed_by_a_wall_that_overtakes_it() -> None:
     air = Air(cells(*TOP), (0.0, -0.1))
     air.contact.fill_(RELEASED)
-    _, v = air.extend(wall_velocity=wp.array([[0.0, -0.25, 0.0]], dtype=wp.vec3, device="cpu"))
+    _, v = air.extend(wall_velocity=-0.25)
     assert v[CEILING, 1:-1] == pytest.approx(-0.25)
 
 

@@ -107,8 +107,9 @@ class Page:
         for place, number in enumerate(numbers):
             points, values = self.recording.read(number)
             left, top = place % self.columns * width, self.line + place // self.columns * (height + self.caption)
-            page.paste(self.stage.draw(points, self.scale.colors(values)), (left, top + self.caption))
-            time = f"t = {clock.frame_time(number):.{digits}f} s"
+            moment = clock.frame_time(number)
+            page.paste(self.stage.draw(points, self.scale.colors(values), moment), (left, top + self.caption))
+            time = f"t = {moment:.{digits}f} s"
             if self.caption:
                 self._write(pen, time, left + width / 2, top + self.caption / 2, "mm")
             else:

@@ -9,8 +9,8 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from warp_lcp.driver.shapes import Liquid, Shape, Solid, Vector, Wall
-from warp_lcp.driver.table import ANY_VALUE, Complaint, Problem, SceneError, Table, refuse, validate
+from warp_lcp.driver.shapes import Liquid, Shape, Solid, Wall
+from warp_lcp.driver.table import ANY_VALUE, Complaint, Problem, SceneError, Table, Vector, refuse, validate
 
 __all__ = ["Complaint", "Liquid", "Problem", "Scene", "SceneError", "Shape", "Solid", "Table", "Vector", "Wall", "validate"]
 
@@ -53,6 +53,9 @@ class Domain(Table):
     size: list[Length] = Field(min_length=2, max_length=3, description="the sides of the domain [m], [x, y] or [x, y, z]")
     resolution: int = Field(ge=2, le=4096, description="cells along the longest side")
     wall: Wall = Field(default="separating", description="whether liquid may let go of the domain's walls")
+    solids: Literal["cut-cell", "voxel"] = Field(
+        default="voxel", description="cut-cell: solids cut through cells as their surfaces do; voxel: they fill whole cells"
+    )
     periodic: list[Literal[False]] | None = Field(default=None, description="false along every axis")
 
 
@@ -137,7 +140,7 @@ class Scene(Table):
             found.append(Complaint(("physics", "gravity"), self.physics.gravity, message))
         if self.time.dt_min > self.time.dt_max:
             found.append(Complaint(("time", "dt_min"), self.time.dt_min, f"must not exceed time.dt_max = {self.time.dt_max}"))
-        return found + self.shape_complaints("solid", self.solid)
+        return found + self.shape_complaints("solid", self.solid) + self._motion_complaints()
 
     def shape_complaints(self, key: str, shapes: Sequence[Shape], *, inside: bool = False) -> list[Complaint]:
         """Return what is wrong with an array of shapes.
@@ -174,6 +177,12 @@ class Scene(Table):
             ("frames", f"{self.time.frame_count + 1} at {self.time.frames_per_second:g} per second"),
             ("solver", f"{self.solver.method} to {self.solver.tolerance:g}, {self.solver.precision} precision"),
         ]
+
+    def _motion_complaints(self) -> list[Complaint]:
+        if self.domain.solids == "cut-cell":
+            return []
+        message = 'needs domain.solids = "cut-cell": solids that fill whole cells cannot move'
+        return [Complaint(("solid", index, "motion"), None, message) for index, solid in enumerate(self.solid) if solid.motion]
 
     def _grid_complaints(self) -> list[Complaint]:
         found = []

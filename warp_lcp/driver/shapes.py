@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field
+from pydantic import Field
 
-from warp_lcp.driver.table import ANY_VALUE, Complaint, Table
+from warp_lcp.driver.motions import Motion
+from warp_lcp.driver.table import ANY_VALUE, Angles, Complaint, Table, Vector
 
 if TYPE_CHECKING:
     from warp_lcp.grid.solids import Geometry, Placement
@@ -17,14 +18,6 @@ if TYPE_CHECKING:
 BUILTIN = "builtin:"  # how the name of a mesh that the project generates begins
 
 Wall = Literal["separating", "free-slip"]
-Vector = Annotated[list[float], Field(min_length=2, max_length=3)]
-
-
-def _as_list(value: object) -> object:
-    return [value] if isinstance(value, (int, float)) and not isinstance(value, bool) else value
-
-
-Angles = Annotated[list[float], Field(min_length=1, max_length=3), BeforeValidator(_as_list, json_schema_input_type=float | list[float])]
 
 
 class Shape(Table):
@@ -171,11 +164,17 @@ class Mesh(Shape):
         return None
 
 
-class SolidProperties(Table):
+class SolidProperties(Shape):
     """What a solid has besides its shape."""
 
-    later: ClassVar = {"friction": ANY_VALUE, "motion": ANY_VALUE, "mass": ANY_VALUE}
+    later: ClassVar = {"friction": ANY_VALUE, "mass": ANY_VALUE}
     wall: Wall | None = Field(default=None, description="whether liquid may let go of it; domain.wall unless given")
+    motion: Motion | None = Field(default=None, description="how it moves, from where it is placed; it stands still unless given")
+
+    def complaints(self, dimension: int) -> list[Complaint]:
+        """Return what is wrong with the solid in a scene of 2 or 3 dimensions."""
+        moves = self.motion.complaints(dimension) if self.motion else []
+        return super().complaints(dimension) + [Complaint(("motion", *c.place), c.value, c.message) for c in moves]
 
 
 class LiquidProperties(Table):

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
-import warp as wp
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from warp_lcp.driver.scene import Scene
-from warp_lcp.driver.shapes import Box, Capsule, Mesh, Plane, Shape, Sphere
+from warp_lcp.driver.scenery import FlatScenery, RoomScenery
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
 SAMPLES = 2  # per pixel and direction: images are drawn larger and averaged down, since splats have no other anti-aliasing
-OUTLINE_POINTS = 1500  # along the longest side, where 2-D solids are sampled: about a drawn pixel
 SHADING_CELLS = 4e6  # of the density that shades a liquid, to bound its memory
-FLAT_SOLID, SOLID, EDGE, FLOOR = "#bfc3c8", "#cdd1d5", "#6b7075", "#f1f2f3"
 
 VIEW_ANGLE = 25.0  # degrees, over the height of an image
 MARGIN = 1.04
@@ -36,7 +32,7 @@ BALL = DISC + "ambientColor *= 0.8 + 0.2 * sqrt(1.0 - distance2);\ndiffuseColor 
 
 
 class Stage:
-    """A window without a screen in which domain and solids stand, and particles come and go.
+    """A window without a screen in which domain and solids stand or move, and particles come and go.
 
     Args:
         scene: of the run.
@@ -58,22 +54,21 @@ class Stage:
         for position, kind, intensity in [(LIGHT, "scene light", 0.45), (np.array([0.0, 0.0, 1.0]), "headlight", 0.25)]:
             light = pyvista.Light(position=tuple(position), focal_point=(0, 0, 0), light_type=kind, intensity=intensity)
             self.plotter.add_light(light)
-        if self.flat:
-            self._add_flat_solids()
-        else:
-            self._add_solids()
+        self.scenery = FlatScenery(self.plotter, scene, 2 * SAMPLES) if self.flat else RoomScenery(self.plotter, scene, 2 * SAMPLES)
         self._place_camera(size[0] / size[1])
 
-    def draw(self, points: np.ndarray, colors: np.ndarray) -> Image:
+    def draw(self, points: np.ndarray, colors: np.ndarray, time: float) -> Image:
         """Return an image of particles among the solids.
 
         Args:
             points: [m], shape (n, 3).
             colors: of the particles in plain light, red, green and blue from 0 to 255, shape (n, 3).
+            time: that solids with a motion are drawn at [s].
         """
         import pyvista
         from PIL import Image
 
+        self.scenery.place(time)
         self.plotter.remove_actor("particles", render=False)
         if len(points):
             cloud = pyvista.PolyData(points)
@@ -91,53 +86,6 @@ class Stage:
     def close(self) -> None:
         """Free the window."""
         self.plotter.close()
-
-    def _add(self, mesh: Any, **looks: Any) -> None:
-        if mesh.n_points:
-            self.plotter.add_mesh(mesh, reset_camera=False, render=False, show_scalar_bar=False, **looks)
-
-    def _add_flat_solids(self) -> None:
-        """Fill where the signed distance to a solid is negative, a little behind the particles; a line around it and the domain."""
-        import pyvista
-
-        width, height, _ = self.size
-        step = max(width, height) / OUTLINE_POINTS
-        counts = [math.ceil(side / step) + 1 for side in (width, height)]
-        behind = -1e-3 * max(width, height)
-        plane = pyvista.ImageData(dimensions=(*counts, 1), spacing=(width / (counts[0] - 1), height / (counts[1] - 1), 1.0))
-        points = plane.points * [1.0, 1.0, 0.0]
-        nearest = np.full(len(points), np.inf, dtype=np.float32)
-        device_points = wp.array(points, dtype=wp.vec3, device="cpu")
-        distance = wp.empty(len(points), dtype=wp.float32, device="cpu")
-        for solid in self.scene.solid:
-            solid.to_geometry(Path(), 2).signed_distance(device_points, distance)
-            np.minimum(nearest, distance.numpy(), out=nearest)
-        if nearest.min() < 0.0:
-            plane.origin = (0.0, 0.0, behind)
-            plane["distance"] = np.minimum(nearest, 1e3 * step)
-            self._add(plane.clip_scalar(scalars="distance", value=0.0), color=FLAT_SOLID, lighting=False)
-            if nearest.max() > 0.0:
-                line = plane.contour([0.0], scalars="distance").translate((0.0, 0.0, -0.5 * behind))
-                self._add(line, color=EDGE, line_width=1.5 * SAMPLES, lighting=False)
-        corners = np.array([[0, 0, 0], [width, 0, 0], [width, height, 0], [0, height, 0], [0, 0, 0]], dtype=np.float64)
-        self._add(pyvista.lines_from_points(corners), color=EDGE, line_width=2 * SAMPLES, lighting=False)
-
-    def _add_solids(self) -> None:
-        """Draw solids as surfaces, containers (inverted shapes) as their translucent far sides, a floor, and the domain's edges."""
-        import pyvista
-
-        x, y, z = self.size
-        for shape in self.scene.solid:
-            mesh = surface(shape, self.size)
-            if shape.invert and not isinstance(shape, Plane):
-                self._add(mesh, color=SOLID, ambient=0.3, opacity=0.3, culling="front", smooth_shading=True, split_sharp_edges=True)
-                self._add(mesh.extract_feature_edges(30.0), color=EDGE, line_width=SAMPLES, lighting=False)
-            else:
-                self._add(mesh, color=SOLID, ambient=0.5, smooth_shading=True, split_sharp_edges=True)
-        below = -1e-3 * y
-        self._add(pyvista.Rectangle([[0.0, below, 0.0], [x, below, 0.0], [x, below, z]]), color=FLOOR, lighting=False)
-        edges = pyvista.Box((0.0, x, 0.0, y, 0.0, z)).extract_all_edges()
-        self._add(edges, color=EDGE, line_width=1.2 * SAMPLES, lighting=False)
 
     def _place_camera(self, aspect: float) -> None:
         """Look at the domain's middle from as near as shows all of it."""
@@ -158,53 +106,6 @@ class Stage:
         camera.position = tuple(focus @ axes + distance * toward)
         camera.up = (0.0, 1.0, 0.0)
         camera.view_angle = VIEW_ANGLE
-
-
-def surface(shape: Shape, size: np.ndarray) -> Any:
-    """Return the surface of a 3-D shape inside the domain, as pyvista's PolyData. Inverted shapes have the surface of what they leave out.
-
-    Args:
-        shape: in 3-D.
-        size: of the domain [m], shape (3,).
-
-    Raises:
-        TypeError: there is no drawing of such a shape.
-    """
-    import pyvista
-
-    domain = pyvista.Box(np.stack([np.zeros(3), size], axis=-1).ravel()).clean()
-    placement = shape.placement(3)
-    match shape:
-        case Plane():
-            normal = placement.rotation @ np.array(shape.normal) * (-1.0 if shape.invert else 1.0)
-            return domain.clip_closed_surface(normal=-normal, origin=placement.apply(np.array(shape.point)))
-        case Box():
-            mesh = pyvista.Box(np.stack([shape.min, shape.max], axis=-1).ravel())
-        case Sphere():
-            mesh = pyvista.Sphere(radius=shape.radius, center=shape.center, theta_resolution=96, phi_resolution=64)
-        case Capsule():
-            start, end = np.array(shape.start), np.array(shape.end)
-            mesh = pyvista.Capsule(
-                center=0.5 * (start + end), direction=end - start, radius=shape.radius,
-                cylinder_length=float(np.linalg.norm(end - start)), resolution=64,
-            )  # fmt: skip
-        case Mesh():
-            solid = cast(Any, shape.to_geometry(Path(), 3)).surface
-            mesh = pyvista.PolyData.from_regular_faces(solid.vertices, solid.triangles)
-        case _:
-            raise TypeError(f"a {type(shape).__name__} cannot be drawn")
-    mesh = mesh.triangulate().clean()
-    mesh.points = placement.apply(mesh.points)
-    return mesh if shape.invert else _clipped(mesh, size)
-
-
-def _clipped(mesh: Any, size: np.ndarray) -> Any:
-    """Cut a closed surface at the domain's walls, where it reaches beyond."""
-    for axis in range(3):
-        for end, sign in ((0.0, 1.0), (size[axis], -1.0)):
-            if mesh.n_points and (sign * (mesh.points[:, axis] - end)).min() < -1e-6 * size[axis]:
-                mesh = mesh.clip_closed_surface(normal=sign * np.eye(3)[axis], origin=end * np.eye(3)[axis])
-    return mesh
 
 
 def shaded(points: np.ndarray, colors: np.ndarray, spacing: float) -> np.ndarray:

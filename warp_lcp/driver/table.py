@@ -6,9 +6,9 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
-from typing import Any, ClassVar, TypeVar, get_args
+from typing import Annotated, Any, ClassVar, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
@@ -38,6 +38,15 @@ MESSAGES = {
 }
 NOT_YET = "not available yet in this version"
 ANY_VALUE: frozenset[object] = frozenset()
+VARIANT_KEYS = ("shape", "kind")  # of tables that come in several forms, each with keys of its own
+
+
+def _as_list(value: object) -> object:
+    return [value] if isinstance(value, (int, float)) and not isinstance(value, bool) else value
+
+
+Vector = Annotated[list[float], Field(min_length=2, max_length=3)]
+Angles = Annotated[list[float], Field(min_length=1, max_length=3), BeforeValidator(_as_list, json_schema_input_type=float | list[float])]
 
 
 class Table(BaseModel):
@@ -141,18 +150,16 @@ class _Place:
 
 def _locate(model: type[Table], location: tuple[str | int, ...]) -> _Place:
     place = _Place(path="", below=(model,))
-    previous: str | int = ""
     for part in location:
         if isinstance(part, int):
             place.path += f"[{part}]"
-        elif isinstance(previous, int) and part in _shapes(place.below):  # pydantic names the shape it chose; the file does not
-            place.below = (_shapes(place.below)[part],)
+        elif part in _variants(place.below):  # pydantic names the shape it chose; the file does not
+            place.below = (_variants(place.below)[part],)
         else:
             owner = place.below[0] if len(place.below) == 1 else None
             found = _keys(owner).get(part) if owner else None
             path = f"{place.path}.{part}" if place.path else part
             place = _Place(path, part, owner, found, _tables(found.annotation) if found else ())
-        previous = part
     return place
 
 
@@ -161,7 +168,7 @@ def _problem(model: type[Table], error: ErrorDetails) -> Problem:
     place = _locate(model, error["loc"])
     later = place.owner.later if place.owner else {}
     if kind.startswith("union_tag"):
-        return _unknown_shape(place, context.get("tag"))
+        return _unknown_variant(place, context["discriminator"].strip("'"), context.get("tag"))
     if kind == "extra_forbidden":
         known = _keys(place.owner) if place.owner else {}
         return Problem(place.path, NOT_YET if place.key in later else f"unknown key; {nearest(place.key, known)}")
@@ -175,11 +182,11 @@ def _problem(model: type[Table], error: ErrorDetails) -> Problem:
     return Problem(place.path, f"{message} ({hint})" if hint else message, value)
 
 
-def _unknown_shape(place: _Place, tag: object) -> Problem:
-    shapes = _shapes(place.below)
+def _unknown_variant(place: _Place, key: str, tag: object) -> Problem:
+    known = _variants(place.below)
     if tag is None:
-        return Problem(f"{place.path}.shape", f"is missing; choose from {', '.join(sorted(shapes))}")
-    return Problem(f"{place.path}.shape", f"unknown shape; {nearest(str(tag), shapes)}", written(tag))
+        return Problem(f"{place.path}.{key}", f"is missing; choose from {', '.join(sorted(known))}")
+    return Problem(f"{place.path}.{key}", f"unknown {key}; {nearest(str(tag), known)}", written(tag))
 
 
 def _keys(table: type[Table]) -> dict[str, FieldInfo]:
@@ -194,8 +201,11 @@ def _tables(annotation: object) -> tuple[type[Table], ...]:
     return tuple(table for argument in get_args(annotation) for table in _tables(argument))
 
 
-def _shapes(tables: tuple[type[Table], ...]) -> dict[str, type[Table]]:
-    return {table.model_fields["shape"].default: table for table in tables if "shape" in table.model_fields}
+def _variants(tables: tuple[type[Table], ...]) -> dict[str, type[Table]]:
+    """Return the tables that one key, such as `shape`, chooses from, by its value; none when there is nothing to choose."""
+    if len(tables) < 2:
+        return {}
+    return {table.model_fields[key].default: table for table in tables for key in VARIANT_KEYS if key in table.model_fields}
 
 
 def written(value: object) -> str:

@@ -8,8 +8,9 @@ particles nothing can stop; only the others walk.
 
 import warp as wp
 
-from warp_lcp.grid.advection_kernels import MARGIN, MAX_CLEARANCE, advect_kernel, clearance_kernel
+from warp_lcp.grid.advection_kernels import MAX_CLEARANCE, advect_kernel, clearance_kernel
 from warp_lcp.grid.particle_loops import launch
+from warp_lcp.grid.runge_kutta import MARGIN
 from warp_lcp.grid.staggered import StaggeredGrid
 
 __all__ = ["MARGIN", "MAX_CLEARANCE", "advect", "clearance"]

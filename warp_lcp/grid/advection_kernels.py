@@ -5,36 +5,10 @@ import typing
 
 import warp as wp
 
-from warp_lcp.grid.particle_loops import particle_loop
-from warp_lcp.native import BLOCK
+from warp_lcp.grid.runge_kutta import runge_kutta
 from warp_lcp.operators.grid_poisson import SOLID
 
-MARGIN = 1e-3  # how far from a wall particles stay, in cells: well above the rounding of float32 positions in 10^3 cells
 MAX_CLEARANCE = 6  # cells; a particle that moves further in a step takes the careful way, which is always right
-
-# Interpolate the velocity at grid coordinates; points outside the domain and NaN are brought inside.
-SAMPLE = """
-    auto sample = [&](const Block& at, Block& result, int n) {
-        const T ex = nx + 1, ey = ny + 1, ez = nz + 1;
-        for (int axis = 0; axis <= planes; ++axis) {
-            const T* g = axis == 0 ? u_.data : (axis == 1 ? v_.data : w_.data);
-            const T hx = axis == 0 ? (T)0 : (T)0.5, hy = axis == 1 ? (T)0 : (T)0.5, hz = axis == 2 ? (T)0 : (T)0.5;
-            SIMD for (int m = 0; m < n; ++m) {
-                T x = at[0][m], y = at[1][m], z = at[2][m];
-                x = x > 1 ? x : (T)1; y = y > 1 ? y : (T)1; z = z > 1 ? z : (T)1;
-                x = (x < ex ? x : ex) - hx; y = (y < ey ? y : ey) - hy; z = planes == 2 ? (z < ez ? z : ez) - hz : (T)1;
-                int i = (int)x, j = (int)y, k = (int)z;
-                i = i < nx ? i : nx; j = j < ny ? j : ny; k = k < nz ? k : nz;  // the next node is stored, too
-                const T fx = x - (T)i, fy = y - (T)j, fz = z - (T)k;
-                const T* a = g + (k*s1 + j*s2 + i); const T* b = a + up;
-                const T a0 = a[0] + fx*(a[1] - a[0]), a1 = a[s2] + fx*(a[s2 + 1] - a[s2]);
-                const T b0 = b[0] + fx*(b[1] - b[0]), b1 = b[s2] + fx*(b[s2 + 1] - b[s2]);
-                const T low = a0 + fy*(a1 - a0), high = b0 + fy*(b1 - b0);
-                result[axis][m] = low + fz*(high - low);
-            }
-        }
-    };
-"""
 
 # Move a particle from cell to cell along the straight line to its aim: a closed face stops it, it slides on along the face.
 WALK = """
@@ -104,39 +78,15 @@ MOVE = """
     };
 """
 
-ADVECT = """
-    typedef float T; typedef T Block[3][M];
-    const T margin = (T)MARGIN;
-    T* position = (T*)x_.data; const signed char* room = (const signed char*)room_.data;
-    const int nx = u_.shape[2] - 2, ny = u_.shape[1] - 2, nz = u_.shape[0] - 2;
-    const long long s2 = nx + 2, s1 = s2*(ny + 2), up = planes == 2 ? s1 : 0, stride[3] = {1, s2, s1};
-    Block from, to, k1, k2, k3;
-    int hit[M], begin[M], end[M], cells[M], list[M];
-    auto abs_of = [](T x) { return x < 0 ? -x : x; };
-    GRID_COORDINATE SAMPLE WALK MOVE
-    int stopped = 0;
-    for (int start = first; start < last; start += M) {
-        const int n = last - start < M ? last - start : M;
-        T* x = position + 3*(long long)start;
-        for (int d = 0; d < 3; ++d) { SIMD for (int m = 0; m < n; ++m) from[d][m] = grid_coordinate(x[3*m + d]); }
-        sample(from, k1, n);
-        move((T)0.5*h, k1, 0, k1, 0, k1, n);
-        sample(to, k2, n);
-        move((T)0.75*h, k2, 0, k2, 0, k2, n);
-        sample(to, k3, n);
-        move((T)2/9*h, k1, (T)3/9*h, k2, (T)4/9*h, k3, n);
-        for (int m = 0; m < n; ++m) stopped += hit[m];
-        for (int d = 0; d < 3; ++d) {
-            SIMD for (int m = 0; m < n; ++m) x[3*m + d] = d <= planes ? (to[d][m] - 1)*dx : (T)0;
-        }
-    }
-    return stopped;
+ROOM = """
+    const signed char* room = (const signed char*)room_.data;
+    const long long stride[3] = {1, s2, s1};
+    int begin[M], end[M], cells[M];
+    auto prepare = [](int) {};
 """
 
-_source = BLOCK + ADVECT.replace("SAMPLE", SAMPLE).replace("WALK", WALK).replace("MOVE", MOVE).replace("MARGIN", repr(MARGIN))
 
-
-@wp.func_native(particle_loop(_source))
+@wp.func_native(runge_kutta(ROOM + WALK + MOVE))
 def advect_some(
     planes: int, dx: float, inverse_dx: float, h: float, x_: wp.array(dtype=wp.vec3), u_: wp.array3d(dtype=wp.float32),
     v_: wp.array3d(dtype=wp.float32), w_: wp.array3d(dtype=wp.float32), room_: wp.array3d(dtype=wp.int8), first: int, last: int,

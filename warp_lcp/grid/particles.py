@@ -7,8 +7,8 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.grid import particles_kernels as kernels
-from warp_lcp.grid.advection_kernels import MARGIN
 from warp_lcp.grid.particle_loops import launch
+from warp_lcp.grid.runge_kutta import MARGIN
 from warp_lcp.grid.staggered import StaggeredGrid
 
 CHUNK = 256  # the fewest particles that one thread adds up

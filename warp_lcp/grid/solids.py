@@ -9,15 +9,18 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, runtime_checkable
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.grid.solids_kernels import box_distance, capsule_distance, mesh_distance, plane_distance, sphere_distance
 from warp_lcp.grid.triangle_mesh import ClosedSurface, load_surface
+
+if TYPE_CHECKING:
+    from warp_lcp.grid.motion import Pose
 
 Vector = Sequence[float] | np.ndarray
 
@@ -31,6 +34,9 @@ class Geometry(Protocol):
 
     def bounds(self) -> np.ndarray | None:
         """Return the low and the high corner [m] of a box around the region, shape (2, 3), or None when the region has no limits."""
+
+    def moved(self, pose: Pose) -> Geometry:
+        """Return the region after a change of place; surface data is shared with this one."""
 
 
 def _vector(name: str, value: Vector) -> tuple[float, ...]:
@@ -132,6 +138,11 @@ class Placement:
         """Return `points`, shape (m, 3), of the shape's coordinates in the domain's [m]."""
         return self.scale * np.asarray(points) @ self.rotation.T + self.translation
 
+    def moved(self, pose: Pose) -> Placement:
+        """Return this placement followed by a change of place."""
+        rotation, translation = pose.rotation @ self.rotation, pose.apply(self.translation)
+        return Placement(scale=self.scale, rotation=rotation, translation=translation)
+
 
 @dataclass(frozen=True, kw_only=True)
 class _Shape(ABC):
@@ -170,6 +181,10 @@ class _Shape(ABC):
         placed = self.placement.apply(corners)
         margin *= self.placement.scale
         return np.stack([placed.min(axis=0) - margin, placed.max(axis=0) + margin])
+
+    def moved(self, pose: Pose) -> Self:
+        """Return the shape after a change of place [m]; the surface of a mesh, and what is on the device of it, is shared."""
+        return replace(self, placement=self.placement.moved(pose))
 
     def _origin(self) -> np.ndarray:
         """Return the point, in the shape's coordinates, from which its kernel counts."""

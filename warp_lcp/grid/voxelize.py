@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from warp_lcp.grid.motion import Motion
 from warp_lcp.grid.solids import Geometry, TriangleMesh
 from warp_lcp.grid.solids_kernels import cell_centers, claim_cells
 
@@ -26,11 +27,13 @@ class PlacedSolid:
         geometry: the region it fills.
         separating: whether liquid may leave its wall (otherwise it slides along it only).
         name: what messages call it, for example `solid[2] (sphere)`.
+        motion: takes the geometry from where it is placed to where it is; None: it stands still.
     """
 
     geometry: Geometry
     separating: bool
     name: str
+    motion: Motion | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

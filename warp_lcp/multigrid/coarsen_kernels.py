@@ -159,12 +159,11 @@ def coarsen_kernels(variable: bool, d_type: Any, real: Any) -> Any:
         c: wp.int64, n: int, start: int, fx: int, fy: int, fz: int, one_plane: bool, one_row: bool, W: Wraps, stiffen: real, held: real,
     ): ...  # fmt: skip
 
-    @wp.kernel(enable_backward=False, module=name)
-    def coarsen(
-        A: StencilShape, d: d_array, wx: field, wy: field, wz: field, n: wp.vec3i, periodic: wp.vec3i, C: StencilShape, G: Aggregates,
-        grain: int, stiffen: real, held: real, dc: field, wxc: field, wyc: field, wzc: field,
+    @wp.func
+    def coarsen_chunk(
+        k: int, j: int, c: int, A: StencilShape, d: d_array, wx: field, wy: field, wz: field, n: wp.vec3i, periodic: wp.vec3i,
+        C: StencilShape, G: Aggregates, grain: int, stiffen: real, held: real, dc: field, wxc: field, wyc: field, wzc: field,
     ):  # fmt: skip
-        k, j, c = wp.tid()
         plane = one_plane(G, k)
         row = one_row(G, j)
         last_k = G.fz * k
@@ -187,6 +186,15 @@ def coarsen_kernels(variable: bool, d_type: Any, real: Any) -> Any:
             A, d, wx, wy, wz, p, dc, wxc, wyc, wzc, o, m, row_first(C, k, j, c, grain), G.fx, G.fy, G.fz, plane, row, W, stiffen, held
         )
 
+    @wp.kernel(enable_backward=False, module=name)
+    def coarsen(
+        A: StencilShape, d: d_array, wx: field, wy: field, wz: field, n: wp.vec3i, periodic: wp.vec3i, C: StencilShape, G: Aggregates,
+        grain: int, stiffen: real, held: real, dc: field, wxc: field, wyc: field, wzc: field,
+    ):  # fmt: skip
+        k, j, c = wp.tid()
+        coarsen_chunk(k, j, c, A, d, wx, wy, wz, n, periodic, C, G, grain, stiffen, held, dc, wxc, wyc, wzc)
+
+    coarsen.chunk = coarsen_chunk
     return coarsen
 
 

@@ -289,4 +289,5 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         descend=descend_kernel,
         ascend=ascend_kernel,
         relax=relax_kernel,
+        rows=SimpleNamespace(sweep=sweep_row, first_sweep=first_sweep_row, restrict=restrict_row, bounds=bounds_row, correct=correct_row),
     )

@@ -15,6 +15,7 @@ from warp_lcp.layout import Padding
 from warp_lcp.multigrid import coarsen_kernels as kernels
 from warp_lcp.multigrid.coarsen_kernels import UNBOUNDED
 from warp_lcp.multigrid.cycle_kernels import Aggregates, cycle_kernels
+from warp_lcp.multigrid.small_levels import SmallLevels, first_small
 from warp_lcp.operators.stencil import Stencil
 from warp_lcp.operators.stencil_kernels import coarsen_spans_kernel
 from warp_lcp.program import Launch, Program
@@ -38,7 +39,10 @@ class CycleSettings:
             over-correction applies to them in part only.
         interval: bounds of the spectrum of D^-1 A that the two Chebyshev-Jacobi sweeps damp.
         coarsest_cpu: the most cells of the coarsest level, which is inverted densely.
-        coarsest_cuda: the same where one thread of a GPU factors it.
+        coarsest_cuda: the same on a GPU.
+        one_launch_cpu: the most cells of levels that run together in one launch of one thread; 0: none do. On the CPU a captured graph's
+            launches cost next to nothing, and its legs that stream through a level are faster.
+        one_launch_cuda: the same on a GPU, in one block of threads: 16^3 cells are few enough for one multiprocessor.
         semi: axes whose mean weight is below this share of the strongest one's are not coarsened until they have caught up.
         projected_sweeps: pairs of sweeps that stand for a solve on the coarsest level of a projected cycle.
     """
@@ -48,7 +52,9 @@ class CycleSettings:
     excess: float = 1.5
     interval: tuple[float, float] = (0.5, 2.0)
     coarsest_cpu: int = 64
-    coarsest_cuda: int = 16
+    coarsest_cuda: int = 64
+    one_launch_cpu: int = 0
+    one_launch_cuda: int = 4096
     semi: float = 0.3
     projected_sweeps: int = 8
 
@@ -68,7 +74,8 @@ class Level:
         field: Callable[[], wp.array[Any]] = lambda: wp.zeros(stencil.padding.size, dtype=real, device=stencil.device)  # noqa: E731
         self.x, self.b, self.t = field(), field(), field()
         self.lower, self.upper = (bounds or (field(), field())) if bounded else (self.x, self.x)
-        self.kernels = cycle_kernels(stencil.weights is not None, stencil.d.dtype, real)
+        self.form = (stencil.weights is not None, stencil.d.dtype, real)
+        self.kernels = cycle_kernels(*self.form)
         nothing = wp.empty(0, dtype=real, device=stencil.device)
         self.aggregates: Aggregates | None = None  # how the finer level's cells make up this one's
         self.visits, self.shrunk = 1, 1.0  # by a cycle of the next finer level; by how much since a level that was visited more
@@ -126,6 +133,10 @@ class Hierarchy:
             self.levels.append(self._coarser(self.levels[-1], bounded=bounded))
         m = math.prod(self.levels[-1].stencil.padding.counts)
         self._matrix, self._inverse = (wp.zeros((m, m), dtype=wp.float64, device=self.device) for _ in range(2))
+        cells = self.settings.one_launch_cuda if self.device.is_cuda else self.settings.one_launch_cpu
+        self._first_small = first_small(self.levels, cells)  # its index; none is small: len(levels)
+        small = self.levels[self._first_small :]
+        self._small = SmallLevels(small, self.settings, self._inverse, self._matrix) if small else None
         self.refresh()
 
     @property
@@ -163,7 +174,7 @@ class Hierarchy:
     @cached_property
     def _coarsening(self) -> Program:
         program = Program(self.device)
-        for fine, coarse in zip(self.levels, self.levels[1:], strict=False):
+        for fine, coarse in zip(self.levels[: self._first_small], self.levels[1:], strict=False):
             s, c = fine.stencil, coarse.stencil
             sizes = [wp.vec3i(*s.padding.counts), wp.vec3i(*map(int, s.periodic)), c.shape, coarse.aggregates, c.grain]
             sizes += [self.settings.over_correction, self.settings.excess]
@@ -171,6 +182,9 @@ class Hierarchy:
             program.launch(kernel, c.threads, [*fine.operands, *sizes, c.d, *(c.weights or ())], device=self.device)
             for w in c.weights or ():
                 c.wrap(w, launch=program.launch)
+        if self._small is not None:
+            self._small.rebuild(PINNED[self.real], program.launch)
+            return program
         last, s = self.levels[-1], self.levels[-1].stencil
         sizes = [wp.vec3i(*s.padding.counts), wp.vec3i(*map(int, s.periodic))]
         inputs = [s.shape, *last.grids, *sizes, wp.float64(PINNED[self.real]), self._matrix]
@@ -182,7 +196,7 @@ class Hierarchy:
     def cycle(self) -> Program:
         """One linear cycle: a symmetric positive (semi-)definite approximation of the inverse."""
         program = Program(self.device)
-        self._descend(0, program.launch, projected=False, from_zero=True)
+        self._visit(0, 1, program.launch, projected=False)
         return program
 
     @cached_property
@@ -192,8 +206,16 @@ class Hierarchy:
         It moves whole aggregates on and off their bounds, where an active-set method moves the boundary by about a layer of cells a step.
         """
         program = Program(self.device)
-        self._descend(0, program.launch, projected=True, from_zero=True)
+        self._visit(0, 1, program.launch, projected=True)
         return program
+
+    def _visit(self, level: int, visits: int, launch: Launch, *, projected: bool) -> None:
+        """Launch cycles on a level and those below it, one after another, the first from x = 0."""
+        if self._small is not None and level == self._first_small:
+            self._small.cycle(visits, launch, projected=projected)
+            return
+        for visit in range(visits):
+            self._descend(level, launch, projected=projected, from_zero=visit == 0)
 
     def _descend(self, level: int, launch: Launch, *, projected: bool, from_zero: bool) -> None:
         """Launch a cycle on a level and those below it."""
@@ -209,8 +231,8 @@ class Hierarchy:
             self._restrict(level, launch)
         if projected:
             self._restrict_bounds(level, launch)
-        for visit in range(self.levels[level + 1].visits if level + 2 < len(self.levels) else 1):
-            self._descend(level + 1, launch, projected=projected, from_zero=visit == 0)
+        visits = self.levels[level + 1].visits if level + 2 < len(self.levels) else 1
+        self._visit(level + 1, visits, launch, projected=projected)
         if fused:
             self._ascending_leg(level, launch, projected=projected)
         else:

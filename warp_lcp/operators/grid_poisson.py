@@ -37,6 +37,8 @@ class GridPoisson:
         face_y: likewise, (nz, ny + 1, nx).
         face_z: likewise, (nz + 1, ny, nx); 2-D has none.
         shift: None, a number or an array of the shape of `cells`, >= 0.
+            Face coefficients and shift may also be given in the padded shape (nz + 2, ny + 2, nx + 2), as wp.array of type `dtype` on
+            the operator's device, a face's coefficient with the cell above it: they are then used in place and read again by `update`.
         periodic: whether x, y, z wrap around.
         device: Warp device; that of `cells` or the default device if None.
         dtype: storage of coefficients, wp.float32 or wp.float64. In float32 unequal coefficients and their sums are rounded, so that the
@@ -104,7 +106,7 @@ class GridPoisson:
         self._refill(wp.array(np.pad(host.reshape(counts), 1).astype(np.int8), device=self.device))
 
     def update(self, cells: wp.array[Any]) -> None:
-        """Take new cell types in place, without allocating.
+        """Take new cell types, and what face coefficients and shift in padded arrays have become, in place and without allocating.
 
         Args:
             cells: wp.int8 array on the operator's device, of its shape (3-D) or of the padded shape (nz + 2, ny + 2, nx + 2), whose
@@ -200,6 +202,8 @@ class GridPoisson:
         if np.ndim(face) == 0 and not isinstance(face, wp.array):
             _check_coefficients(np.asarray(face, dtype=np.float64), name)
             return wp.empty((0, 0, 0), dtype=self.dtype, device=self.device)
+        if self._in_place(face, name):
+            return face
         host = face.numpy() if isinstance(face, wp.array) else np.asarray(face, dtype=np.float64)
         expected = list(self.shape)
         expected[-1 - axis] += 1
@@ -213,9 +217,20 @@ class GridPoisson:
         padding = [(1, 0) if a == 2 - axis else (1, 1) for a in range(3)]
         return wp.array(np.pad(host.reshape(counts), padding), dtype=self.dtype, device=self.device)
 
+    def _in_place(self, field: Any, name: str) -> bool:
+        """Return whether a coefficient field is the caller's padded array, after checking it."""
+        if not isinstance(field, wp.array) or tuple(field.shape) != self.layout.stored_shape or self.layout.stored_shape == self.shape:
+            return False
+        if field.dtype is not self.dtype or field.device != self.device:
+            raise ValueError(f"{name} in the padded shape must be of type {self.dtype.__name__} on {self.device}")
+        _check_coefficients(field.numpy(), name)
+        return True
+
     def _stored_shift(self, shift: Any) -> wp.array[Any]:
         if shift is None:
             return wp.empty((0, 0, 0), dtype=self.dtype, device=self.device)
+        if self._in_place(shift, "shift"):
+            return shift
         host = shift.numpy() if isinstance(shift, wp.array) else np.asarray(shift, dtype=np.float64)
         host = np.full(self.shape, host) if host.ndim == 0 else host
         if host.shape != self.shape:

@@ -14,7 +14,7 @@ from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
 from warp_lcp.program import Launch, Program
 from warp_lcp.residual import NaturalResidual
-from warp_lcp.solve import IterateInBuffers, Precision, Step
+from warp_lcp.solve import Precision, Step
 from warp_lcp.solvers import projected_multigrid_kernels as kernels
 from warp_lcp.vectors import Reduction, convert, launch_spans
 
@@ -90,7 +90,7 @@ class AssessedResidual(NaturalResidual):
         R = self.row_sums = kernels.RowSums()
         R.planes, R.all_planes, R.rows, R.chunks, R.threads = slab, planes, rows, chunks, math.prod(self.threads)
         self.scalars = wp.zeros(kernels.SLOTS, dtype=wp.float64, device=A.device)
-        self.sums = Reduction(problem.layout.size, A.device, self.scalars, columns=5, threads=R.threads)
+        self.sums = Reduction(problem.layout.size, A.device, self.scalars, columns=4, threads=R.threads)
         self.row_kernels = kernels.row_kernels(*s.storage, self._finest.stencil.d.dtype, hierarchy.real)
         self.classify, self.stale, self.active, self._norm_of_b = False, True, 0, 0.0
 
@@ -104,6 +104,7 @@ class AssessedResidual(NaturalResidual):
         if not keep:
             self._norm_of_b = super().norm_of_b()
             self.set(kernels.SIZE, self._norm_of_b or 1.0)
+            self.set(kernels.STEP, 0.0)
 
     def norm_of_b(self) -> float:
         """Return ||b|| over the unknowns."""
@@ -116,19 +117,42 @@ class AssessedResidual(NaturalResidual):
 
     def assess(self, x: wp.array[Any], *, launch: Launch = wp.launch) -> None:
         """Launch the evaluation."""
-        p, s, finest = self.problem, self._A.stencil, self._finest
+        p, s = self.problem, self._A.stencil
         s.wrap(x, launch=launch)
-        inputs = [
-            *s.operands, self.row_sums, x, p.b, *p.bounds, p.unknown, finest.stencil.d, finest.b, self.scalars, self.classify,
-            self.sums.partials,
-        ]  # fmt: skip
+        inputs = [*s.operands, self.row_sums, x, *self._assessed()]
         launch(self.row_kernels.assess, self.threads, inputs, device=p.device)
         self.sums.add_up(int(kernels.NORM), columns=3, launch=launch)
 
+    def update(self, x: wp.array[Any], direction: wp.array[Any], *, launch: Launch = wp.launch) -> None:
+        """Launch the step from x along the direction that the cycle's correction gives."""
+        p, s = self.problem, self._A.stencil
+        inputs = [s.shape, s.grain, x, self._finest.x, direction, *p.bounds.operands, self.scalars]
+        launch(self.row_kernels.update, s.threads, inputs, device=p.device)
+
+    def advance(self, x: wp.array[Any], direction: wp.array[Any], *, launch: Launch = wp.launch) -> None:
+        """Launch the step and the evaluation where it ends: one launch on the CPU, unless ghost cells must be filled between."""
+        p, s = self.problem, self._A.stencil
+        if p.device.is_cuda or any(s.periodic):
+            self.update(x, direction, launch=launch)
+            self.assess(x, launch=launch)
+            return
+        inputs = [*s.operands[:-1], self.row_sums, x, self._finest.x, direction, *self._assessed()]
+        launch(self.row_kernels.advance, 1, inputs, device=p.device)
+        self.sums.add_up(int(kernels.NORM), columns=3, launch=launch)
+
+    def _assessed(self) -> list[Any]:
+        """Return what the evaluation takes besides the stencil and x."""
+        p, finest = self.problem, self._finest
+        fields = [p.b, *p.bounds.operands, p.unknown, finest.stencil.d, finest.b]
+        return [*fields, self.scalars, self.classify, self.sums.partials]
+
     def read(self) -> float:
-        """Read what the evaluation found."""
-        square, moved, active = self.scalars.numpy()[:3]
+        """Read what the evaluation found; a step that is not finite was not taken, and its residual is no number."""
+        scalars = self.scalars.numpy()
+        square, moved, active = scalars[:3]
         self.norm, self.current, self.active = float(np.sqrt(square)), True, int(active)
+        if not math.isfinite(scalars[int(kernels.STEP)]):
+            self.norm = math.nan
         self.stale = self.stale or moved > 0
         return self.norm
 
@@ -137,26 +161,64 @@ class AssessedResidual(NaturalResidual):
         self.scalars[int(slot) : int(slot) + 1].fill_(value)
 
 
-class MultigridWorkspace(IterateInBuffers):
-    """Memory of the method for one problem."""
+class MultigridWorkspace:
+    """Memory of the method for one problem.
+
+    x is moved in place. The best iterate is not stored while it is x, nor when x is one step past it, for a step can be taken back; it
+    is when the residual has risen and goes on from there.
+    """
 
     def __init__(self, problem: LCP, A: GridPoisson, settings: ProjectedMultigrid) -> None:
-        super().__init__(problem.layout.zeros(wp.float64))
         self.problem, self.A, self.settings, self.precision = problem, A, settings, Precision(settings.precision)
         self.bounded = problem.bounded
         real = self.precision.correction
-        self._p, self._ap = problem.layout.zeros(real), problem.layout.zeros(real)
-        # a projected cycle forgets the search direction, so its bounds may lie in that memory: finite numbers, and 0 off the unknowns
-        self.hierarchy = Hierarchy(A.stencil, real, bounded=self.bounded, settings=settings.cycle, bounds=(self._p, self._ap))
+        self.x, self._p = problem.layout.zeros(wp.float64), problem.layout.zeros(real)
+        # a projected cycle forgets the search direction, so its lower bounds may lie in that memory: finite numbers, and 0 off the unknowns
+        upper = problem.layout.zeros(real)
+        self.hierarchy = Hierarchy(A.stencil, real, bounded=self.bounded, settings=settings.cycle, bounds=(self._p, upper))
         self.residual = AssessedResidual(problem, A, self.hierarchy)
-        self._flat = kernels.flat_kernels(self.hierarchy.finest.stencil.d.dtype, real)
+        self._flat = kernels.flat_kernels(real)
         self._spans = self.residual._reduction.spans
         self._rounded = problem.layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
-        self._programs: dict[tuple[int, int], Program] = {}  # a truncated cycle from one buffer to another
+        self._programs: dict[tuple[Any, ...], Program] = {}  # truncated cycles
         self._mask: wp.array[Any] | None = None
         self.scratch = self.hierarchy.finest.t if real is wp.float32 else None  # free between cycles
         self.floating: Any = None
+        self._best: wp.array[Any] | None = None
+        self._past, self._stored = 0, False  # steps since the best iterate; whether it is in memory of its own
         self._cycles_left, self._rises = 0, 0
+
+    def keep(self) -> None:
+        """Remember x as the best iterate."""
+        self._past, self._stored = 0, False
+
+    def restore(self) -> None:
+        """Make x the best iterate again."""
+        if self._stored:
+            wp.copy(self.x, self._best)
+        elif self._past == 1:
+            self._undo(self.x)
+        self.residual.set(kernels.STEP, 0.0)
+        self.keep()
+
+    def _leave(self) -> None:
+        """Store the best iterate before x leaves it behind: it was x, or one step ago."""
+        exact = self.floating is None and self._rounded is None  # else x is more than a step from it
+        if not self._stored and self._past == (1 if exact else 0):
+            if self._best is None:
+                self._best = wp.empty_like(self.x)
+            if exact:
+                self._undo(self._best)
+            else:
+                wp.copy(self._best, self.x)
+            self._stored = True
+        self._past += 1
+
+    def _undo(self, out: wp.array[Any]) -> None:
+        """Write where the last step began."""
+        p = self.problem
+        inputs = [self.x, self._p, *p.bounds.operands, p.unknown, out, self.residual.scalars]
+        launch_spans(self._flat.undo, self._spans, inputs, [], p.device)
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the search direction; the operator may have changed."""
@@ -192,66 +254,71 @@ class MultigridWorkspace(IterateInBuffers):
         """Projected cycle on all unknowns."""
         p, finest, last = self.problem, self.hierarchy.finest, self.residual.norm
         self._rebuild()
-        self._forget()
-        before = [self.x, *p.bounds, p.unknown, finest.lower, finest.upper, self.residual.scalars]
+        self._leave()
+        before = [self.x, *p.bounds.operands, p.unknown, finest.lower, finest.upper, self.residual.scalars]
         launch_spans(self._flat.gaps, self._spans, before, [], p.device)
         self.hierarchy.monotone_cycle.run()
-        out = self.fresh()
-        launch_spans(self._flat.add, self._spans, [self.x, finest.x, *p.bounds, out, self.residual.scalars], [], p.device)
-        wp.launch(kernels.rescale_kernel, 1, [self.residual.scalars], device=p.device)
-        self._round(out)
-        self.advance(out)
+        wp.launch(kernels.plan_whole_step_kernel, 1, [self.residual.scalars], device=p.device)
         self._cycles_left -= 1
         self._classify_next()
-        self.residual.evaluate(out)
+        self._advance()
+        self.residual.read()
         self._count_rises(last)
         return Step("monotone cycle", 1, None)
 
     def truncated_step(self) -> Step:
         """One linear cycle on the free unknowns, made conjugate to the last direction, projected."""
-        p, last, active = self.problem, self.residual.norm, self.residual.active
+        last, active = self.residual.norm, self.residual.active
         if self.residual.stale:
             self._rebuild()
             self._forget()  # measured: making the old direction fit the new free set costs a product and saves no iteration
-        x, out = self.x, self.fresh()
+        self._leave()
+        self.residual.classify = True
         if self.floating is None and self._rounded is None:
-            self._program(x, out).run()
+            self._program().run()
         else:
             self.hierarchy.cycle.run()
-            self._correct(x, out)
-            if self.floating is not None:
-                self.floating.settle(out, p.lower, p.upper)
-            self._round(out)
-            self.residual.assess(out)
-        self.advance(out)
+            self._measure()
+            self._advance(settle=True)
         self.residual.read()
         if self.floating is not None:
             self._project()
         self._count_rises(last)
         return Step("truncated cycle", 1, active)
 
-    def _program(self, x: wp.array[Any], out: wp.array[Any]) -> Program:
-        """Return the launches that step from x to out and assess it."""
-        program = self._programs.get((x.ptr, out.ptr))
+    def _program(self) -> Program:
+        """Return the launches of a truncated cycle; bounds in place may be coded now and not in the next solve."""
+        lower, least, upper, most, code = self.problem.bounds.operands
+        key = (lower.ptr, float(least), upper.ptr, float(most), code.ptr)
+        program = self._programs.get(key)
         if program is None:
-            program = self._programs[x.ptr, out.ptr] = Program(self.A.device)
+            program = self._programs[key] = Program(self.A.device)
             program.extend(self.hierarchy.cycle)
-            self.residual.classify = True
-            self._correct(x, out, launch=program.launch)
-            self.residual.assess(out, launch=program.launch)
+            self._measure(launch=program.launch)
+            self.residual.advance(self.x, self._p, launch=program.launch)
         return program
 
-    def _correct(self, x: wp.array[Any], out: wp.array[Any], *, launch: Launch = wp.launch) -> None:
-        """Measure the cycle's correction, step from x to out."""
-        p, residual, finest, device = self.problem, self.residual, self.hierarchy.finest, self.A.device
+    def _measure(self, *, launch: Launch = wp.launch) -> None:
+        """Measure the cycle's correction and plan the step."""
+        residual, finest, device = self.residual, self.hierarchy.finest, self.A.device
         finest.stencil.wrap(finest.x, launch=launch)
-        fields = [finest.x, self._p, self._ap, finest.b, finest.t, residual.sums.partials]
+        fields = [finest.x, self._p, finest.b, residual.sums.partials]
         inputs = [*finest.operands, finest.stencil.grain, residual.row_sums, *fields]
         launch(residual.row_kernels.measure, residual.threads, inputs, device=device)
-        residual.sums.add_up(int(kernels.ZAZ), columns=5, launch=launch)
+        residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=launch)
         launch(kernels.plan_step_kernel, 1, [residual.scalars], device=device)
-        before = [x, finest.x, finest.t, self._p, self._ap, *p.bounds, out, residual.scalars]
-        launch_spans(self._flat.update, self._spans, before, [], device, launch=launch)
+
+    def _advance(self, *, settle: bool = False) -> None:
+        """Take the planned step and evaluate the residual there."""
+        p = self.problem
+        if self.floating is None and self._rounded is None:
+            self.residual.advance(self.x, self._p)
+            return
+        self.residual.update(self.x, self._p)
+        if self.floating is not None and settle:
+            self.floating.settle(self.x, p.lower, p.upper)
+        self._round(self.x)
+        self.residual.assess(self.x)
 
     def _rebuild(self) -> None:
         if self.residual.stale:

@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Kernels of the projected multigrid method: residual, active set and right-hand side in one pass; the CG step in two more."""
+"""Kernels of the projected multigrid method: a CG step, and the residual, active set and right-hand side after it."""
 
 import functools
 from types import SimpleNamespace
@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_lcp.native import BLOCK, C_TYPES, simd
 from warp_lcp.operators.stencil_kernels import NEIGHBORS, StencilShape, row_count, row_start, stencil_head
-from warp_lcp.vector_kernels import BOUNDED, flat, span_end, span_start
+from warp_lcp.vector_kernels import CODED, flat, span_end, span_start
 
 # Slots of the device scalars. NORM, MOVED and ACTIVE are sums of one pass, and so are ZAZ ... GP.
 NORM = wp.constant(0)  # squared norm of the natural residual
@@ -17,16 +17,20 @@ MOVED = wp.constant(1)  # not 0 if the free set has changed
 ACTIVE = wp.constant(2)  # unknowns held at a bound
 ZAZ = wp.constant(3)
 ZAP = wp.constant(4)
-PAP = wp.constant(5)
-GZ = wp.constant(6)
-GP = wp.constant(7)
+GZ = wp.constant(5)
+GP = wp.constant(6)
+PAP = wp.constant(7)  # of the search direction, carried from step to step
 SIZE = wp.constant(8)  # corrections are computed for a right-hand side divided by this
 BETA = wp.constant(9)
-STEP = wp.constant(10)
+STEP = wp.constant(10)  # x moved by this multiple of the direction
 CARRY = wp.constant(11)  # 0: forget the search direction
 SLOTS = 12
 
-f64 = wp.array(dtype=wp.float64)
+f64, i8, u8 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int8), wp.array(dtype=wp.uint8)
+
+AT_ROW = CODED
+for _field in ("l_", "u_", "code_"):
+    AT_ROW = AT_ROW.replace(f"{_field}.data[i]", f"{_field}.data[p + i]")
 
 
 @wp.struct
@@ -42,26 +46,26 @@ class RowSums:
 
 @functools.cache
 def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: Any) -> SimpleNamespace:
-    """Return the kernels that apply the stencil.
+    """Return the kernels of a step.
 
-    `assess` evaluates y = A x + b in float64 with the operator's own diagonal (d_type) and weights (w_type), sums the natural residual,
-    finds the free set and writes g = -y / SIZE on it. `measure` multiplies a correction on the free set and sums the five products that
-    beta and the step need.
+    `measure` multiplies a correction z on the free set and sums the products that beta and the step need. `update` makes the direction
+    p = z + beta p and moves x along it, onto the bounds. `assess` evaluates y = A x + b in float64 with the operator's own diagonal
+    (d_type) and weights (w_type), sums the natural residual, finds the free set and writes g = -y / SIZE on it. `advance` is `update` and
+    `assess` by one CPU thread.
     """
     form = "variable" if variable else "uniform"
     name = f"warp_lcp.projected_multigrid.{form}_{d_type.__name__}_{w_type.__name__}_{free_type.__name__}_{real.__name__}"
     d_array, w_array, free_array, field = (wp.array(dtype=t) for t in (d_type, w_type, free_type, real))
-    i8 = wp.array(dtype=wp.int8)
 
     @wp.func_native(
         simd(
             BLOCK
-            + BOUNDED.replace("l_.data[i]", "l_.data[p + i]").replace("u_.data[i]", "u_.data[p + i]")
+            + AT_ROW
             + stencil_head(variable, "double")
             + f"""typedef {C_TYPES[free_type]} F; F* free = free_.data + p;
         const T* x = x_.data + p; const T* b = b_.data + p; auto* g = g_.data + p;
         const auto* m = m_.data + p; T s = 0; int moved = 0, active = 0; unsigned char hold[M];
-        const bool free_all = !l_.data && !u_.data && l_value == -(T)INFINITY && u_value == (T)INFINITY;
+        const bool free_all = !l_.data && !u_.data && !code_.data && l_value == -(T)INFINITY && u_value == (T)INFINITY;
         for (int begin = 0; begin < n; begin += M) {{
             const int end = n - begin < M ? n : begin + (int)M; T y[M];
             SIMD8 for (int k = begin; k < end; ++k) {{
@@ -93,31 +97,51 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
     )
     def assess_row(
         A: StencilShape, d_: d_array, wx_: w_array, wy_: w_array, wz_: w_array, x_: f64, b_: f64, l_: f64, l_value: wp.float64, u_: f64,
-        u_value: wp.float64, m_: i8, free_: free_array, g_: field, inverse: wp.float64, classify: bool, p: wp.int64, n: int, t: int,
+        u_value: wp.float64, code_: u8, m_: i8, free_: free_array, g_: field, inverse: wp.float64, classify: bool, p: wp.int64, n: int, t: int,
         threads: int, more: bool, out: f64,
     ): ...  # fmt: skip
 
     @wp.func_native(
         simd(
             stencil_head(variable, C_TYPES[real])
-            + f"""const T* x = z_.data + p; const T* q = p_.data + p; const T* aq = ap_.data + p; const T* g = g_.data + p;
-        T* az = az_.data + p; T zaz = 0, zap = 0, pap = 0, gz = 0, gp = 0;
+            + f"""const T* x = z_.data + p; const T* q = p_.data + p; const T* g = g_.data + p; T zaz = 0, zap = 0, gz = 0, gp = 0;
         SIMD for (int k = 0; k < n; ++k) {{
             const T e = unit*(T)d[k], v = e*x[k] - {NEIGHBORS[variable]}, w = e != 0 ? v : (T)0;
-            az[k] = w; zaz += x[k]*w; zap += x[k]*aq[k]; pap += q[k]*aq[k]; gz += g[k]*x[k]; gp += g[k]*q[k]; }}
-        const double all[5] = {{zaz, zap, pap, gz, gp}}; double* sums = out.data + t;
-        for (int c = 0; c < 5; ++c) sums[c*threads] = more ? all[c] + sums[c*threads] : all[c];"""
+            zaz += x[k]*w; zap += q[k]*w; gz += g[k]*x[k]; gp += g[k]*q[k]; }}
+        const double all[4] = {{zaz, zap, gz, gp}}; double* sums = out.data + t;
+        for (int c = 0; c < 4; ++c) sums[c*threads] = more ? all[c] + sums[c*threads] : all[c];"""
         )
     )
     def measure_row(
-        A: StencilShape, d_: free_array, wx_: field, wy_: field, wz_: field, z_: field, p_: field, ap_: field, g_: field, az_: field,
-        p: wp.int64, n: int, t: int, threads: int, more: bool, out: f64,
+        A: StencilShape, d_: free_array, wx_: field, wy_: field, wz_: field, z_: field, p_: field, g_: field, p: wp.int64, n: int, t: int,
+        threads: int, more: bool, out: f64,
+    ): ...  # fmt: skip
+
+    @wp.func_native(
+        simd(
+            AT_ROW
+            + """double* x = x_.data + p; const auto* z = z_.data + p; auto* q = p_.data + p; double missed = 0;
+        const bool fresh = beta == 0;  // then q may hold anything, a NaN too
+        const double inverse = step != 0 ? 1/step : 0;
+        with_bounds([&](auto lower, auto upper) {
+            SIMD8 for (int k = 0; k < n; ++k) {
+                const auto s = fresh ? z[k] : z[k] + beta*q[k];
+                const double l = lower(k), u = upper(k), v = x[k] + step*(double)s, w = v < l ? l : v, c = w > u ? u : w;
+                const bool moves = (s != 0) & (v - v == 0), cut = moves & (c != v);  // a NaN or infinite step leaves x as it was
+                const double left = (c - x[k])*inverse;
+                missed += cut ? 1.0 : 0.0; q[k] = cut ? left : (double)s; x[k] = moves ? c : x[k]; } });
+        if (missed != 0) scalars.data[carry] = 0;  // all threads write the same"""
+        )
+    )
+    def update_row(
+        x_: f64, z_: field, p_: field, l_: f64, l_value: wp.float64, u_: f64, u_value: wp.float64, code_: u8, beta: real, step: wp.float64,
+        p: wp.int64, n: int, carry: int, scalars: f64,
     ): ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module=name)
     def assess(
         A: StencilShape, d: d_array, wx: w_array, wy: w_array, wz: w_array, grain: int, R: RowSums, x: f64, b: f64, lower: f64,
-        lower_value: wp.float64, upper: f64, upper_value: wp.float64, unknown: i8, free: free_array, g: field, scalars: f64,
+        lower_value: wp.float64, upper: f64, upper_value: wp.float64, code: u8, unknown: i8, free: free_array, g: field, scalars: f64,
         classify: bool, out: f64,
     ):  # fmt: skip
         slab, j, c = wp.tid()
@@ -127,112 +151,121 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
             n = row_count(A, k, j, c, grain)
             p = row_start(A, k, j, c, grain)
             assess_row(
-                A, d, wx, wy, wz, x, b, lower, lower_value, upper, upper_value, unknown, free, g, inverse, classify, p, n, t,
+                A, d, wx, wy, wz, x, b, lower, lower_value, upper, upper_value, code, unknown, free, g, inverse, classify, p, n, t,
                 R.threads, k > slab * R.planes, out,
             )  # fmt: skip
 
     @wp.kernel(enable_backward=False, module=name)
     def measure(
-        A: StencilShape, d: free_array, wx: field, wy: field, wz: field, grain: int, R: RowSums, z: field, p: field, ap: field, g: field,
-        az: field, out: f64,
-    ):  # fmt: skip
+        A: StencilShape, d: free_array, wx: field, wy: field, wz: field, grain: int, R: RowSums, z: field, p: field, g: field, out: f64
+    ):
         slab, j, c = wp.tid()
         t = (slab * R.rows + j) * R.chunks + c
         for k in range(slab * R.planes, wp.min((slab + 1) * R.planes, R.all_planes)):
             n = row_count(A, k, j, c, grain)
             o = row_start(A, k, j, c, grain)
-            measure_row(A, d, wx, wy, wz, z, p, ap, g, az, o, n, t, R.threads, k > slab * R.planes, out)
-
-    return SimpleNamespace(assess=assess, measure=measure)
-
-
-@functools.cache
-def flat_kernels(free_type: Any, real: Any) -> SimpleNamespace:
-    """Return the kernels on flat fields: `update`, `gaps`, `add`."""
-    name = f"warp_lcp.projected_multigrid.{free_type.__name__}_{real.__name__}"
-    field, i8 = wp.array(dtype=real), wp.array(dtype=wp.int8)
-
-    @wp.func_native(
-        flat(
-            BOUNDED
-            + """const double* x = x_.data; double* o = o_.data; const auto *z = z_.data, *az = az_.data; auto *q = p_.data, *aq = ap_.data;
-        const bool fresh = beta == 0;  // then q may hold anything, a NaN too
-        with_bounds([&](auto lower, auto upper) {
-            EACH {
-                const auto s = fresh ? z[i] : z[i] + beta*q[i], as = fresh ? az[i] : az[i] + beta*aq[i];
-                const double l = lower(i), u = upper(i), v = x[i] + step*(double)s, w = v < l ? l : v, c = w > u ? u : w;
-                q[i] = s; aq[i] = as; o[i] = s == 0 ? x[i] : c; } });"""
-        )
-    )
-    def update_span(
-        x_: f64, z_: field, az_: field, p_: field, ap_: field, l_: f64, l_value: wp.float64, u_: f64, u_value: wp.float64, o_: f64,
-        beta: real, step: wp.float64, start: wp.int64, end: wp.int64, stride: wp.int64,
-    ): ...  # fmt: skip
-
-    @wp.func_native(
-        flat(
-            BOUNDED
-            + """const double* x = x_.data; auto *lo = lo_.data, *hi = hi_.data; const auto* m = m_.data; const double big = 1e30;
-        with_bounds([&](auto lower, auto upper) {
-            EACH {
-                const double a = (lower(i) - x[i])*inverse, c = (upper(i) - x[i])*inverse;
-                const double l = a < -big ? -big : (a > 0 ? 0.0 : a), u = c > big ? big : (c < 0 ? 0.0 : c);
-                lo[i] = m[i] == 1 ? l : 0.0; hi[i] = m[i] == 1 ? u : 0.0; } });"""
-        )
-    )
-    def gaps_span(
-        x_: f64, l_: f64, l_value: wp.float64, u_: f64, u_value: wp.float64, m_: i8, lo_: field, hi_: field, inverse: wp.float64,
-        start: wp.int64, end: wp.int64, stride: wp.int64,
-    ): ...  # fmt: skip
-
-    @wp.func_native(
-        flat(
-            BOUNDED
-            + """const double* x = x_.data; double* o = o_.data; const auto* z = z_.data;
-        with_bounds([&](auto lower, auto upper) {
-            EACH {
-                const double l = lower(i), u = upper(i), v = x[i] + size*(double)z[i], w = v < l ? l : v, c = w > u ? u : w;
-                o[i] = z[i] == 0 ? x[i] : c; } });"""
-        )
-    )
-    def add_span(
-        x_: f64, z_: field, l_: f64, l_value: wp.float64, u_: f64, u_value: wp.float64, o_: f64, size: wp.float64, start: wp.int64,
-        end: wp.int64, stride: wp.int64,
-    ): ...  # fmt: skip
+            measure_row(A, d, wx, wy, wz, z, p, g, o, n, t, R.threads, k > slab * R.planes, out)
 
     @wp.kernel(enable_backward=False, module=name)
     def update(
-        x: f64, z: field, az: field, p: field, ap: field, lower: f64, lower_value: wp.float64, upper: f64, upper_value: wp.float64,
-        out: f64, scalars: f64, n: int, chunk: int, stride: wp.int64,
+        A: StencilShape, grain: int, x: f64, z: field, p: field, lower: f64, lower_value: wp.float64, upper: f64,
+        upper_value: wp.float64, code: u8, scalars: f64,
     ):  # fmt: skip
-        t = wp.tid()
+        k, j, c = wp.tid()
+        o = row_start(A, k, j, c, grain)
+        n = row_count(A, k, j, c, grain)
         beta = real(scalars[BETA])
-        start = span_start(t, chunk)
-        end = span_end(t, chunk, n)
-        update_span(x, z, az, p, ap, lower, lower_value, upper, upper_value, out, beta, scalars[STEP], start, end, stride)
+        update_row(x, z, p, lower, lower_value, upper, upper_value, code, beta, scalars[STEP], o, n, CARRY, scalars)
+
+    @wp.kernel(enable_backward=False, module=name)
+    def advance(
+        A: StencilShape, d: d_array, wx: w_array, wy: w_array, wz: w_array, R: RowSums, x: f64, z: field, p: field, b: f64, lower: f64,
+        lower_value: wp.float64, upper: f64, upper_value: wp.float64, code: u8, unknown: i8, free: free_array, g: field, scalars: f64,
+        classify: bool, out: f64,
+    ):  # fmt: skip
+        """A plane is assessed when the one above it has moved: x is still in the cache."""
+        inverse = wp.float64(1.0) / scalars[SIZE]
+        beta = real(scalars[BETA])
+        step = scalars[STEP]
+        for s in range(R.all_planes + 1):
+            if s < R.all_planes:
+                for j in range(R.rows):
+                    o = row_start(A, s, j, 0, A.nx)
+                    n = row_count(A, s, j, 0, A.nx)
+                    update_row(x, z, p, lower, lower_value, upper, upper_value, code, beta, step, o, n, CARRY, scalars)
+            k = s - 1
+            if k >= 0:
+                slab = k // R.planes
+                for j in range(R.rows):
+                    n = row_count(A, k, j, 0, A.nx)
+                    o = row_start(A, k, j, 0, A.nx)
+                    assess_row(
+                        A, d, wx, wy, wz, x, b, lower, lower_value, upper, upper_value, code, unknown, free, g, inverse, classify, o, n,
+                        slab * R.rows + j, R.threads, k > slab * R.planes, out,
+                    )  # fmt: skip
+
+    return SimpleNamespace(assess=assess, measure=measure, update=update, advance=advance)
+
+
+@functools.cache
+def flat_kernels(real: Any) -> SimpleNamespace:
+    """Return the kernels on flat fields: `gaps` to the bounds, `undo` of an update."""
+    name = f"warp_lcp.projected_multigrid.{real.__name__}"
+    field = wp.array(dtype=real)
+
+    @wp.func_native(
+        flat(
+            CODED
+            + """const double* x = x_.data; auto *lo = lo_.data, *hi = hi_.data; const auto* m = m_.data; const double big = 1e30;
+        with_bounds([&](auto lower, auto upper) {
+            EACH {
+                const double a = (lower(i) - x[i])*inverse, l = a < -big ? -big : (a > 0 ? 0.0 : a); lo[i] = m[i] == 1 ? l : 0.0; }
+            if (hi) EACH {
+                const double c = (upper(i) - x[i])*inverse, u = c > big ? big : (c < 0 ? 0.0 : c); hi[i] = m[i] == 1 ? u : 0.0; } });"""
+        )
+    )
+    def gaps_span(
+        x_: f64, l_: f64, l_value: wp.float64, u_: f64, u_value: wp.float64, code_: u8, m_: i8, lo_: field, hi_: field,
+        inverse: wp.float64, start: wp.int64, end: wp.int64, stride: wp.int64,
+    ): ...  # fmt: skip
+
+    @wp.func_native(
+        flat(
+            CODED
+            + """const double* x = x_.data; const auto* q = p_.data; double* o = o_.data;
+        with_bounds([&](auto lower, auto upper) {
+            EACH {
+                const double l = lower(i), u = upper(i), v = x[i] - step*(double)q[i], w = v < l ? l : v, c = w > u ? u : w;
+                o[i] = (m_.data[i] == 1) & (q[i] != 0) & (v - v == 0) ? c : x[i]; } });"""
+        )
+    )
+    def undo_span(
+        x_: f64, p_: field, l_: f64, l_value: wp.float64, u_: f64, u_value: wp.float64, code_: u8, m_: i8, o_: f64, step: wp.float64,
+        start: wp.int64, end: wp.int64, stride: wp.int64,
+    ): ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module=name)
     def gaps(
-        x: f64, lower: f64, lower_value: wp.float64, upper: f64, upper_value: wp.float64, unknown: i8, lo: field, hi: field, scalars: f64,
-        n: int, chunk: int, stride: wp.int64,
+        x: f64, lower: f64, lower_value: wp.float64, upper: f64, upper_value: wp.float64, code: u8, unknown: i8, lo: field, hi: field,
+        scalars: f64, n: int, chunk: int, stride: wp.int64,
     ):  # fmt: skip
         t = wp.tid()
         inverse = wp.float64(1.0) / scalars[SIZE]
         start = span_start(t, chunk)
         end = span_end(t, chunk, n)
-        gaps_span(x, lower, lower_value, upper, upper_value, unknown, lo, hi, inverse, start, end, stride)
+        gaps_span(x, lower, lower_value, upper, upper_value, code, unknown, lo, hi, inverse, start, end, stride)
 
     @wp.kernel(enable_backward=False, module=name)
-    def add(
-        x: f64, z: field, lower: f64, lower_value: wp.float64, upper: f64, upper_value: wp.float64, out: f64, scalars: f64, n: int,
-        chunk: int, stride: wp.int64,
+    def undo(
+        x: f64, p: field, lower: f64, lower_value: wp.float64, upper: f64, upper_value: wp.float64, code: u8, unknown: i8, out: f64,
+        scalars: f64, n: int, chunk: int, stride: wp.int64,
     ):  # fmt: skip
         t = wp.tid()
         start = span_start(t, chunk)
         end = span_end(t, chunk, n)
-        add_span(x, z, lower, lower_value, upper, upper_value, out, scalars[SIZE], start, end, stride)
+        undo_span(x, p, lower, lower_value, upper, upper_value, code, unknown, out, scalars[STEP], start, end, stride)
 
-    return SimpleNamespace(update=update, gaps=gaps, add=add)
+    return SimpleNamespace(gaps=gaps, undo=undo)
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.projected_multigrid")
@@ -252,6 +285,7 @@ def plan_step_kernel(scalars: f64):
     length = zero
     if curvature > zero:
         length = gain / curvature
+    scalars[PAP] = curvature
     scalars[BETA] = beta
     scalars[STEP] = length * scalars[SIZE]
     scalars[CARRY] = wp.float64(1.0)
@@ -266,8 +300,11 @@ def rescale(scalars: f64):
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.projected_multigrid")
-def rescale_kernel(scalars: f64):
-    """Take the norm of the residual as the next right-hand side's unit."""
+def plan_whole_step_kernel(scalars: f64):
+    """Take the correction as it is: what a projected cycle returns keeps to the bounds. The direction is forgotten."""
+    scalars[BETA] = wp.float64(0.0)
+    scalars[STEP] = scalars[SIZE]
+    scalars[CARRY] = wp.float64(0.0)
     rescale(scalars)
 
 

@@ -1,0 +1,116 @@
+"""A dam break against the experiments of Martin & Moyce 1952: a column of base a and height n^2 a, n^2 = 2."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmarks.record import Chart, Lines
+from benchmarks.validation.finding import Findings, Trial, attempt
+from benchmarks.validation.signals import arrivals, best_shift, column_height, front, relative_rms, slope
+from benchmarks.validation.tank import GRAVITY, SUB_CELL, Numerics, box, create, fill, steps
+
+RESOLUTIONS = (12, 24)  # cells of a
+LIMITS = {12: 5.0, 24: 3.0}  # [%] of the RMS error after the best shift
+A = 0.05715  # [m]
+N2 = 2.0
+LENGTH, HEIGHT = 6.0, 2.5  # of the tank, in units of a: the front meets no wall
+END = 3.7  # T
+MAX_SHIFT = 0.3  # of T: the experiment's time origin is uncertain
+FIRST, LAST = 0.84, 3.33  # T of the data compared
+STRAIGHT = 1.6  # T from which on the front moves evenly
+TAU_LAST = 2.45
+COLUMNS = 2  # beside the wall, that the height is measured in
+
+# [MartinMoyce1952], front and height of the column of square section, n^2 = 2
+T = np.array([0.41, 0.84, 1.19, 1.43, 1.63, 1.83, 1.98, 2.20, 2.32, 2.51, 2.65, 2.83, 2.98, 3.11, 3.33])
+Z = np.array([1.11, 1.22, 1.44, 1.67, 1.89, 2.11, 2.33, 2.56, 2.78, 3.00, 3.22, 3.44, 3.67, 3.89, 4.11])
+TAU = np.array([0.56, 0.77, 0.93, 1.08, 1.28, 1.46, 1.66, 1.84, 2.00, 2.21, 2.45, 2.70, 3.06, 3.44, 4.20, 5.25])
+H = np.array([0.94, 0.89, 0.83, 0.78, 0.72, 0.67, 0.61, 0.56, 0.50, 0.44, 0.39, 0.33, 0.28, 0.22, 0.17, 0.11])
+
+
+@dataclass(frozen=True)
+class Collapse:
+    """A collapse in the experiment's units.
+
+    Attributes:
+        T: when the front came to a new place, T = n t sqrt(g / a).
+        Z: these places over a.
+        tau: t sqrt(g / a) of every step.
+        H: height beside the wall over n^2 a.
+    """
+
+    T: np.ndarray
+    Z: np.ndarray
+    tau: np.ndarray
+    H: np.ndarray
+
+
+def check(device: str) -> tuple[list[Trial], list[Chart]]:
+    """Run the check at its resolutions."""
+    trials = [trial(n, device) for n in RESOLUTIONS]
+    fronts = {"Martin & Moyce": (T.tolist(), Z.tolist())}
+    heights = {"Martin & Moyce": (TAU.tolist(), H.tolist())}
+    for t in trials:
+        fronts |= {f"{t.resolution}{label[5:]}": curve for label, curve in t.curves.items() if label.startswith("front")}
+        heights |= {f"{t.resolution}{label[6:]}": curve for label, curve in t.curves.items() if label.startswith("height")}
+    linear = {"logarithmic_x": False, "logarithmic_y": False}
+    data = frozenset({"Martin & Moyce"})
+    return trials, [
+        Lines("dam-break-front", "Front of a collapsing column", "T = n t sqrt(g / a)", "Z = x / a", fronts, marked=data, **linear),
+        Lines("dam-break-height", "Height at the wall", "tau = t sqrt(g / a)", "H = y / (n^2 a)", heights, marked=data, **linear),
+    ]
+
+
+def trial(cells: int, device: str, numerics: Numerics = SUB_CELL) -> Trial:
+    """Compare a collapse with the data; the control has half the gravity that its time is measured in."""
+
+    def run(found: Findings) -> None:
+        limit = LIMITS[cells]
+        compared = (T >= FIRST) & (T <= LAST)
+        at, expected = T[compared], Z[compared]
+        c = collapse(cells, device, numerics)
+        shift, rms = best_shift(c.T, c.Z, at, expected, MAX_SHIFT)
+        found.add("RMS error of Z", 100.0 * relative_rms(c.T, c.Z, at, expected), high=20.0, unit="%")
+        found.add("RMS error of Z after the best shift", 100.0 * rms, high=limit, unit="%")
+        found.add("the best shift of T", shift, low=-MAX_SHIFT, high=MAX_SHIFT)
+        found.add("dZ/dT", slope(c.T, c.Z, STRAIGHT + shift, LAST + shift), low=1.19, high=1.74)
+        early = TAU <= TAU_LAST
+        found.add("largest |dH|", float(np.abs(np.interp(TAU[early], c.tau, c.H) - H[early]).max()), high=0.05)
+        found.curves["front"], found.curves["height"] = (c.T.tolist(), c.Z.tolist()), (c.tau.tolist(), c.H.tolist())
+        found.curves[f"front, shifted by {-shift:.2f}"] = ((c.T - shift).tolist(), c.Z.tolist())
+        slow = collapse(cells, device, numerics, gravity=0.5 * GRAVITY)
+        found.must_break(
+            "half the gravity: RMS error of Z after the best shift", 100.0 * best_shift(slow.T, slow.Z, at, expected, MAX_SHIFT)[1],
+            high=limit, unit="%",
+        )  # fmt: skip
+
+    return attempt("dam break", f"{cells} cells of a, {numerics.name}", run)
+
+
+def collapse(cells: int, device: str, numerics: Numerics, *, gravity: float = GRAVITY) -> Collapse:
+    """Let a column collapse on a floor that it can slip on.
+
+    Args:
+        cells: of the column's base.
+        device: where it runs.
+        numerics: of solids and surface.
+        gravity: downward [m/s^2]; T and tau are measured in the real one.
+    """
+    size, column = [LENGTH * A, HEIGHT * A], [box([0.0, 0.0], [A, N2 * A])]
+    simulation = create(
+        numerics, size=size, resolution=round(LENGTH * cells), liquid=column, physics={"gravity": [0.0, -gravity]}, device=device
+    )  # fmt: skip
+    unit = math.sqrt(GRAVITY / A)
+    liquid = fill(simulation)
+    time, place, height = [0.0], [front(liquid)], [column_height(liquid, COLUMNS)]
+    for row in steps(simulation, END / (math.sqrt(N2) * unit)):
+        liquid = fill(simulation)
+        time.append(row["time"])
+        place.append(front(liquid))
+        height.append(column_height(liquid, COLUMNS))
+    tau = unit * np.array(time)
+    arrived, places = arrivals(math.sqrt(N2) * tau, np.array(place) / cells)
+    return Collapse(arrived, places, tau, np.array(height) / (N2 * cells))

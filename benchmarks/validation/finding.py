@@ -1,0 +1,153 @@
+"""What a check finds: figures beside the bounds that they must keep, or must break where the set-up is wrong on purpose."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+from benchmarks.record import Record, Table
+from benchmarks.timing import Figure
+from warp_lcp.driver.simulator import SimulationFailed, StepFailed
+
+COLUMNS = ("check", "resolution", "figure", "measured", "bound", "as it must be?")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A figure and its bound.
+
+    Args:
+        what: the figure, unique in its trial.
+        value: measured; NaN if it could not be.
+        low: the bound from below.
+        high: the bound from above.
+        unit: of value and bounds.
+        control: a negative control: it belongs to a set-up that is wrong on purpose, and must break the bound.
+    """
+
+    what: str
+    value: float
+    low: float = -math.inf
+    high: float = math.inf
+    unit: str = ""
+    control: bool = False
+
+    @property
+    def passed(self) -> bool:
+        """Whether the figure keeps its bound; of a control, whether it breaks it. NaN does neither."""
+        within = self.low <= self.value <= self.high
+        return within != self.control and not math.isnan(self.value)
+
+    @property
+    def bound(self) -> str:
+        """The bound in words."""
+        unit = f" {self.unit}" if self.unit else ""
+        if math.isinf(self.low):
+            return f"<= {self.high:g}{unit}"
+        return f">= {self.low:g}{unit}" if math.isinf(self.high) else f"{self.low:g} to {self.high:g}{unit}"
+
+    def row(self) -> list[str]:
+        """Return what a table says of it."""
+        bound = f"must break {self.bound}" if self.control else self.bound
+        measured = f"{self.value:.4g}{f' {self.unit}' if self.unit else ''}"
+        return [self.what, measured, bound, "yes" if self.passed else "NO"]
+
+
+def control(finding: Finding) -> Finding:
+    """Return the figure as that of a negative control."""
+    return replace(finding, what=f"control: {finding.what}", control=True)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A check at one resolution.
+
+    Args:
+        check: its name.
+        resolution: in words.
+        findings: what was found.
+        seconds: wall time [s].
+        error: why it could not be finished; empty if it was.
+    """
+
+    check: str
+    resolution: str
+    findings: Sequence[Finding]
+    seconds: float = 0.0
+    error: str = ""
+    curves: dict[str, tuple[Sequence[float], Sequence[float]]] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """The name of its record."""
+        return f"{self.check}, {self.resolution}"
+
+    @property
+    def passed(self) -> bool:
+        """Whether every figure keeps its bound and every control breaks its own."""
+        return not self.error and bool(self.findings) and all(f.passed for f in self.findings)
+
+    def record(self) -> Record:
+        """Return what the file keeps."""
+        figures = {f.what: Figure(f.value, f.unit) for f in self.findings if not math.isnan(f.value)}
+        own, controls = ([f for f in self.findings if f.control is kind] for kind in (False, True))
+        facts = {
+            "check": self.check,
+            "resolution": self.resolution,
+            "bounds": {f.what: f.bound for f in self.findings},
+            "passed": not self.error and all(f.passed for f in own),
+            "controls_failed_as_they_must": all(f.passed for f in controls) if controls else None,
+            "error": self.error or None,
+        }
+        return Record(self.name, figures | {"seconds": Figure(self.seconds, "s")}, facts)
+
+    def failures(self) -> list[str]:
+        """Return a line for each thing that is not as it must be."""
+        lines = [f"{self.name}: {self.error}"] if self.error else []
+        for f in self.findings:
+            if not f.passed:
+                lines.append(f"{self.name}: {f.what} = {f.value:.4g} {f.unit}".rstrip() + f" ({f.row()[2]})")
+        return lines
+
+
+def attempt(check: str, resolution: str, run: Callable[[Findings], None]) -> Trial:
+    """Run a check; a simulation that ends early is a failure of the check, not of the suite.
+
+    Args:
+        check: its name.
+        resolution: in words.
+        run: adds findings to what it is given.
+    """
+    found, begun, error = Findings(), time.perf_counter(), ""
+    try:
+        run(found)
+    except (StepFailed, SimulationFailed, ValueError) as reason:
+        error = str(reason)
+    return Trial(check, resolution, found.findings, time.perf_counter() - begun, error, found.curves)
+
+
+@dataclass
+class Findings:
+    """Collects what a check finds; `curves` are x and y of lines to draw, by label."""
+
+    findings: list[Finding] = field(default_factory=list)
+    curves: dict[str, tuple[Sequence[float], Sequence[float]]] = field(default_factory=dict)
+
+    def add(self, what: str, value: float, *, low: float = -math.inf, high: float = math.inf, unit: str = "") -> None:
+        """Note a figure that must keep its bound."""
+        self.findings.append(Finding(what, float(value), low, high, unit))
+
+    def must_break(self, what: str, value: float, *, low: float = -math.inf, high: float = math.inf, unit: str = "") -> None:
+        """Note a figure of a negative control, which must break the bound."""
+        self.findings.append(control(Finding(what, float(value), low, high, unit)))
+
+
+def table(trials: Sequence[Trial]) -> Table:
+    """Return all findings."""
+    rows = [[t.check, t.resolution, *f.row()] for t in trials for f in t.findings]
+    rows += [[t.check, t.resolution, "error", t.error, "none", "NO"] for t in trials if t.error]
+    wrong = sum(row[-1] == "NO" for row in rows)
+    remark = f"{len(rows)} figures in {sum(t.seconds for t in trials):.0f} s, {wrong} not as they must be."
+    return Table("Findings", COLUMNS, rows, remark + " A control is wrong on purpose: it must break its bound.")

@@ -1,0 +1,168 @@
+"""Liquids at rest: they stay there, and their pressure is that of their depth."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from benchmarks.record import Chart, Lines
+from benchmarks.validation.enclosed import enclosed_cells
+from benchmarks.validation.finding import Findings, Trial, attempt
+from benchmarks.validation.tank import (
+    DENSITY, GRAVITY, PER_AXIS, SMOOTHED, SUB_CELL, VOXEL, Numerics, box, create, gravity_speed, positions, pressures, steps, tilted,
+)  # fmt: skip
+from fluids import LiquidSimulation
+
+RESOLUTIONS = (20, 40)  # cells a side
+SIDE, LEVEL = 0.8, 0.4  # [m]: of the domain, and of a pool
+DURATION, TILTED_DURATION = 10.0, 20.0  # [s]
+AVERAGED = 1.0  # [s] at the end over which the pressure's bias is averaged
+SLOPE, TILT = 30.0, 20.0  # degrees: of the planes of a V, and of gravity
+
+POOL = [box([0.0, 0.0], [SIDE, LEVEL])]
+FULL = [box([0.0, 0.0], [SIDE, SIDE])]
+V = [
+    {"shape": "plane", "point": [0.5 * SIDE, 0.0], "normal": [side * math.sin(math.radians(SLOPE)), math.cos(math.radians(SLOPE))]}
+    for side in (-1, 1)
+]
+CASES: dict[str, dict[str, Any]] = {
+    "pool": {"liquid": POOL},
+    "pool in a V": {"liquid": POOL, "solid": V},
+    "full box": {"liquid": FULL},
+    "full tilted box": {"liquid": FULL, "physics": tilted(TILT)},
+}
+
+
+@dataclass(frozen=True)
+class Rest:
+    """What a liquid that should rest did.
+
+    Attributes:
+        time: ends of the steps [s].
+        speed: largest of the particles, in units of sqrt(g dx).
+        bias: of the pressure below the surface at the end, in units of rho g dx; NaN where there is no level surface.
+        profile: heights of rows of cells [m] and their mean pressure [Pa].
+        volume: inside the sub-cell surface at the end over that at the start.
+    """
+
+    time: np.ndarray
+    speed: np.ndarray
+    bias: float
+    profile: tuple[np.ndarray, np.ndarray]
+    volume: float
+
+    def largest(self, begin: float, end: float) -> float:
+        """Return the largest speed of the steps that end in a span of time [s]."""
+        return float(self.speed[(self.time > begin) & (self.time <= end + 1e-9)].max())
+
+
+def check(device: str) -> tuple[list[Trial], list[Chart]]:
+    """Run the check at its resolutions."""
+    trials = [trial(n, device) for trial in (whole_cells, sub_cell, tilted_surface) for n in RESOLUTIONS]
+    speeds = {f"{t.name}: {label}": curve for t in trials for label, curve in t.curves.items() if label != "profile"}
+    profiles = {t.name: t.curves["profile"] for t in trials if "profile" in t.curves}
+    charts: list[Chart] = [Lines("rest", "Largest speed at rest", "t [s]", "largest speed / sqrt(g dx)", speeds, logarithmic_x=False)]
+    depth = np.array([0.0, LEVEL])
+    exact = {"rho g (h - y)": (depth / LEVEL, 1.0 - depth / LEVEL)}
+    charts.append(
+        Lines("pressure", "Pressure in a pool at rest", "y / h", "p / (rho g h)", exact | profiles, logarithmic_x=False, logarithmic_y=False)
+    )
+    return trials, charts
+
+
+def whole_cells(resolution: int, device: str) -> Trial:
+    """Rest with a surface and solids of whole cells."""
+
+    def run(found: Findings) -> None:
+        for case, tables in CASES.items():
+            rest = settle(resolution, device, VOXEL, DURATION, **tables)
+            found.add(f"{case}: largest speed", rest.largest(0.0, DURATION), high=1e-3)
+            if case.startswith("pool"):
+                found.add(f"{case}: bias of the pressure", rest.bias, low=0.48, high=0.52, unit="rho g dx")
+            if case == "pool":
+                found.curves["profile"] = _normalized(rest)
+
+    return attempt("rest", f"{resolution} cells, {VOXEL.name}", run)
+
+
+def sub_cell(resolution: int, device: str, numerics: Numerics = SUB_CELL) -> Trial:
+    """Rest with a sub-cell surface and cut cells; the control is the bias that a surface of whole cells has."""
+
+    def run(found: Findings) -> None:
+        for case, tables in CASES.items():
+            rest = settle(resolution, device, numerics, DURATION, **tables)
+            found.add(f"{case}: largest speed in the first second", rest.largest(0.0, 1.0), high=0.05)
+            found.add(f"{case}: largest speed from 8 to 10 s", rest.largest(8.0, DURATION), high=0.01)
+            found.curves[case] = (rest.time.tolist(), rest.speed.tolist())
+            if case.startswith("pool"):
+                found.add(f"{case}: |bias of the pressure|", abs(rest.bias), high=0.02, unit="rho g dx")
+            if case == "pool":
+                found.curves["profile"] = _normalized(rest)
+        whole = settle(resolution, device, VOXEL, 2 * AVERAGED, **CASES["pool"])
+        found.must_break("whole cells: |bias of the pressure|", abs(whole.bias), high=0.02, unit="rho g dx")
+
+    return attempt("rest", f"{resolution} cells, {numerics.name}", run)
+
+
+def tilted_surface(resolution: int, device: str, numerics: Numerics = SMOOTHED) -> Trial:
+    """Rest of a free surface that gravity tilts; the control is a surface of whole cells, whose stairs run."""
+    normal = [-math.sin(math.radians(TILT)), math.cos(math.radians(TILT))]
+    tables = {
+        "liquid": [{"shape": "plane", "point": [0.5 * SIDE, 0.5 * SIDE], "normal": normal}],
+        "physics": tilted(TILT),
+    }
+
+    def run(found: Findings) -> None:
+        rest = settle(resolution, device, numerics, TILTED_DURATION, **tables)
+        half = 0.5 * TILTED_DURATION
+        late, early = (rest.speed[rest.time > half].mean(), rest.speed[rest.time <= half].mean())
+        found.add("largest speed", rest.largest(0.0, TILTED_DURATION), high=0.1)
+        found.add("mean of the largest speeds, second half over first", late / early, high=1.0)
+        found.add("change of volume", 100.0 * abs(rest.volume - 1.0), high=0.5, unit="%")
+        stairs = settle(resolution, device, VOXEL, TILTED_DURATION, **tables)
+        found.must_break("whole cells: largest speed", stairs.largest(0.0, TILTED_DURATION), high=0.3)
+        for name, curve in (("surface", rest), ("whole cells", stairs)):
+            found.curves[name] = (curve.time.tolist(), curve.speed.tolist())
+
+    return attempt("tilted rest", f"{resolution} cells, {numerics.name}", run)
+
+
+def settle(resolution: int, device: str, numerics: Numerics, duration: float, **tables: Any) -> Rest:
+    """Let a liquid rest for a time [s]."""
+    simulation = create(numerics, size=[SIDE, SIDE], resolution=resolution, device=device, **tables)
+    before, unit = _enclosed(simulation), gravity_speed(simulation)
+    time, speed, fields = [], [], []
+    for row in steps(simulation, duration):
+        time.append(row["time"])
+        speed.append(row["max_speed"] / unit)
+        if row["time"] > duration - AVERAGED:
+            fields.append(pressures(simulation))
+    mean = np.mean(fields, axis=0)
+    level = "physics" not in tables and tables["liquid"] is POOL
+    bias, profile = _bias(mean, simulation.grid.spacing) if level else (math.nan, (np.empty(0), np.empty(0)))
+    return Rest(np.array(time), np.array(speed), bias, profile, _enclosed(simulation) / before)
+
+
+def _bias(pressure: np.ndarray, dx: float) -> tuple[float, tuple[np.ndarray, np.ndarray]]:
+    """Return the mean of p - rho g (h - y) in the cells that lie a cell or more below the surface, and the rows' mean pressures."""
+    y = (np.arange(len(pressure)) + 0.5) * dx
+    wet = pressure > 0.0
+    deep = wet & (y < LEVEL - dx)[:, None]
+    hydrostatic = DENSITY * GRAVITY * (LEVEL - y)[:, None]
+    rows = wet.any(axis=1)
+    means = pressure.sum(axis=1)[rows] / wet.sum(axis=1)[rows]
+    return float((pressure - hydrostatic)[deep].mean() / (DENSITY * GRAVITY * dx)), (y[rows], means)
+
+
+def _normalized(rest: Rest) -> tuple[list[float], list[float]]:
+    y, pressure = rest.profile
+    return (y / LEVEL).tolist(), (pressure / (DENSITY * GRAVITY * LEVEL)).tolist()
+
+
+def _enclosed(simulation: LiquidSimulation) -> float:
+    """Return the volume inside the sub-cell surface [cells]; the domain's box is the only solid it knows."""
+    nx, ny, _ = simulation.grid.counts
+    return enclosed_cells(positions(simulation) / simulation.grid.spacing, (nx, ny), 1.0 / PER_AXIS**2)

@@ -1,0 +1,99 @@
+"""Numbers from curves: periods, curves compared after a shift in time, fronts and heights of a liquid's cells. All of it plain NumPy."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+HALF_FULL = 0.5
+SHIFT_STEP = 0.01
+
+
+def crossings(time: np.ndarray, signal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the times at which a signal rises and at which it falls through 0, linear between samples."""
+    time, signal = np.asarray(time, dtype=float), np.asarray(signal, dtype=float)
+    below, above = signal[:-1], signal[1:]
+    found = []
+    for at in (np.flatnonzero((below < 0) & (above >= 0)), np.flatnonzero((below > 0) & (above <= 0))):
+        found.append(time[at] + (time[at + 1] - time[at]) * below[at] / (below[at] - above[at]))
+    return found[0], found[1]
+
+
+def period(time: np.ndarray, signal: np.ndarray) -> float:
+    """Return the period of a signal: from crossings in one direction, so that its mean need not be 0 and it may fade.
+
+    Raises:
+        ValueError: neither direction is crossed twice.
+    """
+    rising, falling = crossings(time, signal)
+    spans = [(len(at) - 1, at[-1] - at[0]) for at in (rising, falling) if len(at) > 1]
+    if not spans:
+        raise ValueError("the signal crosses 0 less than twice in one direction: it has no period")
+    return float(sum(span for _, span in spans) / sum(count for count, _ in spans))
+
+
+def mode(x: np.ndarray, wavenumber: float, area: float, length: float) -> float:
+    """Return the amplitude [m] of cos(k x) in a liquid's elevation, from equal particles that fill it.
+
+    The integral of cos(k x) over a liquid of depth h + eta(x) is that of eta cos(k x), where k is a multiple of pi / length.
+
+    Args:
+        x: of the particles [m], shape (n,).
+        wavenumber: k [1/m].
+        area: of one particle [m^2].
+        length: of the tank [m].
+    """
+    return float(2.0 / length * area * np.cos(wavenumber * np.asarray(x)).sum())
+
+
+def relative_rms(time: np.ndarray, values: np.ndarray, at: np.ndarray, expected: np.ndarray, shift: float = 0.0) -> float:
+    """Return the root mean square of values(at + shift) / expected - 1, linear between samples."""
+    found = np.interp(np.asarray(at) + shift, time, values)
+    return float(np.sqrt(np.mean((found / np.asarray(expected) - 1.0) ** 2)))
+
+
+def best_shift(time: np.ndarray, values: np.ndarray, at: np.ndarray, expected: np.ndarray, limit: float) -> tuple[float, float]:
+    """Return the shift within +-limit that makes `relative_rms` smallest, and that error."""
+    count = round(limit / SHIFT_STEP)
+    shifts = np.linspace(-limit, limit, 2 * count + 1)
+    errors = [relative_rms(time, values, at, expected, shift) for shift in shifts]
+    best = int(np.argmin(errors))
+    return float(shifts[best]), errors[best]
+
+
+def slope(x: np.ndarray, y: np.ndarray, low: float, high: float) -> float:
+    """Return the slope of the line through the points with low <= x <= high, by least squares."""
+    x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
+    chosen = (x >= low) & (x <= high)
+    if chosen.sum() < 2:
+        raise ValueError(f"less than two points lie between {low} and {high}")
+    return float(np.polyfit(x[chosen], y[chosen], 1)[0])
+
+
+def front(fill: np.ndarray) -> int:
+    """Return the right edge, in cells, of the farthest floor cell that is at least half full; 0 if there is none.
+
+    Args:
+        fill: fraction of each cell that is liquid, shape (ny, nx), the floor first.
+    """
+    full = np.flatnonzero(np.asarray(fill)[0] >= HALF_FULL)
+    return int(full[-1]) + 1 if len(full) else 0
+
+
+def arrivals(time: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return when a front first was where it had not been, and these places: a stair's edges, to interpolate between."""
+    time, place = np.asarray(time, dtype=float), np.asarray(place, dtype=float)
+    farthest = np.maximum.accumulate(place)
+    new = np.flatnonzero(np.diff(farthest, prepend=-math.inf) > 0)
+    return time[new], farthest[new]
+
+
+def column_height(fill: np.ndarray, columns: int) -> float:
+    """Return the liquid's mean height, in cells, in the first columns beside the left wall."""
+    return float(np.asarray(fill)[:, :columns].sum() / columns)
+
+
+def order(errors: list[float], refinement: float = 2.0) -> float:
+    """Return the order of convergence that the first and the last error show; the step shrinks by `refinement` from one to the next."""
+    return math.log(errors[0] / errors[-1]) / math.log(refinement) / (len(errors) - 1)

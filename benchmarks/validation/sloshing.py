@@ -1,0 +1,103 @@
+"""Sloshing of a small amplitude: omega^2 = g k tanh(k h), linear theory of waves on water of depth h."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.record import Chart, Lines
+from benchmarks.validation.finding import Findings, Trial, attempt
+from benchmarks.validation.signals import mode, period
+from benchmarks.validation.tank import GRAVITY, PER_AXIS, SUB_CELL, VOXEL, Numerics, create, positions, steps
+
+RESOLUTIONS = (14, 28)  # cells of depth
+LENGTH, DEPTH, HEIGHT = 1.0, 0.5, 0.75  # [m]: of the tank, of the liquid, of the tank
+AMPLITUDE = 0.05 * DEPTH
+WAVENUMBER = math.pi / LENGTH
+PERIOD = 2.0 * math.pi / math.sqrt(GRAVITY * WAVENUMBER * math.tanh(WAVENUMBER * DEPTH))
+PERIODS = 5
+POINTS = 257  # of the surface at the start
+
+
+def check(device: str) -> tuple[list[Trial], list[Chart]]:
+    """Run the check at its resolutions."""
+    trials = [trial(n, device) for n in RESOLUTIONS]
+    errors = [next((f.value for f in t.findings if f.what == "error of the period"), math.nan) for t in trials]
+
+    def refined(found: Findings) -> None:
+        found.add("error of the period", errors[1], high=max(errors[0], 0.5), unit="%")
+
+    comparison = attempt("sloshing", f"{RESOLUTIONS[1]} against {RESOLUTIONS[0]} cells", refined)
+    time = np.linspace(0.0, PERIODS * PERIOD, 400)
+    curves = {"linear theory": (time.tolist(), np.cos(2.0 * math.pi * time / PERIOD).tolist())}
+    for t in trials:
+        curves |= {f"{t.resolution}: {label}": curve for label, curve in t.curves.items()}
+    chart = Lines("sloshing", "First mode of the elevation", "t [s]", "amplitude / start", curves, logarithmic_x=False, logarithmic_y=False)
+    return [*trials, comparison], [chart]
+
+
+def trial(cells: int, device: str, numerics: Numerics = SUB_CELL, periods: int = PERIODS) -> Trial:
+    """Measure the period; the control is a surface of whole cells, which is half a cell too high."""
+
+    def run(found: Findings) -> None:
+        limit = 3.0 if cells >= RESOLUTIONS[-1] else 5.0
+        for each in (numerics, VOXEL):
+            time, elevation = slosh(cells, device, each, periods)
+            measured = period(time, elevation)
+            error = 100.0 * abs(measured / PERIOD - 1.0)
+            found.curves[f"{each.name}, {measured:.4f} s"] = (time.tolist(), (elevation / AMPLITUDE).tolist())
+            if each is numerics:
+                found.add("error of the period", error, high=limit, unit="%")
+            else:
+                found.must_break("whole cells: error of the period", error, high=8.0, unit="%")
+
+    return attempt("sloshing", f"{cells} cells of depth, {numerics.name}", run)
+
+
+def slosh(cells: int, device: str, numerics: Numerics, periods: int = PERIODS) -> tuple[np.ndarray, np.ndarray]:
+    """Return times [s] and the amplitude of the first mode [m].
+
+    Args:
+        cells: of depth.
+        device: where it runs.
+        numerics: of solids and surface.
+        periods: how many of linear theory to run for.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        write_wave(Path(folder) / "wave.obj")
+        resolution = round(cells * LENGTH / DEPTH)
+        liquid = [{"shape": "mesh", "file": "wave.obj"}]
+        simulation = create(
+            numerics, size=[LENGTH, HEIGHT], resolution=resolution, liquid=liquid, device=device, folder=Path(folder)
+        )  # fmt: skip
+    area = (simulation.grid.spacing / PER_AXIS) ** 2
+
+    def amplitude() -> float:
+        return mode(positions(simulation)[:, 0], WAVENUMBER, area, LENGTH)
+
+    time, elevation = [0.0], [amplitude()]
+    for row in steps(simulation, periods * PERIOD):
+        time.append(row["time"])
+        elevation.append(amplitude())
+    return np.array(time), np.array(elevation)
+
+
+def write_wave(path: Path) -> None:
+    """Write the liquid at the start as a closed surface, extruded along z: its cut by z = 0 lies below y = h + a cos(k x)."""
+    margin = 0.1 * LENGTH  # beyond the walls, so that none of the liquid's sides lies on them
+    x = np.linspace(-margin, LENGTH + margin, POINTS)
+    outline = [*zip(x, DEPTH + AMPLITUDE * np.cos(WAVENUMBER * x), strict=True), (x[-1], -margin), (x[0], -margin)]
+    n = len(outline)
+    vertices = [f"v {a:.9g} {b:.9g} {z:g}" for z in (-1.0, 1.0) for a, b in outline]
+    sides = []
+    for p in range(n):
+        q = (p + 1) % n
+        sides += [(p + 1, q + 1, n + q + 1), (p + 1, n + q + 1, n + p + 1)]
+    low, high = POINTS + 2, POINTS + 1  # corners at the floor, left and right, counted from 1
+    fans = [(low, p + 1, p + 2) for p in range(POINTS - 1)] + [(low, POINTS, high)]
+    caps = [*fans, *((a + n, c + n, b + n) for a, b, c in fans)]
+    faces = [f"f {a} {b} {c}" for a, b, c in [*sides, *caps]]
+    path.write_text("\n".join([*vertices, *faces]) + "\n", encoding="utf-8")

@@ -1,0 +1,222 @@
+"""Particles and grid: what the transfers conserve, and the order of the advection."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+import warp_lcp as wl
+from benchmarks.record import Chart, Lines
+from benchmarks.validation.finding import Findings, Trial, attempt
+from benchmarks.validation.signals import order
+from benchmarks.validation.tank import SUB_CELL, Numerics, create, positions, steps, velocities
+from fluids import LiquidSimulation
+from warp_lcp.grid.advection import advect, clearance
+from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
+
+RESOLUTIONS = (16, 32)  # cells a side
+PER_CELL = 4
+RANDOM_SEED = 4711
+REALS: dict[str, tuple[Any, Any, Any, float]] = {
+    "float32": (wp.float32, wp.vec3, np.float32, 1e-5),
+    "float64": (wp.float64, wp.vec3d, np.float64, 1e-12),
+}
+CENTER = np.array([0.5, 0.5, 0.0])
+TURN_STEPS = (20, 40, 80)  # of one turn of Zalesak's disk
+VORTEX_GRIDS = (16, 32, 64)
+VORTEX_SIZE, VORTEX_TIME, VORTEX_STEPS = 0.15, 3.0, 96  # [m], [s] at 1 rad/s in the middle; steps enough for the grid's error to show
+BLOB_RADIUS = 0.25  # [m]
+
+
+def check(device: str) -> tuple[list[Trial], list[Chart]]:
+    """Run the checks at their resolutions."""
+    order_trial = attempt("advection", f"{TURN_STEPS[0]} to {TURN_STEPS[-1]} steps, {VORTEX_GRIDS[0]} to {VORTEX_GRIDS[-1]} cells",
+                          lambda found: _orders(found, device))  # fmt: skip
+    trials = [round_trip(n, device) for n in RESOLUTIONS] + [order_trial] + [rotating_blob(2 * n, device) for n in RESOLUTIONS]
+    chart = Lines("advection", "Error of the advection", "steps a turn, or cells a side", "largest error [m]", order_trial.curves)
+    return trials, [chart]
+
+
+@dataclass
+class Cloud:
+    """Particles away from the walls, and the fields that they are transferred to."""
+
+    grid: StaggeredGrid
+    position: wp.array[Any]
+    velocity: wp.array[Any]
+    affine: list[wp.array[Any]]
+    fields: list[wp.array[Any]]
+    weights: list[wp.array[Any]]
+
+    def round_trip(self) -> None:
+        """Transfer to the faces and back."""
+        particles_to_faces(self.grid, self.position, self.velocity, self.affine, self.fields, self.weights)
+        faces_to_particles(self.grid, self.fields, self.position, self.velocity, self.affine)
+
+    def momentum(self) -> np.ndarray:
+        """Return the sum of velocities, shape (3,)."""
+        return np.asarray(self.velocity.numpy(), dtype=np.float64).sum(axis=0)
+
+    def angular_momentum(self) -> float:
+        """Return it about the origin, with what the affine part carries in the tents around a particle: f (1 - f) dx^2 dv/dx."""
+        gradients = [g.numpy() for g in self.affine]
+        return angular_momentum(self.position.numpy(), self.velocity.numpy(), gradients, self.grid.spacing)
+
+
+def angular_momentum(position: np.ndarray, velocity: np.ndarray, gradients: list[np.ndarray], dx: float) -> float:
+    """Return the angular momentum of equal particles of unit mass about the origin, the affine part included.
+
+    Args:
+        position: [m], shape (n, 2 or 3).
+        velocity: [m/s], same shape.
+        gradients: of each component [1/s]; empty without an affine part.
+        dx: the grid's spacing [m].
+    """
+    x, v = np.asarray(position, dtype=np.float64), np.asarray(velocity, dtype=np.float64)
+    total = float((x[:, 0] * v[:, 1] - x[:, 1] * v[:, 0]).sum())
+    for component, gradient in enumerate(gradients):
+        along = 1 - component  # the arm: x for v, y for u
+        f = x[:, along] / dx + 0.5  # from the nodes, which are centers of cells along that axis
+        f -= np.floor(f)
+        share = float((f * (1.0 - f) * dx**2 * np.asarray(gradient, dtype=np.float64)[:, along]).sum())
+        total += share if component == 1 else -share
+    return total
+
+
+def cloud(n: int, real: str, device: str, *, affine: bool) -> Cloud:
+    """Return a spinning, disturbed disk of particles in the middle of n x n cells."""
+    scalar, vector, numpy_type, _ = REALS[real]
+    grid = StaggeredGrid((n, n, 1), 1.0 / n, 2, device)
+    rng = np.random.default_rng(RANDOM_SEED)
+    position = np.zeros((PER_CELL * n * n, 3))
+    position[:, :2] = rng.random((len(position), 2))
+    position = position[np.linalg.norm(position - CENTER, axis=1) < 0.35]
+    noise = 0.1 * rng.normal(size=(3, *position.shape))
+    noise[..., 2] = 0.0
+    arm = position - CENTER
+    velocity = np.stack([-arm[:, 1], arm[:, 0], 0.0 * arm[:, 0]], axis=1) + noise[0]
+    gradients = [np.array(row) + noise[1 + c] for c, row in enumerate(([0.0, -1.0, 0.0], [1.0, 0.0, 0.0]))] if affine else []
+    position, velocity, *gradients = (
+        wp.array(values.astype(numpy_type), dtype=vector, device=device) for values in (position, velocity, *gradients)
+    )
+    return Cloud(grid, position, velocity, gradients, grid.faces(scalar), grid.faces(scalar))
+
+
+def round_trip(n: int, device: str) -> Trial:
+    """Transfer to the grid and back; the control is PIC, which loses angular momentum."""
+
+    def run(found: Findings) -> None:
+        for real, (*_, limit) in REALS.items():
+            linear, angular = changes(cloud(n, real, device, affine=True))
+            found.add(f"APIC, {real}: change of momentum", linear, high=limit)
+            found.add(f"APIC, {real}: change of angular momentum", angular, high=limit)
+        linear, angular = changes(cloud(n, "float64", device, affine=False))
+        found.add("PIC, float64: change of momentum", linear, high=1e-12)
+        found.must_break("PIC, float64: change of angular momentum", angular, high=1e-5)
+
+    return attempt("transfers", f"{n} cells", run)
+
+
+def changes(c: Cloud) -> tuple[float, float]:
+    """Return the changes of momentum and angular momentum in a round trip, relative to the sums of the particles' |v| and |x| |v|."""
+    speed, arm = (np.linalg.norm(a.numpy(), axis=1) for a in (c.velocity, c.position))
+    linear, angular = c.momentum(), c.angular_momentum()
+    c.round_trip()
+    lost = np.linalg.norm(c.momentum() - linear)
+    return float(lost / speed.sum()), abs(c.angular_momentum() - angular) / float((arm * speed).sum())
+
+
+def _orders(found: Findings, device: str) -> None:
+    """Find the order of the advection in time on Zalesak's disk, and in space in a vortex."""
+    turns = [zalesak_error(steps, device) for steps in TURN_STEPS]
+    found.add("Zalesak's disk, one turn: order in time", order(turns), low=2.7, high=3.3)
+    found.add(f"Zalesak's disk, {TURN_STEPS[-1]} steps: largest error over the slot's width", turns[-1] / 0.05, high=0.01)
+    errors = [vortex_error(n, device) for n in VORTEX_GRIDS]
+    found.add("rotating blob in a vortex: order in space", order(errors), low=1.8, high=2.4)
+    found.curves["Zalesak's disk, steps a turn"] = (TURN_STEPS, turns)
+    found.curves["vortex, cells a side"] = (VORTEX_GRIDS, errors)
+
+
+def zalesak_error(steps: int, device: str, n: int = 64) -> float:
+    """Return the largest error [m] of particles of Zalesak's disk after a turn; the grid interpolates a rigid rotation exactly."""
+    x, y = np.meshgrid(*[(np.arange(2 * n) + 0.5) / (2 * n)] * 2)
+    disk = ((x - 0.5) ** 2 + (y - 0.75) ** 2 < 0.15**2) & ~((abs(x - 0.5) < 0.025) & (y < 0.85))
+    start = np.stack([x[disk], y[disk], 0.0 * x[disk]], axis=1)
+    moved = carried(start, n, 2.0 * math.pi / steps, steps, lambda r: np.ones_like(r), device)
+    return float(np.linalg.norm(moved - start, axis=1).max())
+
+
+def vortex_error(n: int, device: str) -> float:
+    """Return the largest error [m] of a ring of particles in a vortex whose angular velocity falls off with the radius."""
+    angle = np.linspace(0.0, 2.0 * math.pi, 97)[:-1]
+    start = CENTER + np.stack([0.15 * np.cos(angle), 0.15 * np.sin(angle), 0.0 * angle], axis=1)
+
+    def rate(r: np.ndarray) -> np.ndarray:
+        return np.exp(-((r / VORTEX_SIZE) ** 2))
+
+    moved = carried(start, n, VORTEX_TIME / VORTEX_STEPS, VORTEX_STEPS, rate, device)
+    turn = VORTEX_TIME * float(rate(np.array(0.15)))
+    exact = CENTER + np.stack([0.15 * np.cos(angle + turn), 0.15 * np.sin(angle + turn), 0.0 * angle], axis=1)
+    return float(np.linalg.norm(moved - exact, axis=1).max())
+
+
+def carried(start: np.ndarray, n: int, dt: float, count: int, rate: Any, device: str) -> np.ndarray:
+    """Return where particles are [m] after `count` steps in a steady field that turns about the center with rate(r) [rad/s]."""
+    grid = StaggeredGrid((n, n, 1), 1.0 / n, 2, device)
+    j, i = np.meshgrid(np.arange(n + 2), np.arange(n + 2), indexing="ij")
+    fields = grid.faces()
+    for axis, field in enumerate(fields):
+        x, y = (i - (0.5 if axis else 1.0)) / n - 0.5, (j - (1.0 if axis else 0.5)) / n - 0.5
+        turning = rate(np.hypot(x, y)) * (x if axis else -y)
+        field.assign(np.broadcast_to(turning, grid.shape).astype(np.float32))
+    cells = np.full(grid.shape, wl.SOLID, np.int8)
+    cells[1:-1, 1:-1, 1:-1] = wl.AIR
+    room = clearance(grid, wp.array(cells, dtype=wp.int8, device=device))
+    position = wp.array(start.astype(np.float32), dtype=wp.vec3, device=device)
+    stopped = wp.zeros(1, dtype=wp.int32, device=device)
+    for _ in range(count):
+        advect(grid, fields, room, dt, position, stopped)
+    return np.asarray(position.numpy(), dtype=np.float64)
+
+
+def rotating_blob(n: int, device: str, numerics: Numerics = SUB_CELL) -> Trial:
+    """Let a free disk of liquid turn once: a whole simulation keeps most of its angular momentum with APIC, the control is PIC."""
+
+    def run(found: Findings) -> None:
+        found.add("APIC: loss of angular momentum", 100.0 * turned(n, device, numerics, "apic"), low=-2.0, high=2.0, unit="%")
+        found.must_break("PIC: loss of angular momentum", 100.0 * turned(n, device, numerics, "pic"), low=-2.0, high=2.0, unit="%")
+
+    return attempt("rotating blob", f"{n} cells, {numerics.name}", run)
+
+
+def turned(n: int, device: str, numerics: Numerics, transfer: str) -> float:
+    """Return the share of its angular momentum that a disk of liquid loses in one turn."""
+    liquid = [{"shape": "sphere", "center": [0.5, 0.5], "radius": BLOB_RADIUS}]
+    simulation = create(
+        numerics, size=[1.0, 1.0], resolution=n, liquid=liquid, particles={"transfer": transfer}, physics={"gravity": [0.0, 0.0]},
+        device=device,
+    )  # fmt: skip
+    arm = simulation.particles.position.numpy() - CENTER
+    spin = np.stack([-arm[:, 1], arm[:, 0], 0.0 * arm[:, 0]], axis=1).astype(np.float32)
+    simulation.particles.velocity.assign(spin)
+    for gradient, row in zip(simulation.particles.affine, ([0.0, -1.0, 0.0], [1.0, 0.0, 0.0]), strict=False):
+        gradient.assign(np.tile(np.array(row, dtype=np.float32), (len(arm), 1)))
+    before = _spin(simulation)
+    for _ in steps(simulation, 2.0 * math.pi):
+        pass
+    return 1.0 - _spin(simulation) / before
+
+
+def _spin(simulation: LiquidSimulation) -> float:
+    """Return the angular momentum about the liquid's own center, the affine part included."""
+    x, v = positions(simulation), velocities(simulation)
+    gradients = [g.numpy() for g in simulation.particles.affine]
+    # moving the origin changes nothing but the arm of the whole momentum
+    mean_x, total = x.mean(axis=0), v.sum(axis=0)
+    about_origin = angular_momentum(x, v, gradients, simulation.grid.spacing)
+    return about_origin - float(mean_x[0] * total[1] - mean_x[1] * total[0])

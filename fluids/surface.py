@@ -1,0 +1,114 @@
+"""The free surface: which cells hold liquid, and where between cells it ends."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import warp as wp
+
+from fluids import surface_kernels as kernels
+from fluids.boundary import Boundary
+from warp_lcp.grid.extrapolate import extrapolate
+from warp_lcp.grid.level_set import LevelSet
+from warp_lcp.grid.particles import Particles
+from warp_lcp.grid.staggered import StaggeredGrid, Window
+
+SLIVER = 0.35  # a cell whose open share is smaller may hold no particle though liquid fills it: the level set decides
+REACH = 2  # layers that u* is continued into cells of the level set whose faces no particle gave weight
+
+
+class FreeSurface(Protocol):
+    """Where the liquid ends.
+
+    Attributes:
+        phi: float32 distance to the surface at cell centers [cells], < 0 in liquid; None: the surface lies on the cells' faces.
+    """
+
+    phi: wp.array | None
+
+    def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
+        """Write the cells' kinds.
+
+        Args:
+            particles: the liquid; `key` holds its cells.
+            window: cells that it can touch.
+            kind: int8 of AIR, FLUID, SOLID (written).
+        """
+
+    def complete(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
+        """Give u* to faces of FLUID cells that no particle gave weight; `known` is scratch memory."""
+
+    def volume(self, cells: int) -> float:
+        """Return the liquid's volume [m^3; m^2 in 2-D] when it was last marked, given the number of FLUID cells."""
+
+
+class WholeCellSurface:
+    """Cells that hold a particle are liquid.
+
+    In cells that a solid cuts down to a sliver there may be no particle though the liquid fills them; a level set decides there.
+    """
+
+    phi = None
+
+    def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int) -> None:
+        """Make a level set if cells are cut."""
+        self.grid, self.boundary = grid, boundary
+        self._level_set = LevelSet(grid, particles_a_cell=particles_a_cell) if boundary.open else None
+
+    def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
+        """Write the cells' kinds."""
+        wp.copy(kind, self.boundary.base)
+        wp.launch(kernels.mark_particles_kernel, particles.count, [particles.key, kind.flatten()], device=self.grid.device)
+        if self._level_set is not None:
+            self._level_set.update(particles, window, self.boundary.capacity, self.boundary.base)
+            window.launch(kernels.mark_inside_kernel, [self._level_set.phi, self.boundary.capacity, SLIVER, kind])
+
+    def complete(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
+        """Give u* to slivers."""
+        if self._level_set is not None:
+            _complete(window, velocity, weights, known)
+
+    def volume(self, cells: int) -> float:
+        """Return the volume of the FLUID cells."""
+        return cells * self.grid.cell_volume
+
+
+class GhostFluidSurface:
+    """The zero of a level set that the particles' density gives: air begins between the cells' centers [Gibou et al. 2002].
+
+    Args:
+        grid: the grid.
+        boundary: solids and walls.
+        particles_a_cell: of liquid at rest.
+        smoothing: binomial passes over the density: quieter, and less accurate in thin sheets.
+    """
+
+    def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int, smoothing: int = 0) -> None:
+        """Allocate the level set."""
+        self.grid, self.boundary = grid, boundary
+        self.level_set = LevelSet(grid, particles_a_cell=particles_a_cell, smoothing=smoothing)
+        self.phi: wp.array | None = self.level_set.phi
+        self._window = grid.everywhere
+
+    def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
+        """Write the cells' kinds: FLUID below the surface."""
+        self._window = window
+        self.level_set.update(particles, window, self.boundary.capacity, self.boundary.base)
+        wp.copy(kind, self.boundary.base)
+        window.launch(kernels.mark_inside_kernel, [self.level_set.phi, self.boundary.capacity, 2.0, kind])
+
+    def complete(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
+        """Give u* to FLUID faces between particles."""
+        _complete(window, velocity, weights, known)
+
+    def volume(self, cells: int) -> float:
+        """Return the volume inside the surface."""
+        return self.level_set.volume(self.boundary.distance, self._window)
+
+
+def _complete(window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
+    for field, weight, marks in zip(velocity, weights, known, strict=True):
+        marks.zero_()
+        window.launch(kernels.weighted_kernel, [weight, marks])
+        extrapolate(window, marks, field, REACH)

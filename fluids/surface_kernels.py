@@ -1,0 +1,55 @@
+"""Kernels that say which cells hold liquid."""
+
+import typing
+
+import warp as wp
+
+from warp_lcp.grid.staggered import CellRange
+from warp_lcp.grid.transfer import TINY_WEIGHT
+from warp_lcp.operators.grid_poisson import AIR, FLUID
+
+_AIR = wp.constant(wp.int8(AIR))
+_FLUID = wp.constant(wp.int8(FLUID))
+
+options: dict[str, typing.Any] = {"enable_backward": False, "module": "fluids.surface"}
+
+
+@wp.kernel(**options)
+@typing.no_type_check
+def mark_particles_kernel(key: wp.array(dtype=wp.int32), kind: wp.array(dtype=wp.int8)):
+    """A cell that holds a particle is FLUID."""
+    cell = key[wp.tid()]
+    if kind[cell] == _AIR:
+        kind[cell] = _FLUID
+
+
+@wp.kernel(**options)
+@typing.no_type_check
+def mark_inside_kernel(
+    cells: CellRange,
+    phi: wp.array3d(dtype=wp.float32),
+    capacity: wp.array3d(dtype=wp.float32),
+    most: float,
+    kind: wp.array3d(dtype=wp.int8),
+):
+    """An open cell below the free surface is FLUID, if the share of its kernel that is open is no more than `most`."""
+    plane, row, chunk = wp.tid()
+    k = cells.k + plane
+    j = cells.j + row
+    first = cells.i + chunk * cells.grain
+    for i in range(first, wp.min(first + cells.grain, cells.end)):
+        if kind[k, j, i] == _AIR:
+            if phi[k, j, i] < 0.0 and capacity[k, j, i] <= most:
+                kind[k, j, i] = _FLUID
+
+
+@wp.kernel(**options)
+@typing.no_type_check
+def weighted_kernel(cells: CellRange, weight: wp.array3d(dtype=wp.float32), known: wp.array3d(dtype=wp.int8)):
+    """Mark the faces that particles gave weight."""
+    plane, row, chunk = wp.tid()
+    k = cells.k + plane
+    j = cells.j + row
+    first = cells.i + chunk * cells.grain
+    for i in range(first, wp.min(first + cells.grain, cells.end)):
+        known[k, j, i] = wp.where(weight[k, j, i] > TINY_WEIGHT, wp.int8(1), wp.int8(0))

@@ -1,0 +1,145 @@
+"""All small levels in one launch against one launch a stage, and the inverse of the coarsest one against dense algebra."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warp_lcp as wl
+from multigrid.test_hierarchy import level_matrix, masked_hierarchy
+from warp_lcp.multigrid import CycleSettings, Hierarchy
+from warp_lcp.multigrid.small_levels import SmallLevels
+
+TOGETHER = {"one_launch_cpu": 4096, "one_launch_cuda": 4096}
+APART = {"one_launch_cpu": 0, "one_launch_cuda": 0}
+GRIDS = [((17, 12, 21), (False,) * 3), ((33, 40), (False,) * 3), ((8, 12, 10), (True, False, True))]
+FACES = ["equal", "numbers", "arrays"]
+
+
+def problem(shape, faces, seed=83):
+    """Cells, the free ones and keywords of their faces."""
+    rng = np.random.default_rng(seed)
+    cells = rng.choice(3, shape, p=[0.1, 0.85, 0.05])
+    arrays = rng.uniform(0.1, 1, (*shape[:-1], shape[-1] + 1))
+    arrays[..., -1] = arrays[..., 0]
+    return cells, rng.random(shape) < 0.9, {"equal": {}, "numbers": {"face_x": 2.0}, "arrays": {"face_x": arrays}}[faces]
+
+
+def fill(hierarchy, cells, seed=89):
+    """Set a right-hand side and bounds, and return the unknowns."""
+    rng, finest = np.random.default_rng(seed), hierarchy.finest
+    inside = np.pad(cells.reshape(finest.stencil.padding.counts) == wl.FLUID, 1).ravel()
+    finest.b.assign(rng.standard_normal(inside.size) * inside)
+    finest.lower.assign(-rng.uniform(0, 0.3, inside.size) * inside)
+    finest.upper.assign(rng.uniform(0, 0.3, inside.size) * inside)
+    return inside
+
+
+def run_cycle(hierarchy, cells, projected):
+    inside = fill(hierarchy, cells)
+    (hierarchy.monotone_cycle if projected else hierarchy.cycle).run()
+    return hierarchy.finest.x.numpy() * inside
+
+
+@pytest.mark.parametrize("real", [wp.float32, wp.float64])
+@pytest.mark.parametrize("faces", FACES)
+@pytest.mark.parametrize(("shape", "periodic"), GRIDS)
+def test_cycles_and_levels_are_those_of_single_launches(shape, periodic, faces, real, device):
+    """A stage left out, out of order or on a wrong array changes the cycle by far more than rounding."""
+    cells, free, keywords = problem(shape, faces)
+    apart = masked_hierarchy(cells, free, periodic, device, CycleSettings(**APART), real, True, **keywords)[1]
+    together = masked_hierarchy(cells, free, periodic, device, CycleSettings(**TOGETHER), real, True, **keywords)[1]
+    for one, other in zip(apart.levels, together.levels, strict=True):
+        np.testing.assert_array_equal(one.stencil.d.numpy(), other.stencil.d.numpy())
+    eps = np.finfo(wp.dtype_to_numpy(real)).eps
+    for projected in (False, True):
+        expected = run_cycle(apart, cells, projected)
+        np.testing.assert_allclose(run_cycle(together, cells, projected), expected, rtol=0, atol=20 * eps * np.abs(expected).max())
+        assert np.abs(expected).max() > 0.1
+        # the last launches of the descent, the visits and the first of the ascent have become one
+        program = "monotone_cycle" if projected else "cycle"
+        assert len(getattr(together, program)) < len(getattr(apart, program))
+
+
+@pytest.mark.parametrize("projected", [False, True])
+@pytest.mark.parametrize(("shape", "periodic"), GRIDS)
+def test_threads_of_a_block_share_a_stage_in_any_number(shape, periodic, projected):
+    """As on a GPU, a cell at a time by strided threads, but with a launch a stage in place of the barriers.
+
+    A cell that two threads or none take, and a stage whose threads read what others of it write, give another result.
+    """
+    cells, free, keywords = problem(shape, "arrays")
+    hierarchy = masked_hierarchy(cells, free, periodic, "cpu", CycleSettings(**TOGETHER), wp.float64, True, **keywords)[1]
+    rows, first = hierarchy._small, hierarchy._small.levels[0]
+    inverse = hierarchy._inverse.numpy().copy()
+    rng = np.random.default_rng(101)
+    inside = first.stencil.d.numpy() != 0
+    first.b.assign(rng.standard_normal(inside.size) * inside)
+    first.lower.assign(-rng.uniform(0, 0.3, inside.size) * inside)
+    first.upper.assign(rng.uniform(0, 0.3, inside.size) * inside)
+    rows.cycle(2, wp.launch, projected=projected)
+    expected = first.x.numpy() * inside
+    assert np.abs(expected).max() > 0.1
+
+    for level in rows.levels:
+        level.stencil.grain, level.stencil.threads = 1, level.stencil.padding.counts
+    single = SmallLevels(rows.levels, rows.settings, hierarchy._inverse, hierarchy._matrix)
+    single.rebuild(1e-13, wp.launch)
+    np.testing.assert_allclose(hierarchy._inverse.numpy(), inverse, rtol=1e-12)
+    stages = single.stages(2, projected=projected)
+    for threads in (1, 7, 64):
+        for level in rows.levels:
+            level.x.zero_()
+            level.t.zero_()
+        for i in range(len(stages)):
+            inputs = [single.table, stages[i : i + 1], 1, threads, rows.settings.over_correction, projected, hierarchy._inverse]
+            wp.launch(single.kernels.cycle, threads, inputs, device="cpu")
+        np.testing.assert_allclose(first.x.numpy() * inside, expected, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("faces", FACES)
+@pytest.mark.parametrize(("shape", "periodic"), [((3, 4, 5), (False,) * 3), ((2, 3, 2), (True, True, True)), ((7, 9), (True, False))])
+def test_the_coarsest_level_is_inverted(shape, periodic, faces, device):
+    """Its matrix comes from its own product, column by column; two faces join the cells of a periodic axis of two."""
+    cells, free, keywords = problem(shape, faces)
+    _, hierarchy = masked_hierarchy(cells, free, periodic, device, CycleSettings(**TOGETHER), **keywords)
+    assert len(hierarchy.levels) == 1
+    matrix, inverse = level_matrix(hierarchy.finest.stencil), hierarchy._inverse.numpy()
+    unknown = np.diag(matrix) > 0
+    assert 0 < unknown.sum() < cells.size
+    np.testing.assert_allclose((inverse @ matrix)[np.ix_(unknown, unknown)], np.eye(unknown.sum()), atol=1e-12)
+    assert not inverse[~unknown].any()
+    assert not inverse[:, ~unknown].any()
+
+
+@pytest.mark.parametrize("real", [wp.float32, wp.float64])
+def test_a_singular_coarsest_level_is_pinned(real, device):
+    """A closed domain: one unknown of each component is 0, and what remains is a generalized inverse."""
+    cells = np.full((4, 4, 4), wl.FLUID)
+    cells[:, :, 2] = wl.SOLID  # two components
+    _, hierarchy = masked_hierarchy(cells, np.ones(cells.shape), (False,) * 3, device, CycleSettings(**TOGETHER), real)
+    matrix, inverse = level_matrix(hierarchy.finest.stencil, real), hierarchy._inverse.numpy()
+    assert np.linalg.matrix_rank(inverse) == (cells == wl.FLUID).sum() - 2
+    np.testing.assert_allclose(matrix @ inverse @ matrix, matrix, atol=1e-11)
+
+
+@pytest.mark.parametrize("method", [wl.MinimumMapNewton, wl.ProjectedMultigrid])
+def test_solves_take_the_same_iterations(method, device):
+    cells, _, _ = problem((20, 24, 18), "equal")
+    b = np.random.default_rng(97).standard_normal(cells.shape)
+    results = []
+    for settings in (APART, TOGETHER):
+        A = wl.GridPoisson(cells, device=device)
+        results.append(wl.solve(wl.LCP(A, b), method(cycle=CycleSettings(**settings))))
+    one, other = results
+    assert one
+    assert other
+    assert (one.iterations, one.linear_iterations) == (other.iterations, other.linear_iterations)
+    np.testing.assert_allclose([r.residual for r in other.history], [r.residual for r in one.history], rtol=1e-3)
+
+
+def test_levels_of_at_most_so_many_cells_are_taken(device):
+    A = wl.GridPoisson(np.full((32, 32, 32), wl.FLUID), device=device)
+    for cells in (0, 64, 512, 4096):
+        hierarchy = Hierarchy(A.stencil, wp.float32, bounded=False, settings=CycleSettings(one_launch_cpu=cells, one_launch_cuda=cells))
+        counts = [np.prod(level.stencil.padding.counts) for level in hierarchy.levels[hierarchy._first_small :]]
+        assert counts == [n for n in (4096, 512, 64) if n <= cells]

@@ -1,0 +1,117 @@
+"""Bounds of a problem: numbers, fields, or, where all finite ones are equal, a byte a cell instead of eight."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.bounds_kernels import LOWER_IS_FINITE, UPPER_IS_FINITE, decode_kernel, encode_kernel
+from warp_lcp.layout import Array, Layout
+from warp_lcp.native import Spans
+
+NAMES, INFINITE = ("lower", "upper"), (-np.inf, np.inf)
+BITS = (int(LOWER_IS_FINITE), int(UPPER_IS_FINITE))
+
+
+class Bounds:
+    """Lower and upper bounds, each a number or a field.
+
+    A pressure is bounded by 0 on wall cells and not at all elsewhere: such bounds are coded, one byte a cell with a bit for each side.
+    Fields from the host are not kept then. Fields on the device, which the caller may change, are; `refresh` codes them again.
+
+    Args:
+        layout: of the problem's fields.
+        lower: a number or a field.
+        upper: a number or a field.
+
+    Attributes:
+        fields: stored float64 fields; empty where a number or the code counts.
+        values: the numbers that count where there is no field; where bounds are coded, the value of the finite ones.
+        code: stored uint8 field, bit 1 where the lower bound is finite, bit 2 where the upper one is; empty if bounds are not coded.
+    """
+
+    def __init__(self, layout: Layout, lower: Any, upper: Any) -> None:
+        self.layout, self.device = layout, layout.device
+        self._none = wp.empty(0, dtype=wp.float64, device=self.device)
+        self._no_code = wp.empty(0, dtype=wp.uint8, device=self.device)
+        self.fields, self.values, self.code = [self._none, self._none], list(INFINITE), self._no_code
+        self._memory: wp.array[Any] | None = None
+        sides = (lower, upper)
+        varies = [isinstance(v, wp.array) or np.ndim(v) > 0 for v in sides]
+        self.varying = tuple(varies)
+        self.in_place = any(varies[s] and layout.holds(sides[s], wp.float64) for s in (0, 1))
+        for side in (0, 1):
+            if not varies[side]:
+                self.values[side] = float(sides[side])
+        if any(varies) and not self.in_place and self._code_from_host(sides):
+            return
+        for side in (0, 1):
+            if varies[side]:
+                self.fields[side] = layout.load(sides[side], wp.float64, NAMES[side])
+                self.values[side] = 0.0
+        if self.in_place:
+            self.refresh()
+
+    @property
+    def may_bind(self) -> tuple[bool, bool]:
+        """Whether a lower and an upper bound may be finite, now or after the caller changed a field."""
+        below, above = (self.varying[side] or bool(np.isfinite(self.values[side])) for side in (0, 1))
+        return below, above
+
+    @property
+    def operands(self) -> list[Any]:
+        """As kernels that know the code take them: a field or an empty array and the number that then counts, for each; the code."""
+        numbers = [wp.float64(v) for v in self.values]
+        if self.code.size:
+            return [self._none, numbers[0], self._none, numbers[1], self.code]
+        return [self.fields[0], numbers[0], self.fields[1], numbers[1], self.code]
+
+    def refresh(self) -> None:
+        """Code fields again that the caller may have changed, where all their finite values are 0."""
+        if not self.in_place:
+            return
+        if self._memory is None:
+            self._memory = self.layout.zeros(wp.uint8)
+            self._others = wp.zeros(Spans.of(self.layout.size, self.device).threads, dtype=wp.float64, device=self.device)
+        spans = Spans.of(self.layout.size, self.device)
+        numbers = [wp.float64(0.0 if field.size else v) for field, v in zip(self.fields, self.values, strict=True)]
+        inputs = [self.fields[0], numbers[0], self.fields[1], numbers[1], self._memory, spans.n, spans.chunk, spans.stride, self._others]
+        wp.launch(encode_kernel, spans.threads, inputs, device=self.device)
+        self.code = self._no_code if self._others.numpy().any() else self._memory
+
+    def as_field(self, side: int) -> wp.array[Any]:
+        """Return a stored float64 field of the lower (0) or the upper bound (1)."""
+        if self.fields[side].size:
+            return self.fields[side]
+        field = wp.full(self.layout.size, self.values[side], dtype=wp.float64, device=self.device)
+        if self.code.size and not self.in_place:
+            inputs = [self.code, BITS[side], wp.float64(self.values[side]), wp.float64(INFINITE[side]), field]
+            wp.launch(decode_kernel, self.layout.size, inputs, device=self.device)
+        return field
+
+    def _code_from_host(self, sides: tuple[Array, Array]) -> bool:
+        """Code fields that are not stored yet; returns False, with nothing done, if their finite values differ or one is a NaN."""
+        code, values = np.zeros(self.layout.stored_shape, dtype=np.uint8), list(self.values)
+        for side in (0, 1):
+            host = sides[side].numpy() if isinstance(sides[side], wp.array) else np.asarray(sides[side])
+            if not self.varying[side]:
+                code += np.uint8(BITS[side] * bool(np.isfinite(values[side])))
+                continue
+            if not self.layout.fits(host) or host.dtype.kind not in "fiu":
+                return False
+            value = float(host.max() if side == 0 else host.min())
+            finite = host == value
+            if value == -INFINITE[side] or np.isnan(value):
+                return False
+            if not np.isfinite(value):
+                finite[...] = False
+            elif np.count_nonzero(finite) + np.count_nonzero(host == INFINITE[side]) != host.size:
+                return False
+            inner = self.layout.target(code, host)
+            inner += finite.reshape(inner.shape).view(np.uint8) * np.uint8(BITS[side])
+            values[side] = value
+        self.values = values
+        self.code = wp.array(code.ravel(), dtype=wp.uint8, device=self.device)
+        return True
