@@ -42,7 +42,7 @@ class Suite:
 
         Raises:
             ValueError: a size or the number of samples is out of range.
-            RuntimeError: a measurement failed or a check did; what it said is on the error stream, and the files are there in the latter case.
+            RuntimeError: a measurement or a check failed; what it said is on the error stream. A failed check leaves the files.
         """
         if sizes and not self.resizable:
             raise ValueError(f"size = {sizes[0]}: the suite {self.name} has its own resolutions")

@@ -99,3 +99,11 @@ def wall_velocity_kernel(
         wall = wp.max(index[k, j, i], index[c, b, a])
         if wall >= 0:
             field[k, j, i] = walls[wall][axis]
+
+
+@wp.kernel(**options)
+@typing.no_type_check
+def larger_kernel(a: wp.array(dtype=wp.float32), b: wp.array(dtype=wp.float32)):
+    """Set b to the larger of a and b."""
+    i = wp.tid()
+    b[i] = wp.max(a[i], b[i])

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from warp_lcp.grid.staggered import CellRange
-from warp_lcp.native import simd
+from warp_lcp.native import BLOCK, simd
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 
 TOUCHES_NOTHING = 0  # no solid face
@@ -96,14 +96,18 @@ SUBTRACT = """
 CONTACT = """
     const float* u = u_.data + row; const float* v = v_.data + row; const float* w = planes == 2 ? w_.data + row : u;
     const unsigned char* touch = touch_.data + row; const double* x = x_.data + row; unsigned char* contact = contact_.data + row;
-    int released = 0; double worst = 0.0;
-    SIMD8 for (int i = first; i < last; ++i) {
-        const double y = outflow(u, v, w, i), size = y < 0.0 ? -y : y;
-        const int fluid = kind[i] == FLUID, leaves = fluid & ((touch[i] & LETS_GO) != 0) & (x[i] <= 0.0) & (y > threshold);
-        contact[i] = leaves ? RELEASED : ((fluid & (touch[i] & TOUCHES)) ? HELD : 0);
-        released += leaves;
-        const double rest = (fluid & !leaves) ? size : 0.0;
-        worst = worst < rest ? rest : worst;
+    int released = 0; double worst = 0.0, rest[M]; unsigned char leaves[M];
+    for (int from = first; from < last; from += M) {
+        const int n = last - from < M ? last - from : M;
+        SIMD8 for (int m = 0; m < n; ++m) {
+            const int i = from + m, fluid = kind[i] == FLUID;
+            const double y = outflow(u, v, w, i), size = y < 0.0 ? -y : y;
+            const int leaving = fluid & ((touch[i] & LETS_GO) != 0) & (x[i] <= 0.0) & (y > threshold);
+            contact[i] = leaving ? RELEASED : ((fluid & (touch[i] & TOUCHES)) ? HELD : 0);
+            leaves[m] = leaving;
+            rest[m] = (fluid & !leaving) ? size : 0.0;
+        }
+        for (int m = 0; m < n; ++m) { released += leaves[m]; worst = rest[m] > worst ? rest[m] : worst; }
     }
     double* sums = sums_.data + 2*(k*kind_.shape[1] + j);
     sums[0] = released; sums[1] = worst;
@@ -124,7 +128,7 @@ def _source(body: str, *, cut: bool = False, moving: bool = False, ghost: bool =
     """Return a native function's body with its constants."""
     values = _CONSTANTS | {"CUT": int(cut), "MOVING": int(moving), "GHOST": int(ghost)}
     names = "".join(f"constexpr int {name} = {value}; " for name, value in values.items())
-    return simd(names + f"constexpr double THETA_MIN = {THETA_MIN};" + body)
+    return simd(BLOCK + names + f"constexpr double THETA_MIN = {THETA_MIN};" + body)
 
 
 @functools.cache

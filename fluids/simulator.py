@@ -12,6 +12,7 @@ import warp as wp
 
 import warp_lcp as wl
 from fluids.boundary import Boundary, WholeCells
+from fluids.cut_boundary import CutBoundary
 from fluids.gravity import accelerate
 from fluids.pressure import PressureProjection, Projection
 from fluids.pressure_kernels import RELEASED, TOUCHES_NOTHING
@@ -20,6 +21,7 @@ from fluids.surface import FreeSurface, GhostFluidSurface, WholeCellSurface
 from warp_lcp.driver.profile import NoStopwatch, Stopwatch
 from warp_lcp.driver.scene import Scene, Solver
 from warp_lcp.driver.simulator import Cells, Points, SimulationFailed, StepFailed
+from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.particles import MARGIN, Particles, ParticleTotals, seed
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid, Window
@@ -141,8 +143,9 @@ class LiquidSimulation:
 
         SI units; in 2-D mass, energies and volume are per meter of depth. Energies are the particles' own; potential_energy is 0 at the
         origin. solve_residual is relative to the right-hand side's, which in free fall is rounding noise that is not iterated on: it may
-        then be up to 1. volume counts FLUID cells, or lies inside the surface where that is finer than cells. active: wall cells that let go; max_divergence [1/s]: of the other FLUID cells after the
-        projection; stopped: particles that met a wall; pushed: those that a moving solid swept along.
+        then be up to 1. volume counts FLUID cells, or lies inside the surface where that is finer than cells. active: wall cells that let
+        go; max_divergence [1/s]: of the other FLUID cells after the projection; stopped: particles that met a wall; pushed: those that a
+        moving solid swept along.
         """
         return (*COLUMNS, "pushed") if self.boundary.moves else COLUMNS
 
@@ -337,10 +340,17 @@ def _boundary(scene: LiquidScene, grid: StaggeredGrid, folder: Path, wall_veloci
             geometry=solid.to_geometry(folder, scene.dimension),
             separating=(solid.wall or scene.domain.wall) == "separating",
             name=f"solid[{number}] ({solid.shape})",
+            motion=solid.motion.to_motion(scene.dimension) if solid.motion else None,
         )
         for number, solid in enumerate(scene.solid)
     ]
     separating = scene.domain.wall == "separating"
+    if scene.domain.solids == "cut-cell":
+        if wall_velocity is not None:
+            raise ValueError('wall_velocity: only for solids = "voxel"; solids that cut cells have a motion')
+        cut = CutCells(grid, placed, wall_separating=separating)
+        if not cut.whole_cells:
+            return CutBoundary(grid, cut), cut.notes
     solids = voxelize(grid.counts, grid.spacing, grid.dimension, placed, wall_separating=separating, device=grid.device)
     return WholeCells(grid, solids, wall_velocity), solids.notes
 

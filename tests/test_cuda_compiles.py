@@ -10,13 +10,16 @@ import warp as wp
 import fluids
 import warp_lcp as wl
 from warp_lcp.grid import transfer_kernels
+from warp_lcp.multigrid import CycleSettings
 
+ONE_LAUNCH = [CycleSettings(one_launch_cpu=4096), CycleSettings(one_launch_cpu=4096, coarsest_cpu=8)]  # as GPUs cycle
 METHODS = [
     wl.MinimumMapNewton(),
     wl.MinimumMapNewton(precision="double"),
     wl.ProjectedMultigrid(),
     wl.ProjectedMultigrid(precision="double"),
     wl.ProjectedSOR(),
+    *(wl.ProjectedMultigrid(precision=p, cycle=c) for p in ("mixed", "double") for c in ONE_LAUNCH),
 ]
 
 

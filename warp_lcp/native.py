@@ -17,6 +17,8 @@ BLOCK = "\n#ifdef __CUDA_ARCH__\nenum { M = 1 };\n#else\nenum { M = 128 };\n#end
 CUDA_BLOCK = 256  # threads that add up partial sums
 CUDA_SEGMENTS = 256  # blocks that do so first where there are very many
 
+AHEAD = 512  # elements: at 128^3 and 256^3 fetching so far ahead made passes over many fields 20 to 25 % faster
+
 C_TYPES = {wp.uint8: "unsigned char", wp.float32: "float", wp.float64: "double"}
 
 
@@ -28,6 +30,21 @@ def simd(source: str) -> str:
     pragma = "\n#ifndef __CUDA_ARCH__\n#pragma clang loop vectorize(assume_safety) vectorize_width({}) interleave_count(1)\n#endif\n"
     head = "\n#ifndef __CUDA_ARCH__\n#pragma clang fp reassociate(on) contract(fast)\n#endif\n"
     return head + source.replace("SIMD8 ", pragma.format(8)).replace("SIMD ", pragma.format(16)) + "\n"
+
+
+def fetch(begin: str, end: str, **pointers: int) -> str:
+    """Return a loop that asks for the cache lines which elements begin ... end of fields will need `AHEAD` elements later.
+
+    The processor's own prefetching does not keep up with a pass over seven fields or more whose rows are short. A request is no fault
+    wherever it points. It cannot stand in a vectorized loop, so it comes before each block of one.
+
+    Args:
+        begin: first element.
+        end: one past the last.
+        pointers: bytes of an element, by name of the pointer to it.
+    """
+    loops = [f"for (int i = {begin}; i < {end}; i += {64 // size}) __builtin_prefetch({p} + i + {AHEAD});" for p, size in pointers.items()]
+    return "\n#ifndef __CUDA_ARCH__\n" + " ".join(loops) + "\n#endif\n"
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,14 @@ import warp as wp
 CPU_RUNS_BEFORE_CAPTURE = 24  # recording a CPU graph costs about as much as it saves in so many runs
 
 
+def loops_on_device(device: wp.Device) -> bool:
+    """Return whether loops run on the device, without the host: on CUDA, from driver 12.4.
+
+    A CPU graph can loop as well, but would hold up Ctrl-C for all of a loop to save a microsecond an iteration.
+    """
+    return bool(device.is_cuda and wp.is_conditional_graph_supported())
+
+
 class Launch(Protocol):
     """Launches a kernel now, as `wp.launch` does, or records it, as `Program.launch` does."""
 
@@ -32,6 +40,7 @@ class Program:
         self._arguments: list[Any] = []  # a recorded launch holds addresses only
         self._runs = 0
         self._graph: Any = None
+        self._loops: dict[int, Any] = {}  # graphs by the address of their condition
 
     def __len__(self) -> int:
         """Return the number of launches."""
@@ -48,15 +57,34 @@ class Program:
         self._arguments += other._arguments
 
     def run(self) -> None:
-        """Launch everything."""
+        """Launch everything once."""
         if self._graph is not None:
             wp.capture_launch(self._graph)
             return
-        for command in self._commands:
-            command.launch()
+        self._launch()
         self._runs += 1
         if self._runs >= (1 if self.device.is_cuda else CPU_RUNS_BEFORE_CAPTURE):
             with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
-                for command in self._commands:
-                    command.launch()
+                self._launch()
             self._graph = capture.graph
+
+    def run_while(self, condition: wp.array[Any]) -> None:
+        """Launch everything again and again while the condition is not 0; the launches update it.
+
+        Where loops run on the device, all but the first call are one graph, and return before it has ended.
+
+        Args:
+            condition: shape (1,), wp.int32.
+        """
+        if self._runs == 0 or not loops_on_device(self.device):  # the first run loads the kernels
+            wp.capture_while(condition, self.run)
+            return
+        if condition.ptr not in self._loops:
+            with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
+                wp.capture_while(condition, self._launch)
+            self._loops[condition.ptr] = capture.graph
+        wp.capture_launch(self._loops[condition.ptr])
+
+    def _launch(self) -> None:
+        for command in self._commands:
+            command.launch()

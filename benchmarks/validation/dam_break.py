@@ -8,9 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.record import Chart, Lines
+from benchmarks.validation.enclosed import filled_fraction
 from benchmarks.validation.finding import Findings, Trial, attempt
-from benchmarks.validation.signals import arrivals, best_shift, column_height, front, relative_rms, slope
-from benchmarks.validation.tank import GRAVITY, SUB_CELL, Numerics, box, create, fill, steps
+from benchmarks.validation.signals import best_shift, front, relative_rms, slope, stays, surface_height
+from benchmarks.validation.tank import GRAVITY, PER_AXIS, SUB_CELL, Numerics, box, create, fill, positions, steps
+from fluids import LiquidSimulation
 
 RESOLUTIONS = (12, 24)  # cells of a
 LIMITS = {12: 5.0, 24: 3.0}  # [%] of the RMS error after the best shift
@@ -22,7 +24,6 @@ MAX_SHIFT = 0.3  # of T: the experiment's time origin is uncertain
 FIRST, LAST = 0.84, 3.33  # T of the data compared
 STRAIGHT = 1.6  # T from which on the front moves evenly
 TAU_LAST = 2.45
-COLUMNS = 2  # beside the wall, that the height is measured in
 
 # [MartinMoyce1952], front and height of the column of square section, n^2 = 2
 T = np.array([0.41, 0.84, 1.19, 1.43, 1.63, 1.83, 1.98, 2.20, 2.32, 2.51, 2.65, 2.83, 2.98, 3.11, 3.33])
@@ -36,7 +37,7 @@ class Collapse:
     """A collapse in the experiment's units.
 
     Attributes:
-        T: when the front came to a new place, T = n t sqrt(g / a).
+        T: of the front's stays at its places, T = n t sqrt(g / a).
         Z: these places over a.
         tau: t sqrt(g / a) of every step.
         H: height beside the wall over n^2 a.
@@ -104,13 +105,17 @@ def collapse(cells: int, device: str, numerics: Numerics, *, gravity: float = GR
         numerics, size=size, resolution=round(LENGTH * cells), liquid=column, physics={"gravity": [0.0, -gravity]}, device=device
     )  # fmt: skip
     unit = math.sqrt(GRAVITY / A)
-    liquid = fill(simulation)
-    time, place, height = [0.0], [front(liquid)], [column_height(liquid, COLUMNS)]
+    time, place, height = [0.0], [front(fill(simulation))], [_height(simulation)]
     for row in steps(simulation, END / (math.sqrt(N2) * unit)):
-        liquid = fill(simulation)
         time.append(row["time"])
-        place.append(front(liquid))
-        height.append(column_height(liquid, COLUMNS))
+        place.append(front(fill(simulation)))
+        height.append(_height(simulation))
     tau = unit * np.array(time)
-    arrived, places = arrivals(math.sqrt(N2) * tau, np.array(place) / cells)
-    return Collapse(arrived, places, tau, np.array(height) / (N2 * cells))
+    return Collapse(*stays(math.sqrt(N2) * tau, np.array(place) / cells), tau, np.array(height) / (N2 * cells))
+
+
+def _height(simulation: LiquidSimulation) -> float:
+    """Return the height of the surface at the left wall [cells]."""
+    nx, ny, _ = simulation.grid.counts
+    fraction = filled_fraction(positions(simulation) / simulation.grid.spacing, (nx, ny), 1.0 / PER_AXIS**2)
+    return surface_height(fraction[:, 0])

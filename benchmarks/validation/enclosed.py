@@ -51,4 +51,5 @@ def enclosed_cells(cells: np.ndarray, counts: tuple[int, int], volume: float) ->
     distance = np.pad(-np.interp(fraction, cumulative(KNOTS), KNOTS), 1, mode="edge")
     y, x = ((np.arange(n * SAMPLES) + 0.5) / SAMPLES + 0.5 for n in (ny, nx))
     sampled = map_coordinates(distance, np.meshgrid(y, x, indexing="ij"), order=1)
-    return float(np.count_nonzero(sampled < 0.0)) / SAMPLES**2
+    covered = np.clip(0.5 - SAMPLES * sampled, 0.0, 1.0)  # of the little square around a sample, by a surface at this distance
+    return float(covered.sum()) / SAMPLES**2

@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks.record import Chart, Lines
+from benchmarks.validation import tank
 from benchmarks.validation.enclosed import enclosed_cells
 from benchmarks.validation.finding import Findings, Trial, attempt
-from benchmarks.validation.tank import (
-    DENSITY, GRAVITY, PER_AXIS, SMOOTHED, SUB_CELL, VOXEL, Numerics, box, create, gravity_speed, positions, pressures, steps, tilted,
-)  # fmt: skip
+from benchmarks.validation.tank import DENSITY, GRAVITY, SMOOTHED, SUB_CELL, VOXEL, Numerics
 from fluids import LiquidSimulation
 
 RESOLUTIONS = (20, 40)  # cells a side
@@ -22,8 +21,8 @@ DURATION, TILTED_DURATION = 10.0, 20.0  # [s]
 AVERAGED = 1.0  # [s] at the end over which the pressure's bias is averaged
 SLOPE, TILT = 30.0, 20.0  # degrees: of the planes of a V, and of gravity
 
-POOL = [box([0.0, 0.0], [SIDE, LEVEL])]
-FULL = [box([0.0, 0.0], [SIDE, SIDE])]
+POOL = [tank.box([0.0, 0.0], [SIDE, LEVEL])]
+FULL = [tank.box([0.0, 0.0], [SIDE, SIDE])]
 V = [
     {"shape": "plane", "point": [0.5 * SIDE, 0.0], "normal": [side * math.sin(math.radians(SLOPE)), math.cos(math.radians(SLOPE))]}
     for side in (-1, 1)
@@ -32,7 +31,7 @@ CASES: dict[str, dict[str, Any]] = {
     "pool": {"liquid": POOL},
     "pool in a V": {"liquid": POOL, "solid": V},
     "full box": {"liquid": FULL},
-    "full tilted box": {"liquid": FULL, "physics": tilted(TILT)},
+    "full tilted box": {"liquid": FULL, "physics": tank.tilted(TILT)},
 }
 
 
@@ -43,7 +42,7 @@ class Rest:
     Attributes:
         time: ends of the steps [s].
         speed: largest of the particles, in units of sqrt(g dx).
-        bias: of the pressure below the surface at the end, in units of rho g dx; NaN where there is no level surface.
+        bias: of the pressure below the surface at the end, in units of rho g dx, if it is level.
         profile: heights of rows of cells [m] and their mean pressure [Pa].
         volume: inside the sub-cell surface at the end over that at the start.
     """
@@ -62,13 +61,22 @@ class Rest:
 def check(device: str) -> tuple[list[Trial], list[Chart]]:
     """Run the check at its resolutions."""
     trials = [trial(n, device) for trial in (whole_cells, sub_cell, tilted_surface) for n in RESOLUTIONS]
-    speeds = {f"{t.name}: {label}": curve for t in trials for label, curve in t.curves.items() if label != "profile"}
-    profiles = {t.name: t.curves["profile"] for t in trials if "profile" in t.curves}
-    charts: list[Chart] = [Lines("rest", "Largest speed at rest", "t [s]", "largest speed / sqrt(g dx)", speeds, logarithmic_x=False)]
-    depth = np.array([0.0, LEVEL])
-    exact = {"rho g (h - y)": (depth / LEVEL, 1.0 - depth / LEVEL)}
+    profiles = {t.resolution: t.curves["profile"] for t in trials if "profile" in t.curves}
+    charts: list[Chart] = []
+    for check, title in (("rest", "Largest speed at rest"), ("tilted rest", "Largest speed of a tilted surface at rest")):
+        speeds = {
+            f"{t.resolution}: {label}": curve
+            for t in trials
+            for label, curve in t.curves.items()
+            if t.check == check and label != "profile"
+        }
+        name = check.replace(" ", "-")
+        charts.append(Lines(name, title, "t [s]", "largest speed / sqrt(g dx)", speeds, logarithmic_x=False))
+    exact = {"rho g (h - y)": ([0.0, 1.0], [1.0, 0.0])}
     charts.append(
-        Lines("pressure", "Pressure in a pool at rest", "y / h", "p / (rho g h)", exact | profiles, logarithmic_x=False, logarithmic_y=False)
+        Lines(
+            "pressure", "Pressure in a pool at rest", "y / h", "p / (rho g h)", exact | profiles, logarithmic_x=False, logarithmic_y=False
+        )
     )
     return trials, charts
 
@@ -90,10 +98,11 @@ def whole_cells(resolution: int, device: str) -> Trial:
 
 def sub_cell(resolution: int, device: str, numerics: Numerics = SUB_CELL) -> Trial:
     """Rest with a sub-cell surface and cut cells; the control is the bias that a surface of whole cells has."""
+    half = LEVEL + 0.5 * SIDE / resolution
 
     def run(found: Findings) -> None:
-        for case, tables in CASES.items():
-            rest = settle(resolution, device, numerics, DURATION, **tables)
+        for case, tables in {**CASES, "pool half a cell higher": {"liquid": [tank.box([0.0, 0.0], [SIDE, half])]}}.items():
+            rest = settle(resolution, device, numerics, DURATION, half if "half" in case else LEVEL, **tables)
             found.add(f"{case}: largest speed in the first second", rest.largest(0.0, 1.0), high=0.05)
             found.add(f"{case}: largest speed from 8 to 10 s", rest.largest(8.0, DURATION), high=0.01)
             found.curves[case] = (rest.time.tolist(), rest.speed.tolist())
@@ -112,7 +121,7 @@ def tilted_surface(resolution: int, device: str, numerics: Numerics = SMOOTHED) 
     normal = [-math.sin(math.radians(TILT)), math.cos(math.radians(TILT))]
     tables = {
         "liquid": [{"shape": "plane", "point": [0.5 * SIDE, 0.5 * SIDE], "normal": normal}],
-        "physics": tilted(TILT),
+        "physics": tank.tilted(TILT),
     }
 
     def run(found: Findings) -> None:
@@ -130,28 +139,27 @@ def tilted_surface(resolution: int, device: str, numerics: Numerics = SMOOTHED) 
     return attempt("tilted rest", f"{resolution} cells, {numerics.name}", run)
 
 
-def settle(resolution: int, device: str, numerics: Numerics, duration: float, **tables: Any) -> Rest:
-    """Let a liquid rest for a time [s]."""
-    simulation = create(numerics, size=[SIDE, SIDE], resolution=resolution, device=device, **tables)
-    before, unit = _enclosed(simulation), gravity_speed(simulation)
+def settle(resolution: int, device: str, numerics: Numerics, duration: float, level: float = LEVEL, **tables: Any) -> Rest:
+    """Let a liquid rest for a time [s]; `level` is how high it stands where it stands level [m]."""
+    simulation = tank.create(numerics, size=[SIDE, SIDE], resolution=resolution, device=device, **tables)
+    before, unit = _enclosed(simulation), tank.gravity_speed(simulation)
     time, speed, fields = [], [], []
-    for row in steps(simulation, duration):
+    for row in tank.steps(simulation, duration):
         time.append(row["time"])
         speed.append(row["max_speed"] / unit)
         if row["time"] > duration - AVERAGED:
-            fields.append(pressures(simulation))
+            fields.append(tank.pressures(simulation))
     mean = np.mean(fields, axis=0)
-    level = "physics" not in tables and tables["liquid"] is POOL
-    bias, profile = _bias(mean, simulation.grid.spacing) if level else (math.nan, (np.empty(0), np.empty(0)))
+    bias, profile = _bias(mean, simulation.grid.spacing, level)
     return Rest(np.array(time), np.array(speed), bias, profile, _enclosed(simulation) / before)
 
 
-def _bias(pressure: np.ndarray, dx: float) -> tuple[float, tuple[np.ndarray, np.ndarray]]:
+def _bias(pressure: np.ndarray, dx: float, level: float = LEVEL) -> tuple[float, tuple[np.ndarray, np.ndarray]]:
     """Return the mean of p - rho g (h - y) in the cells that lie a cell or more below the surface, and the rows' mean pressures."""
     y = (np.arange(len(pressure)) + 0.5) * dx
     wet = pressure > 0.0
-    deep = wet & (y < LEVEL - dx)[:, None]
-    hydrostatic = DENSITY * GRAVITY * (LEVEL - y)[:, None]
+    deep = wet & (y < level - dx)[:, None]
+    hydrostatic = DENSITY * GRAVITY * (level - y)[:, None]
     rows = wet.any(axis=1)
     means = pressure.sum(axis=1)[rows] / wet.sum(axis=1)[rows]
     return float((pressure - hydrostatic)[deep].mean() / (DENSITY * GRAVITY * dx)), (y[rows], means)
@@ -165,4 +173,4 @@ def _normalized(rest: Rest) -> tuple[list[float], list[float]]:
 def _enclosed(simulation: LiquidSimulation) -> float:
     """Return the volume inside the sub-cell surface [cells]; the domain's box is the only solid it knows."""
     nx, ny, _ = simulation.grid.counts
-    return enclosed_cells(positions(simulation) / simulation.grid.spacing, (nx, ny), 1.0 / PER_AXIS**2)
+    return enclosed_cells(tank.positions(simulation) / simulation.grid.spacing, (nx, ny), 1.0 / tank.PER_AXIS**2)

@@ -81,17 +81,29 @@ def front(fill: np.ndarray) -> int:
     return int(full[-1]) + 1 if len(full) else 0
 
 
-def arrivals(time: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return when a front first was where it had not been, and these places: a stair's edges, to interpolate between."""
+def stays(time: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the middle of the time that an advancing front stayed at each place, and these places; the last stay has no end.
+
+    A front that is known to a cell is on average where the stair of its places says, and best known in the middle of a tread.
+    """
     time, place = np.asarray(time, dtype=float), np.asarray(place, dtype=float)
     farthest = np.maximum.accumulate(place)
     new = np.flatnonzero(np.diff(farthest, prepend=-math.inf) > 0)
-    return time[new], farthest[new]
+    return 0.5 * (time[new[:-1]] + time[new[1:]]), farthest[new[:-1]]
 
 
-def column_height(fill: np.ndarray, columns: int) -> float:
-    """Return the liquid's mean height, in cells, in the first columns beside the left wall."""
-    return float(np.asarray(fill)[:, :columns].sum() / columns)
+def surface_height(column: np.ndarray) -> float:
+    """Return the height, in cells, where the liquid's fraction in a column of cells falls below a half for the last time.
+
+    Args:
+        column: fraction of each cell that is liquid, the floor first; linear between the cells' centers.
+    """
+    column = np.append(np.asarray(column, dtype=float), 0.0)
+    wet = np.flatnonzero(column >= HALF_FULL)
+    if len(wet) == 0:
+        return 0.0
+    top = int(wet[-1])
+    return top + 0.5 + float((column[top] - HALF_FULL) / (column[top] - column[top + 1]))
 
 
 def order(errors: list[float], refinement: float = 2.0) -> float:

@@ -34,7 +34,7 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
     time = np.linspace(0.0, PERIODS * PERIOD, 400)
     curves = {"linear theory": (time.tolist(), np.cos(2.0 * math.pi * time / PERIOD).tolist())}
     for t in trials:
-        curves |= {f"{t.resolution}: {label}": curve for label, curve in t.curves.items()}
+        curves |= t.curves
     chart = Lines("sloshing", "First mode of the elevation", "t [s]", "amplitude / start", curves, logarithmic_x=False, logarithmic_y=False)
     return [*trials, comparison], [chart]
 
@@ -48,7 +48,7 @@ def trial(cells: int, device: str, numerics: Numerics = SUB_CELL, periods: int =
             time, elevation = slosh(cells, device, each, periods)
             measured = period(time, elevation)
             error = 100.0 * abs(measured / PERIOD - 1.0)
-            found.curves[f"{each.name}, {measured:.4f} s"] = (time.tolist(), (elevation / AMPLITUDE).tolist())
+            found.curves[f"{cells} cells, {each.name}, {measured:.4f} s"] = (time.tolist(), (elevation / AMPLITUDE).tolist())
             if each is numerics:
                 found.add("error of the period", error, high=limit, unit="%")
             else:

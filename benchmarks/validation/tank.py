@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from fluids import FluidsSimulator, LiquidScene, LiquidSimulation
+from warp_lcp.driver.simulator import Cells
 
 GRAVITY = 9.81  # [m/s^2]
 DENSITY = 1000.0  # [kg/m^3]
@@ -105,10 +106,11 @@ def fill(simulation: LiquidSimulation) -> np.ndarray:
 
 def pressures(simulation: LiquidSimulation) -> np.ndarray:
     """Return the pressure [Pa] of the cells, shape (ny, nx); 0 outside the liquid."""
-    frame = next(part for part in simulation.frame() if part.name == "grid")
     nx, ny, _ = simulation.grid.counts
     field = np.zeros((ny, nx))
-    field[frame.index[:, 1], frame.index[:, 0]] = frame.fields["pressure"]
+    for part in simulation.frame():
+        if isinstance(part, Cells):
+            field[part.index[:, 1], part.index[:, 0]] = part.fields["pressure"]
     return field
 
 

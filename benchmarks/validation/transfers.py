@@ -13,8 +13,6 @@ import warp_lcp as wl
 from benchmarks.record import Chart, Lines
 from benchmarks.validation.finding import Findings, Trial, attempt
 from benchmarks.validation.signals import order
-from benchmarks.validation.tank import SUB_CELL, Numerics, create, positions, steps, velocities
-from fluids import LiquidSimulation
 from warp_lcp.grid.advection import advect, clearance
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
@@ -30,14 +28,13 @@ CENTER = np.array([0.5, 0.5, 0.0])
 TURN_STEPS = (20, 40, 80)  # of one turn of Zalesak's disk
 VORTEX_GRIDS = (16, 32, 64)
 VORTEX_SIZE, VORTEX_TIME, VORTEX_STEPS = 0.15, 3.0, 96  # [m], [s] at 1 rad/s in the middle; steps enough for the grid's error to show
-BLOB_RADIUS = 0.25  # [m]
 
 
 def check(device: str) -> tuple[list[Trial], list[Chart]]:
     """Run the checks at their resolutions."""
     order_trial = attempt("advection", f"{TURN_STEPS[0]} to {TURN_STEPS[-1]} steps, {VORTEX_GRIDS[0]} to {VORTEX_GRIDS[-1]} cells",
                           lambda found: _orders(found, device))  # fmt: skip
-    trials = [round_trip(n, device) for n in RESOLUTIONS] + [order_trial] + [rotating_blob(2 * n, device) for n in RESOLUTIONS]
+    trials = [round_trip(n, device) for n in RESOLUTIONS] + [order_trial]
     chart = Lines("advection", "Error of the advection", "steps a turn, or cells a side", "largest error [m]", order_trial.curves)
     return trials, [chart]
 
@@ -147,7 +144,7 @@ def zalesak_error(steps: int, device: str, n: int = 64) -> float:
     x, y = np.meshgrid(*[(np.arange(2 * n) + 0.5) / (2 * n)] * 2)
     disk = ((x - 0.5) ** 2 + (y - 0.75) ** 2 < 0.15**2) & ~((abs(x - 0.5) < 0.025) & (y < 0.85))
     start = np.stack([x[disk], y[disk], 0.0 * x[disk]], axis=1)
-    moved = carried(start, n, 2.0 * math.pi / steps, steps, lambda r: np.ones_like(r), device)
+    moved = carried(start, n, 2.0 * math.pi / steps, steps, np.ones_like, device)
     return float(np.linalg.norm(moved - start, axis=1).max())
 
 
@@ -182,41 +179,3 @@ def carried(start: np.ndarray, n: int, dt: float, count: int, rate: Any, device:
     for _ in range(count):
         advect(grid, fields, room, dt, position, stopped)
     return np.asarray(position.numpy(), dtype=np.float64)
-
-
-def rotating_blob(n: int, device: str, numerics: Numerics = SUB_CELL) -> Trial:
-    """Let a free disk of liquid turn once: a whole simulation keeps most of its angular momentum with APIC, the control is PIC."""
-
-    def run(found: Findings) -> None:
-        found.add("APIC: loss of angular momentum", 100.0 * turned(n, device, numerics, "apic"), low=-2.0, high=2.0, unit="%")
-        found.must_break("PIC: loss of angular momentum", 100.0 * turned(n, device, numerics, "pic"), low=-2.0, high=2.0, unit="%")
-
-    return attempt("rotating blob", f"{n} cells, {numerics.name}", run)
-
-
-def turned(n: int, device: str, numerics: Numerics, transfer: str) -> float:
-    """Return the share of its angular momentum that a disk of liquid loses in one turn."""
-    liquid = [{"shape": "sphere", "center": [0.5, 0.5], "radius": BLOB_RADIUS}]
-    simulation = create(
-        numerics, size=[1.0, 1.0], resolution=n, liquid=liquid, particles={"transfer": transfer}, physics={"gravity": [0.0, 0.0]},
-        device=device,
-    )  # fmt: skip
-    arm = simulation.particles.position.numpy() - CENTER
-    spin = np.stack([-arm[:, 1], arm[:, 0], 0.0 * arm[:, 0]], axis=1).astype(np.float32)
-    simulation.particles.velocity.assign(spin)
-    for gradient, row in zip(simulation.particles.affine, ([0.0, -1.0, 0.0], [1.0, 0.0, 0.0]), strict=False):
-        gradient.assign(np.tile(np.array(row, dtype=np.float32), (len(arm), 1)))
-    before = _spin(simulation)
-    for _ in steps(simulation, 2.0 * math.pi):
-        pass
-    return 1.0 - _spin(simulation) / before
-
-
-def _spin(simulation: LiquidSimulation) -> float:
-    """Return the angular momentum about the liquid's own center, the affine part included."""
-    x, v = positions(simulation), velocities(simulation)
-    gradients = [g.numpy() for g in simulation.particles.affine]
-    # moving the origin changes nothing but the arm of the whole momentum
-    mean_x, total = x.mean(axis=0), v.sum(axis=0)
-    about_origin = angular_momentum(x, v, gradients, simulation.grid.spacing)
-    return about_origin - float(mean_x[0] * total[1] - mean_x[1] * total[0])

@@ -31,7 +31,7 @@ def measured(tmp_path, suite, *options):
 
 
 def test_suites_are_installed():
-    assert sorted(benchmarks()) == ["kernels", "run", "solvers"]
+    assert sorted(benchmarks()) == ["kernels", "run", "solvers", "validation"]
     assert all(suite.name == name and suite.summary for name, suite in benchmarks().items())
 
 
@@ -77,6 +77,7 @@ def test_run(tmp_path):
         (["kernals"], "did you mean 'kernels'?"),
         (["kernels", "--device", "cuda:77"], "--device cuda:77: there is no such device"),
         (["kernels", "--size", "4"], "size = 4: must be >= 8"),
+        (["validation", "--size", "16"], "size = 16: the suite validation has its own resolutions"),
         (["kernels", "--repeat", "0"], "--repeat"),
         (["kernels", "--compare", "a.json"], "--compare"),
         (["kernels", "--compare", "a.json", "b.json"], "a.json: no results of a benchmark"),

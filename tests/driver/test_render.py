@@ -13,10 +13,9 @@ from warp_lcp.driver.frames import FrameFolder
 from warp_lcp.driver.recording import Color, Recording, RenderError, Scale, _round_up, spread
 from warp_lcp.driver.render import INSTALL, Page, parse_size, render_run
 from warp_lcp.driver.scene_file import dump_scene, load_scene
-from warp_lcp.driver.simulator import Cells, Points
 from warp_lcp.driver.scenery import Outline
+from warp_lcp.driver.simulator import Cells, Points
 from warp_lcp.driver.stage import MARGIN, shaded
-from warp_lcp.grid.motion import Pose
 
 RNG = np.random.default_rng(9127)
 WHITE = 255
@@ -309,7 +308,7 @@ def test_a_flat_solid_stands_where_it_is_at_the_time_of_a_frame(pyvista, make_ru
 
 def test_a_solid_in_a_room_is_drawn_anew_in_every_frame(pyvista, make_run):
     motion = '{ kind = "translation", velocity = [0.0, 8.0, 0.0] }'
-    text = f"[[solid]]\n{SOLIDS['sphere']}\nmotion = {motion}\n[[solid]]\n{SOLIDS['box']}\n"
+    text = f"[[solid]]\n{SOLIDS['sphere']}\nmotion = {motion}\n"
     folder = make_run([([0.9, 0.9, 0.9], [1.0, 0.0, 0.0])] * 4, text, size=ROOM, solids="cut-cell")
     page = Page(Recording(folder, Color.PLAIN), (400, 300), 1)
     images = [np.asarray(page.draw([frame]), dtype=int)[page.line :] for frame in (0, 1, 3, 0)]
@@ -317,8 +316,8 @@ def test_a_solid_in_a_room_is_drawn_anew_in_every_frame(pyvista, make_run):
     assert (images[0] != images[1]).any()
     np.testing.assert_array_equal(images[0], images[3])
     gray = [((np.ptp(image, axis=-1) < 16) & (image < 215).all(axis=-1)).sum() for image in images]
-    assert gray[2] < 0.7 * gray[0]  # by 0.15 s the ball has left through the ceiling, the box is still there
-    assert gray[2] > 500
+    assert gray[1] > 1.5 * gray[2]
+    assert gray[0] > 1.5 * gray[2]  # by 0.15 s the ball has left through the ceiling; the room's edges stay
 
 
 def test_containers_do_not_hide_what_is_in_them(pyvista, make_run):

@@ -135,4 +135,5 @@ def test_built_in_scenes_are_valid(name):
 
 def test_the_promised_scenes_are_there():
     promised = {"dam-break-2d", "dam-break", "ceiling-drop", "splash-in-circle", "water-labyrinth", "splash-in-square", "mesh-obstacle"}
+    promised |= {"wave-maker", "retracting-wall", "stirred-tank"}
     assert promised <= built_in_scenes().keys()

@@ -12,11 +12,16 @@ STEPS = 2000
 
 
 def scene(*, size: list[float], resolution: int, liquid: list[dict[str, Any]], **tables: Any) -> LiquidScene:
-    """Return a scene; `wall` and `cfl` are short for domain.wall and time.cfl, the rest are tables."""
+    """Return a scene; `wall`, `solids` and `cfl` are short for domain.wall, domain.solids and time.cfl, the rest are tables."""
     data: dict[str, Any] = {
         "scene": {"simulator": "fluids"},
         "time": {"duration": 10.0, "cfl": tables.pop("cfl", 2.0)},
-        "domain": {"size": size, "resolution": resolution, "wall": tables.pop("wall", "separating")},
+        "domain": {
+            "size": size,
+            "resolution": resolution,
+            "wall": tables.pop("wall", "separating"),
+            "solids": tables.pop("solids", "voxel"),
+        },
         "liquid": liquid,
     }
     return LiquidScene.model_validate(data | tables)

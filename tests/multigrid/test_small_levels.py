@@ -1,5 +1,7 @@
 """All small levels in one launch against one launch a stage, and the inverse of the coarsest one against dense algebra."""
 
+import re
+
 import numpy as np
 import pytest
 import warp as wp
@@ -8,6 +10,8 @@ import warp_lcp as wl
 from multigrid.test_hierarchy import level_matrix, masked_hierarchy
 from warp_lcp.multigrid import CycleSettings, Hierarchy
 from warp_lcp.multigrid.small_levels import SmallLevels
+from warp_lcp.multigrid.small_levels_kernels import CUDA_THREADS, small_levels_kernels
+from warp_lcp.operators.grid_poisson import mask_diagonal
 
 TOGETHER = {"one_launch_cpu": 4096, "one_launch_cuda": 4096}
 APART = {"one_launch_cpu": 0, "one_launch_cuda": 0}
@@ -135,6 +139,40 @@ def test_solves_take_the_same_iterations(method, device):
     assert other
     assert (one.iterations, one.linear_iterations) == (other.iterations, other.linear_iterations)
     np.testing.assert_allclose([r.residual for r in other.history], [r.residual for r in one.history], rtol=1e-3)
+
+
+def test_levels_follow_when_the_cells_change(device):
+    """The tables on the device hold addresses: rows, spans and weights that change in place are seen."""
+    cells = np.full((10, 12, 48), wl.AIR)
+    cells[:, :6, :10] = wl.FLUID
+    moved = np.full(cells.shape, wl.AIR)
+    moved[:5, :, 30:] = wl.FLUID
+    A = wl.GridPoisson(cells, device=device, dtype=wp.float64)
+    both = [Hierarchy(A.stencil, wp.float64, bounded=True, settings=CycleSettings(**s)) for s in (APART, TOGETHER)]
+    for now in (cells, moved):
+        A.update(wp.array(now.astype(np.int8), dtype=wp.int8, device=device))
+        found = []
+        for hierarchy in both:
+            hierarchy.refresh()
+            mask_diagonal(A.stencil.d, A.layout.load((now == wl.FLUID).astype(np.uint8), wp.uint8), hierarchy.finest.stencil.d)
+            hierarchy.rebuild()
+            found.append([run_cycle(hierarchy, now, projected) for projected in (False, True)])
+        for expected, other in zip(*found, strict=True):
+            np.testing.assert_allclose(other, expected, rtol=0, atol=1e-13)
+            assert np.abs(expected).max() > 0.1
+
+
+@pytest.mark.parametrize("real", [wp.float32, wp.float64])
+def test_the_gpu_waits_after_every_stage_and_reads_what_others_wrote(real, tmp_path):
+    """Barriers are in the GPU's source only, and no load goes past the cache that sees a block's own writes."""
+    small_levels_kernels(True, real, real)
+    module = f"warp_lcp.small_levels.variable_{real.__name__}_{real.__name__}"
+    (path,) = wp.compile_aot_module(module, device=None, arch=[80], module_dir=tmp_path, use_ptx=True)
+    kernels = path.read_text().split(".visible .entry")[1:]
+    barriers = {re.search("(cycle|rebuild)_", text)[1]: text.count("bar.sync") for text in kernels}
+    assert barriers == {"cycle": 1, "rebuild": 5}  # coarsened, wrapped, assembled, eliminated to and fro
+    assert not any("ld.global.nc" in text for text in kernels)
+    assert all(f".maxntid {CUDA_THREADS}" in text for text in kernels)  # else there may be too few registers for such a block
 
 
 def test_levels_of_at_most_so_many_cells_are_taken(device):

@@ -137,7 +137,7 @@ def schema(simulator: Annotated[str, typer.Option(help="Whose scenes.")] = "flui
 
 @app.command()
 def bench(
-    suite: Annotated[str, typer.Argument(metavar="SUITE", help="What to measure: kernels, solvers or run.")],
+    suite: Annotated[str, typer.Argument(metavar="SUITE", help="What to measure: kernels, solvers or run; or validation.")],
     device: Annotated[str, typer.Option(help="cpu or cuda:N.")] = "cpu",
     out: Annotated[Path, typer.Option(help="The folder of SUITE.json, SUITE.md and the plots.")] = Path("out/bench"),
     size: Annotated[list[int] | None, typer.Option(metavar="N", help="Cells along a side; may be repeated.", show_default=False)] = None,

@@ -170,9 +170,11 @@ class Scene(Table):
     def plan(self) -> list[tuple[str, str]]:
         """Return what a run would do, as pairs of a word and a line. Subclasses append theirs, such as particles and memory."""
         cells = self.cell_counts[: self.dimension]
+        moving = ", ".join(f"solid {index} {solid.motion.kind}" for index, solid in enumerate(self.solid) if solid.motion)
         return [
             ("grid", f"{' x '.join(map(str, cells))} = {math.prod(cells):,} cells of {self.spacing:.6g} m"),
             ("walls", ", ".join([self.domain.wall, *(f"solid {i} {s.wall}" for i, s in enumerate(self.solid) if s.wall)])),
+            *([("moving", moving)] if moving else []),
             ("time", f"{self.time.duration:g} s in steps of at most {self.time.dt_max:g} s, CFL {self.time.cfl:g}"),
             ("frames", f"{self.time.frame_count + 1} at {self.time.frames_per_second:g} per second"),
             ("solver", f"{self.solver.method} to {self.solver.tolerance:g}, {self.solver.precision} precision"),

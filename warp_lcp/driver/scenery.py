@@ -145,6 +145,7 @@ class RoomScenery(Scenery):
     def _draw(self, outline: Outline, pose: Pose, *, passing: bool) -> None:
         mesh = outline.inside(self.size, pose)
         if outline.shape.invert and not isinstance(outline.shape, Plane):
+            mesh = _clipped(mesh, self.size, closed=False)  # beyond the walls of the domain there is nothing to contain
             far_side = {"opacity": 0.3, "culling": "front"}
             self._add(mesh, passing=passing, color=SOLID, ambient=0.3, smooth_shading=True, split_sharp_edges=True, **far_side)
             edges = mesh.extract_feature_edges(30.0)
@@ -207,10 +208,11 @@ class Outline:
         return mesh if self.shape.invert else _clipped(mesh, size)
 
 
-def _clipped(mesh: Any, size: np.ndarray) -> Any:
-    """Cut a closed surface at the domain's walls, where it reaches beyond."""
+def _clipped(mesh: Any, size: np.ndarray, *, closed: bool = True) -> Any:
+    """Cut a surface at the domain's walls, where it reaches beyond; a closed one is closed again there."""
     for axis in range(3):
         for end, sign in ((0.0, 1.0), (size[axis], -1.0)):
             if mesh.n_points and (sign * (mesh.points[:, axis] - end)).min() < -1e-6 * size[axis]:
-                mesh = mesh.clip_closed_surface(normal=sign * np.eye(3)[axis], origin=end * np.eye(3)[axis])
+                normal, origin = sign * np.eye(3)[axis], end * np.eye(3)[axis]
+                mesh = mesh.clip_closed_surface(normal=normal, origin=origin) if closed else mesh.clip(-normal, origin)
     return mesh

@@ -9,6 +9,7 @@ from warp_lcp.native import BLOCK
 
 AIM = 1.1 * MARGIN  # where particles are put: float32 positions in 10^3 cells round by less than the difference
 STRIDE = 0.25  # cells a particle goes near a wall before it looks again: it never gets through what is twice as thick
+SHORTEST = 0.02  # cells a stride is cut to where a wall is thinner than that
 STRIDES = 128  # of a move: 32 cells along a wall
 CORNER = 0.5  # walls whose normals are further apart (cosine) stop a particle between them, nearer ones it slides over
 BEND = 0.9  # normals that are nearer than this are one wall
@@ -41,6 +42,22 @@ DISTANCE = """
             g[2] = d0 + fy*(d1 - d0);
         }
         return low + fy*(high - low);
+    };
+    auto measure_all = [&](const Block& at, T* result, int n) {
+        const T ex = nx + 1, ey = ny + 1, ez = nz + 1;
+        SIMD for (int m = 0; m < n; ++m) {
+            T x = at[0][m], y = at[1][m], z = planes == 2 ? at[2][m] : (T)1;
+            x = x > 1 ? x : (T)1; y = y > 1 ? y : (T)1; z = z > 1 ? z : (T)1;
+            x = x < ex ? x : ex; y = y < ey ? y : ey; z = z < ez ? z : ez;
+            int i = (int)x, j = (int)y, k = (int)z;
+            i = i < nx ? i : nx; j = j < ny ? j : ny; k = k < nz ? k : nz;
+            const T fx = x - (T)i, fy = y - (T)j, fz = z - (T)k;
+            const T* a = distance + (k*s1 + j*s2 + i); const T* b = a + up;
+            const T a0 = a[0] + fx*(a[1] - a[0]), a1 = a[s2] + fx*(a[s2 + 1] - a[s2]);
+            const T b0 = b[0] + fx*(b[1] - b[0]), b1 = b[s2] + fx*(b[s2 + 1] - b[s2]);
+            const T low = a0 + fy*(a1 - a0), high = b0 + fy*(b1 - b0);
+            result[m] = low + fz*(high - low);
+        }
     };
     auto square = [](const T* g) { return g[0]*g[0] + g[1]*g[1] + g[2]*g[2]; };
 """
@@ -85,7 +102,8 @@ PROJECT = """
         for (int d = 0; d < 3; ++d) x[d] = y[d];
         return true;
     };
-    // Put a point that is too near or inside at the distance `aim`; n becomes the normal there. False: no way out within the limit.
+    // Put a point that is too near or inside at the distance `aim`; n becomes the normal there. 0: no way out within the limit, 2: it was
+    // the gradient that led nowhere.
     auto project = [&](T* x, T* n, T limit) {
         const T start[3] = {x[0], x[1], x[2]};
         T s = measure(x, n), far = 0;
@@ -99,10 +117,10 @@ PROJECT = """
             const T way[3] = {x[0] - start[0], x[1] - start[1], x[2] - start[2]};
             far = square(way);
         }
-        bool out = s >= margin && far <= limit*limit;
+        int out = s >= margin && far <= limit*limit;
         if (!out) {
             for (int d = 0; d < 3; ++d) x[d] = start[d];
-            out = search(x, first_length > margin ? first_length : margin, limit);
+            out = search(x, first_length > margin ? first_length : margin, limit) ? 2 : 0;
             measure(x, n);
         }
         const T size = sqrt(square(n));
@@ -117,41 +135,68 @@ MARCH = """
         const T inward = rest[0]*n[0] + rest[1]*n[1] + rest[2]*n[2];
         for (int d = 0; d < 3; ++d) rest[d] -= inward < 0 ? inward*n[d] : (T)0;
     };
+    auto follow_edge = [&](T* rest, const T* one, const T* other) {
+        const T e[3] = {one[1]*other[2] - one[2]*other[1], one[2]*other[0] - one[0]*other[2], one[0]*other[1] - one[1]*other[0]};
+        const T size = square(e), along = size > (T)1e-6 ? (rest[0]*e[0] + rest[1]*e[1] + rest[2]*e[2])/size : (T)0;
+        for (int d = 0; d < 3; ++d) rest[d] = along*e[d];
+    };
+    // Where a gradient leads nowhere the walls on either side of the way may be two.
+    auto leave_corner = [&](const T* x, const T* n, T* rest) {
+        const T length = sqrt(square(rest));
+        if (!(length > 0)) return;
+        T y[3], g[2][3];
+        for (int side = 0; side < 2; ++side) {
+            for (int d = 0; d < 3; ++d) y[d] = x[d] + (T)0.5*n[d] + (side ? (T)0.4 : (T)-0.4)*rest[d]/length;
+            into_domain(y);
+            measure(y, g[side]);
+        }
+        const T sizes = sqrt(square(g[0])*square(g[1]));
+        if (g[0][0]*g[1][0] + g[0][1]*g[1][1] + g[0][2]*g[1][2] < (T)CORNER*sizes) follow_edge(rest, g[0], g[1]);
+    };
     auto march = [&](int m) {
-        T x[3], rest[3], wall[3] = {0, 0, 0}, n[3]; int met = 0;
+        T x[3], rest[3], wall[3], n[3]; int met = 0;
         T most = 0; int finite = 1;
         for (int d = 0; d < 3; ++d) {
-            x[d] = from[d][m]; rest[d] = to[d][m] - x[d];
+            x[d] = from[d][m]; rest[d] = d <= planes ? to[d][m] - x[d] : (T)0;
             finite &= (int)(abs_of(rest[d]) <= (T)3e38);
             most = abs_of(rest[d]) > most ? abs_of(rest[d]) : most;
         }
         if (!finite) return;  // the sums over particles will find it
         if (most > 1024) { for (int d = 0; d < 3; ++d) rest[d] *= 1024/most; }
         into_domain(x);
-        T s = measure(x, n);
+        T s = measure(x, wall);
+        const T steepness = sqrt(square(wall));
+        int touching = s < 2*aim; T least = (T)STRIDE;
+        for (int d = 0; d < 3; ++d) wall[d] = steepness > 0 ? wall[d]/steepness : (T)0;
         for (int stride = 0; stride < STRIDES; ++stride) {
             const T length = sqrt(square(rest));
-            const T sure = s > (T)(2*STRIDE) ? s - (T)STRIDE : (T)STRIDE;
+            const T sure = s > (T)(2*STRIDE) ? s - (T)STRIDE : least;
             const T t = sure < length ? sure/length : (T)1;
             T y[3];
-            for (int d = 0; d < 3; ++d) { y[d] = x[d] + t*rest[d]; rest[d] *= 1 - t; }
+            for (int d = 0; d < 3; ++d) y[d] = x[d] + t*rest[d];
             into_domain(y);
+            const T before = s;
             s = measure(y, n);
             if (s < margin) {
-                if (!project(y, n, (T)REACH)) { met = 1; break; }
-                slide(rest, n);
-                const T angle = n[0]*wall[0] + n[1]*wall[1] + n[2]*wall[2];
-                if (met && angle < (T)BEND) {  // on along the edge between two walls
-                    const T e[3] = {n[1]*wall[2] - n[2]*wall[1], n[2]*wall[0] - n[0]*wall[2], n[0]*wall[1] - n[1]*wall[0]};
-                    if (angle < (T)CORNER || rest[0]*wall[0] + rest[1]*wall[1] + rest[2]*wall[2] < 0) {
-                        const T size = square(e);
-                        const T along = size > (T)1e-6 ? (rest[0]*e[0] + rest[1]*e[1] + rest[2]*e[2])/size : (T)0;
-                        for (int d = 0; d < 3; ++d) rest[d] = along*e[d];
-                    }
-                } else for (int d = 0; d < 3; ++d) wall[d] = n[d];
+                const int out = project(y, n, (T)REACH);
                 met = 1;
+                if (before >= margin && t*length > (T)SHORTEST && (!out || n[0]*rest[0] + n[1]*rest[1] + n[2]*rest[2] > 0)) {
+                    s = before; least = (T)0.5*(t*length < least ? t*length : least);  // out on the far side: too long a stride
+                    if (s > (T)(2*STRIDE)) s = (T)(2*STRIDE);
+                    continue;
+                }
+                if (!out) break;
+                for (int d = 0; d < 3; ++d) rest[d] *= 1 - t;
+                slide(rest, n);
+                if (out == 2) leave_corner(y, n, rest);
+                const T angle = n[0]*wall[0] + n[1]*wall[1] + n[2]*wall[2];
+                if (touching && angle < (T)BEND) {  // another wall: if the way is blocked, on along the edge between the two
+                    if (angle < (T)CORNER || rest[0]*wall[0] + rest[1]*wall[1] + rest[2]*wall[2] < 0) follow_edge(rest, n, wall);
+                } else for (int d = 0; d < 3; ++d) wall[d] = n[d];
+                touching = 1;
                 s = aim;
-            }
+            } else for (int d = 0; d < 3; ++d) rest[d] *= 1 - t;
+            least = (T)STRIDE;
             for (int d = 0; d < 3; ++d) x[d] = y[d];
             if (!(square(rest) > (T)1e-12)) break;
         }
@@ -164,19 +209,10 @@ MARCH = """
 MOVE = """
     T sure[M];
     auto prepare = [&](int n) {
-        const T flat = planes == 2 ? (T)0.57735 : (T)0.7071, ex = nx + 1, ey = ny + 1, ez = nz + 1;
+        const T flat = planes == 2 ? (T)0.57735 : (T)0.7071;
+        measure_all(from, sure, n);
         SIMD for (int m = 0; m < n; ++m) {
-            T x = from[0][m], y = from[1][m], z = planes == 2 ? from[2][m] : (T)1;
-            x = x > 1 ? x : (T)1; y = y > 1 ? y : (T)1; z = z > 1 ? z : (T)1;
-            x = x < ex ? x : ex; y = y < ey ? y : ey; z = z < ez ? z : ez;
-            int i = (int)x, j = (int)y, k = (int)z;
-            i = i < nx ? i : nx; j = j < ny ? j : ny; k = k < nz ? k : nz;
-            const T fx = x - (T)i, fy = y - (T)j, fz = planes == 2 ? z - (T)k : (T)0;
-            const T* a = distance + (k*s1 + j*s2 + i); const T* b = a + up;
-            const T a0 = a[0] + fx*(a[1] - a[0]), a1 = a[s2] + fx*(a[s2 + 1] - a[s2]);
-            const T b0 = b[0] + fx*(b[1] - b[0]), b1 = b[s2] + fx*(b[s2 + 1] - b[s2]);
-            const T low = a0 + fy*(a1 - a0), high = b0 + fy*(b1 - b0), s = low + fz*(high - low);
-            const T near = s*flat, far = s - (T)STRIDE, r = (near > far ? near : far) - margin;
+            const T near = sure[m]*flat, far = sure[m] - (T)STRIDE, r = (near > far ? near : far) - margin;
             sure[m] = r > 0 ? r*r : (T)-1;
         }
     };
@@ -194,38 +230,86 @@ MOVE = """
 """
 
 PUSH_OUT = """
-    typedef float T;
+    typedef float T; typedef T Block[3][M];
     const T margin = (T)MARGIN;
     T* position = (T*)x_.data;
     const int nx = distance_.shape[2] - 2, ny = distance_.shape[1] - 2, nz = distance_.shape[0] - 2;
     const long long s2 = nx + 2, s1 = s2*(ny + 2), up = planes == 2 ? s1 : 0;
+    Block at; T room[M]; int inside[M], list[M];
     GRID_COORDINATE DISTANCE PROJECT
-    int moved = 0;
-    for (long long p = first; p < last; ++p) {
-        T x[3], n[3]; int finite = 1;
-        for (int d = 0; d < 3; ++d) {
-            x[d] = d <= planes ? grid_coordinate(position[3*p + d]) : (T)1.5;
-            finite &= (int)(x[d] <= (T)3e38) & (int)(x[d] >= (T)-3e38);
+    int moved = 0, left = 0;
+    for (int start = first; start < last; start += M) {
+        const int n = last - start < M ? last - start : M;
+        T* position_here = position + 3*(long long)start;
+        for (int d = 0; d < 3; ++d) { SIMD for (int m = 0; m < n; ++m) at[d][m] = grid_coordinate(position_here[3*m + d]); }
+        measure_all(at, room, n);
+        const T ex = nx + 1, ey = ny + 1, ez = nz + 1;
+        SIMD for (int m = 0; m < n; ++m) {
+            const T x = at[0][m], y = at[1][m], z = planes == 2 ? at[2][m] : (T)1;
+            const int outside = (int)(x < 1) | (int)(y < 1) | (int)(z < 1) | (int)(x > ex) | (int)(y > ey) | (int)(z > ez);
+            inside[m] = outside | (int)(room[m] < margin);
         }
-        if (!finite) continue;
-        const T y[3] = {x[0], x[1], x[2]};
-        into_domain(x);
-        const bool outside = x[0] != y[0] || x[1] != y[1] || x[2] != y[2];
-        if (measure(x, n) >= margin && !outside) continue;
-        if (!project(x, n, (T)PUSH)) { wp::atomic_add(left_.data, 1); continue; }
-        for (int d = 0; d <= planes; ++d) position[3*p + d] = (x[d] - 1)*dx;
-        ++moved;
+        int count = 0;
+        for (int m = 0; m < n; ++m) { list[count] = m; count += inside[m]; }
+        for (int q = 0; q < count; ++q) {
+            const int m = list[q];
+            T x[3] = {at[0][m], at[1][m], at[2][m]}, normal[3]; int finite = 1;
+            for (int d = 0; d <= planes; ++d) finite &= (int)(x[d] <= (T)3e38) & (int)(x[d] >= (T)-3e38);
+            if (!finite) continue;  // the sums over particles will find it
+            into_domain(x);
+            if (!project(x, normal, (T)PUSH)) { ++left; continue; }
+            for (int d = 0; d <= planes; ++d) position_here[3*m + d] = (x[d] - 1)*dx;
+            ++moved;
+        }
     }
-    return moved;
+    return left*65536 + moved;
 """
 
 
 def _named(source: str) -> str:
-    """Return source with its numbers put in."""
+    """Return source with its parts and numbers put in."""
     source = source.replace("DISTANCE", DISTANCE).replace("PROJECT", PROJECT)
-    for name, value in (
-        ("STRIDES", STRIDES), ("STRIDE", STRIDE), ("CORNER", CORNER), ("BEND", BEND), ("REACH", REACH), ("PUSH", PUSH), ("AIM", AIM),
-        ("MARGIN", MARGIN),
-    ):  # fmt: skip
-        source = source.replace(name, repr(value))
+    numbers = {"STRIDES": STRIDES, "STRIDE": STRIDE, "SHORTEST": SHORTEST, "CORNER": CORNER, "BEND": BEND}
+    lengths = {"REACH": REACH, "PUSH": PUSH, "AIM": AIM}
+    for name, number in (numbers | lengths).items():
+        source = source.replace(name, repr(number))
     return source
+
+
+@wp.func_native(runge_kutta(_named("DISTANCE PROJECT" + MARCH + MOVE)))
+def advect_some(
+    planes: int, dx: float, inverse_dx: float, h: float, x_: wp.array(dtype=wp.vec3), u_: wp.array3d(dtype=wp.float32),
+    v_: wp.array3d(dtype=wp.float32), w_: wp.array3d(dtype=wp.float32), distance_: wp.array3d(dtype=wp.float32), first: int, last: int,
+) -> int: ...  # fmt: skip
+
+
+@wp.func_native(particle_loop(BLOCK + _named(PUSH_OUT).replace("MARGIN", repr(MARGIN))))
+def push_some(
+    planes: int, dx: float, inverse_dx: float, x_: wp.array(dtype=wp.vec3), distance_: wp.array3d(dtype=wp.float32), first: int, last: int
+) -> int: ...
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.grid.distance_advection")
+def advect_kernel(
+    count: int, grain: int, planes: int, dx: float, inverse_dx: float, h: float, position: wp.array(dtype=wp.vec3),
+    u: wp.array3d(dtype=wp.float32), v: wp.array3d(dtype=wp.float32), w: wp.array3d(dtype=wp.float32),
+    distance: wp.array3d(dtype=wp.float32), stopped: wp.array(dtype=wp.int32),
+):  # fmt: skip
+    """One Runge-Kutta step of some particles; h is the time step in units of 1 / (velocity in cells)."""
+    first = wp.tid() * grain
+    hits = advect_some(planes, dx, inverse_dx, h, position, u, v, w, distance, first, wp.min(first + grain, count))
+    if hits > 0:
+        wp.atomic_add(stopped, 0, hits)
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.grid.push_out")
+def push_kernel(
+    count: int, grain: int, planes: int, dx: float, inverse_dx: float, position: wp.array(dtype=wp.vec3),
+    distance: wp.array3d(dtype=wp.float32), moved: wp.array(dtype=wp.int32), left: wp.array(dtype=wp.int32),
+):  # fmt: skip
+    """Put some particles that are inside walls, or too near, outside; count those it moved and those it could not."""
+    first = wp.tid() * grain
+    both = push_some(planes, dx, inverse_dx, position, distance, first, wp.min(first + grain, count))
+    if both > 0:
+        wp.atomic_add(moved, 0, both % 65536)
+        wp.atomic_add(left, 0, both // 65536)

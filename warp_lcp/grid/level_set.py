@@ -24,8 +24,8 @@ class LevelSet:
     The density is the sum of the particles' quadratic B-splines at the cell's center, in units of the density at rest. Divided by the
     capacity, what the cell's kernel can hold beside solids, it is the filled share of the kernel, and phi is the distance at which a half
     space fills that share: unbiased for a plane along an axis, at a wall that the plane is perpendicular to as well, without a radius to
-    tune. A plane across the axes is off by up to 0.01 cells. A film on a wall within the kernel's reach looks too thin: by up to 0.11
-    cells in a cell that the wall bounds, by up to 0.36 in one whose center lies on the wall.
+    tune. A plane across the axes is off by up to 0.01 cells. A film on a wall within the kernel's reach looks too thin: phi is 0
+    with the liquid still 0.11 cells above the center of a cell that the wall bounds, 0.36 above a center that lies on the wall.
 
     Binomial passes (1, 2, 1)/4 over density and capacity make the kernel wider and closer to the normal distribution of variance
     1/4 + passes/2, whose quantile phi then is. They quiet a surface at rest and erase thin fronts.

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Protocol, cast, runtime_checkable
 
 import numpy as np
@@ -18,6 +19,7 @@ from scipy.spatial import transform
 Vector = Sequence[float] | np.ndarray
 
 ROTATION_ERROR = 1e-9  # of a pose's R R' - 1; products of a few rotations stay near 1e-15
+SPEED_SAMPLES = 4  # of a span in which the top speed is looked for
 SAME_AXIS = 1e-9  # 1 - cosine of the angle between two axes that count as one
 
 
@@ -242,6 +244,33 @@ class Keyframes:
         return Pose.about(np.asarray(self.center), rotation, shift)
 
 
+def top_speed(motion: Motion, bounds: np.ndarray | None, size: np.ndarray, time: float, span: float) -> float:
+    """Return how fast a solid in the domain will be at most in the time to come [m/s].
+
+    A rigid body is fastest at a corner of a box around it; velocities are means over a few parts of the span.
+
+    Args:
+        motion: of the solid.
+        bounds: low and high corner [m] of a box around the solid as it is placed, shape (2, 3); None: it has no limits.
+        size: of the domain [m], shape (3,), z = 0 in 2-D.
+        time: [s].
+        span: what is looked ahead [s], > 0.
+    """
+    domain = np.stack([np.zeros(3), size])
+    poses = [motion.pose(moment) for moment in np.linspace(time, time + span, SPEED_SAMPLES + 1)]
+    fastest = 0.0
+    for pose, later in pairwise(poses):
+        low, high = domain
+        if bounds is not None:
+            placed = pose.apply(_corners(np.where(size > 0.0, bounds, 0.0)))
+            low, high = np.maximum(low, placed.min(axis=0)), np.minimum(high, placed.max(axis=0))
+        if (low <= high).all():
+            corners = _corners(np.stack([low, high]))
+            moved = later.after(pose.inverse()).apply(corners) - corners
+            fastest = max(fastest, float(np.linalg.norm(moved, axis=1).max()) * SPEED_SAMPLES / span)
+    return fastest
+
+
 class _Curve:
     """Values over time, constant before the first and after the last.
 
@@ -311,6 +340,11 @@ class _Turns:
         size = self._size[step]
         within = (angle - float(self._angle.values[step, 0])) / size if size > 0.0 else 0.0
         return cast(np.ndarray, self._slerp(step + min(max(within, 0.0), 1.0)).as_matrix())
+
+
+def _corners(bounds: np.ndarray) -> np.ndarray:
+    """Return the corners of a box, shape (8, 3), from its low and high one, shape (2, 3)."""
+    return np.stack(np.meshgrid(*bounds.T), axis=-1).reshape(-1, 3)
 
 
 def _turn(axis: np.ndarray, degrees: float) -> np.ndarray:

@@ -9,14 +9,13 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.grid.motion import Motion
-from warp_lcp.grid.solids import Geometry, TriangleMesh
+from warp_lcp.grid.solid_notes import placement_notes, thin_notes
+from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.solids_kernels import cell_centers, claim_cells
 
 OPEN = -1
 DOMAIN_WALL = 0
 CHUNK = 1 << 20  # points at a time: 16 MB of positions and distances
-STRAY = 0.5  # of a cell: a mesh may reach this far out of the domain before anyone is told
-THIN_SHARE = 0.01  # of a mesh's surface, from which thin parts are worth a warning
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +87,7 @@ def voxelize(
     notes: list[str] = []
     for number, solid in enumerate(solids, start=1):
         notes += placement_notes(solid.geometry, solid.name, counts, spacing, dimension)
-        notes += _thin_notes(solid, spacing, device)
+        notes += thin_notes(solid.geometry, solid.name, spacing, device)
         _claim(index, covered, solid.geometry, number, spacing, dimension)
     claimed = covered.numpy()[1:]
     notes += [
@@ -107,52 +106,6 @@ def voxelize(
         covered=tuple(int(cells) for cells in claimed),
         notes=tuple(notes),
     )
-
-
-def placement_notes(geometry: Geometry, name: str, counts: tuple[int, int, int], spacing: float, dimension: int) -> list[str]:
-    """Return warnings about a region: what its mesh needed repaired, and that a mesh sticks out of the domain.
-
-    Args:
-        geometry: a solid, or the liquid's start.
-        name: what messages call it.
-        counts: number of cells (nx, ny, nz), nz = 1 in 2-D.
-        spacing: side of a cell [m].
-        dimension: 2 or 3.
-
-    Raises:
-        ValueError: the region lies wholly outside the domain.
-    """
-    notes = [f"{name}: {warning}" for warning in geometry.surface.warnings] if isinstance(geometry, TriangleMesh) else []
-    bounds = geometry.bounds()
-    if bounds is None:
-        return notes
-    low, high = bounds
-    if dimension == 2 and (low[2] > 0.0 or high[2] < 0.0):
-        raise ValueError(
-            f"{name} spans z = [{low[2]:.4g}, {high[2]:.4g}] m and misses the plane z = 0, which is a 2-D scene's; check its translation"
-        )
-    low, high = low[:dimension], high[:dimension]
-    size = spacing * np.array(counts[:dimension])
-    if (high <= 0.0).any() or (low >= size).any():
-        spans = " x ".join(f"[{a:.4g}, {b:.4g}]" for a, b in zip(low, high, strict=True))
-        domain = " x ".join(f"[0, {extent:.4g}]" for extent in size)
-        raise ValueError(
-            f"{name} lies wholly outside the domain: it spans {spans} m, the domain {domain} m; check its scale and translation"
-        )
-    stray = max(float((-low).max()), float((high - size).max()))
-    if isinstance(geometry, TriangleMesh) and stray > STRAY * spacing:
-        notes.append(f"{name} reaches {stray:.4g} m out of the domain; what is out there has no effect")
-    return notes
-
-
-def _thin_notes(solid: PlacedSolid, spacing: float, device: wp.Device) -> list[str]:
-    """Return a warning when a mesh has walls that the cells may miss."""
-    if not isinstance(solid.geometry, TriangleMesh) or solid.geometry.invert:
-        return []
-    thin = solid.geometry.thin_fraction(spacing, device)
-    if thin <= THIN_SHARE:
-        return []
-    return [f"{solid.name} is thinner than a cell of {spacing:.4g} m under {thin:.0%} of its surface: liquid may pass there"]
 
 
 def inside(geometries: Sequence[Geometry], points: np.ndarray, *, device: wp.Device | str) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Preconditioned conjugate gradients with scalars that stay on the device; one program an iteration."""
+"""Preconditioned conjugate gradients with scalars, and the decision to go on, on the device; one program an iteration."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 import warp as wp
 
-from warp_lcp.krylov.conjugate_gradient_kernels import PQ, RR, RZ, kernels, remember_kernel
+from warp_lcp.krylov.conjugate_gradient_kernels import ITERATIONS, PQ, RR, RZ, SLOTS, begin_kernel, end_kernel, kernels
 from warp_lcp.program import Launch, Program
 from warp_lcp.vectors import Reduction, launch_spans
 
@@ -38,8 +38,8 @@ class RecordedPreconditioner(Preconditioner, Protocol):
 class ConjugateGradient:
     """Solve A x = r for a symmetric positive (semi-)definite A.
 
-    The right-hand side is the preconditioner's field `r`, which becomes the residual; the solution is `x`. The host reads one scalar
-    after each iteration, the residual's norm.
+    The right-hand side is the preconditioner's field `r`, which becomes the residual; the solution is `x`. The device decides after each
+    iteration whether another one follows. Where graphs have loops the host waits once a solve, else it reads that decision every time.
 
     Args:
         product: A.
@@ -50,13 +50,14 @@ class ConjugateGradient:
         self._product, self._preconditioner = product, preconditioner
         r = preconditioner.r
         self.device, self.x, self._p, self._q = r.device, wp.zeros_like(r), wp.zeros_like(r), wp.zeros_like(r)
-        self._scalars = wp.zeros(4, dtype=wp.float64, device=r.device)
+        self._scalars = wp.zeros(SLOTS, dtype=wp.float64, device=r.device)
+        self._going = wp.zeros(1, dtype=wp.int32, device=r.device)
         self._reduction = Reduction(r.size, r.device, self._scalars)
         self._kernels = kernels(r.dtype)
         self._program: Program | None = None
 
     def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
-        """Iterate from x = 0 until ||r|| <= tolerance.
+        """Iterate from x = 0 until ||r|| <= tolerance, ||r|| is no number, or it has grown by GROWTH over its least.
 
         Returns:
             The iterations done and the norm of the carried residual, an estimate that rounding bounds from below.
@@ -64,29 +65,23 @@ class ConjugateGradient:
         self.x.zero_()
         self._p.zero_()
         self._q.zero_()  # A writes its own rows only
-        self._scalars.zero_()
-        norm, best = np.inf, np.inf
-        for iteration in range(1, max_iterations + 1):
-            self._iterate()
-            norm = float(np.sqrt(self._scalars.numpy()[RR]))
-            if norm <= tolerance or not np.isfinite(norm):
-                return iteration, norm
-            if norm >= 1e3 * best:  # the carried residual grows: A or M is not positive definite to this precision
-                return iteration, norm
-            best = min(best, norm)
-        return max_iterations, norm
-
-    def _iterate(self) -> None:
+        wp.launch(begin_kernel, 1, [self._scalars, self._going, tolerance, max_iterations], device=self.device)
         cycle = getattr(self._preconditioner, "program", None)
         if cycle is None:
-            self._preconditioner.apply()
-            self._advance(wp.launch)
-            return
-        if self._program is None:
-            self._program = Program(self.device)
-            self._program.extend(cycle)
-            self._advance(self._program.launch)
-        self._program.run()
+            wp.capture_while(self._going, self._iterate)
+        else:
+            if self._program is None:
+                self._program = Program(self.device)
+                self._program.extend(cycle)
+                self._advance(self._program.launch)
+            self._program.run_while(self._going)
+        scalars = self._scalars.numpy()
+        return int(scalars[ITERATIONS]), float(np.sqrt(scalars[RR]))
+
+    def _iterate(self) -> None:
+        """Launch an iteration whose preconditioner is no program."""
+        self._preconditioner.apply()
+        self._advance(wp.launch)
 
     def _advance(self, launch: Launch) -> None:
         """Launch what follows the preconditioner."""
@@ -98,4 +93,4 @@ class ConjugateGradient:
         update = [self._p, self._q, self.x, r, self._scalars]
         launch_spans(self._kernels.update, spans, update, [partials], self.device, launch=launch)
         self._reduction.add_up(int(RR), launch=launch)
-        launch(remember_kernel, 1, [self._scalars], device=self.device)
+        launch(end_kernel, 1, [self._scalars, self._going], device=self.device)

@@ -66,7 +66,9 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
             + f"""T* y = y_.data + p; const T* x = x_.data + p; const T* b = b_.data + p;
         if (projected) {{
             const T* lo = l_.data + p; const T* hi = u_.data + p;
-            SIMD for (int k = 0; k < n; ++k) {{ {value} const T w = v < lo[k] ? lo[k] : v; y[k] = w > hi[k] ? hi[k] : w; }}
+            if (u_.data) SIMD for (int k = 0; k < n; ++k) {{
+                {value} const T w = v < lo[k] ? lo[k] : v; y[k] = w > hi[k] ? hi[k] : w; }}
+            else SIMD for (int k = 0; k < n; ++k) {{ {value} y[k] = v < lo[k] ? lo[k] : v; }}
         }} else {{
             SIMD for (int k = 0; k < n; ++k) {{ {value} y[k] = v; }}
         }}"""
@@ -115,8 +117,10 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
             + """T* x = x_.data + p; const T* xc = c_.data + c;
         if (projected) {
             const T* lo = l_.data + p; const T* hi = u_.data + p;
-            SIMD for (int k = 0; k < n; ++k) {
+            if (u_.data) SIMD for (int k = 0; k < n; ++k) {
                 const T v = d[k] != 0 ? x[k] + scale*xc[k >> shift] : (T)0, w = v < lo[k] ? lo[k] : v; x[k] = w > hi[k] ? hi[k] : w; }
+            else SIMD for (int k = 0; k < n; ++k) {
+                const T v = d[k] != 0 ? x[k] + scale*xc[k >> shift] : (T)0; x[k] = v < lo[k] ? lo[k] : v; }
         } else if (shift == 0) {
             SIMD for (int k = 0; k < n; ++k) x[k] += d[k] != 0 ? scale*xc[k] : (T)0;
         } else {
@@ -141,16 +145,18 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
             for (int row = 0; row < 4; ++row) {{
                 if (((row >> 1) && one_plane) || ((row & 1) && one_row)) continue;
                 const long long q = p + fx*begin + (row >> 1)*A.s1 + (row & 1)*A.s2;
-                const auto* d = d_.data + q; const T* x = x_.data + q; const T* l = l_.data + q; const T* u = u_.data + q;
+                const auto* d = d_.data + q; const T* x = x_.data + q; const T* l = l_.data + q;
+                const T* u = u_.data ? u_.data + q : l;
                 SIMD for (int k = 0; k < fx*m; ++k) {{
                     const T a0 = (l[k] - x[k])*inverse, b0 = (u[k] - x[k])*inverse, a1 = a0 > 0 ? (T)0 : a0, b1 = b0 < 0 ? (T)0 : b0;
                     const T a = d[k] != 0 ? a1 : -big, b = d[k] != 0 ? b1 : big;
                     lo[k] = a > lo[k] ? a : lo[k]; hi[k] = b < hi[k] ? b : hi[k]; }}
             }}
-            if (fx == 1) {{ SIMD for (int k = 0; k < m; ++k) {{ lower[begin + k] = lo[k]; upper[begin + k] = hi[k]; }} }}
-            else {{ SIMD for (int k = 0; k < m; ++k) {{
-                lower[begin + k] = lo[2*k] > lo[2*k+1] ? lo[2*k] : lo[2*k+1];
-                upper[begin + k] = hi[2*k] < hi[2*k+1] ? hi[2*k] : hi[2*k+1]; }} }}
+            if (fx == 1) {{ SIMD for (int k = 0; k < m; ++k) lower[begin + k] = lo[k]; }}
+            else {{ SIMD for (int k = 0; k < m; ++k) lower[begin + k] = lo[2*k] > lo[2*k+1] ? lo[2*k] : lo[2*k+1]; }}
+            if (!uc_.data) continue;
+            if (fx == 1) {{ SIMD for (int k = 0; k < m; ++k) upper[begin + k] = hi[k]; }}
+            else {{ SIMD for (int k = 0; k < m; ++k) upper[begin + k] = hi[2*k] < hi[2*k+1] ? hi[2*k] : hi[2*k+1]; }}
         }}"""
         )
     )

@@ -39,7 +39,7 @@ class CycleSettings:
             over-correction applies to them in part only.
         interval: bounds of the spectrum of D^-1 A that the two Chebyshev-Jacobi sweeps damp.
         coarsest_cpu: the most cells of the coarsest level, which is inverted densely.
-        coarsest_cuda: the same on a GPU.
+        coarsest_cuda: the same on a GPU; without `one_launch_cuda` one thread factors it, which is quick for 16 cells only.
         one_launch_cpu: the most cells of levels that run together in one launch of one thread; 0: none do. On the CPU a captured graph's
             launches cost next to nothing, and its legs that stream through a level are faster.
         one_launch_cuda: the same on a GPU, in one block of threads: 16^3 cells are few enough for one multiprocessor.
@@ -69,14 +69,14 @@ class CycleSettings:
 class Level:
     """One grid: its stencil, iterate x, right-hand side b, a second buffer t, and bounds of x if cycles are projected."""
 
-    def __init__(self, stencil: Stencil, real: Any, *, bounded: bool, bounds: Pair | None = None) -> None:
+    def __init__(self, stencil: Stencil, real: Any, *, bounded: bool, upper: bool = True, bounds: Pair | None = None) -> None:
         self.stencil, self.real = stencil, real
         field: Callable[[], wp.array[Any]] = lambda: wp.zeros(stencil.padding.size, dtype=real, device=stencil.device)  # noqa: E731
         self.x, self.b, self.t = field(), field(), field()
-        self.lower, self.upper = (bounds or (field(), field())) if bounded else (self.x, self.x)
+        nothing = wp.empty(0, dtype=real, device=stencil.device)
+        self.lower, self.upper = (bounds or (field(), field() if upper else nothing)) if bounded else (self.x, self.x)
         self.form = (stencil.weights is not None, stencil.d.dtype, real)
         self.kernels = cycle_kernels(*self.form)
-        nothing = wp.empty(0, dtype=real, device=stencil.device)
         self.aggregates: Aggregates | None = None  # how the finer level's cells make up this one's
         self.visits, self.shrunk = 1, 1.0  # by a cycle of the next finer level; by how much since a level that was visited more
         self.operands = [stencil.shape, stencil.d, *(stencil.weights or (nothing,) * 3)]
@@ -111,7 +111,8 @@ class Hierarchy:
         real: type of the corrections.
         bounded: whether projected cycles are wanted; they need bounds on every level.
         settings: how cycles go.
-        bounds: memory of the finest level's bounds, where the caller has two fields that a projected cycle may overwrite.
+        bounds: memory of the finest level's bounds, where the caller has fields that a projected cycle may overwrite; an empty upper one if
+            corrections have no upper bounds.
     """
 
     def __init__(
@@ -313,7 +314,7 @@ class Hierarchy:
         spans = None if s.spans is None else wp.zeros(padding.counts[:2], dtype=wp.vec2i, device=self.device)
         weights = (new[1], new[2], new[3])
         stencil = Stencil(padding, new[0], weights, (0.0, 0.0, 0.0), 1.0, periodic, spans)  # type: ignore[arg-type]
-        level = Level(stencil, self.real, bounded=bounded)
+        level = Level(stencil, self.real, bounded=bounded, upper=fine.upper.size > 0)
         G = level.aggregates = Aggregates()
         G.fx, G.fy, G.fz, G.ny, G.nz = *factors, counts[1], counts[0]
         # visiting levels of half the cells twice would cost as much on each of them: only every second one is

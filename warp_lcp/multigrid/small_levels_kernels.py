@@ -50,6 +50,21 @@ __syncthreads();
 def meet(): ...
 
 
+# row r of inverse b; threads read the columns of the symmetric inverse side by side, several loads under way at a time
+PRODUCT = """
+const double* column = inverse_.data + r; double v = 0;
+for (int k = 1; k <= n[0]; ++k)
+    for (int j = 1; j <= n[1]; ++j) {
+        const auto* b = b_.data + k*A.s1 + j*A.s2 + 1;
+#if defined(__CUDA_ARCH__)
+#pragma unroll 4
+#endif
+        for (int i = 0; i < n[2]; ++i) v += column[i*m]*(double)b[i];
+        column += n[2]*m; }
+return v;
+"""
+
+
 @functools.cache
 def small_levels_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
     """Return the struct `SmallLevel` and the kernels `cycle` and `rebuild` for levels stored in this form.
@@ -145,16 +160,16 @@ def small_levels_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamesp
         j = (r // L.n[2]) % L.n[1]
         return (k + 1) * int(L.A.s1) + (j + 1) * int(L.A.s2) + r % L.n[2] + 1
 
+    @wp.func_native(PRODUCT)
+    def product(inverse_: square, b_: field, A: StencilShape, n: wp.vec3i, r: int, m: int) -> wp.float64: ...
+
     @wp.func
     def solve(levels: level_array, l: int, t: int, threads: int, inverse: square):
-        """X = inverse b; threads read the rows of the symmetric inverse side by side."""
+        """X = inverse b."""
         L = levels[l]
         m = L.n[0] * L.n[1] * L.n[2]
         for r in range(t, m, threads):
-            v = wp.float64(0.0)
-            for s in range(m):
-                v += inverse[s, r] * wp.float64(L.b[element(L, s)])
-            L.x[element(L, r)] = real(v)
+            L.x[element(L, r)] = real(product(inverse, L.b, L.A, L.n, r, m))
 
     @wp.func
     def wrap(L: SmallLevel, f: field, t: int, threads: int):
@@ -285,7 +300,8 @@ def small_levels_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamesp
         """One step of Gauss-Jordan from `old` to `new`, so that no thread reads what another has written since the last barrier."""
         m = old.shape[0]
         pivot = old[c, c]
-        pinned = pivot <= rounding * entry(L, c, c)
+        pinned = pivot <= rounding * L.A.unit * wp.float64(L.d[element(L, c)])
+        reciprocal = wp.float64(1.0) / pivot  # not used where it is infinite
         for q in range(t, m * m, threads):
             i = q // m
             j = q % m
@@ -294,13 +310,13 @@ def small_levels_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamesp
                 if i == c or j == c:
                     v = wp.float64(0.0)
             elif i == c and j == c:
-                v = wp.float64(1.0) / pivot
+                v = reciprocal
             elif i == c:
-                v = v / pivot
+                v = v * reciprocal
             elif j == c:
-                v = -v / pivot
+                v = -v * reciprocal
             else:
-                v -= old[i, c] * old[c, j] / pivot
+                v -= old[i, c] * (old[c, j] * reciprocal)
             new[i, j] = v
         meet()
 

@@ -174,7 +174,7 @@ class MultigridWorkspace:
         real = self.precision.correction
         self.x, self._p = problem.layout.zeros(wp.float64), problem.layout.zeros(real)
         # a projected cycle forgets the search direction, so its lower bounds may lie in that memory: finite numbers, and 0 off the unknowns
-        upper = problem.layout.zeros(real)
+        upper = problem.layout.zeros(real) if problem.bounds.may_bind[1] else wp.empty(0, dtype=real, device=A.device)
         self.hierarchy = Hierarchy(A.stencil, real, bounded=self.bounded, settings=settings.cycle, bounds=(self._p, upper))
         self.residual = AssessedResidual(problem, A, self.hierarchy)
         self._flat = kernels.flat_kernels(real)

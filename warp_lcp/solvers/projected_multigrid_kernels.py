@@ -7,7 +7,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.native import BLOCK, C_TYPES, simd
+from warp_lcp.native import BLOCK, C_TYPES, fetch, simd
 from warp_lcp.operators.stencil_kernels import NEIGHBORS, StencilShape, row_count, row_start, stencil_head
 from warp_lcp.vector_kernels import CODED, flat, span_end, span_start
 
@@ -63,11 +63,12 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
             + AT_ROW
             + stencil_head(variable, "double")
             + f"""typedef {C_TYPES[free_type]} F; F* free = free_.data + p;
-        const T* x = x_.data + p; const T* b = b_.data + p; auto* g = g_.data + p;
+        const T *x = x_.data + p, *above = x + s1, *b = b_.data + p; auto* g = g_.data + p;
         const auto* m = m_.data + p; T s = 0; int moved = 0, active = 0; unsigned char hold[M];
         const bool free_all = !l_.data && !u_.data && !code_.data && l_value == -(T)INFINITY && u_value == (T)INFINITY;
         for (int begin = 0; begin < n; begin += M) {{
             const int end = n - begin < M ? n : begin + (int)M; T y[M];
+            {fetch("begin", "end", above=8, b=8, g=4, d=1, m=1, free=1)}
             SIMD8 for (int k = begin; k < end; ++k) {{
                 const T e = unit*(T)d[k], v = e*x[k] - {NEIGHBORS[variable]}; y[k - begin] = (e != 0 ? v : (T)0) + b[k]; }}
             if (free_all) {{
@@ -104,7 +105,8 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
     @wp.func_native(
         simd(
             stencil_head(variable, C_TYPES[real])
-            + f"""const T* x = z_.data + p; const T* q = p_.data + p; const T* g = g_.data + p; T zaz = 0, zap = 0, gz = 0, gp = 0;
+            + f"""const T *x = z_.data + p, *above = x + s1, *q = p_.data + p, *g = g_.data + p; T zaz = 0, zap = 0, gz = 0, gp = 0;
+        {fetch("0", "n", above=4, q=4, g=4)}
         SIMD for (int k = 0; k < n; ++k) {{
             const T e = unit*(T)d[k], v = e*x[k] - {NEIGHBORS[variable]}, w = e != 0 ? v : (T)0;
             zaz += x[k]*w; zap += q[k]*w; gz += g[k]*x[k]; gp += g[k]*q[k]; }}
@@ -123,6 +125,9 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
             + """double* x = x_.data + p; const auto* z = z_.data + p; auto* q = p_.data + p; double missed = 0;
         const bool fresh = beta == 0;  // then q may hold anything, a NaN too
         const double inverse = step != 0 ? 1/step : 0;
+        """
+            + fetch("0", "n", x=8, z=4, q=4)
+            + """
         with_bounds([&](auto lower, auto upper) {
             SIMD8 for (int k = 0; k < n; ++k) {
                 const auto s = fresh ? z[k] : z[k] + beta*q[k];

@@ -1,0 +1,89 @@
+"""Solids that cut through cells: faces are open in part, particles keep their distance, solids may move."""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+from warp_lcp.grid.cut_cells import CutCells
+
+from fluids import boundary_kernels as kernels
+from fluids.boundary import Faces
+from fluids.cut_wall import extend_velocity_cut
+from warp_lcp.grid.distance_advection import MARGIN, advect_with_distance, push_out
+from warp_lcp.grid.staggered import StaggeredGrid, Window
+
+
+class CutBoundary:
+    """Solids as fractions of faces and a distance; implements `fluids.boundary.Boundary`.
+
+    In a step that starts at time t the pressure meets the solids where they are at t, moving as they will until t + dt. Then they move,
+    and the particles with them: a particle may go where it is open before or after, and what is then inside a solid is pushed out. So a
+    wall that advances pushes what its own velocity has not carried away, and one that retreats can be followed.
+
+    Args:
+        grid: the grid.
+        cut: the solids, with their capacity.
+    """
+
+    def __init__(self, grid: StaggeredGrid, cut: CutCells) -> None:
+        """Allocate the fields."""
+        self.grid, self.cut, self.moves = grid, cut, cut.moves
+        self.base, self.open, self.capacity, self.distance = cut.base, cut.open, cut.capacity, cut.distance
+        self.velocity: Faces = cut.velocity or []
+        self.touch = grid.field(wp.uint8)
+        self._scratch = grid.faces()
+        self._reachable = grid.field() if cut.moves else cut.distance  # distance where particles may go within a step
+        self._counts = wp.zeros(3, dtype=wp.int32, device=grid.device)
+        self._find_walls()
+
+    def begin_step(self, time: float, dt: float) -> None:
+        """Find how fast the solids move from `time` on [s]."""
+        if self.moves:
+            self.cut.set_velocity(time, dt)
+
+    def extend(self, window: Window, velocity: Faces, weights: Faces, known: Faces, kind: wp.array, contact: wp.array, layers: int) -> None:
+        """Continue the projected velocity into air and walls."""
+        extend_velocity_cut(window, velocity, weights, known, kind, contact, self.cut, self._scratch, layers)
+
+    def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> tuple[int, int]:
+        """Move particles, then the solids to `time`. Return the particles that met a wall, and those that a solid pushed."""
+        self._counts.zero_()
+        if self.moves:
+            wp.copy(self._reachable, self.cut.distance)
+            self.place(time)
+            wp.launch(
+                kernels.larger_kernel, self.grid.size, [self.cut.distance.flatten(), self._reachable.flatten()], device=self.grid.device
+            )
+        advect_with_distance(self.grid, fields, self._reachable, dt, position, self._counts[0:1])
+        if self.moves:
+            push_out(self.grid, self.cut.distance, position, self._counts[1:2], self._counts[2:3])
+        met, pushed, _ = (int(n) for n in self._counts.numpy())
+        return met, pushed
+
+    def place(self, time: float) -> None:
+        """Put the solids where they are at `time` [s]."""
+        if self.moves:
+            self.cut.place(time)
+            self._find_walls()
+
+    def admits(self, points: np.ndarray) -> np.ndarray:
+        """Tell which points [m], shape (n, 3), keep the distance that particles keep from walls."""
+        coordinates = self.grid.to_grid(points)
+        if self.grid.dimension == 2:
+            coordinates[:, 2] = 1.0
+        last = np.array(self.grid.shape[::-1]) - 2
+        cell = np.clip(np.floor(coordinates).astype(np.int64), 0, last)
+        i, j, k = cell.T
+        x, y, z = (coordinates - cell).T
+        d = self.cut.distance.numpy().astype(np.float64)
+        planes = [
+            (1 - y) * ((1 - x) * d[c, j, i] + x * d[c, j, i + 1]) + y * ((1 - x) * d[c, j + 1, i] + x * d[c, j + 1, i + 1])
+            for c in (k, k + 1)
+        ]
+        between = planes[0] if self.grid.dimension == 2 else (1 - z) * planes[0] + z * planes[1]
+        return np.asarray(between >= MARGIN)
+
+    def _find_walls(self) -> None:
+        self.touch.zero_()
+        for axis, wall in enumerate(self.cut.wall):
+            self.grid.domain.launch(kernels.touch_cut_kernel, [axis, wall, self.cut.separating, self.touch])

@@ -1,0 +1,204 @@
+"""Solids that cut cells: which part of each face they leave open, and how they move.
+
+All of it comes from the solids' signed distances at the nodes of the grid (the cells' corners), linear in between: exact for planes, of
+second order for smooth walls; at a solid's edges, and where it or a gap is thinner than two cells, off by a part of a cell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.grid import cut_cells_kernels as kernels
+from warp_lcp.grid.capacity_kernels import integrate_kernel
+from warp_lcp.grid.motion import Motion
+from warp_lcp.grid.node_distance import NodeDistances, NodeSampler, nodes_near
+from warp_lcp.grid.solid_notes import placement_notes, repair_notes, thin_notes
+from warp_lcp.grid.solids import Geometry
+from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.grid.voxelize import PlacedSolid
+from warp_lcp.operators.grid_poisson import SOLID
+
+
+class CutCells:
+    """Say what solids leave open of the faces and cells of a grid, at a time.
+
+    Node (k, j, i) is the low corner of stored cell (k, j, i), face (k, j, i) of a component the cell's lower face; 2-D uses plane k = 1.
+
+    Args:
+        grid: the grid.
+        solids: in the order of their numbers, 1 + s; the domain is number 0.
+        wall_separating: whether liquid may leave the domain's wall.
+        capacity: whether to keep the capacity.
+
+    Attributes:
+        distance: float32 signed distance to the nearest wall, the domain's included, at nodes [cells], positive in the open. Distances to
+            solids are exact below `FAR` cells; others are at least that.
+        open: float32 open fraction of each face, a list of one field a component: 0, or in [1e-3, 1]; 0 on the domain's faces and outside.
+        wall: int16 number of the solid that closes a face, the nearest to its center: -1 on open faces, 0 on the domain's.
+        base: int8, SOLID where all faces of a cell are closed, else AIR; the ring is SOLID.
+        capacity: float32 integral of the cell's quadratic B-spline kernel over what is open, 1 away from walls; None if not asked for.
+        velocity: float32 velocity of the wall at the center of each face that is not open [m/s], the component along the face's normal (on
+            a face of the domain: times the part that the solid covers); None when no solid moves.
+        separating: uint8 of shape (1 + solids,).
+        names: of those numbers, the first "domain".
+        notes: warnings worth a line at the start of a run.
+        whole_cells: whether every face is open or closed and nothing moves.
+        moves: whether a solid moves.
+
+    Raises:
+        ValueError: a solid that stands still lies wholly outside the domain, or the solids leave no open cell.
+    """
+
+    def __init__(self, grid: StaggeredGrid, solids: Sequence[PlacedSolid], *, wall_separating: bool, capacity: bool = True) -> None:
+        self.grid, self.solids = grid, tuple(solids)
+        self.moves = any(solid.motion is not None for solid in solids)
+        self.names = ("domain", *(solid.name for solid in solids))
+        self.separating = wp.array([wall_separating, *(solid.separating for solid in solids)], dtype=wp.uint8, device=grid.device)
+        self.distance, self.open, self.wall = grid.field(), grid.faces(), grid.faces(wp.int16)
+        self.base, self._state = grid.field(wp.int8), grid.field(wp.int8)
+        self.capacity = grid.field() if capacity else None
+        self.velocity = grid.faces() if self.moves else None
+        self._counts = wp.zeros(2, dtype=wp.int32, device=grid.device)
+        self._turn = wp.zeros(1 + len(solids), dtype=wp.mat33, device=grid.device)
+        self._shift = wp.zeros(1 + len(solids), dtype=wp.vec3, device=grid.device)
+        notes = self._solid_notes()
+        self._sampler, self._nodes = NodeSampler(grid), NodeDistances(grid, second=len(solids) > 1)
+        standing = [(number, solid.geometry) for number, solid in enumerate(solids, start=1) if solid.motion is None]
+        for number, geometry in standing:
+            self._sampler.enter(self._nodes, number, geometry)
+        self._marks = wp.array(_ring(grid), dtype=wp.int8, device=grid.device)
+        self._sampler.look_at_centers(
+            self._nodes, [geometry for _, geometry in standing], np.zeros(3, dtype=int), np.array(grid.shape[::-1]), self._marks
+        )
+        wp.copy(self.base, self._marks)
+        if self.moves:
+            self._standing = NodeDistances(grid, second=len(solids) > 1)
+            self._standing.copy_from(self._nodes)
+            self._enter_moving(0.0)
+        self._refresh()
+        dropped, partial = self._counts.numpy().tolist()
+        self.whole_cells = partial == 0 and not self.moves
+        self.notes = (*notes, *self._result_notes(dropped))
+        if not self.moves:  # needed by `place` only
+            del self._sampler, self._nodes, self._marks
+
+    @property
+    def dropped(self) -> int:
+        """Number of faces whose open fraction was below 1e-3 and became 0."""
+        return int(self._counts.numpy()[0])
+
+    def move(self, time: float, dt: float) -> None:
+        """Put the moving solids where they are at a time, with the velocity that took them there; nothing happens if none moves.
+
+        Args:
+            time: [s].
+            dt: the step that ends at `time` [s].
+        """
+        self.place(time)
+        self.set_velocity(time, -dt)
+
+    def place(self, time: float) -> None:
+        """Put the moving solids where they are at a time [s] and refill all fields but the velocity; nothing happens if none moves."""
+        if not self.moves:
+            return
+        self._nodes.copy_from(self._standing)
+        wp.copy(self.base, self._marks)
+        self._enter_moving(time)
+        self._refresh()
+
+    def set_velocity(self, time: float, dt: float) -> None:
+        """Fill the velocity: the way of the solids' points from one time to another, divided by the time between.
+
+        So the volume that a wall sweeps is its displacement's, whatever the motion is like within the step.
+
+        Args:
+            time: at which the solids were placed [s].
+            dt: how long from there on [s]; negative: the step that ended at `time`.
+
+        Raises:
+            ValueError: dt is 0.
+        """
+        if self.velocity is None:
+            return
+        if dt == 0.0:
+            raise ValueError("dt = 0: a velocity needs two different times")
+        turn, shift = np.zeros((len(self.names), 3, 3)), np.zeros((len(self.names), 3))
+        for number, _, motion in self._moving():
+            way = motion.pose(time + dt).after(motion.pose(time).inverse())
+            turn[number], shift[number] = (way.rotation - np.eye(3)) / dt, way.translation / dt
+        self._turn.assign(turn.astype(np.float32))
+        self._shift.assign(shift.astype(np.float32))
+        grid, nodes = self.grid, self._nodes
+        for axis, (field, open_, wall) in enumerate(zip(self.velocity, self.open, self.wall, strict=True)):
+            window = grid.window((1, 1, 1), [count + (axis == other) for other, count in enumerate(grid.counts)])
+            inputs = [grid.planes, axis, grid.spacing, nodes.near, nodes.owner, open_, wall, self._turn, self._shift, field]
+            window.launch(kernels.velocity_kernel, inputs)
+
+    def _moving(self) -> list[tuple[int, Geometry, Motion]]:
+        """Return the solids that move, with their numbers, as the scene places them."""
+        return [(number, s.geometry, s.motion) for number, s in enumerate(self.solids, start=1) if s.motion is not None]
+
+    def _enter_moving(self, time: float) -> None:
+        """Enter the solids that move into the distances, and mark again the cells that only their centers tell about."""
+        placed = [(number, geometry.moved(motion.pose(time))) for number, geometry, motion in self._moving()]
+        for number, geometry in placed:
+            self._sampler.enter(self._nodes, number, geometry)
+        every = [s.geometry for s in self.solids if s.motion is None] + [geometry for _, geometry in placed]
+        for _, geometry in placed:
+            near = nodes_near(self.grid, geometry)
+            if near is not None:
+                self._sampler.look_at_centers(self._nodes, every, *near, self.base)
+
+    def _refresh(self) -> None:
+        """Fill everything that follows from the distances."""
+        grid, nodes = self.grid, self._nodes
+        planes, (nx, ny, nz) = grid.planes, grid.counts
+        grid.everywhere.launch(kernels.with_domain, [planes, nx, ny, nz, nodes.near, self.distance])
+        faces = [*self.open, *self.open[1:2]][:3]
+        walls = [*self.wall, *self.wall[1:2]][:3]
+        self._counts.zero_()
+        # the marks are in `base`, until the next kernel fills it
+        grid.domain.launch(kernels.fractions_kernel, [planes, *nodes.arrays, self.base, *faces, *walls, self._counts])
+        grid.domain.launch(kernels.states_kernel, [planes, nodes.near, *faces, self.base, self._state])
+        if self.capacity is not None:
+            integrate_kernel(grid.domain, planes, nodes.near, self._state, self.capacity)
+
+    def _solid_notes(self) -> list[str]:
+        """Return what is to be said about the solids before they are sampled."""
+        grid, notes = self.grid, []
+        for solid in self.solids:
+            geometry = solid.geometry
+            if solid.motion is None:
+                notes += placement_notes(geometry, solid.name, grid.counts, grid.spacing, grid.dimension)
+            else:  # it may come in later
+                notes += repair_notes(geometry, solid.name)
+            notes += thin_notes(geometry, solid.name, grid.spacing, grid.device)
+        return notes
+
+    def _result_notes(self, dropped: int) -> list[str]:
+        """Return what is to be said about the faces."""
+        grid = self.grid
+        if self.solids and not (grid.interior(self.base.numpy()) != SOLID).any():
+            raise ValueError(
+                "the solids fill the whole domain: no open cell is left (is one inverted, or a plane's normal the wrong way round?)"
+            )
+        counts = [np.bincount(wall.numpy().ravel() + 1, minlength=1 + len(self.names)) for wall in self.wall]
+        closed = np.sum(counts, axis=0)[1:]
+        notes = [
+            f"{solid.name} closes no part of a face: it is too small for cells of {grid.spacing:.4g} m, or lies in other solids"
+            for number, solid in enumerate(self.solids, start=1)
+            if not closed[number] and solid.motion is None
+        ]
+        if dropped:
+            notes.append(f"{dropped} faces are less than {kernels.DROP:g} open and count as closed")
+        return notes
+
+
+def _ring(grid: StaggeredGrid) -> np.ndarray:
+    """Return SOLID in the ring, else 0, in the stored shape."""
+    host = np.full(grid.shape, SOLID, dtype=np.int8)
+    host[1:-1, 1:-1, 1:-1] = 0
+    return host

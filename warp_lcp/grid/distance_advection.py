@@ -1,0 +1,55 @@
+"""Particles carried by the grid's velocity among walls that are given by their distance.
+
+The Runge-Kutta step is that of `warp_lcp.grid.advection`. A particle whose distance to walls exceeds its way needs no care. The others go
+in strides that the distance allows, but never less than a quarter of a cell, so that one that rests on a wall gets on; whoever ends a
+stride too near a wall or inside it is put back along the normal. On a plane that takes just the normal part from the way. The rest of
+the way loses its part into the wall, and between two walls all but the part along their edge.
+
+Positions are measured by the distance that is interpolated between nodes, which defines where walls are.
+"""
+
+import warp as wp
+
+from warp_lcp.grid.distance_advection_kernels import PUSH, advect_kernel, push_kernel
+from warp_lcp.grid.particle_loops import launch
+from warp_lcp.grid.runge_kutta import MARGIN
+from warp_lcp.grid.staggered import StaggeredGrid
+
+__all__ = ["MARGIN", "PUSH", "advect_with_distance", "push_out"]
+
+
+def advect_with_distance(
+    grid: StaggeredGrid, fields: list[wp.array], distance: wp.array, dt: float, position: wp.array, stopped: wp.array
+) -> None:
+    """Move particles through the grid's velocity for a time step; nobody ends within MARGIN cells of a wall who did not start there.
+
+    Where no way back out of a wall is found within a cell, a particle stays where its last stride was open. A move goes at most 1024
+    cells, and 32 along walls.
+
+    Args:
+        grid: the grid.
+        fields: velocity of each component on the faces [m/s].
+        distance: to walls, the domain's included, at the low corners of the cells, float32 in cells, > 0 in the open; in the stored
+            shape. In 2-D the plane k = 1 is used.
+        dt: time step [s].
+        position: [m], shape (n,) (updated).
+        stopped: int32, shape (1,): raised by the number of particles that met a wall.
+    """
+    u, v, w = [*fields, None][:3]
+    inverse = 1.0 / grid.spacing
+    inputs = [grid.planes, grid.spacing, inverse, dt * inverse, position, u, v, w, distance, stopped]
+    launch(advect_kernel, len(position), inputs, grid.device)
+
+
+def push_out(grid: StaggeredGrid, distance: wp.array, position: wp.array, moved: wp.array, left: wp.array) -> None:
+    """Put particles that walls have run over, or come too near, back into the open along the gradient of the distance.
+
+    Args:
+        grid: the grid.
+        distance: to walls in cells, as for `advect_with_distance`.
+        position: [m], shape (n,) (updated): moved by at most PUSH cells.
+        moved: int32, shape (1,): raised by the number of particles that were put outside.
+        left: int32, shape (1,): raised by the number of those for which no way out was found; they stay where they were.
+    """
+    inputs = [grid.planes, grid.spacing, 1.0 / grid.spacing, position, distance, moved, left]
+    launch(push_kernel, len(position), inputs, grid.device)

@@ -1,0 +1,196 @@
+# mypy: ignore-errors
+"""Distances of solids at nodes, and the cells that only their centers tell about."""
+
+import typing
+
+import warp as wp
+
+from warp_lcp.grid.staggered import CellRange
+
+FAR = 4.0  # cells: distances below it are exact, others at least this large
+COARSE = 4  # nodes along an axis of a block in which one distance may stand for all
+HOLLOW = 1  # a mark of cells with distance 0 at all corners whose center is open: one cell wide gaps
+
+options = {"enable_backward": False, "module": "warp_lcp.grid.node_distance"}
+_F32 = wp.array3d(dtype=wp.float32)
+_I16 = wp.array3d(dtype=wp.int16)
+_I8 = wp.array3d(dtype=wp.int8)
+
+
+@wp.struct
+class NodeBlock:
+    """A box of nodes, x fastest, as kernels see it; `stride` 1, or COARSE and each item stands for so many nodes along every axis."""
+
+    low: wp.vec3i
+    high: wp.vec3i  # one past the last
+    counts: wp.vec3i  # of items
+    stride: int
+    flat: bool  # 2-D: z does not count
+    spacing: float  # [m]
+
+
+@wp.func
+@typing.no_type_check
+def first_node(block: NodeBlock, item: int):
+    """Return the low node (x, y, z) of an item of a block."""
+    across = block.counts[0]
+    i = item % across
+    j = (item // across) % block.counts[1]
+    k = item // (across * block.counts[1])
+    return block.low + block.stride * wp.vec3i(i, j, k)
+
+
+@wp.func
+@typing.no_type_check
+def node_position(block: NodeBlock, node: wp.vec3i, offset: float):
+    """Return the place [m] of a node, moved by `offset` cells along each axis; 2-D has z = 0."""
+    z = (float(node[2] - 1) + offset) * block.spacing
+    if block.flat:
+        z = 0.0
+    return wp.vec3((float(node[0] - 1) + offset) * block.spacing, (float(node[1] - 1) + offset) * block.spacing, z)
+
+
+@wp.func
+@typing.no_type_check
+def enter(node: wp.vec3i, d: float, solid: int, near: _F32, owner: _I16, next_near: _F32, next_owner: _I16):
+    """Enter a solid's distance d [cells] at a node among the two nearest; of solids equally near the first stays."""
+    k = node[2]
+    j = node[1]
+    i = node[0]
+    if d < near[k, j, i]:
+        next_near[k, j, i] = near[k, j, i]
+        next_owner[k, j, i] = owner[k, j, i]
+        near[k, j, i] = d
+        owner[k, j, i] = wp.int16(solid)
+    elif d < next_near[k, j, i]:
+        next_near[k, j, i] = d
+        next_owner[k, j, i] = wp.int16(solid)
+
+
+@wp.func
+@typing.no_type_check
+def snapped(meters: float, spacing: float, snap: float):
+    """Return a distance in cells; within `snap` of 0 it is 0, so that walls on faces stay there."""
+    d = meters / spacing
+    if wp.abs(d) < snap:
+        d = 0.0
+    return d
+
+
+@wp.kernel(**options)
+@typing.no_type_check
+def item_points(block: NodeBlock, out: wp.array(dtype=wp.vec3)):
+    """Fill the places [m] of the items of a block: nodes, or the middles of groups of nodes."""
+    c = wp.tid()
+    out[c] = node_position(block, first_node(block, c), 0.5 * float(block.stride - 1))
+
+
+@wp.kernel(**options)
+@typing.no_type_check
+def claim_nodes(
+    block: NodeBlock,
+    distance: wp.array(dtype=wp.float32),
+    snap: float,
+    solid: int,
+    near: _F32,
+    owner: _I16,
+    next_near: _F32,
+    next_owner: _I16,
+):
+    """Enter the distances [m] of a solid at a block of nodes."""
+    c = wp.tid()
+    enter(first_node(block, c), snapped(distance[c], block.spacing, snap), solid, near, owner, next_near, next_owner)
+
+
+@wp.kernel(**options)
+@typing.no_type_check
+def claim_groups(
+    block: NodeBlock,
+    distance: wp.array(dtype=wp.float32),
+    solid: int,
+    near: _F32,
+    owner: _I16,
+    next_near: _F32,
+    next_owner: _I16,
+    list: wp.array(dtype=wp.vec3i),
+    listed: wp.array(dtype=wp.int32),
+):
+    """Bound the distances of groups of nodes by that of their middles; list the nodes that may be nearer than FAR."""
+    c = wp.tid()
+    low = first_node(block, c)
+    high = wp.min(low + wp.vec3i(block.stride), block.high)
+    center = distance[c] / block.spacing
+    middle = 0.5 * float(block.stride - 1)
+    for k in range(low[2], high[2]):
+        for j in range(low[1], high[1]):
+            for i in range(low[0], high[0]):
+                x = float(i - low[0]) - middle
+                y = float(j - low[1]) - middle
+                z = float(k - low[2]) - middle
+                if block.flat:
+                    z = 0.0
+                d = wp.abs(center) - wp.length(wp.vec3(x, y, z))
+                if d >= FAR:
+                    enter(wp.vec3i(i, j, k), wp.sign(center) * d, solid, near, owner, next_near, next_owner)
+                else:
+                    list[wp.atomic_add(listed, 0, 1)] = wp.vec3i(i, j, k)
+
+
+@wp.kernel(**options)
+@typing.no_type_check
+def listed_points(block: NodeBlock, list: wp.array(dtype=wp.vec3i), offset: float, out: wp.array(dtype=wp.vec3)):
+    """Fill the places [m] of listed nodes (offset 0) or of the centers of listed cells (0.5)."""
+    c = wp.tid()
+    out[c] = node_position(block, list[c], offset)
+
+
+@wp.kernel(**options)
+@typing.no_type_check
+def claim_listed(
+    block: NodeBlock,
+    list: wp.array(dtype=wp.vec3i),
+    distance: wp.array(dtype=wp.float32),
+    snap: float,
+    solid: int,
+    near: _F32,
+    owner: _I16,
+    next_near: _F32,
+    next_owner: _I16,
+):
+    """Enter the distances [m] of a solid at listed nodes."""
+    c = wp.tid()
+    enter(list[c], snapped(distance[c], block.spacing, snap), solid, near, owner, next_near, next_owner)
+
+
+@wp.kernel(**options)
+@typing.no_type_check
+def find_flat_cells(cells: CellRange, planes: int, near: _F32, list: wp.array(dtype=wp.vec3i), count: wp.array(dtype=wp.int32)):
+    """List the cells with distance 0 at all corners: a gap or a plate, one cell wide; only their centers tell which."""
+    plane, row, chunk = wp.tid()
+    k = cells.k + plane
+    j = cells.j + row
+    first = cells.i + chunk * cells.grain
+    for i in range(first, wp.min(first + cells.grain, cells.end)):
+        if near[k, j, i] == 0.0:
+            most = wp.abs(near[k, j, i + 1]) + wp.abs(near[k, j + 1, i]) + wp.abs(near[k, j + 1, i + 1])
+            if planes == 2:
+                most = most + wp.abs(near[k + 1, j, i]) + wp.abs(near[k + 1, j, i + 1])
+                most = most + wp.abs(near[k + 1, j + 1, i]) + wp.abs(near[k + 1, j + 1, i + 1])
+            if most == 0.0:
+                slot = wp.atomic_add(count, 0, 1)
+                if slot < list.shape[0]:
+                    list[slot] = wp.vec3i(i, j, k)
+
+
+@wp.kernel(**options)
+@typing.no_type_check
+def mark_listed(list: wp.array(dtype=wp.vec3i), distance: wp.array(dtype=wp.float32), begin: bool, marks: _I8):
+    """Mark the listed cells HOLLOW that no solid so far covers at their center."""
+    c = wp.tid()
+    i = list[c][0]
+    j = list[c][1]
+    k = list[c][2]
+    if begin:
+        marks[k, j, i] = wp.int8(HOLLOW)
+    if distance[c] <= 0.0:
+        marks[k, j, i] = wp.int8(0)
