@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import warp as wp
-from warp_lcp.grid.cut_cells import CutCells
 
 from fluids import boundary_kernels as kernels
 from fluids.boundary import Faces
 from fluids.cut_wall import extend_velocity_cut
+from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.distance_advection import MARGIN, advect_with_distance, push_out
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 

@@ -19,7 +19,8 @@ class Pressure(Table):
     later: ClassVar = {"model": frozenset({"unilateral"})}
     model: Literal["incompressible"] = Field(default="incompressible", description="the only model of this version")
     surface: Literal["ghost-fluid", "voxel"] = Field(
-        default="voxel", description="ghost-fluid: the free surface lies between cell centers, second order; voxel: on the cells' faces"
+        default="ghost-fluid",
+        description="ghost-fluid: the free surface lies between cell centers, second order; voxel: on the cells' faces",
     )
     smoothing: int = Field(default=0, ge=0, le=8, description="binomial passes over the level set of a ghost-fluid surface")
 

@@ -20,7 +20,7 @@ def scene(*, size: list[float], resolution: int, liquid: list[dict[str, Any]], *
             "size": size,
             "resolution": resolution,
             "wall": tables.pop("wall", "separating"),
-            "solids": tables.pop("solids", "voxel"),
+            "solids": tables.pop("solids", "cut-cell"),
         },
         "liquid": liquid,
     }

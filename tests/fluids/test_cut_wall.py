@@ -1,3 +1,4 @@
+from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,14 +19,14 @@ SPACE = StaggeredGrid((12, 13, 11), 0.1, 3)
 JUNK = 1e3  # on faces that are neither projected nor carry weight
 
 
-def points(grid: StaggeredGrid, offset: tuple[float, float, float]) -> np.ndarray:
+def points(grid: StaggeredGrid, offset: Sequence[float]) -> np.ndarray:
     """Return the points (x, y, z) in cells from the domain's corner that lie at an offset from the cells' low corners."""
     k, j, i = np.meshgrid(*(np.arange(n) - 1.0 for n in grid.shape), indexing="ij")
     return np.stack([i + offset[0], j + offset[1], (k + offset[2]) * (grid.dimension == 3)], axis=-1)
 
 
 def face_centers(grid: StaggeredGrid, axis: int) -> np.ndarray:
-    return points(grid, tuple(0.0 if d == axis else 0.5 for d in range(3)))
+    return points(grid, [0.0 if d == axis else 0.5 for d in range(3)])
 
 
 class Slope:
@@ -49,7 +50,8 @@ class Slope:
         distance = np.minimum(nodes, np.min(sides[: grid.dimension], axis=0))
         ring = np.ones(grid.shape, bool)
         ring[1:-1, 1:-1, 1:-1] = False
-        self.open, self.wall, self.closed = [], [], []
+        self.open: list[np.ndarray] = []
+        self.wall: list[np.ndarray] = []
         for axis in range(grid.dimension):
             fraction = self.fraction(axis)
             outside = ring.copy()
@@ -83,7 +85,7 @@ class Slope:
             for c in samples if len(others) == 2 else samples[:1]:
                 offset = np.zeros(3)
                 offset[others] = [b, c][: len(others)]
-                total += self.signed(points(self.grid, tuple(offset))) > 0
+                total += self.signed(points(self.grid, offset)) > 0
         return (total / n ** len(others)).astype(np.float32)
 
     def extend(self, velocity: tuple[float, ...], layers: int = 4) -> list[np.ndarray]:
@@ -242,9 +244,7 @@ def test_a_box_is_treated_as_one_of_whole_cells(counts: tuple[int, int, int], ra
         reached = results[0][1][axis] > 0
         if grid.dimension == 2:
             reached[[0, 2]] = False
-        low = [slice(None)] * 3
-        low[2 - axis] = 0
-        reached[tuple(low)] = False  # no tent reaches a face behind the domain's lower wall
+        np.moveaxis(reached, 2 - axis, 0)[0] = False  # no tent reaches a face behind the domain's lower wall
         assert smooth[reached] == pytest.approx(voxel[reached], abs=1e-6)
 
 

@@ -35,7 +35,7 @@ def test_a_dam_breaks(dimension: int) -> None:
     assert all(tuple(row)[1:] == simulation.columns() for row in rows)
     assert first["mass"] == pytest.approx(1000.0 * 0.375**2 * (0.25 if dimension == 3 else 1.0))
     assert last["mass"] == first["mass"]
-    assert first["volume"] == pytest.approx(first["mass"] / 1000.0)
+    assert first["volume"] == pytest.approx(first["mass"] / 1000.0, rel=0.015)  # the level set rounds the corners
     assert last["center_of_mass_y"] < 0.75 * first["center_of_mass_y"]
     energies = [row["kinetic_energy"] + row["potential_energy"] for row in rows]
     assert max(energies) <= energies[0] * 1.01
@@ -315,7 +315,8 @@ def test_a_step_marks_its_stages() -> None:
 def test_a_piston_drives_the_liquid_of_a_scene() -> None:
     """A solid with a velocity of its own, in the simulator: its cells stay, its face pushes."""
     solid = [box([0.0, 0.0], [0.0625, 0.5])]
-    model = scene(size=[1.0, 0.5], resolution=16, liquid=[box([0.0625, 0.0], [1.0, 0.25])], solid=solid, physics={"gravity": [0.0, 0.0]})
+    tables = {"physics": {"gravity": [0.0, 0.0]}, "solids": "voxel", "pressure": {"surface": "voxel"}}
+    model = scene(size=[1.0, 0.5], resolution=16, liquid=[box([0.0625, 0.0], [1.0, 0.25])], solid=solid, **tables)
     simulation = create(model, np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]))
     row = simulation.step(0.01)
     v = simulation.velocity[1].numpy()[1]

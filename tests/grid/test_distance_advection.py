@@ -1,6 +1,7 @@
 from collections.abc import Callable
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 import warp as wp
 from hypothesis import given, settings
@@ -65,7 +66,7 @@ def velocities(grid: StaggeredGrid, velocity: tuple[float, ...]) -> list[wp.arra
     return fields
 
 
-def move(grid: StaggeredGrid, fields: list[wp.array], distance: wp.array, dt: float, points: np.ndarray) -> tuple[np.ndarray, int]:
+def move(grid: StaggeredGrid, fields: list[wp.array], distance: wp.array, dt: float, points: npt.ArrayLike) -> tuple[np.ndarray, int]:
     position = wp.array(np.asarray(points, dtype=np.float32), dtype=wp.vec3, device="cpu")
     stopped = wp.zeros(1, dtype=wp.int32, device="cpu")
     advect_with_distance(grid, fields, distance, dt, position, stopped)

@@ -54,7 +54,7 @@ class Domain(Table):
     resolution: int = Field(ge=2, le=4096, description="cells along the longest side")
     wall: Wall = Field(default="separating", description="whether liquid may let go of the domain's walls")
     solids: Literal["cut-cell", "voxel"] = Field(
-        default="voxel", description="cut-cell: solids cut through cells as their surfaces do; voxel: they fill whole cells"
+        default="cut-cell", description="cut-cell: solids cut through cells as their surfaces do; voxel: they fill whole cells"
     )
     periodic: list[Literal[False]] | None = Field(default=None, description="false along every axis")
 

@@ -1,9 +1,10 @@
 """Particles carried by the grid's velocity among walls that are given by their distance.
 
 The Runge-Kutta step is that of `warp_lcp.grid.advection`. A particle whose distance to walls exceeds its way needs no care. The others go
-in strides that the distance allows, but never less than a quarter of a cell, so that one that rests on a wall gets on; whoever ends a
-stride too near a wall or inside it is put back along the normal. On a plane that takes just the normal part from the way. The rest of
-the way loses its part into the wall, and between two walls all but the part along their edge.
+in strides that the distance allows, but of half a cell at least, so that one that rests on a wall gets on; whoever ends a stride too
+near a wall or inside it is put back along the normal. On a plane that takes just the normal part from the way. The rest of the way loses
+its part into the wall, and between two walls all but the part along their edge. A stride that would end on another side of a wall is
+halved, so that plates of more than a cell are not tunnelled at any speed.
 
 Positions are measured by the distance that is interpolated between nodes, which defines where walls are.
 """

@@ -8,9 +8,10 @@ from warp_lcp.grid.runge_kutta import MARGIN, runge_kutta
 from warp_lcp.native import BLOCK
 
 AIM = 1.1 * MARGIN  # where particles are put: float32 positions in 10^3 cells round by less than the difference
-STRIDE = 0.25  # cells a particle goes near a wall before it looks again: it never gets through what is twice as thick
+SLACK = 0.25  # cells by which the interpolated distance may exceed the way that is free
+STRIDE = 0.5  # cells a particle goes near a wall before it looks again; shorter where it would come out on another side
 SHORTEST = 0.02  # cells a stride is cut to where a wall is thinner than that
-STRIDES = 128  # of a move: 32 cells along a wall
+STRIDES = 64  # of a move: 32 cells along a wall
 CORNER = 0.5  # walls whose normals are further apart (cosine) stop a particle between them, nearer ones it slides over
 BEND = 0.9  # normals that are nearer than this are one wall
 REACH = 1.0  # cells that a step may put a particle back: more than its stride and the diagonal of the walls' rounding
@@ -153,7 +154,7 @@ MARCH = """
         const T sizes = sqrt(square(g[0])*square(g[1]));
         if (g[0][0]*g[1][0] + g[0][1]*g[1][1] + g[0][2]*g[1][2] < (T)CORNER*sizes) follow_edge(rest, g[0], g[1]);
     };
-    auto march = [&](int m) {
+    auto march = [&](int m, bool arrives) {
         T x[3], rest[3], wall[3], n[3]; int met = 0;
         T most = 0; int finite = 1;
         for (int d = 0; d < 3; ++d) {
@@ -163,6 +164,14 @@ MARCH = """
         }
         if (!finite) return;  // the sums over particles will find it
         if (most > 1024) { for (int d = 0; d < 3; ++d) rest[d] *= 1024/most; }
+        if (!arrives && square(rest) <= 4) {  // velocity is sampled there, no more: what lies between is left to the last stage
+            T y[3] = {to[0][m], to[1][m], to[2][m]};
+            into_domain(y);
+            if (measure(y, n) >= margin || project(y, n, (T)REACH)) {
+                for (int d = 0; d <= planes; ++d) to[d][m] = y[d];
+                return;
+            }
+        }
         into_domain(x);
         T s = measure(x, wall);
         const T steepness = sqrt(square(wall));
@@ -170,7 +179,7 @@ MARCH = """
         for (int d = 0; d < 3; ++d) wall[d] = steepness > 0 ? wall[d]/steepness : (T)0;
         for (int stride = 0; stride < STRIDES; ++stride) {
             const T length = sqrt(square(rest));
-            const T sure = s > (T)(2*STRIDE) ? s - (T)STRIDE : least;
+            const T sure = s - (T)SLACK > least ? s - (T)SLACK : least;
             const T t = sure < length ? sure/length : (T)1;
             T y[3];
             for (int d = 0; d < 3; ++d) y[d] = x[d] + t*rest[d];
@@ -181,8 +190,7 @@ MARCH = """
                 const int out = project(y, n, (T)REACH);
                 met = 1;
                 if (before >= margin && t*length > (T)SHORTEST && (!out || n[0]*rest[0] + n[1]*rest[1] + n[2]*rest[2] > 0)) {
-                    s = before; least = (T)0.5*(t*length < least ? t*length : least);  // out on the far side: too long a stride
-                    if (s > (T)(2*STRIDE)) s = (T)(2*STRIDE);
+                    s = margin; least = (T)0.5*(t*length < least ? t*length : least);  // out on another side: too long a stride
                     continue;
                 }
                 if (!out) break;
@@ -212,7 +220,7 @@ MOVE = """
         const T flat = planes == 2 ? (T)0.57735 : (T)0.7071;
         measure_all(from, sure, n);
         SIMD for (int m = 0; m < n; ++m) {
-            const T near = sure[m]*flat, far = sure[m] - (T)STRIDE, r = (near > far ? near : far) - margin;
+            const T near = sure[m]*flat, far = sure[m] - (T)SLACK, r = (near > far ? near : far) - margin;
             sure[m] = r > 0 ? r*r : (T)-1;
         }
     };
@@ -225,7 +233,7 @@ MOVE = """
         }
         int careful = 0;
         for (int m = 0; m < n; ++m) { list[careful] = m; careful += hit[m]; hit[m] = 0; }
-        for (int q = 0; q < careful; ++q) march(list[q]);
+        for (int q = 0; q < careful; ++q) march(list[q], c != 0);
     };
 """
 
@@ -269,7 +277,7 @@ PUSH_OUT = """
 def _named(source: str) -> str:
     """Return source with its parts and numbers put in."""
     source = source.replace("DISTANCE", DISTANCE).replace("PROJECT", PROJECT)
-    numbers = {"STRIDES": STRIDES, "STRIDE": STRIDE, "SHORTEST": SHORTEST, "CORNER": CORNER, "BEND": BEND}
+    numbers = {"STRIDES": STRIDES, "STRIDE": STRIDE, "SLACK": SLACK, "SHORTEST": SHORTEST, "CORNER": CORNER, "BEND": BEND}
     lengths = {"REACH": REACH, "PUSH": PUSH, "AIM": AIM}
     for name, number in (numbers | lengths).items():
         source = source.replace(name, repr(number))

@@ -122,7 +122,7 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
     @wp.func_native(
         simd(
             AT_ROW
-            + """double* x = x_.data + p; const auto* z = z_.data + p; auto* q = p_.data + p; double missed = 0;
+            + """double* x = x_.data + p; const auto* z = z_.data + p; auto* q = p_.data + p;
         const bool fresh = beta == 0;  // then q may hold anything, a NaN too
         const double inverse = step != 0 ? 1/step : 0;
         """
@@ -130,17 +130,16 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
             + """
         with_bounds([&](auto lower, auto upper) {
             SIMD8 for (int k = 0; k < n; ++k) {
-                const auto s = fresh ? z[k] : z[k] + beta*q[k];
+                const auto s = (fresh | (z[k] == 0)) ? z[k] : z[k] + beta*q[k];  // held unknowns leave the direction
                 const double l = lower(k), u = upper(k), v = x[k] + step*(double)s, w = v < l ? l : v, c = w > u ? u : w;
                 const bool moves = (s != 0) & (v - v == 0), cut = moves & (c != v);  // a NaN or infinite step leaves x as it was
                 const double left = (c - x[k])*inverse;
-                missed += cut ? 1.0 : 0.0; q[k] = cut ? left : (double)s; x[k] = moves ? c : x[k]; } });
-        if (missed != 0) scalars.data[carry] = 0;  // all threads write the same"""
+                q[k] = cut ? left : (double)s; x[k] = moves ? c : x[k]; } });"""
         )
     )
     def update_row(
         x_: f64, z_: field, p_: field, l_: f64, l_value: wp.float64, u_: f64, u_value: wp.float64, code_: u8, beta: real, step: wp.float64,
-        p: wp.int64, n: int, carry: int, scalars: f64,
+        p: wp.int64, n: int,
     ): ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module=name)
@@ -180,7 +179,7 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
         o = row_start(A, k, j, c, grain)
         n = row_count(A, k, j, c, grain)
         beta = real(scalars[BETA])
-        update_row(x, z, p, lower, lower_value, upper, upper_value, code, beta, scalars[STEP], o, n, CARRY, scalars)
+        update_row(x, z, p, lower, lower_value, upper, upper_value, code, beta, scalars[STEP], o, n)
 
     @wp.kernel(enable_backward=False, module=name)
     def advance(
@@ -197,7 +196,7 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
                 for j in range(R.rows):
                     o = row_start(A, s, j, 0, A.nx)
                     n = row_count(A, s, j, 0, A.nx)
-                    update_row(x, z, p, lower, lower_value, upper, upper_value, code, beta, step, o, n, CARRY, scalars)
+                    update_row(x, z, p, lower, lower_value, upper, upper_value, code, beta, step, o, n)
             k = s - 1
             if k >= 0:
                 slab = k // R.planes
