@@ -40,6 +40,9 @@ class Boundary(Protocol):
     capacity: wp.array | None
     distance: wp.array | None
 
+    def top_speed(self, time: float, span: float) -> float:
+        """Return how fast the solids move at most [m/s] from `time` to `time` + `span` [s]."""
+
     def begin_step(self, time: float, dt: float) -> None:
         """Find how fast the solids move from `time` on [s]."""
 
@@ -90,6 +93,10 @@ class WholeCells:
                 grid.everywhere.launch(kernels.wall_velocity_kernel, [axis, solids.index, walls, field])
         self._room = clearance(grid, self.base)
         self._stopped = wp.zeros(1, dtype=wp.int32, device=grid.device)
+
+    def top_speed(self, time: float, span: float) -> float:
+        """Return 0: cells stay where they are."""
+        return 0.0
 
     def begin_step(self, time: float, dt: float) -> None:
         """Do nothing: velocities are constant."""

@@ -10,6 +10,7 @@ from fluids.boundary import Faces
 from fluids.cut_wall import extend_velocity_cut
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.distance_advection import MARGIN, advect_with_distance, push_out
+from warp_lcp.grid.motion import top_speed
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 
 
@@ -34,7 +35,14 @@ class CutBoundary:
         self._scratch = grid.faces()
         self._reachable = grid.field() if cut.moves else cut.distance  # distance where particles may go within a step
         self._counts = wp.zeros(3, dtype=wp.int32, device=grid.device)
+        self._moving = [(solid.motion, solid.geometry.bounds()) for solid in cut.solids if solid.motion is not None]
         self._find_walls()
+
+    def top_speed(self, time: float, span: float) -> float:
+        """Return how fast the solids move at most [m/s] from `time` to `time` + `span` [s]."""
+        size = np.array(self.grid.counts) * self.grid.spacing
+        size[self.grid.dimension :] = 0.0
+        return max((top_speed(motion, bounds, size, time, span) for motion, bounds in self._moving), default=0.0)
 
     def begin_step(self, time: float, dt: float) -> None:
         """Find how fast the solids move from `time` on [s]."""

@@ -12,11 +12,11 @@ Partly open faces have been projected and keep their velocity. The interpolated 
 
 import typing
 from collections.abc import Sequence
-from typing import Protocol
 
 import warp as wp
 
 from fluids.pressure_kernels import HELD, RELEASED, TOUCHES_NOTHING
+from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.extrapolate import extrapolate
 from warp_lcp.grid.staggered import CellRange, Window
 from warp_lcp.grid.transfer import TINY_WEIGHT
@@ -91,6 +91,7 @@ CONSTRAIN_ROW = """
     };
     auto constrain = [&](int i) {
         int at[3] = {i, j, k};
+        if (at[axis] == 0) { result[row + i] = field[axis][row + i]; return; }  // behind the domain's wall: no tent reaches it
         for (int d = 0; d <= planes; ++d) {  // the ring follows what lies beside it
             const int most = counts[d] + (d == axis ? 1 : 0);
             at[d] = at[d] < 1 ? 1 : (at[d] < most ? at[d] : most);
@@ -216,16 +217,6 @@ def take_kernel(
     take_row(axis, planes, known, open, result, field, cells.k + plane, cells.j + row, first, end)
 
 
-class Walls(Protocol):
-    """What is asked of `warp_lcp.grid.cut_cells.CutCells`."""
-
-    distance: wp.array
-    open: Sequence[wp.array]
-    wall: Sequence[wp.array]
-    velocity: Sequence[wp.array] | None
-    separating: wp.array
-
-
 def extend_velocity_cut(
     window: Window,
     velocity: Sequence[wp.array],
@@ -233,7 +224,7 @@ def extend_velocity_cut(
     known: Sequence[wp.array],
     kind: wp.array,
     contact: wp.array,
-    cut: Walls,
+    cut: CutCells,
     scratch: Sequence[wp.array],
     layers: int,
 ) -> None:

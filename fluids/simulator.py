@@ -96,11 +96,15 @@ class LiquidSimulation:
         self.projection.show()
 
     def stable_dt(self) -> float:
-        """Return CFL dx / (v_max + sqrt(CFL g dx)) [s]: gravity's own speed counts, so that a liquid at rest does not take off."""
+        """Return CFL dx / (v_max + sqrt(CFL g dx)) [s]; v_max is of the liquid and of solids in the time to come.
+
+        Gravity's own speed counts, so that a liquid at rest does not take off.
+        """
         cfl, dx = self.scene.time.cfl, self.grid.spacing
         with self.watch.stage("diagnostics", self.particles.position, self.particles.velocity):
             totals = self.particles.totals()
-        speed = totals.max_speed + math.sqrt(cfl * float(np.linalg.norm(self.gravity)) * dx)
+        solids = self.boundary.top_speed(self.time, self.scene.time.dt_max)
+        speed = max(totals.max_speed, solids) + math.sqrt(cfl * float(np.linalg.norm(self.gravity)) * dx)
         return cfl * dx / speed if speed > 0.0 else math.inf
 
     def step(self, dt: float) -> dict[str, float | int | str | None]:

@@ -8,7 +8,6 @@ import warp as wp
 
 import warp_lcp as wl
 from oracle import lemke, natural_residual
-from warp_lcp.solve import IterateInBuffers
 
 
 def poisson(n=16, seed=7, device="cpu", **options):
@@ -201,20 +200,6 @@ def test_psor_settings_are_checked(bad):
 def test_newton_settings_are_checked(bad):
     with pytest.raises(ValueError, match=next(iter(bad))):
         wl.MinimumMapNewton(**bad)
-
-
-def test_buffers_never_overwrite_the_best_iterate():
-    iterate = IterateInBuffers(wp.zeros(1, dtype=wp.float64, device="cpu"))
-    iterate.keep()
-    for value in range(1, 6):
-        out = iterate.fresh()
-        out.fill_(value)
-        iterate.advance(out)
-        if value == 2:
-            iterate.keep()
-    assert iterate.x.numpy()[0] == 5
-    iterate.restore()
-    assert iterate.x.numpy()[0] == 2
 
 
 class TestStatuses:

@@ -2,7 +2,7 @@
 
 from importlib.metadata import PackageNotFoundError, version
 
-from warp_lcp.operators import AIR, FLUID, SOLID, DenseOperator, GridPoisson, Operator
+from warp_lcp.operators import AIR, FLUID, SOLID, DenseOperator, GridPoisson, Operator, SparseOperator
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import Record, SolveResult, SolveStatus
@@ -31,6 +31,7 @@ __all__ = [
     "Record",
     "SolveResult",
     "SolveStatus",
+    "SparseOperator",
     "Step",
     "StoppingCriteria",
     "default_method",

@@ -25,11 +25,11 @@ C_TYPES = {wp.uint8: "unsigned char", wp.float32: "float", wp.float64: "double"}
 def simd(source: str) -> str:
     """Return the body of a native function: `SIMD for` becomes a vectorized loop, sums may be taken in any order.
 
-    `SIMD8 for` takes half as many elements at a time, which is faster where most of them are doubles.
+    `SIMD8 for` takes half as many elements at a time, which is faster where most of them are doubles; `SIMD64 for` is for bytes.
     """
     pragma = "\n#ifndef __CUDA_ARCH__\n#pragma clang loop vectorize(assume_safety) vectorize_width({}) interleave_count(1)\n#endif\n"
     head = "\n#ifndef __CUDA_ARCH__\n#pragma clang fp reassociate(on) contract(fast)\n#endif\n"
-    return head + source.replace("SIMD8 ", pragma.format(8)).replace("SIMD ", pragma.format(16)) + "\n"
+    return head + source.replace("SIMD64 ", pragma.format(64)).replace("SIMD8 ", pragma.format(8)).replace("SIMD ", pragma.format(16)) + "\n"
 
 
 def fetch(begin: str, end: str, **pointers: int) -> str:

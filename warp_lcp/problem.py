@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cached_property, singledispatch
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +17,22 @@ if TYPE_CHECKING:
     from warp_lcp.operators.protocol import Operator
 
 
+@singledispatch
+def as_operator(A: Any, device: Any = None) -> Operator:
+    """Return A as an operator; operators register here which arrays they take (numpy arrays, scipy.sparse matrices).
+
+    Args:
+        A: an operator, or what one is made of.
+        device: where an operator is made; the default device if None.
+
+    Raises:
+        ValueError: A is neither.
+    """
+    if not hasattr(A, "apply"):
+        raise ValueError(f"A is a {type(A).__name__}: expected an operator, a numpy array or a scipy.sparse matrix")
+    return A
+
+
 class LCP:
     """A linear complementarity problem ([Book] 1.2).
 
@@ -28,7 +44,7 @@ class LCP:
     that layout too.
 
     Args:
-        A: an Operator.
+        A: an Operator, or a numpy array or scipy.sparse matrix of shape (n, n), which becomes one on b's device.
         b: field of A's shape, units of y.
         lower: l, a number or a field; -inf where there is none.
         upper: u, a number or a field; inf where there is none.
@@ -46,7 +62,8 @@ class LCP:
         [0.  1.5]
     """
 
-    def __init__(self, A: Operator, b: Array, lower: Any = 0.0, upper: Any = np.inf) -> None:
+    def __init__(self, A: Operator | Array, b: Array, lower: Any = 0.0, upper: Any = np.inf) -> None:
+        A = as_operator(A, b.device if isinstance(b, wp.array) else None)
         self.A, self.layout = A, layout_of(A)
         if getattr(A, "unknowns", self.layout.size) == 0:
             raise ValueError("A has no unknowns: the problem is empty")

@@ -54,12 +54,14 @@ class Step:
         linear_iterations: iterations on the finest grid.
         active: unknowns held at a bound, None where the method has no active set.
         failure: the status with which the method gives up, None to go on.
+        interim: the residual need not fall before the method's end (a pivot on the way): patience and divergence do not apply yet.
     """
 
     name: str
     linear_iterations: int = 1
     active: int | None = None
     failure: SolveStatus | None = None
+    interim: bool = False
 
 
 class Workspace(Protocol):
@@ -101,33 +103,6 @@ class IterateInPlace:
         """Take x back."""
         if self._best is not None:
             wp.copy(self.x, self._best)
-
-
-class IterateInBuffers:
-    """Keeps the best iterate by not overwriting it; for methods that write each iterate to `fresh()` and then call `advance`."""
-
-    def __init__(self, first: wp.array[Any]) -> None:
-        self.x, self._best, self._buffers = first, first, [first]
-
-    def fresh(self) -> wp.array[Any]:
-        """Return a buffer that holds neither the iterate nor the best one; the third is made only when it is needed."""
-        for buffer in self._buffers:
-            if buffer is not self.x and buffer is not self._best:
-                return buffer
-        self._buffers.append(wp.zeros_like(self.x))
-        return self._buffers[-1]
-
-    def advance(self, x: wp.array[Any]) -> None:
-        """Take a buffer as the iterate."""
-        self.x = x
-
-    def keep(self) -> None:
-        """Remember x."""
-        self._best = self.x
-
-    def restore(self) -> None:
-        """Take x back."""
-        self.x = self._best
 
 
 class Solver(Protocol):
@@ -215,7 +190,7 @@ class _Loop:
             self._record(iteration, step)
             if self.residual.norm < self.best_norm:
                 self._keep(iteration)
-            status = self._status(iteration, step.failure)
+            status = self._status(iteration, step.failure, interim=step.interim)
         return self._finish(status, iteration)
 
     def _guess(self, x0: Array) -> wp.array[Any]:
@@ -233,7 +208,7 @@ class _Loop:
         if not math.isfinite(self.residual.evaluate(self.work.x)):
             raise ValueError("x0 gives a residual that is not finite")
 
-    def _status(self, iteration: int, failure: SolveStatus | None) -> SolveStatus | None:
+    def _status(self, iteration: int, failure: SolveStatus | None, *, interim: bool = False) -> SolveStatus | None:
         """Return how the solve ends now, None if it goes on."""
         norm, stopping = self.residual.norm, self.stopping
         if not math.isfinite(norm):
@@ -242,16 +217,18 @@ class _Loop:
             return SolveStatus.CONVERGED
         if failure is not None:
             return self._floor_or(failure)
-        if norm > stopping.divergence * max(self.history[0].residual, self.reference):
+        if not interim and norm > stopping.divergence * max(self.history[0].residual, self.reference):
             return SolveStatus.DIVERGED
         if iteration >= stopping.max_iterations:
             return SolveStatus.MAX_ITERATIONS
-        if iteration - self.best_iteration >= stopping.patience:
+        if not interim and iteration - self.best_iteration >= stopping.patience:
             return self._floor_or(SolveStatus.STAGNATED)
         return None
 
     def _floor_or(self, status: SolveStatus) -> SolveStatus:
-        """Return FLOOR where the residual is what rounding leaves, else the status."""
+        """Return FLOOR where the best iterate's residual is what rounding leaves, else the status: the solve ends with it."""
+        if self.best_iteration != self.history[-1].iteration:
+            self.work.restore()
         floor = FLOOR_MARGIN * self.residual.rounding_floor(self.work.x, self.work.precision.epsilon)
         return SolveStatus.FLOOR if self.best_norm <= floor else status
 

@@ -17,7 +17,7 @@ from fluids import LiquidSimulation
 RESOLUTIONS = (32, 64)  # cells of the domain's height
 DURATION = 0.25  # [s]
 SIZE, LOW = [0.4, 0.8], 0.55  # [m]: the domain, and where the block begins
-SLANTED = math.radians(10.0)
+SLANTED = math.radians(5.0)
 CEILINGS: dict[str, list[dict[str, Any]]] = {
     "flat": [],
     "slanted": [{"shape": "plane", "point": [0.2, 0.76], "normal": [math.sin(SLANTED), -math.cos(SLANTED)]}],  # cuts cells
@@ -106,4 +106,4 @@ def _hold(simulation: LiquidSimulation) -> None:
     def forgetful(*given: Any) -> None:
         extend(*(nothing if a is contact else a for a in given))
 
-    simulation.boundary.extend = forgetful  # type: ignore[method-assign]
+    simulation.boundary.extend = forgetful  # type: ignore[assignment, method-assign]

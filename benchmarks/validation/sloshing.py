@@ -19,6 +19,7 @@ AMPLITUDE = 0.05 * DEPTH
 WAVENUMBER = math.pi / LENGTH
 PERIOD = 2.0 * math.pi / math.sqrt(GRAVITY * WAVENUMBER * math.tanh(WAVENUMBER * DEPTH))
 PERIODS = 5
+SEEDS = (2015, 1, 2)  # of the particles: with whole cells the period is a matter of chance too, once the wave is lower than a cell
 POINTS = 257  # of the surface at the start
 
 
@@ -39,39 +40,40 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
     return [*trials, comparison], [chart]
 
 
-def trial(cells: int, device: str, numerics: Numerics = SUB_CELL, periods: int = PERIODS) -> Trial:
-    """Measure the period; the control is a surface of whole cells, which is half a cell too high."""
+def trial(cells: int, device: str, numerics: Numerics = SUB_CELL) -> Trial:
+    """Measure the period, the worst of some samples; the control is a surface of whole cells, which follows waves in stairs."""
 
     def run(found: Findings) -> None:
-        limit = 3.0 if cells >= RESOLUTIONS[-1] else 5.0
         for each in (numerics, VOXEL):
-            time, elevation = slosh(cells, device, each, periods)
-            measured = period(time, elevation)
-            error = 100.0 * abs(measured / PERIOD - 1.0)
-            found.curves[f"{cells} cells, {each.name}, {measured:.4f} s"] = (time.tolist(), (elevation / AMPLITUDE).tolist())
+            waves = [slosh(cells, device, each, seed) for seed in SEEDS]
+            periods = [period(*wave) for wave in waves]
+            worst = int(np.argmax(np.abs(np.array(periods) - PERIOD)))
+            error = 100.0 * abs(periods[worst] / PERIOD - 1.0)
+            time, elevation = waves[worst]
+            found.curves[f"{cells} cells, {each.name}, {periods[worst]:.4f} s"] = (time.tolist(), (elevation / AMPLITUDE).tolist())
             if each is numerics:
-                found.add("error of the period", error, high=limit, unit="%")
+                found.add("error of the period", error, high=3.0, unit="%")
             else:
                 found.must_break("whole cells: error of the period", error, high=8.0, unit="%")
 
     return attempt("sloshing", f"{cells} cells of depth, {numerics.name}", run)
 
 
-def slosh(cells: int, device: str, numerics: Numerics, periods: int = PERIODS) -> tuple[np.ndarray, np.ndarray]:
+def slosh(cells: int, device: str, numerics: Numerics, seed: int = SEEDS[0]) -> tuple[np.ndarray, np.ndarray]:
     """Return times [s] and the amplitude of the first mode [m].
 
     Args:
         cells: of depth.
         device: where it runs.
         numerics: of solids and surface.
-        periods: how many of linear theory to run for.
+        seed: of the particles' places.
     """
     with tempfile.TemporaryDirectory() as folder:
         write_wave(Path(folder) / "wave.obj")
-        resolution = round(cells * LENGTH / DEPTH)
         liquid = [{"shape": "mesh", "file": "wave.obj"}]
         simulation = create(
-            numerics, size=[LENGTH, HEIGHT], resolution=resolution, liquid=liquid, device=device, folder=Path(folder)
+            numerics, size=[LENGTH, HEIGHT], resolution=round(cells * LENGTH / DEPTH), liquid=liquid, particles={"seed": seed},
+            device=device, folder=Path(folder),
         )  # fmt: skip
     area = (simulation.grid.spacing / PER_AXIS) ** 2
 
@@ -79,7 +81,7 @@ def slosh(cells: int, device: str, numerics: Numerics, periods: int = PERIODS) -
         return mode(positions(simulation)[:, 0], WAVENUMBER, area, LENGTH)
 
     time, elevation = [0.0], [amplitude()]
-    for row in steps(simulation, periods * PERIOD):
+    for row in steps(simulation, PERIODS * PERIOD):
         time.append(row["time"])
         elevation.append(amplitude())
     return np.array(time), np.array(elevation)

@@ -13,10 +13,10 @@ import benchmarks.__main__ as process
 from benchmarks import validation
 from benchmarks.record import Lines
 from benchmarks.suite import VALIDATION
-from benchmarks.validation import ceiling, dam_break, rest, signals, sloshing, transfers
+from benchmarks.validation import ceiling, dam_break, rest, signals, slope, sloshing, transfers
 from benchmarks.validation.enclosed import cumulative, enclosed_cells, filled_fraction
 from benchmarks.validation.finding import Finding, Findings, Trial, attempt, control, table
-from benchmarks.validation.tank import VOXEL, create, fill
+from benchmarks.validation.tank import SUB_CELL, VOXEL, Numerics, create, fill
 from warp_lcp.driver.simulator import StepFailed
 from warp_lcp.grid.triangle_mesh import load_surface
 
@@ -201,10 +201,18 @@ def test_round_trips_keep_what_they_must() -> None:
     assert trial.record().facts["controls_failed_as_they_must"]
 
 
-def test_a_block_lets_go_of_the_ceiling_and_its_controls_do_not() -> None:
-    trial = ceiling.trial(24, "cpu", VOXEL)
+@pytest.mark.parametrize(("numerics", "shape"), [(VOXEL, "flat"), (SUB_CELL, "slanted")])
+def test_a_block_lets_go_of_the_ceiling_and_its_controls_do_not(numerics: Numerics, shape: str) -> None:
+    trial = ceiling.trial(24, "cpu", numerics, shape)
     assert trial.failures() == []
     assert len([f for f in trial.findings if f.control]) == 3
+
+
+def test_a_layer_slides_along_a_slope_and_is_stopped_by_stairs() -> None:
+    trial = slope.trial(5, "cpu")
+    assert trial.failures() == []
+    assert trial.findings[-1].control
+    assert trial.findings[-1].value > 5.0
 
 
 @pytest.mark.parametrize("error", [0.5, 2.0])

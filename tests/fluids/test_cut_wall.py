@@ -238,7 +238,7 @@ def test_a_box_is_treated_as_one_of_whole_cells(counts: tuple[int, int, int], ra
             extend_velocity_cut(grid.everywhere, fields, weight, known, liquid, touch, cut, grid.faces(), layers)
         else:
             index = wp.array(np.where(kind == SOLID, 0, -1).astype(np.int32), device="cpu")
-            extend_velocity(grid.everywhere, fields, weight, known, liquid, touch, index, separating, None, layers)
+            extend_velocity(grid.everywhere, fields, weight, known, liquid, touch, index, separating, [], layers)
         results.append(([f.numpy() for f in fields], [m.numpy() for m in known]))
     for axis, (voxel, smooth) in enumerate(zip(results[0][0], results[1][0], strict=True)):
         reached = results[0][1][axis] > 0

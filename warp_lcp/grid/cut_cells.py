@@ -36,6 +36,7 @@ class CutCells:
     Attributes:
         distance: float32 signed distance to the nearest wall, the domain's included, at nodes [cells], positive in the open. Distances to
             solids are exact below `FAR` cells; others are at least that.
+        solid_distance: the same without the domain.
         open: float32 open fraction of each face, a list of one field a component: 0, or in [1e-3, 1]; 0 on the domain's faces and outside.
         wall: int16 number of the solid that closes a face, the nearest to its center: -1 on open faces, 0 on the domain's.
         base: int8, SOLID where all faces of a cell are closed, else AIR; the ring is SOLID.
@@ -74,6 +75,8 @@ class CutCells:
             self._nodes, [geometry for _, geometry in standing], np.zeros(3, dtype=int), np.array(grid.shape[::-1]), self._marks
         )
         wp.copy(self.base, self._marks)
+        self._moved_from: list[tuple[np.ndarray, np.ndarray]] = []  # nodes near the solids that move, where the velocity was filled last
+        self._moved_to: list[tuple[np.ndarray, np.ndarray]] = []  # and where they are
         if self.moves:
             self._standing = NodeDistances(grid, second=len(solids) > 1)
             self._standing.copy_from(self._nodes)
@@ -82,6 +85,7 @@ class CutCells:
         dropped, partial = self._counts.numpy().tolist()
         self.whole_cells = partial == 0 and not self.moves
         self.notes = (*notes, *self._result_notes(dropped))
+        self.solid_distance = self._nodes.near
         if not self.moves:  # needed by `place` only
             del self._sampler, self._nodes, self._marks
 
@@ -132,10 +136,16 @@ class CutCells:
         self._turn.assign(turn.astype(np.float32))
         self._shift.assign(shift.astype(np.float32))
         grid, nodes = self.grid, self._nodes
+        near = [*self._moved_from, *self._moved_to]
+        if not near:
+            return
+        low, high = np.min([block[0] for block in near], axis=0), np.max([block[1] for block in near], axis=0)
         for axis, (field, open_, wall) in enumerate(zip(self.velocity, self.open, self.wall, strict=True)):
-            window = grid.window((1, 1, 1), [count + (axis == other) for other, count in enumerate(grid.counts)])
+            last = [min(int(high[a]) - 1, count + (a == axis)) for a, count in enumerate(grid.counts)]
+            window = grid.window([max(int(first), 1) for first in low], last)
             inputs = [grid.planes, axis, grid.spacing, nodes.near, nodes.owner, open_, wall, self._turn, self._shift, field]
             window.launch(kernels.velocity_kernel, inputs)
+        self._moved_from = self._moved_to
 
     def _moving(self) -> list[tuple[int, Geometry, Motion]]:
         """Return the solids that move, with their numbers, as the scene places them."""
@@ -147,10 +157,10 @@ class CutCells:
         for number, geometry in placed:
             self._sampler.enter(self._nodes, number, geometry)
         every = [s.geometry for s in self.solids if s.motion is None] + [geometry for _, geometry in placed]
-        for _, geometry in placed:
-            near = nodes_near(self.grid, geometry)
-            if near is not None:
-                self._sampler.look_at_centers(self._nodes, every, *near, self.base)
+        near = [nodes_near(self.grid, geometry) for _, geometry in placed]
+        self._moved_to = [block for block in near if block is not None]
+        for low, high in self._moved_to:
+            self._sampler.look_at_centers(self._nodes, every, low, high, self.base)
 
     def _refresh(self) -> None:
         """Fill everything that follows from the distances."""

@@ -14,6 +14,7 @@ SHORTEST = 0.02  # cells a stride is cut to where a wall is thinner than that
 STRIDES = 64  # of a move: 32 cells along a wall
 CORNER = 0.5  # walls whose normals are further apart (cosine) stop a particle between them, nearer ones it slides over
 BEND = 0.9  # normals that are nearer than this are one wall
+LEG = 0.25  # cells of such a search in one direction
 REACH = 1.0  # cells that a step may put a particle back: more than its stride and the diagonal of the walls' rounding
 PUSH = 3.0  # cells that a wall may push a particle in a step
 
@@ -64,7 +65,7 @@ DISTANCE = """
 """
 
 # Where the distance on a grid has a saddle, as in the edge between two walls along the grid, Newton's method along the gradient goes
-# astray. There the direction is that of differences over a cell, and the length is searched.
+# astray. There the direction is that of differences over a cell, and the way out is searched in short legs.
 PROJECT = """
     auto wide_normal = [&](const T* x, T* n) {
         for (int d = 0; d < 3; ++d) {
@@ -83,25 +84,29 @@ PROJECT = """
         return size > (T)1e-6;
     };
     auto search = [&](T* x, T first_length, T limit) {
-        T n[3], y[3], g[3], inside = 0, open = 0;
-        if (!wide_normal(x, n)) return false;
+        T n[3], y[3], g[3];
+        const T leg = (T)LEG;
         auto distance_along = [&](T c) {
             for (int d = 0; d < 3; ++d) y[d] = x[d] + c*n[d];
             into_domain(y);
             return measure(y, g);
         };
-        for (T c = first_length; open == 0 && c < 2*limit; c *= 2) {
-            const T at = c < limit ? c : limit;
-            if (distance_along(at) >= aim) open = at; else inside = at;
+        for (T gone = 0; gone < limit; gone += leg) {
+            if (!wide_normal(x, n)) return false;
+            T inside = 0, open = 0;
+            for (T c = first_length < leg ? first_length : leg; open == 0 && c < 2*leg; c *= 2) {
+                const T at = c < leg ? c : leg;
+                if (distance_along(at) >= aim) open = at; else inside = at;
+            }
+            for (int halving = 0; open > 0 && halving < 6; ++halving) {
+                const T middle = (T)0.5*(inside + open);
+                if (distance_along(middle) >= aim) open = middle; else inside = middle;
+            }
+            distance_along(open > 0 ? open : leg);
+            for (int d = 0; d < 3; ++d) x[d] = y[d];
+            if (open > 0) return true;
         }
-        if (open == 0) return false;
-        for (int halving = 0; halving < 6; ++halving) {
-            const T middle = (T)0.5*(inside + open);
-            if (distance_along(middle) >= aim) open = middle; else inside = middle;
-        }
-        distance_along(open);
-        for (int d = 0; d < 3; ++d) x[d] = y[d];
-        return true;
+        return false;
     };
     // Put a point that is too near or inside at the distance `aim`; n becomes the normal there. 0: no way out within the limit, 2: it was
     // the gradient that led nowhere.
@@ -112,7 +117,8 @@ PROJECT = """
         for (int step = 0; step < 8 && s < margin && far <= limit*limit; ++step) {
             const T need = aim - s, steepness = square(n), trust = 4*need + (T)0.05;
             if (!(need*need <= steepness*trust*trust)) break;
-            for (int d = 0; d < 3; ++d) x[d] += need/steepness*n[d];
+            const T slope = sqrt(steepness), length = need/slope, most = need + (T)0.05;  // it is only here that the slope is not 1
+            for (int d = 0; d < 3; ++d) x[d] += (length < most ? length : most)/slope*n[d];
             into_domain(x);
             s = measure(x, n);
             const T way[3] = {x[0] - start[0], x[1] - start[1], x[2] - start[2]};
@@ -278,7 +284,7 @@ def _named(source: str) -> str:
     """Return source with its parts and numbers put in."""
     source = source.replace("DISTANCE", DISTANCE).replace("PROJECT", PROJECT)
     numbers = {"STRIDES": STRIDES, "STRIDE": STRIDE, "SLACK": SLACK, "SHORTEST": SHORTEST, "CORNER": CORNER, "BEND": BEND}
-    lengths = {"REACH": REACH, "PUSH": PUSH, "AIM": AIM}
+    lengths = {"LEG": LEG, "REACH": REACH, "PUSH": PUSH, "AIM": AIM}
     for name, number in (numbers | lengths).items():
         source = source.replace(name, repr(number))
     return source

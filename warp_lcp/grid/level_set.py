@@ -90,6 +90,10 @@ class LevelSet:
         self._filled = window
         inputs = [density, capacity, smooth, base, self._spread, self.limit, self.phi, self._known]
         window.launch(kernels.distance_kernel, inputs)
+        if smooth is not None:
+            shifted = next(field for field in self._scratch if field is not smooth)
+            window.launch(kernels.wall_shift_kernel, [self._spread**2, self.limit, smooth, self.phi, self._known, shifted])
+            window.launch(kernels.copy_kernel, [shifted, self.phi])
         extrapolate(window, self._known, self.phi, kernels.EXTENDED)
 
     def volume(self, distance: wp.array | None, window: Window) -> float:

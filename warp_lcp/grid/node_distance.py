@@ -81,8 +81,8 @@ class NodeSampler:
         size = max(min(CHUNK, grid.size), max(grid.shape) * COARSE**2)  # a row of groups fits
         self._points = wp.empty(size, dtype=wp.vec3, device=grid.device)
         self._distances = wp.empty(size, dtype=wp.float32, device=grid.device)
-        self._list = wp.empty(size, dtype=wp.vec3i, device=grid.device)
-        self._listed = wp.zeros(1, dtype=wp.int32, device=grid.device)
+        self._list, self._sure = (wp.empty(size, dtype=wp.vec4i, device=grid.device) for _ in range(2))  # (x, y, z, sign if sure)
+        self._listed = wp.zeros(2, dtype=wp.int32, device=grid.device)
 
     def enter(self, nodes: NodeDistances, number: int, geometry: Geometry) -> None:
         """Enter a solid's distances.
@@ -95,7 +95,8 @@ class NodeSampler:
         near = nodes_near(self.grid, geometry)
         if near is None:
             return
-        # A mesh takes microseconds a node: the distance at the middle of a group of nodes tells whether the others matter.
+        # A mesh takes microseconds a node, most of them for the sign: the distance at the middle of a group of nodes tells whether the
+        # others matter, and the sign of many.
         stride = COARSE if isinstance(geometry, TriangleMesh) else 1
         for block in self._parts(*near, stride):
             counts: Any = block.counts
@@ -106,13 +107,14 @@ class NodeSampler:
                 )
                 continue
             self._listed.zero_()
-            inputs = [block, distances, number, *nodes.arrays, self._list, self._listed]
+            inputs = [block, distances, number, *nodes.arrays, self._list, self._sure, self._listed]
             wp.launch(kernels.claim_groups, len(distances), inputs, device=self.grid.device)
-            listed = self._list[: int(self._listed.numpy()[0])]
-            if len(listed):
-                distances = self._measure(geometry, len(listed), kernels.listed_points, [block, listed, 0.0])
-                inputs = [block, listed, distances, self.snap, number, *nodes.arrays]
-                wp.launch(kernels.claim_listed, len(listed), inputs, device=self.grid.device)
+            for listed, count in zip((self._list, self._sure), self._listed.numpy().tolist(), strict=True):
+                if count:
+                    known = listed is self._sure
+                    distances = self._measure(geometry, count, kernels.listed_points, [block, listed, 0.0], unsigned=known)
+                    inputs = [block, listed, distances, self.snap, number, *nodes.arrays]
+                    wp.launch(kernels.claim_listed, count, inputs, device=self.grid.device)
 
     def look_at_centers(self, nodes: NodeDistances, solids: Sequence[Geometry], low: np.ndarray, high: np.ndarray, marks: wp.array) -> None:
         """Mark as HOLLOW the cells in the open whose corners all have distance 0: gaps of one cell, where plates have no mark.
@@ -144,11 +146,14 @@ class NodeSampler:
                 distances = self._measure(geometry, found, kernels.listed_points, [block, listed, 0.5])
                 wp.launch(kernels.mark_listed, found, [listed, distances, order == 0, marks], device=self.grid.device)
 
-    def _measure(self, geometry: Geometry, count: int, fill: wp.Kernel, inputs: list[Any]) -> wp.array:
-        """Return the distances [m] of `count` points that a kernel makes."""
+    def _measure(self, geometry: Geometry, count: int, fill: wp.Kernel, inputs: list[Any], *, unsigned: bool = False) -> wp.array:
+        """Return the distances [m] of `count` points that a kernel makes; only a mesh can be asked for those without sign."""
         points, distances = self._points[:count], self._distances[:count]
         wp.launch(fill, count, [*inputs, points], device=self.grid.device)
-        geometry.signed_distance(points, distances)
+        if unsigned and isinstance(geometry, TriangleMesh):
+            geometry.distance_to_surface(points, distances)
+        else:
+            geometry.signed_distance(points, distances)
         return distances
 
     def _block(self, low: np.ndarray, high: np.ndarray, stride: int) -> NodeBlock:

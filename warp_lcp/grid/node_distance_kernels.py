@@ -8,7 +8,8 @@ import warp as wp
 from warp_lcp.grid.staggered import CellRange
 
 FAR = 4.0  # cells: distances below it are exact, others at least this large
-COARSE = 4  # nodes along an axis of a block in which one distance may stand for all
+COARSE = 3  # nodes along an axis of a block in which one distance may stand for all
+ROUNDING = 1.0e-3  # cells: signs this near to 0 are not relied on
 HOLLOW = 1  # a mark of cells with distance 0 at all corners whose center is open: one cell wide gaps
 
 options = {"enable_backward": False, "module": "warp_lcp.grid.node_distance"}
@@ -112,10 +113,14 @@ def claim_groups(
     owner: _I16,
     next_near: _F32,
     next_owner: _I16,
-    list: wp.array(dtype=wp.vec3i),
+    unsure: wp.array(dtype=wp.vec4i),
+    sure: wp.array(dtype=wp.vec4i),
     listed: wp.array(dtype=wp.int32),
 ):
-    """Bound the distances of groups of nodes by that of their middles; list the nodes that may be nearer than FAR."""
+    """Bound the distances of groups of nodes by that of their middles; list the nodes that may be nearer than FAR.
+
+    A node that is nearer to the middle than the surface is lies on the same side: its sign is sure.
+    """
     c = wp.tid()
     low = first_node(block, c)
     high = wp.min(low + wp.vec3i(block.stride), block.high)
@@ -132,23 +137,25 @@ def claim_groups(
                 d = wp.abs(center) - wp.length(wp.vec3(x, y, z))
                 if d >= FAR:
                     enter(wp.vec3i(i, j, k), wp.sign(center) * d, solid, near, owner, next_near, next_owner)
+                elif d > ROUNDING:
+                    sure[wp.atomic_add(listed, 1, 1)] = wp.vec4i(i, j, k, int(wp.sign(center)))
                 else:
-                    list[wp.atomic_add(listed, 0, 1)] = wp.vec3i(i, j, k)
+                    unsure[wp.atomic_add(listed, 0, 1)] = wp.vec4i(i, j, k, 0)
 
 
 @wp.kernel(**options)
 @typing.no_type_check
-def listed_points(block: NodeBlock, list: wp.array(dtype=wp.vec3i), offset: float, out: wp.array(dtype=wp.vec3)):
+def listed_points(block: NodeBlock, list: wp.array(dtype=wp.vec4i), offset: float, out: wp.array(dtype=wp.vec3)):
     """Fill the places [m] of listed nodes (offset 0) or of the centers of listed cells (0.5)."""
     c = wp.tid()
-    out[c] = node_position(block, list[c], offset)
+    out[c] = node_position(block, wp.vec3i(list[c][0], list[c][1], list[c][2]), offset)
 
 
 @wp.kernel(**options)
 @typing.no_type_check
 def claim_listed(
     block: NodeBlock,
-    list: wp.array(dtype=wp.vec3i),
+    list: wp.array(dtype=wp.vec4i),
     distance: wp.array(dtype=wp.float32),
     snap: float,
     solid: int,
@@ -157,14 +164,18 @@ def claim_listed(
     next_near: _F32,
     next_owner: _I16,
 ):
-    """Enter the distances [m] of a solid at listed nodes."""
+    """Enter the distances [m] of a solid at listed nodes; where the list has a sign, it is that of the distance."""
     c = wp.tid()
-    enter(list[c], snapped(distance[c], block.spacing, snap), solid, near, owner, next_near, next_owner)
+    node = list[c]
+    d = snapped(distance[c], block.spacing, snap)
+    if node[3] < 0:
+        d = -d
+    enter(wp.vec3i(node[0], node[1], node[2]), d, solid, near, owner, next_near, next_owner)
 
 
 @wp.kernel(**options)
 @typing.no_type_check
-def find_flat_cells(cells: CellRange, planes: int, near: _F32, list: wp.array(dtype=wp.vec3i), count: wp.array(dtype=wp.int32)):
+def find_flat_cells(cells: CellRange, planes: int, near: _F32, list: wp.array(dtype=wp.vec4i), count: wp.array(dtype=wp.int32)):
     """List the cells with distance 0 at all corners: a gap or a plate, one cell wide; only their centers tell which."""
     plane, row, chunk = wp.tid()
     k = cells.k + plane
@@ -179,12 +190,12 @@ def find_flat_cells(cells: CellRange, planes: int, near: _F32, list: wp.array(dt
             if most == 0.0:
                 slot = wp.atomic_add(count, 0, 1)
                 if slot < list.shape[0]:
-                    list[slot] = wp.vec3i(i, j, k)
+                    list[slot] = wp.vec4i(i, j, k, 0)
 
 
 @wp.kernel(**options)
 @typing.no_type_check
-def mark_listed(list: wp.array(dtype=wp.vec3i), distance: wp.array(dtype=wp.float32), begin: bool, marks: _I8):
+def mark_listed(list: wp.array(dtype=wp.vec4i), distance: wp.array(dtype=wp.float32), begin: bool, marks: _I8):
     """Mark the listed cells HOLLOW that no solid so far covers at their center."""
     c = wp.tid()
     i = list[c][0]

@@ -16,7 +16,14 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, runtime_checkab
 import numpy as np
 import warp as wp
 
-from warp_lcp.grid.solids_kernels import box_distance, capsule_distance, mesh_distance, plane_distance, sphere_distance
+from warp_lcp.grid.solids_kernels import (
+    box_distance,
+    capsule_distance,
+    mesh_distance,
+    mesh_surface_distance,
+    plane_distance,
+    sphere_distance,
+)
 from warp_lcp.grid.triangle_mesh import ClosedSurface, load_surface
 
 if TYPE_CHECKING:
@@ -165,11 +172,15 @@ class _Shape(ABC):
         """
         if points.shape != out.shape:
             raise ValueError(f"out has shape {out.shape}, points have {points.shape}")
+        sign = -1.0 if self.invert else 1.0
+        common = [points, *self._frame(), sign]
+        wp.launch(self.kernel, dim=points.shape[0], inputs=[*common, *self._parameters(points.device)], outputs=[out], device=points.device)
+
+    def _frame(self) -> list[Any]:
+        """Return what takes points into the shape's coordinates: inverse rotation, translation and scale."""
         placement = self.placement
         translation = placement.translation + placement.scale * placement.rotation @ self._origin()
-        sign = -1.0 if self.invert else 1.0
-        common = [points, wp.mat33(placement.rotation.T), wp.vec3(*translation), placement.scale * self._unit(), sign]
-        wp.launch(self.kernel, dim=points.shape[0], inputs=[*common, *self._parameters(points.device)], outputs=[out], device=points.device)
+        return [wp.mat33(placement.rotation.T), wp.vec3(*translation), placement.scale * self._unit()]
 
     def bounds(self) -> np.ndarray | None:
         """Return the low and the high corner [m] of a box around the region, shape (2, 3); None when it is unlimited or inverted."""
@@ -407,6 +418,16 @@ class TriangleMesh(_Shape):
     def volume(self) -> float:
         """Volume inside the surface as placed [m^3]."""
         return self.surface.volume * self.placement.scale**3
+
+    def distance_to_surface(self, points: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.float32)) -> None:
+        """Write the distance to the closest triangle, >= 0: a fifth of the work of `signed_distance`, for points whose sign is known.
+
+        Args:
+            points: [m], shape (m,), on any device.
+            out: [m], shape (m,), on the same device.
+        """
+        inputs = [points, *self._frame(), *self._parameters(points.device)]
+        wp.launch(mesh_surface_distance, dim=points.shape[0], inputs=inputs, outputs=[out], device=points.device)
 
     def thin_fraction(self, thickness: float, device: wp.Device) -> float:
         """Return the share of the surface's area behind which the solid is thinner than `thickness` [m]."""

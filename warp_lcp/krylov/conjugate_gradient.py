@@ -44,10 +44,12 @@ class ConjugateGradient:
     Args:
         product: A.
         preconditioner: M. If it is recorded (has a `program`), so must A be, and an iteration is one program.
+        weight: residuals are measured as ||weight^(1/2) r||, field like r >= 0; None: all 1. Rows that a large shift makes stiff would
+            else decide when to stop.
     """
 
-    def __init__(self, product: LinearMap, preconditioner: Preconditioner) -> None:
-        self._product, self._preconditioner = product, preconditioner
+    def __init__(self, product: LinearMap, preconditioner: Preconditioner, *, weight: wp.array[Any] | None = None) -> None:
+        self._product, self._preconditioner, self._weight = product, preconditioner, weight
         r = preconditioner.r
         self.device, self.x, self._p, self._q = r.device, wp.zeros_like(r), wp.zeros_like(r), wp.zeros_like(r)
         self._scalars = wp.zeros(SLOTS, dtype=wp.float64, device=r.device)
@@ -90,7 +92,9 @@ class ConjugateGradient:
         launch_spans(self._kernels.direction, spans, [z, self._p, self._scalars], [], self.device, launch=launch)
         self._product(self._p, self._q, launch=launch)
         self._reduction.dot(self._p, self._q, int(PQ), launch=launch)
-        update = [self._p, self._q, self.x, r, self._scalars]
-        launch_spans(self._kernels.update, spans, update, [partials], self.device, launch=launch)
+        update, kernel = [self._p, self._q, self.x, r, self._scalars], self._kernels.update
+        if self._weight is not None:
+            update, kernel = [*update, self._weight], self._kernels.update_weighted
+        launch_spans(kernel, spans, update, [partials], self.device, launch=launch)
         self._reduction.add_up(int(RR), launch=launch)
         launch(end_kernel, 1, [self._scalars, self._going], device=self.device)

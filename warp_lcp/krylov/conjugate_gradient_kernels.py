@@ -42,6 +42,17 @@ def kernels(real: Any) -> SimpleNamespace:
         p_: field, q_: field, x_: field, r_: field, alpha: real, start: wp.int64, end: wp.int64, stride: wp.int64
     ) -> wp.float64: ...
 
+    @wp.func_native(
+        flat(
+            """const auto *p = p_.data, *q = q_.data, *w = w_.data; auto *x = x_.data, *r = r_.data; double s = 0;
+        EACH { const auto v = r[i] - alpha*q[i]; x[i] += alpha*p[i]; r[i] = v; s += (double)w[i]*v*v; }
+        return s;"""
+        )
+    )
+    def update_weighted_span(
+        p_: field, q_: field, x_: field, r_: field, w_: field, alpha: real, start: wp.int64, end: wp.int64, stride: wp.int64
+    ) -> wp.float64: ...
+
     @wp.kernel(enable_backward=False, module=name)
     def direction(z: field, p: field, scalars: f64, n: int, chunk: int, stride: wp.int64):
         t = wp.tid()
@@ -58,7 +69,17 @@ def kernels(real: Any) -> SimpleNamespace:
             alpha = scalars[RZ] / scalars[PQ]
         partials[t] = update_span(p, q, x, r, real(alpha), span_start(t, chunk), span_end(t, chunk, n), stride)
 
-    return SimpleNamespace(direction=direction, update=update)
+    @wp.kernel(enable_backward=False, module=name)
+    def update_weighted(
+        p: field, q: field, x: field, r: field, scalars: f64, w: field, n: int, chunk: int, stride: wp.int64, partials: f64
+    ):
+        t = wp.tid()
+        alpha = wp.float64(0.0)
+        if scalars[PQ] > wp.float64(0.0):
+            alpha = scalars[RZ] / scalars[PQ]
+        partials[t] = update_weighted_span(p, q, x, r, w, real(alpha), span_start(t, chunk), span_end(t, chunk, n), stride)
+
+    return SimpleNamespace(direction=direction, update=update, update_weighted=update_weighted)
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.conjugate_gradient")

@@ -18,6 +18,9 @@ options = {"enable_backward": False, "module": "warp_lcp.coarsen"}
 
 UNBOUNDED = 1e30  # stands for an infinite bound of a correction; corrections are of order one
 
+# a row is the same to the last bit whichever kernel makes it: only those that change are made again
+IN_ORDER = "\n#ifndef __CUDA_ARCH__\n#pragma clang fp reassociate(off) contract(off)\n#endif\n"
+
 
 @wp.func
 def lower_weight(w: wp.array3d(dtype=Any), uniform: wp.float64, k: int, j: int, i: int):
@@ -42,23 +45,19 @@ class Wraps:
 
 @wp.func
 def below(first: bool, periodic: int, step: wp.int64, n: int):
-    """Offset to the row or plane below."""
+    """Offset to the row or plane below: a ghost below the first one, unless they wrap around."""
     o = -step
-    if first:
-        o = wp.int64(0)
-        if periodic != 0:
-            o = wp.int64(n - 1) * step
+    if first and periodic != 0:
+        o = wp.int64(n - 1) * step
     return o
 
 
 @wp.func
 def above(last: bool, periodic: int, step: wp.int64, n: int):
-    """Offset to the row or plane above."""
+    """Offset to the row or plane above: a ghost above the last one, unless they wrap around."""
     o = step
-    if last:
-        o = wp.int64(0)
-        if periodic != 0:
-            o = wp.int64(1 - n) * step
+    if last and periodic != 0:
+        o = wp.int64(1 - n) * step
     return o
 
 
@@ -76,75 +75,80 @@ def coarsen_kernels(variable: bool, d_type: Any, real: Any) -> Any:
 
     # equal weights: faces are counted in bytes and scaled at the end
     counts = d_type is wp.uint8
-    buffer, diagonal = ("unsigned char", "d_.data[p + k]") if counts else (C_TYPES[real], "(T)A.unit*(T)d_.data[p + k]")
+    buffer, diagonal = ("unsigned char", "d[k]") if counts else (C_TYPES[real], "(T)A.unit*(T)d[k]")
     least = "1e-6" if real is wp.float32 else "1e-14"  # of a diagonal: an excess below it is what rounding left
     kept = "v" if counts else f"v > (B){least}*({diagonal}) ? v : (B)0"
+    weights = "const auto *wx = wx_.data, *wy = wy_.data, *wz = wz_.data;" if variable else ""
 
-    def weight(axis: str, shift: str) -> str:
-        """Weight of a face stored `shift` after the cell."""
-        if variable:
-            return f"(B)w{axis}_.data[p + k + {shift}]"
-        return f"(B)(A.c{axis} > 0)" if counts else f"(B)A.c{axis}"
+    def face(axis: str, shift: str, other: str) -> str:
+        """Weight of a cell's face, stored `shift` after it, to the cell at `other`; 0 unless both are unknowns."""
+        if counts:
+            return f"(B)(one(d[k]) & one(d[k + {other}]) & (B)(A.c{axis} > 0))"
+        weight = f"(B)w{axis}[k + {shift}]" if variable else f"(B)A.c{axis}"
+        return f"((d[k] != 0) & (d[k + {other}] != 0)) ? {weight} : (B)0"
 
-    def faces(axis: str, side: str, shift: str) -> str:
-        """Weights of a row's faces to the row at offset `at`: off the excess, and onto the outer faces."""
-        return f"""{{ const long long at = {side}_{axis}; const bool outer = outer_{side}_{axis};
-                    if (at != 0) {{
-                        const auto* here = d_.data + p; const auto* there = here + at; B* sum = outer ? {side[0]}{axis} : none;
-                        SIMD for (int k = 0; k < fx*m; ++k) {{
-                            const B w = {weight(axis, shift)}, f = ((here[k] != 0) & (there[k] != 0)) ? w : (B)0; e[k] -= f; sum[k] += f; }}
-                    }} }}"""
+    def chunks(body: str) -> str:
+        """Source of a loop over the row's cells: bytes go 64 at a time as long as there are as many."""
+        if not counts:
+            return f"SIMD for (int i = 0; i < fx*m; ++i) {body};"
+        return f"const int whole = fx*m/64*64; SIMD64 for (int i = 0; i < whole; ++i) {body}; SIMD for (int i = whole; i < fx*m; ++i) {body};"
 
     @wp.func_native(
         simd(
-            BLOCK
+            IN_ORDER
+            + BLOCK
             + f"""typedef {C_TYPES[real]} T; typedef {buffer} B; const int last_cell = A.nx - 1 - fx*start;
-        B excess[2*M], bx[2*M], ax[2*M], by[2*M], ay[2*M], bz[2*M], az[2*M], e[2*M], none[2*M];
+        struct No {{ enum {{ value = 0 }}; }}; struct Yes {{ enum {{ value = 1 }}; }};
+        auto one = [](B v) -> B {{ return v < (B)1 ? v : (B)1; }};
+        // a periodic axis of two cells has one aggregate, and no outer faces
+        const bool whole_x = fx == 2 && W.below_x == 1, whole_y = !one_row && W.below_y == A.s2, whole_z = !one_plane && W.below_z == A.s1;
+        const T scale = {"(T)A.unit" if counts else "(T)1"}, se = scale*(fx*fy*fz == 8 ? held : stiffen);
+        const T sx = whole_x ? (T)0 : fx == 2 ? scale : scale*stiffen, sy = whole_y ? (T)0 : fy == 2 ? scale : scale*stiffen;
+        const T sz = whole_z ? (T)0 : fz == 2 ? scale : scale*stiffen;
+        B excess[2*M], bx[2*M], ax[2*M], by[2*M], ay[2*M], bz[2*M], az[2*M];
         for (int begin = 0; begin < n; begin += M) {{
-            const int m = n - begin < M ? n - begin : (int)M;
-            SIMD for (int k = 0; k < fx*m; ++k) {{
-                excess[k] = 0; bx[k] = 0; ax[k] = 0; by[k] = 0; ay[k] = 0; bz[k] = 0; az[k] = 0; none[k] = 0; }}
-            for (int row = 0; row < 4; ++row) {{
-                const bool upper_z = row >> 1, upper_y = row & 1;
-                if ((upper_z && one_plane) || (upper_y && one_row)) continue;
-                const long long p = p0 + fx*begin + (upper_z ? A.s1 : 0) + (upper_y ? A.s2 : 0);
-                const long long below_y = upper_y ? -A.s2 : W.below_y, below_z = upper_z ? -A.s1 : W.below_z;
-                const long long above_y = upper_y || one_row ? W.above_y : A.s2, above_z = upper_z || one_plane ? W.above_z : A.s1;
-                const bool whole_y = !one_row && W.below_y == A.s2, whole_z = !one_plane && W.below_z == A.s1;  // periodic, two rows
-                const bool outer_below_y = !upper_y && !whole_y, outer_above_y = (upper_y || one_row) && !whole_y;
-                const bool outer_below_z = !upper_z && !whole_z, outer_above_z = (upper_z || one_plane) && !whole_z;
-                const auto* d = d_.data + p;
-                SIMD for (int k = 0; k < fx*m; ++k) {{
-                    const B w = {weight("x", "0")}, v = {weight("x", "1")};
-                    const B f = ((d[k] != 0) & (d[k-1] != 0)) ? w : (B)0, g = ((d[k] != 0) & (d[k+1] != 0)) ? v : (B)0;
-                    e[k] = (B)({diagonal}) - f - g; bx[k] += f; ax[k] += g; }}
-                if (start + begin == 0 && W.below_x != 0) {{
-                    const int k = 0;
-                    const B f = ((d[k] != 0) & (d[k + W.below_x] != 0)) ? {weight("x", "0")} : (B)0; e[k] -= f; bx[k] += f; }}
-                const int z = last_cell - fx*begin;
-                if (z < fx*m && W.above_x != 0) {{
-                    const int k = z;
-                    const B f = ((d[k] != 0) & (d[k + W.above_x] != 0)) ? {weight("x", "1")} : (B)0; e[k] -= f; ax[k] += f; }}
-                {faces("y", "below", "0")}
-                {faces("y", "above", "A.s2")}
-                {faces("z", "below", "0")}
-                {faces("z", "above", "A.s1")}
-                SIMD for (int k = 0; k < fx*m; ++k) {{ const B v = e[k]; excess[k] += {kept}; }}
-            }}
-            const T scale = {"(T)A.unit" if counts else "(T)1"}, se = scale*(fx*fy*fz == 8 ? held : stiffen);
-            const bool whole_x = fx == 2 && W.below_x == 1;  // a periodic row of two cells is one aggregate
-            const T sx = whole_x ? (T)0 : fx == 2 ? scale : scale*stiffen;
-            const T sy = fy == 2 ? scale : scale*stiffen, sz = fz == 2 ? scale : scale*stiffen;
+            const int m = n - begin < M ? n - begin : (int)M, last = last_cell - fx*begin; const long long p = p0 + fx*begin;
+            auto rows = [&](auto two_y, auto two_z) {{
+                // Cell i of a row in both planes: what it adds to the aggregate's excess and to the outer faces below and above it. Rows go
+                // one after another, for memory is fetched ahead best along them; planes together, which halves the passes.
+                auto cell = [&](auto second, int i, long long left, long long right) {{
+                    enum {{ UY = decltype(second)::value, NY = decltype(two_y)::value, NZ = decltype(two_z)::value }};
+                    B sum = 0, bx_ = 0, ax_ = 0, by_ = 0, ay_ = 0, bz_ = 0, az_ = 0;
+                    if (UY) {{ sum = excess[i]; bx_ = bx[i]; ax_ = ax[i]; by_ = by[i]; ay_ = ay[i]; bz_ = bz[i]; az_ = az[i]; }}
+                    auto add = [&](auto upper) {{
+                        enum {{ UZ = decltype(upper)::value }};
+                        const long long k = p + i + (UY ? A.s2 : 0) + (UZ ? A.s1 : 0); const auto* d = d_.data; {weights}
+                        const B f = {face("x", "0", "left")}, g = {face("x", "1", "right")};
+                        const B h = {face("y", "0", "(UY ? -A.s2 : W.below_y)")}, l = {face("y", "A.s2", "(NY && !UY ? A.s2 : W.above_y)")};
+                        const B o = {face("z", "0", "(UZ ? -A.s1 : W.below_z)")}, q = {face("z", "A.s1", "(NZ && !UZ ? A.s1 : W.above_z)")};
+                        const B v = (B)({diagonal}) - f - g - h - l - o - q;
+                        sum += {kept}; bx_ += f; ax_ += g;
+                        if (!UY) by_ += h;
+                        if (UY || !NY) ay_ += l;
+                        if (!UZ) bz_ += o;
+                        if (UZ || !NZ) az_ += q; }};
+                    add(No());
+                    if (NZ) add(Yes());
+                    excess[i] = sum; bx[i] = bx_; ax[i] = ax_; by[i] = by_; ay[i] = ay_; bz[i] = bz_; az[i] = az_; }};
+                auto row = [&](auto second) {{ {chunks("cell(second, i, -1, 1)")} }};
+                auto end = [&](int i, long long left, long long right) {{  // a cell whose neighbor is at the other end of the row
+                    cell(No(), i, left, right);
+                    if (decltype(two_y)::value) cell(Yes(), i, left, right); }};
+                row(No());
+                if (decltype(two_y)::value) row(Yes());
+                if (start + begin == 0 && W.below_x != -1) end(0, W.below_x, 1);
+                if (last < fx*m && W.above_x != 1) end(last, -1, W.above_x); }};
+            if (one_row) {{ if (one_plane) rows(No(), No()); else rows(No(), Yes()); }}
+            else {{ if (one_plane) rows(Yes(), No()); else rows(Yes(), Yes()); }}
             T* dc = dc_.data + c + begin; T* wxc = wxc_.data + c + begin; T* wyc = wyc_.data + c + begin; T* wzc = wzc_.data + c + begin;
             if (fx == 2) {{
                 SIMD for (int k = 0; k < m; ++k) {{
                     const int a = 2*k, b = a + 1;
-                    const T x = sx*(T)bx[a], y = sy*((T)by[a] + (T)by[b]), z = sz*((T)bz[a] + (T)bz[b]);
+                    const T x = sx*(T)bx[a], y = sy*(T)(B)(by[a] + by[b]), z = sz*(T)(B)(bz[a] + bz[b]);
                     wxc[k] = x; wyc[k] = y; wzc[k] = z;
-                    const T above = sx*(T)ax[b] + sy*((T)ay[a] + (T)ay[b]) + sz*((T)az[a] + (T)az[b]);
-                    dc[k] = se*((T)excess[a] + (T)excess[b]) + x + y + z + above; }}
-                const int odd = last_cell - 2*begin;  // the last cell of an odd row is an aggregate: its upper face is an outer one
-                if (odd < 2*m && odd % 2 == 0) dc[odd / 2] += sx*(T)ax[odd];
+                    const T above = sx*(T)ax[b] + sy*(T)(B)(ay[a] + ay[b]) + sz*(T)(B)(az[a] + az[b]);
+                    dc[k] = se*(T)(B)(excess[a] + excess[b]) + x + y + z + above; }}
+                if (last < 2*m && last % 2 == 0) dc[last / 2] += sx*(T)ax[last];  // the last cell of an odd row is an aggregate
             }} else {{
                 SIMD for (int k = 0; k < m; ++k) {{
                     const T x = sx*(T)bx[k], y = sy*(T)by[k], z = sz*(T)bz[k];

@@ -13,6 +13,8 @@ import warp as wp
 from warp_lcp.native import BLOCK, C_TYPES, simd
 from warp_lcp.operators.stencil_kernels import NEIGHBORS, StencilShape, row_count, row_first, row_start, stencil_head
 
+RING = wp.constant(3)  # planes that a leg keeps in t: it sweeps a plane out of the ring once the next one is in
+
 
 @wp.struct
 class Aggregates:
@@ -57,13 +59,14 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
     name = f"warp_lcp.cycle.{form}_{d_type.__name__}_{real.__name__}"
     d_array, field = wp.array(dtype=d_type), wp.array(dtype=real)
     head, neighbors = stencil_head(variable, C_TYPES[real]), NEIGHBORS[variable]
+    around = neighbors.replace("x[k-s1]", "x[k+down]").replace("x[k+s1]", "x[k+up]")
 
     def sweep(update: str) -> str:
-        """Source of a sweep whose new value is `update`, plain or clipped."""
+        """Source of a sweep whose new value is `update`, plain or clipped. It reads x and writes y, which may lie in a ring of planes."""
         value = f"const T e = unit*(T)d[k], u = {update}, v = e != 0 ? u : (T)0;"
         return simd(
             head
-            + f"""T* y = y_.data + p; const T* x = x_.data + p; const T* b = b_.data + p;
+            + f"""T* y = y_.data + to; const T* x = x_.data + start; const T* b = b_.data + p;
         if (projected) {{
             const T* lo = l_.data + p; const T* hi = u_.data + p;
             if (u_.data) SIMD for (int k = 0; k < n; ++k) {{
@@ -74,17 +77,79 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         }}"""
         )
 
-    @wp.func_native(sweep(f"x[k] + omega*((b[k] + {neighbors}) / (e != 0 ? e : (T)1) - x[k])"))
-    def sweep_row(
-        A: StencilShape, d_: d_array, wx_: field, wy_: field, wz_: field, y_: field, x_: field, b_: field, l_: field, u_: field,
-        p: wp.int64, n: int, omega: real, projected: bool,
+    @wp.func_native(sweep(f"x[k] + omega*((b[k] + {around}) / (e != 0 ? e : (T)1) - x[k])"))
+    def sweep_between(
+        A: StencilShape, d_: d_array, wx_: field, wy_: field, wz_: field, y_: field, to: wp.int64, x_: field, start: wp.int64,
+        down: wp.int64, up: wp.int64, b_: field, l_: field, u_: field, p: wp.int64, n: int, omega: real, projected: bool,
     ): ...  # fmt: skip
 
     @wp.func_native(sweep("omega*b[k] / (e != 0 ? e : (T)1)"))
-    def first_sweep_row(
-        A: StencilShape, d_: d_array, wx_: field, wy_: field, wz_: field, y_: field, x_: field, b_: field, l_: field, u_: field,
-        p: wp.int64, n: int, omega: real, projected: bool,
+    def first_sweep_to(
+        A: StencilShape, d_: d_array, wx_: field, wy_: field, wz_: field, y_: field, to: wp.int64, x_: field, start: wp.int64,
+        b_: field, l_: field, u_: field, p: wp.int64, n: int, omega: real, projected: bool,
     ): ...  # fmt: skip
+
+    @wp.func
+    def sweep_row(
+        A: StencilShape, d: d_array, wx: field, wy: field, wz: field, y: field, x: field, b: field, lower: field, upper: field,
+        p: wp.int64, n: int, omega: real, projected: bool,
+    ):  # fmt: skip
+        sweep_between(A, d, wx, wy, wz, y, p, x, p, -A.s1, A.s1, b, lower, upper, p, n, omega, projected)
+
+    @wp.func
+    def first_sweep_row(
+        A: StencilShape, d: d_array, wx: field, wy: field, wz: field, y: field, x: field, b: field, lower: field, upper: field,
+        p: wp.int64, n: int, omega: real, projected: bool,
+    ):  # fmt: skip
+        first_sweep_to(A, d, wx, wy, wz, y, p, x, p, b, lower, upper, p, n, omega, projected)
+
+    @wp.func_native(
+        simd(
+            f"""{C_TYPES[real]}* t = t_.data + row;
+        for (int k = 0; k < first; ++k) t[k] = 0;
+        for (int k = first + n; k < nx; ++k) t[k] = 0;"""
+        )
+    )
+    def clear_around(t_: field, row: wp.int64, first: int, n: int, nx: int): ...
+
+    @wp.func
+    def sweep_plane_into_ring(
+        A: StencilShape, d: d_array, wx: field, wy: field, wz: field, rows: int, k: int, from_zero: bool, t: field, x: field, b: field,
+        lower: field, upper: field, omega: real, projected: bool,
+    ):  # fmt: skip
+        """Sweep plane k of x into its place in the ring, the first planes of t."""
+        ring = wp.int64(k % RING - k) * A.s1
+        for j in range(rows):
+            p = row_start(A, k, j, 0, A.nx)
+            n = row_count(A, k, j, 0, A.nx)
+            if A.spans:  # those of the plane that was here before may be wider
+                first = row_first(A, k, j, 0, A.nx)
+                clear_around(t, p + ring - wp.int64(first), first, n, A.nx)
+            if from_zero:
+                first_sweep_to(A, d, wx, wy, wz, t, p + ring, x, p, b, lower, upper, p, n, omega, projected)
+            else:
+                sweep_between(A, d, wx, wy, wz, t, p + ring, x, p, -A.s1, A.s1, b, lower, upper, p, n, omega, projected)
+
+    @wp.func
+    def sweep_plane_out_of_ring(
+        A: StencilShape, d: d_array, wx: field, wy: field, wz: field, planes: int, rows: int, k: int, x: field, t: field, b: field,
+        lower: field, upper: field, omega: real, projected: bool,
+    ):  # fmt: skip
+        """Sweep plane k in the ring into x. The ghost plane below the ring stands below the first plane and above the last one."""
+        slot = k % RING
+        down = -A.s1
+        if slot == 0 and k > 0:
+            down = wp.int64(RING - 1) * A.s1
+        up = A.s1
+        if k == planes - 1:
+            up = wp.int64(-1 - slot) * A.s1
+        elif slot == RING - 1:
+            up = wp.int64(1 - RING) * A.s1
+        ring = wp.int64(slot - k) * A.s1
+        for j in range(rows):
+            p = row_start(A, k, j, 0, A.nx)
+            n = row_count(A, k, j, 0, A.nx)
+            sweep_between(A, d, wx, wy, wz, x, p, t, p + ring, down, up, b, lower, upper, p, n, omega, projected)
 
     @wp.func_native(
         simd(
@@ -113,14 +178,22 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
 
     @wp.func_native(
         simd(
-            head
+            BLOCK
+            + head
             + """T* x = x_.data + p; const T* xc = c_.data + c;
         if (projected) {
-            const T* lo = l_.data + p; const T* hi = u_.data + p;
-            if (u_.data) SIMD for (int k = 0; k < n; ++k) {
-                const T v = d[k] != 0 ? x[k] + scale*xc[k >> shift] : (T)0, w = v < lo[k] ? lo[k] : v; x[k] = w > hi[k] ? hi[k] : w; }
-            else SIMD for (int k = 0; k < n; ++k) {
-                const T v = d[k] != 0 ? x[k] + scale*xc[k >> shift] : (T)0; x[k] = v < lo[k] ? lo[k] : v; }
+            T e[2*M];  // the correction of each cell, so that what follows reads all fields in steps of one
+            for (int begin = 0; begin < n; begin += 2*M) {
+                const int m = n - begin < 2*M ? n - begin : (int)(2*M); const T* coarse = xc + (begin >> shift);
+                if (shift == 0) { SIMD for (int k = 0; k < m; ++k) e[k] = scale*coarse[k]; }
+                else {
+                    SIMD for (int k = 0; k < m / 2; ++k) { const T v = scale*coarse[k]; e[2*k] = v; e[2*k+1] = v; }
+                    if (m % 2) e[m-1] = scale*coarse[m/2]; }
+                const auto* at = d + begin; T* to = x + begin; const T* lo = l_.data + p + begin; const T* hi = u_.data + p + begin;
+                if (u_.data) SIMD for (int k = 0; k < m; ++k) {
+                    const T v = at[k] != 0 ? to[k] + e[k] : (T)0, w = v < lo[k] ? lo[k] : v; to[k] = w > hi[k] ? hi[k] : w; }
+                else SIMD for (int k = 0; k < m; ++k) {
+                    const T v = at[k] != 0 ? to[k] + e[k] : (T)0; to[k] = v < lo[k] ? lo[k] : v; } }
         } else if (shift == 0) {
             SIMD for (int k = 0; k < n; ++k) x[k] += d[k] != 0 ? scale*xc[k] : (T)0;
         } else {
@@ -221,18 +294,10 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         k = int(0)
         for s in range(G.nz + 1):
             if s < G.nz:
-                for j in range(G.ny):
-                    p = row_start(A, s, j, 0, A.nx)
-                    n = row_count(A, s, j, 0, A.nx)
-                    if from_zero:
-                        first_sweep_row(A, d, wx, wy, wz, t, x, b, lower, upper, p, n, first, projected)
-                    else:
-                        sweep_row(A, d, wx, wy, wz, t, x, b, lower, upper, p, n, first, projected)
+                sweep_plane_into_ring(A, d, wx, wy, wz, G.ny, s, from_zero, t, x, b, lower, upper, first, projected)
             i = s - 1
             if i >= 0:
-                for j in range(G.ny):
-                    n = row_count(A, i, j, 0, A.nx)
-                    sweep_row(A, d, wx, wy, wz, x, t, b, lower, upper, row_start(A, i, j, 0, A.nx), n, second, projected)
+                sweep_plane_out_of_ring(A, d, wx, wy, wz, G.nz, G.ny, i, x, t, b, lower, upper, second, projected)
             while k < planes and (G.fz * (k + 1) <= i or i == G.nz - 1):
                 for j in range(rows):
                     p = first_cell(A, C, G, k, j, 0, C.nx)
@@ -256,14 +321,10 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
                     correct_row(A, d, wx, wy, wz, x, p, coarse, o, lower, upper, n, G.fx - 1, scale, projected)
             i = s - 1
             if i >= 0 and i < G.nz:
-                for j in range(G.ny):
-                    n = row_count(A, i, j, 0, A.nx)
-                    sweep_row(A, d, wx, wy, wz, t, x, b, lower, upper, row_start(A, i, j, 0, A.nx), n, first, projected)
+                sweep_plane_into_ring(A, d, wx, wy, wz, G.ny, i, False, t, x, b, lower, upper, first, projected)
             i = s - 2
             if i >= 0:
-                for j in range(G.ny):
-                    n = row_count(A, i, j, 0, A.nx)
-                    sweep_row(A, d, wx, wy, wz, x, t, b, lower, upper, row_start(A, i, j, 0, A.nx), n, second, projected)
+                sweep_plane_out_of_ring(A, d, wx, wy, wz, G.nz, G.ny, i, x, t, b, lower, upper, second, projected)
 
     @wp.kernel(enable_backward=False, module=name)
     def relax_kernel(

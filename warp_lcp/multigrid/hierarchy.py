@@ -111,16 +111,24 @@ class Hierarchy:
         real: type of the corrections.
         bounded: whether projected cycles are wanted; they need bounds on every level.
         settings: how cycles go.
+        shifted: whether the finest diagonal is a number of type `real` even where the operator only counts faces, so that a shift fits.
         bounds: memory of the finest level's bounds, where the caller has fields that a projected cycle may overwrite; an empty upper one if
             corrections have no upper bounds.
     """
 
     def __init__(
-        self, stencil: Stencil, real: Any, *, bounded: bool, settings: CycleSettings | None = None, bounds: Pair | None = None
+        self,
+        stencil: Stencil,
+        real: Any,
+        *,
+        bounded: bool,
+        settings: CycleSettings | None = None,
+        bounds: Pair | None = None,
+        shifted: bool = False,
     ) -> None:
         self.settings, self.real, self._source = settings or CycleSettings(), real, stencil
         self.device = stencil.device
-        d_type = wp.uint8 if stencil.d.dtype is wp.uint8 else real
+        d_type = wp.uint8 if stencil.d.dtype is wp.uint8 and not shifted else real
         weights = stencil.weights
         if weights is not None and weights[0].dtype is not real:
             weights = tuple(wp.zeros(w.size, dtype=real, device=w.device) for w in weights)

@@ -3,5 +3,6 @@
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID, GridPoisson
 from warp_lcp.operators.protocol import Operator
+from warp_lcp.operators.sparse import SparseOperator
 
-__all__ = ["AIR", "FLUID", "SOLID", "DenseOperator", "GridPoisson", "Operator"]
+__all__ = ["AIR", "FLUID", "SOLID", "DenseOperator", "GridPoisson", "Operator", "SparseOperator"]

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from warp_lcp.operators.grid_poisson import GridPoisson
 
 
+Scratch = tuple[wp.array[Any], wp.array[Any]]
+
+
 class FloatingComponents:
     """The floating components of an operator, numbered from 0, and what keeps a solve on them well posed.
 
@@ -90,8 +93,7 @@ class ComponentFinder:
 
     def __init__(self, A: GridPoisson) -> None:
         self._A, device = A, A.device
-        self._own: wp.array[Any] | None = None
-        self._grounded = wp.zeros(A.layout.size, dtype=wp.uint8, device=device)
+        self._own: Scratch | None = None
         self._count = wp.zeros(1, dtype=wp.int32, device=device)
         self._shape = StencilShape()
         self._shape.nx, self._shape.s1, self._shape.s2 = A.stencil.shape.nx, A.stencil.shape.s1, A.stencil.shape.s2
@@ -99,13 +101,14 @@ class ComponentFinder:
         self._shape.spans = A.stencil.spans
         self._kernels = kernels.component_kernels(A.dtype)
 
-    def find(self, scratch: wp.array[Any] | None = None) -> FloatingComponents | None:
+    def find(self, scratch: Scratch | None = None) -> FloatingComponents | None:
         """Return the floating components, or None if there are none; `scratch` as in GridPoisson.floating_components."""
-        A, grounded, s = self._A, self._grounded, self._A.stencil
-        if scratch is not None:
-            parent = scratch.view(wp.int32)
-        else:
-            parent = self._own = wp.zeros(A.layout.size, dtype=wp.int32, device=A.device) if self._own is None else self._own
+        A, s = self._A, self._A.stencil
+        if scratch is None:
+            if self._own is None:
+                self._own = wp.zeros(A.layout.size, dtype=wp.int32, device=A.device), wp.zeros(A.layout.size, dtype=wp.uint8, device=A.device)
+            scratch = self._own
+        parent, grounded = scratch[0].view(wp.int32), scratch[1]
         cells, faces = A.cells_around.flatten(), [f.flatten() for f in A.faces]
         self._count.zero_()
         sizes = wp.vec3i(*A.layout.padding.counts)
@@ -116,16 +119,16 @@ class ComponentFinder:
             (self._kernels.count_floating, [cells, parent, grounded, s.grain, self._count]),
         ):
             wp.launch(kernel, s.threads, [self._shape, *inputs], device=A.device)
-        return self._label(parent.numpy()) if self._count.numpy()[0] else None
+        return self._label(parent.numpy(), grounded.numpy()) if self._count.numpy()[0] else None
 
-    def _label(self, parent: np.ndarray) -> FloatingComponents:
+    def _label(self, parent: np.ndarray, grounded: np.ndarray) -> FloatingComponents:
         """Number the components that nothing holds; rare, so on the host."""
         A = self._A
         interior = np.zeros(A.layout.stored_shape, dtype=bool)
         interior[1:-1, 1:-1, 1:-1] = A.cells.numpy()[1:-1, 1:-1, 1:-1] == FLUID
         inside = interior.ravel()
         roots = _roots(np.where(inside, parent, np.arange(parent.size, dtype=np.int32)))
-        floating = inside & (self._grounded.numpy()[roots] == 0)
+        floating = inside & (grounded[roots] == 0)
         label = np.full(roots.size, -1, dtype=np.int32)
         label[floating] = np.unique(roots[floating], return_inverse=True)[1]
         return FloatingComponents(label, A.device)

@@ -9,6 +9,7 @@ import warp as wp
 
 from warp_lcp.layout import Layout
 from warp_lcp.operators.dense_kernels import product_kernel, relax_kernel
+from warp_lcp.problem import as_operator
 
 
 class DenseOperator:
@@ -72,3 +73,8 @@ class DenseOperator:
         out = wp.zeros_like(x) if out is None else out
         wp.launch(product_kernel, self.shape[0], [self.matrix, x, transposed, out], device=self.device)
         return out
+
+
+@as_operator.register(np.ndarray)
+def _dense(A: np.ndarray, device: Any = None) -> DenseOperator:
+    return DenseOperator(A, device=device)

@@ -11,7 +11,7 @@ import warp as wp
 from warp_lcp.layout import PaddedLayout
 from warp_lcp.native import Spans
 from warp_lcp.operators import grid_poisson_kernels as kernels
-from warp_lcp.operators.components import ComponentFinder, FloatingComponents
+from warp_lcp.operators.components import ComponentFinder, FloatingComponents, Scratch
 from warp_lcp.operators.grid_poisson_kernels import AIR, FLUID, SOLID
 from warp_lcp.operators.stencil import Stencil, wrap
 from warp_lcp.operators.stencil_kernels import StencilShape, find_spans_kernel
@@ -158,11 +158,11 @@ class GridPoisson:
         """Sweep stored fields once, red cells then black ones (forward) or the reverse, each unknown projected onto its bounds."""
         self.stencil.relax(x, b, lower, upper, omega, forward=forward)
 
-    def floating_components(self, scratch: wp.array[Any] | None = None) -> FloatingComponents | None:
+    def floating_components(self, scratch: Scratch | None = None) -> FloatingComponents | None:
         """Return the components on which A is singular, or None if there are none.
 
         Args:
-            scratch: stored field of 4-byte elements that may be overwritten on the rows' spans; saves as much memory.
+            scratch: stored fields, one of 4-byte elements and one of bytes, that may be overwritten on the rows' spans; saves as much memory.
         """
         if self._finder is None:
             self._finder = ComponentFinder(self)

@@ -26,11 +26,11 @@ PLANES_A_THREAD = {"cpu": 1, "cuda": 16}
 class ProjectedMultigrid:
     """Solve the LCP of a grid in about as many multigrid cycles as the linear system needs.
 
-    Cold, the first steps are projected (monotone) cycles, which move whole aggregates on and off their bounds. Then each step evaluates
+    Cold, the first step is a projected (monotone) cycle, which moves whole aggregates on and off their bounds. Then each step evaluates
     y = A x + b in float64, takes the unknowns that sit at a bound with y of the right sign out of the hierarchy (they are *truncated*),
-    preconditions -y by one linear cycle on the rest, makes the correction conjugate to the last direction while that set stays the same,
-    and projects the step onto the bounds. There are no inner tolerances: without bounds this is preconditioned conjugate gradients with a
-    true residual, and the same code is the linear solver. If the residual rises `patience` times running, a monotone cycle follows.
+    preconditions -y by one linear cycle on the rest, makes the correction conjugate to what is left of the last direction, and projects
+    the step onto the bounds. There are no inner tolerances: without bounds this is preconditioned conjugate gradients with a true
+    residual, and the same code is the linear solver. If the residual rises `patience` times running, a monotone cycle follows.
 
     Args:
         precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate rounded to float32 as well.
@@ -43,7 +43,7 @@ class ProjectedMultigrid:
     """
 
     precision: str = "mixed"
-    monotone_cycles: int = 2
+    monotone_cycles: int = 1  # without one the set creeps; two or three were never faster on splashes, basins and obstacles, 2-D and 3-D
     patience: int = 3
     cycle: CycleSettings = field(default_factory=CycleSettings)
 
@@ -182,11 +182,16 @@ class MultigridWorkspace:
         self._rounded = problem.layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
         self._programs: dict[tuple[Any, ...], Program] = {}  # truncated cycles
         self._mask: wp.array[Any] | None = None
-        self.scratch = self.hierarchy.finest.t if real is wp.float32 else None  # free between cycles
+        self.scratch = self._scratch() if real is wp.float32 else None
         self.floating: Any = None
         self._best: wp.array[Any] | None = None
         self._past, self._stored = 0, False  # steps since the best iterate; whether it is in memory of its own
         self._cycles_left, self._rises = 0, 0
+
+    def _scratch(self) -> tuple[wp.array[Any], wp.array[Any]]:
+        """Return what is free between cycles, as fields of four bytes and of one byte a cell."""
+        x, t = self.hierarchy.finest.x, self.hierarchy.finest.t
+        return t, wp.array(ptr=x.ptr, dtype=wp.uint8, shape=x.shape, device=x.device)
 
     def keep(self) -> None:
         """Remember x as the best iterate."""
@@ -225,6 +230,7 @@ class MultigridWorkspace:
         self._cycles_left = self.settings.monotone_cycles if self.bounded and not warm else 0
         self._rises = 0
         self._forget()
+        self.hierarchy.finest.x[: self.x.size // 4 + 1].zero_()  # its bytes were scratch memory
         size = float(self.residual.scalars.numpy()[int(kernels.SIZE)])
         rescale = not 1e-6 < self.residual.norm / size < 1e6  # corrections in float32 would overflow, or vanish
         if rescale:

@@ -287,7 +287,7 @@ def plan_step_kernel(scalars: f64):
             curvature = rest
             gain += beta * scalars[GP]
     length = zero
-    if curvature > zero:
+    if curvature > zero or not wp.isfinite(curvature):  # a step that is not finite is not taken, and is reported
         length = gain / curvature
     scalars[PAP] = curvature
     scalars[BETA] = beta

@@ -1,0 +1,124 @@
+"""Restarted, right-preconditioned GMRES with its vectors on the device (Saad & Schultz 1986)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.field_set import FieldSet
+from warp_lcp.krylov.conjugate_gradient import LinearMap, Preconditioner
+from warp_lcp.krylov.gmres_kernels import kernels
+from warp_lcp.native import Spans
+from warp_lcp.vectors import launch_spans
+
+STALLED = 0.99  # a restart that leaves more than this share of the residual gains nothing that another one would not
+
+
+class GMRES:
+    """Solve A x = r for any A.
+
+    The right-hand side is the preconditioner's field `r`, which is overwritten; the solution is `x`. Preconditioned from the right, the
+    residual that is minimized is the true one; it is computed from x after every restart, and only that one is ever reported.
+
+    Args:
+        product: A.
+        preconditioner: M, an approximation of A's inverse.
+        restart: vectors before a restart.
+        weight: residuals are measured as ||weight^(1/2) r||, field like r >= 0; None: all 1.
+    """
+
+    def __init__(self, product: LinearMap, preconditioner: Preconditioner, *, restart: int = 30, weight: wp.array[Any] | None = None) -> None:
+        r = preconditioner.r
+        self._product, self._preconditioner, self._restart = product, preconditioner, restart
+        self.device, self.x = r.device, wp.zeros_like(r)
+        self._b, self._q = wp.zeros_like(r), wp.zeros_like(r)
+        self._weight = wp.empty(0, dtype=r.dtype, device=r.device) if weight is None else weight
+        self._basis = FieldSet(restart + 1, r.size, r.dtype, r.device)
+        self._factors = wp.zeros(restart + 1, dtype=wp.float64, device=r.device)
+        self._kernels, self._spans = kernels(r.dtype), Spans.of(r.size, r.device)
+        self._H, self._rotations, self._g = np.zeros((restart + 1, restart)), np.zeros((restart, 2)), np.zeros(restart + 1)
+
+    def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
+        """Iterate from x = 0 until the residual, computed from x, is at most the tolerance, is no number, or has stalled.
+
+        Returns:
+            The iterations done, products with A that restarts cost not counted, and the norm of the residual.
+        """
+        wp.copy(self._b, self._preconditioner.r)
+        self.x.zero_()
+        self._q.zero_()
+        norm, done = self._start(), 0
+        while norm > tolerance and done < max_iterations and math.isfinite(norm):
+            columns = self._expand(norm, tolerance, min(self._restart, max_iterations - done))
+            done += columns
+            self._correct(columns)
+            self._product(self.x, self._q)
+            before, norm = norm, self._start()
+            if norm > STALLED * before:
+                break
+        return done, norm
+
+    def _start(self) -> float:
+        """Make the residual the first vector; return its norm. `_q` is A x."""
+        inputs = [self._b, self._q, self._weight, self._q]
+        launch_spans(self._kernels.residual, self._spans, inputs, [], self.device)
+        self._basis.add(self._factors, self._q, count=0, norm=True)
+        self._basis.store(self._q, 0)
+        return float(np.sqrt(self._basis.sums.numpy()[-1]))
+
+    def _expand(self, norm: float, tolerance: float, most: int) -> int:
+        """Add vectors until the residual's estimate is small enough; return their number."""
+        H, g = self._H, self._g
+        g[:] = 0.0
+        g[0] = norm
+        for k in range(most):
+            self._basis.take(k, self._preconditioner.r)
+            self._preconditioner.apply()
+            self._product(self._preconditioner.z, self._q)
+            if self._weight.size:
+                launch_spans(self._kernels.weigh, self._spans, [self._weight, self._q], [], self.device)
+            H[: k + 2, k] = self._orthogonalize(k + 1)
+            self._rotate(k)
+            if not abs(g[k + 1]) > tolerance:  # also where it is no number
+                return k + 1
+        return most
+
+    def _orthogonalize(self, count: int) -> np.ndarray:
+        """Take the first vectors out of `_q`, twice, and store the rest as the next one; return the column of H."""
+        basis = self._basis
+        basis.add(basis.dots(self._q, count), self._q, sign=-1.0, count=count)
+        first = basis.sums.numpy()[:count].copy()
+        basis.add(basis.dots(self._q, count), self._q, sign=-1.0, count=count, norm=True)
+        basis.store(self._q, count)
+        sums = basis.sums.numpy()
+        return np.r_[first + sums[:count], np.sqrt(sums[-1])]
+
+    def _rotate(self, k: int) -> None:
+        """Make column k of H upper triangular by the old rotations and a new one."""
+        H, g, rotations = self._H, self._g, self._rotations
+        for i in range(k):
+            c, s = rotations[i]
+            H[i, k], H[i + 1, k] = c * H[i, k] + s * H[i + 1, k], c * H[i + 1, k] - s * H[i, k]
+        length = math.hypot(H[k, k], H[k + 1, k])
+        c, s = (H[k, k] / length, H[k + 1, k] / length) if length > 0 else (1.0, 0.0)
+        rotations[k] = c, s
+        H[k, k], H[k + 1, k] = length, 0.0
+        g[k], g[k + 1] = c * g[k], -s * g[k]
+
+    def _correct(self, columns: int) -> None:
+        """x += M V y with y from the triangle; columns that are singular to rounding count for nothing."""
+        H, g = self._H[:columns, :columns], self._g
+        y = np.zeros(self._restart + 1)
+        largest = float(np.abs(np.diag(H)).max(initial=0.0))
+        for k in reversed(range(columns)):
+            if abs(H[k, k]) > 1e-14 * largest:
+                y[k] = (g[k] - H[k, k + 1 :] @ y[k + 1 : columns]) / H[k, k]
+        self._factors.assign(y)
+        r = self._preconditioner.r
+        r.zero_()
+        self._basis.add(self._factors, r, count=columns)
+        self._preconditioner.apply()
+        launch_spans(self._kernels.increase, self._spans, [self._preconditioner.z, self.x], [], self.device)

@@ -1,0 +1,308 @@
+"""Algebraic multigrid for the principal systems of a sparse matrix: PyAMG's aggregates, cycled and coarsened anew on the device.
+
+Which unknowns make up a coarse one is decided once, on A. When the free set or the shift changes, only numbers are computed again: the
+Galerkin products P' M P go into patterns that are known, by lists of places made once.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+import warp as wp
+from pyamg.aggregation.aggregate import standard_aggregation
+from pyamg.aggregation.smooth import jacobi_prolongation_smoother
+from pyamg.aggregation.tentative import fit_candidates
+from pyamg.strength import symmetric_strength_of_connection
+
+from warp_lcp.multigrid.algebraic_kernels import factor_kernel, fill_kernel, invert_kernel, kernels, places_kernel
+from warp_lcp.native import Spans
+from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.operators.sparse_kernels import kernels as sparse_kernels
+from warp_lcp.program import Launch, Program
+from warp_lcp.vectors import launch_spans
+
+PINNED = {wp.float32: 3e-5, wp.float64: 1e-13}  # of a coarsest level's diagonal: what rounding leaves of a singular component's last pivot
+Matrix = scipy.sparse.csr_array
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlgebraicSettings:
+    """How the hierarchy is built and cycled.
+
+    Args:
+        strength: entries below this share of sqrt(a_ii a_jj) do not aggregate; 0 takes all, as PyAMG does.
+        gamma: coarse cycles a level; 1 is a V-cycle.
+        interval: bounds of the spectrum, in units of its l1 bound, that the two Chebyshev-Jacobi sweeps damp.
+        coarsest_cpu: the most unknowns of the coarsest level, which is inverted densely.
+        coarsest_cuda: the same on a GPU, where one thread factors it.
+        stall: a level that keeps more than this share of its unknowns is not coarsened.
+        last_sweeps: pairs of sweeps on a coarsest level that is too large to invert.
+    """
+
+    strength: float = 0.0
+    gamma: int = 1
+    interval: tuple[float, float] = (0.25, 1.0)
+    coarsest_cpu: int = 64
+    coarsest_cuda: int = 24
+    stall: float = 0.7
+    last_sweeps: int = 4
+
+    @property
+    def weights(self) -> tuple[float, float]:
+        """Relaxation weights: reciprocals of the Chebyshev points of the interval."""
+        a, b = self.interval
+        points = [0.5 * (a + b) + 0.5 * (b - a) * math.cos(math.pi * (2 * i + 1) / 4) for i in range(2)]
+        return 1 / points[0], 1 / points[1]
+
+
+class DeviceMatrix:
+    """A sparse matrix in compressed rows on the device, any shape."""
+
+    def __init__(self, host: Matrix, real: Any, device: wp.Device) -> None:
+        self.shape, self.device = host.shape, device
+        self.indptr, self.indices = (wp.array(v, dtype=wp.int32, device=device) for v in (host.indptr, host.indices))
+        self.values = wp.array(host.data, dtype=real, device=device)
+        self.operands = [self.indptr, self.indices, self.values]
+
+
+class DeviceProduct:
+    """A B into a known pattern.
+
+    Args:
+        left: A.
+        right: B.
+        out: where the product goes; its pattern holds that of A B.
+    """
+
+    def __init__(self, left: DeviceMatrix, right: DeviceMatrix, out: DeviceMatrix, host: tuple[Matrix, Matrix]) -> None:
+        A, B = host
+        ends = np.concatenate([[0], np.cumsum(np.diff(B.indptr).astype(np.int64)[A.indices])])
+        device = left.device
+        first = wp.array(ends[A.indptr], dtype=wp.int64, device=device)
+        place = wp.zeros(int(ends[-1]), dtype=wp.uint16, device=device)
+        self._spans = Spans.of(left.shape[0], device)
+        inputs = [left.indptr, left.indices, right.indptr, right.indices, out.indptr, out.indices, first, place]
+        launch_spans(places_kernel, self._spans, inputs, [], device)
+        self._inputs = [*left.operands, right.indptr, right.values, out.indptr, first, place, out.values]
+        self.nbytes = first.capacity + place.capacity
+
+    def compute(self, kernel: Any, device: wp.Device, launch: Launch) -> None:
+        """Launch the product."""
+        launch_spans(kernel, self._spans, self._inputs, [], device, launch=launch)
+
+
+class AlgebraicLevel:
+    """One level: its matrix, iterate x, right-hand side b, a second buffer t, the smoother's scale, and the way to the next level."""
+
+    def __init__(self, host: Matrix, real: Any, device: wp.Device) -> None:
+        self.size, self.device = host.shape[0], device
+        self.A = DeviceMatrix(host, real, device)
+        self.x, self.b, self.t, self.inverse = (wp.zeros(self.size, dtype=real, device=device) for _ in range(4))
+        self.spans = Spans.of(self.size, device)
+        self.P: DeviceMatrix | None = None
+        self.kernels = kernels(real)
+
+    def connect(self, host: Matrix, P: Matrix, coarse: AlgebraicLevel, coarse_host: Matrix, real: Any) -> None:
+        """Take the prolongation P from a coarser level; `host` and `coarse_host` are the patterns of both levels."""
+        device = self.device
+        R, turn = P.T.tocsr(), _numbered(P).T.tocsr().data
+        AP = _pattern_product(host, P)
+        self.P, self.R = DeviceMatrix(P, real, device), DeviceMatrix(R, real, device)
+        self.plain = wp.clone(self.P.values)  # P's entries before its rows are scaled
+        self.turn = wp.array(turn, dtype=wp.int32, device=device)
+        self.AP = DeviceMatrix(AP, real, device)
+        self.products = (
+            DeviceProduct(self.A, self.P, self.AP, (host, P)),
+            DeviceProduct(self.R, self.AP, coarse.A, (R, AP)),
+        )
+
+    def sweep(self, y: wp.array[Any], x: wp.array[Any], omega: float, launch: Launch, *, from_zero: bool = False) -> None:
+        """Y = x + omega (b - A x) over the rows' l1 norms; x is taken for 0 if from_zero."""
+        inputs = [*self.A.operands, self.inverse, x, self.b, omega, from_zero, y]
+        launch_spans(self.kernels.sweep, self.spans, inputs, [], self.device, launch=launch)
+
+
+class AlgebraicHierarchy:
+    """Multigrid for M e = r, M = P A P + P D P, with a sparse A.
+
+    Rows of the finest prolongation are scaled by a_ii / (a_ii + D_i), the value that the row's own equation asks for, and are 0 off the
+    free set: a coarse correction then leaves stiff unknowns alone, whatever D's size. On an unsymmetric A the aggregates are those of its
+    symmetric part, and the coarse matrices are P' M P with M as it is.
+
+    Args:
+        A: the matrix.
+        real: type of the corrections.
+        settings: how it is built and cycled.
+
+    Attributes:
+        r: the right-hand side, field of A's shape; z: what a cycle makes of it.
+        weight: one over the diagonal of M, field like r; 1 where that is 0, 0 off the free set.
+    """
+
+    def __init__(self, A: SparseOperator, real: Any, settings: AlgebraicSettings | None = None) -> None:
+        self.settings, self.real, self.source, self.device = settings or AlgebraicSettings(), real, A, A.device
+        host = A.matrix()
+        symmetric = host if A.symmetric else ((host + host.T) * 0.5).tocsr()
+        pattern = _with_diagonal(host if A.symmetric else _union(host))
+        hosts, prolongations = _coarsen(scipy.sparse.csr_array(symmetric), pattern, self.settings, self._most)
+        self._order = self._find_entries(host, pattern)
+        self.levels = [AlgebraicLevel(h, real, self.device) for h in hosts]
+        for k, P in enumerate(prolongations):
+            self.levels[k].connect(hosts[k], P, self.levels[k + 1], hosts[k + 1], real)
+        n, last = A.unknowns, self.levels[-1].size
+        self.scale = wp.zeros(n, dtype=real, device=self.device)
+        self.weight = wp.zeros(n, dtype=real, device=self.device)
+        self.inverts = last <= self._most
+        shape = (last, last) if self.inverts else (0, 0)
+        self._matrix, self._inverse = (wp.zeros(shape, dtype=wp.float64, device=self.device) for _ in range(2))
+        self._no_shift = wp.empty(0, dtype=wp.float64, device=self.device)
+        self.r, self.z = self.levels[0].b, self.levels[0].x
+
+    @property
+    def complexity(self) -> float:
+        """Entries of all levels' matrices over those of the finest one."""
+        return sum(level.A.values.size for level in self.levels) / self.levels[0].A.values.size
+
+    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
+        """Take a free set (uint8 field) and a shift D >= 0 (float64 field; None: 0), and coarsen."""
+        finest, A = self.levels[0], self.source
+        fields = [A.values, A.diagonal(), free, self._no_shift if shift is None else shift, finest.A.values, finest.inverse]
+        inputs = [finest.A.indptr, finest.A.indices, self._order, *fields, self.scale, self.weight]
+        launch_spans(fill_kernel(A.dtype, self.real), finest.spans, inputs, [], self.device)
+        self._coarsening.run()
+
+    def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
+        """Q = M p."""
+        finest = self.levels[0]
+        inputs = [*finest.A.operands, p, p, False, q]
+        launch_spans(sparse_kernels(self.real, self.real).product, finest.spans, inputs, [], self.device, launch=launch)
+
+    @cached_property
+    def program(self) -> Program:
+        """One cycle: z = an approximation of M^-1 r, symmetric positive (semi-)definite if M is."""
+        program = Program(self.device)
+        self._visit(0, program.launch, from_zero=True)
+        return program
+
+    def apply(self) -> None:
+        """Cycle once."""
+        self.program.run()
+
+    @cached_property
+    def _coarsening(self) -> Program:
+        program = Program(self.device)
+        launch, k = program.launch, self.levels[0].kernels
+        for depth, (fine, coarse) in enumerate(zip(self.levels, self.levels[1:], strict=False)):
+            P = fine.P
+            assert P is not None
+            if depth == 0:
+                launch_spans(k.scale, fine.spans, [P.indptr, fine.plain, self.scale, P.values], [], self.device, launch=launch)
+                launch(k.gather, fine.turn.size, [P.values, fine.turn, fine.R.values], device=self.device)
+            for product in fine.products:
+                product.compute(k.multiply, self.device, launch)
+            launch_spans(k.inverse, coarse.spans, [coarse.A.indptr, coarse.A.values, coarse.inverse], [], self.device, launch=launch)
+        if self.inverts:
+            last = self.levels[-1]
+            launch(k.densify, last.size, [*last.A.operands, self._matrix], device=self.device)
+            launch(factor_kernel, 1, [self._matrix, wp.float64(PINNED[self.real])], device=self.device)
+            launch(invert_kernel, last.size, [self._matrix, self._inverse], device=self.device)
+        return program
+
+    def _visit(self, depth: int, launch: Launch, *, from_zero: bool) -> None:
+        """Launch a cycle on a level and those below it."""
+        L, (first, second) = self.levels[depth], self.settings.weights
+        if depth == len(self.levels) - 1:
+            self._solve_coarsest(L, launch, from_zero=from_zero)
+            return
+        C, P = self.levels[depth + 1], L.P
+        assert P is not None
+        L.sweep(L.t, L.x, first, launch, from_zero=from_zero)
+        L.sweep(L.x, L.t, second, launch)
+        launch_spans(L.kernels.residual, L.spans, [*L.A.operands, L.x, L.b, L.t], [], self.device, launch=launch)
+        launch_spans(L.kernels.transfer, C.spans, [*L.R.operands, L.t, False, C.b], [], self.device, launch=launch)
+        for visit in range(self.settings.gamma if depth + 2 < len(self.levels) else 1):
+            self._visit(depth + 1, launch, from_zero=visit == 0)
+        launch_spans(L.kernels.transfer, L.spans, [*P.operands, C.x, True, L.x], [], self.device, launch=launch)
+        L.sweep(L.t, L.x, second, launch)
+        L.sweep(L.x, L.t, first, launch)
+
+    def _solve_coarsest(self, L: AlgebraicLevel, launch: Launch, *, from_zero: bool) -> None:
+        if self.inverts:
+            launch(L.kernels.solve, L.size, [self._inverse, L.b, L.x], device=self.device)
+            return
+        first, second = self.settings.weights
+        for pair in range(self.settings.last_sweeps):  # forth and back, so that the whole is symmetric
+            L.sweep(L.t, L.x, first if pair % 2 == 0 else second, launch, from_zero=from_zero and pair == 0)
+            L.sweep(L.x, L.t, second if pair % 2 == 0 else first, launch)
+
+    @property
+    def _most(self) -> int:
+        return self.settings.coarsest_cuda if self.device.is_cuda else self.settings.coarsest_cpu
+
+    def _find_entries(self, host: Matrix, pattern: Matrix) -> wp.array[Any]:
+        """Return which entry of A each entry of the pattern is, -1 for none; empty if the patterns are one."""
+        if np.array_equal(host.indptr, pattern.indptr) and np.array_equal(host.indices, pattern.indices):
+            return wp.empty(0, dtype=wp.int32, device=self.device)
+        n = np.int64(host.shape[0])
+        keys = [np.repeat(np.arange(n), np.diff(m.indptr)) * n + m.indices for m in (host, pattern)]
+        order = np.full(pattern.nnz, -1, dtype=np.int32)
+        order[np.searchsorted(keys[1], keys[0])] = np.arange(host.nnz, dtype=np.int32)
+        return wp.array(order, dtype=wp.int32, device=self.device)
+
+
+def _coarsen(A: Matrix, pattern: Matrix, settings: AlgebraicSettings, most: int) -> tuple[list[Matrix], list[Matrix]]:
+    """Return the patterns of all levels' matrices and the prolongations between them."""
+    hosts, prolongations = [pattern], []
+    current = scipy.sparse.csr_matrix(A)
+    candidates = np.ones((A.shape[0], 1))
+    while current.shape[0] > most:
+        current.eliminate_zeros()
+        C = symmetric_strength_of_connection(current, theta=settings.strength)
+        aggregates, _ = standard_aggregation(C)
+        if not 0 < aggregates.shape[1] <= settings.stall * current.shape[0]:
+            break
+        T, candidates = fit_candidates(aggregates, candidates)
+        # local weights are sums of magnitudes; spectral ones start from random vectors, so runs would differ
+        P = scipy.sparse.csr_matrix(jacobi_prolongation_smoother(current, T, C, candidates, omega=4 / 3, weighting="local"))
+        P.sort_indices()
+        hosts.append(_pattern_product(_ones(P.T.tocsr()), _pattern_product(hosts[-1], P)))
+        prolongations.append(scipy.sparse.csr_array(P))
+        current = (P.T @ current @ P).tocsr()
+    return hosts, prolongations
+
+
+def _ones(matrix: Matrix) -> Matrix:
+    return scipy.sparse.csr_array((np.ones(matrix.nnz, dtype=np.float32), matrix.indices, matrix.indptr), shape=matrix.shape)
+
+
+def _pattern_product(A: Matrix, B: Matrix) -> Matrix:
+    """Return the pattern of A B, sorted: sums of positive numbers cannot vanish."""
+    product = (_ones(A) @ _ones(B)).tocsr()
+    product.sort_indices()
+    return product
+
+
+def _numbered(matrix: Matrix) -> Matrix:
+    """Return a matrix whose entries are their own places; transposed, it tells the order of the transpose's entries."""
+    return scipy.sparse.csr_array((np.arange(matrix.nnz), matrix.indices, matrix.indptr), shape=matrix.shape)
+
+
+def _union(matrix: Matrix) -> Matrix:
+    """Return the pattern of A + A'."""
+    return (_ones(matrix) + _ones(matrix).T).tocsr()
+
+
+def _with_diagonal(matrix: Matrix) -> Matrix:
+    """Return the pattern of a matrix with a whole diagonal."""
+    pattern = _ones(matrix)
+    pattern = (pattern + scipy.sparse.eye_array(matrix.shape[0], dtype=np.float32)).tocsr()
+    pattern.sort_indices()
+    return pattern
+
+
+__all__ = ["AlgebraicHierarchy", "AlgebraicSettings"]

@@ -1,0 +1,254 @@
+"""A sparse matrix as an operator: compressed rows on the device."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+import warp as wp
+
+from warp_lcp.layout import Layout
+from warp_lcp.native import Spans
+from warp_lcp.operators.sparse_kernels import color_kernel, gather_kernel, kernels
+from warp_lcp.problem import as_operator
+from warp_lcp.program import Launch
+from warp_lcp.vectors import launch_spans
+
+SYMMETRIC = 64 * float(np.finfo(np.float64).eps)  # of the largest entries of two rows: what assembly in float64 leaves of symmetry
+
+
+class SparseOperator:
+    """A x with a sparse square matrix A, from scipy.sparse.
+
+    Duplicate entries are summed and columns sorted, as `matrix.tocsr().sum_duplicates()` does; explicit zeros are kept, so that
+    `update` may fill them.
+
+    Args:
+        matrix: A, any scipy.sparse matrix or array of shape (n, n), real and finite. Rows may be empty.
+        device: Warp device; the default device if None.
+        dtype: storage of A's entries, wp.float64 or wp.float32.
+
+    Attributes:
+        indptr: where each row begins, shape (n + 1,), wp.int32.
+        indices: column of each entry, shape (nnz,), wp.int32, ascending in each row.
+        values: the entries, shape (nnz,), `dtype`.
+        symmetric: whether A equals its transpose, to rounding.
+        version: how often the entries have been taken.
+
+    Raises:
+        ValueError: the matrix is not square, empty, complex, not finite, or has more than 2^31 - 1 entries.
+
+    Example:
+        >>> import scipy.sparse, warp as wp, warp_lcp as wl
+        >>> A = wl.SparseOperator(scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(3, 3)), device="cpu")
+        >>> print(A.apply(wp.array([1.0, 2.0, 4.0], dtype=wp.float64, device="cpu")).numpy(), A.symmetric)
+        [ 0. -1.  6.] True
+    """
+
+    def __init__(self, matrix: Any, *, device: Any = None, dtype: Any = wp.float64) -> None:
+        if dtype not in (wp.float32, wp.float64):
+            raise ValueError(f"dtype = {dtype}: must be wp.float32 or wp.float64")
+        host = _checked(matrix)
+        self.device, self.dtype, self.shape = wp.get_device(device), dtype, (host.shape[0],)
+        self.layout = Layout(self.shape, self.device)
+        self.indptr = wp.array(host.indptr, dtype=wp.int32, device=self.device)
+        self.indices = wp.array(host.indices, dtype=wp.int32, device=self.device)
+        self.values = wp.array(host.data, dtype=dtype, device=self.device)
+        self._indptr, self._indices = host.indptr, host.indices
+        self._diagonal = wp.zeros(self.unknowns, dtype=dtype, device=self.device)
+        self._transpose_values: wp.array[Any] | None = None
+        self.version = 0
+        self._take(host)
+
+    @property
+    def unknowns(self) -> int:
+        """Number of rows."""
+        return self.shape[0]
+
+    @property
+    def nnz(self) -> int:
+        """Number of stored entries."""
+        return int(self.values.size)
+
+    def matrix(self) -> scipy.sparse.csr_array:
+        """Return A as it is now, on the host, in float64."""
+        return self._matrix_of(self.values.numpy())
+
+    def update(self, values: Any) -> None:
+        """Take other entries in the same places.
+
+        Args:
+            values: entries in the order of `indices`, shape (nnz,), numpy or wp.array; or a scipy.sparse matrix with the same pattern.
+
+        Raises:
+            ValueError: shape or pattern differ, or a value is not finite.
+        """
+        if scipy.sparse.issparse(values):
+            host = _checked(values)
+            if not (np.array_equal(host.indptr, self._indptr) and np.array_equal(host.indices, self._indices)):
+                raise ValueError("values has another pattern than the operator: make a new SparseOperator")
+        else:
+            array = values.numpy() if isinstance(values, wp.array) else np.asarray(values)
+            if array.shape != (self.nnz,):
+                raise ValueError(f"values has shape {array.shape}: expected {(self.nnz,)}")
+            host = self._matrix_of(array)
+            if not np.isfinite(host.data).all():
+                raise ValueError("values holds a value that is not finite")
+        self.values.assign(host.data.astype(wp.dtype_to_numpy(self.dtype)))
+        self._take(host)
+
+    def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+        """Return A x, x of shape (n,) and type wp.float32 or wp.float64."""
+        out = self._result(x, out)
+        self.product(x, out)
+        return out
+
+    def apply_transpose(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+        """Return A' x. The transpose is stored when this is first called, unless A is symmetric."""
+        if self.symmetric:
+            return self.apply(x, out)
+        out = self._result(x, out)
+        indptr, indices, order = self._transpose
+        if self._transpose_values is None:
+            self._transpose_values = wp.zeros_like(self.values)
+            self._gather(order)
+        inputs = [indptr, indices, self._transpose_values, x, x, False, out]
+        launch_spans(kernels(self.dtype, x.dtype).product, Spans.of(x.size, self.device), inputs, [], self.device)
+        return out
+
+    def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
+        """Out = A x + b in one pass; fields of one type."""
+        self.product(x, out, plus=b)
+
+    def product(self, x: wp.array[Any], out: wp.array[Any], plus: wp.array[Any] | None = None, *, launch: Launch = wp.launch) -> None:
+        """Out = A x, or A x + plus; kernel launches only."""
+        inputs = [self.indptr, self.indices, self.values, x, x if plus is None else plus, plus is not None, out]
+        launch_spans(kernels(self.dtype, x.dtype).product, Spans.of(x.size, self.device), inputs, [], self.device, launch=launch)
+
+    def diagonal(self) -> wp.array[Any]:
+        """Return the diagonal of A, shape (n,): the operator's own memory, which `update` keeps current."""
+        return self._diagonal
+
+    def masked(self, free: Any, shift: Any = None) -> SparseOperator:
+        """Return P A P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift)."""
+        p = scipy.sparse.diags_array((self.layout.load(free, wp.uint8, "free").numpy() != 0).astype(np.float64))
+        matrix = p @ self.matrix() @ p
+        if shift is not None:
+            matrix = matrix + p @ scipy.sparse.diags_array(self.layout.load(shift, wp.float64, "shift").numpy())
+        return SparseOperator(matrix, device=self.device, dtype=self.dtype)
+
+    def relax(self, x: Any, b: Any, lower: Any, upper: Any, omega: float, *, forward: bool = True, colored: bool | None = None) -> None:
+        """Sweep x once, each unknown projected onto its bounds; rows with a zero diagonal are passed over.
+
+        Args:
+            x: field, moved in place.
+            b: field like x.
+            lower: field like x.
+            upper: field like x.
+            omega: relaxation factor.
+            forward: rows, or colors, in ascending order; else descending.
+            colored: color by color, all rows of a color at once, instead of row by row by one thread; on CUDA if None.
+        """
+        found = kernels(self.dtype, x.dtype)
+        before = [self.indptr, self.indices, self.values, self._diagonal, b, lower, upper, wp.float64(omega)]
+        if not (self.device.is_cuda if colored is None else colored):
+            wp.launch(found.relax, 1, [*before, forward, self._no_rows, x, x.size], device=self.device)
+            return
+        rows, starts = self.colors
+        colors = range(len(starts) - 1)
+        for c in colors if forward else reversed(colors):
+            spans = Spans.of(starts[c + 1] - starts[c], self.device)
+            launch_spans(found.relax_color, spans, [*before, rows, starts[c], x], [], self.device)
+
+    @cached_property
+    def colors(self) -> tuple[wp.array[Any], list[int]]:
+        """Rows grouped by color (no row has an entry in a row of its color), on the device, and where each color begins, plus the end.
+
+        Greedy in row order, so the same on every run: red-black on the 5- and the 7-point stencil.
+        """
+        color = self.coloring()
+        counts = np.bincount(color)
+        rows = wp.array(np.argsort(color, kind="stable"), dtype=wp.int32, device=self.device)
+        return rows, [0, *np.cumsum(counts).tolist()]
+
+    def coloring(self) -> np.ndarray:
+        """Return the color of each row, shape (n,), from 0."""
+        pattern = _ones(self._indptr, self._indices)
+        both = (pattern + pattern.T).tocsr()
+        inputs = [wp.array(v, dtype=wp.int32, device="cpu") for v in (both.indptr, both.indices)]
+        taken = wp.zeros(int(np.diff(both.indptr).max(initial=0)) + 2, dtype=wp.int32, device="cpu")
+        color = wp.zeros(self.unknowns, dtype=wp.int32, device="cpu")
+        wp.launch(color_kernel, 1, [*inputs, taken, color, self.unknowns], device="cpu")
+        return color.numpy()
+
+    def _take(self, host: scipy.sparse.csr_array) -> None:
+        """Derive what follows from the entries."""
+        self.symmetric = _is_symmetric(host)
+        self._diagonal.assign(host.diagonal().astype(wp.dtype_to_numpy(self.dtype)))
+        if self._transpose_values is not None:
+            self._gather(self._transpose[2])
+        self.version += 1
+
+    def _gather(self, order: wp.array[Any]) -> None:
+        wp.launch(gather_kernel(self.dtype), order.size, [self.values, order, self._transpose_values], device=self.device)
+
+    @cached_property
+    def _transpose(self) -> tuple[wp.array[Any], wp.array[Any], wp.array[Any]]:
+        """Rows and columns of A', and which of A's entries each of its entries is."""
+        numbered = scipy.sparse.csr_array((np.arange(self.nnz), self._indices, self._indptr), shape=self.shape * 2)
+        turned = numbered.T.tocsr()
+        parts = [wp.array(v, dtype=wp.int32, device=self.device) for v in (turned.indptr, turned.indices, turned.data)]
+        return parts[0], parts[1], parts[2]
+
+    @cached_property
+    def _no_rows(self) -> wp.array[Any]:
+        return wp.empty(0, dtype=wp.int32, device=self.device)
+
+    def _matrix_of(self, values: np.ndarray) -> scipy.sparse.csr_array:
+        return scipy.sparse.csr_array((values.astype(np.float64), self._indices, self._indptr), shape=self.shape * 2)
+
+    def _result(self, x: wp.array[Any], out: wp.array[Any] | None) -> wp.array[Any]:
+        if tuple(x.shape) != self.shape:
+            raise ValueError(f"x has shape {tuple(x.shape)}: expected {self.shape}")
+        return wp.zeros_like(x) if out is None else out
+
+
+def _checked(matrix: Any) -> scipy.sparse.csr_array:
+    """Return a matrix in compressed rows, sorted, without duplicates, in float64."""
+    if not scipy.sparse.issparse(matrix):
+        raise ValueError(f"matrix is a {type(matrix).__name__}: expected a scipy.sparse matrix (DenseOperator takes numpy arrays)")
+    if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1] or matrix.shape[0] == 0:
+        raise ValueError(f"matrix has shape {matrix.shape}: expected (n, n) with n >= 1")
+    if matrix.dtype.kind not in "fiub":
+        raise ValueError(f"matrix has entries of type {matrix.dtype}: expected real numbers")
+    host = scipy.sparse.csr_array(matrix, dtype=np.float64, copy=True)
+    host.sum_duplicates()
+    if not np.isfinite(host.data).all():
+        raise ValueError("matrix holds a value that is not finite")
+    if host.nnz > np.iinfo(np.int32).max:
+        raise ValueError(f"matrix has {host.nnz} entries: at most 2^31 - 1 can be indexed")
+    return host
+
+
+def _ones(indptr: np.ndarray, indices: np.ndarray) -> scipy.sparse.csr_array:
+    n = len(indptr) - 1
+    return scipy.sparse.csr_array((np.ones(len(indices), dtype=np.float32), indices, indptr), shape=(n, n))
+
+
+def _is_symmetric(host: scipy.sparse.csr_array) -> bool:
+    """Return whether |a_ij - a_ji| is rounding of the smaller one of the largest entries of rows i and j, for all i, j."""
+    difference = (host - host.T).tocoo()
+    if difference.nnz == 0:
+        return True
+    n = host.shape[0]
+    largest = np.zeros(n)
+    np.maximum.at(largest, np.repeat(np.arange(n), np.diff(host.indptr)), np.abs(host.data))
+    return bool((np.abs(difference.data) <= SYMMETRIC * np.minimum(largest[difference.row], largest[difference.col])).all())
+
+
+@as_operator.register(scipy.sparse.sparray)
+@as_operator.register(scipy.sparse.spmatrix)
+def _sparse(A: Any, device: Any = None) -> SparseOperator:
+    return SparseOperator(A, device=device)

@@ -1,0 +1,215 @@
+"""Incremental pivoting after Baraff: one row after the other is made to hold, and none is let go again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import scipy.linalg
+import warp as wp
+
+from warp_lcp.problem import LCP
+from warp_lcp.result import SolveStatus
+from warp_lcp.solve import Step
+from warp_lcp.solvers.dense_problem import DenseWorkspace, assemble, check_size, pivots_of
+from warp_lcp.solvers.principal_inverse import PrincipalInverse
+
+EPS = float(np.finfo(np.float64).eps)
+ZERO = 1e-11  # a rate below this part of the terms that it is a sum of is rounding: nothing changes there
+DEFINITE = 1e-10  # shift, in units of the largest diagonal entry, with which a semi-definite matrix must have a Cholesky factor
+RESTARTS = 3  # times that the last check may send rows back that rounding has undone
+OPEN, FREE, LOW, HIGH = 0, 1, 2, 3  # not held yet; y = 0; x = l and y >= 0; x = u and y <= 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class IncrementalPivoting:
+    """Solve a dense symmetric problem by Baraff's incremental pivoting ([Book] 2.1.2, algorithm 2; eqs. 2.20-2.27).
+
+    The most violated row j is driven to y_j = 0 or to its bound while all rows that hold keep holding: dx_F = -A_FF^-1 A_Fj, dy = A dx, and
+    the longest step is taken that keeps x_F within its bounds and the signs of y at bounds; what blocks it changes sides. Each change
+    of F updates the inverse of A_FF in O(n^2). Boxed bounds and equations are driven from either side. A positive semi-definite A needs
+    no care: whatever joins F leaves A_FF regular; where y_j cannot change and nothing blocks, no solution exists (INFEASIBLE).
+
+    A warm start begins with the rows of x0 that are violated. The last step solves A_FF x_F = -(b + A x_bound)_F afresh. A step is a block
+    of pivots; `linear_iterations` counts pivots.
+
+    Args:
+        pivots_per_step: pivots in a step of the solve loop, which checks, records and counts steps; max(2, n / 8) if None.
+
+    Raises:
+        ValueError: pivots_per_step < 1.
+    """
+
+    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
+    needs: ClassVar[str] = "symmetric, positive semi-definite, n <= 4096"
+    most_unknowns: ClassVar[int] = 4096  # three dense n x n float64 arrays of 134 MB each
+
+    pivots_per_step: int | None = None
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        if self.pivots_per_step is not None and self.pivots_per_step < 1:
+            raise ValueError(f"pivots_per_step = {self.pivots_per_step}: must be >= 1")
+
+    def init(self, problem: LCP) -> PivotingWorkspace:
+        """Return a workspace.
+
+        Raises:
+            ValueError: A is too large, not symmetric or not positive semi-definite.
+        """
+        check_size(problem, "IncrementalPivoting", self.most_unknowns)
+        if not problem.A.symmetric:
+            raise ValueError("A is not symmetric: IncrementalPivoting needs it to be; Lemke does not")
+        A = assemble(problem, np.flatnonzero(problem.unknown.numpy() == 1))
+        shift = DEFINITE * np.abs(np.diag(A)).max()
+        try:
+            scipy.linalg.cholesky(A + max(shift, EPS) * np.eye(len(A)), overwrite_a=True, check_finite=False)
+        except np.linalg.LinAlgError:
+            raise ValueError("A is not positive semi-definite: IncrementalPivoting needs it to be; Lemke does not") from None
+        return PivotingWorkspace(problem)
+
+    def step(self, problem: LCP, work: PivotingWorkspace, x: wp.array[Any]) -> Step:
+        """Make a block of pivots."""
+        done = work.pivot(pivots_of(self.pivots_per_step, len(work.data.b)))
+        return work.result("pivots", done, work.held)
+
+
+class PivotingWorkspace(DenseWorkspace):
+    """The sets and the row that is being driven."""
+
+    def start(self, *, warm: bool, tolerance: float) -> None:
+        """Begin with no row held."""
+        super().start(warm=warm, tolerance=tolerance)
+        n = len(self.data.b)
+        self.values = np.clip(self.read_iterate(), self.data.lower, self.data.upper)
+        self.kind = np.zeros(n, dtype=np.int8)
+        self.inverse = PrincipalInverse(self.data.A)
+        self.driven, self.sign, self.idle, self.restarts = -1, 0.0, 0, 0
+        self.magnitude = np.abs(self.data.A)
+        self.y = self.data.affine(self.values)
+
+    @property
+    def held(self) -> int:
+        """Unknowns held at a bound."""
+        return int(np.count_nonzero(self.kind >= LOW))
+
+    def pivot(self, count: int) -> int:
+        """Make at most `count` pivots; returns how many were made."""
+        done = 0
+        while done < count and self.ended is None:
+            if self.driven < 0 and not self._choose():
+                self._finish()
+                continue
+            self._advance()
+            done += 1
+        self.write_iterate(self.values)
+        return done
+
+    def _violation(self) -> np.ndarray:
+        """Return |y| of the rows that do not hold, 0 of the others, whatever their kind."""
+        x, y, data = self.values, self.y, self.data
+        wrong = np.where(y < 0, x < data.upper, x > data.lower)
+        noise = 8 * EPS * (self.magnitude @ np.abs(x) + np.abs(data.b))
+        return np.where(wrong & (np.abs(y) > noise), np.abs(y), 0.0)
+
+    def _choose(self) -> bool:
+        """Take the worst open row as the one to drive; False if all hold."""
+        self._correct()
+        violation = np.where(self.kind == OPEN, self._violation(), 0.0)
+        j = int(violation.argmax())
+        if violation[j] == 0:
+            return False
+        self.driven, self.sign, self.idle = j, 1.0 if self.y[j] < 0 else -1.0, 0
+        return True
+
+    def _correct(self) -> None:
+        """Compute y afresh and let a Newton step on F take out what rounding has left of y_F."""
+        F, data = self.inverse.members, self.data
+        if len(F):
+            self.y = data.affine(self.values)
+            x = self.values[F] - self.inverse.solve(self.y[F])
+            self.values[F] = np.clip(x, data.lower[F], data.upper[F])
+        self.y = data.affine(self.values)
+        self.y[F] = 0.0
+
+    def _advance(self) -> None:
+        """Move along the direction of the driven row to the first thing that blocks, and let that change sides."""
+        j, F, data = self.driven, self.inverse.members, self.data
+        dx = np.zeros(len(data.b))
+        dx[F] = -self.sign * self.inverse.solve(data.A[F, j])
+        dx[j] = self.sign
+        dy = data.A @ dx
+        dy[F] = 0.0
+        noise = ZERO * (self.magnitude @ np.abs(dx))
+        rate = self.sign * dy[j]
+        if rate < -1e3 * noise[j]:
+            self.ended = SolveStatus.NON_DESCENT  # negative curvature: A, changed since init, is not positive semi-definite
+            return
+        steps = self._steps(dx, dy, noise)
+        length = steps.min()
+        if not np.isfinite(length):
+            self.ended = SolveStatus.INFEASIBLE
+            return
+        self.idle = self.idle + 1 if length <= EPS * np.abs(self.values).max() else 0
+        ties = np.flatnonzero(steps <= length * (1 + 4 * EPS))
+        strength = np.where(self.kind[ties] == FREE, np.abs(dx[ties]), np.abs(dy[ties]))
+        # the strongest of equals is the most accurate pivot; after many steps of length 0 the least index ends a cycle (Bland)
+        q = int(ties[strength.argmax()] if self.idle < len(steps) else ties[0])
+        self.values += length * dx
+        self.y += length * dy
+        self.y[F] = 0.0
+        self._exchange(q, dx[q])
+
+    def _steps(self, dx: np.ndarray, dy: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Return how far each row lets the driven one go ([Book] eqs. 2.26-2.27)."""
+        x, y, kind, data, j = self.values, self.y, self.kind, self.data, self.driven
+        steps = np.full(len(x), np.inf)
+        free = (kind == FREE) & (np.abs(dx) > ZERO * np.abs(dx).max())
+        free[j] = True
+        room = np.where(dx > 0, data.upper - x, x - data.lower)
+        steps[free] = np.maximum(room[free], 0.0) / np.abs(dx[free])
+        leaving = ((kind == LOW) & (dy < -noise)) | ((kind == HIGH) & (dy > noise))
+        leaving &= data.lower < data.upper
+        slack = np.where(kind == LOW, y, -y)
+        steps[leaving] = np.maximum(slack[leaving], 0.0) / np.abs(dy[leaving])
+        to_zero = abs(y[j]) / abs(dy[j]) if self.sign * dy[j] > noise[j] else np.inf
+        self._vanishes = to_zero <= steps[j]  # y_j reaches 0 before x_j reaches its bound
+        steps[j] = min(steps[j], to_zero)
+        return steps
+
+    def _exchange(self, q: int, rate: float) -> None:
+        """Let the blocking row change sides."""
+        x, data = self.values, self.data
+        if q == self.driven:
+            self.driven = -1
+            if self._vanishes:
+                self._set_free(q)
+                return
+        elif self.kind[q] != FREE:
+            self._set_free(q)
+            return
+        else:
+            self.inverse.remove(q)
+        upward = rate > 0
+        self.kind[q] = HIGH if upward else LOW
+        x[q] = data.upper[q] if upward else data.lower[q]
+
+    def _set_free(self, q: int) -> None:
+        self.kind[q], self.y[q] = FREE, 0.0
+        self.inverse.insert(q)
+
+    def _finish(self) -> None:
+        """Solve for x_F afresh; rows that rounding has undone are open again, a few times."""
+        if len(self.inverse.members):
+            self.inverse.refresh()
+        self._correct()
+        self._correct()
+        self.y = self.data.affine(self.values)
+        violation = self._violation()
+        undone = (self.kind >= LOW) & (violation > 0)
+        if undone.any() and self.restarts < RESTARTS:
+            self.restarts += 1
+            self.kind[undone] = OPEN
+            return
+        self.ended = SolveStatus.STAGNATED

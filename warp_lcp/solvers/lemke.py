@@ -1,0 +1,280 @@
+"""Lemke's complementary pivoting: any dense matrix, the oracle of the other methods."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+import warp as wp
+
+from warp_lcp.problem import LCP
+from warp_lcp.result import SolveStatus
+from warp_lcp.solve import Step
+from warp_lcp.solvers.dense_problem import DenseWorkspace, check_size, pivots_of
+from warp_lcp.solvers.lemke_form import LemkeForm
+
+EPS = float(np.finfo(np.float64).eps)
+PIVOT = 1e-10  # entries of the entering column below this part of its largest are no pivots (methods.md: 200 of 200 with it)
+TIE = 1e-12  # relative difference of ratios that counts as a tie, which the lexicographic rule breaks
+NOISE = 1e-6  # residual, relative to that of clip(0, l, u), beyond which an end of the path is no solution
+PERIOD = 20  # pivots after which the inverse of the basis is computed afresh; its columns are refined in between
+ACCEPTED = 1e-9  # relative error of the entering column after refinement with which the inverse stays in use
+SEMIDEFINITE = 1e-10  # shift, in units of the largest entry, with which a semi-definite symmetric part must have a Cholesky factor
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lemke:
+    """Solve a dense problem by Lemke's method with the lexicographic rule ([Book] 2.1, appendix C; LCP of w - M z - d z0 = q).
+
+    z0 and the covering vector d > 0 make the start feasible; complements enter until z0 leaves. It processes every problem with a
+    copositive-plus matrix, positive semi-definite ones among them, symmetric or not, and every P-matrix; for others it may end in a ray.
+    A ray is believed only when further covering vectors, random in [.5, 1.5], end in one too; the status is then INFEASIBLE if the
+    symmetric part of A is positive semi-definite, or if a linear program shows that no x meets the inequalities; STAGNATED if neither is
+    known.
+
+    Boxes add a pair of variables, equations are eliminated or, where their block is singular, split (see LemkeForm). x0 is not used. A
+    pivot costs O(m^2), m <= 2n. A step is a block of pivots; `linear_iterations` counts pivots.
+
+    Args:
+        pivots_per_step: pivots in a step of the solve loop, which checks, records and counts steps; max(2, n / 8) if None.
+        covering_vectors: random covering vectors tried after a ray, >= 1.
+
+    Raises:
+        ValueError: an argument is outside its range.
+    """
+
+    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
+    needs: ClassVar[str] = "n <= 4096; sure of an end for copositive-plus and P-matrices"
+    most_unknowns: ClassVar[int] = 4096  # the basis and its inverse take 134 MB each, four times that with boxes everywhere
+
+    pivots_per_step: int | None = None
+    covering_vectors: int = 3
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        if self.pivots_per_step is not None and self.pivots_per_step < 1:
+            raise ValueError(f"pivots_per_step = {self.pivots_per_step}: must be >= 1")
+        if self.covering_vectors < 1:
+            raise ValueError(f"covering_vectors = {self.covering_vectors}: must be >= 1")
+
+    def init(self, problem: LCP) -> LemkeWorkspace:
+        """Return a workspace.
+
+        Raises:
+            ValueError: A is too large.
+        """
+        check_size(problem, "Lemke", self.most_unknowns)
+        return LemkeWorkspace(problem, self.covering_vectors)
+
+    def step(self, problem: LCP, work: LemkeWorkspace, x: wp.array[Any]) -> Step:
+        """Make a block of pivots."""
+        done = work.pivot(pivots_of(self.pivots_per_step, len(work.data.b)))
+        return work.result("pivots", done, work.held)
+
+
+class Basis:
+    """A complementary basis of w - M z - d z0 = q but for z0's pair, and its inverse.
+
+    Variables are numbered w: 0 ... m-1, z: m ... 2m-1, z0: 2m.
+
+    Args:
+        M: shape (m, m).
+        q: shape (m,).
+        d: covering vector > 0, shape (m,).
+    """
+
+    def __init__(self, M: np.ndarray, q: np.ndarray, d: np.ndarray) -> None:
+        m = len(q)
+        self.M, self.q, self.d, self.m = M, q, d, m
+        self.variables = np.arange(m)
+        self.matrix: np.ndarray = np.eye(m)
+        self.inverse: np.ndarray = np.eye(m)
+        self._scratch = np.empty((m, m))
+        self.values, self.age = q.copy(), 0
+        # the lexicographic minimum of (q_i, e_i) / d_i leaves: of equal ratios the last, whose row has the later 1
+        ratios = q / d
+        self.row = int(np.flatnonzero(ratios <= ratios.min() + TIE * abs(ratios.min()))[-1])
+        self.entering = 2 * m
+
+    def pivot(self) -> bool | None:
+        """Let the entering variable in; True when z0 has left, False on a ray, None to go on."""
+        first = self.entering == 2 * self.m
+        direction = self._direction()
+        if not first:
+            row = self._leaving(direction)
+            if row is None:
+                return False
+            self.row = row
+        leaving = int(self.variables[self.row])
+        self._replace(direction)
+        if leaving == 2 * self.m:
+            return True
+        self.entering = leaving + self.m if leaving < self.m else leaving - self.m
+        return None
+
+    def z(self) -> np.ndarray:
+        """Return z of the basis, shape (m,)."""
+        values = np.zeros(2 * self.m + 1)
+        values[self.variables] = np.maximum(self.values, 0.0)
+        return values[self.m : 2 * self.m]
+
+    def refresh(self) -> None:
+        """Compute the inverse afresh, O(m^3)."""
+        self.age = 0
+        try:
+            self.inverse = np.linalg.inv(self.matrix)
+        except np.linalg.LinAlgError:
+            self.inverse = np.linalg.pinv(self.matrix)
+        self.values = self._solve(self.q)
+
+    def _column(self) -> np.ndarray:
+        """Return the entering variable's column."""
+        if self.entering == 2 * self.m:
+            return -self.d
+        column = np.zeros(self.m)
+        if self.entering < self.m:
+            column[self.entering] = 1.0
+            return column
+        return -self.M[:, self.entering - self.m]
+
+    def _solve(self, r: np.ndarray) -> np.ndarray:
+        z = self.inverse @ r
+        return z + self.inverse @ (r - self.matrix @ z)
+
+    def _direction(self) -> np.ndarray:
+        column = self._column()
+        direction = self._solve(column)
+        if self.age >= PERIOD or np.abs(self.matrix @ direction - column).max() > ACCEPTED * np.abs(column).max():
+            self.refresh()
+            direction = self._solve(column)
+        return direction
+
+    def _leaving(self, direction: np.ndarray) -> int | None:
+        """Return the row of the lexicographic minimum ratio; z0 leaves whenever it may; None on a ray."""
+        rows = np.flatnonzero(direction > PIVOT * np.abs(direction).max())
+        if not len(rows):
+            return None
+        ratios = np.maximum(self.values[rows], 0.0) / direction[rows]
+        rows = rows[ratios <= ratios.min() + TIE * max(ratios.min(), np.abs(self.q).max())]
+        if (self.variables[rows] == 2 * self.m).any():
+            return int(rows[self.variables[rows] == 2 * self.m][0])
+        for column in range(self.m):
+            if len(rows) == 1:
+                break
+            ratios = self.inverse[rows, column] / direction[rows]
+            rows = rows[ratios <= ratios.min() + TIE * np.abs(ratios).max()]
+        return int(rows[direction[rows].argmax()])
+
+    def _replace(self, direction: np.ndarray) -> None:
+        """Put the entering column into the leaving row's place."""
+        row, others = self.row, direction.copy()
+        self.matrix[:, row] = self._column()
+        self.inverse[row] /= direction[row]
+        others[row] = 0.0
+        np.multiply(others[:, None], self.inverse[row], out=self._scratch)
+        self.inverse -= self._scratch
+        self.variables[row] = self.entering
+        self.age += 1
+        self.values = self._solve(self.q)
+
+
+class LemkeWorkspace(DenseWorkspace):
+    """The basis, the covering vectors tried and what they showed."""
+
+    def __init__(self, problem: LCP, covering_vectors: int) -> None:
+        super().__init__(problem)
+        self.covering_vectors, self.rays = covering_vectors, 0
+
+    def start(self, *, warm: bool, tolerance: float) -> None:
+        """Begin at z = 0 with the covering vector of ones."""
+        super().start(warm=warm, tolerance=tolerance)
+        self.form = LemkeForm.of(self.data)
+        self.rays, self._random = 0, np.random.default_rng(5381)
+        m = len(self.form.q)
+        self._sizes = (float(np.abs(self.form.M).max(initial=0.0)) or 1.0, float(np.abs(self.form.q).max(initial=0.0)) or 1.0)
+        self._cover(np.ones(m))
+
+    @property
+    def held(self) -> int:
+        """Unknowns at a bound."""
+        x = self.read_iterate()
+        return int(np.count_nonzero((x <= self.data.lower) | (x >= self.data.upper)))
+
+    def pivot(self, count: int) -> int:
+        """Make at most `count` pivots; returns how many were made."""
+        done = 0
+        if self.basis is None:
+            self._finish(np.zeros(len(self.form.q)))
+            return 0
+        while done < count and self.ended is None:
+            outcome = self.basis.pivot()
+            done += outcome is not False
+            if outcome is True:
+                self.basis.refresh()
+                self._finish(self._scaled())
+            elif outcome is False:
+                self._ray()
+        if self.ended is None:
+            self.write_iterate(self.form.solution(self._scaled()))
+        return done
+
+    def _scaled(self) -> np.ndarray:
+        assert self.basis is not None
+        return self.basis.z() * (self._sizes[1] / self._sizes[0])
+
+    def _cover(self, d: np.ndarray) -> None:
+        """Start with a covering vector, M and q scaled to 1; no basis is needed where z = 0 is the solution."""
+        M, q = self.form.M / self._sizes[0], self.form.q / self._sizes[1]
+        self.basis = Basis(M, q, d) if (q < 0).any() else None
+
+    def _finish(self, z: np.ndarray) -> None:
+        """Write the solution, after y = 0 is solved for afresh between the bounds; one that is none is a ray, from a pivot that was noise."""
+        data = self.data
+        x = np.clip(self.form.solution(z), data.lower, data.upper)
+        best = min((x, self._polished(x)), key=self._error)
+        if self.basis is not None and not self._error(best) <= NOISE * self._error(np.clip(0.0, data.lower, data.upper)):
+            self._ray()
+            return
+        self.write_iterate(best)
+        self.ended = SolveStatus.STAGNATED
+
+    def _polished(self, x: np.ndarray) -> np.ndarray:
+        data, out = self.data, x.copy()
+        size = EPS * max(float(np.abs(x).max(initial=0.0)), EPS)
+        free = np.flatnonzero((x - data.lower > 16 * size) & (data.upper - x > 16 * size))
+        block = data.A[np.ix_(free, free)]
+        try:
+            for _ in range(2):
+                out[free] -= np.linalg.solve(block, data.affine(out)[free])
+        except np.linalg.LinAlgError:
+            return x
+        if not np.isfinite(out).all():
+            return x
+        return np.clip(out, data.lower, data.upper)
+
+    def _error(self, x: np.ndarray) -> float:
+        data = self.data
+        d = np.abs(np.diag(data.A))
+        d = np.where(d == 0, 1.0, d)
+        return float(np.linalg.norm(d * (x - np.clip(x - data.affine(x) / d, data.lower, data.upper))))
+
+    def _ray(self) -> None:
+        """Try another covering vector, or say what the rays mean."""
+        if self.rays < self.covering_vectors:
+            self.rays += 1
+            self._cover(self._random.uniform(0.5, 1.5, len(self.form.q)))
+            return
+        self.ended = SolveStatus.INFEASIBLE if self._has_none() else SolveStatus.STAGNATED
+
+    def _has_none(self) -> bool:
+        """Return whether a ray proves that there is no solution: M positive semi-definite, or no z >= 0 with M z + q >= 0."""
+        M, q = self.form.M / self._sizes[0], self.form.q / self._sizes[1]
+        try:
+            scipy.linalg.cholesky((M + M.T) / 2 + SEMIDEFINITE * np.eye(len(q)), overwrite_a=True, check_finite=False)
+            return True
+        except np.linalg.LinAlgError:
+            found = scipy.optimize.linprog(np.zeros(len(q)), A_ub=-M, b_ub=q, method="highs")
+            return bool(found.status == 2)  # HiGHS: infeasible

@@ -1,0 +1,76 @@
+"""Boxed problems as the LCP of larger size that Lemke's method pivots in: 0 <= z, w = M z + q >= 0, z'w = 0."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from warp_lcp.solvers.dense_problem import DenseProblem
+
+REGULAR = 1e-10  # reciprocal condition number above which the equations' block is eliminated
+
+
+@dataclass(frozen=True)
+class LemkeForm:
+    """M, q and the affine map from z back to x ([Book] 1.2.2 and table 3.4 state the reformulations).
+
+    - l = u: x is known; its row asks nothing.
+    - a finite l: x = l + z; only u finite: x = u - z, and the row changes its sign.
+    - both finite: one more pair, s = u - l - z >= 0 with v >= 0 and y = w - v: M = [[A, I], [-I, 0]], positive semi-definite if A is.
+    - equations: x_E = -A_EE^-1 (b_E + A_EI x_I) is eliminated where A_EE is regular (M is then the Schur complement); otherwise x = x+ - x-
+      with M = [[A, -A], [-A, A]], positive semi-definite if A is.
+
+    Attributes:
+        M: shape (m, m).
+        q: shape (m,).
+        base: x at z = 0, shape (n,).
+        map: x = base + map z, shape (n, m).
+    """
+
+    M: np.ndarray
+    q: np.ndarray
+    base: np.ndarray
+    map: np.ndarray
+
+    @classmethod
+    def of(cls, data: DenseProblem) -> LemkeForm:
+        """Reformulate a boxed problem."""
+        A, lower, upper, n = data.A, data.lower, data.upper, len(data.b)
+        fixed = lower == upper
+        below, above = np.isfinite(lower) & ~fixed, np.isfinite(upper) & ~fixed
+        equations = np.flatnonzero(~below & ~above & ~fixed)
+        sided = np.flatnonzero(below | above)
+        base = np.where(np.isfinite(lower), lower, np.where(np.isfinite(upper), upper, 0.0))
+        sign = np.where(below, 1.0, -1.0)[sided]
+        # columns: what z does to x; the rows of y are combined likewise
+        columns = np.zeros((n, len(sided)))
+        columns[sided, np.arange(len(sided))] = sign
+        if len(equations):
+            block = A[np.ix_(equations, equations)]
+            if 1 / np.linalg.cond(block) > REGULAR:
+                base[equations] = 0.0
+                base[equations] = -np.linalg.solve(block, (A @ base + data.b)[equations])
+                columns[equations] = -np.linalg.solve(block, (A @ columns)[equations])
+                tests = columns[sided].T
+                M, q = tests @ (A @ columns)[sided], tests @ (A @ base + data.b)[sided]
+            else:
+                split = np.zeros((n, 2 * len(equations)))
+                split[np.r_[equations, equations], np.arange(2 * len(equations))] = np.repeat([1.0, -1.0], len(equations))
+                columns = np.hstack([columns, split])
+                M, q = columns.T @ A @ columns, columns.T @ (A @ base + data.b)
+        else:
+            M, q = columns.T @ A @ columns, columns.T @ (A @ base + data.b)
+        both = np.flatnonzero((below & above)[sided])
+        if len(both):
+            m, k = len(q), len(both)
+            pick = np.zeros((k, m))
+            pick[np.arange(k), both] = 1.0
+            M = np.block([[M, pick.T], [-pick, np.zeros((k, k))]])
+            q = np.r_[q, (upper - lower)[sided][both]]
+            columns = np.hstack([columns, np.zeros((n, k))])
+        return cls(M, q, base, columns)
+
+    def solution(self, z: np.ndarray) -> np.ndarray:
+        """Return x."""
+        return self.base + self.map @ z

@@ -1,0 +1,133 @@
+"""The quadratic program of a symmetric problem, solved by PIQP."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+import scipy.sparse.linalg
+import warp as wp
+
+from warp_lcp.problem import LCP
+from warp_lcp.result import SolveStatus
+from warp_lcp.solve import Step
+from warp_lcp.solvers.dense_problem import DenseProblem, DenseWorkspace, check_size, sparse_matrix
+
+try:
+    import piqp
+except ImportError:  # it comes with the extra `peers`
+    piqp = None
+
+SEMIDEFINITE = 1e-10  # shift, in units of the largest diagonal entry, with which a semi-definite matrix must factorize
+
+
+@dataclass(frozen=True, kw_only=True)
+class QuadraticProgram:
+    """Minimize x'Ax / 2 + b'x over l <= x <= u by PIQP, a proximal interior-point solver ([Book] 2.2.2, eq. 2.56; extra `peers`).
+
+    The minimizers are the solutions of the problem, because A is symmetric and positive semi-definite and the gradient is y = A x + b.
+    Sparse operators stay sparse; others are taken as dense matrices. x0 is not used; one step solves, and `linear_iterations` counts
+    PIQP's iterations, a factorization each. An objective that is unbounded below is INFEASIBLE: no x solves the problem.
+
+    Args:
+        tolerance: PIQP's absolute and relative tolerance, on the problem scaled to max |b| = 1; > 0. The loop's criteria are checked on
+            the natural residual whatever PIQP says.
+        max_iterations: the most iterations of PIQP, >= 1.
+
+    Raises:
+        ValueError: an argument is outside its range.
+    """
+
+    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
+    needs: ClassVar[str] = "symmetric, positive semi-definite, n <= 4096 unless sparse; the extra `peers`"
+    most_unknowns: ClassVar[int] = 4096  # a dense n x n float64 array of 134 MB, and its factor; sparse operators have no limit
+
+    tolerance: float = 1e-12
+    max_iterations: int = 250
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        if not self.tolerance > 0:
+            raise ValueError(f"tolerance = {self.tolerance}: must be > 0")
+        if self.max_iterations < 1:
+            raise ValueError(f"max_iterations = {self.max_iterations}: must be >= 1")
+
+    def init(self, problem: LCP) -> QuadraticProgramWorkspace:
+        """Return a workspace.
+
+        Raises:
+            ValueError: A is not symmetric, not positive semi-definite, or dense and too large.
+            ImportError: PIQP is not installed.
+        """
+        if piqp is None:
+            raise ImportError("QuadraticProgram needs PIQP: pip install 'warp-lcp[peers]' (or pip install piqp)")
+        if not problem.A.symmetric:
+            raise ValueError("A is not symmetric: QuadraticProgram needs it to be, y = A x + b is the gradient of no quadratic otherwise")
+        if sparse_matrix(problem) is None:
+            check_size(problem, "QuadraticProgram", self.most_unknowns)
+        work = QuadraticProgramWorkspace(problem)
+        work.check_definite()
+        return work
+
+    def step(self, problem: LCP, work: QuadraticProgramWorkspace, x: wp.array[Any]) -> Step:
+        """Solve the quadratic program."""
+        iterations = work.minimize(self.tolerance, self.max_iterations)
+        values = work.read_iterate()
+        held = (values <= work.data.lower) | (values >= work.data.upper)
+        return work.result("quadratic program", iterations, int(np.count_nonzero(held)))
+
+
+class QuadraticProgramWorkspace(DenseWorkspace):
+    """The problem as PIQP takes it."""
+
+    def read(self) -> DenseProblem:
+        """Read the problem; a sparse A stays sparse."""
+        return DenseProblem.read(self.problem, keep_sparse=True)
+
+    def check_definite(self) -> None:
+        """Factorize A, slightly shifted.
+
+        Raises:
+            ValueError: A is not positive semi-definite.
+        """
+        A = self.read().A
+        shift = max(SEMIDEFINITE * float(np.abs(A.diagonal()).max()), float(np.finfo(np.float64).tiny))
+        if scipy.sparse.issparse(A):
+            shifted = (A + shift * scipy.sparse.eye_array(A.shape[0])).tocsc()
+            settings = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
+            try:  # without row exchanges the signs of U's diagonal are A's inertia
+                definite = bool((scipy.sparse.linalg.splu(shifted, **settings).U.diagonal() > 0).all())
+            except RuntimeError:
+                definite = False
+        else:
+            try:
+                scipy.linalg.cholesky(A + shift * np.eye(len(A)), overwrite_a=True, check_finite=False)
+                definite = True
+            except np.linalg.LinAlgError:
+                definite = False
+        if not definite:
+            raise ValueError("A is not positive semi-definite: QuadraticProgram needs a convex objective; Lemke does not")
+
+    def minimize(self, tolerance: float, max_iterations: int) -> int:
+        """Run PIQP; returns its iterations."""
+        data = self.data
+        scale = float(np.abs(data.b).max()) or 1.0
+        sparse = scipy.sparse.issparse(data.A)
+        solver = piqp.SparseSolver() if sparse else piqp.DenseSolver()
+        solver.settings.eps_abs = solver.settings.eps_rel = tolerance
+        solver.settings.eps_duality_gap_abs = solver.settings.eps_duality_gap_rel = tolerance**1.1  # bounds hold to its root
+        solver.settings.max_iter = max_iterations
+        A = scipy.sparse.csc_matrix(data.A) if sparse else np.asfortranarray(data.A)
+        solver.setup(A, data.b / scale, x_l=data.lower / scale, x_u=data.upper / scale)
+        status = solver.solve()
+        x = np.asarray(solver.result.x) * scale
+        if status == piqp.PIQP_DUAL_INFEASIBLE:
+            self.ended = SolveStatus.INFEASIBLE
+            return int(solver.result.info.iter)
+        if np.isfinite(x).all():
+            self.write_iterate(x)
+        self.ended = SolveStatus.MAX_ITERATIONS if status == piqp.PIQP_MAX_ITER_REACHED else SolveStatus.STAGNATED
+        return int(solver.result.info.iter)
