@@ -140,6 +140,9 @@ def _hear(scene: Splash, device: str) -> tuple[dict[str, Launch], Launch]:
     kinds: dict[str, Launch] = {}
     for launch in [*heard, new[0]]:
         kinds.setdefault(launch.name, launch)
+    for launch in kinds.values():
+        if "changed" in launch.arrays:  # rows that are made again: all of them
+            launch.arrays["changed"].fill_(1)
     return kinds, kinds[new[0].name]
 
 

@@ -29,7 +29,7 @@ class Boundary(Protocol):
         open: float32 open fraction a_f of each component's lower faces; empty: a face is closed where a cell beside it is SOLID.
         velocity: float32 velocity of the solids on each component's faces [m/s]; empty: they stand still.
         capacity: float32 share of a cell's quadratic kernel that is open.
-        distance: float32 distance to the walls at the cells' low corners [cells]; None: whole cells, no distance.
+        distance: float32 distance to the solids at the cells' low corners [cells]; None: whole cells, no distance.
     """
 
     moves: bool  # whether a solid moves

@@ -75,7 +75,7 @@ class CutBoundary:
             self._find_walls()
 
     def admits(self, points: np.ndarray) -> np.ndarray:
-        """Tell which points [m], shape (n, 3), keep the distance that particles keep from walls."""
+        """Tell which points [m] of the domain, shape (n, 3), keep the distance that particles keep from walls."""
         coordinates = self.grid.to_grid(points)
         if self.grid.dimension == 2:
             coordinates[:, 2] = 1.0
@@ -89,7 +89,9 @@ class CutBoundary:
             for c in (k, k + 1)
         ]
         between = planes[0] if self.grid.dimension == 2 else (1 - z) * planes[0] + z * planes[1]
-        return np.asarray(between >= MARGIN)
+        axes = slice(self.grid.dimension)
+        side = np.minimum(coordinates - 1.0, np.array(self.grid.counts) + 1.0 - coordinates)[:, axes].min(axis=1)
+        return np.asarray(np.minimum(between, side) >= MARGIN)
 
     def _find_walls(self) -> None:
         self.touch.zero_()

@@ -2,8 +2,9 @@
 
 The order is that of `fluids.wall`, for the same reasons. 1. One layer is extrapolated from the projected faces. 2. Open faces between AIR
 cells that particles gave weight keep their own velocity. 3. Further layers are extrapolated from both; closed faces have taken part and
-carry the liquid's velocity. 4. With n the gradient of the distance at a closed face's center, u the velocity there and u_s the wall's,
-w = n.(u - u_s) is the relative normal velocity. Where the wall holds the liquid the face loses w n, of either sign, so that a moving
+carry the liquid's velocity. 4. With n the gradient of the distance to the wall that closes a face, at the face's center, u the velocity
+there and u_s the wall's, w = n.(u - u_s) is the relative normal velocity. (Beside two walls the gradient of the smaller distance is
+between their normals: taken with one wall's u_s it would turn the velocity of a piston upwards from the floor that it slides on.) Where the wall holds the liquid the face loses w n, of either sign, so that a moving
 wall drags its liquid along; released cells and AIR lose it only where w < 0, so that the last particles can leave. 5. Faces of the ring
 beside the domain's walls follow the faces next to them, so that tangential flow is not slowed by a wall.
 
@@ -63,7 +64,8 @@ CONSTRAIN_ROW = """
     const signed char* marks[3] = {(const signed char*)ku_.data, (const signed char*)kv_.data, (const signed char*)kw_.data};
     const short* wall[3] = {(const short*)au_.data, (const short*)av_.data, (const short*)aw_.data};
     const float* moving[3] = {su_.data, sv_.data, sw_.data};
-    const float* distance = distance_.data; float* result = result_.data;
+    const float* distance = distance_.data; const float* next = next_.data; float* result = result_.data;
+    const short* owner = (const short*)owner_.data; const short* next_owner = (const short*)next_owner_.data;
     const signed char* kind = (const signed char*)kind_.data; const unsigned char* contact = (const unsigned char*)contact_.data;
     const unsigned char* separating = (const unsigned char*)separating_.data;
     const long long stride[3] = {1, s2, s1}; const int counts[3] = {nx, ny, nz};
@@ -101,24 +103,28 @@ CONSTRAIN_ROW = """
         if (known[e] <= 0) { result[here] = field[axis][here]; return; }
         result[here] = own;
         if (open[e] > 0) return;
+        const int number = wall[axis][e] > 0 ? wall[axis][e] : 0;
+        auto distance_to = [&](long long node) {  // that wall; of other nodes than its own, to the nearest
+            return owner && owner[node] != number && next_owner[node] == number ? next[node] : distance[node];
+        };
         // the distance at the face's nodes (b along the first tangential axis, c along the second), and its gradient at the center
         const int p = axis == 0 ? 1 : 0, q = axis == 2 ? 1 : 2, nodes = planes == 2 ? 2 : 1;
         const long long back = -stride[axis], ahead = at[axis] <= counts[axis] ? stride[axis] : 0;
         float s = 0, n[3] = {0, 0, 0};
         for (int c = 0; c < nodes; ++c) {
             for (int b = 0; b < 2; ++b) {
-                const float* a = distance + (e + b*stride[p] + c*stride[q]);
-                s += a[0];
-                n[axis] += (a[ahead] - a[back])/(ahead ? 2.0f : 1.0f);
-                n[p] += b ? 2*a[0] : -2*a[0];
-                n[q] += nodes == 1 ? 0.0f : (c ? 2*a[0] : -2*a[0]);
+                const long long a = e + b*stride[p] + c*stride[q]; const float d = distance_to(a);
+                s += distance[a];
+                n[axis] += (distance_to(a + ahead) - distance_to(a + back))/(ahead ? 2.0f : 1.0f);
+                n[p] += b ? 2*d : -2*d;
+                n[q] += nodes == 1 ? 0.0f : (c ? 2*d : -2*d);
             }
         }
+        if (number == 0) { n[0] = 0; n[1] = 0; n[2] = 0; n[axis] = (at[axis] == 1 ? 2.0f : -2.0f)*(float)nodes; }  // the domain's wall
         const float share = 0.5f/(float)nodes, size = share*sqrt(n[0]*n[0] + n[1]*n[1] + n[2]*n[2]);
         s *= share;
         if (s < -DEPTHf || !(size > 0.1f)) return;  // within a thin plate the normal means nothing
         for (int d = 0; d < 3; ++d) n[d] *= share/size;
-        const int number = wall[axis][e] > 0 ? wall[axis][e] : 0;
         float relative = n[axis]*(own - (moving[axis] ? moving[axis][e] : 0.0f)), center[3];
         for (int d = 0; d < 3; ++d) center[d] = (float)at[d] + (d == axis ? 0.0f : 0.5f);
         for (int d = 0; d <= planes; ++d) {
@@ -161,6 +167,7 @@ def constrain_row(  # noqa: D103
     contact_: wp.array3d(dtype=wp.uint8), known_: wp.array3d(dtype=wp.int8), open_: wp.array3d(dtype=wp.float32),
     au_: wp.array3d(dtype=wp.int16), av_: wp.array3d(dtype=wp.int16), aw_: wp.array3d(dtype=wp.int16), su_: wp.array3d(dtype=wp.float32),
     sv_: wp.array3d(dtype=wp.float32), sw_: wp.array3d(dtype=wp.float32), distance_: wp.array3d(dtype=wp.float32),
+    owner_: wp.array3d(dtype=wp.int16), next_: wp.array3d(dtype=wp.float32), next_owner_: wp.array3d(dtype=wp.int16),
     separating_: wp.array(dtype=wp.uint8), result_: wp.array3d(dtype=wp.float32), k: int, j: int, first: int, last: int,
 ): ...  # fmt: skip
 
@@ -192,7 +199,8 @@ def constrain_kernel(
     kind: wp.array3d(dtype=wp.int8), contact: wp.array3d(dtype=wp.uint8), known: wp.array3d(dtype=wp.int8),
     open: wp.array3d(dtype=wp.float32), wall_u: wp.array3d(dtype=wp.int16), wall_v: wp.array3d(dtype=wp.int16),
     wall_w: wp.array3d(dtype=wp.int16), moving_u: wp.array3d(dtype=wp.float32), moving_v: wp.array3d(dtype=wp.float32),
-    moving_w: wp.array3d(dtype=wp.float32), distance: wp.array3d(dtype=wp.float32), separating: wp.array(dtype=wp.uint8),
+    moving_w: wp.array3d(dtype=wp.float32), distance: wp.array3d(dtype=wp.float32), owner: wp.array3d(dtype=wp.int16),
+    next_near: wp.array3d(dtype=wp.float32), next_owner: wp.array3d(dtype=wp.int16), separating: wp.array(dtype=wp.uint8),
     result: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
     """Write what a component's closed faces become; old values alone are read, so that the order of faces does not matter."""
@@ -200,7 +208,7 @@ def constrain_kernel(
     first = cells.i + chunk * cells.grain
     constrain_row(
         axis, planes, u, v, w, ku, kv, kw, kind, contact, known, open, wall_u, wall_v, wall_w, moving_u, moving_v, moving_w, distance,
-        separating, result, cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end),
+        owner, next_near, next_owner, separating, result, cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end),
     )  # fmt: skip
 
 
@@ -237,7 +245,7 @@ def extend_velocity_cut(
         known: int8 of each component (updated): 1 on projected faces, 0 on others, -1 on those deep inside solids.
         kind: int8 of AIR, FLUID, SOLID.
         contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED.
-        cut: the walls: distance at nodes, open fractions, whose wall closes a face, and its velocity.
+        cut: the walls: distances at nodes, open fractions, whose wall closes a face, and its velocity.
         scratch: a float32 field for each component (written).
         layers: how far into air and walls, in faces.
     """
@@ -249,7 +257,7 @@ def extend_velocity_cut(
     pads = [None] * (3 - len(velocity))
     moving = [None] * 3 if cut.velocity is None else [*cut.velocity, *pads]
     fields = [*velocity, *pads, *known, *pads, kind, contact]
-    walls = [*cut.wall, *pads, *moving, cut.distance, cut.separating]
+    walls = [*cut.wall, *pads, *moving, cut.distance, *(cut.nearest or [None] * 3), cut.separating]
     for axis, (marks, fraction, result) in enumerate(zip(known, cut.open, scratch, strict=True)):
         window.launch(constrain_kernel, [axis, planes, *fields, marks, fraction, *walls, result])
     for axis, (field, marks, fraction, result) in enumerate(zip(velocity, known, cut.open, scratch, strict=True)):

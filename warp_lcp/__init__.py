@@ -2,7 +2,18 @@
 
 from importlib.metadata import PackageNotFoundError, version
 
-from warp_lcp.operators import AIR, FLUID, SOLID, DenseOperator, GridPoisson, Operator, SparseOperator
+from warp_lcp.affine_bounds import AffineBounds
+from warp_lcp.operators import (
+    AIR,
+    FLUID,
+    SOLID,
+    DenseOperator,
+    GridPoisson,
+    LowRankOperator,
+    Operator,
+    SparseOperator,
+    SumOperator,
+)
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import Record, SolveResult, SolveStatus
@@ -20,8 +31,10 @@ __all__ = [
     "FLUID",
     "LCP",
     "SOLID",
+    "AffineBounds",
     "DenseOperator",
     "GridPoisson",
+    "LowRankOperator",
     "MinimumMapNewton",
     "NaturalResidual",
     "Operator",
@@ -34,6 +47,7 @@ __all__ = [
     "SparseOperator",
     "Step",
     "StoppingCriteria",
+    "SumOperator",
     "default_method",
     "solve",
 ]

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.bounds_kernels import LOWER_IS_FINITE, UPPER_IS_FINITE, decode_kernel, encode_kernel
+from warp_lcp.affine_bounds import affine_fields
+from warp_lcp.bounds_kernels import LOWER_IS_FINITE, UPPER_IS_FINITE, decode_kernel, encode_kernel, encode_rows_kernel
 from warp_lcp.layout import Array, Layout
 from warp_lcp.native import Spans
 
@@ -23,10 +24,11 @@ class Bounds:
 
     Args:
         layout: of the problem's fields.
-        lower: a number or a field.
-        upper: a number or a field.
+        lower: a number or a field, or AffineBounds.
+        upper: likewise.
 
     Attributes:
+        affine: where bounds depend on x: what they are made of; `fields` then hold them at the x of the last `follow`.
         fields: stored float64 fields; empty where a number or the code counts.
         values: the numbers that count where there is no field; where bounds are coded, the value of the finite ones.
         code: stored uint8 field, bit 1 where the lower bound is finite, bit 2 where the upper one is; empty if bounds are not coded.
@@ -38,9 +40,13 @@ class Bounds:
         self._no_code = wp.empty(0, dtype=wp.uint8, device=self.device)
         self.fields, self.values, self.code = [self._none, self._none], list(INFINITE), self._no_code
         self._memory: wp.array[Any] | None = None
+        self.affine = affine_fields(layout, lower, upper)
+        if self.affine is not None:
+            self.fields, self.values, self.varying, self.in_place = list(self.affine.values), [0.0, 0.0], (True, True), False
+            return
         sides = (lower, upper)
         varies = [isinstance(v, wp.array) or np.ndim(v) > 0 for v in sides]
-        self.varying = tuple(varies)
+        self.varying = (varies[0], varies[1])
         self.in_place = any(varies[s] and layout.holds(sides[s], wp.float64) for s in (0, 1))
         for side in (0, 1):
             if not varies[side]:
@@ -67,6 +73,11 @@ class Bounds:
         if self.code.size:
             return [self._none, numbers[0], self._none, numbers[1], self.code]
         return [self.fields[0], numbers[0], self.fields[1], numbers[1], self.code]
+
+    def follow(self, x: wp.array[Any]) -> None:
+        """Evaluate bounds that depend on x at x (stored, float64)."""
+        if self.affine is not None:
+            self.affine.evaluate(x)
 
     def refresh(self) -> None:
         """Code fields again that the caller may have changed, where all their finite values are 0."""
@@ -102,16 +113,22 @@ class Bounds:
             if not self.layout.fits(host) or host.dtype.kind not in "fiu":
                 return False
             value = float(host.max() if side == 0 else host.min())
-            finite = host == value
-            if value == -INFINITE[side] or np.isnan(value):
+            if value == -INFINITE[side] or np.isnan(value) or not self._code_rows(side, host, value, code):
                 return False
-            if not np.isfinite(value):
-                finite[...] = False
-            elif np.count_nonzero(finite) + np.count_nonzero(host == INFINITE[side]) != host.size:
-                return False
-            inner = self.layout.target(code, host)
-            inner += finite.reshape(inner.shape).view(np.uint8) * np.uint8(BITS[side])
             values[side] = value
         self.values = values
         self.code = wp.array(code.ravel(), dtype=wp.uint8, device=self.device)
         return True
+
+    def _code_rows(self, side: int, host: np.ndarray, value: float, code: np.ndarray) -> bool:
+        """Add a side's bits to a code on the host; returns False if there are other finite values."""
+        target = self.layout.target(code, host)
+        target = target if target.ndim == 3 else target.reshape(1, 1, -1)
+        source = np.ascontiguousarray(host, dtype=np.float64).ravel()
+        first = target.__array_interface__["data"][0] - code.__array_interface__["data"][0]
+        others = np.zeros(target.shape[:2])
+        given, bits, out = (wp.array(a, device="cpu", copy=False) for a in (source, code.ravel(), others))
+        numbers = [wp.float64(value), wp.float64(INFINITE[side]), BITS[side]]
+        inputs = [given, *numbers, bits, first, *target.strides[:2], target.shape[2], out]
+        wp.launch(encode_rows_kernel, target.shape[:2], inputs, device="cpu")
+        return not others.any()

@@ -3,6 +3,7 @@
 
 import warp as wp
 
+from warp_lcp.native import simd
 from warp_lcp.vector_kernels import flat, span_end, span_start
 
 LOWER_IS_FINITE = wp.constant(1)
@@ -36,6 +37,30 @@ def encode_kernel(
     t = wp.tid()
     start = span_start(t, chunk)
     out[t] = encode_span(lower, lower_value, upper, upper_value, code, start, span_end(t, chunk, n), stride)
+
+
+@wp.func_native(
+    simd(
+        """const double* v = field_.data + row*n; unsigned char* code = code_.data + p; double other = 0;
+    SIMD for (long long k = 0; k < n; ++k) {
+        const bool a = v[k] == value, none = v[k] == infinite; other += a | none ? 0.0 : 1.0; code[k] += a & !none ? bit : 0; }
+    return other;"""
+    )
+)
+def encode_row(
+    field_: f64, row: wp.int64, value: wp.float64, infinite: wp.float64, bit: int, code_: u8, p: wp.int64, n: wp.int64
+) -> wp.float64: ...
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.bounds")
+def encode_rows_kernel(
+    field: f64, value: wp.float64, infinite: wp.float64, bit: int, code: u8, first: wp.int64, s1: wp.int64, s2: wp.int64, n: wp.int64,
+    out: wp.array2d(dtype=wp.float64),
+):  # fmt: skip
+    """The same for one side and a field without ghost cells, a row a thread; s1 and s2 are elements from plane to plane, row to row."""
+    k, j = wp.tid()
+    row = wp.int64(k) * wp.int64(out.shape[1]) + wp.int64(j)
+    out[k, j] = encode_row(field, row, value, infinite, bit, code, first + wp.int64(k) * s1 + wp.int64(j) * s2, n)
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.bounds")

@@ -20,9 +20,7 @@ def kernels(set_type: Any, real: Any) -> SimpleNamespace:
     @wp.func_native(flat("const auto* v = v_.data + at; const auto* x = x_.data; double s = 0; EACH { s += (double)v[i]*x[i]; } return s;"))
     def dot_span(v_: fields, at: wp.int64, x_: field, start: wp.int64, end: wp.int64, stride: wp.int64) -> wp.float64: ...
 
-    @wp.func_native(
-        flat(f"const auto* v = v_.data + at; auto* x = x_.data; const {T} c = ({T})factor; EACH {{ x[i] += c*({T})v[i]; }}")
-    )
+    @wp.func_native(flat(f"const auto* v = v_.data + at; auto* x = x_.data; const {T} c = ({T})factor; EACH {{ x[i] += c*({T})v[i]; }}"))
     def add_span(v_: fields, at: wp.int64, factor: wp.float64, x_: field, start: wp.int64, end: wp.int64, stride: wp.int64): ...
 
     @wp.func_native(flat("const auto* x = x_.data; double s = 0; EACH { s += (double)x[i]*x[i]; } return s;"))

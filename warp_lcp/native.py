@@ -29,7 +29,9 @@ def simd(source: str) -> str:
     """
     pragma = "\n#ifndef __CUDA_ARCH__\n#pragma clang loop vectorize(assume_safety) vectorize_width({}) interleave_count(1)\n#endif\n"
     head = "\n#ifndef __CUDA_ARCH__\n#pragma clang fp reassociate(on) contract(fast)\n#endif\n"
-    return head + source.replace("SIMD64 ", pragma.format(64)).replace("SIMD8 ", pragma.format(8)).replace("SIMD ", pragma.format(16)) + "\n"
+    for word, width in (("SIMD64 ", 64), ("SIMD8 ", 8), ("SIMD ", 16)):
+        source = source.replace(word, pragma.format(width))
+    return head + source + "\n"
 
 
 def fetch(begin: str, end: str, **pointers: int) -> str:

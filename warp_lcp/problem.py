@@ -46,8 +46,8 @@ class LCP:
     Args:
         A: an Operator, or a numpy array or scipy.sparse matrix of shape (n, n), which becomes one on b's device.
         b: field of A's shape, units of y.
-        lower: l, a number or a field; -inf where there is none.
-        upper: u, a number or a field; inf where there is none.
+        lower: l, a number or a field; -inf where there is none; or AffineBounds, which depend on x.
+        upper: u, a number or a field; inf where there is none; or AffineBounds.
 
     Raises:
         ValueError: a NaN, a wrong shape, l > u, l = inf, u = -inf, or no unknown; the message names the argument.

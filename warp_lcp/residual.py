@@ -44,6 +44,7 @@ class NaturalResidual:
     def evaluate(self, x: wp.array[Any]) -> float:
         """Compute y and return the norm of the natural residual at x (stored, float64)."""
         p = self.problem
+        p.bounds.follow(x)
         self.affine(x)
         before = [x, self.y, self.diagonal, self.unit, *p.bounds.operands, p.unknown]
         spans, partials = self._reduction.spans, self._reduction.partials
@@ -65,7 +66,9 @@ class NaturalResidual:
     def start(self, x: wp.array[Any], *, keep: bool) -> None:
         """Set x to clip(x, l, u), or to clip(0, l, u), and to 0 where there is no unknown."""
         p = self.problem
-        launch_spans(start_kernel, self._reduction.spans, [x, *p.bounds.operands, p.unknown, keep], [], p.device)
+        for _ in range(1 if p.bounds.affine is None else 2):  # bounds that depend on x: at x as it is, then at x within its bounds
+            p.bounds.follow(x)
+            launch_spans(start_kernel, self._reduction.spans, [x, *p.bounds.operands, p.unknown, keep], [], p.device)
         self.current = False
 
     def settle_isolated(self, x: wp.array[Any]) -> None:

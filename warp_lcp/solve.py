@@ -129,6 +129,8 @@ def solve(
     callback: Callable[[Record], None] | None = None,
 ) -> SolveResult:
     """Solve a problem by a method; what `wl.solve` documents, for callers that bring the method themselves."""
+    if problem.bounds.affine is not None and not getattr(solver, "affine_bounds", False):
+        raise ValueError(f"{type(solver).__name__} takes no bounds that are affine in x: take ProjectedSOR or another sweeping method")
     return _Loop(problem, solver, stopping or StoppingCriteria(), workspace or solver.init(problem), callback).run(x0)
 
 

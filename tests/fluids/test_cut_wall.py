@@ -109,6 +109,7 @@ class Slope:
             open=[wp.array(f, dtype=wp.float32, device="cpu") for f in self.open],
             wall=[wp.array(w, dtype=wp.int16, device="cpu") for w in self.wall],
             velocity=moving,
+            nearest=[],
             separating=wp.array(self.separating, dtype=wp.uint8, device="cpu"),
         )
 
@@ -216,7 +217,9 @@ def test_a_box_is_treated_as_one_of_whole_cells(counts: tuple[int, int, int], ra
     separating = wp.array([random_seed % 3 > 0], dtype=wp.uint8, device="cpu")
     x = points(grid, (0, 0, 0))
     sides = np.min([np.minimum(x[..., d], grid.counts[d] - x[..., d]) for d in range(grid.dimension)], axis=0)
-    cut = SimpleNamespace(distance=wp.array(sides.astype(np.float32), device="cpu"), open=[], wall=[], velocity=None, separating=separating)
+    cut = SimpleNamespace(
+        distance=wp.array(sides.astype(np.float32), device="cpu"), open=[], wall=[], velocity=None, nearest=[], separating=separating
+    )
     results = []
     start, weights, marks = [], [], []
     for axis in range(grid.dimension):

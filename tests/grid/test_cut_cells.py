@@ -368,11 +368,10 @@ def test_distance_is_exact_near_walls_and_large_elsewhere(dimension):
     z, y, x = np.meshgrid(*axes, indexing="ij")
     nodes = np.stack([x, y, z], axis=-1)[..., :dimension]
     exact = np.linalg.norm(nodes - center / 0.05, axis=-1) - 0.33 / 0.05
-    walls = np.minimum(nodes, np.array(grid.counts[:dimension]) - nodes).min(axis=-1)
     used = slice(None) if dimension == 3 else slice(1, 2)
-    computed, exact, walls = cut.distance.numpy()[used], exact[used], walls[used]
-    near = np.minimum(exact, walls) < FAR
-    np.testing.assert_allclose(computed[near], np.minimum(exact, walls)[near], atol=1e-4)
+    computed, exact = cut.distance.numpy()[used], exact[used]
+    near = exact < FAR
+    np.testing.assert_allclose(computed[near], exact[near], atol=1e-4)
     assert (computed[~near] >= FAR).all()
 
 
@@ -543,7 +542,7 @@ def test_an_empty_domain():
     assert cut.names == ("domain",)
     assert cut.notes == ()
     np.testing.assert_array_equal(cut.open[0].numpy()[1, 1:4, 2:5], 1.0)
-    np.testing.assert_array_equal(cut.distance.numpy()[1, 1:, 1:], np.minimum(*np.meshgrid([0, 1, 2, 1, 0], [0, 1, 1, 0])))
+    assert (cut.distance.numpy() >= FAR).all()
     assert cut.separating.numpy().tolist() == [0]
 
 

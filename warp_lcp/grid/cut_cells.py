@@ -34,9 +34,9 @@ class CutCells:
         capacity: whether to keep the capacity.
 
     Attributes:
-        distance: float32 signed distance to the nearest wall, the domain's included, at nodes [cells], positive in the open. Distances to
-            solids are exact below `FAR` cells; others are at least that.
-        solid_distance: the same without the domain.
+        distance: float32 signed distance to the nearest solid at nodes [cells], positive in the open, exact below `FAR` cells; others are
+            at least that. Without the domain's walls: beside them linear interpolation would close what is open by less than a cell.
+        nearest: the solids' two nearest to each node, see `NodeDistances`: owner, next_near, next_owner; empty when no solid moves.
         open: float32 open fraction of each face, a list of one field a component: 0, or in [1e-3, 1]; 0 on the domain's faces and outside.
         wall: int16 number of the solid that closes a face, the nearest to its center: -1 on open faces, 0 on the domain's.
         base: int8, SOLID where all faces of a cell are closed, else AIR; the ring is SOLID.
@@ -58,7 +58,7 @@ class CutCells:
         self.moves = any(solid.motion is not None for solid in solids)
         self.names = ("domain", *(solid.name for solid in solids))
         self.separating = wp.array([wall_separating, *(solid.separating for solid in solids)], dtype=wp.uint8, device=grid.device)
-        self.distance, self.open, self.wall = grid.field(), grid.faces(), grid.faces(wp.int16)
+        self.open, self.wall = grid.faces(), grid.faces(wp.int16)
         self.base, self._state = grid.field(wp.int8), grid.field(wp.int8)
         self.capacity = grid.field() if capacity else None
         self.velocity = grid.faces() if self.moves else None
@@ -67,6 +67,8 @@ class CutCells:
         self._shift = wp.zeros(1 + len(solids), dtype=wp.vec3, device=grid.device)
         notes = self._solid_notes()
         self._sampler, self._nodes = NodeSampler(grid), NodeDistances(grid, second=len(solids) > 1)
+        self.distance = self._nodes.near
+        self.nearest = self._nodes.arrays[1:] if self.moves else []
         standing = [(number, solid.geometry) for number, solid in enumerate(solids, start=1) if solid.motion is None]
         for number, geometry in standing:
             self._sampler.enter(self._nodes, number, geometry)
@@ -85,7 +87,6 @@ class CutCells:
         dropped, partial = self._counts.numpy().tolist()
         self.whole_cells = partial == 0 and not self.moves
         self.notes = (*notes, *self._result_notes(dropped))
-        self.solid_distance = self._nodes.near
         if not self.moves:  # needed by `place` only
             del self._sampler, self._nodes, self._marks
 
@@ -141,8 +142,11 @@ class CutCells:
             return
         low, high = np.min([block[0] for block in near], axis=0), np.max([block[1] for block in near], axis=0)
         for axis, (field, open_, wall) in enumerate(zip(self.velocity, self.open, self.wall, strict=True)):
+            first = [max(int(node), 1) for node in low]
             last = [min(int(high[a]) - 1, count + (a == axis)) for a, count in enumerate(grid.counts)]
-            window = grid.window([max(int(first), 1) for first in low], last)
+            if any(a > b for a, b in zip(first, last, strict=True)):
+                continue  # only the ring is near
+            window = grid.window(first, last)
             inputs = [grid.planes, axis, grid.spacing, nodes.near, nodes.owner, open_, wall, self._turn, self._shift, field]
             window.launch(kernels.velocity_kernel, inputs)
         self._moved_from = self._moved_to
@@ -165,8 +169,7 @@ class CutCells:
     def _refresh(self) -> None:
         """Fill everything that follows from the distances."""
         grid, nodes = self.grid, self._nodes
-        planes, (nx, ny, nz) = grid.planes, grid.counts
-        grid.everywhere.launch(kernels.with_domain, [planes, nx, ny, nz, nodes.near, self.distance])
+        planes = grid.planes
         faces = [*self.open, *self.open[1:2]][:3]
         walls = [*self.wall, *self.wall[1:2]][:3]
         self._counts.zero_()

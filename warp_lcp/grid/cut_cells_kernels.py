@@ -19,21 +19,6 @@ _I16 = wp.array3d(dtype=wp.int16)
 _I8 = wp.array3d(dtype=wp.int8)
 
 
-@wp.kernel(**options)
-@typing.no_type_check
-def with_domain(cells: CellRange, planes: int, nx: int, ny: int, nz: int, near: _F32, distance: _F32):
-    """Take the smaller of the solids' and the domain's distance."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    across = wp.min(j - 1, ny + 1 - j)
-    if planes == 2:
-        across = wp.min(across, wp.min(k - 1, nz + 1 - k))
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        distance[k, j, i] = wp.min(near[k, j, i], float(wp.min(across, wp.min(i - 1, nx + 1 - i))))
-
-
 # The area {d > 0} of a face from its corners v, in order around it: that of the polygon whose vertices lie where d, linear along the edges,
 # is 0. Exact for planes.
 AREA = """

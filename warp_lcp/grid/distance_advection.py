@@ -6,7 +6,7 @@ near a wall or inside it is put back along the normal. On a plane that takes jus
 its part into the wall, and between two walls all but the part along their edge. A stride that would end on another side of a wall is
 halved, so that plates of more than a cell are not tunnelled at any speed.
 
-Positions are measured by the distance that is interpolated between nodes, which defines where walls are.
+Positions are measured by the distance that is interpolated between nodes, which defines where solids are, and by that to the domain's walls.
 """
 
 import warp as wp
@@ -30,8 +30,8 @@ def advect_with_distance(
     Args:
         grid: the grid.
         fields: velocity of each component on the faces [m/s].
-        distance: to walls, the domain's included, at the low corners of the cells, float32 in cells, > 0 in the open; in the stored
-            shape. In 2-D the plane k = 1 is used.
+        distance: to solids at the low corners of the cells, float32 in cells, > 0 in the open; in the stored shape. In 2-D the plane
+            k = 1 is used. The domain's walls need not be in it.
         dt: time step [s].
         position: [m], shape (n,) (updated).
         stopped: int32, shape (1,): raised by the number of particles that met a wall.
@@ -47,7 +47,7 @@ def push_out(grid: StaggeredGrid, distance: wp.array, position: wp.array, moved:
 
     Args:
         grid: the grid.
-        distance: to walls in cells, as for `advect_with_distance`.
+        distance: to solids in cells, as for `advect_with_distance`.
         position: [m], shape (n,) (updated): moved by at most PUSH cells.
         moved: int32, shape (1,): raised by the number of particles that were put outside.
         left: int32, shape (1,): raised by the number of those for which no way out was found; they stay where they were.

@@ -18,7 +18,8 @@ LEG = 0.25  # cells of such a search in one direction
 REACH = 1.0  # cells that a step may put a particle back: more than its stride and the diagonal of the walls' rounding
 PUSH = 3.0  # cells that a wall may push a particle in a step
 
-# The distance to walls and its gradient at grid coordinates in the domain, in cells.
+# The distance to walls and its gradient at grid coordinates in the domain, in cells: that of the solids, linear between nodes, or of the
+# domain. The smaller of both taken at the nodes would close what is open between a solid and the domain's wall next to it.
 DISTANCE = """
     const float* distance = distance_.data;
     const T aim = (T)AIM;
@@ -43,7 +44,12 @@ DISTANCE = """
             const T d1 = (b[s2] - a[s2]) + fx*((b[s2 + 1] - a[s2 + 1]) - (b[s2] - a[s2]));
             g[2] = d0 + fy*(d1 - d0);
         }
-        return low + fy*(high - low);
+        T least = low + fy*(high - low);
+        for (int d = 0; d <= planes; ++d) {
+            const T below = x[d] - (T)1, above = (T)(counts[d] + 1) - x[d], side = below < above ? below : above;
+            if (side < least) { least = side; g[0] = 0; g[1] = 0; g[2] = 0; g[d] = below < above ? (T)1 : (T)-1; }
+        }
+        return least;
     };
     auto measure_all = [&](const Block& at, T* result, int n) {
         const T ex = nx + 1, ey = ny + 1, ez = nz + 1;
@@ -58,7 +64,10 @@ DISTANCE = """
             const T a0 = a[0] + fx*(a[1] - a[0]), a1 = a[s2] + fx*(a[s2 + 1] - a[s2]);
             const T b0 = b[0] + fx*(b[1] - b[0]), b1 = b[s2] + fx*(b[s2 + 1] - b[s2]);
             const T low = a0 + fy*(a1 - a0), high = b0 + fy*(b1 - b0);
-            result[m] = low + fz*(high - low);
+            const T ax = x - 1 < ex - x ? x - 1 : ex - x, ay = y - 1 < ey - y ? y - 1 : ey - y;
+            const T az = planes == 2 ? (z - 1 < ez - z ? z - 1 : ez - z) : ax, s = low + fz*(high - low);
+            const T flat = ax < ay ? ax : ay, side = flat < az ? flat : az;
+            result[m] = s < side ? s : side;
         }
     };
     auto square = [](const T* g) { return g[0]*g[0] + g[1]*g[1] + g[2]*g[2]; };

@@ -30,7 +30,9 @@ class GMRES:
         weight: residuals are measured as ||weight^(1/2) r||, field like r >= 0; None: all 1.
     """
 
-    def __init__(self, product: LinearMap, preconditioner: Preconditioner, *, restart: int = 30, weight: wp.array[Any] | None = None) -> None:
+    def __init__(
+        self, product: LinearMap, preconditioner: Preconditioner, *, restart: int = 30, weight: wp.array[Any] | None = None
+    ) -> None:
         r = preconditioner.r
         self._product, self._preconditioner, self._restart = product, preconditioner, restart
         self.device, self.x = r.device, wp.zeros_like(r)
@@ -76,15 +78,20 @@ class GMRES:
         g[0] = norm
         for k in range(most):
             self._basis.take(k, self._preconditioner.r)
+            self._weigh(self._preconditioner.r, inverse=True)
             self._preconditioner.apply()
             self._product(self._preconditioner.z, self._q)
-            if self._weight.size:
-                launch_spans(self._kernels.weigh, self._spans, [self._weight, self._q], [], self.device)
+            self._weigh(self._q)
             H[: k + 2, k] = self._orthogonalize(k + 1)
             self._rotate(k)
             if not abs(g[k + 1]) > tolerance:  # also where it is no number
                 return k + 1
         return most
+
+    def _weigh(self, q: wp.array[Any], *, inverse: bool = False) -> None:
+        """Take a residual to the vectors of the basis, or back."""
+        if self._weight.size:
+            launch_spans(self._kernels.weigh, self._spans, [self._weight, inverse, q], [], self.device)
 
     def _orthogonalize(self, count: int) -> np.ndarray:
         """Take the first vectors out of `_q`, twice, and store the rest as the next one; return the column of H."""
@@ -109,7 +116,7 @@ class GMRES:
         g[k], g[k + 1] = c * g[k], -s * g[k]
 
     def _correct(self, columns: int) -> None:
-        """x += M V y with y from the triangle; columns that are singular to rounding count for nothing."""
+        """X += M V y with y from the triangle; columns that are singular to rounding count for nothing."""
         H, g = self._H[:columns, :columns], self._g
         y = np.zeros(self._restart + 1)
         largest = float(np.abs(np.diag(H)).max(initial=0.0))
@@ -120,5 +127,6 @@ class GMRES:
         r = self._preconditioner.r
         r.zero_()
         self._basis.add(self._factors, r, count=columns)
+        self._weigh(r, inverse=True)
         self._preconditioner.apply()
         launch_spans(self._kernels.increase, self._spans, [self._preconditioner.z, self.x], [], self.device)

@@ -23,8 +23,13 @@ def kernels(real: Any) -> SimpleNamespace:
     )
     def residual_span(b_: field, q_: field, w_: field, o_: field, start: wp.int64, end: wp.int64, stride: wp.int64): ...
 
-    @wp.func_native(flat("const auto* w = w_.data; auto* q = q_.data; EACH { q[i] *= sqrt(w[i]); }"))
-    def weigh_span(w_: field, q_: field, start: wp.int64, end: wp.int64, stride: wp.int64): ...
+    @wp.func_native(
+        flat(
+            """const auto* w = w_.data; auto* q = q_.data;
+        if (inverse) { EACH { q[i] = w[i] > 0 ? q[i]/sqrt(w[i]) : 0; } } else { EACH { q[i] *= sqrt(w[i]); } }"""
+        )
+    )
+    def weigh_span(w_: field, inverse: bool, q_: field, start: wp.int64, end: wp.int64, stride: wp.int64): ...
 
     @wp.func_native(flat("const auto* z = z_.data; auto* x = x_.data; EACH { x[i] += z[i]; }"))
     def increase_span(z_: field, x_: field, start: wp.int64, end: wp.int64, stride: wp.int64): ...
@@ -36,10 +41,10 @@ def kernels(real: Any) -> SimpleNamespace:
         residual_span(b, q, w, out, span_start(t, chunk), span_end(t, chunk, n), stride)
 
     @wp.kernel(enable_backward=False, module=name)
-    def weigh(w: field, q: field, n: int, chunk: int, stride: wp.int64):
-        """Q = w^(1/2) q."""
+    def weigh(w: field, inverse: bool, q: field, n: int, chunk: int, stride: wp.int64):
+        """Q = w^(1/2) q, or w^(-1/2) q."""
         t = wp.tid()
-        weigh_span(w, q, span_start(t, chunk), span_end(t, chunk, n), stride)
+        weigh_span(w, inverse, q, span_start(t, chunk), span_end(t, chunk, n), stride)
 
     @wp.kernel(enable_backward=False, module=name)
     def increase(z: field, x: field, n: int, chunk: int, stride: wp.int64):

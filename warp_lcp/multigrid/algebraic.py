@@ -27,6 +27,7 @@ from warp_lcp.program import Launch, Program
 from warp_lcp.vectors import launch_spans
 
 PINNED = {wp.float32: 3e-5, wp.float64: 1e-13}  # of a coarsest level's diagonal: what rounding leaves of a singular component's last pivot
+WIDEST = np.iinfo(np.uint16).max  # entries of a row whose places are known
 Matrix = scipy.sparse.csr_array
 
 
@@ -35,7 +36,8 @@ class AlgebraicSettings:
     """How the hierarchy is built and cycled.
 
     Args:
-        strength: entries below this share of sqrt(a_ii a_jj) do not aggregate; 0 takes all, as PyAMG does.
+        strength: entries below this share of sqrt(a_ii a_jj) do not aggregate. It must be above what rounding leaves of
+            entries that cancel.
         gamma: coarse cycles a level; 1 is a V-cycle.
         interval: bounds of the spectrum, in units of its l1 bound, that the two Chebyshev-Jacobi sweeps damp.
         coarsest_cpu: the most unknowns of the coarsest level, which is inverted densely.
@@ -44,7 +46,7 @@ class AlgebraicSettings:
         last_sweeps: pairs of sweeps on a coarsest level that is too large to invert.
     """
 
-    strength: float = 0.0
+    strength: float = 1e-3
     gamma: int = 1
     interval: tuple[float, float] = (0.25, 1.0)
     coarsest_cpu: int = 64
@@ -77,23 +79,33 @@ class DeviceProduct:
         left: A.
         right: B.
         out: where the product goes; its pattern holds that of A B.
+        hosts: the patterns of A, B and A B.
     """
 
-    def __init__(self, left: DeviceMatrix, right: DeviceMatrix, out: DeviceMatrix, host: tuple[Matrix, Matrix]) -> None:
-        A, B = host
+    def __init__(self, left: DeviceMatrix, right: DeviceMatrix, out: DeviceMatrix, hosts: tuple[Matrix, Matrix, Matrix]) -> None:
+        A, B, C = hosts
         ends = np.concatenate([[0], np.cumsum(np.diff(B.indptr).astype(np.int64)[A.indices])])
-        device = left.device
-        first = wp.array(ends[A.indptr], dtype=wp.int64, device=device)
-        place = wp.zeros(int(ends[-1]), dtype=wp.uint16, device=device)
-        self._spans = Spans.of(left.shape[0], device)
-        inputs = [left.indptr, left.indices, right.indptr, right.indices, out.indptr, out.indices, first, place]
-        launch_spans(places_kernel, self._spans, inputs, [], device)
+        place = wp.zeros(int(ends[-1]), dtype=wp.uint16, device="cpu")
+        patterns = [wp.array(v, dtype=wp.int32, device="cpu") for m in hosts for v in (m.indptr, m.indices)]
+        at = wp.zeros(C.shape[1], dtype=wp.int32, device="cpu")
+        wp.launch(places_kernel, 1, [*patterns, at, place, A.shape[0]], device="cpu")
+        self._spans = Spans.of(left.shape[0], left.device)
+        first, place = wp.array(ends[A.indptr], dtype=wp.int64, device=left.device), place.to(left.device)
         self._inputs = [*left.operands, right.indptr, right.values, out.indptr, first, place, out.values]
         self.nbytes = first.capacity + place.capacity
 
     def compute(self, kernel: Any, device: wp.Device, launch: Launch) -> None:
         """Launch the product."""
         launch_spans(kernel, self._spans, self._inputs, [], device, launch=launch)
+
+
+@dataclass(frozen=True)
+class Step:
+    """From one level to the next: prolongation P, R = P', and the pattern of A P, on the host."""
+
+    P: Matrix
+    R: Matrix
+    AP: Matrix
 
 
 class AlgebraicLevel:
@@ -107,18 +119,17 @@ class AlgebraicLevel:
         self.P: DeviceMatrix | None = None
         self.kernels = kernels(real)
 
-    def connect(self, host: Matrix, P: Matrix, coarse: AlgebraicLevel, coarse_host: Matrix, real: Any) -> None:
-        """Take the prolongation P from a coarser level; `host` and `coarse_host` are the patterns of both levels."""
-        device = self.device
-        R, turn = P.T.tocsr(), _numbered(P).T.tocsr().data
-        AP = _pattern_product(host, P)
+    def connect(self, host: Matrix, step: Step, coarse: AlgebraicLevel, coarse_host: Matrix, real: Any) -> None:
+        """Take the prolongation from a coarser level; `host` and `coarse_host` are both matrices' patterns."""
+        device, P, R, AP = self.device, step.P, step.R, step.AP
+        turn = scipy.sparse.csr_array((np.arange(P.nnz), P.indices, P.indptr), shape=P.shape).T.tocsr().data
         self.P, self.R = DeviceMatrix(P, real, device), DeviceMatrix(R, real, device)
         self.plain = wp.clone(self.P.values)  # P's entries before its rows are scaled
         self.turn = wp.array(turn, dtype=wp.int32, device=device)
         self.AP = DeviceMatrix(AP, real, device)
         self.products = (
-            DeviceProduct(self.A, self.P, self.AP, (host, P)),
-            DeviceProduct(self.R, self.AP, coarse.A, (R, AP)),
+            DeviceProduct(self.A, self.P, self.AP, (host, P, AP)),
+            DeviceProduct(self.R, self.AP, coarse.A, (R, AP, coarse_host)),
         )
 
     def sweep(self, y: wp.array[Any], x: wp.array[Any], omega: float, launch: Launch, *, from_zero: bool = False) -> None:
@@ -149,11 +160,8 @@ class AlgebraicHierarchy:
         host = A.matrix()
         symmetric = host if A.symmetric else ((host + host.T) * 0.5).tocsr()
         pattern = _with_diagonal(host if A.symmetric else _union(host))
-        hosts, prolongations = _coarsen(scipy.sparse.csr_array(symmetric), pattern, self.settings, self._most)
         self._order = self._find_entries(host, pattern)
-        self.levels = [AlgebraicLevel(h, real, self.device) for h in hosts]
-        for k, P in enumerate(prolongations):
-            self.levels[k].connect(hosts[k], P, self.levels[k + 1], hosts[k + 1], real)
+        self.levels = _coarsen(symmetric, pattern, real, self.device, self.settings, self._most)
         n, last = A.unknowns, self.levels[-1].size
         self.scale = wp.zeros(n, dtype=real, device=self.device)
         self.weight = wp.zeros(n, dtype=real, device=self.device)
@@ -255,41 +263,47 @@ class AlgebraicHierarchy:
         return wp.array(order, dtype=wp.int32, device=self.device)
 
 
-def _coarsen(A: Matrix, pattern: Matrix, settings: AlgebraicSettings, most: int) -> tuple[list[Matrix], list[Matrix]]:
-    """Return the patterns of all levels' matrices and the prolongations between them."""
-    hosts, prolongations = [pattern], []
-    current = scipy.sparse.csr_matrix(A)
+def _coarsen(A: Matrix, pattern: Matrix, real: Any, device: wp.Device, settings: AlgebraicSettings, most: int) -> list[AlgebraicLevel]:
+    """Return the levels of a matrix whose entries are stored in `pattern`."""
+    zeros = scipy.sparse.csr_array((np.zeros(pattern.nnz), pattern.indices, pattern.indptr), shape=pattern.shape)
+    current = (A + zeros).tocsr()
     candidates = np.ones((A.shape[0], 1))
+    levels = [AlgebraicLevel(current, real, device)]
     while current.shape[0] > most:
-        current.eliminate_zeros()
-        C = symmetric_strength_of_connection(current, theta=settings.strength)
+        fine = levels[-1]
+        entries = scipy.sparse.csr_matrix(current, copy=True)
+        entries.eliminate_zeros()
+        C = symmetric_strength_of_connection(entries, theta=settings.strength)
         aggregates, _ = standard_aggregation(C)
         if not 0 < aggregates.shape[1] <= settings.stall * current.shape[0]:
             break
         T, candidates = fit_candidates(aggregates, candidates)
         # local weights are sums of magnitudes; spectral ones start from random vectors, so runs would differ
-        P = scipy.sparse.csr_matrix(jacobi_prolongation_smoother(current, T, C, candidates, omega=4 / 3, weighting="local"))
+        P = scipy.sparse.csr_array(jacobi_prolongation_smoother(entries, T, C, candidates, omega=4 / 3, weighting="local"))
         P.sort_indices()
-        hosts.append(_pattern_product(_ones(P.T.tocsr()), _pattern_product(hosts[-1], P)))
-        prolongations.append(scipy.sparse.csr_array(P))
-        current = (P.T @ current @ P).tocsr()
-    return hosts, prolongations
-
-
-def _ones(matrix: Matrix) -> Matrix:
-    return scipy.sparse.csr_array((np.ones(matrix.nnz, dtype=np.float32), matrix.indices, matrix.indptr), shape=matrix.shape)
+        R = P.T.tocsr()
+        AP = _pattern_product(current, P)
+        coarse = _pattern_product(R, AP)
+        if coarse.nnz > current.nnz or np.diff(AP.indptr).max() > WIDEST:  # wide rows, which coarsening fills
+            break
+        levels.append(AlgebraicLevel(coarse, real, device))
+        fine.connect(current, Step(P, R, AP), levels[-1], coarse, real)
+        for product in fine.products:
+            product.compute(fine.kernels.multiply, device, wp.launch)
+        values = levels[-1].A.values.numpy().astype(np.float64)
+        current = scipy.sparse.csr_array((values, coarse.indices, coarse.indptr), shape=coarse.shape)
+    return levels
 
 
 def _pattern_product(A: Matrix, B: Matrix) -> Matrix:
-    """Return the pattern of A B, sorted: sums of positive numbers cannot vanish."""
+    """Return the pattern of A B, sorted. SciPy drops entries that cancel; those of positive numbers do not."""
     product = (_ones(A) @ _ones(B)).tocsr()
     product.sort_indices()
     return product
 
 
-def _numbered(matrix: Matrix) -> Matrix:
-    """Return a matrix whose entries are their own places; transposed, it tells the order of the transpose's entries."""
-    return scipy.sparse.csr_array((np.arange(matrix.nnz), matrix.indices, matrix.indptr), shape=matrix.shape)
+def _ones(matrix: Matrix) -> Matrix:
+    return scipy.sparse.csr_array((np.ones(matrix.nnz, dtype=np.float32), matrix.indices, matrix.indptr), shape=matrix.shape)
 
 
 def _union(matrix: Matrix) -> Matrix:

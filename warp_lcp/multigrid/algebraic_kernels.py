@@ -41,14 +41,14 @@ ROWS {{
         if (v != 0) for (int q = 0; q < length; ++q) o[place[c + q]] += v*b[begin + q];
         c += length; }} }}"""
 
-PLACES = """const int *ptr = ptr_.data, *col = col_.data, *right = right_ptr_.data, *right_col = right_col_.data;
-const int *out_ptr = out_ptr_.data, *out_col = out_col_.data; unsigned short* place = place_.data;
-ROWS {
-    long long c = start_.data[i]; const int first = out_ptr[i], last = out_ptr[i + 1] - 1;
-    ENTRIES for (int q = right[col[k]]; q < right[col[k] + 1]; ++q) {
-        int low = first, high = last; const int wanted = right_col[q];
-        while (low < high) { const int mid = (low + high)/2; if (out_col[mid] < wanted) low = mid + 1; else high = mid; }
-        place[c++] = (unsigned short)(low - first); } }"""
+PLACES = """
+const int *ptr = ptr_.data, *col = col_.data, *right = right_ptr_.data, *right_col = right_col_.data, *out = out_ptr_.data;
+const int* out_col = out_col_.data; int* at = at_.data; unsigned short* place = place_.data; long long c = 0;
+for (int i = 0; i < n; ++i) {
+    for (int q = out[i]; q < out[i + 1]; ++q) at[out_col[q]] = q - out[i];
+    for (int k = ptr[i]; k < ptr[i + 1]; ++k)
+        for (int q = right[col[k]]; q < right[col[k] + 1]; ++q) place[c++] = (unsigned short)at[right_col[q]]; }
+"""
 
 INVERSE = """typedef {T} T; const int* ptr = ptr_.data; const T* a = a_.data;
 ROWS {{ T s = 0; ENTRIES s += a[k] < 0 ? -a[k] : a[k]; inverse_.data[i] = s > 0 ? (T)1/s : (T)0; }}"""
@@ -196,21 +196,19 @@ def kernels(real: Any) -> SimpleNamespace:
     )  # fmt: skip
 
 
-@wp.func_native(by_rows(PLACES))
-def places_span(
-    ptr_: INDICES, col_: INDICES, right_ptr_: INDICES, right_col_: INDICES, out_ptr_: INDICES, out_col_: INDICES, start_: I64,
-    place_: U16, start: wp.int64, end: wp.int64, stride: wp.int64,
+@wp.func_native(PLACES)
+def places(
+    ptr_: INDICES, col_: INDICES, right_ptr_: INDICES, right_col_: INDICES, out_ptr_: INDICES, out_col_: INDICES, at_: INDICES,
+    place_: U16, n: int,
 ): ...  # fmt: skip
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.algebraic")
 def places_kernel(
-    ptr: INDICES, col: INDICES, right_ptr: INDICES, right_col: INDICES, out_ptr: INDICES, out_col: INDICES, first: I64, place: U16, n: int,
-    chunk: int, stride: wp.int64,
-):  # fmt: skip
-    """Where in its row of the product each product of two entries belongs, by bisection: once a pattern."""
-    t = wp.tid()
-    places_span(ptr, col, right_ptr, right_col, out_ptr, out_col, first, place, span_start(t, chunk), span_end(t, chunk, n), stride)
+    ptr: INDICES, col: INDICES, right_ptr: INDICES, right_col: INDICES, out_ptr: INDICES, out_col: INDICES, at: INDICES, place: U16, n: int
+):
+    """Where in its row of the product each product of two entries belongs; by one thread, once a pattern. `at` is memory for a row."""
+    places(ptr, col, right_ptr, right_col, out_ptr, out_col, at, place, n)
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.algebraic")

@@ -13,6 +13,7 @@ import warp as wp
 from warp_lcp.multigrid.cycle_kernels import Aggregates, first_cell, one_plane, one_row
 from warp_lcp.native import BLOCK, C_TYPES, simd
 from warp_lcp.operators.stencil_kernels import StencilShape, row_count, row_first, row_start
+from warp_lcp.vector_kernels import flat, span_end, span_start
 
 options = {"enable_backward": False, "module": "warp_lcp.coarsen"}
 
@@ -61,6 +62,27 @@ def above(last: bool, periodic: int, step: wp.int64, n: int):
     return o
 
 
+@wp.func
+def depends_on_change(changed: wp.array2d(dtype=wp.uint8), n: wp.vec3i, periodic: wp.vec3i, G: Aggregates, k: int, j: int):
+    """Whether one of the rows of aggregates (k, j), or a row beside them, has changed: their faces depend on both their cells."""
+    planes = wp.min(G.fz, n[0] - G.fz * k)
+    rows = wp.min(G.fy, n[1] - G.fy * j)
+    found = int(0)
+    for a in range(-1, planes + 1):
+        for b in range(-1, rows + 1):
+            if (a >= 0 and a < planes) or (b >= 0 and b < rows):
+                z = G.fz * k + a
+                y = G.fy * j + b
+                if periodic[2] != 0:
+                    z = (z + n[0]) % n[0]
+                if periodic[1] != 0:
+                    y = (y + n[1]) % n[1]
+                if z >= 0 and z < n[0] and y >= 0 and y < n[1]:
+                    if changed[z, y] != wp.uint8(0):
+                        found = 1
+    return found != 0
+
+
 @functools.cache
 def coarsen_kernels(variable: bool, d_type: Any, real: Any) -> Any:
     """Return the kernel that makes one coarse row a thread on the CPU, one aggregate a thread on CUDA.
@@ -91,7 +113,8 @@ def coarsen_kernels(variable: bool, d_type: Any, real: Any) -> Any:
         """Source of a loop over the row's cells: bytes go 64 at a time as long as there are as many."""
         if not counts:
             return f"SIMD for (int i = 0; i < fx*m; ++i) {body};"
-        return f"const int whole = fx*m/64*64; SIMD64 for (int i = 0; i < whole; ++i) {body}; SIMD for (int i = whole; i < fx*m; ++i) {body};"
+        loops = "const int whole = fx*m/64*64; SIMD64 for (int i = 0; i < whole; ++i) {0}; SIMD for (int i = whole; i < fx*m; ++i) {0};"
+        return loops.format(body)
 
     @wp.func_native(
         simd(
@@ -193,13 +216,68 @@ def coarsen_kernels(variable: bool, d_type: Any, real: Any) -> Any:
     @wp.kernel(enable_backward=False, module=name)
     def coarsen(
         A: StencilShape, d: d_array, wx: field, wy: field, wz: field, n: wp.vec3i, periodic: wp.vec3i, C: StencilShape, G: Aggregates,
-        grain: int, stiffen: real, held: real, dc: field, wxc: field, wyc: field, wzc: field,
+        grain: int, stiffen: real, held: real, changed: wp.array2d(dtype=wp.uint8), dc: field, wxc: field, wyc: field, wzc: field,
+        changed_c: wp.array2d(dtype=wp.uint8),
     ):  # fmt: skip
+        """Make the coarse rows that depend on finer ones which have changed; all threads of a row come to the same answer."""
         k, j, c = wp.tid()
-        coarsen_chunk(k, j, c, A, d, wx, wy, wz, n, periodic, C, G, grain, stiffen, held, dc, wxc, wyc, wzc)
+        if depends_on_change(changed, n, periodic, G, k, j):
+            changed_c[k, j] = wp.uint8(1)
+            coarsen_chunk(k, j, c, A, d, wx, wy, wz, n, periodic, C, G, grain, stiffen, held, dc, wxc, wyc, wzc)
+        else:
+            changed_c[k, j] = wp.uint8(0)
 
     coarsen.chunk = coarsen_chunk
     return coarsen
+
+
+@functools.cache
+def hold_kernel(d_type: Any, real: Any) -> Any:
+    """Return the kernel that copies the diagonal on the free set, writes 0 elsewhere, and marks the rows that change by it."""
+    d_array, u8, target = wp.array(dtype=d_type), wp.array(dtype=wp.uint8), C_TYPES[real]
+    out_array = wp.array(dtype=real)
+
+    @wp.func_native(
+        simd(
+            f"""const auto* d = d_.data + p; const auto* free = free_.data + p; auto* out = out_.data + p; unsigned char moved = 0;
+        auto hold = [&](int k) -> unsigned char {{
+            const {target} v = free[k] != 0 ? ({target})d[k] : ({target})0; const unsigned char other = v != out[k]; out[k] = v; return other; }};
+        const int whole = {"n/64*64" if real is wp.uint8 else "0"};
+        SIMD64 for (int k = 0; k < whole; ++k) moved |= hold(k);
+        SIMD for (int k = whole; k < n; ++k) moved |= hold(k);
+        if (moved) changed_.data[row] = 1;"""
+        )
+    )
+    def hold_row(d_: d_array, free_: u8, out_: out_array, changed_: u8, row: int, p: wp.int64, n: int): ...
+
+    @wp.kernel(enable_backward=False, module=f"warp_lcp.coarsen.hold_{d_type.__name__}_{real.__name__}")
+    def hold(A: StencilShape, d: d_array, free: u8, grain: int, rows: int, out: out_array, changed: u8):
+        k, j, c = wp.tid()
+        hold_row(d, free, out, changed, k * rows + j, row_start(A, k, j, c, grain), row_count(A, k, j, c, grain))
+
+    return hold
+
+
+@wp.func_native(flat("EACH { flags.data[i] = value; }"))
+def mark_span(flags: wp.array(dtype=wp.uint8), value: wp.uint8, start: wp.int64, end: wp.int64, stride: wp.int64): ...
+
+
+@wp.kernel(**options)
+def mark_kernel(flags: wp.array(dtype=wp.uint8), value: wp.uint8, n: int, chunk: int, stride: wp.int64):
+    """Mark all rows, or none."""
+    t = wp.tid()
+    mark_span(flags, value, span_start(t, chunk), span_end(t, chunk, n), stride)
+
+
+@wp.func
+def none_changed(changed: wp.array2d(dtype=wp.uint8)):
+    """Whether no row has changed."""
+    found = int(0)
+    for k in range(changed.shape[0]):
+        for j in range(changed.shape[1]):
+            if changed[k, j] != wp.uint8(0):
+                found = 1
+    return found == 0
 
 
 @wp.kernel(**options)
@@ -212,12 +290,15 @@ def factor_kernel(
     n: wp.vec3i,
     periodic: wp.vec3i,
     rounding: wp.float64,
+    changed: wp.array2d(dtype=wp.uint8),
     matrix: wp.array2d(dtype=wp.float64),
 ):
-    """Assemble the coarsest level and factor it in place, L D L', by one thread.
+    """Assemble the coarsest level and factor it in place, L D L', by one thread; nothing to do if none of its rows has changed.
 
     A pivot below `rounding` times its diagonal is a singular component's rounding: its unknown is pinned at 0.
     """
+    if none_changed(changed):
+        return
     m = n[0] * n[1] * n[2]
     for r in range(m):
         for c in range(r + 1):
@@ -269,34 +350,33 @@ def factor_kernel(
                 matrix[r, c] = wp.float64(0.0)
 
 
+INVERT = """
+const double* L = matrix.data; double* X = inverse.data;  // L has ones on its diagonal, where it stores the pivots
+for (int r = 0; r < m; ++r) {
+    SIMD8 for (int c = first; c < end; ++c) X[r*m + c] = r == c ? 1.0 : 0.0;
+    for (int s = 0; s < r; ++s) { const double l = L[r*m + s]; SIMD8 for (int c = first; c < end; ++c) X[r*m + c] -= l*X[s*m + c]; } }
+for (int r = m - 1; r >= 0; --r) {
+    const double pivot = L[r*m + r];
+    SIMD8 for (int c = first; c < end; ++c) X[r*m + c] = pivot > 0 ? X[r*m + c]/pivot : 0.0;
+    for (int s = r + 1; s < m; ++s) {
+        const double l = pivot > 0 ? L[s*m + r] : 0.0; SIMD8 for (int c = first; c < end; ++c) X[r*m + c] -= l*X[s*m + c]; } }
+"""
+
+
+@wp.func_native(simd(INVERT))
+def invert_columns(matrix: wp.array2d(dtype=wp.float64), inverse: wp.array2d(dtype=wp.float64), first: int, end: int, m: int): ...
+
+
 @wp.kernel(**options)
-def invert_kernel(matrix: wp.array2d(dtype=wp.float64), inverse: wp.array2d(dtype=wp.float64)):
-    """Column c of the inverse from the factors, a column a thread; stored as a row, the inverse is symmetric."""
-    c = wp.tid()
+def invert_kernel(
+    changed: wp.array2d(dtype=wp.uint8), matrix: wp.array2d(dtype=wp.float64), columns: int, inverse: wp.array2d(dtype=wp.float64)
+):
+    """So many columns a thread of the inverse, from the factors; nothing to do if none of the rows of cells has changed."""
+    t = wp.tid()
+    if none_changed(changed):
+        return
     m = matrix.shape[0]
-    for r in range(m):
-        v = wp.float64(0.0)
-        if r == c:
-            v = wp.float64(1.0)
-        for s in range(c, r):
-            v -= matrix[r, s] * inverse[c, s]
-        if r < c:
-            v = wp.float64(0.0)
-        inverse[c, r] = v
-    for r in range(m):
-        if matrix[r, r] > wp.float64(0.0):
-            inverse[c, r] = inverse[c, r] / matrix[r, r]
-        else:
-            inverse[c, r] = wp.float64(0.0)
-    for q in range(m):
-        r = m - 1 - q
-        v = inverse[c, r]
-        for s in range(r + 1, m):
-            v -= matrix[s, r] * inverse[c, s]
-        if matrix[r, r] > wp.float64(0.0):
-            inverse[c, r] = v
-        else:
-            inverse[c, r] = wp.float64(0.0)
+    invert_columns(matrix, inverse, t * columns, wp.min(m, (t + 1) * columns), m)
 
 
 @wp.kernel(**options)
@@ -311,11 +391,12 @@ def solve_coarsest_kernel(inverse: wp.array2d(dtype=wp.float64), n: wp.vec3i, b:
 
 
 def _overload() -> None:
+    u8 = wp.array2d(dtype=wp.uint8)
     for real in (wp.float32, wp.float64):
         f = wp.array3d(dtype=real)
         for d_type in (wp.uint8, real):
             d = wp.array3d(dtype=d_type)
-            wp.overload(factor_kernel, [StencilShape, d, f, f, f, wp.vec3i, wp.vec3i, wp.float64, wp.array2d(dtype=wp.float64)])
+            wp.overload(factor_kernel, [StencilShape, d, f, f, f, wp.vec3i, wp.vec3i, wp.float64, u8, wp.array2d(dtype=wp.float64)])
         wp.overload(solve_coarsest_kernel, [wp.array2d(dtype=wp.float64), wp.vec3i, f, f])
 
 

@@ -11,15 +11,16 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.layout import Padding
+from warp_lcp.layout import Padding, zeros
 from warp_lcp.multigrid import coarsen_kernels as kernels
 from warp_lcp.multigrid.coarsen_kernels import UNBOUNDED
 from warp_lcp.multigrid.cycle_kernels import Aggregates, cycle_kernels
 from warp_lcp.multigrid.small_levels import SmallLevels, first_small
+from warp_lcp.native import Spans, grain
 from warp_lcp.operators.stencil import Stencil
 from warp_lcp.operators.stencil_kernels import coarsen_spans_kernel
 from warp_lcp.program import Launch, Program
-from warp_lcp.vectors import convert
+from warp_lcp.vectors import convert, launch_spans
 
 # of a coarsest level's diagonal: what rounding leaves of a singular component's last pivot, with a margin
 PINNED = {wp.float32: 3e-5, wp.float64: 1e-13}
@@ -71,7 +72,7 @@ class Level:
 
     def __init__(self, stencil: Stencil, real: Any, *, bounded: bool, upper: bool = True, bounds: Pair | None = None) -> None:
         self.stencil, self.real = stencil, real
-        field: Callable[[], wp.array[Any]] = lambda: wp.zeros(stencil.padding.size, dtype=real, device=stencil.device)  # noqa: E731
+        field: Callable[[], wp.array[Any]] = lambda: zeros(stencil.padding.size, real, stencil.device)  # noqa: E731
         self.x, self.b, self.t = field(), field(), field()
         nothing = wp.empty(0, dtype=real, device=stencil.device)
         self.lower, self.upper = (bounds or (field(), field() if upper else nothing)) if bounded else (self.x, self.x)
@@ -80,6 +81,7 @@ class Level:
         self.aggregates: Aggregates | None = None  # how the finer level's cells make up this one's
         self.visits, self.shrunk = 1, 1.0  # by a cycle of the next finer level; by how much since a level that was visited more
         self.operands = [stencil.shape, stencil.d, *(stencil.weights or (nothing,) * 3)]
+        self.changed = wp.ones(stencil.padding.counts[:2], dtype=wp.uint8, device=stencil.device)  # rows, since the last rebuild
 
     @property
     def grids(self) -> list[wp.array[Any]]:
@@ -175,9 +177,24 @@ class Hierarchy:
         for w, source in zip(ours or (), theirs or (), strict=True):
             if w is not source:
                 convert(source, w)
+        self.finest.changed.fill_(1)
+
+    def hold(self, d: wp.array[Any], free: wp.array[Any]) -> None:
+        """Fill the finest diagonal: d where the stored uint8 field `free` is not 0, else 0; the rows that change are marked."""
+        s, rows = self.finest.stencil, self.finest.stencil.padding.counts[1]
+        inputs = [s.shape, d, free, s.grain, rows, s.d, self.finest.changed.flatten()]
+        wp.launch(kernels.hold_kernel(d.dtype, s.d.dtype), s.threads, inputs, device=self.device)
 
     def rebuild(self) -> None:
         """Coarsen from the finest diagonal down, and factor the coarsest level."""
+        self.finest.changed.fill_(1)
+        self._coarsening.run()
+
+    def rebuild_changed(self) -> None:
+        """Do what `rebuild` does for the rows of the finest level that are marked in its `changed`, and those that depend on them.
+
+        Whoever writes the finest diagonal marks the rows: `hold` does. The result is that of a complete rebuild, to the last bit.
+        """
         self._coarsening.run()
 
     @cached_property
@@ -188,17 +205,25 @@ class Hierarchy:
             sizes = [wp.vec3i(*s.padding.counts), wp.vec3i(*map(int, s.periodic)), c.shape, coarse.aggregates, c.grain]
             sizes += [self.settings.over_correction, self.settings.excess]
             kernel = kernels.coarsen_kernels(s.weights is not None, s.d.dtype, self.real)
-            program.launch(kernel, c.threads, [*fine.operands, *sizes, c.d, *(c.weights or ())], device=self.device)
+            outputs = [c.d, *(c.weights or ()), coarse.changed]
+            program.launch(kernel, c.threads, [*fine.operands, *sizes, fine.changed, *outputs], device=self.device)
             for w in c.weights or ():
                 c.wrap(w, launch=program.launch)
+        if len(self.levels) > 1:
+            flags = self.finest.changed.flatten()
+            spans = Spans.of(flags.size, self.device)
+            launch_spans(kernels.mark_kernel, spans, [flags, wp.uint8(0)], [], self.device, launch=program.launch)
         if self._small is not None:
             self._small.rebuild(PINNED[self.real], program.launch)
             return program
         last, s = self.levels[-1], self.levels[-1].stencil
         sizes = [wp.vec3i(*s.padding.counts), wp.vec3i(*map(int, s.periodic))]
-        inputs = [s.shape, *last.grids, *sizes, wp.float64(PINNED[self.real]), self._matrix]
+        inputs = [s.shape, *last.grids, *sizes, wp.float64(PINNED[self.real]), last.changed, self._matrix]
         program.launch(kernels.factor_kernel, 1, inputs, device=self.device)
-        program.launch(kernels.invert_kernel, self._matrix.shape[0], [self._matrix, self._inverse], device=self.device)
+        m = self._matrix.shape[0]
+        columns = grain(m, self.device)
+        inputs = [last.changed, self._matrix, columns, self._inverse]
+        program.launch(kernels.invert_kernel, m // columns, inputs, device=self.device)
         return program
 
     @cached_property

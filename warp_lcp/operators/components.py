@@ -106,7 +106,10 @@ class ComponentFinder:
         A, s = self._A, self._A.stencil
         if scratch is None:
             if self._own is None:
-                self._own = wp.zeros(A.layout.size, dtype=wp.int32, device=A.device), wp.zeros(A.layout.size, dtype=wp.uint8, device=A.device)
+                self._own = (
+                    wp.zeros(A.layout.size, dtype=wp.int32, device=A.device),
+                    wp.zeros(A.layout.size, dtype=wp.uint8, device=A.device),
+                )
             scratch = self._own
         parent, grounded = scratch[0].view(wp.int32), scratch[1]
         cells, faces = A.cells_around.flatten(), [f.flatten() for f in A.faces]

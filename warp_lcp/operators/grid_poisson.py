@@ -162,7 +162,7 @@ class GridPoisson:
         """Return the components on which A is singular, or None if there are none.
 
         Args:
-            scratch: stored fields, one of 4-byte elements and one of bytes, that may be overwritten on the rows' spans; saves as much memory.
+            scratch: stored fields, of 4-byte elements and of bytes, that may be overwritten on the rows' spans; saves as much memory.
         """
         if self._finder is None:
             self._finder = ComponentFinder(self)

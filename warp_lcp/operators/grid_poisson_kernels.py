@@ -26,10 +26,13 @@ def copy_row(cells: wp.array(dtype=wp.int8), out: wp.array(dtype=wp.int8), p: wp
     simd(
         """const signed char* c = cells.data + p; unsigned char* o = d.data + p;
     const unsigned char x = along_x, y = along_y, z = along_z;
-    SIMD for (int k = 0; k < n; ++k) {
-        const unsigned char v = x*(unsigned char)((c[k-1] != 2) + (c[k+1] != 2)) + y*(unsigned char)((c[k-s2] != 2) + (c[k+s2] != 2))
-            + z*(unsigned char)((c[k-s1] != 2) + (c[k+s1] != 2));
-        o[k] = c[k] == 1 ? v : (unsigned char)0; }"""
+    auto open = [&](long long k, unsigned char axis) -> unsigned char { return c[k] != 2 ? axis : (unsigned char)0; };
+    auto count = [&](int k) {
+        const unsigned char v = open(k - 1, x) + open(k + 1, x) + open(k - s2, y) + open(k + s2, y) + open(k - s1, z) + open(k + s1, z);
+        o[k] = c[k] == 1 ? v : (unsigned char)0; };
+    const int whole = n/64*64;
+    SIMD64 for (int k = 0; k < whole; ++k) count(k);
+    SIMD for (int k = whole; k < n; ++k) count(k);"""
     )
 )
 def count_faces_row(

@@ -73,9 +73,7 @@ def kernels(a_type: Any, real: Any) -> SimpleNamespace:
     ): ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module=name)
-    def product(
-        ptr: INDICES, col: INDICES, a: values, x: field, b: field, plus: bool, y: field, n: int, chunk: int, stride: wp.int64
-    ):
+    def product(ptr: INDICES, col: INDICES, a: values, x: field, b: field, plus: bool, y: field, n: int, chunk: int, stride: wp.int64):
         """Y = A x, or A x + b if plus."""
         t = wp.tid()
         product_span(ptr, col, a, x, b, plus, y, span_start(t, chunk), span_end(t, chunk, n), stride)

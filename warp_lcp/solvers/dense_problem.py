@@ -6,7 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.linalg
+import scipy.optimize
 import scipy.sparse
+import scipy.sparse.linalg
 import warp as wp
 
 from warp_lcp.operators.dense import DenseOperator
@@ -14,6 +17,9 @@ from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
 from warp_lcp.solve import IterateInPlace, Precision, Step
+
+SEMIDEFINITE = 1e-10  # shift, in units of the largest entry, with which a semi-definite matrix must have a Cholesky factor
+RANK = 1e-12  # singular values below this part of the largest are zero to least-squares solutions (methods.md: all solved with it)
 
 
 @dataclass(frozen=True)
@@ -47,9 +53,26 @@ class DenseProblem:
         """Return y = A x + b."""
         return self.A @ x + self.b
 
-    def rounding(self, x: np.ndarray) -> np.ndarray:
-        """Return |A| |x| + |b|, whose product with eps is what rounding leaves of y."""
-        return np.abs(self.A) @ np.abs(x) + np.abs(self.b)
+    def residual(self, x: np.ndarray) -> float:
+        """Return the norm of the natural residual."""
+        d = np.abs(self.A.diagonal())
+        d = np.where(d == 0, 1.0, d)
+        return float(np.linalg.norm(d * (x - np.clip(x - self.affine(x) / d, self.lower, self.upper))))
+
+    def polished(self, x: np.ndarray, free: np.ndarray) -> np.ndarray:
+        """Return x after two Newton steps on the unknowns `free` for y = 0 there; x itself where that is no improvement.
+
+        Args:
+            x: within the bounds, shape (n,).
+            free: shape (n,), bool.
+        """
+        rows, out = np.flatnonzero(free), x.copy()
+        block = self.A[np.ix_(rows, rows)] if len(rows) else None
+        for _ in range(2 if len(rows) else 0):
+            y = self.affine(out)[rows]
+            out[rows] -= scipy.sparse.linalg.lsmr(block, y, atol=0.0, btol=0.0)[0] if scipy.sparse.issparse(block) else _solved(block, y)
+        out = np.clip(out, self.lower, self.upper)
+        return out if np.isfinite(out).all() and self.residual(out) < self.residual(x) else x
 
 
 def sparse_matrix(problem: LCP) -> scipy.sparse.csr_array | None:
@@ -67,15 +90,54 @@ def assemble(problem: LCP, rows: np.ndarray) -> np.ndarray:
     if sparse is not None:
         return sparse.toarray()[np.ix_(rows, rows)]
     layout, A = problem.layout, problem.A
-    unit, image = layout.zeros(wp.float64), layout.zeros(wp.float64)
+    unit, image, zero = (layout.zeros(wp.float64) for _ in range(3))
+    apply_plus = getattr(A, "apply_plus", None)  # takes stored fields, as grids have them
     host, matrix = np.zeros(layout.size), np.empty((len(rows), len(rows)))
     for column, row in enumerate(rows):
         host[row] = 1.0
         unit.assign(host)
-        A.apply(unit.reshape(layout.stored_shape), image.reshape(layout.stored_shape))
+        if apply_plus is not None:
+            apply_plus(unit, zero, image)
+        else:
+            A.apply(unit.reshape(layout.stored_shape), image.reshape(layout.stored_shape))
         matrix[:, column] = image.numpy()[rows]
         host[row] = 0.0
     return matrix
+
+
+def _solved(A: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """Return A^-1 r, the least-squares solution where A is singular."""
+    try:
+        return np.linalg.solve(A, r)
+    except np.linalg.LinAlgError:
+        return np.linalg.lstsq(A, r, rcond=RANK)[0]
+
+
+def semidefinite(A: np.ndarray) -> bool:
+    """Return whether A + A' is positive semi-definite, by the Cholesky factor of A slightly shifted."""
+    shift = max(SEMIDEFINITE * float(np.abs(A).max()), float(np.finfo(np.float64).tiny))
+    try:
+        scipy.linalg.cholesky((A + A.T) / 2 + shift * np.eye(len(A)), overwrite_a=True, check_finite=False)
+    except np.linalg.LinAlgError:
+        return False
+    return True
+
+
+def inconsistent(data: DenseProblem) -> bool:
+    """Return whether no x within its bounds gives every y a sign that its bounds allow, so that no solution exists (a linear program).
+
+    For a positive semi-definite A, symmetric or not, such an x is also enough for a solution to exist.
+    """
+    below, above = np.isfinite(data.lower), np.isfinite(data.upper)
+    parts = {"ub": [(-1.0, below & ~above), (1.0, above & ~below)], "eq": [(1.0, ~below & ~above)]}
+    stack = scipy.sparse.vstack if scipy.sparse.issparse(data.A) else np.vstack
+    rows: dict[str, Any] = {}
+    for name, pieces in parts.items():
+        rows[f"A_{name}"] = stack([sign * data.A[mask] for sign, mask in pieces])
+        rows[f"b_{name}"] = np.concatenate([-sign * data.b[mask] for sign, mask in pieces])
+    limits = np.stack([data.lower, data.upper], axis=1)
+    found = scipy.optimize.linprog(np.zeros(len(data.b)), **rows, bounds=limits, method="highs")
+    return bool(found.status == 2)  # HiGHS: infeasible
 
 
 def check_size(problem: LCP, method: str, most: int) -> int:

@@ -6,18 +6,16 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-import scipy.linalg
 import warp as wp
 
 from warp_lcp.problem import LCP
 from warp_lcp.result import SolveStatus
 from warp_lcp.solve import Step
-from warp_lcp.solvers.dense_problem import DenseWorkspace, assemble, check_size, pivots_of
+from warp_lcp.solvers.dense_problem import DenseWorkspace, assemble, check_size, pivots_of, semidefinite
 from warp_lcp.solvers.principal_inverse import PrincipalInverse
 
 EPS = float(np.finfo(np.float64).eps)
 ZERO = 1e-11  # a rate below this part of the terms that it is a sum of is rounding: nothing changes there
-DEFINITE = 1e-10  # shift, in units of the largest diagonal entry, with which a semi-definite matrix must have a Cholesky factor
 RESTARTS = 3  # times that the last check may send rows back that rounding has undone
 OPEN, FREE, LOW, HIGH = 0, 1, 2, 3  # not held yet; y = 0; x = l and y >= 0; x = u and y <= 0
 
@@ -62,11 +60,8 @@ class IncrementalPivoting:
         if not problem.A.symmetric:
             raise ValueError("A is not symmetric: IncrementalPivoting needs it to be; Lemke does not")
         A = assemble(problem, np.flatnonzero(problem.unknown.numpy() == 1))
-        shift = DEFINITE * np.abs(np.diag(A)).max()
-        try:
-            scipy.linalg.cholesky(A + max(shift, EPS) * np.eye(len(A)), overwrite_a=True, check_finite=False)
-        except np.linalg.LinAlgError:
-            raise ValueError("A is not positive semi-definite: IncrementalPivoting needs it to be; Lemke does not") from None
+        if not semidefinite(A):
+            raise ValueError("A is not positive semi-definite: IncrementalPivoting needs it to be; Lemke does not")
         return PivotingWorkspace(problem)
 
     def step(self, problem: LCP, work: PivotingWorkspace, x: wp.array[Any]) -> Step:

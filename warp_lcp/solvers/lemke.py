@@ -6,23 +6,20 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-import scipy.linalg
-import scipy.optimize
 import warp as wp
 
 from warp_lcp.problem import LCP
 from warp_lcp.result import SolveStatus
 from warp_lcp.solve import Step
-from warp_lcp.solvers.dense_problem import DenseWorkspace, check_size, pivots_of
+from warp_lcp.solvers.dense_problem import DenseWorkspace, check_size, inconsistent, pivots_of, semidefinite
 from warp_lcp.solvers.lemke_form import LemkeForm
 
 EPS = float(np.finfo(np.float64).eps)
 PIVOT = 1e-10  # entries of the entering column below this part of its largest are no pivots (methods.md: 200 of 200 with it)
 TIE = 1e-12  # relative difference of ratios that counts as a tie, which the lexicographic rule breaks
 NOISE = 1e-6  # residual, relative to that of clip(0, l, u), beyond which an end of the path is no solution
-PERIOD = 20  # pivots after which the inverse of the basis is computed afresh; its columns are refined in between
+PERIOD = 20  # pivots, or an eighth of the rows if that is more, after which the inverse is computed afresh; columns are refined between
 ACCEPTED = 1e-9  # relative error of the entering column after refinement with which the inverse stays in use
-SEMIDEFINITE = 1e-10  # shift, in units of the largest entry, with which a semi-definite symmetric part must have a Cholesky factor
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,7 +144,7 @@ class Basis:
     def _direction(self) -> np.ndarray:
         column = self._column()
         direction = self._solve(column)
-        if self.age >= PERIOD or np.abs(self.matrix @ direction - column).max() > ACCEPTED * np.abs(column).max():
+        if self.age >= max(PERIOD, self.m // 8) or np.abs(self.matrix @ direction - column).max() > ACCEPTED * np.abs(column).max():
             self.refresh()
             direction = self._solve(column)
         return direction
@@ -231,35 +228,16 @@ class LemkeWorkspace(DenseWorkspace):
         self.basis = Basis(M, q, d) if (q < 0).any() else None
 
     def _finish(self, z: np.ndarray) -> None:
-        """Write the solution, after y = 0 is solved for afresh between the bounds; one that is none is a ray, from a pivot that was noise."""
+        """Write the solution, polished where x is between its bounds; one that is none is a ray in truth: a pivot was noise."""
         data = self.data
         x = np.clip(self.form.solution(z), data.lower, data.upper)
-        best = min((x, self._polished(x)), key=self._error)
-        if self.basis is not None and not self._error(best) <= NOISE * self._error(np.clip(0.0, data.lower, data.upper)):
+        size = 16 * EPS * float(np.abs(x).max())
+        x = data.polished(x, (x - data.lower > size) & (data.upper - x > size))
+        if self.basis is not None and not data.residual(x) <= NOISE * data.residual(np.clip(0.0, data.lower, data.upper)):
             self._ray()
             return
-        self.write_iterate(best)
+        self.write_iterate(x)
         self.ended = SolveStatus.STAGNATED
-
-    def _polished(self, x: np.ndarray) -> np.ndarray:
-        data, out = self.data, x.copy()
-        size = EPS * max(float(np.abs(x).max(initial=0.0)), EPS)
-        free = np.flatnonzero((x - data.lower > 16 * size) & (data.upper - x > 16 * size))
-        block = data.A[np.ix_(free, free)]
-        try:
-            for _ in range(2):
-                out[free] -= np.linalg.solve(block, data.affine(out)[free])
-        except np.linalg.LinAlgError:
-            return x
-        if not np.isfinite(out).all():
-            return x
-        return np.clip(out, data.lower, data.upper)
-
-    def _error(self, x: np.ndarray) -> float:
-        data = self.data
-        d = np.abs(np.diag(data.A))
-        d = np.where(d == 0, 1.0, d)
-        return float(np.linalg.norm(d * (x - np.clip(x - data.affine(x) / d, data.lower, data.upper))))
 
     def _ray(self) -> None:
         """Try another covering vector, or say what the rays mean."""
@@ -270,11 +248,5 @@ class LemkeWorkspace(DenseWorkspace):
         self.ended = SolveStatus.INFEASIBLE if self._has_none() else SolveStatus.STAGNATED
 
     def _has_none(self) -> bool:
-        """Return whether a ray proves that there is no solution: M positive semi-definite, or no z >= 0 with M z + q >= 0."""
-        M, q = self.form.M / self._sizes[0], self.form.q / self._sizes[1]
-        try:
-            scipy.linalg.cholesky((M + M.T) / 2 + SEMIDEFINITE * np.eye(len(q)), overwrite_a=True, check_finite=False)
-            return True
-        except np.linalg.LinAlgError:
-            found = scipy.optimize.linprog(np.zeros(len(q)), A_ub=-M, b_ub=q, method="highs")
-            return bool(found.status == 2)  # HiGHS: infeasible
+        """Return whether there is surely no solution: the ray proves it if A is positive semi-definite, a linear program else."""
+        return semidefinite(self.data.A) or inconsistent(self.data)

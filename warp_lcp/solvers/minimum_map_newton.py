@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
@@ -42,6 +42,9 @@ class MinimumMapNewton:
     Raises:
         ValueError: an argument is outside its range.
     """
+
+    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
+    needs: ClassVar[str] = "positive definite or P-matrix"
 
     precision: str = "mixed"
     monotone_cycles: int = 2

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from warp_lcp.solvers.dense_problem import RANK
+
 ACCEPTED = 1e-10  # backward error, relative to the right-hand side, with which a direction is used; a singular block's stays near 1
-RANK = 1e-12  # singular values below this part of the largest are zero to the least-squares fallback (methods.md: all solved with it)
 
 
 class PrincipalInverse:

@@ -1,7 +1,7 @@
-"""The linear system that all Newton-type methods share: (P A P + P D P) e = r on the free unknowns.
+"""The system on the free unknowns that Newton-type methods share: (P A P + P D P) e = r with a free set P and a shift D >= 0.
 
-Grids take multigrid-preconditioned conjugate gradients, dense matrices a factorization, other symmetric operators conjugate gradients
-preconditioned by the diagonal.
+Grids take multigrid-preconditioned conjugate gradients, dense matrices a factorization, sparse ones algebraic multigrid or incomplete
+factors, other operators Krylov methods preconditioned by the diagonal: conjugate gradients where A is symmetric, else GMRES.
 """
 
 from __future__ import annotations
@@ -13,16 +13,26 @@ import scipy.linalg
 import warp as wp
 
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
+from warp_lcp.krylov.gmres import GMRES
 from warp_lcp.multigrid.hierarchy import CycleSettings, Hierarchy
 from warp_lcp.operators.dense import DenseOperator
-from warp_lcp.operators.grid_poisson import GridPoisson, mask_diagonal
+from warp_lcp.operators.grid_poisson import GridPoisson
+from warp_lcp.operators.low_rank import LowRankOperator
+from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.operators.sum import SumOperator
 from warp_lcp.problem import LCP
 from warp_lcp.program import Launch, Program
-from warp_lcp.solvers.principal_system_kernels import divide_kernel, mask_kernel
+from warp_lcp.solvers.principal_system_kernels import divide_kernel, kernels, mask_kernel, shift_kernel
+from warp_lcp.solvers.principal_system_norm import WeightedNorm
+from warp_lcp.solvers.principal_system_sparse import SparseSystem
+from warp_lcp.vectors import Reduction, launch_spans
 
 
 class PrincipalSystem(Protocol):
     """The system on a free set.
+
+    A system made with `shifted=True` measures residuals as ||d^(-1/2) r||, d the diagonal of A + D, in `norm` and in `solve`: rows that
+    a large D makes stiff would else decide when to stop. Without it they are ||r||. Dense systems, solved directly, always take ||r||.
 
     Attributes:
         r: stored field; the right-hand side, zero off the free set, overwritten by `solve`.
@@ -33,24 +43,30 @@ class PrincipalSystem(Protocol):
     e: wp.array[Any]
 
     def refresh(self) -> None:
-        """Take A's entries again after they changed in place."""
+        """Take A's entries again after they changed in place; `restrict` must follow."""
 
-    def restrict(self, free: wp.array[Any]) -> None:
-        """Take another free set (stored uint8 field)."""
+    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
+        """Take another free set (stored uint8 field) and shift (stored float64 field, >= 0; needs `shifted=True`; None: 0)."""
+
+    def norm(self) -> float:
+        """Return the norm of r, as `solve` measures it."""
 
     def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
-        """Solve to ||r|| <= tolerance; return iterations and the norm reached."""
+        """Solve until the residual's norm is at most `tolerance`; return iterations and the norm reached."""
 
 
 class GridSystem:
     """Conjugate gradients on a grid, preconditioned by a linear multigrid cycle on the free set."""
 
-    def __init__(self, A: GridPoisson, real: Any, *, bounded: bool, settings: CycleSettings | None = None) -> None:
+    def __init__(self, A: GridPoisson, real: Any, *, bounded: bool, settings: CycleSettings | None = None, shifted: bool = False) -> None:
         self._A = A
         self._version = A.version
-        self.hierarchy = Hierarchy(A.stencil, real, bounded=bounded, settings=settings)
+        self.hierarchy = Hierarchy(A.stencil, real, bounded=bounded, settings=settings, shifted=shifted)
         self.r, self.z = self.hierarchy.finest.b, self.hierarchy.finest.x
-        self._krylov = ConjugateGradient(self.hierarchy.finest.stencil.product, self)
+        self._weight = wp.zeros_like(self.r) if shifted else None
+        self._norm = WeightedNorm(self.r, self._weight)
+        self._no_shift = wp.empty(0, dtype=wp.float64, device=A.device)
+        self._krylov = ConjugateGradient(self.hierarchy.finest.stencil.product, self, weight=self._weight)
         self.e = self._krylov.x
 
     def refresh(self) -> None:
@@ -59,10 +75,26 @@ class GridSystem:
             self._version = self._A.version
             self.hierarchy.refresh()
 
-    def restrict(self, free: wp.array[Any]) -> None:
-        """Mask the finest diagonal and coarsen."""
-        mask_diagonal(self._A.stencil.d, free, self.hierarchy.finest.stencil.d)
-        self.hierarchy.rebuild()
+    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
+        """Mask and shift the finest diagonal and coarsen.
+
+        Raises:
+            ValueError: a shift, but the system was not made for one.
+        """
+        source, target = self._A.stencil, self.hierarchy.finest.stencil.d
+        if self._weight is None:
+            if shift is not None:
+                raise ValueError("shift: make the system with shifted=True")
+            self.hierarchy.hold(source.d, free)
+            self.hierarchy.rebuild_changed()
+        else:
+            inputs = [source.d, wp.float64(source.unit), free, self._no_shift if shift is None else shift, target, self._weight]
+            launch_spans(shift_kernel(source.d.dtype, target.dtype), self._norm.spans, inputs, [], target.device)
+            self.hierarchy.rebuild()
+
+    def norm(self) -> float:
+        """Return the norm of r."""
+        return self._norm.of(self.r)
 
     def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
         """Iterate."""
@@ -82,29 +114,79 @@ class GridSystem:
         self.hierarchy.monotone_cycle.run()
 
 
+class CoupledGridSystem:
+    """Conjugate gradients on a grid operator plus a symmetric one that has products only, preconditioned by the grid's multigrid."""
+
+    def __init__(
+        self, A: SumOperator, grid: GridPoisson, rest: Any, real: Any, *, settings: CycleSettings | None = None, shifted: bool = False
+    ) -> None:
+        self._grid, self._rest, self._shape = GridSystem(grid, real, bounded=False, settings=settings, shifted=shifted), rest, A.layout.size
+        self.r, self.z = self._grid.r, self._grid.z
+        self._extra = wp.zeros_like(self.r)
+        self._free: wp.array[Any] | None = None
+        self._krylov = ConjugateGradient(self._product, self, weight=self._grid._weight)
+        self.e = self._krylov.x
+        self._spans = Reduction(self.r.size, self.r.device, wp.zeros(1, dtype=wp.float64, device=self.r.device)).spans
+
+    def refresh(self) -> None:
+        """Take the grid's rows again if they changed."""
+        self._grid.refresh()
+
+    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
+        """Take another free set and shift."""
+        self._free = free
+        self._grid.restrict(free, shift)
+
+    def norm(self) -> float:
+        """Return the norm of r."""
+        return self._grid.norm()
+
+    def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
+        """Iterate."""
+        return self._krylov.solve(tolerance, max_iterations)
+
+    def apply(self) -> None:
+        """Precondition: one cycle of the grid's multigrid."""
+        self._grid.apply()
+
+    def _product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
+        self._grid.hierarchy.finest.stencil.product(p, q)
+        self._rest.apply(p, self._extra)
+        launch_spans(kernels(q.dtype).add_free, self._spans, [self._extra, self._free, q], [], q.device)
+
+
 class DenseSystem:
     """LU factors of the free block, on the host; the minimum-norm least-squares step where the block is singular."""
 
     def __init__(self, A: DenseOperator) -> None:
         self._A = A
         self.r, self.e = A.layout.zeros(wp.float64), A.layout.zeros(wp.float64)
+        self._shift: np.ndarray | None = None
         self.refresh()
 
     def refresh(self) -> None:
         """Copy the matrix to the host."""
         self._matrix = self._A.matrix.numpy().astype(np.float64)
 
-    def restrict(self, free: wp.array[Any]) -> None:
-        """Remember the free set."""
+    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
+        """Remember the free set and the shift."""
         self._free = np.flatnonzero(free.numpy())
+        self._shift = None if shift is None else shift.numpy()[self._free].astype(np.float64)
+
+    def norm(self) -> float:
+        """Return ||r||."""
+        return float(np.linalg.norm(self.r.numpy()))
 
     def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
         """Factor and solve."""
         free, r, e = self._free, self.r.numpy(), np.zeros(self.e.size)
         norm = 0.0
         if free.size:
-            block = self._matrix[np.ix_(free, free)]
-            e[free] = _solve_or_least_squares(block, r[free])
+            block, scale = self._matrix[np.ix_(free, free)], np.ones(free.size)
+            if self._shift is not None:
+                block = block + np.diag(self._shift)
+                scale = 1 / np.sqrt(1 + self._shift)  # rows with a large shift make no others look singular
+            e[free] = scale * _solve_or_least_squares(block * np.outer(scale, scale), scale * r[free])
             norm = float(np.linalg.norm(block @ e[free] - r[free]))
         self.e.assign(e)
         return 1, norm
@@ -113,28 +195,39 @@ class DenseSystem:
 def _solve_or_least_squares(block: np.ndarray, r: np.ndarray) -> np.ndarray:
     factors, pivots, info = scipy.linalg.lapack.dgetrf(block)
     pivot = np.abs(np.diag(factors))
-    if info != 0 or pivot.min() <= 1e-13 * pivot.max():
+    if info != 0 or pivot.min() <= 1e-13 * np.abs(block).sum(axis=1).max():
         return np.linalg.lstsq(block, r, rcond=1e-12)[0]
     return scipy.linalg.lapack.dgetrs(factors, pivots, r)[0]
 
 
 class DiagonalSystem:
-    """Conjugate gradients preconditioned by the diagonal, for any symmetric operator, in float64."""
+    """A Krylov method preconditioned by the diagonal, for any operator, in float64: conjugate gradients if A is symmetric, else GMRES."""
 
-    def __init__(self, problem: LCP) -> None:
+    def __init__(self, problem: LCP, *, shifted: bool = False) -> None:
         self._A, self._layout = problem.A, problem.layout
         self.r, self.z = self._layout.zeros(wp.float64), self._layout.zeros(wp.float64)
-        self._krylov = ConjugateGradient(self._product, self)
+        self._diagonal, self._inverse = self._layout.zeros(wp.float64), self._layout.zeros(wp.float64)
+        weight = self._inverse if shifted else None
+        self._norm = WeightedNorm(self.r, weight)
+        self._no_shift = self._shift = wp.empty(0, dtype=wp.float64, device=self._layout.device)
+        method = ConjugateGradient if self._A.symmetric else GMRES
+        self._krylov = method(self._product, self, weight=weight)
         self.e = self._krylov.x
         self.refresh()
 
     def refresh(self) -> None:
         """Take the diagonal again."""
-        self._d = self._layout.load(self._A.diagonal().numpy(), wp.float64)
+        self._own = self._layout.load(self._A.diagonal().numpy(), wp.float64)
 
-    def restrict(self, free: wp.array[Any]) -> None:
-        """Remember the free set."""
-        self._free = free
+    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
+        """Remember the free set and the shift, and shift the diagonal."""
+        self._free, self._shift = free, self._no_shift if shift is None else shift
+        inputs = [self._own, wp.float64(1.0), free, self._shift, self._diagonal, self._inverse]
+        launch_spans(shift_kernel(wp.float64, wp.float64), self._norm.spans, inputs, [], self._layout.device)
+
+    def norm(self) -> float:
+        """Return the norm of r."""
+        return self._norm.of(self.r)
 
     def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
         """Iterate."""
@@ -142,27 +235,35 @@ class DiagonalSystem:
 
     def apply(self) -> None:
         """Precondition: z = r / d."""
-        wp.launch(divide_kernel, self.r.size, [self.r, self._d, self.z], device=self._layout.device)
+        wp.launch(divide_kernel, self.r.size, [self.r, self._diagonal, self.z], device=self._layout.device)
 
     def _product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
         shape = self._layout.stored_shape
         self._A.apply(p.reshape(shape), q.reshape(shape))
-        wp.launch(mask_kernel, q.size, [self._free, q], device=self._layout.device)
+        wp.launch(mask_kernel, q.size, [self._free, self._shift, p, q], device=self._layout.device)
 
 
-def principal_system(problem: LCP, real: Any, *, bounded: bool, settings: CycleSettings | None = None) -> PrincipalSystem:
+def principal_system(
+    problem: LCP, real: Any, *, bounded: bool, settings: CycleSettings | None = None, shifted: bool = False
+) -> PrincipalSystem:
     """Return the system for a problem's operator.
 
-    Raises:
-        ValueError: the operator is not symmetric and not dense.
+    Args:
+        problem: the problem.
+        real: type of the corrections, where the operator leaves a choice.
+        bounded: whether projected cycles are wanted on grids.
+        settings: how a grid's cycles go.
+        shifted: whether `restrict` gets a shift; see `PrincipalSystem` for what it does to norms.
     """
     A = problem.A
     if isinstance(A, GridPoisson):
-        return GridSystem(A, real, bounded=bounded, settings=settings)
+        return GridSystem(A, real, bounded=bounded, settings=settings, shifted=shifted)
     if isinstance(A, DenseOperator):
         return DenseSystem(A)
-    if not A.symmetric:
-        raise ValueError(
-            f"{type(A).__name__} is not symmetric: conjugate gradients need a symmetric A (dense matrices are factored instead)"
-        )
-    return DiagonalSystem(problem)
+    if isinstance(A, SparseOperator):
+        return SparseSystem(A, real, shifted=shifted)
+    if isinstance(A, SumOperator) and A.symmetric:
+        for grid, rest in ((A.first, A.second), (A.second, A.first)):
+            if isinstance(grid, GridPoisson) and isinstance(rest, LowRankOperator):
+                return CoupledGridSystem(A, grid, rest, real, settings=settings, shifted=shifted)
+    return DiagonalSystem(problem, shifted=shifted)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
@@ -41,6 +41,9 @@ class ProjectedMultigrid:
     Raises:
         ValueError: an argument is outside its range.
     """
+
+    supports: ClassVar[frozenset[str]] = frozenset({"grid"})
+    needs: ClassVar[str] = ""
 
     precision: str = "mixed"
     monotone_cycles: int = 1  # without one the set creeps; two or three were never faster on splashes, basins and obstacles, 2-D and 3-D
@@ -89,6 +92,7 @@ class AssessedResidual(NaturalResidual):
         self.threads = (-(-planes // slab), rows, chunks)
         R = self.row_sums = kernels.RowSums()
         R.planes, R.all_planes, R.rows, R.chunks, R.threads = slab, planes, rows, chunks, math.prod(self.threads)
+        R.changed = self._finest.changed.flatten()
         self.scalars = wp.zeros(kernels.SLOTS, dtype=wp.float64, device=A.device)
         self.sums = Reduction(problem.layout.size, A.device, self.scalars, columns=4, threads=R.threads)
         self.row_kernels = kernels.row_kernels(*s.storage, self._finest.stencil.d.dtype, hierarchy.real)
@@ -326,7 +330,7 @@ class MultigridWorkspace:
 
     def _rebuild(self) -> None:
         if self.residual.stale:
-            self.hierarchy.rebuild()
+            self.hierarchy.rebuild_changed()
             self.residual.stale = False
 
     def _classify_next(self) -> None:

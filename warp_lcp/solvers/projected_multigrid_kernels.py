@@ -42,6 +42,7 @@ class RowSums:
     rows: int
     chunks: int
     threads: int
+    changed: wp.array(dtype=wp.uint8)  # rows (k, j) whose free set has changed since the hierarchy was rebuilt
 
 
 @functools.cache
@@ -92,14 +93,15 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
                 const F now = hold[k - begin] ? (F)0 : (F)d[k]; const unsigned char one = free[k] != now, two = hold[k - begin] & m[k];
                 changed |= one; count += two; free[k] = now; }}
             moved += changed; active += count; }}
+        if (moved) changed_.data[row] = 1;
         const double all[3] = {{s, (double)moved, (double)active}}; double* sums = out.data + t;
         for (int c = 0; c < 3; ++c) sums[c*threads] = more ? all[c] + sums[c*threads] : all[c];"""
         )
     )
     def assess_row(
         A: StencilShape, d_: d_array, wx_: w_array, wy_: w_array, wz_: w_array, x_: f64, b_: f64, l_: f64, l_value: wp.float64, u_: f64,
-        u_value: wp.float64, code_: u8, m_: i8, free_: free_array, g_: field, inverse: wp.float64, classify: bool, p: wp.int64, n: int, t: int,
-        threads: int, more: bool, out: f64,
+        u_value: wp.float64, code_: u8, m_: i8, free_: free_array, g_: field, inverse: wp.float64, classify: bool, p: wp.int64, n: int,
+        t: int, threads: int, more: bool, changed_: u8, row: int, out: f64,
     ): ...  # fmt: skip
 
     @wp.func_native(
@@ -156,7 +158,7 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
             p = row_start(A, k, j, c, grain)
             assess_row(
                 A, d, wx, wy, wz, x, b, lower, lower_value, upper, upper_value, code, unknown, free, g, inverse, classify, p, n, t,
-                R.threads, k > slab * R.planes, out,
+                R.threads, k > slab * R.planes, R.changed, k * R.rows + j, out,
             )  # fmt: skip
 
     @wp.kernel(enable_backward=False, module=name)
@@ -205,7 +207,7 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
                     o = row_start(A, k, j, 0, A.nx)
                     assess_row(
                         A, d, wx, wy, wz, x, b, lower, lower_value, upper, upper_value, code, unknown, free, g, inverse, classify, o, n,
-                        slab * R.rows + j, R.threads, k > slab * R.planes, out,
+                        slab * R.rows + j, R.threads, k > slab * R.planes, R.changed, k * R.rows + j, out,
                     )  # fmt: skip
 
     return SimpleNamespace(assess=assess, measure=measure, update=update, advance=advance)

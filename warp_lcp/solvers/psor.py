@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
-import numpy as np
 import warp as wp
 
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.solve import IterateInPlace, Precision, Step
+from warp_lcp.solvers.spectrum import scaled_spectrum
+from warp_lcp.solvers.sweep import Contraction, Diagonal, Sweep, SweepOrder, sweep_for
 from warp_lcp.vectors import convert
+
+DIRECTIONS = {"forward": (True,), "backward": (False,), "symmetric": (True, False)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,64 +24,97 @@ class ProjectedSOR:
     x_i <- clip(x_i - omega (A x + b)_i / A_ii, l_i, u_i), red-black order on grids, row order otherwise. Converges for symmetric positive
     definite A and 0 < omega < 2 ([Book] 2.2.2). The iteration count grows with the grid; on large grids take MinimumMapNewton.
 
+    Where A_ii = 0, x_i goes to the bound that the sign of y_i asks for, and stays where y_i = 0 or there is no such bound; where A_ii < 0
+    it goes to the bound that solves the scalar problem, of two the one of lesser energy ([Book] 2.2.2, fig. 2.4). Bounds may be affine in
+    x: they follow each change of x in dense and sparse matrices, each sweep on grids.
+
+    Each sweep is tested for contraction ([Book] algorithm 4, see `Contraction`): DIVERGED, or NON_DESCENT where a sweep changes nothing.
+
+    The orders of the book's figure 2.3, in matrices: "impulse" is order = "magnitude", "greedy" is "greedy", "coordinate" and "staggered"
+    are permutations that the caller makes, by height, or normals before tangentials; "extreme staggered" is the method `Staggering`. The
+    book names these without defining them; the definitions are ours. Sweeps in another than the operator's order are made by one thread.
+
     Args:
-        omega: relaxation factor in (0, 2); 1 is projected Gauss-Seidel.
+        omega: relaxation factor in (0, 2); 1 is projected Gauss-Seidel. See `advised_omega`.
         direction: "forward", "backward", or "symmetric", which follows every forward sweep with a backward one.
+        order: "natural"; for sparse matrices "multicolor", whose colors are swept at once (the default on CUDA); for dense and sparse ones
+            "magnitude", the largest |x_i| first, or "greedy", in which a sweep is n times the row that would change most, O(n^2).
+        permutation: rows of a matrix in the order of a sweep.
         precision: "mixed" or "double" keep the iterate in float64, "single" rounds it to float32.
 
     Raises:
         ValueError: an argument is outside its range.
     """
 
+    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
+    needs: ClassVar[str] = "symmetric positive (semi-)definite A for a proof of convergence; A_ii <= 0 case by case"
+    affine_bounds: ClassVar[bool] = True
+
     omega: float = 1.4  # best of the book's parameter study (fig. C.4)
     direction: str = "forward"
+    order: str = "natural"
+    permutation: tuple[int, ...] | None = None
     precision: str = "mixed"
 
     def __post_init__(self) -> None:
         """Check the settings."""
         if not 0 < self.omega < 2:
             raise ValueError(f"omega = {self.omega}: must be in (0, 2)")
-        if self.direction not in ("forward", "backward", "symmetric"):
+        if self.direction not in DIRECTIONS:
             raise ValueError(f"direction = {self.direction!r}: must be 'forward', 'backward' or 'symmetric'")
+        if self.order not in [order.value for order in SweepOrder]:
+            raise ValueError(f"order = {self.order!r}: must be one of {', '.join(repr(order.value) for order in SweepOrder)}")
+        if self.permutation is not None:
+            if self.order != "natural":
+                raise ValueError(f"permutation: is an order itself, and cannot be combined with order = {self.order!r}")
+            object.__setattr__(self, "permutation", tuple(int(i) for i in self.permutation))
         Precision(self.precision)
 
     def init(self, problem: LCP) -> SweepWorkspace:
         """Return a workspace.
 
         Raises:
-            ValueError: A cannot be swept, has a negative diagonal, a zero diagonal with a right-hand side that it cannot meet, or an
-                odd periodic side.
+            ValueError: A cannot be swept (in this order), has a zero or negative diagonal entry with a right-hand side that no bound
+                meets, or an odd periodic side.
         """
-        if not hasattr(problem.A, "relax"):
-            raise ValueError(f"{type(problem.A).__name__} has no method `relax`, which ProjectedSOR sweeps with")
-        for axis, periodic in zip("xyz", getattr(problem.A, "periodic", ()), strict=False):
-            count = problem.layout.shape["xyz".index(axis) * -1 - 1] if periodic else 0
-            if count % 2:
-                raise ValueError(f"the periodic {axis} axis has {count} cells: red-black sweeps need an even number")
         work = SweepWorkspace(problem, Precision(self.precision))
-        work.check_diagonal()
+        work.sweep = sweep_for(problem, work.diagonal, self.omega, SweepOrder(self.order), self.permutation)
+        work.diagonal.check()
         return work
 
     def step(self, problem: LCP, work: SweepWorkspace, x: wp.array[Any]) -> Step:
         """Sweep once, or forward and backward if symmetric."""
-        for forward in {"forward": (True,), "backward": (False,), "symmetric": (True, False)}[self.direction]:
-            problem.A.relax(x, problem.b, problem.lower, problem.upper, self.omega, forward=forward)  # type: ignore[attr-defined]
+        directions = DIRECTIONS[self.direction]
+        for forward in directions:
+            work.sweep.run(x, forward=forward)
         work.round_iterate()
-        return Step("sweep", 2 if self.direction == "symmetric" else 1)
+        return Step("sweep", len(directions), failure=work.contraction.test(x))
 
 
 class SweepWorkspace(IterateInPlace):
-    """Memory of a method that needs the iterate and its residual only."""
+    """Memory of a method that sweeps.
+
+    Attributes:
+        sweep: how.
+        diagonal: A's.
+        contraction: the test of its sweeps.
+    """
+
+    sweep: Sweep
 
     def __init__(self, problem: LCP, precision: Precision) -> None:
         self.problem, self.precision = problem, precision
         self.x = problem.layout.zeros(wp.float64)
         self.residual = NaturalResidual(problem)
+        self.diagonal = Diagonal(problem, self.residual)
+        self.contraction = Contraction(problem)
         self.floating: Any = None
         self._rounded = problem.layout.zeros(wp.float32) if precision is Precision.SINGLE else None
 
     def start(self, *, warm: bool, tolerance: float) -> None:
-        """Nothing is carried from solve to solve."""
+        """Look at the operator again; nothing else is carried from solve to solve."""
+        self.sweep.start()
+        self.contraction.start(self.x)
 
     def round_iterate(self) -> None:
         """Round the iterate to its precision."""
@@ -86,20 +122,28 @@ class SweepWorkspace(IterateInPlace):
             convert(self.x, self._rounded)
             convert(self._rounded, self.x)
 
-    def check_diagonal(self) -> None:
-        """Refuse rows that a scalar solve cannot handle ([Book] 2.2.2).
 
-        Raises:
-            ValueError: A_ii < 0, or A_ii = 0 with a b_i that asks for a move without a bound in its way.
-        """
-        p = self.problem
-        d = self.residual.diagonal.numpy() * self.residual.unit
-        b, lower, upper, inside = p.b.numpy(), p.lower.numpy(), p.upper.numpy(), p.unknown.numpy() == 1
-        if (inside & (d < 0)).any():
-            raise ValueError(f"A has {np.count_nonzero(inside & (d < 0))} negative diagonal entries: ProjectedSOR needs them positive")
-        stuck = inside & (d == 0) & (((b < 0) & np.isinf(upper)) | ((b > 0) & np.isinf(lower)))
-        if stuck.any():
-            row = int(np.flatnonzero(stuck)[0])
-            raise ValueError(
-                f"A has a zero on the diagonal where b asks for an unbounded move (row {row}, b = {b[row]}): no sweep can solve it"
-            )
+def advised_omega(problem: LCP, steps: int = 60, free: Any = None) -> float:
+    """Return a relaxation factor for over-relaxation: Young's 2 / (1 + sqrt(1 - rho^2)).
+
+    rho = 1 - lambda_min(D^-1 A) is the spectral radius of Jacobi's method, estimated by Lanczos' method. The formula is exact for
+    equations in two colors (grids), and a guide elsewhere. Only the free unknowns count in the end: where many are held at bounds, the
+    whole matrix advises too much, and a second look with the free set of an earlier solution pays.
+
+    Args:
+        problem: with a symmetric A and a positive diagonal.
+        steps: products with A.
+        free: field of the problem's shape, non-zero where x is thought to be off its bounds; everywhere if None.
+
+    Raises:
+        ValueError: A is not symmetric, a diagonal entry is negative, or `free` is empty.
+
+    Example:
+        >>> import numpy as np, warp_lcp as wl
+        >>> A = wl.GridPoisson(np.array([[wl.AIR] + 20 * [wl.FLUID] + [wl.AIR]]), device="cpu")
+        >>> round(advised_omega(wl.LCP(A, np.zeros((1, 22)))), 3)  # 2 / (1 + sin(pi / 21))
+        1.741
+    """
+    least, _ = scaled_spectrum(problem, steps, free)
+    rho = min(max(1 - least, 0.0), 1.0)
+    return float(min(2 / (1 + (1 - rho**2) ** 0.5), 1.99))

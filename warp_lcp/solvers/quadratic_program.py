@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-import scipy.linalg
 import scipy.sparse
 import scipy.sparse.linalg
 import warp as wp
@@ -14,14 +13,12 @@ import warp as wp
 from warp_lcp.problem import LCP
 from warp_lcp.result import SolveStatus
 from warp_lcp.solve import Step
-from warp_lcp.solvers.dense_problem import DenseProblem, DenseWorkspace, check_size, sparse_matrix
+from warp_lcp.solvers.dense_problem import SEMIDEFINITE, DenseProblem, DenseWorkspace, check_size, inconsistent, semidefinite, sparse_matrix
 
 try:
     import piqp
 except ImportError:  # it comes with the extra `peers`
     piqp = None
-
-SEMIDEFINITE = 1e-10  # shift, in units of the largest diagonal entry, with which a semi-definite matrix must factorize
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +27,8 @@ class QuadraticProgram:
 
     The minimizers are the solutions of the problem, because A is symmetric and positive semi-definite and the gradient is y = A x + b.
     Sparse operators stay sparse; others are taken as dense matrices. x0 is not used; one step solves, and `linear_iterations` counts
-    PIQP's iterations, a factorization each. An objective that is unbounded below is INFEASIBLE: no x solves the problem.
+    PIQP's iterations, a factorization each. What PIQP's multipliers hold is then set on its bound, and y = 0 solved for in the others, if
+    that is better. An objective that is unbounded below is INFEASIBLE: no x solves the problem.
 
     Args:
         tolerance: PIQP's absolute and relative tolerance, on the problem scaled to max |b| = 1; > 0. The loop's criteria are checked on
@@ -94,8 +92,8 @@ class QuadraticProgramWorkspace(DenseWorkspace):
             ValueError: A is not positive semi-definite.
         """
         A = self.read().A
-        shift = max(SEMIDEFINITE * float(np.abs(A.diagonal()).max()), float(np.finfo(np.float64).tiny))
         if scipy.sparse.issparse(A):
+            shift = max(SEMIDEFINITE * float(np.abs(A.diagonal()).max()), float(np.finfo(np.float64).tiny))
             shifted = (A + shift * scipy.sparse.eye_array(A.shape[0])).tocsc()
             settings = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
             try:  # without row exchanges the signs of U's diagonal are A's inertia
@@ -103,11 +101,7 @@ class QuadraticProgramWorkspace(DenseWorkspace):
             except RuntimeError:
                 definite = False
         else:
-            try:
-                scipy.linalg.cholesky(A + shift * np.eye(len(A)), overwrite_a=True, check_finite=False)
-                definite = True
-            except np.linalg.LinAlgError:
-                definite = False
+            definite = semidefinite(A)
         if not definite:
             raise ValueError("A is not positive semi-definite: QuadraticProgram needs a convex objective; Lemke does not")
 
@@ -123,11 +117,17 @@ class QuadraticProgramWorkspace(DenseWorkspace):
         A = scipy.sparse.csc_matrix(data.A) if sparse else np.asfortranarray(data.A)
         solver.setup(A, data.b / scale, x_l=data.lower / scale, x_u=data.upper / scale)
         status = solver.solve()
-        x = np.asarray(solver.result.x) * scale
-        if status == piqp.PIQP_DUAL_INFEASIBLE:
+        iterations, x = int(solver.result.info.iter), np.asarray(solver.result.x) * scale
+        solved = status == piqp.PIQP_SOLVED
+        # PIQP often runs along an unbounded direction to its iteration limit without saying so: a linear program decides
+        if not solved and len(data.b) <= QuadraticProgram.most_unknowns and inconsistent(data):
             self.ended = SolveStatus.INFEASIBLE
-            return int(solver.result.info.iter)
+            return iterations
         if np.isfinite(x).all():
-            self.write_iterate(x)
-        self.ended = SolveStatus.MAX_ITERATIONS if status == piqp.PIQP_MAX_ITER_REACHED else SolveStatus.STAGNATED
-        return int(solver.result.info.iter)
+            x = np.clip(x, data.lower, data.upper)
+            low = x - data.lower < np.asarray(solver.result.z_bl) * scale
+            high = data.upper - x < np.asarray(solver.result.z_bu) * scale
+            settled = data.polished(np.where(low, data.lower, np.where(high, data.upper, x)), ~(low | high))
+            self.write_iterate(min((x, settled), key=data.residual))
+        self.ended = SolveStatus.STAGNATED if solved or iterations < max_iterations else SolveStatus.MAX_ITERATIONS
+        return iterations

@@ -1,0 +1,132 @@
+"""Rebuilding the rows that changed gives what a complete rebuild gives, to the last bit, and leaves the others alone."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warp_lcp as wl
+from warp_lcp.multigrid import CycleSettings, Hierarchy
+
+GRIDS = [
+    ((24, 21, 19), (False,) * 3, {}),
+    ((40, 37), (False,) * 3, {}),
+    ((12, 10, 14), (True, True, True), {}),
+    ((14, 9, 12), (False, False, True), {}),
+    ((24, 20, 16), (False,) * 3, {"face_y": 100.0}),  # only y is coarsened at first
+    ((24, 20, 16), (False,) * 3, {"face_x": 100.0, "face_z": 100.0}),
+]
+SETTINGS = CycleSettings(coarsest_cpu=8, coarsest_cuda=8, one_launch_cuda=0)
+
+
+def operator(shape, periodic, numbers, arrays, device, rng):
+    cells = rng.choice(3, shape, p=[0.1, 0.85, 0.05])
+    faces = dict(numbers)
+    if arrays:
+        values = rng.uniform(0.1, 1, (*shape[:-1], shape[-1] + 1))
+        values[..., -1] = values[..., 0]
+        faces["face_x"] = values * numbers.get("face_x", 1.0)
+    return cells, wl.GridPoisson(cells, periodic=periodic, device=device, **faces)
+
+
+def stored(A, free):
+    return A.layout.load(free.astype(np.uint8), wp.uint8)
+
+
+def snapshot(hierarchy):
+    fields = [f for lv in hierarchy.levels for f in (lv.stencil.d, *(lv.stencil.weights or ()))]
+    return [f.numpy().copy() for f in (*fields, hierarchy._inverse)]
+
+
+def sets(cells, rng):
+    """Free sets that differ in one cell, in some, in a block, in none, in all."""
+    free = np.ones(cells.shape, dtype=bool)
+    yield free.copy()
+    for _ in range(4):
+        free[tuple(rng.integers(0, n) for n in free.shape)] ^= True
+        yield free.copy()
+    yield free.copy()
+    free[tuple(slice(n // 3, n // 2) for n in free.shape)] ^= True
+    yield free.copy()
+    free ^= rng.random(free.shape) < 0.02
+    yield free.copy()
+    yield np.zeros(cells.shape, dtype=bool)
+    yield rng.random(free.shape) < 0.6
+
+
+@pytest.mark.parametrize("arrays", [False, True])
+@pytest.mark.parametrize(("shape", "periodic", "numbers"), GRIDS)
+def test_changed_rows_give_what_a_complete_rebuild_gives(shape, periodic, numbers, arrays, device):
+    """A row that depends on a changed one and is left out keeps a face, or an excess, of the last free set."""
+    rng = np.random.default_rng(811)
+    cells, A = operator(shape, periodic, numbers, arrays, device, rng)
+    partly, whole = (Hierarchy(A.stencil, wp.float32, bounded=False, settings=SETTINGS) for _ in range(2))
+    assert len(whole.levels) > 2
+    for free in sets(cells, rng):
+        partly.hold(A.stencil.d, stored(A, free & (cells == wl.FLUID)))
+        partly.rebuild_changed()
+        whole.hold(A.stencil.d, stored(A, free & (cells == wl.FLUID)))
+        whole.rebuild()
+        for one, other in zip(snapshot(partly), snapshot(whole), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def test_rows_that_nothing_changed_are_not_touched(device):
+    rng = np.random.default_rng(821)
+    cells, A = operator((32, 32, 32), (False,) * 3, {}, True, device, rng)
+    hierarchy = Hierarchy(A.stencil, wp.float32, bounded=False, settings=SETTINGS)
+    fluid = cells == wl.FLUID
+    hierarchy.hold(A.stencil.d, stored(A, fluid))
+    hierarchy.rebuild_changed()
+    assert not hierarchy.finest.changed.numpy().any()
+    spoiled = [lv.stencil.d for lv in hierarchy.levels[1:]] + [hierarchy._inverse]
+    for field in spoiled:
+        field.fill_(7.0)
+    hierarchy.hold(A.stencil.d, stored(A, fluid))
+    hierarchy.rebuild_changed()
+    assert all((field.numpy() == 7).all() for field in spoiled)
+    row = tuple(np.argwhere(fluid)[0])
+    fluid[row] = False
+    hierarchy.hold(A.stencil.d, stored(A, fluid))
+    assert np.argwhere(hierarchy.finest.changed.numpy()).tolist() == [list(row[:2])]
+    hierarchy.rebuild_changed()
+    level = hierarchy.levels[1].stencil
+    made = (level.d.numpy().reshape(level.padding.shape)[1:-1, 1:-1, 1:-1] != 7).any(axis=2)
+    assert 1 <= made.sum() <= 4  # its own aggregates, and what lies beside the row
+    assert (hierarchy._inverse.numpy() != 7).any()
+
+
+def test_the_first_rebuild_after_new_cells_is_complete(device):
+    rng = np.random.default_rng(823)
+    cells, A = operator((16, 16, 16), (False,) * 3, {}, False, device, rng)
+    partly = Hierarchy(A.stencil, wp.float32, bounded=False, settings=SETTINGS)
+    for _ in range(3):
+        partly.hold(A.stencil.d, stored(A, cells == wl.FLUID))
+        partly.rebuild_changed()
+        fresh = Hierarchy(A.stencil, wp.float32, bounded=False, settings=SETTINGS)
+        fresh.hold(A.stencil.d, stored(A, cells == wl.FLUID))
+        fresh.rebuild()
+        for one, other in zip(snapshot(partly), snapshot(fresh), strict=True):
+            np.testing.assert_array_equal(one, other)
+        cells = rng.choice(3, cells.shape, p=[0.2, 0.7, 0.1])
+        A.update(wp.array(cells, dtype=wp.int8, device=device))
+        partly.refresh()
+
+
+@pytest.mark.parametrize("arrays", [False, True])
+@pytest.mark.parametrize("bounds", ["walls", "everywhere"])
+def test_a_solve_leaves_the_hierarchy_of_its_last_free_set(bounds, arrays, device):
+    """The pass that evaluates the residual marks the rows; one that it forgets would be stale in the hierarchy."""
+    rng = np.random.default_rng(827)
+    cells, A = operator((18, 20, 22), (False,) * 3, {}, arrays, device, rng)
+    b = np.where(cells == wl.FLUID, rng.standard_normal(cells.shape), 0.0)
+    lower = np.zeros(cells.shape) if bounds == "everywhere" else np.where(rng.random(cells.shape) < 0.2, 0.0, -np.inf)
+    problem, solver = wl.LCP(A, b, lower), wl.ProjectedMultigrid(cycle=SETTINGS)
+    work = solver.init(problem)
+    for most in (3, 5, 40):
+        result = wl.solve(problem, solver, stopping=wl.StoppingCriteria(rtol=1e-6, max_iterations=most), workspace=work)
+        work.hierarchy.rebuild_changed()
+        found = snapshot(work.hierarchy)
+        work.hierarchy.rebuild()
+        for one, other in zip(found, snapshot(work.hierarchy), strict=True):
+            np.testing.assert_array_equal(one, other)
+    assert result

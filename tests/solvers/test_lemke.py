@@ -1,0 +1,174 @@
+"""Lemke's method: any matrix, contacts with friction, boxes by reformulation, rays."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import warp_lcp as wl
+from oracle import boxed, lemke, natural_residual
+from warp_lcp.solvers.lemke import Basis, Lemke
+
+TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=1000)
+
+
+def solve(A, b, lower=0.0, upper=np.inf, solver=None, stopping=TIGHT):
+    return wl.solve(wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower, upper), solver or Lemke(), stopping=stopping)
+
+
+def contacts(count, rng, friction=0.5):
+    """Stewart-Trinkle LCP of random bodies that touch in random points: blocks of normal, four tangents and the sliding speed beta."""
+    bodies = max(2, count // 3)
+    masses = rng.uniform(0.5, 2.0, bodies)
+    inverse = np.concatenate([np.r_[np.full(3, 1 / m), 1 / (m * rng.uniform(0.1, 1.0, 3))] for m in masses])
+    J = np.zeros((5 * count, 6 * bodies))
+    for k in range(count):
+        first, second = rng.choice(bodies, 2, replace=False)
+        normal = rng.standard_normal(3)
+        normal /= np.linalg.norm(normal)
+        tangent = np.cross(normal, rng.standard_normal(3))
+        tangent /= np.linalg.norm(tangent)
+        arms = rng.uniform(-1.0, 1.0, (2, 3))
+        other = np.cross(normal, tangent)
+        for row, direction in enumerate((normal, tangent, other, -tangent, -other)):
+            J[5 * k + row, 6 * first : 6 * first + 6] = -np.r_[direction, np.cross(arms[0], direction)]
+            J[5 * k + row, 6 * second : 6 * second + 6] = np.r_[direction, np.cross(arms[1], direction)]
+    A, b = np.zeros((6 * count, 6 * count)), np.zeros(6 * count)
+    forces = np.flatnonzero(np.arange(6 * count) % 6 != 5)
+    A[np.ix_(forces, forces)] = (J * inverse) @ J.T
+    for k in range(0, 6 * count, 6):
+        A[k + 5, k], A[k + 5, k + 1 : k + 5], A[k + 1 : k + 5, k + 5] = friction, -1.0, 1.0
+    b[forces] = J @ rng.standard_normal(6 * bodies)
+    return A, b
+
+
+def test_hundred_contact_problems_of_180_variables():
+    pivots = []
+    for seed in range(100):
+        A, b = contacts(30, np.random.default_rng(9000 + seed))
+        result = solve(A, b)
+        assert result, f"seed {seed}: {result.status.name}"
+        assert natural_residual(A, b, 0.0, np.inf, result.x.numpy()) <= 1e-10 * natural_residual(A, b, 0.0, np.inf, np.zeros(180))
+        pivots.append(result.linear_iterations)
+    assert np.mean(pivots) < 180
+
+
+@pytest.mark.parametrize("zeros", [0.2, 0.5, 0.8])
+def test_semidefinite_problems(zeros):
+    rng = np.random.default_rng(int(800 + 10 * zeros))
+    for _ in range(10):
+        B = rng.standard_normal((60, 60 - int(60 * zeros)))
+        A, held = B @ B.T, rng.random(60) < 0.5
+        b = np.where(held, rng.uniform(0.1, 1.0, 60), 0.0) - A @ np.where(held, 0.0, rng.uniform(0.1, 1.0, 60))
+        result = solve(A, b)
+        assert result, result.status
+        assert result.relative_residual <= 1e-10
+
+
+def test_against_the_tableau():
+    rng = np.random.default_rng(811)
+    for _ in range(10):
+        B, C = rng.standard_normal((2, 40, 40))
+        A, b = B @ B.T / 40 + 0.1 * np.eye(40) + C - C.T, rng.standard_normal(40)  # positive definite, far from symmetric
+        np.testing.assert_allclose(solve(A, b).x.numpy(), lemke(A, b), atol=1e-9)
+
+
+@settings(max_examples=150, deadline=None)
+@given(seed=st.integers(0, 10**6), n=st.integers(1, 6))
+def test_boxes_equations_and_fixed_values(seed, n):
+    rng = np.random.default_rng(seed)
+    B, C = rng.standard_normal((2, n, n))
+    A, b, kind = B @ B.T + 0.1 * np.eye(n) + C - C.T, rng.standard_normal(n), rng.integers(0, 5, n)
+    lower = np.where(np.isin(kind, (1, 3)), -rng.random(n), np.where(kind == 4, 0.3, -np.inf))
+    upper = np.where(np.isin(kind, (2, 3)), rng.random(n), np.where(kind == 4, 0.3, np.inf))
+    result = solve(A, b, lower, upper)
+    assert result, result.status
+    np.testing.assert_allclose(result.x.numpy(), boxed(A, b, lower, upper), atol=1e-8)
+
+
+def test_equations_with_a_singular_block_are_split():
+    """x_0 and x_1 are free and their block is 0: a saddle point that only its third row determines."""
+    A = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, -2.0], [1.0, 2.0, 1.0]])
+    b, lower = np.array([1.0, 2.0, -4.0]), np.array([-np.inf, -np.inf, 0.0])
+    result = solve(A, b, lower)
+    assert result, result.status
+    x = result.x.numpy()
+    np.testing.assert_allclose(x[2], 1.0, atol=1e-12)
+    np.testing.assert_allclose(A @ x + b, 0.0, atol=1e-12)
+
+
+def test_degenerate_problem_does_not_cycle():
+    A = np.ones((30, 30)) + np.eye(30)
+    result = solve(A, -np.ones(30))
+    assert result, result.status
+    np.testing.assert_allclose(result.x.numpy(), np.full(30, 1 / 31), atol=1e-12)
+
+
+def test_lexicographic_rule_passes_an_example_with_ties():
+    """All ratios tie at the start and after it; a rule that takes any of them can come back to a basis (Kostreva's matrix is a P-matrix)."""
+    A = np.array([[1.0, 2.0, 0.0], [0.0, 1.0, 2.0], [2.0, 0.0, 1.0]])
+    seen, basis = set(), Basis(A, -np.ones(3), np.ones(3))
+    while (outcome := basis.pivot()) is None:
+        key = tuple(sorted(basis.variables.tolist()))
+        assert key not in seen
+        seen.add(key)
+    assert outcome is True
+    np.testing.assert_allclose(basis.z(), np.full(3, 1 / 3), atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("A", "b", "lower"),
+    [
+        (np.zeros((2, 2)), np.array([1.0, -1.0]), 0.0),
+        (np.ones((2, 2)), np.array([-1.0, -2.0]), -np.inf),
+        (-np.eye(3), -np.ones(3), 0.0),  # not semi-definite: the linear program tells
+        (np.array([[0.0, -1.0], [0.0, 0.0]]), np.array([-1.0, 1.0]), 0.0),
+    ],
+)
+def test_a_confirmed_ray_is_infeasible(A, b, lower):
+    problem = wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower)
+    solver = Lemke()
+    work = solver.init(problem)
+    result = wl.solve(problem, solver, stopping=TIGHT, workspace=work)
+    assert result.status is wl.SolveStatus.INFEASIBLE
+    assert work.rays == 3  # the three random covering vectors were tried
+
+
+def test_a_ray_is_not_called_infeasible_where_a_solution_exists():
+    """Indefinite matrices with a planted solution: the path may end in rays, which then prove nothing."""
+    rng = np.random.default_rng(821)
+    statuses = []
+    for _ in range(60):
+        A = rng.standard_normal((8, 8))
+        held = rng.random(8) < 0.5
+        b = np.where(held, rng.uniform(0.1, 1.0, 8), 0.0) - A @ np.where(held, 0.0, rng.uniform(0.1, 1.0, 8))
+        statuses.append(solve(A, b).status)
+    assert set(statuses) == {wl.SolveStatus.CONVERGED, wl.SolveStatus.STAGNATED}
+    assert statuses.count(wl.SolveStatus.CONVERGED) > 30
+
+
+def test_unsymmetric_p_matrix_with_a_cycle_of_period_three():
+    A = np.array([[1.0, 0.0, 4.0], [4.0, 1.0, 0.0], [0.0, 4.0, 1.0]])
+    np.testing.assert_allclose(solve(A, -np.ones(3)).x.numpy(), np.full(3, 0.2), atol=1e-12)
+
+
+def test_limit_counts_single_pivots_where_asked_for():
+    A, b = contacts(5, np.random.default_rng(823))
+    full = solve(A, b, solver=Lemke(pivots_per_step=1))
+    assert full
+    assert full.iterations == full.linear_iterations
+    short = solve(A, b, solver=Lemke(pivots_per_step=1), stopping=wl.StoppingCriteria(rtol=1e-10, max_iterations=4, patience=1))
+    assert short.status is wl.SolveStatus.MAX_ITERATIONS
+    assert short.iterations == 4
+
+
+@pytest.mark.parametrize("settings", [{"pivots_per_step": 0}, {"covering_vectors": 0}])
+def test_settings_are_checked(settings):
+    with pytest.raises(ValueError, match=next(iter(settings))):
+        Lemke(**settings)
+
+
+def test_large_problems_are_refused(monkeypatch):
+    monkeypatch.setattr(Lemke, "most_unknowns", 3)
+    with pytest.raises(ValueError, match="4 unknowns: Lemke is a dense method for at most 3"):
+        solve(np.eye(4), -np.ones(4))

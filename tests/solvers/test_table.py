@@ -1,0 +1,110 @@
+"""Every registered method on every family of operators it supports, in each precision, against oracles: new methods are picked up."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import scipy.sparse
+import warp as wp
+
+import warp_lcp as wl
+from oracle import assemble, boxed, lemke, natural_residual
+from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.solvers.registry import METHODS
+
+FAMILIES = ("dense", "sparse", "grid")
+BOUNDS = ("lcp", "box", "mixed")
+RTOL = {"mixed": 1e-8, "double": 1e-8, "single": 1e-4}
+CRITERIA = {"max_iterations": 20_000, "patience": 2000}
+MANY = 30  # unknowns, for methods that take as many
+
+
+def precisions(cls):
+    names = {field.name for field in dataclasses.fields(cls)}
+    return ("mixed", "double", "single") if "precision" in names else ("double",)
+
+
+def cases():
+    for name, cls in METHODS.items():
+        for family in FAMILIES:
+            for bounds in BOUNDS:
+                for precision in precisions(cls):
+                    if family in cls.supports and (bounds == "lcp" or getattr(cls, "boxed", True)):
+                        yield pytest.param(name, family, bounds, precision, id=f"{name}-{family}-{bounds}-{precision}")
+
+
+def operator(family, tiny, rng, device):
+    """An operator, its dense matrix between the unknowns, and which entries of a field are unknowns; independent of the library."""
+    if family == "grid":
+        cells = np.ones((1, 4) if tiny else (6, 7), dtype=int)
+        cells[0, 0] = wl.AIR
+        if not tiny:
+            cells[2, 3] = wl.SOLID
+        inside = cells.ravel() == wl.FLUID
+        return wl.GridPoisson(cells, device=device, dtype=wp.float64), assemble(cells)[np.ix_(inside, inside)], inside
+    n = 3 if tiny else MANY
+    if family == "sparse":
+        P = scipy.sparse.random_array((n, n), density=0.15, rng=rng, data_sampler=lambda size: -rng.uniform(0.1, 1.0, size))
+        P = P + P.T
+        A = P + scipy.sparse.diags_array(0.5 - np.asarray(P.sum(axis=1)).ravel())
+        return SparseOperator(A, device=device), A.toarray(), np.ones(n, dtype=bool)
+    B = rng.standard_normal((n, n))
+    A = B @ B.T / n + np.eye(n)
+    return wl.DenseOperator((A + A.T) / 2, device=device), (A + A.T) / 2, np.ones(n, dtype=bool)
+
+
+def planted(A, bounds, rng):
+    """b and bounds with a known, strictly complementary solution: y > 0 at l, y < 0 at u, 0 in between."""
+    n = len(A)
+    lower, upper = np.zeros(n), np.full(n, np.inf)
+    if bounds != "lcp":
+        lower, upper = -rng.uniform(0.1, 1.0, n), rng.uniform(0.1, 1.0, n)
+    if bounds == "mixed":
+        kind = rng.integers(0, 4, n)
+        lower, upper = np.where(kind % 2, lower, -np.inf), np.where(kind // 2, upper, np.inf)
+    held = rng.integers(0, 3, n)
+    low, high = (held == 1) & np.isfinite(lower), (held == 2) & np.isfinite(upper)
+    between = np.where(np.isfinite(lower), lower, -1.0), np.where(np.isfinite(upper), upper, 1.0)
+    x = np.where(low, lower, np.where(high, upper, between[0] + rng.uniform(0.1, 0.9, n) * (between[1] - between[0])))
+    y = np.where(low, 1.0, np.where(high, -1.0, 0.0)) * rng.uniform(0.1, 1.0, n)
+    return y - A @ x, lower, upper, x
+
+
+def scatter(values, inside, shape, rest=0.0):
+    field = np.full(inside.size, rest)
+    field[inside] = values
+    return field.reshape(shape)
+
+
+@pytest.mark.parametrize(("name", "family", "bounds", "precision"), list(cases()))
+def test_method(name, family, bounds, precision, device):
+    rng = np.random.default_rng(sum(map(ord, family + bounds)))
+    cls = METHODS[name]
+    if name == "quadratic-program":
+        pytest.importorskip("piqp")
+    tiny = getattr(cls, "most_unknowns", MANY) < MANY
+    A, matrix, inside = operator(family, tiny, rng, device)
+    b, lower, upper, x = planted(matrix, bounds, rng)
+    oracle = boxed(matrix, b, lower, upper) if len(b) <= 6 else lemke(matrix, b) if bounds == "lcp" else x
+    np.testing.assert_allclose(oracle, x, atol=1e-8)  # the plant and the oracle agree
+    solver = cls(precision=precision) if "precision" in {f.name for f in dataclasses.fields(cls)} else cls()
+    fields = [scatter(values, inside, A.shape) for values in (b, lower, upper)]
+    stopping = wl.StoppingCriteria(rtol=RTOL[precision], **CRITERIA)
+    result = wl.solve(wl.LCP(A, *fields), solver, stopping=stopping)
+    got = result.x.numpy().astype(np.float64).ravel()[inside]
+    reference = natural_residual(matrix, b, lower, upper, np.clip(np.zeros(len(b)), lower, upper))
+    own = natural_residual(matrix, b, lower, upper, got)
+    assert result, f"{result.status.name} at {result.relative_residual:.1e}"
+    assert own <= RTOL[precision] * reference * (1 + 1e-6)  # what the result says is so
+    assert own == pytest.approx(result.residual, rel=1e-3, abs=1e-11 * reference)
+    np.testing.assert_allclose(got, x, atol=1e3 * RTOL[precision])
+    assert len(result.history) == result.iterations + 1
+
+
+def test_every_method_says_where_it_works():
+    for name, cls in METHODS.items():
+        assert cls.supports, name
+        assert cls.supports <= set(FAMILIES), name
+        assert isinstance(cls.needs, str), name
+        assert name == name.lower(), name
+        assert not set(name) - set("abcdefghijklmnopqrstuvwxyz-"), name

@@ -1,0 +1,118 @@
+"""What a gallery function returns: data on the host, a solution where one is known, and what holds for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+import warp as wp
+
+from warp_lcp.operators.dense import DenseOperator
+from warp_lcp.operators.grid_poisson import FLUID, GridPoisson
+from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.problem import LCP
+
+FACTS = frozenset(
+    {
+        "symmetric",
+        "positive-definite",  # x'Ax > 0, also of an A that is not symmetric
+        "semidefinite",  # x'Ax >= 0
+        "p-matrix",  # every principal minor is positive: one solution for every b
+        "m-matrix",  # a P-matrix without positive entries off the diagonal
+        "copositive",  # x'Ax >= 0 for x >= 0
+        "positive-diagonal",
+        "boxed",  # there are finite upper bounds
+        "mixed",  # there are rows without bounds
+        "strict",  # the known solution is strictly complementary
+        "unique",  # there is one solution
+        "solvable",  # there is one at least
+    }
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """An LCP to try methods on: y = A x + b, lower <= x <= upper.
+
+    Args:
+        name: what it is, with its parameters.
+        A: a GridPoisson, a scipy.sparse matrix or a numpy array.
+        b: field of A's shape; 0 where a grid has no unknown.
+        lower: l, a field like b.
+        upper: u, a field like b.
+        solution: a solution, a field like b; None if none is known.
+        facts: what holds, members of FACTS.
+
+    Raises:
+        ValueError: a fact is no member of FACTS.
+    """
+
+    name: str
+    A: Any
+    b: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    solution: np.ndarray | None
+    facts: frozenset[str]
+
+    def __post_init__(self) -> None:
+        """Check the facts."""
+        unknown = sorted(self.facts - FACTS)
+        if unknown:
+            raise ValueError(f"facts holds {unknown}: allowed are {sorted(FACTS)}")
+
+    @property
+    def kind(self) -> str:
+        """The family of its operator: "grid", "sparse" or "dense"."""
+        if isinstance(self.A, GridPoisson):
+            return "grid"
+        return "sparse" if scipy.sparse.issparse(self.A) else "dense"
+
+    def lcp(self, *, device: Any = None, dtype: Any = wp.float64) -> LCP:
+        """Return the problem for a solver; a grid's operator is on its device, of its type, already.
+
+        Args:
+            device: Warp device of a matrix; the default device if None.
+            dtype: storage of a matrix.
+        """
+        make = {"grid": lambda: self.A, "sparse": lambda: SparseOperator(self.A, device=device, dtype=dtype)}
+        A = make.get(self.kind, lambda: DenseOperator(self.A, device=device, dtype=dtype))()
+        return LCP(A, self.b, self.lower, self.upper)
+
+    def sparse(self) -> Problem:
+        """Return the problem of a grid's FLUID cells, in their order, with a scipy.sparse matrix; any other as it is."""
+        if not isinstance(self.A, GridPoisson):
+            return self
+        rows = np.flatnonzero(self.A.cells.numpy()[1:-1, 1:-1, 1:-1].ravel() == FLUID)
+        b, lower, upper = (f.ravel()[rows] for f in (self.b, self.lower, self.upper))
+        x = None if self.solution is None else self.solution.ravel()[rows]
+        return Problem(f"{self.name} as sparse", grid_matrix(self.A), b, lower, upper, x, self.facts)
+
+    def dense(self) -> Problem:
+        """Return the problem with a numpy matrix, of a grid's FLUID cells alone."""
+        if self.kind == "dense":
+            return self
+        p = self.sparse()
+        return Problem(f"{self.name} as dense", p.A.toarray(), p.b, p.lower, p.upper, p.solution, p.facts)
+
+
+def grid_matrix(A: GridPoisson) -> scipy.sparse.csr_array:
+    """Assemble a grid operator on its FLUID cells, in their order, from its diagonal and lower-face weights; no axis may be periodic."""
+    s, padding = A.stencil, A.layout.padding
+    fluid = A.cells.numpy().ravel() == FLUID
+    index = np.cumsum(fluid) - 1
+    cells = np.flatnonzero(fluid)
+    rows, columns, entries = [index[cells]], [index[cells]], [s.d.numpy()[cells].astype(np.float64) * s.unit]
+    for axis, offset in enumerate((1, padding.row, padding.plane)):
+        joined = cells[fluid[cells - offset]]
+        weight = s.weights[axis].numpy()[joined].astype(np.float64) if s.weights is not None else np.full(len(joined), s.coefficients[axis])
+        i, j = index[joined], index[joined - offset]
+        rows += [i, j]
+        columns += [j, i]
+        entries += [-weight, -weight]
+    n = len(cells)
+    matrix = scipy.sparse.coo_array((np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))), shape=(n, n)).tocsr()
+    matrix.eliminate_zeros()
+    return matrix

@@ -1,0 +1,101 @@
+"""Dense matrices of known kind: positive definite, semi-definite, P-matrices on which plain Newton methods cycle."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from warp_lcp.gallery.planted import Plant, planted
+from warp_lcp.gallery.problem import Problem
+
+
+def spectrum_matrix(eigenvalues: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return Q diag(eigenvalues) Q' with a random orthogonal Q, exactly symmetric."""
+    n = len(eigenvalues)
+    Q = np.linalg.qr(rng.standard_normal((n, n)))[0]
+    A = (Q * eigenvalues) @ Q.T
+    return 0.5 * (A + A.T)
+
+
+def definite(n: int, *, condition: float = 100.0, plant: Plant | None = None, seed: int = 2015) -> Problem:
+    """Return a planted problem with a dense symmetric positive definite matrix.
+
+    Args:
+        n: unknowns.
+        condition: largest over smallest eigenvalue, >= 1; they are spaced evenly in their logarithm, the largest is 1.
+        plant: how the solution is chosen.
+        seed: of all choices.
+
+    Raises:
+        ValueError: condition < 1.
+    """
+    if not condition >= 1:
+        raise ValueError(f"condition = {condition}: must be >= 1")
+    rng = np.random.default_rng(seed)
+    A = spectrum_matrix(np.geomspace(1 / condition, 1, n), rng)
+    facts = frozenset({"symmetric", "positive-definite", "p-matrix", "positive-diagonal"})
+    return planted(A, rng, plant or Plant(), name=f"definite {n}, condition {condition:g}", facts=facts)
+
+
+def semidefinite(n: int, *, zeros: float = 0.5, plant: Plant | None = None, seed: int = 2015) -> Problem:
+    """Return a planted, hence solvable, problem with a dense symmetric positive semi-definite matrix B B' of rank n - zeros n.
+
+    y is the same for all its solutions, x need not be.
+
+    Args:
+        n: unknowns.
+        zeros: share of zero eigenvalues, in [0, 1).
+        plant: how the solution is chosen.
+        seed: of all choices.
+
+    Raises:
+        ValueError: zeros is outside [0, 1).
+    """
+    if not 0 <= zeros < 1:
+        raise ValueError(f"zeros = {zeros}: must be in [0, 1)")
+    rng = np.random.default_rng(seed)
+    rank = n - round(zeros * n)
+    B = rng.standard_normal((n, max(rank, 1))) / np.sqrt(n)
+    facts = {"symmetric", "semidefinite", "positive-diagonal"} | ({"positive-definite", "p-matrix"} if rank == n else set())
+    return planted(B @ B.T, rng, plant or Plant(), name=f"semidefinite {n}, {zeros:.0%} zeros", facts=frozenset(facts))
+
+
+def skewed(n: int, *, skew: float = 1.0, plant: Plant | None = None, seed: int = 2015) -> Problem:
+    """Return a planted problem with a positive definite matrix that is not symmetric: a P-matrix B B' + I/2 + skew (C - C').
+
+    Args:
+        n: unknowns.
+        skew: size of the skew part's entries relative to 1 / sqrt(n).
+        plant: how the solution is chosen.
+        seed: of all choices.
+    """
+    rng = np.random.default_rng(seed)
+    B, C = (rng.standard_normal((n, n)) / np.sqrt(n) for _ in range(2))
+    facts = frozenset({"positive-definite", "p-matrix", "positive-diagonal"})
+    return planted(B @ B.T + 0.5 * np.eye(n) + skew * (C - C.T), rng, plant or Plant(), name=f"skewed {n}", facts=facts)
+
+
+def period_three(blocks: int = 1, *, plant: Plant | None = None, seed: int | None = None) -> Problem:
+    """Return P-matrices of size 3 on which Newton's method on the minimum map cycles with period 3 from some starts (Ben Gharbia, Gilbert).
+
+    Each block is [[1, 0, a], [a, 1, 0], [0, a, 1]], whose principal minors are 1, 1 and 1 + a^3. Without a plant b = -1.
+
+    Args:
+        blocks: how many, each with its own a in [1.5, 4.5], their rows and columns scaled by positive numbers; with seed=None one
+            block with a = 4, unscaled.
+        plant: how the solution is chosen; b = -1 if None.
+        seed: of all choices.
+    """
+    rng = np.random.default_rng(seed if seed is not None else 2015)
+    A = np.zeros((3 * blocks, 3 * blocks))
+    for k in range(blocks):
+        a = 4.0 if seed is None else rng.uniform(1.5, 4.5)
+        block = np.eye(3) + a * np.roll(np.eye(3), 1, axis=0)
+        if seed is not None:
+            block = rng.uniform(0.5, 2, 3)[:, None] * block * rng.uniform(0.5, 2, 3)
+        A[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = block
+    facts, name = frozenset({"p-matrix", "positive-diagonal"}), f"period three, {blocks} blocks"
+    if plant is not None:
+        return planted(A, rng, plant, name=name, facts=facts)
+    n = len(A)
+    x = np.linalg.solve(A, np.ones(n)) if seed is None else None
+    return Problem(name, A, -np.ones(n), np.zeros(n), np.full(n, np.inf), x, facts | {"solvable", "unique"})

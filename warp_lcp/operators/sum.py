@@ -1,0 +1,104 @@
+"""The sum of two operators, for methods that need products only."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.layout import layout_of
+from warp_lcp.operators.low_rank import LowRankOperator
+from warp_lcp.operators.low_rank_kernels import add_kernel
+from warp_lcp.operators.protocol import Operator
+from warp_lcp.problem import as_operator
+
+
+class SumOperator:
+    """(A + B) x = A x + B x.
+
+    It has no `relax`: methods that sweep refuse it, those that take products (Newton types, gradient methods) do not. With a grid
+    operator and a LowRankOperator as its terms, principal systems are preconditioned by the grid's multigrid.
+
+    Args:
+        A: an operator, numpy array or scipy.sparse matrix.
+        B: another of the same shape and device. A LowRankOperator is stored like A's fields.
+
+    Attributes:
+        first: A.
+        second: B.
+        symmetric: whether both are.
+        version: changes when either operator changes in place.
+
+    Raises:
+        ValueError: shapes, devices or layouts differ.
+    """
+
+    def __init__(self, A: Any, B: Any) -> None:
+        first, second = as_operator(A), as_operator(B)
+        if tuple(first.shape) != tuple(second.shape):
+            raise ValueError(f"B has shape {tuple(second.shape)}: expected A's, {tuple(first.shape)}")
+        if first.device != second.device:
+            raise ValueError(f"B is on {second.device}: expected A's device, {first.device}")
+        if isinstance(first, LowRankOperator):
+            first = first.stored_like(second)
+        elif isinstance(second, LowRankOperator):
+            second = second.stored_like(first)
+        self.layout = layout_of(first)
+        if self.layout.stored_shape != layout_of(second).stored_shape:
+            raise ValueError("A and B store their fields differently (a grid's are padded): they cannot be summed")
+        self.first: Operator = first
+        self.second: Operator = second
+        self.shape, self.device = tuple(first.shape), first.device
+        self.dtype = wp.float64 if wp.float64 in (first.dtype, second.dtype) else wp.float32
+        self._scratch: dict[Any, wp.array[Any]] = {}
+        grid = next((A for A in (first, second) if hasattr(A, "cells")), None)
+        if grid is not None:
+            self.cells = grid.cells
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether both terms are."""
+        return self.first.symmetric and self.second.symmetric
+
+    @property
+    def version(self) -> int:
+        """How often a term has changed."""
+        return sum(int(getattr(A, "version", 0)) for A in (self.first, self.second))
+
+    @property
+    def unknowns(self) -> int:
+        """Number of unknowns."""
+        return min(int(getattr(A, "unknowns", self.layout.size)) for A in (self.first, self.second))
+
+    def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+        """Return A x + B x."""
+        return self._add(x, out, transposed=False)
+
+    def apply_transpose(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+        """Return A' x + B' x."""
+        return self._add(x, out, transposed=True)
+
+    def diagonal(self) -> wp.array[Any]:
+        """Return the sum of the diagonals."""
+        d = self.first.diagonal().numpy().astype(np.float64) + self.second.diagonal().numpy()
+        return wp.array(d, dtype=self.dtype, device=self.device)
+
+    def masked(self, free: Any, shift: Any = None) -> SumOperator:
+        """Return P (A + B) P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift)."""
+        if isinstance(self.first, LowRankOperator):  # it cannot take a shift
+            return SumOperator(self.first.masked(free), self.second.masked(free, shift))
+        return SumOperator(self.first.masked(free, shift), self.second.masked(free))
+
+    def _add(self, x: wp.array[Any], out: wp.array[Any] | None, *, transposed: bool) -> wp.array[Any]:
+        if x.size not in (self.layout.size, int(np.prod(self.shape))):
+            raise ValueError(f"x has shape {tuple(x.shape)}: expected {self.shape}")
+        out = wp.zeros_like(x) if out is None else out
+        key = (x.dtype, tuple(x.shape))
+        if key not in self._scratch:
+            self._scratch[key] = wp.zeros_like(x)
+        other = self._scratch[key]
+        for A, target in ((self.first, out), (self.second, other)):
+            (A.apply_transpose if transposed else A.apply)(x, target)
+        wp.launch(add_kernel, out.size, [other.flatten(), out.flatten()], device=self.device)
+        return out

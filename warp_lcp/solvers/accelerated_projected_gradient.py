@@ -1,0 +1,134 @@
+"""Accelerated projected gradients: the proximal-map form of the problem, with Nesterov's momentum."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import warp as wp
+
+from warp_lcp.problem import LCP
+from warp_lcp.residual import NaturalResidual
+from warp_lcp.solve import IterateInPlace, Precision, Step
+from warp_lcp.solvers.accelerated_projected_gradient_kernels import advance_kernel, progress_kernel
+from warp_lcp.solvers.spectrum import positive_diagonal, scaled_spectrum
+from warp_lcp.vectors import Reduction, convert, launch_spans
+
+MARGIN = 1.05  # Lanczos' estimate is from below
+NOISE = 1e-20  # relative (squared) length of a step below which its curvature is rounding
+
+
+@dataclass(frozen=True, kw_only=True)
+class AcceleratedProjectedGradient:
+    """Iterate the proximal map x = prox_K(x - r (A x + b)) of the box K with momentum ([Book] 1.1.4).
+
+    With the diagonal D of A as metric and L = lambda_max(D^-1/2 A D^-1/2): x+ = clip(z - D^-1 (A z + b) / L, l, u), z = x + beta (x -
+    x before) with Nesterov's beta. The momentum starts anew where (z - x+)' D (x+ - x) > 0. L comes from Lanczos' method and grows where
+    a step's curvature exceeds it. One product a step, since A z + b is extrapolated as z is. Converges for symmetric positive
+    semidefinite A; the error of the energy falls as 1/k^2, faster in the end.
+
+    Args:
+        lipschitz: L > 0 in the metric D; estimated if None.
+        estimate_steps: products that the estimate takes.
+        precision: "mixed" or "double" keep the iterate in float64, "single" rounds it to float32.
+
+    Raises:
+        ValueError: an argument is outside its range.
+    """
+
+    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
+    needs: ClassVar[str] = "symmetric positive semidefinite A"
+
+    lipschitz: float | None = None
+    estimate_steps: int = 20
+    precision: str = "mixed"
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        if self.lipschitz is not None and not self.lipschitz > 0:
+            raise ValueError(f"lipschitz = {self.lipschitz}: must be > 0")
+        if self.estimate_steps < 1:
+            raise ValueError(f"estimate_steps = {self.estimate_steps}: must be >= 1")
+        Precision(self.precision)
+
+    def init(self, problem: LCP) -> GradientWorkspace:
+        """Return a workspace.
+
+        Raises:
+            ValueError: A is not symmetric, or a diagonal entry is negative.
+        """
+        if not problem.A.symmetric:
+            raise ValueError(f"{type(problem.A).__name__} is not symmetric: A x + b is no gradient")
+        positive_diagonal(problem)
+        return GradientWorkspace(problem, self)
+
+    def step(self, problem: LCP, work: GradientWorkspace, x: wp.array[Any]) -> Step:
+        """Take one step with momentum."""
+        work.advance(x)
+        return Step("gradient")
+
+
+class GradientWorkspace(IterateInPlace):
+    """Memory of the method.
+
+    Attributes:
+        lipschitz: L as it is now.
+    """
+
+    def __init__(self, problem: LCP, settings: AcceleratedProjectedGradient) -> None:
+        self.problem, self.settings, self.precision = problem, settings, Precision(settings.precision)
+        zeros = problem.layout.zeros
+        self.x, self._x_old, self._y_old, self._z, self._y_z = (zeros(wp.float64) for _ in range(5))
+        self.residual = NaturalResidual(problem)
+        self.floating: Any = None
+        self.lipschitz = settings.lipschitz or 1.0
+        self._version: Any = object()
+        self._d = zeros(wp.float64)
+        self._scalars = wp.zeros(4, dtype=wp.float64, device=problem.device)
+        self._reduction = Reduction(problem.layout.size, problem.device, self._scalars, columns=4)
+        self._rounded = zeros(wp.float32) if self.precision is Precision.SINGLE else None
+
+    def start(self, *, warm: bool, tolerance: float) -> None:
+        """Forget the momentum; look at the operator again if it has changed."""
+        self._momentum = 0.0  # Nesterov's t; 0 before the first step, when there is no z
+        version = getattr(self.problem.A, "version", None)
+        if version != self._version:
+            self._version = version
+            self._d.assign(positive_diagonal(self.problem))
+            if self.settings.lipschitz is None:
+                self.lipschitz = MARGIN * scaled_spectrum(self.problem, self.settings.estimate_steps)[1]
+
+    def advance(self, x: wp.array[Any]) -> None:
+        """Take the step; the residual's y is that of x."""
+        p, y, spans = self.problem, self.residual.y, self._reduction.spans
+        beta = self._beta(x) if self._momentum > 0 else 0.0
+        if self._momentum == 0:
+            self._momentum = 1.0
+        moved = [x, self._x_old, self._y_old, self._z, self._y_z]
+        before = [y, self._d, p.lower, p.upper, p.unknown, beta, self.lipschitz, *moved]
+        launch_spans(advance_kernel, spans, before, [], p.device)
+        self.round_iterate()
+
+    def _beta(self, x: wp.array[Any]) -> float:
+        """Look at the last step, correct L, return the share of it that goes on."""
+        r, spans = self._reduction, self._reduction.spans
+        before = [x, self._x_old, self.residual.y, self._z, self._y_z, self._d, self.problem.unknown]
+        launch_spans(progress_kernel, spans, before, [r.threads, r.partials], self.problem.device)
+        r.add_up(0, columns=4)
+        curvature, metric, turned, size = self._scalars.numpy()
+        exceeded = metric > NOISE * size and curvature > self.lipschitz * metric
+        if exceeded:
+            self.lipschitz = min(MARGIN * float(curvature / metric), 2 * self.lipschitz)
+        if exceeded or turned > 0:
+            self._momentum = 1.0
+            return 0.0
+        t = self._momentum
+        self._momentum = (1 + math.sqrt(1 + 4 * t * t)) / 2
+        return (t - 1) / self._momentum
+
+    def round_iterate(self) -> None:
+        """Round the iterate to its precision."""
+        if self._rounded is not None:
+            convert(self.x, self._rounded)
+            convert(self._rounded, self.x)

@@ -1,0 +1,165 @@
+"""Problems that depend on each other's solutions, solved in turn, each by its own method ([Book] 2.2.4)."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.problem import LCP
+from warp_lcp.result import SolveResult, SolveStatus
+from warp_lcp.solve import Solver, solve
+from warp_lcp.stopping import StoppingCriteria
+
+SHARE = 0.3  # of the coupled tolerance, which a block need not be solved beyond
+
+
+class CoupledBlock(Protocol):
+    """One of several problems that depend on each other: pressure and friction of sand, a liquid and its rigid bodies.
+
+    The blocks share state that they know and the loop does not. Operators and devices may differ.
+
+    Attributes:
+        problem: the block's own LCP. Its b and bounds are device fields that `couple` writes in place (see `LCP`).
+    """
+
+    problem: LCP
+
+    def couple(self) -> None:
+        """Write b and the bounds of `problem` from what the other blocks have published."""
+
+    def guess(self) -> wp.array[Any]:
+        """Return the block's last solution, a field of its problem; called after `couple`."""
+
+    def accept(self, result: SolveResult) -> None:
+        """Publish the block's new solution; `result.x` may be overwritten by the next solve."""
+
+
+@dataclass(frozen=True)
+class CoupledResult:
+    """The outcome of `solve_coupled`; true only if all blocks' residuals, at one state, meet the criteria together.
+
+    Attributes:
+        status: how the loop ended.
+        iterations: rounds through all blocks.
+        linear_iterations: of all blocks together.
+        residual: root of the sum of squares of the blocks' residuals.
+        relative_residual: residual over that of the first round.
+        blocks: residual of each block.
+        history: residual before each round, and at the end.
+        seconds: wall time.
+    """
+
+    status: SolveStatus
+    iterations: int
+    linear_iterations: int
+    residual: float
+    relative_residual: float
+    blocks: tuple[float, ...]
+    history: list[float] = field(repr=False)
+    seconds: float
+
+    def __bool__(self) -> bool:
+        """Return whether the loop converged."""
+        return self.status is SolveStatus.CONVERGED
+
+
+class StaggeredRound:
+    """Solves every block once, in turn.
+
+    Args:
+        blocks: in their order.
+        solvers: one for each.
+        eta: a block's residual is reduced by this factor, or to what the whole one needs.
+        max_iterations: the most steps in a block.
+    """
+
+    def __init__(self, blocks: Sequence[CoupledBlock], solvers: Sequence[Solver], *, eta: float, max_iterations: int) -> None:
+        if len(blocks) != len(solvers):
+            raise ValueError(f"solvers: {len(solvers)} for {len(blocks)} blocks, expected one for each")
+        self.blocks, self.solvers, self._eta, self._max = list(blocks), list(solvers), eta, max_iterations
+        self._works = [solver.init(block.problem) for block, solver in zip(self.blocks, self.solvers, strict=True)]
+
+    def residuals(self) -> tuple[float, ...]:
+        """Return each block's residual at the state as it is."""
+        return tuple(self._residual(k) for k in range(len(self.blocks)))
+
+    def run(self, target: float, *, forward: bool = True) -> int:
+        """Solve each block once, from first to last or back; `target` is the residual asked for of all. Returns linear iterations."""
+        count, linear = len(self.blocks), 0
+        for k in range(count) if forward else reversed(range(count)):
+            norm = self._residual(k)
+            goal = max(self._eta * norm, SHARE * target / math.sqrt(count))
+            if not math.isfinite(norm) or norm <= goal:
+                continue
+            block, stopping = self.blocks[k], StoppingCriteria(rtol=0.0, atol=goal, max_iterations=self._max)
+            result = solve(block.problem, self.solvers[k], stopping=stopping, x0=block.guess(), workspace=self._works[k])
+            linear += result.linear_iterations
+            block.accept(result)
+        return linear
+
+    def _residual(self, k: int) -> float:
+        block, work = self.blocks[k], self._works[k]
+        block.couple()
+        block.problem.bounds.refresh()
+        wp.copy(work.x, block.problem.layout.load(block.guess(), wp.float64))
+        return work.residual.evaluate(work.x)
+
+
+def solve_coupled(
+    blocks: Sequence[CoupledBlock],
+    solvers: Sequence[Solver],
+    *,
+    stopping: StoppingCriteria | None = None,
+    eta: float = 1e-2,
+    max_block_iterations: int = 100,
+    staggered: StaggeredRound | None = None,
+) -> CoupledResult:
+    """Solve coupled problems in turn until all are solved at once ([Book] 2.2.4, staggering).
+
+    Converges where the coupling is weak or comes from one symmetric positive definite matrix; there is no proof for friction.
+
+    Args:
+        blocks: the problems.
+        solvers: a method for each.
+        stopping: criteria for the blocks' residuals together; relative to those at the state in which the loop starts.
+        eta: each solve of a block reduces its residual by this factor, or to what the whole still needs.
+        max_block_iterations: the most steps in one block's solve.
+        staggered: memory of an earlier call with these blocks and solvers.
+
+    Raises:
+        ValueError: numbers of blocks and solvers differ, or a method does not take its block.
+    """
+    begun, stopping = time.perf_counter(), stopping or StoppingCriteria()
+    rounds = staggered or StaggeredRound(blocks, solvers, eta=eta, max_iterations=max_block_iterations)
+    norms = rounds.residuals()
+    history = [float(np.linalg.norm(norms))]
+    tolerance, linear, best = stopping.tolerance(history[0]), 0, 0
+    status = _status(history, tolerance, best, stopping)
+    while status is None:
+        linear += rounds.run(tolerance)
+        norms = rounds.residuals()
+        history.append(float(np.linalg.norm(norms)))
+        best = len(history) - 1 if history[-1] < min(history[:-1]) else best
+        status = _status(history, tolerance, best, stopping)
+    relative = history[-1] / history[0] if history[0] > 0 else 0.0
+    return CoupledResult(status, len(history) - 1, linear, history[-1], relative, norms, history, time.perf_counter() - begun)
+
+
+def _status(history: list[float], tolerance: float, best: int, stopping: StoppingCriteria) -> SolveStatus | None:
+    """Return how the loop ends now, None if it goes on."""
+    norm, rounds = history[-1], len(history) - 1
+    if not math.isfinite(norm):
+        return SolveStatus.NON_FINITE
+    if norm <= tolerance:
+        return SolveStatus.CONVERGED
+    if norm > stopping.divergence * history[0]:
+        return SolveStatus.DIVERGED
+    if rounds >= stopping.max_iterations:
+        return SolveStatus.MAX_ITERATIONS
+    return SolveStatus.STAGNATED if rounds - best >= stopping.patience else None

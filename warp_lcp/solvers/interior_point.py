@@ -1,0 +1,278 @@
+"""The interior-point method: Newton's method on the Kojima map, with Mehrotra's predictor and corrector."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.multigrid.hierarchy import CycleSettings
+from warp_lcp.operators.grid_poisson import GridPoisson
+from warp_lcp.problem import LCP
+from warp_lcp.residual import NaturalResidual
+from warp_lcp.solve import IterateInPlace, Precision, Step
+from warp_lcp.solvers.interior_point_kernels import kernels
+from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
+from warp_lcp.solvers.principal_system import GridSystem, principal_system
+from warp_lcp.vectors import Reduction, convert, launch_spans
+
+SUMS, LONGEST = 0, 2  # slots of the device scalars
+import os
+NEAR = float(os.environ.get("NEAR", "1"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class InteriorPoint:
+    """Follow the central path to the solution ([Book] 2.3, eq. 2.105-2.114, algorithm 9; Mehrotra 1992 for the default).
+
+    With w = x - l, v = u - x and multipliers s, t >= 0, the solution has A x + b = s - t, W s = 0, V t = 0. A step is Newton's for
+    W s = V t = tau: (A + D) dx = -(A x + b) + tau / w - tau / v with D = s / w + t / v, so that dx, ds and dt keep all of w, v, s and t
+    positive; equations have D = 0, unknowns with l = u are held. Mehrotra's rule solves with tau = 0 first (the predictor), takes
+    sigma = (mu_after / mu)^3 and solves again with tau = sigma mu and the predictor's second-order terms. The book's rule solves once with
+    tau = mu / k and goes the share k / (N + 1) of the way to the boundary in step k. All variables take one common step, without which
+    the method does not converge for LCPs that are no quadratic programs.
+
+    A must be positive semi-definite (x'Ax >= 0; it need not be symmetric), else steps may become arbitrarily short. A float32 correction
+    carries D up to 1e30: nothing is clamped. On grids the shifted systems are solved by conjugate gradients with multigrid, stopped on
+    the norm of d^(-1/2) r, d the diagonal of A + D. `linear_iterations` counts their iterations.
+
+    Args:
+        precision: "mixed": iterate and multipliers float64, corrections float32 on grids; "double"; or "single": x rounded as well.
+        mehrotra: predictor and corrector; False: the book's step rule.
+        horizon: N of the book's rule, the number of steps in which it reaches the boundary.
+        backoff: share of the longest step that is taken, in (0, 1).
+        crossover: hand over to MinimumMapNewton when the residual is below this multiple of the first one; 0: never.
+        start: a cold start has w A_ii and s at least this multiple of the root mean square of b.
+        monotone_cycles: projected multigrid cycles of a cold start on a grid, from which the path is joined where it is near.
+        predictor_eta: the predictor's linear solve reduces its residual by this factor.
+        eta: the same of the corrector, and of the book's step.
+        max_linear_iterations: the most iterations of one linear solve.
+        cycle: how multigrid cycles go.
+
+    Raises:
+        ValueError: an argument is outside its range.
+
+    Example:
+        >>> import numpy as np, warp_lcp as wl
+        >>> from warp_lcp.solvers.interior_point import InteriorPoint
+        >>> A = wl.DenseOperator(np.array([[2.0, -1.0], [-1.0, 2.0]]), device="cpu")
+        >>> result = wl.solve(wl.LCP(A, np.array([2.0, -3.0])), InteriorPoint())
+        >>> print(result.status.name, result.x.numpy().round(4))
+        CONVERGED [0.  1.5]
+    """
+
+    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
+    needs: ClassVar[str] = "A positive semi-definite; it need not be symmetric"
+
+    precision: str = "mixed"
+    mehrotra: bool = True
+    horizon: int = 100
+    backoff: float = 0.995
+    crossover: float = 0.0
+    start: float = 15.0
+    monotone_cycles: int = 2
+    predictor_eta: float = 0.3
+    eta: float = 0.1
+    max_linear_iterations: int = 200
+    cycle: CycleSettings = field(default_factory=CycleSettings)
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        Precision(self.precision)
+        for name in ("backoff", "predictor_eta", "eta"):
+            if not 0 < getattr(self, name) < 1:
+                raise ValueError(f"{name} = {getattr(self, name)}: must be in (0, 1)")
+        if not 0 <= self.crossover < 1:
+            raise ValueError(f"crossover = {self.crossover}: must be in [0, 1)")
+        if not (self.start > 0 and math.isfinite(self.start)):
+            raise ValueError(f"start = {self.start}: must be finite and > 0")
+        for name, least in (("monotone_cycles", 0), ("max_linear_iterations", 1), ("horizon", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} = {getattr(self, name)}: must be >= {least}")
+
+    def init(self, problem: LCP) -> InteriorPointWorkspace:
+        """Return a workspace."""
+        return InteriorPointWorkspace(problem, self)
+
+    def step(self, problem: LCP, work: InteriorPointWorkspace, x: wp.array[Any]) -> Step:
+        """Take a monotone cycle while the start is cold, a step along the path, or a Newton step after the crossover."""
+        if work.cycles_left > 0:
+            work.cycles_left -= 1
+            return work.active_set.monotone_cycle(x)
+        if not work.crossed and work.begun and work.residual.norm <= self.crossover * work.first_norm:
+            work.cross()
+        if work.crossed:
+            return work.active_set.newton_step(x)
+        if not work.begun:
+            work.begin(x)
+        return work.path_step(x)
+
+
+class InteriorPointWorkspace(IterateInPlace):
+    """Memory of the method for one problem.
+
+    Attributes:
+        mu: mean of the products w s and v t, units of x y.
+        active_set: the method that makes monotone cycles and takes over at the crossover; it works on this one's residual.
+    """
+
+    def __init__(self, problem: LCP, settings: InteriorPoint) -> None:
+        self.problem, self.settings, self.precision = problem, settings, Precision(settings.precision)
+        layout, device = problem.layout, problem.device
+        self.x, self.residual = layout.zeros(wp.float64), NaturalResidual(problem)
+        self.system = principal_system(problem, self.precision.correction, bounded=False, settings=settings.cycle, shifted=problem.bounded)
+        upper = problem.bounds.may_bind[1]
+        self._w, self._s = layout.zeros(wp.float64), layout.zeros(wp.float64)
+        self._v, self._t = (layout.zeros(wp.float64), layout.zeros(wp.float64)) if upper else (self._w, self._s)
+        self._D, self.free = layout.zeros(wp.float64), layout.zeros(wp.uint8)
+        self._predicted = wp.zeros_like(self.system.e)
+        self._scalars = wp.zeros(3, dtype=wp.float64, device=device)
+        self._reduction = Reduction(layout.size, device, self._scalars, columns=2)
+        self._kernels = kernels(self.residual.diagonal.dtype, self.system.r.dtype, upper)
+        self._rounded = layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
+        self._carries = isinstance(self.system, GridSystem)  # conjugate gradients leave the residual in r
+        self.active_set: NewtonWorkspace = None  # type: ignore[assignment]
+        if problem.bounded and (settings.crossover > 0 or (settings.monotone_cycles > 0 and isinstance(problem.A, GridPoisson))):
+            newton = MinimumMapNewton(
+                precision=settings.precision, max_linear_iterations=settings.max_linear_iterations, cycle=settings.cycle
+            )
+            self.active_set = newton.init(problem)
+            self.active_set.residual = self.residual
+        self.floating: Any = None
+        self.start(warm=False, tolerance=0.0)
+
+    def start(self, *, warm: bool, tolerance: float) -> None:
+        """Forget the path; the operator may have changed."""
+        s = self.settings
+        cold_grid = self.problem.bounded and isinstance(self.problem.A, GridPoisson) and not warm
+        self.cycles_left = s.monotone_cycles if cold_grid else 0
+        self.near = warm or self.cycles_left > 0
+        self.begun = self.crossed = False
+        self.steps, self.mu, self.count, self.target = 0, 0.0, 0, tolerance
+        self.first_norm = self.residual.norm
+        self.system.refresh()
+        if self.active_set is not None:
+            self.active_set.floating = self.floating
+            self.active_set.start(warm=not cold_grid, tolerance=tolerance)
+
+    def cross(self) -> None:
+        """Hand over to the active-set method."""
+        self.crossed = True
+        self.active_set.start(warm=True, tolerance=self.target)
+
+    def begin(self, x: wp.array[Any]) -> None:
+        """Move x inside its bounds, and choose multipliers: by the size of b far from the path, by the residual near it."""
+        p = self.problem
+        self._inside(x, 0.0)
+        self.count = int(self._multipliers(0.0)[1])
+        if self.count:
+            unknowns = max(int(np.count_nonzero(p.unknown.numpy() == 1)), 1)
+            far = self.settings.start * self.residual.norm_of_b() / math.sqrt(unknowns)
+            least = NEAR * self.residual.norm / math.sqrt(self.count) if self.near else far
+            self._inside(x, least)
+            self.residual.affine(x)
+            self.mu = self._multipliers(least)[0] / self.count
+        self.begun = True
+        if self.floating is not None:  # what is singular: components none of whose unknowns is bounded
+            free, w, v = self.free.numpy() != 0, self._w.numpy(), self._v.numpy()
+            self._without_bounds = wp.array((free & np.isinf(w) & np.isinf(v)).astype(np.uint8), device=p.device)
+
+    def path_step(self, x: wp.array[Any]) -> Step:
+        """Solve for the direction, and go nearly as far along it as w, v, s and t stay positive."""
+        s, self.steps = self.settings, self.steps + 1
+        self.size = max(self.residual.norm, 1e-300)
+        tau = 0.0 if s.mehrotra else self.mu / self.steps
+        second = 0.0
+        fields = [self.residual.y, *self._pairs, self.free, self.system.r, self._D, wp.float64(1 / self.size), wp.float64(tau)]
+        self._flat(self._kernels.condense, fields)
+        self.system.restrict(self.free, self._D if self.problem.bounded else None)
+        self._project()
+        iterations = self._solve(s.predictor_eta if s.mehrotra and self.count else s.eta)
+        longest, products = self._ratios(second, tau)
+        if s.mehrotra and self.count:
+            length = min(1.0, 1 / longest) if longest > 0 else 1.0
+            after = (1 - length) * self.mu + length**2 * products / self.count
+            tau, second = self.mu * min(1.0, max(0.0, after / self.mu)) ** 3, 1.0
+            fields = [self.residual.y, *self._pairs, self.free, self.system.e, self._predicted, self.system.r]
+            self._flat(self._kernels.center, [*fields, wp.float64(self.size), wp.float64(tau), self._carries])
+            self._project()
+            iterations += self._solve(s.eta)
+            longest, _ = self._ratios(second, tau)
+        share = s.backoff if s.mehrotra else min(s.backoff, self.steps / (s.horizon + 1))
+        length = min(1.0, share / longest) if longest > 0 else 1.0
+        self._move(x, second, tau, length)
+        name = "predictor-corrector" if s.mehrotra else "path"
+        return Step(name, iterations, None, interim=not s.mehrotra and self.steps <= s.horizon)
+
+    @property
+    def _pairs(self) -> list[wp.array[Any]]:
+        return [self._w, self._v, self._s, self._t]
+
+    def _direction(self, second: float, tau: float) -> list[Any]:
+        """What ds and dt are computed from."""
+        joined = 1.0 if self._carries else 0.0
+        return [*self._pairs, self._predicted, self.system.e, *(wp.float64(v) for v in (self.size, second, joined, tau))]
+
+    def _ratios(self, second: float, tau: float) -> tuple[float, float]:
+        """Return the reciprocal of the longest step, 0 if there is none, and the sum of dw ds + dv dt."""
+        longest = self._scalars[LONGEST : LONGEST + 1]
+        longest.zero_()
+        r = self._reduction
+        launch_spans(self._kernels.ratios, r.spans, self._direction(second, tau), [longest, r.partials], self.problem.device)
+        r.add_up(SUMS)
+        found = self._scalars.numpy()
+        return float(found[LONGEST]), float(found[SUMS])
+
+    def _move(self, x: wp.array[Any], second: float, tau: float, length: float) -> None:
+        """Take the step, and remember mu."""
+        p, r = self.problem, self._reduction
+        w, v, s, t, *rest = self._direction(second, tau)
+        before = [p.lower, p.upper, w, v, s, t, rest[0], rest[1], x, *rest[2:], wp.float64(length)]
+        launch_spans(self._kernels.move, r.spans, before, [r.partials], p.device)
+        r.add_up(SUMS)
+        self.mu = float(self._scalars.numpy()[SUMS]) / max(self.count, 1)
+        if self.floating is not None:
+            self.floating.settle(x, p.lower, p.upper)
+        self._round(x)
+
+    def _inside(self, x: wp.array[Any], width: float) -> None:
+        """Set w and v to at least width / d, and x accordingly."""
+        p, d = self.problem, self.residual
+        before = [p.lower, p.upper, p.unknown, d.diagonal, d.unit, wp.float64(width), x, self._w, self._v, self.free]
+        self._flat(self._kernels.inside, before)
+
+    def _multipliers(self, least: float) -> tuple[float, float]:
+        """Set s and t to y's sides, at least `least`; return the sum of products and how many bounds are finite."""
+        r = self._reduction
+        before = [self.residual.y, *self._pairs, wp.float64(least)]
+        launch_spans(self._kernels.multipliers, r.spans, before, [r.threads, r.partials], self.problem.device)
+        r.add_up(SUMS, columns=2)
+        found = self._scalars.numpy()
+        return float(found[0]), float(found[1])
+
+    def _solve(self, eta: float) -> int:
+        """Reduce the right-hand side by a factor; return linear iterations."""
+        target = eta
+        if not self.count:
+            target = max(eta, 0.3 * self.target / self.size)
+        return self.system.solve(target * self.system.norm(), self.settings.max_linear_iterations)[0]
+
+    def _project(self) -> None:
+        """Take off what a singular component without bounds cannot meet."""
+        if self.floating is not None:
+            self.floating.project(self.system.r, self._without_bounds)
+
+    def _flat(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
+        launch_spans(kernel, self._reduction.spans, inputs, [], self.problem.device)
+
+    def round_iterate(self) -> None:
+        """Round x to its precision."""
+        self._round(self.x)
+
+    def _round(self, x: wp.array[Any]) -> None:
+        if self._rounded is not None:
+            convert(x, self._rounded)
+            convert(self._rounded, x)

@@ -1,0 +1,100 @@
+"""The nonsmooth nonlinear conjugate gradient method: Fletcher-Reeves on what projected Gauss-Seidel takes away."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import warp as wp
+
+from warp_lcp.problem import LCP
+from warp_lcp.solve import Precision, Step
+from warp_lcp.solvers.nncg_kernels import direction_kernel, gradient_kernel
+from warp_lcp.solvers.psor import DIRECTIONS, SweepWorkspace
+from warp_lcp.solvers.sweep import sweep_for
+from warp_lcp.vectors import Reduction, launch_spans
+
+
+@dataclass(frozen=True, kw_only=True)
+class NNCG:
+    """Accelerate projected Gauss-Seidel by nonlinear conjugate gradients ([Book] 2.2.6, algorithm 8; Silcowitz-Hansen et al. 2010).
+
+    The change of a sweep is taken for the negative gradient, g = x - PGS(x), of a function whose minimum is the sweep's fixed point. With
+    beta = |g|^2 / |g before|^2: x <- PGS(x) + beta p and p <- beta p - g without a line search; where beta > 1, p <- 0 and x <- PGS(x).
+    Unlike algorithm 8, x is projected onto the bounds after the move along p, so that iterates stay feasible. No proof of convergence;
+    on grids it saves three quarters of the sweeps of omega = 1, and ProjectedSOR with its best omega saves more.
+
+    Args:
+        direction: of its sweeps, "forward", "backward" or "symmetric".
+        omega: relaxation factor of its sweeps, in (0, 2).
+        precision: "mixed" or "double" keep the iterate in float64, "single" rounds it to float32.
+
+    Raises:
+        ValueError: an argument is outside its range.
+    """
+
+    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
+    needs: ClassVar[str] = "what ProjectedSOR needs"
+    affine_bounds: ClassVar[bool] = True
+
+    direction: str = "forward"
+    omega: float = 1.0
+    precision: str = "mixed"
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        if not 0 < self.omega < 2:
+            raise ValueError(f"omega = {self.omega}: must be in (0, 2)")
+        if self.direction not in DIRECTIONS:
+            raise ValueError(f"direction = {self.direction!r}: must be 'forward', 'backward' or 'symmetric'")
+        Precision(self.precision)
+
+    def init(self, problem: LCP) -> NNCGWorkspace:
+        """Return a workspace.
+
+        Raises:
+            ValueError: A cannot be swept; see ProjectedSOR.
+        """
+        work = NNCGWorkspace(problem, Precision(self.precision))
+        work.sweep = sweep_for(problem, work.diagonal, self.omega)
+        work.diagonal.check()
+        return work
+
+    def step(self, problem: LCP, work: NNCGWorkspace, x: wp.array[Any]) -> Step:
+        """Sweep and move on along the last direction."""
+        wp.copy(work.g, x)
+        for forward in DIRECTIONS[self.direction]:
+            work.sweep.run(x, forward=forward)
+        work.advance(x)
+        return Step("sweep", len(DIRECTIONS[self.direction]), failure=work.contraction.test(x))
+
+
+class NNCGWorkspace(SweepWorkspace):
+    """Memory of the method.
+
+    Attributes:
+        g: stored field, x before the sweep, then the gradient.
+        p: stored field, the direction.
+    """
+
+    def __init__(self, problem: LCP, precision: Precision) -> None:
+        super().__init__(problem, precision)
+        self.g, self.p = problem.layout.zeros(wp.float64), problem.layout.zeros(wp.float64)
+        self._scalars = wp.zeros(2, dtype=wp.float64, device=problem.device)
+        self._reduction = Reduction(problem.layout.size, problem.device, self._scalars)
+
+    def start(self, *, warm: bool, tolerance: float) -> None:
+        """Forget the direction."""
+        super().start(warm=warm, tolerance=tolerance)
+        self._scalars.zero_()
+        self.p.zero_()
+
+    def advance(self, x: wp.array[Any]) -> None:
+        """Move x, which a sweep has just moved, along p, and turn p."""
+        p, spans = self.problem, self._reduction.spans
+        launch_spans(gradient_kernel, spans, [x, p.unknown, self.g], [self._reduction.partials], p.device)
+        self._reduction.add_up(0)
+        p.bounds.follow(x)
+        launch_spans(direction_kernel, spans, [self._scalars, self.g, p.lower, p.upper, p.unknown, x, self.p], [], p.device)
+        wp.copy(self._scalars, self._scalars, dest_offset=1, src_offset=0, count=1)
+        self.round_iterate()

@@ -1,0 +1,215 @@
+"""A problem in blocks: which unknowns belong together, and each block as a problem of its own while the others stand still."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+import warp as wp
+
+from warp_lcp.operators.dense import DenseOperator
+from warp_lcp.operators.grid_poisson import AIR, FLUID, GridPoisson
+from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.operators.sparse_kernels import color_kernel
+from warp_lcp.problem import LCP
+from warp_lcp.result import SolveResult
+from warp_lcp.solvers.partition_kernels import outside_kernel, put_kernel, take_kernel
+
+Blocks = int | Sequence[Any]
+
+
+def blocks_of_size(problem: LCP, size: int) -> list[np.ndarray]:
+    """Return stored indices of the unknowns, `size` consecutive ones a block; the last block may be smaller."""
+    unknowns = np.flatnonzero(problem.unknown.numpy() == 1)
+    return [unknowns[i : i + size] for i in range(0, len(unknowns), size)]
+
+
+def given_blocks(problem: LCP, blocks: Sequence[Any]) -> list[np.ndarray]:
+    """Return stored indices of each block.
+
+    Args:
+        problem: whose unknowns they are.
+        blocks: for each block flat indices into a field of the problem's shape; together all unknowns, each once.
+
+    Raises:
+        ValueError: an index is out of range, an unknown is missing or in two blocks, or a block is empty.
+    """
+    layout = problem.layout
+    place = layout.target(np.arange(layout.size).reshape(layout.stored_shape), np.empty(layout.shape)).ravel()
+    found = []
+    for k, block in enumerate(blocks):
+        index = np.asarray(block, dtype=np.int64).ravel()
+        if index.size == 0:
+            raise ValueError(f"blocks[{k}] is empty")
+        if index.min() < 0 or index.max() >= len(place):
+            raise ValueError(f"blocks[{k}] has indices from {index.min()} to {index.max()}: expected 0 ... {len(place) - 1}")
+        found.append(place[index])
+    count = np.bincount(np.concatenate(found), minlength=layout.size) if found else np.zeros(layout.size, dtype=int)
+    wrong = count != (problem.unknown.numpy() == 1)
+    if wrong.any():
+        at = int(np.flatnonzero(wrong[place])[0])
+        raise ValueError(f"blocks hold {count[place[at]]} times index {at}, expected {int(problem.unknown.numpy()[place[at]] == 1)}")
+    return found
+
+
+def color_blocks(matrix: scipy.sparse.csr_array, owner: np.ndarray, count: int) -> list[np.ndarray]:
+    """Return the blocks of each color, in order: no row of a block has an entry in a column of another block of its color.
+
+    Args:
+        matrix: A.
+        owner: block of each row.
+        count: number of blocks.
+    """
+    members = scipy.sparse.csr_array((np.ones(len(owner)), (np.arange(len(owner)), owner)), shape=(len(owner), count))
+    pattern = scipy.sparse.csr_array((np.ones(matrix.nnz), matrix.indices, matrix.indptr), shape=matrix.shape)
+    between = (members.T @ pattern @ members).tocsr()
+    between = (between + between.T).tocsr()
+    inputs = [wp.array(v, dtype=wp.int32, device="cpu") for v in (between.indptr, between.indices)]
+    taken = wp.zeros(int(np.diff(between.indptr).max()) + 2, dtype=wp.int32, device="cpu")
+    color = wp.zeros(count, dtype=wp.int32, device="cpu")
+    wp.launch(color_kernel, 1, [*inputs, taken, color, count], device="cpu")
+    host = color.numpy()
+    return [np.flatnonzero(host == c) for c in range(int(host.max()) + 1)]
+
+
+class MatrixBlock:
+    """A block of a dense or sparse problem: A_BB x_B + (b_B + A_BC x_C), C the other unknowns. Products with A_BC are made on the host.
+
+    Attributes:
+        problem: the block's own; b and bounds are written by `couple`.
+    """
+
+    def __init__(self, whole: LCP, x: wp.array[Any], rows: np.ndarray) -> None:
+        self._whole, self._x, self._rows = whole, x, rows
+        inner, self._outer = self._entries()
+        made: Any = DenseOperator if isinstance(whole.A, DenseOperator) else SparseOperator
+        device, size = whole.device, len(rows)
+        A = made(inner, device=device, dtype=whole.A.dtype)
+        b, low, high = (wp.zeros(size, dtype=wp.float64, device=device) for _ in range(3))
+        self.problem = LCP(A, b, low, high)
+        self._version = getattr(whole.A, "version", 0)
+
+    def refresh(self) -> None:
+        """Take A's entries again."""
+        A, version = self.problem.A, getattr(self._whole.A, "version", 0)
+        if isinstance(A, SparseOperator) and version == self._version:
+            return
+        self._version = version
+        inner, self._outer = self._entries()
+        if isinstance(A, DenseOperator):
+            A.matrix.assign(inner)
+        elif isinstance(A, SparseOperator):
+            A.update(inner)
+
+    def couple(self) -> None:
+        """Write b_B + A_BC x_C and the bounds at x."""
+        whole, problem, rows = self._whole, self.problem, self._rows
+        whole.bounds.follow(self._x)
+        problem.b.assign(whole.b.numpy()[rows] + self._outer @ self._x.numpy())
+        for field, source in ((problem.lower, whole.lower), (problem.upper, whole.upper)):
+            field.assign(source.numpy()[rows])
+
+    def guess(self) -> wp.array[Any]:
+        """Return x_B."""
+        return wp.array(self._x.numpy()[self._rows], dtype=wp.float64, device=self._whole.device)
+
+    def accept(self, result: SolveResult) -> None:
+        """Write x_B."""
+        values = self._x.numpy()
+        values[self._rows] = result.x.numpy()
+        self._x.assign(values)
+
+    def _entries(self) -> tuple[Any, Any]:
+        """Return A_BB, and the block's rows of A with 0 in place of it."""
+        A, rows = self._whole.A, self._rows
+        if isinstance(A, DenseOperator):
+            outer = A.matrix.numpy()[rows].astype(np.float64)
+            inner = outer[:, rows].copy()
+            outer[:, rows] = 0.0
+            return inner, outer
+        assert isinstance(A, SparseOperator)
+        slab = scipy.sparse.csr_array(A.matrix()[rows])
+        others = np.ones(A.unknowns)
+        others[rows] = 0.0
+        outer = slab @ scipy.sparse.diags_array(others)
+        return slab[:, rows], outer
+
+
+class GridBlock:
+    """A block of a grid problem: the same grid with AIR, x = 0, in place of the other unknowns, whose part is in b.
+
+    Attributes:
+        problem: the block's own, in the layout of the whole; bounds are shared with it.
+    """
+
+    def __init__(self, whole: LCP, x: wp.array[Any], rows: np.ndarray) -> None:
+        A = whole.A
+        assert isinstance(A, GridPoisson)
+        layout = whole.layout
+        self._whole, self._x = whole, x
+        member = np.zeros(layout.size, dtype=np.uint8)
+        member[rows] = 1
+        self._member = wp.array(member, dtype=wp.uint8, device=whole.device)
+        inner = tuple(slice(1, -1) for _ in range(3))
+        cells = self._cells().reshape(layout.stored_shape)[inner].reshape(A.shape)
+        faces = {f"face_{axis}": f if f.size else c for axis, f, c in zip("xyz", A.faces, A.uniform, strict=True)}
+        shift = A.shift if A.shift.size else None
+        sub = GridPoisson(cells, **faces, shift=shift, periodic=A.periodic, device=whole.device, dtype=A.dtype)
+        self._b, self._y, self._z, self._guess = (layout.zeros(wp.float64) for _ in range(4))
+        stored = layout.stored_shape
+        self.problem = LCP(sub, self._b.reshape(stored), whole.lower.reshape(stored), whole.upper.reshape(stored))
+        self._version = A.version
+
+    def refresh(self) -> None:
+        """Take A's coefficients again; cells that are no longer FLUID leave the block, new ones belong to none."""
+        A = self._whole.A
+        assert isinstance(A, GridPoisson)
+        if A.version != self._version:
+            self._version = A.version
+            cells = self._cells().reshape(self._whole.layout.stored_shape)
+            self.problem.A.update(wp.array(cells, dtype=wp.int8, device=self._whole.device))  # type: ignore[attr-defined]
+
+    def couple(self) -> None:
+        """Write what A x + b leaves of b when the block's own part is taken out."""
+        whole, n = self._whole, self._x.size
+        whole.bounds.follow(self._x)
+        whole.A.apply_plus(self._x, whole.b, self._y)  # type: ignore[attr-defined]
+        wp.launch(take_kernel, n, [self._x, self._member, self._guess], device=whole.device)
+        self.problem.A.apply(self._guess, self._z)
+        wp.launch(outside_kernel, n, [self._y, self._z, self._member, self._b], device=whole.device)
+
+    def guess(self) -> wp.array[Any]:
+        """Return x_B as `couple` found it."""
+        return self._guess
+
+    def accept(self, result: SolveResult) -> None:
+        """Write x_B."""
+        wp.launch(put_kernel, self._x.size, [result.x.flatten(), self._member, self._x], device=self._whole.device)
+
+    def _cells(self) -> np.ndarray:
+        """Return the padded cell types with AIR in place of the other unknowns."""
+        cells, member = self._whole.A.cells.numpy().ravel(), self._member.numpy()  # type: ignore[attr-defined]
+        return np.where((cells == FLUID) & (member == 0), AIR, cells).astype(np.int8)
+
+
+Block = MatrixBlock | GridBlock
+
+
+def block_problem(whole: LCP, x: wp.array[Any], rows: np.ndarray) -> Block:
+    """Return a block of a problem as a problem of its own.
+
+    Args:
+        whole: the problem.
+        x: the iterate that all blocks share, stored.
+        rows: the block's stored indices.
+
+    Raises:
+        ValueError: the operator has no principal sub-operators.
+    """
+    if isinstance(whole.A, GridPoisson):
+        return GridBlock(whole, x, rows)
+    if isinstance(whole.A, (DenseOperator, SparseOperator)):
+        return MatrixBlock(whole, x, rows)
+    raise ValueError(f"{type(whole.A).__name__} cannot be taken apart: blocks are for DenseOperator, SparseOperator and GridPoisson")

@@ -1,0 +1,164 @@
+"""The principal system of a sparse matrix: conjugate gradients or GMRES, preconditioned by algebraic multigrid or incomplete factors."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.linalg
+import warp as wp
+
+from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
+from warp_lcp.krylov.gmres import GMRES
+from warp_lcp.multigrid.algebraic import AlgebraicHierarchy, AlgebraicSettings
+from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.program import Launch
+from warp_lcp.solvers.principal_system_norm import WeightedNorm
+
+DOMINANT = 0.9  # share of rows that must be diagonally dominant for multigrid to serve an unsymmetric matrix
+DIRECT = 2000  # unknowns up to which factors are complete: that costs less than the iterations it saves
+POSITIVE = 0.1  # share of the off-diagonal entries' magnitude that may be positive there
+
+
+class SparsePreconditioner(Protocol):
+    """An approximate inverse of M = P A P + P D P, and M itself."""
+
+    r: wp.array[Any]
+    z: wp.array[Any]
+    weight: wp.array[Any]
+
+    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
+        """Take a free set and a shift."""
+
+    def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
+        """Q = M p."""
+
+    def apply(self) -> None:
+        """Write z."""
+
+
+class SparseSystem:
+    """(P A P + P D P) e = r with a sparse A.
+
+    Symmetric matrices whose diagonal is not negative take conjugate gradients with algebraic multigrid, which falls back on sweeps where
+    nothing aggregates. Others take GMRES: with algebraic multigrid if most rows are diagonally dominant and nearly all off-diagonal
+    entries negative (convection-diffusion), else with incomplete factors made anew by SciPy on the CPU, and sweeps on CUDA.
+    """
+
+    def __init__(self, A: SparseOperator, real: Any, *, shifted: bool = False, settings: AlgebraicSettings | None = None) -> None:
+        self._A, self._real, self._shifted, self._settings = A, real, shifted, settings
+        self._build()
+
+    def _build(self) -> None:
+        A, real = self._A, self._real
+        host = A.matrix()
+        self._version, self._symmetric = A.version, A.symmetric
+        positive = bool((host.diagonal() >= 0).all())
+        self.preconditioner: SparsePreconditioner
+        if (A.symmetric and positive) or suits_multigrid(host):
+            self.preconditioner = AlgebraicHierarchy(A, real, self._settings)
+        elif A.device.is_cpu:
+            self.preconditioner = IncompleteFactors(A, real)
+        else:
+            self.preconditioner = AlgebraicHierarchy(A, real, AlgebraicSettings(coarsest_cpu=0, coarsest_cuda=0, stall=0.0, last_sweeps=1))
+        M = self.preconditioner
+        weight = M.weight if self._shifted else None
+        method = ConjugateGradient if A.symmetric and positive else GMRES
+        self._krylov = method(M.product, M, weight=weight)
+        self.r, self.e = M.r, self._krylov.x
+        self._norm = WeightedNorm(self.r, weight)
+
+    def refresh(self) -> None:
+        """Choose again where an update of A has changed whether it is symmetric; `restrict` takes the entries.
+
+        Raises:
+            ValueError: A was symmetric and is not any more: this system's fields serve conjugate gradients.
+        """
+        if self._version != self._A.version:
+            self._version = self._A.version
+            if self._symmetric and not self._A.symmetric:
+                raise ValueError("A was updated from a symmetric to an unsymmetric matrix: make a new workspace")
+
+    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
+        """Take another free set and shift, and compute the preconditioner anew."""
+        self.preconditioner.restrict(free, shift)
+
+    def norm(self) -> float:
+        """Return the norm of r."""
+        return self._norm.of(self.r)
+
+    def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
+        """Iterate."""
+        return self._krylov.solve(tolerance, max_iterations)
+
+
+class IncompleteFactors:
+    """L U factors of the free block by SciPy, on the CPU; incomplete ones of more than `DIRECT` unknowns.
+
+    Args:
+        A: the matrix, on the CPU.
+        real: type of the corrections.
+        drop: entries of the factors below this share of their column are dropped.
+        fill: the most entries of the factors, in units of A's.
+    """
+
+    def __init__(self, A: SparseOperator, real: Any, *, drop: float = 1e-4, fill: float = 10.0) -> None:
+        self._A, self._drop, self._fill = A, drop, fill
+        self.r, self.z, self.weight = (wp.zeros(A.unknowns, dtype=real, device="cpu") for _ in range(3))
+        self._factors: Any = None
+        self._free = np.zeros(0, dtype=np.intp)
+
+    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
+        """Factor the free block; where a factor is singular, with a small multiple of its largest entry on the diagonal."""
+        self._free = np.flatnonzero(free.numpy())
+        matrix = self._A.matrix()
+        if shift is not None:
+            matrix = (matrix + scipy.sparse.diags_array(shift.numpy())).tocsr()
+        mask = scipy.sparse.diags_array((free.numpy() != 0).astype(np.float64))
+        self._M = (mask @ matrix @ mask).tocsr()
+        diagonal = np.abs(self._M.diagonal())
+        self.weight.assign(np.where(free.numpy() != 0, 1 / np.where(diagonal > 0, diagonal, 1.0), 0.0))
+        self.z.zero_()
+        self._factors = self._factor(matrix[self._free][:, self._free].tocsc()) if self._free.size else None
+
+    def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
+        """Q = M p, on the host."""
+        q.assign(self._M @ p.numpy())
+
+    def apply(self) -> None:
+        """Precondition."""
+        if self._factors is not None:
+            self.z.numpy()[self._free] = self._factors.solve(self.r.numpy()[self._free].astype(np.float64))
+
+    def _factor(self, block: Any) -> Any:
+        size = float(np.abs(block.data).max(initial=0.0)) or 1.0
+        for nudge in (0.0, 1e-10, 1e-6):
+            try:
+                nudged = block if nudge == 0 else (block + nudge * size * scipy.sparse.eye_array(block.shape[0])).tocsc()
+                if block.shape[0] <= DIRECT:
+                    return scipy.sparse.linalg.splu(nudged)
+                return scipy.sparse.linalg.spilu(nudged, drop_tol=self._drop, fill_factor=self._fill)
+            except RuntimeError:  # a factor is exactly singular
+                continue
+        return _Identity()
+
+
+class _Identity:
+    """Stands for factors that cannot be had."""
+
+    def solve(self, r: np.ndarray) -> np.ndarray:
+        return r
+
+
+def suits_multigrid(host: scipy.sparse.csr_array) -> bool:
+    """Return whether a matrix is near enough to a diagonally dominant M-matrix."""
+    d = host.diagonal()
+    if not (d > 0).all():
+        return False
+    off = (host - scipy.sparse.diags_array(d)).tocsr()
+    magnitude = np.abs(off).sum(axis=1)
+    total = float(magnitude.sum())
+    if total > 0 and float(off.data[off.data > 0].sum()) > POSITIVE * total:
+        return False
+    return float((magnitude <= 1.01 * d).mean()) >= DOMINANT

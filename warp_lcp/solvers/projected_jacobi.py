@@ -1,0 +1,93 @@
+"""Projected Jacobi: all unknowns at once, from the same iterate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import warp as wp
+
+from warp_lcp.problem import LCP
+from warp_lcp.solve import Precision, Step
+from warp_lcp.solvers.psor import SweepWorkspace
+from warp_lcp.solvers.spectrum import scaled_spectrum
+from warp_lcp.solvers.sweep_kernels import jacobi_kernel
+
+STEPS = 20  # of Lanczos' method
+SHARE = 1.8  # of the 2 / lambda_max at which Jacobi's method stops converging; Lanczos sees lambda_max from below
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProjectedJacobi:
+    """Solve each scalar problem from the same x ([Book] 2.2.1, table 2.1 and eq. 2.63 with M = D / omega).
+
+    x <- clip(x - omega D^-1 (A x + b), l, u). Converges for symmetric positive definite A and 0 < omega < 2 / lambda_max(D^-1 A), which
+    the book's omega = 1 exceeds for many matrices; the test of algorithm 4 then says DIVERGED (see `Contraction`). About half as fast as
+    projected Gauss-Seidel, but the same in every order, and no slower on a GPU. Zero and negative diagonals as in ProjectedSOR. Works
+    with any operator, and with bounds affine in x, which are those at the last x.
+
+    Args:
+        omega: damping > 0; min(1, 1.8 / lambda_max), estimated, if None. Without symmetry, 1.
+        precision: "mixed" or "double" keep the iterate in float64, "single" rounds it to float32.
+
+    Raises:
+        ValueError: an argument is outside its range.
+    """
+
+    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
+    needs: ClassVar[str] = "symmetric positive (semi-)definite A for a proof of convergence; A_ii <= 0 case by case"
+    affine_bounds: ClassVar[bool] = True
+
+    omega: float | None = None
+    precision: str = "mixed"
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        if self.omega is not None and not self.omega > 0:
+            raise ValueError(f"omega = {self.omega}: must be > 0")
+        Precision(self.precision)
+
+    def init(self, problem: LCP) -> JacobiWorkspace:
+        """Return a workspace.
+
+        Raises:
+            ValueError: a zero or negative diagonal entry with a right-hand side that no bound meets.
+        """
+        work = JacobiWorkspace(problem, self)
+        work.diagonal.check()
+        return work
+
+    def step(self, problem: LCP, work: JacobiWorkspace, x: wp.array[Any]) -> Step:
+        """Pass once over the unknowns; y is that of the residual."""
+        r = work.residual
+        inputs = [r.diagonal, r.unit, r.y, problem.lower, problem.upper, problem.unknown, work.omega, x]
+        wp.launch(jacobi_kernel(r.diagonal.dtype), x.size, inputs, device=problem.device)
+        work.round_iterate()
+        return Step("sweep", 1, failure=work.contraction.test(x))
+
+
+class JacobiWorkspace(SweepWorkspace):
+    """Memory of the method.
+
+    Attributes:
+        omega: the damping in use.
+    """
+
+    def __init__(self, problem: LCP, settings: ProjectedJacobi) -> None:
+        super().__init__(problem, Precision(settings.precision))
+        self._given, self._version = settings.omega, object()
+        self.omega = settings.omega or 1.0
+
+    def start(self, *, warm: bool, tolerance: float) -> None:
+        """Estimate the damping where the operator is new."""
+        version = getattr(self.problem.A, "version", None)
+        if self._given is None and version != self._version:
+            self._version = version
+            self.omega = self._estimate()
+        self.contraction.start(self.x)
+
+    def _estimate(self) -> float:
+        A = self.problem.A
+        if not A.symmetric or (self.diagonal.values() < 0).any():
+            return 1.0
+        return min(1.0, SHARE / scaled_spectrum(self.problem, STEPS)[1])

@@ -1,0 +1,170 @@
+"""Projected Gauss-Seidel subspace minimization: sweeps find the free set, a linear solve finds x on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.multigrid.hierarchy import CycleSettings
+from warp_lcp.problem import LCP
+from warp_lcp.solve import Precision, Step
+from warp_lcp.solvers.principal_system import principal_system
+from warp_lcp.solvers.psor import SweepWorkspace
+from warp_lcp.solvers.subspace_minimization_kernels import classify_kernel, free_square_kernel, kernels
+from warp_lcp.solvers.sweep import sweep_for
+from warp_lcp.vectors import Reduction, launch_spans
+
+MOVED, HELD, FREE_NORM, XY, XB = range(5)  # slots of the device scalars; HELD follows MOVED
+ROUNDING = 1e-14  # relative change of the energy that is none
+
+
+@dataclass(frozen=True, kw_only=True)
+class SubspaceMinimization:
+    """Sweep, then solve A_FF x_F = -(b_F + A_FH x_H) on the unknowns off their bounds and project ([Book] 2.2.5, algorithm 7, eq. 2.95).
+
+    A step is `sweeps` projected Gauss-Seidel sweeps and up to `solves` such solves, until the free set stays ([Book] eq. 2.98). Each solve is
+    inexact, as far as the whole one still needs. Its projected correction is halved until the energy x'A x / 2 + b'x or the residual
+    falls, up to `backtracks` times; if neither falls, x stays what the sweeps made of it. The book takes full steps, whose "jaggyness"
+    (fig. 2.10) is what this cures; `backtracks = -1` does as the book does.
+    `linear_iterations` counts sweeps and preconditioned iterations.
+
+    Args:
+        sweeps: of each step, >= 1.
+        solves: on the free set, of each step, at most; >= 1.
+        omega: relaxation factor of the sweeps, in (0, 2).
+        eta: each linear solve reduces its residual by this factor, or to what the whole solve still needs.
+        max_linear_iterations: the most iterations of one linear solve.
+        backtracks: halvings of a correction; -1 takes all corrections as they come.
+        precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate rounded to float32 as well.
+        cycle: how multigrid cycles go.
+
+    Raises:
+        ValueError: an argument is outside its range.
+    """
+
+    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
+    needs: ClassVar[str] = "what ProjectedSOR needs; regular principal blocks (dense: least squares otherwise)"
+
+    sweeps: int = 5
+    solves: int = 2
+    omega: float = 1.0
+    eta: float = 0.1
+    max_linear_iterations: int = 200
+    backtracks: int = 5
+    precision: str = "mixed"
+    cycle: CycleSettings = field(default_factory=CycleSettings)
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        Precision(self.precision)
+        if not 0 < self.omega < 2:
+            raise ValueError(f"omega = {self.omega}: must be in (0, 2)")
+        if not 0 < self.eta < 1:
+            raise ValueError(f"eta = {self.eta}: must be in (0, 1)")
+        for name, least in (("sweeps", 1), ("solves", 1), ("max_linear_iterations", 1), ("backtracks", -1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} = {getattr(self, name)}: must be >= {least}")
+
+    def init(self, problem: LCP) -> SubspaceWorkspace:
+        """Return a workspace.
+
+        Raises:
+            ValueError: A cannot be swept, or its principal systems cannot be solved.
+        """
+        work = SubspaceWorkspace(problem, self)
+        work.diagonal.check()
+        return work
+
+    def step(self, problem: LCP, work: SubspaceWorkspace, x: wp.array[Any]) -> Step:
+        """Sweep, then minimize on the free set until it stays."""
+        for _ in range(self.sweeps):
+            work.sweep.run(x, forward=True)
+        work.round_iterate()
+        iterations, held = self.sweeps, 0
+        for solve in range(self.solves):
+            moved, held = work.classify(x)
+            if solve > 0 and not moved:
+                break
+            iterations += work.minimize(x)
+        return Step("subspace", iterations, held, work.contraction.test(x))
+
+
+class SubspaceWorkspace(SweepWorkspace):
+    """Memory of the method for one problem."""
+
+    def __init__(self, problem: LCP, settings: SubspaceMinimization) -> None:
+        super().__init__(problem, Precision(settings.precision))
+        self.settings, layout = settings, problem.layout
+        self.sweep = sweep_for(problem, self.diagonal, settings.omega)
+        self.system = principal_system(problem, self.precision.correction, bounded=False, settings=settings.cycle)
+        self.free, self._before = layout.zeros(wp.uint8), layout.zeros(wp.float64)
+        self._scalars = wp.zeros(5, dtype=wp.float64, device=problem.device)
+        self._reduction = Reduction(layout.size, problem.device, self._scalars, columns=2)
+        self._kernels = kernels(self.system.r.dtype)
+        self._stale, self._target = True, 0.0
+
+    def start(self, *, warm: bool, tolerance: float) -> None:
+        """Forget the free set; the operator may have changed."""
+        super().start(warm=warm, tolerance=tolerance)
+        self._stale, self._target = True, tolerance
+        self.system.refresh()
+
+    def classify(self, x: wp.array[Any]) -> tuple[int, int]:
+        """Find the free set; return how many unknowns entered or left it, and how many are held."""
+        p, r = self.problem, self._reduction
+        before = [x, p.lower, p.upper, p.unknown, self.free]
+        launch_spans(classify_kernel, r.spans, before, [r.threads, r.partials], p.device)
+        r.add_up(MOVED, columns=2)
+        moved, held = (int(v) for v in self._scalars.numpy()[:2])
+        if moved or self._stale:
+            self.system.restrict(self.free)
+            self._stale = False
+        return moved, held
+
+    def minimize(self, x: wp.array[Any]) -> int:
+        """Solve on the free set and move x along the projected correction; returns linear iterations."""
+        s, residual = self.settings, self.residual
+        norm, energy = residual.evaluate(x), self._energy(x)
+        size = self._free_norm()
+        if size == 0 or norm <= self._target:
+            return 0
+        self._flat(self._kernels.right_side, [residual.y, self.free, 1 / size, self.system.r])
+        if self.floating is not None:
+            self.floating.project(self.system.r, self.free)
+        iterations = self.system.solve(max(s.eta, 0.3 * self._target / size), s.max_linear_iterations)[0]
+        wp.copy(self._before, x)
+        for halving in range(max(s.backtracks, 0) + 1):
+            self._correct(x, size * 0.5**halving)
+            if s.backtracks < 0 or residual.evaluate(x) < norm or self._energy(x) < energy - ROUNDING * abs(energy):
+                residual.current = s.backtracks >= 0
+                return iterations
+        wp.copy(x, self._before)
+        residual.current = False
+        return iterations
+
+    def _correct(self, x: wp.array[Any], scale: float) -> None:
+        p = self.problem
+        self._flat(self._kernels.correct, [self._before, self.system.e, p.lower, p.upper, scale, x])
+        if self.floating is not None:
+            self.floating.settle(x, p.lower, p.upper)
+        self.round_iterate()
+
+    def _energy(self, x: wp.array[Any]) -> float:
+        """Return x'A x / 2 + b'x = x'(y + b) / 2, y being that of x; infinite if A is not symmetric and has none."""
+        if not self.problem.A.symmetric:
+            return np.inf
+        self._reduction.dot(x, self.residual.y, XY)
+        self._reduction.dot(x, self.problem.b, XB)
+        return 0.5 * float(self._scalars.numpy()[XY:].sum())
+
+    def _free_norm(self) -> float:
+        r = self._reduction
+        launch_spans(free_square_kernel, r.spans, [self.residual.y, self.free], [r.partials], self.problem.device)
+        r.add_up(FREE_NORM)
+        return float(np.sqrt(self._scalars.numpy()[FREE_NORM]))
+
+    def _flat(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
+        launch_spans(kernel, self._reduction.spans, inputs, [], self.problem.device)

@@ -1,0 +1,271 @@
+"""How the unknowns of a problem are swept: by the operator itself, or row by row where rows are at hand; and whether sweeps contract."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, Protocol
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.native import Spans
+from warp_lcp.operators.dense import DenseOperator
+from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.problem import LCP
+from warp_lcp.residual import NaturalResidual
+from warp_lcp.residual_kernels import add_kernel
+from warp_lcp.result import SolveStatus
+from warp_lcp.solvers.sweep_kernels import change_kernel, row_kernels
+from warp_lcp.vectors import launch_spans
+
+
+class SweepOrder(Enum):
+    """In which order the unknowns of a sweep are visited ([Book] 2.2.1 and fig. 2.3)."""
+
+    NATURAL = "natural"
+    MULTICOLOR = "multicolor"
+    MAGNITUDE = "magnitude"
+    GREEDY = "greedy"
+
+
+class Sweep(Protocol):
+    """Sweeps a problem's iterate."""
+
+    def start(self) -> None:
+        """Take A's diagonal again."""
+
+    def run(self, x: wp.array[Any], *, forward: bool) -> None:
+        """Sweep x (stored, float64) once."""
+
+
+class OperatorSweep:
+    """The operator's own sweep: red-black on grids, by rows or by colors on sparse matrices. Affine bounds are evaluated once a sweep."""
+
+    def __init__(self, problem: LCP, omega: float, *, colored: bool | None = None) -> None:
+        self.problem, self.omega = problem, omega
+        self._options: dict[str, bool] = {} if colored is None else {"colored": colored}
+
+    def start(self) -> None:
+        """The operator knows its diagonal."""
+
+    def run(self, x: wp.array[Any], *, forward: bool) -> None:
+        """Sweep."""
+        p = self.problem
+        p.bounds.follow(x)
+        p.A.relax(x, p.b, p.lower, p.upper, self.omega, forward=forward, **self._options)  # type: ignore[attr-defined]
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """The entries of a dense or sparse operator by rows, on its device, shared with it.
+
+    Attributes:
+        indptr: where each row begins, shape (n + 1,), wp.int32.
+        indices: columns, wp.int32; empty if every row is full.
+        values: entries.
+    """
+
+    indptr: wp.array[Any]
+    indices: wp.array[Any]
+    values: wp.array[Any]
+
+    @classmethod
+    def of(cls, A: Any) -> Rows | None:
+        """Return the rows of an operator, None if it has none to show."""
+        if isinstance(A, SparseOperator):
+            return cls(A.indptr, A.indices, A.values)
+        if isinstance(A, DenseOperator):
+            n = A.unknowns
+            none = wp.empty(0, dtype=wp.int32, device=A.device)
+            return cls(wp.array(np.arange(n + 1) * n, dtype=wp.int32, device=A.device), none, A.matrix.flatten())
+        return None
+
+
+def bound_operands(problem: LCP) -> list[Any]:
+    """Return constant, index and slope of the lower and of the upper bounds, as kernels take them; no index where none depends on x."""
+    affine = problem.bounds.affine
+    if affine is None:
+        empty = [wp.empty(0, dtype=t, device=problem.device) for t in (wp.int32, wp.float64)]
+        return [problem.lower, *empty, problem.upper, *empty]
+    sides = zip(affine.constant, affine.index, affine.coefficient, strict=True)
+    return [operand for side in sides for operand in side]
+
+
+class RowSweep:
+    """Rows one after the other by one thread, in any order; bounds affine in x and zero or negative diagonals are minded row by row.
+
+    Args:
+        problem: with a dense or sparse operator.
+        rows: its rows.
+        omega: relaxation factor.
+        order: NATURAL, MAGNITUDE (largest |x| first, sorted anew before each sweep) or GREEDY (always the row that would change most).
+        permutation: rows in the order of a sweep; all of them by number if None.
+    """
+
+    def __init__(self, problem: LCP, rows: Rows, omega: float, order: SweepOrder, permutation: tuple[int, ...] | None) -> None:
+        self.problem, self._rows, self._omega, self._order = problem, rows, wp.float64(omega), order
+        n = problem.layout.size
+        self._n = n if permutation is None else len(permutation)
+        given = np.zeros(n if order is SweepOrder.MAGNITUDE else 0) if permutation is None else permutation
+        self._places = wp.array(given, dtype=wp.int32, device=problem.device)
+        self._operands = [rows.indptr, rows.indices, rows.values]
+        self._bounds = bound_operands(problem)
+        self._kernels = row_kernels(rows.values.dtype)
+        self._y = problem.layout.zeros(wp.float64) if order is SweepOrder.GREEDY else None
+
+    def start(self) -> None:
+        """Rows are shared with the operator."""
+
+    def run(self, x: wp.array[Any], *, forward: bool) -> None:
+        """Sweep."""
+        p = self.problem
+        if self._y is not None:
+            p.A.apply(x, self._y)
+            wp.launch(add_kernel, x.size, [p.b, self._y], device=p.device)
+            inputs = [*self._operands, p.A.diagonal(), p.b, *self._bounds, self._omega, x.size, self._y, x]
+            wp.launch(self._kernels.greedy, 1, inputs, device=p.device)
+            return
+        if self._order is SweepOrder.MAGNITUDE:
+            self._places.assign(np.argsort(-np.abs(x.numpy()), kind="stable").astype(np.int32))
+        inputs = [*self._operands, p.b, *self._bounds, self._omega, self._places, forward, self._n, x]
+        wp.launch(self._kernels.sweep, 1, inputs, device=p.device)
+
+
+class DiagonalSweep:
+    """The operator's own sweep while the diagonal is positive, row by row where an entry of it is not."""
+
+    def __init__(self, own: Sweep, by_rows: Sweep | None, diagonal: Diagonal) -> None:
+        self._own, self._by_rows, self._diagonal, self._current = own, by_rows, diagonal, own
+
+    def start(self) -> None:
+        """Look at the diagonal."""
+        self._current = self._own if self._by_rows is None or self._diagonal.positive() else self._by_rows
+
+    def run(self, x: wp.array[Any], *, forward: bool) -> None:
+        """Sweep."""
+        self._current.run(x, forward=forward)
+
+
+class Diagonal:
+    """A problem's diagonal, and what a scalar problem can make of it."""
+
+    def __init__(self, problem: LCP, residual: NaturalResidual) -> None:
+        self.problem, self._residual = problem, residual
+
+    def values(self) -> np.ndarray:
+        """Return the diagonal, a stored field on the host, float64."""
+        r = self._residual
+        d = r.diagonal if getattr(self.problem.A, "stencil", None) else self.problem.A.diagonal()
+        return d.numpy().ravel().astype(np.float64) * r.unit
+
+    def positive(self) -> bool:
+        """Return whether every unknown's entry is positive."""
+        return bool((self.values()[self.problem.unknown.numpy() == 1] > 0).all())
+
+    def check(self) -> None:
+        """Refuse rows without a minimizer in their own direction ([Book] 2.2.2, fig. 2.4).
+
+        Raises:
+            ValueError: A_ii = 0 with a b_i that asks for a move without a bound in its way, or A_ii < 0 where no bound solves the row.
+        """
+        p, d = self.problem, self.values()
+        b, lower, upper, inside = p.b.numpy(), p.lower.numpy(), p.upper.numpy(), p.unknown.numpy() == 1
+        with np.errstate(invalid="ignore", over="ignore"):
+            below = np.isinf(lower) | (b + d * lower < 0)  # neither the lower bound solves the scalar problem with the others at 0,
+            above = np.isinf(upper) | (b + d * upper > 0)  # nor the upper one
+        concave = inside & (d < 0) & below & above
+        if concave.any():
+            row = int(np.flatnonzero(concave)[0])
+            raise ValueError(
+                f"A has {np.count_nonzero(concave)} negative diagonal entries where no bound solves the row (the first is row {row}, "
+                f"b = {b[row]}): no sweep can solve them"
+            )
+        stuck = inside & (d == 0) & (((b < 0) & np.isinf(upper)) | ((b > 0) & np.isinf(lower)))
+        if stuck.any():
+            row = int(np.flatnonzero(stuck)[0])
+            raise ValueError(
+                f"A has a zero on the diagonal where b asks for an unbounded move (row {row}, b = {b[row]}): no sweep can solve it"
+            )
+
+
+def sweep_for(
+    problem: LCP, diagonal: Diagonal, omega: float, order: SweepOrder = SweepOrder.NATURAL, permutation: tuple[int, ...] | None = None
+) -> Sweep:
+    """Return the sweep for a problem.
+
+    Raises:
+        ValueError: the operator cannot be swept in this order.
+    """
+    A, rows = problem.A, Rows.of(problem.A)
+    kind = type(A).__name__
+    if order is SweepOrder.MULTICOLOR:
+        if not isinstance(A, SparseOperator):
+            raise ValueError(f"order 'multicolor' is for sparse matrices; {kind} has its own order (grids: red-black)")
+        if problem.bounds.affine is not None or not diagonal.positive():
+            raise ValueError("order 'multicolor' needs constant bounds and a positive diagonal")
+        return OperatorSweep(problem, omega, colored=True)
+    if permutation is not None and rows is not None and sorted(permutation) != list(range(problem.layout.size)):
+        raise ValueError(f"permutation: must hold every row from 0 to {problem.layout.size - 1} once")
+    special = permutation is not None or order is not SweepOrder.NATURAL
+    if special and rows is None:
+        raise ValueError(f"{kind} has its own order of sweeps: only dense and sparse matrices can be swept in another one")
+    if order is SweepOrder.GREEDY and not A.symmetric:
+        raise ValueError("order 'greedy' updates y by rows of A, which must be symmetric")
+    by_rows = None if rows is None else RowSweep(problem, rows, omega, order, permutation)
+    if by_rows is not None and (special or problem.bounds.affine is not None):
+        return by_rows
+    if not hasattr(A, "relax"):
+        raise ValueError(f"{kind} has no method `relax`, which sweeps an operator")
+    check_colors(problem)
+    return DiagonalSweep(OperatorSweep(problem, omega), by_rows, diagonal)
+
+
+def check_colors(problem: LCP) -> None:
+    """Refuse grids that two colors do not suffice for.
+
+    Raises:
+        ValueError: a periodic side has an odd number of cells.
+    """
+    for axis, periodic in zip("xyz", getattr(problem.A, "periodic", ()), strict=False):
+        count = problem.layout.shape["xyz".index(axis) * -1 - 1] if periodic else 0
+        if count % 2:
+            raise ValueError(f"the periodic {axis} axis has {count} cells: red-black sweeps need an even number")
+
+
+class Contraction:
+    """Tests sweeps for contraction and divergence ([Book] 2.2.1, algorithm 4).
+
+    The book compares max |x_i| of successive sweeps, and calls any growth divergence. From x = 0 that stops every solve at its second
+    sweep, so the change delta = max |x_i - x_i before| is compared, which a contraction shrinks: divergence is a delta that has grown in
+    RISES sweeps in a row and is GROWTH times the least one. Bounds can hide divergence: iterates then jump between bounds, delta stays as
+    it is, and the solve ends as stagnated. A delta of 0 is a sweep that changes nothing.
+
+    Attributes:
+        factor: delta over the one before; estimates the rate of convergence once it has settled. NaN before the second sweep.
+    """
+
+    RISES, GROWTH = 10, 100.0
+
+    def __init__(self, problem: LCP) -> None:
+        self._old = problem.layout.zeros(wp.float64)
+        self._out = wp.zeros(1, dtype=wp.float64, device=problem.device)
+        self._spans = Spans.of(problem.layout.size, problem.device)
+        self.factor = np.nan
+
+    def start(self, x: wp.array[Any]) -> None:
+        """Begin with x."""
+        wp.copy(self._old, x)
+        self._last, self._least, self._rises, self.factor = np.nan, np.inf, 0, np.nan
+
+    def test(self, x: wp.array[Any]) -> SolveStatus | None:
+        """Compare x with the x of the last call; return DIVERGED, NON_DESCENT where nothing changed, or None."""
+        self._out.zero_()
+        launch_spans(change_kernel, self._spans, [x, self._old], [self._out], x.device)
+        delta = float(self._out.numpy()[0])
+        if delta == 0:
+            return SolveStatus.NON_DESCENT
+        self.factor = delta / self._last
+        self._rises = self._rises + 1 if delta > self._last else 0
+        self._last, self._least = delta, min(self._least, delta)
+        return SolveStatus.DIVERGED if self._rises >= self.RISES and delta > self.GROWTH * self._least else None

@@ -1,0 +1,159 @@
+# mypy: ignore-errors
+"""Kernels of sweeps: the scalar problem of one unknown, rows one after the other in any order, Jacobi's pass, the size of a change."""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from warp_lcp.affine_bounds_kernels import bound_at
+from warp_lcp.vector_kernels import flat, span_end, span_start
+
+f64, i32, i8 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32), wp.array(dtype=wp.int8)
+ZERO = wp.constant(wp.float64(0.0))
+INFINITE = wp.constant(wp.float64(1.0e300))  # bounds beyond are none
+
+
+@wp.func
+def bound_for_concave(x: wp.float64, y: wp.float64, d: wp.float64, l: wp.float64, u: wp.float64):
+    """Where d < 0: the bound at which y has the sign it should have; of two, the one with the lesser d t^2 / 2 + y t."""
+    has_l = l > -INFINITE
+    has_u = u < INFINITE
+    v = x
+    if has_l:
+        v = l
+    if has_u:
+        if not has_l:
+            v = u
+        else:
+            s = l - x
+            t = u - x
+            l_solves = y + d * s >= ZERO
+            u_solves = y + d * t <= ZERO
+            if u_solves:
+                if not l_solves:
+                    v = u
+                elif t * (y + wp.float64(0.5) * d * t) < s * (y + wp.float64(0.5) * d * s):
+                    v = u
+    return v
+
+
+@wp.func
+def scalar_solution(x: wp.float64, y: wp.float64, d: wp.float64, l: wp.float64, u: wp.float64, omega: wp.float64):
+    """What x becomes, case by case on the sign of the diagonal d ([Book] 2.2.2, fig. 2.4)."""
+    v = x
+    if d > ZERO:
+        v = wp.clamp(x - omega * y / d, l, u)
+    elif d == ZERO:
+        if y > ZERO:
+            v = l
+        if y < ZERO:
+            v = u
+        if wp.abs(v) > INFINITE:
+            v = x  # no minimizer in this direction: x waits for the others
+        v = wp.clamp(v, l, u)
+    else:
+        v = bound_for_concave(x, y, d, l, u)
+    return v
+
+
+@functools.cache
+def row_kernels(a_type: Any) -> SimpleNamespace:
+    """Return the kernels for entries of type a_type: `sweep` in a given order, `greedy` by the largest residual."""
+    name = f"warp_lcp.sweep.{a_type.__name__}"
+    entries = wp.array(dtype=a_type)
+
+    @wp.kernel(enable_backward=False, module=name)
+    def sweep(
+        ptr: i32, col: i32, a: entries, b: f64, l: f64, l_index: i32, l_slope: f64, u: f64, u_index: i32, u_slope: f64, omega: wp.float64,
+        order: i32, forward: bool, n: int, x: f64,
+    ):  # fmt: skip
+        """Relax the rows of `order` (empty: all, by number) one after the other, by one thread; col may be empty for full rows."""
+        for place in range(n):
+            r = place
+            if not forward:
+                r = n - 1 - place
+            i = r
+            if order.shape[0] > 0:
+                i = order[r]
+            first = ptr[i]
+            y = b[i]
+            d = ZERO
+            for k in range(first, ptr[i + 1]):
+                j = k - first
+                if col.shape[0] > 0:
+                    j = col[k]
+                v = wp.float64(a[k])
+                y += v * x[j]
+                if j == i:
+                    d += v
+            lower = bound_at(l, l_index, l_slope, x, i)
+            upper = bound_at(u, u_index, u_slope, x, i)
+            x[i] = scalar_solution(x[i], y, d, lower, upper, omega)
+
+    @wp.kernel(enable_backward=False, module=name)
+    def greedy(
+        ptr: i32, col: i32, a: entries, diagonal: entries, b: f64, l: f64, l_index: i32, l_slope: f64, u: f64, u_index: i32, u_slope: f64,
+        omega: wp.float64, n: int, y: f64, x: f64,
+    ):  # fmt: skip
+        """Relax n times the row whose x would change most, measured by |d| |change|; A is symmetric, so that its column is its row."""
+        for _ in range(n):
+            chosen = int(-1)
+            most = ZERO
+            for i in range(n):
+                lower = bound_at(l, l_index, l_slope, x, i)
+                upper = bound_at(u, u_index, u_slope, x, i)
+                d = wp.float64(diagonal[i])
+                weight = wp.abs(d)
+                if weight == ZERO:
+                    weight = wp.float64(1.0)
+                size = weight * wp.abs(scalar_solution(x[i], y[i], d, lower, upper, wp.float64(1.0)) - x[i])
+                if size > most:
+                    most = size
+                    chosen = i
+            if chosen >= 0:
+                i = chosen
+                lower = bound_at(l, l_index, l_slope, x, i)
+                upper = bound_at(u, u_index, u_slope, x, i)
+                v = scalar_solution(x[i], y[i], wp.float64(diagonal[i]), lower, upper, omega)
+                change = v - x[i]
+                x[i] = v
+                first = ptr[i]
+                for k in range(first, ptr[i + 1]):
+                    j = k - first
+                    if col.shape[0] > 0:
+                        j = col[k]
+                    y[j] += wp.float64(a[k]) * change
+
+    return SimpleNamespace(sweep=sweep, greedy=greedy)
+
+
+@functools.cache
+def jacobi_kernel(d_type: Any) -> Any:
+    """Return the kernel of Jacobi's pass for a diagonal of type d_type."""
+
+    @wp.kernel(enable_backward=False, module=f"warp_lcp.jacobi.{d_type.__name__}")
+    def jacobi(d: wp.array(dtype=d_type), unit: wp.float64, y: f64, lower: f64, upper: f64, unknown: i8, omega: wp.float64, x: f64):
+        """Solve each scalar problem from the same x."""
+        i = wp.tid()
+        if unknown[i] == wp.int8(1):
+            x[i] = scalar_solution(x[i], y[i], unit * wp.float64(d[i]), lower[i], upper[i], omega)
+
+    return jacobi
+
+
+@wp.func_native(
+    flat(
+        """const double* x = x_.data; double* o = old_.data; double s = 0;
+    EACH { const double e = x[i] - o[i], v = e < 0 ? -e : e; s = v > s ? v : s; o[i] = x[i]; } return s;"""
+    )
+)
+def change_span(x_: f64, old_: f64, start: wp.int64, end: wp.int64, stride: wp.int64) -> wp.float64: ...
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.sweep")
+def change_kernel(x: f64, old: f64, n: int, chunk: int, stride: wp.int64, out: f64):
+    """Set out[0] to the largest |x - old| and old to x; out is 0 before."""
+    t = wp.tid()
+    wp.atomic_max(out, 0, change_span(x, old, span_start(t, chunk), span_end(t, chunk, n), stride))
