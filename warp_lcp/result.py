@@ -21,7 +21,7 @@ class SolveStatus(Enum):
     NON_DESCENT = "no step reduces the merit function: take another method, for example ProjectedSOR"
     DIVERGED = "the residual grew beyond `divergence` times the first one: the method's assumptions on A do not hold"
     NON_FINITE = "a NaN or an infinity appeared: check b, the bounds and the coefficients"
-    INFEASIBLE = "the problem has no solution: b is incompatible with a singular component"
+    INFEASIBLE = "the problem has no solution: b is incompatible with a singular component, or the method has proved it"
 
 
 @dataclass(frozen=True)

@@ -71,6 +71,12 @@ class Slope:
         self.distance = distance
         self.separating = [1, 1]
         self.moving: list[np.ndarray] | None = None
+        self.speed = np.zeros(3)
+
+    def move(self, velocity: np.ndarray) -> None:
+        """Let the plane move [m/s]."""
+        self.speed = velocity
+        self.moving = [np.where(f < 1, velocity[axis], np.nan) for axis, f in enumerate(self.open)]  # open faces have no wall's velocity
 
     def signed(self, x: np.ndarray) -> np.ndarray:
         return (x - self.at) @ self.normal
@@ -110,6 +116,9 @@ class Slope:
             wall=[wp.array(w, dtype=wp.int16, device="cpu") for w in self.wall],
             velocity=moving,
             nearest=[],
+            grid=self.grid,
+            turn=wp.zeros(2, dtype=wp.mat33, device="cpu"),
+            shift=wp.array([np.zeros(3), self.speed], dtype=wp.vec3, device="cpu"),
             separating=wp.array(self.separating, dtype=wp.uint8, device="cpu"),
         )
 
@@ -172,7 +181,7 @@ def test_closed_faces_take_the_normal_velocity_of_a_wall_that_moves(towards: flo
     """Liquid that is held follows a wall both ways, and nothing of the wall's tangential velocity."""
     slope = Slope(*SLOPES[-1])
     wall = np.array([0.4, -0.2, 0.7]) + 2.0 * towards * slope.normal
-    slope.moving = [np.where(f < 1, wall[axis], np.nan) for axis, f in enumerate(slope.open)]  # open faces have no wall's velocity
+    slope.move(wall)
     velocity = np.array([0.3, 0.5, -0.6])
     wanted = velocity - ((velocity - wall) @ slope.normal) * slope.normal
     for axis, field in enumerate(slope.extend(tuple(velocity))):
@@ -183,7 +192,7 @@ def test_released_liquid_is_pushed_by_a_wall_that_overtakes_it() -> None:
     for speed, holds in ((0.2, True), (-0.2, False)):
         slope = Slope(*SLOPES[0], contact=RELEASED)
         wall = 0.5 * slope.normal
-        slope.moving = [np.where(f < 1, wall[axis], np.nan) for axis, f in enumerate(slope.open)]
+        slope.move(wall)
         velocity = (0.5 - speed) * slope.normal + np.array([slope.normal[1], -slope.normal[0], 0.0])
         wanted = velocity - ((velocity - wall) @ slope.normal) * slope.normal * holds
         for axis, field in enumerate(slope.extend(tuple(velocity[:2]))):
@@ -218,8 +227,9 @@ def test_a_box_is_treated_as_one_of_whole_cells(counts: tuple[int, int, int], ra
     x = points(grid, (0, 0, 0))
     sides = np.min([np.minimum(x[..., d], grid.counts[d] - x[..., d]) for d in range(grid.dimension)], axis=0)
     cut = SimpleNamespace(
-        distance=wp.array(sides.astype(np.float32), device="cpu"), open=[], wall=[], velocity=None, nearest=[], separating=separating
-    )
+        distance=wp.array(sides.astype(np.float32), device="cpu"), open=[], wall=[], velocity=None, nearest=[], separating=separating,
+        grid=grid, turn=wp.zeros(1, dtype=wp.mat33, device="cpu"), shift=wp.zeros(1, dtype=wp.vec3, device="cpu"),
+    )  # fmt: skip
     results = []
     start, weights, marks = [], [], []
     for axis in range(grid.dimension):

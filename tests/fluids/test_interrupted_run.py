@@ -27,6 +27,8 @@ class Silent:
         assert index <= last
 
 
+MOVING = ["domain.resolution=60", "time.duration=0.4", "output.checkpoint_every=5", "pressure.smoothing=1", "particles.transfer=flip"]
+TANK = ["domain.resolution=24", "time.duration=0.12", "output.checkpoint_every=5"]
 OVERRIDES = ["domain.resolution=32", "time.duration=0.3", "output.checkpoint_every=5"]
 
 
@@ -36,9 +38,18 @@ def written(folder: Path) -> dict[str, bytes]:
     return {str(file.relative_to(folder)): file.read_bytes() for file in files}
 
 
-@pytest.mark.parametrize("name", ["dam-break-2d", "dam-break"])
-def test_resumed_equals_uninterrupted(name: str, tmp_path: Path) -> None:
-    scene = load_scene(name, [*OVERRIDES, *(["time.duration=0.1"] if name == "dam-break" else [])])
+@pytest.mark.parametrize(
+    ("name", "overrides"),
+    [
+        ("dam-break-2d", OVERRIDES),
+        ("dam-break", [*OVERRIDES, "time.duration=0.1"]),
+        ("splash-in-circle", [*OVERRIDES, "particles.transfer=flip", "pressure.surface=voxel"]),
+        ("retracting-wall", MOVING),
+        ("stirred-tank", TANK),
+    ],
+)
+def test_resumed_equals_uninterrupted(name: str, overrides: list[str], tmp_path: Path) -> None:
+    scene = load_scene(name, overrides)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     assert run_scene(scene, whole, device="cpu", observer=Silent()).status == "finished"
     watch = Silent()

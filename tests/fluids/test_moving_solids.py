@@ -7,6 +7,7 @@ import pytest
 import warp as wp
 from small_liquids import GRAVITY, advance, box, create, scene
 
+from warp_lcp.driver.simulator import SimulationFailed
 from warp_lcp.grid.motion import Pose
 
 SPEED = 0.5  # of the piston [m/s]
@@ -26,15 +27,16 @@ def distance(simulation, points):
     return nearest
 
 
-def piston(*, wall, speed, surface, dimension=2):
-    """A plug of liquid across a channel without weight, a piston at its left end."""
+def piston(*, wall, speed, surface, dimension=2, floor=None):
+    """A plug of liquid across a channel without weight, a piston at its left end; it slides over a solid floor if that has a height."""
     deep = dimension == 3
     size = [1.0, 0.25, 0.25][:dimension]
     high = [0.6, 0.25, 0.25][:dimension]
     body = box([-1.0, -0.5, -0.5][:dimension], [0.43, 0.5, 0.5][:dimension], wall=wall)  # its face lies within cells
     body["motion"] = {"kind": "translation", "velocity": [speed, 0.0, 0.0][:dimension]}
+    solids = [body] if floor is None else [body, box([-1.0, -0.5, -0.5][:dimension], [2.0, floor, 0.5][:dimension])]
     liquid = [box([0.43, 0.0, 0.0][:dimension], high)]
-    tables = {"wall": "free-slip", "pressure": {"surface": surface}, "solid": [body], **(DEEP if deep else FLAT)}
+    tables = {"wall": "free-slip", "pressure": {"surface": surface}, "solid": solids, **(DEEP if deep else FLAT)}
     return create(scene(size=size, resolution=32 if deep else 64, liquid=liquid, **tables))
 
 
@@ -62,6 +64,30 @@ def test_a_piston_moves_a_plug_of_liquid(wall, speed, expected, surface, dimensi
     low = simulation.particles.position.numpy()[:, 0].min()
     assert low >= 0.43 + speed * 0.2 - 1e-3 * simulation.grid.spacing
     assert all(row["solve_status"] == "CONVERGED" for row in rows)
+
+
+@pytest.mark.parametrize("height", [None, 0.037])
+@pytest.mark.parametrize("speed", [SPEED, -SPEED])
+def test_the_corner_between_a_piston_and_a_floor_turns_nothing_upwards(speed, height):
+    """With the normal of the nearest of both walls, or with the piston's speed on all of a face that both close, particles in the corner
+    rose at a quarter and a half of its speed."""
+    simulation = piston(wall="free-slip", speed=speed, surface="voxel", floor=height)
+    most = 0.0
+    while simulation.time < 0.2:
+        simulation.step(min(simulation.stable_dt(), 0.01))
+        most = max(most, float(np.abs(simulation.particles.velocity.numpy()[:, 1]).max()))
+    assert most < 0.01 * SPEED
+    np.testing.assert_allclose(simulation.particles.velocity.numpy()[:, 0], speed, atol=0.01 * SPEED)
+
+
+@pytest.mark.parametrize("surface", ["ghost-fluid", "voxel"])
+def test_a_solid_crosses_the_domain_from_outside_to_outside(surface):
+    ball = {"shape": "sphere", "center": [-0.5, 0.1], "radius": 0.09, "motion": {"kind": "translation", "velocity": [3.0, 0.5]}}
+    liquid = [box([0.4, 0.0], [1.0, 0.2])]
+    simulation = create(scene(size=[1.0, 0.5], resolution=16, liquid=liquid, solid=[ball], pressure={"surface": surface}))
+    rows = advance(simulation, 0.7)
+    assert max(row["max_speed"] for row in rows) > 0.5
+    assert (simulation.boundary.base.numpy()[1, 1:-1, 1:-1] == 0).all()
 
 
 def test_a_disc_that_turns_in_place_leaves_the_liquid_alone():
@@ -124,3 +150,29 @@ def test_the_step_is_shortened_before_a_solid_sets_off():
     assert simulation.stable_dt() == pytest.approx(2.0 * 0.02 / math.sqrt(2.0 * GRAVITY * 0.02))
     advance(simulation, 0.05)
     assert simulation.stable_dt() == pytest.approx(2.0 * 0.02 / (6.0 + math.sqrt(2.0 * GRAVITY * 0.02)), rel=0.01)
+
+
+@pytest.mark.parametrize(("wall", "speed", "fails"), [("free-slip", 0.5, True), ("free-slip", -0.5, True), ("separating", -0.5, False)])
+def test_a_piston_in_a_box_full_of_liquid(wall, speed, fails):
+    """What cannot be compressed can only let go of a wall that separates; a shorter step would not help."""
+    piston = box([-1.0, -1.0], [0.3, 1.0], motion={"kind": "translation", "velocity": [speed, 0.0]})
+    simulation = create(scene(size=[1.0, 0.5], resolution=16, wall=wall, liquid=[box([0.0, 0.0], [1.0, 0.5])], solid=[piston]))
+    if fails:
+        with pytest.raises(SimulationFailed, match="fills a closed space"):
+            simulation.step(0.01)
+        return
+    rows = advance(simulation, 0.1)
+    assert sum(row["active"] for row in rows) > 0
+    assert rows[0]["volume"] == pytest.approx(0.35, rel=0.01)  # of the liquid as the step finds it, not after the wall has moved
+    assert sum(row["stuck"] for row in rows) == 0
+
+
+def test_particles_between_solids_that_close_are_counted():
+    jaws = [box([-1.0, -1.0], [0.3, 2.0]), box([0.7, -1.0], [2.0, 2.0])]
+    for jaw, speed in zip(jaws, (1.0, -1.0), strict=True):
+        jaw["motion"] = {"kind": "translation", "velocity": [speed, 0.0], "stop": 0.25}
+    drop = {"shape": "sphere", "center": [0.5, 0.5], "radius": 0.03}
+    simulation = create(scene(size=[1.0, 1.0], resolution=20, liquid=[drop], solid=jaws, **FLAT))
+    rows = advance(simulation, 0.3)
+    assert rows[0]["stuck"] == 0
+    assert rows[-1]["stuck"] > 0

@@ -81,3 +81,23 @@ def test_a_full_tilted_box_has_its_lowest_pressure_in_the_corner_that_is_up() ->
 def test_restarts_need_few_iterations() -> None:
     rows = advance(tank("pool", **VOXEL), 0.5)
     assert np.mean([row["solve_iterations"] for row in rows[1:]]) <= 1.0
+
+
+BALLS: dict[str, list[dict[str, Any]]] = {
+    "0.3 cells above the floor": [{"shape": "sphere", "center": [0.4, 0.172], "radius": 0.16}],
+    "on the floor": [{"shape": "sphere", "center": [0.4, 0.16], "radius": 0.16}],
+}
+
+
+@pytest.mark.parametrize("wall", ["separating", "free-slip"])
+@pytest.mark.parametrize("surface", ["ghost-fluid", "voxel"])
+@pytest.mark.parametrize("ball", BALLS)
+def test_a_gap_of_less_than_a_cell_above_the_floor_is_no_sink(ball: str, surface: str, wall: str) -> None:
+    """Particles must be able to go where the faces are open: else the gap holds no liquid, what flows in is lost, and the pool spins up."""
+    simulation = tank("full box", solid=BALLS[ball], pressure={"surface": surface}, wall=wall)
+    volume = 0.64 - math.pi * 0.16**2
+    rows = advance(simulation, 0.6)
+    assert max(row["max_speed"] for row in rows[len(rows) // 2 :]) < 0.05 * math.sqrt(GRAVITY * simulation.grid.spacing)
+    if surface == "ghost-fluid":
+        assert rows[-1]["volume"] == pytest.approx(volume, rel=0.01)
+    assert simulation.projection.unknowns() == (simulation.boundary.base.numpy()[1:-1, 1:-1, 1:-1] == 0).sum()

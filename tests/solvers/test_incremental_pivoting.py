@@ -41,8 +41,9 @@ def test_semidefinite_problems(zeros):
         b = planted(A, rng)
         result = solve(A, b)
         assert result, result.status
-        assert result.relative_residual <= 1e-8
-        assert natural_residual(A, b, 0.0, np.inf, result.x.numpy()) == pytest.approx(result.residual, rel=1e-3, abs=1e-10)
+        x = result.x.numpy()
+        rounding = np.finfo(float).eps * np.linalg.norm(np.abs(A) @ np.abs(x) + np.abs(b))
+        assert natural_residual(A, b, 0.0, np.inf, x) <= 100 * rounding
 
 
 @settings(max_examples=150, deadline=None)

@@ -42,9 +42,10 @@ def contacts(count, rng, friction=0.5):
     return A, b
 
 
-def test_hundred_contact_problems_of_180_variables():
+@pytest.mark.parametrize("count", [15, pytest.param(100, marks=pytest.mark.slow)])
+def test_contact_problems_of_180_variables(count):
     pivots = []
-    for seed in range(100):
+    for seed in range(count):
         A, b = contacts(30, np.random.default_rng(9000 + seed))
         result = solve(A, b)
         assert result, f"seed {seed}: {result.status.name}"
@@ -105,7 +106,7 @@ def test_degenerate_problem_does_not_cycle():
 
 
 def test_lexicographic_rule_passes_an_example_with_ties():
-    """All ratios tie at the start and after it; a rule that takes any of them can come back to a basis (Kostreva's matrix is a P-matrix)."""
+    """All ratios tie at the start and after it; a rule that takes any of them may come back to a basis it has had."""
     A = np.array([[1.0, 2.0, 0.0], [0.0, 1.0, 2.0], [2.0, 0.0, 1.0]])
     seen, basis = set(), Basis(A, -np.ones(3), np.ones(3))
     while (outcome := basis.pivot()) is None:

@@ -101,6 +101,25 @@ def test_method(name, family, bounds, precision, device):
     assert len(result.history) == result.iterations + 1
 
 
+@pytest.mark.parametrize("name", [name for name, cls in METHODS.items() if "dense" in cls.supports])
+def test_unsymmetric_matrix(name, device):
+    """Strictly diagonally dominant: whatever takes an unsymmetric A solves it; the others refuse it before they start."""
+    cls = METHODS[name]
+    rng = np.random.default_rng(1033)
+    n = min(getattr(cls, "most_unknowns", MANY), MANY)
+    A = rng.uniform(-1.0, 1.0, (n, n)) / n + 2 * np.eye(n)
+    b = planted(A, "lcp", rng)[0]
+    problem = wl.LCP(wl.DenseOperator(A, device=device), b)
+    try:
+        result = wl.solve(problem, cls(), stopping=wl.StoppingCriteria(rtol=1e-8, **CRITERIA))
+    except ValueError as refusal:
+        assert "symmetric" in str(refusal)
+        assert "symmetric" in cls.needs
+        return
+    assert result, result.status
+    np.testing.assert_allclose(result.x.numpy(), lemke(A, b), atol=1e-6)
+
+
 def test_every_method_says_where_it_works():
     for name, cls in METHODS.items():
         assert cls.supports, name

@@ -1,4 +1,4 @@
-"""The command line: `warp-lcp run | render | check | scenes | schema | bench | info`."""
+"""The command line: `warp-lcp run | render | check | scenes | schema | solve | bench | info`."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from warp_lcp.driver.render import parse_size, render_run
 from warp_lcp.driver.run import run_scene
 from warp_lcp.driver.run_folder import OutputError, RunRecord
 from warp_lcp.driver.scene_file import built_in_scenes, check_shapes, installed_simulators, load_scene
+from warp_lcp.driver.solve_file import ProblemError, solve_files, write_vector
 from warp_lcp.driver.table import SceneError, nearest
 from warp_lcp.driver.versions import shadowing_distributions, versions
 
@@ -136,6 +137,35 @@ def schema(simulator: Annotated[str, typer.Option(help="Whose scenes.")] = "flui
 
 
 @app.command()
+def solve(
+    matrix: Annotated[Path, typer.Argument(metavar="A.mtx", help="A of y = A x + b, a Matrix Market file, sparse or dense.")],
+    right_side: Annotated[Path, typer.Argument(metavar="b.mtx", help="b, a vector.")],
+    lower: Annotated[str, typer.Option(metavar="NUMBER|FILE", help="Lower bounds of x; -inf for none.")] = "0",
+    upper: Annotated[str, typer.Option(metavar="NUMBER|FILE", help="Upper bounds of x.")] = "inf",
+    method: Annotated[str | None, typer.Option(metavar="NAME", help="The fastest for A unless given.", show_default=False)] = None,
+    tolerance: Annotated[float, typer.Option(metavar="T", help="Of the residual, relative to the one at clip(0, lower, upper).")] = 1e-6,
+    max_iterations: Annotated[int, typer.Option(min=0, metavar="N", help="The most steps.")] = 1000,
+    out: Annotated[Path | None, typer.Option(metavar="x.mtx", help="Where x goes.", show_default=False)] = None,
+    device: Annotated[str, typer.Option(help="cpu or cuda:N.")] = "cpu",
+) -> None:
+    """Solve the complementarity problem of a matrix and a vector: y = A x + b, lower <= x <= upper."""
+    with _wrong_input():
+        chosen = choose_device(device)
+        options = {"lower": lower, "upper": upper, "method": method, "tolerance": tolerance, "max_iterations": max_iterations}
+        if out is not None and not out.parent.is_dir():
+            raise ProblemError(f"--out {out}: there is no folder {out.parent}")
+        outcome = solve_files(matrix, right_side, device=chosen, **options)  # type: ignore[arg-type]
+        if out is not None:
+            write_vector(out, outcome.result.x.numpy())
+    console = Console(soft_wrap=True, highlight=False)
+    console.print(outcome.heading(), markup=False)
+    console.print(outcome.table())
+    if not outcome.result:
+        _end(outcome.ending(), FAILED)
+    console.print(outcome.ending(), markup=False)
+
+
+@app.command()
 def bench(
     suite: Annotated[str, typer.Argument(metavar="SUITE", help="What to measure: kernels, solvers or run; or validation.")],
     device: Annotated[str, typer.Option(help="cpu or cuda:N.")] = "cpu",
@@ -187,7 +217,7 @@ def _print_pairs(pairs: list[tuple[str, str]]) -> None:
 def _wrong_input() -> Iterator[None]:
     try:
         yield
-    except (SceneError, OutputError, DeviceError, RenderError) as error:
+    except (SceneError, OutputError, DeviceError, RenderError, ProblemError) as error:
         _end(str(error), WRONG_INPUT)
 
 

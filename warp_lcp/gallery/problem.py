@@ -79,7 +79,7 @@ class Problem:
         """
         make = {"grid": lambda: self.A, "sparse": lambda: SparseOperator(self.A, device=device, dtype=dtype)}
         A = make.get(self.kind, lambda: DenseOperator(self.A, device=device, dtype=dtype))()
-        return LCP(A, self.b, self.lower, self.upper)
+        return LCP(A, self.b, _number_or_field(self.lower), _number_or_field(self.upper))
 
     def sparse(self) -> Problem:
         """Return the problem of a grid's FLUID cells, in their order, with a scipy.sparse matrix; any other as it is."""
@@ -96,6 +96,12 @@ class Problem:
             return self
         p = self.sparse()
         return Problem(f"{self.name} as dense", p.A.toarray(), p.b, p.lower, p.upper, p.solution, p.facts)
+
+
+def _number_or_field(bound: np.ndarray) -> float | np.ndarray:
+    """Return a bound that is the same everywhere as a number: methods are faster with it."""
+    first = float(bound.flat[0])
+    return first if (bound == first).all() else bound
 
 
 def grid_matrix(A: GridPoisson) -> scipy.sparse.csr_array:

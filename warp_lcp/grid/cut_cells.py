@@ -41,8 +41,10 @@ class CutCells:
         wall: int16 number of the solid that closes a face, the nearest to its center: -1 on open faces, 0 on the domain's.
         base: int8, SOLID where all faces of a cell are closed, else AIR; the ring is SOLID.
         capacity: float32 integral of the cell's quadratic B-spline kernel over what is open, 1 away from walls; None if not asked for.
-        velocity: float32 velocity of the wall at the center of each face that is not open [m/s], the component along the face's normal (on
-            a face of the domain: times the part that the solid covers); None when no solid moves.
+        velocity: float32 mean velocity of what is not open of each face [m/s], the component along the face's normal: that of the solid
+            that moves, times its part; None when no solid moves.
+        turn: mat33 of shape (1 + solids,): the velocity of a solid's point x is turn x + shift [1/s].
+        shift: vec3 [m/s].
         separating: uint8 of shape (1 + solids,).
         names: of those numbers, the first "domain".
         notes: warnings worth a line at the start of a run.
@@ -63,8 +65,8 @@ class CutCells:
         self.capacity = grid.field() if capacity else None
         self.velocity = grid.faces() if self.moves else None
         self._counts = wp.zeros(2, dtype=wp.int32, device=grid.device)
-        self._turn = wp.zeros(1 + len(solids), dtype=wp.mat33, device=grid.device)
-        self._shift = wp.zeros(1 + len(solids), dtype=wp.vec3, device=grid.device)
+        self.turn = wp.zeros(1 + len(solids), dtype=wp.mat33, device=grid.device)
+        self.shift = wp.zeros(1 + len(solids), dtype=wp.vec3, device=grid.device)
         notes = self._solid_notes()
         self._sampler, self._nodes = NodeSampler(grid), NodeDistances(grid, second=len(solids) > 1)
         self.distance = self._nodes.near
@@ -80,6 +82,7 @@ class CutCells:
         self._moved_from: list[tuple[np.ndarray, np.ndarray]] = []  # nodes near the solids that move, where the velocity was filled last
         self._moved_to: list[tuple[np.ndarray, np.ndarray]] = []  # and where they are
         if self.moves:
+            self._moving_numbers = wp.array([False, *(s.motion is not None for s in solids)], dtype=wp.uint8, device=grid.device)
             self._standing = NodeDistances(grid, second=len(solids) > 1)
             self._standing.copy_from(self._nodes)
             self._enter_moving(0.0)
@@ -134,8 +137,8 @@ class CutCells:
         for number, _, motion in self._moving():
             way = motion.pose(time + dt).after(motion.pose(time).inverse())
             turn[number], shift[number] = (way.rotation - np.eye(3)) / dt, way.translation / dt
-        self._turn.assign(turn.astype(np.float32))
-        self._shift.assign(shift.astype(np.float32))
+        self.turn.assign(turn.astype(np.float32))
+        self.shift.assign(shift.astype(np.float32))
         grid, nodes = self.grid, self._nodes
         near = [*self._moved_from, *self._moved_to]
         if not near:
@@ -147,7 +150,8 @@ class CutCells:
             if any(a > b for a, b in zip(first, last, strict=True)):
                 continue  # only the ring is near
             window = grid.window(first, last)
-            inputs = [grid.planes, axis, grid.spacing, nodes.near, nodes.owner, open_, wall, self._turn, self._shift, field]
+            solids = [*nodes.arrays, self._standing.near, open_, wall, self._moving_numbers, self.turn, self.shift]
+            inputs = [grid.planes, axis, grid.spacing, *solids, field]
             window.launch(kernels.velocity_kernel, inputs)
         self._moved_from = self._moved_to
 

@@ -200,6 +200,20 @@ def states_kernel(cells: CellRange, planes: int, near: _F32, ax: _F32, ay: _F32,
 def open_area(a: float, b: float, c: float, d: float) -> float: ...
 
 
+@wp.func
+@typing.no_type_check
+def least_moving(k: int, j: int, i: int, near: _F32, owner: _I16, next_near: _F32, next_owner: _I16, moving: wp.array(dtype=wp.uint8)):
+    """Return the moving solid among a node's two nearest, 0 if neither moves, and its distance [cells]."""
+    solid = int(owner[k, j, i])
+    d = near[k, j, i]
+    if moving[solid] == wp.uint8(0):
+        solid = int(next_owner[k, j, i])
+        d = next_near[k, j, i]
+    if moving[solid] == wp.uint8(0):
+        solid = 0
+    return solid, d
+
+
 @wp.kernel(**options)
 @typing.no_type_check
 def velocity_kernel(
@@ -209,15 +223,20 @@ def velocity_kernel(
     spacing: float,
     near: _F32,
     owner: _I16,
+    next_near: _F32,
+    next_owner: _I16,
+    standing: _F32,
     open: _F32,
     wall: _I16,
+    moving: wp.array(dtype=wp.uint8),
     turn: wp.array(dtype=wp.mat33),
     shift: wp.array(dtype=wp.vec3),
     velocity: _F32,
 ):
-    """Fill the velocity turn x + shift of the walls at the centers of the faces that are not open [m/s].
+    """Fill the mean velocity of what is not open of each face [m/s], at its center turn x + shift of a solid that moves.
 
-    A face of the domain takes the velocity of a solid times the part that it covers, so that what enters there displaces liquid.
+    What the solids that stand still cover rests, and so does a face of the domain but for the part that a moving solid covers: of a
+    piston that slides over a floor, the part above the floor displaces liquid.
     """
     plane, row, chunk = wp.tid()
     k = cells.k + plane
@@ -231,25 +250,32 @@ def velocity_kernel(
         dk = 0
     for i in range(first, wp.min(first + cells.grain, cells.end)):
         value = float(0.0)
-        if open[k, j, i] < 1.0:
+        free = open[k, j, i]
+        if free < 1.0:
             solid = int(wall[k, j, i])
-            part = float(1.0)
-            if solid == 0:  # the domain's; the corners are (a), along (di, dj, 0), and along (0, ej, dk)
-                a = near[k, j, i]
-                b = near[k, j + dj, i + di]
-                c = near[k + dk, j + dj + ej, i + di]
-                d = near[k + dk, j + ej, i]
-                part = 1.0 - open_area(a, b, c, d)
-                if part > 0.0:
-                    least = wp.min(wp.min(a, b), wp.min(c, d))
-                    solid = int(owner[k, j, i])
-                    if b == least:
-                        solid = int(owner[k, j + dj, i + di])
-                    if c == least:
-                        solid = int(owner[k + dk, j + dj + ej, i + di])
-                    if d == least:
-                        solid = int(owner[k + dk, j + ej, i])
+            least = float(1.0e30)
+            if moving[wp.max(solid, 0)] == wp.uint8(0):  # the corners are (0), along (di, dj, 0), and along (0, ej, dk)
+                solid = 0
+                for n in range(4):
+                    a = n & 1
+                    b = n >> 1
+                    found, d = least_moving(k + b * dk, j + a * dj + b * ej, i + a * di, near, owner, next_near, next_owner, moving)
+                    if found > 0 and d < least:
+                        least = d
+                        solid = found
             if solid > 0:
+                if wall[k, j, i] == wp.int16(0):
+                    free = open_area(near[k, j, i], near[k, j + dj, i + di], near[k + dk, j + dj + ej, i + di], near[k + dk, j + ej, i])
+                    closed = float(1.0)
+                else:
+                    closed = 1.0 - free
+                at_rest = 1.0 - open_area(
+                    standing[k, j, i],
+                    standing[k, j + dj, i + di],
+                    standing[k + dk, j + dj + ej, i + di],
+                    standing[k + dk, j + ej, i],
+                )
+                part = wp.clamp((1.0 - free - at_rest) / closed, 0.0, 1.0)
                 x = wp.vec3(float(i) - 0.5, float(j) - 0.5, float(k) - 0.5) * spacing
                 x[axis] = x[axis] - 0.5 * spacing
                 if planes == 1:

@@ -6,7 +6,8 @@ near a wall or inside it is put back along the normal. On a plane that takes jus
 its part into the wall, and between two walls all but the part along their edge. A stride that would end on another side of a wall is
 halved, so that plates of more than a cell are not tunnelled at any speed.
 
-Positions are measured by the distance that is interpolated between nodes, which defines where solids are, and by that to the domain's walls.
+Positions are measured by the distance that is interpolated between nodes, which defines where solids are, and by that to the domain's
+walls.
 """
 
 import warp as wp

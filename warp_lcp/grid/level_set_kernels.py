@@ -15,7 +15,9 @@ from warp_lcp.grid.staggered import CellRange
 from warp_lcp.native import BLOCK, simd
 from warp_lcp.operators.grid_poisson import SOLID
 
-MIN_CAPACITY = 1e-3  # of a cell's kernel: where less of it is open, the cell is given its neighbors' distance
+# Of a cell's kernel: where less is open, too few particles fit to tell (one, of four a cell), and an empty wedge deep in the liquid would
+# count as air, into which the liquid falls. Such a cell is given its neighbors' distance.
+MIN_CAPACITY = 0.25
 TAIL = 1e-4  # the least filled share whose quantile is taken after smoothing
 EXTENDED = 2  # layers of cells without a distance of their own that are given one
 

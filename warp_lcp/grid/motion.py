@@ -260,14 +260,16 @@ def top_speed(motion: Motion, bounds: np.ndarray | None, size: np.ndarray, time:
     poses = [motion.pose(moment) for moment in np.linspace(time, time + span, SPEED_SAMPLES + 1)]
     fastest = 0.0
     for pose, later in pairwise(poses):
-        low, high = domain
-        if bounds is not None:
-            placed = pose.apply(_corners(np.where(size > 0.0, bounds, 0.0)))
-            low, high = np.maximum(low, placed.min(axis=0)), np.minimum(high, placed.max(axis=0))
-        if (low <= high).all():
-            corners = _corners(np.stack([low, high]))
-            moved = later.after(pose.inverse()).apply(corners) - corners
-            fastest = max(fastest, float(np.linalg.norm(moved, axis=1).max()) * SPEED_SAMPLES / span)
+        way = later.after(pose.inverse())
+        for place, step in ((pose, way), (later, way.inverse())):  # it may be in the domain at one end of the way only
+            low, high = domain
+            if bounds is not None:
+                placed = place.apply(_corners(np.where(size > 0.0, bounds, 0.0)))
+                low, high = np.maximum(low, placed.min(axis=0)), np.minimum(high, placed.max(axis=0))
+            if (low <= high).all():
+                corners = _corners(np.stack([low, high]))
+                moved = step.apply(corners) - corners
+                fastest = max(fastest, float(np.linalg.norm(moved, axis=1).max()) * SPEED_SAMPLES / span)
     return fastest
 
 

@@ -28,7 +28,7 @@ from warp_lcp.vectors import launch_spans
 
 PINNED = {wp.float32: 3e-5, wp.float64: 1e-13}  # of a coarsest level's diagonal: what rounding leaves of a singular component's last pivot
 WIDEST = np.iinfo(np.uint16).max  # entries of a row whose places are known
-Matrix = scipy.sparse.csr_array
+Matrix = Any  # a scipy.sparse.csr_array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -254,19 +254,18 @@ class AlgebraicHierarchy:
 
     def _find_entries(self, host: Matrix, pattern: Matrix) -> wp.array[Any]:
         """Return which entry of A each entry of the pattern is, -1 for none; empty if the patterns are one."""
-        if np.array_equal(host.indptr, pattern.indptr) and np.array_equal(host.indices, pattern.indices):
+        if _alike(host, pattern):
             return wp.empty(0, dtype=wp.int32, device=self.device)
-        n = np.int64(host.shape[0])
-        keys = [np.repeat(np.arange(n), np.diff(m.indptr)) * n + m.indices for m in (host, pattern)]
         order = np.full(pattern.nnz, -1, dtype=np.int32)
-        order[np.searchsorted(keys[1], keys[0])] = np.arange(host.nnz, dtype=np.int32)
+        order[_places(host, pattern)] = np.arange(host.nnz, dtype=np.int32)
         return wp.array(order, dtype=wp.int32, device=self.device)
 
 
 def _coarsen(A: Matrix, pattern: Matrix, real: Any, device: wp.Device, settings: AlgebraicSettings, most: int) -> list[AlgebraicLevel]:
     """Return the levels of a matrix whose entries are stored in `pattern`."""
-    zeros = scipy.sparse.csr_array((np.zeros(pattern.nnz), pattern.indices, pattern.indptr), shape=pattern.shape)
-    current = (A + zeros).tocsr()
+    values = np.zeros(pattern.nnz)
+    values[_places(A, pattern)] = A.data
+    current = scipy.sparse.csr_array((values, pattern.indices, pattern.indptr), shape=pattern.shape)
     candidates = np.ones((A.shape[0], 1))
     levels = [AlgebraicLevel(current, real, device)]
     while current.shape[0] > most:
@@ -275,7 +274,7 @@ def _coarsen(A: Matrix, pattern: Matrix, real: Any, device: wp.Device, settings:
         entries.eliminate_zeros()
         C = symmetric_strength_of_connection(entries, theta=settings.strength)
         aggregates, _ = standard_aggregation(C)
-        if not 0 < aggregates.shape[1] <= settings.stall * current.shape[0]:
+        if aggregates.nnz == 0 or aggregates.shape[1] > settings.stall * current.shape[0]:
             break
         T, candidates = fit_candidates(aggregates, candidates)
         # local weights are sums of magnitudes; spectral ones start from random vectors, so runs would differ
@@ -300,6 +299,20 @@ def _pattern_product(A: Matrix, B: Matrix) -> Matrix:
     product = (_ones(A) @ _ones(B)).tocsr()
     product.sort_indices()
     return product
+
+
+def _alike(A: Matrix, B: Matrix) -> bool:
+    """Return whether two matrices have one pattern."""
+    return np.array_equal(A.indptr, B.indptr) and np.array_equal(A.indices, B.indices)
+
+
+def _places(A: Matrix, pattern: Matrix) -> np.ndarray:
+    """Return where each entry of A is in a sorted pattern that has them all; SciPy's sum of both would drop zeros."""
+    if _alike(A, pattern):
+        return np.arange(A.nnz)
+    n = np.int64(A.shape[0])
+    keys = [np.repeat(np.arange(n), np.diff(m.indptr)) * n + m.indices for m in (A, pattern)]
+    return np.searchsorted(keys[1], keys[0])
 
 
 def _ones(matrix: Matrix) -> Matrix:

@@ -53,8 +53,8 @@ for (int i = 0; i < n; ++i) {
 INVERSE = """typedef {T} T; const int* ptr = ptr_.data; const T* a = a_.data;
 ROWS {{ T s = 0; ENTRIES s += a[k] < 0 ? -a[k] : a[k]; inverse_.data[i] = s > 0 ? (T)1/s : (T)0; }}"""
 
-SWEEP = """typedef {T} T; const int *ptr = ptr_.data, *col = col_.data; const T *a = a_.data, *x = x_.data, *b = b_.data, *e = inverse_.data;
-T* y = y_.data; const T w = omega;
+SWEEP = """typedef {T} T; const int *ptr = ptr_.data, *col = col_.data; const T *a = a_.data, *x = x_.data, *b = b_.data;
+const T *e = inverse_.data, w = omega; T* y = y_.data;
 if (from_zero) {{ ROWS y[i] = w*e[i]*b[i]; }}
 else {{ ROWS {{ T s = b[i]; ENTRIES s -= a[k]*x[col[k]]; y[i] = x[i] + w*e[i]*s; }} }}"""
 

@@ -241,7 +241,8 @@ def hold_kernel(d_type: Any, real: Any) -> Any:
         simd(
             f"""const auto* d = d_.data + p; const auto* free = free_.data + p; auto* out = out_.data + p; unsigned char moved = 0;
         auto hold = [&](int k) -> unsigned char {{
-            const {target} v = free[k] != 0 ? ({target})d[k] : ({target})0; const unsigned char other = v != out[k]; out[k] = v; return other; }};
+            const {target} v = free[k] != 0 ? ({target})d[k] : ({target})0; const unsigned char differs = v != out[k];
+            out[k] = v; return differs; }};
         const int whole = {"n/64*64" if real is wp.uint8 else "0"};
         SIMD64 for (int k = 0; k < whole; ++k) moved |= hold(k);
         SIMD for (int k = whole; k < n; ++k) moved |= hold(k);

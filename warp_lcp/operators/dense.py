@@ -11,6 +11,8 @@ from warp_lcp.layout import Layout
 from warp_lcp.operators.dense_kernels import product_kernel, relax_kernel
 from warp_lcp.problem import as_operator
 
+SYMMETRIC = 64 * float(np.finfo(np.float64).eps)  # of the largest entries of two rows: what J M^-1 J' in float64 leaves of symmetry
+
 
 class DenseOperator:
     """A x with a dense square matrix A.
@@ -35,7 +37,8 @@ class DenseOperator:
         self.device, self.dtype, self.shape = wp.get_device(device), dtype, (host.shape[0],)
         self.layout = Layout(self.shape, self.device)
         self.matrix = wp.array(host, dtype=dtype, device=self.device)
-        self.symmetric = bool(np.array_equal(host, host.T))
+        largest = np.abs(host).max(axis=1)
+        self.symmetric = bool((np.abs(host - host.T) <= SYMMETRIC * np.minimum.outer(largest, largest)).all())
 
     @property
     def unknowns(self) -> int:

@@ -94,6 +94,13 @@ class SumOperator:
         if x.size not in (self.layout.size, int(np.prod(self.shape))):
             raise ValueError(f"x has shape {tuple(x.shape)}: expected {self.shape}")
         out = wp.zeros_like(x) if out is None else out
+        if x.size == self.layout.size and self.layout.stored_shape != self.shape:
+            self._add_fields(x.flatten(), out.flatten(), transposed=transposed)
+        else:
+            self._add_fields(x, out, transposed=transposed)
+        return out
+
+    def _add_fields(self, x: wp.array[Any], out: wp.array[Any], *, transposed: bool) -> None:
         key = (x.dtype, tuple(x.shape))
         if key not in self._scratch:
             self._scratch[key] = wp.zeros_like(x)
@@ -101,4 +108,3 @@ class SumOperator:
         for A, target in ((self.first, out), (self.second, other)):
             (A.apply_transpose if transposed else A.apply)(x, target)
         wp.launch(add_kernel, out.size, [other.flatten(), out.flatten()], device=self.device)
-        return out

@@ -16,6 +16,7 @@ from warp_lcp.solvers.spectrum import positive_diagonal, scaled_spectrum
 from warp_lcp.vectors import Reduction, convert, launch_spans
 
 MARGIN = 1.05  # Lanczos' estimate is from below
+FAR = 1.5  # times L: a step of more curvature is taken back
 NOISE = 1e-20  # relative (squared) length of a step below which its curvature is rounding
 
 
@@ -23,10 +24,10 @@ NOISE = 1e-20  # relative (squared) length of a step below which its curvature i
 class AcceleratedProjectedGradient:
     """Iterate the proximal map x = prox_K(x - r (A x + b)) of the box K with momentum ([Book] 1.1.4).
 
-    With the diagonal D of A as metric and L = lambda_max(D^-1/2 A D^-1/2): x+ = clip(z - D^-1 (A z + b) / L, l, u), z = x + beta (x -
-    x before) with Nesterov's beta. The momentum starts anew where (z - x+)' D (x+ - x) > 0. L comes from Lanczos' method and grows where
-    a step's curvature exceeds it. One product a step, since A z + b is extrapolated as z is. Converges for symmetric positive
-    semidefinite A; the error of the energy falls as 1/k^2, faster in the end.
+    With the diagonal D of A as metric and L = lambda_max(D^-1/2 A D^-1/2): x+ = clip(z - D^-1 (A z + b) / L, l, u), where z = x + beta
+    (x - x before) with Nesterov's beta. The momentum starts anew where (z - x+)' D (x+ - x) > 0. L comes from Lanczos' method and grows
+    where a step's curvature exceeds it; where by far, the step is taken back. One product a step, since A z + b is extrapolated as z is.
+    Converges for symmetric positive semidefinite A; the error of the energy falls as 1/k^2, faster in the end.
 
     Args:
         lipschitz: L > 0 in the metric D; estimated if None.
@@ -119,7 +120,11 @@ class GradientWorkspace(IterateInPlace):
         curvature, metric, turned, size = self._scalars.numpy()
         exceeded = metric > NOISE * size and curvature > self.lipschitz * metric
         if exceeded:
-            self.lipschitz = min(MARGIN * float(curvature / metric), 2 * self.lipschitz)
+            rejected = curvature > FAR * self.lipschitz * metric
+            self.lipschitz = MARGIN * float(curvature / metric)
+            if rejected:
+                wp.copy(x, self._x_old)
+                wp.copy(self.residual.y, self._y_old)
         if exceeded or turned > 0:
             self._momentum = 1.0
             return 0.0

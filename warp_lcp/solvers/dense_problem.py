@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg
-import scipy.optimize
 import scipy.sparse
 import scipy.sparse.linalg
 import warp as wp
@@ -18,7 +17,8 @@ from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
 from warp_lcp.solve import IterateInPlace, Precision, Step
 
-SEMIDEFINITE = 1e-10  # shift, in units of the largest entry, with which a semi-definite matrix must have a Cholesky factor
+SEMIDEFINITE = 1e-10  # shift with which an equilibrated semi-definite matrix must have a Cholesky factor
+EQUILIBRATIONS = 8  # sweeps of Ruiz's iteration, which halves the logarithms of rows that differ
 RANK = 1e-12  # singular values below this part of the largest are zero to least-squares solutions (methods.md: all solved with it)
 
 
@@ -53,6 +53,19 @@ class DenseProblem:
         """Return y = A x + b."""
         return self.A @ x + self.b
 
+    def scaled(self) -> tuple[DenseProblem, np.ndarray]:
+        """Return the problem in units in which A's rows and columns have entries near 1, and b too, and those units of x.
+
+        With x = beta S x', y = beta S^-1 y' it is S A S, S b / beta and l / (beta S), u / (beta S): of the same class and symmetry. The
+        units are powers of 2, so that nothing is rounded.
+        """
+        S = equilibration(self.A)
+        b = S * self.b
+        beta = _power_of_two(np.abs(b).max() or 1.0)
+        units = beta * S
+        A = scipy.sparse.csr_array(self.A.multiply(S[:, None]).multiply(S)) if scipy.sparse.issparse(self.A) else S[:, None] * self.A * S
+        return DenseProblem(self.rows, A, b / beta, self.lower / units, self.upper / units), units
+
     def residual(self, x: np.ndarray) -> float:
         """Return the norm of the natural residual."""
         d = np.abs(self.A.diagonal())
@@ -67,7 +80,7 @@ class DenseProblem:
             free: shape (n,), bool.
         """
         rows, out = np.flatnonzero(free), x.copy()
-        block = self.A[np.ix_(rows, rows)] if len(rows) else None
+        block: Any = self.A[np.ix_(rows, rows)] if len(rows) else None
         for _ in range(2 if len(rows) else 0):
             y = self.affine(out)[rows]
             out[rows] -= scipy.sparse.linalg.lsmr(block, y, atol=0.0, btol=0.0)[0] if scipy.sparse.issparse(block) else _solved(block, y)
@@ -105,6 +118,22 @@ def assemble(problem: LCP, rows: np.ndarray) -> np.ndarray:
     return matrix
 
 
+def _power_of_two(value: Any) -> Any:
+    """Return the nearest power of 2, on a logarithmic scale; 1 for 0."""
+    return 2.0 ** np.round(np.log2(np.where(value > 0, value, 1.0)))
+
+
+def equilibration(A: Any) -> np.ndarray:
+    """Return S > 0 so that S A S has a largest entry near 1 in each row and column together (Ruiz's iteration, kept symmetric)."""
+    magnitude, S = abs(A), np.ones(A.shape[0])
+    sparse = scipy.sparse.issparse(A)
+    for _ in range(EQUILIBRATIONS):
+        scaled = magnitude.multiply(S[:, None]).multiply(S).tocsr() if sparse else S[:, None] * magnitude * S
+        rows, columns = (scaled.max(axis=k).toarray().ravel() if sparse else scaled.max(axis=k) for k in (1, 0))
+        S = S * _power_of_two(1 / np.sqrt(np.where(np.maximum(rows, columns) > 0, np.maximum(rows, columns), 1.0)))
+    return S
+
+
 def _solved(A: np.ndarray, r: np.ndarray) -> np.ndarray:
     """Return A^-1 r, the least-squares solution where A is singular."""
     try:
@@ -115,9 +144,10 @@ def _solved(A: np.ndarray, r: np.ndarray) -> np.ndarray:
 
 def semidefinite(A: np.ndarray) -> bool:
     """Return whether A + A' is positive semi-definite, by the Cholesky factor of A slightly shifted."""
-    shift = max(SEMIDEFINITE * float(np.abs(A).max()), float(np.finfo(np.float64).tiny))
+    S = equilibration(A)
+    scaled = S[:, None] * A * S
     try:
-        scipy.linalg.cholesky((A + A.T) / 2 + shift * np.eye(len(A)), overwrite_a=True, check_finite=False)
+        scipy.linalg.cholesky((scaled + scaled.T) / 2 + SEMIDEFINITE * np.eye(len(A)), overwrite_a=True, check_finite=False)
     except np.linalg.LinAlgError:
         return False
     return True
@@ -128,6 +158,9 @@ def inconsistent(data: DenseProblem) -> bool:
 
     For a positive semi-definite A, symmetric or not, such an x is also enough for a solution to exist.
     """
+    from scipy.optimize import linprog  # a fifth of a second to import, and seldom needed
+
+    data, _ = data.scaled()
     below, above = np.isfinite(data.lower), np.isfinite(data.upper)
     parts = {"ub": [(-1.0, below & ~above), (1.0, above & ~below)], "eq": [(1.0, ~below & ~above)]}
     stack = scipy.sparse.vstack if scipy.sparse.issparse(data.A) else np.vstack
@@ -136,7 +169,7 @@ def inconsistent(data: DenseProblem) -> bool:
         rows[f"A_{name}"] = stack([sign * data.A[mask] for sign, mask in pieces])
         rows[f"b_{name}"] = np.concatenate([-sign * data.b[mask] for sign, mask in pieces])
     limits = np.stack([data.lower, data.upper], axis=1)
-    found = scipy.optimize.linprog(np.zeros(len(data.b)), **rows, bounds=limits, method="highs")
+    found = linprog(np.zeros(len(data.b)), **rows, bounds=limits, method="highs")
     return bool(found.status == 2)  # HiGHS: infeasible
 
 

@@ -115,27 +115,28 @@ def kernels(d_type: Any, real: Any, upper: bool) -> SimpleNamespace:
         EACH {{
             const double a_ = unit*(double)d[i], b_ = a_ < 0 ? -a_ : a_, size = b_ == 0 ? 1.0 : b_;
             const bool free = (m[i] == 1) & (l[i] < u[i]), low = free & (l[i] > -{INFINITE}), high = free & (u[i] < {INFINITE});
-            const double span = u[i] - l[i], most = 0.25*span, least = width/size < most ? width/size : most;
-            const double a = x[i] - l[i], c = a < least ? least : a;
-            {two("const double o = u[i] - x[i], g = low ? span - (c < span - least ? c : span - least) : (o < least ? least : o);")}
-            const double k = {"high ? span - g : c" if upper else "c"};
+            const double span = u[i] - l[i], below = x[i] - l[i]{two(", above = u[i] - x[i]")};
+            const double least = width/size, c = below < least ? least : below, k0 = c < 0.5*span ? c : 0.5*span;
+            {two("const double o = above < least ? least : above, g0 = o < 0.5*span ? o : 0.5*span;")}
+            {two("const bool near = below <= above; const double g = (low & near) ? span - k0 : g0;")}
+            const double k = {"(high & !near) ? span - g0 : k0" if upper else "k0"};
             f[i] = free; w[i] = low ? k : {INFINITE}; {two(f"v[i] = high ? g : {INFINITE};")}
             x[i] = low ? l[i] + k : {"(high ? u[i] - g : x[i])" if upper else "x[i]"}; }}"""
         )
     )
     def inside_span(
-        l_: f64, u_: f64, m_: i8, d_: d_array, unit: wp.float64, width: wp.float64, x_: f64, w_: f64, v_: f64, f_: u8, start: wp.int64,
-        end: wp.int64, stride: wp.int64,
+        l_: f64, u_: f64, m_: i8, d_: d_array, unit: wp.float64, width: wp.float64, x_: f64, w_: f64, v_: f64, f_: u8,
+        start: wp.int64, end: wp.int64, stride: wp.int64,
     ): ...  # fmt: skip
 
     @wp.func_native(
         flat(
             f"""const double *y = y_.data, *w = w_.data, *v = v_.data; double *s = s_.data, *t = t_.data; double total = 0, count = 0;
         EACH {{
-            const bool low = w[i] < {INFINITE}, high = {f"v[i] < {INFINITE}" if upper else "false"};
-            const double a = y[i] > least ? y[i] : least, c = -y[i] > least ? -y[i] : least;
-            s[i] = low ? a : 0.0; {two("t[i] = high ? c : 0.0;")}
-            total += (low ? w[i]*a : 0.0){two(" + (high ? v[i]*c : 0.0)")}; count += (low ? 1.0 : 0.0) + (high ? 1.0 : 0.0); }}
+            const bool low = w[i] < {INFINITE}; const double a = y[i] > least ? y[i] : least;
+            s[i] = low ? a : 0.0; total += low ? w[i]*a : 0.0; count += low ? 1.0 : 0.0;
+            {two(f"const bool high = v[i] < {INFINITE}; const double c = -y[i] > least ? -y[i] : least;")}
+            {two("t[i] = high ? c : 0.0; total += high ? v[i]*c : 0.0; count += high ? 1.0 : 0.0;")} }}
         return wp::vec2d(total, count);"""
         )
     )
@@ -145,8 +146,8 @@ def kernels(d_type: Any, real: Any, upper: bool) -> SimpleNamespace:
 
     @wp.kernel(enable_backward=False, module=name)
     def inside(
-        lower: f64, upper: f64, unknown: i8, d: d_array, unit: wp.float64, width: wp.float64, x: f64, w: f64, v: f64, free: u8, n: int,
-        chunk: int, stride: wp.int64,
+        lower: f64, upper: f64, unknown: i8, d: d_array, unit: wp.float64, width: wp.float64, x: f64, w: f64, v: f64, free: u8,
+        n: int, chunk: int, stride: wp.int64,
     ):  # fmt: skip
         k = wp.tid()
         inside_span(lower, upper, unknown, d, unit, width, x, w, v, free, span_start(k, chunk), span_end(k, chunk, n), stride)

@@ -188,7 +188,8 @@ class LemkeWorkspace(DenseWorkspace):
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Begin at z = 0 with the covering vector of ones."""
         super().start(warm=warm, tolerance=tolerance)
-        self.form = LemkeForm.of(self.data)
+        scaled, self.units = self.data.scaled()
+        self.form = LemkeForm.of(scaled)
         self.rays, self._random = 0, np.random.default_rng(5381)
         m = len(self.form.q)
         self._sizes = (float(np.abs(self.form.M).max(initial=0.0)) or 1.0, float(np.abs(self.form.q).max(initial=0.0)) or 1.0)
@@ -215,7 +216,7 @@ class LemkeWorkspace(DenseWorkspace):
             elif outcome is False:
                 self._ray()
         if self.ended is None:
-            self.write_iterate(self.form.solution(self._scaled()))
+            self.write_iterate(self.units * self.form.solution(self._scaled()))
         return done
 
     def _scaled(self) -> np.ndarray:
@@ -230,8 +231,8 @@ class LemkeWorkspace(DenseWorkspace):
     def _finish(self, z: np.ndarray) -> None:
         """Write the solution, polished where x is between its bounds; one that is none is a ray in truth: a pivot was noise."""
         data = self.data
-        x = np.clip(self.form.solution(z), data.lower, data.upper)
-        size = 16 * EPS * float(np.abs(x).max())
+        x = np.clip(self.units * self.form.solution(z), data.lower, data.upper)
+        size = 16 * EPS * self.units * np.abs(x / self.units).max()
         x = data.polished(x, (x - data.lower > size) & (data.upper - x > size))
         if self.basis is not None and not data.residual(x) <= NOISE * data.residual(np.clip(0.0, data.lower, data.upper)):
             self._ray()

@@ -25,7 +25,7 @@ from warp_lcp.program import Launch, Program
 from warp_lcp.solvers.principal_system_kernels import divide_kernel, kernels, mask_kernel, shift_kernel
 from warp_lcp.solvers.principal_system_norm import WeightedNorm
 from warp_lcp.solvers.principal_system_sparse import SparseSystem
-from warp_lcp.vectors import Reduction, launch_spans
+from warp_lcp.vectors import launch_spans
 
 
 class PrincipalSystem(Protocol):
@@ -120,26 +120,33 @@ class CoupledGridSystem:
     def __init__(
         self, A: SumOperator, grid: GridPoisson, rest: Any, real: Any, *, settings: CycleSettings | None = None, shifted: bool = False
     ) -> None:
-        self._grid, self._rest, self._shape = GridSystem(grid, real, bounded=False, settings=settings, shifted=shifted), rest, A.layout.size
+        self._grid, self._rest, self._A = GridSystem(grid, real, bounded=False, settings=settings, shifted=shifted), rest, A
         self.r, self.z = self._grid.r, self._grid.z
         self._extra = wp.zeros_like(self.r)
         self._free: wp.array[Any] | None = None
-        self._krylov = ConjugateGradient(self._product, self, weight=self._grid._weight)
+        self._weight = wp.zeros_like(self.r) if shifted else None
+        self._norm = WeightedNorm(self.r, self._weight)
+        self._no_shift = wp.empty(0, dtype=wp.float64, device=self.r.device)
+        self._krylov = ConjugateGradient(self._product, self, weight=self._weight)
         self.e = self._krylov.x
-        self._spans = Reduction(self.r.size, self.r.device, wp.zeros(1, dtype=wp.float64, device=self.r.device)).spans
+        self._take_diagonal()
 
     def refresh(self) -> None:
         """Take the grid's rows again if they changed."""
         self._grid.refresh()
+        self._take_diagonal()
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
         """Take another free set and shift."""
         self._free = free
         self._grid.restrict(free, shift)
+        if self._weight is not None:
+            inputs = [self._own, wp.float64(1.0), free, self._no_shift if shift is None else shift, self._extra, self._weight]
+            launch_spans(shift_kernel(wp.float64, self.r.dtype), self._norm.spans, inputs, [], self.r.device)
 
     def norm(self) -> float:
         """Return the norm of r."""
-        return self._grid.norm()
+        return self._norm.of(self.r)
 
     def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
         """Iterate."""
@@ -152,7 +159,11 @@ class CoupledGridSystem:
     def _product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
         self._grid.hierarchy.finest.stencil.product(p, q)
         self._rest.apply(p, self._extra)
-        launch_spans(kernels(q.dtype).add_free, self._spans, [self._extra, self._free, q], [], q.device)
+        launch_spans(kernels(q.dtype).add_free, self._norm.spans, [self._extra, self._free, q], [], q.device)
+
+    def _take_diagonal(self) -> None:
+        if self._weight is not None:
+            self._own = self._A.layout.load(self._A.diagonal().numpy(), wp.float64)
 
 
 class DenseSystem:

@@ -27,7 +27,8 @@ class ProjectedJacobi:
     with any operator, and with bounds affine in x, which are those at the last x.
 
     Args:
-        omega: damping > 0; min(1, 1.8 / lambda_max), estimated, if None. Without symmetry, 1.
+        omega: damping > 0; min(1, 1.8 / lambda_max), estimated, if None. Without symmetry, lambda_max is that of A's symmetric part, which
+            promises nothing; with a negative diagonal entry, 1.
         precision: "mixed" or "double" keep the iterate in float64, "single" rounds it to float32.
 
     Raises:
@@ -87,7 +88,6 @@ class JacobiWorkspace(SweepWorkspace):
         self.contraction.start(self.x)
 
     def _estimate(self) -> float:
-        A = self.problem.A
-        if not A.symmetric or (self.diagonal.values() < 0).any():
+        if (self.diagonal.values() < 0).any():
             return 1.0
         return min(1.0, SHARE / scaled_spectrum(self.problem, STEPS)[1])

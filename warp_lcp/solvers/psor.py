@@ -136,7 +136,7 @@ def advised_omega(problem: LCP, steps: int = 60, free: Any = None) -> float:
         free: field of the problem's shape, non-zero where x is thought to be off its bounds; everywhere if None.
 
     Raises:
-        ValueError: A is not symmetric, a diagonal entry is negative, or `free` is empty.
+        ValueError: a diagonal entry is negative, or `free` is empty.
 
     Example:
         >>> import numpy as np, warp_lcp as wl

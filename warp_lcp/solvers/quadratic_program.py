@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -15,11 +16,6 @@ from warp_lcp.result import SolveStatus
 from warp_lcp.solve import Step
 from warp_lcp.solvers.dense_problem import SEMIDEFINITE, DenseProblem, DenseWorkspace, check_size, inconsistent, semidefinite, sparse_matrix
 
-try:
-    import piqp
-except ImportError:  # it comes with the extra `peers`
-    piqp = None
-
 
 @dataclass(frozen=True, kw_only=True)
 class QuadraticProgram:
@@ -31,7 +27,7 @@ class QuadraticProgram:
     that is better. An objective that is unbounded below is INFEASIBLE: no x solves the problem.
 
     Args:
-        tolerance: PIQP's absolute and relative tolerance, on the problem scaled to max |b| = 1; > 0. The loop's criteria are checked on
+        tolerance: PIQP's absolute and relative tolerance, on the equilibrated problem; > 0. The loop's criteria are checked on
             the natural residual whatever PIQP says.
         max_iterations: the most iterations of PIQP, >= 1.
 
@@ -60,7 +56,7 @@ class QuadraticProgram:
             ValueError: A is not symmetric, not positive semi-definite, or dense and too large.
             ImportError: PIQP is not installed.
         """
-        if piqp is None:
+        if importlib.util.find_spec("piqp") is None:
             raise ImportError("QuadraticProgram needs PIQP: pip install 'warp-lcp[peers]' (or pip install piqp)")
         if not problem.A.symmetric:
             raise ValueError("A is not symmetric: QuadraticProgram needs it to be, y = A x + b is the gradient of no quadratic otherwise")
@@ -91,10 +87,9 @@ class QuadraticProgramWorkspace(DenseWorkspace):
         Raises:
             ValueError: A is not positive semi-definite.
         """
-        A = self.read().A
+        A = self.read().scaled()[0].A
         if scipy.sparse.issparse(A):
-            shift = max(SEMIDEFINITE * float(np.abs(A.diagonal()).max()), float(np.finfo(np.float64).tiny))
-            shifted = (A + shift * scipy.sparse.eye_array(A.shape[0])).tocsc()
+            shifted = (A + SEMIDEFINITE * scipy.sparse.eye_array(A.shape[0])).tocsc()
             settings = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
             try:  # without row exchanges the signs of U's diagonal are A's inertia
                 definite = bool((scipy.sparse.linalg.splu(shifted, **settings).U.diagonal() > 0).all())
@@ -107,26 +102,26 @@ class QuadraticProgramWorkspace(DenseWorkspace):
 
     def minimize(self, tolerance: float, max_iterations: int) -> int:
         """Run PIQP; returns its iterations."""
-        data = self.data
-        scale = float(np.abs(data.b).max()) or 1.0
+        import piqp  # an extra
+
+        data, (scaled, units) = self.data, self.data.scaled()
         sparse = scipy.sparse.issparse(data.A)
         solver = piqp.SparseSolver() if sparse else piqp.DenseSolver()
         solver.settings.eps_abs = solver.settings.eps_rel = tolerance
         solver.settings.eps_duality_gap_abs = solver.settings.eps_duality_gap_rel = tolerance**1.1  # bounds hold to its root
         solver.settings.max_iter = max_iterations
-        A = scipy.sparse.csc_matrix(data.A) if sparse else np.asfortranarray(data.A)
-        solver.setup(A, data.b / scale, x_l=data.lower / scale, x_u=data.upper / scale)
+        A = scipy.sparse.csc_matrix(scaled.A) if sparse else np.asfortranarray(scaled.A)
+        solver.setup(A, scaled.b, x_l=scaled.lower, x_u=scaled.upper)
         status = solver.solve()
-        iterations, x = int(solver.result.info.iter), np.asarray(solver.result.x) * scale
+        iterations, x = int(solver.result.info.iter), np.asarray(solver.result.x)
         solved = status == piqp.PIQP_SOLVED
         # PIQP often runs along an unbounded direction to its iteration limit without saying so: a linear program decides
         if not solved and len(data.b) <= QuadraticProgram.most_unknowns and inconsistent(data):
             self.ended = SolveStatus.INFEASIBLE
             return iterations
         if np.isfinite(x).all():
-            x = np.clip(x, data.lower, data.upper)
-            low = x - data.lower < np.asarray(solver.result.z_bl) * scale
-            high = data.upper - x < np.asarray(solver.result.z_bu) * scale
+            low, high = x - scaled.lower < np.asarray(solver.result.z_bl), scaled.upper - x < np.asarray(solver.result.z_bu)
+            x = np.clip(units * x, data.lower, data.upper)
             settled = data.polished(np.where(low, data.lower, np.where(high, data.upper, x)), ~(low | high))
             self.write_iterate(min((x, settled), key=data.residual))
         self.ended = SolveStatus.STAGNATED if solved or iterations < max_iterations else SolveStatus.MAX_ITERATIONS

@@ -21,15 +21,11 @@ f64, i8, u8 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int8), wp.array(dtyp
     return wp::vec2d(moved, held);"""
     )
 )
-def classify_span(
-    x_: f64, l_: f64, u_: f64, m_: i8, f_: u8, start: wp.int64, end: wp.int64, stride: wp.int64
-) -> wp.vec2d: ...
+def classify_span(x_: f64, l_: f64, u_: f64, m_: i8, f_: u8, start: wp.int64, end: wp.int64, stride: wp.int64) -> wp.vec2d: ...
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.subspace_minimization")
-def classify_kernel(
-    x: f64, lower: f64, upper: f64, unknown: i8, free: u8, n: int, chunk: int, stride: wp.int64, threads: int, sums: f64
-):
+def classify_kernel(x: f64, lower: f64, upper: f64, unknown: i8, free: u8, n: int, chunk: int, stride: wp.int64, threads: int, sums: f64):
     """Free is what lies between its bounds ([Book] eq. 2.92); counts of unknowns that moved, and of those that are held."""
     t = wp.tid()
     v = classify_span(x, lower, upper, unknown, free, span_start(t, chunk), span_end(t, chunk, n), stride)

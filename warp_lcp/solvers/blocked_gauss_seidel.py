@@ -1,0 +1,138 @@
+"""Blocked Gauss-Seidel: blocks of unknowns in turn, each solved exactly or by any method."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.problem import LCP
+from warp_lcp.solve import Precision, Solver, Step
+from warp_lcp.solvers.blocked_gauss_seidel_kernels import block_kernels
+from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
+from warp_lcp.solvers.partition import blocks_of_size, color_blocks, given_blocks
+from warp_lcp.solvers.psor import DIRECTIONS, SweepWorkspace
+from warp_lcp.solvers.staggering import StaggeringWorkspace
+from warp_lcp.solvers.sweep import Rows, bound_operands
+
+MOST = 6  # unknowns of a block that a thread solves by active sets
+
+
+@dataclass(frozen=True, kw_only=True)
+class BlockedGaussSeidel:
+    """Solve blocks of unknowns in turn, the others held ([Book] 2.2.3).
+
+    With blocks of one unknown it is projected Gauss-Seidel, with one block its solver. Strong coupling within a block, as of a contact's
+    normal and tangential forces, then costs no sweeps. Converges for symmetric positive definite A. Blocks of at most 6 unknowns are
+    solved exactly by a kernel: active sets changed until none is wrong, all sets if that does not end; bounds affine in x, also in
+    unknowns of the block, are part of that system. On CUDA blocks that are not coupled are solved at once. Larger blocks, and all if
+    `sub_solver` is given, are problems of their own, solved one by one from the host.
+
+    On grids give blocks as lists and a `sub_solver`; each block then costs passes over the whole grid, so that a few large blocks only
+    make sense.
+
+    Args:
+        blocks: unknowns of a block, consecutive ones; or for each block flat indices into a field of the problem's shape, together all
+            unknowns, each once.
+        sub_solver: a method for the blocks; None: the kernel for blocks of at most 6 unknowns, MinimumMapNewton for larger ones.
+        omega: relaxation factor in (0, 2) of blocks that the kernel solves; 1 for others.
+        direction: "forward", "backward" or "symmetric".
+        eta: each solve of a block by a `sub_solver` reduces its residual by this factor, or to what the whole one needs.
+        precision: "mixed" or "double" keep the iterate in float64, "single" rounds it to float32.
+
+    Raises:
+        ValueError: an argument is outside its range.
+    """
+
+    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse"})
+    needs: ClassVar[str] = "symmetric positive definite A for a proof of convergence; grids: blocks and sub_solver given"
+    affine_bounds: ClassVar[bool] = True
+
+    blocks: int | Sequence[Any] = 3
+    sub_solver: Solver | None = None
+    omega: float = 1.0
+    direction: str = "forward"
+    eta: float = 1e-2
+    precision: str = "mixed"
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        if isinstance(self.blocks, int) and self.blocks < 1:
+            raise ValueError(f"blocks = {self.blocks}: must be >= 1")
+        if not 0 < self.omega < 2:
+            raise ValueError(f"omega = {self.omega}: must be in (0, 2)")
+        if not 0 < self.eta < 1:
+            raise ValueError(f"eta = {self.eta}: must be in (0, 1)")
+        if self.direction not in DIRECTIONS:
+            raise ValueError(f"direction = {self.direction!r}: must be 'forward', 'backward' or 'symmetric'")
+        if self.sub_solver is not None and self.omega != 1:
+            raise ValueError(f"omega = {self.omega}: must be 1 with a sub_solver")
+        Precision(self.precision)
+
+    def init(self, problem: LCP) -> BlockWorkspace | StaggeringWorkspace:
+        """Return a workspace.
+
+        Raises:
+            ValueError: the blocks are no partition of the unknowns, A cannot be taken apart, or the method does not take its blocks.
+        """
+        rows = Rows.of(problem.A)
+        if rows is None and (isinstance(self.blocks, int) or self.sub_solver is None):
+            raise ValueError(f"{type(problem.A).__name__} shows no rows: give BlockedGaussSeidel lists as blocks and a sub_solver")
+        given = self.blocks
+        blocks = blocks_of_size(problem, given) if isinstance(given, int) else given_blocks(problem, given)
+        if rows is not None and self.sub_solver is None and max(map(len, blocks)) <= MOST:
+            return BlockWorkspace(problem, rows, blocks, self)
+        if self.omega != 1:
+            raise ValueError(f"omega = {self.omega}: must be 1 for blocks of more than {MOST} unknowns")
+        solver: Solver = self.sub_solver or MinimumMapNewton()
+        return StaggeringWorkspace(problem, blocks, [solver] * len(blocks), eta=self.eta, max_iterations=100)
+
+    def step(self, problem: LCP, work: BlockWorkspace | StaggeringWorkspace, x: wp.array[Any]) -> Step:
+        """Solve each block once, or forward and backward if symmetric."""
+        linear = 0
+        for forward in DIRECTIONS[self.direction]:
+            if isinstance(work, BlockWorkspace):
+                work.run(x, forward=forward)
+                linear += 1
+            else:
+                linear += work.rounds.run(work.target, forward=forward)
+        work.round_iterate()
+        return Step("sweep", linear, failure=work.contraction.test(x))
+
+
+class BlockWorkspace(SweepWorkspace):
+    """Memory of sweeps over small blocks."""
+
+    def __init__(self, problem: LCP, rows: Rows, blocks: list[np.ndarray], settings: BlockedGaussSeidel) -> None:
+        super().__init__(problem, Precision(settings.precision))
+        device, n, sizes = problem.device, problem.layout.size, [len(block) for block in blocks]
+        members = np.concatenate(blocks)
+        owner, place = np.empty(n, dtype=np.int32), np.empty(n, dtype=np.int32)
+        owner[members] = np.repeat(np.arange(len(blocks)), sizes)
+        place[members] = np.concatenate([np.arange(size) for size in sizes])
+        colors = [np.arange(len(blocks))]
+        self._parallel = device.is_cuda and isinstance(problem.A, SparseOperator) and problem.bounds.affine is None
+        if self._parallel:
+            colors = color_blocks(problem.A.matrix(), owner, len(blocks))  # type: ignore[attr-defined]
+        self._starts = [0, *np.cumsum([len(color) for color in colors]).tolist()]
+        arrays = [np.concatenate([[0], np.cumsum(sizes)]), members, owner, place, np.concatenate(colors)]
+        self._blocks = [wp.array(v, dtype=wp.int32, device=device) for v in arrays]
+        before = [rows.indptr, rows.indices, rows.values, problem.b, *bound_operands(problem)]
+        self._operands = [*before, wp.float64(settings.omega)]
+        self._kernel = block_kernels(rows.values.dtype, max(sizes)).sweep
+
+    def start(self, *, warm: bool, tolerance: float) -> None:
+        """Rows are shared with the operator."""
+        self.contraction.start(self.x)
+
+    def run(self, x: wp.array[Any], *, forward: bool) -> None:
+        """Solve each block once: by one thread, or color by color."""
+        colors = range(len(self._starts) - 1)
+        for c in colors if forward else reversed(colors):
+            count = self._starts[c + 1] - self._starts[c]
+            threads, each = (count, 1) if self._parallel else (1, count)
+            wp.launch(self._kernel, threads, [*self._operands, *self._blocks, self._starts[c], each, forward, x], device=x.device)

@@ -1,0 +1,276 @@
+# mypy: ignore-errors
+"""Kernels of blocked Gauss-Seidel: small boxed problems, solved exactly by active sets, one block after the other."""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from warp_lcp.affine_bounds_kernels import bound_at
+from warp_lcp.solvers.sweep_kernels import INFINITE, ZERO, scalar_solution
+
+f64, i32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
+AT_LOWER, FREE, AT_UPPER = wp.constant(0), wp.constant(1), wp.constant(2)
+ROUNDING = wp.constant(wp.float64(1e-12))  # of the terms of y and of |x|: what elimination in a small block leaves
+SINGULAR = wp.constant(wp.float64(1e-13))  # of the largest entry
+
+
+@functools.cache
+def block_kernels(a_type: Any, m: int) -> SimpleNamespace:
+    """Return the kernel for entries of type a_type and blocks of at most m unknowns."""
+    name = f"warp_lcp.blocked_gauss_seidel.{a_type.__name__}_{m}"
+    entries = wp.array(dtype=a_type)
+    vector = wp.types.vector(length=m, dtype=wp.float64)
+    places = wp.types.vector(length=m, dtype=wp.int32)
+    table = wp.types.matrix(shape=(m, m + 1), dtype=wp.float64)
+    extended = wp.types.vector(length=m + 1, dtype=wp.float64)
+
+    @wp.struct
+    class Box:
+        """Bounds of a block's unknowns; within it they may be affine in another unknown, `*_at` >= 0."""
+
+        l: vector
+        l_slope: vector
+        l_at: places
+        u: vector
+        u_slope: vector
+        u_at: places
+
+    @wp.func
+    def lower_at(box: Box, x: vector, p: int):
+        value = box.l[p]
+        q = box.l_at[p]
+        if q >= 0:
+            value = value + box.l_slope[p] * x[q]
+        return value
+
+    @wp.func
+    def upper_at(box: Box, x: vector, p: int):
+        value = box.u[p]
+        q = box.u_at[p]
+        if q >= 0:
+            value = value + box.u_slope[p] * x[q]
+        return value
+
+    @wp.func
+    def solve_set(a: table, box: Box, state: places, n: int):
+        """Solve rows of A x = -c where free, x = bound elsewhere; the last component is 1, or 0 where the set is singular."""
+        t = a
+        largest = ZERO
+        for p in range(n):
+            t[p, m] = -a[p, m]
+            if state[p] != FREE:
+                for q in range(n):
+                    t[p, q] = ZERO
+                t[p, p] = wp.float64(1.0)
+                kind = state[p]
+                j = box.l_at[p]
+                slope = box.l_slope[p]
+                t[p, m] = box.l[p]
+                if kind == AT_UPPER:
+                    j = box.u_at[p]
+                    slope = box.u_slope[p]
+                    t[p, m] = box.u[p]
+                if j >= 0:
+                    t[p, j] -= slope
+            for q in range(n):
+                largest = wp.max(largest, wp.abs(t[p, q]))
+        out = extended()
+        regular = wp.float64(1.0)
+        for c in range(n):
+            best = c
+            for p in range(c + 1, n):
+                if wp.abs(t[p, c]) > wp.abs(t[best, c]):
+                    best = p
+            if wp.abs(t[best, c]) <= SINGULAR * largest:
+                regular = ZERO
+            else:
+                for q in range(n):
+                    v = t[c, q]
+                    t[c, q] = t[best, q]
+                    t[best, q] = v
+                v = t[c, m]
+                t[c, m] = t[best, m]
+                t[best, m] = v
+                for p in range(c + 1, n):
+                    f = t[p, c] / t[c, c]
+                    for q in range(c, n):
+                        t[p, q] -= f * t[c, q]
+                    t[p, m] -= f * t[c, m]
+        if regular > ZERO:
+            for r in range(n):
+                p = n - 1 - r
+                s = t[p, m]
+                for q in range(p + 1, n):
+                    s -= t[p, q] * out[q]
+                out[p] = s / t[p, p]
+        out[m] = regular
+        return out
+
+    @wp.func
+    def wanted(a: table, box: Box, x: vector, state: places, n: int):
+        """The set that x asks for: states that are wrong, changed."""
+        new = state
+        size = ZERO
+        for p in range(n):
+            size = wp.max(size, wp.abs(x[p]))
+        for p in range(n):
+            y = a[p, m]
+            terms = wp.abs(y)
+            for q in range(n):
+                y += a[p, q] * x[q]
+                terms += wp.abs(a[p, q] * x[q])
+            l = lower_at(box, x, p)
+            u = upper_at(box, x, p)
+            if state[p] == FREE:
+                if x[p] < l - ROUNDING * size:
+                    new[p] = AT_LOWER
+                elif x[p] > u + ROUNDING * size:
+                    new[p] = AT_UPPER
+            elif u > l:
+                if state[p] == AT_LOWER:
+                    if y < -ROUNDING * terms:
+                        new[p] = FREE
+                elif y > ROUNDING * terms:
+                    new[p] = FREE
+        return new
+
+    @wp.func
+    def solve_block(a: table, box: Box, x: vector, n: int):
+        """Solve the block: change wrong states, all at first, then the one of least index; else try all sets; else scalar problems."""
+        state = places()
+        for p in range(n):
+            state[p] = FREE
+            if x[p] <= lower_at(box, x, p):
+                state[p] = AT_LOWER
+            elif x[p] >= upper_at(box, x, p):
+                state[p] = AT_UPPER
+        solved = int(0)
+        out = x
+        going = int(1)
+        count = int(0)
+        while going == 1:
+            z = solve_set(a, box, state, n)
+            going = 0
+            if z[m] > ZERO:
+                v = vector()
+                for p in range(n):
+                    v[p] = z[p]
+                new = wanted(a, box, v, state, n)
+                first = int(-1)
+                for p in range(n):
+                    q = n - 1 - p
+                    if new[q] != state[q]:
+                        first = q
+                if first < 0:
+                    solved = 1
+                    out = v
+                elif count < 8 * n + 8:
+                    going = 1
+                    if count <= n:
+                        state = new
+                    else:
+                        state[first] = new[first]
+            count += 1
+        if solved == 0:
+            sets = int(1)
+            for _ in range(n):
+                sets = sets * 3
+            code = int(0)
+            while code < sets:
+                rest = code
+                possible = int(1)
+                for p in range(n):
+                    state[p] = rest % 3
+                    rest = rest // 3
+                    if state[p] == AT_LOWER:
+                        if box.l[p] < -INFINITE:
+                            possible = 0
+                    if state[p] == AT_UPPER:
+                        if box.u[p] > INFINITE:
+                            possible = 0
+                if possible == 1:
+                    z = solve_set(a, box, state, n)
+                    if z[m] > ZERO:
+                        v = vector()
+                        for p in range(n):
+                            v[p] = z[p]
+                        new = wanted(a, box, v, state, n)
+                        same = int(1)
+                        for p in range(n):
+                            if new[p] != state[p]:
+                                same = 0
+                        if same == 1:
+                            solved = 1
+                            out = v
+                            code = sets
+                code += 1
+        if solved == 0:
+            for p in range(n):
+                y = a[p, m]
+                for q in range(n):
+                    y += a[p, q] * out[q]
+                out[p] = scalar_solution(out[p], y, a[p, p], lower_at(box, out, p), upper_at(box, out, p), wp.float64(1.0))
+        return out
+
+    @wp.kernel(enable_backward=False, module=name)
+    def sweep(
+        ptr: i32, col: i32, entry: entries, b: f64, l: f64, l_index: i32, l_slope: f64, u: f64, u_index: i32, u_slope: f64,
+        omega: wp.float64, first: i32, rows: i32, owner: i32, place: i32, order: i32, begin: int, each: int, forward: bool, x: f64,
+    ):  # fmt: skip
+        """Solve `each` blocks a thread, from place begin of `order`; owner and place say where in which block a row is."""
+        thread = wp.tid()
+        for step in range(each):
+            at = begin + thread * each + step
+            if not forward:
+                at = begin + thread * each + each - 1 - step
+            block = order[at]
+            start = first[block]
+            n = first[block + 1] - start
+            a = table()
+            box = Box()
+            old = vector()
+            for p in range(n):
+                i = rows[start + p]
+                old[p] = x[i]
+                c = b[i]
+                row = ptr[i]
+                for k in range(row, ptr[i + 1]):
+                    j = k - row
+                    if col.shape[0] > 0:
+                        j = col[k]
+                    v = wp.float64(entry[k])
+                    if owner[j] == block:
+                        q = place[j]
+                        a[p, q] += v
+                    else:
+                        c += v * x[j]
+                a[p, m] = c
+                box.l[p] = bound_at(l, l_index, l_slope, x, i)
+                box.u[p] = bound_at(u, u_index, u_slope, x, i)
+                box.l_at[p] = -1
+                box.u_at[p] = -1
+                if l_index.shape[0] > 0:
+                    j = l_index[i]
+                    if j >= 0:
+                        if owner[j] == block:
+                            box.l[p] = l[i]
+                            box.l_slope[p] = l_slope[i]
+                            box.l_at[p] = place[j]
+                    j = u_index[i]
+                    if j >= 0:
+                        if owner[j] == block:
+                            box.u[p] = u[i]
+                            box.u_slope[p] = u_slope[i]
+                            box.u_at[p] = place[j]
+            new = solve_block(a, box, old, n)
+            for p in range(n):
+                new[p] = old[p] + omega * (new[p] - old[p])
+            for p in range(n):  # unknowns that others' bounds depend on have constant ones, so that their order does not matter
+                if box.l_at[p] < 0 and box.u_at[p] < 0:
+                    new[p] = wp.clamp(new[p], box.l[p], box.u[p])
+            for p in range(n):
+                x[rows[start + p]] = wp.clamp(new[p], lower_at(box, new, p), upper_at(box, new, p))
+
+    return SimpleNamespace(sweep=sweep)

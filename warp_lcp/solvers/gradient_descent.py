@@ -1,0 +1,144 @@
+"""Nonsmooth gradient descent: slow, but every product it needs is one with A or A'; a start for Newton methods."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.problem import LCP
+from warp_lcp.residual import NaturalResidual
+from warp_lcp.result import SolveStatus
+from warp_lcp.solve import IterateInPlace, Precision, Step
+from warp_lcp.solvers.globalization import NonmonotoneSearch
+from warp_lcp.solvers.nonsmooth_map import Kink, NonsmoothMap, Reformulation
+from warp_lcp.vectors import convert
+
+
+@dataclass(frozen=True, kw_only=True)
+class GradientDescent:
+    """Descend on the merit f.f / 2 of a reformulation ([Book] 2.4.4, eq. 2.199, algorithm 13).
+
+    x <- clip(x - t d^-2 J'f, l, u) with an element J = diag(p d) + diag(q) A of the generalized Jacobian and d = |A_ii|, which makes
+    the direction independent of x's units. t comes from a backtracking search along the projected path that starts at twice the last
+    length. Needs products with A' as well, and nothing else of A: it is slow, with a rate that the square of A's condition decides.
+
+    The book's tests end it: the absolute one is the criteria of every method (CONVERGED); the relative one (eq. 2.202), a merit that
+    changes by less than `relative` of itself, and the stagnation test (eq. 2.203), an x that changes by less than `stagnation` of its largest
+    entry, give STAGNATED; a gradient below `gradient` ||f|| gives LOCAL_MINIMUM; a search without success gives NON_DESCENT.
+
+    Args:
+        map: "natural", "fischer" or "penalized".
+        share: lambda of the penalized map, in (0, 1].
+        relative: of the relative test, >= 0.
+        stagnation: of the stagnation test, >= 0.
+        gradient: of the test for a local minimum, >= 0.
+        precision: "mixed" and "double" are the same here; "single" rounds x to float32.
+
+    Raises:
+        ValueError: an argument is outside its range.
+    """
+
+    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
+    needs: ClassVar[str] = "products with A'"
+
+    map: str = "fischer"
+    share: float = 0.95
+    relative: float = 1e-12
+    stagnation: float = 1e-14
+    gradient: float = 1e-10
+    precision: str = "double"
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        Reformulation(self.map), Precision(self.precision)
+        if not 0 < self.share <= 1:
+            raise ValueError(f"share = {self.share}: must be in (0, 1]")
+        for name in ("relative", "stagnation", "gradient"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} = {getattr(self, name)}: must be >= 0")
+
+    def init(self, problem: LCP) -> GradientWorkspace:
+        """Return a workspace."""
+        return GradientWorkspace(problem, self)
+
+    def step(self, problem: LCP, work: GradientWorkspace, x: wp.array[Any]) -> Step:
+        """Go down once."""
+        return work.descend(x)
+
+
+class GradientWorkspace(IterateInPlace):
+    """Memory of the method for one problem; another method's where it shares that one's residual.
+
+    Args:
+        problem: the problem.
+        settings: the method.
+        residual: shared with the method that this one serves; its own if None.
+    """
+
+    def __init__(self, problem: LCP, settings: GradientDescent, residual: NaturalResidual | None = None) -> None:
+        self.problem, self.settings, self.precision = problem, settings, Precision(settings.precision)
+        self.residual = residual or NaturalResidual(problem)
+        self.x = problem.layout.zeros(wp.float64) if residual is None else wp.empty(0, dtype=wp.float64, device=problem.device)
+        self._from = problem.layout.zeros(wp.float64)
+        self._map = NonsmoothMap(problem, self.residual, Reformulation(settings.map), settings.share, wp.float64)
+        self._search = NonmonotoneSearch(memory=1, least=1e-18)
+        self._rounded = problem.layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
+        self.floating: Any = None
+        self.length, self.merit = 1.0, math.inf
+
+    def start(self, *, warm: bool, tolerance: float) -> None:
+        """Forget the last length."""
+        self.length, self.merit = 1.0, math.inf
+        self._map.begin(Kink.PERTURBATION)
+
+    def descend(self, x: wp.array[Any]) -> Step:
+        """Go down once; `residual.y` is current at x before and after."""
+        s, map_ = self.settings, self._map
+        merit = map_.merit(x)
+        slope = map_.descend(x)
+        if slope <= s.gradient * math.sqrt(2 * merit):
+            return Step("gradient", 1, None, SolveStatus.LOCAL_MINIMUM)
+        wp.copy(self._from, x)
+        self._search.forget()
+        self._search.remember(merit)
+        length, reached = self._search.search(lambda t: self._trial(x, t), 0.0, first=min(2 * self.length, 1e6))
+        if length == 0.0:
+            wp.copy(x, self._from)
+            self.residual.evaluate(x)
+            return Step("gradient", 1, None, SolveStatus.NON_DESCENT)
+        self.length = length
+        return Step("gradient", 2, None, self._tested(x, merit, reached))
+
+    def _trial(self, x: wp.array[Any], length: float) -> float:
+        """Move, and return the merit less Armijo's share of what the projected move promises."""
+        self._map.advance(self._from, self._direction, -length, x, projected=True)
+        self.round(x)
+        self.residual.evaluate(x)
+        return self._map.merit(x)
+
+    def _tested(self, x: wp.array[Any], before: float, after: float) -> SolveStatus | None:
+        """Return how the relative and the stagnation test end the solve, None if they do not."""
+        s = self.settings
+        if before - after <= s.relative * before:
+            return SolveStatus.STAGNATED
+        moved = float(np.abs(x.numpy() - self._from.numpy()).max())
+        return SolveStatus.STAGNATED if moved <= s.stagnation * float(np.abs(x.numpy()).max()) else None
+
+    @property
+    def _direction(self) -> wp.array[Any]:
+        assert self._map.direction is not None
+        return self._map.direction
+
+    def round_iterate(self) -> None:
+        """Round x to its precision."""
+        self.round(self.x)
+
+    def round(self, x: wp.array[Any]) -> None:
+        """Round a field to the iterate's precision."""
+        if self._rounded is not None:
+            convert(x, self._rounded)
+            convert(self._rounded, x)
