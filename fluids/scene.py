@@ -9,8 +9,15 @@ from pydantic import Field
 
 from warp_lcp.driver.scene import Complaint, Liquid, Scene, Table
 
-BYTES_PER_CELL = 160  # fields of the grid and of the pressure solve, measured at 128^3
-BYTES_PER_PARTICLE = 96  # with APIC's gradients, sort keys and a spare array
+# Measured at 96^3 as the growth of a process on the CPU, first step included.
+BYTES_A_CELL = 128  # fields of the grid and of the pressure solve
+LEVEL_SET_BYTES = 19  # more a cell for a surface between cells, or slivers
+SMOOTHING_BYTES = 12
+CUT_BYTES = 45
+MOVING_BYTES = 30
+VECTOR_BYTES, KEY_BYTES = 12, 16  # a particle's vectors, one of them spare, and its sort keys
+SEEDING_BYTES = 136  # a particle on the host, while the liquid is made and the solver is not
+LATTICE_BYTES = 130  # a point of one plane of cells, while particles are chosen from them
 
 
 class Pressure(Table):
@@ -55,9 +62,23 @@ class LiquidScene(Scene):
         """Return what a run would do."""
         particles = self.particle_estimate()
         settings = self.particles
-        memory = math.prod(self.cell_counts) * BYTES_PER_CELL + particles * BYTES_PER_PARTICLE
         return [
             *super().plan(),
             ("particles", f"at most {particles:,}, {settings.per_axis**self.dimension} a cell, {settings.transfer}"),
-            ("memory", f"about {max(1, round(memory / 2**20)):,} MB"),
+            ("memory", f"about {max(1, round(self.memory_estimate() / 2**20)):,} MB"),
         ]
+
+    def memory_estimate(self) -> int:
+        """Return about how much memory a run takes at most [bytes], without the program itself."""
+        nx, ny, nz = self.cell_counts
+        cells = nx * ny * (nz if self.dimension == 3 else 3)  # three planes are stored
+        particles = self.particle_estimate()
+        cut = self.domain.solids == "cut-cell" and bool(self.solid)
+        level_set = self.pressure.surface == "ghost-fluid"
+        a_cell = BYTES_A_CELL + LEVEL_SET_BYTES * (level_set or cut) + SMOOTHING_BYTES * (level_set and self.pressure.smoothing > 0)
+        a_cell += CUT_BYTES * cut + MOVING_BYTES * any(solid.motion is not None for solid in self.solid)
+        a_cell += 4 * self.dimension * (self.particles.transfer == "flip")
+        vectors = 3 + (self.dimension if self.particles.transfer == "apic" else 0)
+        running = cells * a_cell + particles * (VECTOR_BYTES * vectors + KEY_BYTES)
+        lattice = nx * ny * self.particles.per_axis**self.dimension
+        return max(running, cells * BYTES_A_CELL // 2 + particles * SEEDING_BYTES + lattice * LATTICE_BYTES)

@@ -348,7 +348,13 @@ def _surface(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary) -> Fre
 
 def _region(geometry: Geometry, boundary: Boundary, device: wp.Device) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function that tells which points lie in a geometry and outside solids."""
-    return lambda points: inside([geometry], points, device=device) & boundary.admits(points)
+
+    def holds(points: np.ndarray) -> np.ndarray:
+        result = inside([geometry], points, device=device)
+        result[result] = boundary.admits(points[result])
+        return result
+
+    return holds
 
 
 def _boundary(scene: LiquidScene, grid: StaggeredGrid, folder: Path, wall_velocity: np.ndarray | None) -> tuple[Boundary, tuple[str, ...]]:

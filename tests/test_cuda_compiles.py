@@ -61,12 +61,32 @@ def use_sparse_kernels():
             A.relax(*(wp.ones(100, dtype=wp.float64, device="cpu") for _ in range(4)), 1.0, colored=True)
 
 
+def use_sweeping_kernels():
+    """Instantiate the kernels of sweeps, small blocks and first-order methods."""
+    T = scipy.sparse.diags_array([-1.0, 3.0, -1.0], offsets=[-1, 0, 1], shape=(30, 30)).tocsr()
+    friction = wl.AffineBounds.friction([-1, 0], 0.5)
+    for dtype in (wp.float32, wp.float64):
+        dense = wl.LCP(wl.DenseOperator(T.toarray(), device="cpu", dtype=dtype), -np.ones(30))
+        sparse = wl.LCP(wl.SparseOperator(T, device="cpu", dtype=dtype), -np.ones(30))
+        grid = wl.LCP(wl.GridPoisson(np.array([[0, 1, 1, 1]]), device="cpu", dtype=dtype), -np.ones((1, 4)))
+        blocks = [wl.BlockedGaussSeidel(blocks=size) for size in range(1, 7)]
+        orders = [wl.ProjectedSOR(order="magnitude"), wl.ProjectedSOR(order="greedy")]
+        first = [wl.ProjectedJacobi(), wl.NNCG(), wl.AcceleratedProjectedGradient(), wl.Staggering(), wl.SubspaceMinimization()]
+        for solver in [*blocks, *orders, *first, wl.SubspaceMinimization(precision="double")]:
+            assert wl.solve(dense, solver)
+        for problem in (sparse, grid):
+            for solver in first:
+                assert wl.solve(problem, solver)
+        assert wl.solve(wl.LCP(wl.DenseOperator(np.eye(2), device="cpu", dtype=dtype), -np.ones(2), *friction), wl.ProjectedSOR())
+
+
 def test_all_kernels_compile_for_sm_80_and_sm_90(tmp_path):
     for package in (wl, fluids):
         for found in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
             importlib.import_module(found.name)
     use_every_kernel()
     use_sparse_kernels()
+    use_sweeping_kernels()
     from warp._src.context import user_modules
 
     names = sorted(name for name, module in user_modules.items() if name.startswith(("warp_lcp", "fluids")) and module.kernels)

@@ -112,8 +112,8 @@ class AffineFields:
         shifted = [layout.load(i + 1, wp.int32, name) for i, name in zip(indices, SIDES, strict=True)]
         self.index = [wp.array(s.numpy() - 1, dtype=wp.int32, device=layout.device) for s in shifted]
         dependent = [i.numpy() >= 0 for i in self.index]
-        for side, name in enumerate(SIDES):
-            needed = self.index[side].numpy()[dependent[side]]
+        for number, name in enumerate(SIDES):
+            needed = self.index[number].numpy()[dependent[number]]
             if (dependent[0] | dependent[1])[needed].any():
                 raise ValueError(f"{name} depends on an unknown whose own bounds are affine: these must be constant")
         self.values = [wp.clone(c) for c in self.constant]

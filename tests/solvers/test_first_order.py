@@ -123,5 +123,5 @@ def test_what_they_cannot_take_is_refused():
         with pytest.raises(ValueError, match=next(iter(settings)) if "precision" not in settings else "half"):
             AcceleratedProjectedGradient(**settings)
     for settings in ({"omega": 0.0}, {"direction": "up"}, {"precision": "half"}):
-        with pytest.raises(ValueError, match="omega|direction|half"):
+        with pytest.raises(ValueError, match=r"omega|direction|half"):
             NNCG(**settings)

@@ -7,7 +7,9 @@ from hypothesis import strategies as st
 
 import warp_lcp as wl
 from oracle import boxed, lemke, natural_residual
+from warp_lcp.solvers.incremental_pivoting import IncrementalPivoting
 from warp_lcp.solvers.lemke import Basis, Lemke
+from warp_lcp.solvers.quadratic_program import QuadraticProgram
 
 TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=1000)
 
@@ -173,3 +175,22 @@ def test_large_problems_are_refused(monkeypatch):
     monkeypatch.setattr(Lemke, "most_unknowns", 3)
     with pytest.raises(ValueError, match="4 unknowns: Lemke is a dense method for at most 3"):
         solve(np.eye(4), -np.ones(4))
+
+
+@pytest.mark.parametrize("method", [Lemke, IncrementalPivoting, QuadraticProgram])
+@pytest.mark.parametrize("size", [1e-8, 1.0, 1e8])
+@pytest.mark.parametrize("load", [1e-8, 1e8])
+def test_units_do_not_matter(method, size, load):
+    """Rows and columns from 1e-3 to 1e3, A and b in any units: no certificate of infeasibility may depend on them."""
+    if method is QuadraticProgram:
+        pytest.importorskip("piqp")
+    rng = np.random.default_rng(827)
+    B, scale = rng.standard_normal((40, 40)), 10 ** rng.uniform(-3, 3, 40)
+    A = (B @ B.T / 40 + 0.1 * np.eye(40)) * np.outer(scale, scale) * size
+    A = (A + A.T) / 2
+    held = rng.random(40) < 0.4
+    x = np.where(held, 0.0, rng.uniform(0.1, 1.0, 40) / scale) * load / size
+    b = np.where(held, rng.uniform(0.1, 1.0, 40) * scale, 0.0) * load - A @ x
+    result = solve(A, b, solver=method())
+    assert result, result.status
+    np.testing.assert_allclose(result.x.numpy(), x, rtol=1e-5, atol=1e-9 * x.max())

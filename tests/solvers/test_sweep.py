@@ -104,7 +104,7 @@ def test_zero_diagonal_goes_to_the_bound_that_y_asks_for(name, b, expected, devi
 
 @pytest.mark.parametrize("name", SCALAR)
 def test_negative_diagonal_goes_to_the_bound_of_lesser_energy(name, device):
-    """Of -x^2 / 2 + x / 5 on [-1, 2] both ends are solutions, with energies -0.7 and -1.6; the upright parabola's rule would stay inside."""
+    """Of -x^2 / 2 + x / 5 on [-1, 2] both ends are solutions, with energies -0.7 and -1.6: the upright parabola's rule stays inside."""
     for operator in operators(np.array([[-1.0]]), device):
         result = wl.solve(wl.LCP(operator, np.array([0.2]), -1.0, 2.0), SCALAR[name], stopping=TIGHT)
         assert result, result.status

@@ -146,7 +146,7 @@ DISTANCE = """
         T* phi = phi_.data + at + start; signed char* known = (signed char*)known_.data + at + start;
         SIMD for (int m = 0; m < n; ++m) {
             const int has = (base[m] != SOLID) & (raw[m] > (T)MIN_CAPACITY);
-            const T c = full[m] > (T)MIN_CAPACITY ? full[m] : (T)MIN_CAPACITY, f = density[m]/c;
+            const T c = full[m] > (T)1e-3 ? full[m] : (T)1e-3, f = density[m]/c;
             share[m] = has ? (f < 1 ? f : (T)1) : (T)0;
             known[m] = has ? 1 : 0;
         }

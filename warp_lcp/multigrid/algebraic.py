@@ -39,6 +39,9 @@ class AlgebraicSettings:
         strength: entries below this share of sqrt(a_ii a_jj) do not aggregate. It must be above what rounding leaves of
             entries that cancel.
         gamma: coarse cycles a level; 1 is a V-cycle.
+        gamma_unsymmetric: the same on an unsymmetric A.
+        skew: a level whose skew part is larger than this share of its symmetric off-diagonal part takes plain aggregates: Galerkin products
+            of smoothed ones are centered differences, which are unstable where convection rules; those of plain ones stay M-matrices.
         interval: bounds of the spectrum, in units of its l1 bound, that the two Chebyshev-Jacobi sweeps damp.
         coarsest_cpu: the most unknowns of the coarsest level, which is inverted densely.
         coarsest_cuda: the same on a GPU, where one thread factors it.
@@ -48,6 +51,8 @@ class AlgebraicSettings:
 
     strength: float = 1e-3
     gamma: int = 1
+    gamma_unsymmetric: int = 2
+    skew: float = 0.35
     interval: tuple[float, float] = (0.25, 1.0)
     coarsest_cpu: int = 64
     coarsest_cuda: int = 24
@@ -143,7 +148,7 @@ class AlgebraicHierarchy:
 
     Rows of the finest prolongation are scaled by a_ii / (a_ii + D_i), the value that the row's own equation asks for, and are 0 off the
     free set: a coarse correction then leaves stiff unknowns alone, whatever D's size. On an unsymmetric A the aggregates are those of its
-    symmetric part, and the coarse matrices are P' M P with M as it is.
+    symmetric part, smoothed where that part rules, and the coarse matrices are P' M P with M as it is.
 
     Args:
         A: the matrix.
@@ -158,10 +163,10 @@ class AlgebraicHierarchy:
     def __init__(self, A: SparseOperator, real: Any, settings: AlgebraicSettings | None = None) -> None:
         self.settings, self.real, self.source, self.device = settings or AlgebraicSettings(), real, A, A.device
         host = A.matrix()
-        symmetric = host if A.symmetric else ((host + host.T) * 0.5).tocsr()
         pattern = _with_diagonal(host if A.symmetric else _union(host))
         self._order = self._find_entries(host, pattern)
-        self.levels = _coarsen(symmetric, pattern, real, self.device, self.settings, self._most)
+        self.levels = _coarsen(host, pattern, real, self.device, self.settings, self._most)
+        self._gamma = self.settings.gamma if A.symmetric else self.settings.gamma_unsymmetric
         n, last = A.unknowns, self.levels[-1].size
         self.scale = wp.zeros(n, dtype=real, device=self.device)
         self.weight = wp.zeros(n, dtype=real, device=self.device)
@@ -233,7 +238,7 @@ class AlgebraicHierarchy:
         L.sweep(L.x, L.t, second, launch)
         launch_spans(L.kernels.residual, L.spans, [*L.A.operands, L.x, L.b, L.t], [], self.device, launch=launch)
         launch_spans(L.kernels.transfer, C.spans, [*L.R.operands, L.t, False, C.b], [], self.device, launch=launch)
-        for visit in range(self.settings.gamma if depth + 2 < len(self.levels) else 1):
+        for visit in range(self._gamma if depth + 2 < len(self.levels) else 1):
             self._visit(depth + 1, launch, from_zero=visit == 0)
         launch_spans(L.kernels.transfer, L.spans, [*P.operands, C.x, True, L.x], [], self.device, launch=launch)
         L.sweep(L.t, L.x, second, launch)
@@ -270,7 +275,8 @@ def _coarsen(A: Matrix, pattern: Matrix, real: Any, device: wp.Device, settings:
     levels = [AlgebraicLevel(current, real, device)]
     while current.shape[0] > most:
         fine = levels[-1]
-        entries = scipy.sparse.csr_matrix(current, copy=True)
+        turned = current.T.tocsr()
+        entries = scipy.sparse.csr_matrix((current + turned) * 0.5)
         entries.eliminate_zeros()
         C = symmetric_strength_of_connection(entries, theta=settings.strength)
         aggregates, _ = standard_aggregation(C)
@@ -278,7 +284,10 @@ def _coarsen(A: Matrix, pattern: Matrix, real: Any, device: wp.Device, settings:
             break
         T, candidates = fit_candidates(aggregates, candidates)
         # local weights are sums of magnitudes; spectral ones start from random vectors, so runs would differ
-        P = scipy.sparse.csr_array(jacobi_prolongation_smoother(entries, T, C, candidates, omega=4 / 3, weighting="local"))
+        P = T
+        if _skewness(current, turned, entries) <= settings.skew:
+            P = jacobi_prolongation_smoother(entries, T, C, candidates, omega=4 / 3, weighting="local")
+        P = scipy.sparse.csr_array(P)
         P.sort_indices()
         R = P.T.tocsr()
         AP = _pattern_product(current, P)
@@ -299,6 +308,12 @@ def _pattern_product(A: Matrix, B: Matrix) -> Matrix:
     product = (_ones(A) @ _ones(B)).tocsr()
     product.sort_indices()
     return product
+
+
+def _skewness(A: Matrix, turned: Matrix, symmetric: Matrix) -> float:
+    """Return the sum of |A - A'| / 2 over that of the off-diagonal |A + A'| / 2."""
+    off = float(np.abs(symmetric.data).sum() - np.abs(symmetric.diagonal()).sum())
+    return 0.5 * float(np.abs((A - turned).data).sum()) / off if off > 0 else 0.0
 
 
 def _alike(A: Matrix, B: Matrix) -> bool:

@@ -9,16 +9,19 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
+from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem import LCP
 from warp_lcp.solve import Precision, Solver, Step
 from warp_lcp.solvers.blocked_gauss_seidel_kernels import block_kernels
+from warp_lcp.solvers.grid_lines import GridLines, LineSweep
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.partition import blocks_of_size, color_blocks, given_blocks
 from warp_lcp.solvers.psor import DIRECTIONS, SweepWorkspace
 from warp_lcp.solvers.staggering import StaggeringWorkspace
 from warp_lcp.solvers.sweep import Rows, bound_operands
 
+CONSECUTIVE = 3  # unknowns of a block unless given: a contact in space
 MOST = 6  # unknowns of a block that a thread solves by active sets
 
 
@@ -32,12 +35,13 @@ class BlockedGaussSeidel:
     unknowns of the block, are part of that system. On CUDA blocks that are not coupled are solved at once. Larger blocks, and all if
     `sub_solver` is given, are problems of their own, solved one by one from the host.
 
-    On grids give blocks as lists and a `sub_solver`; each block then costs passes over the whole grid, so that a few large blocks only
-    make sense.
+    On grids blocks are lines of cells, in two colors: lines along an axis whose coefficients are many times the others' make sweeps as
+    good as if all were equal. Or give blocks as lists and a `sub_solver`; each block then costs passes over the whole grid, so that a few
+    large blocks only make sense.
 
     Args:
-        blocks: unknowns of a block, consecutive ones; or for each block flat indices into a field of the problem's shape, together all
-            unknowns, each once.
+        blocks: unknowns of a block, consecutive ones; or `GridLines`; or for each block flat indices into a field of the problem's shape,
+            together all unknowns, each once. If None, 3 unknowns, on grids lines along x.
         sub_solver: a method for the blocks; None: the kernel for blocks of at most 6 unknowns, MinimumMapNewton for larger ones.
         omega: relaxation factor in (0, 2) of blocks that the kernel solves; 1 for others.
         direction: "forward", "backward" or "symmetric".
@@ -48,11 +52,11 @@ class BlockedGaussSeidel:
         ValueError: an argument is outside its range.
     """
 
-    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse"})
-    needs: ClassVar[str] = "symmetric positive definite A for a proof of convergence; grids: blocks and sub_solver given"
+    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
+    needs: ClassVar[str] = "symmetric positive definite A for a proof of convergence"
     affine_bounds: ClassVar[bool] = True
 
-    blocks: int | Sequence[Any] = 3
+    blocks: int | GridLines | Sequence[Any] | None = None
     sub_solver: Solver | None = None
     omega: float = 1.0
     direction: str = "forward"
@@ -73,16 +77,21 @@ class BlockedGaussSeidel:
             raise ValueError(f"omega = {self.omega}: must be 1 with a sub_solver")
         Precision(self.precision)
 
-    def init(self, problem: LCP) -> BlockWorkspace | StaggeringWorkspace:
+    def init(self, problem: LCP) -> BlockWorkspace | LineWorkspace | StaggeringWorkspace:
         """Return a workspace.
 
         Raises:
             ValueError: the blocks are no partition of the unknowns, A cannot be taken apart, or the method does not take its blocks.
         """
-        rows = Rows.of(problem.A)
-        if rows is None and (isinstance(self.blocks, int) or self.sub_solver is None):
-            raise ValueError(f"{type(problem.A).__name__} shows no rows: give BlockedGaussSeidel lists as blocks and a sub_solver")
-        given = self.blocks
+        rows, given, kind = Rows.of(problem.A), self.blocks, type(problem.A).__name__
+        if given is None:
+            given = GridLines.X if isinstance(problem.A, GridPoisson) else CONSECUTIVE
+        if isinstance(given, GridLines):
+            if not isinstance(problem.A, GridPoisson) or self.sub_solver is not None:
+                raise ValueError(f"blocks = {given}: are for GridPoisson without a sub_solver; A is a {kind}")
+            return LineWorkspace(problem, given, self)
+        if rows is None and (isinstance(given, int) or self.sub_solver is None):
+            raise ValueError(f"{kind} shows no rows: give BlockedGaussSeidel GridLines, or lists as blocks and a sub_solver")
         blocks = blocks_of_size(problem, given) if isinstance(given, int) else given_blocks(problem, given)
         if rows is not None and self.sub_solver is None and max(map(len, blocks)) <= MOST:
             return BlockWorkspace(problem, rows, blocks, self)
@@ -91,15 +100,15 @@ class BlockedGaussSeidel:
         solver: Solver = self.sub_solver or MinimumMapNewton()
         return StaggeringWorkspace(problem, blocks, [solver] * len(blocks), eta=self.eta, max_iterations=100)
 
-    def step(self, problem: LCP, work: BlockWorkspace | StaggeringWorkspace, x: wp.array[Any]) -> Step:
+    def step(self, problem: LCP, work: BlockWorkspace | LineWorkspace | StaggeringWorkspace, x: wp.array[Any]) -> Step:
         """Solve each block once, or forward and backward if symmetric."""
         linear = 0
         for forward in DIRECTIONS[self.direction]:
-            if isinstance(work, BlockWorkspace):
+            if isinstance(work, StaggeringWorkspace):
+                linear += work.rounds.run(work.target, forward=forward)
+            else:
                 work.run(x, forward=forward)
                 linear += 1
-            else:
-                linear += work.rounds.run(work.target, forward=forward)
         work.round_iterate()
         return Step("sweep", linear, failure=work.contraction.test(x))
 
@@ -136,3 +145,21 @@ class BlockWorkspace(SweepWorkspace):
             count = self._starts[c + 1] - self._starts[c]
             threads, each = (count, 1) if self._parallel else (1, count)
             wp.launch(self._kernel, threads, [*self._operands, *self._blocks, self._starts[c], each, forward, x], device=x.device)
+
+
+class LineWorkspace(SweepWorkspace):
+    """Memory of sweeps over a grid's lines."""
+
+    sweep: LineSweep
+
+    def __init__(self, problem: LCP, axis: GridLines, settings: BlockedGaussSeidel) -> None:
+        super().__init__(problem, Precision(settings.precision))
+        self.sweep = LineSweep(problem, axis, settings.omega)
+
+    def start(self, *, warm: bool, tolerance: float) -> None:
+        """The stencil is the operator's own."""
+        self.contraction.start(self.x)
+
+    def run(self, x: wp.array[Any], *, forward: bool) -> None:
+        """Solve each line once."""
+        self.sweep.run(x, forward=forward)

@@ -17,6 +17,8 @@ from warp_lcp.solvers.globalization import NonmonotoneSearch
 from warp_lcp.solvers.nonsmooth_map import Kink, NonsmoothMap, Reformulation
 from warp_lcp.vectors import convert
 
+LEAST = 1e-12  # relative decrease of the merit without which a step is none
+
 
 @dataclass(frozen=True, kw_only=True)
 class GradientDescent:
@@ -104,7 +106,7 @@ class GradientWorkspace(IterateInPlace):
             return Step("gradient", 1, None, SolveStatus.LOCAL_MINIMUM)
         wp.copy(self._from, x)
         self._search.forget()
-        self._search.remember(merit)
+        self._search.remember(merit * (1 - LEAST))  # a projected step promises less than Armijo asks of a free one
         length, reached = self._search.search(lambda t: self._trial(x, t), 0.0, first=min(2 * self.length, 1e6))
         if length == 0.0:
             wp.copy(x, self._from)
@@ -114,7 +116,7 @@ class GradientWorkspace(IterateInPlace):
         return Step("gradient", 2, None, self._tested(x, merit, reached))
 
     def _trial(self, x: wp.array[Any], length: float) -> float:
-        """Move, and return the merit less Armijo's share of what the projected move promises."""
+        """Move along the projected path, and return the merit."""
         self._map.advance(self._from, self._direction, -length, x, projected=True)
         self.round(x)
         self.residual.evaluate(x)

@@ -9,20 +9,23 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 import warp as wp
 
-from warp_lcp.multigrid.hierarchy import CycleSettings
+from warp_lcp.multigrid.hierarchy import CycleSettings, Level
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
-from warp_lcp.solve import IterateInPlace, Precision, Step
+from warp_lcp.solve import Precision, Step
 from warp_lcp.solvers import mprgp_kernels as kernels
+from warp_lcp.solvers import projected_multigrid_kernels as engine
 from warp_lcp.solvers.minimum_map_newton_kernels import all_free_kernel
 from warp_lcp.solvers.principal_system import DiagonalSystem, principal_system
 from warp_lcp.solvers.principal_system_sparse import SparseSystem
+from warp_lcp.solvers.projected_multigrid import PLANES_A_THREAD
 from warp_lcp.vectors import Reduction, convert, launch_spans
 
 SINGLE_SLACK = 1.2e-7  # a bound that float32 rounds is met within this part of it
+LEAST_REST = 1e-3  # of a correction's energy that must not lie along the last direction; what is left else is cancellation
 ENERGY_ROUNDING = 1e-12  # rises of the energy within this part of it are rounding
 
 
@@ -38,7 +41,7 @@ class MPRGP:
     linear solve, this one 1.5. Cold, the first steps on a grid are projected multigrid cycles.
 
     On grids the residual may rise `patience` times running, then a projected cycle follows; elsewhere a projected step that raises the
-    energy is halved. `linear_iterations` counts products with A and monotone cycles.
+    energy is halved. `linear_iterations` counts monotone cycles and products with A: one a step, two if it releases unknowns.
 
     Args:
         precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate rounded to float32 as well. Dense
@@ -85,12 +88,14 @@ class MPRGP:
         return work
 
     def step(self, problem: LCP, work: GradientWorkspace, x: wp.array[Any]) -> Step:
-        """Take a monotone cycle while the start is cold, a proportioning step, or a projected conjugate-gradient step."""
+        """Take a monotone cycle while the start is cold, else a projected conjugate-gradient step, after a proportioning one if need be."""
         if work.wants_monotone_cycle():
             return work.monotone_step(x)
-        if work.residual.chopped > self.gamma**2 * work.residual.reduced:
-            return work.proportioning_step(x)
-        return work.conjugate_step(x)
+        held = work.residual.active
+        release = work.residual.chopped > self.gamma**2 * work.residual.reduced
+        if (release and not work.proportion()) or not work.conjugate():
+            return Step("unbounded", 1, held, SolveStatus.DIVERGED)
+        return Step("proportioning", 2, held) if release else Step("conjugate gradient", 1, held)
 
 
 class Preconditioner(Protocol):
@@ -107,60 +112,81 @@ class Preconditioner(Protocol):
 
 
 class SplitResidual(NaturalResidual):
-    """The natural residual, with what decides on the next step: its parts, the free set, the right-hand side there.
+    """The natural residual, with what decides on the next step: its parts, the free set, the right-hand side there, the chopped step.
+
+    Args:
+        problem: the problem.
+        r: stored field, receives the right-hand side -y / size on the free set.
+        chopped_step: stored field like r, receives -residual / (A_ii size) on the held unknowns.
+        slack: an unknown within this part of a bound is at it.
 
     Attributes:
         free: stored uint8 field, 1 where an unknown is off its bounds.
-        size: the right-hand side is -y / size on the free set.
+        size: see `r`.
         moved: whether the free set has changed since this was last set to False.
         chopped: squared norm of the residual on the held unknowns.
         reduced: product of the residual and y on the free ones.
+        release: product of -y / size and the chopped step.
         active: number of held unknowns.
-        energy: 1/2 x'Ax + b'x, where it is wanted.
+        energy: 1/2 x'Ax + b'x; not on grids.
     """
 
-    def __init__(self, problem: LCP, r: wp.array[Any], *, slack: float, with_energy: bool) -> None:
+    def __init__(self, problem: LCP, r: wp.array[Any], chopped_step: wp.array[Any], *, slack: float) -> None:
         super().__init__(problem)
         device = problem.device
-        self.free, self._r, self._slack = problem.layout.zeros(wp.uint8), r, slack
-        self._b = problem.b if with_energy else wp.empty(0, dtype=wp.float64, device=device)
+        self.free, self._r, self._chopped_step, self._slack = problem.layout.zeros(wp.uint8), r, chopped_step, slack
         self.scalars = wp.zeros(kernels.SLOTS, dtype=wp.float64, device=device)
-        self.sums = Reduction(problem.layout.size, device, self.scalars, columns=kernels.COLUMNS)
+        self.sums = Reduction(problem.layout.size, device, self.scalars, columns=2)
         self.kernels = kernels.kernels(self.diagonal.dtype, r.dtype)
-        self.size, self.moved, self.chopped, self.reduced, self.active, self.energy = 1.0, True, 0.0, 0.0, 0, 0.0
+        self.size, self.moved, self.chopped, self.reduced, self.release, self.active, self.energy = 1.0, True, 0.0, 0.0, 0.0, 0, 0.0
+        self._stencil = problem.A.stencil if isinstance(problem.A, GridPoisson) else None
+        if self._stencil is None:
+            self._split = Reduction(problem.layout.size, device, self.scalars, columns=kernels.COLUMNS)
+            return
+        self._assess = kernels.row_kernels(*self._stencil.storage, r.dtype)
+        self._rows = row_sums(self._stencil.threads, device)
+        self._split = Reduction(problem.layout.size, device, self.scalars, columns=kernels.COLUMNS, threads=self._rows.threads)
 
     def start(self, x: wp.array[Any], *, keep: bool) -> None:
         """Set x to clip(x, l, u) or clip(0, l, u)."""
         super().start(x, keep=keep)
         if not keep:
-            self.size = self.norm_of_b() or 1.0
+            self.size, self.norm = self.norm_of_b() or 1.0, 0.0
 
     def evaluate(self, x: wp.array[Any]) -> float:
-        """Compute y, the norm of the natural residual, the free set and the right-hand side at x."""
-        p, sums = self.problem, self.sums
+        """Compute the norm of the natural residual at x and what the attributes hold; on grids y is not stored."""
+        p = self.problem
         if 0 < self.norm < math.inf:
             self.size = self.norm
-        self.affine(x)
-        before = [*self.at(x), self._b, self.free, self._r, wp.float64(1 / self.size), wp.float64(self._slack)]
-        launch_spans(self.kernels.split, sums.spans, before, [sums.threads, sums.partials], p.device)
-        sums.add_up(kernels.SQUARE, columns=kernels.COLUMNS)
-        square, self.chopped, self.reduced, moved, active, self.energy = (float(v) for v in self.scalars.numpy()[: kernels.COLUMNS])
+        numbers = [wp.float64(1 / self.size), wp.float64(self._slack)]
+        written = [self.free, self._r, self._chopped_step, *numbers]
+        if self._stencil is None:
+            self.affine(x)
+            before = [x, self.y, self.diagonal, wp.float64(self.unit), *p.bounds.operands, p.unknown, p.b, *written]
+            launch_spans(self.kernels.split, self._split.spans, before, [self._split.threads, self._split.partials], p.device)
+        else:
+            s, R = self._stencil, self._rows
+            s.wrap(x)
+            inputs = [*s.operands, R, x, p.b, *p.bounds.operands, p.unknown, *written, self._split.partials]
+            wp.launch(self._assess, (-(-R.all_planes // R.planes), R.rows, R.chunks), inputs, device=p.device)
+        self._split.add_up(kernels.SQUARE, columns=kernels.COLUMNS)
+        square, self.chopped, self.reduced, release, moved, active, self.energy = (
+            float(v) for v in self.scalars.numpy()[: kernels.COLUMNS]
+        )
+        self.release = release / self.size**2
         self.norm, self.current, self.active, self.moved = float(np.sqrt(square)), True, int(active), self.moved or moved > 0
         return self.norm
 
-    def chop(self, x: wp.array[Any], direction: wp.array[Any]) -> None:
-        """Write the step along the chopped gradient, and its product with -y / size."""
-        inputs = [*self.at(x), direction, wp.float64(1 / self.size), wp.float64(self._slack)]
-        launch_spans(self.kernels.chop, self.sums.spans, inputs, [self.sums.partials], self.problem.device)
-        self.sums.add_up(kernels.GAIN)
-
-    def at(self, x: wp.array[Any]) -> list[Any]:
-        """Return what kernels need to evaluate the residual's entries at x."""
-        p = self.problem
-        return [x, self.y, self.diagonal, wp.float64(self.unit), *p.bounds.operands, p.unknown]
+    def measure(self, finest: Level, p: wp.array[Any]) -> None:
+        """Write z'Az, z'Ap, r'z and r'p to the first scalars, on a grid's finest level with its x = z and b = r."""
+        R, s = self._rows, self.problem.A.stencil  # type: ignore[attr-defined]
+        measure = engine.row_kernels(*s.storage, finest.stencil.d.dtype, finest.real).measure
+        inputs = [*finest.operands, finest.stencil.grain, R, finest.x, p, finest.b, self._split.partials]
+        wp.launch(measure, (-(-R.all_planes // R.planes), R.rows, R.chunks), inputs, device=self.problem.device)
+        self._split.add_up(0, columns=4)
 
 
-class GradientWorkspace(IterateInPlace):
+class GradientWorkspace:
     """Memory of the method for one problem."""
 
     def __init__(self, problem: LCP, settings: MPRGP) -> None:
@@ -168,13 +194,12 @@ class GradientWorkspace(IterateInPlace):
         self.bounded, self.is_grid = problem.bounded, isinstance(problem.A, GridPoisson)
         self.system, self.preconditioner = _preconditioner(problem, self.precision.correction, settings.cycle)
         z, single = self.preconditioner.z, self.precision is Precision.SINGLE
-        self.x = problem.layout.zeros(wp.float64)
+        self._fields = [problem.layout.zeros(wp.float64) for _ in range(2 if self.is_grid else 3)]
+        self.x, self._best = self._fields[0], self._fields[0]
         self._p, self._q = wp.zeros_like(z), wp.zeros_like(z)
         self._rounded = problem.layout.zeros(wp.float32) if single else None
-        self.residual = SplitResidual(
-            problem, self.preconditioner.r, slack=SINGLE_SLACK if single else 0.0, with_energy=not self.is_grid and self.bounded
-        )
-        self._trial = None if self.is_grid else problem.layout.zeros(wp.float64)
+        self._chopped = z if self.is_grid else wp.zeros_like(z)  # a multigrid cycle leaves nothing of what was in z
+        self.residual = SplitResidual(problem, self.preconditioner.r, self._chopped, slack=SINGLE_SLACK if single else 0.0)
         self.floating: Any = None
         self._cycles_left, self._rises, self._carry, self._curvature = 0, 0, False, 0.0
 
@@ -184,8 +209,6 @@ class GradientWorkspace(IterateInPlace):
         self._rises, self._carry, self._last = 0, False, math.inf
         self.residual.moved = True
         self.system.refresh()
-        if self.floating is not None:
-            self._project()
 
     def wants_monotone_cycle(self) -> bool:
         """Return whether the next step is a projected cycle."""
@@ -203,99 +226,152 @@ class GradientWorkspace(IterateInPlace):
         self._flat(all_free_kernel, [p.unknown, residual.free])
         system.restrict(residual.free)
         residual.moved, self._carry = True, False
+        residual.affine(x)
         finest = system.hierarchy.finest
-        self._flat(residual.kernels.gaps, [*self._at(x), finest.lower, finest.upper, system.r, wp.float64(1 / residual.size)])
+        scaled = [finest.lower, finest.upper, system.r, wp.float64(1 / residual.size)]
+        self._flat(residual.kernels.gaps, [x, residual.y, *p.bounds.operands, p.unknown, *scaled])
         system.monotone_cycle()
-        self._move(x, system.z, residual.size, x)
+        self._move(system.z, residual.size)
         return Step("monotone cycle", 1, None)
 
-    def proportioning_step(self, x: wp.array[Any]) -> Step:
-        """Step along the chopped gradient as far as the energy falls: it releases unknowns from their bounds."""
-        residual, active = self.residual, self.residual.active
+    def proportion(self) -> bool:
+        """Step along the chopped gradient as far as the energy falls: it releases unknowns. False: it falls without end."""
+        residual, direction = self.residual, self._chopped
         self._carry = False
-        residual.chop(x, self._p)
-        gain = float(residual.scalars.numpy()[kernels.GAIN])
-        self._product()
-        residual.sums.dot(self._p, self._q, kernels.CURVATURE)
+        self._product(direction)
+        residual.sums.dot(direction, self._q, kernels.CURVATURE)
         curvature = float(residual.scalars.numpy()[kernels.CURVATURE])
-        return self._projected_step(x, "proportioning", gain, curvature, active)
+        if not (self.is_grid and curvature > 0):
+            return self._projected_step(direction, residual.release, curvature)
+        factor, target, bounds = residual.release / curvature, self._target(), self.problem.bounds.operands
+        inputs = [self.x, direction, self._q, residual.diagonal, wp.float64(residual.unit), *bounds, residual.free, self.preconditioner.r]
+        self._flat(residual.kernels.release, [*inputs, target, wp.float64(factor), wp.float64(factor * residual.size)])
+        self._settle(target)
+        residual.moved = True
+        return True
 
-    def conjugate_step(self, x: wp.array[Any]) -> Step:
-        """Precondition on the free set, make the direction conjugate to the last one if the set is the same, take the projected step."""
-        residual, M, active = self.residual, self.preconditioner, self.residual.active
+    def conjugate(self) -> bool:
+        """Precondition on the free set, make the direction conjugate to the last one if the set is the same, take the projected step.
+
+        Returns:
+            False: the energy falls without end along it.
+        """
+        residual, M = self.residual, self.preconditioner
         if residual.moved:
             M.restrict(residual.free)
             residual.moved, self._carry = False, False
         if self.floating is not None:
-            self._project()
+            self.floating.project(M.r, residual.free)
         M.apply()
-        beta = 0.0
+        return self._grid_step() if self.is_grid else self._general_step()
+
+    def _general_step(self) -> bool:
+        """Keep q = A p from step to step."""
+        residual, M, beta = self.residual, self.preconditioner, 0.0
         if self._carry:
             residual.sums.dot(M.z, self._q, kernels.OVERLAP)
             beta = -float(residual.scalars.numpy()[kernels.OVERLAP]) / self._curvature
         self._flat(residual.kernels.direct, [M.z, self._p, M.z.dtype(beta if math.isfinite(beta) else 0.0)])
-        self._product()
+        self._product(self._p)
         sums = residual.sums
         after = [sums.threads, sums.partials]
         launch_spans(residual.kernels.measure, sums.spans, [self._p, self._q, M.r], after, self.problem.device)
         sums.add_up(kernels.GAIN, columns=2)
         gain, curvature = (float(v) for v in residual.scalars.numpy()[kernels.GAIN : kernels.GAIN + 2])
         self._carry, self._curvature = curvature > 0, curvature
-        return self._projected_step(x, "conjugate gradient", gain, curvature, active)
+        return self._projected_step(self._p, gain, curvature)
 
-    def _projected_step(self, x: wp.array[Any], name: str, gain: float, curvature: float, active: int) -> Step:
-        """Move x along p to the minimum of the energy, projected; shorter where the projection makes the energy rise."""
-        residual, size = self.residual, self.residual.size
+    def _grid_step(self) -> bool:
+        """Sum the products of z and p in one pass over the grid, then make p and move x in another."""
+        residual, finest = self.residual, self.system.hierarchy.finest
+        finest.stencil.wrap(finest.x)
+        residual.measure(finest, self._p)
+        zaz, zap, gz, gp = (float(v) for v in residual.scalars.numpy()[:4])
+        beta, curvature, gain = 0.0, zaz, gz
+        if self._carry:
+            ratio = -zap / self._curvature
+            rest = zaz + ratio * (2 * zap + ratio * self._curvature)
+            if rest > LEAST_REST * zaz:
+                beta, curvature, gain = ratio, rest, gz + ratio * gp
+        if not curvature > 0:
+            wp.copy(self._p, finest.x)
+            self._carry = False
+            return self._projected_step(self._p, gz, zaz)
+        self._carry, self._curvature = True, curvature
+        target, bounds = self._target(), self.problem.bounds.operands
+        numbers = [finest.x.dtype(beta), wp.float64(gain / curvature * residual.size)]
+        self._flat(residual.kernels.direct_advance, [self.x, finest.x, self._p, *bounds, target, *numbers])
+        self._settle(target)
+        return True
+
+    def _projected_step(self, direction: wp.array[Any], gain: float, curvature: float) -> bool:
+        """Move x along a direction to the minimum of the energy, projected; shorter where the projection makes the energy rise."""
+        residual = self.residual
         if curvature > 0:
-            length = gain / curvature * size
-        else:  # the energy falls without end: to the farthest bound
-            length = self._farthest(x) if gain > 0 else 0.0
+            length = gain / curvature * residual.size
+        else:  # the energy falls without end: to the first bound
+            length = self._first_bound(direction) if gain > 0 else 0.0
             if not math.isfinite(length):
-                return Step(name, 1, active, SolveStatus.DIVERGED)
-        if self._trial is None:
-            self._move(x, self._p, length, x)
-            return Step(name, 1, active)
-        wp.copy(self._trial, x)
+                return False
         energy = residual.energy
-        for _ in range(30):
-            self._move(self._trial, self._p, length, x)
-            residual.evaluate(x)
+        origin = self._move(direction, length)
+        for _ in range(0 if self.is_grid else 30):
+            residual.evaluate(self.x)
             if not residual.moved or residual.energy <= energy + ENERGY_ROUNDING * abs(energy):
                 break
             length *= 0.5
-        return Step(name, 1, active)
+            self._advance(origin, direction, length, self.x)
+        return True
 
-    def _move(self, source: wp.array[Any], direction: wp.array[Any], length: float, x: wp.array[Any]) -> None:
-        p = self.problem
-        self._flat(self.residual.kernels.advance, [source, direction, *p.bounds.operands, x, wp.float64(length)])
+    def _move(self, direction: wp.array[Any], length: float) -> wp.array[Any]:
+        """Step along a direction; returns where x was before."""
+        origin = self.x
+        self._advance(origin, direction, length, self._target())
+        return origin
+
+    def _target(self) -> wp.array[Any]:
+        """Return memory for the next x: not the best iterate's, and not x's either where a step may be taken again."""
+        if self.is_grid and self.x is not self._best:
+            return self.x
+        return next(f for f in self._fields if f is not self._best and f is not self.x)
+
+    def _advance(self, origin: wp.array[Any], direction: wp.array[Any], length: float, target: wp.array[Any]) -> None:
+        """X = clip(origin + length direction, l, u)."""
+        bounds = self.problem.bounds.operands
+        self._flat(self.residual.kernels.advance, [origin, direction, *bounds, target, wp.float64(length)])
+        self._settle(target)
+
+    def _settle(self, target: wp.array[Any]) -> None:
+        """Take what a step wrote as x."""
+        self.x = target
         if self.floating is not None:
-            self.floating.settle(x, p.lower, p.upper)
-        self._round(x)
+            self.floating.settle(self.x, self.problem.lower, self.problem.upper)
+        self._round(self.x)
         self.residual.current = False
 
-    def _farthest(self, x: wp.array[Any]) -> float:
-        """Return how far the first bound is along p, on the host; inf if there is none. Semi-definite matrices ask for it now and then."""
-        p, at = self._p.numpy().astype(np.float64), x.numpy()
+    def keep(self) -> None:
+        """Remember x as the best iterate: the next step goes to other memory."""
+        self._best = self.x
+
+    def restore(self) -> None:
+        """Make the best iterate x again."""
+        self.x = self._best
+
+    def _first_bound(self, direction: wp.array[Any]) -> float:
+        """Return how far the first bound is, on the host; inf if there is none. Semi-definite matrices ask for it now and then."""
+        p, at = direction.numpy().astype(np.float64), self.x.numpy()
         lower, upper = self.problem.lower.numpy(), self.problem.upper.numpy()
         with np.errstate(divide="ignore", invalid="ignore"):
             gaps = np.where(p > 0, (upper - at) / p, np.where(p < 0, (lower - at) / p, np.inf))
         return float(gaps.min())
 
-    def _product(self) -> None:
-        """Q = A p."""
+    def _product(self, direction: wp.array[Any]) -> None:
+        """Q = A times a direction."""
         A, shape = self.problem.A, self.problem.layout.stored_shape
         if isinstance(A, GridPoisson):
-            A.stencil.product(self._p, self._q)
+            A.stencil.product(direction, self._q)
         else:
-            A.apply(self._p.reshape(shape), self._q.reshape(shape))
-
-    def _project(self) -> None:
-        """Keep the right-hand side compatible on singular components."""
-        self.floating.project(self.preconditioner.r, self.residual.free)
-
-    def _at(self, x: wp.array[Any]) -> list[Any]:
-        p = self.problem
-        return [x, self.residual.y, *p.bounds.operands, p.unknown]
+            A.apply(direction.reshape(shape), self._q.reshape(shape))
 
     def _flat(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
         launch_spans(kernel, self.residual.sums.spans, inputs, [], self.problem.device)
@@ -310,6 +386,15 @@ class GradientWorkspace(IterateInPlace):
             convert(self._rounded, x)
 
 
+def row_sums(threads: tuple[int, int, int], device: wp.Device) -> Any:
+    """Return how a grid's rows are shared out to places for sums."""
+    planes, rows, chunks = threads
+    slab = PLANES_A_THREAD["cuda" if device.is_cuda else "cpu"]
+    R = engine.RowSums()
+    R.planes, R.all_planes, R.rows, R.chunks, R.threads = slab, planes, rows, chunks, -(-planes // slab) * rows * chunks
+    return R
+
+
 def _preconditioner(problem: LCP, real: Any, cycle: CycleSettings) -> tuple[Any, Any]:
     """Return the principal system and what preconditions it."""
     if isinstance(problem.A, DenseOperator):  # its own system is solved directly: then this would be an active-set method
@@ -317,4 +402,3 @@ def _preconditioner(problem: LCP, real: Any, cycle: CycleSettings) -> tuple[Any,
     else:
         system = principal_system(problem, real, bounded=problem.bounded, settings=cycle)
     return system, system.preconditioner if isinstance(system, SparseSystem) else system
-

@@ -7,12 +7,16 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.native import C_TYPES
+from warp_lcp.native import BLOCK, C_TYPES, fetch, simd
+from warp_lcp.operators.stencil_kernels import NEIGHBORS, StencilShape, row_count, row_start, stencil_head
 from warp_lcp.residual_kernels import NATURAL
+from warp_lcp.solvers.projected_multigrid_kernels import AT_ROW, RowSums
 from warp_lcp.vector_kernels import CODED, flat, span_end, span_start
 
-COLUMNS = 6  # sums of a split: slots of the device scalars from SQUARE on
-SQUARE, CHOPPED, REDUCED, MOVED, ACTIVE, ENERGY = range(COLUMNS)
+# Sums of a split, slots of the device scalars: of the residual's square, of that on held unknowns, of residual times y on the free
+# ones, of held residual times chopped step; whether the free set has changed; held unknowns; energy
+COLUMNS = 7
+SQUARE, CHOPPED, REDUCED, RELEASE, MOVED, ACTIVE, ENERGY = range(COLUMNS)
 GAIN, CURVATURE, OVERLAP = range(COLUMNS, COLUMNS + 3)
 SLOTS = COLUMNS + 3
 
@@ -33,39 +37,25 @@ def kernels(d_type: Any, real: Any) -> SimpleNamespace:
         flat(
             CODED
             + f"""const double *x = x_.data, *y = y_.data, *b = b_.data; const auto* d = d_.data; const auto* m = m_.data;
-        unsigned char* free = free_.data; {T}* r_out = r_.data;
-        double s = 0, chopped = 0, reduced = 0, moved = 0, active = 0, energy = 0;
+        unsigned char* free = free_.data; {T} *right = r_.data, *c_ = step_.data;
+        double s = 0, chopped = 0, reduced = 0, release = 0, moved = 0, active = 0, energy = 0;
         with_bounds([&](auto lower, auto upper) {{ EACH {{
             {NATURAL} {HELD}
             const unsigned char now = ((m[i] == 1) & !held);
-            s += r*r; chopped += held ? r*r : 0.0; reduced += held ? 0.0 : r*y[i];
+            const double v = held ? r : 0.0;
+            s += r*r; chopped += v*v; reduced += held ? 0.0 : r*y[i]; release += v*v/e;
             moved += now != free[i] ? 1.0 : 0.0; active += held ? 1.0 : 0.0;
-            free[i] = now; r_out[i] = now ? ({T})(-y[i]*inverse) : ({T})0; }} }});
+            free[i] = now; right[i] = now ? ({T})(-y[i]*inverse) : ({T})0; c_[i] = ({T})(-v/e*inverse); }} }});
         if (b) EACH {{ energy += m[i] == 1 ? 0.5*x[i]*(y[i] + b[i]) : 0.0; }}
-        const double all[{COLUMNS}] = {{s, chopped, reduced, moved, active, energy}};
+        const double all[{COLUMNS}] = {{s, chopped, reduced, release, moved, active, energy}};
         for (int c = 0; c < {COLUMNS}; ++c) out.data[c*threads + t] = all[c];"""
         )
     )
     def split_span(
         x_: f64, y_: f64, d_: d_array, unit: wp.float64, l_: f64, l_value: wp.float64, u_: f64, u_value: wp.float64, code_: u8, m_: i8,
-        b_: f64, free_: u8, r_: field, inverse: wp.float64, slack: wp.float64, start: wp.int64, end: wp.int64, stride: wp.int64, t: int,
-        threads: int, out: f64,
+        b_: f64, free_: u8, r_: field, step_: field, inverse: wp.float64, slack: wp.float64, start: wp.int64, end: wp.int64,
+        stride: wp.int64, t: int, threads: int, out: f64,
     ): ...  # fmt: skip
-
-    @wp.func_native(
-        flat(
-            CODED
-            + f"""const double *x = x_.data, *y = y_.data; const auto* d = d_.data; const auto* m = m_.data; {T}* p = p_.data; double gain = 0;
-        with_bounds([&](auto lower, auto upper) {{ EACH {{
-            {NATURAL} {HELD}
-            const {T} v = held ? ({T})(-r/e*inverse) : ({T})0; p[i] = v; gain -= y[i]*inverse*(double)v; }} }});
-        return gain;"""
-        )
-    )
-    def chop_span(
-        x_: f64, y_: f64, d_: d_array, unit: wp.float64, l_: f64, l_value: wp.float64, u_: f64, u_value: wp.float64, code_: u8, m_: i8,
-        p_: field, inverse: wp.float64, slack: wp.float64, start: wp.int64, end: wp.int64, stride: wp.int64,
-    ) -> wp.float64: ...  # fmt: skip
 
     @wp.func_native(
         flat(
@@ -86,6 +76,21 @@ def kernels(d_type: Any, real: Any) -> SimpleNamespace:
     @wp.func_native(
         flat(
             CODED
+            + """const double* x = x_.data; const auto* z = z_.data; auto* p = p_.data; double* o = o_.data; const bool fresh = beta == 0;
+        with_bounds([&](auto lower, auto upper) { EACH {
+            const auto s = fresh ? z[i] : z[i] + beta*p[i];
+            const double l = lower(i), u = upper(i), v = x[i] + step*(double)s, w = v < l ? l : v, c = w > u ? u : w;
+            p[i] = s; o[i] = ((s != 0) & (v - v == 0)) ? c : x[i]; } });"""
+        )
+    )
+    def direct_advance_span(
+        x_: f64, z_: field, p_: field, l_: f64, l_value: wp.float64, u_: f64, u_value: wp.float64, code_: u8, o_: f64, beta: real,
+        step: wp.float64, start: wp.int64, end: wp.int64, stride: wp.int64,
+    ): ...  # fmt: skip
+
+    @wp.func_native(
+        flat(
+            CODED
             + """const double* x = x_.data; const auto* p = p_.data; double* o = o_.data;
         with_bounds([&](auto lower, auto upper) { EACH {
             const double l = lower(i), u = upper(i), v = x[i] + step*(double)p[i], w = v < l ? l : v, c = w > u ? u : w;
@@ -95,6 +100,25 @@ def kernels(d_type: Any, real: Any) -> SimpleNamespace:
     def advance_span(
         x_: f64, p_: field, l_: f64, l_value: wp.float64, u_: f64, u_value: wp.float64, code_: u8, o_: f64, step: wp.float64,
         start: wp.int64, end: wp.int64, stride: wp.int64,
+    ): ...  # fmt: skip
+
+    @wp.func_native(
+        flat(
+            CODED
+            + f"""const double* x = x_.data; const auto* d = d_.data; const auto *c_ = step_.data, *q = q_.data; auto* r = r_.data;
+        unsigned char* free = free_.data; double* o = o_.data; const {T} part = ({T})factor;
+        with_bounds([&](auto lower, auto upper) {{ EACH {{
+            const double a = unit*(double)d[i], e = a == 0 ? 1.0 : a;
+            const double l = lower(i), u = upper(i), v = x[i] + length*(double)c_[i], w = v < l ? l : v, c = w > u ? u : w;
+            const bool leaves = c_[i] != 0; const {T} before = leaves ? ({T})(e*(double)c_[i]) : r[i];
+            o[i] = (leaves & (v - v == 0)) ? c : x[i];
+            const unsigned char now = leaves ? (unsigned char)1 : free[i]; free[i] = now;
+            r[i] = now ? before - part*q[i] : ({T})0; }} }});"""
+        )
+    )
+    def release_span(
+        x_: f64, step_: field, q_: field, d_: d_array, unit: wp.float64, l_: f64, l_value: wp.float64, u_: f64, u_value: wp.float64,
+        code_: u8, free_: u8, r_: field, o_: f64, factor: wp.float64, length: wp.float64, start: wp.int64, end: wp.int64, stride: wp.int64,
     ): ...  # fmt: skip
 
     @wp.func_native(
@@ -117,29 +141,16 @@ def kernels(d_type: Any, real: Any) -> SimpleNamespace:
     @wp.kernel(enable_backward=False, module=name)
     def split(
         x: f64, y: f64, d: d_array, unit: wp.float64, lower: f64, lower_value: wp.float64, upper: f64, upper_value: wp.float64, code: u8,
-        unknown: i8, b: f64, free: u8, r: field, inverse: wp.float64, slack: wp.float64, n: int, chunk: int, stride: wp.int64,
+        unknown: i8, b: f64, free: u8, r: field, step: field, inverse: wp.float64, slack: wp.float64, n: int, chunk: int, stride: wp.int64,
         threads: int, out: f64,
     ):  # fmt: skip
-        """Write the free set and the right-hand side on it; sum what decides on the next step. An empty b: no energy is wanted."""
+        """Write the free set, the right-hand side on it and the chopped step; sum what decides. An empty b: no energy is wanted."""
         t = wp.tid()
         start = span_start(t, chunk)
         end = span_end(t, chunk, n)
         split_span(
-            x, y, d, unit, lower, lower_value, upper, upper_value, code, unknown, b, free, r, inverse, slack, start, end, stride, t,
-            threads, out,
-        )  # fmt: skip
-
-    @wp.kernel(enable_backward=False, module=name)
-    def chop(
-        x: f64, y: f64, d: d_array, unit: wp.float64, lower: f64, lower_value: wp.float64, upper: f64, upper_value: wp.float64, code: u8,
-        unknown: i8, p: field, inverse: wp.float64, slack: wp.float64, n: int, chunk: int, stride: wp.int64, out: f64,
-    ):  # fmt: skip
-        """P = the chopped gradient's step, scaled by the diagonal."""
-        t = wp.tid()
-        start = span_start(t, chunk)
-        end = span_end(t, chunk, n)
-        out[t] = chop_span(
-            x, y, d, unit, lower, lower_value, upper, upper_value, code, unknown, p, inverse, slack, start, end, stride
+            x, y, d, unit, lower, lower_value, upper, upper_value, code, unknown, b, free, r, step, inverse, slack, start, end,
+            stride, t, threads, out,
         )  # fmt: skip
 
     @wp.kernel(enable_backward=False, module=name)
@@ -167,6 +178,31 @@ def kernels(d_type: Any, real: Any) -> SimpleNamespace:
         advance_span(x, p, lower, lower_value, upper, upper_value, code, out, step, start, span_end(t, chunk, n), stride)
 
     @wp.kernel(enable_backward=False, module=name)
+    def direct_advance(
+        x: f64, z: field, p: field, lower: f64, lower_value: wp.float64, upper: f64, upper_value: wp.float64, code: u8, out: f64,
+        beta: real, step: wp.float64, n: int, chunk: int, stride: wp.int64,
+    ):  # fmt: skip
+        """P = z + beta p, then out = clip(x + step p, l, u) where p is not 0."""
+        t = wp.tid()
+        start = span_start(t, chunk)
+        end = span_end(t, chunk, n)
+        direct_advance_span(x, z, p, lower, lower_value, upper, upper_value, code, out, beta, step, start, end, stride)
+
+    @wp.kernel(enable_backward=False, module=name)
+    def release(
+        x: f64, step: field, q: field, d: d_array, unit: wp.float64, lower: f64, lower_value: wp.float64, upper: f64,
+        upper_value: wp.float64, code: u8, free: u8, r: field, out: f64, factor: wp.float64, length: wp.float64, n: int, chunk: int,
+        stride: wp.int64,
+    ):  # fmt: skip
+        """Out = clip(x + length step, l, u); what moves is free; the right-hand side loses factor q and gains rows: e step = -y / size."""
+        t = wp.tid()
+        start = span_start(t, chunk)
+        end = span_end(t, chunk, n)
+        release_span(
+            x, step, q, d, unit, lower, lower_value, upper, upper_value, code, free, r, out, factor, length, start, end, stride
+        )  # fmt: skip
+
+    @wp.kernel(enable_backward=False, module=name)
     def gaps(
         x: f64, y: f64, lower: f64, lower_value: wp.float64, upper: f64, upper_value: wp.float64, code: u8, unknown: i8, lo: field,
         hi: field, r: field, inverse: wp.float64, n: int, chunk: int, stride: wp.int64,
@@ -177,4 +213,68 @@ def kernels(d_type: Any, real: Any) -> SimpleNamespace:
         end = span_end(t, chunk, n)
         gaps_span(x, y, lower, lower_value, upper, upper_value, code, unknown, lo, hi, r, inverse, start, end, stride)
 
-    return SimpleNamespace(split=split, chop=chop, direct=direct, measure=measure, advance=advance, gaps=gaps)
+    return SimpleNamespace(
+        split=split, direct=direct, measure=measure, advance=advance, direct_advance=direct_advance, release=release, gaps=gaps
+    )
+
+
+@functools.cache
+def row_kernels(variable: bool, d_type: Any, w_type: Any, real: Any) -> Any:
+    """Return `assess`: a grid's `split` in one pass, y = A x + b included and not stored."""
+    form = "variable" if variable else "uniform"
+    name = f"warp_lcp.mprgp.{form}_{d_type.__name__}_{w_type.__name__}_{real.__name__}"
+    d_array, w_array, field, R = wp.array(dtype=d_type), wp.array(dtype=w_type), wp.array(dtype=real), C_TYPES[real]
+
+    @wp.func_native(
+        simd(
+            BLOCK
+            + AT_ROW
+            + stencil_head(variable, "double")
+            + f"""const T *x = x_.data + p, *over = x + s1, *b = b_.data + p; {R} *g = g_.data + p, *c_ = step_.data + p;
+        unsigned char* free = free_.data + p; const auto* m = m_.data + p; T s = 0, chopped = 0, reduced = 0, release = 0;
+        int moved = 0, active = 0; unsigned char now[M];
+        for (int begin = 0; begin < n; begin += M) {{
+            const int end = n - begin < M ? n : begin + (int)M; T y[M];
+            {fetch("begin", "end", over=8, b=8, g=4, c_=4, d=1, m=1, free=1)}
+            SIMD8 for (int k = begin; k < end; ++k) {{
+                const T e = unit*(T)d[k], v = e*x[k] - {NEIGHBORS[variable]}; y[k - begin] = (e != 0 ? v : (T)0) + b[k]; }}
+            unsigned char changed = 0, count = 0;
+            with_bounds([&](auto lower, auto upper) {{
+                SIMD8 for (int k = begin; k < end; ++k) {{
+                    const T e = unit*(T)d[k], f = e != 0 ? e : (T)1, l = lower(k), u = upper(k), v = y[k - begin];
+                    const T below = f*(x[k] - l), above = f*(x[k] - u), least = below < v ? below : v, r0 = above > least ? above : least;
+                    const bool in = m[k] == 1, held = in & ((x[k] <= l + slack*(l < 0 ? -l : l)) | (x[k] >= u - slack*(u < 0 ? -u : u)));
+                    const T r = in ? r0 : (T)0, h = held ? r : (T)0, w = h/f;
+                    s += r*r; chopped += h*h; reduced += held ? (T)0 : r*v; release += h*w;
+                    now[k - begin] = in & !held; g[k] = ({R})((in & !held) ? -v*inverse : (T)0); c_[k] = ({R})(-w*inverse); }} }});
+            SIMD64 for (int k = begin; k < end; ++k) {{
+                const unsigned char one = now[k - begin] != free[k], two = (m[k] == 1) & !now[k - begin];
+                changed |= one; count += two; free[k] = now[k - begin]; }}
+            moved += changed; active += count; }}
+        const double all[6] = {{s, chopped, reduced, release, (double)moved, (double)active}}; double* sums = out.data + t;
+        for (int c = 0; c < 6; ++c) sums[c*threads] = more ? all[c] + sums[c*threads] : all[c];"""
+        )
+    )
+    def assess_row(
+        A: StencilShape, d_: d_array, wx_: w_array, wy_: w_array, wz_: w_array, x_: f64, b_: f64, l_: f64, l_value: wp.float64, u_: f64,
+        u_value: wp.float64, code_: u8, m_: i8, free_: u8, g_: field, step_: field, inverse: wp.float64, slack: wp.float64, p: wp.int64,
+        n: int, t: int, threads: int, more: bool, out: f64,
+    ): ...  # fmt: skip
+
+    @wp.kernel(enable_backward=False, module=name)
+    def assess(
+        A: StencilShape, d: d_array, wx: w_array, wy: w_array, wz: w_array, grain: int, S: RowSums, x: f64, b: f64, lower: f64,
+        lower_value: wp.float64, upper: f64, upper_value: wp.float64, code: u8, unknown: i8, free: u8, g: field, step: field,
+        inverse: wp.float64, slack: wp.float64, out: f64,
+    ):  # fmt: skip
+        slab, j, c = wp.tid()
+        t = (slab * S.rows + j) * S.chunks + c
+        for k in range(slab * S.planes, wp.min((slab + 1) * S.planes, S.all_planes)):
+            n = row_count(A, k, j, c, grain)
+            p = row_start(A, k, j, c, grain)
+            assess_row(
+                A, d, wx, wy, wz, x, b, lower, lower_value, upper, upper_value, code, unknown, free, g, step, inverse, slack, p, n, t,
+                S.threads, k > slab * S.planes, out,
+            )  # fmt: skip
+
+    return assess

@@ -21,8 +21,8 @@ class NNCG:
 
     The change of a sweep is taken for the negative gradient, g = x - PGS(x), of a function whose minimum is the sweep's fixed point. With
     beta = |g|^2 / |g before|^2: x <- PGS(x) + beta p and p <- beta p - g without a line search; where beta > 1, p <- 0 and x <- PGS(x).
-    Unlike algorithm 8, x is projected onto the bounds after the move along p, so that iterates stay feasible. No proof of convergence;
-    on grids it saves three quarters of the sweeps of omega = 1, and ProjectedSOR with its best omega saves more.
+    Unlike algorithm 8, x is projected onto the bounds after the move along p, so that iterates stay feasible. No proof of convergence. On
+    64^3 cells to 1e-6 it took 250 sweeps where omega = 1 took 3,900, and the best omega, 1.9, 150 to 200 (`benchmarks.sweep_prices`).
 
     Args:
         direction: of its sweeps, "forward", "backward" or "symmetric".

@@ -179,3 +179,23 @@ def kernels(d_type: Any, real: Any, natural: bool) -> SimpleNamespace:
     return SimpleNamespace(
         merit=merit, values=values, condense=condense, weighted=weighted, gradient=gradient, advance=advance
     )
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.nonsmooth_map")
+def difference_kernel(free: u8, f: f64, over: wp.float64, q: f64):
+    """Q = over (q - f) on the free unknowns, 0 elsewhere."""
+    i = wp.tid()
+    v = wp.float64(0.0)
+    if free[i] != wp.uint8(0):
+        v = over * (q[i] - f[i])
+    q[i] = v
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.nonsmooth_map")
+def scale_rows_kernel(r: f64, d: f64, z: f64):
+    """Z = r / |d|, r where d is 0."""
+    i = wp.tid()
+    v = r[i]
+    if d[i] != wp.float64(0.0):
+        v = r[i] / wp.abs(d[i])
+    z[i] = v

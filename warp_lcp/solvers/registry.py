@@ -15,6 +15,7 @@ from warp_lcp.solvers.direct_enumeration import DirectEnumeration
 from warp_lcp.solvers.incremental_pivoting import IncrementalPivoting
 from warp_lcp.solvers.lemke import Lemke
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
+from warp_lcp.solvers.mprgp import MPRGP
 from warp_lcp.solvers.nncg import NNCG
 from warp_lcp.solvers.projected_jacobi import ProjectedJacobi
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
@@ -30,6 +31,7 @@ METHODS: dict[str, type[Any]] = {
     "incremental-pivoting": IncrementalPivoting,
     "lemke": Lemke,
     "minimum-map-newton": MinimumMapNewton,
+    "mprgp": MPRGP,
     "nncg": NNCG,
     "projected-jacobi": ProjectedJacobi,
     "projected-multigrid": ProjectedMultigrid,

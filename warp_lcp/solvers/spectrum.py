@@ -14,7 +14,9 @@ SEED = 20151
 
 
 def scaled_spectrum(problem: LCP, steps: int, free: Any = None) -> tuple[float, float]:
-    """Return estimates of the least and the greatest eigenvalue of D^-1/2 A D^-1/2, D the diagonal of A; of its symmetric part if it is not.
+    """Return estimates of the least and the greatest eigenvalue of D^-1/2 A D^-1/2, D the diagonal of A.
+
+    Where A is not symmetric, of its symmetric part.
 
     The greatest is estimated from below, mostly to a percent in 20 steps; the least from above, and slowly. The vectors are on the host.
 
@@ -67,7 +69,9 @@ def positive_diagonal(problem: LCP) -> np.ndarray:
 
 def _lanczos(product: Any, v: np.ndarray, steps: int) -> tuple[float, float]:
     """Return the extreme Ritz values of a symmetric map; plain three-term recurrence, whose ghosts do no harm to them."""
-    alpha, beta, old = [], [], np.zeros_like(v)
+    alpha: list[float] = []
+    beta: list[float] = []
+    old = np.zeros_like(v)
     for _ in range(steps):
         w = product(v)
         if beta:

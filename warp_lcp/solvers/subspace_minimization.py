@@ -25,10 +25,11 @@ ROUNDING = 1e-14  # relative change of the energy that is none
 class SubspaceMinimization:
     """Sweep, then solve A_FF x_F = -(b_F + A_FH x_H) on the unknowns off their bounds and project ([Book] 2.2.5, algorithm 7, eq. 2.95).
 
-    A step is `sweeps` projected Gauss-Seidel sweeps and up to `solves` such solves, until the free set stays ([Book] eq. 2.98). Each solve is
-    inexact, as far as the whole one still needs. Its projected correction is halved until the energy x'A x / 2 + b'x or the residual
+    A step is `sweeps` projected Gauss-Seidel sweeps and up to `solves` such solves, until the free set stays ([Book] eq. 2.98). Each solve
+    is inexact, as far as the whole one still needs. Its projected correction is halved until the energy x'A x / 2 + b'x or the residual
     falls, up to `backtracks` times; if neither falls, x stays what the sweeps made of it. The book takes full steps, whose "jaggyness"
     (fig. 2.10) is what this cures; `backtracks = -1` does as the book does.
+
     `linear_iterations` counts sweeps and preconditioned iterations.
 
     Args:

@@ -32,9 +32,8 @@ def bound_for_concave(x: wp.float64, y: wp.float64, d: wp.float64, l: wp.float64
             l_solves = y + d * s >= ZERO
             u_solves = y + d * t <= ZERO
             if u_solves:
-                if not l_solves:
-                    v = u
-                elif t * (y + wp.float64(0.5) * d * t) < s * (y + wp.float64(0.5) * d * s):
+                energy_falls = t * (y + wp.float64(0.5) * d * t) < s * (y + wp.float64(0.5) * d * s)
+                if energy_falls or not l_solves:
                     v = u
     return v
 

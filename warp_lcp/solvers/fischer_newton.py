@@ -1,0 +1,210 @@
+"""Newton's method on the Fischer-Burmeister map, matrix-free: shifted principal systems on grids and sparse operators."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.multigrid.hierarchy import CycleSettings
+from warp_lcp.operators.dense import DenseOperator
+from warp_lcp.operators.grid_poisson import GridPoisson
+from warp_lcp.problem import LCP
+from warp_lcp.residual import NaturalResidual
+from warp_lcp.result import SolveStatus
+from warp_lcp.solve import IterateInPlace, Precision, Step
+from warp_lcp.solvers.finite_difference import FiniteDifferenceSystem
+from warp_lcp.solvers.fischer_newton_dense import FischerDenseWorkspace
+from warp_lcp.solvers.globalization import NonmonotoneSearch
+from warp_lcp.solvers.gradient_descent import GradientDescent, GradientWorkspace
+from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
+from warp_lcp.solvers.nonsmooth_map import Kink, NonsmoothMap, Reformulation
+from warp_lcp.solvers.principal_system import principal_system
+from warp_lcp.vectors import convert
+
+
+@dataclass(frozen=True, kw_only=True)
+class FischerNewton:
+    """Solve f(x) = 0 for the Fischer-Burmeister map, plain or penalized, by a nonsmooth Newton method ([Book] 2.4.2-3, algorithm 12).
+
+    f_i = lambda psi(a_i, y_i) + (1 - lambda) a_i+ y_i+ / scale, psi(a, b) = a + b - sqrt(a^2 + b^2), a = d (x - l), d = |A_ii|; two-sided
+    rows take psi(a, -psi(-y, d (u - x))) ([Book] eq. 1.48), rows without bounds y. The step solves J dx = -f with J = diag(p d) +
+    diag(q) A: divided by q it is the shifted system (A + D) dx = -f / q, D = d p / q, which multigrid preconditions on grids. The merit
+    f.f / 2 may not exceed the largest of the last ones. Iterates need not obey the bounds before the end.
+
+    Dense problems (frictional contact, semi-definite A) are solved with factors of J on the host. `safeguard` makes them a chain: at most
+    30 steps (J'J + nu I)^-1 J'f with nu = 1e-6 min(1, ||f||) on the penalized map, searched nonmonotonically, the gradient where that is no
+    descent; then two homotopies on the smoothed map x + y - sqrt(x^2 + y^2 + 2 mu), mu -> 0. There is no pivoting method inside.
+
+    `linear_iterations` counts preconditioned iterations on the finest grid, factorizations where A is dense.
+
+    Args:
+        kink: what stands for the derivative at a kink: "random", "zero", "perturbation" or "approximation" (see `Kink`).
+        share: lambda, in (0, 1]; 1 is the plain map.
+        safeguard: False: monotone Armijo search along the projected path, and an end with NON_DESCENT or LOCAL_MINIMUM where that
+            fails: the book's method. True: what is described above.
+        precision: "mixed": iterate float64, corrections float32 on grids; "double"; or "single": the iterate rounded to float32 too.
+        warm_start: steps of gradient descent on the same map before the first Newton step.
+        monotone_cycles: projected multigrid cycles of a cold start on a grid.
+        eta: each linear solve reduces its residual by this factor.
+        max_linear_iterations: the most iterations of one linear solve.
+        memory: merits that a safeguarded search remembers.
+        cycle: how multigrid cycles go.
+
+    Raises:
+        ValueError: an argument is outside its range.
+
+    Example:
+        >>> import numpy as np, warp_lcp as wl
+        >>> from warp_lcp.solvers.fischer_newton import FischerNewton
+        >>> A = wl.DenseOperator(np.array([[2.0, -1.0], [-1.0, 2.0]]), device="cpu")
+        >>> result = wl.solve(wl.LCP(A, np.array([2.0, -3.0])), FischerNewton())
+        >>> print(result.status.name, abs(result.x.numpy().round(6)))
+        CONVERGED [0.  1.5]
+    """
+
+    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
+    needs: ClassVar[str] = "a P0-matrix for plain steps; the safeguarded chain also solves copositive contact problems"
+
+    kink: str = "perturbation"
+    share: float = 0.95
+    safeguard: bool = True
+    precision: str = "mixed"
+    warm_start: int = 0
+    monotone_cycles: int = 2
+    eta: float = 0.1
+    max_linear_iterations: int = 200
+    memory: int = 8
+    cycle: CycleSettings = field(default_factory=CycleSettings)
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        Precision(self.precision), Kink(self.kink)
+        if not 0 < self.share <= 1:
+            raise ValueError(f"share = {self.share}: must be in (0, 1]")
+        if not 0 < self.eta < 1:
+            raise ValueError(f"eta = {self.eta}: must be in (0, 1)")
+        for name, least in (("warm_start", 0), ("monotone_cycles", 0), ("max_linear_iterations", 1), ("memory", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} = {getattr(self, name)}: must be >= {least}")
+
+    @property
+    def reformulation(self) -> Reformulation:
+        """The map."""
+        return Reformulation.FISCHER if self.share == 1 else Reformulation.PENALIZED
+
+    def init(self, problem: LCP) -> FischerWorkspace | FischerDenseWorkspace:
+        """Return a workspace: on the host for dense matrices, unless the Jacobian is to be approximated."""
+        if isinstance(problem.A, DenseOperator) and Kink(self.kink) is not Kink.APPROXIMATION:
+            return FischerDenseWorkspace(problem, self)
+        return FischerWorkspace(problem, self)
+
+    def step(self, problem: LCP, work: Any, x: wp.array[Any]) -> Step:
+        """Take a monotone cycle or a gradient step while the start is cold, else a Newton step."""
+        if work.cycles_left > 0:
+            work.cycles_left -= 1
+            return work.active_set.monotone_cycle(x)
+        if work.descents_left > 0:
+            work.descents_left -= 1
+            return work.descend(x)
+        return work.newton_step(x)
+
+
+class FischerWorkspace(IterateInPlace):
+    """Memory of the method for one problem, on the device."""
+
+    def __init__(self, problem: LCP, settings: FischerNewton) -> None:
+        self.problem, self.settings, self.precision = problem, settings, Precision(settings.precision)
+        layout = problem.layout
+        self.x, self._from, self._shift = (layout.zeros(wp.float64) for _ in range(3))
+        self.free, self.residual = layout.zeros(wp.uint8), NaturalResidual(problem)
+        self.kink = Kink(settings.kink)
+        self.system: Any = (
+            FiniteDifferenceSystem(problem, self.residual, settings.reformulation, settings.share)
+            if self.kink is Kink.APPROXIMATION
+            else principal_system(problem, self.precision.correction, bounded=False, settings=settings.cycle, shifted=True)
+        )
+        self.map = NonsmoothMap(problem, self.residual, settings.reformulation, settings.share, self.system.r.dtype)
+        self._search = NonmonotoneSearch(memory=settings.memory if settings.safeguard else 1)
+        self._gradient: GradientWorkspace | None = None
+        self.active_set: NewtonWorkspace = None  # type: ignore[assignment]
+        if isinstance(problem.A, GridPoisson) and problem.bounded and settings.monotone_cycles > 0:
+            self.active_set = MinimumMapNewton(precision=settings.precision, cycle=settings.cycle).init(problem)
+            self.active_set.residual = self.residual
+        self._rounded = layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
+        self.floating: Any = None
+        self.start(warm=False, tolerance=0.0)
+
+    def start(self, *, warm: bool, tolerance: float) -> None:
+        """Forget the last solve; the operator may have changed."""
+        s = self.settings
+        self.cycles_left = s.monotone_cycles if self.active_set is not None and not warm else 0
+        self.descents_left, self.steps, self.target = s.warm_start, 0, tolerance
+        self._search.forget()
+        self.map.begin(self.kink)
+        self.system.refresh()
+        if self.active_set is not None:
+            self.active_set.floating = self.floating
+            self.active_set.start(warm=False, tolerance=tolerance)
+        if self.floating is not None:  # what is singular: components none of whose unknowns is bounded
+            p = self.problem
+            free = (p.unknown.numpy() == 1) & np.isinf(p.lower.numpy()) & np.isinf(p.upper.numpy())
+            self._without_bounds = wp.array(free.astype(np.uint8), device=p.device)
+
+    def newton_step(self, x: wp.array[Any]) -> Step:
+        """Solve for the direction, and search along it."""
+        s, self.steps = self.settings, self.steps + 1
+        size = max(self.residual.norm, 1e-300)
+        merit = self.map.condense(x, self._shift, self.system.r, self.free, 1 / size, self.steps)
+        if isinstance(self.system, FiniteDifferenceSystem):
+            self.system.linearize(x, self.free, size)
+        else:
+            self.system.restrict(self.free, self._shift)
+        if self.floating is not None:
+            self.floating.project(self.system.r, self._without_bounds)
+        norm = self.system.norm()
+        iterations = self.system.solve(s.eta * norm, s.max_linear_iterations)[0] if norm > 0 else 0
+        self._search.remember(merit)
+        wp.copy(self._from, x)
+        length, _ = self._search.search(lambda t: self._trial(x, t * size), -2 * merit)
+        if length > 0.0:
+            return Step("fischer", iterations)
+        wp.copy(x, self._from)
+        self.residual.evaluate(x)
+        return self._fall_back(x, iterations)
+
+    def _fall_back(self, x: wp.array[Any], iterations: int) -> Step:
+        """Go down the gradient where Newton's direction is of no use, or say so."""
+        if not self.settings.safeguard:
+            return Step("fischer", iterations, None, SolveStatus.NON_DESCENT)
+        step = self.descend(x)
+        return Step("gradient", iterations + step.linear_iterations, None, step.failure)
+
+    def descend(self, x: wp.array[Any]) -> Step:
+        """Go down the gradient of the same map once."""
+        if self._gradient is None:
+            s = self.settings
+            method = GradientDescent(map=s.reformulation.value, share=s.share, precision="single" if self._rounded is not None else "double")
+            self._gradient = GradientWorkspace(self.problem, method, self.residual)
+            self._gradient.start(warm=True, tolerance=self.target)
+        return self._gradient.descend(x)
+
+    def _trial(self, x: wp.array[Any], scale: float) -> float:
+        """Move, and return the merit."""
+        self.map.advance(self._from, self.system.e, scale, x, projected=not self.settings.safeguard)
+        if self.floating is not None:
+            self.floating.settle(x, self.problem.lower, self.problem.upper)
+        self._round(x)
+        return self.map.merit(x) if math.isfinite(self.residual.evaluate(x)) else math.inf
+
+    def round_iterate(self) -> None:
+        """Round x to its precision."""
+        self._round(self.x)
+
+    def _round(self, x: wp.array[Any]) -> None:
+        if self._rounded is not None:
+            convert(x, self._rounded)
+            convert(self._rounded, x)
