@@ -7,6 +7,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from benchmarks.machine import machine
 from benchmarks.record import Bars, Record, Results, Table
 from benchmarks.stopwatch import timed
 from benchmarks.timing import Figure, Options
+from fluids.boundary import WholeCells
 from warp_lcp.driver.run import run_scene
 from warp_lcp.driver.scene_file import load_scene
 from warp_lcp.driver.simulator import simulators
@@ -27,11 +29,11 @@ SCENES = {"dam-break-2d": 0.3, "dam-break": 0.2}  # [s] simulated
 PARTICLES = 128  # cells along the longest side of the scene whose particles are timed
 PARTICLE_STEPS = 12
 WALL_TIME = 0.6  # [s] simulated of the scene in which solves with and without walls are compared: the splash lies in it
-STAGES = {
+STAGES: dict[str, tuple[ModuleType | type, str]] = {
     "to grid": (fluids.simulator, "particles_to_faces"),
     "to particles": (fluids.simulator, "faces_to_particles"),
-    "advection": (fluids.simulator, "advect"),
-    "extrapolation": (fluids.simulator, "extend_velocity"),
+    "advection": (WholeCells, "advect"),  # the scenes' solids fill whole cells
+    "extrapolation": (WholeCells, "extend"),
     "solve": (wl, "solve"),
 }
 

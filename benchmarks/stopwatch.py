@@ -13,8 +13,8 @@ import warp as wp
 
 
 @contextmanager
-def timed(device: str, functions: dict[str, tuple[ModuleType, str]]) -> Iterator[dict[str, list[float]]]:
-    """Time every call of functions that callers look up in a module.
+def timed(device: str, functions: dict[str, tuple[ModuleType | type, str]]) -> Iterator[dict[str, list[float]]]:
+    """Time every call of functions that callers look up in a module or a class.
 
     Args:
         device: synchronized around each call.

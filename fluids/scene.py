@@ -15,9 +15,10 @@ LEVEL_SET_BYTES = 19  # more a cell for a surface between cells, or slivers
 SMOOTHING_BYTES = 12
 CUT_BYTES = 45
 MOVING_BYTES = 30
+PLANES = 2.5  # that a 2-D cell counts for: its fields have three, the solver's one
 VECTOR_BYTES, KEY_BYTES = 12, 16  # a particle's vectors, one of them spare, and its sort keys
 SEEDING_BYTES = 136  # a particle on the host, while the liquid is made and the solver is not
-LATTICE_BYTES = 130  # a point of one plane of cells, while particles are chosen from them
+LATTICE_BYTES = 50  # a point of one plane of cells, while particles are chosen from them
 
 
 class Pressure(Table):
@@ -71,7 +72,7 @@ class LiquidScene(Scene):
     def memory_estimate(self) -> int:
         """Return about how much memory a run takes at most [bytes], without the program itself."""
         nx, ny, nz = self.cell_counts
-        cells = nx * ny * (nz if self.dimension == 3 else 3)  # three planes are stored
+        cells = round(nx * ny * (nz if self.dimension == 3 else PLANES))
         particles = self.particle_estimate()
         cut = self.domain.solids == "cut-cell" and bool(self.solid)
         level_set = self.pressure.surface == "ghost-fluid"

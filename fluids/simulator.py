@@ -210,7 +210,7 @@ class LiquidSimulation:
     def _window(self, totals: ParticleTotals) -> Window:
         """Return the cells that the particles can touch in a step."""
         low, high = (self.particles.cells_of(corner[None])[0] + 1 for corner in (totals.low, totals.high))
-        return self.grid.window(low, high, grow=self.layers + 2)
+        return self.grid.window(low, high, grow=max(self.layers, 2 * self.scene.pressure.smoothing) + 2)
 
     def _transfer(self, window: Window, dt: float) -> None:
         """Bring the particles' velocities to the faces, and let gravity act on them."""
@@ -334,8 +334,7 @@ class LiquidSimulation:
 
 def _method(settings: Solver) -> Any:
     """Return the solver that a scene names."""
-    methods = {"projected-multigrid": wl.ProjectedMultigrid, "minimum-map-newton": wl.MinimumMapNewton, "psor": wl.ProjectedSOR}
-    return methods[settings.method](precision=settings.precision)
+    return wl.METHODS[settings.method](precision=settings.precision)
 
 
 def _surface(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary) -> FreeSurface:

@@ -77,6 +77,10 @@ def use_sweeping_kernels():
         for problem in (sparse, grid):
             for solver in first:
                 assert wl.solve(problem, solver)
+        for faces in ({}, {"face_x": 2.0}, {"face_x": np.ones((1, 5))}):
+            A = wl.GridPoisson(np.array([[0, 1, 1, 1]]), device="cpu", dtype=dtype, **faces)
+            for axis in wl.GridLines:
+                assert wl.solve(wl.LCP(A, -np.ones((1, 4))), wl.BlockedGaussSeidel(blocks=axis))
         assert wl.solve(wl.LCP(wl.DenseOperator(np.eye(2), device="cpu", dtype=dtype), -np.ones(2), *friction), wl.ProjectedSOR())
 
 

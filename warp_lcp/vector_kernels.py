@@ -57,6 +57,16 @@ def span_end(t: int, chunk: int, n: int):
     return last
 
 
+ADD_UP = """const double* v = partials.data + offset; double s = 0;
+if (stride == 1) { SIMD8 for (int i = start; i < n; ++i) s += v[i]; }
+else for (int i = start; i < n; i += stride) s += v[i];
+return s;"""
+
+
+@wp.func_native(simd(ADD_UP))
+def add_up_span(partials: wp.array(dtype=wp.float64), offset: int, start: int, n: int, stride: int) -> wp.float64: ...
+
+
 @wp.kernel(enable_backward=False, module="warp_lcp.vectors")
 def add_up_kernel(partials: wp.array(dtype=wp.float64), n: int, threads: int, segments: int, out: wp.array(dtype=wp.float64), slot: int):
     """out[slot + column * segments + segment] = the sum of every `segments`-th block of a column of n partials, by one block of threads.
@@ -67,9 +77,7 @@ def add_up_kernel(partials: wp.array(dtype=wp.float64), n: int, threads: int, se
     block = t // threads
     column = block // segments
     segment = block - column * segments
-    s = wp.float64(0.0)
-    for i in range(segment * threads + t - block * threads, n, threads * segments):
-        s += partials[column * n + i]
+    s = add_up_span(partials, column * n, segment * threads + t - block * threads, n, threads * segments)
     total = wp.tile_sum(wp.tile(s))
     if t == block * threads:
         out[slot + block] = total[0]

@@ -57,6 +57,17 @@ def test_the_plan_counts_particles() -> None:
     assert overlapping.particle_estimate() == 16 * 8 * 4
 
 
+def test_the_estimate_of_memory_counts_what_the_options_add() -> None:
+    ball = {"shape": "sphere", "center": [0.7, 0.2], "radius": 0.1}
+    moving = ball | {"motion": {"kind": "translation", "velocity": [1.0, 0.0]}}
+    voxel = {"solids": "voxel", "pressure": {"surface": "voxel"}}
+    options = [voxel, {"solids": "voxel"}, {"solids": "voxel", "pressure": {"smoothing": 1}}, {}, {"solid": [moving]}]
+    size = {"size": [1.0, 0.5], "resolution": 1000, "liquid": [box([0.0, 0.0], [0.1, 0.1])]}
+    sizes = [scene(**size, **({"solid": [ball]} | tables)).memory_estimate() for tables in options]
+    assert sizes == sorted(set(sizes))
+    assert 100 * 2**20 < sizes[0] < 400 * 2**20  # measured: about 160 MB
+
+
 @pytest.mark.parametrize("per_axis", [1, 2, 3])
 def test_the_mass_does_not_depend_on_the_sampling(per_axis: int) -> None:
     simulation = create(small(particles={"per_axis": per_axis}, physics={"density": 500.0, "gravity": [0.0, -9.81]}))

@@ -306,9 +306,8 @@ def test_a_step_marks_its_stages() -> None:
     watched.watch = Names()
     assert watched.step(0.01) == plain.step(0.01)
     assert watched.watch.found == [
-        "diagnostics", "sort", "particles-to-grid", "surface", "pressure set-up", "pressure solve", "projection", "extrapolation",
-        "grid-to-particles",
-        "advection", "diagnostics",
+        "diagnostics", "sort", "particles-to-grid", "surface", "pressure set-up", "pressure solve", "projection", "diagnostics",
+        "extrapolation", "grid-to-particles", "advection", "diagnostics",
     ]  # fmt: skip
 
 

@@ -128,8 +128,8 @@ def test_grids_take_given_blocks_with_a_solver(device):
     result = wl.solve(problem, BlockedGaussSeidel(blocks=rows, sub_solver=wl.ProjectedSOR()), stopping=TIGHT)
     assert result
     np.testing.assert_allclose(result.x.numpy().ravel()[fluid], lemke(dense[np.ix_(fluid, fluid)], b.ravel()[fluid]), atol=1e-8)
-    with pytest.raises(ValueError, match="shows no rows: give BlockedGaussSeidel lists as blocks"):
-        BlockedGaussSeidel().init(problem)
+    with pytest.raises(ValueError, match="shows no rows: give BlockedGaussSeidel GridLines, or lists as blocks"):
+        BlockedGaussSeidel(blocks=3).init(problem)
 
 
 def test_colors_separate_coupled_blocks():

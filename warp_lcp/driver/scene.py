@@ -11,10 +11,13 @@ from pydantic import Field, model_validator
 
 from warp_lcp.driver.shapes import Liquid, Shape, Solid, Wall
 from warp_lcp.driver.table import ANY_VALUE, Complaint, Problem, SceneError, Table, Vector, refuse, validate
+from warp_lcp.solvers.registry import grid_methods
 
 __all__ = ["Complaint", "Liquid", "Problem", "Scene", "SceneError", "Shape", "Solid", "Table", "Vector", "Wall", "validate"]
 
 Length = Annotated[float, Field(gt=0)]
+
+GridMethod = Literal[grid_methods()]
 
 WHOLE_CELLS = 1e-6  # how far a side may be from a whole number of cells, relative
 
@@ -70,9 +73,7 @@ class Solver(Table):
     """[solver]: the method for the complementarity problem of every step, and how far it goes."""
 
     later: ClassVar = {"preset": ANY_VALUE}
-    method: Literal["projected-multigrid", "minimum-map-newton", "psor"] = Field(
-        default="projected-multigrid", description="projected-multigrid is the fastest, psor simple and slow"
-    )
+    method: GridMethod = Field(default="projected-multigrid", description="projected-multigrid is the fastest")
     tolerance: float = Field(default=1e-4, gt=0, lt=1, description="the relative residual to reach")
     precision: Literal["mixed", "single", "double"] = Field(default="mixed", description="of the method's arithmetic")
     max_iterations: int = Field(default=100, ge=1, description="iterations before the step counts as failed")

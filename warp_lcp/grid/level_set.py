@@ -66,7 +66,8 @@ class LevelSet:
         Args:
             particles: the liquid. If it is indexed it must not have moved since it was sorted: each cell then gathers from the particles
                 around it, the same bits on every run of a GPU. Otherwise they scatter.
-            window: cells that hold all particles, with 2 + `smoothing` to spare on each side.
+            window: cells that hold all particles, with 2 + 2 `smoothing` to spare on each side: what a pass reads from beyond the window
+                then stays out of reach of the density.
             capacity: share of each cell's kernel that is open, float32; None: 1 everywhere.
             base: int8, SOLID in cells that hold no liquid.
         """

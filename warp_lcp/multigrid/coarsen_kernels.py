@@ -380,15 +380,45 @@ def invert_kernel(
     invert_columns(matrix, inverse, t * columns, wp.min(m, (t + 1) * columns), m)
 
 
+SOLVE = """
+#ifdef __CUDA_ARCH__
+enum { R = 1 };
+#else
+enum { R = 64 };
+#endif
+const int m = nz*ny*nx; const long long s2 = nx + 2, s1 = (ny + 2)*s2; const double* A = inverse.data; double v[R];
+for (int begin = first; begin < end; begin += R) {
+    const int count = end - begin < R ? end - begin : (int)R;
+    for (int r = 0; r < count; ++r) v[r] = 0;
+    const double* row = A + begin;  // the inverse is symmetric
+    for (int k = 1; k <= nz; ++k) for (int j = 1; j <= ny; ++j) for (int i = 1; i <= nx; ++i, row += m) {
+        const double value = (double)b.data[k*s1 + j*s2 + i];
+        SIMD8 for (int r = 0; r < count; ++r) v[r] += row[r]*value; }
+    for (int r = 0; r < count; ++r) {
+        const int q = begin + r; x.data[(q / (ny*nx) + 1)*s1 + (q / nx % ny + 1)*s2 + q % nx + 1] = v[r]; } }
+"""
+
+
+@wp.func_native(simd(SOLVE))
+def solve_rows(
+    inverse: wp.array2d(dtype=wp.float64),
+    b: wp.array3d(dtype=Any),
+    x: wp.array3d(dtype=Any),
+    nz: int,
+    ny: int,
+    nx: int,
+    first: int,
+    end: int,
+): ...
+
+
 @wp.kernel(**options)
-def solve_coarsest_kernel(inverse: wp.array2d(dtype=wp.float64), n: wp.vec3i, b: wp.array3d(dtype=Any), x: wp.array3d(dtype=Any)):
-    """X = inverse b, a row a thread."""
-    r = wp.tid()
-    m = n[0] * n[1] * n[2]
-    v = wp.float64(0.0)
-    for s in range(m):
-        v += inverse[r, s] * wp.float64(b[s // (n[1] * n[2]) + 1, (s // n[2]) % n[1] + 1, s % n[2] + 1])
-    x[r // (n[1] * n[2]) + 1, (r // n[2]) % n[1] + 1, r % n[2] + 1] = x.dtype(v)
+def solve_coarsest_kernel(
+    inverse: wp.array2d(dtype=wp.float64), n: wp.vec3i, rows: int, b: wp.array3d(dtype=Any), x: wp.array3d(dtype=Any)
+):
+    """X = inverse b, so many rows a thread."""
+    t = wp.tid()
+    solve_rows(inverse, b, x, n[0], n[1], n[2], t * rows, wp.min(inverse.shape[0], (t + 1) * rows))
 
 
 def _overload() -> None:
@@ -398,7 +428,7 @@ def _overload() -> None:
         for d_type in (wp.uint8, real):
             d = wp.array3d(dtype=d_type)
             wp.overload(factor_kernel, [StencilShape, d, f, f, f, wp.vec3i, wp.vec3i, wp.float64, u8, wp.array2d(dtype=wp.float64)])
-        wp.overload(solve_coarsest_kernel, [wp.array2d(dtype=wp.float64), wp.vec3i, f, f])
+        wp.overload(solve_coarsest_kernel, [wp.array2d(dtype=wp.float64), wp.vec3i, int, f, f])
 
 
 _overload()

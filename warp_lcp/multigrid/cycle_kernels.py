@@ -238,6 +238,17 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         inverse: real, fx: int, one_plane: bool, one_row: bool,
     ): ...  # fmt: skip
 
+    @wp.func
+    def correct_plane(
+        A: StencilShape, d: d_array, wx: field, wy: field, wz: field, C: StencilShape, G: Aggregates, k: int, x: field, coarse: field,
+        lower: field, upper: field, scale: real, projected: bool,
+    ):  # fmt: skip
+        for j in range(G.ny):
+            o = coarse_start(A, C, G, k, j, 0, A.nx)
+            p = row_start(A, k, j, 0, A.nx)
+            n = row_count(A, k, j, 0, A.nx)
+            correct_row(A, d, wx, wy, wz, x, p, coarse, o, lower, upper, n, G.fx - 1, scale, projected)
+
     @wp.kernel(enable_backward=False, module=name)
     def bounds_kernel(
         A: StencilShape, d: d_array, grain: int, C: StencilShape, G: Aggregates, x: field, lower: field, upper: field, scale: real,
@@ -314,11 +325,7 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         """Correction and two sweeps by one CPU thread, each a plane behind the one before."""
         for s in range(G.nz + 2):
             if s < G.nz:
-                for j in range(G.ny):
-                    o = coarse_start(A, C, G, s, j, 0, A.nx)
-                    p = row_start(A, s, j, 0, A.nx)
-                    n = row_count(A, s, j, 0, A.nx)
-                    correct_row(A, d, wx, wy, wz, x, p, coarse, o, lower, upper, n, G.fx - 1, scale, projected)
+                correct_plane(A, d, wx, wy, wz, C, G, s, x, coarse, lower, upper, scale, projected)
             i = s - 1
             if i >= 0 and i < G.nz:
                 sweep_plane_into_ring(A, d, wx, wy, wz, G.ny, i, False, t, x, b, lower, upper, first, projected)
@@ -357,4 +364,5 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         ascend=ascend_kernel,
         relax=relax_kernel,
         rows=SimpleNamespace(sweep=sweep_row, first_sweep=first_sweep_row, restrict=restrict_row, bounds=bounds_row, correct=correct_row),
+        planes=SimpleNamespace(correct=correct_plane, into_ring=sweep_plane_into_ring, out_of_ring=sweep_plane_out_of_ring),
     )

@@ -147,6 +147,7 @@ class Hierarchy:
         cells = self.settings.one_launch_cuda if self.device.is_cuda else self.settings.one_launch_cpu
         self._first_small = first_small(self.levels, cells)  # its index; none is small: len(levels)
         small = self.levels[self._first_small :]
+        self._descents: dict[tuple[int, bool, bool], Program] = {}
         self._small = SmallLevels(small, self.settings, self._inverse, self._matrix) if small else None
         self.refresh()
 
@@ -229,9 +230,7 @@ class Hierarchy:
     @cached_property
     def cycle(self) -> Program:
         """One linear cycle: a symmetric positive (semi-)definite approximation of the inverse."""
-        program = Program(self.device)
-        self._visit(0, 1, program.launch, projected=False)
-        return program
+        return self._descent(0, projected=False, from_zero=True)
 
     @cached_property
     def monotone_cycle(self) -> Program:
@@ -239,24 +238,45 @@ class Hierarchy:
 
         It moves whole aggregates on and off their bounds, where an active-set method moves the boundary by about a layer of cells a step.
         """
+        return self._descent(0, projected=True, from_zero=True)
+
+    @cached_property
+    def open_cycle(self) -> Program | None:
+        """The linear cycle without its last leg, for a caller who fuses that with what follows; None where it is no single launch."""
+        if len(self.levels) == 1 or self._first_small == 0 or not self._fuses(self.finest):
+            return None
         program = Program(self.device)
-        self._visit(0, 1, program.launch, projected=True)
+        self._descend(0, program, projected=False, from_zero=True, whole=False)
         return program
 
-    def _visit(self, level: int, visits: int, launch: Launch, *, projected: bool) -> None:
-        """Launch cycles on a level and those below it, one after another, the first from x = 0."""
+    def last_leg(self) -> list[Any]:
+        """Return what the last leg of a linear cycle takes, as `ascend` in `cycle_kernels` does."""
+        return self._ascent(0, projected=False)
+
+    def _descent(self, level: int, *, projected: bool, from_zero: bool) -> Program:
+        """Return a cycle on a level and those below it. A W-cycle repeats it many times: it is recorded once."""
+        key = level, projected, from_zero
+        if key not in self._descents:
+            program = self._descents[key] = Program(self.device)
+            if self._small is not None and level == self._first_small:
+                self._small.cycle(1, program.launch, projected=projected)
+            elif level == len(self.levels) - 1:
+                self._solve_coarsest(program.launch, projected=projected, from_zero=from_zero)
+            else:
+                self._descend(level, program, projected=projected, from_zero=from_zero)
+        return self._descents[key]
+
+    def _visit(self, level: int, visits: int, program: Program, *, projected: bool) -> None:
+        """Append cycles on a level and those below it, one after another, the first from x = 0."""
         if self._small is not None and level == self._first_small:
-            self._small.cycle(visits, launch, projected=projected)
+            self._small.cycle(visits, program.launch, projected=projected)
             return
         for visit in range(visits):
-            self._descend(level, launch, projected=projected, from_zero=visit == 0)
+            program.extend(self._descent(level, projected=projected, from_zero=visit == 0))
 
-    def _descend(self, level: int, launch: Launch, *, projected: bool, from_zero: bool) -> None:
-        """Launch a cycle on a level and those below it."""
-        if level == len(self.levels) - 1:
-            self._solve_coarsest(launch, projected=projected, from_zero=from_zero)
-            return
-        L = self.levels[level]
+    def _descend(self, level: int, program: Program, *, projected: bool, from_zero: bool, whole: bool = True) -> None:
+        """Record a cycle on a level and those below it, with the last leg or without."""
+        L, launch = self.levels[level], program.launch
         fused = self._fuses(L)
         if fused:
             self._descending_leg(level, launch, projected=projected, from_zero=from_zero)
@@ -266,9 +286,11 @@ class Hierarchy:
         if projected:
             self._restrict_bounds(level, launch)
         visits = self.levels[level + 1].visits if level + 2 < len(self.levels) else 1
-        self._visit(level + 1, visits, launch, projected=projected)
+        self._visit(level + 1, visits, program, projected=projected)
+        if not whole:
+            return
         if fused:
-            self._ascending_leg(level, launch, projected=projected)
+            launch(L.kernels.ascend, 1, self._ascent(level, projected=projected), device=self.device)
         else:
             self._correct(level, launch, projected=projected)
             self._pair(L, launch, reverse=True, projected=projected)
@@ -285,12 +307,12 @@ class Hierarchy:
         inputs = [*L.operands, C.stencil.shape, C.aggregates, planes, rows, from_zero, *fields]
         launch(L.kernels.descend, 1, inputs, device=self.device)
 
-    def _ascending_leg(self, level: int, launch: Launch, *, projected: bool) -> None:
-        """Correction and sweeps in one launch of one CPU thread."""
+    def _ascent(self, level: int, *, projected: bool) -> list[Any]:
+        """Return the inputs of correction and sweeps in one launch of one CPU thread."""
         L, C = self.levels[level], self.levels[level + 1]
         first, second = reversed(self.settings.weights)
         fields = [L.x, L.b, L.t, L.lower, L.upper, C.x, first, second, self.settings.over_correction, projected]
-        launch(L.kernels.ascend, 1, [*L.operands, C.stencil.shape, C.aggregates, *fields], device=self.device)
+        return [*L.operands, C.stencil.shape, C.aggregates, *fields]
 
     def _solve_coarsest(self, launch: Launch, *, projected: bool, from_zero: bool) -> None:
         """Multiply by the inverse; projected sweeps stand for that where there are bounds."""
@@ -307,8 +329,10 @@ class Hierarchy:
                 self._pair(L, launch, reverse=True, projected=True)
             return
         counts, shape = L.stencil.padding.counts, L.stencil.padding.shape
-        inputs = [self._inverse, wp.vec3i(*counts), L.b.reshape(shape), L.x.reshape(shape)]
-        launch(kernels.solve_coarsest_kernel, math.prod(counts), inputs, device=self.device)
+        m = math.prod(counts)
+        rows = grain(m, self.device)
+        inputs = [self._inverse, wp.vec3i(*counts), rows, L.b.reshape(shape), L.x.reshape(shape)]
+        launch(kernels.solve_coarsest_kernel, m // rows, inputs, device=self.device)
 
     def _pair(self, L: Level, launch: Launch, *, projected: bool, from_zero: bool = False, reverse: bool = False) -> None:
         """Two Chebyshev-Jacobi sweeps; the reverse pair after the correction keeps the cycle symmetric."""

@@ -150,11 +150,9 @@ class BlockWorkspace(SweepWorkspace):
 class LineWorkspace(SweepWorkspace):
     """Memory of sweeps over a grid's lines."""
 
-    sweep: LineSweep
-
     def __init__(self, problem: LCP, axis: GridLines, settings: BlockedGaussSeidel) -> None:
         super().__init__(problem, Precision(settings.precision))
-        self.sweep = LineSweep(problem, axis, settings.omega)
+        self._lines = LineSweep(problem, axis, settings.omega)
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """The stencil is the operator's own."""
@@ -162,4 +160,4 @@ class LineWorkspace(SweepWorkspace):
 
     def run(self, x: wp.array[Any], *, forward: bool) -> None:
         """Solve each line once."""
-        self.sweep.run(x, forward=forward)
+        self._lines.run(x, forward=forward)

@@ -71,7 +71,9 @@ class FischerMap:
             return p, q, kinks
         up, down = np.maximum(y, 0), np.maximum(-y, 0)
         p = self.share * p + (1 - self.share) / self.scale * (self.low * (a > 0) * up + self.high * (c > 0) * down)
-        q = self.share * q + (1 - self.share) / self.scale * (self.low * (y > 0) * np.maximum(a, 0) + self.high * (y < 0) * np.maximum(c, 0))
+        q = self.share * q + (1 - self.share) / self.scale * (
+            self.low * (y > 0) * np.maximum(a, 0) + self.high * (y < 0) * np.maximum(c, 0)
+        )
         return p, q, kinks
 
     def jacobian(self, p: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -108,7 +110,7 @@ class FischerDenseWorkspace(DenseWorkspace):
 
     def __init__(self, problem: LCP, settings: FischerNewton) -> None:
         super().__init__(problem)
-        self.settings, self.precision = settings, Precision.DOUBLE
+        self.settings, self._descent, self.precision = settings, settings.descent(problem), Precision.DOUBLE
         self.cycles_left, self.descents_left, self.stage, self.steps = 0, settings.warm_start, 0, 0
         self.active_set: Any = None
         self._search = NonmonotoneSearch(memory=settings.memory if settings.safeguard else 1)
@@ -118,7 +120,7 @@ class FischerDenseWorkspace(DenseWorkspace):
         """Read the problem, and begin the first stage."""
         super().start(warm=warm, tolerance=tolerance)
         s = self.settings
-        self.map = FischerMap(self.data, s.share, Kink(s.kink), np.random.default_rng(2015))
+        self.map = FischerMap(self.data, self._descent.share, Kink(s.kink), np.random.default_rng(2015))
         self._identity = np.eye(len(self.data.b))
         self._search.forget()
         self.descents_left, self.stage, self.steps, self.target = s.warm_start, 0, 0, tolerance
@@ -127,10 +129,8 @@ class FischerDenseWorkspace(DenseWorkspace):
 
     def descend(self, x: Any) -> Step:
         """Go down the gradient of the same map once."""
-        s = self.settings
         if self._gradient is None:
-            map_ = Reformulation.FISCHER if s.share == 1 else Reformulation.PENALIZED
-            self._gradient = GradientWorkspace(self.problem, GradientDescent(map=map_.value, share=s.share), self.residual)
+            self._gradient = GradientWorkspace(self.problem, self._descent, self.residual)
             self._gradient.start(warm=True, tolerance=self.target)
         step = self._gradient.descend(x)
         self._iterate = self._begun = self.read_iterate()
@@ -219,6 +219,8 @@ class FischerDenseWorkspace(DenseWorkspace):
         gap, f = self.data.affine(x) - y, map_.value(x, y, self._mu)
         p, q, _ = map_.derivative(x, y, self._mu)
         dx = _solve(map_.jacobian(p, q), -f - q * gap)
+        if not np.isfinite(dx).all():
+            dx, self._steps_left = np.zeros(len(x)), 1
         dy, size, length = A @ dx + gap, float(np.hypot(np.linalg.norm(gap), np.linalg.norm(f))), 1.0
         while length > 1e-6:
             after = map_.value(x + length * dx, y + length * dy, self._mu)

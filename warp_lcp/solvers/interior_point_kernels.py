@@ -196,6 +196,4 @@ def kernels(d_type: Any, real: Any, upper: bool) -> SimpleNamespace:
         start, end = span_start(k, chunk), span_end(k, chunk, n)
         sums[k] = move_span(lower, upper, w, v, s, t, a, e, x, scale, second, joined, tau, length, start, end, stride)
 
-    return SimpleNamespace(
-        inside=inside, multipliers=multipliers, condense=condense, ratios=ratios, center=center, move=move
-    )
+    return SimpleNamespace(inside=inside, multipliers=multipliers, condense=condense, ratios=ratios, center=center, move=move)

@@ -15,10 +15,11 @@ from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
 from warp_lcp.solve import IterateInPlace, Precision, Step
 from warp_lcp.solvers.minimum_map_newton_kernels import all_free_kernel, kernels
-from warp_lcp.solvers.principal_system import GridSystem, principal_system
+from warp_lcp.solvers.principal_system import DenseSystem, GridSystem, principal_system
 from warp_lcp.vectors import Reduction, convert, launch_spans
 
-MOVED, ACTIVE, FREE_NORM = range(3)  # slots of the device scalars; ACTIVE follows MOVED
+MOVED, SQUARE = 0, 3  # slots of the device scalars: cells moved, active, shifted, and the free residual's square
+REGULARIZATIONS = (1e-8, 1e-4, 1e-2, 0.1, 1.0, 10.0, 100.0)  # of J'J, times its mean diagonal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +34,7 @@ class MinimumMapNewton:
     Args:
         precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate rounded to float32 as well.
         monotone_cycles: projected cycles of a cold start on a grid.
-        eta: each linear solve reduces its residual by this factor, or to what the whole solve still needs.
+        eta: each linear solve reduces its residual by this factor, or to what the whole solve still needs, once the active set has settled.
         max_linear_iterations: the most conjugate-gradient iterations of one step.
         backtracks: halvings of a step before it is given up.
         memory: residuals that a step may fall back to.
@@ -48,7 +49,7 @@ class MinimumMapNewton:
 
     precision: str = "mixed"
     monotone_cycles: int = 2
-    eta: float = 0.2
+    eta: float = 0.1
     max_linear_iterations: int = 200
     backtracks: int = 6
     memory: int = 4
@@ -90,8 +91,9 @@ class NewtonWorkspace(IterateInPlace):
         self.residual = NaturalResidual(problem)
         self.system = principal_system(problem, self.precision.correction, bounded=self.bounded, settings=settings.cycle)
         self.free = layout.zeros(wp.uint8)
-        self._scalars = wp.zeros(3, dtype=wp.float64, device=problem.device)
-        self._reduction = Reduction(layout.size, problem.device, self._scalars, columns=2)
+        self._scalars = wp.zeros(4, dtype=wp.float64, device=problem.device)
+        self._reduction = Reduction(layout.size, problem.device, self._scalars, columns=4)
+        self._nothing = wp.empty(0, dtype=wp.float64, device=problem.device)
         self._kernels = kernels(self.residual.diagonal.dtype, self.system.r.dtype)
         self._rounded = layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
         self.floating: Any = None
@@ -116,12 +118,11 @@ class NewtonWorkspace(IterateInPlace):
             system.restrict(self.free)
         self.stale = True  # the next Newton step takes cells out again
         size = self.residual.norm
-        self._flat(self._kernels.right_side, [self.residual.y, self.free, 1 / size, system.r])
+        self._right_side(size)
         finest = system.hierarchy.finest
         self._flat(self._kernels.gaps, [x, p.lower, p.upper, p.unknown, 1 / size, finest.lower, finest.upper])
         system.monotone_cycle()
-        self._flat(self._kernels.correct, [x, system.z, p.lower, p.upper, size, x])
-        self._round(x)
+        self._correct(x, system.z, size, x)
         if self.cycles_left > 0:
             self.stale = False
         return Step("monotone cycle", 1, None)
@@ -130,63 +131,98 @@ class NewtonWorkspace(IterateInPlace):
         """Classify, solve on the free set, move along the projected step."""
         p, residual = self.problem, self.residual
         self.norms = [*self.norms, residual.norm][-self.settings.memory :]
-        before = [x, residual.y, residual.diagonal, residual.unit, p.lower, p.upper, p.unknown, self.free]
+        size = residual.norm
+        before = [x, residual.y, residual.diagonal, residual.unit, *p.bounds.operands, p.unknown, self.free, self.system.r]
         reduction = self._reduction
-        launch_spans(self._kernels.classify, reduction.spans, before, [reduction.threads, reduction.partials], p.device)
-        reduction.add_up(MOVED, columns=2)
-        moved, active = (int(v) for v in self._scalars.numpy()[:2])
-        residual.affine(x)  # the held unknowns have moved to their bounds
+        after = [reduction.threads, reduction.partials]
+        launch_spans(self._kernels.classify, reduction.spans, [*before, wp.float64(1 / size)], after, p.device)
+        reduction.add_up(MOVED, columns=4)
+        moved, active, shifted, square = self._scalars.numpy()
         if moved or self.stale:
             self.system.restrict(self.free)
             self.stale = False
-        size = self._free_norm()
-        if size == 0:
-            return Step("newton", 0, active)
-        iterations = self._solve(size)
-        return self._move(x, size, iterations, active)
+        if shifted:  # held unknowns have moved to their bounds
+            residual.affine(x)
+            square = self._right_side(size)
+        if square == 0:
+            return Step("newton", 0, int(active))
+        iterations = self._solve(float(np.sqrt(square)) / size, size, settled=not moved)
+        return self._move(x, size, iterations, int(active))
 
-    def _solve(self, size: float) -> int:
-        """Solve for the correction; returns linear iterations."""
+    def _right_side(self, size: float) -> float:
+        """Set the system's right-hand side to -y / size on the free set; return the square of y's norm there."""
+        reduction = self._reduction
+        before = [self.residual.y, self.free, self.system.r, wp.float64(1 / size)]
+        launch_spans(self._kernels.right_side, reduction.spans, before, [reduction.partials], self.problem.device)
+        reduction.add_up(SQUARE)
+        return float(self._scalars.numpy()[SQUARE])
+
+    def _solve(self, norm: float, size: float, *, settled: bool) -> int:
+        """Solve for the correction, once and for all if the active set has not moved; returns linear iterations."""
         s = self.settings
-        self._flat(self._kernels.right_side, [self.residual.y, self.free, 1 / size, self.system.r])
         if self.floating is not None:
             self.floating.project(self.system.r, self.free)
         target = 0.3 * self.target / size
-        return self.system.solve(max(s.eta, target), s.max_linear_iterations)[0]
+        return self.system.solve(max(0.0 if settled else s.eta * norm, target), s.max_linear_iterations)[0]
 
     def _move(self, x: wp.array[Any], size: float, iterations: int, active: int) -> Step:
         """Accept the longest of the halved, projected steps that the safeguard allows."""
         p, residual, s = self.problem, self.residual, self.settings
-        wp.copy(self.trial, x)
         limit, scale, best, best_scale = max(self.norms), 1.0, math.inf, 1.0
         for _ in range(s.backtracks + 1):
-            self._flat(self._kernels.correct, [self.trial, self.system.e, p.lower, p.upper, scale * size, x])
+            self._correct(x if scale == 1 else self.trial, self.system.e, scale * size, x, kept=self.trial if scale == 1 else None)
             if self.floating is not None:
                 self.floating.settle(x, p.lower, p.upper)
-            self._round(x)
+                self._round(x)
             norm = residual.evaluate(x)
             if norm <= (1 - 1e-4 * scale) * limit:
                 return Step("newton", iterations, active)
             if norm < best:
                 best, best_scale = norm, scale
             scale *= 0.5
-        self._flat(self._kernels.correct, [self.trial, self.system.e, p.lower, p.upper, best_scale * size, x])
-        self._round(x)
+        self._correct(self.trial, self.system.e, best_scale * size, x)
         if isinstance(self.system, GridSystem) and self.bounded:
             residual.evaluate(x)
             self.stale = True
             residual.current = False
             return Step("monotone cycle", iterations + self.monotone_cycle(x).linear_iterations, active)
-        failure = SolveStatus.NON_DESCENT if best > limit else None
-        residual.current = False
-        return Step("newton", iterations, active, failure)
+        if best <= limit:
+            residual.current = False
+            return Step("newton", iterations, active)
+        wp.copy(x, self.trial)
+        descended = isinstance(self.system, DenseSystem) and self._regularized(x, limit)
+        residual.evaluate(x)
+        return Step("regularized", iterations, active, None if descended else SolveStatus.NON_DESCENT)
 
-    def _free_norm(self) -> float:
-        launch_spans(
-            self._kernels.free_square, self._reduction.spans, [self.residual.y, self.free], [self._reduction.partials], self.problem.device
-        )
-        self._reduction.add_up(FREE_NORM)
-        return float(np.sqrt(self._scalars.numpy()[FREE_NORM]))
+    def _regularized(self, x: wp.array[Any], limit: float) -> bool:
+        """Take the shortest of some Levenberg-Marquardt steps of the minimum map that reduces its norm; return whether one does.
+
+        Where Newton's steps cycle, and where the free block is singular, (J'J + nu I)^-1 J'r is still a descent direction.
+        """
+        p, residual, start = self.problem, self.residual, x.numpy().copy()
+        norm, y = residual.evaluate(x), residual.y.numpy()
+        d = np.abs(residual.diagonal.numpy().astype(np.float64)) * residual.unit
+        d = np.where(d == 0, 1.0, d)
+        lower, upper, A = p.lower.numpy(), p.upper.numpy(), p.A.matrix.numpy().astype(np.float64)  # type: ignore[attr-defined]
+        r = d * (start - np.clip(start - y / d, lower, upper))
+        held = (start - y / d < lower) | (start - y / d > upper)
+        J = np.where(held[:, None], np.diag(d), A)
+        gradient, normal = J.T @ r, J.T @ J
+        size = float(np.trace(normal)) / len(r)
+        for nu in REGULARIZATIONS:
+            dx = np.linalg.solve(normal + nu * size * np.eye(len(r)), -gradient)
+            x.assign(np.clip(start + dx, lower, upper))
+            if residual.evaluate(x) <= (1 - 1e-6) * norm:
+                self.norms.clear()  # from here on no step may undo this one
+                return True
+        x.assign(start)
+        return False
+
+    def _correct(self, base: wp.array[Any], e: wp.array[Any], scale: float, x: wp.array[Any], kept: wp.array[Any] | None = None) -> None:
+        """Set x = clip(base + scale e), rounded, where e is not 0; remember base if `kept` is given."""
+        kept = self._nothing if kept is None else kept
+        self._flat(self._kernels.correct, [base, e, *self.problem.bounds.operands, x, kept, wp.float64(scale)])
+        self._round(x)
 
     def _flat(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
         launch_spans(kernel, self._reduction.spans, inputs, [], self.problem.device)

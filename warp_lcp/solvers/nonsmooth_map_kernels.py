@@ -126,8 +126,8 @@ def kernels(d_type: Any, real: Any, natural: bool) -> SimpleNamespace:
     @wp.func_native(
         flat(
             """const double *b = b_.data, *l = l_.data, *u = u_.data; const auto* e = e_.data; double* x = x_.data;
-        EACH { const double v = b[i] + scale*(double)e[i], w = v < l[i] ? l[i] : v, k = w > u[i] ? u[i] : w;
-            x[i] = projected ? k : v; }"""
+        if (projected) { EACH { const double v = b[i] + scale*(double)e[i], w = v < l[i] ? l[i] : v; x[i] = w > u[i] ? u[i] : w; } }
+        else { EACH { x[i] = b[i] + scale*(double)e[i]; } }"""
         )
     )
     def advance_span(
@@ -136,9 +136,7 @@ def kernels(d_type: Any, real: Any, natural: bool) -> SimpleNamespace:
     ): ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module=name)
-    def merit(
-        M: Map, x: f64, y: f64, d: d_array, lower: f64, upper: f64, unknown: i8, n: int, chunk: int, stride: wp.int64, sums: f64
-    ):
+    def merit(M: Map, x: f64, y: f64, d: d_array, lower: f64, upper: f64, unknown: i8, n: int, chunk: int, stride: wp.int64, sums: f64):
         k = wp.tid()
         sums[k] = merit_span(M, x, y, d, lower, upper, unknown, span_start(k, chunk), span_end(k, chunk, n), stride)
 
@@ -176,9 +174,7 @@ def kernels(d_type: Any, real: Any, natural: bool) -> SimpleNamespace:
         k = wp.tid()
         advance_span(base, e, lower, upper, x, scale, projected, span_start(k, chunk), span_end(k, chunk, n), stride)
 
-    return SimpleNamespace(
-        merit=merit, values=values, condense=condense, weighted=weighted, gradient=gradient, advance=advance
-    )
+    return SimpleNamespace(merit=merit, values=values, condense=condense, weighted=weighted, gradient=gradient, advance=advance)
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.nonsmooth_map")

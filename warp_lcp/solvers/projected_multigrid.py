@@ -81,6 +81,7 @@ class AssessedResidual(NaturalResidual):
         classify: whether unknowns at a bound leave the free set.
         stale: whether the free set has changed since the hierarchy was built.
         active: unknowns held.
+        storage: form and types that choose the kernels.
     """
 
     def __init__(self, problem: LCP, A: GridPoisson, hierarchy: Hierarchy) -> None:
@@ -95,7 +96,8 @@ class AssessedResidual(NaturalResidual):
         R.changed = self._finest.changed.flatten()
         self.scalars = wp.zeros(kernels.SLOTS, dtype=wp.float64, device=A.device)
         self.sums = Reduction(problem.layout.size, A.device, self.scalars, columns=4, threads=R.threads)
-        self.row_kernels = kernels.row_kernels(*s.storage, self._finest.stencil.d.dtype, hierarchy.real)
+        self.storage = (*s.storage, self._finest.stencil.d.dtype, hierarchy.real)
+        self.row_kernels = kernels.row_kernels(*self.storage)
         self.classify, self.stale, self.active, self._norm_of_b = False, True, 0, 0.0
 
     def start(self, x: wp.array[Any], *, keep: bool) -> None:
@@ -301,10 +303,22 @@ class MultigridWorkspace:
         program = self._programs.get(key)
         if program is None:
             program = self._programs[key] = Program(self.A.device)
-            program.extend(self.hierarchy.cycle)
-            self._measure(launch=program.launch)
+            self._correct(program)
             self.residual.advance(self.x, self._p, launch=program.launch)
         return program
+
+    def _correct(self, program: Program) -> None:
+        """Record a cycle, the measuring of its correction and the plan of the step; on the CPU the cycle's last leg measures."""
+        residual, hierarchy, device = self.residual, self.hierarchy, self.A.device
+        if hierarchy.open_cycle is None:
+            program.extend(hierarchy.cycle)
+            self._measure(launch=program.launch)
+            return
+        program.extend(hierarchy.open_cycle)
+        inputs = [*hierarchy.last_leg(), residual.row_sums, self._p, residual.sums.partials]
+        program.launch(kernels.climb_kernel(*residual.storage), 1, inputs, device=device)
+        residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=program.launch)
+        program.launch(kernels.plan_step_kernel, 1, [residual.scalars], device=device)
 
     def _measure(self, *, launch: Launch = wp.launch) -> None:
         """Measure the cycle's correction and plan the step."""

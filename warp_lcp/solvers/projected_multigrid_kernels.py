@@ -7,6 +7,7 @@ from typing import Any
 
 import warp as wp
 
+from warp_lcp.multigrid.cycle_kernels import Aggregates, cycle_kernels
 from warp_lcp.native import BLOCK, C_TYPES, fetch, simd
 from warp_lcp.operators.stencil_kernels import NEIGHBORS, StencilShape, row_count, row_start, stencil_head
 from warp_lcp.vector_kernels import CODED, flat, span_end, span_start
@@ -210,7 +211,42 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
                         slab * R.rows + j, R.threads, k > slab * R.planes, R.changed, k * R.rows + j, out,
                     )  # fmt: skip
 
-    return SimpleNamespace(assess=assess, measure=measure, update=update, advance=advance)
+    return SimpleNamespace(assess=assess, measure=measure, update=update, advance=advance, measure_row=measure_row)
+
+
+@functools.cache
+def climb_kernel(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: Any) -> Any:
+    """Return the kernel that climbs the last leg of a cycle and does what `measure` does, by one CPU thread."""
+    field, free_array = wp.array(dtype=real), wp.array(dtype=free_type)
+    planes = cycle_kernels(variable, free_type, real).planes
+    correct, into_ring, out_of_ring = planes.correct, planes.into_ring, planes.out_of_ring
+    measure_row = row_kernels(variable, d_type, w_type, free_type, real).measure_row
+    form = "variable" if variable else "uniform"
+
+    @wp.kernel(enable_backward=False, module=f"warp_lcp.climb.{form}_{free_type.__name__}_{real.__name__}")
+    def climb(
+        A: StencilShape, d: free_array, wx: field, wy: field, wz: field, C: StencilShape, G: Aggregates, x: field, b: field, t: field,
+        lower: field, upper: field, coarse: field, first: real, second: real, scale: real, projected: bool, R: RowSums, p: field, out: f64,
+    ):  # fmt: skip
+        """Correction, two sweeps and the products, each a plane behind the one before: z is still in the cache."""
+        for s in range(G.nz + 3):
+            if s < G.nz:
+                correct(A, d, wx, wy, wz, C, G, s, x, coarse, lower, upper, scale, projected)
+            i = s - 1
+            if i >= 0 and i < G.nz:
+                into_ring(A, d, wx, wy, wz, G.ny, i, False, t, x, b, lower, upper, first, projected)
+            i = s - 2
+            if i >= 0 and i < G.nz:
+                out_of_ring(A, d, wx, wy, wz, G.nz, G.ny, i, x, t, b, lower, upper, second, projected)
+            k = s - 3
+            if k >= 0:
+                slab = k // R.planes
+                for j in range(R.rows):
+                    n = row_count(A, k, j, 0, A.nx)
+                    o = row_start(A, k, j, 0, A.nx)
+                    measure_row(A, d, wx, wy, wz, x, p, b, o, n, slab * R.rows + j, R.threads, k > slab * R.planes, out)
+
+    return climb
 
 
 @functools.cache

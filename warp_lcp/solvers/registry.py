@@ -7,16 +7,21 @@ no upper bounds and no equations has `boxed = False`.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 from warp_lcp.solvers.accelerated_projected_gradient import AcceleratedProjectedGradient
 from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel
 from warp_lcp.solvers.direct_enumeration import DirectEnumeration
+from warp_lcp.solvers.fischer_newton import FischerNewton
+from warp_lcp.solvers.gradient_descent import GradientDescent
 from warp_lcp.solvers.incremental_pivoting import IncrementalPivoting
+from warp_lcp.solvers.interior_point import InteriorPoint
 from warp_lcp.solvers.lemke import Lemke
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.mprgp import MPRGP
 from warp_lcp.solvers.nncg import NNCG
+from warp_lcp.solvers.primal_dual_active_set import PrimalDualActiveSet
 from warp_lcp.solvers.projected_jacobi import ProjectedJacobi
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 from warp_lcp.solvers.psor import ProjectedSOR
@@ -28,11 +33,15 @@ METHODS: dict[str, type[Any]] = {
     "accelerated-projected-gradient": AcceleratedProjectedGradient,
     "blocked-gauss-seidel": BlockedGaussSeidel,
     "direct-enumeration": DirectEnumeration,
+    "fischer-newton": FischerNewton,
+    "gradient-descent": GradientDescent,
     "incremental-pivoting": IncrementalPivoting,
+    "interior-point": InteriorPoint,
     "lemke": Lemke,
     "minimum-map-newton": MinimumMapNewton,
     "mprgp": MPRGP,
     "nncg": NNCG,
+    "primal-dual-active-set": PrimalDualActiveSet,
     "projected-jacobi": ProjectedJacobi,
     "projected-multigrid": ProjectedMultigrid,
     "psor": ProjectedSOR,
@@ -40,3 +49,16 @@ METHODS: dict[str, type[Any]] = {
     "staggering": Staggering,
     "subspace-minimization": SubspaceMinimization,
 }
+
+
+def grid_methods() -> tuple[str, ...]:
+    """Return the names of the methods that take a grid of any size and a precision: what a scene may name."""
+    return tuple(name for name, method in METHODS.items() if "grid" in method.supports and _has_precision(method) and not _is_small(method))
+
+
+def _is_small(method: type[Any]) -> bool:
+    return hasattr(method, "most_unknowns")
+
+
+def _has_precision(method: type[Any]) -> bool:
+    return any(field.name == "precision" for field in dataclasses.fields(method))

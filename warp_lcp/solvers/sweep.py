@@ -181,6 +181,8 @@ class Diagonal:
                 f"A has {np.count_nonzero(concave)} negative diagonal entries where no bound solves the row (the first is row {row}, "
                 f"b = {b[row]}): no sweep can solve them"
             )
+        if hasattr(p.A, "floating_components"):
+            return  # a grid's zero diagonals are isolated cells, which the loop settles or calls INFEASIBLE
         stuck = inside & (d == 0) & (((b < 0) & np.isinf(upper)) | ((b > 0) & np.isinf(lower)))
         if stuck.any():
             row = int(np.flatnonzero(stuck)[0])

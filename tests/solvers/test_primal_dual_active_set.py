@@ -1,0 +1,96 @@
+"""The primal-dual active set method: planted problems, the cycle of period three, boxes, what follows a cycle."""
+
+import itertools
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warp_lcp as wl
+from oracle import boxed, lemke, natural_residual
+from warp_lcp.gallery import Plant, banded, contact, definite, period_three, poisson, skewed, splash
+from warp_lcp.solvers.primal_dual_active_set import PrimalDualActiveSet
+
+TIGHT = wl.StoppingCriteria(rtol=1e-10)
+
+
+@pytest.mark.parametrize("plant", [Plant(), Plant(active=0.8, weak=0.5), Plant(boxed=True, mixed=0.2, active=0.5)])
+@pytest.mark.parametrize(
+    "make", [lambda plant: poisson((9, 7, 5), plant=plant, dtype=wp.float64, device="cpu"), lambda plant: banded(80, plant=plant)]
+)
+def test_m_matrices_in_few_steps(make, plant):
+    p = make(plant)
+    for problem in (p, p.sparse(), p.dense()):
+        result = wl.solve(problem.lcp(device="cpu"), PrimalDualActiveSet(), stopping=TIGHT)
+        assert result, result.status
+        assert result.iterations <= 16
+        np.testing.assert_allclose(result.x.numpy(), problem.solution, atol=1e-7)
+
+
+def test_the_set_found_is_the_planted_one_and_the_last_step_ends_it():
+    p = definite(40, condition=10, plant=Plant(active=0.5), seed=3)
+    result = wl.solve(p.lcp(device="cpu"), PrimalDualActiveSet(), stopping=TIGHT)
+    assert result, result.status
+    np.testing.assert_array_equal(result.x.numpy() == 0, p.solution == 0)
+    assert result.history[-1].active == np.count_nonzero(p.solution == 0)
+    assert {r.step for r in result.history} == {"start", "active set"}
+
+
+def test_period_three_from_every_set():
+    p = period_three()
+    problem = p.lcp(device="cpu")
+    names = set()
+    for signs in itertools.product((0.0, 10.0), repeat=3):
+        result = wl.solve(problem, PrimalDualActiveSet(), x0=np.array(signs), stopping=TIGHT)
+        assert result, (signs, result.status)
+        np.testing.assert_allclose(result.x.numpy(), p.solution, atol=1e-10)
+        names |= {r.step for r in result.history}
+    assert "least index" in names  # some starts do cycle
+
+
+@pytest.mark.parametrize("boxes", [False, True])
+def test_period_three_blocks_from_random_starts(boxes):
+    rng = np.random.default_rng(71)
+    cycled = 0
+    for seed in range(40):
+        p = period_three(2, plant=Plant(active=rng.random(), boxed=boxes), seed=seed)
+        result = wl.solve(p.lcp(device="cpu"), PrimalDualActiveSet(), x0=rng.uniform(0, 5, 6), stopping=TIGHT)
+        assert result, (seed, result.status)
+        np.testing.assert_allclose(result.x.numpy(), boxed(p.A, p.b, p.lower, p.upper), atol=1e-8)
+        cycled += result.history[-1].step == "least index"
+    assert cycled > 0
+
+
+def test_unsymmetric_p_matrix_against_lemke():
+    for seed in range(10):
+        p = skewed(30, skew=3.0, seed=seed)
+        result = wl.solve(p.lcp(device="cpu"), PrimalDualActiveSet(), stopping=TIGHT)
+        assert result, result.status
+        np.testing.assert_allclose(result.x.numpy(), lemke(p.A, p.b), atol=1e-7)
+
+
+def test_contacts_are_solved_or_reported():
+    solved = 0
+    for seed in range(10):
+        p = contact(4, seed=seed)
+        result = wl.solve(p.lcp(device="cpu"), PrimalDualActiveSet())
+        own = natural_residual(p.A, p.b, p.lower, p.upper, result.x.numpy())
+        assert bool(result) == (own <= 1e-6 * natural_residual(p.A, p.b, p.lower, p.upper, np.zeros(len(p.b))))
+        solved += bool(result)
+    assert solved >= 1  # their matrices are no P-matrices: nothing is promised
+
+
+def test_splash_takes_as_few_steps_as_newton():
+    for bounds in ("walls", "everywhere"):
+        problem = splash(32).named(bounds, device="cpu").lcp()
+        ours, newton = (wl.solve(problem, m) for m in (PrimalDualActiveSet(), wl.MinimumMapNewton()))
+        assert ours, ours.status
+        assert ours.iterations <= newton.iterations + 1
+        np.testing.assert_allclose(ours.x.numpy(), newton.x.numpy(), atol=1e-4 * np.abs(newton.x.numpy()).max())
+
+
+def test_settings_are_checked():
+    with pytest.raises(ValueError, match="eta"):
+        PrimalDualActiveSet(eta=0.0)
+    with pytest.raises(ValueError, match="monotone_cycles"):
+        PrimalDualActiveSet(monotone_cycles=-1)

@@ -1,0 +1,181 @@
+"""The primal-dual active set method: Newton's method on the minimum map with full steps, watched for cycles."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.multigrid.hierarchy import CycleSettings
+from warp_lcp.operators.dense import DenseOperator
+from warp_lcp.problem import LCP
+from warp_lcp.result import SolveStatus
+from warp_lcp.solve import Step
+from warp_lcp.solvers import mprgp_kernels
+from warp_lcp.solvers.dense_problem import DenseProblem, pivots_of
+from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
+
+LOWER, FREE, UPPER = -1, 0, 1  # where least-index pivoting has an unknown
+SLACK = 1e-12  # of the largest magnitudes of x and y: violations below it are rounding
+
+
+@dataclass(frozen=True, kw_only=True)
+class PrimalDualActiveSet:
+    """Guess the active set from x and y, solve for the rest, repeat until the guess stays (Hintermueller, Ito, Kunisch 2003).
+
+    Unknown i is held at l_i if x_i - y_i / A_ii < l_i, at u_i if it is above, else free: y_i = 0 there. This is MinimumMapNewton's step
+    without search or projection, and shares its implementation. Started anywhere it ends after finitely many steps if A is an M-matrix;
+    on other P-matrices it may cycle. A set that comes again without a smaller residual is a cycle: then dense problems go on by
+    least-index principal pivoting (Murty; with bounds Judice and Pires), which is finite for every P-matrix but may be slow; others by
+    MinimumMapNewton's safeguarded steps. Cold, the first steps on a grid are projected multigrid cycles.
+
+    `linear_iterations` counts what MinimumMapNewton's does; a least-index pivot counts one.
+
+    Args:
+        precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate rounded to float32 as well. Dense
+            problems are solved in float64.
+        monotone_cycles: projected cycles of a cold start on a grid.
+        eta: each linear solve reduces its residual by this factor, or to what the whole solve still needs.
+        max_linear_iterations: the most conjugate-gradient iterations of one step.
+        cycle: how multigrid cycles go.
+
+    Raises:
+        ValueError: an argument is outside its range.
+    """
+
+    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
+    needs: ClassVar[str] = "M-matrix, or P-matrix where dense"
+
+    precision: str = "mixed"
+    monotone_cycles: int = 2
+    eta: float = 0.01
+    max_linear_iterations: int = 200
+    cycle: CycleSettings = field(default_factory=CycleSettings)
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        self.as_newton()
+
+    def as_newton(self) -> MinimumMapNewton:
+        """Return the method whose steps take over on operators that are not dense."""
+        return MinimumMapNewton(
+            precision=self.precision,
+            monotone_cycles=self.monotone_cycles,
+            eta=self.eta,
+            max_linear_iterations=self.max_linear_iterations,
+            cycle=self.cycle,
+        )
+
+    def init(self, problem: LCP) -> ActiveSetWorkspace:
+        """Return a workspace.
+
+        Raises:
+            ValueError: what MinimumMapNewton raises.
+        """
+        return ActiveSetWorkspace(problem, self.as_newton())
+
+    def step(self, problem: LCP, work: ActiveSetWorkspace, x: wp.array[Any]) -> Step:
+        """Take a monotone cycle while the start is cold, else a full step; after a cycle what is safe."""
+        if work.cycles_left > 0:
+            work.cycles_left -= 1
+            return work.monotone_cycle(x)
+        return work.least_index_step(x) if work.places is not None else work.newton_step(x)
+
+
+class ActiveSetWorkspace(NewtonWorkspace):
+    """Memory of the method for one problem.
+
+    Attributes:
+        places: where least-index pivoting has each unknown (LOWER, FREE, UPPER); None before a cycle is met.
+        cycled: whether a set has come again.
+    """
+
+    places: np.ndarray | None = None
+
+    def start(self, *, warm: bool, tolerance: float) -> None:
+        """Forget the sets; the operator may have changed."""
+        super().start(warm=warm, tolerance=tolerance)
+        self._seen: dict[bytes, float] = {}  # residuals at the sets met
+        self._last, self._moved = b"", True
+        self.cycled, self.places = False, None
+        nothing, none = wp.empty(0, dtype=wp.float64, device=self.problem.device), wp.empty(0, dtype=wp.uint8, device=self.problem.device)
+        self._unbounded = [nothing, wp.float64(-np.inf), nothing, wp.float64(np.inf), none]
+        self._plain = mprgp_kernels.kernels(self.residual.diagonal.dtype, self.system.r.dtype)
+
+    def newton_step(self, x: wp.array[Any]) -> Step:
+        """Classify, solve on the free set, take the whole step."""
+        step = super().newton_step(x)
+        if step.linear_iterations == 0 and self._cycles(x) and isinstance(self.problem.A, DenseOperator):  # every unknown is held
+            return self.least_index_step(x)
+        return step
+
+    def _move(self, x: wp.array[Any], size: float, iterations: int, active: int) -> Step:
+        """Take the whole step, without a search: the base class has classified, and solved on the free set."""
+        p = self.problem
+        if self._cycles(x):
+            return self.least_index_step(x) if isinstance(p.A, DenseOperator) else super()._move(x, size, iterations, active)
+        bounds = self._unbounded if self._moved else p.bounds.operands  # within rounding of the bounds at the end
+        self._flat(self._plain.advance, [x, self.system.e, *bounds, x, wp.float64(size)])
+        if self.floating is not None:
+            self.floating.settle(x, p.lower, p.upper)
+        self._round(x)
+        return Step("active set", iterations, active)
+
+    def _cycles(self, x: wp.array[Any]) -> bool:
+        """Return whether the set has come again, now or before, without a residual much smaller than then."""
+        key, norm = self._fingerprint(x), self.norms[-1]
+        self._moved, self._last = key != self._last, key
+        self.cycled = self.cycled or (self._moved and key in self._seen and norm > 0.5 * self._seen[key])
+        self._seen[key] = norm
+        return self.cycled
+
+    def _fingerprint(self, x: wp.array[Any]) -> bytes:
+        """Return what tells a set, with its bounds, from others."""
+        free = self.free.numpy() != 0
+        at_upper = ~free & (x.numpy() == self.problem.upper.numpy())
+        return hashlib.blake2b(np.packbits(free).tobytes() + np.packbits(at_upper).tobytes(), digest_size=16).digest()
+
+    def least_index_step(self, x: wp.array[Any]) -> Step:
+        """Some pivots of the first unknown that violates its condition; interim until none does."""
+        data = DenseProblem.read(self.problem)
+        if self.places is None:
+            free, at = self.free.numpy()[data.rows] != 0, x.numpy()[data.rows]
+            self.places = np.where(free, FREE, np.where(at == data.upper, UPPER, LOWER))
+        pivots, most = 0, pivots_of(None, len(data.b)) * 8
+        values, violated = _basic_solution(data, self.places)
+        while violated.size and pivots < most:
+            self.places[violated[0]] = _other_place(data, self.places, values, int(violated[0]))
+            values, violated = _basic_solution(data, self.places)
+            pivots += 1
+        if not np.isfinite(values).all():
+            return Step("least index", pivots, None, SolveStatus.STAGNATED)
+        stored = x.numpy().copy()
+        stored[data.rows] = np.clip(values, data.lower, data.upper)
+        x.assign(stored)
+        self._round(x)
+        failure = None if violated.size else SolveStatus.STAGNATED  # counts only if the criteria are not met by rounding
+        return Step("least index", pivots, int(np.count_nonzero(self.places != FREE)), failure, interim=bool(violated.size))
+
+
+def _basic_solution(data: DenseProblem, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return x with y = 0 on the free unknowns and the others at their bounds, and the indices that violate their condition."""
+    x = np.where(places == LOWER, data.lower, np.where(places == UPPER, data.upper, 0.0))
+    free = np.flatnonzero(places == FREE)
+    if free.size:
+        y = data.affine(x)[free]
+        block = data.A[np.ix_(free, free)]
+        x[free] = -np.linalg.lstsq(block, y, rcond=1e-12)[0] if np.linalg.cond(block) > 1e12 else -np.linalg.solve(block, y)
+    y = data.affine(x)
+    tiny_x, tiny_y = SLACK * max(1.0, np.abs(x).max(initial=0.0)), SLACK * np.abs(data.b).max(initial=0.0)
+    wrong = np.where(places == FREE, (x < data.lower - tiny_x) | (x > data.upper + tiny_x), places * y > tiny_y)
+    return x, np.flatnonzero(wrong)
+
+
+def _other_place(data: DenseProblem, places: np.ndarray, x: np.ndarray, i: int) -> int:
+    """Return where a violating unknown goes."""
+    if places[i] != FREE:
+        return FREE
+    return LOWER if x[i] < data.lower[i] else UPPER
