@@ -14,6 +14,7 @@ from fluids import boundary_kernels as kernels
 from fluids.wall import extend_velocity
 from warp_lcp.grid.advection import advect, clearance
 from warp_lcp.grid.level_set import whole_cell_capacity
+from warp_lcp.grid.sides import continue_beyond
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.voxelize import VoxelSolids
 
@@ -24,7 +25,8 @@ class Boundary(Protocol):
     """Solids and the domain's walls.
 
     Attributes:
-        base: int8 cells without liquid: SOLID or AIR.
+        open_sides: of the domain, see `warp_lcp.grid.sides`.
+        base: int8 cells without liquid: SOLID or AIR. The ring is SOLID, or AIR beyond open sides.
         touch: uint8 a cell: TOUCHES if a face is not open, LETS_GO if the wall of such a face separates.
         open: float32 open fraction a_f of each component's lower faces; empty: a face is closed where a cell beside it is SOLID.
         velocity: float32 velocity of the solids on each component's faces [m/s]; empty: they stand still.
@@ -33,6 +35,7 @@ class Boundary(Protocol):
     """
 
     moves: bool  # whether a solid moves
+    open_sides: int
     base: wp.array
     touch: wp.array
     open: Faces
@@ -52,6 +55,9 @@ class Boundary(Protocol):
     def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> tuple[int, int, int]:
         """Move particles, then the solids to `time`. Return how many met a wall, were pushed by a solid, and are stuck inside one."""
 
+    def displace(self, fields: Faces, position: wp.array) -> None:
+        """Move particles by the displacement [m] on the faces of each axis; walls stop them, solids stay where they are."""
+
     def place(self, time: float) -> None:
         """Put the solids where they are at `time` [s]."""
 
@@ -67,6 +73,7 @@ class WholeCells:
         solids: which cells are solid, and whose walls separate.
         wall_velocity: velocity [m/s] of the domain's wall and of each solid, shape (1 + solids, 3), constant; the cells stay where they
             are. None: all stand still.
+        open_sides: those that `solids` was made with.
 
     Raises:
         ValueError: `wall_velocity` has another shape.
@@ -75,9 +82,9 @@ class WholeCells:
     distance: wp.array | None = None
     moves = False
 
-    def __init__(self, grid: StaggeredGrid, solids: VoxelSolids, wall_velocity: np.ndarray | None = None) -> None:
+    def __init__(self, grid: StaggeredGrid, solids: VoxelSolids, wall_velocity: np.ndarray | None = None, *, open_sides: int = 0) -> None:
         """Allocate the fields."""
-        self.grid, self.solids = grid, solids
+        self.grid, self.solids, self.open_sides = grid, solids, open_sides
         if wall_velocity is not None and np.shape(wall_velocity) != (len(solids.separating), 3):
             raise ValueError(f"wall_velocity has shape {np.shape(wall_velocity)}: expected ({len(solids.separating)}, 3)")
         self.base, self.touch, self.capacity = grid.field(wp.int8), grid.field(wp.uint8), grid.field()
@@ -87,6 +94,7 @@ class WholeCells:
         everywhere.launch(kernels.base_kernel, [solids.index, self.base])
         grid.domain.launch(kernels.touch_kernel, [solids.index, solids.separating, grid.planes, self.touch])
         whole_cell_capacity(grid, self.base, self.capacity)
+        continue_beyond(grid, open_sides, self.capacity)
         if wall_velocity is not None:
             walls = wp.array(np.asarray(wall_velocity, dtype=np.float32), dtype=wp.vec3, device=grid.device)
             for axis, field in enumerate(self.velocity):
@@ -111,6 +119,10 @@ class WholeCells:
         self._stopped.zero_()
         advect(self.grid, fields, self._room, dt, position, self._stopped)
         return int(self._stopped.numpy()[0]), 0, 0
+
+    def displace(self, fields: Faces, position: wp.array) -> None:
+        """Move particles by a displacement [m], never into a SOLID cell."""
+        advect(self.grid, fields, self._room, 1.0, position, self._stopped)
 
     def place(self, time: float) -> None:
         """Do nothing: the cells stay."""

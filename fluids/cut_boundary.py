@@ -28,7 +28,7 @@ class CutBoundary:
 
     def __init__(self, grid: StaggeredGrid, cut: CutCells) -> None:
         """Allocate the fields."""
-        self.grid, self.cut, self.moves = grid, cut, cut.moves
+        self.grid, self.cut, self.moves, self.open_sides = grid, cut, cut.moves, cut.open_sides
         self.base, self.open, self.capacity, self.distance = cut.base, cut.open, cut.capacity, cut.distance
         self.velocity: Faces = cut.velocity or []
         self.touch = grid.field(wp.uint8)
@@ -62,11 +62,16 @@ class CutBoundary:
             wp.launch(
                 kernels.larger_kernel, self.grid.size, [self.cut.distance.flatten(), self._reachable.flatten()], device=self.grid.device
             )
-        advect_with_distance(self.grid, fields, self._reachable, dt, position, self._counts[0:1])
+        sides = self.open_sides
+        advect_with_distance(self.grid, fields, self._reachable, dt, position, self._counts[0:1], open_sides=sides)
         if self.moves:
-            push_out(self.grid, self.cut.distance, position, self._counts[1:2], self._counts[2:3])
+            push_out(self.grid, self.cut.distance, position, self._counts[1:2], self._counts[2:3], open_sides=sides)
         met, pushed, stuck = (int(n) for n in self._counts.numpy())
         return met, pushed, stuck
+
+    def displace(self, fields: Faces, position: wp.array) -> None:
+        """Move particles by a displacement [m] among the solids where they are now."""
+        advect_with_distance(self.grid, fields, self.cut.distance, 1.0, position, self._counts[0:1], open_sides=self.open_sides)
 
     def place(self, time: float) -> None:
         """Put the solids where they are at `time` [s]."""

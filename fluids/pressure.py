@@ -47,7 +47,8 @@ class PressureProjection:
 
     is the net outflow after u = u* - (x_right - x_left) / theta. FLUID cells with a face that is not open on a separating wall have
     0 <= x complementary to y >= 0, the others y = 0. Whole cells have a = 0 or 1, a surface on the cells' faces theta = 1: without
-    solids that cut cells the matrix keeps unit weights, and the surface adds a_f (1 / theta_f - 1) to the diagonal.
+    solids that cut cells the matrix keeps unit weights, and the surface adds a_f (1 / theta_f - 1) to the diagonal. Beyond an open side of
+    the domain lies AIR that the operator does not have: its faces add a_f / theta_f.
 
     Args:
         grid: the grid.
@@ -84,7 +85,7 @@ class PressureProjection:
         wp.copy(self.kind, boundary.base)
         self._b, self._lower, self._start = (grid.field(wp.float64) for _ in range(3))
         self._lower.fill_(-np.inf)
-        self._shift = grid.field() if phi is not None else None
+        self._shift = grid.field() if phi is not None or boundary.open_sides else None
         self._sums = wp.zeros((*grid.shape[:2], 2), dtype=wp.float64, device=grid.device)
         self._problem: wl.LCP | None = None  # built when there is liquid: an empty problem is refused
         self._dt = 0.0

@@ -45,7 +45,8 @@ FACE = """
     };
     auto inverse_theta = [&](long long i, long long n) {  // FLUID i, AIR n
         const float inverse = GHOST ? 1.0f - phi[GHOST ? n : 0]/phi[GHOST ? i : 0] : 1.0f;
-        return inverse < (float)(1.0/THETA_MIN) ? inverse : (float)(1.0/THETA_MIN);
+        const float least = inverse > 1.0f ? inverse : 1.0f;  // beyond an open side there is air whatever phi says
+        return least < (float)(1.0/THETA_MIN) ? least : (float)(1.0/THETA_MIN);
     };
     auto outflow = [&](const float* u, const float* v, const float* w, long long i) {
         return passes(u, 0, i + 1, 1) - passes(u, 0, i, 1) + passes(v, 1, i + s2, s2) - passes(v, 1, i, s2)
@@ -64,14 +65,17 @@ PREPARE = """
         lower[i] = fluid ? bound : -INFINITY;
         start[i] = fluid ? (x < bound ? bound : x) : 0.0;
     }
-    if (GHOST) {  // a FLUID cell that sees the air nearer than a cell away: what its diagonal has more
+    // What the diagonal of a FLUID cell has more than the operator knows: air nearer than a cell away, and the air beyond open sides.
+    if (shift_.data) {
         float* shift = shift_.data + row;
-        auto nearer = [&](int axis, long long face, long long s, long long i, long long n) {
-            return kind[n] == AIR ? fraction(axis, face, s)*(inverse_theta(i, n) - 1.0f) : 0.0f;
+        const int nx = kind_.shape[2] - 2, ny = kind_.shape[1] - 2, nz = kind_.shape[0] - 2;
+        auto nearer = [&](int axis, long long face, long long s, long long i, long long n, bool side) {
+            return kind[n] == AIR ? fraction(axis, face, s)*(inverse_theta(i, n) - (side ? 0.0f : 1.0f)) : 0.0f;
         };
         SIMD for (int i = first; i < last_cell; ++i) {
-            const float more = nearer(0, i + 1, 1, i, i + 1) + nearer(0, i, 1, i, i - 1) + nearer(1, i + s2, s2, i, i + s2)
-                + nearer(1, i, s2, i, i - s2) + nearer(2, i + sz, sz, i, i + sz) + nearer(2, i, sz, i, i - sz);
+            const float more = nearer(0, i + 1, 1, i, i + 1, i == nx) + nearer(0, i, 1, i, i - 1, i == 1)
+                + nearer(1, i + s2, s2, i, i + s2, j == ny) + nearer(1, i, s2, i, i - s2, j == 1)
+                + nearer(2, i + sz, sz, i, i + sz, k == nz) + nearer(2, i, sz, i, i - sz, k == 1);
             shift[i] = kind[i] == FLUID ? more : 0.0f;
         }
     }
@@ -86,7 +90,7 @@ SUBTRACT = """
         const int here = kind[i], below = kind[i - s], wet = (here == FLUID) | (below == FLUID);
         const float open = fraction(axis, i, s);
         const float inverse = !GHOST ? 1.0f : (here == AIR ? inverse_theta(i - s, i) : (below == AIR ? inverse_theta(i, i - s) : 1.0f));
-        const int projected = wet & (open > 0.0f);
+        const int projected = wet & (open > 0.0f) & (here != SOLID) & (below != SOLID);  // a source's cells are SOLID, their faces open
         field[i] -= projected ? (float)(x[i] - x[i - s])*inverse : 0.0f;
         const int hidden = CUT ? 0 : (here == SOLID) & (below == SOLID);
         known[i] = projected ? 1 : (hidden ? -1 : 0);

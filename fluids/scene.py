@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from typing import ClassVar, Literal
 
+import numpy as np
 from pydantic import Field
 
 from warp_lcp.driver.scene import Complaint, Liquid, Scene, Table
+from warp_lcp.driver.shapes import Drain, Source
 
 # Measured at 96^3 as the growth of a process on the CPU, first step included.
 BYTES_A_CELL = 128  # fields of the grid and of the pressure solve
@@ -33,6 +35,14 @@ class Pressure(Table):
     smoothing: int = Field(default=0, ge=0, le=8, description="binomial passes over the level set of a ghost-fluid surface")
 
 
+class Reseed(Table):
+    """[particles.reseed]: evens out particles deep in the liquid; off unless the table is there."""
+
+    every: int = Field(default=5, ge=1, description="steps from one time to the next")
+    min: int | None = Field(default=None, ge=1, description="particles in a cell, fewer are filled up; 3/8 of those at rest unless given")
+    max: int | None = Field(default=None, ge=1, description="particles in a cell, more are handed on; twice those at rest unless given")
+
+
 class ParticleSettings(Table):
     """[particles]: how the liquid is sampled and how its velocity moves between particles and grid."""
 
@@ -41,6 +51,22 @@ class ParticleSettings(Table):
     flip_ratio: float = Field(default=0.95, ge=0, le=1, description="the share of FLIP when transfer is flip; the rest is PIC")
     jitter: float = Field(default=0.25, ge=0, le=1, description="random displacement at the start, a fraction of the particles' distance")
     seed: int = Field(default=2015, ge=0, description="of the random displacements")
+    reseed: Reseed | None = None
+
+    def reseed_range(self, dimension: int) -> tuple[int, int]:
+        """Return the fewest and the most particles of a cell that reseeding leaves alone."""
+        at_rest, given = self.per_axis**dimension, self.reseed or Reseed()
+        return given.min or math.ceil(0.375 * at_rest), given.max or 2 * at_rest
+
+
+class DensityCorrectionSettings(Table):
+    """[density_correction]: moves particles apart where they have come too close; off unless the table is there."""
+
+    every: int = Field(default=1, ge=1, description="steps from one correction to the next")
+    tolerance: float = Field(default=1e-2, gt=0, lt=1, description="the relative residual to reach")
+    max_density: float | None = Field(
+        default=None, gt=0, le=2, description="of a cell, in units of the density at rest; 1 + 0.1 / particles.per_axis unless given"
+    )
 
 
 class LiquidScene(Scene):
@@ -48,16 +74,45 @@ class LiquidScene(Scene):
 
     pressure: Pressure = Field(default_factory=Pressure)
     particles: ParticleSettings = Field(default_factory=ParticleSettings)
-    liquid: list[Liquid] = Field(min_length=1)
+    density_correction: DensityCorrectionSettings | None = None
+    liquid: list[Liquid] = Field(default_factory=list)
+    source: list[Source] = Field(default_factory=list)
+    drain: list[Drain] = Field(default_factory=list)
 
     def complaints(self) -> list[Complaint]:
         """Return what is wrong across keys."""
-        return super().complaints() + self.shape_complaints("liquid", self.liquid, inside=True)
+        found = [] if self.liquid or self.source else [Complaint(("liquid",), None, "is missing, and there is no [[source]] either")]
+        for key, shapes in (("liquid", self.liquid), ("source", self.source), ("drain", self.drain)):
+            found += self.shape_complaints(key, shapes, inside=True)
+        return super().complaints() + found + self._reseed_complaints()
+
+    def _reseed_complaints(self) -> list[Complaint]:
+        least, most = self.particles.reseed_range(self.dimension)
+        at_rest = self.particles.per_axis**self.dimension
+        if self.particles.reseed is None or least <= at_rest <= most:
+            return []
+        key, value, word = ("min", least, "most") if least > at_rest else ("max", most, "least")
+        message = f"must be at {word} the {at_rest} particles of a cell at rest"
+        return [Complaint(("particles", "reseed", key), value, message)]
 
     def particle_estimate(self) -> int:
-        """Return about how many particles the scene starts with, at most: meshes and slanted shapes count as the boxes around them."""
-        volume = min(sum(self.enclosed_volume(liquid) for liquid in self.liquid), math.prod(self.domain.size))
+        """Return about how many particles the scene has at most: meshes and slanted shapes count as the boxes around them.
+
+        Sources may fill the domain; whether they do, and what leaves it, is not known before.
+        """
+        let_in = sum(self._source_volume(source) for source in self.source)
+        volume = min(sum(self.enclosed_volume(liquid) for liquid in self.liquid) + let_in, math.prod(self.domain.size))
         return round(volume / self.spacing**self.dimension * self.particles.per_axis**self.dimension)
+
+    def _source_volume(self, source: Source) -> float:
+        """Return an upper bound of what a source holds and lets in [m^3; m^2 in 2-D]."""
+        size = np.array(self.domain.size)
+        bounds = source.bounds(self.dimension)
+        low, high = (np.zeros_like(size), size) if bounds is None else (corner[: self.dimension] for corner in bounds)
+        sides = np.maximum(np.minimum(high, size) - np.maximum(low, 0.0), 0.0)
+        seconds = max(min(source.stop or math.inf, self.time.duration) - source.start, 0.0)
+        areas = np.array([np.delete(sides, axis).prod() for axis in range(self.dimension)])
+        return float(sides.prod() + areas @ np.abs(source.velocity) * seconds)
 
     def plan(self) -> list[tuple[str, str]]:
         """Return what a run would do."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,22 +11,23 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from fluids.boundary import Boundary, WholeCells
-from fluids.cut_boundary import CutBoundary
+from fluids.assembly import make_boundary, make_outlets, make_particles, make_sources
+from fluids.boundary import Boundary
+from fluids.density_correction import DensityCorrection
 from fluids.gravity import accelerate
+from fluids.outlets import Outlets
 from fluids.pressure import PressureProjection, Projection
 from fluids.pressure_kernels import RELEASED, TOUCHES_NOTHING
+from fluids.reseeding import Reseeding
 from fluids.scene import LiquidScene
+from fluids.sources import Sources
 from fluids.surface import FreeSurface, GhostFluidSurface, WholeCellSurface
 from warp_lcp.driver.profile import NoStopwatch, Stopwatch
 from warp_lcp.driver.scene import Scene, Solver
 from warp_lcp.driver.simulator import Cells, Points, SimulationFailed, StepFailed
-from warp_lcp.grid.cut_cells import CutCells
-from warp_lcp.grid.particles import MARGIN, Particles, ParticleTotals, seed
-from warp_lcp.grid.solids import Geometry
+from warp_lcp.grid.particles import MARGIN, Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
-from warp_lcp.grid.voxelize import PlacedSolid, inside, placement_notes, voxelize
 
 COLUMNS = (
     "particles",
@@ -48,6 +49,9 @@ COLUMNS = (
 )
 
 
+CORRECTION_COLUMNS = ("density_status", "density_iterations", "max_density")
+
+
 class LiquidSimulation:
     """A liquid in progress; implements `warp_lcp.driver.simulator.Simulation`.
 
@@ -56,6 +60,8 @@ class LiquidSimulation:
         grid: its grid.
         boundary: its solids and the domain's walls.
         particles: the liquid at the start.
+        sources: where liquid comes in.
+        outlets: where it leaves.
         notes: facts for the start of a run.
 
     Attributes:
@@ -74,10 +80,13 @@ class LiquidSimulation:
         boundary: Boundary,
         particles: Particles,
         *,
+        sources: Sources | None = None,
+        outlets: Outlets | None = None,
         notes: list[str] | None = None,
     ) -> None:
         """Allocate the fields and find the liquid's cells."""
         self.scene, self.grid, self.boundary, self.particles = scene, grid, boundary, particles
+        self.sources, self.outlets = sources, outlets
         self.time, self.step_count = 0.0, 0
         self.watch: Stopwatch = NoStopwatch()
         self._notes = list(notes or [])
@@ -90,7 +99,10 @@ class LiquidSimulation:
         self.projection = PressureProjection(
             grid, boundary, _method(settings), tolerance=settings.tolerance, max_iterations=settings.max_iterations, phi=self.surface.phi
         )
+        self.reseeding, self.correction = _reseeding(scene, grid, boundary), _correction(scene, grid, boundary)
         self.layers = math.ceil(scene.time.cfl) + 2
+        if sources is not None:
+            sources.emit(particles, None, self.time)
         particles.sort()
         self.surface.mark(particles, grid.everywhere, self.projection.kind)
         self.projection.show()
@@ -98,14 +110,15 @@ class LiquidSimulation:
     def stable_dt(self) -> float:
         """Return CFL dx / (v_max + sqrt(CFL g dx)) [s]; v_max is of the liquid and of solids in the time to come.
 
-        Gravity's own speed counts, so that a liquid at rest does not take off.
+        Gravity's own speed counts, so that a liquid at rest does not take off. A step ends when a source or drain starts or stops.
         """
         cfl, dx = self.scene.time.cfl, self.grid.spacing
         with self.watch.stage("diagnostics", self.particles.position, self.particles.velocity):
             totals = self.particles.totals()
         solids = self.boundary.top_speed(self.time, self.scene.time.dt_max)
         speed = max(totals.max_speed, solids) + math.sqrt(cfl * float(np.linalg.norm(self.gravity)) * dx)
-        return cfl * dx / speed if speed > 0.0 else math.inf
+        event = min((part.next_event(self.time) for part in (self.sources, self.outlets) if part is not None), default=math.inf)
+        return min(cfl * dx / speed if speed > 0.0 else math.inf, event - self.time)
 
     def step(self, dt: float) -> dict[str, float | int | str | None]:
         """Advance by dt [s].
@@ -131,6 +144,8 @@ class LiquidSimulation:
         p, wall = self.projection, self.boundary
         with watch.stage("extrapolation", *self.velocity, *self.weights, *p.known, p.kind, p.contact, *wall.open):
             wall.extend(window, self.velocity, self.weights, p.known, p.kind, p.contact, self.layers)
+            if self.sources is not None:
+                self.sources.hold(self.velocity, [])
         with watch.stage("grid-to-particles", *particles.arrays().values(), *self.velocity):
             flip = self.scene.particles.flip_ratio if self._saved else 0.0
             faces_to_particles(
@@ -138,10 +153,14 @@ class LiquidSimulation:
             )
         with watch.stage("advection", particles.position, *self.velocity):
             moved = wall.advect(self.velocity, dt, self.time + dt, particles.position)
+        exchanged = self._exchange(dt)
         after = self._checked_totals("after")
+        row = self._rearrange(after)
+        if row:
+            after = self._checked_totals("after the density correction of")
         self.time += dt
         self.step_count += 1
-        return self._row(dt, after, projected, volume, moved)
+        return self._row(dt, after, projected, volume, moved, row | exchanged)
 
     def columns(self) -> tuple[str, ...]:
         """Return the names of the log's columns.
@@ -150,9 +169,16 @@ class LiquidSimulation:
         origin. solve_residual is relative to the right-hand side's, which in free fall is rounding noise that is not iterated on: it may
         then be up to 1. volume counts FLUID cells, or lies inside the surface where that is finer than cells. active: wall cells that let
         go; max_divergence [1/s]: of the other FLUID cells after the projection; stopped: particles that met a wall; pushed: those that a
-        moving solid swept along; stuck: those inside solids that found no way out, between solids that close, say.
+        moving solid swept along; stuck: those inside solids that found no way out, between solids that close, say. max_density: before the
+        density correction of the step, of liquid at rest 1; reseeded: particles that went to a neighboring cell; emitted, drained, departed: those
+        that sources have added in the step, that drains have swallowed, and that have left through open sides.
         """
-        return (*COLUMNS, "pushed", "stuck") if self.boundary.moves else COLUMNS
+        columns = (*COLUMNS, "pushed", "stuck") if self.boundary.moves else COLUMNS
+        if self.reseeding is not None:
+            columns = (*columns, "reseeded")
+        columns = (*columns, *CORRECTION_COLUMNS) if self.correction is not None else columns
+        exchanged = {"emitted": self.scene.source, "drained": self.scene.drain, "departed": self.scene.domain.open}
+        return (*columns, *(name for name, used in exchanged.items() if used))
 
     def frame(self) -> list[Points | Cells]:
         """Return the particles (velocity, speed) and the liquid's cells of the last solve (pressure [Pa], wall and released flags)."""
@@ -172,7 +198,8 @@ class LiquidSimulation:
         """Return what `restore` needs to continue bit for bit on the CPU."""
         particles = {name: array.numpy().copy() for name, array in self.particles.arrays().items()}
         clock = {"time": np.array(self.time), "step_count": np.array(self.step_count), "signature": self._signature()}
-        return clock | particles | self.projection.state()
+        correction = {"density_correction": self.correction.x.numpy().copy()} if self.correction is not None else {}
+        return clock | particles | self.projection.state() | correction
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from `state`.
@@ -188,6 +215,8 @@ class LiquidSimulation:
             raise ValueError("the state's grid, spacing, number of particles a cell or transfer differ from this scene's")
         for name, value in expected.items():
             given = np.asarray(state[name])
+            if name in self.particles.arrays() and (self.sources or self.outlets):
+                value = np.empty((len(state["position"]), 3), dtype=value.dtype)  # their number changes
             if given.shape != value.shape or given.dtype != value.dtype:
                 found, wanted = f"{given.dtype}{given.shape}", f"{value.dtype}{value.shape}"
                 raise ValueError(f"the state's {name} is {found}: this scene has {wanted}")
@@ -195,9 +224,10 @@ class LiquidSimulation:
                 raise ValueError(f"the state's {name} holds values that are not finite")
         if not self.boundary.moves and not np.array_equal(state["cells"] == wl.SOLID, expected["cells"] == wl.SOLID):
             raise ValueError("the state's solids are not this scene's")
-        for name, array in self.particles.arrays().items():
-            array.assign(state[name])
+        self.particles.assign(state)
         self.projection.restore({name: np.asarray(state[name]) for name in ("pressure", "pressure_dt", "cells", "contact")})
+        if self.correction is not None:
+            self.correction.x.assign(state["density_correction"])
         self.time, self.step_count = float(state["time"]), int(state["step_count"])
         self.boundary.place(self.time)
 
@@ -231,25 +261,59 @@ class LiquidSimulation:
             self.surface.complete(window, self.velocity, self.weights, projection.known)
         with watch.stage("pressure set-up", *self.velocity, *projection.fields()):
             self.boundary.begin_step(self.time, dt)
+            if self.sources is not None:
+                self.sources.supply(self.time, self.velocity, projection.kind)
             unknowns = projection.prepare(self.velocity, dt)
         if unknowns == 0:
-            return projection.leave(dt)
+            return self._held(projection.leave(dt))
         with watch.stage("pressure solve", *projection.fields()):
             result, criteria = projection.solve(speed, unknowns)
         if not result:
             if result.status is wl.SolveStatus.NON_FINITE:
                 self._explain_not_finite()
-            if result.status is wl.SolveStatus.INFEASIBLE and self.boundary.velocity:  # speeds that do not fit: no dt helps
+            if result.status is wl.SolveStatus.INFEASIBLE and (self.boundary.velocity or self.sources):  # no dt helps
                 raise SimulationFailed(
-                    f"step {self.step_count}: liquid fills a closed space, and walls move so that its volume would have to change; leave "
-                    'air in it, or give the wall that moves away from it wall = "separating"'
+                    f"step {self.step_count}: liquid fills a closed space, and walls move or sources run so that its volume would have "
+                    'to change; leave air in it, or give the wall that moves away from it wall = "separating"'
                 )
             raise StepFailed(
                 f"step {self.step_count}: the pressure solve ended with {result.status.name} after {result.iterations} iterations at a "
                 f"relative residual of {result.relative_residual:.2e} (tolerance {self.projection.tolerance:.1e}): {result.status.value}"
             )
         with watch.stage("projection", *self.velocity, *projection.known, projection.pressure, projection.kind, projection.contact):
-            return projection.project(self.velocity, dt, window, result, criteria, unknowns)
+            return self._held(projection.project(self.velocity, dt, window, result, criteria, unknowns))
+
+    def _held(self, projected: Projection) -> Projection:
+        """Give the sources' faces their velocity back, and show their cells as liquid."""
+        if self.sources is not None:
+            self.sources.hold(self.velocity, self.projection.known, self.projection.shown)
+        return projected
+
+    def _rearrange(self, totals: ParticleTotals) -> dict[str, float | int | str | None]:
+        """Even out the particles and move them apart, if the scene asks for it and it is time; return what the log says of it."""
+        particles = self.particles
+        row: dict[str, float | int | str | None] = {}
+        if self.reseeding is not None and self.step_count % self.reseeding.every == 0:
+            with self.watch.stage("reseeding", *particles.arrays().values()):
+                row["reseeded"] = self.reseeding.apply(particles, self._window(totals), self.step_count)
+        correction = self.correction
+        if correction is not None and self.step_count % correction.every == 0:
+            with self.watch.stage("density correction", particles.position, correction.density, correction.x, *correction.displacement):
+                done = correction.apply(particles, self._window(totals))
+            row["density_status"] = done.result.status.name if done.result is not None else "NOTHING_TO_DO"
+            row["density_iterations"] = done.result.iterations if done.result is not None else 0
+            row["max_density"] = done.max_density
+        return row
+
+    def _exchange(self, dt: float) -> dict[str, float | int | str | None]:
+        """Remove the particles that have left in the step and add those that have come in; return what the log says of it."""
+        drained = departed = emitted = 0
+        with self.watch.stage("sources and outlets", self.particles.position):
+            if self.outlets is not None:
+                drained, departed = self.outlets.apply(self.particles, self.time + dt)
+            if self.sources is not None:
+                emitted = self.sources.emit(self.particles, self.time, self.time + dt)
+        return {"emitted": emitted, "drained": drained, "departed": departed}
 
     def _volume(self, projected: Projection) -> float:
         """Return the liquid's volume [m^3; m^2 in 2-D] at the start of the step, before solids move."""
@@ -296,7 +360,13 @@ class LiquidSimulation:
         return int(i) - 1, int(j) - 1, int(k) - 1
 
     def _row(
-        self, dt: float, totals: ParticleTotals, projected: Projection, volume: float, moved: tuple[int, int, int]
+        self,
+        dt: float,
+        totals: ParticleTotals,
+        projected: Projection,
+        volume: float,
+        moved: tuple[int, int, int],
+        corrected: dict[str, float | int | str | None],
     ) -> dict[str, float | int | str | None]:
         mass = totals.count * self.particle_mass
         result = projected.result
@@ -314,6 +384,7 @@ class LiquidSimulation:
             "stopped": moved[0],
             "pushed": moved[1],
             "stuck": moved[2],
+            **corrected,
         }
         if result is not None:
             row |= {
@@ -337,68 +408,36 @@ def _method(settings: Solver) -> Any:
     return wl.METHODS[settings.method](precision=settings.precision)
 
 
+def _reseeding(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary) -> Reseeding | None:
+    """Return what evens out the particles if a scene asks for it."""
+    settings = scene.particles.reseed
+    if settings is None:
+        return None
+    at_rest = scene.particles.per_axis**grid.dimension
+    least, most = scene.particles.reseed_range(grid.dimension)
+    return Reseeding(grid, boundary, least=least, most=most, particles_a_cell=at_rest, every=settings.every)
+
+
+def _correction(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary) -> DensityCorrection | None:
+    """Return the density correction if a scene asks for one."""
+    settings = scene.density_correction
+    if settings is None:
+        return None
+    count = scene.particles.per_axis
+    most = settings.max_density or 1.0 + 0.1 / count
+    solver = wl.ProjectedMultigrid(precision=scene.solver.precision)
+    return DensityCorrection(
+        grid, boundary, solver, particles_a_cell=count**grid.dimension, max_density=most, every=settings.every,
+        tolerance=settings.tolerance,
+    )  # fmt: skip
+
+
 def _surface(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary) -> FreeSurface:
     """Return the free surface that a scene asks for."""
     count = scene.particles.per_axis**grid.dimension
     if scene.pressure.surface == "ghost-fluid":
         return GhostFluidSurface(grid, boundary, particles_a_cell=count, smoothing=scene.pressure.smoothing)
     return WholeCellSurface(grid, boundary, particles_a_cell=count)
-
-
-def _region(geometry: Geometry, boundary: Boundary, device: wp.Device) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function that tells which points lie in a geometry and outside solids."""
-
-    def holds(points: np.ndarray) -> np.ndarray:
-        result = inside([geometry], points, device=device)
-        result[result] = boundary.admits(points[result])
-        return result
-
-    return holds
-
-
-def _boundary(scene: LiquidScene, grid: StaggeredGrid, folder: Path, wall_velocity: np.ndarray | None) -> tuple[Boundary, tuple[str, ...]]:
-    """Return solids and walls as the scene asks for them, and warnings."""
-    placed = [
-        PlacedSolid(
-            geometry=solid.to_geometry(folder, scene.dimension),
-            separating=(solid.wall or scene.domain.wall) == "separating",
-            name=f"solid[{number}] ({solid.shape})",
-            motion=solid.motion.to_motion(scene.dimension) if solid.motion else None,
-        )
-        for number, solid in enumerate(scene.solid)
-    ]
-    separating = scene.domain.wall == "separating"
-    if scene.domain.solids == "cut-cell":
-        if wall_velocity is not None:
-            raise ValueError('wall_velocity: only for solids = "voxel"; solids that cut cells have a motion')
-        cut = CutCells(grid, placed, wall_separating=separating)
-        if not cut.whole_cells:
-            return CutBoundary(grid, cut), cut.notes
-    solids = voxelize(grid.counts, grid.spacing, grid.dimension, placed, wall_separating=separating, device=grid.device)
-    return WholeCells(grid, solids, wall_velocity), solids.notes
-
-
-def _seed(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, folder: Path) -> tuple[Particles, list[str]]:
-    """Return the particles of all liquids, and warnings."""
-    geometries = [liquid.to_geometry(folder, scene.dimension) for liquid in scene.liquid]
-    regions = [_region(geometry, boundary, grid.device) for geometry in geometries]
-    notes: list[str] = []
-    for number, (liquid, geometry) in enumerate(zip(scene.liquid, geometries, strict=True)):
-        notes += placement_notes(geometry, f"liquid[{number}] ({liquid.shape})", grid.counts, grid.spacing, grid.dimension)
-    settings = scene.particles
-    open_cells = grid.interior(boundary.base.numpy()) != wl.SOLID
-    position, owner = seed(
-        grid, regions, open_cells, per_axis=settings.per_axis, jitter=settings.jitter, random_seed=settings.seed
-    )  # fmt: skip
-    counts = np.bincount(owner, minlength=len(geometries))
-    for number, count in enumerate(counts):
-        if count == 0:
-            raise ValueError(
-                f"liquid[{number}] ({scene.liquid[number].shape}) holds no particle: it is too small for cells of {grid.spacing:.4g} m, or "
-                "lies in solids, outside the domain or in an earlier liquid"
-            )
-    start = np.array([[*(liquid.velocity or [0.0, 0.0]), 0.0][:3] for liquid in scene.liquid], dtype=np.float32)
-    return Particles(grid, position, start[owner], affine=settings.transfer == "apic"), notes
 
 
 class FluidsSimulator:
@@ -424,6 +463,7 @@ class FluidsSimulator:
         if not isinstance(scene, LiquidScene):
             raise ValueError("scene.simulator: fluids needs a scene of liquid")
         grid = StaggeredGrid(scene.cell_counts, scene.spacing, scene.dimension, device)
-        boundary, warnings = _boundary(scene, grid, folder, wall_velocity)
-        particles, notes = _seed(scene, grid, boundary, folder)
-        return LiquidSimulation(scene, grid, boundary, particles, notes=[*warnings, *notes])
+        boundary, warnings = make_boundary(scene, grid, folder, wall_velocity)
+        particles, notes = make_particles(scene, grid, boundary, folder)
+        sources, outlets = make_sources(scene, grid, boundary, folder), make_outlets(scene, grid, folder)
+        return LiquidSimulation(scene, grid, boundary, particles, sources=sources, outlets=outlets, notes=[*warnings, *notes])

@@ -32,13 +32,13 @@ def mark_inside_kernel(
     most: float,
     kind: wp.array3d(dtype=wp.int8),
 ):
-    """An open cell below the free surface is FLUID, if the share of its kernel that is open is no more than `most`."""
+    """An open cell of the domain below the free surface is FLUID, if the share of its kernel that is open is no more than `most`."""
     plane, row, chunk = wp.tid()
     k = cells.k + plane
     j = cells.j + row
     first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        if kind[k, j, i] == _AIR:
+    for i in range(wp.max(first, 1), wp.min(wp.min(first + cells.grain, cells.end), kind.shape[2] - 1)):
+        if kind[k, j, i] == _AIR and k > 0 and j > 0 and k + 1 < kind.shape[0] and j + 1 < kind.shape[1]:
             if phi[k, j, i] < 0.0 and capacity[k, j, i] <= most:
                 kind[k, j, i] = _FLUID
 

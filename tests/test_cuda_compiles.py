@@ -12,6 +12,7 @@ import fluids
 import warp_lcp as wl
 from warp_lcp.grid import transfer_kernels
 from warp_lcp.multigrid import CycleSettings
+from warp_lcp.solvers.mprgp import MPRGP
 from warp_lcp.solvers.principal_system import principal_system
 
 ONE_LAUNCH = [CycleSettings(one_launch_cpu=4096), CycleSettings(one_launch_cpu=4096, coarsest_cpu=8)]  # as GPUs cycle
@@ -84,6 +85,19 @@ def use_sweeping_kernels():
         assert wl.solve(wl.LCP(wl.DenseOperator(np.eye(2), device="cpu", dtype=dtype), -np.ones(2), *friction), wl.ProjectedSOR())
 
 
+def use_gradient_projection_kernels():
+    """Instantiate the kernels of MPRGP on all operators."""
+    T = scipy.sparse.diags_array([-1.0, 3.0, -1.0], offsets=[-1, 0, 1], shape=(100, 100)).tocsr()
+    cells = np.array([[0, 1, 1, 1]])
+    for dtype in (wp.float32, wp.float64):
+        operators = [wl.DenseOperator(T.toarray(), device="cpu", dtype=dtype), wl.SparseOperator(T, device="cpu", dtype=dtype)]
+        for faces in ({}, {"face_x": 2.0}, {"face_x": np.ones((1, 5))}):
+            operators.append(wl.GridPoisson(cells, device="cpu", dtype=dtype, **faces))
+        for A in operators:
+            for precision in ("mixed", "double"):
+                assert wl.solve(wl.LCP(A, -np.ones(A.shape)), MPRGP(precision=precision))
+
+
 def test_all_kernels_compile_for_sm_80_and_sm_90(tmp_path):
     for package in (wl, fluids):
         for found in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
@@ -91,6 +105,7 @@ def test_all_kernels_compile_for_sm_80_and_sm_90(tmp_path):
     use_every_kernel()
     use_sparse_kernels()
     use_sweeping_kernels()
+    use_gradient_projection_kernels()
     from warp._src.context import user_modules
 
     names = sorted(name for name, module in user_modules.items() if name.startswith(("warp_lcp", "fluids")) and module.kernels)

@@ -10,7 +10,7 @@ from pathlib import Path
 from benchmarks.machine import machine
 from benchmarks.record import Results
 from benchmarks.timing import Options
-from benchmarks.validation import ceiling, dam_break, rest, slope, sloshing, transfers
+from benchmarks.validation import ceiling, dam_break, rest, slope, sloshing, transfers, volume
 from benchmarks.validation.finding import Trial, table
 
 TITLE = "Liquids against known answers"
@@ -21,6 +21,7 @@ CHECKS = {
     "dam break": dam_break,
     "sloshing": sloshing,
     "rest": rest,
+    "volume": volume,
 }
 
 

@@ -37,8 +37,34 @@ def test_objects_need_a_pickle_and_are_refused(folder):
 def test_pruning_keeps_the_newest(folder):
     for step in (14, 16, 1_000_000):
         folder.write(Checkpoint(step, 0.0, STATE))
-    folder.prune()
-    assert folder.steps() == [1_000_000, 16]
+    folder.prune(3)
+    assert folder.steps() == [1_000_000, 16, 14]
+    folder.prune(1)
+    assert folder.steps() == [1_000_000]
+
+
+def test_what_is_set_aside_is_neither_read_nor_counted(folder):
+    for step in (14, 16):
+        folder.write(Checkpoint(step, 0.0, STATE))
+    (folder.path(14)).write_text("broken")
+    assert [path.name for path in folder.set_aside(12)] == ["refused_000016.npz", "refused_000014.npz"]
+    assert folder.steps() == [12]
+    assert (folder.folder / "refused_000014.npz").read_text() == "broken"
+    folder.prune(1)
+    assert len(list(folder.folder.iterdir())) == 3
+
+
+def test_the_scene_is_written_with_the_state(tmp_path):
+    keys = {"time.cfl": 2.0, "liquid[0].max": [0.4, 0.4], "solid[0].wall": "free-slip"}
+    folder = CheckpointFolder(tmp_path / "checkpoints", "fingerprint", keys)
+    folder.write(Checkpoint(3, 0.1, STATE))
+    assert folder.read(3).keys == keys
+
+
+def test_a_renamed_checkpoint_is_not_another_step(folder):
+    folder.path(12).rename(folder.path(40))
+    with pytest.raises(CheckpointError, match="holds step 12, renamed"):
+        folder.read(40)
 
 
 def damage(path: Path, how: str) -> None:
@@ -63,7 +89,7 @@ def damage(path: Path, how: str) -> None:
         elif how == "other scene":
             arrays["meta"] = np.array(str(arrays["meta"]).replace("fingerprint", "another"))
         elif how == "other format":
-            arrays["meta"] = np.array(str(arrays["meta"]).replace('"format": 1', '"format": 99'))
+            arrays["meta"] = np.array(str(arrays["meta"]).replace('"format": 2', '"format": 99'))
         np.savez(path, **arrays)
 
 
@@ -78,7 +104,7 @@ def damage(path: Path, how: str) -> None:
         ("foreign key", "holds arrays that no run writes: surprise"),
         ("lost key", "its checksum does not fit"),
         ("other scene", "belongs to another scene"),
-        ("other format", "written in format 99, this version reads format 1"),
+        ("other format", "written in format 99, this version reads format 2"),
     ],
 )
 def test_damage_is_found_and_the_one_before_is_used(folder, how, reason):

@@ -13,6 +13,8 @@ import pytest
 from rich.console import Console
 
 from warp_lcp.driver import frames as frames_module
+from warp_lcp.driver import run as run_module
+from warp_lcp.driver.checkpoint import CheckpointFolder
 from warp_lcp.driver.frames import FrameFolder
 from warp_lcp.driver.profile import NoStopwatch, Profile
 from warp_lcp.driver.progress import Lines
@@ -137,6 +139,40 @@ def test_checkpoints_are_kept_sparingly(scene_file, tmp_path):
     assert names == [f"step_{step:06d}.npz" for step in sorted({last - 4, last, result.steps})]
 
 
+@pytest.mark.parametrize("kept", [1, 2, 6])
+def test_as_many_checkpoints_are_kept_as_the_scene_says(dots, scene_file, tmp_path, kept):
+    most = []
+    dots.before_step = lambda simulation, dt: most.append(len(list(tmp_path.glob("out/checkpoints/step_*.npz"))))
+    result = go(scene_file, tmp_path / "out", f"output.checkpoints_kept={kept}")
+    names = sorted(path.name for path in (tmp_path / "out" / "checkpoints").iterdir())
+    every = [*range(0, result.steps, 4), result.steps]
+    assert names == [f"step_{step:06d}.npz" for step in every[-kept:]]
+    assert max(most) == kept
+    assert most[0] == 1  # a run can be continued from its first step on
+
+
+def test_checkpoints_by_the_clock(dots, scene_file, tmp_path, monkeypatch):
+    """Every third step lasts a minute: with a checkpoint at least every 1.5 minutes there is one after each sixth step."""
+    now = [0.0]
+    monkeypatch.setattr(run_module.clock, "monotonic", lambda: now[0])
+    written = []
+    write = CheckpointFolder.write
+    monkeypatch.setattr(CheckpointFolder, "write", lambda self, checkpoint: (written.append(checkpoint.step), write(self, checkpoint))[1])
+
+    def before_step(simulation: Any, dt: float) -> None:
+        now[0] += 60.0 * (simulation.step_count % 3 == 2)
+
+    dots.before_step = before_step
+    by_clock = ["output.checkpoint_every=0", "output.checkpoint_minutes=1.5"]
+    steps = go(scene_file, tmp_path / "clock", *by_clock, last_frame=4).steps
+    assert steps > 18
+    assert written == sorted({*range(0, steps, 6), steps})
+    written.clear()
+    steps = go(scene_file, tmp_path / "both", "output.checkpoint_every=5", "output.checkpoint_minutes=1.5", last_frame=3).steps
+    assert written[:5] == [0, 5, 9, 10, 15]  # the clock starts anew with each
+    assert written[-1] == steps
+
+
 def test_output_can_be_turned_off(scene_file, tmp_path):
     go(scene_file, tmp_path / "out", "output.particles=false")
     assert not (tmp_path / "out" / "particles.pvd").exists()
@@ -200,8 +236,11 @@ def test_resume_reports_a_broken_checkpoint_and_takes_the_one_before(scene_file,
     observer = Watcher()
     result = go(scene_file, parts, resume=True, observer=observer)
     assert result.resumed_from_step == 8
-    assert len(result.warnings) == 1
+    assert result.warnings == observer.notes == record(parts)["warnings"]
     assert "step_000010.npz: cut short" in observer.notes[0]
+    assert observer.notes[1].startswith("continuing from step 8 instead")
+    assert (parts / "checkpoints" / "refused_000010.npz").is_file()
+    (parts / "checkpoints" / "refused_000010.npz").unlink()
     assert contents(parts) == contents(whole)
 
 
@@ -338,7 +377,7 @@ def test_a_step_that_fails_after_a_frame_did_writes_no_checkpoint(dots, scene_fi
     assert result.status == "failed"
     assert "no at 6" in result.reason
     assert any("No space left" in warning for warning in result.warnings)
-    assert not list(out.glob("checkpoints/*"))
+    assert [path.name for path in out.glob("checkpoints/*")] == ["step_000000.npz"]
 
 
 def test_a_profile_counts_every_stage(scene_file, tmp_path):
@@ -350,7 +389,7 @@ def test_a_profile_counts_every_stage(scene_file, tmp_path):
     assert stages["frames, written"]["calls"] == 11
     assert stages["frames, written"]["beside"]
     assert stages["frames, written"]["bytes"] == sum(path.stat().st_size for path in out.glob("frames/*.vtu"))
-    assert stages["checkpoints"]["calls"] == result.steps // 4 + (result.steps % 4 > 0)
+    assert stages["checkpoints"]["calls"] == 1 + result.steps // 4 + (result.steps % 4 > 0)
     assert stages["checkpoints"]["bytes"] > 0
     assert sum(stage["seconds"] for stage in stages.values() if not stage["beside"]) <= result.seconds
 

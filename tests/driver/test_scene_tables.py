@@ -99,7 +99,6 @@ def test_unknown_keys_suggest(changes, expected):
 @pytest.mark.parametrize(
     ("changes", "path"),
     [
-        ({"density_correction": {"every": 1}}, "density_correction"),
         ({"sand": [BOX]}, "sand"),
         ({"domain.open": ["top"]}, "domain.open"),
         ({"domain.friction": 0.5}, "domain.friction"),

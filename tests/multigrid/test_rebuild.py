@@ -130,3 +130,60 @@ def test_a_solve_leaves_the_hierarchy_of_its_last_free_set(bounds, arrays, devic
         for one, other in zip(found, snapshot(work.hierarchy), strict=True):
             np.testing.assert_array_equal(one, other)
     assert result
+
+
+def scene(rng):
+    """Cells of a box of FLUID that moves and of some more, in rows longer than several spans."""
+    cells = np.zeros((10, 11, 70), dtype=np.int8)
+    low = rng.integers(0, 30)
+    cells[rng.integers(0, 3) :, rng.integers(0, 4) :, low : low + rng.integers(1, 40)] = wl.FLUID
+    cells[rng.integers(0, 10), rng.integers(0, 11), rng.integers(0, 70)] = wl.FLUID
+    cells[rng.integers(0, 10), :, rng.integers(0, 70)] = wl.SOLID
+    return cells
+
+
+@pytest.mark.parametrize("real", [wp.float32, wp.float64])  # float64 corrections have weights of their own
+@pytest.mark.parametrize("arrays", [False, True])
+def test_new_cells_and_weights_rebuild_the_rows_that_they_change(arrays, real, device):
+    """Spans shrink, grow and empty; weights change in place; fields that are not 0 off the new spans would enter the next cycle."""
+    rng = np.random.default_rng(829)
+    padded = (12, 13, 72)
+    faces = {f"face_{a}": wp.array(rng.uniform(0.1, 1, padded), dtype=wp.float32, device=device) for a in "xyz"} if arrays else {}
+    A = wl.GridPoisson(scene(rng), device=device, **faces)
+    partly = Hierarchy(A.stencil, real, bounded=False, settings=SETTINGS)
+    cells = None
+    for step in range(12):
+        if arrays and step % 3 == 1:  # one coefficient, of a face along each axis
+            for face in faces.values():
+                values = face.numpy()
+                values[tuple(rng.integers(1, n - 1) for n in padded)] *= 0.5
+                face.assign(values)
+        if step % 4 != 1 or cells is None:
+            cells = scene(rng)
+        A.update(wp.array(cells, dtype=wp.int8, device=device))
+        partly.refresh()
+        partly.hold(A.stencil.d, stored(A, cells == wl.FLUID))
+        partly.rebuild_changed()
+        fresh = Hierarchy(A.stencil, real, bounded=False, settings=SETTINGS)
+        fresh.hold(A.stencil.d, stored(A, cells == wl.FLUID))
+        fresh.rebuild()
+        for one, other in zip(snapshot(partly), snapshot(fresh), strict=True):
+            np.testing.assert_array_equal(one, other)
+        b = np.where(cells == wl.FLUID, rng.standard_normal(cells.shape), 0.0)
+        for hierarchy in (partly, fresh):
+            wp.copy(hierarchy.finest.b, A.layout.load(b, real))
+            hierarchy.cycle.run()
+        for one, other in zip(partly.levels, fresh.levels, strict=True):
+            np.testing.assert_array_equal(one.x.numpy(), other.x.numpy())
+
+
+def test_new_cells_that_are_the_old_ones_change_no_row(device):
+    rng = np.random.default_rng(831)
+    cells, A = operator((16, 16, 40), (False,) * 3, {}, True, device, rng)
+    hierarchy = Hierarchy(A.stencil, wp.float32, bounded=False, settings=SETTINGS)
+    hierarchy.hold(A.stencil.d, stored(A, cells == wl.FLUID))
+    hierarchy.rebuild_changed()
+    A.update(wp.array(cells.astype(np.int8), device=device))
+    hierarchy.refresh()
+    hierarchy.hold(A.stencil.d, stored(A, cells == wl.FLUID))
+    assert not hierarchy.finest.changed.numpy().any()

@@ -7,7 +7,7 @@ import json
 import re
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,9 @@ import numpy as np
 
 from warp_lcp.driver.atomic import replacing
 
-FORMAT = 1
-KEPT = 2  # checkpoints that stay while a run goes on; the final one is a third
+FORMAT = 2
 CHECKPOINT_FILE = re.compile(r"step_(?P<step>\d{6,})\.npz")
+REFUSED_FILE = re.compile(r"refused_\d{6,}\.npz")  # set aside when a run continued from an earlier one
 STATE = "state/"
 META = "meta"
 
@@ -34,20 +34,29 @@ class Checkpoint:
         step: the number of steps taken.
         time: reached by them [s].
         state: the simulation's arrays.
+        keys: of the scene that led there, with their values; not needed to write one.
     """
 
     step: int
     time: float
     state: Mapping[str, np.ndarray]
+    keys: Mapping[str, Any] = field(default_factory=dict)
 
 
 class CheckpointFolder:
-    """The checkpoints of one run, `step_<number>.npz`. `fingerprint` tells its scene from others."""
+    """The checkpoints of one run, `step_<number>.npz`.
 
-    def __init__(self, folder: Path, fingerprint: str) -> None:
-        """Look at a folder; it is made when the first checkpoint is written."""
+    Args:
+        folder: made when the first checkpoint is written.
+        fingerprint: tells the run's scene from others, whatever may change when it goes on.
+        keys: of the scene, with their values, written with each checkpoint.
+    """
+
+    def __init__(self, folder: Path, fingerprint: str, keys: Mapping[str, Any] | None = None) -> None:
+        """Look at a folder."""
         self.folder = folder
         self.fingerprint = fingerprint
+        self.keys = dict(keys or {})
 
     def path(self, step: int) -> Path:
         """Return the file of a step."""
@@ -74,6 +83,7 @@ class CheckpointFolder:
             "scene": self.fingerprint,
             "step": checkpoint.step,
             "time": checkpoint.time,
+            "keys": self.keys,
             "checksum": _checksum(checkpoint.state),
         }
         arrays: dict[str, Any] = {META: np.array(json.dumps(meta))}
@@ -82,10 +92,22 @@ class CheckpointFolder:
             np.savez(file, **arrays)
         return self.path(checkpoint.step)
 
-    def prune(self) -> None:
-        """Delete all but the newest."""
-        for step in self.steps()[KEPT:]:
+    def prune(self, kept: int) -> None:
+        """Delete all but the newest `kept`.
+
+        Raises:
+            OSError: a file cannot be deleted.
+        """
+        for step in self.steps()[kept:]:
             self.path(step).unlink()
+
+    def set_aside(self, after: int) -> list[Path]:
+        """Rename what is newer than a step, so that it is neither continued from nor counted; return the new names.
+
+        Raises:
+            OSError: a file cannot be renamed.
+        """
+        return [self.path(step).replace(self.folder / f"refused_{step:06d}.npz") for step in self.steps() if step > after]
 
     def read(self, step: int) -> Checkpoint:
         """Read and verify a checkpoint.
@@ -99,7 +121,7 @@ class CheckpointFolder:
                 arrays = {name: file[name] for name in file.files}
             meta = json.loads(str(arrays.pop(META)))
             found = (meta["format"], meta["scene"], meta["checksum"])
-            step, time = int(meta["step"]), float(meta["time"])
+            written, time, keys = int(meta["step"]), float(meta["time"]), dict(meta.get("keys", {}))
         except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
             raise CheckpointError(f"{path}: cut short, damaged or not a checkpoint ({error})") from error
         if found[0] != FORMAT:
@@ -112,7 +134,9 @@ class CheckpointFolder:
         state = {name.removeprefix(STATE): array for name, array in arrays.items()}
         if found[2] != _checksum(state):
             raise CheckpointError(f"{path}: damaged (its checksum does not fit)")
-        return Checkpoint(step, time, state)
+        if written != step:
+            raise CheckpointError(f"{path}: holds step {written}, renamed")
+        return Checkpoint(step, time, state, keys)
 
     def newest(self) -> tuple[Checkpoint | None, list[str]]:
         """Return the newest valid checkpoint, if there is one, and what is wrong with each newer file."""

@@ -223,20 +223,24 @@ def _wrong_input() -> Iterator[None]:
 
 @contextmanager
 def _interruptible(console: Console) -> Iterator[Callable[[], bool]]:
-    """Give a function that says whether Ctrl-C was pressed; a second Ctrl-C does not wait for the step's end."""
+    """Give a function that says whether Ctrl-C was pressed or SIGTERM came; a second Ctrl-C does not wait for the step's end."""
     pressed = False
 
-    def press(number: int, frame: FrameType | None) -> None:
+    def press(given: int, frame: FrameType | None) -> None:
         nonlocal pressed
         pressed = True
-        signal.signal(signal.SIGINT, previous)
-        console.print("stopping after this step; press Ctrl-C again to end now", highlight=False)
+        number, again = signal.Signals(given), ""
+        if number == signal.SIGINT:  # SIGTERM may come several times, to the process and to its group
+            signal.signal(number, previous[number])
+            again = "; press Ctrl-C again to end now"
+        console.print(f"stopping after this step{again}", highlight=False)
 
-    previous = signal.signal(signal.SIGINT, press)
+    previous = {number: signal.signal(number, press) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield lambda: pressed
     finally:
-        signal.signal(signal.SIGINT, previous)
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 def _report(record: RunRecord, folder: Path) -> None:
@@ -246,7 +250,7 @@ def _report(record: RunRecord, folder: Path) -> None:
         typer.echo(f"finished: {record.reason}; {taken}; ParaView opens the .pvd files in {folder}")
         return
     message = f"{record.status}: {record.reason}\n{taken}; frames 0 to {record.frames} are in {folder}"
-    newest = max(folder.glob("checkpoints/step_*.npz"), default=None)
+    newest = max(folder.glob("checkpoints/step_*.npz"), key=lambda file: int(file.stem.removeprefix("step_")), default=None)
     if newest is None:
         _end(f"{message}; there is no checkpoint yet", FAILED)
     again = f"warp-lcp run {folder / 'scene.toml'} --out {folder} --device {record.device} --resume"

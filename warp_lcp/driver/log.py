@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TextIO
@@ -43,6 +44,15 @@ class Log:
             ValueError: the row has a value for a column that the log lacks.
         """
         self._writer.writerow({name: _cell(value) for name, value in row.items()})
+
+    def sync(self) -> None:
+        """Wait until the rows are on the disk.
+
+        Raises:
+            OSError: the disk is full.
+        """
+        self._file.flush()
+        os.fsync(self._file.fileno())
 
     def close(self) -> None:
         """Close the file."""

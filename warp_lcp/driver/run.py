@@ -9,14 +9,14 @@ from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
-from warp_lcp.driver.checkpoint import KEPT, Checkpoint
+from warp_lcp.driver.checkpoint import Checkpoint
 from warp_lcp.driver.frames import FrameWriter, frame_bytes
 from warp_lcp.driver.log import Log, Value
 from warp_lcp.driver.profile import NoStopwatch, Profile, Stopwatch
 from warp_lcp.driver.progress import Observer
-from warp_lcp.driver.run_folder import OutputError, RunFolder, RunRecord
+from warp_lcp.driver.run_folder import Continuation, OutputError, RunFolder, RunRecord
 from warp_lcp.driver.scene import Scene, Time
-from warp_lcp.driver.simulator import Cells, Points, Profiled, Simulation, SimulationFailed, StepFailed, simulators
+from warp_lcp.driver.simulator import Cells, Points, Profiled, Resampled, Simulation, SimulationFailed, StepFailed, simulators
 from warp_lcp.driver.table import Problem, SceneError
 
 RETRIES = 6  # halvings of dt: a step 64 times shorter that still fails has another cause than its length
@@ -57,22 +57,40 @@ def run_scene(
         SceneError: the scene cannot be simulated.
     """
     folder = RunFolder(out, scene)
-    record = RunRecord(scene.scene.name, scene.scene.simulator, device)
-    checkpoint: Checkpoint | None = None
-    if resume:
-        checkpoint, record.warnings = folder.resume()
-    else:
-        folder.check_new(force=force)
+    with folder.held(resume=resume) as remarks:
+        record = RunRecord(scene.scene.name, scene.scene.simulator, device, warnings=list(remarks), mesh_files=folder.mesh_files)
+        continued: Continuation | None = None
+        if resume:
+            continued = folder.resume()
+            record.warnings += continued.remarks
+            record.changed, record.resampled_from_resolution = continued.changed, continued.resampled_from
+            record.resumed_from_step = continued.checkpoint.step if continued.checkpoint else 0
+        else:
+            folder.check_new(force=force)
+        simulation, notes = _create(scene, device, continued)
+        record.warnings += notes
+        for note in record.warnings:
+            observer.note(note)
+        checkpoint = continued.checkpoint if continued else None
+        return _Run(scene, simulation, folder, record, observer, profile).execute(last_frame, stop, resumed=checkpoint is not None)
+
+
+def _create(scene: Scene, device: str, continued: Continuation | None) -> tuple[Simulation, list[str]]:
+    """Return the simulation where the run begins or goes on, and what it has to say."""
     try:
         simulation = simulators()[scene.scene.simulator].create(scene, device=device, folder=Path.cwd())
-        if checkpoint:
-            simulation.restore(checkpoint.state)
+        notes: list[str] = []
+        if continued and continued.checkpoint:
+            state = continued.checkpoint.state
+            if continued.resampled_from is None:
+                simulation.restore(state)
+            elif isinstance(simulation, Resampled):
+                notes = simulation.resample(state)
+            else:
+                raise ValueError(f"domain.resolution: must stay {continued.resampled_from}: {scene.scene.simulator} cannot change grids")
     except ValueError as error:
         raise SceneError(scene.scene.name, [Problem("", str(error))]) from error
-    record.warnings += simulation.notes()
-    for note in record.warnings:
-        observer.note(note)
-    return _Run(scene, simulation, folder, record, observer, profile).execute(last_frame, stop, resumed=checkpoint is not None)
+    return simulation, simulation.notes() + notes
 
 
 def plan_dt(stable: float, remaining: float, time: Time) -> float:
@@ -113,6 +131,7 @@ class _Run:
         self._first_step = 0
         self._below_dt_min = False
         self._checkpointed: int | None = None  # the newest checkpoint's step
+        self._checkpoint_time = clock.monotonic()
 
     def execute(self, last_frame: int | None, stop: Callable[[], bool], *, resumed: bool) -> RunRecord:
         """Run to the last frame, and write in run.json how that ended, whatever happened."""
@@ -124,7 +143,7 @@ class _Run:
             with self.writer, closing(self._resume() if resumed else self._start(last, start)) as log:
                 self.observer.start(self.simulation.time, self.time.frame_time(last))
                 stopped = self._advance(log, last, stop)
-            self._write_checkpoint()
+                self._write_checkpoint(log)
             self.record.status = "stopped" if stopped else "finished"
             self.record.reason = "interrupted" if stopped else f"frame {last} of {count} reached"
         except (StepFailed, SimulationFailed) as error:
@@ -146,21 +165,23 @@ class _Run:
     def _check_space(self, last: int, frame: list[Points | Cells]) -> None:
         frames = max(0, last - self._frames_done() + 1)
         state = sum(array.nbytes for array in self.simulation.state().values())
-        self.folder.check_space(int(SPACE_MARGIN * (frame_bytes(frame) * frames + (KEPT + 2) * state)))  # final and temporary ones too
+        states = self.output.checkpoints_kept + 1  # the one being written too
+        self.folder.check_space(int(SPACE_MARGIN * (frame_bytes(frame) * frames + states * state)))
 
     def _start(self, last: int, frame: list[Points | Cells]) -> Log:
         """Write what there is before the first step."""
         self.folder.start(self.record)
         log = Log(self.folder.log, self._columns())
         self._write_frame(0, last, frame)
+        self._write_checkpoint(log)  # so that a run can be continued from its first moment on
         return log
 
     def _resume(self) -> Log:
         """Take back what an interrupted run wrote after its checkpoint."""
-        self.record.resumed_from_step = self.simulation.step_count
         self.record.frames = self._frames_done()
-        self._write_record()
         self._first_step = self.simulation.step_count
+        self._count()
+        self.folder.go_on(self.record, self._first_step)
         self.folder.frames.resume([self.time.frame_time(index) for index in range(self.record.frames + 1)])
         try:
             return Log(self.folder.log, self._columns(), after_step=self.simulation.step_count)
@@ -181,9 +202,8 @@ class _Run:
             if self._frames_done() >= frame:
                 self._write_frame(frame, last, self._frame())
                 frame += 1
-            if self.simulation.step_count % self.output.checkpoint_every == 0:
-                self._write_checkpoint()
-                self.folder.checkpoints.prune()
+            if self._checkpoint_is_due():
+                self._write_checkpoint(log)
             if stop() and frame <= last:
                 return True
         return False
@@ -243,25 +263,39 @@ class _Run:
             self.writer.put(index, self.time.frame_time(index), frame)
         self.observer.frame(index, last)
 
-    def _write_checkpoint(self) -> None:
+    def _checkpoint_is_due(self) -> bool:
+        every, minutes = self.output.checkpoint_every, self.output.checkpoint_minutes
+        if every and self.simulation.step_count % every == 0:
+            return True
+        return minutes is not None and clock.monotonic() - self._checkpoint_time >= 60.0 * minutes
+
+    def _write_checkpoint(self, log: Log | None = None) -> None:
+        """Write a checkpoint unless there is one of this step; what a run that continues from it expects is on the disk before."""
         step = self.simulation.step_count
         if self._checkpointed == step:
             return
         with self.watch.stage("checkpoints"):
-            self.writer.flush()  # a run that continues from here expects its frames
+            self.writer.flush()
+            if log:
+                log.sync()
             file = self.folder.checkpoints.write(Checkpoint(step, self.simulation.time, self.simulation.state()))
+            self.folder.checkpoints.prune(self.output.checkpoints_kept)
         self.watch.wrote("checkpoints", file)
-        self._checkpointed = step
+        self._checkpointed, self._checkpoint_time = step, clock.monotonic()
 
     def _write_profile(self) -> None:
         assert self.profile is not None
         self.profile.write(self.folder.path, self.simulation.step_count - self._first_step, self.record.seconds)
 
-    def _write_record(self) -> None:
+    def _count(self) -> None:
+        """Bring the record up to date."""
         if self.writer.newest is not None:
             self.record.frames = self.writer.newest
         self.record.steps, self.record.time = self.simulation.step_count, self.simulation.time
         self.record.seconds = round(clock.perf_counter() - self._begun, 3)
+
+    def _write_record(self) -> None:
+        self._count()
         self.folder.write_record(self.record)
 
     def _fail(self, reason: str) -> None:

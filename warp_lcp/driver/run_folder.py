@@ -2,29 +2,37 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
 import shutil
 import tempfile
+import tomllib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from warp_lcp.driver.atomic import SUFFIX, write_text
-from warp_lcp.driver.checkpoint import CHECKPOINT_FILE, Checkpoint, CheckpointFolder
+from warp_lcp.driver.checkpoint import CHECKPOINT_FILE, REFUSED_FILE, Checkpoint, CheckpointFolder
+from warp_lcp.driver.continuation import MAY_CHANGE, RESOLUTION, Change, differences, fingerprint, mesh_digests
+from warp_lcp.driver.folder_lock import LOCK, FolderBusyError, locked
 from warp_lcp.driver.frames import FRAME_FILE, FrameFolder
 from warp_lcp.driver.scene import Scene
-from warp_lcp.driver.scene_file import differences, dump_scene, load_scene
+from warp_lcp.driver.scene_file import dump_scene, keys, load_scene, table_keys
+from warp_lcp.driver.table import SceneError
 from warp_lcp.driver.versions import versions
 
 Status = Literal["running", "finished", "stopped", "failed"]
 
 RECORD = "run.json"
+SCENE = "scene.toml"
+ROUNDING = 1e-9
 OWN_FILES = re.compile(r"scene\.toml|run\.json|profile\.json|log\.csv|[a-z][a-z_]*\.pvd")
 IMAGE_FILE = re.compile(r"(?:frame_\d{6,}|sheet)\.png")
-OWN_FOLDERS = {"frames": FRAME_FILE, "checkpoints": CHECKPOINT_FILE, "images": IMAGE_FILE}
+CHECKPOINTS = "checkpoints"
+STORED_STATE = re.compile(f"{CHECKPOINT_FILE.pattern}|{REFUSED_FILE.pattern}")
+OWN_FOLDERS = {"frames": FRAME_FILE, CHECKPOINTS: STORED_STATE, "images": IMAGE_FILE}
 
 
 class OutputError(ValueError):
@@ -44,7 +52,10 @@ class RunRecord:
         steps: taken since the scene's start.
         time: reached [s].
         frames: the number of the newest frame.
-        resumed_from_step: the checkpoint that this part of the run continued, if it did.
+        resumed_from_step: the checkpoint that this part of the run continued, if it did; 0 if there was none and it began anew.
+        changed: the scene's keys that have other values than in the part before, with both.
+        resampled_from_resolution: domain.resolution of the checkpoint, if the state was brought to another grid.
+        mesh_files: a digest of what is in each mesh file, by its key.
         seconds: that this part of the run took.
         warnings: what the user should know about the results.
         versions: of the software.
@@ -59,21 +70,67 @@ class RunRecord:
     time: float = 0.0
     frames: int = 0
     resumed_from_step: int | None = None
+    changed: list[str] = field(default_factory=list)
+    resampled_from_resolution: int | None = None
+    mesh_files: dict[str, str] = field(default_factory=dict)
     seconds: float = 0.0
     warnings: list[str] = field(default_factory=list)
     versions: dict[str, str] = field(default_factory=versions)
+
+
+@dataclass(frozen=True)
+class Continuation:
+    """Where a run goes on.
+
+    Args:
+        checkpoint: to continue from; None: nothing was computed yet.
+        remarks: what the user should know, such as newer checkpoints that cannot be used.
+        changed: a line for each key of the scene that has another value than when the checkpoint was written.
+        resampled_from: domain.resolution of the checkpoint, if the scene has another one.
+    """
+
+    checkpoint: Checkpoint | None
+    remarks: list[str] = field(default_factory=list)
+    changed: list[str] = field(default_factory=list)
+    resampled_from: int | None = None
 
 
 class RunFolder:
     """scene.toml, run.json, log.csv, frames and checkpoints of one run."""
 
     def __init__(self, path: Path, scene: Scene) -> None:
-        """Look at a folder, there or not; nothing is written yet."""
+        """Look at a folder, there or not; nothing is written yet.
+
+        Raises:
+            SceneError: a mesh file of the scene cannot be read.
+        """
         self.path = path
         self.scene = scene
+        self.mesh_files = mesh_digests(scene)
         self.log = path / "log.csv"
         self.frames = FrameFolder(path)
-        self.checkpoints = CheckpointFolder(path / "checkpoints", fingerprint(scene))
+        self.checkpoints = CheckpointFolder(path / CHECKPOINTS, fingerprint(scene, self.mesh_files), keys(scene))
+
+    @contextmanager
+    def held(self, *, resume: bool) -> Iterator[list[str]]:
+        """Keep other processes out of the folder, which is made if a new run needs it; yields remarks.
+
+        Args:
+            resume: there must be a run.
+
+        Raises:
+            OutputError: the folder cannot be made or written, another process runs there, or there is no run to resume.
+        """
+        if self.path.exists() and not self.path.is_dir():
+            raise OutputError(f"{self.path}: is not a folder")
+        if resume:
+            self._check_run()
+        _probe(self.path)
+        try:
+            with locked(self.path) as remarks:
+                yield remarks
+        except FolderBusyError as error:
+            raise OutputError(str(error)) from error
 
     def check_new(self, *, force: bool) -> None:
         """Refuse what a new run may not overwrite, and folders that cannot be written.
@@ -88,7 +145,7 @@ class RunFolder:
             raise OutputError(f"{self.path}: is not a folder")
         _probe(self.path)
         own, foreign = self._contents()
-        if not own and not foreign:
+        if not foreign and all(path.name == f".{RECORD}{SUFFIX}" for path in own):  # nothing, or killed with its first file
             return
         if foreign or self.path / RECORD not in own:
             shown = ", ".join(str(path.relative_to(self.path)) for path in [*foreign, *own][:3])
@@ -103,31 +160,56 @@ class RunFolder:
             OSError: a file cannot be deleted or written.
         """
         own, _ = self._contents()
-        for file in sorted(own, key=lambda file: file.name == RECORD):  # last, so that a half-deleted run is still a run
-            file.unlink()
+        own.sort(key=lambda file: file.parent.name != CHECKPOINTS)  # first, so that a half-deleted run is not continued
+        for file in own:
+            if file.name != RECORD:  # replaced below: at every moment the folder is a run's
+                file.unlink()
         self.write_record(record)
-        write_text(self.path / "scene.toml", dump_scene(self.scene))
+        write_text(self.path / SCENE, dump_scene(self.scene))
 
-    def resume(self) -> tuple[Checkpoint, list[str]]:
-        """Return the checkpoint to continue from, and a warning for each newer one that cannot be used.
+    def resume(self) -> Continuation:
+        """Return where to continue.
 
         Raises:
             OutputError: there is no run, its scene is another one, or no checkpoint is valid.
         """
-        recorded = self.path / "scene.toml"
-        if not recorded.is_file():
-            raise OutputError(f"{self.path}: there is no run to resume")
-        _probe(self.path)
-        changes = [line for line in differences(load_scene(recorded), self.scene) if not re.match(r"time\.duration:|output\.", line)]
-        if changes:
-            raise OutputError(
-                "\n  ".join([f"{self.path}: --resume needs the same scene; only time.duration and [output] may differ", *changes])
-            )
+        self._check_run()
+        self._check_same_scene()
         checkpoint, refused = self.checkpoints.newest()
+        if checkpoint is None and not refused and not self._has_steps():
+            return Continuation(None, [f"{self.path}: the run that was interrupted had no checkpoint yet; it begins anew"])
         if checkpoint is None:
             reasons = refused or ["none was written"]
             raise OutputError("\n  ".join([f"{self.path}: no checkpoint to resume from; --force starts again", *reasons]))
-        return checkpoint, refused
+        end = self.scene.time.frame_time(self.scene.time.frame_count)
+        if checkpoint.time > end * (1.0 + ROUNDING):
+            raise OutputError(
+                f"{self.path}: time.duration = {self.scene.time.duration:g} s ends before the checkpoint's time, {checkpoint.time:.6g} s: "
+                "frames would be lost; choose a longer one"
+            )
+        remarks = [*refused, *self._other_versions()]
+        if refused:
+            remarks.append(f"continuing from step {checkpoint.step} instead; refused checkpoints stay as checkpoints/refused_*.npz")
+        now = keys(self.scene)
+        before = checkpoint.keys or now
+        steps = differences(before, now, Change.OTHER_STEPS)
+        if steps:
+            remarks.append(f"from step {checkpoint.step} on the steps are not those of the run that began: {'; '.join(steps)}")
+        old = int(before.get(RESOLUTION, now[RESOLUTION]))
+        changed = differences(before, now, Change.SAME_STEPS, Change.OTHER_STEPS, Change.RESAMPLED)
+        return Continuation(checkpoint, remarks, changed, None if old == now[RESOLUTION] else old)
+
+    def go_on(self, record: RunRecord, step: int) -> None:
+        """Begin to write behind a step, once everything is known to fit: what a killed process left half-written goes.
+
+        Raises:
+            OSError: a file cannot be written, renamed or deleted.
+        """
+        self.write_record(record)
+        write_text(self.path / SCENE, dump_scene(self.scene))
+        for file in (path for path, _ in _walk(self.path) if path.name.endswith(SUFFIX) and path.name.startswith(".")):
+            file.unlink()
+        self.checkpoints.set_aside(step)
 
     def write_record(self, record: RunRecord) -> None:
         """Write run.json.
@@ -153,6 +235,55 @@ class RunFolder:
                 "make room, choose another --out, or write less (time.frames_per_second, output.particles, output.grid)"
             )
 
+    def _check_run(self) -> None:
+        if not (self.path / RECORD).is_file():
+            raise OutputError(f"{self.path}: there is no run to resume")
+
+    def _check_same_scene(self) -> None:
+        """Refuse other values of keys that must not change, and mesh files that hold something else."""
+        before, now = _recorded_keys(self.path / SCENE), keys(self.scene)
+        known = self._record().get("mesh_files")
+        files = known if isinstance(known, dict) else {}
+        if before is None:  # killed before it was written: the checkpoints tell whose they are
+            before = now
+        for key, digest in self.mesh_files.items():
+            if files.get(key) == digest:
+                before[key] = now[key]  # the same mesh in another place
+            elif key in files and before.get(key) == now[key]:
+                raise OutputError(
+                    f"{self.path}: {key} = {now[key]!r}: what is in the file has changed since the run began; put the old one back, or "
+                    "start again with --force"
+                )
+        changes = differences(before, now, Change.REFUSED)
+        if changes:
+            head = f"{self.path}: --resume continues the same scene, and these keys have other values"
+            raise OutputError("\n  ".join([head, *changes, f"may change: {MAY_CHANGE}"]))
+
+    def _has_steps(self) -> bool:
+        """Return whether the log has a row."""
+        try:
+            return len(self.log.read_text(encoding="utf-8").splitlines()) > 1
+        except FileNotFoundError:
+            return False
+
+    def _record(self) -> dict[str, Any]:
+        """Return what run.json says; nothing if it cannot be read."""
+        try:
+            record = json.loads((self.path / RECORD).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return {}
+        return record if isinstance(record, dict) else {}
+
+    def _other_versions(self) -> list[str]:
+        """Return a remark if the run began with other software, which need not give the same bits."""
+        before = self._record().get("versions")
+        if not isinstance(before, dict):
+            return []
+        now = versions()
+        now.pop("platform", None)  # its name tells the kernel, not the processor
+        other = [f"{name} {before[name]}, now {now[name]}" for name in sorted(before.keys() & now.keys()) if before[name] != now[name]]
+        return [f"written with other software ({'; '.join(other)}): results need not be the same bit for bit"] if other else []
+
     def _contents(self) -> tuple[list[Path], list[Path]]:
         """Return the files that a run makes, and everything else."""
         own: list[Path] = []
@@ -164,10 +295,16 @@ class RunFolder:
         return own, foreign
 
 
-def fingerprint(scene: Scene) -> str:
-    """Return a digest of everything that must not change between the parts of a run: all but time.duration and [output]."""
-    table = scene.model_dump(by_alias=True, exclude_none=True, exclude={"output": True, "time": {"duration"}})
-    return hashlib.blake2b(json.dumps(table, sort_keys=True).encode(), digest_size=16).hexdigest()
+def _recorded_keys(path: Path) -> dict[str, Any] | None:
+    """Return the keys of the scene as it ran; None if there is no such file or it is not a scene's."""
+    try:
+        return keys(load_scene(path))
+    except SceneError:
+        pass  # a mesh has been moved, perhaps; what the file says still counts
+    try:
+        return table_keys(tomllib.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError):
+        return None
 
 
 def _walk(folder: Path) -> Iterator[tuple[Path, re.Pattern[str]]]:
@@ -176,7 +313,7 @@ def _walk(folder: Path) -> Iterator[tuple[Path, re.Pattern[str]]]:
         if path.name in OWN_FOLDERS and path.is_dir() and not path.is_symlink():
             for file in path.iterdir():
                 yield file, OWN_FOLDERS[path.name]
-        else:
+        elif path.name != LOCK:
             yield path, OWN_FILES
 
 

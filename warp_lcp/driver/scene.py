@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 
 from warp_lcp.driver.shapes import Liquid, Shape, Solid, Wall
 from warp_lcp.driver.table import ANY_VALUE, Complaint, Problem, SceneError, Table, Vector, refuse, validate
+from warp_lcp.grid.sides import SIDES
 from warp_lcp.solvers.registry import grid_methods
 
 __all__ = ["Complaint", "Liquid", "Problem", "Scene", "SceneError", "Shape", "Solid", "Table", "Vector", "Wall", "validate"]
@@ -52,12 +53,15 @@ class Time(Table):
 class Domain(Table):
     """[domain]: the box that everything happens in, and its grid."""
 
-    later: ClassVar = {"open": ANY_VALUE, "friction": ANY_VALUE, "periodic": frozenset({True})}
+    later: ClassVar = {"friction": ANY_VALUE, "periodic": frozenset({True})}
     size: list[Length] = Field(min_length=2, max_length=3, description="the sides of the domain [m], [x, y] or [x, y, z]")
     resolution: int = Field(ge=2, le=4096, description="cells along the longest side")
     wall: Wall = Field(default="separating", description="whether liquid may let go of the domain's walls")
     solids: Literal["cut-cell", "voxel"] = Field(
         default="cut-cell", description="cut-cell: solids cut through cells as their surfaces do; voxel: they fill whole cells"
+    )
+    open: list[Literal[SIDES]] = Field(  # type: ignore[valid-type]
+        default_factory=list, description="sides without a wall, where liquid leaves; y is up, x to the right, z to the front"
     )
     periodic: list[Literal[False]] | None = Field(default=None, description="false along every axis")
 
@@ -86,13 +90,15 @@ class Output(Table):
     particles: bool = Field(default=True, description="write a frame of particles")
     grid: bool = Field(default=True, description="write a frame of cells")
     surface: Literal[False] = Field(default=False, description="write the liquid's surface")
-    checkpoint_every: int = Field(default=50, ge=1, description="steps between checkpoints")
+    checkpoint_every: int = Field(default=50, ge=0, description="steps between checkpoints; 0: not by steps")
+    checkpoint_minutes: float | None = Field(default=None, gt=0, description="the most minutes of real time between checkpoints")
+    checkpoints_kept: int = Field(default=3, ge=1, description="how many of the newest checkpoints stay")
 
 
 class Scene(Table):
     """A scene file, read and checked. SI units; y is up; a domain of two sides is the x-y plane."""
 
-    later: ClassVar = {"density_correction": ANY_VALUE, "sand": ANY_VALUE}
+    later: ClassVar = {"sand": ANY_VALUE}
     scene: About
     time: Time
     domain: Domain
@@ -141,7 +147,7 @@ class Scene(Table):
             found.append(Complaint(("physics", "gravity"), self.physics.gravity, message))
         if self.time.dt_min > self.time.dt_max:
             found.append(Complaint(("time", "dt_min"), self.time.dt_min, f"must not exceed time.dt_max = {self.time.dt_max}"))
-        return found + self.shape_complaints("solid", self.solid) + self._motion_complaints()
+        return found + self.shape_complaints("solid", self.solid) + self._motion_complaints() + self._side_complaints()
 
     def shape_complaints(self, key: str, shapes: Sequence[Shape], *, inside: bool = False) -> list[Complaint]:
         """Return what is wrong with an array of shapes.
@@ -175,11 +181,21 @@ class Scene(Table):
         return [
             ("grid", f"{' x '.join(map(str, cells))} = {math.prod(cells):,} cells of {self.spacing:.6g} m"),
             ("walls", ", ".join([self.domain.wall, *(f"solid {i} {s.wall}" for i, s in enumerate(self.solid) if s.wall)])),
+            *([("open", ", ".join(self.domain.open))] if self.domain.open else []),
             *([("moving", moving)] if moving else []),
             ("time", f"{self.time.duration:g} s in steps of at most {self.time.dt_max:g} s, CFL {self.time.cfl:g}"),
             ("frames", f"{self.time.frame_count + 1} at {self.time.frames_per_second:g} per second"),
             ("solver", f"{self.solver.method} to {self.solver.tolerance:g}, {self.solver.precision} precision"),
         ]
+
+    def _side_complaints(self) -> list[Complaint]:
+        found = []
+        for index, side in enumerate(self.domain.open):
+            if side in self.domain.open[:index]:
+                found.append(Complaint(("domain", "open", index), side, "is named twice"))
+            if side in SIDES[2 * self.dimension :]:
+                found.append(Complaint(("domain", "open", index), side, "is a side of a 3-D domain; domain.size has 2 entries"))
+        return found
 
     def _motion_complaints(self) -> list[Complaint]:
         if self.domain.solids == "cut-cell":

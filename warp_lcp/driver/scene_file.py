@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -84,14 +84,14 @@ def dump_scene(scene: Scene) -> str:
     return HEADER + tomli_w.dumps(scene.model_dump(by_alias=True, exclude_none=True))
 
 
-def differences(old: Scene, new: Scene) -> list[str]:
-    """Return a line for each key in which two scenes differ, such as `time.cfl: 2.0 before, 4.0 now`."""
-    before, after = (dict(_leaves(scene.model_dump(by_alias=True, exclude_none=True))) for scene in (old, new))
-    return [
-        f"{key}: {written(before.get(key, 'none'))} before, {written(after.get(key, 'none'))} now"
-        for key in sorted(before.keys() | after.keys())
-        if before.get(key) != after.get(key)
-    ]
+def keys(scene: Scene) -> dict[str, Any]:
+    """Return every key of a scene with its value, such as `time.cfl` or `liquid[0].max`."""
+    return table_keys(scene.model_dump(by_alias=True, exclude_none=True))
+
+
+def table_keys(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return every key of a table of tables with its value, as `keys` does."""
+    return dict(_leaves(dict(table)))
 
 
 def _leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:

@@ -223,5 +223,81 @@ class LiquidMesh(LiquidProperties, Mesh):
     """Liquid inside a surface of triangles."""
 
 
+class Schedule(Table):
+    """When something runs."""
+
+    start: float = Field(default=0.0, ge=0, description="when it starts to run [s]")
+    stop: float | None = Field(default=None, description="when it no longer runs [s]; it goes on unless given")
+
+    def schedule_complaints(self) -> list[Complaint]:
+        """Return what is wrong with the times."""
+        if self.stop is not None and self.stop <= self.start:
+            return [Complaint(("stop",), self.stop, f"must be later than start = {self.start:g}")]
+        return []
+
+
+class SourceProperties(Schedule, Shape):
+    """What a source has besides its shape."""
+
+    velocity: Vector = Field(description="of the liquid that comes out [m/s]")
+
+    def complaints(self, dimension: int) -> list[Complaint]:
+        """Return what is wrong with the source in a scene of 2 or 3 dimensions."""
+        found = super().complaints(dimension) + self.schedule_complaints()
+        if not any(self.velocity):
+            found.append(Complaint(("velocity",), self.velocity, "must not be zero: nothing would come out"))
+        return found
+
+
+class DrainProperties(Schedule, Shape):
+    """What a drain has besides its shape."""
+
+    def complaints(self, dimension: int) -> list[Complaint]:
+        """Return what is wrong with the drain in a scene of 2 or 3 dimensions."""
+        return super().complaints(dimension) + self.schedule_complaints()
+
+
+class SourceBox(SourceProperties, Box):
+    """A box that liquid comes out of."""
+
+
+class SourceSphere(SourceProperties, Sphere):
+    """A ball that liquid comes out of."""
+
+
+class SourceCapsule(SourceProperties, Capsule):
+    """A capsule that liquid comes out of."""
+
+
+class SourcePlane(SourceProperties, Plane):
+    """A half space that liquid comes out of."""
+
+
+class SourceMesh(SourceProperties, Mesh):
+    """A surface of triangles that liquid comes out of."""
+
+
+class DrainBox(DrainProperties, Box):
+    """A box that swallows liquid."""
+
+
+class DrainSphere(DrainProperties, Sphere):
+    """A ball that swallows liquid."""
+
+
+class DrainCapsule(DrainProperties, Capsule):
+    """A capsule that swallows liquid."""
+
+
+class DrainPlane(DrainProperties, Plane):
+    """A half space that swallows liquid."""
+
+
+class DrainMesh(DrainProperties, Mesh):
+    """A surface of triangles that swallows liquid."""
+
+
 Solid = Annotated[SolidBox | SolidSphere | SolidCapsule | SolidPlane | SolidMesh, Field(discriminator="shape")]
 Liquid = Annotated[LiquidBox | LiquidSphere | LiquidCapsule | LiquidPlane | LiquidMesh, Field(discriminator="shape")]
+Source = Annotated[SourceBox | SourceSphere | SourceCapsule | SourcePlane | SourceMesh, Field(discriminator="shape")]
+Drain = Annotated[DrainBox | DrainSphere | DrainCapsule | DrainPlane | DrainMesh, Field(discriminator="shape")]

@@ -97,6 +97,18 @@ class Profiled(Protocol):
 
 
 @runtime_checkable
+class Resampled(Protocol):
+    """What a Simulation may also be: one that can go on on another grid than the one its state was made on."""
+
+    def resample(self, state: Mapping[str, np.ndarray]) -> list[str]:
+        """Continue from the state of a simulation that differs in `domain.resolution` alone; return what the user should know of it.
+
+        Raises:
+            ValueError: the state does not belong to this scene on any grid, or cannot be brought to this one.
+        """
+
+
+@runtime_checkable
 class Simulator(Protocol):
     """A plug-in: a kind of material and the scenes that describe it."""
 

@@ -21,7 +21,7 @@ def clearance(grid: StaggeredGrid, cells: wp.array) -> wp.array:
 
     Args:
         grid: the grid.
-        cells: int8 of AIR, FLUID, SOLID, in the stored shape; the ring is SOLID.
+        cells: int8 of AIR, FLUID, SOLID, in the stored shape; the ring is SOLID, or AIR where particles may leave the domain.
 
     Returns:
         int8, in the stored shape.

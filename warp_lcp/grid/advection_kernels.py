@@ -34,7 +34,14 @@ WALK = """
             x[axis] = (T)cell[axis] + (side > 0 ? (T)1 : (T)0);
             if (room[cell[2]*s1 + cell[1]*s2 + cell[0] + side*stride[axis]] == 0) {
                 x[axis] -= (T)side*margin; rest[axis] = 0; ++stopped;
-            } else cell[axis] += side;
+            } else {
+                cell[axis] += side;
+                if (cell[axis] < 1 || cell[axis] > counts[axis]) {  // out through an open side: there is nothing to meet
+                    for (int d = 0; d <= planes; ++d) to[d][m] = x[d] + rest[d];
+                    hit[m] = stopped > 0;
+                    return;
+                }
+            }
         }
         const signed char* here = room + (cell[2]*s1 + cell[1]*s2 + cell[0]);
         for (int d = 0; d <= planes; ++d) {  // whoever moves along a closed face keeps off it too
@@ -58,7 +65,7 @@ MOVE = """
             to[0][m] = X; to[1][m] = Y; to[2][m] = Z; hit[m] = 0;
             T p = x > 1 ? x : (T)1, q = y > 1 ? y : (T)1, r = z > 1 ? z : (T)1;
             const int i = (int)(p < (T)nx ? p : (T)nx), j = (int)(q < (T)ny ? q : (T)ny), k = (int)(r < (T)nz ? r : (T)nz);
-            p = X > 0 ? X : (T)0; q = Y > 0 ? Y : (T)0; r = Z > 0 ? Z : (T)0;  // the ring is SOLID: no need to stay off it
+            p = X > 0 ? X : (T)0; q = Y > 0 ? Y : (T)0; r = Z > 0 ? Z : (T)0;  // beyond the ring nothing is known, nor needed
             const int I = (int)(p < (T)(nx + 1) ? p : (T)(nx + 1)), J = (int)(q < (T)(ny + 1) ? q : (T)(ny + 1));
             const int K = (int)(r < (T)(nz + 1) ? r : (T)(nz + 1));
             int di = I - i, dj = J - j, dk = K - k;
@@ -81,6 +88,7 @@ MOVE = """
 ROOM = """
     const signed char* room = (const signed char*)room_.data;
     const long long stride[3] = {1, s2, s1};
+    const int counts[3] = {nx, ny, nz};
     int begin[M], end[M], cells[M];
     auto prepare = [](int) {};
 """

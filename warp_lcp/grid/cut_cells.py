@@ -15,6 +15,7 @@ from warp_lcp.grid import cut_cells_kernels as kernels
 from warp_lcp.grid.capacity_kernels import integrate_kernel
 from warp_lcp.grid.motion import Motion
 from warp_lcp.grid.node_distance import NodeDistances, NodeSampler, nodes_near
+from warp_lcp.grid.sides import SIDES, continue_beyond, open_ring
 from warp_lcp.grid.solid_notes import placement_notes, repair_notes, thin_notes
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid
@@ -32,6 +33,7 @@ class CutCells:
         solids: in the order of their numbers, 1 + s; the domain is number 0.
         wall_separating: whether liquid may leave the domain's wall.
         capacity: whether to keep the capacity.
+        open_sides: of `warp_lcp.grid.sides.side_bits`: there the faces are open as far as no solid closes them, and the ring is air.
 
     Attributes:
         distance: float32 signed distance to the nearest solid at nodes [cells], positive in the open, exact below `FAR` cells; others are
@@ -55,13 +57,17 @@ class CutCells:
         ValueError: a solid that stands still lies wholly outside the domain, or the solids leave no open cell.
     """
 
-    def __init__(self, grid: StaggeredGrid, solids: Sequence[PlacedSolid], *, wall_separating: bool, capacity: bool = True) -> None:
-        self.grid, self.solids = grid, tuple(solids)
+    def __init__(
+        self, grid: StaggeredGrid, solids: Sequence[PlacedSolid], *, wall_separating: bool, capacity: bool = True, open_sides: int = 0
+    ) -> None:
+        self.grid, self.solids, self.open_sides = grid, tuple(solids), open_sides
         self.moves = any(solid.motion is not None for solid in solids)
         self.names = ("domain", *(solid.name for solid in solids))
         self.separating = wp.array([wall_separating, *(solid.separating for solid in solids)], dtype=wp.uint8, device=grid.device)
         self.open, self.wall = grid.faces(), grid.faces(wp.int16)
         self.base, self._state = grid.field(wp.int8), grid.field(wp.int8)
+        if open_sides:
+            self._state.assign(np.where(open_ring(grid.shape, open_sides), kernels.OPEN, kernels.CLOSED).astype(np.int8))
         self.capacity = grid.field() if capacity else None
         self.velocity = grid.faces() if self.moves else None
         self._counts = wp.zeros(2, dtype=wp.int32, device=grid.device)
@@ -74,7 +80,7 @@ class CutCells:
         standing = [(number, solid.geometry) for number, solid in enumerate(solids, start=1) if solid.motion is None]
         for number, geometry in standing:
             self._sampler.enter(self._nodes, number, geometry)
-        self._marks = wp.array(_ring(grid), dtype=wp.int8, device=grid.device)
+        self._marks = wp.array(_ring(grid, open_sides), dtype=wp.int8, device=grid.device)
         self._sampler.look_at_centers(
             self._nodes, [geometry for _, geometry in standing], np.zeros(3, dtype=int), np.array(grid.shape[::-1]), self._marks
         )
@@ -179,9 +185,22 @@ class CutCells:
         self._counts.zero_()
         # the marks are in `base`, until the next kernel fills it
         grid.domain.launch(kernels.fractions_kernel, [planes, *nodes.arrays, self.base, *faces, *walls, self._counts])
+        for number in range(2 * grid.dimension):
+            if self.open_sides >> number & 1:
+                self._open_side(number >> 1, SIDES[number])
         grid.domain.launch(kernels.states_kernel, [planes, nodes.near, *faces, self.base, self._state])
         if self.capacity is not None:
             integrate_kernel(grid.domain, planes, nodes.near, self._state, self.capacity)
+            continue_beyond(grid, self.open_sides, self.capacity)
+
+    def _open_side(self, axis: int, name: str) -> None:
+        """Fill the fractions of the faces on an open side of the domain."""
+        grid = self.grid
+        face = 1 + grid.counts[axis] if SIDES.index(name) & 1 else 1
+        low, high = [1, 1, 1], list(grid.counts)
+        low[axis] = high[axis] = face
+        inputs = [grid.planes, axis, self._nodes.near, self._nodes.arrays[1], self.open[axis], self.wall[axis], self._counts]
+        grid.window(low, high).launch(kernels.side_kernel, inputs)
 
     def _solid_notes(self) -> list[str]:
         """Return what is to be said about the solids before they are sampled."""
@@ -214,8 +233,9 @@ class CutCells:
         return notes
 
 
-def _ring(grid: StaggeredGrid) -> np.ndarray:
-    """Return SOLID in the ring, else 0, in the stored shape."""
+def _ring(grid: StaggeredGrid, open_sides: int) -> np.ndarray:
+    """Return SOLID in the ring but beyond open sides, else 0, in the stored shape."""
     host = np.full(grid.shape, SOLID, dtype=np.int8)
     host[1:-1, 1:-1, 1:-1] = 0
+    host[open_ring(grid.shape, open_sides)] = 0
     return host

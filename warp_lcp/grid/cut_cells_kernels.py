@@ -200,6 +200,41 @@ def states_kernel(cells: CellRange, planes: int, near: _F32, ax: _F32, ay: _F32,
 def open_area(a: float, b: float, c: float, d: float) -> float: ...
 
 
+@wp.kernel(**options)
+@typing.no_type_check
+def side_kernel(
+    cells: CellRange, planes: int, axis: int, near: _F32, owner: _I16, open: _F32, wall: _I16, counts: wp.array(dtype=wp.int32)
+):
+    """Fill open fractions and wall numbers of the faces on an open side of the domain; count the dropped and the partial ones."""
+    plane, row, chunk = wp.tid()
+    k = cells.k + plane
+    j = cells.j + row
+    first = cells.i + chunk * cells.grain
+    dj = wp.where(axis == 0, 1, 0)
+    di = 1 - dj
+    dk = wp.where(axis == 2, 0, planes - 1)
+    ej = wp.where(axis == 2, 1, 0)
+    for i in range(first, wp.min(first + cells.grain, cells.end)):
+        free = open_area(near[k, j, i], near[k, j + dj, i + di], near[k + dk, j + dj + ej, i + di], near[k + dk, j + ej, i])
+        if free > 0.0 and free < DROP:
+            free = float(0.0)
+            wp.atomic_add(counts, 0, 1)
+        if free > 0.0 and free < 1.0:
+            wp.atomic_add(counts, 1, 1)
+        number = int(-1)
+        if free < 1.0:  # the solid that is nearest to a corner: (0), along (di, dj, 0), and along (0, ej, dk)
+            least = float(1.0e30)
+            for n in range(4):
+                a = n & 1
+                b = n >> 1
+                d = near[k + b * dk, j + a * dj + b * ej, i + a * di]
+                if d < least:
+                    least = d
+                    number = int(owner[k + b * dk, j + a * dj + b * ej, i + a * di])
+        open[k, j, i] = free
+        wall[k, j, i] = wp.int16(number)
+
+
 @wp.func
 @typing.no_type_check
 def least_moving(k: int, j: int, i: int, near: _F32, owner: _I16, next_near: _F32, next_owner: _I16, moving: wp.array(dtype=wp.uint8)):

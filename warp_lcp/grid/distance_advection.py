@@ -21,7 +21,14 @@ __all__ = ["MARGIN", "PUSH", "advect_with_distance", "push_out"]
 
 
 def advect_with_distance(
-    grid: StaggeredGrid, fields: list[wp.array], distance: wp.array, dt: float, position: wp.array, stopped: wp.array
+    grid: StaggeredGrid,
+    fields: list[wp.array],
+    distance: wp.array,
+    dt: float,
+    position: wp.array,
+    stopped: wp.array,
+    *,
+    open_sides: int = 0,
 ) -> None:
     """Move particles through the grid's velocity for a time step; nobody ends within MARGIN cells of a wall who did not start there.
 
@@ -36,14 +43,17 @@ def advect_with_distance(
         dt: time step [s].
         position: [m], shape (n,) (updated).
         stopped: int32, shape (1,): raised by the number of particles that met a wall.
+        open_sides: of `warp_lcp.grid.sides.side_bits`: they stop nobody. Who crosses them ends on them or beyond.
     """
     u, v, w = [*fields, None][:3]
     inverse = 1.0 / grid.spacing
-    inputs = [grid.planes, grid.spacing, inverse, dt * inverse, position, u, v, w, distance, stopped]
+    inputs = [grid.planes, grid.spacing, inverse, dt * inverse, position, u, v, w, distance, open_sides, stopped]
     launch(advect_kernel, len(position), inputs, grid.device)
 
 
-def push_out(grid: StaggeredGrid, distance: wp.array, position: wp.array, moved: wp.array, left: wp.array) -> None:
+def push_out(
+    grid: StaggeredGrid, distance: wp.array, position: wp.array, moved: wp.array, left: wp.array, *, open_sides: int = 0
+) -> None:
     """Put particles that walls have run over, or come too near, back into the open along the gradient of the distance.
 
     Args:
@@ -52,6 +62,7 @@ def push_out(grid: StaggeredGrid, distance: wp.array, position: wp.array, moved:
         position: [m], shape (n,) (updated): moved by at most PUSH cells.
         moved: int32, shape (1,): raised by the number of particles that were put outside.
         left: int32, shape (1,): raised by the number of those for which no way out was found; they stay where they were.
+        open_sides: of `warp_lcp.grid.sides.side_bits`: particles beyond stay there.
     """
-    inputs = [grid.planes, grid.spacing, 1.0 / grid.spacing, position, distance, moved, left]
+    inputs = [grid.planes, grid.spacing, 1.0 / grid.spacing, position, distance, open_sides, moved, left]
     launch(push_kernel, len(position), inputs, grid.device)

@@ -30,6 +30,7 @@ DISTANCE = """
             x[d] = x[d] > 1 ? x[d] : (T)1; x[d] = x[d] < end ? x[d] : end;
         }
     };
+    auto closed = [=](int side) { return !(open_sides >> side & 1); };
     auto measure = [&](const T* x, T* g) -> T {
         int i = (int)x[0], j = (int)x[1], k = planes == 2 ? (int)x[2] : 1;
         i = i < nx ? i : nx; j = j < ny ? j : ny; k = k < nz ? k : nz;
@@ -46,13 +47,16 @@ DISTANCE = """
         }
         T least = low + fy*(high - low);
         for (int d = 0; d <= planes; ++d) {
-            const T below = x[d] - (T)1, above = (T)(counts[d] + 1) - x[d], side = below < above ? below : above;
+            const T below = closed(2*d) ? x[d] - (T)1 : (T)1e9, above = closed(2*d + 1) ? (T)(counts[d] + 1) - x[d] : (T)1e9;
+            const T side = below < above ? below : above;
             if (side < least) { least = side; g[0] = 0; g[1] = 0; g[2] = 0; g[d] = below < above ? (T)1 : (T)-1; }
         }
         return least;
     };
     auto measure_all = [&](const Block& at, T* result, int n) {
-        const T ex = nx + 1, ey = ny + 1, ez = nz + 1;
+        const T ex = nx + 1, ey = ny + 1, ez = nz + 1, far = 1e9;
+        const T x0 = closed(0) ? (T)1 : -far, x1 = closed(1) ? ex : far, y0 = closed(2) ? (T)1 : -far, y1 = closed(3) ? ey : far;
+        const T z0 = closed(4) ? (T)1 : -far, z1 = closed(5) ? ez : far;
         SIMD for (int m = 0; m < n; ++m) {
             T x = at[0][m], y = at[1][m], z = planes == 2 ? at[2][m] : (T)1;
             x = x > 1 ? x : (T)1; y = y > 1 ? y : (T)1; z = z > 1 ? z : (T)1;
@@ -64,8 +68,8 @@ DISTANCE = """
             const T a0 = a[0] + fx*(a[1] - a[0]), a1 = a[s2] + fx*(a[s2 + 1] - a[s2]);
             const T b0 = b[0] + fx*(b[1] - b[0]), b1 = b[s2] + fx*(b[s2 + 1] - b[s2]);
             const T low = a0 + fy*(a1 - a0), high = b0 + fy*(b1 - b0);
-            const T ax = x - 1 < ex - x ? x - 1 : ex - x, ay = y - 1 < ey - y ? y - 1 : ey - y;
-            const T az = planes == 2 ? (z - 1 < ez - z ? z - 1 : ez - z) : ax, s = low + fz*(high - low);
+            const T ax = x - x0 < x1 - x ? x - x0 : x1 - x, ay = y - y0 < y1 - y ? y - y0 : y1 - y;
+            const T az = planes == 2 ? (z - z0 < z1 - z ? z - z0 : z1 - z) : ax, s = low + fz*(high - low);
             const T flat = ax < ay ? ax : ay, side = flat < az ? flat : az;
             result[m] = s < side ? s : side;
         }
@@ -270,7 +274,7 @@ PUSH_OUT = """
         SIMD for (int m = 0; m < n; ++m) {
             const T x = at[0][m], y = at[1][m], z = planes == 2 ? at[2][m] : (T)1;
             const int outside = (int)(x < 1) | (int)(y < 1) | (int)(z < 1) | (int)(x > ex) | (int)(y > ey) | (int)(z > ez);
-            inside[m] = outside | (int)(room[m] < margin);
+            inside[m] = (outside & (int)(open_sides == 0)) | (int)(room[m] < margin);
         }
         int count = 0;
         for (int m = 0; m < n; ++m) { list[count] = m; count += inside[m]; }
@@ -302,25 +306,27 @@ def _named(source: str) -> str:
 @wp.func_native(runge_kutta(_named("DISTANCE PROJECT" + MARCH + MOVE)))
 def advect_some(
     planes: int, dx: float, inverse_dx: float, h: float, x_: wp.array(dtype=wp.vec3), u_: wp.array3d(dtype=wp.float32),
-    v_: wp.array3d(dtype=wp.float32), w_: wp.array3d(dtype=wp.float32), distance_: wp.array3d(dtype=wp.float32), first: int, last: int,
+    v_: wp.array3d(dtype=wp.float32), w_: wp.array3d(dtype=wp.float32), distance_: wp.array3d(dtype=wp.float32), open_sides: int,
+    first: int, last: int,
 ) -> int: ...  # fmt: skip
 
 
 @wp.func_native(particle_loop(BLOCK + _named(PUSH_OUT).replace("MARGIN", repr(MARGIN))))
 def push_some(
-    planes: int, dx: float, inverse_dx: float, x_: wp.array(dtype=wp.vec3), distance_: wp.array3d(dtype=wp.float32), first: int, last: int
-) -> int: ...
+    planes: int, dx: float, inverse_dx: float, x_: wp.array(dtype=wp.vec3), distance_: wp.array3d(dtype=wp.float32), open_sides: int,
+    first: int, last: int,
+) -> int: ...  # fmt: skip
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.distance_advection")
 def advect_kernel(
     count: int, grain: int, planes: int, dx: float, inverse_dx: float, h: float, position: wp.array(dtype=wp.vec3),
     u: wp.array3d(dtype=wp.float32), v: wp.array3d(dtype=wp.float32), w: wp.array3d(dtype=wp.float32),
-    distance: wp.array3d(dtype=wp.float32), stopped: wp.array(dtype=wp.int32),
+    distance: wp.array3d(dtype=wp.float32), open_sides: int, stopped: wp.array(dtype=wp.int32),
 ):  # fmt: skip
     """One Runge-Kutta step of some particles; h is the time step in units of 1 / (velocity in cells)."""
     first = wp.tid() * grain
-    hits = advect_some(planes, dx, inverse_dx, h, position, u, v, w, distance, first, wp.min(first + grain, count))
+    hits = advect_some(planes, dx, inverse_dx, h, position, u, v, w, distance, open_sides, first, wp.min(first + grain, count))
     if hits > 0:
         wp.atomic_add(stopped, 0, hits)
 
@@ -328,11 +334,11 @@ def advect_kernel(
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.push_out")
 def push_kernel(
     count: int, grain: int, planes: int, dx: float, inverse_dx: float, position: wp.array(dtype=wp.vec3),
-    distance: wp.array3d(dtype=wp.float32), moved: wp.array(dtype=wp.int32), left: wp.array(dtype=wp.int32),
+    distance: wp.array3d(dtype=wp.float32), open_sides: int, moved: wp.array(dtype=wp.int32), left: wp.array(dtype=wp.int32),
 ):  # fmt: skip
     """Put some particles that are inside walls, or too near, outside; count those it moved and those it could not."""
     first = wp.tid() * grain
-    both = push_some(planes, dx, inverse_dx, position, distance, first, wp.min(first + grain, count))
+    both = push_some(planes, dx, inverse_dx, position, distance, open_sides, first, wp.min(first + grain, count))
     if both > 0:
         wp.atomic_add(moved, 0, both % 65536)
         wp.atomic_add(left, 0, both // 65536)

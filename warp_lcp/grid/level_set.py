@@ -72,12 +72,7 @@ class LevelSet:
             base: int8, SOLID in cells that hold no liquid.
         """
         grid = self.grid
-        numbers = [grid.planes, 1.0 / grid.spacing, 1.0 / self.particles_a_cell]
-        self.density.zero_()
-        if particles.offsets is not None:
-            window.launch(kernels.gather_kernel, [*numbers, particles.offsets, particles.position, self.density])
-        else:
-            launch(kernels.scatter_kernel, particles.count, [*numbers, particles.position, self.density], grid.device)
+        particle_density(grid, particles, window, self.particles_a_cell, self.density)
         density, smooth = self.density, None
         if self.smoothing:
             for field in self._scratch[:2]:  # a pass looks one cell beyond the window, where an earlier update may have left something
@@ -122,6 +117,24 @@ class LevelSet:
             window.launch(kernels.binomial_kernel, [self.grid.planes, source, first])
             source, first, second = first, second, first
         return source
+
+
+def particle_density(grid: StaggeredGrid, particles: Particles, window: Window, particles_a_cell: int, density: wp.array) -> None:
+    """Add up the particles' quadratic B-splines at the cells' centers, in units of the density at rest.
+
+    Args:
+        grid: the grid.
+        particles: the liquid. If it is indexed it must not have moved since it was sorted.
+        window: cells that hold all particles, with 2 to spare on each side.
+        particles_a_cell: particles in a full cell at rest.
+        density: float32 (written, 0 away from particles).
+    """
+    numbers = [grid.planes, 1.0 / grid.spacing, 1.0 / particles_a_cell]
+    density.zero_()
+    if particles.offsets is not None:
+        window.launch(kernels.gather_kernel, [*numbers, particles.offsets, particles.position, density])
+    else:
+        launch(kernels.scatter_kernel, particles.count, [*numbers, particles.position, density], grid.device)
 
 
 def whole_cell_capacity(grid: StaggeredGrid, base: wp.array, capacity: wp.array) -> None:

@@ -66,7 +66,7 @@ class Particles:
 
     Args:
         grid: the grid whose cells order the particles.
-        position: [m], shape (n, 3), n > 0; z = 0 in 2-D.
+        position: [m], shape (n, 3); z = 0 in 2-D.
         velocity: [m/s], shape (n, 3).
         affine: also carry the gradient of each velocity component [1/s].
         indexed: sort every step and know where each cell's particles begin, for transfers that gather; those that need it on CUDA are
@@ -78,7 +78,7 @@ class Particles:
         offsets: first particle of each stored cell, int32, shape (cells + 1,), at the last sort; None unless `indexed`.
 
     Raises:
-        ValueError: the shapes do not match or there is no particle.
+        ValueError: the shapes do not match.
     """
 
     def __init__(
@@ -86,14 +86,13 @@ class Particles:
     ) -> None:
         """Copy the particles to the device."""
         _check_shapes(position, velocity)
-        if len(position) == 0:
-            raise ValueError("position has shape (0, 3): must be (n, 3) with n > 0")
         self.grid, self.count, self._capacity = grid, 0, 0
         indexed = grid.device.is_cuda if indexed is None else indexed
         self.offsets = wp.zeros(grid.size + 1, dtype=wp.int32, device=grid.device) if indexed else None
         self._names = ["position", "velocity", *(f"affine_{c}" for c in range(grid.dimension if affine else 0))]
         self._partials = wp.zeros((THREADS, kernels.COLUMNS), dtype=wp.float64, device=grid.device)
         self._columns: dict[str, Column] = {}
+        self._grow(0)
         self.append(position, velocity)
 
     @property
@@ -129,20 +128,63 @@ class Particles:
         _check_shapes(position, velocity)
         if len(position) == 0:
             return
-        before, self.count = self.count, self.count + len(position)
-        if self.count > self._capacity:
-            self._grow(before)
-        for column in (*self._columns.values(), self._spare):
-            column.view = column.store[: self.count]
+        before = self.count
+        self._resize(before + len(position))
         for name, host in (("position", position), ("velocity", velocity)):
             self._columns[name].view[before:].assign(np.ascontiguousarray(host, dtype=np.float32))
         for gradient in self.affine:
             gradient[before:].zero_()  # sorting may have left anything behind the particles in use
 
+    @property
+    def marks(self) -> wp.array:
+        """Scratch memory for `remove`, int32, shape (count,)."""
+        return self._order[self._capacity : self._capacity + self.count]
+
+    def remove(self, marks: wp.array) -> int:
+        """Remove particles in place; the others keep their order. Without a particle to remove nothing is copied.
+
+        Args:
+            marks: int32, shape (count,): not 0 where a particle is to go; may be `marks`.
+
+        Returns:
+            How many were removed.
+        """
+        if self.count == 0:
+            return 0
+        device, stay = self.grid.device, self._order[: self.count]
+        wp.launch(kernels.stays_kernel, self.count, [marks, stay], device=device)
+        wp.utils.array_scan(stay, stay, inclusive=True)
+        left = int(stay[self.count - 1 :].numpy()[0])
+        removed = self.count - left
+        if removed:
+            for name, column in self._columns.items():
+                wp.launch(kernels.close_ranks_kernel, self.count, [marks, stay, column.view, self._spare.view], device=device)
+                self._columns[name], self._spare = self._spare, column
+            self._resize(left)
+        return removed
+
+    def assign(self, arrays: typing.Mapping[str, np.ndarray]) -> None:
+        """Take other particles, as many as there are in the arrays.
+
+        Args:
+            arrays: float32 of shape (n, 3) for every name of `arrays`.
+        """
+        self._resize(len(arrays["position"]))
+        for name, view in self.arrays().items():
+            view.assign(arrays[name])
+
+    def _resize(self, count: int) -> None:
+        """Use `count` places; those beyond the particles there were hold anything."""
+        before, self.count = self.count, count
+        if count > self._capacity:
+            self._grow(before)
+        for column in (*self._columns.values(), self._spare):
+            column.view = column.store[:count]
+
     def _grow(self, before: int) -> None:
         """Make room for `count` particles and more, and keep those there were `before`."""
         device = self.grid.device
-        self._capacity = max(self.count, int(GROWTH * self._capacity))
+        self._capacity = max(self.count, int(GROWTH * self._capacity), 1)
         for name in self._names:
             column = Column(self._capacity, self.count, device)
             if before:
@@ -173,6 +215,10 @@ class Particles:
     def sort(self) -> None:
         """Bring the particles into the order of their cells; equal cells keep their order, so that a run is repeatable."""
         grid = self.grid
+        if self.count == 0:
+            if self.offsets is not None:
+                self.offsets.zero_()
+            return
         self.number()
         wp.launch(kernels.count_up_kernel, self.count, [self._order], device=grid.device)
         wp.utils.radix_sort_pairs(self.key, self._order, self.count, end_bit=grid.size.bit_length())
@@ -183,7 +229,9 @@ class Particles:
             wp.launch(kernels.offset_kernel, grid.size + 1, [self.key, self.count, self.offsets], device=grid.device)
 
     def totals(self) -> ParticleTotals:
-        """Return sums over the particles as they are now; the same bits on every run."""
+        """Return sums over the particles as they are now; the same bits on every run. Without particles all are 0."""
+        if self.count == 0:
+            return ParticleTotals(0, 0.0, np.zeros(3), np.zeros(3), np.zeros(3), 0.0, 0, 0)
         chunk = max(CHUNK, -(-self.count // THREADS))
         rows = -(-self.count // chunk)
         inputs = [self.count, chunk, self.position, self.velocity, self._partials]

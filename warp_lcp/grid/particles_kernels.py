@@ -108,6 +108,23 @@ def reorder_kernel(order: wp.array(dtype=wp.int32), source: wp.array(dtype=wp.ve
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")
+def stays_kernel(marks: wp.array(dtype=wp.int32), stays: wp.array(dtype=wp.int32)):
+    """Write 1 for a particle without a mark, 0 for others."""
+    p = wp.tid()
+    stays[p] = wp.where(marks[p] == 0, 1, 0)
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")
+def close_ranks_kernel(
+    marks: wp.array(dtype=wp.int32), stay: wp.array(dtype=wp.int32), source: wp.array(dtype=wp.vec3), target: wp.array(dtype=wp.vec3)
+):
+    """Move particles without a mark to where `stay`, the number of those up to and with each, says."""
+    p = wp.tid()
+    if marks[p] == 0:
+        target[stay[p] - 1] = source[p]
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")
 def total_kernel(
     count: int, chunk: int, position: wp.array(dtype=wp.vec3), velocity: wp.array(dtype=wp.vec3), out: wp.array2d(dtype=wp.float64)
 ):

@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.grid.motion import Motion
+from warp_lcp.grid.sides import open_ring
 from warp_lcp.grid.solid_notes import placement_notes, thin_notes
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.solids_kernels import cell_centers, claim_cells
@@ -40,7 +41,8 @@ class VoxelSolids:
     """Solids as whole cells.
 
     Args:
-        index: int32 of shape (nz + 2, ny + 2, nx + 2): -1 in open cells, 0 in the domain's wall (the ring), 1 + s in cells of solid s.
+        index: int32 of shape (nz + 2, ny + 2, nx + 2): -1 in open cells, 0 in the domain's wall (the ring, but for what lies beyond open
+            sides), 1 + s in cells of solid s.
         separating: uint8 of shape (1 + solids,), on the device: 1 where the wall of that index lets liquid leave.
         names: of those indices, the first "domain".
         covered: number of cells whose center lies in each solid (whichever claimed it), without the domain; shape (solids,).
@@ -62,6 +64,7 @@ def voxelize(
     *,
     wall_separating: bool,
     device: wp.Device | str,
+    open_sides: int = 0,
 ) -> VoxelSolids:
     """Give every cell whose center lies inside a solid to the first such solid.
 
@@ -72,6 +75,7 @@ def voxelize(
         solids: in the order of their claims.
         wall_separating: whether liquid may leave the domain's wall.
         device: where the arrays live.
+        open_sides: of `warp_lcp.grid.sides.side_bits`: beyond them cells are open.
 
     Raises:
         ValueError: a solid lies wholly outside the domain, or the solids leave no open cell.
@@ -82,6 +86,7 @@ def voxelize(
     device = wp.get_device(device)
     host = np.full((nz + 2, ny + 2, nx + 2), DOMAIN_WALL, dtype=np.int32)
     host[1:-1, 1:-1, 1:-1] = OPEN
+    host[open_ring((nz + 2, ny + 2, nx + 2), open_sides)] = OPEN
     index = wp.array(host, dtype=wp.int32, device=device)
     covered = wp.zeros(1 + len(solids), dtype=wp.int32, device=device)
     notes: list[str] = []
@@ -95,7 +100,7 @@ def voxelize(
         for solid, cells in zip(solids, claimed, strict=True)
         if not cells
     ]
-    if solids and not (index.numpy() == OPEN).any():
+    if solids and not (index.numpy()[1:-1, 1:-1, 1:-1] == OPEN).any():
         raise ValueError(
             "the solids fill the whole domain: no open cell is left (is one inverted, or a plane's normal the wrong way round?)"
         )

@@ -15,6 +15,7 @@ from warp_lcp.layout import Padding, zeros
 from warp_lcp.multigrid import coarsen_kernels as kernels
 from warp_lcp.multigrid.coarsen_kernels import UNBOUNDED
 from warp_lcp.multigrid.cycle_kernels import Aggregates, cycle_kernels
+from warp_lcp.multigrid.renew_kernels import renew_kernels
 from warp_lcp.multigrid.small_levels import SmallLevels, first_small
 from warp_lcp.native import Spans, grain
 from warp_lcp.operators.stencil import Stencil
@@ -81,7 +82,22 @@ class Level:
         self.aggregates: Aggregates | None = None  # how the finer level's cells make up this one's
         self.visits, self.shrunk = 1, 1.0  # by a cycle of the next finer level; by how much since a level that was visited more
         self.operands = [stencil.shape, stencil.d, *(stencil.weights or (nothing,) * 3)]
-        self.changed = wp.ones(stencil.padding.counts[:2], dtype=wp.uint8, device=stencil.device)  # rows, since the last rebuild
+        rows = stencil.padding.counts[:2]
+        self.changed = wp.ones(rows, dtype=wp.uint8, device=stencil.device)  # rows, since the last rebuild
+        self._spans = None if stencil.spans is None else wp.zeros(rows, dtype=wp.vec2i, device=stencil.device)  # of the fields' contents
+
+    def renew(self, *, keeps_weights: bool, launch: Launch) -> None:
+        """Clear the fields outside the rows' new spans and mark rows whose span has changed.
+
+        Args:
+            keeps_weights: whether the weights are not the level's own to clear.
+            launch: launches or records.
+        """
+        s = self.stencil
+        weights = () if keeps_weights or s.weights is None else s.weights
+        nothing = wp.empty(0, dtype=self.real, device=s.device)
+        inputs = [s.shape, self._spans, self.changed, self.x, self.b, self.t, s.d, *(weights or (nothing,) * 3)]
+        launch(renew_kernels(s.d.dtype, self.real).renew, s.padding.counts[:2], inputs, device=s.device)
 
     @property
     def grids(self) -> list[wp.array[Any]]:
@@ -145,6 +161,8 @@ class Hierarchy:
         m = math.prod(self.levels[-1].stencil.padding.counts)
         self._matrix, self._inverse = (wp.zeros((m, m), dtype=wp.float64, device=self.device) for _ in range(2))
         cells = self.settings.one_launch_cuda if self.device.is_cuda else self.settings.one_launch_cpu
+        signed = finest.weights is not None and finest.spans is not None
+        self._signs = wp.zeros(finest.padding.counts[:2], dtype=wp.uint64, device=self.device) if signed else None  # of rows of weights
         self._first_small = first_small(self.levels, cells)  # its index; none is small: len(levels)
         small = self.levels[self._first_small :]
         self._descents: dict[tuple[int, bool, bool], Program] = {}
@@ -162,23 +180,34 @@ class Hierarchy:
         return sum(sum(a.capacity for a in {id(v): v for v in (lv.x, lv.b, lv.t, lv.lower, lv.upper)}.values()) for lv in self.levels)
 
     def refresh(self) -> None:
-        """Take the operator's rows and weights again after they changed in place, and clear what lies outside the new rows."""
-        for fine, coarse in zip(self.levels, self.levels[1:], strict=False):
-            f, c, G = fine.stencil, coarse.stencil, coarse.aggregates
-            if f.spans is not None and G is not None:
-                inputs = [f.spans, wp.vec3i(G.fz, G.fy, G.fx), c.padding.counts[2], c.spans]
-                wp.launch(coarsen_spans_kernel, c.padding.counts[:2], inputs, device=self.device)
-        for level in self.levels:
-            for field in (level.x, level.b, level.t, level.stencil.d):
-                field.zero_()
-        for level in self.levels[1:]:
-            for field in level.stencil.weights or ():
-                field.zero_()
+        """Take the operator's rows and weights again after they changed in place, and clear what lies outside the new rows.
+
+        Rows whose span or weights are not what they were are marked in the finest level's `changed`. Weights are compared by 64 bits a
+        row that they hash to.
+        """
         ours, theirs = self.finest.stencil.weights, self._source.weights
         for w, source in zip(ours or (), theirs or (), strict=True):
             if w is not source:
                 convert(source, w)
-        self.finest.changed.fill_(1)
+        if self.finest.stencil.spans is None:
+            self.finest.changed.fill_(1)
+        self._renewal.run()
+
+    @cached_property
+    def _renewal(self) -> Program:
+        program = Program(self.device)
+        for fine, coarse in zip(self.levels, self.levels[1:], strict=False):
+            f, c, G = fine.stencil, coarse.stencil, coarse.aggregates
+            if f.spans is not None and G is not None:
+                inputs = [f.spans, wp.vec3i(G.fz, G.fy, G.fx), c.padding.counts[2], c.spans]
+                program.launch(coarsen_spans_kernel, c.padding.counts[:2], inputs, device=self.device)
+        for level in self.levels if self.finest.stencil.spans is not None else []:
+            level.renew(keeps_weights=level is self.finest, launch=program.launch)
+        s = self.finest.stencil
+        if s.weights is not None and self._signs is not None:
+            inputs = [s.shape, *s.weights, self._signs, self.finest.changed]
+            program.launch(renew_kernels(s.d.dtype, self.real).sign, s.padding.counts[:2], inputs, device=self.device)
+        return program
 
     def hold(self, d: wp.array[Any], free: wp.array[Any]) -> None:
         """Fill the finest diagonal: d where the stored uint8 field `free` is not 0, else 0; the rows that change are marked."""

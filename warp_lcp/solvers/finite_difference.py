@@ -33,7 +33,7 @@ class FiniteDifferenceSystem:
     def __init__(self, problem: LCP, residual: NaturalResidual, map: Reformulation, share: float) -> None:
         layout, self._problem, self._residual = problem.layout, problem, residual
         self.r, self.z, self._f, self._moved = (layout.zeros(wp.float64) for _ in range(4))
-        self._map = NonsmoothMap(problem, residual, map, share, wp.float64)
+        self._map = NonsmoothMap(problem, residual, map, share, wp.float64, Kink.APPROXIMATION)
         self._sums = wp.zeros(1, dtype=wp.float64, device=problem.device)
         self._reduction = Reduction(layout.size, problem.device, self._sums)
         self._krylov = GMRES(self._product, self)
@@ -42,7 +42,7 @@ class FiniteDifferenceSystem:
 
     def refresh(self) -> None:
         """Take the diagonal and b's scale again."""
-        self._map.begin(Kink.APPROXIMATION)
+        self._map.begin()
         d = self._residual.diagonal.numpy().astype(np.float64) * self._residual.unit
         self._diagonal = wp.array(d, dtype=wp.float64, device=self._problem.device)
 

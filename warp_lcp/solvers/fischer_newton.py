@@ -45,8 +45,8 @@ class FischerNewton:
 
     Args:
         kink: what stands for the derivative at a kink: "random", "zero", "perturbation" or "approximation" (see `Kink`).
-        share: lambda, in (0, 1]; 1 is the plain map. None: 0.95 for dense matrices, 1 for others, where the penalty made the steps grow with
-            the grid (ball obstacle, 65^2 to 1025^2: 6 to 11 steps with 0.95, 6 to 7 with 1).
+        share: lambda, in (0, 1]; 1 is the plain map. None: 0.95 for dense matrices, 1 for others, where the penalty made the steps
+            grow with the grid (ball obstacle, 65^2 to 1025^2: 6 to 11 steps with 0.95, 6 to 7 with 1).
         safeguard: False: monotone Armijo search along the projected path, and an end with NON_DESCENT or LOCAL_MINIMUM where that
             fails: the book's method. True: what is described above.
         precision: "mixed": iterate float64, corrections float32 on grids; "double"; or "single": the iterate rounded to float32 too.
@@ -62,9 +62,8 @@ class FischerNewton:
 
     Example:
         >>> import numpy as np, warp_lcp as wl
-        >>> from warp_lcp.solvers.fischer_newton import FischerNewton
         >>> A = wl.DenseOperator(np.array([[2.0, -1.0], [-1.0, 2.0]]), device="cpu")
-        >>> result = wl.solve(wl.LCP(A, np.array([2.0, -3.0])), FischerNewton())
+        >>> result = wl.solve(wl.LCP(A, np.array([2.0, -3.0])), wl.FischerNewton())
         >>> print(result.status.name, abs(result.x.numpy().round(6)))
         CONVERGED [0.  1.5]
     """
@@ -133,7 +132,7 @@ class FischerWorkspace(IterateInPlace):
             if self.kink is Kink.APPROXIMATION
             else principal_system(problem, self.precision.correction, bounded=False, settings=settings.cycle, shifted=True)
         )
-        self.map = NonsmoothMap(problem, self.residual, map_, share, self.system.r.dtype)
+        self.map = NonsmoothMap(problem, self.residual, map_, share, self.system.r.dtype, self.kink)
         self._search = NonmonotoneSearch(memory=settings.memory if settings.safeguard else 1)
         self._gradient: GradientWorkspace | None = None
         self.active_set: NewtonWorkspace = None  # type: ignore[assignment]
@@ -151,7 +150,7 @@ class FischerWorkspace(IterateInPlace):
         self.descents_left, self.steps, self.target = s.warm_start, 0, tolerance
         self._scale = self._merit = self._gone = 0.0
         self._search.forget()
-        self.map.begin(self.kink)
+        self.map.begin()
         self.system.refresh()
         if self.active_set is not None:
             self.active_set.floating = self.floating

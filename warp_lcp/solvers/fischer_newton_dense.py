@@ -12,8 +12,8 @@ from warp_lcp.result import SolveStatus
 from warp_lcp.solve import Precision, Step
 from warp_lcp.solvers.dense_problem import DenseProblem, DenseWorkspace
 from warp_lcp.solvers.globalization import NonmonotoneSearch
-from warp_lcp.solvers.gradient_descent import GradientDescent, GradientWorkspace
-from warp_lcp.solvers.nonsmooth_map import KINK, Kink, Reformulation
+from warp_lcp.solvers.gradient_descent import GradientWorkspace
+from warp_lcp.solvers.nonsmooth_map import KINK, Kink
 
 if TYPE_CHECKING:
     from warp_lcp.solvers.fischer_newton import FischerNewton
@@ -69,11 +69,9 @@ class FischerMap:
         kinks = (kink1 & self.low) | (kink2 & self.high)
         if smoothing or self.share == 1:
             return p, q, kinks
-        up, down = np.maximum(y, 0), np.maximum(-y, 0)
-        p = self.share * p + (1 - self.share) / self.scale * (self.low * (a > 0) * up + self.high * (c > 0) * down)
-        q = self.share * q + (1 - self.share) / self.scale * (
-            self.low * (y > 0) * np.maximum(a, 0) + self.high * (y < 0) * np.maximum(c, 0)
-        )
+        rest, lowered, raised = (1 - self.share) / self.scale, self.low * np.maximum(a, 0), self.high * np.maximum(c, 0)
+        p = self.share * p + rest * ((lowered > 0) * np.maximum(y, 0) + (raised > 0) * np.maximum(-y, 0))
+        q = self.share * q + rest * ((y > 0) * lowered + (y < 0) * raised)
         return p, q, kinks
 
     def jacobian(self, p: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -110,7 +108,7 @@ class FischerDenseWorkspace(DenseWorkspace):
 
     def __init__(self, problem: LCP, settings: FischerNewton) -> None:
         super().__init__(problem)
-        self.settings, self._descent, self.precision = settings, settings.descent(problem), Precision.DOUBLE
+        self.settings, self._descent, self.precision = settings, settings.descent(problem), Precision(settings.precision)
         self.cycles_left, self.descents_left, self.stage, self.steps = 0, settings.warm_start, 0, 0
         self.active_set: Any = None
         self._search = NonmonotoneSearch(memory=settings.memory if settings.safeguard else 1)
@@ -147,10 +145,17 @@ class FischerDenseWorkspace(DenseWorkspace):
         else:
             failure = self._homotopy()
         stored = x.numpy().copy()
-        stored[self.data.rows] = self._iterate
+        stored[self.data.rows] = self._rounded(self._iterate)
         x.assign(stored)
         name = "fischer" if self.stage == 0 else "homotopy"
         return Step(name, 1, None, failure, interim=self.settings.safeguard and failure is None)
+
+    def round_iterate(self) -> None:
+        """Round x to its precision."""
+        self.x.assign(self._rounded(self.x.numpy()))
+
+    def _rounded(self, x: np.ndarray) -> np.ndarray:
+        return x.astype(np.float32).astype(np.float64) if self.precision is Precision.SINGLE else x
 
     def _plain(self) -> SolveStatus | None:
         """Take a step of the book's method: algorithm 12."""

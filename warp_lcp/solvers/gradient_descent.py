@@ -14,10 +14,11 @@ from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
 from warp_lcp.solve import IterateInPlace, Precision, Step
 from warp_lcp.solvers.globalization import NonmonotoneSearch
-from warp_lcp.solvers.nonsmooth_map import Kink, NonsmoothMap, Reformulation
+from warp_lcp.solvers.nonsmooth_map import NonsmoothMap, Reformulation
 from warp_lcp.vectors import convert
 
 LEAST = 1e-12  # relative decrease of the merit without which a step is none
+LONGEST = 1e6  # length tried
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,12 +26,13 @@ class GradientDescent:
     """Descend on the merit f.f / 2 of a reformulation ([Book] 2.4.4, eq. 2.199, algorithm 13).
 
     x <- clip(x - t d^-2 J'f, l, u) with an element J = diag(p d) + diag(q) A of the generalized Jacobian and d = |A_ii|, which makes
-    the direction independent of x's units. t comes from a backtracking search along the projected path that starts at twice the last
-    length. Needs products with A' as well, and nothing else of A: it is slow, with a rate that the square of A's condition decides.
+    the direction independent of x's units. t comes from a backtracking search along the projected path that starts at Barzilai and
+    Borwein's length; the merit may not exceed the largest of the last ones. Needs products with A' as well, and nothing else of A: it
+    is slow, with a rate that the square of A's condition decides.
 
     The book's tests end it: the absolute one is the criteria of every method (CONVERGED); the relative one (eq. 2.202), a merit that
-    changes by less than `relative` of itself, and the stagnation test (eq. 2.203), an x that changes by less than `stagnation` of its largest
-    entry, give STAGNATED; a gradient below `gradient` ||f|| gives LOCAL_MINIMUM; a search without success gives NON_DESCENT.
+    changes by less than `relative` of itself, and the stagnation test (eq. 2.203), an x that changes by less than `stagnation` of its
+    largest entry, give STAGNATED; a gradient below `gradient` ||f|| gives LOCAL_MINIMUM; a search without success gives NON_DESCENT.
 
     Args:
         map: "natural", "fischer" or "penalized".
@@ -38,6 +40,7 @@ class GradientDescent:
         relative: of the relative test, >= 0.
         stagnation: of the stagnation test, >= 0.
         gradient: of the test for a local minimum, >= 0.
+        memory: merits that the search remembers, >= 1; 1 is the book's monotone search.
         precision: "mixed" and "double" are the same here; "single" rounds x to float32.
 
     Raises:
@@ -52,6 +55,7 @@ class GradientDescent:
     relative: float = 1e-12
     stagnation: float = 1e-14
     gradient: float = 1e-10
+    memory: int = 10
     precision: str = "double"
 
     def __post_init__(self) -> None:
@@ -59,6 +63,8 @@ class GradientDescent:
         Reformulation(self.map), Precision(self.precision)
         if not 0 < self.share <= 1:
             raise ValueError(f"share = {self.share}: must be in (0, 1]")
+        if self.memory < 1:
+            raise ValueError(f"memory = {self.memory}: must be >= 1")
         for name in ("relative", "stagnation", "gradient"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} = {getattr(self, name)}: must be >= 0")
@@ -87,27 +93,31 @@ class GradientWorkspace(IterateInPlace):
         self.x = problem.layout.zeros(wp.float64) if residual is None else wp.empty(0, dtype=wp.float64, device=problem.device)
         self._from = problem.layout.zeros(wp.float64)
         self._map = NonsmoothMap(problem, self.residual, Reformulation(settings.map), settings.share, wp.float64)
-        self._search = NonmonotoneSearch(memory=1, least=1e-18)
+        self._search = NonmonotoneSearch(memory=settings.memory, least=1e-18)
         self._rounded = problem.layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
         self.floating: Any = None
-        self.length, self.merit = 1.0, math.inf
+        self.length, self._square = 1.0, 0.0
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the last length."""
-        self.length, self.merit = 1.0, math.inf
-        self._map.begin(Kink.PERTURBATION)
+        self.length, self._square = 1.0, 0.0
+        self._search.forget()
+        self._map.begin()
 
     def descend(self, x: wp.array[Any]) -> Step:
         """Go down once; `residual.y` is current at x before and after."""
         s, map_ = self.settings, self._map
         merit = map_.merit(x)
-        slope = map_.descend(x)
-        if slope <= s.gradient * math.sqrt(2 * merit):
+        square, inner = map_.descend(x)
+        if math.sqrt(square) <= s.gradient * math.sqrt(2 * merit):
             return Step("gradient", 1, None, SolveStatus.LOCAL_MINIMUM)
+        if self._square > 0:  # Barzilai and Borwein's length, of a step that no bound cut short
+            change = 1 - inner / self._square
+            self.length = self.length / change if change > 1e-6 else 10 * self.length
+        self._square = square
         wp.copy(self._from, x)
-        self._search.forget()
         self._search.remember(merit * (1 - LEAST))  # a projected step promises less than Armijo asks of a free one
-        length, reached = self._search.search(lambda t: self._trial(x, t), 0.0, first=min(2 * self.length, 1e6))
+        length, reached = self._search.search(lambda t: self._trial(x, t), 0.0, first=min(self.length, LONGEST))
         if length == 0.0:
             wp.copy(x, self._from)
             self.residual.evaluate(x)
@@ -117,7 +127,7 @@ class GradientWorkspace(IterateInPlace):
 
     def _trial(self, x: wp.array[Any], length: float) -> float:
         """Move along the projected path, and return the merit."""
-        self._map.advance(self._from, self._direction, -length, x, projected=True)
+        self._map.advance(self._from, self._map.direction, -length, x, projected=True)
         self.round(x)
         self.residual.evaluate(x)
         return self._map.merit(x)
@@ -125,15 +135,10 @@ class GradientWorkspace(IterateInPlace):
     def _tested(self, x: wp.array[Any], before: float, after: float) -> SolveStatus | None:
         """Return how the relative and the stagnation test end the solve, None if they do not."""
         s = self.settings
-        if before - after <= s.relative * before:
+        if abs(before - after) <= s.relative * before:
             return SolveStatus.STAGNATED
         moved = float(np.abs(x.numpy() - self._from.numpy()).max())
         return SolveStatus.STAGNATED if moved <= s.stagnation * float(np.abs(x.numpy()).max()) else None
-
-    @property
-    def _direction(self) -> wp.array[Any]:
-        assert self._map.direction is not None
-        return self._map.direction
 
     def round_iterate(self) -> None:
         """Round x to its precision."""

@@ -56,9 +56,8 @@ class InteriorPoint:
 
     Example:
         >>> import numpy as np, warp_lcp as wl
-        >>> from warp_lcp.solvers.interior_point import InteriorPoint
         >>> A = wl.DenseOperator(np.array([[2.0, -1.0], [-1.0, 2.0]]), device="cpu")
-        >>> result = wl.solve(wl.LCP(A, np.array([2.0, -3.0])), InteriorPoint())
+        >>> result = wl.solve(wl.LCP(A, np.array([2.0, -3.0])), wl.InteriorPoint())
         >>> print(result.status.name, result.x.numpy().round(4))
         CONVERGED [0.  1.5]
     """

@@ -67,8 +67,8 @@ def kernels(d_type: Any, real: Any, upper: bool) -> SimpleNamespace:
         )
     )
     def ratios_span(
-        w_: f64, v_: f64, s_: f64, t_: f64, a_: field, e_: field, scale: wp.float64, second: wp.float64, joined: wp.float64, tau: wp.float64, start: wp.int64,
-        end: wp.int64, stride: wp.int64,
+        w_: f64, v_: f64, s_: f64, t_: f64, a_: field, e_: field, scale: wp.float64, second: wp.float64, joined: wp.float64,
+        tau: wp.float64, start: wp.int64, end: wp.int64, stride: wp.int64,
     ) -> wp.vec2d: ...  # fmt: skip
 
     @wp.func_native(
@@ -171,8 +171,8 @@ def kernels(d_type: Any, real: Any, upper: bool) -> SimpleNamespace:
 
     @wp.kernel(enable_backward=False, module=name)
     def ratios(
-        w: f64, v: f64, s: f64, t: f64, a: field, e: field, scale: wp.float64, second: wp.float64, joined: wp.float64, tau: wp.float64, n: int, chunk: int,
-        stride: wp.int64, longest: f64, sums: f64,
+        w: f64, v: f64, s: f64, t: f64, a: field, e: field, scale: wp.float64, second: wp.float64, joined: wp.float64, tau: wp.float64,
+        n: int, chunk: int, stride: wp.int64, longest: f64, sums: f64,
     ):  # fmt: skip
         k = wp.tid()
         found = ratios_span(w, v, s, t, a, e, scale, second, joined, tau, span_start(k, chunk), span_end(k, chunk, n), stride)

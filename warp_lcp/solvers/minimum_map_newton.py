@@ -34,7 +34,8 @@ class MinimumMapNewton:
     Args:
         precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate rounded to float32 as well.
         monotone_cycles: projected cycles of a cold start on a grid.
-        eta: each linear solve reduces its residual by this factor, or to what the whole solve still needs, once the active set has settled.
+        eta: each linear solve reduces its residual by this factor, its square once the active set has settled, or to
+            what the whole solve still needs.
         max_linear_iterations: the most conjugate-gradient iterations of one step.
         backtracks: halvings of a step before it is given up.
         memory: residuals that a step may fall back to.
@@ -158,12 +159,12 @@ class NewtonWorkspace(IterateInPlace):
         return float(self._scalars.numpy()[SQUARE])
 
     def _solve(self, norm: float, size: float, *, settled: bool) -> int:
-        """Solve for the correction, once and for all if the active set has not moved; returns linear iterations."""
+        """Solve for the correction, more accurately if the active set has not moved; returns linear iterations."""
         s = self.settings
         if self.floating is not None:
             self.floating.project(self.system.r, self.free)
         target = 0.3 * self.target / size
-        return self.system.solve(max(0.0 if settled else s.eta * norm, target), s.max_linear_iterations)[0]
+        return self.system.solve(max((s.eta**2 if settled else s.eta) * norm, target), s.max_linear_iterations)[0]
 
     def _move(self, x: wp.array[Any], size: float, iterations: int, active: int) -> Step:
         """Accept the longest of the halved, projected steps that the safeguard allows."""

@@ -65,7 +65,8 @@ def kernels(d_type: Any, real: Any) -> SimpleNamespace:
     @wp.func_native(
         flat(
             CODED
-            + """const double* b = b_.data; const auto* e = e_.data; double *o = o_.data, *k = k_.data; const bool keep = k_.data != nullptr;
+            + """const double* b = b_.data; const auto* e = e_.data; double *o = o_.data, *k = k_.data;
+        const bool keep = k_.data != nullptr;
         with_bounds([&](auto lower, auto upper) {
             auto moved = [&](double from, double by, double l, double u) {
                 const double v = from + scale*by, w = v < l ? l : v; return by == 0 ? from : (w > u ? u : w); };

@@ -139,6 +139,7 @@ class SplitResidual(NaturalResidual):
         self.sums = Reduction(problem.layout.size, device, self.scalars, columns=2)
         self.kernels = kernels.kernels(self.diagonal.dtype, r.dtype)
         self.size, self.moved, self.chopped, self.reduced, self.release, self.active, self.energy = 1.0, True, 0.0, 0.0, 0.0, 0, 0.0
+        self._norm_of_b = 0.0
         self._stencil = problem.A.stencil if isinstance(problem.A, GridPoisson) else None
         if self._stencil is None:
             self._split = Reduction(problem.layout.size, device, self.scalars, columns=kernels.COLUMNS)
@@ -151,7 +152,12 @@ class SplitResidual(NaturalResidual):
         """Set x to clip(x, l, u) or clip(0, l, u)."""
         super().start(x, keep=keep)
         if not keep:
-            self.size, self.norm = self.norm_of_b() or 1.0, 0.0
+            self._norm_of_b = super().norm_of_b()
+            self.size, self.norm = self._norm_of_b or 1.0, 0.0
+
+    def norm_of_b(self) -> float:
+        """Return ||b|| over the unknowns, as it was when the solve began."""
+        return self._norm_of_b
 
     def evaluate(self, x: wp.array[Any]) -> float:
         """Compute the norm of the natural residual at x and what the attributes hold; on grids y is not stored."""
@@ -170,10 +176,9 @@ class SplitResidual(NaturalResidual):
             inputs = [*s.operands, R, x, p.b, *p.bounds.operands, p.unknown, *written, self._split.partials]
             wp.launch(self._assess, (-(-R.all_planes // R.planes), R.rows, R.chunks), inputs, device=p.device)
         self._split.add_up(kernels.SQUARE, columns=kernels.COLUMNS)
-        square, self.chopped, self.reduced, release, moved, active, self.energy = (
+        square, self.chopped, self.reduced, self.release, moved, active, self.energy = (
             float(v) for v in self.scalars.numpy()[: kernels.COLUMNS]
         )
-        self.release = release / self.size**2
         self.norm, self.current, self.active, self.moved = float(np.sqrt(square)), True, int(active), self.moved or moved > 0
         return self.norm
 

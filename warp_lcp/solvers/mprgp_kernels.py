@@ -43,7 +43,7 @@ def kernels(d_type: Any, real: Any) -> SimpleNamespace:
             {NATURAL} {HELD}
             const unsigned char now = ((m[i] == 1) & !held);
             const double v = held ? r : 0.0;
-            s += r*r; chopped += v*v; reduced += held ? 0.0 : r*y[i]; release += v*v/e;
+            s += r*r; chopped += v*v; reduced += held ? 0.0 : r*y[i]; release += v*v/e*inverse*inverse;
             moved += now != free[i] ? 1.0 : 0.0; active += held ? 1.0 : 0.0;
             free[i] = now; right[i] = now ? ({T})(-y[i]*inverse) : ({T})0; c_[i] = ({T})(-v/e*inverse); }} }});
         if (b) EACH {{ energy += m[i] == 1 ? 0.5*x[i]*(y[i] + b[i]) : 0.0; }}
@@ -244,9 +244,10 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, real: Any) -> Any:
                     const T e = unit*(T)d[k], f = e != 0 ? e : (T)1, l = lower(k), u = upper(k), v = y[k - begin];
                     const T below = f*(x[k] - l), above = f*(x[k] - u), least = below < v ? below : v, r0 = above > least ? above : least;
                     const bool in = m[k] == 1, held = in & ((x[k] <= l + slack*(l < 0 ? -l : l)) | (x[k] >= u - slack*(u < 0 ? -u : u)));
-                    const T r = in ? r0 : (T)0, h = held ? r : (T)0, w = h/f;
-                    s += r*r; chopped += h*h; reduced += held ? (T)0 : r*v; release += h*w;
-                    now[k - begin] = in & !held; g[k] = ({R})((in & !held) ? -v*inverse : (T)0); c_[k] = ({R})(-w*inverse); }} }});
+                    const T r = in ? r0 : (T)0, h = held ? r : (T)0;
+                    const {R} w = ({R})(-h*inverse)/({R})f;  // division is what would take longest in double precision
+                    s += r*r; chopped += h*h; reduced += held ? (T)0 : r*v; release -= h*inverse*(T)w;
+                    now[k - begin] = in & !held; g[k] = ({R})((in & !held) ? -v*inverse : (T)0); c_[k] = w; }} }});
             SIMD64 for (int k = begin; k < end; ++k) {{
                 const unsigned char one = now[k - begin] != free[k], two = (m[k] == 1) & !now[k - begin];
                 changed |= one; count += two; free[k] = now[k - begin]; }}

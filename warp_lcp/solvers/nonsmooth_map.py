@@ -8,16 +8,17 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.layout import PaddedLayout
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
-from warp_lcp.solvers.nonsmooth_map_kernels import Map, kernels
+from warp_lcp.solvers.nonsmooth_map_kernels import Form, Map, kernels
 from warp_lcp.vectors import Reduction, launch_spans
 
 KINK = 1e-14  # times the size of b: a point this near to both sides of a kink is on it
 
 
 class Reformulation(Enum):
-    """Which map ([Book] 1.1.2-3): the minimum map, Fischer's psi(a, b) = a + b - sqrt(a^2 + b^2), or Chen, Chen and Kanzow's penalized one."""
+    """Which map ([Book] 1.1.2-3): the minimum map, Fischer and Burmeister's, or Chen, Chen and Kanzow's penalized one."""
 
     NATURAL = "natural"
     FISCHER = "fischer"
@@ -41,9 +42,9 @@ class Kink(Enum):
 class NonsmoothMap:
     """f, the merit f.f / 2 and its gradient, at the point where a residual was evaluated last.
 
-    With d = |A_ii| (1 where that is 0), a = d (x - l), c = d (u - x) and psi(a, b) = a + b - sqrt(a^2 + b^2), the Fischer map of a boxed row is
-    psi(a, -psi(-y, c)) ([Book] eq. 1.48, signs turned so that f > 0 where y > 0), of one without upper bound psi(a, y), of an equation
-    y; penalized: lambda times that plus (1 - lambda) (a+ y+ - c+ (-y)+) / scale with `scale` the root mean square of b. The
+    With d = |A_ii| (1 where that is 0), a = d (x - l), c = d (u - x) and psi(a, b) = a + b - sqrt(a^2 + b^2), the Fischer map of a boxed
+    row is psi(a, -psi(-y, c)) ([Book] eq. 1.48, signs turned so that f > 0 where y > 0), of one without upper bound psi(a, y), of an
+    equation y; penalized: lambda times that plus (1 - lambda) (a+ y+ - c+ (-y)+) / scale with `scale` the root mean square of b. The
     factor d makes f's units those of y, so that a change of x's units changes nothing.
 
     Args:
@@ -52,29 +53,32 @@ class NonsmoothMap:
         map: which of the three.
         share: lambda of the penalized map.
         real: type of corrections.
+        kink: what stands for the derivative at a kink.
     """
 
-    def __init__(self, problem: LCP, residual: NaturalResidual, map: Reformulation, share: float, real: Any) -> None:
+    def __init__(
+        self, problem: LCP, residual: NaturalResidual, map: Reformulation, share: float, real: Any, kink: Kink = Kink.PERTURBATION
+    ) -> None:
         self.problem, self.residual, self.map = problem, residual, map
         layout, self._share = problem.layout, share if map is Reformulation.PENALIZED else 1.0
-        self._kernels = kernels(residual.diagonal.dtype, real, map is Reformulation.NATURAL)
-        self._double = kernels(residual.diagonal.dtype, wp.float64, map is Reformulation.NATURAL)
-        self._sums = wp.zeros(1, dtype=wp.float64, device=problem.device)
-        self._reduction = Reduction(layout.size, problem.device, self._sums)
+        natural, penalized = map is Reformulation.NATURAL, self._share < 1
+        form = Form(natural, problem.bounds.may_bind[1], penalized, kink is Kink.RANDOM and not natural)
+        self._kernels = kernels(residual.diagonal.dtype, real, form)
+        self._double = kernels(residual.diagonal.dtype, wp.float64, form)
+        self._sums = wp.zeros(2, dtype=wp.float64, device=problem.device)
+        self._reduction = Reduction(layout.size, problem.device, self._sums, columns=2)
         self._data = Map()
-        self.direction: wp.array[Any] | None = None
-        self._product: wp.array[Any] | None = None
-        self.begin(Kink.RANDOM)
+        self._gradients: list[wp.array[Any]] = []  # this one and the last, the product, the weights: made when first asked for
+        self._drop = 1.0 if kink in (Kink.ZERO, Kink.APPROXIMATION) else 0.0
+        self.begin()
 
-    def begin(self, kink: Kink) -> None:
+    def begin(self) -> None:
         """Take the scale of b as it is now."""
         p, data = self.problem, self._data
         count = max(int(np.count_nonzero(p.unknown.numpy() == 1)), 1)
         scale = self.residual.norm_of_b() / np.sqrt(count) or 1.0
         data.unit, data.share, data.over, data.kinks = self.residual.unit, self._share, 1 / scale, KINK * scale
-        data.at_p, data.at_q = 0.0, 1.0
-        data.seed, data.random = 0, int(kink is Kink.RANDOM)
-        self._drop = 1.0 if kink in (Kink.ZERO, Kink.APPROXIMATION) else 0.0
+        data.seed = 0
 
     def merit(self, x: wp.array[Any]) -> float:
         """Return f.f / 2."""
@@ -98,19 +102,31 @@ class NonsmoothMap:
         self._data.seed = turn * self.problem.layout.size
         return self._half_sum(self._kernels.condense, x, [shift, r, free, wp.float64(scale), wp.float64(self._drop)])
 
-    def descend(self, x: wp.array[Any]) -> float:
-        """Write the gradient J'f, scaled by d^-2, to `direction`; return ||d^-1 J'f||, which has the units of f."""
+    def descend(self, x: wp.array[Any]) -> tuple[float, float]:
+        """Write the gradient J'f, scaled by d^-2, to `direction`.
+
+        Returns:
+            ||d^-1 J'f||^2, and the inner product of d^-1 J'f with what it was the last time.
+        """
         p = self.problem
-        if self.direction is None:
-            self.direction, self._weights, self._product = (p.layout.zeros(wp.float64) for _ in range(3))
-        self._half_sum(self._kernels.weighted, x, [self.direction, self._weights])
-        shape = p.layout.stored_shape
-        p.A.apply_transpose(self._weights.reshape(shape), self._product.reshape(shape))
+        if not self._gradients:
+            self._gradients = [p.layout.zeros(wp.float64) for _ in range(4)]
+        last, new, product, weights = self._gradients
+        self._gradients = [new, last, product, weights]
+        self._half_sum(self._kernels.weighted, x, [new, weights])
+        shape = (p.layout.size,) if isinstance(p.layout, PaddedLayout) else p.layout.stored_shape  # grids take stored fields flat
+        p.A.apply_transpose(weights.reshape(shape), product.reshape(shape))
         r, reduction = self.residual, self._reduction
-        before = [self.direction, self._product, r.diagonal, wp.float64(r.unit), p.unknown]
-        launch_spans(self._kernels.gradient, reduction.spans, before, [reduction.partials], p.device)
-        reduction.add_up(0)
-        return float(np.sqrt(self._sums.numpy()[0]))
+        before = [new, product, last, r.diagonal, wp.float64(r.unit), p.unknown]
+        launch_spans(self._kernels.gradient, reduction.spans, before, [reduction.threads, reduction.partials], p.device)
+        reduction.add_up(0, columns=2)
+        square, inner = self._sums.numpy()
+        return float(square), float(inner)
+
+    @property
+    def direction(self) -> wp.array[Any]:
+        """What `descend` wrote."""
+        return self._gradients[0]
 
     def advance(self, base: wp.array[Any], e: wp.array[Any], scale: float, x: wp.array[Any], *, projected: bool) -> None:
         """Set x = base + scale e, projected onto the bounds or not; base and x may be one field."""

@@ -1,0 +1,68 @@
+"""Two columns that collapse into each other keep their volume for half a minute, if their particles are kept apart."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from benchmarks.record import Chart, Lines
+from benchmarks.validation.enclosed import enclosed_cells
+from benchmarks.validation.finding import Findings, Trial, attempt
+from benchmarks.validation.tank import PER_AXIS, SUB_CELL, Numerics, box, create, positions, steps
+from fluids import LiquidSimulation
+
+RESOLUTIONS = (64, 96)  # cells along the domain
+SIZE, COLUMN = [1.6, 0.8], 0.4  # [m]: of the domain, and the side of each column
+DURATION, AVERAGED = 30.0, 2.0  # [s], and the end over which the volume is averaged
+CORRECTED: dict[str, Any] = {"density_correction": {"every": 1}}
+
+
+def check(device: str) -> tuple[list[Trial], list[Chart]]:
+    """Run the check at its resolutions."""
+    trials = [trial(n, device) for n in RESOLUTIONS]
+    curves = {f"{t.resolution}: {label}": curve for t in trials for label, curve in t.curves.items()}
+    title = "Volume of two columns that collapse"
+    return trials, [Lines("volume", title, "t [s]", "volume / start", curves, logarithmic_x=False, logarithmic_y=False)]
+
+
+def trial(resolution: int, device: str, numerics: Numerics = SUB_CELL) -> Trial:
+    """Compare the volume inside the surface with the one at the start; the control goes without the correction."""
+
+    def run(found: Findings) -> None:
+        time, volume, density = collapse(resolution, device, numerics, **CORRECTED)
+        found.add("volume of the last 2 s over that at the start", _late(time, volume), low=0.98, high=1.02)
+        found.add("mean of the largest densities", float(density.mean()), high=1.3)
+        found.curves["with density correction"] = (time.tolist(), volume.tolist())
+        time, volume, _ = collapse(resolution, device, numerics)
+        found.must_break("no correction: volume of the last 2 s over that at the start", _late(time, volume), low=0.8)
+        found.curves["without"] = (time.tolist(), volume.tolist())
+
+    return attempt("volume", f"{resolution} cells, {numerics.name}", run)
+
+
+def collapse(resolution: int, device: str, numerics: Numerics, **tables: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the ends of the steps [s], the volume inside the surface over that at the start, and the largest densities, if corrected.
+
+    The surface is measured apart from the simulation: a count of particles could not show a loss.
+    """
+    low, high = [SIZE[0] - COLUMN, 0.0], [SIZE[0], COLUMN]
+    liquid = [box([0.0, 0.0], [COLUMN, COLUMN]), box(low, high)]
+    simulation = create(numerics, size=SIZE, resolution=resolution, liquid=liquid, device=device, **tables)
+    before = _enclosed(simulation)
+    time, volume, density = [], [], []
+    for row in steps(simulation, DURATION):
+        time.append(row["time"])
+        volume.append(_enclosed(simulation) / before)
+        density.append(row.get("max_density", np.nan))
+    return np.array(time), np.array(volume), np.array(density)
+
+
+def _late(time: np.ndarray, volume: np.ndarray) -> float:
+    return float(volume[time > DURATION - AVERAGED].mean())
+
+
+def _enclosed(simulation: LiquidSimulation) -> float:
+    """Return the volume inside the sub-cell surface [cells]."""
+    nx, ny, _ = simulation.grid.counts
+    return enclosed_cells(positions(simulation) / simulation.grid.spacing, (nx, ny), 1.0 / PER_AXIS**2)

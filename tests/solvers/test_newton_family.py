@@ -1,0 +1,268 @@
+"""Interior point, Fischer-Newton, gradient descent and the minimum map's safeguard: what each promises beyond the table of all methods."""
+
+import numpy as np
+import pytest
+import scipy.sparse
+import warp as wp
+
+import warp_lcp as wl
+from oracle import assemble, boxed, lemke, natural_residual
+from warp_lcp.gallery.contact import contact
+from warp_lcp.gallery.obstacle import ball_obstacle
+from warp_lcp.gallery.psd import semidefinite
+from warp_lcp.residual import NaturalResidual
+from warp_lcp.solvers.fischer_newton import FischerNewton
+from warp_lcp.solvers.globalization import NonmonotoneSearch
+from warp_lcp.solvers.gradient_descent import GradientDescent
+from warp_lcp.solvers.interior_point import InteriorPoint
+from warp_lcp.solvers.nonsmooth_map import Kink, NonsmoothMap, Reformulation
+
+TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=300)
+KINKS = [k.value for k in Kink]
+PERIOD_THREE = np.array([[1.0, 0.0, 4.0], [4.0, 1.0, 0.0], [0.0, 4.0, 1.0]])
+
+
+def dense(A, b, lower=0.0, upper=np.inf):
+    return wl.LCP(wl.DenseOperator(A, device="cpu"), b, lower, upper)
+
+
+def random_boxed(rng, n=6):
+    """An unsymmetric positive definite problem with every kind of row."""
+    B, C = rng.standard_normal((2, n, n))
+    lower, upper = -rng.random(n), rng.random(n)
+    lower[0], upper[1], (lower[2], upper[2]) = -np.inf, np.inf, (0.3, 0.3)
+    lower[3], upper[3] = -np.inf, np.inf
+    return B @ B.T + 0.2 * np.eye(n) + C - C.T, 2 * rng.standard_normal(n), lower, upper
+
+
+METHODS = [
+    InteriorPoint(),
+    InteriorPoint(mehrotra=False),
+    InteriorPoint(crossover=1e-2),
+    *(FischerNewton(kink=k, safeguard=s, share=c) for k in KINKS for s, c in ((True, 0.95), (False, 1.0))),
+    FischerNewton(warm_start=3),
+]
+
+
+@pytest.mark.parametrize("method", METHODS, ids=lambda m: repr(m)[:90])
+def test_boxed_mixed_and_held_rows(method):
+    """Exhaustive search is the oracle; exchanged bounds or a wrong sign of y in one row would move the solution."""
+    rng = np.random.default_rng(2203)
+    for _ in range(5):
+        A, b, lower, upper = random_boxed(rng)
+        result = wl.solve(dense(A, b, lower, upper), method, stopping=TIGHT)
+        assert result, result.status
+        np.testing.assert_allclose(result.x.numpy(), boxed(A, b, lower, upper), atol=1e-8)
+
+
+@pytest.mark.parametrize("method", [InteriorPoint(), FischerNewton(), GradientDescent()], ids=lambda m: type(m).__name__)
+def test_equations_alone_are_a_linear_solve(method):
+    rng = np.random.default_rng(2207)
+    B = rng.standard_normal((12, 12))
+    A, b = B @ B.T / 12 + np.eye(12), rng.standard_normal(12)
+    result = wl.solve(dense(A, b, -np.inf), method, stopping=wl.StoppingCriteria(rtol=1e-9, max_iterations=2000))
+    assert result, result.status
+    np.testing.assert_allclose(result.x.numpy(), np.linalg.solve(A, -b), atol=1e-7)
+
+
+@pytest.mark.parametrize("method", [InteriorPoint(), InteriorPoint(precision="double"), FischerNewton(), FischerNewton(share=0.95)])
+@pytest.mark.parametrize("upper", [np.inf, 0.4])
+def test_grid_against_a_dense_matrix(method, upper, device):
+    rng = np.random.default_rng(2213)
+    cells = rng.choice(3, (6, 7, 5), p=[0.1, 0.8, 0.1])
+    cells[0, 0, 0] = wl.AIR
+    fluid, matrix, b = cells.ravel() == wl.FLUID, assemble(cells), rng.standard_normal(cells.shape)
+    result = wl.solve(wl.LCP(wl.GridPoisson(cells, device=device), b, 0.0, upper), method, stopping=TIGHT)
+    assert result, result.status
+    n = int(fluid.sum())
+    block, x = matrix[np.ix_(fluid, fluid)], result.x.numpy().ravel()[fluid]
+    free = (x > 1e-6) & (x < upper - 1e-6)
+    expected = np.where(x > 1e-6, np.where(free, 0.0, upper), 0.0)
+    expected[free] = np.linalg.solve(block[np.ix_(free, free)], -(b.ravel()[fluid] + block @ expected)[free])
+    np.testing.assert_allclose(x, expected, atol=1e-8)
+    bounds = np.zeros(n), np.full(n, upper)
+    assert natural_residual(block, b.ravel()[fluid], *bounds, expected) < 1e-9
+    if np.isinf(upper):
+        np.testing.assert_allclose(x, lemke(block, b.ravel()[fluid]), atol=1e-8)
+
+
+@pytest.mark.parametrize("method", [InteriorPoint(), FischerNewton()], ids=lambda m: type(m).__name__)
+def test_unsymmetric_sparse_matrix(method):
+    rng = np.random.default_rng(2221)
+    S = scipy.sparse.random_array((40, 40), density=0.1, rng=rng) + scipy.sparse.diags_array(np.full(40, 4.0))
+    b = rng.standard_normal(40)
+    result = wl.solve(wl.LCP(wl.SparseOperator(S, device="cpu"), b), method, stopping=wl.StoppingCriteria(rtol=1e-9))
+    assert result, result.status
+    np.testing.assert_allclose(result.x.numpy(), lemke(S.toarray(), b), atol=1e-7)
+
+
+@pytest.mark.parametrize("map_", list(Reformulation))
+def test_gradient_of_the_merit(map_):
+    """Against central differences at a point off the kinks: any wrong sign in p or q shows."""
+    rng = np.random.default_rng(2237)
+    A, b, lower, upper = random_boxed(rng)
+    problem = dense(A, b, lower, upper)
+    residual, x = NaturalResidual(problem), rng.standard_normal(6)
+    f = NonsmoothMap(problem, residual, map_, 0.7, wp.float64)
+
+    def merit(point):
+        field = wp.array(point, dtype=wp.float64, device="cpu")
+        residual.evaluate(field)
+        return f.merit(field), field
+
+    field = merit(x)[1]
+    square, _ = f.descend(field)
+    d = np.abs(np.diag(A))
+    gradient = f.direction.numpy() * d**2
+    steps = 1e-6 * np.eye(6)
+    expected = np.array([(merit(x + h)[0] - merit(x - h)[0]) / 2e-6 for h in steps])
+    np.testing.assert_allclose(gradient, expected, rtol=1e-5, atol=1e-6)
+    assert square == pytest.approx(float(np.sum((gradient / d) ** 2)))
+
+
+@pytest.mark.parametrize("map_", list(Reformulation))
+def test_maps_vanish_at_solutions_only(map_):
+    rng = np.random.default_rng(2239)
+    A, b, lower, upper = random_boxed(rng)
+    problem = dense(A, b, lower, upper)
+    residual, x = NaturalResidual(problem), boxed(A, b, lower, upper)
+    f = NonsmoothMap(problem, residual, map_, 0.95, wp.float64)
+    values = []
+    for point in (x, x + 0.01 * np.eye(6)[4], x - 0.01 * np.eye(6)[4]):
+        field = wp.array(point, dtype=wp.float64, device="cpu")
+        residual.evaluate(field)
+        values.append(f.merit(field))
+    assert values[0] < 1e-18
+    assert min(values[1:]) > 1e-8
+
+
+@pytest.mark.parametrize("map_", ["natural", "fischer", "penalized"])
+def test_gradient_descent_on_a_grid(map_):
+    rng = np.random.default_rng(2243)
+    cells = np.ones((4, 5), dtype=int)
+    cells[0] = wl.AIR
+    fluid, b = cells.ravel() == wl.FLUID, rng.standard_normal((4, 5))
+    result = wl.solve(
+        wl.LCP(wl.GridPoisson(cells, device="cpu"), b),
+        GradientDescent(map=map_),
+        stopping=wl.StoppingCriteria(rtol=1e-6, max_iterations=5000),
+    )
+    assert result, result.status
+    np.testing.assert_allclose(result.x.numpy().ravel()[fluid], lemke(assemble(cells)[np.ix_(fluid, fluid)], b.ravel()[fluid]), atol=1e-4)
+
+
+def test_statuses_of_gradient_descent():
+    """Each of the book's tests is reached on purpose; the last problem has y < 0 for all x >= 0."""
+    rng = np.random.default_rng(2251)
+    B = rng.standard_normal((30, 30))
+    A, b = B @ B.T + 1e-3 * np.eye(30), rng.standard_normal(30)
+    many = wl.StoppingCriteria(rtol=1e-12, max_iterations=500, patience=500)
+    assert wl.solve(dense(A, b), GradientDescent(relative=0.5, memory=1), stopping=many).status is wl.SolveStatus.STAGNATED
+    assert wl.solve(dense(A, b), GradientDescent(stagnation=0.5), stopping=many).status is wl.SolveStatus.STAGNATED
+    assert wl.solve(dense(A, b), GradientDescent(gradient=1e3), stopping=many).status is wl.SolveStatus.LOCAL_MINIMUM
+    assert wl.solve(dense(A, b), GradientDescent(), stopping=many).status in (wl.SolveStatus.MAX_ITERATIONS, wl.SolveStatus.STAGNATED)
+    none = wl.solve(dense(np.array([[-1.0]]), np.array([-1.0])), GradientDescent(map="natural"), stopping=many)
+    assert none.status in (wl.SolveStatus.NON_DESCENT, wl.SolveStatus.LOCAL_MINIMUM, wl.SolveStatus.STAGNATED)
+
+
+@pytest.mark.parametrize("contacts", [20, 30])
+def test_safeguarded_fischer_solves_frictional_contacts(contacts):
+    """All of 15 here (200 of 200 were measured); a linear complementarity oracle of our own is not needed: the residual is recomputed."""
+    steps = []
+    for seed in range(15):
+        problem = contact(contacts, seed=seed)
+        result = wl.solve(dense(problem.A, problem.b), FischerNewton())
+        assert result, (seed, result.status)
+        n = len(problem.b)
+        own = natural_residual(problem.A, problem.b, np.zeros(n), np.full(n, np.inf), result.x.numpy())
+        assert own == pytest.approx(result.residual, rel=1e-6, abs=1e-12)
+        steps.append(result.iterations)
+    assert np.mean(steps) <= 20
+
+
+def test_plain_fischer_fails_on_some_contacts_and_says_so():
+    results = [wl.solve(dense(p.A, p.b), FischerNewton(safeguard=False, share=0.95)) for p in (contact(20, seed=s) for s in range(12))]
+    failed = [r for r in results if not r]
+    assert 0 < len(failed) < 12
+    assert {r.status for r in failed} <= {wl.SolveStatus.NON_DESCENT, wl.SolveStatus.LOCAL_MINIMUM, wl.SolveStatus.MAX_ITERATIONS}
+
+
+@pytest.mark.parametrize("zeros", [0.0, 0.4, 0.8])
+def test_semidefinite_matrices(zeros):
+    for seed in range(4):
+        problem = semidefinite(60, zeros=zeros, seed=seed)
+        for method in (FischerNewton(), InteriorPoint()):
+            result = wl.solve(dense(problem.A, problem.b), method)
+            assert result, (type(method).__name__, seed, result.status)
+        newton = wl.solve(dense(problem.A, problem.b), wl.MinimumMapNewton())
+        assert newton or newton.status is wl.SolveStatus.NON_DESCENT
+
+
+def test_minimum_map_newton_leaves_the_cycle_of_period_three():
+    """From 200 random starts, half of them with random sets at the bound; plain Newton-min cycles from most of them."""
+    problem, rng = dense(PERIOD_THREE, -np.ones(3)), np.random.default_rng(3)
+    solver = wl.MinimumMapNewton()
+    work = solver.init(problem)
+    for k in range(200):
+        x0 = np.where(rng.random(3) < 0.5, 0.0, rng.uniform(0.1, 5.0, 3)) if k % 2 else rng.uniform(-5, 5, 3)
+        result = wl.solve(problem, solver, x0=x0, workspace=work, stopping=TIGHT)
+        assert result, (k, result.status)
+        np.testing.assert_allclose(PERIOD_THREE @ result.x.numpy(), np.ones(3), atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("method", "growth"), [(wl.MinimumMapNewton(), 2), (FischerNewton(), 2), (InteriorPoint(), 4)], ids=lambda m: type(m).__name__
+)
+def test_ball_obstacle_iterations_do_not_grow(method, growth):
+    counts = [wl.solve(ball_obstacle(n, device="cpu").lcp(), method) for n in (65, 129, 257)]
+    assert all(counts)
+    assert max(r.iterations for r in counts) - counts[0].iterations <= growth
+
+
+def test_crossover_hands_over_to_the_active_set():
+    rng = np.random.default_rng(2267)
+    B = rng.standard_normal((30, 30))
+    A, b = B @ B.T / 30 + np.eye(30), rng.standard_normal(30)
+    result = wl.solve(dense(A, b), InteriorPoint(crossover=1e-2), stopping=TIGHT)
+    names = [record.step for record in result.history]
+    assert "predictor-corrector" in names
+    assert names[-1] == "newton"
+    np.testing.assert_allclose(result.x.numpy(), lemke(A, b), atol=1e-10)
+
+
+def test_units_of_x_do_not_matter():
+    """Columns scaled by c and bounds by 1 / c: the same steps, for residuals and maps carry d (x - l)."""
+    rng = np.random.default_rng(2269)
+    B = rng.standard_normal((20, 20))
+    A, b = B @ B.T / 20 + np.eye(20), rng.standard_normal(20)
+    for method in (FischerNewton(safeguard=False), InteriorPoint()):
+        small = wl.solve(dense(A, b), method, stopping=TIGHT)
+        large = wl.solve(dense(A * 2.0**20, b), method, stopping=TIGHT)
+        assert small.iterations == large.iterations
+        np.testing.assert_allclose(large.x.numpy() * 2.0**20, small.x.numpy(), atol=1e-9)
+
+
+def test_nonmonotone_search_remembers():
+    search = NonmonotoneSearch(memory=2)
+    search.remember(9.0)
+    search.remember(1.0)
+    assert search.search(lambda t: 5.0, -1e-3) == (1.0, 5.0)  # above the last merit, below the largest of two
+    search.remember(5.0)
+    assert search.search(lambda t: 6.0, -1e-3)[0] == 0.0
+    assert search.search(lambda t: 4.0 if t < 0.3 else float("nan"), -1e-3)[0] == 0.25
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (lambda: InteriorPoint(backoff=1.0), "backoff"),
+        (lambda: InteriorPoint(horizon=0), "horizon"),
+        (lambda: FischerNewton(share=0.0), "share"),
+        (lambda: FischerNewton(kink="none"), "none"),
+        (lambda: GradientDescent(map="none"), "none"),
+        (lambda: GradientDescent(memory=0), "memory"),
+    ],
+)
+def test_settings_out_of_range(make, name):
+    with pytest.raises(ValueError, match=name):
+        make()
