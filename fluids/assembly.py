@@ -1,4 +1,4 @@
-"""What a scene of liquid asks for, made: solids and walls, the first particles, where liquid comes in and goes out."""
+"""What a scene of liquid asks for, made: walls, surface and pressure, the first particles, where liquid comes in and goes out."""
 
 from __future__ import annotations
 
@@ -12,8 +12,11 @@ import warp_lcp as wl
 from fluids.boundary import Boundary, WholeCells
 from fluids.cut_boundary import CutBoundary
 from fluids.outlets import Drain, Outlets
+from fluids.pressure import PressureProjection
 from fluids.scene import LiquidScene
 from fluids.sources import Source, Sources
+from fluids.surface import FreeSurface, GhostFluidSurface, WholeCellSurface
+from fluids.unilateral import UnilateralPressure
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.particles import Particles, seed
 from warp_lcp.grid.sides import side_bits
@@ -48,6 +51,30 @@ def make_boundary(
     if wall_velocity is None and scene.source:
         wall_velocity = np.zeros((1 + len(placed), 3))  # what a source's faces are given goes there
     return WholeCells(grid, solids, wall_velocity, open_sides=sides), solids.notes
+
+
+def make_surface(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary) -> FreeSurface:
+    """Return the free surface that a scene asks for."""
+    count = scene.particles.per_axis**grid.dimension
+    if scene.pressure.surface == "ghost-fluid":
+        return GhostFluidSurface(grid, boundary, particles_a_cell=count, smoothing=scene.pressure.smoothing)
+    return WholeCellSurface(grid, boundary, particles_a_cell=count)
+
+
+def make_pressure(
+    scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, surface: FreeSurface, weights: list[wp.array]
+) -> PressureProjection:
+    """Return the pressure that a scene asks for; `weights` are those of the particles on each component's faces."""
+    settings = scene.solver
+    solver = wl.METHODS[settings.method](precision=settings.precision)
+    if isinstance(surface, GhostFluidSurface) and scene.pressure.model == "unilateral":
+        return UnilateralPressure(
+            grid, boundary, solver, level_set=surface.level_set, weights=weights, tolerance=settings.tolerance,
+            max_iterations=settings.max_iterations,
+        )  # fmt: skip
+    return PressureProjection(
+        grid, boundary, solver, tolerance=settings.tolerance, max_iterations=settings.max_iterations, phi=surface.phi
+    )  # fmt: skip
 
 
 def make_particles(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, folder: Path) -> tuple[Particles, list[str]]:
@@ -90,7 +117,7 @@ def make_sources(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, fo
             name=f"source[{number}] ({source.shape})",
             contains=_inside(source.to_geometry(folder, scene.dimension), grid.device),
             velocity=np.array(_vector(source.velocity)),
-            start=source.start,
+            start=source.begin,
             stop=np.inf if source.stop is None else source.stop,
         )
         for number, source in enumerate(scene.source)
@@ -104,7 +131,7 @@ def make_outlets(scene: LiquidScene, grid: StaggeredGrid, folder: Path) -> Outle
     if not scene.drain and not scene.domain.open:
         return None
     drains = [
-        Drain(drain.to_geometry(folder, scene.dimension), drain.start, np.inf if drain.stop is None else drain.stop)
+        Drain(drain.to_geometry(folder, scene.dimension), drain.begin, np.inf if drain.stop is None else drain.stop)
         for drain in scene.drain
     ]
     return Outlets(grid, drains, side_bits(scene.domain.open))

@@ -108,7 +108,7 @@ class PressureProjection:
             return 0
         ratio = dt / self._dt if self._dt > 0.0 else 0.0
         fields = [self.pressure, ratio, self._b, self._lower, self._start, self._shift]
-        inputs = [*_three(velocity), self.kind, self.boundary.touch, *self._faces(), *fields]
+        inputs = [*three(velocity), self.kind, self.boundary.touch, *self._faces(), *fields]
         self.grid.domain.launch(self._kernels.prepare, inputs)
         self._operator.update(self.kind)
         return unknowns
@@ -130,7 +130,7 @@ class PressureProjection:
 
     def _faces(self) -> list[Any]:
         """Return what the kernels take of solids and surface."""
-        return [*_three(self.boundary.open), *_three(self.boundary.velocity), self._phi, self.grid.planes]
+        return [*three(self.boundary.open), *three(self.boundary.velocity), self._phi, self.grid.planes]
 
     def solve(self, speed: float, unknowns: int) -> tuple[wl.SolveResult, wl.StoppingCriteria]:
         """Solve the prepared problem for x without changing velocity or pressure.
@@ -176,15 +176,14 @@ class PressureProjection:
         # the criteria bound a 2-norm; what a cell may carry of it is the root mean square
         threshold = RELEASE_FACTOR * criteria.tolerance(reference) / max(unknowns, 1) ** 0.5
         fields = [self.pressure, threshold, self.contact, self._sums]
-        inputs = [*_three(velocity), self.kind, self.boundary.touch, *self._faces(), *fields]
+        inputs = [*three(velocity), self.kind, self.boundary.touch, *self._faces(), *fields]
         self.grid.domain.launch_rows(self._kernels.contact, inputs)
         sums = self._row_sums()
         return Projection(result, unknowns, int(sums[..., 0].sum()), float(sums[..., 1].max()))
 
     def unknowns(self) -> int:
         """Return the number of FLUID cells."""
-        self.grid.domain.launch_rows(kernels.count_kernel, [self.kind, self._sums])
-        return int(self._row_sums()[..., 0].sum())
+        return self._count(self.kind)
 
     def not_finite(self) -> np.ndarray:
         """Return the cells (x, y, z), counted from 0, whose right-hand side is not finite, shape (n, 3)."""
@@ -216,12 +215,17 @@ class PressureProjection:
         scale = density * self.grid.spacing / self._dt if self._dt > 0.0 else 0.0
         return self.pressure.numpy() * scale
 
+    def _count(self, kind: wp.array) -> int:
+        """Return the number of cells that are FLUID in a field."""
+        self.grid.domain.launch_rows(kernels.count_kernel, [kind, self._sums])
+        return int(self._row_sums()[..., 0].sum())
+
     def _row_sums(self) -> np.ndarray:
         """Return the sums of the rows in use."""
         low, high = self.grid.domain.low, self.grid.domain.high
         return self._sums.numpy()[low[0] : high[0], low[1] : high[1]]
 
 
-def _three(fields: Sequence[wp.array]) -> list[wp.array | None]:
+def three(fields: Sequence[wp.array]) -> list[wp.array | None]:
     """Return three fields, None where there are fewer."""
     return [*fields, None, None, None][:3]

@@ -46,9 +46,9 @@ class Reseeding:
             raise ValueError(f"least = {least}, most = {most}: must be at least 1, and {particles_a_cell} between them")
         self.grid, self.boundary, self.every = grid, boundary, every
         self.least, self.most, self.particles_a_cell = least, most, particles_a_cell
-        self._count, self._deep = grid.field(wp.int32), grid.field(wp.uint8)
+        self._count, self._takers = grid.field(wp.int32), wp.zeros(grid.size, dtype=wp.int32, device=grid.device)
         self._offsets = wp.zeros(grid.size + 1, dtype=wp.int32, device=grid.device)
-        self._moved = wp.zeros(1, dtype=wp.int32, device=grid.device)
+        self._numbers = wp.zeros(2, dtype=wp.int32, device=grid.device)  # of takers, and of particles moved
         steps = [(-1, 0, 1) if axis < grid.dimension else (0,) for axis in (2, 1, 0)]
         self._directions = sorted((d for d in itertools.product(*steps) if any(d)), key=lambda d: sum(map(abs, d)))
 
@@ -68,12 +68,14 @@ class Reseeding:
         if offsets is None:
             offsets = self._offsets
             wp.launch(offset_kernel, grid.size + 1, [particles.key, particles.count, offsets], device=grid.device)
-        self._moved.zero_()
+        self._numbers.zero_()
         window.launch(kernels.count_kernel, [offsets, self._count])
-        b = self.boundary
-        window.launch(kernels.deep_kernel, [planes, float(self.particles_a_cell), self._count, b.capacity, b.base, b.touch, self._deep])
-        limits = [self.least, self.particles_a_cell, self.most, step, grid.spacing, 1.0 / grid.spacing]
-        fields = [self._deep, offsets, self._count, particles.position, self._moved]
+        b, limits = self.boundary, [self.least, self.particles_a_cell, self.most]
+        window.launch(kernels.find_kernel, [planes, *limits, self._count, b.capacity, b.base, b.touch, self._takers, self._numbers])
+        takers = int(self._numbers.numpy()[0])
+        if takers == 0:
+            return 0
+        inputs = [*limits, step, grid.spacing, 1.0 / grid.spacing, self._takers, offsets, self._count, particles.position, self._numbers]
         for direction in self._directions:
-            window.launch(kernels.exchange_kernel, [planes, *direction, *limits, *fields])
-        return int(self._moved.numpy()[0])
+            wp.launch(kernels.exchange_kernel, takers, [planes, *direction, *inputs], device=grid.device)
+        return int(self._numbers.numpy()[1])

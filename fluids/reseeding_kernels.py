@@ -8,7 +8,7 @@ from warp_lcp.grid.staggered import CellRange
 from warp_lcp.operators.grid_poisson import AIR
 
 JITTER = 0.25  # of half a cell: how far from the center of its part of a cell a particle is put at random, as at the start
-FULL = 0.85  # of what the cells around one can hold: less, and it is near the surface, or in a bubble of more than a cell
+FULL = 0.75  # of what the cells around one can hold: less, and it is near a surface (a level one: 2/3), or in a bubble of more than a cell
 
 _AIR = wp.constant(wp.int8(AIR))
 _TOUCHES = wp.constant(wp.uint8(TOUCHES))
@@ -27,28 +27,34 @@ def count_kernel(cells: CellRange, offsets: wp.array(dtype=wp.int32), count: wp.
 
 
 @wp.kernel(enable_backward=False, module="fluids.reseeding")
-def deep_kernel(
-    cells: CellRange, planes: int, at_rest: float, count: wp.array3d(dtype=wp.int32), capacity: wp.array3d(dtype=wp.float32),
-    base: wp.array3d(dtype=wp.int8), touch: wp.array3d(dtype=wp.uint8), deep: wp.array3d(dtype=wp.uint8),
+def find_kernel(
+    cells: CellRange, planes: int, least: int, at_rest: int, most: int, count: wp.array3d(dtype=wp.int32),
+    capacity: wp.array3d(dtype=wp.float32), base: wp.array3d(dtype=wp.int8), touch: wp.array3d(dtype=wp.uint8),
+    takers: wp.array(dtype=wp.int32), numbers: wp.array(dtype=wp.int32),
 ):  # fmt: skip
-    """Mark open cells that no wall touches and whose surroundings, themselves included, are full but for a little."""
+    """List open cells that no wall touches, that want particles, and whose surroundings, themselves included, are full but for a little.
+
+    The order of the list differs from run to run on CUDA, and does not matter.
+    """
     plane, row, chunk = wp.tid()
     k = cells.k + plane
     j = cells.j + row
     first = cells.i + chunk * cells.grain
     for i in range(first, wp.min(first + cells.grain, cells.end)):
-        deep[k, j, i] = wp.uint8(0)
-        if base[k, j, i] == _AIR and (touch[k, j, i] & _TOUCHES) == wp.uint8(0):
+        has = count[k, j, i]
+        if has < at_rest and base[k, j, i] == _AIR and (touch[k, j, i] & _TOUCHES) == wp.uint8(0):
             held = int(0)
+            crowd = int(0)
             room = float(0.0)
             for c in range(k - planes + 1, k + planes):
                 for b in range(j - 1, j + 2):
                     for a in range(i - 1, i + 2):
                         if base[c, b, a] == _AIR:
                             held += count[c, b, a]
+                            crowd = wp.max(crowd, count[c, b, a])
                             room += capacity[c, b, a]
-            if float(held) >= FULL * at_rest * room:
-                deep[k, j, i] = wp.uint8(1)
+            if (has < least or crowd > most) and float(held) >= FULL * float(at_rest) * room:
+                takers[wp.atomic_add(numbers, 0, 1)] = (k * count.shape[1] + j) * count.shape[2] + i
 
 
 @wp.func
@@ -73,42 +79,38 @@ def emptiest(planes: int, i: int, j: int, k: int, start: int, here: int, inverse
 
 @wp.kernel(enable_backward=False, module="fluids.reseeding")
 def exchange_kernel(
-    cells: CellRange, planes: int, dk: int, dj: int, di: int, least: int, at_rest: int, most: int, seed: int, dx: float, inverse_dx: float,
-    deep: wp.array3d(dtype=wp.uint8), offsets: wp.array(dtype=wp.int32), count: wp.array3d(dtype=wp.int32),
-    position: wp.array(dtype=wp.vec3), moved: wp.array(dtype=wp.int32),
+    planes: int, dk: int, dj: int, di: int, least: int, at_rest: int, most: int, seed: int, dx: float, inverse_dx: float,
+    takers: wp.array(dtype=wp.int32), offsets: wp.array(dtype=wp.int32), count: wp.array3d(dtype=wp.int32),
+    position: wp.array(dtype=wp.vec3), numbers: wp.array(dtype=wp.int32),
 ):  # fmt: skip
-    """Let each deep cell take particles from the neighbor in one direction.
+    """Let each cell that wants particles take some from the neighbor in one direction.
 
     No race, though a cell may be the neighbor of another that takes: whoever gives holds more than `at_rest` before and no less after,
     whoever takes holds less before and no more after.
     """
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        if deep[k, j, i] != wp.uint8(0):
-            has = count[k, j, i]
-            gives = count[k + dk, j + dj, i + di]
-            cell = (k * count.shape[1] + j) * count.shape[2] + i
-            start = offsets[cell]
-            here = offsets[cell + 1] - start
-            donor = offsets[((k + dk) * count.shape[1] + j + dj) * count.shape[2] + i + di]
-            first_part = int(0)
-            if gives > at_rest and (has < least or (has < at_rest and gives > most)):
-                first_part = emptiest(planes, i, j, k, start, here, inverse_dx, position)
-            taken = int(0)
-            while gives > at_rest and (has < least or (has < at_rest and gives > most)):
-                part = (first_part + has - here) % (2 << planes)
-                state = wp.rand_init(seed, cell * 64 + has)
-                x = float(i - 1) + 0.25 + 0.5 * float(part % 2) + 0.5 * JITTER * (wp.randf(state) - 0.5)
-                y = float(j - 1) + 0.25 + 0.5 * float((part // 2) % 2) + 0.5 * JITTER * (wp.randf(state) - 0.5)
-                z = float(k - 1) + 0.25 + 0.5 * float(part // 4) + 0.5 * JITTER * (wp.randf(state) - 0.5)
-                position[donor + gives - 1] = wp.vec3(x * dx, y * dx, wp.where(planes == 2, z * dx, 0.0))
-                gives -= 1
-                has += 1
-                taken += 1
-            if taken > 0:
-                count[k, j, i] = has
-                count[k + dk, j + dj, i + di] = gives
-                wp.atomic_add(moved, 0, taken)
+    cell = takers[wp.tid()]
+    i = cell % count.shape[2]
+    j = (cell // count.shape[2]) % count.shape[1]
+    k = cell // (count.shape[2] * count.shape[1])
+    has = count[k, j, i]
+    gives = count[k + dk, j + dj, i + di]
+    if gives <= at_rest or (has >= least and (has >= at_rest or gives <= most)):
+        return
+    start = offsets[cell]
+    here = offsets[cell + 1] - start
+    donor = offsets[cell + (dk * count.shape[1] + dj) * count.shape[2] + di]
+    first_part = emptiest(planes, i, j, k, start, here, inverse_dx, position)
+    taken = int(0)
+    while gives > at_rest and (has < least or (has < at_rest and gives > most)):
+        part = (first_part + has - here) % (2 << planes)
+        state = wp.rand_init(seed, cell * 64 + has)
+        x = float(i - 1) + 0.25 + 0.5 * float(part % 2) + 0.5 * JITTER * (wp.randf(state) - 0.5)
+        y = float(j - 1) + 0.25 + 0.5 * float((part // 2) % 2) + 0.5 * JITTER * (wp.randf(state) - 0.5)
+        z = float(k - 1) + 0.25 + 0.5 * float(part // 4) + 0.5 * JITTER * (wp.randf(state) - 0.5)
+        position[donor + gives - 1] = wp.vec3(x * dx, y * dx, wp.where(planes == 2, z * dx, 0.0))
+        gives -= 1
+        has += 1
+        taken += 1
+    count[k, j, i] = has
+    count[k + dk, j + dj, i + di] = gives
+    wp.atomic_add(numbers, 1, taken)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -26,8 +26,10 @@ LATTICE_BYTES = 50  # a point of one plane of cells, while particles are chosen 
 class Pressure(Table):
     """[pressure]: what the pressure does."""
 
-    later: ClassVar = {"model": frozenset({"unilateral"})}
-    model: Literal["incompressible"] = Field(default="incompressible", description="the only model of this version")
+    model: Literal["incompressible", "unilateral"] = Field(
+        default="incompressible",
+        description="incompressible: liquid keeps its volume; unilateral: it cannot be compressed, but comes apart freely",
+    )
     surface: Literal["ghost-fluid", "voxel"] = Field(
         default="ghost-fluid",
         description="ghost-fluid: the free surface lies between cell centers, second order; voxel: on the cells' faces",
@@ -38,7 +40,7 @@ class Pressure(Table):
 class Reseed(Table):
     """[particles.reseed]: evens out particles deep in the liquid; off unless the table is there."""
 
-    every: int = Field(default=5, ge=1, description="steps from one time to the next")
+    every: int = Field(default=1, ge=1, description="steps from one time to the next")
     min: int | None = Field(default=None, ge=1, description="particles in a cell, fewer are filled up; 3/8 of those at rest unless given")
     max: int | None = Field(default=None, ge=1, description="particles in a cell, more are handed on; twice those at rest unless given")
 
@@ -84,6 +86,10 @@ class LiquidScene(Scene):
         found = [] if self.liquid or self.source else [Complaint(("liquid",), None, "is missing, and there is no [[source]] either")]
         for key, shapes in (("liquid", self.liquid), ("source", self.source), ("drain", self.drain)):
             found += self.shape_complaints(key, shapes, inside=True)
+        if self.pressure.model == "unilateral" and self.pressure.surface == "voxel":
+            found.append(
+                Complaint(("pressure", "surface"), "voxel", 'has no meaning for model = "unilateral", whose pressure needs no surface')
+            )
         return super().complaints() + found + self._reseed_complaints()
 
     def _reseed_complaints(self) -> list[Complaint]:
@@ -110,7 +116,7 @@ class LiquidScene(Scene):
         bounds = source.bounds(self.dimension)
         low, high = (np.zeros_like(size), size) if bounds is None else (corner[: self.dimension] for corner in bounds)
         sides = np.maximum(np.minimum(high, size) - np.maximum(low, 0.0), 0.0)
-        seconds = max(min(source.stop or math.inf, self.time.duration) - source.start, 0.0)
+        seconds = max(min(source.stop or math.inf, self.time.duration) - source.begin, 0.0)
         areas = np.array([np.delete(sides, axis).prod() for axis in range(self.dimension)])
         return float(sides.prod() + areas @ np.abs(source.velocity) * seconds)
 

@@ -5,25 +5,23 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from fluids.assembly import make_boundary, make_outlets, make_particles, make_sources
+from fluids.assembly import make_boundary, make_outlets, make_particles, make_pressure, make_sources, make_surface
 from fluids.boundary import Boundary
 from fluids.density_correction import DensityCorrection
 from fluids.gravity import accelerate
 from fluids.outlets import Outlets
-from fluids.pressure import PressureProjection, Projection
+from fluids.pressure import Projection
 from fluids.pressure_kernels import RELEASED, TOUCHES_NOTHING
 from fluids.reseeding import Reseeding
 from fluids.scene import LiquidScene
 from fluids.sources import Sources
-from fluids.surface import FreeSurface, GhostFluidSurface, WholeCellSurface
 from warp_lcp.driver.profile import NoStopwatch, Stopwatch
-from warp_lcp.driver.scene import Scene, Solver
+from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.simulator import Cells, Points, SimulationFailed, StepFailed
 from warp_lcp.grid.particles import MARGIN, Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
@@ -94,11 +92,8 @@ class LiquidSimulation:
         self.particle_mass = scene.physics.density * grid.cell_volume / scene.particles.per_axis**grid.dimension  # [kg], 2-D: [kg/m]
         self.velocity, self.weights = grid.faces(), grid.faces()
         self._saved = grid.faces() if scene.particles.transfer == "flip" else None
-        self.surface = _surface(scene, grid, boundary)
-        settings = scene.solver
-        self.projection = PressureProjection(
-            grid, boundary, _method(settings), tolerance=settings.tolerance, max_iterations=settings.max_iterations, phi=self.surface.phi
-        )
+        self.surface = make_surface(scene, grid, boundary)
+        self.projection = make_pressure(scene, grid, boundary, self.surface, self.weights)
         self.reseeding, self.correction = _reseeding(scene, grid, boundary), _correction(scene, grid, boundary)
         self.layers = math.ceil(scene.time.cfl) + 2
         if sources is not None:
@@ -170,8 +165,8 @@ class LiquidSimulation:
         then be up to 1. volume counts FLUID cells, or lies inside the surface where that is finer than cells. active: wall cells that let
         go; max_divergence [1/s]: of the other FLUID cells after the projection; stopped: particles that met a wall; pushed: those that a
         moving solid swept along; stuck: those inside solids that found no way out, between solids that close, say. max_density: before the
-        density correction of the step, of liquid at rest 1; reseeded: particles that went to a neighboring cell; emitted, drained, departed: those
-        that sources have added in the step, that drains have swallowed, and that have left through open sides.
+        density correction of the step, of liquid at rest 1; reseeded: particles that went to a neighboring cell; emitted, drained,
+        departed: those that sources have added in the step, that drains have swallowed, and that have left through open sides.
         """
         columns = (*COLUMNS, "pushed", "stuck") if self.boundary.moves else COLUMNS
         if self.reseeding is not None:
@@ -308,6 +303,8 @@ class LiquidSimulation:
     def _exchange(self, dt: float) -> dict[str, float | int | str | None]:
         """Remove the particles that have left in the step and add those that have come in; return what the log says of it."""
         drained = departed = emitted = 0
+        if self.outlets is None and self.sources is None:
+            return {}
         with self.watch.stage("sources and outlets", self.particles.position):
             if self.outlets is not None:
                 drained, departed = self.outlets.apply(self.particles, self.time + dt)
@@ -403,11 +400,6 @@ class LiquidSimulation:
         return np.array([*self.grid.counts, self.grid.dimension, self.grid.spacing, settings.per_axis, transfer], dtype=np.float64)
 
 
-def _method(settings: Solver) -> Any:
-    """Return the solver that a scene names."""
-    return wl.METHODS[settings.method](precision=settings.precision)
-
-
 def _reseeding(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary) -> Reseeding | None:
     """Return what evens out the particles if a scene asks for it."""
     settings = scene.particles.reseed
@@ -430,14 +422,6 @@ def _correction(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary) -> 
         grid, boundary, solver, particles_a_cell=count**grid.dimension, max_density=most, every=settings.every,
         tolerance=settings.tolerance,
     )  # fmt: skip
-
-
-def _surface(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary) -> FreeSurface:
-    """Return the free surface that a scene asks for."""
-    count = scene.particles.per_axis**grid.dimension
-    if scene.pressure.surface == "ghost-fluid":
-        return GhostFluidSurface(grid, boundary, particles_a_cell=count, smoothing=scene.pressure.smoothing)
-    return WholeCellSurface(grid, boundary, particles_a_cell=count)
 
 
 class FluidsSimulator:

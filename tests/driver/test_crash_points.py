@@ -122,7 +122,7 @@ def test_killed_while_it_resumes(scene_file, tmp_path, stride):
     assert count * stride > 30
 
 
-@pytest.mark.parametrize("stride", [3, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("stride", [6, pytest.param(1, marks=pytest.mark.slow)])
 def test_killed_while_force_deletes(scene_file, tmp_path, stride):
     """Another run lay in the folder: its steps are not continued, nor are its files left over."""
     go(scene_file, tmp_path / "whole")
@@ -134,4 +134,4 @@ def test_killed_while_force_deletes(scene_file, tmp_path, stride):
         count += 1
         go(scene_file, out, force=True)
         assert contents(out) == expected, f"killed before operation {operation}"
-    assert count > 15
+    assert count * stride > 50

@@ -100,7 +100,6 @@ def test_unknown_keys_suggest(changes, expected):
     ("changes", "path"),
     [
         ({"sand": [BOX]}, "sand"),
-        ({"domain.open": ["top"]}, "domain.open"),
         ({"domain.friction": 0.5}, "domain.friction"),
         ({"domain.periodic": [True, False]}, "domain.periodic[0] = true"),
         ({"solver.preset": "standard"}, "solver.preset"),

@@ -29,7 +29,8 @@ def test_defaults() -> None:
 @pytest.mark.parametrize(
     ("tables", "place"),
     [
-        ({"pressure": {"model": "unilateral"}}, "pressure"),
+        ({"pressure": {"model": "compressible"}}, "pressure"),
+        ({"pressure": {"model": "unilateral", "surface": "voxel"}}, "surface"),
         ({"particles": {"per_axis": 0}}, "per_axis"),
         ({"particles": {"per_axis": 1.5}}, "per_axis"),
         ({"particles": {"transfer": "mpm"}}, "transfer"),

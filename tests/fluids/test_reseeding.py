@@ -44,7 +44,7 @@ def reseeding(simulation: Any, least: int, most: int) -> Reseeding:
     return Reseeding(simulation.grid, simulation.boundary, least=least, most=most, particles_a_cell=2**simulation.grid.dimension)
 
 
-@pytest.mark.parametrize(("dimension", "least", "most"), [(2, 2, 8), (3, 3, 16)])
+@pytest.mark.parametrize(("dimension", "least", "most"), [(2, 3, 6), (3, 5, 12)])
 def test_cells_deep_in_the_liquid_hold_enough(dimension: int, least: int, most: int) -> None:
     simulation = pool(dimension)
     grid, particles = simulation.grid, uneven(simulation)
@@ -55,7 +55,7 @@ def test_cells_deep_in_the_liquid_hold_enough(dimension: int, least: int, most: 
     for step in range(4):
         moved = reseed.apply(particles, grid.everywhere, step)
     after = counts(grid, particles)
-    assert (after[deep] < least).sum() <= 0.1 * (before[deep] < least).sum()  # a thin region around one stays thin
+    assert (after[deep] < least).sum() <= 0.15 * (before[deep] < least).sum()  # a thin region around one stays thin
     assert after.sum() == before.sum() == particles.count
     assert moved <= 2
 
@@ -67,7 +67,7 @@ def test_each_keeps_its_velocity_and_goes_to_a_neighboring_cell(dimension: int) 
     grid, particles = simulation.grid, uneven(simulation)
     particles.sort()
     before = {name: array.numpy().copy() for name, array in particles.arrays().items()}
-    moved = reseeding(simulation, 3, 6 * dimension).apply(particles, grid.everywhere, 7)
+    moved = reseeding(simulation, 3 * dimension - 3, 6 * dimension).apply(particles, grid.everywhere, 7)
     after = {name: array.numpy() for name, array in particles.arrays().items()}
     for name in before.keys() - {"position"}:
         assert np.array_equal(before[name], after[name])
@@ -91,8 +91,7 @@ def test_the_surface_bubbles_and_walls_are_left_alone() -> None:
     touched = np.zeros(after.shape, dtype=bool)
     touched[0], touched[:, 0], touched[:, -1] = True, True, True
     assert (after[touched] <= before[touched]).all()  # they may give
-    distance = np.linalg.norm(particles.position.numpy()[:, :2] - 0.1, axis=1)
-    assert distance.min() > 0.13 - 0.05 * grid.spacing
+    assert simulation.boundary.admits(particles.position.numpy()).all()
 
 
 def test_nothing_is_drawn_from_cells_that_hold_no_more_than_at_rest() -> None:
@@ -109,7 +108,7 @@ def test_nothing_is_drawn_from_cells_that_hold_no_more_than_at_rest() -> None:
 def test_runs_are_repeatable() -> None:
     found = []
     for _ in range(2):
-        simulation = dam(particles={"reseed": {"every": 1}}, density_correction={})
+        simulation = dam(particles={"reseed": {"every": 1, "min": 4, "max": 4}}, density_correction={})
         rows = advance(simulation, 0.6)
         assert sum(row["reseeded"] for row in rows) > 0
         found.append({name: array.numpy().copy() for name, array in simulation.particles.arrays().items()})

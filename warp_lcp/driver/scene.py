@@ -60,7 +60,7 @@ class Domain(Table):
     solids: Literal["cut-cell", "voxel"] = Field(
         default="cut-cell", description="cut-cell: solids cut through cells as their surfaces do; voxel: they fill whole cells"
     )
-    open: list[Literal[SIDES]] = Field(  # type: ignore[valid-type]
+    open: list[Literal[SIDES]] = Field(
         default_factory=list, description="sides without a wall, where liquid leaves; y is up, x to the right, z to the front"
     )
     periodic: list[Literal[False]] | None = Field(default=None, description="false along every axis")

@@ -226,13 +226,13 @@ class LiquidMesh(LiquidProperties, Mesh):
 class Schedule(Table):
     """When something runs."""
 
-    start: float = Field(default=0.0, ge=0, description="when it starts to run [s]")
+    begin: float = Field(alias="start", default=0.0, ge=0, description="when it starts to run [s]")
     stop: float | None = Field(default=None, description="when it no longer runs [s]; it goes on unless given")
 
     def schedule_complaints(self) -> list[Complaint]:
         """Return what is wrong with the times."""
-        if self.stop is not None and self.stop <= self.start:
-            return [Complaint(("stop",), self.stop, f"must be later than start = {self.start:g}")]
+        if self.stop is not None and self.stop <= self.begin:
+            return [Complaint(("stop",), self.stop, f"must be later than start = {self.begin:g}")]
         return []
 
 

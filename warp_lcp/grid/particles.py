@@ -81,6 +81,9 @@ class Particles:
         ValueError: the shapes do not match.
     """
 
+    _order: wp.array  # scratch memory, as large as `key`
+    _spare: Column  # where the next reordered column goes
+
     def __init__(
         self, grid: StaggeredGrid, position: np.ndarray, velocity: np.ndarray, *, affine: bool, indexed: bool | None = None
     ) -> None:

@@ -1,0 +1,149 @@
+"""Pressure that only keeps cells from over-filling: liquid may separate anywhere, and spray flies freely."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+import warp_lcp as wl
+from fluids import unilateral_kernels as kernels
+from fluids.boundary import Boundary
+from fluids.density_correction import SHIFT
+from fluids.pressure import PressureProjection, Projection, three
+from warp_lcp.grid.level_set import LevelSet
+from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.operators.grid_poisson import FLUID
+from warp_lcp.vectors import convert
+
+MAX_DENSITY = 1.0  # of a cell, in units of the density at rest: a liquid as it is seeded neither falls into itself nor bursts
+
+
+class UnilateralPressure(PressureProjection):
+    """Solve 0 <= p complementary to rho_max - rho >= 0 in every cell that is not SOLID [Gerszewski & Bargteil 2013; Narain et al. 2010].
+
+    rho_i is the density of the particles in units of that at rest, capacity_i what fits beside walls, a_f the open fraction of a face,
+    rho_f the mean filled share of the cells beside it, s_f = +-1 outward. Mass is conserved and the pressure accelerates it:
+
+        rho_i(t + dt) = rho_i - (dt / dx) sum of s_f [a_f rho_f u_f + (1 - a_f) rho_max u_s,f],
+        rho_f u_f = rho_f u*_f - (x_right - x_left),   x = dt p / (rho_0 dx) [m/s].
+
+    (A solid that comes in takes room: the second term.) With y_i = (dx / dt) [rho_max capacity_i - rho_i(t + dt)] this is
+
+        y_i = (dx / dt) (rho_max capacity_i - rho_i) + sum of s_f [a_f rho_f u*_f + (1 - a_f) rho_max u_s,f]
+              + sum of a_f (x_i - x_neighbor),   0 <= x complementary to y >= 0,
+
+    whose matrix is symmetric and has no density in it, since it is the momentum rho_f u_f and not the velocity that the pressure's
+    gradient changes. Where a cell has room for what flows in, x = 0: nothing holds liquid together, and walls let go as air does. An
+    over-full cell has y < 0 for x = 0: its x is positive and pushes outward. It gives off `RELAXED` of its excess in a step.
+
+    The density is that of a kernel three cells wide, so that the two layers of cells beneath a surface are not full and carry no pressure
+    until they have been compressed a little.
+
+    Args:
+        grid: the grid.
+        boundary: solids and walls.
+        solver: settings of the method.
+        level_set: of the liquid's surface, whose density is used.
+        weights: of the particles on each component's faces: faces without keep nothing.
+        tolerance: relative residual at which a solve is done.
+        max_iterations: of the method a solve may take.
+        max_density: rho_max, > 0.
+
+    Attributes: as of `PressureProjection`; `kind` says where the level set lies in the liquid.
+    """
+
+    def __init__(
+        self,
+        grid: StaggeredGrid,
+        boundary: Boundary,
+        solver: Any,
+        *,
+        level_set: LevelSet,
+        weights: Sequence[wp.array],
+        tolerance: float,
+        max_iterations: int = 100,
+        max_density: float = MAX_DENSITY,
+    ) -> None:
+        """Allocate the fields."""
+        super().__init__(grid, boundary, solver, tolerance=tolerance, max_iterations=max_iterations)
+        if max_density <= 0.0:
+            raise ValueError(f"max_density = {max_density}: must be positive")
+        self._weights = list(weights)
+        self._cells = grid.field(wp.int8)
+        wp.copy(self._cells, boundary.base)  # the ring stays as it is
+        if boundary.open and self._shift is None:  # pockets between solids that are too full
+            self._shift = grid.field()
+        setting = kernels.Setting()
+        setting.planes, setting.most = grid.planes, max_density
+        setting.density, setting.capacity = level_set.density, boundary.capacity
+        setting.cells, setting.base = self._cells, boundary.base
+        self._setting = setting
+
+    def prepare(self, velocity: Sequence[wp.array], dt: float) -> int:
+        """Set up the problem of all cells that are not SOLID and return their number. The first guess is the last pressure.
+
+        Args:
+            velocity: u* of each component [m/s].
+            dt: time step [s].
+        """
+        ratio = dt / self._dt if self._dt > 0.0 else 0.0
+        self._setting.rate = wp.float64(self.grid.spacing / dt)
+        least = SHIFT if self.boundary.open else 0.0
+        fields = [self.pressure, ratio, least, self._b, self._start, self._shift]
+        self.grid.domain.launch(kernels.prepare_kernel, [self._setting, self.kind, *self._sides(velocity), *fields])
+        unknowns = self.unknowns()
+        if unknowns and self._problem is None:
+            self._make_problem()
+        if unknowns:
+            self._operator.update(self._cells)
+        return unknowns
+
+    def unknowns(self) -> int:
+        """Return the number of unknowns."""
+        return self._count(self._cells)
+
+    def project(
+        self, velocity: Sequence[wp.array], dt: float, window: Window, result: wl.SolveResult, criteria: wl.StoppingCriteria, unknowns: int
+    ) -> Projection:
+        """Take a result: let the pressure act, mark valid faces, find the walls that liquid presses on.
+
+        Args:
+            velocity: u* of each component [m/s] (updated).
+            dt: time step [s].
+            window: cells that hold all liquid, with one to spare on each side.
+            result: of `solve`.
+            criteria: of `solve`.
+            unknowns: of `prepare`.
+        """
+        convert(result.x.flatten(), self.pressure.flatten())
+        wp.copy(self.shown, self.kind)
+        self._dt = dt
+        for axis, field in enumerate(velocity):
+            self.known[axis].zero_()
+            open_ = self.boundary.open[axis] if self.boundary.open else None
+            inputs = [self._setting, axis, self.pressure, open_, self._weights[axis], field, self.known[axis]]
+            window.launch(kernels.push_kernel, inputs)
+        fields = [self.pressure, self.contact, self._sums]
+        self.grid.domain.launch_rows(
+            kernels.contact_kernel, [self._setting, self.kind, self.boundary.touch, *self._sides(velocity), *fields]
+        )
+        sums = self._row_sums()
+        return Projection(result, unknowns, int(sums[..., 0].sum()), float(sums[..., 1].max()))
+
+    def fluid_cells(self) -> np.ndarray:
+        """Return where there was liquid or pressure in the last projection, as (k, j, i) in the stored shape, shape (n, 3)."""
+        return np.argwhere((self.shown.numpy() == FLUID) | (self.pressure.numpy() > 0.0))
+
+    def _make_problem(self) -> None:
+        faces = {f"face_{axis}": field for axis, field in zip("xyz", self.boundary.open, strict=False)}
+        cells = self.grid.interior(self._cells.numpy())
+        self._operator = wl.GridPoisson(cells, shift=self._shift, device=self.grid.device, **faces)
+        self._problem = wl.LCP(self._operator, self._b, 0.0, np.inf)
+        self._work = self.solver.init(self._problem)
+
+    def _sides(self, velocity: Sequence[wp.array]) -> list[Any]:
+        """Return velocities, open fractions and solids' velocities as the kernels take them."""
+        return [*three(velocity), *three(self.boundary.open), *three(self.boundary.velocity)]

@@ -1,0 +1,194 @@
+"""Kernels of the pressure that only keeps cells from over-filling."""
+
+import typing
+
+import warp as wp
+
+from fluids.pressure_kernels import HELD, LETS_GO, RELEASED, TOUCHES
+from warp_lcp.grid.staggered import CellRange
+from warp_lcp.grid.transfer import TINY_WEIGHT
+from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
+
+LEAST_SHARE = 0.25  # of a cell's kernel that must be open for its filled share to be told, as in `warp_lcp.grid.level_set`
+LEAST_DENSITY = 0.1  # of a face: less mass would be thrown about by the pressure of a full cell beside it
+RELAXED = 0.2  # share of what a cell holds too much that a step takes out: all of it at once would be a kick
+
+_AIR = wp.constant(wp.int8(AIR))
+_FLUID = wp.constant(wp.int8(FLUID))
+_SOLID = wp.constant(wp.int8(SOLID))
+_F32, _F64, _I8, _U8 = (wp.array3d(dtype=t) for t in (wp.float32, wp.float64, wp.int8, wp.uint8))
+
+options: dict[str, typing.Any] = {"enable_backward": False, "module": "fluids.unilateral"}
+
+
+@wp.struct
+class Setting:
+    """What is the same for all cells of a step, and the fields that say where liquid is."""
+
+    planes: int
+    rate: wp.float64  # dx / dt [m/s]
+    most: float  # largest density, of the density at rest
+    density: wp.array3d(dtype=wp.float32)
+    capacity: wp.array3d(dtype=wp.float32)
+    cells: wp.array3d(dtype=wp.int8)  # FLUID: an unknown
+    base: wp.array3d(dtype=wp.int8)
+
+
+@wp.func
+@typing.no_type_check
+def open_part(s: Setting, open: _F32, k: int, j: int, i: int, c: int, b: int, a: int):
+    """Return the open fraction of the lower face of cell (k, j, i), beyond which cell (c, b, a) lies."""
+    part = float(1.0)
+    if open:
+        part = open[k, j, i]
+    elif s.base[k, j, i] == _SOLID or s.base[c, b, a] == _SOLID:
+        part = float(0.0)
+    return part
+
+
+@wp.func
+@typing.no_type_check
+def filled(s: Setting, k: int, j: int, i: int):
+    """Return which share of a cell is filled."""
+    return s.density[k, j, i] / wp.max(s.capacity[k, j, i], LEAST_SHARE)
+
+
+@wp.func
+@typing.no_type_check
+def face_density(s: Setting, k: int, j: int, i: int, c: int, b: int, a: int):
+    """Return the density on the face between two cells, of the density at rest."""
+    total = float(0.0)
+    count = float(0.0)
+    if s.base[k, j, i] != _SOLID:
+        total += filled(s, k, j, i)
+        count += 1.0
+    if s.base[c, b, a] != _SOLID:
+        total += filled(s, c, b, a)
+        count += 1.0
+    return wp.max(total / wp.max(count, 1.0), LEAST_DENSITY)
+
+
+@wp.func
+@typing.no_type_check
+def passing(s: Setting, u: _F32, open: _F32, solid: _F32, k: int, j: int, i: int, c: int, b: int, a: int):
+    """Return what passes the lower face of cell (k, j, i) [m/s], in units of the density at rest; solids take the place of full liquid."""
+    part = open_part(s, open, k, j, i, c, b, a)
+    flow = part * face_density(s, k, j, i, c, b, a) * u[k, j, i]
+    if solid:
+        flow += (1.0 - part) * s.most * solid[k, j, i]
+    return wp.float64(flow)
+
+
+@wp.func
+@typing.no_type_check
+def slack(
+    s: Setting, u: _F32, v: _F32, w: _F32, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32, solid_y: _F32, solid_z: _F32,
+    k: int, j: int, i: int,
+):  # fmt: skip
+    """Return y of a cell: what it may still take, and what flows out of it [m/s]."""
+    room = s.most * s.capacity[k, j, i] - s.density[k, j, i]
+    if room < 0.0:
+        room = RELAXED * room
+    y = s.rate * wp.float64(room)
+    y += passing(s, u, open_x, solid_x, k, j, i + 1, k, j, i) - passing(s, u, open_x, solid_x, k, j, i, k, j, i - 1)
+    y += passing(s, v, open_y, solid_y, k, j + 1, i, k, j, i) - passing(s, v, open_y, solid_y, k, j, i, k, j - 1, i)
+    if s.planes == 2:
+        y += passing(s, w, open_z, solid_z, k + 1, j, i, k, j, i) - passing(s, w, open_z, solid_z, k, j, i, k - 1, j, i)
+    return y
+
+
+@wp.kernel(**options)
+@typing.no_type_check
+def prepare_kernel(
+    cells: CellRange, s: Setting, kind: _I8, u: _F32, v: _F32, w: _F32, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32,
+    solid_y: _F32, solid_z: _F32, last: _F64, ratio: wp.float64, least: float, b: _F64, start: _F64, shift: _F32,
+):  # fmt: skip
+    """Mark the unknowns; fill right-hand side, first guess and what the open sides add to the diagonal."""
+    plane, row, chunk = wp.tid()
+    k = cells.k + plane
+    j = cells.j + row
+    first = cells.i + chunk * cells.grain
+    for i in range(first, wp.min(first + cells.grain, cells.end)):
+        unknown = s.base[k, j, i] != _SOLID and kind[k, j, i] != _SOLID
+        value = wp.float64(0.0)
+        guess = wp.float64(0.0)
+        if unknown:
+            value = slack(s, u, v, w, open_x, open_y, open_z, solid_x, solid_y, solid_z, k, j, i)
+            guess = wp.max(last[k, j, i] * ratio, wp.float64(0.0))
+        s.cells[k, j, i] = wp.where(unknown, _FLUID, _SOLID)
+        b[k, j, i] = value
+        start[k, j, i] = guess
+        if shift:
+            more = least
+            if i == 1 and s.base[k, j, 0] == _AIR:
+                more += open_part(s, open_x, k, j, i, k, j, i - 1)
+            if i + 2 == b.shape[2] and s.base[k, j, i + 1] == _AIR:
+                more += open_part(s, open_x, k, j, i + 1, k, j, i)
+            if j == 1 and s.base[k, 0, i] == _AIR:
+                more += open_part(s, open_y, k, j, i, k, j - 1, i)
+            if j + 2 == b.shape[1] and s.base[k, j + 1, i] == _AIR:
+                more += open_part(s, open_y, k, j + 1, i, k, j, i)
+            if s.planes == 2:
+                if k == 1 and s.base[0, j, i] == _AIR:
+                    more += open_part(s, open_z, k, j, i, k - 1, j, i)
+                if k + 2 == b.shape[0] and s.base[k + 1, j, i] == _AIR:
+                    more += open_part(s, open_z, k + 1, j, i, k, j, i)
+            shift[k, j, i] = more
+
+
+@wp.kernel(**options)
+@typing.no_type_check
+def push_kernel(cells: CellRange, s: Setting, axis: int, x: _F64, open: _F32, weight: _F32, field: _F32, known: _I8):
+    """Let the pressure act on the open faces that particles gave weight, and mark them 1; others 0, or -1 inside solids of whole cells."""
+    plane, row, chunk = wp.tid()
+    k = cells.k + plane
+    j = cells.j + row
+    first = cells.i + chunk * cells.grain
+    c = k - wp.where(axis == 2, 1, 0)
+    b = j - wp.where(axis == 1, 1, 0)
+    for i in range(first, wp.min(first + cells.grain, cells.end)):
+        a = i - wp.where(axis == 0, 1, 0)
+        mark = int(0)
+        if a < 0 or b < 0 or c < 0:  # the ring's own lower faces lie in the wall
+            mark = -1
+        elif open_part(s, open, k, j, i, c, b, a) > 0.0:
+            if weight[k, j, i] > TINY_WEIGHT:
+                mark = 1
+                # a source's cells are no unknowns, and their faces' velocities are given
+                if s.cells[k, j, i] != _SOLID and s.cells[c, b, a] != _SOLID:
+                    change = x[k, j, i] - x[c, b, a]
+                    field[k, j, i] = field[k, j, i] - wp.float32(change) / face_density(s, k, j, i, c, b, a)
+        elif not open:
+            if s.base[k, j, i] == _SOLID and s.base[c, b, a] == _SOLID:
+                mark = -1
+        known[k, j, i] = wp.int8(mark)
+
+
+@wp.kernel(**options)
+@typing.no_type_check
+def contact_kernel(
+    cells: CellRange, s: Setting, kind: _I8, touch: _U8, u: _F32, v: _F32, w: _F32, open_x: _F32, open_y: _F32, open_z: _F32,
+    solid_x: _F32, solid_y: _F32, solid_z: _F32, x: _F64, contact: _U8, sums: _F64,
+):  # fmt: skip
+    """Find the wall cells that hold liquid and those that let go, [0] their number in a row, and [1] the largest |y| of full cells."""
+    plane, row = wp.tid()
+    k = cells.k + plane
+    j = cells.j + row
+    released = int(0)
+    worst = wp.float64(0.0)
+    for i in range(cells.i, cells.end):
+        state = int(0)
+        walls = int(touch[k, j, i])
+        full = x[k, j, i] > wp.float64(0.0)
+        if full or kind[k, j, i] == _FLUID:
+            if (walls & TOUCHES) != 0:
+                state = HELD
+                if (walls & LETS_GO) != 0 and not full:
+                    state = RELEASED
+                    released += 1
+        contact[k, j, i] = wp.uint8(state)
+        if full:
+            y = slack(s, u, v, w, open_x, open_y, open_z, solid_x, solid_y, solid_z, k, j, i)
+            worst = wp.max(worst, wp.abs(y))
+    sums[k, j, 0] = wp.float64(released)
+    sums[k, j, 1] = worst
