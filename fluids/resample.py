@@ -24,9 +24,9 @@ def resampled(
 ) -> tuple[dict[str, np.ndarray], int]:
     """Return the particles of a state, made finer or coarser for another grid.
 
-    With k times as many particles as there were, every one is followed by k on average: its own place, or places in the square or cube
-    that was its share of a cell at rest, where its velocity is continued by its gradient. With k < 1 every 1/k-th of them stays, in the
-    order of their cells. A uniform velocity is added, so that momentum is conserved but for the rounding of their number.
+    With k > 1 times as many particles as there were, every one is followed by k on average, spread over the square or cube that was its
+    share of a cell at rest; its velocity is continued there by its gradient. With k < 1 one of every 1/k stays, chosen by chance among
+    neighbors. A uniform velocity is added, so that momentum is conserved but for the rounding of the particles' number.
 
     Args:
         state: `position` [m], `velocity` [m/s] and, for APIC, `affine_0` ... [1/s]; float32, shape (n, 3), about in the order of the cells.
@@ -44,16 +44,19 @@ def resampled(
     """
     position, dimension = state["position"].astype(np.float64), grid.dimension
     share = (spacing / grid.spacing) ** dimension  # new particles for an old one
-    ends = np.floor(share * np.arange(len(position) + 1) + 0.5).astype(np.int64)
-    parent = np.repeat(np.arange(len(position)), np.diff(ends))
-    if len(parent) == 0 < len(position):
+    count, rng = round(share * len(position)), np.random.default_rng(random_seed)
+    if count == 0 < len(position):
         raise ValueError(f"domain.resolution: {len(position)} particles are not enough for one on a grid of {grid.spacing:.4g} m")
-    offset = np.zeros((len(parent), 3))
+    offset = np.zeros((count, 3))
     if share > 1.0:
-        number = np.arange(len(parent)) - ends[parent]
-        shift = np.random.default_rng(random_seed).random((len(position), dimension))
+        ends = np.floor(share * np.arange(len(position) + 1) + 0.5).astype(np.int64)
+        ends[-1] = count
+        parent = np.repeat(np.arange(len(position)), np.diff(ends))
+        number, shift = np.arange(count) - ends[parent], rng.random((len(position), dimension))
         steps = PLASTIC[dimension] ** -np.arange(1.0, dimension + 1)
         offset[:, :dimension] = ((shift[parent] + number[:, None] * steps) % 1.0 - 0.5) * (spacing / per_axis)
+    else:
+        parent = np.minimum((np.arange(count) + rng.random(count)) / share, len(position) - 1).astype(np.int64)
     size = np.array(grid.counts)[:dimension] * grid.spacing
     margin = 1.1 * MARGIN * grid.spacing  # more than is asked for: float32 rounds
     placed = _placed(position[parent], offset, admits, margin, size - margin)
@@ -65,6 +68,24 @@ def resampled(
     if len(parent):
         velocity += state["velocity"].mean(axis=0, dtype=np.float64) - velocity.mean(axis=0)
     return arrays | {"position": placed.astype(np.float32), "velocity": velocity.astype(np.float32)}, int(moved.sum())
+
+
+def resampling_notes(before: int, after: int, moved: int, spacing: float, grid: StaggeredGrid) -> list[str]:
+    """Return what a user should know of a resampled liquid.
+
+    Args:
+        before: particles on the old grid.
+        after: particles on the new one.
+        moved: particles that were moved out of solids.
+        spacing: of the old grid [m].
+        grid: the new one.
+    """
+    change = after * grid.cell_volume / (before * spacing**grid.dimension) - 1.0 if before else 0.0
+    notes = [
+        f"resampled from cells of {spacing:.4g} m to {grid.spacing:.4g} m: {after} particles for {before}, each with the mass of its share "
+        f"of a cell as before (mass {change:+.2e} relative); pressure and grid fields begin anew; what follows is another run's"
+    ]
+    return [*notes, f"{moved} resampled particles were moved out of solids"] if moved else notes
 
 
 def _placed(start: np.ndarray, offset: np.ndarray, admits: Callable[[np.ndarray], np.ndarray], low: float, high: np.ndarray) -> np.ndarray:

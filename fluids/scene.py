@@ -40,7 +40,7 @@ class Pressure(Table):
 class Reseed(Table):
     """[particles.reseed]: evens out particles deep in the liquid; off unless the table is there."""
 
-    every: int = Field(default=1, ge=1, description="steps from one time to the next")
+    every: int = Field(default=2, ge=1, description="steps from one time to the next")
     min: int | None = Field(default=None, ge=1, description="particles in a cell, fewer are filled up; 3/8 of those at rest unless given")
     max: int | None = Field(default=None, ge=1, description="particles in a cell, more are handed on; twice those at rest unless given")
 

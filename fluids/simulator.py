@@ -17,6 +17,7 @@ from fluids.gravity import accelerate
 from fluids.outlets import Outlets
 from fluids.pressure import Projection
 from fluids.pressure_kernels import RELEASED, TOUCHES_NOTHING
+from fluids.resample import resampled, resampling_notes
 from fluids.reseeding import Reseeding
 from fluids.scene import LiquidScene
 from fluids.sources import Sources
@@ -225,6 +226,34 @@ class LiquidSimulation:
             self.correction.x.assign(state["density_correction"])
         self.time, self.step_count = float(state["time"]), int(state["step_count"])
         self.boundary.place(self.time)
+
+    def resample(self, state: Mapping[str, np.ndarray]) -> list[str]:
+        """Continue from the state of the same scene on another grid: with other particles, and without a pressure to start from.
+
+        Raises:
+            ValueError: the state differs in more than the grid, or no particle is left.
+        """
+        before, now = np.asarray(state.get("signature", np.zeros(7))), self._signature()
+        size = before[:3] * before[4], now[:3] * now[4]
+        if not np.array_equal(before[[3, 5, 6]], now[[3, 5, 6]]) or not np.allclose(*(side[: self.grid.dimension] for side in size)):
+            raise ValueError("the state's domain, number of particles a cell or transfer differ from this scene's")
+        self.time, self.step_count = float(state["time"]), int(state["step_count"])
+        self.boundary.place(self.time)
+        settings, wanted = self.scene.particles, self.particles.arrays().keys()
+        arrays, moved = resampled(
+            {name: np.asarray(state[name]) for name in wanted}, self.grid, self._admits, spacing=float(before[4]),
+            per_axis=settings.per_axis, random_seed=settings.seed + self.step_count,
+        )  # fmt: skip
+        self.particles.assign(arrays)
+        self.particles.sort()
+        self.surface.mark(self.particles, self.grid.everywhere, self.projection.kind)
+        self.projection.show()
+        return resampling_notes(len(state["position"]), self.particles.count, moved, float(before[4]), self.grid)
+
+    def _admits(self, points: np.ndarray) -> np.ndarray:
+        """Tell which points [m], shape (n, 3), a particle may be at."""
+        i, j, k = self.particles.cells_of(points).T + 1
+        return (self.boundary.base.numpy()[k, j, i] != wl.SOLID) & self.boundary.admits(points)
 
     def notes(self) -> list[str]:
         """Return warnings and facts worth a line at the start of a run."""

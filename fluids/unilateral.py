@@ -37,7 +37,8 @@ class UnilateralPressure(PressureProjection):
 
     whose matrix is symmetric and has no density in it, since it is the momentum rho_f u_f and not the velocity that the pressure's
     gradient changes. Where a cell has room for what flows in, x = 0: nothing holds liquid together, and walls let go as air does. An
-    over-full cell has y < 0 for x = 0: its x is positive and pushes outward. It gives off `RELAXED` of its excess in a step.
+    over-full cell has y < 0 for x = 0: its x is positive and pushes its excess outward within the step. (To take out a part only seems
+    gentler and is not: with a fifth a step a pool starts to boil within seconds, with all of it it is at rest.)
 
     The density is that of a kernel three cells wide, so that the two layers of cells beneath a surface are not full and carry no pressure
     until they have been compressed a little.

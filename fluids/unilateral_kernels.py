@@ -11,7 +11,6 @@ from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 
 LEAST_SHARE = 0.25  # of a cell's kernel that must be open for its filled share to be told, as in `warp_lcp.grid.level_set`
 LEAST_DENSITY = 0.1  # of a face: less mass would be thrown about by the pressure of a full cell beside it
-RELAXED = 0.2  # share of what a cell holds too much that a step takes out: all of it at once would be a kick
 
 _AIR = wp.constant(wp.int8(AIR))
 _FLUID = wp.constant(wp.int8(FLUID))
@@ -86,10 +85,7 @@ def slack(
     k: int, j: int, i: int,
 ):  # fmt: skip
     """Return y of a cell: what it may still take, and what flows out of it [m/s]."""
-    room = s.most * s.capacity[k, j, i] - s.density[k, j, i]
-    if room < 0.0:
-        room = RELAXED * room
-    y = s.rate * wp.float64(room)
+    y = s.rate * wp.float64(s.most * s.capacity[k, j, i] - s.density[k, j, i])
     y += passing(s, u, open_x, solid_x, k, j, i + 1, k, j, i) - passing(s, u, open_x, solid_x, k, j, i, k, j, i - 1)
     y += passing(s, v, open_y, solid_y, k, j + 1, i, k, j, i) - passing(s, v, open_y, solid_y, k, j, i, k, j - 1, i)
     if s.planes == 2:

@@ -12,10 +12,11 @@ from warp_lcp.vector_kernels import CODED, flat, span_end, span_start
 f64 = wp.array(dtype=wp.float64)
 i8, u8 = wp.array(dtype=wp.int8), wp.array(dtype=wp.uint8)
 
-# r = d (x - clip(x - y/d, l, u)) = max(d (x - u), min(d (x - l), y)): no division, and a NaN in y stays one
+# r = d (x - clip(x - y/d, l, u)) = max(d (x - u), min(d (x - l), y)): no division, and a NaN in y stays one;
+# 0 x makes NaN of an x that is not finite where its column of A is empty, so that y says nothing of it
 NATURAL = """const double a_ = unit*(double)d[i], b_ = a_ < 0 ? -a_ : a_, e = b_ == 0 ? 1.0 : b_;
             const double below = e*(x[i] - lower(i)), above = e*(x[i] - upper(i));
-            const double least = below < y[i] ? below : y[i], r0 = above > least ? above : least, r = m[i] == 1 ? r0 : 0.0;"""
+            const double least = below < y[i] ? below : y[i], r0 = above > least ? above : least, r = m[i] == 1 ? r0 + 0.0*x[i] : 0.0;"""
 
 
 @functools.cache

@@ -3,6 +3,7 @@
 import csv
 import errno
 import json
+import os
 import shutil
 import time
 from pathlib import Path
@@ -414,6 +415,33 @@ def test_only_a_profiled_run_measures(dots, scene_file, tmp_path, monkeypatch):
     assert set(map(id, seen)) == {id(profile)}
 
 
+@pytest.mark.parametrize(
+    ("code", "reason"), [(errno.ENOSPC, "the disk is full"), (errno.EROFS, "[Errno 30] Read-only"), (errno.EFBIG, "[Errno 27] File too")]
+)
+def test_a_checkpoint_that_cannot_be_written_leaves_the_last_good_one(dots, scene_file, tmp_path, monkeypatch, code, reason):
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    go(scene_file, whole)
+    save, calls = np.savez, []
+
+    def fails(file: Any, **arrays: Any) -> None:
+        calls.append(file)
+        if len(calls) > 3:  # steps 0, 4 and 8 are written
+            file.write(b"half a checkpoint")
+            raise OSError(code, os.strerror(code))
+        save(file, **arrays)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(np, "savez", fails)
+        result = go(scene_file, out)
+    assert (result.status, result.steps) == ("failed", 12)
+    assert result.reason.startswith(reason)
+    assert result.reason.endswith("what was written before is intact")
+    names = sorted(path.name for path in (out / "checkpoints").iterdir())
+    assert names == [f"step_{step:06d}.npz" for step in (0, 4, 8)]
+    assert go(scene_file, out, resume=True).resumed_from_step == 8
+    assert contents(out) == contents(whole)
+
+
 def test_a_run_that_will_not_fit_does_not_begin(scene_file, tmp_path, monkeypatch):
     usage = shutil.disk_usage(tmp_path)._replace(free=20_000)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage)
@@ -428,6 +456,15 @@ def test_a_scene_that_cannot_be_simulated(dots, scene_file, tmp_path):
     with pytest.raises(SceneError, match=r"dots: liquid\[0\]: holds no particle"):
         go(scene_file, tmp_path / "out", force=True)
     assert record(tmp_path / "out")["status"] == "finished"  # nothing was deleted for it
+
+
+def test_a_simulator_that_cannot_change_grids(scene_file, tmp_path):
+    out = tmp_path / "out"
+    go(scene_file, out, stop=stop_at(5))
+    with pytest.raises(SceneError, match=r"domain.resolution: must stay 8: dots cannot change grids"):
+        go(scene_file, out, "domain.resolution=16", resume=True)
+    assert record(out)["status"] == "stopped"  # nothing was touched
+    assert go(scene_file, out, resume=True).resumed_from_step == 5
 
 
 def test_an_empty_simulation_has_frames(dots, scene_file, tmp_path):

@@ -98,7 +98,8 @@ class GradientWorkspace(IterateInPlace):
             self._version = version
             self._d.assign(positive_diagonal(self.problem))
             if self.settings.lipschitz is None:
-                self.lipschitz = MARGIN * scaled_spectrum(self.problem, self.settings.estimate_steps)[1]
+                greatest = scaled_spectrum(self.problem, self.settings.estimate_steps)[1]
+                self.lipschitz = MARGIN * greatest if greatest > 0 else 1.0  # any L will do for a zero matrix
 
     def advance(self, x: wp.array[Any]) -> None:
         """Take the step; the residual's y is that of x."""

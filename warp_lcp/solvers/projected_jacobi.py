@@ -90,4 +90,5 @@ class JacobiWorkspace(SweepWorkspace):
     def _estimate(self) -> float:
         if (self.diagonal.values() < 0).any():
             return 1.0
-        return min(1.0, SHARE / scaled_spectrum(self.problem, STEPS)[1])
+        greatest = scaled_spectrum(self.problem, STEPS)[1]
+        return min(1.0, SHARE / greatest) if greatest > 0 else 1.0

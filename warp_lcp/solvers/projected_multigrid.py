@@ -18,6 +18,7 @@ from warp_lcp.solve import Precision, Step
 from warp_lcp.solvers import projected_multigrid_kernels as kernels
 from warp_lcp.vectors import Reduction, convert, launch_spans
 
+LEAP = 10.0  # a residual that exceeds the least one by this factor says that the free set was a bad guess: CG's own rises are smaller
 # planes that a thread sums over: on CUDA, a place for the sums of every cell would cost more memory than the rest of the method
 PLANES_A_THREAD = {"cpu": 1, "cuda": 16}
 
@@ -112,6 +113,10 @@ class AssessedResidual(NaturalResidual):
             self.set(kernels.SIZE, self._norm_of_b or 1.0)
             self.set(kernels.STEP, 0.0)
 
+    def clip(self, x: wp.array[Any]) -> None:
+        """Bring x within its bounds."""
+        super().start(x, keep=True)
+
     def norm_of_b(self) -> float:
         """Return ||b|| over the unknowns."""
         return self._norm_of_b
@@ -192,7 +197,7 @@ class MultigridWorkspace:
         self.floating: Any = None
         self._best: wp.array[Any] | None = None
         self._past, self._stored = 0, False  # steps since the best iterate; whether it is in memory of its own
-        self._cycles_left, self._rises = 0, 0
+        self._cycles_left, self._rises, self._relapse, self._least = 0, 0, 1, math.inf
 
     def _scratch(self) -> tuple[wp.array[Any], wp.array[Any]]:
         """Return what is free between cycles, as fields of four bytes and of one byte a cell."""
@@ -202,6 +207,7 @@ class MultigridWorkspace:
     def keep(self) -> None:
         """Remember x as the best iterate."""
         self._past, self._stored = 0, False
+        self._least = min(self._least, self.residual.norm)
 
     def restore(self) -> None:
         """Make x the best iterate again."""
@@ -234,7 +240,7 @@ class MultigridWorkspace:
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the search direction; the operator may have changed."""
         self._cycles_left = self.settings.monotone_cycles if self.bounded and not warm else 0
-        self._rises = 0
+        self._rises, self._relapse, self._least = 0, 1, self.residual.norm
         self._forget()
         self.hierarchy.finest.x[: self.x.size // 4 + 1].zero_()  # its bytes were scratch memory
         size = float(self.residual.scalars.numpy()[int(kernels.SIZE)])
@@ -254,10 +260,14 @@ class MultigridWorkspace:
 
     def wants_monotone_cycle(self) -> bool:
         """Return whether the next step is a projected cycle."""
-        if self._rises >= self.settings.patience and self.bounded:  # conjugate gradients alone may rise
+        leapt = self.residual.norm > LEAP * self._least
+        if self._cycles_left == 0 and self.bounded and (leapt or self._rises >= self.settings.patience):
+            if leapt:
+                self.restore()
             self._rises = 0
             self._forget()
-            self._cycles_left = 1
+            # an active set can go round in a circle, projected cycles never do: each time it takes twice as many of them
+            self._cycles_left, self._relapse = self._relapse, 2 * self._relapse
             self.residual.classify = False
             self.residual.evaluate(self.x)
         return self._cycles_left > 0
@@ -374,3 +384,4 @@ class MultigridWorkspace:
         if self._rounded is not None:
             convert(x, self._rounded)
             convert(self._rounded, x)
+            self.residual.clip(x)  # a bound that is no float32 number: rounding would move x off it
