@@ -1,4 +1,4 @@
-"""What sweeps and first-order methods cost on a grid: steps and seconds to 1e-3 and to 1e-6, beside projected multigrid.
+"""What methods cost on a grid: steps and seconds to 1e-3 and to 1e-6, beside projected multigrid.
 
 python -m benchmarks.sweep_prices 64 pgs nncg
 """
@@ -27,6 +27,11 @@ METHODS = {
     "nncg-symmetric": NNCG(direction="symmetric"),
     "gradient": AcceleratedProjectedGradient(),
     "pgs-sm": SubspaceMinimization(),
+    "newton": wl.MinimumMapNewton(),
+    "active-set": wl.PrimalDualActiveSet(),
+    "mprgp": wl.MPRGP(),
+    "fischer": wl.FischerNewton(),
+    "interior-point": wl.InteriorPoint(),
     "multigrid": wl.ProjectedMultigrid(),
 }
 GOALS = (1e-3, 1e-6)

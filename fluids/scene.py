@@ -17,6 +17,8 @@ LEVEL_SET_BYTES = 19  # more a cell for a surface between cells, or slivers
 SMOOTHING_BYTES = 12
 CUT_BYTES = 45
 MOVING_BYTES = 30
+CORRECTION_BYTES, CUT_CORRECTION_BYTES = 54, 22  # the density correction's fields and method, and more where cells are cut
+RESEED_BYTES = 13
 PLANES = 2.5  # that a 2-D cell counts for: its fields have three, the solver's one
 VECTOR_BYTES, KEY_BYTES = 12, 16  # a particle's vectors, one of them spare, and its sort keys
 SEEDING_BYTES = 136  # a particle on the host, while the liquid is made and the solver is not
@@ -69,6 +71,10 @@ class DensityCorrectionSettings(Table):
     max_density: float | None = Field(
         default=None, gt=0, le=2, description="of a cell, in units of the density at rest; 1 + 0.1 / particles.per_axis unless given"
     )
+
+    def largest(self, per_axis: int) -> float:
+        """Return the density [of that at rest] that a cell may have: particles on a lattice are uneven the more, the fewer they are."""
+        return self.max_density if self.max_density is not None else 1.0 + 0.1 / per_axis
 
 
 class LiquidScene(Scene):
@@ -127,8 +133,20 @@ class LiquidScene(Scene):
         return [
             *super().plan(),
             ("particles", f"at most {particles:,}, {settings.per_axis**self.dimension} a cell, {settings.transfer}"),
+            *self._rearrangement(),
             ("memory", f"about {max(1, round(self.memory_estimate() / 2**20)):,} MB"),
         ]
+
+    def _rearrangement(self) -> list[tuple[str, str]]:
+        """Return what moves particles apart from the flow."""
+        lines, correction, reseed = [], self.density_correction, self.particles.reseed
+        if correction is not None:
+            most = correction.largest(self.particles.per_axis)
+            lines.append(("density", f"at most {most:.4g} of that at rest, corrected {_steps(correction.every)}"))
+        if reseed is not None:
+            least, many = self.particles.reseed_range(self.dimension)
+            lines.append(("reseeding", f"{least} to {many} particles a cell, {_steps(reseed.every)}"))
+        return lines
 
     def memory_estimate(self) -> int:
         """Return about how much memory a run takes at most [bytes], without the program itself."""
@@ -140,7 +158,14 @@ class LiquidScene(Scene):
         a_cell = BYTES_A_CELL + LEVEL_SET_BYTES * (level_set or cut) + SMOOTHING_BYTES * (level_set and self.pressure.smoothing > 0)
         a_cell += CUT_BYTES * cut + MOVING_BYTES * any(solid.motion is not None for solid in self.solid)
         a_cell += 4 * self.dimension * (self.particles.transfer == "flip")
+        a_cell += (CORRECTION_BYTES + CUT_CORRECTION_BYTES * cut) * (self.density_correction is not None)
+        a_cell += RESEED_BYTES * (self.particles.reseed is not None)
         vectors = 3 + (self.dimension if self.particles.transfer == "apic" else 0)
         running = cells * a_cell + particles * (VECTOR_BYTES * vectors + KEY_BYTES)
         lattice = nx * ny * self.particles.per_axis**self.dimension
         return max(running, cells * BYTES_A_CELL // 2 + particles * SEEDING_BYTES + lattice * LATTICE_BYTES)
+
+
+def _steps(every: int) -> str:
+    """Return how often, in words."""
+    return "every step" if every == 1 else f"every {every} steps"

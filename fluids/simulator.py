@@ -445,7 +445,7 @@ def _correction(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary) -> 
     if settings is None:
         return None
     count = scene.particles.per_axis
-    most = settings.max_density or 1.0 + 0.1 / count
+    most = settings.largest(count)
     solver = wl.ProjectedMultigrid(precision=scene.solver.precision)
     return DensityCorrection(
         grid, boundary, solver, particles_a_cell=count**grid.dimension, max_density=most, every=settings.every,

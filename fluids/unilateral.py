@@ -25,7 +25,7 @@ class UnilateralPressure(PressureProjection):
     """Solve 0 <= p complementary to rho_max - rho >= 0 in every cell that is not SOLID [Gerszewski & Bargteil 2013; Narain et al. 2010].
 
     rho_i is the density of the particles in units of that at rest, capacity_i what fits beside walls, a_f the open fraction of a face,
-    rho_f the mean filled share of the cells beside it, s_f = +-1 outward. Mass is conserved and the pressure accelerates it:
+    rho_f the density on a face, s_f = +-1 outward. Mass is conserved and the pressure accelerates it:
 
         rho_i(t + dt) = rho_i - (dt / dx) sum of s_f [a_f rho_f u_f + (1 - a_f) rho_max u_s,f],
         rho_f u_f = rho_f u*_f - (x_right - x_left),   x = dt p / (rho_0 dx) [m/s].
@@ -39,6 +39,10 @@ class UnilateralPressure(PressureProjection):
     gradient changes. Where a cell has room for what flows in, x = 0: nothing holds liquid together, and walls let go as air does. An
     over-full cell has y < 0 for x = 0: its x is positive and pushes its excess outward within the step. (To take out a part only seems
     gentler and is not: with a fifth a step a pool starts to boil within seconds, with all of it it is at rest.)
+
+    In rho_f u*_f the density is the filled share of the cell that the flow comes from, and no cell gives more than it holds, whatever the
+    Courant number: with the mean of both cells, or without that limit, the front of a block in free flight seems to over-fill the cells
+    ahead and is blown off. What the gradient accelerates is the mean of both.
 
     The density is that of a kernel three cells wide, so that the two layers of cells beneath a surface are not full and carry no pressure
     until they have been compressed a little.
@@ -81,6 +85,7 @@ class UnilateralPressure(PressureProjection):
         setting.planes, setting.most = grid.planes, max_density
         setting.density, setting.capacity = level_set.density, boundary.capacity
         setting.cells, setting.base = self._cells, boundary.base
+        setting.limit = wp.ones(grid.shape, dtype=wp.float32, device=grid.device)
         self._setting = setting
 
     def prepare(self, velocity: Sequence[wp.array], dt: float) -> int:
@@ -93,6 +98,7 @@ class UnilateralPressure(PressureProjection):
         ratio = dt / self._dt if self._dt > 0.0 else 0.0
         self._setting.rate = wp.float64(self.grid.spacing / dt)
         least = SHIFT if self.boundary.open else 0.0
+        self.grid.domain.launch(kernels.limit_kernel, [self._setting, *three(velocity), *three(self.boundary.open)])
         fields = [self.pressure, ratio, least, self._b, self._start, self._shift]
         self.grid.domain.launch(kernels.prepare_kernel, [self._setting, self.kind, *self._sides(velocity), *fields])
         unknowns = self.unknowns()

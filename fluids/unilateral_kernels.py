@@ -29,6 +29,7 @@ class Setting:
     most: float  # largest density, of the density at rest
     density: wp.array3d(dtype=wp.float32)
     capacity: wp.array3d(dtype=wp.float32)
+    limit: wp.array3d(dtype=wp.float32)  # share of its outflow that a cell can give in a step
     cells: wp.array3d(dtype=wp.int8)  # FLUID: an unknown
     base: wp.array3d(dtype=wp.int8)
 
@@ -72,7 +73,11 @@ def face_density(s: Setting, k: int, j: int, i: int, c: int, b: int, a: int):
 def passing(s: Setting, u: _F32, open: _F32, solid: _F32, k: int, j: int, i: int, c: int, b: int, a: int):
     """Return what passes the lower face of cell (k, j, i) [m/s], in units of the density at rest; solids take the place of full liquid."""
     part = open_part(s, open, k, j, i, c, b, a)
-    flow = part * face_density(s, k, j, i, c, b, a) * u[k, j, i]
+    flow = part * u[k, j, i]
+    if flow > 0.0:
+        flow = flow * filled(s, c, b, a) * s.limit[c, b, a]
+    elif flow < 0.0:
+        flow = flow * filled(s, k, j, i) * s.limit[k, j, i]
     if solid:
         flow += (1.0 - part) * s.most * solid[k, j, i]
     return wp.float64(flow)
@@ -91,6 +96,30 @@ def slack(
     if s.planes == 2:
         y += passing(s, w, open_z, solid_z, k + 1, j, i, k, j, i) - passing(s, w, open_z, solid_z, k, j, i, k - 1, j, i)
     return y
+
+
+@wp.func
+@typing.no_type_check
+def leaving(s: Setting, u: _F32, open: _F32, outward: float, k: int, j: int, i: int, c: int, b: int, a: int):
+    """Return the speed at which a face takes liquid out of the cell that it is the upper (`outward` 1) or lower (-1) face of [m/s]."""
+    return wp.max(outward * open_part(s, open, k, j, i, c, b, a) * u[k, j, i], 0.0)
+
+
+@wp.kernel(**options)
+@typing.no_type_check
+def limit_kernel(cells: CellRange, s: Setting, u: _F32, v: _F32, w: _F32, open_x: _F32, open_y: _F32, open_z: _F32):
+    """Find the share of its outflow that each cell can give: all of it while that is no more than what it holds."""
+    plane, row, chunk = wp.tid()
+    k = cells.k + plane
+    j = cells.j + row
+    first = cells.i + chunk * cells.grain
+    for i in range(first, wp.min(first + cells.grain, cells.end)):
+        out = leaving(s, u, open_x, 1.0, k, j, i + 1, k, j, i) + leaving(s, u, open_x, -1.0, k, j, i, k, j, i - 1)
+        out += leaving(s, v, open_y, 1.0, k, j + 1, i, k, j, i) + leaving(s, v, open_y, -1.0, k, j, i, k, j - 1, i)
+        if s.planes == 2:
+            out += leaving(s, w, open_z, 1.0, k + 1, j, i, k, j, i) + leaving(s, w, open_z, -1.0, k, j, i, k - 1, j, i)
+        rate = wp.float32(s.rate)
+        s.limit[k, j, i] = rate / wp.max(out, rate)
 
 
 @wp.kernel(**options)
@@ -153,7 +182,9 @@ def push_kernel(cells: CellRange, s: Setting, axis: int, x: _F64, open: _F32, we
                 # a source's cells are no unknowns, and their faces' velocities are given
                 if s.cells[k, j, i] != _SOLID and s.cells[c, b, a] != _SOLID:
                     change = x[k, j, i] - x[c, b, a]
-                    field[k, j, i] = field[k, j, i] - wp.float32(change) / face_density(s, k, j, i, c, b, a)
+                    u = field[k, j, i]
+                    limit = wp.where(u > 0.0, s.limit[c, b, a], s.limit[k, j, i])
+                    field[k, j, i] = u - wp.float32(change) / (limit * face_density(s, k, j, i, c, b, a))
         elif not open:
             if s.base[k, j, i] == _SOLID and s.base[c, b, a] == _SOLID:
                 mark = -1

@@ -10,6 +10,7 @@ import warp as wp
 
 import fluids
 import warp_lcp as wl
+from fluids.density_correction_kernels import displacement_kernel
 from warp_lcp.grid import transfer_kernels
 from warp_lcp.multigrid import CycleSettings
 from warp_lcp.solvers.mprgp import MPRGP
@@ -103,6 +104,8 @@ def test_all_kernels_compile_for_sm_80_and_sm_90(tmp_path):
         for found in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
             importlib.import_module(found.name)
     use_every_kernel()
+    for cut in (False, True):
+        displacement_kernel(cut)
     use_sparse_kernels()
     use_sweeping_kernels()
     use_gradient_projection_kernels()

@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_lcp.affine_bounds import affine_fields
 from warp_lcp.bounds_kernels import LOWER_IS_FINITE, UPPER_IS_FINITE, decode_kernel, encode_kernel, encode_rows_kernel
-from warp_lcp.layout import Array, Layout
+from warp_lcp.layout import Array, Layout, real_array
 from warp_lcp.native import Spans
 
 NAMES, INFINITE = ("lower", "upper"), (-np.inf, np.inf)
@@ -50,7 +50,7 @@ class Bounds:
         self.in_place = any(varies[s] and layout.holds(sides[s], wp.float64) for s in (0, 1))
         for side in (0, 1):
             if not varies[side]:
-                self.values[side] = float(sides[side])
+                self.values[side] = float(real_array(sides[side], NAMES[side]))
         if any(varies) and not self.in_place and self._code_from_host(sides):
             return
         for side in (0, 1):

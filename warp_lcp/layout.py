@@ -25,6 +25,33 @@ def zeros(n: int, dtype: Any, device: wp.Device) -> wp.array[Any]:
     return wp.zeros(n, dtype=dtype, device=device)
 
 
+def real_array(values: Any, name: str) -> np.ndarray:
+    """Return an array, or what makes one, as a numpy array of real numbers of any type.
+
+    Raises:
+        ValueError: it holds something else; the message names it.
+    """
+    try:
+        host = np.asarray(values)
+    except ValueError:
+        raise ValueError(f"{name}: its rows differ in length") from None
+    if host.dtype.kind not in "biuf":
+        raise ValueError(f"{name} is a {type(values).__name__} of type {host.dtype}: expected real numbers")
+    return host
+
+
+def check_storable(values: np.ndarray, dtype: Any, name: str) -> None:
+    """Check that values can be stored in a type.
+
+    Raises:
+        ValueError: one is NaN or infinite, or becomes so.
+    """
+    if not np.isfinite(values).all():
+        raise ValueError(f"{name} holds a value that is not finite")
+    if np.abs(values).max(initial=0.0) > np.finfo(wp.dtype_to_numpy(dtype)).max:
+        raise ValueError(f"{name} holds a value that is too large for {dtype.__name__}")
+
+
 class Layout:
     """Fields stored as they are."""
 
@@ -55,11 +82,11 @@ class Layout:
         """Return `field` as a stored field; no copy is made if it is one already.
 
         Raises:
-            ValueError: its shape is neither the operator's nor the stored one.
+            ValueError: its shape is neither the operator's nor the stored one, or it does not hold real numbers.
         """
         if self.holds(field, dtype):
             return field.flatten()
-        host = field.numpy() if isinstance(field, wp.array) else np.asarray(field)
+        host = real_array(field.numpy() if isinstance(field, wp.array) else field, name)
         if not self.fits(host):
             raise ValueError(f"{name} has shape {host.shape}: expected {self.shape}")
         stored = np.zeros(self.stored_shape, dtype=wp.dtype_to_numpy(dtype))

@@ -44,7 +44,7 @@ class LCP:
     that layout too.
 
     Args:
-        A: an Operator, or a numpy array or scipy.sparse matrix of shape (n, n), which becomes one on b's device.
+        A: an Operator, or an array (numpy, Warp) or scipy.sparse matrix of shape (n, n), which becomes one on b's device.
         b: field of A's shape, units of y.
         lower: l, a number or a field; -inf where there is none; or AffineBounds, which depend on x.
         upper: u, a number or a field; inf where there is none; or AffineBounds.

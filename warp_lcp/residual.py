@@ -73,9 +73,18 @@ class NaturalResidual:
 
     def settle_isolated(self, x: wp.array[Any]) -> None:
         """Set x where A's row is empty, so that y = b, to the bound that b's sign asks for; methods move coupled unknowns only."""
-        p = self.problem
-        wp.launch(settle_isolated_kernel, x.size, [self.diagonal, p.b, p.lower, p.upper, p.unknown, x], device=p.device)
+        p, sizes = self.problem, getattr(self.problem.A, "row_sizes", None)  # of grids, only an empty row has a zero diagonal
+        zero_if_empty = self.diagonal if sizes is None else sizes
+        wp.launch(settle_isolated_kernel, x.size, [zero_if_empty, p.b, p.lower, p.upper, p.unknown, x], device=p.device)
         self.current = False
+
+    def unattainable(self) -> float:
+        """Return the norm of b where a matrix has an empty row and b's sign asks for a bound that is infinite: no x will do."""
+        p, sizes = self.problem, getattr(self.problem.A, "row_sizes", None)
+        if sizes is None:
+            return 0.0
+        b = np.where(sizes.numpy() == 0, p.b.numpy(), 0.0)
+        return float(np.linalg.norm(b[np.where(b > 0, np.isneginf(p.lower.numpy()), np.isposinf(p.upper.numpy()))]))
 
     def norm_of_b(self) -> float:
         """Return ||b|| over the unknowns."""

@@ -29,6 +29,10 @@ class Precision(Enum):
     SINGLE = "single"
     DOUBLE = "double"
 
+    @classmethod
+    def _missing_(cls, value: object) -> Precision:
+        raise ValueError(f"precision = {value!r}: must be 'mixed', 'single' or 'double'")
+
     @property
     def iterate(self) -> Any:
         """Type of the iterate."""
@@ -129,6 +133,13 @@ def solve(
     callback: Callable[[Record], None] | None = None,
 ) -> SolveResult:
     """Solve a problem by a method; what `wl.solve` documents, for callers that bring the method themselves."""
+    if not isinstance(problem, LCP):
+        raise ValueError(f"problem is a {type(problem).__name__}: expected an LCP")
+    if isinstance(solver, type) or not (hasattr(solver, "init") and hasattr(solver, "step")):
+        kind = f"the class {solver.__name__}" if isinstance(solver, type) else f"a {type(solver).__name__}"
+        raise ValueError(f"solver is {kind}: expected a method with its settings, say MinimumMapNewton()")
+    if not (stopping is None or isinstance(stopping, StoppingCriteria)):
+        raise ValueError(f"stopping is a {type(stopping).__name__}: expected StoppingCriteria(rtol=...)")
     if problem.bounds.affine is not None and not getattr(solver, "affine_bounds", False):
         raise ValueError(f"{type(solver).__name__} takes no bounds that are affine in x: take ProjectedSOR or another sweeping method")
     return _Loop(problem, solver, stopping or StoppingCriteria(), workspace or solver.init(problem), callback).run(x0)
@@ -167,10 +178,10 @@ class _Loop:
         find = getattr(self.problem.A, "floating_components", lambda scratch: None)
         floating = find(getattr(self.work, "scratch", None))
         self.work.floating = floating
-        lost = floating.unattainable(self.problem.b, self.problem.lower, self.problem.upper) if floating else 0.0
+        lost = floating.unattainable(self.problem.b, self.problem.lower, self.problem.upper) if floating else residual.unattainable()
         if guess is not None:
             self._take(guess)
-        if floating is not None:
+        if floating is not None or getattr(self.problem.A, "row_sizes", None) is not None:
             residual.settle_isolated(self.work.x)
             residual.evaluate(self.work.x)
         self._record(0, Step("start", 0))

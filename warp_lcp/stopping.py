@@ -41,10 +41,10 @@ class StoppingCriteria:
             raise ValueError(f"rtol = {self.rtol}: must be in [0, 1)")
         if not (self.atol >= 0 and math.isfinite(self.atol)):
             raise ValueError(f"atol = {self.atol}: must be finite and >= 0, in the units of y")
-        if self.max_iterations < 0:
-            raise ValueError(f"max_iterations = {self.max_iterations}: must be >= 0")
-        if self.patience < 1:
-            raise ValueError(f"patience = {self.patience}: must be >= 1")
+        for name, least in (("max_iterations", 0), ("patience", 1)):
+            value = getattr(self, name)
+            if not (value >= least and value == math.floor(value)):
+                raise ValueError(f"{name} = {value}: must be an integer >= {least}")
         if not self.divergence > 1:
             raise ValueError(f"divergence = {self.divergence}: must be > 1")
 

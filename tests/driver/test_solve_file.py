@@ -104,14 +104,16 @@ def test_a_long_history_is_shortened(problem, tmp_path):
         (["complex.mtx", "b.mtx"], "complex.mtx: holds complex numbers"),
         (["nan.mtx", "b.mtx"], "nan.mtx: holds 1 values that are not finite"),
         (["A.mtx", "A.mtx"], "A.mtx: has shape 36 x 36: expected 36 x 1"),
-        (["A.mtx", "bnan.mtx"], "bnan.mtx: holds 2 values that are NaN"),
-        (["A.mtx", "binf.mtx"], "b holds 1 values that are not finite"),
+        (["A.mtx", "bnan.mtx"], "bnan.mtx: holds 2 values that are not finite"),
+        (["A.mtx", "binf.mtx"], "binf.mtx: holds 1 values that are not finite"),
+        (["A.mtx", "b.mtx", "--upper", "bnan.mtx"], "bnan.mtx: holds 2 values that are NaN"),
+        (["A.mtx", "b.mtx", "--out", "."], "--out .: is a folder; name a file"),
         (["A.mtx", "b.mtx", "--lower", "none"], "--lower none: neither a number nor a file"),
         (["A.mtx", "b.mtx", "--lower", "2", "--upper", "1"], "lower > upper in 36"),
         (["A.mtx", "b.mtx", "--lower", "nan"], "lower holds 36 NaN"),
         (["A.mtx", "b.mtx", "--method", "lemk"], "--method lemk: no such method; did you mean 'lemke'?"),
         (["A.mtx", "b.mtx", "--method", "projected-multigrid"], "does not take sparse matrices; choose from"),
-        (["A.mtx", "b.mtx", "--tolerance", "2"], "rtol = 2.0: must be in [0, 1)"),
+        (["A.mtx", "b.mtx", "--tolerance", "2"], "--tolerance 2.0: rtol = 2.0: must be in [0, 1)"),
         (["A.mtx", "b.mtx", "--max-iterations", "-1"], "--max-iterations"),
         (["A.mtx", "b.mtx", "--out", "no/where/x.mtx"], "--out no/where/x.mtx: there is no folder no/where"),
         (["A.mtx"], "b.mtx"),
@@ -133,3 +135,30 @@ def test_wrong_input_exits_with_2(problem, tmp_path, monkeypatch, arguments, exp
     assert result.exit_code == 2, result.stdout
     assert expected in result.stderr
     assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "coordinate real symmetric\n2 2 3\n1 1 2.0\n2 1 -1.0\n2 2 2.0\n",
+        "coordinate integer symmetric\n2 2 3\n1 1 2\n2 1 -1\n2 2 2\n",
+        "array real symmetric\n2 2\n2.0\n-1.0\n2.0\n",
+        "array integer general\n2 2\n2\n-1\n-1\n2\n",
+        "coordinate real general\n2 2 5\n1 1 1.5\n1 1 0.5\n1 2 -1\n2 1 -1\n2 2 2\n",  # entries given twice are summed
+    ],
+)
+@pytest.mark.parametrize("right_side", ["array integer general\n2 1\n1\n-5\n", "array real general\n1 2\n1.0\n-5.0\n"])
+def test_all_forms_of_a_file_mean_the_same(text, right_side, tmp_path):
+    """2 x1 - x2 + 1 and -x1 + 2 x2 - 5 vanish at x = (1, 3)."""
+    for name, content in (("A.mtx", text), ("b.mtx", right_side)):
+        (tmp_path / name).write_text(f"%%MatrixMarket matrix {content}")
+    result = call(tmp_path / "A.mtx", tmp_path / "b.mtx", "--out", tmp_path / "x.mtx", "--tolerance", 1e-12)
+    assert result.exit_code == 0, result.stderr
+    np.testing.assert_allclose(scipy.io.mmread(tmp_path / "x.mtx").ravel(), [1.0, 3.0], atol=1e-10)
+
+
+def test_a_pattern_is_a_matrix_of_ones(tmp_path):
+    (tmp_path / "A.mtx").write_text("%%MatrixMarket matrix coordinate pattern symmetric\n2 2 2\n1 1\n2 2\n")
+    write(tmp_path / "b.mtx", np.array([-2.0, 3.0]))
+    assert call(tmp_path / "A.mtx", tmp_path / "b.mtx", "--out", tmp_path / "x.mtx").exit_code == 0
+    np.testing.assert_allclose(scipy.io.mmread(tmp_path / "x.mtx").ravel(), [2.0, 0.0], atol=1e-6)

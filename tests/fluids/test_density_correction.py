@@ -234,6 +234,23 @@ def test_only_a_scene_that_asks_for_it_has_one() -> None:
     assert "density_correction" in corrected.state()
 
 
+@pytest.mark.parametrize("tables", [{}, {"density_correction": {}, "particles": {"reseed": {}}}])
+def test_a_scene_without_it_launches_none_of_its_kernels(tables: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor does it allocate: fields are made when the simulation is."""
+    launched, launch = set(), wp.launch
+
+    def note(kernel: wp.Kernel, *arguments: Any, **named: Any) -> Any:
+        launched.add(kernel.module.name)
+        return launch(kernel, *arguments, **named)
+
+    monkeypatch.setattr(wp, "launch", note)
+    simulation = dam(**tables)
+    advance(simulation, 0.2)
+    own = {name for name in launched if name.startswith(("fluids.density_correction", "fluids.reseeding"))}
+    assert "warp_lcp.grid.density" in launched
+    assert own == ({"fluids.density_correction", "fluids.reseeding"} if tables else set())
+
+
 def test_every_third_step() -> None:
     simulation = dam(density_correction={"every": 3})
     rows = advance(simulation, 0.3)

@@ -48,6 +48,7 @@ def written(folder: Path) -> dict[str, bytes]:
         ("dam-break", [*OVERRIDES, "time.duration=0.1"]),
         ("splash-in-circle", [*OVERRIDES, "particles.transfer=flip", "pressure.surface=voxel"]),
         ("retracting-wall", MOVING),
+        ("retracting-wall", [*MOVING, "density_correction.every=2", "particles.reseed.every=1"]),
         ("stirred-tank", TANK),
     ],
 )
@@ -77,6 +78,9 @@ BALL = {"shape": "sphere", "center": [0.7, 0.3, 0.5], "radius": 0.15}
         (2, {"pressure": {"smoothing": 8}, "cfl": 0.5}),  # a level set that reaches farther than a step
         (2, {"particles": {"transfer": "flip"}, "pressure": {"surface": "voxel"}}),
         (3, {"pressure": {"smoothing": 1}}),
+        (2, {"density_correction": {}, "particles": {"reseed": {"min": 4, "max": 4}}}),
+        (2, {"density_correction": {"every": 2}, "solid": [BALL | {"motion": {"kind": "translation", "velocity": [-0.8, 0.2, 0.0]}}]}),
+        (3, {"density_correction": {}, "solids": "voxel"}),
         (3, {"solids": "voxel", "cfl": 4.0}),
     ],
 )

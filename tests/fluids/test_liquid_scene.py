@@ -58,11 +58,19 @@ def test_the_plan_counts_particles() -> None:
     assert overlapping.particle_estimate() == 16 * 8 * 4
 
 
+def test_the_plan_says_what_moves_particles_apart() -> None:
+    assert not {"density", "reseeding"} & dict(small().plan()).keys()
+    plan = dict(small(density_correction={"every": 2}, particles={"per_axis": 3, "reseed": {"every": 1}}).plan())
+    assert plan["density"] == "at most 1.033 of that at rest, corrected every 2 steps"
+    assert plan["reseeding"] == "4 to 18 particles a cell, every step"
+
+
 def test_the_estimate_of_memory_counts_what_the_options_add() -> None:
     ball = {"shape": "sphere", "center": [0.7, 0.2], "radius": 0.1}
     moving = ball | {"motion": {"kind": "translation", "velocity": [1.0, 0.0]}}
     voxel = {"solids": "voxel", "pressure": {"surface": "voxel"}}
     options = [voxel, {"solids": "voxel"}, {"solids": "voxel", "pressure": {"smoothing": 1}}, {}, {"solid": [moving]}]
+    options += [{"solid": [moving], "density_correction": {}, "particles": more} for more in ({}, {"reseed": {}})]
     size = {"size": [1.0, 0.5], "resolution": 1000, "liquid": [box([0.0, 0.0], [0.1, 0.1])]}
     sizes = [scene(**size, **({"solid": [ball]} | tables)).memory_estimate() for tables in options]
     assert sizes == sorted(set(sizes))

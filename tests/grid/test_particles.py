@@ -141,6 +141,38 @@ def test_values_as_large_as_can_be_are_finite() -> None:
     assert particles.totals().high[0] == pytest.approx(3e38)
 
 
+@pytest.mark.parametrize("keep", [0.0, 0.3, 1.0])
+def test_removing_keeps_the_others_in_order_and_in_place(keep: float) -> None:
+    particles = random_particles(FLAT, 500, 31)
+    position, velocity = particles.position.numpy().copy(), particles.velocity.numpy().copy()
+    gone = np.random.default_rng(12).random(500) >= keep
+    storage, memory = particles.capacity, {particles.key.ptr, *(a.ptr for a in particles.arrays().values()), particles._spare.store.ptr}
+    marks = particles.marks
+    marks.assign(gone.astype(np.int32))
+    assert particles.remove(marks) == gone.sum()
+    assert particles.count == len(particles.position) == (~gone).sum()
+    np.testing.assert_array_equal(particles.position.numpy(), position[~gone])
+    np.testing.assert_array_equal(particles.velocity.numpy(), velocity[~gone])
+    assert particles.capacity == storage
+    assert {particles.key.ptr, *(a.ptr for a in particles.arrays().values()), particles._spare.store.ptr} == memory
+    particles.arrange(0)
+    assert particles.totals().count == (~gone).sum()
+    particles.append(position[:3], velocity[:3])
+    np.testing.assert_array_equal(particles.position.numpy()[-3:], position[:3])
+
+
+def test_there_may_be_no_particles() -> None:
+    particles = Particles(FLAT, np.zeros((0, 3)), np.zeros((0, 3)), affine=True, indexed=True)
+    particles.arrange(0)
+    assert particles.remove(particles.marks) == 0
+    totals = particles.totals()
+    assert totals.finite
+    assert (totals.count, totals.max_speed) == (0, 0.0)
+    particles.append(np.full((2, 3), 0.1), np.ones((2, 3)))
+    particles.arrange(1)
+    assert particles.totals().count == 2
+
+
 def test_mismatched_particles_are_refused() -> None:
     with pytest.raises(ValueError, match="velocity"):
         Particles(FLAT, np.zeros((2, 3)), np.zeros((2, 2)), affine=True)

@@ -154,6 +154,8 @@ def solve(
         options = {"lower": lower, "upper": upper, "method": method, "tolerance": tolerance, "max_iterations": max_iterations}
         if out is not None and not out.parent.is_dir():
             raise ProblemError(f"--out {out}: there is no folder {out.parent}")
+        if out is not None and out.is_dir():
+            raise ProblemError(f"--out {out}: is a folder; name a file")
         outcome = solve_files(matrix, right_side, device=chosen, **options)  # type: ignore[arg-type]
         if out is not None:
             write_vector(out, outcome.result.x.numpy())

@@ -105,9 +105,12 @@ def solve_files(
     b = read_vector(right_side, n)
     sides = [_bound(value, n, f"--{name}") for name, value in (("lower", lower), ("upper", upper))]
     try:
+        stopping = StoppingCriteria(rtol=tolerance, max_iterations=max_iterations)
+    except ValueError as error:
+        raise ProblemError(f"--tolerance {tolerance}: {error}") from error
+    try:
         operator = SparseOperator(A, device=device) if scipy.sparse.issparse(A) else DenseOperator(A, device=device)
         problem = LCP(operator, b, *sides)
-        stopping = StoppingCriteria(rtol=tolerance, max_iterations=max_iterations)
         solver = default_method(problem) if method is None else _method(method, operator)
         work = solver.init(problem)
     except ValueError as error:
@@ -128,13 +131,13 @@ def read_matrix(path: Path) -> Any:
     return matrix
 
 
-def read_vector(path: Path, n: int) -> np.ndarray:
-    """Return a vector of n numbers from a file of shape n x 1 or 1 x n.
+def read_vector(path: Path, n: int, *, infinite: bool = False) -> np.ndarray:
+    """Return a vector of n finite numbers, or also infinite ones, from a file of shape n x 1 or 1 x n.
 
     Raises:
         ProblemError: the file cannot be read, or holds something else.
     """
-    matrix = _read(path, infinite=True)
+    matrix = _read(path, infinite=infinite)
     dense = matrix.toarray() if scipy.sparse.issparse(matrix) else np.asarray(matrix)
     if dense.shape not in ((n, 1), (1, n), (n,)):
         raise ProblemError(f"{path}: has shape {_size(dense)}: expected {n} x 1, a number for each row of A")
@@ -180,7 +183,7 @@ def _bound(value: str, n: int, option: str) -> float | np.ndarray:
     except ValueError:
         if not Path(value).exists():
             raise ProblemError(f"{option} {value}: neither a number nor a file") from None
-        return read_vector(Path(value), n)
+        return read_vector(Path(value), n, infinite=True)
 
 
 def _method(name: str, operator: Any) -> Any:

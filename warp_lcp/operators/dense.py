@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import scipy.sparse
 import warp as wp
 
-from warp_lcp.layout import Layout
+from warp_lcp.layout import Layout, check_storable, real_array
 from warp_lcp.operators.dense_kernels import product_kernel, relax_kernel
 from warp_lcp.problem import as_operator
 
@@ -18,9 +19,12 @@ class DenseOperator:
     """A x with a dense square matrix A.
 
     Args:
-        matrix: A, numpy array (n, n), finite.
+        matrix: A, numpy array or wp.array (n, n), finite.
         device: Warp device; the default device if None.
         dtype: storage of A, wp.float64 or wp.float32.
+
+    Attributes:
+        row_sizes: the largest magnitude of each row, shape (n,), wp.float64; None where no row is empty.
 
     Raises:
         ValueError: the matrix is not square, empty or not finite.
@@ -29,15 +33,17 @@ class DenseOperator:
     def __init__(self, matrix: Any, *, device: Any = None, dtype: Any = wp.float64) -> None:
         if dtype not in (wp.float32, wp.float64):
             raise ValueError(f"dtype = {dtype}: must be wp.float32 or wp.float64")
-        host = np.asarray(matrix, dtype=np.float64)
+        if scipy.sparse.issparse(matrix):
+            raise ValueError("matrix is a sparse one: SparseOperator takes it")
+        host = np.asarray(real_array(matrix.numpy() if isinstance(matrix, wp.array) else matrix, "matrix"), dtype=np.float64)
         if host.ndim != 2 or host.shape[0] != host.shape[1] or host.size == 0:
             raise ValueError(f"matrix has shape {host.shape}: expected (n, n) with n >= 1")
-        if not np.isfinite(host).all():
-            raise ValueError("matrix holds a value that is not finite")
+        check_storable(host, dtype, "matrix")
         self.device, self.dtype, self.shape = wp.get_device(device), dtype, (host.shape[0],)
         self.layout = Layout(self.shape, self.device)
         self.matrix = wp.array(host, dtype=dtype, device=self.device)
         largest = np.abs(host).max(axis=1)
+        self.row_sizes = None if largest.all() else wp.array(largest, dtype=wp.float64, device=self.device)
         self.symmetric = bool((np.abs(host - host.T) <= SYMMETRIC * np.minimum.outer(largest, largest)).all())
 
     @property
@@ -81,3 +87,8 @@ class DenseOperator:
 @as_operator.register(np.ndarray)
 def _dense(A: np.ndarray, device: Any = None) -> DenseOperator:
     return DenseOperator(A, device=device)
+
+
+@as_operator.register(wp.array)
+def _dense_on_device(A: Any, device: Any = None) -> DenseOperator:
+    return DenseOperator(A, device=A.device if device is None else device)

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse
 import warp as wp
 
-from warp_lcp.layout import Layout
+from warp_lcp.layout import Layout, check_storable
 from warp_lcp.native import Spans
 from warp_lcp.operators.sparse_kernels import color_kernel, gather_kernel, kernels
 from warp_lcp.problem import as_operator
@@ -35,6 +35,7 @@ class SparseOperator:
         indices: column of each entry, shape (nnz,), wp.int32, ascending in each row.
         values: the entries, shape (nnz,), `dtype`.
         symmetric: whether A equals its transpose, to rounding.
+        row_sizes: the largest magnitude of each row, shape (n,), wp.float64; None where no row is empty.
         version: how often the entries have been taken.
 
     Raises:
@@ -51,6 +52,7 @@ class SparseOperator:
         if dtype not in (wp.float32, wp.float64):
             raise ValueError(f"dtype = {dtype}: must be wp.float32 or wp.float64")
         host = _checked(matrix)
+        check_storable(host.data, dtype, "matrix")
         self.device, self.dtype, self.shape = wp.get_device(device), dtype, (host.shape[0],)
         self.layout = Layout(self.shape, self.device)
         self.indptr = wp.array(host.indptr, dtype=wp.int32, device=self.device)
@@ -94,8 +96,7 @@ class SparseOperator:
             if array.shape != (self.nnz,):
                 raise ValueError(f"values has shape {array.shape}: expected {(self.nnz,)}")
             host = self._matrix_of(array)
-            if not np.isfinite(host.data).all():
-                raise ValueError("values holds a value that is not finite")
+        check_storable(host.data, self.dtype, "values")
         self.values.assign(host.data.astype(wp.dtype_to_numpy(self.dtype)))
         self._take(host)
 
@@ -186,6 +187,8 @@ class SparseOperator:
     def _take(self, host: scipy.sparse.csr_array) -> None:
         """Derive what follows from the entries."""
         self.symmetric = _is_symmetric(host)
+        largest = abs(host).max(axis=1).toarray().ravel()
+        self.row_sizes = None if largest.all() else wp.array(largest, dtype=wp.float64, device=self.device)
         self._diagonal.assign(host.diagonal().astype(wp.dtype_to_numpy(self.dtype)))
         if self._transpose_values is not None:
             self._gather(self._transpose[2])
@@ -225,8 +228,6 @@ def _checked(matrix: Any) -> scipy.sparse.csr_array:
         raise ValueError(f"matrix has entries of type {matrix.dtype}: expected real numbers")
     host = scipy.sparse.csr_array(matrix, dtype=np.float64, copy=True)
     host.sum_duplicates()
-    if not np.isfinite(host.data).all():
-        raise ValueError("matrix holds a value that is not finite")
     if host.nnz > np.iinfo(np.int32).max:
         raise ValueError(f"matrix has {host.nnz} entries: at most 2^31 - 1 can be indexed")
     return host

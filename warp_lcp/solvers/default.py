@@ -44,9 +44,10 @@ def solve(
         works in place: then it is the workspace's own iterate, overwritten by the next solve with that workspace.
 
     Raises:
-        ValueError: x0 has a wrong shape or is not finite, a workspace comes without its solver, or the method cannot take this A.
+        ValueError: an argument is of another kind, x0 has a wrong shape or is not finite, a workspace comes without its solver, or the
+            method cannot take this A.
     """
     if solver is None and workspace is not None:
         raise ValueError("workspace: name the solver that made it")
-    solver = solver or default_method(problem)
+    solver = default_method(problem) if solver is None else solver
     return solve_by(problem, solver, stopping=stopping, x0=x0, workspace=workspace, callback=callback)

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
-from warp_lcp.layout import Array
+from warp_lcp.layout import Array, real_array
 from warp_lcp.problem import LCP
 from warp_lcp.result import SolveStatus
 from warp_lcp.solve import Step
@@ -123,6 +123,7 @@ def enumerate_batch(
         [[1. 1.]
          [1. 0.]] [4 1]
     """
+    A, b = (value if isinstance(value, wp.array) else real_array(value, name) for value, name in ((A, "A"), (b, "b")))
     shape = tuple(A.shape)
     if len(shape) != 3 or shape[1] != shape[2] or not 1 <= shape[1] <= MOST or shape[0] == 0:
         raise ValueError(f"A has shape {shape}: expected (m, n, n) with m >= 1 and 1 <= n <= {MOST}")
@@ -135,7 +136,7 @@ def enumerate_batch(
     right = _on_device(b, (m, n), dtype, device, "b")
     bounds = [_bounds(value, m, n, dtype, device, name) for value, name in ((lower, "lower"), (upper, "upper"))]
     if not any(isinstance(v, wp.array) for v in (lower, upper)):
-        low, high = (np.asarray(v, dtype=np.float64) for v in (lower, upper))
+        low, high = (np.asarray(real_array(v, name), dtype=np.float64) for v, name in ((lower, "lower"), (upper, "upper")))
         if np.isnan(low).any() or np.isnan(high).any() or (low > high).any() or (low == np.inf).any() or (high == -np.inf).any():
             raise ValueError("lower, upper: need lower <= upper without NaN, lower < inf and upper > -inf")
     if out is None:
@@ -148,12 +149,15 @@ def enumerate_batch(
 
 
 def _candidates(data: DenseProblem) -> tuple[np.ndarray, np.ndarray]:
-    """Return the x of every set, shape (3^n, n), and its measure: 2 where the set has none, at most 1 elsewhere."""
-    n = len(data.b)
-    inputs = [wp.array(field, dtype=wp.float64, device="cpu") for field in (data.A, data.b, data.lower, data.upper)]
+    """Return the x of every set, shape (3^n, n), and its measure: 2 where the set has none, at most 1 elsewhere.
+
+    The sets are tried in units in which A is equilibrated: what counts as a zero pivot does not depend on the units of the rows.
+    """
+    n, (scaled, units) = len(data.b), data.scaled()
+    inputs = [wp.array(field, dtype=wp.float64, device="cpu") for field in (scaled.A, scaled.b, scaled.lower, scaled.upper)]
     x, measures = wp.empty((3**n, n), dtype=wp.float64, device="cpu"), wp.empty(3**n, dtype=wp.float64, device="cpu")
     wp.launch(kernels(n, wp.float64).each, 3**n, [*inputs, x, measures], device="cpu")
-    return x.numpy(), measures.numpy()
+    return x.numpy() * units, measures.numpy()
 
 
 def _on_device(field: Array, shape: tuple[int, ...], dtype: Any, device: wp.Device, name: str) -> wp.array[Any]:
@@ -176,7 +180,7 @@ def _bounds(value: Any, m: int, n: int, dtype: Any, device: wp.Device, name: str
         if tuple(value.shape) not in ((n,), (1, n), (m, n)) or value.dtype is not dtype or value.device != device:
             raise ValueError(f"{name} is of shape {tuple(value.shape)}: expected ({n},) or ({m}, {n}) of A's type and device")
         return value.reshape((1, n)) if value.ndim == 1 else value
-    host = np.asarray(value, dtype=np.float64)
+    host = np.asarray(real_array(value, name), dtype=np.float64)
     if host.shape not in ((), (n,), (1, n), (m, n)):
         raise ValueError(f"{name} has shape {host.shape}: expected a number, ({n},) or ({m}, {n})")
     host = np.broadcast_to(host, (1, n)) if host.ndim < 2 else host

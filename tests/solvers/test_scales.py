@@ -1,0 +1,53 @@
+"""Units are the user's: a method takes the same path when A, x or both are given in others."""
+
+import numpy as np
+import pytest
+import scipy.sparse
+
+import warp_lcp as wl
+
+N = 20
+GRID = np.array([[0] * 5] + [[1] * 5] * 3)
+SCALES = [(1e8, 1.0), (1e-8, 1.0), (1.0, 1e8), (1.0, 1e-8), (1e-8, 1e-8), (1e8, 1e8)]  # of A and of x
+CASES = [
+    pytest.param(name, family, id=f"{name}-{family}")
+    for name, cls in wl.METHODS.items()
+    for family in ("dense", "sparse", "grid")
+    if family in cls.supports and name != "direct-enumeration" and (name, family) != ("fischer-newton", "dense")
+]
+
+
+def problem(family, a, x, device):
+    rng = np.random.default_rng(5)
+    B, b = rng.standard_normal((N, N)), a * x * rng.standard_normal(N)
+    if family == "grid":
+        return wl.LCP(wl.GridPoisson(GRID, face_x=a, face_y=a, device=device), b.reshape(GRID.shape) * GRID, 0.0, 2 * x)
+    if family == "dense":
+        return wl.LCP(wl.DenseOperator(a * (B @ B.T / N + np.eye(N)), device=device), b, 0.0, 2 * x)
+    T = scipy.sparse.diags_array([-a, 2.05 * a, -a], offsets=[-1, 0, 1], shape=(N, N))
+    return wl.LCP(wl.SparseOperator(T, device=device), b, 0.0, 2 * x)
+
+
+@pytest.mark.parametrize(("name", "family"), CASES)
+def test_iterations_do_not_depend_on_units(name, family, device):
+    if name == "quadratic-program":
+        pytest.importorskip("piqp")
+    stopping = wl.StoppingCriteria(max_iterations=2000)
+    plain = wl.solve(problem(family, 1.0, 1.0, device), wl.METHODS[name](), stopping=stopping)
+    for a, x in SCALES:
+        result = wl.solve(problem(family, a, x, device), wl.METHODS[name](), stopping=stopping)
+        assert result, (a, x, result.status)
+        assert abs(result.iterations - plain.iterations) <= max(2, 0.1 * plain.iterations), (a, x)
+        np.testing.assert_allclose(result.x.numpy() / x, plain.x.numpy(), atol=1e-4)
+
+
+def test_enumeration_of_rows_in_different_units(device):
+    """S A S with S from 1e-8 to 1e8: pivots differ by 1e32, and all count."""
+    rng = np.random.default_rng(77)
+    B, S = rng.standard_normal((4, 4)), np.array([1e-8, 1.0, 1e8, 1.0])
+    A, b = B @ B.T / 4 + np.eye(4), np.array([-1.0, 0.4, -2.0, 0.1])
+    plain = wl.solve(wl.LCP(wl.DenseOperator(A, device=device), b), wl.DirectEnumeration())
+    scaled = wl.LCP(wl.DenseOperator(S[:, None] * A * S, device=device), S * b)
+    assert np.count_nonzero(plain.x.numpy()) >= 2
+    np.testing.assert_allclose(wl.solve(scaled, wl.DirectEnumeration()).x.numpy() * S, plain.x.numpy(), atol=1e-12)
+    np.testing.assert_allclose(wl.DirectEnumeration().solutions(scaled) * S, [plain.x.numpy()], atol=1e-12)
