@@ -17,7 +17,7 @@ from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.vectors import convert
 
 LONGEST = 0.5  # cells that a correction moves a particle at most
-EXCESS = 1e-3  # of a cell, root mean square over the liquid's cells, that is not worth a solve
+EXCESS = 1e-3  # of a cell, root mean square over the over-full cells, that is not worth a solve
 SHIFT = 1e-5  # of the diagonal: gives closed pockets a solution, and leaves 0.5 % of what is too much 45 cells deep
 
 
@@ -105,11 +105,11 @@ class DensityCorrection:
         if particles.offsets is not None:
             particles.sort()  # they have moved: gathering needs the order, and gives the same bits on every run
         particle_density(self.grid, particles, window, self.particles_a_cell, self.density)
-        unknowns, over_full, most = self._prepare()
+        over_full, most = self._prepare()
         if over_full == 0:
             self.x.zero_()
             return Correction(None, 0, most)
-        result = self._solve(unknowns)
+        result = self._solve(over_full)
         if result.status in (wl.SolveStatus.INFEASIBLE, wl.SolveStatus.NON_FINITE):  # a closed room is too full: there is no way out
             self.x.zero_()
             return Correction(result, over_full, most)
@@ -122,17 +122,17 @@ class DensityCorrection:
         self.boundary.displace(self.displacement, particles.position)
         return Correction(result, over_full, most)
 
-    def _prepare(self) -> tuple[int, int, float]:
-        """Set up the problem; return its unknowns, how many of them are over-full, and the largest density."""
+    def _prepare(self) -> tuple[int, float]:
+        """Set up the problem; return how many cells are over-full, and the largest density."""
         b = self.boundary
         self.grid.domain.launch_rows(
             kernels.prepare_kernel, [b.base, self.density, b.capacity, self.max_density, self._kind, self._b, self.x, self._sums]
         )
         low, high = self.grid.domain.low, self.grid.domain.high
         sums = self._sums.numpy()[low[0] : high[0], low[1] : high[1]]
-        return int(sums[..., 0].sum()), int(sums[..., 1].sum()), float(sums[..., 2].max())
+        return int(sums[..., 0].sum()), float(sums[..., 1].max())
 
-    def _solve(self, unknowns: int) -> wl.SolveResult:
+    def _solve(self, over_full: int) -> wl.SolveResult:
         if self._problem is None:
             faces = {f"face_{axis}": field for axis, field in zip("xyz", self.boundary.open, strict=False)}
             cells = self.grid.interior(self._kind.numpy())
@@ -140,5 +140,5 @@ class DensityCorrection:
             self._problem = wl.LCP(self._operator, self._b, 0.0, np.inf)
             self._work = self.solver.init(self._problem)
         self._operator.update(self._kind)
-        criteria = wl.StoppingCriteria(rtol=self.tolerance, atol=EXCESS * unknowns**0.5, max_iterations=self.max_iterations)
+        criteria = wl.StoppingCriteria(rtol=self.tolerance, atol=EXCESS * over_full**0.5, max_iterations=self.max_iterations)
         return wl.solve(self._problem, self.solver, stopping=criteria, x0=self.x, workspace=self._work)

@@ -12,14 +12,14 @@ from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 
 LEAST_DENSITY = 0.5  # that displacements are divided by: thin spray need not carry off what a full cell has too much
 LEAST_CAPACITY = 0.1  # that densities are divided by there
-COLUMNS = 3  # of a row's sums, see `prepare`
+COLUMNS = 2  # of a row's sums, see `prepare`
 
 PREPARE = """
     const long long row = (k*(long long)kind_.shape[1] + j)*kind_.shape[2];
     const signed char* base = (const signed char*)base_.data + row; signed char* kind = (signed char*)kind_.data + row;
     const float* density = density_.data + row; const float* capacity = capacity_.data + row;
     double* b = b_.data + row; double* x = x_.data + row;
-    int liquid = 0, full = 0; float worst = -1.0f, over[M];
+    int full = 0; float worst = -1.0f, over[M];
     for (int start = first; start < last; start += M) {
         const int n = last - start < M ? last - start : M;
         SIMD8 for (int m = 0; m < n; ++m) {
@@ -29,12 +29,12 @@ PREPARE = """
             b[i] = has ? (double)free : 0.0;
             x[i] = has & (int)(x[i] > 0.0) ? x[i] : 0.0;
             over[m] = has ? density[i] - capacity[i] : -1.0f;
-            liquid += has; full += has & (int)(free < 0.0f);
+            full += has & (int)(free < 0.0f);
         }
         for (int m = 0; m < n; ++m) worst = over[m] > worst ? over[m] : worst;
     }
-    double* sums = sums_.data + 3*(k*(long long)kind_.shape[1] + j);
-    sums[0] = liquid; sums[1] = full; sums[2] = 1.0 + (double)worst;
+    double* sums = sums_.data + 2*(k*(long long)kind_.shape[1] + j);
+    sums[0] = full; sums[1] = 1.0 + (double)worst;
 """
 
 DISPLACE = """
@@ -78,7 +78,7 @@ def prepare_row(
 def prepare_kernel(
     cells: CellRange, base: _I8, density: _F32, capacity: _F32, most: float, kind: _I8, b: _F64, x: _F64, sums: _F64,
 ):  # fmt: skip
-    """Unknowns, right-hand side and guess; a row's sums: [0] unknowns, [1] of them over-full, [2] 1 + the most above what fits."""
+    """Unknowns, right-hand side and guess; a row's sums: [0] over-full cells, [1] 1 and the most above what fits."""
     plane, row = wp.tid()
     prepare_row(base, density, capacity, most, kind, b, x, sums, cells.k + plane, cells.j + row, cells.i, cells.end)
 

@@ -17,6 +17,7 @@ LEVEL_SET_BYTES = 19  # more a cell for a surface between cells, or slivers
 SMOOTHING_BYTES = 12
 CUT_BYTES = 45
 MOVING_BYTES = 30
+UNILATERAL_BYTES, SOURCE_BYTES = 5, 8  # their fields
 CORRECTION_BYTES, CUT_CORRECTION_BYTES = 54, 22  # the density correction's fields and method, and more where cells are cut
 RESEED_BYTES = 13
 PLANES = 2.5  # that a 2-D cell counts for: its fields have three, the solver's one
@@ -160,6 +161,7 @@ class LiquidScene(Scene):
         a_cell += 4 * self.dimension * (self.particles.transfer == "flip")
         a_cell += (CORRECTION_BYTES + CUT_CORRECTION_BYTES * cut) * (self.density_correction is not None)
         a_cell += RESEED_BYTES * (self.particles.reseed is not None)
+        a_cell += UNILATERAL_BYTES * (self.pressure.model == "unilateral") + SOURCE_BYTES * bool(self.source)
         vectors = 3 + (self.dimension if self.particles.transfer == "apic" else 0)
         running = cells * a_cell + particles * (VECTOR_BYTES * vectors + KEY_BYTES)
         lattice = nx * ny * self.particles.per_axis**self.dimension

@@ -44,6 +44,8 @@ class UnilateralPressure(PressureProjection):
     Courant number: with the mean of both cells, or without that limit, the front of a block in free flight seems to over-fill the cells
     ahead and is blown off. What the gradient accelerates is the mean of both.
 
+    Cells that are open to less than a quarter hold too few particles to tell a density: they take what fits, but give off no excess.
+
     The density is that of a kernel three cells wide, so that the two layers of cells beneath a surface are not full and carry no pressure
     until they have been compressed a little.
 

@@ -9,7 +9,9 @@ from warp_lcp.grid.staggered import CellRange
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 
-LEAST_SHARE = 0.25  # of a cell's kernel that must be open for its filled share to be told, as in `warp_lcp.grid.level_set`
+# Of a cell's kernel: where less is open, as in `warp_lcp.grid.level_set`, a particle more or less is not to tell. Such a cell takes what
+# fits, but is not pushed for what it holds too much: kicks of up to 29 m/s threw a pool around a ball about. With 0.5 the pool sank by 4 %.
+LEAST_SHARE = 0.25
 LEAST_DENSITY = 0.1  # of a face: less mass would be thrown about by the pressure of a full cell beside it
 
 _AIR = wp.constant(wp.int8(AIR))
@@ -90,7 +92,10 @@ def slack(
     k: int, j: int, i: int,
 ):  # fmt: skip
     """Return y of a cell: what it may still take, and what flows out of it [m/s]."""
-    y = s.rate * wp.float64(s.most * s.capacity[k, j, i] - s.density[k, j, i])
+    room = s.most * s.capacity[k, j, i] - s.density[k, j, i]
+    if s.capacity[k, j, i] < LEAST_SHARE:
+        room = wp.max(room, 0.0)
+    y = s.rate * wp.float64(room)
     y += passing(s, u, open_x, solid_x, k, j, i + 1, k, j, i) - passing(s, u, open_x, solid_x, k, j, i, k, j, i - 1)
     y += passing(s, v, open_y, solid_y, k, j + 1, i, k, j, i) - passing(s, v, open_y, solid_y, k, j, i, k, j - 1, i)
     if s.planes == 2:

@@ -50,6 +50,8 @@ def written(folder: Path) -> dict[str, bytes]:
         ("retracting-wall", MOVING),
         ("retracting-wall", [*MOVING, "density_correction.every=2", "particles.reseed.every=1"]),
         ("stirred-tank", TANK),
+        ("tap-and-drain", [*OVERRIDES, "time.duration=1.2"]),
+        ("splash-unilateral", ["domain.resolution=40", *OVERRIDES[1:]]),
     ],
 )
 def test_resumed_equals_uninterrupted(name: str, overrides: list[str], tmp_path: Path) -> None:
@@ -78,6 +80,7 @@ BALL = {"shape": "sphere", "center": [0.7, 0.3, 0.5], "radius": 0.15}
         (2, {"pressure": {"smoothing": 8}, "cfl": 0.5}),  # a level set that reaches farther than a step
         (2, {"particles": {"transfer": "flip"}, "pressure": {"surface": "voxel"}}),
         (3, {"pressure": {"smoothing": 1}}),
+        (3, {"pressure": {"model": "unilateral"}, "solid": [BALL]}),
         (2, {"density_correction": {}, "particles": {"reseed": {"min": 4, "max": 4}}}),
         (2, {"density_correction": {"every": 2}, "solid": [BALL | {"motion": {"kind": "translation", "velocity": [-0.8, 0.2, 0.0]}}]}),
         (3, {"density_correction": {}, "solids": "voxel"}),

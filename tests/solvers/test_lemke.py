@@ -122,7 +122,7 @@ def test_lexicographic_rule_passes_an_example_with_ties():
 @pytest.mark.parametrize(
     ("A", "b", "lower"),
     [
-        (np.zeros((2, 2)), np.array([1.0, -1.0]), 0.0),
+        (np.array([[1.0, -1.0], [-1.0, 1.0]]), np.array([1.0, -2.0]), 0.0),
         (np.ones((2, 2)), np.array([-1.0, -2.0]), -np.inf),
         (-np.eye(3), -np.ones(3), 0.0),  # not semi-definite: the linear program tells
         (np.array([[0.0, -1.0], [0.0, 0.0]]), np.array([-1.0, 1.0]), 0.0),

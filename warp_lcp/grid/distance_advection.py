@@ -51,9 +51,7 @@ def advect_with_distance(
     launch(advect_kernel, len(position), inputs, grid.device)
 
 
-def push_out(
-    grid: StaggeredGrid, distance: wp.array, position: wp.array, moved: wp.array, left: wp.array, *, open_sides: int = 0
-) -> None:
+def push_out(grid: StaggeredGrid, distance: wp.array, position: wp.array, moved: wp.array, left: wp.array, *, open_sides: int = 0) -> None:
     """Put particles that walls have run over, or come too near, back into the open along the gradient of the distance.
 
     Args:

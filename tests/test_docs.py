@@ -1,0 +1,59 @@
+"""The documentation's table of methods is what the registry says, and its examples work as they stand."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+import warp_lcp as wl
+from benchmarks import sweep_prices
+from warp_lcp.solvers.registry import grid_methods
+
+DOCS = Path(__file__).parents[1] / "docs"
+TEXT = (DOCS / "methods.md").read_text()
+COLUMNS = ("name", "class", "book", "takes", "needs", "affine", "step", "when")
+ROWS = [
+    dict(zip(COLUMNS, (cell.strip() for cell in line.strip("|\n ").split("|")), strict=True))
+    for line in TEXT.splitlines()
+    if re.match(r"\| `[a-z-]+`( \*)? \| `\w+` \|", line)
+]
+
+
+def test_every_method_has_its_row():
+    assert [row["name"].strip("* ").strip("`") for row in ROWS] == sorted(wl.METHODS)
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row["class"].strip("`"))
+def test_rows_say_what_the_classes_say(row):
+    name = row["name"].strip("* ").strip("`")
+    method = wl.METHODS[name]
+    assert row["class"] == f"`{method.__name__}`"
+    assert getattr(wl, method.__name__) is method
+    assert set(row["takes"].split(", ")) == method.supports
+    assert row["affine"] == ("yes" if getattr(method, "affine_bounds", False) else "no")
+    assert row["name"].endswith("*") == (name in grid_methods())
+    most = re.search(r"n <= (\d+)", row["needs"])
+    assert (int(most.group(1)) if most else None) == getattr(method, "most_unknowns", None)
+    assert ("symmetric" in row["needs"]) >= (method.needs.startswith("symmetric"))
+    assert getattr(method, "boxed", True)  # the text says so of all
+    section = re.match(r"[\d.]+", row["book"])
+    assert section is None or section.group() in method.__doc__
+
+
+def test_prices_name_methods():
+    """Rows of the tables of prices are those of the benchmarks."""
+    named = re.findall(r"^\| (?:walls|everywhere) \| ([\w.-]+) \|", TEXT, flags=re.M)
+    assert set(named) <= set(sweep_prices.METHODS)
+    assert "multigrid" in named
+    assert set(re.findall(r"^\| ([a-z-]+) \| (?:\d|refused|[A-Z_]{5})", TEXT, flags=re.M)) <= set(wl.METHODS)
+
+
+@pytest.mark.parametrize("code", re.findall(r"```python\n(.*?)```", TEXT, flags=re.S))
+def test_python_examples_run(code, capsys):
+    exec(compile(code, "methods.md", "exec"), {})
+    assert capsys.readouterr().out.startswith("CONVERGED")
+
+
+def test_links_lead_somewhere():
+    for target in re.findall(r"\]\(([^)#]+)\)", TEXT):
+        assert target.startswith("http") or (DOCS / target).exists(), target
