@@ -142,8 +142,11 @@ def mixed_to_boxed(A: Any, b: Vector, equations: Vector, *, device: Any = None) 
         b: shape (n,).
         equations: E, shape (n,), bool.
         device: Warp device of the problem.
+
+    Raises:
+        ValueError: equations has another shape or type.
     """
-    return _same(A, b, np.where(equations, -np.inf, 0.0), np.full(len(b), np.inf), device)
+    return _same(A, b, np.where(_marked(equations, len(b)), -np.inf, 0.0), np.full(len(b), np.inf), device)
 
 
 def mixed_to_lcp(A: Any, b: Vector, equations: Vector, *, device: Any = None) -> Reformulation:
@@ -158,9 +161,10 @@ def mixed_to_lcp(A: Any, b: Vector, equations: Vector, *, device: Any = None) ->
         device: Warp device of the problem.
 
     Raises:
-        ValueError: A_EE is singular, or every row is an equation.
+        ValueError: A_EE is singular, every row is an equation, or equations has another shape or type.
     """
-    E, N = np.flatnonzero(equations), np.flatnonzero(~np.asarray(equations))
+    mask = _marked(equations, len(b))
+    E, N = np.flatnonzero(mask), np.flatnonzero(~mask)
     if N.size == 0:
         raise ValueError("equations holds every row: this is a linear system, see linear_equations_to_boxed")
     M = A.toarray() if scipy.sparse.issparse(A) else np.asarray(A, dtype=np.float64)
@@ -188,13 +192,14 @@ def boxed_to_lcp(A: Any, b: Vector, lower: Vector, upper: Vector, *, device: Any
     Args:
         A: matrix (n, n).
         b: shape (n,).
-        lower: l, shape (n,).
-        upper: u, shape (n,).
+        lower: l, a number or shape (n,).
+        upper: u, likewise.
         device: Warp device of the problem.
 
     Raises:
         ValueError: a row is an equation, without bounds: eliminate these by mixed_to_lcp first.
     """
+    lower, upper = (np.broadcast_to(np.asarray(side, dtype=np.float64), b.shape) for side in (lower, upper))
     below, above = np.isfinite(lower), np.isfinite(upper)
     if not (below | above).all():
         raise ValueError(f"lower and upper leave {np.count_nonzero(~(below | above))} rows without bounds: eliminate equations first")
@@ -294,6 +299,14 @@ def boxed_to_fischer_burmeister(A: Any, b: Vector, lower: Vector, upper: Vector)
         return np.where(finite, np.hypot(s, t) - s - t, -t)
 
     return lambda x: fischer(x - lower, fischer(upper - x, -(A @ x + b)))
+
+
+def _marked(equations: Any, n: int) -> np.ndarray:
+    """Return which rows are equations; row numbers and 0/1 integers are refused, for each could be taken for the other."""
+    mask = np.asarray(equations)
+    if mask.shape != (n,) or mask.dtype != bool:
+        raise ValueError(f"equations has shape {mask.shape} and type {mask.dtype}: expected ({n},) and bool")
+    return mask
 
 
 def _same(A: Any, b: Vector, lower: Vector, upper: Vector, device: Any) -> Reformulation:

@@ -70,7 +70,12 @@ def splash(n: int, *, phase: float = 0.0) -> Splash:
     Args:
         n: cells along a side.
         phase: shifts the velocity field that b is the net outflow of.
+
+    Raises:
+        ValueError: n < 1.
     """
+    if n < 1:
+        raise ValueError(f"n = {n}: must be >= 1 cells a side")
     c, f = (np.arange(n) + 0.5) / n, np.arange(n + 1) / n
     x, y, z = np.meshgrid(c, c, c, indexing="ij", sparse=True)
     solid = sum((a - m) ** 2 for a, m in zip((x, y, z), SOLID_CENTER, strict=True)) < SOLID_RADIUS**2

@@ -55,7 +55,12 @@ def planted(A: Any, rng: np.random.Generator, plant: Plant, *, name: str, facts:
         plant: how.
         name: of the problem.
         facts: what holds for A; the plant's own are added.
+
+    Raises:
+        ValueError: A is empty or not square.
     """
+    if A.shape[0] < 1 or A.shape != (A.shape[0],) * 2:
+        raise ValueError(f"A has shape {A.shape}: expected (n, n) with n >= 1")
     n, S = A.shape[0], plant.size
     equation = rng.random(n) < plant.mixed
     held = (rng.random(n) < plant.active) & ~equation

@@ -26,7 +26,7 @@ def definite(n: int, *, condition: float = 100.0, plant: Plant | None = None, se
         seed: of all choices.
 
     Raises:
-        ValueError: condition < 1.
+        ValueError: n < 1 or condition < 1.
     """
     if not condition >= 1:
         raise ValueError(f"condition = {condition}: must be >= 1")
@@ -84,7 +84,12 @@ def period_three(blocks: int = 1, *, plant: Plant | None = None, seed: int | Non
             block with a = 4, unscaled.
         plant: how the solution is chosen; b = -1 if None.
         seed: of all choices.
+
+    Raises:
+        ValueError: blocks < 1.
     """
+    if blocks < 1:
+        raise ValueError(f"blocks = {blocks}: must be >= 1")
     rng = np.random.default_rng(seed if seed is not None else 2015)
     A = np.zeros((3 * blocks, 3 * blocks))
     for k in range(blocks):

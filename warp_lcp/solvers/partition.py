@@ -36,6 +36,8 @@ def given_blocks(problem: LCP, blocks: Sequence[Any]) -> list[np.ndarray]:
     Raises:
         ValueError: an index is out of range, an unknown is missing or in two blocks, or a block is empty.
     """
+    if isinstance(blocks, str) or not hasattr(blocks, "__iter__"):
+        raise ValueError(f"blocks = {blocks!r}: expected a number of unknowns, or for each block a list of indices")
     layout = problem.layout
     place = layout.target(np.arange(layout.size).reshape(layout.stored_shape), np.empty(layout.shape)).ravel()
     found = []

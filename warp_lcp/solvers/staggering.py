@@ -29,7 +29,7 @@ class Staggering:
     Args:
         blocks: for each block flat indices into a field of the problem's shape, together all unknowns, each once; or a number of blocks
             of consecutive unknowns.
-        solvers: a method for each block; MinimumMapNewton for all if empty, one for all if it is a single one.
+        solvers: a method for each block; MinimumMapNewton for all if empty, one for all if it is a single one, in a list or not.
         eta: each solve of a block reduces its residual by this factor, or to what the whole one needs.
         max_block_iterations: the most steps in a block.
 
@@ -42,7 +42,7 @@ class Staggering:
     affine_bounds: ClassVar[bool] = True
 
     blocks: int | Sequence[Any] = 2
-    solvers: Sequence[Solver] = ()
+    solvers: Solver | Sequence[Solver] = ()
     eta: float = 1e-2
     max_block_iterations: int = 100
 
@@ -66,7 +66,7 @@ class Staggering:
             rows = [block for block in rows if block.size]
         else:
             rows = given_blocks(problem, self.blocks)
-        solvers = list(self.solvers) or [MinimumMapNewton()]
+        solvers = [self.solvers] if hasattr(self.solvers, "step") else list(self.solvers) or [MinimumMapNewton()]
         solvers = solvers * len(rows) if len(solvers) == 1 else solvers
         return StaggeringWorkspace(problem, rows, solvers, eta=self.eta, max_iterations=self.max_block_iterations)
 
