@@ -71,5 +71,7 @@ KERNELS = Suite("kernels", "each hot kernel on the finest grid against this mach
 SOLVERS = Suite("solvers", "linear and LCP solves: set-up, iterations, time to a tolerance, memory; against PyAMG and SciPy")
 RUN = Suite("run", "steps per second of built-in scenes, and what the particles cost")
 VALIDATION = Suite(
-    "validation", "liquids against known answers: rest, sloshing, ceiling, dam break, transfers, slopes, volume; with negative controls", False
+    "validation",
+    "liquids against known answers: rest, sloshing, ceiling, dam break, transfers, slopes, volume; with negative controls",
+    False,
 )

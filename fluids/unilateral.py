@@ -22,7 +22,9 @@ MAX_DENSITY = 1.0  # of a cell, in units of the density at rest: a liquid as it 
 
 
 class UnilateralPressure(PressureProjection):
-    """Solve 0 <= p complementary to rho_max - rho >= 0 in every cell that is not SOLID [Gerszewski & Bargteil 2013; Narain et al. 2010].
+    """Solve 0 <= p complementary to rho_max - rho >= 0 in every cell that is not SOLID.
+
+    The idea is that of Narain et al. (2010) and Gerszewski and Bargteil (2013), as [Book] 1.3 reports it; the discrete law is derived here.
 
     rho_i is the density of the particles in units of that at rest, capacity_i what fits beside walls, a_f the open fraction of a face,
     rho_f the density on a face, s_f = +-1 outward. Mass is conserved and the pressure accelerates it:

@@ -176,3 +176,20 @@ def test_a_chain_of_forms_ends_where_it_began():
     box = form.quadratic_program_to_boxed(program, device="cpu")
     new = form.boxed_to_lcp(box.A, box.b, box.lower, box.upper, device="cpu")
     np.testing.assert_allclose(box.back(new.back(lemke(new.A, new.b))), p.solution, atol=1e-8)
+
+
+@pytest.mark.parametrize("equations", [[0], [1, 0], np.array([1, 0]), np.array([True]), "ab"])
+def test_equations_are_marked_not_numbered(equations):
+    """~ of the integers 1, 0 is -2, -1: both rows would be bounded."""
+    A, b = np.array([[2.0, -1.0], [-1.0, 2.0]]), np.array([0.5, -2.5])
+    for make in (form.mixed_to_lcp, form.mixed_to_boxed):
+        with pytest.raises(ValueError, match=r"equations has shape .* expected \(2,\) and bool"):
+            make(A, b, equations, device="cpu")
+    assert form.mixed_to_lcp(A, b, [True, False], device="cpu").b == pytest.approx([-2.25])  # -2.5 + 0.5 / 2
+
+
+def test_bounds_of_a_box_may_be_numbers():
+    A, b = np.array([[2.0, -1.0], [-1.0, 2.0]]), np.array([0.5, -2.5])
+    new, same = (form.boxed_to_lcp(A, b, *box, device="cpu") for box in ((0, 1.25), (np.zeros(2), np.full(2, 1.25))))
+    np.testing.assert_array_equal(new.A, same.A)
+    np.testing.assert_allclose(new.back(lemke(new.A, new.b)), boxed(A, b, np.zeros(2), np.full(2, 1.25)), atol=1e-12)

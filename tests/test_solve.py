@@ -142,6 +142,8 @@ def test_without_a_method_the_fastest_is_taken():
     dense = wl.LCP(wl.DenseOperator(np.eye(3), device="cpu"), -np.ones(3))
     assert isinstance(wl.default_method(wl.LCP(A, b)), wl.ProjectedMultigrid)
     assert isinstance(wl.default_method(dense), wl.MinimumMapNewton)
+    friction = wl.LCP(wl.DenseOperator(np.eye(2), device="cpu"), -np.ones(2), *wl.AffineBounds.friction([-1, 0], 0.5))
+    np.testing.assert_allclose(wl.solve(friction).x.numpy(), [1.0, 0.5], atol=1e-5)  # x_n = 1, and x_t = 1 beyond mu x_n
     assert wl.solve(wl.LCP(A, b)).history[1].step == "monotone cycle"
     assert wl.solve(dense)
     with pytest.raises(ValueError, match="name the solver"):

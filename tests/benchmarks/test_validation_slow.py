@@ -4,7 +4,6 @@ import pytest
 
 from benchmarks.validation import CHECKS
 
-
 # single particles that leave a free surface under tilted gravity run down above it; all but 1 % stay below 4 % of sqrt(g dx)
 UNMET = {"rest": pytest.mark.xfail(strict=True, reason="the tilted free surface exceeds 10 % of sqrt(g dx)")}
 

@@ -150,3 +150,20 @@ def test_what_cannot_be_taken_apart_is_refused():
     for settings in ({"blocks": 0}, {"eta": 1.0}, {"max_block_iterations": 0}):
         with pytest.raises(ValueError, match=next(iter(settings))):
             Staggering(**settings)
+
+
+def test_one_method_serves_all_blocks():
+    problem = wl.LCP(wl.DenseOperator(spd(8, 3), device="cpu"), np.random.default_rng(197).standard_normal(8))
+    alone, listed = (wl.solve(problem, Staggering(solvers=solvers), stopping=TIGHT) for solvers in (Lemke(), [Lemke()]))
+    assert alone
+    assert alone.iterations == listed.iterations
+    np.testing.assert_array_equal(alone.x.numpy(), listed.x.numpy())
+
+
+@pytest.mark.parametrize("blocks", [2.5, "ab", None])
+@pytest.mark.parametrize("method", [wl.BlockedGaussSeidel, Staggering])
+def test_blocks_of_another_kind_are_named(method, blocks):
+    if blocks is None and method is wl.BlockedGaussSeidel:
+        pytest.skip("None means 3 unknowns there")
+    with pytest.raises(ValueError, match=r"blocks = .*expected a number of unknowns"):
+        wl.solve(wl.LCP(wl.DenseOperator(np.eye(4), device="cpu"), -np.ones(4)), method(blocks=blocks))

@@ -66,7 +66,8 @@ class Staggering:
             rows = [block for block in rows if block.size]
         else:
             rows = given_blocks(problem, self.blocks)
-        solvers = [self.solvers] if hasattr(self.solvers, "step") else list(self.solvers) or [MinimumMapNewton()]
+        solvers: list[Solver] = list(self.solvers) if isinstance(self.solvers, Sequence) else [self.solvers]
+        solvers = solvers or [MinimumMapNewton()]
         solvers = solvers * len(rows) if len(solvers) == 1 else solvers
         return StaggeringWorkspace(problem, rows, solvers, eta=self.eta, max_iterations=self.max_block_iterations)
 
