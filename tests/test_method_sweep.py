@@ -28,6 +28,8 @@ MAY_DIVERGE = {"projected-jacobi", "blocked-gauss-seidel", "staggering", "accele
 
 
 def precisions(cls):
+    if cls is wl.GradientDescent:  # "mixed" and "double" are the same there, and it is slow
+        return ("double", "single")
     return ("mixed", "double", "single") if "precision" in {f.name for f in dataclasses.fields(cls)} else ("double",)
 
 
