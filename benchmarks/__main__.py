@@ -16,16 +16,20 @@ from benchmarks.timing import Options
 def main() -> None:
     """Measure a suite and write its files."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks")
-    parser.add_argument("suite", choices=["kernels", "solvers", "run", "validation"])
+    parser.add_argument("suite", choices=["kernels", "solvers", "run", "validation", "replay"])
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--size", type=int, action="append", default=[])
     parser.add_argument("--repeat", type=int, default=5)
+    parser.add_argument("--problems", type=Path)
+    parser.add_argument("--method", action="append", default=[])
     given = parser.parse_args()
     wp.config.log_level = wp.LOG_ERROR
     launches.install()  # before anything imports warp_lcp
     suite, report = importlib.import_module(f"benchmarks.{given.suite}"), importlib.import_module("benchmarks.report")
-    options = Options(given.device, tuple(given.size), given.repeat, lambda text: sys.stderr.write(f"{text}\n"))
+    options = Options(
+        given.device, tuple(given.size), given.repeat, lambda text: sys.stderr.write(f"{text}\n"), given.problems, tuple(given.method)
+    )
     given.out.mkdir(parents=True, exist_ok=True)
     results = suite.measure(options, given.out)
     for line in report.write(given.suite, suite.TITLE, results, options, given.out):

@@ -9,7 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.compare import comparison
+from warp_lcp.gallery import recorded
+from warp_lcp.solvers import METHODS
 
+REPLAY = "replay"  # module and files of recorded problems
 # before NumPy is imported: PyAMG's set-up takes 20 times as long when two BLAS threads fight over two cores
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
 
@@ -22,13 +25,24 @@ class Suite:
         name: what the command line calls it; the files are NAME.json, NAME.md and NAME-*.png.
         summary: what it measures.
         resizable: whether it can be asked for other sizes.
+        replays: whether it can be asked for recorded problems.
     """
 
     name: str
     summary: str
     resizable: bool = True
+    replays: bool = False
 
-    def run(self, *, device: str, out: Path, sizes: tuple[int, ...] = (), repeat: int = 5) -> list[Path]:
+    def run(
+        self,
+        *,
+        device: str,
+        out: Path,
+        sizes: tuple[int, ...] = (),
+        repeat: int = 5,
+        problems: Path | None = None,
+        methods: tuple[str, ...] = (),
+    ) -> list[Path]:
         """Measure and write the files.
 
         Args:
@@ -36,12 +50,14 @@ class Suite:
             out: folder of the files.
             sizes: cells along a side; the suite's own without any.
             repeat: samples of each timing.
+            problems: folder of recorded problems to measure methods on instead; the files are then replay.json and so on.
+            methods: names of those methods; the suite's choice without any.
 
         Returns:
             The files.
 
         Raises:
-            ValueError: a size or the number of samples is out of range.
+            ValueError: a size or the number of samples is out of range, a method is unknown, or `problems` holds no problem.
             RuntimeError: a measurement or a check failed; what it said is on the error stream. A failed check leaves the files.
         """
         if sizes and not self.resizable:
@@ -50,13 +66,35 @@ class Suite:
             raise ValueError(f"repeat = {repeat}: must be >= 1")
         if min(sizes, default=8) < 8:
             raise ValueError(f"size = {min(sizes)}: must be >= 8 cells a side")
-        arguments = [self.name, "--device", device, "--out", str(out), "--repeat", str(repeat)]
+        name = self.name
+        if problems is not None or methods:
+            self._check_replay(problems, methods, sizes)
+            name = REPLAY
+        arguments = [name, "--device", device, "--out", str(out), "--repeat", str(repeat)]
         for size in sizes:
             arguments += ["--size", str(size)]
+        arguments += [part for method in methods for part in ("--method", method)]
+        arguments += ["--problems", str(problems)] if problems is not None else []
         process = subprocess.run([sys.executable, "-m", "benchmarks", *arguments], env={**os.environ, **ONE_THREAD}, check=False)
         if process.returncode != 0:
-            raise RuntimeError(f"the suite {self.name} ended with exit code {process.returncode}")
-        return sorted(p for p in out.glob(f"{self.name}*") if p.suffix in (".json", ".md", ".png"))
+            raise RuntimeError(f"the suite {name} ended with exit code {process.returncode}")
+        return sorted(p for p in out.glob(f"{name}*") if p.suffix in (".json", ".md", ".png"))
+
+    def _check_replay(self, problems: Path | None, methods: tuple[str, ...], sizes: tuple[int, ...]) -> None:
+        """Refuse what cannot be replayed, before a process is started for it."""
+        if not self.replays:
+            raise ValueError(f"--problems and --method: the suite {self.name} replays no problems; use solvers")
+        if problems is None:
+            raise ValueError("--method: name the problems too, --problems DIR")
+        if sizes:
+            raise ValueError("--size: recorded problems have sizes of their own")
+        unknown = sorted(set(methods) - METHODS.keys())
+        if unknown:
+            raise ValueError(f"--method {unknown[0]}: no such method; choose from {', '.join(sorted(METHODS))}")
+        if not recorded.files(problems):
+            raise ValueError(f"--problems {problems}: there is no problem_*.npz; `warp-lcp run SCENE --record-problems DIR` writes them")
+        for path in recorded.files(problems):
+            recorded.check(path)
 
     def compare(self, old: Path, new: Path) -> str:
         """Return a table of new figures over old ones with the bounds that their ranges give.
@@ -68,7 +106,7 @@ class Suite:
 
 
 KERNELS = Suite("kernels", "each hot kernel on the finest grid against this machine's copy bandwidth, Numba and a plain Warp kernel")
-SOLVERS = Suite("solvers", "linear and LCP solves: set-up, iterations, time to a tolerance, memory; against PyAMG and SciPy")
+SOLVERS = Suite("solvers", "linear and LCP solves: set-up, iterations, time to a tolerance, memory; against PyAMG and SciPy", replays=True)
 RUN = Suite("run", "steps per second of built-in scenes, and what the particles cost")
 VALIDATION = Suite(
     "validation",

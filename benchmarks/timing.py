@@ -6,6 +6,7 @@ import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 SHORTEST_SAMPLE = 2e-3  # [s]: a sample repeats shorter work up to this, clock and launch would show otherwise
 
@@ -19,12 +20,16 @@ class Options:
         sizes: cells along a side; empty for the suite's own.
         repeat: samples of each timing.
         say: takes a line about progress.
+        problems: folder of recorded problems, for the suite `replay`.
+        methods: names of those it tries; empty for its own.
     """
 
     device: str
     sizes: tuple[int, ...]
     repeat: int
     say: Callable[[str], object]
+    problems: Path | None = None
+    methods: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import warp as wp
 import warp_lcp as wl
 from fluids import pressure_kernels as kernels
 from fluids.boundary import Boundary
+from warp_lcp.gallery import recorded
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.operators.grid_poisson import FLUID
 from warp_lcp.vectors import convert
@@ -135,8 +136,6 @@ class PressureProjection:
     def solve(self, speed: float, unknowns: int) -> tuple[wl.SolveResult, wl.StoppingCriteria]:
         """Solve the prepared problem for x without changing velocity or pressure.
 
-        The absolute tolerance is the rounding noise of b, so that a liquid at rest or in free fall is not iterated on it.
-
         Args:
             speed: scale of u* [m/s].
             unknowns: of `prepare`.
@@ -144,10 +143,33 @@ class PressureProjection:
         Returns:
             The result and the criteria it was held to.
         """
-        criteria = wl.StoppingCriteria(rtol=self.tolerance, atol=ROUNDING * speed * unknowns**0.5, max_iterations=self.max_iterations)
+        criteria = self.criteria(speed, unknowns)
         assert self._problem is not None, "prepare comes first"
         result = wl.solve(self._problem, self.solver, stopping=criteria, x0=self._start, workspace=self._work)
         return result, criteria
+
+    def criteria(self, speed: float, unknowns: int) -> wl.StoppingCriteria:
+        """Return when a solve is done.
+
+        The absolute tolerance is the rounding noise of b, so that a liquid at rest or in free fall is not iterated on it.
+
+        Args:
+            speed: scale of u* [m/s].
+            unknowns: of `prepare`.
+        """
+        return wl.StoppingCriteria(rtol=self.tolerance, atol=ROUNDING * speed * unknowns**0.5, max_iterations=self.max_iterations)
+
+    def recorded(self, speed: float, unknowns: int) -> dict[str, np.ndarray]:
+        """Return the prepared problem as `warp_lcp.gallery.recorded` describes it, without what the simulation knows: step, time, dt.
+
+        Args:
+            speed: scale of u* [m/s].
+            unknowns: of `prepare`.
+        """
+        assert self._problem is not None, "prepare comes first"
+        criteria = self.criteria(speed, unknowns)
+        numbers = {"tolerance": criteria.rtol, "absolute_tolerance": criteria.atol, "spacing": self.grid.spacing}
+        return recorded.arrays(self._problem, self._start) | {name: np.array(value) for name, value in numbers.items()}
 
     def fields(self) -> list[wp.array]:
         """Return the fields of the problem: its cells, right-hand side, lower bound and first guess."""

@@ -12,7 +12,7 @@ from warp_lcp.driver.scene import Complaint, Liquid, Scene, Table
 from warp_lcp.driver.shapes import Drain, Source
 
 # Measured at 96^3 as the growth of a process on the CPU, first step included.
-BYTES_A_CELL = 128  # fields of the grid and of the pressure solve
+GRID_BYTES, PRESSURE_BYTES = 36, 92  # fields of the grid and of the pressure solve
 LEVEL_SET_BYTES = 19  # more a cell for a surface between cells, or slivers
 SMOOTHING_BYTES = 12
 CUT_BYTES = 45
@@ -108,12 +108,15 @@ class LiquidScene(Scene):
         message = f"must be at {word} the {at_rest} particles of a cell at rest"
         return [Complaint(("particles", "reseed", key), value, message)]
 
-    def particle_estimate(self) -> int:
+    def particle_estimate(self, *, later: bool = True) -> int:
         """Return about how many particles the scene has at most: meshes and slanted shapes count as the boxes around them.
 
         Sources may fill the domain; whether they do, and what leaves it, is not known before.
+
+        Args:
+            later: count what sources let in; False: the liquid at the start.
         """
-        let_in = sum(self._source_volume(source) for source in self.source)
+        let_in = sum(self._source_volume(source) for source in self.source) if later else 0.0
         volume = min(sum(self.enclosed_volume(liquid) for liquid in self.liquid) + let_in, math.prod(self.domain.size))
         return round(volume / self.spacing**self.dimension * self.particles.per_axis**self.dimension)
 
@@ -131,11 +134,13 @@ class LiquidScene(Scene):
         """Return what a run would do."""
         particles = self.particle_estimate()
         settings = self.particles
+        at_first = f"{self.particle_estimate(later=False):,} at the start, " if self.source else ""
         return [
             *super().plan(),
-            ("particles", f"at most {particles:,}, {settings.per_axis**self.dimension} a cell, {settings.transfer}"),
+            ("particles", f"{at_first}at most {particles:,}, {settings.per_axis**self.dimension} a cell, {settings.transfer}"),
             *self._rearrangement(),
-            ("memory", f"about {max(1, round(self.memory_estimate() / 2**20)):,} MB"),
+            ("memory", f"about {_megabytes(self.memory_estimate())} MB"),
+            *((f"  {name}", f"{_megabytes(count)} MB") for name, count in self.memory_parts().items()),
         ]
 
     def _rearrangement(self) -> list[tuple[str, str]]:
@@ -149,23 +154,39 @@ class LiquidScene(Scene):
             lines.append(("reseeding", f"{least} to {many} particles a cell, {_steps(reseed.every)}"))
         return lines
 
-    def memory_estimate(self) -> int:
-        """Return about how much memory a run takes at most [bytes], without the program itself."""
-        nx, ny, nz = self.cell_counts
-        cells = round(nx * ny * (nz if self.dimension == 3 else PLANES))
-        particles = self.particle_estimate()
+    def memory_parts(self) -> dict[str, int]:
+        """Return about how much memory each part of a run takes at most on its device [bytes]; parts that it does not have are left out."""
+        cells, settings = self._counted_cells(), self.particles
         cut = self.domain.solids == "cut-cell" and bool(self.solid)
         level_set = self.pressure.surface == "ghost-fluid"
-        a_cell = BYTES_A_CELL + LEVEL_SET_BYTES * (level_set or cut) + SMOOTHING_BYTES * (level_set and self.pressure.smoothing > 0)
-        a_cell += CUT_BYTES * cut + MOVING_BYTES * any(solid.motion is not None for solid in self.solid)
-        a_cell += 4 * self.dimension * (self.particles.transfer == "flip")
-        a_cell += (CORRECTION_BYTES + CUT_CORRECTION_BYTES * cut) * (self.density_correction is not None)
-        a_cell += RESEED_BYTES * (self.particles.reseed is not None)
-        a_cell += UNILATERAL_BYTES * (self.pressure.model == "unilateral") + SOURCE_BYTES * bool(self.source)
-        vectors = 3 + (self.dimension if self.particles.transfer == "apic" else 0)
-        running = cells * a_cell + particles * (VECTOR_BYTES * vectors + KEY_BYTES)
+        moving = any(solid.motion is not None for solid in self.solid)
+        vectors = 3 + (self.dimension if settings.transfer == "apic" else 0)
+        parts = {
+            "grid": cells * (GRID_BYTES + 4 * self.dimension * (settings.transfer == "flip")),
+            "pressure": cells * (PRESSURE_BYTES + UNILATERAL_BYTES * (self.pressure.model == "unilateral")),
+            "surface": cells * (LEVEL_SET_BYTES * (level_set or cut) + SMOOTHING_BYTES * (level_set and self.pressure.smoothing > 0)),
+            "solids": cells * (CUT_BYTES * cut + MOVING_BYTES * moving),
+            "density correction": cells * (CORRECTION_BYTES + CUT_CORRECTION_BYTES * cut) * (self.density_correction is not None),
+            "reseeding": cells * RESEED_BYTES * (settings.reseed is not None),
+            "sources": cells * SOURCE_BYTES * bool(self.source),
+            "particles": self.particle_estimate() * (VECTOR_BYTES * vectors + KEY_BYTES),
+        }
+        return {name: count for name, count in parts.items() if count}
+
+    def memory_estimate(self) -> int:
+        """Return about how much memory a run takes at most [bytes], without the program itself; the liquid's making may take the most."""
+        nx, ny, _ = self.cell_counts
         lattice = nx * ny * self.particles.per_axis**self.dimension
-        return max(running, cells * BYTES_A_CELL // 2 + particles * SEEDING_BYTES + lattice * LATTICE_BYTES)
+        making = self._counted_cells() * (GRID_BYTES + PRESSURE_BYTES) // 2 + self.particle_estimate() * SEEDING_BYTES
+        return max(super().memory_estimate(), making + lattice * LATTICE_BYTES)
+
+    def _counted_cells(self) -> int:
+        nx, ny, nz = self.cell_counts
+        return round(nx * ny * (nz if self.dimension == 3 else PLANES))
+
+
+def _megabytes(count: int) -> str:
+    return f"{count / 2**20:,.0f}" if count >= 10 * 2**20 else f"{count / 2**20:.1f}"
 
 
 def _steps(every: int) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -70,6 +70,7 @@ class LiquidSimulation:
         time: [s].
         step_count: steps done.
         watch: what the stages of a step are measured with.
+        record: takes the problem of each step before it is solved, if it is set.
     """
 
     def __init__(
@@ -88,6 +89,7 @@ class LiquidSimulation:
         self.sources, self.outlets = sources, outlets
         self.time, self.step_count = 0.0, 0
         self.watch: Stopwatch = NoStopwatch()
+        self.record: Callable[[Mapping[str, np.ndarray]], object] | None = None
         self._notes = list(notes or [])
         self.gravity = np.array([*scene.physics.gravity, 0.0][:3])
         self.particle_mass = scene.physics.density * grid.cell_volume / scene.particles.per_axis**grid.dimension  # [kg], 2-D: [kg/m]
@@ -290,6 +292,10 @@ class LiquidSimulation:
             unknowns = projection.prepare(self.velocity, dt)
         if unknowns == 0:
             return self._held(projection.leave(dt))
+        if self.record is not None:
+            with watch.stage("recording", *projection.fields()):
+                clock = {"step": np.array(self.step_count), "time": np.array(self.time), "dt": np.array(float(dt))}
+                self.record(projection.recorded(speed, unknowns) | clock)
         with watch.stage("pressure solve", *projection.fields()):
             result, criteria = projection.solve(speed, unknowns)
         if not result:

@@ -16,8 +16,17 @@ class Benchmark(Protocol):
     name: str
     summary: str
 
-    def run(self, *, device: str, out: Path, sizes: tuple[int, ...] = (), repeat: int = 5) -> list[Path]:
-        """Measure, and return the files written to `out`: NAME.json, NAME.md and plots.
+    def run(
+        self,
+        *,
+        device: str,
+        out: Path,
+        sizes: tuple[int, ...] = (),
+        repeat: int = 5,
+        problems: Path | None = None,
+        methods: tuple[str, ...] = (),
+    ) -> list[Path]:
+        """Measure, and return the files written to `out`: NAME.json, NAME.md and plots. `problems`: measure `methods` on these instead.
 
         Raises:
             ValueError: an option is out of range.

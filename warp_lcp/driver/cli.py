@@ -9,13 +9,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
 import warp as wp
 from rich.console import Console
 
 from warp_lcp.driver.benchmark import benchmarks
+from warp_lcp.driver.calibrate import step_seconds
+from warp_lcp.driver.check import check_memory, check_scene
 from warp_lcp.driver.devices import DeviceError, choose_device, cuda_driver, devices
 from warp_lcp.driver.profile import Profile
 from warp_lcp.driver.progress import Bar, Lines
@@ -23,7 +25,7 @@ from warp_lcp.driver.recording import Color, RenderError
 from warp_lcp.driver.render import parse_size, render_run
 from warp_lcp.driver.run import run_scene
 from warp_lcp.driver.run_folder import OutputError, RunRecord
-from warp_lcp.driver.scene_file import built_in_scenes, check_shapes, installed_simulators, load_scene
+from warp_lcp.driver.scene_file import built_in_scenes, installed_simulators, load_scene
 from warp_lcp.driver.solve_file import ProblemError, solve_files, write_vector
 from warp_lcp.driver.table import SceneError, nearest
 from warp_lcp.driver.versions import shadowing_distributions, versions
@@ -47,6 +49,8 @@ SetOption = Annotated[
     typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Override a key of the scene; may be repeated. Arrays: liquid.0.max=[1,1]."),
 ]
 
+ForceMemory = Annotated[bool, typer.Option("--force-memory", help="Run even what will not fit into the device's free memory.")]
+
 
 def main() -> None:
     """Run the command line."""
@@ -67,7 +71,11 @@ def run(
     frames: Annotated[int | None, typer.Option(min=0, metavar="N", help="End after frame N.", show_default=False)] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the run in the folder from its newest checkpoint.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Delete the run in the folder first.")] = False,
+    force_memory: ForceMemory = False,
     profile: Annotated[bool, typer.Option("--profile", help="Measure where the time goes; also into profile.json.")] = False,
+    record_problems: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Write each step's pressure problem into DIR.", show_default=False)
+    ] = None,
     overrides: SetOption = None,
 ) -> None:
     """Simulate a scene into a folder that ParaView opens."""
@@ -82,8 +90,9 @@ def run(
         with _interruptible(console) as stop, Bar(console) if console.is_terminal else Lines(console) as observer:
             watch = Profile(chosen) if profile else None
             record = run_scene(
-                loaded, folder, device=chosen, observer=observer, last_frame=frames, resume=resume, force=force, stop=stop, profile=watch
-            )
+                loaded, folder, device=chosen, observer=observer, last_frame=frames, resume=resume, force=force, force_memory=force_memory, stop=stop, profile=watch,
+                record_problems=record_problems,
+            )  # fmt: skip
     if watch:
         typer.echo("\n".join(watch.table(record.steps - (record.resumed_from_step or 0), record.seconds)))
     _report(record, folder)
@@ -111,12 +120,27 @@ def render(
 
 
 @app.command()
-def check(scene: SceneArgument, overrides: SetOption = None) -> None:
-    """Say whether a scene is valid, and what a run of it would do."""
+def check(
+    scene: SceneArgument,
+    device: Annotated[str | None, typer.Option(help="cpu or cuda:N, whose memory counts.", show_default=False)] = None,
+    calibrate: Annotated[bool, typer.Option("--calibrate", help="Also take a few steps, and say how long a step takes.")] = False,
+    force_memory: ForceMemory = False,
+    overrides: SetOption = None,
+) -> None:
+    """Say whether a scene is valid and fits into memory, and what a run of it would do."""
     with _wrong_input():
-        loaded = load_scene(scene, overrides or ())
-        check_shapes(loaded, scene)
-    _print_pairs([("scene", loaded.scene.name), ("simulator", loaded.scene.simulator), *loaded.plan()])
+        chosen = choose_device(device)
+        loaded, lines = check_scene(scene, overrides or ())
+        _print_pairs(lines)
+        if not force_memory:
+            check_memory(loaded, chosen)
+        if not calibrate:
+            return
+        try:
+            seconds, steps = step_seconds(loaded, device=chosen)
+        except (StepFailed, SimulationFailed) as error:
+            _end(str(error), FAILED)
+    _print_pairs([("seconds a step", f"about {seconds:.3g} on {chosen}, the median of {steps}")])
 
 
 @app.command()
@@ -174,6 +198,12 @@ def bench(
     out: Annotated[Path, typer.Option(help="The folder of SUITE.json, SUITE.md and the plots.")] = Path("out/bench"),
     size: Annotated[list[int] | None, typer.Option(metavar="N", help="Cells along a side; may be repeated.", show_default=False)] = None,
     repeat: Annotated[int, typer.Option(min=1, metavar="K", help="Samples of each timing.")] = 5,
+    problems: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Replay the problems that `run --record-problems DIR` wrote.", show_default=False)
+    ] = None,
+    method: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="With --problems: a method; may be repeated.", show_default=False)
+    ] = None,
     compare: Annotated[
         tuple[Path, Path] | None,
         typer.Option(metavar="A.json B.json", help="Compare two results instead of measuring.", show_default=False),
@@ -189,7 +219,8 @@ def bench(
         if compare is not None:
             typer.echo(installed[suite].compare(*compare))
             return
-        files = installed[suite].run(device=chosen, out=out, sizes=tuple(size or ()), repeat=repeat)
+        replay: dict[str, Any] = {} if problems is None and not method else {"problems": problems, "methods": tuple(method or ())}
+        files = installed[suite].run(device=chosen, out=out, sizes=tuple(size or ()), repeat=repeat, **replay)
     except ValueError as error:
         _end(str(error), WRONG_INPUT)
     except RuntimeError as error:

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import warp as wp
+
+MEMORY = Path("/proc/meminfo")
 
 
 class DeviceError(ValueError):
@@ -34,6 +38,18 @@ def choose_device(name: str | None) -> str:
     if alias not in there:
         raise DeviceError(f"--device {name}: there is no such device; choose from {', '.join(there)}")
     return alias
+
+
+def free_memory(name: str) -> int | None:
+    """Return the memory of a device that programs may still take [bytes]; None where the system does not tell."""
+    device = wp.get_device(name)
+    if device.is_cuda:
+        return int(device.free_memory)
+    if MEMORY.exists():
+        found = re.search(r"MemAvailable:\s+(\d+) kB", MEMORY.read_text(encoding="ascii"))
+        if found:
+            return 1024 * int(found[1])
+    return None
 
 
 def cuda_driver() -> str:

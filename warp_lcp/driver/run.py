@@ -9,14 +9,16 @@ from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
+from warp_lcp.driver.check import check_memory
 from warp_lcp.driver.checkpoint import Checkpoint
 from warp_lcp.driver.frames import FrameWriter, frame_bytes
 from warp_lcp.driver.log import Log, Value
+from warp_lcp.driver.problem_folder import ProblemFolder
 from warp_lcp.driver.profile import NoStopwatch, Profile, Stopwatch
 from warp_lcp.driver.progress import Observer
 from warp_lcp.driver.run_folder import Continuation, OutputError, RunFolder, RunRecord
 from warp_lcp.driver.scene import Scene, Time
-from warp_lcp.driver.simulator import Cells, Points, Profiled, Resampled, Simulation, SimulationFailed, StepFailed, simulators
+from warp_lcp.driver.simulator import Cells, Points, Profiled, Recorded, Resampled, Simulation, SimulationFailed, StepFailed, simulators
 from warp_lcp.driver.table import Problem, SceneError
 
 RETRIES = 6  # halvings of dt: a step 64 times shorter that still fails has another cause than its length
@@ -33,8 +35,10 @@ def run_scene(
     last_frame: int | None = None,
     resume: bool = False,
     force: bool = False,
+    force_memory: bool = False,
     stop: Callable[[], bool] = lambda: False,
     profile: Profile | None = None,
+    record_problems: Path | None = None,
 ) -> RunRecord:
     """Simulate a scene into a folder.
 
@@ -46,8 +50,10 @@ def run_scene(
         last_frame: end after this frame; the scene's last one without it.
         resume: continue the run in the folder.
         force: delete the run in the folder.
+        force_memory: run even what will not fit into the device's free memory.
         stop: asked after every step; True ends the run with a checkpoint.
         profile: measures the run's stages; written to profile.json at the end.
+        record_problems: folder that takes the problem of each step, see `warp_lcp.gallery.recorded`.
 
     Returns:
         How the run ended, as in run.json.
@@ -56,6 +62,8 @@ def run_scene(
         OutputError: the folder cannot take the run.
         SceneError: the scene cannot be simulated.
     """
+    if not force_memory:
+        check_memory(scene, device)
     folder = RunFolder(out, scene)
     with folder.held(resume=resume) as remarks:
         record = RunRecord(scene.scene.name, scene.scene.simulator, device, warnings=list(remarks), mesh_files=folder.mesh_files)
@@ -68,6 +76,8 @@ def run_scene(
         else:
             folder.check_new(force=force)
         simulation, notes = _create(scene, device, continued)
+        if record_problems is not None:
+            _record_problems(simulation, scene, record_problems, more=resume)
         record.warnings += notes
         for note in record.warnings:
             observer.note(note)
@@ -91,6 +101,13 @@ def _create(scene: Scene, device: str, continued: Continuation | None) -> tuple[
     except ValueError as error:
         raise SceneError(scene.scene.name, [Problem("", str(error))]) from error
     return simulation, simulation.notes() + notes
+
+
+def _record_problems(simulation: Simulation, scene: Scene, folder: Path, *, more: bool) -> None:
+    """Have a simulation write the problem of each step into a folder."""
+    if not isinstance(simulation, Recorded):
+        raise OutputError(f"--record-problems: the simulator {scene.scene.simulator} has no problems to show")
+    simulation.record = ProblemFolder(folder, more=more).write
 
 
 def plan_dt(stable: float, remaining: float, time: Time) -> float:

@@ -174,6 +174,14 @@ class Scene(Table):
         low, high = (corner[: self.dimension] for corner in bounds)
         return float(np.maximum(np.minimum(high, size) - np.maximum(low, 0.0), 0.0).prod())
 
+    def memory_parts(self) -> dict[str, int]:
+        """Return about how much memory each part of a run takes on its device [bytes]. Subclasses that know it say so."""
+        return {}
+
+    def memory_estimate(self) -> int:
+        """Return about how much memory a run takes at most [bytes], without the program itself; 0: not known."""
+        return sum(self.memory_parts().values())
+
     def plan(self) -> list[tuple[str, str]]:
         """Return what a run would do, as pairs of a word and a line. Subclasses append theirs, such as particles and memory."""
         cells = self.cell_counts[: self.dimension]

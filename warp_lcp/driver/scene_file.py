@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import files
@@ -15,6 +16,9 @@ from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.shapes import BUILTIN
 from warp_lcp.driver.simulator import Simulator, simulators
 from warp_lcp.driver.table import Problem, SceneError, nearest, validate, written
+
+DEEPEST = 16  # tables and arrays in each other; a scene needs six
+LARGEST = 1e18  # of a number: its square is a float32, and sums of cubes are float64
 
 HEADER = "# The scene as it ran: defaults filled in, overrides applied, paths absolute.\n"
 
@@ -53,6 +57,7 @@ def load_scene(path_or_name: str | Path, overrides: Sequence[str] = ()) -> Scene
     data = _parse(file, source)
     for override in overrides:
         _override(data, override, source)
+    _refuse_extremes(data, source)
     _resolve_paths(data, Path.cwd() if source in built_in_scenes() else Path(source).resolve().parent)
     model = _scene_model(data, source)
     about = data["scene"]
@@ -127,6 +132,30 @@ def _parse(file: Path | Traversable, source: str) -> dict[str, Any]:
         raise SceneError(source, [Problem("", f"is not UTF-8 text (byte {error.start})")]) from error
     except tomllib.TOMLDecodeError as error:
         raise SceneError(source, [Problem("", f"is not valid TOML: {error}")]) from error
+    except RecursionError as error:
+        raise SceneError(source, [Problem("", "is not valid TOML: nested too deeply")]) from error
+    except ValueError as error:  # Python refuses to convert thousands of digits
+        raise SceneError(source, [Problem("", "is not valid TOML: a number has too many digits")]) from error
+
+
+def _refuse_extremes(data: dict[str, Any], source: str) -> None:
+    """Refuse what no scene needs and no arithmetic survives; nan and inf are for the validation, which knows the keys."""
+    problems = []
+    waiting: list[tuple[str, Any, int]] = [(key, value, 1) for key, value in data.items()]
+    while waiting:  # not recursive: dotted keys nest without limit
+        path, value, depth = waiting.pop()
+        if depth > DEEPEST:
+            raise SceneError(source, [Problem(path, "is nested too deeply")])
+        if isinstance(value, dict):
+            waiting += [(f"{path}.{key}", entry, depth + 1) for key, entry in value.items()]
+        elif isinstance(value, list):
+            waiting += [(f"{path}[{index}]", entry, depth + 1) for index, entry in enumerate(value)]
+        elif isinstance(value, int) and abs(value) >= 2**63:
+            problems.append(Problem(path, "has too many digits: whole numbers have 64 bits"))
+        elif isinstance(value, float) and LARGEST < abs(value) < math.inf:
+            problems.append(Problem(path, f"must not be beyond {LARGEST:g}", written(value)))
+    if problems:
+        raise SceneError(source, problems)
 
 
 def _override(data: dict[str, Any], override: str, source: str) -> None:
@@ -159,7 +188,7 @@ def _place(table: object, keys: list[str], depth: int, source: str) -> str | int
 def _value(text: str) -> Any:
     try:
         return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):  # not TOML, too many digits, nested too deeply
         return text
 
 

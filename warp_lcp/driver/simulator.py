@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -94,6 +94,17 @@ class Profiled(Protocol):
     """
 
     watch: Stopwatch
+
+
+@runtime_checkable
+class Recorded(Protocol):
+    """What a Simulation may also be: one that shows the problems it solves.
+
+    Until a run sets `record`, it is None and costs nothing. Then each step calls it before its solve, once an attempt, with the arrays of a
+    file as `warp_lcp.gallery.recorded` describes them; problems that no method solves are recorded too.
+    """
+
+    record: Callable[[Mapping[str, np.ndarray]], object] | None
 
 
 @runtime_checkable

@@ -173,7 +173,7 @@ def _problem(model: type[Table], error: ErrorDetails) -> Problem:
         known = _keys(place.owner) if place.owner else {}
         return Problem(place.path, NOT_YET if place.key in later else f"unknown key; {nearest(place.key, known)}")
     value = "" if kind == "missing" or error["input"] is None else written(error["input"])
-    if kind == "literal_error" and error["input"] in later.get(place.key, ANY_VALUE):
+    if kind == "literal_error" and error["input"] in tuple(later.get(place.key, ANY_VALUE)):
         return Problem(place.path, NOT_YET, value)
     if kind == "list_type" and place.below:
         return Problem(place.path, f"must be an array of tables, written [[{place.path}]]", value)

@@ -85,7 +85,7 @@ class AssessedResidual(NaturalResidual):
         storage: form and types that choose the kernels.
     """
 
-    def __init__(self, problem: LCP, A: GridPoisson, hierarchy: Hierarchy) -> None:
+    def __init__(self, problem: LCP, A: GridPoisson, hierarchy: Hierarchy, *, rounded: bool) -> None:
         super().__init__(problem)
         self._A, self._finest, self._hierarchy, self._version = A, hierarchy.finest, hierarchy, A.version
         s = A.stencil
@@ -98,7 +98,7 @@ class AssessedResidual(NaturalResidual):
         self.scalars = wp.zeros(kernels.SLOTS, dtype=wp.float64, device=A.device)
         self.sums = Reduction(problem.layout.size, A.device, self.scalars, columns=4, threads=R.threads)
         self.storage = (*s.storage, self._finest.stencil.d.dtype, hierarchy.real)
-        self.row_kernels = kernels.row_kernels(*self.storage)
+        self.row_kernels = kernels.row_kernels(*self.storage, rounded=rounded)
         self.classify, self.stale, self.active, self._norm_of_b = False, True, 0, 0.0
 
     def start(self, x: wp.array[Any], *, keep: bool) -> None:
@@ -112,10 +112,6 @@ class AssessedResidual(NaturalResidual):
             self._norm_of_b = super().norm_of_b()
             self.set(kernels.SIZE, self._norm_of_b or 1.0)
             self.set(kernels.STEP, 0.0)
-
-    def clip(self, x: wp.array[Any]) -> None:
-        """Bring x within its bounds."""
-        super().start(x, keep=True)
 
     def norm_of_b(self) -> float:
         """Return ||b|| over the unknowns."""
@@ -187,7 +183,7 @@ class MultigridWorkspace:
         # a projected cycle forgets the search direction, so its lower bounds may lie in that memory: finite numbers, and 0 off the unknowns
         upper = problem.layout.zeros(real) if problem.bounds.may_bind[1] else wp.empty(0, dtype=real, device=A.device)
         self.hierarchy = Hierarchy(A.stencil, real, bounded=self.bounded, settings=settings.cycle, bounds=(self._p, upper))
-        self.residual = AssessedResidual(problem, A, self.hierarchy)
+        self.residual = AssessedResidual(problem, A, self.hierarchy, rounded=self.precision is Precision.SINGLE)
         self._flat = kernels.flat_kernels(real)
         self._spans = self.residual._reduction.spans
         self._rounded = problem.layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
@@ -384,4 +380,3 @@ class MultigridWorkspace:
         if self._rounded is not None:
             convert(x, self._rounded)
             convert(self._rounded, x)
-            self.residual.clip(x)  # a bound that is no float32 number: rounding would move x off it

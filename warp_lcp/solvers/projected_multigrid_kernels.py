@@ -47,16 +47,18 @@ class RowSums:
 
 
 @functools.cache
-def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: Any) -> SimpleNamespace:
+def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: Any, *, rounded: bool = False) -> SimpleNamespace:
     """Return the kernels of a step.
 
     `measure` multiplies a correction z on the free set and sums the products that beta and the step need. `update` makes the direction
     p = z + beta p and moves x along it, onto the bounds. `assess` evaluates y = A x + b in float64 with the operator's own diagonal
     (d_type) and weights (w_type), sums the natural residual, finds the free set and writes g = -y / SIZE on it. `advance` is `update` and
-    `assess` by one CPU thread.
+    `assess` by one CPU thread. Where x is `rounded` to float32, an unknown is at its bound if it is at the bound rounded so.
     """
     form = "variable" if variable else "uniform"
     name = f"warp_lcp.projected_multigrid.{form}_{d_type.__name__}_{w_type.__name__}_{free_type.__name__}_{real.__name__}"
+    name += "_rounded" * rounded
+    near = "(T)(float)" if rounded else ""
     d_array, w_array, free_array, field = (wp.array(dtype=t) for t in (d_type, w_type, free_type, real))
 
     @wp.func_native(
@@ -87,7 +89,7 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
                 SIMD8 for (int k = begin; k < end; ++k) {{
                     const T e = unit*(T)d[k], f = e != 0 ? e : (T)1, l = lower(k), u = upper(k), v = y[k - begin];
                     const T below = f*(x[k] - l), above = f*(x[k] - u), least = below < v ? below : v, r0 = above > least ? above : least;
-                    const bool held = classify & (((x[k] <= l) & (v >= 0)) | ((x[k] >= u) & (v <= 0)));
+                    const bool held = classify & (((x[k] <= {near}l) & (v >= 0)) | ((x[k] >= {near}u) & (v <= 0)));
                     const T r = m[k] == 1 ? r0 : (T)0;
                     s += r*r; hold[k - begin] = held; g[k] = ((e != 0) & !held) ? -v*inverse : (T)0; }} }});
             SIMD for (int k = begin; k < end; ++k) {{  // bytes only, where the diagonal is one

@@ -1,0 +1,155 @@
+"""Scene files that are wrong in ways nobody thought of: `check` accepts or refuses them, quickly, and does nothing else."""
+
+from __future__ import annotations
+
+import copy
+import datetime
+import math
+import random
+import signal
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import pytest
+import tomli_w
+
+from warp_lcp.driver.check import check_scene
+from warp_lcp.driver.scene_file import built_in_scenes
+from warp_lcp.driver.table import SceneError
+
+SECONDS = 5.0  # for one file, on a busy machine; usual ones take milliseconds
+CHUNK = 100
+NUMBERS = [0, -1, 1, 2, 3, 7, 4096, 10**9, 2**63 - 1, -(2**63), 2**64, 10**400, 0.0, -0.0, 0.5, -2.5, 1e-320, 1e-30, 1e-9, 1e12, 1e30, 1e200, 1.7e308, -1e308]
+NUMBERS += [math.nan, math.inf, -math.inf]
+WORDS = ["", " ", "box", "sphere", "plane", "mesh", "fluids", "granular", "é\u200b漢🌊", "a\x00b", "/", ".", "..", "builtin:", "builtin:torus", "builtin:x", "x" * 5000]
+WORDS += ["translation", "rotation", "sinusoid", "keyframes", "flip", "unilateral", "voxel", "left", "front", "nan", "{}", "%s", "'", "psor"]
+OTHERS = [True, False, [], [[]], {}, {"a": {"b": []}}, datetime.date(2026, 2, 28), datetime.time(1, 2), [1.0], [1.0] * 3, [0.1] * 1000]
+
+
+def test_three_hundred_fuzzed_files_are_accepted_or_refused(tmp_path: Path) -> None:
+    outcomes = [_outcome(seed, tmp_path) for seed in range(300)]
+    assert min(outcomes.count(True), outcomes.count(False)) > 20, "mutations that all do the same test nothing"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("first", range(0, 10_000, CHUNK))
+def test_ten_thousand_fuzzed_files_are_accepted_or_refused(first: int, tmp_path: Path) -> None:
+    outcomes = [_outcome(seed, tmp_path) for seed in range(first, first + CHUNK)]
+    assert outcomes.count(False) > CHUNK // 5
+
+
+def _outcome(seed: int, folder: Path) -> bool:
+    """Return whether `check` takes the scene of this seed (exit code 0) or refuses it (2); anything else fails."""
+    file = folder / "scene.toml"
+    file.write_bytes(fuzzed(random.Random(seed)))
+    try:
+        with at_most(SECONDS):
+            _, lines = check_scene(str(file))
+    except SceneError as error:
+        assert error.problems and len(str(error)) < 200_000, f"seed {seed}"
+        return False
+    except BaseException as error:
+        raise AssertionError(f"seed {seed}: {error!r}") from error
+    assert dict(lines)["grid"], f"seed {seed}"
+    return True
+
+
+class TooLongError(Exception):
+    """A file that takes too long."""
+
+
+@contextmanager
+def at_most(seconds: float) -> Iterator[None]:
+    """Interrupt what takes longer."""
+
+    def ring(number: int, frame: FrameType | None) -> None:
+        raise TooLongError(f"longer than {seconds} s")
+
+    before = signal.signal(signal.SIGALRM, ring)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def fuzzed(chance: random.Random) -> bytes:
+    """Return a built-in scene with a few random changes of its keys and values, and sometimes of its bytes."""
+    data = tomllib.loads(chance.choice(list(built_in_scenes().values())).read_text("utf-8"))
+    change = chance.choice([_change, _change_number])
+    for _ in range(chance.choice([1, 1, 1, 2, 3, 5])):
+        change(data, chance)
+    text = tomli_w.dumps(data).encode("utf-8", "replace")
+    return _scramble(text, chance) if chance.random() < 0.2 else text
+
+
+def _places(value: Any) -> Iterator[tuple[Any, Any]]:
+    """Yield every container of a document with each of its keys."""
+    for key, entry in list(value.items() if isinstance(value, dict) else enumerate(value)):
+        yield value, key
+        if isinstance(entry, (dict, list)):
+            yield from _places(entry)
+
+
+def _value(chance: random.Random) -> Any:
+    return copy.deepcopy(chance.choice(chance.choice([NUMBERS, NUMBERS, WORDS, OTHERS])))
+
+
+def _change_number(data: dict[str, Any], chance: random.Random) -> None:
+    """Change a number to one that the scene may well allow, so that what comes after the first checks is reached."""
+    owner, key = chance.choice([(o, k) for o, k in _places(data) if isinstance(o[k], (int, float)) and not isinstance(o[k], bool)])
+    old = owner[key]
+    larger = old * chance.choice([2, 3, 10, 1000, 10**6, 10**15])
+    owner[key] = chance.choice([larger, larger, old + 1, old * 1e-3, old * 1e-15, old * 1e-200, old * 1e-320, 1e18, old * 1e30, old * 1e200, -old])
+
+
+def _change(data: dict[str, Any], chance: random.Random) -> None:
+    places = list(_places(data))
+    if not places:
+        return
+    owner, key = chance.choice(places)
+    old = owner[key]
+    numeric = isinstance(old, (int, float)) and not isinstance(old, bool)
+    kind = chance.choice(["value", "value", "number", "number", "drop", "rename", "swap", "nest", "repeat", "add", "text"])
+    if kind == "number" and numeric:
+        owner[key] = chance.choice([old * 10.0 ** chance.uniform(-6, 6), -old, old + 1, chance.choice(NUMBERS)])
+    elif kind == "drop":
+        del owner[key]
+    elif kind == "rename" and isinstance(owner, dict):
+        owner[chance.choice([f"{key}x", key.upper(), key[1:] or "q", chance.choice(WORDS)])] = owner.pop(key)
+    elif kind == "swap":
+        other, place = chance.choice(places)
+        owner[key] = copy.deepcopy(other[place])
+    elif kind == "nest":
+        owner[key] = chance.choice([[old], {"value": old}, [old] * 3, {key if isinstance(key, str) else "k": old}])
+    elif kind == "repeat" and isinstance(old, list) and old:
+        owner[key] = [copy.deepcopy(chance.choice(old)) for _ in range(chance.choice([2, 3, 10, 200]))]
+    elif kind == "add" and isinstance(old, dict):
+        old[chance.choice([*WORDS, "scale", "rotate", "translate", "motion", "file", "invert", "smoothing", "open", "shape"])] = _value(chance)
+    elif kind == "text" and isinstance(old, str):
+        owner[key] = chance.choice(WORDS)
+    else:
+        owner[key] = _value(chance)
+
+
+def _scramble(text: bytes, chance: random.Random) -> bytes:
+    lines = text.splitlines(keepends=True)
+    at, line = chance.randrange(len(text) + 1), chance.randrange(len(lines) + 1)
+    kind = chance.randrange(6)
+    if kind == 0:
+        return text[:at]
+    if kind == 1:
+        return text[:at] + chance.randbytes(chance.choice([1, 2, 40])) + text[at:]
+    if kind == 2:
+        return text[:at] + bytes([chance.randrange(32, 127)]) + text[at + 1 :]
+    if kind == 3:
+        return b"".join([*lines[:line], *lines[line : line + 2], *lines[line:]])
+    if kind == 4:
+        chance.shuffle(lines)
+        return b"".join(lines)
+    return text[:at] + chance.choice([b"[" * 3000, b"[[x]]\n", b"\n[time]\n", b"=", b"\r", b'"""', b"9" * 5000, b"\ntime" + b".a" * 3000 + b" = 1\n", b"0x" + b"f" * 5000]) + text[at:]

@@ -1,0 +1,180 @@
+"""A run's pressure problems as files: what is read back is what was solved, and every method can be tried on it."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_liquids import box, create, dam, scene
+from typer.testing import CliRunner
+
+import warp_lcp as wl
+from oracle import assemble, natural_residual
+from warp_lcp.driver import cli
+from warp_lcp.driver.problem_folder import ProblemFolder
+from warp_lcp.driver.run_folder import OutputError
+from warp_lcp.driver.simulator import Recorded
+from warp_lcp.gallery.recorded import FORMAT, files, load
+
+RAMP = box([0.5, -0.2], [0.9, 0.08], rotate=20)
+CASES = {
+    "voxel": lambda: dam(solids="voxel", pressure={"surface": "voxel"}),
+    "cut": lambda: dam(solid=[RAMP]),
+    "3-D": lambda: dam(3),
+    "unilateral": lambda: dam(solid=[RAMP], pressure={"model": "unilateral"}),
+    "moving": lambda: dam(solid=[RAMP | {"motion": {"kind": "translation", "velocity": [0.5, 0.0]}}]),
+}
+
+
+def record(simulation, folder, steps=3):
+    """Step, and return the accepted pressure of every step."""
+    assert isinstance(simulation, Recorded)
+    simulation.record = ProblemFolder(folder).write
+    pressures = []
+    for _ in range(steps):
+        simulation.step(min(simulation.stable_dt(), 0.01))
+        inner = simulation.grid.interior(simulation.projection.pressure.numpy())
+        pressures.append(inner.copy())
+    return pressures
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_recorded_problem_is_the_one_that_was_solved(tmp_path, name):
+    simulation = CASES[name]()
+    pressures = record(simulation, tmp_path)
+    assert [path.name for path in files(tmp_path)] == [f"problem_{step:06d}.npz" for step in range(3)]
+    for path, pressure in zip(files(tmp_path), pressures, strict=True):
+        problem = load(path, device="cpu")
+        kept = dict(np.load(path, allow_pickle=False))
+        # the oracle reads the file by its description alone: a face off by one, or a shift of another step, is not solved by the run's x
+        faces = [kept.get(f"face_{axis}", 1.0) for axis in "xyz"]
+        A = assemble(kept["cells"], faces, kept.get("shift"))
+        fluid = kept["cells"].ravel() == wl.FLUID
+        A = A[np.ix_(fluid, fluid)]
+        np.testing.assert_allclose(problem.dense().A, A, atol=2e-6 * np.abs(A).max())
+        b, lower, upper = (np.broadcast_to(kept[key], kept["cells"].shape).ravel()[fluid] for key in ("b", "lower", "upper"))
+        x = pressure.ravel()[fluid]
+        reference = natural_residual(A, b, lower, upper, np.clip(0.0 * b, lower, upper))
+        allowed = max(float(kept["absolute_tolerance"]), float(kept["tolerance"]) * reference)
+        assert natural_residual(A, b, lower, upper, x) <= 1.5 * allowed + 1e-6 * np.abs(A).max() * np.linalg.norm(x)
+        criteria = wl.StoppingCriteria(rtol=1e-9, atol=1e-12, max_iterations=300)
+        for start in (None, problem.x0):
+            result = wl.solve(problem.lcp(), wl.MinimumMapNewton(precision="double"), stopping=criteria, x0=start)
+            assert result, result.status
+            np.testing.assert_allclose(result.x.numpy(), pressure, atol=2e-3 * np.abs(pressure).max())
+
+
+def test_coefficients_are_there_only_where_they_vary(tmp_path):
+    record(CASES["voxel"](), tmp_path / "voxel", 1)
+    record(CASES["cut"](), tmp_path / "cut", 1)
+    plain, cut = (set(np.load(files(tmp_path / name)[0]).files) for name in ("voxel", "cut"))
+    assert not plain & {"face_x", "face_y", "face_z", "shift"}
+    assert {"face_x", "face_y", "shift"} <= cut
+    assert "face_z" not in cut
+    text = (tmp_path / "cut" / "README.md").read_text()
+    assert all(f"`{key}`" in text for key in cut)
+
+
+def test_numbers_and_first_guess(tmp_path):
+    simulation = CASES["voxel"]()
+    first, *_ = record(simulation, tmp_path)
+    problems = [load(path, device="cpu") for path in files(tmp_path)]
+    assert [p.step for p in problems] == [0, 1, 2]
+    assert [p.time for p in problems] == pytest.approx([0.0, problems[0].dt, problems[0].dt + problems[1].dt])
+    assert problems[0].spacing == simulation.grid.spacing
+    assert problems[0].tolerance == simulation.projection.tolerance
+    assert not problems[0].x0.any()
+    both = (first != 0) & (problems[1].x0 != 0)  # the last pressure, scaled with the step
+    ratio = problems[1].dt / problems[0].dt
+    np.testing.assert_allclose(problems[1].x0[both], ratio * first[both], rtol=1e-12)
+    assert both.sum() > 20
+
+
+def test_recording_changes_nothing(tmp_path):
+    plain, recorded = CASES["cut"](), CASES["cut"]()
+    assert plain.record is None
+    record(recorded, tmp_path)
+    for _ in range(3):
+        plain.step(min(plain.stable_dt(), 0.01))
+    for name, array in plain.state().items():
+        np.testing.assert_array_equal(array, recorded.state()[name], name)
+
+
+def test_spray_has_no_problem(tmp_path):
+    spray = create(scene(size=[1.0, 1.0], resolution=8, liquid=[box([0.51, 0.51], [0.57, 0.57])]))
+    record(spray, tmp_path, 1)
+    assert len(files(tmp_path)) <= 1
+    assert (tmp_path / "README.md").is_file()
+
+
+def test_damaged_files_are_refused(tmp_path):
+    record(CASES["voxel"](), tmp_path, 1)
+    (path,) = files(tmp_path)
+    whole, kept = path.read_bytes(), dict(np.load(path))
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match=r"problem_000000\.npz: no recorded problem"):
+        load(path)
+    np.savez(path, **{**kept, "format": FORMAT + 1})
+    with pytest.raises(ValueError, match="its format is 2, this version reads 1"):
+        load(path)
+    np.savez(path, **{key: kept[key] for key in kept if key != "b"})
+    with pytest.raises(ValueError, match="it lacks b"):
+        load(path)
+    np.savez(path, **{**kept, "b": kept["b"][1:]})
+    with pytest.raises(ValueError, match="no recorded problem"):
+        load(path)
+
+
+def test_a_folder_takes_one_run(tmp_path):
+    record(CASES["voxel"](), tmp_path, 1)
+    with pytest.raises(OutputError, match="holds recorded problems already"):
+        ProblemFolder(tmp_path)
+    ProblemFolder(tmp_path, more=True)
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="--record-problems"):
+        ProblemFolder(tmp_path / "file" / "below")
+
+
+def call(*arguments):
+    return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
+
+
+def test_record_and_replay_by_the_command_line(tmp_path):
+    folder, out = tmp_path / "problems", tmp_path / "bench"
+    run = ["run", "dam-break", "--device", "cpu", "--set", "domain.resolution=16", "--set", "time.duration=0.1"]
+    done = call(*run, "--out", tmp_path / "run", "--frames", 1, "--record-problems", folder)
+    assert done.exit_code == 0, done.stderr
+    count = len(files(folder))
+    assert count == json.loads((tmp_path / "run" / "run.json").read_text())["steps"]
+    again = call(*run, "--out", tmp_path / "run", "--frames", 1, "--force", "--record-problems", folder)
+    assert again.exit_code == 2
+    assert "holds recorded problems already" in again.stderr
+    result = call("bench", "solvers", "--problems", folder, "--out", out, "--repeat", 1)
+    assert result.exit_code == 0, result.stderr
+    records = [r for r in json.loads((out / "replay.json").read_text()) if r["name"] != "machine"]
+    assert len(records) == count * 3 * 2
+    assert {r["method"] for r in records} == {"projected-multigrid", "minimum-map-newton", "mprgp"}
+    assert {r["status"] for r in records} == {"CONVERGED"}
+    tolerance = load(files(folder)[0]).tolerance
+    assert min(r["figures"]["residual"]["value"] for r in records) <= 1.1 * tolerance
+    assert "| projected-multigrid | warm |" in (out / "replay.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["solvers", "--problems", "{empty}"], "there is no problem_*.npz"),
+        (["solvers", "--problems", "{empty}/none"], "there is no problem_*.npz"),
+        (["solvers", "--problems", "{broken}"], "no recorded problem"),
+        (["solvers", "--method", "psor"], "--problems DIR"),
+        (["solvers", "--problems", "{broken}", "--method", "psr"], "--method psr: no such method"),
+        (["kernels", "--problems", "{broken}"], "replays no problems"),
+    ],
+)
+def test_what_cannot_be_replayed_exits_with_2(tmp_path: Path, arguments, expected):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken" / "problem_000000.npz").write_bytes(b"PK no archive")
+    result = call("bench", *(a.format(empty=tmp_path / "empty", broken=tmp_path / "broken") for a in arguments))
+    assert result.exit_code == 2
+    assert expected in result.stderr

@@ -1,0 +1,46 @@
+"""What can be told of a scene before its run: whether it is valid, and what a run of it would do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from warp_lcp.driver.devices import free_memory
+from warp_lcp.driver.scene import Scene
+from warp_lcp.driver.scene_file import check_shapes, load_scene
+from warp_lcp.driver.table import Problem, SceneError
+
+
+def check_scene(path_or_name: str, overrides: Sequence[str] = ()) -> tuple[Scene, list[tuple[str, str]]]:
+    """Return a scene, its shapes built once, and what a run of it would do, as pairs of a word and a line.
+
+    Args:
+        path_or_name: as of `load_scene`.
+        overrides: as of `load_scene`.
+
+    Raises:
+        SceneError: listing everything that is wrong.
+    """
+    scene = load_scene(path_or_name, overrides)
+    check_shapes(scene, path_or_name)
+    return scene, [("scene", scene.scene.name), ("simulator", scene.scene.simulator), *scene.plan()]
+
+
+def check_memory(scene: Scene, device: str) -> None:
+    """Refuse a scene that takes more memory than a device has free.
+
+    Args:
+        scene: what would run.
+        device: a Warp device's name; on a GPU, the making of the liquid, on the host, does not count.
+
+    Raises:
+        SceneError: naming both amounts.
+    """
+    needed = scene.memory_estimate() if device == "cpu" else sum(scene.memory_parts().values())
+    free = free_memory(device)
+    if free is not None and needed > free:
+        largest = ", ".join(sorted(scene.memory_parts(), key=scene.memory_parts().__getitem__, reverse=True)[:2])
+        message = (
+            f"the run needs about {needed / 2**20:,.0f} MB of memory, most of it for {largest}, and {free / 2**20:,.0f} MB are free on "
+            f"{device}; lower domain.resolution, or run it anyway with --force-memory"
+        )
+        raise SceneError(scene.scene.name, [Problem("domain.resolution", message, str(scene.domain.resolution))])

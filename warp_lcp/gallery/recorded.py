@@ -1,0 +1,162 @@
+"""Problems of grids as files, `problem_<step>.npz`: the pressure problems that a run met, for every method to be tried on."""
+
+from __future__ import annotations
+
+import re
+import zipfile
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.gallery.problem import Problem
+from warp_lcp.operators.grid_poisson import AXES, FLUID, GridPoisson
+from warp_lcp.problem import LCP
+
+FORMAT = 1
+PROBLEM_FILE = re.compile(r"problem_(?P<step>\d{6,})\.npz")
+NUMBERS = ("step", "time", "dt", "spacing", "tolerance", "absolute_tolerance")
+REQUIRED = frozenset({"format", "cells", "b", "lower", "upper", "x0", *NUMBERS})
+DESCRIPTION = """\
+# Complementarity problems of a simulation
+
+`problem_<step>.npz` is the problem of the step from <step> to <step> + 1: find x with y = A x + b, lower <= x <= upper, and y > 0 only
+where x = lower, y < 0 only where x = upper. Of a step that was tried again it is the last attempt; a step without liquid cells has none.
+The files are NumPy archives of plain arrays (`numpy.load`, no pickles). Cells are indexed [z, y, x], or [y, x] in 2-D.
+
+| key | type | shape | meaning |
+|---|---|---|---|
+| `format` | int64 | () | 1 |
+| `cells` | int8 | (nz, ny, nx) or (ny, nx) | 0 AIR: x = 0; 1 FLUID: an unknown; 2 SOLID: closed, as all beyond the grid is |
+| `face_x`, `face_y`, `face_z` | float32 or float64 | one more along the axis | coefficients of the faces; 1 where there is no such key |
+| `shift` | float32 or float64 | as `cells` | added to the diagonal; 0 where there is no such key |
+| `b`, `x0` | float64 | as `cells` | right-hand side, and where the simulation started; 0 off FLUID |
+| `lower`, `upper` | float64 | () or as `cells` | bounds; -inf or inf where there is none |
+| `step`, `time`, `dt`, `spacing` | int64, float64 | () | steps done before; their time [s]; length of the step [s]; edge of a cell [m] |
+| `tolerance`, `absolute_tolerance` | float64 | () | what the solve was held to: r <= max(absolute, tolerance r at clip(0, lower, upper)) |
+
+(A x)_i = shift_i x_i + sum of face (x_i - x_neighbor) over the faces of FLUID cell i that no SOLID cell touches. r is the 2-norm of
+d (x - clip(x - y / d, lower, upper)) with d the diagonal of A. `absolute_tolerance` has the unit of y.
+
+`warp_lcp.gallery.recorded.load(file)` gives the problem to Python; `warp-lcp bench solvers --problems FOLDER` replays methods on all.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedProblem(Problem):
+    """A problem that a simulation met.
+
+    Args:
+        x0: where the simulation started, a field like b.
+        step: steps done before.
+        time: reached by them [s].
+        dt: length of the step [s].
+        spacing: edge of a cell [m].
+        tolerance: relative residual that the simulation asked for.
+        absolute_tolerance: residual that it took for 0, in the units of y.
+    """
+
+    x0: np.ndarray
+    step: int
+    time: float
+    dt: float
+    spacing: float
+    tolerance: float
+    absolute_tolerance: float
+
+
+def arrays(problem: LCP, x0: wp.array[Any]) -> dict[str, np.ndarray]:
+    """Return what a file holds of a problem on a grid, as host arrays; `NUMBERS` are the caller's to add.
+
+    Args:
+        problem: whose operator is a GridPoisson.
+        x0: first guess, float64 in the padded layout.
+
+    Raises:
+        ValueError: the operator is no GridPoisson, or an axis is periodic.
+    """
+    A = problem.A
+    if not isinstance(A, GridPoisson) or any(A.periodic):
+        raise ValueError("a file holds problems of a GridPoisson without periodic axes")
+    cells = _inner(A.cells, A)
+    fluid = cells == FLUID
+    kept: dict[str, np.ndarray] = {"format": np.array(FORMAT), "cells": cells}
+    for name, field in (("b", problem.b), ("x0", x0)):
+        kept[name] = np.where(fluid, _inner(field, A), 0.0)
+    for name, bound, none in (("lower", problem.lower, -np.inf), ("upper", problem.upper, np.inf)):
+        host = _inner(bound, A)
+        first = host[fluid][0]
+        kept[name] = np.array(first) if (host[fluid] == first).all() else np.where(fluid, host, none)
+    for axis in range(len(A.shape)):
+        if A.faces[axis].size:
+            kept[f"face_{AXES[axis]}"] = _inner(A.faces[axis], A, axis)
+        elif A.uniform[axis] != 1.0:
+            faces = [n + (a == len(A.shape) - 1 - axis) for a, n in enumerate(A.shape)]
+            kept[f"face_{AXES[axis]}"] = np.full(faces, A.uniform[axis])
+    if A.shift.size:
+        host = _inner(A.shift, A)
+        kept["shift"] = np.where(fluid, host, host.dtype.type(0))
+    return kept
+
+
+def _inner(field: wp.array[Any], A: GridPoisson, axis: int | None = None) -> np.ndarray:
+    """Return a stored field without its ring; of faces the upper ones of the last cells too."""
+    host = field.numpy().reshape(A.layout.stored_shape)
+    inner = host[tuple(slice(1, None if axis is not None and a == 2 - axis else -1) for a in range(3))]
+    return np.ascontiguousarray(inner if len(A.shape) == 3 else inner[0])
+
+
+def files(folder: Path) -> list[Path]:
+    """Return the problems of a folder in the order of their steps; none if there is no such folder."""
+    found = [(int(match["step"]), path) for path in folder.glob("problem_*.npz") if (match := PROBLEM_FILE.fullmatch(path.name))]
+    return [path for _, path in sorted(found)]
+
+
+def load(path: Path, *, device: Any = None, dtype: Any = wp.float32) -> RecordedProblem:
+    """Read a problem.
+
+    Args:
+        path: the file.
+        device: Warp device of its operator; the default device if None.
+        dtype: of the operator's coefficients.
+
+    Raises:
+        ValueError: the file is none of a problem, or is damaged or of a later version; the message names it.
+    """
+    kept = _read(Path(path))
+    try:
+        coefficients: dict[str, Any] = {name: kept[name] for name in ("face_x", "face_y", "face_z", "shift") if name in kept}
+        A = GridPoisson(kept["cells"], device=device, dtype=dtype, **coefficients)
+        b, lower, upper, x0 = (np.broadcast_to(kept[name], A.shape).astype(np.float64) for name in ("b", "lower", "upper", "x0"))
+        numbers: dict[str, Any] = {name: kept[name].item() for name in NUMBERS}
+        facts = {"symmetric", "semidefinite"} | ({"mixed"} if np.isneginf(lower[kept["cells"] == FLUID]).any() else set())
+        return RecordedProblem(Path(path).stem, A, b, lower, upper, None, frozenset(facts), x0, **numbers)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path}: no recorded problem: {error}") from error
+
+
+def check(path: Path) -> None:
+    """Look whether a file is one of a problem, without reading its fields.
+
+    Raises:
+        ValueError: it is not, or is cut short or of a later version; the message names it.
+    """
+    _read(path, ("format",))
+
+
+def _read(path: Path, wanted: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+    try:
+        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:  # NumPy leaves a broken file open
+            version = int(file["format"])
+            if version != FORMAT:
+                raise ValueError(f"its format is {version}, this version reads {FORMAT}")
+            missing = sorted(REQUIRED - set(file.files))
+            if missing:
+                raise ValueError(f"it lacks {', '.join(missing)}")
+            return {name: file[name] for name in wanted or file.files}
+    except (OSError, EOFError, KeyError, ValueError, TypeError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(f"{path}: no recorded problem: {error}") from error
