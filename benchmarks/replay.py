@@ -11,7 +11,7 @@ import warp as wp
 
 import warp_lcp as wl
 from benchmarks.machine import COPIED, machine
-from benchmarks.record import Lines, Record, Results, Table
+from benchmarks.record import Bars, Lines, Record, Results, Table
 from benchmarks.timing import Figure, Options
 from warp_lcp.gallery.recorded import RecordedProblem, files, load
 
@@ -25,29 +25,37 @@ def measure(options: Options, out: object) -> Results:
     """Solve every problem by every method."""
     assert options.problems is not None, "--problems is missing"
     paths = files(options.problems)
-    records = []
+    records: list[Record] = []
+    refused: dict[str, str] = {}
     for number, path in enumerate(paths):
         problem = load(path, device=options.device)
         options.say(f"{problem.name}, {number + 1} of {len(paths)}")
-        records += _measure_problem(problem, options, rehearse=number == 0)
-    elements = min(COPIED, max(int(r.facts["cells"]) for r in records) * 64)
+        records += _measure_problem(problem, options, refused, rehearse=number == 0)
+    elements = min(COPIED, 64 * max((int(r.facts["cells"]) for r in records), default=1))
     curves: dict[str, tuple[list[float], list[float]]] = defaultdict(lambda: ([], []))
     for r in records:
         curve = curves[f"{r.facts['method']}, {r.facts['start']}"]
         curve[0].append(r.facts["step"] + 1)
         curve[1].append(r.figures["seconds"].value)
-    chart = Lines("seconds", "Seconds of each problem", "step", "s", curves, logarithmic_x=False)
-    return Results(
-        [machine(options.device, elements=elements, repeat=options.repeat), *records], [_summary(records), _each(records)], [chart]
-    )
+    charts: list[Bars | Lines] = [Lines("seconds", "Seconds of each problem", "step", "s", curves, logarithmic_x=False)] if records else []
+    found = machine(options.device, elements=elements, repeat=options.repeat)
+    failures = [f"{name}: {reason}" for name, reason in refused.items()]
+    return Results([found, *records], [_summary(records), _each(records)], charts, failures)
 
 
-def _measure_problem(problem: RecordedProblem, options: Options, *, rehearse: bool) -> list[Record]:
-    """Return a record of each method and start; samples are taken in turns."""
+def _measure_problem(problem: RecordedProblem, options: Options, refused: dict[str, str], *, rehearse: bool) -> list[Record]:
+    """Return a record of each method and start; samples are taken in turns. `refused` receives what methods do not take, and why."""
     lcp, quality = problem.lcp(), Quality(problem)
     criteria = wl.StoppingCriteria(rtol=problem.tolerance, atol=problem.absolute_tolerance, max_iterations=MAX_ITERATIONS)
-    solvers: dict[str, Any] = {name: wl.METHODS[name]() for name in options.methods or METHODS}
-    works = {name: solver.init(lcp) for name, solver in solvers.items()}
+    solvers: dict[str, Any] = {}
+    works = {}
+    for name in options.methods or METHODS:
+        solver = wl.METHODS[name]()
+        try:
+            works[name] = solver.init(lcp)
+            solvers[name] = solver
+        except ValueError as error:  # a dense method on a large grid, say
+            refused[f"{problem.name} {name}"] = str(error)
     seconds: dict[tuple[str, str], list[float]] = defaultdict(list)
     results: dict[tuple[str, str], wl.SolveResult] = {}
     for turn in range(options.repeat + rehearse):  # the first turn of all loads kernels
@@ -120,8 +128,8 @@ def _summary(records: list[Record]) -> Table:
         rows.append([method, start, *counts, f"{seconds:.4g}", f"{residual:.2e}"])
     remark = (
         "cold: from clip(0, lower, upper); warm: from the run's own first guess. Each problem is solved to the tolerances that the run "
-        "asked for, with a workspace made before. residual: relative, recomputed in float64; where b is rounding noise, as in free fall, it is "
-        "not iterated on and may be up to 1."
+        "asked for, with a workspace made before. residual: relative, recomputed in float64; where b is rounding noise, as in free fall, "
+        "it is not iterated on and may be up to 1."
     )
     return Table("Methods", columns, rows, remark)
 

@@ -114,20 +114,22 @@ class LiquidScene(Scene):
         Sources may fill the domain; whether they do, and what leaves it, is not known before.
 
         Args:
-            later: count what sources let in; False: the liquid at the start.
+            later: count what sources let in; False: what is there at the start.
         """
-        let_in = sum(self._source_volume(source) for source in self.source) if later else 0.0
+        let_in = sum(self._source_volume(source, later=later) for source in self.source)
         volume = min(sum(self.enclosed_volume(liquid) for liquid in self.liquid) + let_in, math.prod(self.domain.size))
         return round(volume / self.spacing**self.dimension * self.particles.per_axis**self.dimension)
 
-    def _source_volume(self, source: Source) -> float:
-        """Return an upper bound of what a source holds and lets in [m^3; m^2 in 2-D]."""
+    def _source_volume(self, source: Source, *, later: bool) -> float:
+        """Return an upper bound of what a source holds and lets in, or of what it holds at the start [m^3; m^2 in 2-D]."""
         size = np.array(self.domain.size)
         bounds = source.bounds(self.dimension)
         low, high = (np.zeros_like(size), size) if bounds is None else (corner[: self.dimension] for corner in bounds)
         sides = np.maximum(np.minimum(high, size) - np.maximum(low, 0.0), 0.0)
         seconds = max(min(source.stop or math.inf, self.time.duration) - source.begin, 0.0)
         areas = np.array([np.delete(sides, axis).prod() for axis in range(self.dimension)])
+        if not later:
+            return float(sides.prod()) if source.begin == 0.0 else 0.0
         return float(sides.prod() + areas @ np.abs(source.velocity) * seconds)
 
     def plan(self) -> list[tuple[str, str]]:

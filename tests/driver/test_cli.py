@@ -56,6 +56,7 @@ def test_the_folder_is_named_after_the_scene(scene_file, tmp_path, monkeypatch):
         (["run", "{scene}", "--resume"], "there is no run to resume"),
         (["run", "{scene}", "--resume", "--force"], "choose one"),
         (["run", "{scene}", "--frames", "-1"], "--frames"),
+        (["run", "{scene}", "--device", "cpu", "--record-problems", "problems"], "the simulator dots has no problems to show"),
         (["run"], "SCENE"),
         (["run", "{scene}", "--fast"], "--fast"),
         (["check", "{scene}", "--set", "domain.wal=x"], "did you mean 'wall'?"),

@@ -23,16 +23,70 @@ from warp_lcp.driver.table import SceneError
 
 SECONDS = 5.0  # for one file, on a busy machine; usual ones take milliseconds
 CHUNK = 100
-NUMBERS = [0, -1, 1, 2, 3, 7, 4096, 10**9, 2**63 - 1, -(2**63), 2**64, 10**400, 0.0, -0.0, 0.5, -2.5, 1e-320, 1e-30, 1e-9, 1e12, 1e30, 1e200, 1.7e308, -1e308]
-NUMBERS += [math.nan, math.inf, -math.inf]
-WORDS = ["", " ", "box", "sphere", "plane", "mesh", "fluids", "granular", "é\u200b漢🌊", "a\x00b", "/", ".", "..", "builtin:", "builtin:torus", "builtin:x", "x" * 5000]
-WORDS += ["translation", "rotation", "sinusoid", "keyframes", "flip", "unilateral", "voxel", "left", "front", "nan", "{}", "%s", "'", "psor"]
+NUMBERS = [0, -1, 1, 2, 3, 7, 4096, 10**9, 2**63 - 1, -(2**63), 2**64, 10**400, math.nan, math.inf, -math.inf]
+NUMBERS += [0.0, -0.0, 0.5, -2.5, 1e-320, 1e-30, 1e-9, 1e12, 1e30, 1e200, 1.7e308, -1e308]
+FACTORS = [2, 3, 10, 1000, 10**6, 10**15, 1e-3, 1e-15, 1e-200, 1e-320, 1e30, 1e200, -1]
+WORDS = ["", " ", "é\u200b漢🌊", "a\x00b", "/", ".", "..", "x" * 5000, "nan", "{}", "%s", "'", "builtin:", "builtin:torus", "builtin:x"]
+WORDS += ["box", "sphere", "plane", "mesh", "translation", "rotation", "sinusoid", "keyframes"]
+WORDS += ["fluids", "granular", "flip", "unilateral", "voxel", "left", "front", "psor"]
+KEYS = [*WORDS, "scale", "rotate", "translate", "motion", "file", "invert", "smoothing", "open", "shape"]
 OTHERS = [True, False, [], [[]], {}, {"a": {"b": []}}, datetime.date(2026, 2, 28), datetime.time(1, 2), [1.0], [1.0] * 3, [0.1] * 1000]
+INSERTS = [
+    b"[" * 3000,
+    b"[[x]]\n",
+    b"\n[time]\n",
+    b"=",
+    b"\r",
+    b'"""',
+    b"9" * 5000,
+    b"0x" + b"f" * 5000,
+    b"\ntime" + b".a" * 3000 + b" = 1\n",
+]
 
 
 def test_three_hundred_fuzzed_files_are_accepted_or_refused(tmp_path: Path) -> None:
     outcomes = [_outcome(seed, tmp_path) for seed in range(300)]
     assert min(outcomes.count(True), outcomes.count(False)) > 20, "mutations that all do the same test nothing"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("x = " + "[" * 3000, "nested too deeply"),
+        ("time" + ".a" * 3000 + " = 1", "nested too deeply"),
+        ("x = " + "9" * 5000, "too many digits"),
+        ("time.duration = 0x" + "f" * 5000, "too many digits"),
+        ("time.duration = 1e300", "time.duration = 1e+300: must not be beyond 1e+18"),
+        ("domain.periodic = [{}]", "domain.periodic"),  # a value that is no key of a set
+        ('solver.preset = {a = 1}\nsolver.method = {a = 1}\n[scene]\nsimulator = "fluids"', "solver.method"),
+    ],
+)
+def test_what_once_ended_in_a_traceback_is_refused(text: str, message: str, tmp_path: Path) -> None:
+    file = tmp_path / "scene.toml"
+    file.write_text(text if "[scene]" in text else f'{text}\n[scene]\nsimulator = "fluids"\n')
+    with pytest.raises(SceneError) as caught:
+        check_scene(str(file))
+    assert message in str(caught.value)
+
+
+def test_overrides_that_no_parser_takes_are_refused() -> None:
+    for value in ("9" * 5000, "[" * 3000, "1e300", "0x" + "f" * 5000):
+        with pytest.raises(SceneError, match=r"time\.duration"):
+            check_scene("dam-break-2d", [f"time.duration={value}"])
+
+
+def test_keyframes_too_close_for_a_smooth_motion_are_refused() -> None:
+    times = "solid.0.motion.times=[0.0, 1e-320, 1.2, 2.2]"
+    with pytest.raises(SceneError, match="too close"):
+        check_scene("retracting-wall", [times])
+
+
+def test_a_folder_is_no_scene_and_no_mesh(tmp_path: Path) -> None:
+    (tmp_path / "folder.toml").mkdir()
+    with pytest.raises(SceneError, match="is a folder"):
+        check_scene(str(tmp_path / "folder.toml"))
+    with pytest.raises(SceneError, match="no such file"):
+        check_scene("mesh-obstacle", [f"solid.0.file={tmp_path}"])
 
 
 @pytest.mark.slow
@@ -104,8 +158,7 @@ def _change_number(data: dict[str, Any], chance: random.Random) -> None:
     """Change a number to one that the scene may well allow, so that what comes after the first checks is reached."""
     owner, key = chance.choice([(o, k) for o, k in _places(data) if isinstance(o[k], (int, float)) and not isinstance(o[k], bool)])
     old = owner[key]
-    larger = old * chance.choice([2, 3, 10, 1000, 10**6, 10**15])
-    owner[key] = chance.choice([larger, larger, old + 1, old * 1e-3, old * 1e-15, old * 1e-200, old * 1e-320, 1e18, old * 1e30, old * 1e200, -old])
+    owner[key] = chance.choice([old + 1, 1e18, *(old * factor for factor in FACTORS)])
 
 
 def _change(data: dict[str, Any], chance: random.Random) -> None:
@@ -130,7 +183,9 @@ def _change(data: dict[str, Any], chance: random.Random) -> None:
     elif kind == "repeat" and isinstance(old, list) and old:
         owner[key] = [copy.deepcopy(chance.choice(old)) for _ in range(chance.choice([2, 3, 10, 200]))]
     elif kind == "add" and isinstance(old, dict):
-        old[chance.choice([*WORDS, "scale", "rotate", "translate", "motion", "file", "invert", "smoothing", "open", "shape"])] = _value(chance)
+        old[chance.choice([*WORDS, "scale", "rotate", "translate", "motion", "file", "invert", "smoothing", "open", "shape"])] = _value(
+            chance
+        )
     elif kind == "text" and isinstance(old, str):
         owner[key] = chance.choice(WORDS)
     else:
@@ -152,4 +207,20 @@ def _scramble(text: bytes, chance: random.Random) -> bytes:
     if kind == 4:
         chance.shuffle(lines)
         return b"".join(lines)
-    return text[:at] + chance.choice([b"[" * 3000, b"[[x]]\n", b"\n[time]\n", b"=", b"\r", b'"""', b"9" * 5000, b"\ntime" + b".a" * 3000 + b" = 1\n", b"0x" + b"f" * 5000]) + text[at:]
+    return (
+        text[:at]
+        + chance.choice(
+            [
+                b"[" * 3000,
+                b"[[x]]\n",
+                b"\n[time]\n",
+                b"=",
+                b"\r",
+                b'"""',
+                b"9" * 5000,
+                b"\ntime" + b".a" * 3000 + b" = 1\n",
+                b"0x" + b"f" * 5000,
+            ]
+        )
+        + text[at:]
+    )

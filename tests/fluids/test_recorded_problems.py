@@ -103,7 +103,7 @@ def test_recording_changes_nothing(tmp_path):
 def test_spray_has_no_problem(tmp_path):
     spray = create(scene(size=[1.0, 1.0], resolution=8, liquid=[box([0.51, 0.51], [0.57, 0.57])]))
     record(spray, tmp_path, 1)
-    assert len(files(tmp_path)) <= 1
+    assert files(tmp_path) == []
     assert (tmp_path / "README.md").is_file()
 
 
@@ -149,6 +149,10 @@ def test_record_and_replay_by_the_command_line(tmp_path):
     again = call(*run, "--out", tmp_path / "run", "--frames", 1, "--force", "--record-problems", folder)
     assert again.exit_code == 2
     assert "holds recorded problems already" in again.stderr
+    more = call(*run, "--out", tmp_path / "run", "--frames", 2, "--resume", "--record-problems", folder)
+    assert more.exit_code == 0, more.stderr
+    assert len(files(folder)) == json.loads((tmp_path / "run" / "run.json").read_text())["steps"] > count
+    count = len(files(folder))
     result = call("bench", "solvers", "--problems", folder, "--out", out, "--repeat", 1)
     assert result.exit_code == 0, result.stderr
     records = [r for r in json.loads((out / "replay.json").read_text()) if r["name"] != "machine"]
@@ -158,6 +162,9 @@ def test_record_and_replay_by_the_command_line(tmp_path):
     tolerance = load(files(folder)[0]).tolerance
     assert min(r["figures"]["residual"]["value"] for r in records) <= 1.1 * tolerance
     assert "| projected-multigrid | warm |" in (out / "replay.md").read_text()
+    refused = call("bench", "solvers", "--problems", folder, "--method", "direct-enumeration", "--out", tmp_path / "refused", "--repeat", 1)
+    assert refused.exit_code == 1
+    assert "the suite replay ended with exit code 1" in refused.stderr
 
 
 @pytest.mark.parametrize(

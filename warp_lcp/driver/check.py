@@ -36,7 +36,7 @@ def check_memory(scene: Scene, device: str) -> None:
         SceneError: naming both amounts.
     """
     needed = scene.memory_estimate() if device == "cpu" else sum(scene.memory_parts().values())
-    free = free_memory(device)
+    free = free_memory(device) if needed else None
     if free is not None and needed > free:
         largest = ", ".join(sorted(scene.memory_parts(), key=scene.memory_parts().__getitem__, reverse=True)[:2])
         message = (

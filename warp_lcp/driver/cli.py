@@ -26,6 +26,7 @@ from warp_lcp.driver.render import parse_size, render_run
 from warp_lcp.driver.run import run_scene
 from warp_lcp.driver.run_folder import OutputError, RunRecord
 from warp_lcp.driver.scene_file import built_in_scenes, installed_simulators, load_scene
+from warp_lcp.driver.simulator import SimulationFailed, StepFailed
 from warp_lcp.driver.solve_file import ProblemError, solve_files, write_vector
 from warp_lcp.driver.table import SceneError, nearest
 from warp_lcp.driver.versions import shadowing_distributions, versions
@@ -90,8 +91,8 @@ def run(
         with _interruptible(console) as stop, Bar(console) if console.is_terminal else Lines(console) as observer:
             watch = Profile(chosen) if profile else None
             record = run_scene(
-                loaded, folder, device=chosen, observer=observer, last_frame=frames, resume=resume, force=force, force_memory=force_memory, stop=stop, profile=watch,
-                record_problems=record_problems,
+                loaded, folder, device=chosen, observer=observer, last_frame=frames, resume=resume, force=force, force_memory=force_memory,
+                stop=stop, profile=watch, record_problems=record_problems,
             )  # fmt: skip
     if watch:
         typer.echo("\n".join(watch.table(record.steps - (record.resumed_from_step or 0), record.seconds)))

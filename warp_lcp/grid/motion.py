@@ -19,6 +19,7 @@ from scipy.spatial import transform
 Vector = Sequence[float] | np.ndarray
 
 ROTATION_ERROR = 1e-9  # of a pose's R R' - 1; products of a few rotations stay near 1e-15
+FASTEST = 1e18  # [m/s] or [degrees/s], between keyframes of a smooth motion: cubics have its square and more
 SPEED_SAMPLES = 4  # of a span in which the top speed is looked for
 SAME_AXIS = 1e-9  # 1 - cosine of the angle between two axes that count as one
 
@@ -287,7 +288,10 @@ class _Curve:
         self.times, self.values = times, values
         self._spline = None
         if smooth:
-            slopes = PchipInterpolator(times, values).derivative()(times)
+            with np.errstate(over="ignore", divide="ignore"):  # by slopes of almost 0: weights of slopes that are 0
+                if (np.abs(np.diff(values, axis=0)) > FASTEST * np.diff(times)[:, None]).any():
+                    raise ValueError("times are too close to each other for a smooth motion")
+                slopes = PchipInterpolator(times, values).derivative()(times)
             slopes[[0, -1, *rests]] = 0.0  # smaller slopes keep a monotone cubic monotone
             self._spline = CubicHermiteSpline(times, values, slopes)
 
