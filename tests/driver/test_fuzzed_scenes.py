@@ -16,7 +16,9 @@ from typing import Any
 
 import pytest
 import tomli_w
+from typer.testing import CliRunner
 
+from warp_lcp.driver import cli
 from warp_lcp.driver.check import check_scene
 from warp_lcp.driver.scene_file import built_in_scenes
 from warp_lcp.driver.table import SceneError
@@ -47,6 +49,18 @@ INSERTS = [
 def test_three_hundred_fuzzed_files_are_accepted_or_refused(tmp_path: Path) -> None:
     outcomes = [_outcome(seed, tmp_path) for seed in range(300)]
     assert min(outcomes.count(True), outcomes.count(False)) > 20, "mutations that all do the same test nothing"
+
+
+def test_the_command_ends_with_0_or_2(tmp_path: Path) -> None:
+    file = tmp_path / "scene.toml"
+    codes = []
+    for seed in range(500, 540):
+        file.write_bytes(fuzzed(random.Random(seed)))
+        result = CliRunner().invoke(cli.app, ["check", str(file), "--device", "cpu"])
+        codes.append(result.exit_code)
+        assert result.exception is None or isinstance(result.exception, SystemExit), f"seed {seed}"
+        assert (result.exit_code == cli.WRONG_INPUT) == bool(result.stderr), f"seed {seed}"
+    assert set(codes) == {0, cli.WRONG_INPUT}
 
 
 @pytest.mark.parametrize(

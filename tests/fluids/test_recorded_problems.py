@@ -16,7 +16,7 @@ from warp_lcp.driver.run_folder import OutputError
 from warp_lcp.driver.simulator import Recorded
 from warp_lcp.gallery.recorded import FORMAT, files, load
 
-RAMP = box([0.5, -0.2], [0.9, 0.08], rotate=20)
+RAMP = box([0.2, -0.2], [0.6, 0.08], rotate=20)  # partly beneath the liquid
 CASES = {
     "voxel": lambda: dam(solids="voxel", pressure={"surface": "voxel"}),
     "cut": lambda: dam(solid=[RAMP]),
