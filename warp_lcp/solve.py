@@ -17,6 +17,7 @@ from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import Record, SolveResult, SolveStatus
 from warp_lcp.stopping import StoppingCriteria
+from warp_lcp.vectors import convert
 
 EPS = float(np.finfo(np.float64).eps)
 FLOOR_MARGIN = 8.0  # a stagnated residual within this multiple of the rounding estimate is called the precision's floor
@@ -107,6 +108,22 @@ class IterateInPlace:
         """Take x back."""
         if self._best is not None:
             wp.copy(self.x, self._best)
+
+
+class RoundedIterate:
+    """Rounds iterates through memory of their precision; `_rounded` is None where they are float64."""
+
+    x: wp.array[Any]
+    _rounded: wp.array[Any] | None
+
+    def round_iterate(self) -> None:
+        """Round x to its precision."""
+        self._round(self.x)
+
+    def _round(self, x: wp.array[Any]) -> None:
+        if self._rounded is not None:
+            convert(x, self._rounded)
+            convert(self._rounded, x)
 
 
 class Solver(Protocol):

@@ -19,7 +19,7 @@ def test_a_dam_breaks_over_spot(solids: str, wall: str) -> None:
     liquid = [box([0.0, 0.0, 0.0], [0.5, 0.9, 1.0])]
     simulation = create(scene(size=[1.5, 1.25, 1.0], resolution=24, liquid=liquid, solid=[cow], wall=wall, solids=solids))
     volume = float((1.0 - simulation.boundary.capacity.numpy())[2:-2, 2:-2, 2:-2].sum()) * simulation.grid.cell_volume
-    assert volume == pytest.approx(0.718 * 0.35**3, rel=0.2)
+    assert volume == pytest.approx(0.718 * 0.35**3, rel=0.15 if solids == "cut-cell" else 0.2)
     rows = advance(simulation, 0.6)
     assert {row["solve_status"] for row in rows} == {"CONVERGED"}
     assert np.mean([row["linear_iterations"] for row in rows]) <= 8

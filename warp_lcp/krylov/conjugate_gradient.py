@@ -29,12 +29,6 @@ class Preconditioner(Protocol):
         """Write z."""
 
 
-class RecordedPreconditioner(Preconditioner, Protocol):
-    """A preconditioner that is a program."""
-
-    program: Program
-
-
 class ConjugateGradient:
     """Solve A x = r for a symmetric positive (semi-)definite A.
 

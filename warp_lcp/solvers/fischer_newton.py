@@ -15,7 +15,7 @@ from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
-from warp_lcp.solve import IterateInPlace, Precision, Step
+from warp_lcp.solve import IterateInPlace, Precision, RoundedIterate, Step
 from warp_lcp.solvers.finite_difference import FiniteDifferenceSystem
 from warp_lcp.solvers.fischer_newton_dense import FischerDenseWorkspace
 from warp_lcp.solvers.globalization import NonmonotoneSearch
@@ -23,7 +23,6 @@ from warp_lcp.solvers.gradient_descent import GradientDescent, GradientWorkspace
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
 from warp_lcp.solvers.nonsmooth_map import Kink, NonsmoothMap, Reformulation
 from warp_lcp.solvers.principal_system import principal_system
-from warp_lcp.vectors import convert
 
 SHARE = 0.95  # lambda of the penalized map for dense problems: measured on frictional contacts
 
@@ -116,7 +115,7 @@ class FischerNewton:
         return work.newton_step(x)
 
 
-class FischerWorkspace(IterateInPlace):
+class FischerWorkspace(IterateInPlace, RoundedIterate):
     """Memory of the method for one problem, on the device."""
 
     def __init__(self, problem: LCP, settings: FischerNewton) -> None:
@@ -223,12 +222,3 @@ class FischerWorkspace(IterateInPlace):
         else:
             self.map.advance(self._from, self.system.e, scale, x, projected=True)
         self._gone = scale
-
-    def round_iterate(self) -> None:
-        """Round x to its precision."""
-        self._round(self.x)
-
-    def _round(self, x: wp.array[Any]) -> None:
-        if self._rounded is not None:
-            convert(x, self._rounded)
-            convert(self._rounded, x)

@@ -13,11 +13,11 @@ from warp_lcp.multigrid.hierarchy import CycleSettings
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
-from warp_lcp.solve import IterateInPlace, Precision, Step
+from warp_lcp.solve import IterateInPlace, Precision, RoundedIterate, Step
 from warp_lcp.solvers.interior_point_kernels import kernels
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
 from warp_lcp.solvers.principal_system import GridSystem, principal_system
-from warp_lcp.vectors import Reduction, convert, launch_spans
+from warp_lcp.vectors import Reduction, launch_spans
 
 SUMS, LONGEST = 0, 2  # slots of the device scalars
 NEAR = 10.0  # a near start has w A_ii and s at least this multiple of the residual's root mean square; 3 to 50 measured
@@ -109,7 +109,7 @@ class InteriorPoint:
         return work.path_step(x)
 
 
-class InteriorPointWorkspace(IterateInPlace):
+class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
     """Memory of the method for one problem.
 
     Attributes:
@@ -265,12 +265,3 @@ class InteriorPointWorkspace(IterateInPlace):
 
     def _flat(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
         launch_spans(kernel, self._reduction.spans, inputs, [], self.problem.device)
-
-    def round_iterate(self) -> None:
-        """Round x to its precision."""
-        self._round(self.x)
-
-    def _round(self, x: wp.array[Any]) -> None:
-        if self._rounded is not None:
-            convert(x, self._rounded)
-            convert(self._rounded, x)

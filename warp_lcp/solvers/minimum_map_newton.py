@@ -13,10 +13,10 @@ from warp_lcp.multigrid.hierarchy import CycleSettings
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
-from warp_lcp.solve import IterateInPlace, Precision, Step
+from warp_lcp.solve import IterateInPlace, Precision, RoundedIterate, Step
 from warp_lcp.solvers.minimum_map_newton_kernels import all_free_kernel, kernels
 from warp_lcp.solvers.principal_system import DenseSystem, GridSystem, principal_system
-from warp_lcp.vectors import Reduction, convert, launch_spans
+from warp_lcp.vectors import Reduction, launch_spans
 
 MOVED, SQUARE = 0, 3  # slots of the device scalars: cells moved, active, shifted, and the free residual's square
 REGULARIZATIONS = (1e-8, 1e-4, 1e-2, 0.1, 1.0, 10.0, 100.0)  # of J'J, times its mean diagonal
@@ -81,7 +81,7 @@ class MinimumMapNewton:
         return work.newton_step(x)
 
 
-class NewtonWorkspace(IterateInPlace):
+class NewtonWorkspace(IterateInPlace, RoundedIterate):
     """Memory of the method for one problem."""
 
     def __init__(self, problem: LCP, settings: MinimumMapNewton) -> None:
@@ -227,12 +227,3 @@ class NewtonWorkspace(IterateInPlace):
 
     def _flat(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
         launch_spans(kernel, self._reduction.spans, inputs, [], self.problem.device)
-
-    def round_iterate(self) -> None:
-        """Round x to its precision."""
-        self._round(self.x)
-
-    def _round(self, x: wp.array[Any]) -> None:
-        if self._rounded is not None:
-            convert(x, self._rounded)
-            convert(self._rounded, x)

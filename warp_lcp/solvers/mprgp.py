@@ -15,14 +15,14 @@ from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
-from warp_lcp.solve import Precision, Step
+from warp_lcp.solve import Precision, RoundedIterate, Step
 from warp_lcp.solvers import mprgp_kernels as kernels
 from warp_lcp.solvers import projected_multigrid_kernels as engine
 from warp_lcp.solvers.minimum_map_newton_kernels import all_free_kernel
 from warp_lcp.solvers.principal_system import DiagonalSystem, principal_system
 from warp_lcp.solvers.principal_system_sparse import SparseSystem
 from warp_lcp.solvers.projected_multigrid import PLANES_A_THREAD
-from warp_lcp.vectors import Reduction, convert, launch_spans
+from warp_lcp.vectors import Reduction, launch_spans
 
 SINGLE_SLACK = 1.2e-7  # a bound that float32 rounds is met within this part of it
 LEAST_REST = 1e-3  # of a correction's energy that must not lie along the last direction; what is left else is cancellation
@@ -191,7 +191,7 @@ class SplitResidual(NaturalResidual):
         self._split.add_up(0, columns=4)
 
 
-class GradientWorkspace:
+class GradientWorkspace(RoundedIterate):
     """Memory of the method for one problem."""
 
     def __init__(self, problem: LCP, settings: MPRGP) -> None:
@@ -380,15 +380,6 @@ class GradientWorkspace:
 
     def _flat(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
         launch_spans(kernel, self.residual.sums.spans, inputs, [], self.problem.device)
-
-    def round_iterate(self) -> None:
-        """Round x to its precision."""
-        self._round(self.x)
-
-    def _round(self, x: wp.array[Any]) -> None:
-        if self._rounded is not None:
-            convert(x, self._rounded)
-            convert(self._rounded, x)
 
 
 def row_sums(threads: tuple[int, int, int], device: wp.Device) -> Any:

@@ -14,9 +14,9 @@ from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
 from warp_lcp.program import Launch, Program
 from warp_lcp.residual import NaturalResidual
-from warp_lcp.solve import Precision, Step
+from warp_lcp.solve import Precision, RoundedIterate, Step
 from warp_lcp.solvers import projected_multigrid_kernels as kernels
-from warp_lcp.vectors import Reduction, convert, launch_spans
+from warp_lcp.vectors import Reduction, launch_spans
 
 LEAP = 10.0  # a residual that exceeds the least one by this factor says that the free set was a bad guess: CG's own rises are smaller
 # planes that a thread sums over: on CUDA, a place for the sums of every cell would cost more memory than the rest of the method
@@ -168,7 +168,7 @@ class AssessedResidual(NaturalResidual):
         self.scalars[int(slot) : int(slot) + 1].fill_(value)
 
 
-class MultigridWorkspace:
+class MultigridWorkspace(RoundedIterate):
     """Memory of the method for one problem.
 
     x is moved in place. The best iterate is not stored while it is x, nor when x is one step past it, for a step can be taken back; it
@@ -371,12 +371,3 @@ class MultigridWorkspace:
             self._mask = self.problem.layout.zeros(wp.uint8)
         wp.launch(kernels.free_mask_kernel, free.size, [free, self._mask], device=self.A.device)
         self.floating.project(self.hierarchy.finest.b, self._mask)
-
-    def round_iterate(self) -> None:
-        """Round x to its precision."""
-        self._round(self.x)
-
-    def _round(self, x: wp.array[Any]) -> None:
-        if self._rounded is not None:
-            convert(x, self._rounded)
-            convert(self._rounded, x)
