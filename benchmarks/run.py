@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-import fluids.simulator
 import warp_lcp as wl
 from benchmarks.machine import machine
 from benchmarks.record import Bars, Record, Results, Table
 from benchmarks.stopwatch import timed
 from benchmarks.timing import Figure, Options
-from fluids.boundary import WholeCells
+from warp_lcp.driver import particle_simulation
 from warp_lcp.driver.run import run_scene
 from warp_lcp.driver.scene_file import load_scene
 from warp_lcp.driver.simulator import simulators
+from warp_lcp.material.boundary import WholeCells
 
 TITLE = "Runs of built-in scenes"
 SCENES = {"dam-break-2d": 0.3, "dam-break": 0.2}  # [s] simulated
@@ -30,8 +30,8 @@ PARTICLES = 128  # cells along the longest side of the scene whose particles are
 PARTICLE_STEPS = 12
 WALL_TIME = 0.6  # [s] simulated of the scene in which solves with and without walls are compared: the splash lies in it
 STAGES: dict[str, tuple[ModuleType | type, str]] = {
-    "to grid": (fluids.simulator, "particles_to_faces"),
-    "to particles": (fluids.simulator, "faces_to_particles"),
+    "to grid": (particle_simulation, "particles_to_faces"),
+    "to particles": (particle_simulation, "faces_to_particles"),
     "advection": (WholeCells, "advect"),  # the scenes' solids fill whole cells
     "extrapolation": (WholeCells, "extend"),
     "solve": (wl, "solve"),

@@ -11,9 +11,9 @@ import warp as wp
 
 import warp_lcp as wl
 from fluids import pressure_kernels as kernels
-from fluids.boundary import Boundary
 from warp_lcp.gallery import recorded
 from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.material.boundary import Boundary
 from warp_lcp.operators.grid_poisson import FLUID
 from warp_lcp.vectors import convert
 

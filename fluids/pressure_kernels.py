@@ -12,15 +12,9 @@ from types import SimpleNamespace
 import warp as wp
 
 from warp_lcp.grid.staggered import CellRange
+from warp_lcp.material.contact import HELD, LETS_GO, RELEASED, TOUCHES
 from warp_lcp.native import BLOCK, simd
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
-
-TOUCHES_NOTHING = 0  # no solid face
-HELD = 1  # a wall cell whose liquid stays on its walls
-RELEASED = 2  # a wall cell whose liquid is leaving
-
-TOUCHES = 1  # bits of `touch`: a face of the cell is not open,
-LETS_GO = 2  # and one of those belongs to a wall that separates
 
 THETA_MIN = 1e-3  # the nearest that air comes to a FLUID cell's center, in cells
 

@@ -8,11 +8,11 @@ from typing import Protocol
 import warp as wp
 
 from fluids import surface_kernels as kernels
-from fluids.boundary import Boundary
 from warp_lcp.grid.extrapolate import extrapolate
 from warp_lcp.grid.level_set import LevelSet
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.material.boundary import Boundary
 
 SLIVER = 0.35  # a cell whose open share is smaller may hold no particle though liquid fills it: the level set decides
 REACH = 2  # layers that u* is continued into cells of the level set whose faces no particle gave weight

@@ -10,11 +10,11 @@ import warp as wp
 
 import warp_lcp as wl
 from fluids import unilateral_kernels as kernels
-from fluids.boundary import Boundary
-from fluids.density_correction import SHIFT
 from fluids.pressure import PressureProjection, Projection, three
 from warp_lcp.grid.level_set import LevelSet
 from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.material.boundary import Boundary
+from warp_lcp.material.density_correction import SHIFT
 from warp_lcp.operators.grid_poisson import FLUID
 from warp_lcp.vectors import convert
 

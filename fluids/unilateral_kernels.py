@@ -4,9 +4,9 @@ import typing
 
 import warp as wp
 
-from fluids.pressure_kernels import HELD, LETS_GO, RELEASED, TOUCHES
 from warp_lcp.grid.staggered import CellRange
 from warp_lcp.grid.transfer import TINY_WEIGHT
+from warp_lcp.material.contact import HELD, LETS_GO, RELEASED, TOUCHES
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 
 # Of a cell's kernel: where less is open, as in `warp_lcp.grid.level_set`, a particle more or less is not to tell. Such a cell takes what

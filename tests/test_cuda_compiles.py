@@ -10,9 +10,10 @@ import scipy.sparse
 import warp as wp
 
 import fluids
+import granular
 import warp_lcp as wl
-from fluids.density_correction_kernels import displacement_kernel
 from warp_lcp.grid import transfer_kernels
+from warp_lcp.material.density_correction_kernels import displacement_kernel
 from warp_lcp.multigrid import CycleSettings
 from warp_lcp.solvers.mprgp import MPRGP
 from warp_lcp.solvers.principal_system import principal_system
@@ -101,7 +102,7 @@ def use_gradient_projection_kernels():
 
 
 def test_all_kernels_compile_for_sm_80_and_sm_90(tmp_path):
-    for package in (wl, fluids):
+    for package in (wl, fluids, granular):
         for found in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
             importlib.import_module(found.name)
     use_every_kernel()
@@ -112,7 +113,7 @@ def test_all_kernels_compile_for_sm_80_and_sm_90(tmp_path):
     use_gradient_projection_kernels()
     from warp._src.context import user_modules
 
-    names = sorted(name for name, module in user_modules.items() if name.startswith(("warp_lcp", "fluids")) and module.kernels)
+    names = sorted(name for name, module in user_modules.items() if name.startswith(("warp_lcp", "fluids", "granular")) and module.kernels)
     assert len(names) > 15
     known = Path(wp.config.kernel_cache_dir) / "compiled-for-cuda"  # two minutes for all modules, so each once while it stays as it is
     known.mkdir(exist_ok=True)

@@ -239,8 +239,14 @@ class TestStatuses:
         assert wl.solve(problem, wl.MinimumMapNewton()).status is wl.SolveStatus.NON_FINITE
 
     def test_non_descent(self):
-        A = np.array([[-1.0, 0.0], [0.0, -1.0]])
+        A = np.array([[-1.0, 0.0], [0.0, -1.0]])  # y = -x - 1 < 0 for all x >= 0
         result = wl.solve(wl.LCP(wl.DenseOperator(A, device="cpu"), -np.ones(2)), wl.MinimumMapNewton())
+        assert result.status is wl.SolveStatus.INFEASIBLE
+        rng = np.random.default_rng(0)
+        A, b = rng.standard_normal((3, 3)), rng.standard_normal(3)
+        indefinite = wl.LCP(wl.DenseOperator(A + A.T, device="cpu"), b)
+        assert wl.solve(indefinite, wl.DirectEnumeration())
+        result = wl.solve(indefinite, wl.MinimumMapNewton())
         assert result.status in (wl.SolveStatus.NON_DESCENT, wl.SolveStatus.STAGNATED)
 
     def test_infeasible_closed_pool(self, device, method):

@@ -73,6 +73,34 @@ def test_a_matrix_is_no_problem():
         wl.solve(A, wl.Lemke())
 
 
+OPERATORS = {
+    "dense": lambda device: wl.LCP(wl.DenseOperator(A, device=device), B),
+    "sparse": lambda device: wl.LCP(wl.SparseOperator(scipy.sparse.csr_array(A), device=device), B),
+    "grid": lambda device: wl.LCP(wl.GridPoisson(np.array([[1, 1, 0]]), device=device), np.array([[0.5, -2.5, 0.0]])),
+}
+
+
+@pytest.mark.parametrize("name", wl.METHODS)
+def test_workspaces_of_another_method_problem_or_kind_are_refused(name, device):
+    """A workspace that is taken for another's gives an AttributeError in the middle of a solve, or the other method's iterates."""
+    method = wl.METHODS[name]()
+    if name == "quadratic-program":
+        pytest.importorskip("piqp")
+    for family in wl.METHODS[name].supports:
+        problem, twin = (OPERATORS[family](device) for _ in range(2))
+        assert wl.solve(problem, method, workspace=method.init(problem), stopping=wl.StoppingCriteria(rtol=0.5))
+        with pytest.raises(ValueError, match="workspace was made for another problem"):
+            wl.solve(problem, method, workspace=method.init(twin))
+        for other, cls in wl.METHODS.items():
+            shared = (name, other) == ("blocked-gauss-seidel", "staggering")  # two blocks are staggered
+            if other not in (name, "quadratic-program") and family in cls.supports and not shared:
+                with pytest.raises(ValueError, match=f"workspace is a .*: expected what {type(method).__name__}"):
+                    wl.solve(problem, method, workspace=cls().init(problem))
+    for wrong in ({}, 3, "work", type(method.init(problem)), problem, np.zeros(2)):
+        with pytest.raises(ValueError, match="workspace is "):
+            wl.solve(problem, method, workspace=wrong)
+
+
 @pytest.mark.parametrize("setting", [{"max_iterations": 1.5}, {"max_iterations": -1}, {"patience": 0}, {"patience": float("nan")}])
 def test_limits_are_integers(setting):
     with pytest.raises(ValueError, match=f"{next(iter(setting))} = .*: must be an integer >= "):

@@ -7,7 +7,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, Protocol
+from functools import cache
+from typing import Any, Protocol, get_args, get_type_hints
 
 import numpy as np
 import warp as wp
@@ -159,7 +160,32 @@ def solve(
         raise ValueError(f"stopping is a {type(stopping).__name__}: expected StoppingCriteria(rtol=...)")
     if problem.bounds.affine is not None and not getattr(solver, "affine_bounds", False):
         raise ValueError(f"{type(solver).__name__} takes no bounds that are affine in x: take ProjectedSOR or another sweeping method")
-    return _Loop(problem, solver, stopping or StoppingCriteria(), workspace or solver.init(problem), callback).run(x0)
+    work = solver.init(problem) if workspace is None else _checked(workspace, problem, solver)
+    return _Loop(problem, solver, stopping or StoppingCriteria(), work, callback).run(x0)
+
+
+def _checked(work: Any, problem: LCP, solver: Solver) -> Workspace:
+    """Return a workspace that a caller brought, if it is one, and that of this problem and method."""
+    name = type(solver).__name__
+    if isinstance(work, type) or not all(hasattr(work, part) for part in ("problem", "x", "residual", "start")):
+        kind = f"the class {work.__name__}" if isinstance(work, type) else f"a {type(work).__name__}"
+        raise ValueError(f"workspace is {kind}: expected what {name}.init(problem) returned")
+    made = _workspaces_of(type(solver))
+    if made and type(work) not in made:
+        raise ValueError(f"workspace is a {type(work).__name__}, made by another method: expected what {name}.init(problem) returned")
+    if work.problem is not problem:
+        raise ValueError("workspace was made for another problem: problems that change in place keep theirs")
+    return work
+
+
+@cache
+def _workspaces_of(method: type) -> tuple[type, ...]:
+    """Return the kinds of workspace that a method's `init` says it returns, none where it does not say."""
+    try:
+        hint = get_type_hints(method.init).get("return")  # type: ignore[attr-defined]
+    except NameError:  # a user's method, with names that are there for type checkers only
+        return ()
+    return tuple(kind for kind in get_args(hint) or (hint,) if isinstance(kind, type) and kind is not type(None))
 
 
 class _Loop:
@@ -168,8 +194,6 @@ class _Loop:
     def __init__(
         self, problem: LCP, solver: Solver, stopping: StoppingCriteria, work: Workspace, callback: Callable[[Record], None] | None
     ) -> None:
-        if work.problem is not problem:
-            raise ValueError("workspace was made for another problem: problems that change in place keep theirs")
         self.problem, self.solver, self.stopping, self.work, self.callback = problem, solver, stopping, work, callback
         self.residual, self.history = work.residual, list[Record]()
         self.begun = time.perf_counter()

@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 import warp as wp
-from small_liquids import GRAVITY, STEPS, box, create, scene
 
-import fluids.boundary
 from fluids import LiquidSimulation
+from small_liquids import GRAVITY, STEPS, box, create, scene
+from warp_lcp.material import boundary
 
 
 def block(dimension: int, **tables: Any) -> LiquidSimulation:
@@ -63,12 +63,12 @@ def test_free_slip_walls_hold_it_by_suction(dimension: int) -> None:
 
 def test_a_wall_that_keeps_its_velocity_fails_the_last_particle_only(monkeypatch: pytest.MonkeyPatch) -> None:
     """The negative control of the release: the mean looks right, the last particle lags."""
-    extend = fluids.boundary.extend_velocity
+    extend = boundary.extend_velocity
 
     def hold(window: Any, velocity: Any, weights: Any, known: Any, kind: wp.array, contact: wp.array, *rest: Any) -> None:
         extend(window, velocity, weights, known, kind, wp.zeros_like(contact), *rest)
 
-    monkeypatch.setattr(fluids.boundary, "extend_velocity", hold)
+    monkeypatch.setattr(boundary, "extend_velocity", hold)
     fallen, expected, _ = drop(block(2), 0.25)
     assert abs(fallen.mean() - expected) < 0.7
     assert expected - fallen.min() > 1.0

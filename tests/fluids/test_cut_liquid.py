@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small_liquids import GRAVITY, advance, box, create, scene
 
 import warp_lcp as wl
-from fluids.boundary import WholeCells
-from fluids.cut_boundary import CutBoundary
+from small_liquids import GRAVITY, advance, box, create, scene
+from warp_lcp.material.boundary import WholeCells
+from warp_lcp.material.cut_boundary import CutBoundary
 
 SLOPE = math.radians(30)
 V = [{"shape": "plane", "point": [0.5, 0.1], "normal": [side * math.sin(SLOPE), math.cos(SLOPE)]} for side in (-1, 1)]

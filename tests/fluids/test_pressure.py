@@ -5,11 +5,11 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
-from fluids.boundary import WholeCells
 from fluids.pressure import PressureProjection
-from fluids.pressure_kernels import HELD, RELEASED, TOUCHES_NOTHING
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import OPEN, VoxelSolids
+from warp_lcp.material.boundary import WholeCells
+from warp_lcp.material.contact import HELD, RELEASED, TOUCHES_NOTHING
 
 NX, NY = 6, 7
 

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_liquids import advance, box, create, scene
 
 import warp_lcp as wl
+from small_liquids import advance, box, create, scene
 
 SPOT = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "spot.obj"
 pytestmark = pytest.mark.skipif(not SPOT.is_file(), reason="shared/data/spot.obj is not here")

@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small_liquids import GRAVITY, advance, box, create, scene
 
 from fluids import LiquidSimulation
+from small_liquids import GRAVITY, advance, box, create, scene
 
 UNILATERAL = {"pressure": {"model": "unilateral"}}
 
@@ -32,7 +32,7 @@ def test_the_solution_satisfies_the_law_written_face_by_face() -> None:
     dt, dx = 0.01, 1 / 16
     simulation.particles.sort()
     window = simulation.grid.everywhere
-    simulation._transfer(window, dt)
+    simulation.bring_to_faces(window, dt)
     projection = simulation.projection
     simulation.surface.mark(simulation.particles, window, projection.kind)
     u, v = (field.numpy()[1].astype(np.float64) for field in simulation.velocity)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import scipy.sparse
+import warp as wp
 
 import warp_lcp as wl
 
@@ -13,7 +14,7 @@ CASES = [
     pytest.param(name, family, id=f"{name}-{family}")
     for name, cls in wl.METHODS.items()
     for family in ("dense", "sparse", "grid")
-    if family in cls.supports and name != "direct-enumeration" and (name, family) != ("fischer-newton", "dense")
+    if family in cls.supports and name != "direct-enumeration"
 ]
 
 
@@ -51,3 +52,36 @@ def test_enumeration_of_rows_in_different_units(device):
     assert np.count_nonzero(plain.x.numpy()) >= 2
     np.testing.assert_allclose(wl.solve(scaled, wl.DirectEnumeration()).x.numpy() * S, plain.x.numpy(), atol=1e-12)
     np.testing.assert_allclose(wl.DirectEnumeration().solutions(scaled) * S, [plain.x.numpy()], atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [wp.float64, wp.float32])
+@pytest.mark.parametrize("n", [2, 3, 4])
+def test_batches_of_rows_in_different_units(n, dtype, device):
+    """D A D with D powers of 2 from 2^-13 to 2^13 is the same problem bit for bit: each row's and column's unit is taken out again."""
+    rng = np.random.default_rng(79)
+    m = 200
+    B = rng.standard_normal((m, n, n))
+    A, b = B @ B.transpose(0, 2, 1) / n + np.eye(n), rng.standard_normal((m, n))
+    low, high = -rng.random((m, n)), rng.random((m, n))
+    D = 2.0 ** rng.integers(-13, 14, (m, n))
+
+    def solved(*fields):
+        return wl.enumerate_batch(*(wp.array(f, dtype=dtype, device=device) for f in fields))
+
+    plain, scaled = solved(A, b, low, high), solved(D[:, :, None] * A * D[:, None, :], D * b, low / D, high / D)
+    assert (plain.sets.numpy() >= 0).all()
+    assert len(np.unique(plain.sets.numpy())) > n
+    np.testing.assert_allclose(scaled.x.numpy() * D, plain.x.numpy(), atol=1e-12 if dtype is wp.float64 else 1e-5)
+    np.testing.assert_array_equal(scaled.sets.numpy(), plain.sets.numpy())
+
+
+def test_fischer_newton_of_rows_in_different_units(device):
+    """S A S and S b: plain entries of J'J would differ by 1e24, and nu would drown the small ones."""
+    rng = np.random.default_rng(83)
+    B, S = rng.standard_normal((N, N)), 2.0 ** rng.integers(-20, 21, N)
+    A, b = B @ B.T / N + np.eye(N), rng.standard_normal(N)
+    plain = wl.solve(wl.LCP(wl.DenseOperator(A, device=device), b, 0.0, 2.0), wl.FischerNewton())
+    rows = wl.LCP(wl.DenseOperator(S[:, None] * A * S, device=device), S * b, 0.0, 2.0 / S)
+    scaled = wl.solve(rows, wl.FischerNewton(), stopping=wl.StoppingCriteria(rtol=1e-13))
+    assert plain, plain.status
+    np.testing.assert_allclose(scaled.x.numpy() * S, plain.x.numpy(), atol=1e-4)

@@ -30,7 +30,7 @@ def check_memory(scene: Scene, device: str) -> None:
 
     Args:
         scene: what would run.
-        device: a Warp device's name; on a GPU, the making of the liquid, on the host, does not count.
+        device: a Warp device's name; on a GPU, the making of the particles, on the host, does not count.
 
     Raises:
         SceneError: naming both amounts.

@@ -56,12 +56,12 @@ class Domain(Table):
     later: ClassVar = {"friction": ANY_VALUE, "periodic": frozenset({True})}
     size: list[Length] = Field(min_length=2, max_length=3, description="the sides of the domain [m], [x, y] or [x, y, z]")
     resolution: int = Field(ge=2, le=4096, description="cells along the longest side")
-    wall: Wall = Field(default="separating", description="whether liquid may let go of the domain's walls")
+    wall: Wall = Field(default="separating", description="whether material may let go of the domain's walls")
     solids: Literal["cut-cell", "voxel"] = Field(
         default="cut-cell", description="cut-cell: solids cut through cells as their surfaces do; voxel: they fill whole cells"
     )
     open: list[Literal[SIDES]] = Field(
-        default_factory=list, description="sides without a wall, where liquid leaves; y is up, x to the right, z to the front"
+        default_factory=list, description="sides without a wall, where material leaves; y is up, x to the right, z to the front"
     )
     periodic: list[Literal[False]] | None = Field(default=None, description="false along every axis")
 

@@ -26,6 +26,8 @@ class Shape(Table):
     `rotate` is in degrees: one angle in 2-D, angles about the fixed axes x, y, z (in that order) in 3-D. `invert` swaps inside and outside.
     """
 
+    if TYPE_CHECKING:
+        shape: str  # of the file's key; each kind of shape has a value of its own
     translate: Vector | None = Field(default=None, description="a shift [m]")
     rotate: Angles | None = Field(default=None, description="degrees: one angle in 2-D, [x, y, z] in 3-D")
     scale: float = Field(default=1.0, gt=0, description="a factor, the same along every axis")
@@ -165,10 +167,10 @@ class Mesh(Shape):
 
 
 class SolidProperties(Shape):
-    """What a solid has besides its shape."""
+    """What a solid has besides its shape; where solids have more, classes of their own derive from SolidBox, SolidSphere and so on."""
 
     later: ClassVar = {"friction": ANY_VALUE, "mass": ANY_VALUE}
-    wall: Wall | None = Field(default=None, description="whether liquid may let go of it; domain.wall unless given")
+    wall: Wall | None = Field(default=None, description="whether material may let go of it; domain.wall unless given")
     motion: Motion | None = Field(default=None, description="how it moves, from where it is placed; it stands still unless given")
 
     def complaints(self, dimension: int) -> list[Complaint]:
@@ -177,8 +179,8 @@ class SolidProperties(Shape):
         return super().complaints(dimension) + [Complaint(("motion", *c.place), c.value, c.message) for c in moves]
 
 
-class LiquidProperties(Table):
-    """What a liquid has besides its shape."""
+class MaterialProperties(Shape):
+    """What a material has besides its shape, whatever it is."""
 
     velocity: Vector | None = Field(default=None, description="at the start [m/s]; at rest unless given")
 
@@ -203,23 +205,23 @@ class SolidMesh(SolidProperties, Mesh):
     """A solid inside a surface of triangles."""
 
 
-class LiquidBox(LiquidProperties, Box):
+class LiquidBox(MaterialProperties, Box):
     """A box of liquid."""
 
 
-class LiquidSphere(LiquidProperties, Sphere):
+class LiquidSphere(MaterialProperties, Sphere):
     """A ball of liquid."""
 
 
-class LiquidCapsule(LiquidProperties, Capsule):
+class LiquidCapsule(MaterialProperties, Capsule):
     """A capsule of liquid."""
 
 
-class LiquidPlane(LiquidProperties, Plane):
+class LiquidPlane(MaterialProperties, Plane):
     """A half space of liquid."""
 
 
-class LiquidMesh(LiquidProperties, Mesh):
+class LiquidMesh(MaterialProperties, Mesh):
     """Liquid inside a surface of triangles."""
 
 
@@ -239,7 +241,7 @@ class Schedule(Table):
 class SourceProperties(Schedule, Shape):
     """What a source has besides its shape."""
 
-    velocity: Vector = Field(description="of the liquid that comes out [m/s]")
+    velocity: Vector = Field(description="of what comes out [m/s]")
 
     def complaints(self, dimension: int) -> list[Complaint]:
         """Return what is wrong with the source in a scene of 2 or 3 dimensions."""
@@ -258,43 +260,43 @@ class DrainProperties(Schedule, Shape):
 
 
 class SourceBox(SourceProperties, Box):
-    """A box that liquid comes out of."""
+    """A box that material comes out of."""
 
 
 class SourceSphere(SourceProperties, Sphere):
-    """A ball that liquid comes out of."""
+    """A ball that material comes out of."""
 
 
 class SourceCapsule(SourceProperties, Capsule):
-    """A capsule that liquid comes out of."""
+    """A capsule that material comes out of."""
 
 
 class SourcePlane(SourceProperties, Plane):
-    """A half space that liquid comes out of."""
+    """A half space that material comes out of."""
 
 
 class SourceMesh(SourceProperties, Mesh):
-    """A surface of triangles that liquid comes out of."""
+    """A surface of triangles that material comes out of."""
 
 
 class DrainBox(DrainProperties, Box):
-    """A box that swallows liquid."""
+    """A box that swallows material."""
 
 
 class DrainSphere(DrainProperties, Sphere):
-    """A ball that swallows liquid."""
+    """A ball that swallows material."""
 
 
 class DrainCapsule(DrainProperties, Capsule):
-    """A capsule that swallows liquid."""
+    """A capsule that swallows material."""
 
 
 class DrainPlane(DrainProperties, Plane):
-    """A half space that swallows liquid."""
+    """A half space that swallows material."""
 
 
 class DrainMesh(DrainProperties, Mesh):
-    """A surface of triangles that swallows liquid."""
+    """A surface of triangles that swallows material."""
 
 
 Solid = Annotated[SolidBox | SolidSphere | SolidCapsule | SolidPlane | SolidMesh, Field(discriminator="shape")]

@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.native import grain
+from warp_lcp.program import Launch
 
 
 @wp.struct
@@ -74,10 +75,14 @@ class Window:
         """Planes and rows of the box."""
         return self.high[0] - self.low[0], self.high[1] - self.low[1]
 
-    def launch(self, kernel: wp.Kernel, inputs: list[typing.Any]) -> None:
-        """Launch kernel(cells, *inputs) with threads (plane, row, chunk of a row)."""
-        chunks = -(-(self.high[2] - self.low[2]) // self.cells.grain)
-        wp.launch(kernel, (*self.rows, chunks), [self.cells, *inputs], device=self.device)
+    @property
+    def chunks(self) -> int:
+        """Threads that share a row."""
+        return -(-(self.high[2] - self.low[2]) // self.cells.grain)
+
+    def launch(self, kernel: wp.Kernel, inputs: list[typing.Any], *, launch: Launch | None = None) -> None:
+        """Launch kernel(cells, *inputs) with threads (plane, row, chunk of a row), or record it with `Program.launch`."""
+        (launch or wp.launch)(kernel, (*self.rows, self.chunks), [self.cells, *inputs], device=self.device)
 
     def launch_rows(self, kernel: wp.Kernel, inputs: list[typing.Any]) -> None:
         """Launch kernel(cells, *inputs) with one thread a row (plane, row), for sums that are the same on every run."""

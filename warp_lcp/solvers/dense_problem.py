@@ -60,8 +60,8 @@ class DenseProblem:
         units are powers of 2, so that nothing is rounded.
         """
         S = equilibration(self.A)
-        b = S * self.b
-        beta = _power_of_two(np.abs(b).max() or 1.0)
+        b, start = S * self.b, S * (self.A @ np.clip(0.0, self.lower, self.upper))
+        beta = _power_of_two(max(np.abs(b).max(), np.abs(start).max()) or 1.0)
         units = beta * S
         A = scipy.sparse.csr_array(self.A.multiply(S[:, None]).multiply(S)) if scipy.sparse.issparse(self.A) else S[:, None] * self.A * S
         return DenseProblem(self.rows, A, b / beta, self.lower / units, self.upper / units), units

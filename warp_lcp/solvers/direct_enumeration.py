@@ -101,7 +101,8 @@ def enumerate_batch(
 ) -> BatchResult:
     """Solve many LCPs of at most 4 unknowns in one launch, a problem a thread ([Book] 2.1.1).
 
-    Device arrays of one type are used without a copy, and nothing is allocated if `out` is given besides.
+    Rows may be in units of their own: each problem is equilibrated symmetrically first, exactly, by powers of 2. Device arrays of one type
+    are used without a copy, and nothing is allocated if `out` is given besides.
 
     Args:
         A: matrices, shape (m, n, n), n <= 4; numpy or wp.array, float64 unless a wp.array of wp.float32.

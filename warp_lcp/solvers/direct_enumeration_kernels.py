@@ -9,6 +9,7 @@ import warp as wp
 
 EXACT = 64.0  # units of rounding: a candidate whose measure is below needs no better one
 RANK = 1e3  # units of rounding: pivots below, relative to A's largest entry, are zero
+EQUILIBRATIONS = 8  # sweeps of Ruiz's iteration at most; the first changes nothing where rows are alike
 
 
 @functools.cache
@@ -16,13 +17,15 @@ def kernels(n: int, dtype: type) -> SimpleNamespace:
     """Return the kernels `batch` (a problem a thread) and `each` (a set a thread of one problem) for n unknowns.
 
     `enumerate_sets(A, b, low, high)` is the function behind `batch`, for kernels that have a small problem at hand: it returns x, its
-    measure and its set.
+    measure and its set. It works in units in which A is equilibrated, S A S with S powers of 2: what counts as a zero pivot does not
+    depend on the units of the rows. `each` takes a problem that is so.
     """
     module = wp.get_module(f"warp_lcp.direct_enumeration_{n}_{dtype.__name__}")
     real, count, sets = dtype, n, 3**n
     mat, vec, flags = wp.types.matrix((n, n), dtype), wp.types.vector(n, dtype), wp.types.vector(n, wp.int32)
     eps = float(np.finfo(wp.dtype_to_numpy(dtype)).eps)
     exact, rank, zero, one = dtype(EXACT * eps), dtype(RANK * eps), dtype(0.0), dtype(1.0)
+    half, two = dtype(0.5), dtype(2.0)
 
     @wp.func(module=module)
     def measure(A: mat, b: vec, low: vec, high: vec, x: vec):
@@ -102,17 +105,48 @@ def kernels(n: int, dtype: type) -> SimpleNamespace:
         return y, True
 
     @wp.func(module=module)
+    def equilibration(A: mat):
+        """Return S, powers of 2 with which S A S has a largest entry near 1 in each row and column together."""
+        S = vec()
+        for i in range(count):
+            S[i] = one
+        moved = bool(True)
+        for _sweep in range(EQUILIBRATIONS):
+            if moved:
+                moved = False
+                T = vec()
+                for i in range(count):
+                    largest = real(zero)
+                    for j in range(count):
+                        largest = wp.max(largest, wp.max(S[i] * wp.abs(A[i, j]) * S[j], S[j] * wp.abs(A[j, i]) * S[i]))
+                    T[i] = S[i]
+                    if largest > zero:
+                        power = wp.round(-half * wp.log2(largest))
+                        if power != zero:
+                            T[i] = S[i] * wp.pow(two, power)
+                            moved = True
+                S = T
+        return S
+
+    @wp.func(module=module)
     def enumerate_sets(A: mat, b: vec, low: vec, high: vec):
         """Return the first x that solves to rounding, or the best one; its measure (1 at most); its set, -1 if there is none."""
+        S, M, q, l, u = equilibration(A), mat(), vec(), vec(), vec()
+        for i in range(count):
+            q[i] = S[i] * b[i]
+            l[i] = low[i] / S[i]
+            u[i] = high[i] / S[i]
+            for j in range(count):
+                M[i, j] = S[i] * A[i, j] * S[j]
         best, least, found = vec(), real(one), int(-1)
         for code in range(sets):
             if least > exact:
-                x, possible = assign(A, b, low, high, code)
+                x, possible = assign(M, q, l, u, code)
                 if possible:
-                    m = measure(A, b, low, high, x)
+                    m = measure(M, q, l, u, x)
                     if m < least or found < 0:
                         best, least, found = x, m, code
-        return best, least, found
+        return wp.cw_mul(S, best), least, found
 
     @wp.kernel(enable_backward=False, module=module)
     def batch(

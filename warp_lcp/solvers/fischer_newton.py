@@ -20,9 +20,11 @@ from warp_lcp.solvers.finite_difference import FiniteDifferenceSystem
 from warp_lcp.solvers.fischer_newton_dense import FischerDenseWorkspace
 from warp_lcp.solvers.globalization import NonmonotoneSearch
 from warp_lcp.solvers.gradient_descent import GradientDescent, GradientWorkspace
-from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
+from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
+from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
 from warp_lcp.solvers.nonsmooth_map import Kink, NonsmoothMap, Reformulation
-from warp_lcp.solvers.principal_system import principal_system
+from warp_lcp.solvers.nonsmooth_map_grid import GridMap
+from warp_lcp.solvers.principal_system import GridSystem, principal_system
 
 SHARE = 0.95  # lambda of the penalized map for dense problems: measured on frictional contacts
 
@@ -36,8 +38,9 @@ class FischerNewton:
     diag(q) A: divided by q it is the shifted system (A + D) dx = -f / q, D = d p / q, which multigrid preconditions on grids. The merit
     f.f / 2 may not exceed the largest of the last ones. Iterates need not obey the bounds before the end.
 
-    Dense problems (frictional contact, semi-definite A) are solved with factors of J on the host. `safeguard` makes them a chain: at most
-    30 steps (J'J + nu I)^-1 J'f with nu = 1e-6 min(1, ||f||) on the penalized map, searched nonmonotonically, the gradient where that is no
+    Dense problems (frictional contact, semi-definite A) are solved with factors of J on the host, in units in which A is equilibrated
+    symmetrically and b is near 1, and what is returned is within the bounds. `safeguard` makes them a chain: at most 30 steps
+    (J'J + nu I)^-1 J'f with nu = 1e-6 min(1, ||f||) on the penalized map, searched nonmonotonically, the gradient where that is no
     descent; then two homotopies on the smoothed map x + y - sqrt(x^2 + y^2 + 2 mu), mu -> 0. There is no pivoting method inside.
 
     `linear_iterations` counts preconditioned iterations on the finest grid, factorizations where A is dense.
@@ -108,7 +111,7 @@ class FischerNewton:
         """Take a monotone cycle or a gradient step while the start is cold, else a Newton step."""
         if work.cycles_left > 0:
             work.cycles_left -= 1
-            return work.active_set.monotone_cycle(x)
+            return work.monotone_step()
         if work.descents_left > 0:
             work.descents_left -= 1
             return work.descend(x)
@@ -120,10 +123,15 @@ class FischerWorkspace(IterateInPlace, RoundedIterate):
 
     def __init__(self, problem: LCP, settings: FischerNewton) -> None:
         self.problem, self.settings, self.precision = problem, settings, Precision(settings.precision)
-        layout = problem.layout
-        self.x, self._from, self._shift = (layout.zeros(wp.float64) for _ in range(3))
-        self.free, self.residual = layout.zeros(wp.uint8), NaturalResidual(problem)
-        self.kink = Kink(settings.kink)
+        layout, self.kink = problem.layout, Kink(settings.kink)
+        self.active_set: GridNewtonWorkspace | None = None
+        self.x, self.residual = layout.zeros(wp.float64), NaturalResidual(problem)
+        if isinstance(problem.A, GridPoisson) and self.kink is not Kink.APPROXIMATION:
+            newton = MinimumMapNewton(precision=settings.precision, monotone_cycles=settings.monotone_cycles, cycle=settings.cycle)
+            self.active_set = GridNewtonWorkspace(problem, problem.A, newton)
+            self.x, self.residual, self.scratch = self.active_set.x, self.active_set.residual, self.active_set.scratch
+        self._from, self._shift = layout.zeros(wp.float64), layout.zeros(wp.float64)
+        self.free = layout.zeros(wp.uint8)
         self._descent = settings.descent(problem)
         map_, share = Reformulation(self._descent.map), self._descent.share
         self.system: Any = (
@@ -132,20 +140,20 @@ class FischerWorkspace(IterateInPlace, RoundedIterate):
             else principal_system(problem, self.precision.correction, bounded=False, settings=settings.cycle, shifted=True)
         )
         self.map = NonsmoothMap(problem, self.residual, map_, share, self.system.r.dtype, self.kink)
+        self._passes: GridMap | None = None
+        if isinstance(self.system, GridSystem) and self.system.fused and settings.safeguard and self.precision is not Precision.SINGLE:
+            self._passes = GridMap(self.map, self.system.hierarchy, self.system.e)
         self._search = NonmonotoneSearch(memory=settings.memory if settings.safeguard else 1)
         self._gradient: GradientWorkspace | None = None
-        self.active_set: NewtonWorkspace = None  # type: ignore[assignment]
-        if isinstance(problem.A, GridPoisson) and problem.bounded and settings.monotone_cycles > 0:
-            self.active_set = MinimumMapNewton(precision=settings.precision, cycle=settings.cycle).init(problem)
-            self.active_set.residual = self.residual
         self._rounded = layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
         self.floating: Any = None
-        self.start(warm=False, tolerance=0.0)
+        self.cycles_left = self.descents_left = self.steps = 0
+        self.target = self._scale = self._merit = self._gone = 0.0
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the last solve; the operator may have changed."""
         s = self.settings
-        self.cycles_left = s.monotone_cycles if self.active_set is not None and not warm else 0
+        self.cycles_left = s.monotone_cycles if self.active_set is not None and self.problem.bounded and not warm else 0
         self.descents_left, self.steps, self.target = s.warm_start, 0, tolerance
         self._scale = self._merit = self._gone = 0.0
         self._search.forget()
@@ -153,26 +161,42 @@ class FischerWorkspace(IterateInPlace, RoundedIterate):
         self.system.refresh()
         if self.active_set is not None:
             self.active_set.floating = self.floating
-            self.active_set.start(warm=False, tolerance=tolerance)
+            self.active_set.keep()
+            self.active_set.start(warm=warm, tolerance=tolerance)
         if self.floating is not None:  # what is singular: components none of whose unknowns is bounded
             p = self.problem
             free = (p.unknown.numpy() == 1) & np.isinf(p.lower.numpy()) & np.isinf(p.upper.numpy())
             self._without_bounds = wp.array(free.astype(np.uint8), device=p.device)
 
+    def monotone_step(self) -> Step:
+        """Projected multigrid cycle on all unknowns."""
+        assert self.active_set is not None
+        self.active_set.keep()
+        return self.active_set.monotone_step()
+
+    @property
+    def _fused(self) -> GridMap | None:
+        """What steps in one pass, where the problem allows that."""
+        return self._passes if self.floating is None else None
+
     def newton_step(self, x: wp.array[Any]) -> Step:
         """Solve for the direction, and search along it."""
-        s = self.settings
+        s, fused = self.settings, self._fused
         if self._scale == 0:
+            if fused is None and self.active_set is not None:
+                self.residual.affine(x)
             self._condense(x)
         size, merit = 1 / self._scale, self._merit
         self._scale = 0.0
         if isinstance(self.system, FiniteDifferenceSystem):
             self.system.linearize(x, self.free, size)
+        elif fused is not None:
+            self.system.hierarchy.rebuild()
         else:
             self.system.restrict(self.free, self._shift)
         if self.floating is not None:
             self.floating.project(self.system.r, self._without_bounds)
-        norm = self.system.norm()
+        norm = self.system.norm() if fused is None else fused.norm
         iterations = self.system.solve(s.eta * norm, s.max_linear_iterations)[0] if norm > 0 else 0
         self._search.remember(merit)
         self._gone = 0.0
@@ -183,13 +207,20 @@ class FischerWorkspace(IterateInPlace, RoundedIterate):
             return Step("fischer", iterations)
         self._scale = 0.0
         self._go(x, 0.0)
-        self.residual.evaluate(x)
+        self._evaluate(x)
         return self._fall_back(x, iterations)
 
-    def _condense(self, x: wp.array[Any]) -> float:
-        """Write the system of the next step, and return the merit."""
+    def _evaluate(self, x: wp.array[Any]) -> float:
+        """Return the norm of the natural residual, and write y, which the grid's own evaluation leaves out."""
+        return NaturalResidual.evaluate(self.residual, x)
+
+    def _condense(self, x: wp.array[Any], move: float = 0.0) -> float:
+        """Write the system of the next step, and return the merit; move x first, where that is one pass."""
         self.steps += 1
         self._scale = 1 / max(self.residual.norm, 1e-300)
+        if self._fused is not None:
+            self._merit = self._fused.advance(x, move, self._scale, self.steps)
+            return self._merit
         self._merit = self.map.condense(x, self._shift, self.system.r, self.free, self._scale, self.steps)
         return self._merit
 
@@ -202,18 +233,27 @@ class FischerWorkspace(IterateInPlace, RoundedIterate):
 
     def descend(self, x: wp.array[Any]) -> Step:
         """Go down the gradient of the same map once."""
+        shared = self.active_set is None  # a grid's own residual does not keep y
         if self._gradient is None:
-            self._gradient = GradientWorkspace(self.problem, self._descent, self.residual)
+            self._gradient = GradientWorkspace(self.problem, self._descent, self.residual if shared else NaturalResidual(self.problem))
             self._gradient.start(warm=True, tolerance=self.target)
-        return self._gradient.descend(x)
+        if shared:
+            return self._gradient.descend(x)
+        self._gradient.residual.evaluate(x)
+        step = self._gradient.descend(x)
+        self.residual.norm, self.residual.current = self._gradient.residual.norm, True
+        return step
 
     def _trial(self, x: wp.array[Any], scale: float) -> float:
         """Move, and return the merit; the system is that of the next step then, for a full step is nearly always taken."""
+        if self._fused is not None:
+            move, self._gone = scale - self._gone, scale
+            return self._condense(x, move) if math.isfinite(move) else math.inf
         self._go(x, scale)
         if self.floating is not None:
             self.floating.settle(x, self.problem.lower, self.problem.upper)
         self._round(x)
-        return self._condense(x) if math.isfinite(self.residual.evaluate(x)) else math.inf
+        return self._condense(x) if math.isfinite(self._evaluate(x)) else math.inf
 
     def _go(self, x: wp.array[Any], scale: float) -> None:
         """Move to x + scale e from where the step began; without bounds in the way the last move is taken back, which saves a copy."""

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from warp_lcp.solvers.fischer_newton import FischerNewton
 
 FIRST_STEPS = 30  # of the regularized stage: those that succeed need 5 to 27
-REGULARIZATION = 1e-6  # nu is this times min(1, ||f||): J'J + nu I has a factorization whatever J is
+REGULARIZATION = 1e-6  # nu is this times min(1, ||f||), A's entries being near 1: J'J + nu I has a factorization whatever J is
 HOMOTOPIES = ((None, 1.0, 0.3, 40), (10.0, 1.0, 0.5, 60))  # start of x (None: as the solve began), first mu, its factor, steps
 DESCENT = 1e-10  # a direction whose slope is less than this times ||dx||^2.1 is no descent
 
@@ -102,8 +102,11 @@ def _partial(a: np.ndarray, b: np.ndarray, smoothing: float, kp: Any, kq: Any, k
 class FischerDenseWorkspace(DenseWorkspace):
     """Memory of the method for one dense problem.
 
+    Steps are taken in units in which A is equilibrated, and may leave the bounds; x is the projection of where they are.
+
     Attributes:
         stage: 0 while steps are Newton's on the map itself, k in the k-th homotopy.
+        units: of x, one for each unknown.
     """
 
     def __init__(self, problem: LCP, settings: FischerNewton) -> None:
@@ -118,12 +121,13 @@ class FischerDenseWorkspace(DenseWorkspace):
         """Read the problem, and begin the first stage."""
         super().start(warm=warm, tolerance=tolerance)
         s = self.settings
-        self.map = FischerMap(self.data, self._descent.share, Kink(s.kink), np.random.default_rng(2015))
-        self._identity = np.eye(len(self.data.b))
+        data, self.units = self.data.scaled()
+        self.map = FischerMap(data, self._descent.share, Kink(s.kink), np.random.default_rng(2015))
+        self._identity = np.eye(len(data.b))
         self._search.forget()
         self.descents_left, self.stage, self.steps, self.target = s.warm_start, 0, 0, tolerance
         self._gradient = None
-        self._iterate = self._begun = self.x.numpy()[self.data.rows].copy()
+        self._iterate = self._begun = self.read_iterate() / self.units
 
     def descend(self, x: Any) -> Step:
         """Go down the gradient of the same map once."""
@@ -131,7 +135,7 @@ class FischerDenseWorkspace(DenseWorkspace):
             self._gradient = GradientWorkspace(self.problem, self._descent, self.residual)
             self._gradient.start(warm=True, tolerance=self.target)
         step = self._gradient.descend(x)
-        self._iterate = self._begun = self.read_iterate()
+        self._iterate = self._begun = self.read_iterate() / self.units
         return Step("gradient", step.linear_iterations)
 
     def newton_step(self, x: Any) -> Step:
@@ -144,9 +148,8 @@ class FischerDenseWorkspace(DenseWorkspace):
                 self._next_stage()
         else:
             failure = self._homotopy()
-        stored = x.numpy().copy()
-        stored[self.data.rows] = self._rounded(self._iterate)
-        x.assign(stored)
+        self.write_iterate(self.units * self._iterate)
+        self.round_iterate()
         name = "fischer" if self.stage == 0 else "homotopy"
         return Step(name, 1, None, failure, interim=self.settings.safeguard and failure is None)
 
@@ -160,7 +163,7 @@ class FischerDenseWorkspace(DenseWorkspace):
     def _plain(self) -> SolveStatus | None:
         """Take a step of the book's method: algorithm 12."""
         x, map_ = self._iterate, self.map
-        y = self.data.affine(x)
+        y = map_.data.affine(x)
         f = map_.value(x, y)
         p, q, kinks = map_.derivative(x, y)
         move = ~kinks if map_.kink is Kink.ZERO else np.ones(len(x), dtype=bool)
@@ -175,7 +178,7 @@ class FischerDenseWorkspace(DenseWorkspace):
     def _regularized(self) -> SolveStatus | None:
         """Take a step of the safeguarded method, along the gradient if that of Newton's is no descent."""
         x, map_ = self._iterate, self.map
-        y = self.data.affine(x)
+        y = map_.data.affine(x)
         f = map_.value(x, y)
         p, q, kinks = map_.derivative(x, y)
         if map_.kink is Kink.ZERO:
@@ -192,7 +195,7 @@ class FischerDenseWorkspace(DenseWorkspace):
         """Move along a direction; return how that fails."""
         if not (np.isfinite(slope) and slope < 0):
             return SolveStatus.NON_DESCENT
-        data, found = self.data, x
+        data, found = self.map.data, x
 
         def trial(length: float) -> float:
             nonlocal found
@@ -213,15 +216,16 @@ class FischerDenseWorkspace(DenseWorkspace):
         """Begin the next homotopy: y independent of x, and not below 1 at first."""
         start, self._mu, self._factor, self._steps_left = HOMOTOPIES[self.stage]
         self.stage += 1
-        x = self._begun if start is None else np.clip(np.full(len(self._begun), start), self.data.lower, self.data.upper)
-        y = self.data.affine(x)
+        data = self.map.data
+        x = self._begun if start is None else np.clip(np.full(len(self._begun), start), data.lower, data.upper)
+        y = data.affine(x)
         one_sided = self.map.low & ~self.map.high
         self._iterate, self._y = x, np.where(one_sided, np.maximum(y, 1.0), y)
 
     def _homotopy(self) -> SolveStatus | None:
         """Take a Newton step for A x + b = y and the smoothed map of (x, y), and lower mu."""
-        x, y, map_, A = self._iterate, self._y, self.map, self.data.A
-        gap, f = self.data.affine(x) - y, map_.value(x, y, self._mu)
+        x, y, map_, A = self._iterate, self._y, self.map, self.map.data.A
+        gap, f = map_.data.affine(x) - y, map_.value(x, y, self._mu)
         p, q, _ = map_.derivative(x, y, self._mu)
         dx = _solve(map_.jacobian(p, q), -f - q * gap)
         if not np.isfinite(dx).all():

@@ -137,7 +137,7 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
             newton = MinimumMapNewton(
                 precision=settings.precision, max_linear_iterations=settings.max_linear_iterations, cycle=settings.cycle
             )
-            self.active_set = newton.init(problem)
+            self.active_set = NewtonWorkspace(problem, newton)
             self.active_set.residual = self.residual
         self.floating: Any = None
         self.start(warm=False, tolerance=0.0)

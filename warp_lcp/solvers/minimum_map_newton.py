@@ -10,15 +10,19 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.multigrid.hierarchy import CycleSettings
+from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
-from warp_lcp.solve import IterateInPlace, Precision, RoundedIterate, Step
+from warp_lcp.solve import FLOOR_MARGIN, IterateInPlace, Precision, RoundedIterate, Step
+from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_kernels import all_free_kernel, kernels
 from warp_lcp.solvers.principal_system import DenseSystem, GridSystem, principal_system
+from warp_lcp.solvers.proximal_point import ProximalPoint
 from warp_lcp.vectors import Reduction, launch_spans
 
 MOVED, SQUARE = 0, 3  # slots of the device scalars: cells moved, active, shifted, and the free residual's square
+STALLED = 10  # steps without a smaller residual after which free blocks are taken for singular
 REGULARIZATIONS = (1e-8, 1e-4, 1e-2, 0.1, 1.0, 10.0, 100.0)  # of J'J, times its mean diagonal
 
 
@@ -29,7 +33,10 @@ class MinimumMapNewton:
     Unknown i is held where x_i - y_i / A_ii is outside [l_i, u_i]. Cold, the first steps on a grid are projected multigrid cycles, which
     find the active set to within a few cells; a Newton step alone moves its boundary by about a layer a step. Each Newton correction is
     solved inexactly in the corrections' precision, and the step is shortened along its projection onto the bounds if the residual would
-    exceed the largest of the last `memory` ones. Converges on a grid in a few steps; on dense matrices A should be a P-matrix.
+    exceed the largest of the last `memory` ones. Converges on a grid in a few steps; on other matrices A should be a P-matrix. Where it
+    is not, free blocks may be singular and steps lead nowhere: dense and sparse problems then go on by the proximal-point iteration, each of
+    whose problems, with A + eps D, is one of a P-matrix if A is positive semi-definite or any other P0-matrix. Where that gains nothing
+    either, the status says so: STAGNATED, or INFEASIBLE if a linear program proves it.
 
     Args:
         precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate rounded to float32 as well.
@@ -65,16 +72,18 @@ class MinimumMapNewton:
             if getattr(self, name) < least:
                 raise ValueError(f"{name} = {getattr(self, name)}: must be >= {least}")
 
-    def init(self, problem: LCP) -> NewtonWorkspace:
+    def init(self, problem: LCP) -> NewtonWorkspace | GridNewtonWorkspace:
         """Return a workspace.
 
         Raises:
             ValueError: A is neither a grid operator, dense nor symmetric.
         """
-        return NewtonWorkspace(problem, self)
+        return GridNewtonWorkspace(problem, problem.A, self) if isinstance(problem.A, GridPoisson) else NewtonWorkspace(problem, self)
 
-    def step(self, problem: LCP, work: NewtonWorkspace, x: wp.array[Any]) -> Step:
+    def step(self, problem: LCP, work: Any, x: wp.array[Any]) -> Step:
         """Take a monotone cycle while the start is cold, else a safeguarded Newton step."""
+        if isinstance(work, GridNewtonWorkspace):
+            return work.monotone_step() if work.wants_monotone_cycle() else work.newton_step()
         if work.cycles_left > 0:
             work.cycles_left -= 1
             return work.monotone_cycle(x)
@@ -82,7 +91,15 @@ class MinimumMapNewton:
 
 
 class NewtonWorkspace(IterateInPlace, RoundedIterate):
-    """Memory of the method for one problem."""
+    """Memory of the method for one problem.
+
+    Attributes:
+        last_resort: whether a proximal-point iteration takes over where steps lead nowhere, if A's entries are at hand.
+        resort: that iteration, once it has.
+    """
+
+    last_resort = True
+    resort: ProximalPoint | None = None
 
     def __init__(self, problem: LCP, settings: MinimumMapNewton) -> None:
         self.problem, self.settings, self.precision = problem, settings, Precision(settings.precision)
@@ -108,6 +125,7 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         self.stale = True
         self.norms: list[float] = []
         self.target = tolerance
+        self.resort, self._smallest, self._waited = None, math.inf, 0
         self.system.refresh()
 
     def monotone_cycle(self, x: wp.array[Any]) -> Step:
@@ -131,6 +149,8 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
     def newton_step(self, x: wp.array[Any]) -> Step:
         """Classify, solve on the free set, move along the projected step."""
         p, residual = self.problem, self.residual
+        if self.resort is not None or (self._stalls() and self._may_resort()):
+            return self._resort(x)
         self.norms = [*self.norms, residual.norm][-self.settings.memory :]
         size = residual.norm
         before = [x, residual.y, residual.diagonal, residual.unit, *p.bounds.operands, p.unknown, self.free, self.system.r]
@@ -193,7 +213,29 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         wp.copy(x, self.trial)
         descended = isinstance(self.system, DenseSystem) and self._regularized(x, limit)
         residual.evaluate(x)
+        if not descended and self._may_resort():
+            return self._resort(x)
         return Step("regularized", iterations, active, None if descended else SolveStatus.NON_DESCENT)
+
+    def _stalls(self) -> bool:
+        """Return whether no residual of the last steps is below all those before."""
+        norm = self.residual.norm
+        self._waited = 0 if norm <= 0.999 * self._smallest else self._waited + 1
+        self._smallest = min(self._smallest, norm)
+        return self._waited >= STALLED
+
+    def _may_resort(self) -> bool:
+        """Return whether the proximal-point iteration can be had, and the residual is above what rounding leaves."""
+        floor = FLOOR_MARGIN * self.residual.rounding_floor(self.x, self.precision.epsilon)
+        return self.last_resort and self.residual.norm > floor and ProximalPoint.suits(self.problem)
+
+    def _resort(self, x: wp.array[Any]) -> Step:
+        """Take a step of the proximal-point iteration."""
+        if self.resort is None:
+            self.resort = ProximalPoint(self.problem, self.residual, self.target)
+        step = self.resort.step(x)
+        self._round(x)
+        return step
 
     def _regularized(self, x: wp.array[Any], limit: float) -> bool:
         """Take the shortest of some Levenberg-Marquardt steps of the minimum map that reduces its norm; return whether one does.

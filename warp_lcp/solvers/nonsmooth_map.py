@@ -54,6 +54,11 @@ class NonsmoothMap:
         share: lambda of the penalized map.
         real: type of corrections.
         kink: what stands for the derivative at a kink.
+
+    Attributes:
+        form: what of the maps is computed.
+        data: numbers that the kernels take.
+        drops: whether unknowns at a kink do not move.
     """
 
     def __init__(
@@ -62,19 +67,19 @@ class NonsmoothMap:
         self.problem, self.residual, self.map = problem, residual, map
         layout, self._share = problem.layout, share if map is Reformulation.PENALIZED else 1.0
         natural, penalized = map is Reformulation.NATURAL, self._share < 1
-        form = Form(natural, problem.bounds.may_bind[1], penalized, kink is Kink.RANDOM and not natural)
+        form = self.form = Form(natural, problem.bounds.may_bind[1], penalized, kink is Kink.RANDOM and not natural)
         self._kernels = kernels(residual.diagonal.dtype, real, form)
         self._double = kernels(residual.diagonal.dtype, wp.float64, form)
         self._sums = wp.zeros(2, dtype=wp.float64, device=problem.device)
         self._reduction = Reduction(layout.size, problem.device, self._sums, columns=2)
-        self._data = Map()
+        self.data = Map()
         self._gradients: list[wp.array[Any]] = []  # this one and the last, the product, the weights: made when first asked for
-        self._drop = 1.0 if kink in (Kink.ZERO, Kink.APPROXIMATION) else 0.0
+        self.drops = kink in (Kink.ZERO, Kink.APPROXIMATION)
         self.begin()
 
     def begin(self) -> None:
         """Take the scale of b as it is now."""
-        p, data = self.problem, self._data
+        p, data = self.problem, self.data
         count = max(int(np.count_nonzero(p.unknown.numpy() == 1)), 1)
         scale = self.residual.norm_of_b() / np.sqrt(count) or 1.0
         data.unit, data.share, data.over, data.kinks = self.residual.unit, self._share, 1 / scale, KINK * scale
@@ -99,8 +104,12 @@ class NonsmoothMap:
             scale: of the right-hand side.
             turn: number of the step, so that random elements differ from step to step.
         """
-        self._data.seed = turn * self.problem.layout.size
-        return self._half_sum(self._kernels.condense, x, [shift, r, free, wp.float64(scale), wp.float64(self._drop)])
+        self.turn(turn)
+        return self._half_sum(self._kernels.condense, x, [shift, r, free, wp.float64(scale), wp.float64(self.drops)])
+
+    def turn(self, number: int) -> None:
+        """Draw other random elements than in the last step."""
+        self.data.seed = number * self.problem.layout.size
 
     def descend(self, x: wp.array[Any]) -> tuple[float, float]:
         """Write the gradient J'f, scaled by d^-2, to `direction`.
@@ -142,4 +151,4 @@ class NonsmoothMap:
 
     def _operands(self, x: wp.array[Any]) -> list[Any]:
         p, r = self.problem, self.residual
-        return [self._data, x, r.y, r.diagonal, p.lower, p.upper, p.unknown]
+        return [self.data, x, r.y, r.diagonal, p.lower, p.upper, p.unknown]

@@ -17,8 +17,12 @@ from warp_lcp.solve import Step
 from warp_lcp.solvers import mprgp_kernels
 from warp_lcp.solvers.dense_problem import DenseProblem, pivots_of
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
+from warp_lcp.solvers.proximal_point import ProximalPoint
 
 LOWER, FREE, UPPER = -1, 0, 1  # where least-index pivoting has an unknown
+STUCK = 2  # steps on one set that leave the residual where it is: its free block is singular
+PIVOTS = 50  # least-index pivots, in units of the unknowns, after which A is taken for no P-matrix
+BLOWN = 1e7  # growth of the residual beyond what whole steps on regular blocks cause (5e5 on a grid of 1000^2)
 SLACK = 1e-12  # of the largest magnitudes of x and y: violations below it are rounding
 
 
@@ -30,7 +34,8 @@ class PrimalDualActiveSet:
     without search or projection, and shares its implementation. Started anywhere it ends after finitely many steps if A is an M-matrix;
     on other P-matrices it may cycle. A set that comes again without a smaller residual is a cycle: then dense problems go on by
     least-index principal pivoting (Murty; with bounds Judice and Pires), which is finite for every P-matrix but may be slow; others by
-    MinimumMapNewton's safeguarded steps. Cold, the first steps on a grid are projected multigrid cycles.
+    MinimumMapNewton's safeguarded steps. Where a free block is singular, which no P-matrix has, dense and sparse problems go on by the
+    proximal-point iteration. Cold, the first steps on a grid are projected multigrid cycles.
 
     `linear_iterations` counts what MinimumMapNewton's does; a least-index pivot counts one.
 
@@ -91,6 +96,7 @@ class ActiveSetWorkspace(NewtonWorkspace):
     Attributes:
         places: where least-index pivoting has each unknown (LOWER, FREE, UPPER); None before a cycle is met.
         cycled: whether a set has come again.
+        first: the residual's norm before the first step.
     """
 
     places: np.ndarray | None = None
@@ -99,8 +105,8 @@ class ActiveSetWorkspace(NewtonWorkspace):
         """Forget the sets; the operator may have changed."""
         super().start(warm=warm, tolerance=tolerance)
         self._seen: dict[bytes, float] = {}  # residuals at the sets met
-        self._last, self._moved = b"", True
-        self.cycled, self.places = False, None
+        self._last, self._moved, self._stuck, self._pivots = b"", True, 0, 0
+        self.cycled, self.places, self.first = False, None, 0.0
         nothing, none = wp.empty(0, dtype=wp.float64, device=self.problem.device), wp.empty(0, dtype=wp.uint8, device=self.problem.device)
         self._unbounded = [nothing, wp.float64(-np.inf), nothing, wp.float64(np.inf), none]
         self._plain = mprgp_kernels.kernels(self.residual.diagonal.dtype, self.system.r.dtype)
@@ -108,26 +114,42 @@ class ActiveSetWorkspace(NewtonWorkspace):
     def newton_step(self, x: wp.array[Any]) -> Step:
         """Classify, solve on the free set, take the whole step."""
         step = super().newton_step(x)
-        if step.linear_iterations == 0 and self._cycles(x) and isinstance(self.problem.A, DenseOperator):  # every unknown is held
-            return self.least_index_step(x)
+        if step.linear_iterations == 0 and self.resort is None and self._cycles(x) and isinstance(self.problem.A, DenseOperator):
+            return self.least_index_step(x)  # every unknown is held
         return step
+
+    def _stalls(self) -> bool:
+        """Return whether safeguarded steps stall; whole ones may take the residual up on the way."""
+        return self.cycled and super()._stalls()
 
     def _move(self, x: wp.array[Any], size: float, iterations: int, active: int) -> Step:
         """Take the whole step, without a search: the base class has classified, and solved on the free set."""
         p = self.problem
-        if self._cycles(x):
+        cycles = self._cycles(x)
+        if self._stuck >= STUCK and self._may_resort():
+            return self._resort(x)
+        if cycles:
             return self.least_index_step(x) if isinstance(p.A, DenseOperator) else super()._move(x, size, iterations, active)
+        watched = ProximalPoint.suits(p) and self.last_resort
+        if watched:
+            wp.copy(self.trial, x)
         bounds = self._unbounded if self._moved else p.bounds.operands  # within rounding of the bounds at the end
         self._flat(self._plain.advance, [x, self.system.e, *bounds, x, wp.float64(size)])
         if self.floating is not None:
             self.floating.settle(x, p.lower, p.upper)
         self._round(x)
+        if watched and not self.residual.evaluate(x) <= BLOWN * self.first:  # the free block is all but singular
+            wp.copy(x, self.trial)
+            self.residual.evaluate(x)
+            return self._resort(x)
         return Step("active set", iterations, active)
 
     def _cycles(self, x: wp.array[Any]) -> bool:
         """Return whether the set has come again, now or before, without a residual much smaller than then."""
         key, norm = self._fingerprint(x), self.norms[-1]
+        self.first = self.first or norm
         self._moved, self._last = key != self._last, key
+        self._stuck = self._stuck + 1 if not self._moved and norm > 0.9 * self._seen[key] else 0
         self.cycled = self.cycled or (self._moved and key in self._seen and norm > 0.5 * self._seen[key])
         self._seen[key] = norm
         return self.cycled
@@ -140,17 +162,23 @@ class ActiveSetWorkspace(NewtonWorkspace):
 
     def least_index_step(self, x: wp.array[Any]) -> Step:
         """Some pivots of the first unknown that violates its condition; interim until none does."""
+        if self.resort is not None:
+            return self._resort(x)
         data = DenseProblem.read(self.problem)
         if self.places is None:
             free, at = self.free.numpy()[data.rows] != 0, x.numpy()[data.rows]
             self.places = np.where(free, FREE, np.where(at == data.upper, UPPER, LOWER))
         pivots, most = 0, pivots_of(None, len(data.b)) * 8
-        values, violated = _basic_solution(data, self.places)
-        while violated.size and pivots < most:
+        values, violated, singular = _basic_solution(data, self.places)
+        while violated.size and pivots < most and not (singular and self.last_resort):
             self.places[violated[0]] = _other_place(data, self.places, values, int(violated[0]))
-            values, violated = _basic_solution(data, self.places)
+            values, violated, singular = _basic_solution(data, self.places)
             pivots += 1
-        if not np.isfinite(values).all():
+        self._pivots += pivots
+        lost = singular or not np.isfinite(values).all() or self._pivots > PIVOTS * len(data.b)
+        if lost and violated.size and self._may_resort():  # A is no P-matrix
+            return self._resort(x)
+        if not np.isfinite(values).all() or (lost and not self.last_resort):
             return Step("least index", pivots, None, SolveStatus.STAGNATED)
         stored = x.numpy().copy()
         stored[data.rows] = np.clip(values, data.lower, data.upper)
@@ -160,18 +188,20 @@ class ActiveSetWorkspace(NewtonWorkspace):
         return Step("least index", pivots, int(np.count_nonzero(self.places != FREE)), failure, interim=bool(violated.size))
 
 
-def _basic_solution(data: DenseProblem, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return x with y = 0 on the free unknowns and the others at their bounds, and the indices that violate their condition."""
+def _basic_solution(data: DenseProblem, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Return x with y = 0 on the free unknowns, the others at their bounds; the indices that violate their condition; if x is not unique."""
+    singular = False
     x = np.where(places == LOWER, data.lower, np.where(places == UPPER, data.upper, 0.0))
     free = np.flatnonzero(places == FREE)
     if free.size:
         y = data.affine(x)[free]
         block = data.A[np.ix_(free, free)]
-        x[free] = -np.linalg.lstsq(block, y, rcond=1e-12)[0] if np.linalg.cond(block) > 1e12 else -np.linalg.solve(block, y)
+        singular = bool(np.linalg.cond(block) > 1e12)
+        x[free] = -np.linalg.lstsq(block, y, rcond=1e-12)[0] if singular else -np.linalg.solve(block, y)
     y = data.affine(x)
     tiny_x, tiny_y = SLACK * max(1.0, np.abs(x).max(initial=0.0)), SLACK * np.abs(data.b).max(initial=0.0)
     wrong = np.where(places == FREE, (x < data.lower - tiny_x) | (x > data.upper + tiny_x), places * y > tiny_y)
-    return x, np.flatnonzero(wrong)
+    return x, np.flatnonzero(wrong), singular
 
 
 def _other_place(data: DenseProblem, places: np.ndarray, x: np.ndarray, i: int) -> int:

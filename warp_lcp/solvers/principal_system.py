@@ -22,6 +22,7 @@ from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.operators.sum import SumOperator
 from warp_lcp.problem import LCP
 from warp_lcp.program import Launch, Program
+from warp_lcp.solvers.grid_conjugate_gradient import GridConjugateGradient
 from warp_lcp.solvers.principal_system_kernels import divide_kernel, kernels, mask_kernel, shift_kernel
 from warp_lcp.solvers.principal_system_norm import WeightedNorm
 from warp_lcp.solvers.principal_system_sparse import SparseSystem
@@ -66,7 +67,12 @@ class GridSystem:
         self._weight = wp.zeros_like(self.r) if shifted else None
         self._norm = WeightedNorm(self.r, self._weight)
         self._no_shift = wp.empty(0, dtype=wp.float64, device=A.device)
-        self._krylov = ConjugateGradient(self.hierarchy.finest.stencil.product, self, weight=self._weight)
+        self._krylov: Any
+        self.fused = self.hierarchy.open_cycle is not None  # one CPU thread, no ghost cells to fill
+        if self.fused:
+            self._krylov = GridConjugateGradient(A.stencil, self.hierarchy, weighted=shifted)
+        else:
+            self._krylov = ConjugateGradient(self.hierarchy.finest.stencil.product, self, weight=self._weight)
         self.e = self._krylov.x
 
     def refresh(self) -> None:
@@ -74,6 +80,8 @@ class GridSystem:
         if self._version != self._A.version:
             self._version = self._A.version
             self.hierarchy.refresh()
+            if isinstance(self._krylov, GridConjugateGradient):
+                self._krylov.clear()
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
         """Mask and shift the finest diagonal and coarsen.

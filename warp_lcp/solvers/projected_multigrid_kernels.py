@@ -213,7 +213,7 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
                         slab * R.rows + j, R.threads, k > slab * R.planes, R.changed, k * R.rows + j, out,
                     )  # fmt: skip
 
-    return SimpleNamespace(assess=assess, measure=measure, update=update, advance=advance, measure_row=measure_row)
+    return SimpleNamespace(assess=assess, measure=measure, update=update, advance=advance, measure_row=measure_row, update_row=update_row)
 
 
 @functools.cache

@@ -1,0 +1,119 @@
+"""How densely sand lies on the grid: fractions of cells, masses of faces, and where stresses live."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from granular import packing_kernels as kernels
+from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.operators.grid_poisson import SOLID
+
+SHEARS = {2: ((0, 1),), 3: ((0, 1), (0, 2), (1, 2))}  # the axes of each shear
+
+
+class Packing:
+    """Where sand is in a step, and what of it the stresses move.
+
+    phi is the share of a cell that grains fill, in units of the densest packing. Sand may be denser than 1 by what the particles'
+    sampling makes of it: of phi - 1 > 0 the share `relax` is pushed out in a step. A face has the mean of its cells as mass; those with
+    less than 0.02 are empty, those with less than 0.1 count as 0.1. A cell with phi > 0.3 beside air counts as full in the pressure's
+    problem, so that a surface of partly filled cells carries a pressure, and thus friction; its mass is its own.
+
+    Args:
+        grid: the grid.
+        base: int8, SOLID or AIR.
+        capacity: float32, share of a cell's kernel that is open.
+        relax: of what is too dense, the share that a step pushes out.
+
+    Attributes:
+        fraction: phi, float32.
+        kind: int8 FLUID where a cell holds sand (phi > 0.02), AIR, SOLID.
+        flags: uint8 bits of a cell, see `granular.yield_set`.
+        drive: (1 - phi) dx / dt [m/s] of the pressure's problem, float32.
+        mass, inverse: of each component's faces, in units of a full face's, float32; inverse is 0 where nothing can be moved.
+        start: velocity of each component that the stresses act on [m/s], float32.
+        share: weight of a cell's copy on the edges of each shear, float32, see `granular.yield_set`.
+        stiff: bound of the friction's diagonal in a cell, float32.
+        spans: int32, first and one past the last cell of each row that stresses reach, shape (*grid.shape[:2], 2).
+        nodes: the window of lower faces and edges of all cells and the domain's upper side.
+    """
+
+    def __init__(self, grid: StaggeredGrid, base: wp.array, capacity: wp.array, *, relax: float = 0.2) -> None:
+        """Allocate the fields."""
+        self.grid, self._base, self._capacity, self.relax = grid, base, capacity, relax
+        self.fraction, self.kind, self.flags, self.drive = grid.field(), grid.field(wp.int8), grid.field(wp.uint8), grid.field()
+        wp.copy(self.kind, base)
+        self.mass, self.inverse, self.start = grid.faces(), grid.faces(), grid.faces()
+        self.share = [grid.field() for _ in SHEARS[grid.dimension]]
+        self.stiff = grid.field()
+        self._own = wp.zeros((*grid.shape[:2], 2), dtype=wp.int32, device=grid.device)
+        self.spans = wp.zeros_like(self._own)
+        low, high = grid.domain.low, grid.domain.high
+        more = 1 if grid.dimension == 3 else 0
+        self.nodes = Window(low, (high[0] + more, high[1] + 1, high[2] + 1), grid.device)
+
+    def update(self, density: wp.array, velocity: Sequence[wp.array], dt: float, solid: Sequence[wp.array] = ()) -> None:
+        """Take sand as it is now.
+
+        Args:
+            density: of the particles, in units of the densest packing, float32.
+            velocity: u* of each component [m/s], gravity included.
+            dt: time step [s].
+            solid: velocity of the solids on each component's faces [m/s]; empty: they stand still.
+        """
+        grid, dimension = self.grid, self.grid.dimension
+        domain, nodes = grid.domain, self.nodes
+        domain.launch(kernels.fraction_kernel, [self._base, self._capacity, self.relax, density, self.fraction])
+        rate = grid.spacing / dt
+        domain.launch(kernels.cell_kernel, [self._base, self.fraction, grid.planes, rate, self.kind, self.flags, self.drive])
+        for axis in range(dimension):
+            moving = solid[axis] if solid else None
+            fields = [velocity[axis], moving, self.start[axis], self.mass[axis], self.inverse[axis]]
+            nodes.launch(kernels.face_kernel, [axis, self._base, self.fraction, *fields])
+        for (alpha, beta), share in zip(SHEARS[dimension], self.share, strict=True):
+            nodes.launch(
+                kernels.edge_kernel, [alpha, beta, self._base, self.flags, self.inverse[alpha], self.inverse[beta], share]
+            )  # fmt: skip
+        domain.launch(kernels.stiffness_kernel, [dimension, self.flags, *three(self.inverse), *three(self.share), self.stiff])
+        domain.launch_rows(kernels.span_kernel, [self.flags, self._own])
+        nodes.launch_rows(kernels.widen_kernel, [self._own, self.spans])
+
+    def cells(self) -> int:
+        """Return the number of cells that hold sand."""
+        return int(np.count_nonzero(self.flags.numpy()))
+
+
+def three(fields: Sequence[wp.array]) -> list[wp.array | None]:
+    """Return three fields, None where there are fewer."""
+    return [*fields, None, None, None][:3]
+
+
+def wall_faces(index: np.ndarray, dimension: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the faces between open cells and solids, by cell.
+
+    Args:
+        index: int, -1 in open cells, the wall's number elsewhere; shape of the grid's fields.
+        dimension: 2 or 3.
+
+    Returns:
+        For each face its open cell's flat index (int32), 2 axis + side (uint8) and its wall's number (int32).
+    """
+    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    inner = np.zeros(index.shape, dtype=bool)
+    inner[1:-1, 1:-1, 1:-1] = True
+    flat, open_ = index.ravel(), np.flatnonzero((index.ravel() < 0) & inner.ravel())
+    for axis, stride in zip(range(dimension), (1, index.shape[2], index.shape[1] * index.shape[2]), strict=False):
+        for side in range(2):
+            beyond = open_ + (stride if side else -stride)
+            wall = flat[beyond]
+            at = wall >= 0
+            found.append((open_[at], np.full(int(at.sum()), 2 * axis + side), wall[at]))
+    cells, sides, walls = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    order = np.argsort(cells, kind="stable")
+    return cells[order].astype(np.int32), sides[order].astype(np.uint8), walls[order].astype(np.int32)
+
+
+__all__ = ["SHEARS", "SOLID", "Packing", "three", "wall_faces"]

@@ -1,0 +1,252 @@
+"""Kernels of the packing: masses of faces, shares of edges, what a cell may carry."""
+
+import typing
+
+import warp as wp
+
+from granular.yield_set import FIRM, HOLDS, SHEARS_HERE
+from warp_lcp.grid.staggered import CellRange
+from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
+
+_FLUID = wp.constant(wp.int8(FLUID))
+_AIR = wp.constant(wp.int8(AIR))
+_SOLID = wp.constant(wp.int8(SOLID))
+
+LEAST_FRACTION = 0.02  # of a cell or face, below which it is empty
+LEAST_MASS = 0.1  # of a face, in units of a full one: lighter ones would make the problem stiff
+DENSE = 0.5  # the fraction from which a cell carries shear
+SURFACE = 0.3  # the fraction from which a cell beside air counts as full: a partly filled one has no pressure, and so no friction
+FIRM_FRACTION = 0.9  # from which cohesion holds a cell together
+ROUNDING = 1e-6  # by which a fraction may differ from 1 and count as 1
+
+_F32 = wp.array3d(dtype=wp.float32)
+_I8 = wp.array3d(dtype=wp.int8)
+_U8 = wp.array3d(dtype=wp.uint8)
+options: dict[str, typing.Any] = {"enable_backward": False, "module": "granular.packing"}
+
+
+@wp.kernel(**options)
+@typing.no_type_check
+def fraction_kernel(cells: CellRange, base: _I8, capacity: _F32, relax: float, splatted: _F32, fraction: _F32):
+    """Fraction of a cell from the particles' density; of what exceeds 1 only the share `relax` counts."""
+    plane, row, chunk = wp.tid()
+    k = cells.k + plane
+    j = cells.j + row
+    first = cells.i + chunk * cells.grain
+    for i in range(first, wp.min(first + cells.grain, cells.end)):
+        phi = float(0.0)
+        if base[k, j, i] != _SOLID:
+            phi = splatted[k, j, i] / wp.max(capacity[k, j, i], 0.1)
+            excess = phi - 1.0
+            if wp.abs(excess) <= ROUNDING:
+                phi = 1.0
+            elif excess > 0.0:
+                phi = 1.0 + relax * excess
+        fraction[k, j, i] = phi
+
+
+@wp.kernel(**options)
+@typing.no_type_check
+def cell_kernel(
+    cells: CellRange, base: _I8, fraction: _F32, planes: int, rate: float, kind: _I8, flags: _U8, drive: _F32,
+):  # fmt: skip
+    """Which cells hold sand, and what of them is still free: drive = (1 - saturation) dx / dt [m/s]."""
+    plane, row, chunk = wp.tid()
+    k = cells.k + plane
+    j = cells.j + row
+    first = cells.i + chunk * cells.grain
+    for i in range(first, wp.min(first + cells.grain, cells.end)):
+        solid = base[k, j, i] == _SOLID
+        phi = fraction[k, j, i]
+        mark = int(0)
+        full = phi
+        if not solid and phi > LEAST_FRACTION:
+            mark = HOLDS
+            if phi > DENSE:
+                mark = mark | SHEARS_HERE
+            if phi > FIRM_FRACTION:
+                mark = mark | FIRM
+            if phi >= SURFACE:
+                air = bool(False)
+                for axis in range(planes + 1):
+                    for side in range(2):
+                        step = 2 * side - 1
+                        n = k + wp.where(axis == 2, step, 0)
+                        m = j + wp.where(axis == 1, step, 0)
+                        l = i + wp.where(axis == 0, step, 0)
+                        if base[n, m, l] != _SOLID and fraction[n, m, l] < SURFACE:
+                            air = True
+                if air:
+                    full = wp.max(phi, 1.0)
+        flags[k, j, i] = wp.uint8(mark)
+        drive[k, j, i] = (1.0 - full) * rate
+        if solid:
+            kind[k, j, i] = _SOLID
+        elif mark != 0:
+            kind[k, j, i] = _FLUID
+        else:
+            kind[k, j, i] = _AIR
+
+
+@wp.kernel(**options)
+@typing.no_type_check
+def face_kernel(
+    cells: CellRange, axis: int, base: _I8, fraction: _F32, velocity: _F32, solid: _F32, start: _F32, mass: _F32, inverse: _F32,
+):  # fmt: skip
+    """Mass of a face in units of a full one, its inverse, and the velocity that the stress acts on.
+
+    A face beside a solid cannot be moved: inverse 0. Its mass is the fraction of the open cell where the solid moves (it sweeps sand along),
+    and its velocity the solid's. A face of no mass stays out of it: 0 in all three.
+    """
+    plane, row, chunk = wp.tid()
+    k = cells.k + plane
+    j = cells.j + row
+    first = cells.i + chunk * cells.grain
+    c = wp.max(k - wp.where(axis == 2, 1, 0), 0)
+    b = wp.max(j - wp.where(axis == 1, 1, 0), 0)
+    for i in range(first, wp.min(first + cells.grain, cells.end)):
+        a = wp.max(i - wp.where(axis == 0, 1, 0), 0)
+        m = float(0.0)
+        light = float(0.0)
+        u = float(0.0)
+        if base[k, j, i] == _SOLID or base[c, b, a] == _SOLID:
+            if solid:
+                u = solid[k, j, i]
+                m = fraction[k, j, i] + fraction[c, b, a]  # one is 0, or both
+        else:
+            mean = 0.5 * (fraction[k, j, i] + fraction[c, b, a])
+            if mean > LEAST_FRACTION:
+                m = wp.max(mean, LEAST_MASS)
+                light = 1.0 / m
+                u = velocity[k, j, i]
+        mass[k, j, i] = m
+        inverse[k, j, i] = light
+        start[k, j, i] = u
+
+
+@wp.kernel(**options)
+@typing.no_type_check
+def edge_kernel(
+    cells: CellRange, alpha: int, beta: int, base: _I8, flags: _U8, inverse_alpha: _F32, inverse_beta: _F32, share: _F32,
+):  # fmt: skip
+    """The weight of a copy on an edge: 1 / dense cells around it, or -1 / cells with a wall face that ends there, or 0."""
+    plane, row, chunk = wp.tid()
+    k = cells.k + plane
+    j = cells.j + row
+    first = cells.i + chunk * cells.grain
+    ka = wp.where(alpha == 2, 1, 0)
+    ja = wp.where(alpha == 1, 1, 0)
+    ia = wp.where(alpha == 0, 1, 0)
+    kb = wp.where(beta == 2, 1, 0)
+    jb = wp.where(beta == 1, 1, 0)
+    for i in range(first, wp.min(first + cells.grain, cells.end)):
+        f0 = inverse_alpha[k, j, i]
+        f1 = inverse_alpha[k - kb, j - jb, i]
+        g0 = inverse_beta[k, j, i]
+        g1 = inverse_beta[k - ka, j - ja, i - ia]
+        s00 = base[k, j, i] == _SOLID
+        s10 = base[k - ka, j - ja, i - ia] == _SOLID
+        s01 = base[k - kb, j - jb, i] == _SOLID
+        s11 = base[k - ka - kb, j - ja - jb, i - ia] == _SOLID
+        p00 = int(flags[k, j, i])
+        p10 = int(flags[k - ka, j - ja, i - ia])
+        p01 = int(flags[k - kb, j - jb, i])
+        p11 = int(flags[k - ka - kb, j - ja - jb, i - ia])
+        weight = float(0.0)
+        if not (s00 or s10 or s01 or s11):
+            dense = (p00 & SHEARS_HERE) + (p10 & SHEARS_HERE) + (p01 & SHEARS_HERE) + (p11 & SHEARS_HERE)
+            if dense > 0 and f0 > 0.0 and f1 > 0.0 and g0 > 0.0 and g1 > 0.0:
+                weight = float(SHEARS_HERE) / float(dense)
+        elif f0 + f1 + g0 + g1 > 0.0:
+            count = int(0)
+            if not s00 and (s10 != s01):
+                count += p00 & HOLDS
+            if not s10 and (s00 != s11):
+                count += p10 & HOLDS
+            if not s01 and (s00 != s11):
+                count += p01 & HOLDS
+            if not s11 and (s10 != s01):
+                count += p11 & HOLDS
+            if count > 0:
+                weight = -1.0 / float(count)
+        share[k, j, i] = weight
+
+
+@wp.kernel(**options)
+@typing.no_type_check
+def stiffness_kernel(
+    cells: CellRange, dimension: int, flags: _U8, inverse_x: _F32, inverse_y: _F32, inverse_z: _F32,
+    share_x: _F32, share_y: _F32, share_z: _F32, stiff: _F32,
+):  # fmt: skip
+    """What bounds the friction's part of a step in a cell: the largest diagonal in the metric of its yield set. 0: it carries no shear."""
+    plane, row, chunk = wp.tid()
+    k = cells.k + plane
+    j = cells.j + row
+    first = cells.i + chunk * cells.grain
+    for i in range(first, wp.min(first + cells.grain, cells.end)):
+        most = float(0.0)
+        if int(flags[k, j, i]) & SHEARS_HERE:
+            x = inverse_x[k, j, i] + inverse_x[k, j, i + 1]
+            y = inverse_y[k, j, i] + inverse_y[k, j + 1, i]
+            most = 2.0 * wp.max(x, y)
+            can = x > 0.0 and y > 0.0
+            if dimension == 3:
+                z = inverse_z[k, j, i] + inverse_z[k + 1, j, i]
+                most = wp.max(most, 2.0 * z)
+                can = can and z > 0.0
+            for b in range(2):
+                for a in range(2):
+                    most = wp.max(most, _edge(share_x, inverse_x, inverse_y, k, j + b, i + a, 0, 1, 0, 0, 0, 1))
+                    if dimension == 3:
+                        most = wp.max(most, _edge(share_y, inverse_x, inverse_z, k + b, j, i + a, 1, 0, 0, 0, 0, 1))
+                        most = wp.max(most, _edge(share_z, inverse_y, inverse_z, k + b, j + a, i, 1, 0, 0, 0, 1, 0))
+            if not can:
+                most = 0.0
+        stiff[k, j, i] = most
+
+
+@wp.func
+@typing.no_type_check
+def _edge(share: _F32, first: _F32, second: _F32, k: int, j: int, i: int, bk: int, bj: int, bi: int, ak: int, aj: int, ai: int):
+    """4 share times the sum of the inverse masses around an edge between cells; 0 on walls."""
+    around = first[k, j, i] + first[k - bk, j - bj, i - bi] + second[k, j, i] + second[k - ak, j - aj, i - ai]
+    return 4.0 * wp.max(share[k, j, i], 0.0) * around
+
+
+@wp.kernel(**options)
+@typing.no_type_check
+def span_kernel(cells: CellRange, flags: _U8, own: wp.array3d(dtype=wp.int32)):
+    """First and one past the last cell of a row that holds sand."""
+    plane, row = wp.tid()
+    k = cells.k + plane
+    j = cells.j + row
+    low = int(cells.end)
+    high = int(0)
+    for i in range(cells.i, cells.end):
+        if int(flags[k, j, i]) != 0:
+            low = wp.min(low, i)
+            high = i + 1
+    own[k, j, 0] = low
+    own[k, j, 1] = high
+
+
+@wp.kernel(**options)
+@typing.no_type_check
+def widen_kernel(cells: CellRange, own: wp.array3d(dtype=wp.int32), wide: wp.array3d(dtype=wp.int32)):
+    """The span of a row and the rows around it, a cell wider on both sides, within the range."""
+    plane, row = wp.tid()
+    k = cells.k + plane
+    j = cells.j + row
+    low = int(cells.end)
+    high = int(0)
+    for c in range(wp.max(k - 1, 0), wp.min(k + 2, own.shape[0])):
+        for b in range(wp.max(j - 1, 0), wp.min(j + 2, own.shape[1])):
+            if own[c, b, 1] > 0:
+                low = wp.min(low, own[c, b, 0])
+                high = wp.max(high, own[c, b, 1])
+    if high == 0:
+        wide[k, j, 0] = 0
+        wide[k, j, 1] = 0
+    else:
+        wide[k, j, 0] = wp.max(low - 1, cells.i)
+        wide[k, j, 1] = wp.min(high + 1, cells.end)

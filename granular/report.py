@@ -1,0 +1,69 @@
+"""What a solve of the stresses leaves: the velocity, what holds sand to walls, and figures for the log."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from granular.packing import three
+from granular.report_kernels import REPORT_COLUMNS, report_kernels
+from granular.stress import Stress
+from warp_lcp.material.contact import HELD, RELEASED
+
+
+@dataclass(frozen=True)
+class Report:
+    """Figures of a step.
+
+    Attributes:
+        yielded: share of the cells that carry shear whose friction is at its bound.
+        dissipation: what friction takes, over mass of a full cell [m^2/s^2]; never negative but for the solve's residual.
+        predicted: by how much the fraction of a cell would exceed 1 after the step, at most.
+    """
+
+    yielded: float
+    dissipation: float
+    predicted: float
+
+
+class Outcome:
+    """Takes over what `Stress.checked` holds after a solve.
+
+    Args:
+        stress: the stresses.
+
+    Attributes:
+        ratio: of each cell's friction to its bound, float32.
+        contact: uint8 of HELD where sand has pressure, RELEASED where it has none, 0 elsewhere.
+        known: int8, 1 on each component's faces that the stresses act on.
+    """
+
+    def __init__(self, stress: Stress) -> None:
+        """Allocate the fields."""
+        grid, self.stress = stress.packing.grid, stress
+        self.ratio, self.contact, self.known = grid.field(), grid.field(wp.uint8), grid.faces(wp.int8)
+        self._rows = int(np.prod(grid.shape[:2]))
+        self._sums = wp.zeros(REPORT_COLUMNS * self._rows, dtype=wp.float64, device=grid.device)
+        self._kernels = report_kernels(grid.dimension)
+
+    def take(self, velocity: Sequence[wp.array]) -> None:
+        """Give the faces that stresses act on the velocity that they leave [m/s], and find `known` and `contact`."""
+        stress, packing = self.stress, self.stress.packing
+        for axis, field in enumerate(velocity):
+            packing.nodes.launch(
+                self._kernels.take, [packing.inverse[axis], stress.checked.u[axis], field, self.known[axis]]
+            )  # fmt: skip
+        inputs = [wp.uint8(HELD), wp.uint8(RELEASED), packing.flags, stress.now, self.contact]
+        packing.grid.domain.launch(self._kernels.contact, inputs)
+
+    def report(self, dt: float) -> Report:
+        """Return the figures of a step of dt [s]."""
+        stress, p = self.stress, self.stress.packing
+        fields = [*three(p.share), *three(stress.checked.edge), *three(stress.checked.u), *three(p.mass)]
+        inputs = [p.flags, stress.now, p.drive, *fields, stress.numbers, wp.float64(dt / p.grid.spacing), self.ratio, self._sums]
+        p.grid.domain.launch_rows(self._kernels.report, inputs)
+        cells, yielded, taken, most = self._sums.numpy().reshape(REPORT_COLUMNS, self._rows)
+        return Report(float(yielded.sum() / max(cells.sum(), 1.0)), float(taken.sum()), float(most.max()))

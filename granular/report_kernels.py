@@ -1,0 +1,106 @@
+# mypy: ignore-errors
+"""Kernels of what is told of a step: how near each cell is to yielding, what friction takes, and what holds sand to walls."""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from granular.yield_set import SHAPE, native
+from warp_lcp.grid.staggered import CellRange
+
+RATIO_YIELDS = 0.99  # of the bound, from which a cell counts as yielded
+REPORT_COLUMNS = 4  # of a row's sums: cells that carry shear, yielded ones, dissipation, largest fraction that the pressure's solution predicts
+
+REPORT = SHAPE + """
+    const unsigned char* flags = flags_.data + row; const float* now = now_.data + row; const float* drive = drive_.data + row;
+    const float* share[3] = {share_x.data + row, share_y.data + (DIM == 3 ? row : 0), share_z.data + (DIM == 3 ? row : 0)};
+    const double* rate[3] = {b_x.data + row, b_y.data + (DIM == 3 ? row : 0), b_z.data + (DIM == 3 ? row : 0)};
+    const double* u[3] = {u_x.data + row, u_y.data + row, u_z.data + (DIM == 3 ? row : 0)};
+    const float* mass[3] = {mass_x.data + row, mass_y.data + row, mass_z.data + (DIM == 3 ? row : 0)};
+    float* ratio = ratio_.data + row;
+    double cells = 0, yielded = 0, taken = 0, most = 0;
+    for (int i = first; i < last; ++i) {
+        float size = 0; double e[3], mean = 0, w = drive[i];
+        for (int axis = 0; axis < DIM; ++axis) {
+            const long long o = i + s[axis];
+            e[axis] = u[axis][o] - u[axis][i]; mean += e[axis]/DIM;
+            w += mass[axis][o]*u[axis][o] - mass[axis][i]*u[axis][i];
+        }
+        if (DIM == 2) { const float a = now[layer + i]; size = a*a; taken += a*(e[0] - e[1]); }
+        else for (int c = 0; c < NORMALS; ++c) { const float n = now[(1 + c)*layer + i]; size += 0.5f*n*n; taken += n*(e[c] - mean); }
+        for (int d = 0; d < SHEARS; ++d) {
+            float largest = 0;
+            for (int q = 0; q < 4; ++q) {
+                const long long o = i + (q & 1)*s[ALPHA[d]] + (q >> 1)*s[BETA[d]];
+                const float b = now[(FIRST + 4*d + q)*layer + i], part = share[d][o];
+                if (part > 0.0f) { const float m = b < 0.0f ? -b : b; largest = m > largest ? m : largest; }
+                taken += (part > 0.0f ? part : -part)*b*rate[d][o];
+            }
+            size += largest*largest;
+        }
+        const float bound = numbers.data[FRICTION]*now[i] + (flags[i] & SHEARS_HERE ? numbers.data[COHESION] : 0.0f);
+        const bool carries = (flags[i] & SHEARS_HERE) && bound > 1e-12f;
+        ratio[i] = carries ? sqrt(size)/bound : 0.0f;
+        cells += carries; yielded += carries && ratio[i] > (float)RATIO_YIELDS;
+        if (flags[i] & HOLDS) { const double over = -w*dt_over_dx; most = over > most ? over : most; }
+    }
+    const long long rows = sums_.shape[0]/REPORT_COLUMNS, at = k*(long long)flags_.shape[1] + j;
+    sums_.data[at] = cells; sums_.data[rows + at] = yielded; sums_.data[2*rows + at] = taken; sums_.data[3*rows + at] = most;
+"""
+
+_F32, _F64, _U8 = (wp.array3d(dtype=t) for t in (wp.float32, wp.float64, wp.uint8))
+_STRESS = wp.array4d(dtype=wp.float32)
+
+
+@functools.cache
+def report_kernels(dimension: int) -> SimpleNamespace:
+    """Return the kernels for 2 or 3 dimensions."""
+    words = {"REPORT_COLUMNS": REPORT_COLUMNS, "RATIO_YIELDS": RATIO_YIELDS}
+
+    @wp.func_native(native(REPORT, dimension, wp.float64, box=False, **words))
+    def report_row(
+        flags_: _U8, now_: _STRESS, drive_: _F32, share_x: _F32, share_y: _F32, share_z: _F32, b_x: _F64, b_y: _F64, b_z: _F64,
+        u_x: _F64, u_y: _F64, u_z: _F64, mass_x: _F32, mass_y: _F32, mass_z: _F32, numbers: wp.array(dtype=wp.float32),
+        dt_over_dx: wp.float64, ratio_: _F32, sums_: wp.array(dtype=wp.float64), k: int, j: int, first: int, last: int,
+    ): ...  # fmt: skip
+
+    @wp.kernel(enable_backward=False, module=f"granular.report_{dimension}d")
+    def report(
+        cells: CellRange, flags: _U8, now: _STRESS, drive: _F32, share_x: _F32, share_y: _F32, share_z: _F32,
+        b_x: _F64, b_y: _F64, b_z: _F64, u_x: _F64, u_y: _F64, u_z: _F64, mass_x: _F32, mass_y: _F32, mass_z: _F32,
+        numbers: wp.array(dtype=wp.float32), dt_over_dx: wp.float64, ratio: _F32, sums: wp.array(dtype=wp.float64),
+    ):  # fmt: skip
+        plane, row = wp.tid()
+        report_row(
+            flags, now, drive, share_x, share_y, share_z, b_x, b_y, b_z, u_x, u_y, u_z, mass_x, mass_y, mass_z, numbers, dt_over_dx,
+            ratio, sums, cells.k + plane, cells.j + row, cells.i, cells.end,
+        )  # fmt: skip
+
+    @wp.kernel(enable_backward=False, module=f"granular.report_{dimension}d")
+    def take(cells: CellRange, inverse: _F32, found: _F64, velocity: _F32, known: wp.array3d(dtype=wp.int8)):
+        plane, row, chunk = wp.tid()
+        k = cells.k + plane
+        j = cells.j + row
+        first = cells.i + chunk * cells.grain
+        for i in range(first, wp.min(first + cells.grain, cells.end)):
+            known[k, j, i] = wp.int8(0)
+            if inverse[k, j, i] > 0.0:
+                velocity[k, j, i] = wp.float32(found[k, j, i])
+                known[k, j, i] = wp.int8(1)
+
+    @wp.kernel(enable_backward=False, module=f"granular.report_{dimension}d")
+    def contact(cells: CellRange, held: wp.uint8, released: wp.uint8, flags: _U8, now: _STRESS, out: _U8):
+        plane, row, chunk = wp.tid()
+        k = cells.k + plane
+        j = cells.j + row
+        first = cells.i + chunk * cells.grain
+        for i in range(first, wp.min(first + cells.grain, cells.end)):
+            mark = wp.uint8(0)
+            if flags[k, j, i] != wp.uint8(0):
+                mark = released
+                if now[0, k, j, i] > 0.0:
+                    mark = held
+            out[k, j, i] = mark
+
+    return SimpleNamespace(report=report, take=take, contact=contact)

@@ -1,0 +1,265 @@
+"""Scenes of sand: the tables `material`, `friction`, `gauge` and `sand`, and what sand has of its own in the others."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import Field, model_validator
+
+from granular.materials import MATERIALS, Material, compression_slope, plane_strain_slope
+from warp_lcp.driver.particle_scene import ParticleScene
+from warp_lcp.driver.scene import Complaint, Domain, Table, Time
+from warp_lcp.driver.shapes import (
+    Box,
+    Capsule,
+    MaterialProperties,
+    Mesh,
+    Plane,
+    SolidBox,
+    SolidCapsule,
+    SolidMesh,
+    SolidPlane,
+    SolidSphere,
+    Sphere,
+)
+from warp_lcp.driver.table import ANY_VALUE
+
+STRESS_BYTES = {2: 160, 3: 330}  # a cell: the coupled solve's fields
+STICKS = 1e6  # Coulomb's coefficient of a wall that sand sticks to, as long as it presses against it
+
+Angle = Annotated[float, Field(gt=0, lt=60)]
+WallFriction = Annotated[float, Field(ge=0, le=10)] | Literal["stick"]
+PLACES = "a number from 0 (free slip) to 10, or stick"
+
+
+class SandTime(Time):
+    """[time], with steps short enough for sand: what moves further than a cell a step packs unevenly."""
+
+    cfl: float = Field(default=0.8, gt=0, description="a Courant number, usually 0.5 to 1")
+    dt_max: float = Field(default=5e-3, gt=0, description="the longest step [s]")
+
+
+class SandDomain(Domain):
+    """[domain], with friction on its walls, and sides that sand leaves to come in on the other."""
+
+    later: ClassVar = {}
+    friction: WallFriction | None = Field(default=None, description=f"of the domain's walls: {PLACES}; material.wall_friction unless given")
+    periodic: list[bool] | None = Field(default=None, description="which axes have no end, [x, y] or [x, y, z]; not y")  # type: ignore[assignment]
+
+
+class MaterialTable(Table):
+    """[material]: what kind of grains."""
+
+    name: Literal["dry-sand", "gravel", "sugar"] = Field(default="dry-sand", description="gives what the table does not")
+    friction_angle: Angle | None = Field(default=None, description="degrees, in plane strain")
+    density: float | None = Field(default=None, gt=0, description="at the densest, air included [kg/m^3]")
+    max_fraction: float | None = Field(default=None, gt=0, lt=1, description="of space that grains fill at the densest")
+    wall_friction: WallFriction | None = Field(default=None, description=f"against solids: {PLACES}")
+    cohesion: float = Field(default=0.0, ge=0, description="the shear stress it bears without pressure, over cos(friction angle) [Pa]")
+    tensile_strength: float = Field(default=0.0, ge=0, description="the tension it bears where it is densely packed [Pa]")
+    angle_of: Literal["plane-strain", "triaxial-compression"] = Field(
+        default="plane-strain", description="the test that friction_angle is of; the other makes conical piles as steep as it says"
+    )
+
+
+class Friction(Table):
+    """[friction]: what shear stresses sand bears."""
+
+    model: Literal["cone", "box"] = Field(
+        default="cone",
+        description="cone: alike in all directions; box: that of Narain et al. 2010, cheaper, but layers flow at slopes where they should rest",
+    )
+
+
+class Gauge(Table):
+    """[gauge]: measures what falls through a height, as the log's flow_rate."""
+
+    height: float = Field(description="above the domain's floor [m]")
+
+
+class SandSolver(Table):
+    """[solver]: the method for pressure and friction together."""
+
+    method: Literal["accelerated-projection", "interleaved-sweeps"] = Field(
+        default="accelerated-projection", description="interleaved-sweeps is the textbook's, several times slower"
+    )
+    tolerance: float = Field(default=1e-3, gt=0, lt=1, description="of the stresses, root mean square in units of rho g dx")
+    max_iterations: int = Field(default=600, ge=10, description="iterations after which a step takes the stresses as they are")
+    precision: Literal["single"] = Field(default="single", description="of the stresses; residuals are double")
+
+
+class SandProperties(MaterialProperties):
+    """What a body of sand has besides its shape."""
+
+    friction_angle: Angle | None = Field(default=None, description="degrees; material.friction_angle unless given")
+    cohesion: float | None = Field(default=None, ge=0, description="[Pa]; material.cohesion unless given")
+
+
+class SandBox(SandProperties, Box):
+    """A box of sand."""
+
+
+class SandSphere(SandProperties, Sphere):
+    """A ball of sand."""
+
+
+class SandCapsule(SandProperties, Capsule):
+    """A capsule of sand."""
+
+
+class SandPlane(SandProperties, Plane):
+    """A half space of sand."""
+
+
+class SandMesh(SandProperties, Mesh):
+    """Sand inside a surface of triangles."""
+
+
+class RoughSolid(Table):
+    """What a solid among sand has besides what all have."""
+
+    later: ClassVar = {"mass": ANY_VALUE}
+    friction: WallFriction | None = Field(default=None, description=f"of its surface: {PLACES}; domain.friction unless given")
+
+
+class RoughBox(RoughSolid, SolidBox):
+    """A solid box."""
+
+
+class RoughSphere(RoughSolid, SolidSphere):
+    """A solid ball."""
+
+
+class RoughCapsule(RoughSolid, SolidCapsule):
+    """A solid capsule."""
+
+
+class RoughPlane(RoughSolid, SolidPlane):
+    """A solid half space."""
+
+
+class RoughMesh(RoughSolid, SolidMesh):
+    """A solid inside a surface of triangles."""
+
+
+Sand = Annotated[SandBox | SandSphere | SandCapsule | SandPlane | SandMesh, Field(discriminator="shape")]
+Solid = Annotated[RoughBox | RoughSphere | RoughCapsule | RoughPlane | RoughMesh, Field(discriminator="shape")]
+
+
+class SandScene(ParticleScene):
+    """A scene of sand."""
+
+    later: ClassVar = {}
+    solve_bytes: ClassVar[int] = STRESS_BYTES[3]
+
+    time: SandTime
+    domain: SandDomain
+    material: MaterialTable = Field(default_factory=MaterialTable)
+    friction: Friction = Field(default_factory=Friction)
+    gauge: Gauge | None = None
+    solver: SandSolver = Field(default_factory=SandSolver)  # type: ignore[assignment]
+    sand: list[Sand] = Field(default_factory=list)
+    solid: list[Solid] = Field(default_factory=list)  # type: ignore[assignment]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _density_of_material(cls, data: Any) -> Any:
+        """Take the density from the material unless [physics] says otherwise."""
+        if not isinstance(data, dict):
+            return data
+        material, physics = data.get("material", {}), data.get("physics", {})
+        if not isinstance(material, dict) or not isinstance(physics, dict):
+            return data
+        named = MATERIALS.get(material.get("name", "dry-sand")) if isinstance(material.get("name", ""), str) else None
+        density = material.get("density", named.density if named else None)
+        return data if density is None else {**data, "physics": {"density": density, **physics}}
+
+    def materials(self) -> tuple[str, Sequence[MaterialProperties]]:
+        """Return `sand` and its shapes."""
+        return "sand", self.sand
+
+    @property
+    def preset(self) -> Material:
+        """Return what the named material is like."""
+        return MATERIALS[self.material.name]
+
+    @property
+    def friction_angle(self) -> float:
+        """Return the internal friction angle [degrees]."""
+        own = next((sand.friction_angle for sand in self.sand if sand.friction_angle is not None), None)
+        return own or self.material.friction_angle or self.preset.friction_angle
+
+    @property
+    def cohesion(self) -> float:
+        """Return the cohesion [Pa]."""
+        own = next((sand.cohesion for sand in self.sand if sand.cohesion is not None), None)
+        return self.material.cohesion if own is None else own
+
+    @property
+    def slope(self) -> float:
+        """Return k of the yield set |s|_F / sqrt(2) <= k p."""
+        compressed = self.material.angle_of == "triaxial-compression" and self.dimension == 3
+        return compression_slope(self.friction_angle) if compressed else plane_strain_slope(self.friction_angle)
+
+    @property
+    def max_fraction(self) -> float:
+        """Return the share of space that grains fill at the densest."""
+        return self.material.max_fraction or self.preset.max_fraction
+
+    def wall_frictions(self) -> list[float]:
+        """Return Coulomb's coefficient of the domain's walls and of each solid."""
+        general = self.preset.wall_friction if self.material.wall_friction is None else self.material.wall_friction
+        domain = general if self.domain.friction is None else self.domain.friction
+        given = [domain, *(domain if s.friction is None else s.friction for s in self.solid)]  # type: ignore[attr-defined]
+        return [STICKS if friction == "stick" else float(friction) for friction in given]
+
+    def complaints(self) -> list[Complaint]:
+        """Return what is wrong across keys."""
+        found = super().complaints()
+        for key, first in (("friction_angle", self.friction_angle), ("cohesion", self.cohesion)):
+            for number, sand in enumerate(self.sand):
+                value = getattr(sand, key)
+                if (first if value is None else value) != first:
+                    found.append(Complaint(("sand", number, key), value, f"must be {first:g} as in the other [[sand]]: a scene has one material"))
+        return found + self._strength_complaints() + self._domain_complaints()
+
+    def _strength_complaints(self) -> list[Complaint]:
+        material, most = self.material, self.cohesion / math.tan(math.radians(self.friction_angle))
+        if material.tensile_strength > most:
+            message = f"must be at most {most:.4g}, the cohesion over the tangent of the friction angle"
+            return [Complaint(("material", "tensile_strength"), material.tensile_strength, message)]
+        if material.density is not None and material.density != self.physics.density:
+            message = f"differs from physics.density = {self.physics.density:g}; give one of them"
+            return [Complaint(("material", "density"), material.density, message)]
+        return []
+
+    def _domain_complaints(self) -> list[Complaint]:
+        found, periodic, wall = [], self.domain.periodic or [], self.domain.wall
+        if len(periodic) > 1 and periodic[1]:
+            found.append(Complaint(("domain", "periodic"), periodic, "may be true along x and z only: sand falls along y"))
+        closed = {axis for axis, ends in zip((0, 1, 2), periodic, strict=False) if ends}
+        if any(side in self.domain.open for axis in closed for side in (("left", "right"), (), ("back", "front"))[axis]):
+            found.append(Complaint(("domain", "open"), self.domain.open, "names a side of a periodic axis"))
+        if closed and (self.density_correction or self.particles.reseed or self.source or self.drain):
+            found.append(Complaint(("domain", "periodic"), periodic, "goes without density_correction, reseed, source and drain"))
+        if wall != "separating" or any(solid.wall == "free-slip" for solid in self.solid):
+            found.append(Complaint(("domain", "wall"), wall, 'must be "separating", of solids too: walls do not pull at sand; friction = 0 lets it slip'))
+        if self.gauge is not None and not 0.0 < self.gauge.height < self.domain.size[1]:
+            found.append(Complaint(("gauge", "height"), self.gauge.height, f"must lie in the domain, between 0 and {self.domain.size[1]:g} m"))
+        return found
+
+    def plan(self) -> list[tuple[str, str]]:
+        """Return what a run would do."""
+        frictions = ", ".join("stick" if f == STICKS else f"{f:g}" for f in self.wall_frictions())
+        cohesion = f", cohesion {self.cohesion:g} Pa" if self.cohesion else ""
+        return [
+            *super().plan(),
+            ("material", f"{self.material.name}, friction angle {self.friction_angle:g} degrees{cohesion}, {self.physics.density:g} kg/m^3"),
+            ("friction", f"{self.friction.model}, on walls {frictions}"),
+        ]
+
+    def own_memory_parts(self) -> dict[str, int]:
+        """Return what the stresses take at most on the device [bytes]."""
+        return {"stresses": self.counted_cells * STRESS_BYTES[self.dimension]}

@@ -1,0 +1,288 @@
+"""Sand on a staggered grid, carried by particles: the plug-in `granular`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+import warp_lcp as wl
+from granular.coupled import METHODS, CoupledMethod, CoupledOutcome
+from granular.packing import Packing
+from granular.report import Outcome
+from granular.scene import SandScene
+from granular.solids import SandSolids
+from granular.stress import Stress, YieldSet
+from warp_lcp.driver.particle_assembly import make_boundary, make_outlets, make_particles, make_sources, placed_solids
+from warp_lcp.driver.particle_simulation import ParticleSimulation, Row
+from warp_lcp.driver.scene import Scene
+from warp_lcp.driver.simulator import Cells, Points, SimulationFailed
+from warp_lcp.grid.level_set import particle_density
+from warp_lcp.grid.particles import Particles
+from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.material.boundary import Boundary
+from warp_lcp.material.outlets import Outlets
+from warp_lcp.material.sources import Sources
+from warp_lcp.material.wall import extend_velocity
+from warp_lcp.operators.grid_poisson import FLUID, SOLID
+
+FRONT = 99.0  # percentile of the particles that runout and height are of
+STANDING = 0.05  # of sqrt(g dx): a scale for the residual where there is no gravity
+COLUMNS = (
+    "coupled_residual",
+    "staggering_iterations",
+    "yielded",
+    "dissipation",
+    "predicted_excess",
+    "max_fraction",
+    "runout",
+    "height",
+)  # fmt: skip
+
+
+class SandSimulation(ParticleSimulation):
+    """Sand in progress; implements `warp_lcp.driver.simulator.Simulation`.
+
+    A step brings the particles' mass and velocity to the grid, solves for pressure and friction together, brings the velocity that they
+    leave back to the particles and moves them.
+
+    Args:
+        scene: what to simulate.
+        grid: its grid.
+        boundary: where particles may go.
+        solids: what they press and rub against.
+        particles: the sand at the start.
+        sources: where sand comes in.
+        outlets: where it leaves.
+        notes: facts for the start of a run.
+
+    Attributes:
+        packing: how densely the sand lies.
+        stress: what it bears.
+        outcome: of the last solve.
+    """
+
+    scene: SandScene
+
+    def __init__(
+        self,
+        scene: SandScene,
+        grid: StaggeredGrid,
+        boundary: Boundary,
+        solids: SandSolids,
+        particles: Particles,
+        *,
+        sources: Sources | None = None,
+        outlets: Outlets | None = None,
+        notes: tuple[str, ...] = (),
+    ) -> None:
+        """Allocate the fields and find the sand's cells."""
+        super().__init__(scene, grid, boundary, particles, sources=sources, outlets=outlets, notes=notes)
+        self.solids = solids
+        self.method: CoupledMethod = METHODS[scene.solver.method]()
+        self._base, self.density = grid.field(wp.int8), grid.field()
+        self.packing = Packing(grid, self._base, boundary.capacity)
+        self.stress = Stress(self.packing, solids.walls, box=scene.friction.model == "box")
+        self.outcome = Outcome(self.stress)
+        self._at_rest = scene.particles.per_axis**grid.dimension
+        self._start = self._front()[0]
+        self.mark()
+
+    def mark(self) -> None:
+        """Find the sand's cells, as frames show them before the first step."""
+        wp.copy(self._base, self.solids.base)
+        particle_density(self.grid, self.particles, self.grid.everywhere, self._at_rest, self.density)
+        self.packing.update(self.density, self.velocity, 1.0)
+
+    def step(self, dt: float) -> Row:
+        """Advance by dt [s].
+
+        Stresses that miss their tolerance are taken as they are: the log's coupled_residual says how good they are.
+
+        Raises:
+            SimulationFailed: something is not finite, or a particle has left the domain.
+            ValueError: dt is not positive.
+        """
+        before = self.begin_step(dt)
+        window = self.window(before)
+        self.bring_to_faces(window, dt)
+        solved = self._solve(window, dt)
+        with self.watch.stage("diagnostics", self.packing.flags, self.stress.now):
+            report = self.outcome.report(dt)
+        self._extend(window)
+        self.bring_to_particles()
+        below, most = self._mass_below(), self._most()
+        row = self.move(dt)
+        if self.solids.moves:
+            self.solids.place(self.time)
+            self.stress.face(self.solids.walls)
+        runout, height = self._front()
+        first = solved.history[0][1]
+        return self.logged(
+            row
+            | {
+                "solver": self.scene.solver.method,
+                "solve_status": solved.status.name,
+                "solve_iterations": solved.iterations,
+                "solve_residual": solved.residual / first if first > 0.0 else 0.0,
+                "coupled_residual": solved.residual,
+                "staggering_iterations": solved.iterations,
+                "yielded": report.yielded,
+                "dissipation": report.dissipation * self.scene.physics.density * self.grid.cell_volume,
+                "predicted_excess": report.predicted,
+                "max_fraction": most,
+                "runout": runout - self._start,
+                "height": height,
+                "flow_rate": self._flow_rate(below, row, dt),
+            }
+        )
+
+    def own_columns(self) -> tuple[str, ...]:
+        """Return the names of the columns of the stresses and of the sand's shape.
+
+        coupled_residual: natural residual of pressure and friction together, root mean square over the cells with sand, in units of
+        rho g dx; solve_residual: relative to that at the start of the solve; staggering_iterations: of the coupled method; yielded: share
+        of the cells that carry shear whose friction is at its bound; dissipation [J; J/m in 2-D]: what friction took in the step;
+        predicted_excess: by how much the pressure's solution would pack a cell too densely; max_fraction: of a cell at the start of the
+        step, in units of the densest packing; runout [m]: 99th percentile of x less that at the start; height [m]: 99th percentile of y;
+        flow_rate [kg/s; kg/(s m) in 2-D]: what fell below the gauge, or without one what left through drains and open sides.
+        """
+        return (*COLUMNS, "flow_rate") if self.scene.gauge or self.scene.drain or self.scene.domain.open else COLUMNS
+
+    def frame(self) -> list[Points | Cells]:
+        """Return the particles and the cells that hold sand, with fraction of grains, pressure [Pa] and yield ratio of the last solve."""
+        grid, points = self.grid, self.points()
+        fields = {
+            "fraction": self.packing.fraction.numpy() * self.scene.max_fraction,
+            "pressure": self.pressures().astype(np.float32),
+            "yield_ratio": self.outcome.ratio.numpy(),
+        }
+        i, j, k = self.particles.cells_of(points.points).T + 1
+        for name, field in fields.items():
+            points.fields[name] = field[k, j, i]
+        cells = np.argwhere(self.packing.kind.numpy() == FLUID)
+        at = tuple(cells.T)
+        shown = {name: field[at] for name, field in fields.items()}
+        return [points, Cells("grid", cells[:, ::-1] - 1, grid.spacing, grid.dimension, shown)]
+
+    def pressures(self) -> np.ndarray:
+        """Return the pressure p = rho dx x / dt [Pa] of the last solve, in the stored shape; zeros before the first."""
+        scale = self.scene.physics.density * self.grid.spacing / self.stress.dt if self.stress.dt > 0.0 else 0.0
+        return np.asarray(self.stress.now.numpy()[0] * scale)
+
+    def own_state(self) -> dict[str, np.ndarray]:
+        """Return the stresses, and what a frame shows of the last solve."""
+        packing = self.packing
+        return {
+            "stress": self.stress.now.numpy().copy(),
+            "stress_dt": np.array(self.stress.dt),
+            "cells": packing.kind.numpy().copy(),
+            "fraction": packing.fraction.numpy().copy(),
+            "yield_ratio": self.outcome.ratio.numpy().copy(),
+            "front_at_start": np.array(self._start),
+        }
+
+    def restore_own(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue from the arrays of `own_state`."""
+        self.stress.now.assign(state["stress"])
+        self.stress.dt = float(state["stress_dt"])
+        self.packing.kind.assign(state["cells"])
+        self.packing.fraction.assign(state["fraction"])
+        self.outcome.ratio.assign(state["yield_ratio"])
+        self._start = float(state["front_at_start"])
+        self.solids.place(float(self.time))
+
+    def _solve(self, window: Window, dt: float) -> CoupledOutcome:
+        """Solve for the stresses and take over the velocity that they leave."""
+        packing, stress, solids, scene = self.packing, self.stress, self.solids, self.scene
+        with self.watch.stage("packing", self.density, packing.fraction, *self.velocity):
+            particle_density(self.grid, self.particles, window, self._at_rest, self.density)
+            wp.copy(self._base, solids.base)
+            solids.begin_step(self.time, dt)
+            if self.sources is not None:
+                self.sources.supply(self.time, self.velocity, self._base)
+                self.sources.hold(solids.velocity, [])
+            packing.update(self.density, self.velocity, dt, solids.velocity)
+        impulse = dt / (scene.physics.density * self.grid.spacing)  # of a stress of 1 Pa
+        angle = math.radians(scene.friction_angle)
+        bound = YieldSet(scene.slope, scene.cohesion * math.cos(angle) * impulse, scene.material.tensile_strength * impulse)
+        g = float(np.linalg.norm(self.gravity))
+        scale = g * dt if g > 0.0 else STANDING * math.sqrt(self.grid.spacing)
+        with self.watch.stage("stress", stress.now, *packing.mass, *packing.inverse, *packing.start):
+            stress.begin(bound, self.gravity, dt, decay=self.method.decay)
+            solved = self.method.solve(
+                stress, scale=scale, tolerance=scene.solver.tolerance, max_iterations=scene.solver.max_iterations
+            )  # fmt: skip
+        if solved.status is wl.SolveStatus.NON_FINITE:
+            raise SimulationFailed(f"step {self.step_count}: the stresses are not finite after {solved.iterations} iterations")
+        with self.watch.stage("projection", *self.velocity):
+            self.outcome.take(self.velocity)
+        return solved
+
+    def _extend(self, window: Window) -> None:
+        """Continue the velocity into air and walls."""
+        outcome, solids = self.outcome, self.solids
+        with self.watch.stage("extrapolation", *self.velocity, *self.weights, *outcome.known):
+            extend_velocity(
+                window, self.velocity, self.weights, outcome.known, self.packing.kind, outcome.contact, solids.index, solids.separating,
+                solids.velocity, self.layers,
+            )  # fmt: skip
+            if self.sources is not None:
+                self.sources.hold(self.velocity, [])
+
+    def _front(self) -> tuple[float, float]:
+        """Return the 99th percentile of x and of y [m]."""
+        position = self.particles.position.numpy()
+        if not len(position):
+            return 0.0, 0.0
+        nth = min(int(len(position) * FRONT / 100.0), len(position) - 1)
+        return float(np.partition(position[:, 0], nth)[nth]), float(np.partition(position[:, 1], nth)[nth])
+
+    def _mass_below(self) -> float:
+        """Return the mass below the gauge [kg; kg/m in 2-D], 0 without one."""
+        if self.scene.gauge is None:
+            return 0.0
+        return float(np.count_nonzero(self.particles.position.numpy()[:, 1] < self.scene.gauge.height)) * self.particle_mass
+
+    def _flow_rate(self, below: float, row: Row, dt: float) -> float:
+        left = sum(int(row.get(name) or 0) for name in ("drained", "departed")) * self.particle_mass
+        return (self._mass_below() - below + left) / dt
+
+    def _most(self) -> float:
+        """Return the largest fraction of a cell, in units of the densest packing."""
+        capacity = self.boundary.capacity.numpy()
+        open_ = (self._base.numpy() != SOLID) & (capacity > 0.5)
+        return float((self.density.numpy()[open_] / capacity[open_]).max(initial=0.0))
+
+
+class GranularSimulator:
+    """The plug-in for sand that flows and comes to rest."""
+
+    name = "granular"
+    summary = "sand that flows, piles up and comes to rest"
+    scene_model = SandScene
+
+    def create(self, scene: Scene, *, device: str, folder: Path) -> SandSimulation:
+        """Build a simulation of `scene`.
+
+        Args:
+            scene: a SandScene.
+            device: a Warp device's name.
+            folder: where the files are that the scene names.
+
+        Raises:
+            ValueError: the scene cannot be simulated; the message names the key and what is allowed.
+        """
+        if not isinstance(scene, SandScene):
+            raise ValueError("scene.simulator: granular needs a scene of sand")
+        grid = StaggeredGrid(scene.cell_counts, scene.spacing, scene.dimension, device)
+        boundary, warnings = make_boundary(scene, grid, folder)
+        solids = SandSolids(grid, placed_solids(scene, folder), boundary, scene.wall_frictions(), prescribed=bool(scene.source))
+        particles, notes = make_particles(scene, grid, boundary, folder)
+        sources, outlets = make_sources(scene, grid, boundary, folder), make_outlets(scene, grid, folder)
+        return SandSimulation(
+            scene, grid, boundary, solids, particles, sources=sources, outlets=outlets, notes=(*warnings, *notes)
+        )  # fmt: skip

@@ -1,0 +1,129 @@
+"""Solids as sand meets them: whole cells that push and rub, however finely particles keep off their surfaces."""
+
+from __future__ import annotations
+
+import typing
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from granular.stress import Walls
+from warp_lcp.grid.staggered import CellRange, StaggeredGrid
+from warp_lcp.grid.voxelize import PlacedSolid, voxelize
+from warp_lcp.material.cut_boundary import CutBoundary
+from warp_lcp.material.boundary import Boundary, Faces
+from warp_lcp.operators.grid_poisson import AIR, SOLID
+
+_SOLID = wp.constant(wp.int8(SOLID))
+_AIR = wp.constant(wp.int8(AIR))
+
+
+@wp.kernel(enable_backward=False, module="granular.solids")
+@typing.no_type_check
+def base_kernel(cells: CellRange, index: wp.array3d(dtype=wp.int32), base: wp.array3d(dtype=wp.int8)):
+    """SOLID in walls, AIR elsewhere."""
+    plane, row, chunk = wp.tid()
+    k = cells.k + plane
+    j = cells.j + row
+    first = cells.i + chunk * cells.grain
+    for i in range(first, wp.min(first + cells.grain, cells.end)):
+        if index[k, j, i] >= 0:
+            base[k, j, i] = _SOLID
+        else:
+            base[k, j, i] = _AIR
+
+
+@wp.kernel(enable_backward=False, module="granular.solids")
+@typing.no_type_check
+def rigid_velocity_kernel(
+    cells: CellRange, axis: int, planes: int, spacing: float, index: wp.array3d(dtype=wp.int32), turn: wp.array(dtype=wp.mat33),
+    shift: wp.array(dtype=wp.vec3), field: wp.array3d(dtype=wp.float32),
+):  # fmt: skip
+    """Velocity of the solids on the faces of one component that they touch, 0 elsewhere."""
+    plane, row, chunk = wp.tid()
+    k = cells.k + plane
+    j = cells.j + row
+    first = cells.i + chunk * cells.grain
+    c = wp.max(k - wp.where(axis == 2, 1, 0), 0)
+    b = wp.max(j - wp.where(axis == 1, 1, 0), 0)
+    for i in range(first, wp.min(first + cells.grain, cells.end)):
+        a = wp.max(i - wp.where(axis == 0, 1, 0), 0)
+        wall = wp.max(index[k, j, i], index[c, b, a])
+        u = float(0.0)
+        if wall > 0:
+            x = (float(i) - wp.where(axis == 0, 1.0, 0.5)) * spacing
+            y = (float(j) - wp.where(axis == 1, 1.0, 0.5)) * spacing
+            z = float(0.0)
+            if planes == 2:
+                z = (float(k) - wp.where(axis == 2, 1.0, 0.5)) * spacing
+            v = turn[wall] * wp.vec3(x, y, z) + shift[wall]
+            u = v[axis]
+        field[k, j, i] = u
+
+
+class SandSolids:
+    """Solids and the domain's walls, as whole cells with friction.
+
+    A cell belongs to a solid if its center lies inside. Particles move among the surfaces of `boundary`, which may cut cells.
+
+    Args:
+        grid: the grid.
+        placed: the solids.
+        boundary: where particles may go.
+        friction: Coulomb's coefficient of the domain's walls and of each solid.
+        prescribed: keep velocities on faces even if nothing moves: sources prescribe some.
+
+    Attributes:
+        index: int32, -1 in open cells, the wall's number elsewhere.
+        base: int8, SOLID or AIR.
+        velocity: of the solids on each component's faces [m/s]; empty if they stand still.
+        separating: uint8 of each wall: all ones.
+        walls: the faces between open cells and solids.
+        notes: warnings worth a line at the start of a run.
+    """
+
+    def __init__(
+        self, grid: StaggeredGrid, placed: Sequence[PlacedSolid], boundary: Boundary, friction: Sequence[float], *, prescribed: bool = False
+    ) -> None:
+        """Find the cells."""
+        self.grid, self._placed, self._boundary, self._friction = grid, tuple(placed), boundary, list(friction)
+        self.base = grid.field(wp.int8)
+        self.separating = wp.full(1 + len(placed), 1, dtype=wp.uint8, device=grid.device)
+        self.velocity: Faces = grid.faces() if boundary.moves or prescribed else []
+        self.notes: tuple[str, ...] = ()
+        self.place(0.0)
+
+    @property
+    def moves(self) -> bool:
+        """Return whether a solid moves."""
+        return self._boundary.moves
+
+    def place(self, time: float) -> None:
+        """Put the solids where they are at `time` [s]."""
+        grid = self.grid
+        now = [
+            solid if solid.motion is None else PlacedSolid(
+                geometry=solid.geometry.moved(solid.motion.pose(time)), separating=True, name=solid.name
+            )
+            for solid in self._placed
+        ]  # fmt: skip
+        found = voxelize(
+            grid.counts, grid.spacing, grid.dimension, now, wall_separating=True, device=grid.device,
+            open_sides=self._boundary.open_sides,
+        )  # fmt: skip
+        self.index, self.notes = found.index, found.notes
+        grid.everywhere.launch(base_kernel, [self.index, self.base])
+        self.walls = Walls(grid, self.index.numpy(), self._friction)
+
+    def begin_step(self, time: float, dt: float) -> None:
+        """Find how fast the solids move in the step that starts at `time` [s] and lasts `dt` [s]."""
+        boundary, grid = self._boundary, self.grid
+        boundary.begin_step(time, dt)
+        if self.moves and isinstance(boundary, CutBoundary):
+            cut = boundary.cut
+            for axis, field in enumerate(self.velocity):
+                inputs = [axis, grid.planes, grid.spacing, self.index, cut.turn, cut.shift, field]
+                grid.everywhere.launch(rigid_velocity_kernel, inputs)
+
+

@@ -1,0 +1,202 @@
+"""The stress of sand: pressure and friction that are solved together, and what they leave of the velocity."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from granular.packing import SHEARS, Packing, three, wall_faces
+from granular.stress_kernels import momentum_kernel, stress_kernels
+from granular.yield_set import COLUMNS, NUMBERS, STEP
+from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.program import Launch, Program
+from warp_lcp.vectors import Reduction
+
+WALL_GRAIN = 256  # wall faces a CPU thread takes
+
+
+@dataclass(frozen=True)
+class YieldSet:
+    """The stresses that sand can bear, as impulses over rho dx [m/s]: |s|_F / sqrt(2) <= k x + cohesion, x >= -tension.
+
+    Attributes:
+        k: sine of the friction angle.
+        cohesion: of cells that carry shear.
+        tension: of cells that are nearly full.
+    """
+
+    k: float
+    cohesion: float = 0.0
+    tension: float = 0.0
+
+
+class Walls:
+    """Friction on the faces between sand and solids.
+
+    Args:
+        grid: the grid.
+        index: int, -1 in open cells, the wall's number elsewhere, shape of the grid's fields.
+        friction: Coulomb's coefficient of each wall, >= 0; inf sticks.
+    """
+
+    def __init__(self, grid: StaggeredGrid, index: np.ndarray, friction: Sequence[float]) -> None:
+        """Find the faces."""
+        device = grid.device
+        self.friction = wp.array(np.minimum(friction, 1e6), dtype=wp.float32, device=device)
+        cells, sides, walls = wall_faces(index, grid.dimension)
+        self.count = len(cells)
+        self.cells = wp.array(cells, dtype=wp.int32, device=device)
+        self.sides = wp.array(sides, dtype=wp.uint8, device=device)
+        self.walls = wp.array(walls, dtype=wp.int32, device=device)
+
+
+class Velocity:
+    """The velocity that a stress leaves, in one precision, and the rates of strain.
+
+    Attributes:
+        u: of each component [m/s].
+        edge: of each shear: first the shear stress of the edges, then twice their rate of shear times dx [m/s].
+    """
+
+    def __init__(self, packing: Packing, real: type, *, box: bool) -> None:
+        """Allocate the fields."""
+        grid = packing.grid
+        self.packing, self.real = packing, real
+        self.u = grid.faces(real)
+        self.edge = [grid.field(real) for _ in SHEARS[grid.dimension]]
+        self.kernels = stress_kernels(grid.dimension, real, residual=real is wp.float64, box=box)
+
+    def find(self, stress: wp.array, *, launch: Launch = wp.launch) -> None:
+        """Find velocity and rates of strain under a field of stresses."""
+        p, edge, u, kernels = self.packing, three(self.edge), three(self.u), self.kernels
+        share, window = three(p.share), p.nodes
+        window.launch(kernels.edge_stress, [p.spans, stress, *share, *edge], launch=launch)
+        faces = [*three(p.start), *three(p.inverse), *u]
+        window.launch(kernels.face_velocity, [p.spans, stress, share[0], *edge, *faces], launch=launch)
+        window.launch(kernels.edge_strain, [p.spans, share[0], *u, *edge], launch=launch)
+
+
+class Stress:
+    """Pressure and friction of sand under a packing.
+
+    With x = dt p / (rho dx) and s in the same units, u = u* + (1/m) (-grad x + div s) on faces of mass m, the stress is the solution of
+
+        0 <= x  complementary to  w = (1 - phi) dx / dt + div(m u) >= 0,   s = the nearest point of the yield set of x to s + r E u,
+
+    for any r > 0 [Narain, Golas & Lin 2010; Daviet & Bertails-Descoubes 2016]: sand is never denser than 1, and friction takes as much
+    energy as it can. In a cell |n|^2 / 2 + sum over shears of max_q b_q^2 <= (k x + cohesion)^2. On a face of a solid the shear
+    stress is within mu times the normal load (Coulomb).
+
+    Args:
+        packing: where sand is.
+        walls: its faces with solids.
+        box: bound each part of the friction by itself, as Narain et al. do; else the cone.
+
+    Attributes:
+        now: the stresses, see `granular.yield_set`, float32.
+        dt: time step that they belong to [s]; 0 before the first.
+        checked: the velocity that they leave, in float64, since the last `residual`.
+        last_residual: that of pressure and friction [m/s].
+    """
+
+    def __init__(self, packing: Packing, walls: Walls, *, box: bool = False) -> None:
+        """Allocate the fields."""
+        grid, self.packing, self.walls, self.box = packing.grid, packing, walls, box
+        normals, shears = (3, 3) if grid.dimension == 3 else (1, 1)
+        shape = (1 + normals + 4 * shears, *grid.shape)
+        self.now, self._next = (wp.zeros(shape, dtype=wp.float32, device=grid.device) for _ in range(2))
+        self.velocity, self.checked = Velocity(packing, wp.float32, box=box), Velocity(packing, wp.float64, box=box)
+        self.numbers = wp.zeros(NUMBERS, dtype=wp.float32, device=grid.device)
+        self._momentum = wp.zeros(3, dtype=wp.float64, device=grid.device)
+        self._sums = wp.zeros(2 * COLUMNS, dtype=wp.float64, device=grid.device)
+        threads = int(np.prod(packing.grid.shape[:2])) * grid.domain.chunks
+        self._cell_sums = Reduction(grid.size, grid.device, self._sums, columns=COLUMNS, threads=threads)
+        self._wall_sums: Reduction | None = None
+        self._host = np.zeros(NUMBERS, dtype=np.float32)
+        self._program: Program | None = None
+        self.last_residual = 0.0, 0.0
+        self.dt = 0.0
+        self.face(walls)
+
+    def face(self, walls: Walls) -> None:
+        """Take other walls: solids have moved."""
+        device = self.packing.grid.device
+        self.walls, self._program = walls, None
+        self._grain = 1 if device.is_cuda else WALL_GRAIN
+        threads = -(-walls.count // self._grain)
+        self._wall_sums = Reduction(max(threads, 1), device, self._sums, columns=COLUMNS, threads=threads) if threads else None
+
+    def begin(self, bound: YieldSet, gravity: np.ndarray, dt: float, *, decay: float = 1.0) -> None:
+        """Start from the last stresses, as far as they have a place in the packing now.
+
+        Args:
+            bound: what sand can bear.
+            gravity: [m/s^2], three entries.
+            dt: time step [s].
+            decay: factor of the last stresses; less than 1 damps patterns that exert no force.
+        """
+        self._host = np.array([1.0, bound.k, bound.cohesion, bound.tension, *(gravity * dt)], dtype=np.float32)
+        self.numbers.assign(self._host)
+        p = self.packing
+        ratio = decay * (dt / self.dt if self.dt > 0.0 else 0.0)
+        inputs = [p.flags, p.stiff, *three(p.share), ratio, self.now, self._next]
+        p.grid.domain.launch(self.velocity.kernels.admit, inputs)
+        self.dt = dt
+
+    def restart(self, step: float, most: float) -> None:
+        """Start a sequence of accelerated steps.
+
+        Args:
+            step: of the projected gradient, relative to the diagonal.
+            most: of the last change that is repeated.
+        """
+        self._host[STEP] = step
+        self.numbers.assign(self._host)
+        self._momentum.assign(np.array([1.0, 0.0, most]))
+        wp.copy(self._next, self.now)
+
+    def advance(self, steps: int) -> None:
+        """Take accelerated steps."""
+        if self._program is None:
+            self._program = Program(self.packing.grid.device)
+            self._record(self._program.launch)
+        for _ in range(steps):
+            self._program.run()
+
+    def _record(self, launch: Launch) -> None:
+        self.velocity.find(self._next, launch=launch)
+        self._project(self.velocity, self._next, launch)
+        self._add_up(launch)
+        launch(momentum_kernel, 1, [self._sums, self._momentum], device=self.packing.grid.device)
+
+    def residual(self) -> tuple[float, float]:
+        """Return the natural residual of pressure and friction [m/s], root mean squares over the cells that hold sand, in float64."""
+        self.checked.find(self.now)
+        self._project(self.checked, self.now, wp.launch)
+        self._add_up(wp.launch)
+        sums = self._sums.numpy()
+        cells = max(self.packing.cells(), 1)
+        self.last_residual = math.sqrt(sums[0] / cells), math.sqrt((sums[1] + sums[2]) / cells)
+        return self.last_residual
+
+    def _project(self, velocity: Velocity, source: wp.array, launch: Launch) -> None:
+        p, walls, kernels = self.packing, self.walls, velocity.kernels
+        grid, share, edge, inverse = p.grid, three(p.share), three(velocity.edge), three(p.inverse)
+        stress = [source, self.now, self._next]
+        fields = [p.drive, p.stiff, *share, *edge, *three(p.mass), *inverse, *three(velocity.u)]
+        scalars = [self._momentum, self.numbers]
+        inputs = [p.spans, p.flags, *stress, *fields, *scalars, self._cell_sums.partials, grid.domain.chunks]
+        grid.domain.launch(kernels.step, inputs, launch=launch)
+        if self._wall_sums is not None:
+            faces = [walls.cells, walls.sides, walls.walls, walls.friction, p.flags, p.fraction]
+            inputs = [self._grain, *faces, *stress, *share, *edge, *inverse, *scalars, self._wall_sums.partials]
+            launch(kernels.wall, self._wall_sums.threads, inputs, device=grid.device)
+
+    def _add_up(self, launch: Launch) -> None:
+        self._cell_sums.add_up(0, COLUMNS, launch=launch)
+        if self._wall_sums is not None:
+            self._wall_sums.add_up(COLUMNS, COLUMNS, launch=launch)

@@ -1,0 +1,290 @@
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from warp_lcp import AIR, FLUID, SOLID
+from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.material.contact import HELD, RELEASED, TOUCHES_NOTHING
+from warp_lcp.material.cut_wall import extend_velocity_cut
+from warp_lcp.material.wall import extend_velocity
+
+FLAT = StaggeredGrid((24, 22, 1), 0.1, 2)
+SPACE = StaggeredGrid((12, 13, 11), 0.1, 3)
+JUNK = 1e3  # on faces that are neither projected nor carry weight
+
+
+def points(grid: StaggeredGrid, offset: Sequence[float]) -> np.ndarray:
+    """Return the points (x, y, z) in cells from the domain's corner that lie at an offset from the cells' low corners."""
+    k, j, i = np.meshgrid(*(np.arange(n) - 1.0 for n in grid.shape), indexing="ij")
+    return np.stack([i + offset[0], j + offset[1], (k + offset[2]) * (grid.dimension == 3)], axis=-1)
+
+
+def face_centers(grid: StaggeredGrid, axis: int) -> np.ndarray:
+    return points(grid, [0.0 if d == axis else 0.5 for d in range(3)])
+
+
+class Slope:
+    """Liquid or air over a plane; every open face has been projected to one velocity, unless told otherwise.
+
+    Args:
+        grid: the grid.
+        normal: of the plane, into the open.
+        kind: of the open cells.
+        contact: of the open cells that the plane cuts.
+        shift: how far the plane lies from the domain's center along its normal, in cells.
+    """
+
+    def __init__(
+        self, grid: StaggeredGrid, normal: tuple[float, float, float], kind: int = FLUID, contact: int = HELD, shift: float = 0.0
+    ) -> None:
+        self.grid, self.normal = grid, np.array(normal) / np.linalg.norm(normal)
+        self.at = 0.5 * np.array(grid.counts) * [1, 1, grid.dimension == 3] + shift * self.normal
+        nodes = self.signed(points(grid, (0, 0, 0)))
+        sides = [np.minimum(c, n - c) for c, n in zip(np.moveaxis(points(grid, (0, 0, 0)), -1, 0), grid.counts, strict=False)]
+        distance = np.minimum(nodes, np.min(sides[: grid.dimension], axis=0))
+        ring = np.ones(grid.shape, bool)
+        ring[1:-1, 1:-1, 1:-1] = False
+        self.open: list[np.ndarray] = []
+        self.wall: list[np.ndarray] = []
+        for axis in range(grid.dimension):
+            fraction = self.fraction(axis)
+            outside = ring.copy()
+            outside[(slice(1, -1),) * (2 - axis) + (1,)] = True  # the domain's lower wall
+            fraction[outside] = 0.0
+            self.open.append(fraction)
+            inner = self.signed(face_centers(grid, axis)) < 0.5  # the plane is the nearest wall, or it would not matter
+            self.wall.append(np.where(fraction == 1.0, -1, np.where(inner & ~outside, 1, 0)).astype(np.int16))
+        cells = np.full(grid.shape, SOLID, np.int8)
+        touches = np.full(grid.shape, TOUCHES_NOTHING, np.uint8)
+        for axis, fraction in enumerate(self.open):
+            upper = np.roll(fraction, -1, 2 - axis)
+            cells[((fraction > 0) | (upper > 0)) & ~ring] = kind
+            touches[((fraction < 1) | (upper < 1)) & ~ring] = contact
+        touches[cells != FLUID] = TOUCHES_NOTHING
+        self.kind, self.contact = cells, touches
+        self.distance = distance
+        self.separating = [1, 1]
+        self.moving: list[np.ndarray] | None = None
+        self.speed = np.zeros(3)
+
+    def move(self, velocity: np.ndarray) -> None:
+        """Let the plane move [m/s]."""
+        self.speed = velocity
+        self.moving = [np.where(f < 1, velocity[axis], np.nan) for axis, f in enumerate(self.open)]  # open faces have no wall's velocity
+
+    def signed(self, x: np.ndarray) -> np.ndarray:
+        return (x - self.at) @ self.normal
+
+    def fraction(self, axis: int) -> np.ndarray:
+        """Return the open fraction of each face by samples."""
+        n = 16
+        samples = (np.arange(n) + 0.5) / n
+        total = np.zeros(self.grid.shape)
+        others = [d for d in range(self.grid.dimension) if d != axis]
+        for b in samples:
+            for c in samples if len(others) == 2 else samples[:1]:
+                offset = np.zeros(3)
+                offset[others] = [b, c][: len(others)]
+                total += self.signed(points(self.grid, offset)) > 0
+        return (total / n ** len(others)).astype(np.float32)
+
+    def extend(self, velocity: tuple[float, ...], layers: int = 4) -> list[np.ndarray]:
+        grid = self.grid
+        fields, known = [], []
+        for axis, fraction in enumerate(self.open):
+            fields.append(wp.array(np.where(fraction > 0, velocity[axis], JUNK).astype(np.float32), device="cpu"))
+            known.append(wp.array((fraction > 0).astype(np.int8), device="cpu"))
+            if grid.dimension == 2:
+                known[-1].numpy()[[0, 2]] = 0
+        extend_velocity_cut(
+            grid.everywhere, fields, grid.faces(), known, wp.array(self.kind, device="cpu"), wp.array(self.contact, device="cpu"),
+            self.cut(), grid.faces(), layers,
+        )  # fmt: skip
+        return [field.numpy() for field in fields]
+
+    def cut(self) -> Any:
+        moving = None if self.moving is None else [wp.array(m.astype(np.float32), dtype=wp.float32, device="cpu") for m in self.moving]
+        return SimpleNamespace(
+            distance=wp.array(self.distance.astype(np.float32), dtype=wp.float32, device="cpu"),
+            open=[wp.array(f, dtype=wp.float32, device="cpu") for f in self.open],
+            wall=[wp.array(w, dtype=wp.int16, device="cpu") for w in self.wall],
+            velocity=moving,
+            nearest=[],
+            grid=self.grid,
+            turn=wp.zeros(2, dtype=wp.mat33, device="cpu"),
+            shift=wp.array([np.zeros(3), self.speed], dtype=wp.vec3, device="cpu"),
+            separating=wp.array(self.separating, dtype=wp.uint8, device="cpu"),
+        )
+
+    def judged(self, axis: int) -> np.ndarray:
+        """Return the closed faces that a particle's tent can reach, away from the domain's walls."""
+        x = face_centers(self.grid, axis)
+        away = np.all([(x[..., d] > 2.6) & (x[..., d] < self.grid.counts[d] - 2.6) for d in range(self.grid.dimension)], axis=0)
+        if self.grid.dimension == 2:
+            away[[0, 2]] = False
+        return away & (self.open[axis] == 0) & (self.signed(x) > -1.5)
+
+
+SLOPES = [
+    (FLAT, (-0.5, 0.75**0.5, 0.0)),
+    (FLAT, (0.0, 1.0, 0.0)),
+    (FLAT, (0.7, -0.4, 0.0)),
+    (FLAT, (1.0, 1.0, 0.0)),
+    (SPACE, (-0.3, 0.8, 0.5)),
+]
+IDS = ["30 degrees", "flat", "ceiling", "along diagonals", "3d"]
+
+
+def expected(slope: Slope, velocity: tuple[float, ...], removes: bool) -> np.ndarray:
+    u = np.array([*velocity, 0.0][:3])
+    return u - (u @ slope.normal) * slope.normal * removes
+
+
+@pytest.mark.parametrize(("grid", "normal"), SLOPES, ids=IDS)
+@pytest.mark.parametrize("towards", [-1.0, 1.0])
+@pytest.mark.parametrize(
+    ("kind", "contact", "separating", "holds"),
+    [
+        (FLUID, HELD, 1, True),
+        (FLUID, RELEASED, 1, False),
+        (FLUID, RELEASED, 0, True),  # a free-slip face of a cell that another wall released
+        (FLUID, HELD, 0, True),
+        (AIR, TOUCHES_NOTHING, 1, False),
+        (AIR, TOUCHES_NOTHING, 0, False),
+    ],
+)
+def test_closed_faces_along_a_slope(
+    grid: StaggeredGrid, normal: tuple[float, float, float], towards: float, kind: int, contact: int, separating: int, holds: bool
+) -> None:
+    """Tangential flow stays whole; what leaves is held back only where the wall holds, what goes in is stopped everywhere."""
+    slope = Slope(grid, normal, kind, contact)
+    slope.separating[1] = separating
+    tangent = np.array([slope.normal[1], -slope.normal[0], 0.0])
+    velocity = tuple(0.8 * tangent + 0.3 * towards * slope.normal)[: grid.dimension]
+    fields = slope.extend(velocity)
+    wanted = expected(slope, velocity, holds or towards < 0)
+    for axis, field in enumerate(fields):
+        judged = slope.judged(axis)
+        assert judged.sum() > 15
+        assert np.abs(field[judged] - wanted[axis]).max() < 2e-6
+        assert (field[slope.open[axis] > 0] == np.float32(velocity[axis])).all()
+
+
+@pytest.mark.parametrize("towards", [-1.0, 1.0])
+def test_closed_faces_take_the_normal_velocity_of_a_wall_that_moves(towards: float) -> None:
+    """Liquid that is held follows a wall both ways, and nothing of the wall's tangential velocity."""
+    slope = Slope(*SLOPES[-1])
+    wall = np.array([0.4, -0.2, 0.7]) + 2.0 * towards * slope.normal
+    slope.move(wall)
+    velocity = np.array([0.3, 0.5, -0.6])
+    wanted = velocity - ((velocity - wall) @ slope.normal) * slope.normal
+    for axis, field in enumerate(slope.extend(tuple(velocity))):
+        assert np.abs(field[slope.judged(axis)] - wanted[axis]).max() < 5e-6
+
+
+def test_released_liquid_is_pushed_by_a_wall_that_overtakes_it() -> None:
+    for speed, holds in ((0.2, True), (-0.2, False)):
+        slope = Slope(*SLOPES[0], contact=RELEASED)
+        wall = 0.5 * slope.normal
+        slope.move(wall)
+        velocity = (0.5 - speed) * slope.normal + np.array([slope.normal[1], -slope.normal[0], 0.0])
+        wanted = velocity - ((velocity - wall) @ slope.normal) * slope.normal * holds
+        for axis, field in enumerate(slope.extend(tuple(velocity[:2]))):
+            assert np.abs(field[slope.judged(axis)] - wanted[axis]).max() < 5e-6
+
+
+@pytest.mark.parametrize(("contact", "speed"), [(RELEASED, -1.0), (HELD, 0.0)])
+def test_a_sliver_that_lets_go_decides_and_not_the_cell_behind_it(contact: int, speed: float) -> None:
+    """The wall cell under a ceiling is open for a fifth, the cell below it touches no wall: nothing may hang from that one."""
+    slope = Slope(FLAT, (0.0, -1.0, 0.0), contact=contact, shift=-0.2)
+    row = FLAT.counts[1] // 2 + 1  # of the wall cells
+    assert slope.open[0][1, row, 9] == pytest.approx(0.2, abs=0.02)
+    assert slope.contact[1, row, 9] == contact
+    assert slope.contact[1, row - 1, 9] == TOUCHES_NOTHING
+    v = slope.extend((0.0, -1.0))[1][1]
+    assert v[row + 1, 5:-5] == pytest.approx(speed, abs=1e-6)
+    assert v[row, 5:-5] == pytest.approx(-1.0)
+
+
+@pytest.mark.parametrize("counts", [(7, 6, 1), (5, 6, 4)])
+@settings(max_examples=30, deadline=None)
+@given(random_seed=st.integers(0, 10**6))
+def test_a_box_is_treated_as_one_of_whole_cells(counts: tuple[int, int, int], random_seed: int) -> None:
+    """Without solids the walls are those of the domain, along the grid: what `warp_lcp.material.wall` does is an oracle."""
+    grid = StaggeredGrid(counts, 0.1, 2 if counts[2] == 1 else 3)
+    rng = np.random.default_rng(random_seed)
+    inner = (slice(1, -1),) * 3
+    kind = np.full(grid.shape, SOLID, np.int8)
+    kind[inner] = rng.choice([AIR, FLUID], size=counts[::-1], p=[0.6, 0.4])
+    contact = np.where(kind == FLUID, rng.choice([HELD, RELEASED], size=grid.shape), TOUCHES_NOTHING).astype(np.uint8)
+    separating = wp.array([random_seed % 3 > 0], dtype=wp.uint8, device="cpu")
+    x = points(grid, (0, 0, 0))
+    sides = np.min([np.minimum(x[..., d], grid.counts[d] - x[..., d]) for d in range(grid.dimension)], axis=0)
+    cut = SimpleNamespace(
+        distance=wp.array(sides.astype(np.float32), device="cpu"), open=[], wall=[], velocity=None, nearest=[], separating=separating,
+        grid=grid, turn=wp.zeros(1, dtype=wp.mat33, device="cpu"), shift=wp.zeros(1, dtype=wp.vec3, device="cpu"),
+    )  # fmt: skip
+    results = []
+    start, weights, marks = [], [], []
+    for axis in range(grid.dimension):
+        below = np.roll(kind, 1, 2 - axis)
+        open_face = (kind != SOLID) & (below != SOLID)
+        cut.open.append(wp.array(open_face.astype(np.float32), device="cpu"))
+        cut.wall.append(wp.array(np.where(open_face, -1, 0).astype(np.int16), device="cpu"))
+        projected = open_face & ((kind == FLUID) | (below == FLUID))
+        weights.append((rng.random(grid.shape) < 0.3).astype(np.float32) * open_face)
+        marks.append(np.where((kind == SOLID) & (below == SOLID), -1, projected).astype(np.int8))
+        start.append((rng.normal(size=grid.shape) * (projected | (weights[-1] > 0))).astype(np.float32))
+    layers = 4
+    for cuts in (False, True):
+        fields = [wp.array(f, device="cpu") for f in start]
+        weight = [wp.array(w, device="cpu") for w in weights]
+        known = [wp.array(np.maximum(m, 0) if cuts else m, dtype=wp.int8, device="cpu") for m in marks]
+        liquid, touch = wp.array(kind, device="cpu"), wp.array(contact, device="cpu")
+        if cuts:
+            extend_velocity_cut(grid.everywhere, fields, weight, known, liquid, touch, cut, grid.faces(), layers)
+        else:
+            index = wp.array(np.where(kind == SOLID, 0, -1).astype(np.int32), device="cpu")
+            extend_velocity(grid.everywhere, fields, weight, known, liquid, touch, index, separating, [], layers)
+        results.append(([f.numpy() for f in fields], [m.numpy() for m in known]))
+    for axis, (voxel, smooth) in enumerate(zip(results[0][0], results[1][0], strict=True)):
+        reached = results[0][1][axis] > 0
+        if grid.dimension == 2:
+            reached[[0, 2]] = False
+        np.moveaxis(reached, 2 - axis, 0)[0] = False  # no tent reaches a face behind the domain's lower wall
+        assert smooth[reached] == pytest.approx(voxel[reached], abs=1e-6)
+
+
+def test_spray_keeps_its_own_velocity_on_open_faces_only() -> None:
+    slope = Slope(FLAT, (0.0, 1.0, 0.0), kind=AIR)
+    cut, marks = slope.cut(), FLAT.faces(wp.int8)
+    fields, weights = FLAT.faces(), FLAT.faces()
+    floor = int(slope.at[1]) + 1  # row of the plane's closed faces
+    fields[1].numpy()[1, floor + 4, 9] = -2.0
+    weights[1].numpy()[1, floor + 4, 9] = 1.0
+    fields[1].numpy()[1, floor - 1, 15] = 7.0
+    weights[1].numpy()[1, floor - 1, 15] = 1.0
+    kind, contact = wp.array(slope.kind, device="cpu"), wp.array(slope.contact, device="cpu")
+    extend_velocity_cut(FLAT.everywhere, fields, weights, marks, kind, contact, cut, FLAT.faces(), 2)
+    v, known = fields[1].numpy()[1], marks[1].numpy()[1]
+    assert v[floor + 4, 9] == -2.0
+    assert v[floor + 2, 9] == -2.0  # two layers from it
+    assert known[floor + 4, 9] == 1
+    assert known[floor - 1, 15] == 0
+
+
+def test_deep_faces_are_left_alone() -> None:
+    slope = Slope(FLAT, (0.0, 1.0, 0.0))
+    fields = slope.extend((0.4, -0.5), layers=6)
+    floor = int(slope.at[1]) + 1
+    assert fields[1][1, floor, 5:-5] == pytest.approx(0.0, abs=1e-6)
+    assert fields[1][1, floor - 2, 5:-5] == pytest.approx(0.0, abs=1e-6)
+    assert fields[1][1, floor - 3, 5:-5] == pytest.approx(-0.5)
+    assert fields[0][1, floor - 1, 5:-5] == pytest.approx(0.4)
+    assert fields[1][1, floor - 7, 5:-5] == pytest.approx(JUNK)

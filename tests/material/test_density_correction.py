@@ -1,0 +1,270 @@
+"""The density correction: its problem against a dense one, the way it moves particles, and what it keeps of a liquid."""
+
+import itertools
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warp_lcp as wl
+from small_liquids import advance, box, create, dam, scene
+from warp_lcp.grid.particles import Particles
+from warp_lcp.material.boundary import Boundary
+from warp_lcp.material.density_correction import LONGEST, DensityCorrection
+
+BALL = {"shape": "sphere", "center": [0.5, 0.5], "radius": 0.23}
+
+
+def tank(dimension: int = 2, resolution: int = 12, **tables: Any) -> tuple[Any, Boundary]:
+    """Return grid and boundary of a unit box."""
+    simulation = create(scene(size=[1.0] * dimension, resolution=resolution, liquid=[box([0.0] * dimension, [1.0] * dimension)], **tables))
+    return simulation.grid, simulation.boundary
+
+
+def lattice(grid: Any, boundary: Boundary, per_axis: int = 2) -> np.ndarray:
+    """Return the points of a lattice that fills what is open [m], shape (n, 3)."""
+    axes = [(np.arange(n * per_axis) + 0.5) * grid.spacing / per_axis for n in grid.counts[: grid.dimension]]
+    points = np.stack([c.ravel() for c in np.meshgrid(*axes, indexing="ij")], axis=1)
+    points = np.pad(points, ((0, 0), (0, 3 - grid.dimension)))
+    return points[boundary.admits(points)]
+
+
+def correction(grid: Any, boundary: Boundary, **settings: Any) -> DensityCorrection:
+    """Return a correction of particles, 2 along each axis of a cell."""
+    return DensityCorrection(
+        grid, boundary, wl.ProjectedMultigrid(precision="double"), particles_a_cell=2**grid.dimension, **({"max_density": 1.05} | settings)
+    )
+
+
+def particles_of(grid: Any, points: np.ndarray, indexed: bool = False) -> Particles:
+    """Return particles with a velocity of their own each."""
+    velocity = np.random.default_rng(77).standard_normal((len(points), 3)).astype(np.float32)
+    return Particles(grid, points.astype(np.float32), velocity, affine=True, indexed=indexed)
+
+
+def spline(d: np.ndarray) -> np.ndarray:
+    """Return the quadratic B-spline."""
+    d = np.abs(d)
+    return np.where(d < 0.5, 0.75 - d * d, np.where(d < 1.5, 0.5 * (1.5 - d) ** 2, 0.0))
+
+
+def density_of(grid: Any, points: np.ndarray) -> np.ndarray:
+    """Return the density of points at the cells' centers, in the stored shape: every cell looks at every particle."""
+    result = np.zeros(grid.shape)
+    dimension = grid.dimension
+    for cell in itertools.product(*(range(1, n + 1) for n in grid.counts)):
+        center = np.array(cell) + 0.5
+        weight = spline(grid.to_grid(points)[:, :dimension] - center[:dimension]).prod(axis=1)
+        result[cell[2], cell[1], cell[0]] = weight.sum() / 2**dimension
+    return result
+
+
+def dense_solution(boundary: Boundary, density: np.ndarray, most: float, sweeps: int = 20000) -> np.ndarray:
+    """Return x >= 0 that is complementary to sum a_f (x_i - x_nb) + most capacity - density, in the stored shape, by projected sweeps.
+
+    A face of whole cells is open where no cell beside it is SOLID; x is 0 where there is no density.
+    """
+    base, capacity = boundary.base.numpy(), boundary.capacity.numpy().astype(float)
+    wet = (base != wl.SOLID) & (density > 0)
+    number = np.full(base.shape, -1)
+    number[wet] = np.arange(wet.sum())
+    A = np.zeros((wet.sum(), wet.sum()))
+    for cell in np.argwhere(base != wl.SOLID):
+        for axis in range(3):
+            below = cell.copy()
+            below[2 - axis] -= 1
+            here, there = tuple(cell), tuple(below)
+            if base[there] == wl.SOLID:
+                continue
+            open_ = float(boundary.open[axis].numpy()[here]) if boundary.open else 1.0
+            for one, other in ((number[here], number[there]), (number[there], number[here])):
+                if one >= 0:
+                    A[one, one] += open_
+                if one >= 0 and other >= 0:
+                    A[one, other] -= open_
+    b = most * capacity[wet] - density[wet]
+    x = np.zeros(len(b))
+    for _ in range(sweeps):
+        before = x.copy()
+        for i in range(len(b)):
+            if A[i, i] > 0:
+                x[i] = max(0.0, x[i] - (A[i] @ x + b[i]) / A[i, i])
+        if np.abs(x - before).max() < 1e-12:
+            break
+    field = np.zeros(base.shape)
+    field[wet] = x
+    return field
+
+
+@pytest.mark.parametrize("solid", [[], [box([0.25, 0.25], [0.5, 0.5])], [BALL]])
+def test_the_solution_is_that_of_a_dense_problem(solid: list[dict[str, Any]]) -> None:
+    """Density, capacity beside walls, open fractions and signs enter it: one of them wrong, and x is another one."""
+    grid, boundary = tank(resolution=8, solid=solid)
+    points = lattice(grid, boundary)
+    points = points[points[:, 1] < 0.8]
+    points[:, 1] *= 0.87  # squeezed onto the floor
+    points = points[boundary.admits(points)]
+    corrected = correction(grid, boundary, tolerance=1e-8, max_iterations=60)
+    done = corrected.apply(particles_of(grid, points), grid.everywhere)
+    density = density_of(grid, points.astype(np.float32))
+    expected = dense_solution(boundary, density, 1.05)
+    assert expected.max() > 0.2
+    np.testing.assert_allclose(corrected.x.numpy(), expected, atol=0.01 if boundary.open else 1e-4)
+    open_cells = boundary.base.numpy() != wl.SOLID
+    assert done.max_density == pytest.approx(1 + (density - boundary.capacity.numpy())[open_cells & (density > 0)].max(), abs=1e-4)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("indexed", [False, True])
+def test_an_over_full_cell_pushes_its_neighbors_outward(dimension: int, indexed: bool) -> None:
+    """With the sign of [Book] eq. (1.116) they would be drawn in, and the density would rise."""
+    grid, boundary = tank(dimension, 9)
+    points = lattice(grid, boundary)
+    points = points[points[:, 1] < 7.0 / 9.0]
+    center = np.array([0.5, 0.5, 0.5 if dimension == 3 else 0.0])
+    more = np.random.default_rng(31).uniform(-0.5, 0.5, (2 * 2**dimension, 3)) * grid.spacing
+    more[:, dimension:] = 0.0
+    particles = particles_of(grid, np.concatenate([points, center + more]), indexed)
+    if indexed:
+        particles.sort()
+    corrected, last = correction(grid, boundary), math.inf
+    for turn in range(12):
+        before, speeds = particles.position.numpy().copy(), particles.velocity.numpy().copy()
+        done = corrected.apply(particles, grid.everywhere)
+        assert done.max_density < last
+        last = done.max_density
+        if done.result is None:
+            break
+        assert done.result
+        if turn == 0 and not indexed:
+            away = before - center
+            distance = np.linalg.norm(away, axis=1)
+            outward = ((particles.position.numpy().copy() - before) * away).sum(axis=1) / np.maximum(distance, 1e-9)
+            ring = (distance > 0.6 * grid.spacing) & (distance < 1.6 * grid.spacing)
+            assert (outward[ring] > 0.01 * grid.spacing).all()
+            assert np.array_equal(particles.velocity.numpy().copy(), speeds)
+    assert last < 1.15
+    assert particles.count == len(points) + len(more)
+
+
+@pytest.mark.parametrize("solid", [[], [BALL]])
+def test_nobody_moves_more_than_half_a_cell_or_into_a_wall(solid: list[dict[str, Any]]) -> None:
+    """Ten times too many particles on the floor and around a ball."""
+    grid, boundary = tank(resolution=16, solid=solid)
+    points = np.random.default_rng(5).uniform(0.001, 0.999, (9000, 3)) * [1.0, 0.3, 0.0]
+    points = points[boundary.admits(points)]
+    particles = particles_of(grid, points)
+    corrected = correction(grid, boundary)
+    for _ in range(5):
+        before = particles.position.numpy().astype(float)
+        assert corrected.apply(particles, grid.everywhere).result is not None
+        after = particles.position.numpy().astype(float)
+        moved = np.linalg.norm(after - before, axis=1).max() / grid.spacing
+        assert 0.3 < moved <= LONGEST + 2e-3  # and what a wall pushes
+        assert (after[:, :2] >= 0).all()
+        assert (after[:, :2] <= 1).all()
+        if solid:
+            assert np.linalg.norm(after[:, :2] - 0.5, axis=1).min() > 0.23 - 0.05 * grid.spacing
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_lattice_at_rest_is_left_alone(dimension: int) -> None:
+    """Also beside walls, where a cell's kernel holds less: nothing is solved, no bit changes."""
+    grid, boundary = tank(dimension, 8)
+    particles = particles_of(grid, lattice(grid, boundary))
+    before = particles.position.numpy().copy()
+    done = correction(grid, boundary).apply(particles, grid.everywhere)
+    assert done.result is None
+    assert done.max_density == pytest.approx(1.0, abs=0.03)
+    assert np.array_equal(particles.position.numpy().copy(), before)
+
+
+def test_a_layer_squeezed_against_a_wall_counts_although_half_of_its_kernel_is_wall() -> None:
+    """A cell at the floor holds 5/6: without the capacity 1.2 times that would pass for rest."""
+    grid, boundary = tank(resolution=8)
+    points = lattice(grid, boundary)
+    points = points[points[:, 1] < 1.0 / 8.0]
+    lifted = points + np.array([0.0, 1.0 / 8.0, 0.0])
+    squeezed = np.concatenate([points, points * [1.0, 0.8, 1.0] + np.array([1e-3, 0.0, 0.0])])[: int(1.2 * len(points))]
+    done = correction(grid, boundary).apply(particles_of(grid, np.concatenate([squeezed, lifted])), grid.everywhere)
+    assert density_of(grid, np.concatenate([squeezed, lifted])).max() < 1.3
+    assert done.over_full > 0
+    assert done.result is not None
+
+
+def test_a_closed_room_that_is_too_full_is_left_alone() -> None:
+    """Whole cells and nowhere to go: no exception, no motion, and the log says so."""
+    grid, boundary = tank(resolution=8)
+    points = np.repeat(lattice(grid, boundary), 2, axis=0)
+    particles = particles_of(grid, points)
+    before = particles.position.numpy().copy()
+    done = correction(grid, boundary).apply(particles, grid.everywhere)
+    assert done.result is not None
+    assert done.result.status is wl.SolveStatus.INFEASIBLE
+    assert np.array_equal(particles.position.numpy().copy(), before)
+
+
+def test_a_closed_pocket_that_is_too_full_stops_nobody_else() -> None:
+    """Where solids cut cells the problem of a pocket without a way out is solvable too."""
+    walls = [box([0.3, 0.3], [0.7, 0.4], rotate=3.0), box([0.3, 0.6], [0.7, 0.7], rotate=3.0)]
+    walls += [box([0.3, 0.3], [0.4, 0.7], rotate=3.0), box([0.6, 0.3], [0.7, 0.7], rotate=3.0)]
+    grid, boundary = tank(resolution=24, solid=walls)
+    random = np.random.default_rng(8)
+    inside = np.pad(random.uniform(0.42, 0.58, (400, 2)), ((0, 0), (0, 1)))
+    below = np.pad(random.uniform(0.01, 0.2, (400, 2)), ((0, 0), (0, 1)))
+    particles = particles_of(grid, np.concatenate([inside, below])[boundary.admits(np.concatenate([inside, below]))])
+    before = particles.position.numpy().copy()
+    done = correction(grid, boundary).apply(particles, grid.everywhere)
+    assert done.result is not None
+    assert done.result.status is not wl.SolveStatus.INFEASIBLE
+    outside = before[:, 1] < 0.25
+    assert np.linalg.norm(particles.position.numpy().copy() - before, axis=1)[outside].max() > 0.1 * grid.spacing
+
+
+def test_only_a_scene_that_asks_for_it_has_one() -> None:
+    plain, corrected = dam(), dam(density_correction={})
+    assert plain.correction is None
+    assert not any("density" in name for name in (*plain.columns(), *plain.state()))
+    rows = advance(corrected, 0.2)
+    assert {"density_status", "density_iterations", "max_density"} <= set(corrected.columns())
+    assert {row["density_status"] for row in rows} <= {"CONVERGED", "NOTHING_TO_DO"}
+    assert all(1.0 <= row["max_density"] < 1.6 for row in rows)
+    assert "density_correction" in corrected.state()
+
+
+@pytest.mark.parametrize("tables", [{}, {"density_correction": {}, "particles": {"reseed": {}}}])
+def test_a_scene_without_it_launches_none_of_its_kernels(tables: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor does it allocate: fields are made when the simulation is."""
+    launched, launch = set(), wp.launch
+
+    def note(kernel: wp.Kernel, *arguments: Any, **named: Any) -> Any:
+        launched.add(kernel.module.name)
+        return launch(kernel, *arguments, **named)
+
+    monkeypatch.setattr(wp, "launch", note)
+    simulation = dam(**tables)
+    advance(simulation, 0.2)
+    own = {name for name in launched if name.startswith(("warp_lcp.material.density_correction", "warp_lcp.material.reseeding"))}
+    assert "warp_lcp.grid.density" in launched
+    assert own == ({"warp_lcp.material.density_correction", "warp_lcp.material.reseeding"} if tables else set())
+
+
+def test_every_third_step() -> None:
+    simulation = dam(density_correction={"every": 3})
+    rows = advance(simulation, 0.3)
+    assert [row["max_density"] is not None for row in rows] == [step % 3 == 0 for step in range(len(rows))]
+
+
+@pytest.mark.parametrize("tables", [{}, {"solid": [box([0.5, 0.0], [0.7, 0.11], rotate=20)]}, {"dimension": 3}])
+def test_a_liquid_that_has_splashed_keeps_its_density(tables: dict[str, Any]) -> None:
+    """Without the correction cells at the floor fill up beyond 1.5."""
+    plain, corrected = dam(**tables), dam(density_correction={}, **tables)
+    largest = []
+    for simulation in (plain, corrected):
+        advance(simulation, 1.0)
+        density = wp.zeros_like(simulation.surface.phi)
+        wp.copy(density, simulation.surface.level_set.density)
+        largest.append(float((density.numpy() - simulation.boundary.capacity.numpy())[simulation.boundary.base.numpy() != wl.SOLID].max()))
+    assert largest[1] < 0.8 * largest[0]

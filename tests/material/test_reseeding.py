@@ -1,0 +1,132 @@
+"""Reseeding: who moves where, what is conserved, and what is left alone."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from small_liquids import advance, box, create, dam, scene
+from warp_lcp.driver.table import SceneError
+from warp_lcp.grid.particles import Particles
+from warp_lcp.material.reseeding import Reseeding
+
+CELLS = 12
+
+
+def pool(dimension: int, solid: list[dict[str, Any]] | None = None) -> Any:
+    """Return a simulation of a box, of which grid and boundary are used."""
+    size = [1.0] * dimension
+    return create(scene(size=size, resolution=CELLS, liquid=[box([0.0] * dimension, size)], solid=solid or []))
+
+
+def uneven(simulation: Any, *, bubble: bool = False, top: float = 0.75, seed: int = 12) -> Particles:
+    """Return particles at random places below `top`, on average as many as at rest, each with a velocity of its own."""
+    grid, random = simulation.grid, np.random.default_rng(seed)
+    size = np.array([1.0, top, 1.0 if grid.dimension == 3 else 0.0])
+    points = random.uniform(0.001, 0.999, (int(2**grid.dimension * CELLS**grid.dimension * top), 3)) * size
+    points = points[simulation.boundary.admits(points)]
+    if bubble:
+        points = points[(np.abs(points[:, :2] * CELLS - [6.0, 4.0]) > [2.0, 2.0]).any(axis=1)]
+    velocity = random.standard_normal(points.shape).astype(np.float32)
+    return Particles(grid, points.astype(np.float32), velocity, affine=True)
+
+
+def counts(grid: Any, particles: Particles) -> np.ndarray:
+    """Return the particles of each cell, shape (nz, ny, nx)."""
+    cells = particles.cells_of(particles.position.numpy())
+    nx, ny, nz = grid.counts
+    return np.bincount((cells[:, 2] * ny + cells[:, 1]) * nx + cells[:, 0], minlength=nx * ny * nz).reshape(nz, ny, nx)
+
+
+def reseeding(simulation: Any, least: int, most: int) -> Reseeding:
+    """Return one that is sure of its arguments."""
+    return Reseeding(simulation.grid, simulation.boundary, least=least, most=most, particles_a_cell=2**simulation.grid.dimension)
+
+
+@pytest.mark.parametrize(("dimension", "least", "most"), [(2, 3, 6), (3, 5, 12)])
+def test_cells_deep_in_the_liquid_hold_enough(dimension: int, least: int, most: int) -> None:
+    simulation = pool(dimension)
+    grid, particles = simulation.grid, uneven(simulation)
+    deep = (slice(2, -2), slice(2, 7), slice(2, -2)) if dimension == 3 else (slice(None), slice(2, 7), slice(2, -2))
+    before = counts(grid, particles)
+    assert (before[deep] < least).sum() > 5
+    reseed = reseeding(simulation, least, most)
+    for step in range(4):
+        moved = reseed.apply(particles, grid.everywhere, step)
+    after = counts(grid, particles)
+    assert (after[deep] < least).sum() <= 0.15 * (before[deep] < least).sum()  # a thin region around one stays thin
+    assert after.sum() == before.sum() == particles.count
+    assert moved <= 2
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_each_keeps_its_velocity_and_goes_to_a_neighboring_cell(dimension: int) -> None:
+    """So momentum and energy are the same to the last bit; positions tell who moved."""
+    simulation = pool(dimension)
+    grid, particles = simulation.grid, uneven(simulation)
+    particles.sort()
+    before = {name: array.numpy().copy() for name, array in particles.arrays().items()}
+    moved = reseeding(simulation, 3 * dimension - 3, 6 * dimension).apply(particles, grid.everywhere, 7)
+    after = {name: array.numpy() for name, array in particles.arrays().items()}
+    for name in before.keys() - {"position"}:
+        assert np.array_equal(before[name], after[name])
+    changed = (before["position"] != after["position"]).any(axis=1)
+    assert moved == changed.sum() > 10
+    cells = [particles.cells_of(p["position"]) for p in (before, after)]
+    assert np.abs(cells[1] - cells[0])[changed].max() == 1
+    assert (cells[1] != cells[0]).any(axis=1)[changed].all()
+
+
+def test_the_surface_bubbles_and_walls_are_left_alone() -> None:
+    """A bubble of four cells is air; a cell at the surface has half of its surroundings empty."""
+    ball = {"shape": "sphere", "center": [0.1, 0.1], "radius": 0.13}
+    simulation = pool(2, [ball])
+    grid, particles = simulation.grid, uneven(simulation, bubble=True)
+    before = counts(grid, particles)[0]
+    assert reseeding(simulation, 3, 6).apply(particles, grid.everywhere, 0) > 0
+    after = counts(grid, particles)[0]
+    assert (after[2:6, 4:8] == 0).all()
+    assert (after[9:] == 0).all()
+    touched = np.zeros(after.shape, dtype=bool)
+    touched[0], touched[:, 0], touched[:, -1] = True, True, True
+    assert (after[touched] <= before[touched]).all()  # they may give
+    assert simulation.boundary.admits(particles.position.numpy()).all()
+
+
+def test_nothing_is_drawn_from_cells_that_hold_no_more_than_at_rest() -> None:
+    simulation = pool(2)
+    particles = uneven(simulation)
+    before = counts(simulation.grid, particles)
+    reseeding(simulation, 4, 4).apply(particles, simulation.grid.everywhere, 0)
+    after = counts(simulation.grid, particles)
+    assert (after[before > 4] >= 4).all()
+    assert (after[before <= 4] <= 4).all()
+    assert (after[before <= 4] >= before[before <= 4]).all()
+
+
+def test_runs_are_repeatable() -> None:
+    found = []
+    for _ in range(2):
+        simulation = dam(particles={"reseed": {"every": 1, "min": 4, "max": 4}}, density_correction={})
+        rows = advance(simulation, 0.6)
+        assert sum(row["reseeded"] for row in rows) > 0
+        found.append({name: array.numpy().copy() for name, array in simulation.particles.arrays().items()})
+    for name, array in found[0].items():
+        assert np.array_equal(array, found[1][name])
+
+
+def test_only_a_scene_that_asks_for_it_has_one() -> None:
+    assert dam().reseeding is None
+    assert "reseeded" not in dam().columns()
+    simulation = dam(particles={"reseed": {"every": 4}})
+    rows = advance(simulation, 0.3)
+    assert [row["reseeded"] is not None for row in rows] == [step % 4 == 0 for step in range(len(rows))]
+
+
+@pytest.mark.parametrize(("reseed", "key"), [({"min": 5}, "min"), ({"max": 3}, "max")])
+def test_bounds_that_exclude_rest_are_refused(reseed: dict[str, int], key: str) -> None:
+    with pytest.raises((SceneError, ValidationError), match=f"particles.*reseed.*{key}|at (most|least) the 4 particles"):
+        dam(particles={"reseed": reseed})
+    with pytest.raises(ValueError, match="4 between them"):
+        reseeding(pool(2), *((5, 8) if key == "min" else (2, 3)))

@@ -1,0 +1,161 @@
+"""Sources and drains: how much comes in, where, when, and what is taken out."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from fluids import LiquidSimulation
+from small_liquids import advance, box, create, scene
+from warp_lcp.driver.simulator import SimulationFailed
+
+TAP = box([0.0, 0.5], [0.125, 0.625], velocity=[1.0, 0.0])
+BALL = {"shape": "sphere", "center": [0.8, 0.1], "radius": 0.1}
+
+
+def tap(source: list[dict[str, Any]] | None = None, **tables: Any) -> LiquidSimulation:
+    """Return a basin with a tap."""
+    return create(scene(size=[1.0, 1.0], resolution=32, liquid=tables.pop("liquid", []), source=source or [TAP], **tables))
+
+
+def emitted(rows: list[dict[str, Any]]) -> int:
+    """Return how many particles came in."""
+    return sum(row["emitted"] for row in rows)
+
+
+@pytest.mark.parametrize("surface", ["ghost-fluid", "voxel"])
+@pytest.mark.parametrize("solids", ["cut-cell", "voxel"])
+def test_the_rate_is_area_times_velocity(solids: str, surface: str) -> None:
+    simulation = tap(solids=solids, solid=[BALL], pressure={"surface": surface})
+    start = simulation.particles.count
+    assert start == 4 * 4 * 4  # the source itself is full
+    rows = advance(simulation, 1.0)
+    expected = 0.125 * 1.0 * 1.0 * 32**2 * 4
+    assert emitted(rows) == pytest.approx(expected, rel=0.02)
+    assert simulation.particles.count == start + emitted(rows)
+    mass = simulation.particle_mass * simulation.particles.count
+    assert rows[-1]["mass"] == pytest.approx(mass)
+    x = simulation.particles.position.numpy()
+    inside = (x[:, 0] < 0.125) & (x[:, 1] > 0.5) & (x[:, 1] < 0.625)
+    assert inside.sum() == pytest.approx(start, rel=0.2)  # the seeding density stays
+    np.testing.assert_allclose(
+        simulation.particles.velocity.numpy()[inside & (x[:, 0] < 0.09)], [[1.0, 0.0, 0.0]] * (inside & (x[:, 0] < 0.09)).sum(), atol=0.05
+    )
+
+
+def test_the_rate_in_three_dimensions() -> None:
+    source = box([0.0, 0.25, 0.125], [0.125, 0.375, 0.25], velocity=[2.0, 0.0, 0.0])
+    simulation = create(scene(size=[0.5, 0.5, 0.375], resolution=16, liquid=[], source=[source]))
+    rows = advance(simulation, 0.2)
+    assert emitted(rows) == pytest.approx(0.125**2 * 2.0 * 0.2 * 32**3 * 8, rel=0.02)
+
+
+@pytest.mark.parametrize("velocity", [[-1.0, 0.0], [0.0, 2.0], [0.7, -0.7]])
+def test_any_direction_in_free_fall(velocity: list[float]) -> None:
+    source = box([0.4375, 0.4375], [0.5625, 0.5625], velocity=velocity)
+    rows = advance(tap([source], physics={"gravity": [0.0, 0.0]}), 0.15, 0.005)
+    across = 0.125 * np.abs(velocity).sum()  # of the square's shadow, times the speed
+    assert emitted(rows) == pytest.approx(across * 0.15 * 32**2 * 4, rel=0.05)
+
+
+def test_a_source_in_a_pool_pushes_its_volume_in_and_draws_nothing_from_behind() -> None:
+    # were the source's upstream faces open to the pool, its liquid would circulate and the pool would not rise
+    source = box([0.4375, 0.1875], [0.5625, 0.25], velocity=[0.0, 0.25])
+    simulation = tap([source], liquid=[box([0.0, 0.0], [1.0, 0.5])], density_correction={})
+    rows = advance(simulation, 1.0)
+    assert emitted(rows) == pytest.approx(0.125 * 0.25 * 32**2 * 4, rel=0.1)
+    assert rows[-1]["volume"] - rows[0]["volume"] == pytest.approx(0.125 * 0.25, rel=0.35)
+
+
+def test_it_runs_between_its_times_only() -> None:
+    simulation = tap([{**TAP, "start": 0.1, "stop": 0.3}], liquid=[box([0.0, 0.0], [1.0, 0.1])])
+    start = simulation.particles.count
+    rows = advance(simulation, 0.5)
+    times = np.cumsum([row["dt"] for row in rows])
+    came = np.array([row["emitted"] for row in rows])
+    assert not came[times < 0.1 - 1e-6].any()
+    assert not came[times > 0.3 + 1e-6].any()
+    assert np.isclose(times[:, None], [0.1, 0.3], atol=1e-6).any(axis=0).all()  # steps end there
+    expected = 64 + 0.125 * 1.0 * 0.2 * 32**2 * 4
+    assert came.sum() == simulation.particles.count - start == pytest.approx(expected, rel=0.02)
+
+
+def test_cells_that_are_full_already_are_not_filled() -> None:
+    assert tap(liquid=[box([0.0, 0.0], [1.0, 0.75])]).particles.count == 4 * 32 * 24
+
+
+def test_a_box_that_is_full_ends_the_run_with_a_reason() -> None:
+    simulation = tap(liquid=[box([0.0, 0.0], [1.0, 1.0])])
+    with pytest.raises(SimulationFailed, match="sources run"):
+        simulation.step(0.01)
+
+
+def test_a_drain_takes_what_is_in_it() -> None:
+    drain = box([0.0, 0.0], [0.25, 0.125])
+    simulation = create(
+        scene(size=[1.0, 1.0], resolution=32, liquid=[box([0.0, 0.0], [1.0, 0.25])], drain=[{**drain, "start": 0.1, "stop": 0.4}])
+    )
+    start = simulation.particles.count
+    rows = advance(simulation, 0.6)
+    times = np.cumsum([row["dt"] for row in rows])
+    gone = np.array([row["drained"] for row in rows])
+    assert not gone[times < 0.1 - 1e-6].any()
+    assert not gone[times >= 0.4 - 1e-6].any()
+    assert gone.sum() == start - simulation.particles.count == start - rows[-1]["particles"]
+    assert gone[times < 0.1 + 1e-6].sum() == pytest.approx(4 * 8 * 4, rel=0.2)
+    assert gone.sum() > 1.5 * 4 * 8 * 4  # the rest flows in
+    assert "emitted" not in simulation.columns()
+
+
+@pytest.mark.parametrize("particles", [{}, {"transfer": "flip"}])
+@pytest.mark.parametrize("tables", [{}, {"solid": [BALL]}, {"pressure": {"model": "unilateral"}}])
+def test_an_interrupted_run_goes_on_bit_for_bit(tables: dict[str, Any], particles: dict[str, Any]) -> None:
+    drain = [box([0.5, 0.0], [0.625, 0.125])]
+    through, resumed = (tap(particles=particles, drain=drain, **tables) for _ in range(2))
+    advance(through, 0.4)
+    saved = through.state()
+    assert len(saved["position"]) != resumed.particles.count
+    resumed.restore(saved)
+    for _ in range(12):
+        dt = through.stable_dt()
+        assert resumed.stable_dt() == dt
+        assert through.step(dt) == resumed.step(dt)
+    a, b = through.state(), resumed.state()
+    assert all(np.array_equal(a[name], b[name]) for name in a)
+
+
+def test_arrays_of_different_lengths_are_refused() -> None:
+    simulation = tap()
+    state = simulation.state()
+    with pytest.raises(ValueError, match="velocity"):
+        simulation.restore({**state, "position": state["position"][:-1]})
+
+
+@pytest.mark.parametrize(
+    ("tables", "message"),
+    [
+        ({"source": [box([0.0, 0.0], [0.1, 0.1], velocity=[0.0, 0.0])]}, "nothing would come out"),
+        ({"source": [box([0.0, 0.0], [0.1, 0.1], velocity=[1.0, 0.0, 0.0])]}, "2 entries"),
+        ({"source": [box([0.0, 0.0], [0.1, 0.1])]}, "required"),
+        ({"source": [{**TAP, "start": 1.0, "stop": 0.5}]}, "later than start = 1"),
+        ({"source": [box([2.0, 0.0], [3.0, 0.1], velocity=[1.0, 0.0])]}, "outside the domain"),
+        ({"drain": [{**box([0.0, 0.0], [0.1, 0.1]), "velocity": [1.0, 0.0]}]}, "not permitted"),
+        ({"liquid": []}, r"no \[\[source\]\] either"),
+    ],
+)
+def test_what_they_may_not_be(tables: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        scene(size=[1.0, 1.0], resolution=32, liquid=tables.pop("liquid", [box([0.0, 0.0], [0.5, 0.5])]), **tables)
+
+
+def test_a_source_without_a_cell_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"source\[0\] \(box\) holds no open cell's center"):
+        tap([box([0.0, 0.5], [0.01, 0.51], velocity=[1.0, 0.0])])
+
+
+def test_capsules_have_ends_and_times() -> None:
+    capsule = {"shape": "capsule", "from": [0.2, 0.5], "to": [0.4, 0.5], "radius": 0.1, "velocity": [0.0, 1.0], "start": 0.5}
+    model = scene(size=[1.0, 1.0], resolution=32, liquid=[], source=[capsule])
+    assert (model.source[0].start, model.source[0].end, model.source[0].begin) == ([0.2, 0.5], [0.4, 0.5], 0.5)
+    assert create(model).particles.count == 0

@@ -1,0 +1,195 @@
+"""Scenes of a material that particles carry, whatever it is: its sampling, sources and drains, and what a run would take."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from warp_lcp.driver.scene import Scene
+from warp_lcp.driver.shapes import Drain, MaterialProperties, Source
+from warp_lcp.driver.table import Complaint, Table
+
+# Measured at 96^3 as the growth of a process on the CPU, first step included.
+GRID_BYTES = 36  # fields of the grid, a cell
+CUT_BYTES = 45
+MOVING_BYTES = 30
+SOURCE_BYTES = 8
+CORRECTION_BYTES, CUT_CORRECTION_BYTES = 54, 22  # the density correction's fields and method, and more where cells are cut
+RESEED_BYTES = 13
+PLANES = 2.5  # that a 2-D cell counts for: its fields have three, the solver's one
+VECTOR_BYTES, KEY_BYTES = 12, 16  # a particle's vectors, one of them spare, and its sort keys
+SEEDING_BYTES = 136  # a particle on the host, while the material is made and the solver is not
+LATTICE_BYTES = 50  # a point of one plane of cells, while particles are chosen from them
+
+
+class Reseed(Table):
+    """[particles.reseed]: evens out particles deep in the material; off unless the table is there."""
+
+    every: int = Field(default=2, ge=1, description="steps from one time to the next")
+    min: int | None = Field(default=None, ge=1, description="particles in a cell, fewer are filled up; 3/8 of those at rest unless given")
+    max: int | None = Field(default=None, ge=1, description="particles in a cell, more are handed on; twice those at rest unless given")
+
+
+class ParticleSettings(Table):
+    """[particles]: how the material is sampled and how its velocity moves between particles and grid."""
+
+    per_axis: int = Field(default=2, ge=1, le=4, description="particles along the edge of a cell at the start")
+    transfer: Literal["apic", "flip", "pic"] = Field(default="apic", description="flip is livelier and noisier, pic damps")
+    flip_ratio: float = Field(default=0.95, ge=0, le=1, description="the share of FLIP when transfer is flip; the rest is PIC")
+    jitter: float = Field(default=0.25, ge=0, le=1, description="random displacement at the start, a fraction of the particles' distance")
+    seed: int = Field(default=2015, ge=0, description="of the random displacements")
+    reseed: Reseed | None = None
+
+    def reseed_range(self, dimension: int) -> tuple[int, int]:
+        """Return the fewest and the most particles of a cell that reseeding leaves alone."""
+        at_rest, given = self.per_axis**dimension, self.reseed or Reseed()
+        return given.min or math.ceil(0.375 * at_rest), given.max or 2 * at_rest
+
+
+class DensityCorrectionSettings(Table):
+    """[density_correction]: moves particles apart where they have come too close; off unless the table is there."""
+
+    every: int = Field(default=1, ge=1, description="steps from one correction to the next")
+    tolerance: float = Field(default=1e-2, gt=0, lt=1, description="the relative residual to reach")
+    max_density: float | None = Field(
+        default=None, gt=0, le=2, description="of a cell, in units of the density at rest; 1 + 0.1 / particles.per_axis unless given"
+    )
+
+    def largest(self, per_axis: int) -> float:
+        """Return the density [of that at rest] that a cell may have: particles on a lattice are uneven the more, the fewer they are."""
+        return self.max_density if self.max_density is not None else 1.0 + 0.1 / per_axis
+
+
+class ParticleScene(Scene):
+    """A scene of a material that particles carry.
+
+    Subclasses add the list of the material's shapes and name it in `materials`.
+    """
+
+    solve_bytes: ClassVar[int] = 0  # a cell, of the fields of the solve that are there before the particles are made
+
+    particles: ParticleSettings = Field(default_factory=ParticleSettings)
+    density_correction: DensityCorrectionSettings | None = None
+    source: list[Source] = Field(default_factory=list)
+    drain: list[Drain] = Field(default_factory=list)
+
+    @abstractmethod
+    def materials(self) -> tuple[str, Sequence[MaterialProperties]]:
+        """Return the key of the material's shapes in the file, such as `liquid`, and the shapes."""
+
+    def complaints(self) -> list[Complaint]:
+        """Return what is wrong across keys."""
+        key, materials = self.materials()
+        found = [] if materials or self.source else [Complaint((key,), None, "is missing, and there is no [[source]] either")]
+        found += self.shape_complaints(key, materials, inside=True)
+        found += self.shape_complaints("source", self.source, inside=True) + self.shape_complaints("drain", self.drain, inside=True)
+        return super().complaints() + found + self._reseed_complaints()
+
+    def _reseed_complaints(self) -> list[Complaint]:
+        least, most = self.particles.reseed_range(self.dimension)
+        at_rest = self.particles.per_axis**self.dimension
+        if self.particles.reseed is None or least <= at_rest <= most:
+            return []
+        key, value, word = ("min", least, "most") if least > at_rest else ("max", most, "least")
+        message = f"must be at {word} the {at_rest} particles of a cell at rest"
+        return [Complaint(("particles", "reseed", key), value, message)]
+
+    def particle_estimate(self, *, later: bool = True) -> int:
+        """Return about how many particles the scene has at most: meshes and slanted shapes count as the boxes around them.
+
+        Sources may fill the domain; whether they do, and what leaves it, is not known before.
+
+        Args:
+            later: count what sources let in; False: what is there at the start.
+        """
+        let_in = sum(self._source_volume(source, later=later) for source in self.source)
+        volume = min(sum(self.enclosed_volume(shape) for shape in self.materials()[1]) + let_in, math.prod(self.domain.size))
+        return round(volume / self.spacing**self.dimension * self.particles.per_axis**self.dimension)
+
+    def _source_volume(self, source: Source, *, later: bool) -> float:
+        """Return an upper bound of what a source holds and lets in, or of what it holds at the start [m^3; m^2 in 2-D]."""
+        size = np.array(self.domain.size)
+        bounds = source.bounds(self.dimension)
+        low, high = (np.zeros_like(size), size) if bounds is None else (corner[: self.dimension] for corner in bounds)
+        sides = np.maximum(np.minimum(high, size) - np.maximum(low, 0.0), 0.0)
+        seconds = max(min(source.stop or math.inf, self.time.duration) - source.begin, 0.0)
+        areas = np.array([np.delete(sides, axis).prod() for axis in range(self.dimension)])
+        if not later:
+            return float(sides.prod()) if source.begin == 0.0 else 0.0
+        return float(sides.prod() + areas @ np.abs(source.velocity) * seconds)
+
+    def plan(self) -> list[tuple[str, str]]:
+        """Return what a run would do."""
+        particles = self.particle_estimate()
+        settings = self.particles
+        at_first = f"{self.particle_estimate(later=False):,} at the start, " if self.source else ""
+        return [
+            *super().plan(),
+            ("particles", f"{at_first}at most {particles:,}, {settings.per_axis**self.dimension} a cell, {settings.transfer}"),
+            *self._rearrangement(),
+            ("memory", f"about {_megabytes(self.memory_estimate())} MB"),
+            *((f"  {name}", f"{_megabytes(count)} MB") for name, count in self.memory_parts().items()),
+        ]
+
+    def _rearrangement(self) -> list[tuple[str, str]]:
+        """Return what moves particles apart from the flow."""
+        lines, correction, reseed = [], self.density_correction, self.particles.reseed
+        if correction is not None:
+            most = correction.largest(self.particles.per_axis)
+            lines.append(("density", f"at most {most:.4g} of that at rest, corrected {_steps(correction.every)}"))
+        if reseed is not None:
+            least, many = self.particles.reseed_range(self.dimension)
+            lines.append(("reseeding", f"{least} to {many} particles a cell, {_steps(reseed.every)}"))
+        return lines
+
+    def memory_parts(self) -> dict[str, int]:
+        """Return about how much memory each part of a run takes at most on its device [bytes]; parts that it does not have are left out."""
+        cells, settings, cut = self.counted_cells, self.particles, self.cuts_cells
+        moving = any(solid.motion is not None for solid in self.solid)
+        vectors = 3 + (self.dimension if settings.transfer == "apic" else 0)
+        parts = {
+            "grid": cells * (GRID_BYTES + 4 * self.dimension * (settings.transfer == "flip")),
+            **self.own_memory_parts(),
+            "solids": cells * (CUT_BYTES * cut + MOVING_BYTES * moving),
+            "density correction": cells * (CORRECTION_BYTES + CUT_CORRECTION_BYTES * cut) * (self.density_correction is not None),
+            "reseeding": cells * RESEED_BYTES * (settings.reseed is not None),
+            "sources": cells * SOURCE_BYTES * bool(self.source),
+            "particles": self.particle_estimate() * (VECTOR_BYTES * vectors + KEY_BYTES),
+        }
+        return {name: count for name, count in parts.items() if count}
+
+    def own_memory_parts(self) -> dict[str, int]:
+        """Return what the material's own models take at most on the device [bytes]; parts that a scene does not have count 0."""
+        return {}
+
+    def memory_estimate(self) -> int:
+        """Return about how much memory a run takes at most [bytes], without the program itself; the particles' making may take the most."""
+        nx, ny, _ = self.cell_counts
+        lattice = nx * ny * self.particles.per_axis**self.dimension
+        making = self.counted_cells * (GRID_BYTES + self.solve_bytes) // 2 + self.particle_estimate() * SEEDING_BYTES
+        return max(super().memory_estimate(), making + lattice * LATTICE_BYTES)
+
+    @property
+    def counted_cells(self) -> int:
+        """Return how many cells of a 3-D grid the scene's cells count for in memory."""
+        nx, ny, nz = self.cell_counts
+        return round(nx * ny * (nz if self.dimension == 3 else PLANES))
+
+    @property
+    def cuts_cells(self) -> bool:
+        """Return whether solids may cut through cells."""
+        return self.domain.solids == "cut-cell" and bool(self.solid)
+
+
+def _megabytes(count: int) -> str:
+    return f"{count / 2**20:,.0f}" if count >= 10 * 2**20 else f"{count / 2**20:.1f}"
+
+
+def _steps(every: int) -> str:
+    """Return how often, in words."""
+    return "every step" if every == 1 else f"every {every} steps"

@@ -1,0 +1,404 @@
+"""A material on a staggered grid, carried by particles: what all such simulations do besides their own solve."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import warp as wp
+
+import warp_lcp as wl
+from warp_lcp.driver.particle_assembly import make_density_correction, make_reseeding
+from warp_lcp.driver.particle_scene import ParticleScene
+from warp_lcp.driver.profile import NoStopwatch, Stopwatch
+from warp_lcp.driver.simulator import Points, SimulationFailed
+from warp_lcp.grid.particles import MARGIN, Particles, ParticleTotals
+from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
+from warp_lcp.material.boundary import Boundary
+from warp_lcp.material.gravity import accelerate
+from warp_lcp.material.outlets import Outlets
+from warp_lcp.material.resample import resampled, resampling_notes
+from warp_lcp.material.sources import Sources
+
+Row = dict[str, float | int | str | None]  # of the log
+
+COLUMNS = (
+    "particles",
+    "mass",
+    "kinetic_energy",
+    "potential_energy",
+    "center_of_mass_y",
+    "max_speed",
+    "cfl",
+    "solver",
+    "solve_status",
+    "solve_iterations",
+    "linear_iterations",
+    "solve_residual",
+)
+
+
+CORRECTION_COLUMNS = ("density_status", "density_iterations", "max_density")
+
+
+class ParticleSimulation(ABC):
+    """Particles, the fields that they share, and the parts of a step around a solve, for a subclass to call in its own `step`.
+
+    A step calls `begin_step`, `window` and `bring_to_faces`; changes `velocity` as its material's laws ask; then calls `extend`,
+    `bring_to_particles` and `move`, and returns `logged` of what the log gets. Nothing before `move` changes the state but for the
+    particles' order, so that a solve may fail.
+
+    With `boundary`, `particles`, `sources` and `outlets` of `warp_lcp.driver.particle_assembly` it has a Simulation's clock, time step,
+    checkpoints, resampling, notes and columns; `step` and `frame` are the subclass's.
+
+    Args:
+        scene: what to simulate.
+        grid: its grid.
+        boundary: its solids and the domain's walls.
+        particles: the material at the start.
+        sources: where material comes in.
+        outlets: where it leaves.
+        notes: facts for the start of a run.
+
+    Attributes:
+        particles: the material.
+        velocity: of the last step on the faces, one field a component [m/s].
+        weights: of the particles on each component's faces, in the last step.
+        gravity: [m/s^2], shape (3,).
+        particle_mass: [kg]; 2-D: [kg/m].
+        layers: how far the velocity is continued into air and walls, in faces.
+        reach: how far from particles a step touches cells; more than `layers` where a subclass needs it.
+        time: [s].
+        step_count: steps done.
+        watch: what the stages of a step are measured with.
+    """
+
+    def __init__(
+        self,
+        scene: ParticleScene,
+        grid: StaggeredGrid,
+        boundary: Boundary,
+        particles: Particles,
+        *,
+        sources: Sources | None = None,
+        outlets: Outlets | None = None,
+        notes: Sequence[str] = (),
+    ) -> None:
+        """Allocate the fields, fill the sources that run at the start and sort the particles."""
+        self.scene, self.grid, self.boundary, self.particles = scene, grid, boundary, particles
+        self.sources, self.outlets = sources, outlets
+        self.time, self.step_count = 0.0, 0
+        self.watch: Stopwatch = NoStopwatch()
+        self._notes = list(notes)
+        self.gravity = np.array([*scene.physics.gravity, 0.0][:3])
+        self.particle_mass = scene.physics.density * grid.cell_volume / scene.particles.per_axis**grid.dimension
+        self.velocity, self.weights = grid.faces(), grid.faces()
+        self._saved = grid.faces() if scene.particles.transfer == "flip" else None
+        self.reseeding, self.correction = make_reseeding(scene, grid, boundary), make_density_correction(scene, grid, boundary)
+        self.layers = self.reach = math.ceil(scene.time.cfl) + 2
+        if sources is not None:
+            sources.emit(particles, None, self.time)
+        particles.sort()
+
+    @abstractmethod
+    def mark(self) -> None:
+        """Find the material's cells from the sorted particles, as frames show them before the first step."""
+
+    @abstractmethod
+    def own_columns(self) -> tuple[str, ...]:
+        """Return the names of the log's columns that the material's own models fill."""
+
+    @abstractmethod
+    def own_state(self) -> dict[str, np.ndarray]:
+        """Return copies of what the next solve starts from and a frame shows; `cells`, int8 of AIR, FLUID, SOLID, must be among them."""
+
+    @abstractmethod
+    def restore_own(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue from the arrays of `own_state`, whose shapes, types and values have been checked."""
+
+    def stable_dt(self) -> float:
+        """Return CFL dx / (v_max + sqrt(CFL g dx)) [s]; v_max is of the material and of solids in the time to come.
+
+        Gravity's own speed counts, so that a material at rest does not take off. A step ends when a source or drain starts or stops.
+        """
+        cfl, dx = self.scene.time.cfl, self.grid.spacing
+        with self.watch.stage("diagnostics", self.particles.position, self.particles.velocity):
+            totals = self.particles.totals()
+        solids = self.boundary.top_speed(self.time, self.scene.time.dt_max)
+        speed = max(totals.max_speed, solids) + math.sqrt(cfl * float(np.linalg.norm(self.gravity)) * dx)
+        event = min((part.next_event(self.time) for part in (self.sources, self.outlets) if part is not None), default=math.inf)
+        return min(cfl * dx / speed if speed > 0.0 else math.inf, event - self.time)
+
+    def begin_step(self, dt: float) -> ParticleTotals:
+        """Check time step and particles, bring the particles into order, and return sums over them.
+
+        Args:
+            dt: time step [s].
+
+        Raises:
+            SimulationFailed: something is not finite, or a particle has left the domain.
+            ValueError: dt is not positive.
+        """
+        if not (math.isfinite(dt) and dt > 0.0):
+            raise ValueError(f"dt = {dt}: must be a positive time [s]")
+        totals = self.checked_totals("at the start of")
+        with self.watch.stage("sort", *self.particles.arrays().values()):
+            self.particles.arrange(self.step_count)
+        return totals
+
+    def window(self, totals: ParticleTotals) -> Window:
+        """Return the cells that the particles can touch in a step."""
+        low, high = (self.particles.cells_of(corner[None])[0] + 1 for corner in (totals.low, totals.high))
+        return self.grid.window(low, high, grow=self.reach + 2)
+
+    def top_speed(self, totals: ParticleTotals, dt: float) -> float:
+        """Return the scale of the velocities that `bring_to_faces` leaves [m/s]."""
+        return totals.max_speed + dt * float(np.linalg.norm(self.gravity))
+
+    def bring_to_faces(self, window: Window, dt: float) -> None:
+        """Bring the particles' velocities to the faces, and let gravity act on them for dt [s]."""
+        particles = self.particles
+        with self.watch.stage("particles-to-grid", *particles.arrays().values(), *self.velocity, *self.weights):
+            particles_to_faces(
+                self.grid, particles.position, particles.velocity, particles.affine, self.velocity, self.weights, window=window,
+                offsets=particles.offsets,
+            )  # fmt: skip
+            for field, saved in zip(self.velocity, self._saved or (), strict=False):
+                wp.copy(saved, field)
+            accelerate(window, self.velocity, self.weights, self.gravity * dt)
+
+    def extend(self, window: Window, known: Sequence[wp.array], kind: wp.array, contact: wp.array) -> None:
+        """Continue the velocity from the faces that a solve has made valid into air and walls, see `warp_lcp.material.wall`.
+
+        Args:
+            window: faces to consider.
+            known: int8 of each component (updated): 1 on valid faces, 0 on others, -1 inside solids of whole cells.
+            kind: int8 of AIR, FLUID, SOLID.
+            contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED, see `warp_lcp.material.contact`.
+        """
+        wall = self.boundary
+        with self.watch.stage("extrapolation", *self.velocity, *self.weights, *known, kind, contact, *wall.open):
+            wall.extend(window, self.velocity, self.weights, list(known), kind, contact, self.layers)
+            if self.sources is not None:
+                self.sources.hold(self.velocity, [])
+
+    def bring_to_particles(self) -> None:
+        """Give the particles the velocity of the faces."""
+        particles = self.particles
+        with self.watch.stage("grid-to-particles", *particles.arrays().values(), *self.velocity):
+            flip = self.scene.particles.flip_ratio if self._saved else 0.0
+            faces_to_particles(
+                self.grid, self.velocity, particles.position, particles.velocity, particles.affine, saved=self._saved, flip=flip
+            )
+
+    def move(self, dt: float) -> Row:
+        """Move particles and solids by dt [s], exchange particles with sources and outlets, even them out, and advance the clock.
+
+        Returns:
+            What the log says of it and of the particles.
+
+        Raises:
+            SimulationFailed: something is not finite, or a particle has left the domain.
+        """
+        with self.watch.stage("advection", self.particles.position, *self.velocity):
+            stopped, pushed, stuck = self.boundary.advect(self.velocity, dt, self.time + dt, self.particles.position)
+        exchanged = self._exchange(dt)
+        after = self.checked_totals("after")
+        rearranged = self._rearrange(after)
+        if rearranged:
+            after = self.checked_totals("after the density correction of")
+        self.time += dt
+        self.step_count += 1
+        return self._totals_row(after, dt) | {"stopped": stopped, "pushed": pushed, "stuck": stuck} | rearranged | exchanged
+
+    def solve_row(self, result: wl.SolveResult | None) -> Row:
+        """Return what the log says of a step's solve; nothing if there was none."""
+        if result is None:
+            return {}
+        return {
+            "solver": self.scene.solver.method,
+            "solve_status": result.status.name,
+            "solve_iterations": result.iterations,
+            "linear_iterations": result.linear_iterations,
+            "solve_residual": result.relative_residual,
+        }
+
+    def logged(self, row: Row) -> Row:
+        """Return the entries of a row that the log has columns for, in their order."""
+        return {name: row.get(name) for name in self.columns()}
+
+    def columns(self) -> tuple[str, ...]:
+        """Return the names of the log's columns.
+
+        SI units; in 2-D mass and energies are per meter of depth. Energies are the particles' own; potential_energy is 0 at the origin.
+        solve_residual is relative to the right-hand side's, which in free fall is rounding noise that is not iterated on: it may then be
+        up to 1. stopped: particles that met a wall; pushed: those that a moving solid swept along; stuck: those inside solids that found
+        no way out, between solids that close, say. max_density: before the density correction of the step, of material at rest 1;
+        reseeded: particles that went to a neighboring cell; emitted, drained, departed: those that sources have added in the step, that
+        drains have swallowed, and that have left through open sides.
+        """
+        columns = (*COLUMNS, *self.own_columns(), "stopped")
+        columns = (*columns, "pushed", "stuck") if self.boundary.moves else columns
+        if self.reseeding is not None:
+            columns = (*columns, "reseeded")
+        columns = (*columns, *CORRECTION_COLUMNS) if self.correction is not None else columns
+        exchanged = {"emitted": self.scene.source, "drained": self.scene.drain, "departed": self.scene.domain.open}
+        return (*columns, *(name for name, used in exchanged.items() if used))
+
+    def points(self) -> Points:
+        """Return the particles as a frame shows them, with velocity and speed [m/s]."""
+        position, velocity = self.particles.position.numpy().copy(), self.particles.velocity.numpy().copy()
+        return Points("particles", position, {"velocity": velocity, "speed": np.linalg.norm(velocity, axis=1)})
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return what `restore` needs to continue bit for bit on the CPU."""
+        particles = {name: array.numpy().copy() for name, array in self.particles.arrays().items()}
+        clock = {"time": np.array(self.time), "step_count": np.array(self.step_count), "signature": self._signature()}
+        correction = {"density_correction": self.correction.x.numpy().copy()} if self.correction is not None else {}
+        return clock | particles | self.own_state() | correction
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue from `state`.
+
+        Raises:
+            ValueError: the arrays do not belong to this scene.
+        """
+        expected = self.state()
+        missing = sorted(expected.keys() - state.keys())
+        if missing:
+            raise ValueError(f"the state lacks {', '.join(missing)}: it does not belong to this scene")
+        if not np.array_equal(state["signature"], expected["signature"]):
+            raise ValueError("the state's grid, spacing, number of particles a cell or transfer differ from this scene's")
+        for name, value in expected.items():
+            given = np.asarray(state[name])
+            if name in self.particles.arrays() and (self.sources or self.outlets):
+                value = np.empty((len(state["position"]), 3), dtype=value.dtype)  # their number changes
+            if given.shape != value.shape or given.dtype != value.dtype:
+                found, wanted = f"{given.dtype}{given.shape}", f"{value.dtype}{value.shape}"
+                raise ValueError(f"the state's {name} is {found}: this scene has {wanted}")
+            if given.dtype.kind == "f" and not np.isfinite(given).all():
+                raise ValueError(f"the state's {name} holds values that are not finite")
+        if not self.boundary.moves and not np.array_equal(state["cells"] == wl.SOLID, expected["cells"] == wl.SOLID):
+            raise ValueError("the state's solids are not this scene's")
+        self.particles.assign(state)
+        self.restore_own({name: np.asarray(state[name]) for name in self.own_state()})
+        if self.correction is not None:
+            self.correction.x.assign(state["density_correction"])
+        self.time, self.step_count = float(state["time"]), int(state["step_count"])
+        self.boundary.place(self.time)
+
+    def resample(self, state: Mapping[str, np.ndarray]) -> list[str]:
+        """Continue from the state of the same scene on another grid: with other particles, and without a solution to start from.
+
+        Raises:
+            ValueError: the state differs in more than the grid, or no particle is left.
+        """
+        before, now = np.asarray(state.get("signature", np.zeros(7))), self._signature()
+        size = before[:3] * before[4], now[:3] * now[4]
+        if not np.array_equal(before[[3, 5, 6]], now[[3, 5, 6]]) or not np.allclose(*(side[: self.grid.dimension] for side in size)):
+            raise ValueError("the state's domain, number of particles a cell or transfer differ from this scene's")
+        self.time, self.step_count = float(state["time"]), int(state["step_count"])
+        self.boundary.place(self.time)
+        settings, wanted = self.scene.particles, self.particles.arrays().keys()
+        arrays, moved = resampled(
+            {name: np.asarray(state[name]) for name in wanted}, self.grid, self._admits, spacing=float(before[4]),
+            per_axis=settings.per_axis, random_seed=settings.seed + self.step_count,
+        )  # fmt: skip
+        self.particles.assign(arrays)
+        self.particles.sort()
+        self.mark()
+        return resampling_notes(len(state["position"]), self.particles.count, moved, float(before[4]), self.grid)
+
+    def notes(self) -> list[str]:
+        """Return warnings and facts worth a line at the start of a run."""
+        nx, ny, nz = self.grid.counts
+        cells = f"{nx} x {ny}" + (f" x {nz}" if self.grid.dimension == 3 else "")
+        return [f"{self.particles.count} particles, {cells} cells of {self.grid.spacing:.4g} m", *self._notes]
+
+    def checked_totals(self, when: str) -> ParticleTotals:
+        """Return sums over the particles.
+
+        Args:
+            when: where in the step, such as `after`, for the message.
+
+        Raises:
+            SimulationFailed: a value is not finite or a particle lies outside the domain.
+        """
+        with self.watch.stage("diagnostics", self.particles.position, self.particles.velocity):
+            totals = self.particles.totals()
+        axes = slice(self.grid.dimension)
+        size = np.array(self.grid.counts) * self.grid.spacing
+        end = size - 0.5 * MARGIN * self.grid.spacing  # a tent at the very end would reach beyond what is stored
+        if totals.finite and (totals.low[axes] >= 0.0).all() and (totals.high[axes] <= end[axes]).all():
+            return totals
+        position, velocity = self.particles.position.numpy(), self.particles.velocity.numpy()
+        if totals.bad_velocities:
+            field, bad = "velocity", ~((velocity.astype(np.float64) ** 2).sum(axis=1) <= np.finfo(np.float32).max)
+        elif totals.bad_positions:
+            field, bad = "position", ~np.isfinite(position).all(axis=1)
+        else:
+            field, bad = "position", ((position < 0.0) | (position > end))[:, axes].any(axis=1)
+        first = int(np.flatnonzero(bad)[0])
+        where = self._cell_of(first)
+        wrong = "outside the domain" if totals.finite else "not finite"
+        count = int(bad.sum())
+        raise SimulationFailed(f"{when} step {self.step_count}: {field} is {wrong} in cell (x, y, z) = {where} ({count} particles)")
+
+    def _rearrange(self, totals: ParticleTotals) -> Row:
+        """Even out the particles and move them apart, if the scene asks for it and it is time; return what the log says of it."""
+        particles = self.particles
+        row: Row = {}
+        if self.reseeding is not None and self.step_count % self.reseeding.every == 0:
+            with self.watch.stage("reseeding", *particles.arrays().values()):
+                row["reseeded"] = self.reseeding.apply(particles, self.window(totals), self.step_count)
+        correction = self.correction
+        if correction is not None and self.step_count % correction.every == 0:
+            with self.watch.stage("density correction", particles.position, correction.density, correction.x, *correction.displacement):
+                done = correction.apply(particles, self.window(totals))
+            row["density_status"] = done.result.status.name if done.result is not None else "NOTHING_TO_DO"
+            row["density_iterations"] = done.result.iterations if done.result is not None else 0
+            row["max_density"] = done.max_density
+        return row
+
+    def _exchange(self, dt: float) -> Row:
+        """Remove the particles that have left in the step and add those that have come in; return what the log says of it."""
+        drained = departed = emitted = 0
+        if self.outlets is None and self.sources is None:
+            return {}
+        with self.watch.stage("sources and outlets", self.particles.position):
+            if self.outlets is not None:
+                drained, departed = self.outlets.apply(self.particles, self.time + dt)
+            if self.sources is not None:
+                emitted = self.sources.emit(self.particles, self.time, self.time + dt)
+        return {"emitted": emitted, "drained": drained, "departed": departed}
+
+    def _totals_row(self, totals: ParticleTotals, dt: float) -> Row:
+        mass = totals.count * self.particle_mass
+        return {
+            "particles": totals.count,
+            "mass": mass,
+            "kinetic_energy": 0.5 * mass * totals.mean_square_speed,
+            "potential_energy": -mass * float(self.gravity @ totals.center),
+            "center_of_mass_y": float(totals.center[1]),
+            "max_speed": totals.max_speed,
+            "cfl": totals.max_speed * dt / self.grid.spacing,
+        }
+
+    def _admits(self, points: np.ndarray) -> np.ndarray:
+        """Tell which points [m], shape (n, 3), a particle may be at."""
+        i, j, k = self.particles.cells_of(points).T + 1
+        return (self.boundary.base.numpy()[k, j, i] != wl.SOLID) & self.boundary.admits(points)
+
+    def _cell_of(self, particle: int) -> tuple[int, ...]:
+        """Return the cell that a particle was last sorted into, counted from 0."""
+        k, j, i = np.unravel_index(int(self.particles.key.numpy()[particle]), self.grid.shape)
+        return int(i) - 1, int(j) - 1, int(k) - 1
+
+    def _signature(self) -> np.ndarray:
+        """Return numbers that tell this scene's arrays from another's."""
+        settings = self.scene.particles
+        transfer = ("apic", "flip", "pic").index(settings.transfer)
+        return np.array([*self.grid.counts, self.grid.dimension, self.grid.spacing, settings.per_axis, transfer], dtype=np.float64)

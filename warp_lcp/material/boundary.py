@@ -1,0 +1,132 @@
+"""Solids as the material meets them: what of a face is open, how fast the rest moves, and where particles may go.
+
+Two forms with one face: `WholeCells`, whose cells are solid or open, and `CutBoundary`, whose faces are open in part.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.grid.advection import advect, clearance
+from warp_lcp.grid.level_set import whole_cell_capacity
+from warp_lcp.grid.sides import continue_beyond
+from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.voxelize import VoxelSolids
+from warp_lcp.material import boundary_kernels as kernels
+from warp_lcp.material.wall import extend_velocity
+
+Faces = list[wp.array]  # one field a component
+
+
+class Boundary(Protocol):
+    """Solids and the domain's walls.
+
+    Attributes:
+        open_sides: of the domain, see `warp_lcp.grid.sides`.
+        base: int8 cells without material: SOLID or AIR. The ring is SOLID, or AIR beyond open sides.
+        touch: uint8 a cell: TOUCHES if a face is not open, LETS_GO if the wall of such a face separates.
+        open: float32 open fraction a_f of each component's lower faces; empty: a face is closed where a cell beside it is SOLID.
+        velocity: float32 velocity of the solids on each component's faces [m/s]; empty: they stand still.
+        capacity: float32 share of a cell's quadratic kernel that is open.
+        distance: float32 distance to the solids at the cells' low corners [cells]; None: whole cells, no distance.
+    """
+
+    moves: bool  # whether a solid moves
+    open_sides: int
+    base: wp.array
+    touch: wp.array
+    open: Faces
+    velocity: Faces
+    capacity: wp.array | None
+    distance: wp.array | None
+
+    def top_speed(self, time: float, span: float) -> float:
+        """Return how fast the solids move at most [m/s] from `time` to `time` + `span` [s]."""
+
+    def begin_step(self, time: float, dt: float) -> None:
+        """Find how fast the solids move from `time` on [s]."""
+
+    def extend(self, window: Window, velocity: Faces, weights: Faces, known: Faces, kind: wp.array, contact: wp.array, layers: int) -> None:
+        """Continue the projected velocity into air and walls, see `warp_lcp.material.wall`."""
+
+    def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> tuple[int, int, int]:
+        """Move particles, then the solids to `time`. Return how many met a wall, were pushed by a solid, and are stuck inside one."""
+
+    def displace(self, fields: Faces, position: wp.array) -> None:
+        """Move particles by the displacement [m] on the faces of each axis; walls stop them, solids stay where they are."""
+
+    def place(self, time: float) -> None:
+        """Put the solids where they are at `time` [s]."""
+
+    def admits(self, points: np.ndarray) -> np.ndarray:
+        """Tell which points [m], shape (n, 3), a particle may start at, as far as cells do not say it already."""
+
+
+class WholeCells:
+    """Solids that fill whole cells.
+
+    Args:
+        grid: the grid.
+        solids: which cells are solid, and whose walls separate.
+        wall_velocity: velocity [m/s] of the domain's wall and of each solid, shape (1 + solids, 3), constant; the cells stay where they
+            are. None: all stand still.
+        open_sides: those that `solids` was made with.
+
+    Raises:
+        ValueError: `wall_velocity` has another shape.
+    """
+
+    distance: wp.array | None = None
+    moves = False
+
+    def __init__(self, grid: StaggeredGrid, solids: VoxelSolids, wall_velocity: np.ndarray | None = None, *, open_sides: int = 0) -> None:
+        """Allocate the fields."""
+        self.grid, self.solids, self.open_sides = grid, solids, open_sides
+        if wall_velocity is not None and np.shape(wall_velocity) != (len(solids.separating), 3):
+            raise ValueError(f"wall_velocity has shape {np.shape(wall_velocity)}: expected ({len(solids.separating)}, 3)")
+        self.base, self.touch, self.capacity = grid.field(wp.int8), grid.field(wp.uint8), grid.field()
+        self.open: Faces = []
+        self.velocity: Faces = grid.faces() if wall_velocity is not None else []
+        everywhere = Window((0, 0, 0), grid.shape, grid.device)
+        everywhere.launch(kernels.base_kernel, [solids.index, self.base])
+        grid.domain.launch(kernels.touch_kernel, [solids.index, solids.separating, grid.planes, self.touch])
+        whole_cell_capacity(grid, self.base, self.capacity)
+        continue_beyond(grid, open_sides, self.capacity)
+        if wall_velocity is not None:
+            walls = wp.array(np.asarray(wall_velocity, dtype=np.float32), dtype=wp.vec3, device=grid.device)
+            for axis, field in enumerate(self.velocity):
+                grid.everywhere.launch(kernels.wall_velocity_kernel, [axis, solids.index, walls, field])
+        self._room = clearance(grid, self.base)
+        self._stopped = wp.zeros(1, dtype=wp.int32, device=grid.device)
+
+    def top_speed(self, time: float, span: float) -> float:
+        """Return 0: cells stay where they are."""
+        return 0.0
+
+    def begin_step(self, time: float, dt: float) -> None:
+        """Do nothing: velocities are constant."""
+
+    def extend(self, window: Window, velocity: Faces, weights: Faces, known: Faces, kind: wp.array, contact: wp.array, layers: int) -> None:
+        """Continue the projected velocity into air and walls."""
+        s = self.solids
+        extend_velocity(window, velocity, weights, known, kind, contact, s.index, s.separating, self.velocity, layers)
+
+    def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> tuple[int, int, int]:
+        """Move particles, never into a SOLID cell."""
+        self._stopped.zero_()
+        advect(self.grid, fields, self._room, dt, position, self._stopped)
+        return int(self._stopped.numpy()[0]), 0, 0
+
+    def displace(self, fields: Faces, position: wp.array) -> None:
+        """Move particles by a displacement [m], never into a SOLID cell."""
+        advect(self.grid, fields, self._room, 1.0, position, self._stopped)
+
+    def place(self, time: float) -> None:
+        """Do nothing: the cells stay."""
+
+    def admits(self, points: np.ndarray) -> np.ndarray:
+        """Return True for all points: open cells say where particles may start."""
+        return np.ones(len(points), dtype=bool)

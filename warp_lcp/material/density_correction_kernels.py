@@ -1,0 +1,110 @@
+# mypy: ignore-errors
+"""Kernels of the density correction: its problem, and the displacement that its solution means."""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from warp_lcp.grid.staggered import CellRange
+from warp_lcp.native import BLOCK, simd
+from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
+
+LEAST_DENSITY = 0.5  # that displacements are divided by: thin spray need not carry off what a full cell has too much
+LEAST_CAPACITY = 0.1  # that densities are divided by there
+COLUMNS = 2  # of a row's sums, see `prepare`
+
+PREPARE = """
+    const long long row = (k*(long long)kind_.shape[1] + j)*kind_.shape[2];
+    const signed char* base = (const signed char*)base_.data + row; signed char* kind = (signed char*)kind_.data + row;
+    const float* density = density_.data + row; const float* capacity = capacity_.data + row;
+    double* b = b_.data + row; double* x = x_.data + row;
+    int full = 0; float worst = -1.0f, over[M];
+    for (int start = first; start < last; start += M) {
+        const int n = last - start < M ? last - start : M;
+        SIMD8 for (int m = 0; m < n; ++m) {
+            const int i = start + m, open = base[i] != SOLID, has = open & (int)(density[i] > 0.0f);
+            const float free = most*capacity[i] - density[i];
+            kind[i] = has ? (signed char)FLUID : (open ? (signed char)AIR : (signed char)SOLID);
+            b[i] = has ? (double)free : 0.0;
+            x[i] = has & (int)(x[i] > 0.0) ? x[i] : 0.0;
+            over[m] = has ? density[i] - capacity[i] : -1.0f;
+            full += has & (int)(free < 0.0f);
+        }
+        for (int m = 0; m < n; ++m) worst = over[m] > worst ? over[m] : worst;
+    }
+    double* sums = sums_.data + 2*(k*(long long)kind_.shape[1] + j);
+    sums[0] = full; sums[1] = 1.0 + (double)worst;
+"""
+
+DISPLACE = """
+    const long long s2 = kind_.shape[2], s1 = s2*kind_.shape[1], row = k*s1 + j*s2;
+    const long long s = axis == 0 ? 1 : (axis == 1 ? s2 : s1);
+    const signed char* kind = (const signed char*)kind_.data + row; const float* open = open_.data + (CUT ? row : 0);
+    const float* density = density_.data + row; const float* capacity = capacity_.data + row;
+    const double* x = x_.data + row; float* d = d_.data + row;
+    auto filled = [&](long long i) {
+        const float room = capacity[i] > (float)LEAST_CAPACITY ? capacity[i] : (float)LEAST_CAPACITY;
+        return density[i]/room;
+    };
+    SIMD8 for (int i = first; i < last; ++i) {
+        const int solid = (kind[i] == SOLID) | (kind[i - s] == SOLID), passes = CUT ? (int)(open[CUT ? i : 0] > 0.0f) & !solid : !solid;
+        const float mean = 0.5f*(filled(i) + filled(i - s)), by = mean > (float)LEAST_DENSITY ? mean : (float)LEAST_DENSITY;
+        const float way = (float)(x[i - s] - x[i])/by;
+        const float low = way > -most ? way : -most, clipped = low < most ? low : most;
+        d[i] = passes ? clipped*dx : 0.0f;
+    }
+"""
+
+_CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR}
+_F32, _F64, _I8 = (wp.array3d(dtype=t) for t in (wp.float32, wp.float64, wp.int8))
+
+
+def _source(body: str, **more: int) -> str:
+    """Return a native function's body with its constants."""
+    names = "".join(f"constexpr int {name} = {value}; " for name, value in (_CONSTANTS | more).items())
+    numbers = f"constexpr double LEAST_DENSITY = {LEAST_DENSITY}, LEAST_CAPACITY = {LEAST_CAPACITY};"
+    return simd(BLOCK + names + numbers + body)
+
+
+@wp.func_native(_source(PREPARE))
+def prepare_row(
+    base_: _I8, density_: _F32, capacity_: _F32, most: float, kind_: _I8, b_: _F64, x_: _F64, sums_: _F64,
+    k: int, j: int, first: int, last: int,
+): ...  # fmt: skip
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.material.density_correction")
+def prepare_kernel(
+    cells: CellRange, base: _I8, density: _F32, capacity: _F32, most: float, kind: _I8, b: _F64, x: _F64, sums: _F64,
+):  # fmt: skip
+    """Unknowns, right-hand side and guess; a row's sums: [0] over-full cells, [1] 1 and the most above what fits."""
+    plane, row = wp.tid()
+    prepare_row(base, density, capacity, most, kind, b, x, sums, cells.k + plane, cells.j + row, cells.i, cells.end)
+
+
+@functools.cache
+def displacement_kernel(cut: bool) -> SimpleNamespace:
+    """Return `displace`.
+
+    Args:
+        cut: whether faces have open fractions.
+    """
+
+    @wp.func_native(_source(DISPLACE, CUT=int(cut)))
+    def displace_row(
+        axis: int, x_: _F64, kind_: _I8, open_: _F32, density_: _F32, capacity_: _F32, most: float, dx: float, d_: _F32,
+        k: int, j: int, first: int, last: int,
+    ): ...  # fmt: skip
+
+    @wp.kernel(enable_backward=False, module="warp_lcp.material.density_correction" + "_cut" * cut)
+    def displace(
+        cells: CellRange, axis: int, x: _F64, kind: _I8, open_: _F32, density: _F32, capacity: _F32, most: float, dx: float, d: _F32
+    ):
+        """Displacement [m] on the lower faces of one axis."""
+        plane, row, chunk = wp.tid()
+        first = cells.i + chunk * cells.grain
+        last = wp.min(first + cells.grain, cells.end)
+        displace_row(axis, x, kind, open_, density, capacity, most, dx, d, cells.k + plane, cells.j + row, first, last)
+
+    return SimpleNamespace(displace=displace)

@@ -1,0 +1,81 @@
+"""Particles that are spread unevenly are evened out deep in the material, as many as there are."""
+
+from __future__ import annotations
+
+import itertools
+
+import warp as wp
+
+from warp_lcp.grid.particles import Particles
+from warp_lcp.grid.particles_kernels import offset_kernel
+from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.material import reseeding_kernels as kernels
+from warp_lcp.material.boundary import Boundary
+
+
+class Reseeding:
+    """Let cells deep in the material with few particles take some from their neighbors with many.
+
+    A flow draws particles together along some streamlines and apart along others. A density correction cures the first, but voids between
+    particles remain: they count as material as long as the surface does not see them, and the volume grows. A cell that no wall touches,
+    whose surroundings of 3^dimension cells are full, takes particles from neighbors that hold more than at rest, if it holds fewer than
+    `least`; and from those with more than `most`, until it holds as many as at rest. So nothing comes or goes:
+
+    - mass: particles only move, to the emptiest part of the cell, by less than two cells along each axis;
+    - momentum and kinetic energy: each keeps its velocity and its gradient, which over this way differ from the flow's by as much as the
+      interpolation errs. Angular momentum and the center of mass change with the particles' places;
+    - the surface and bubbles of more than a cell: what is not full around is left alone. A whole region that is thin stays thin.
+
+    The result is the same on every run.
+
+    Args:
+        grid: the grid.
+        boundary: solids and walls.
+        least: particles of a cell below which it is filled up, at most those at rest.
+        most: particles of a cell above which it hands on, at least those at rest.
+        particles_a_cell: of material at rest.
+        every: steps from one time to the next.
+
+    Raises:
+        ValueError: `least` <= `particles_a_cell` <= `most` does not hold.
+    """
+
+    def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, least: int, most: int, particles_a_cell: int, every: int = 1) -> None:
+        """Allocate the fields."""
+        if not 1 <= least <= particles_a_cell <= most:
+            raise ValueError(f"least = {least}, most = {most}: must be at least 1, and {particles_a_cell} between them")
+        self.grid, self.boundary, self.every = grid, boundary, every
+        self.least, self.most, self.particles_a_cell = least, most, particles_a_cell
+        self._count, self._takers = grid.field(wp.int32), wp.zeros(grid.size, dtype=wp.int32, device=grid.device)
+        self._offsets = wp.zeros(grid.size + 1, dtype=wp.int32, device=grid.device)
+        self._numbers = wp.zeros(2, dtype=wp.int32, device=grid.device)  # of takers, and of particles moved
+        steps = [(-1, 0, 1) if axis < grid.dimension else (0,) for axis in (2, 1, 0)]
+        self._directions = sorted((d for d in itertools.product(*steps) if any(d)), key=lambda d: sum(map(abs, d)))
+
+    def apply(self, particles: Particles, window: Window, step: int) -> int:
+        """Move particles; return how many.
+
+        Args:
+            particles: the material (sorted, moved).
+            window: cells that hold all particles, with two to spare on each side.
+            step: number of the step, which the random part of the new places depends on.
+        """
+        if particles.count == 0:
+            return 0
+        grid, planes = self.grid, self.grid.planes
+        particles.sort()
+        offsets = particles.offsets
+        if offsets is None:
+            offsets = self._offsets
+            wp.launch(offset_kernel, grid.size + 1, [particles.key, particles.count, offsets], device=grid.device)
+        self._numbers.zero_()
+        window.launch(kernels.count_kernel, [offsets, self._count])
+        b, limits = self.boundary, [self.least, self.particles_a_cell, self.most]
+        window.launch(kernels.find_kernel, [planes, *limits, self._count, b.capacity, b.base, b.touch, self._takers, self._numbers])
+        takers = int(self._numbers.numpy()[0])
+        if takers == 0:
+            return 0
+        inputs = [*limits, step, grid.spacing, 1.0 / grid.spacing, self._takers, offsets, self._count, particles.position, self._numbers]
+        for direction in self._directions:
+            wp.launch(kernels.exchange_kernel, takers, [planes, *direction, *inputs], device=grid.device)
+        return int(self._numbers.numpy()[1])

@@ -1,0 +1,116 @@
+# mypy: ignore-errors
+"""Kernels that even out how many particles the cells deep in the material hold."""
+
+import warp as wp
+
+from warp_lcp.grid.staggered import CellRange
+from warp_lcp.material.contact import TOUCHES
+from warp_lcp.operators.grid_poisson import AIR
+
+JITTER = 0.25  # of half a cell: how far from the center of its part of a cell a particle is put at random, as at the start
+FULL = 0.75  # of what the cells around one can hold: less, and it is near a surface (a level one: 2/3), or in a bubble of more than a cell
+
+_AIR = wp.constant(wp.int8(AIR))
+_TOUCHES = wp.constant(wp.uint8(TOUCHES))
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.material.reseeding")
+def count_kernel(cells: CellRange, offsets: wp.array(dtype=wp.int32), count: wp.array3d(dtype=wp.int32)):
+    """Count each cell's particles."""
+    plane, row, chunk = wp.tid()
+    k = cells.k + plane
+    j = cells.j + row
+    first = cells.i + chunk * cells.grain
+    for i in range(first, wp.min(first + cells.grain, cells.end)):
+        cell = (k * count.shape[1] + j) * count.shape[2] + i
+        count[k, j, i] = offsets[cell + 1] - offsets[cell]
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.material.reseeding")
+def find_kernel(
+    cells: CellRange, planes: int, least: int, at_rest: int, most: int, count: wp.array3d(dtype=wp.int32),
+    capacity: wp.array3d(dtype=wp.float32), base: wp.array3d(dtype=wp.int8), touch: wp.array3d(dtype=wp.uint8),
+    takers: wp.array(dtype=wp.int32), numbers: wp.array(dtype=wp.int32),
+):  # fmt: skip
+    """List open cells that no wall touches, that want particles, and whose surroundings, themselves included, are full but for a little.
+
+    The order of the list differs from run to run on CUDA, and does not matter.
+    """
+    plane, row, chunk = wp.tid()
+    k = cells.k + plane
+    j = cells.j + row
+    first = cells.i + chunk * cells.grain
+    for i in range(first, wp.min(first + cells.grain, cells.end)):
+        has = count[k, j, i]
+        if has < at_rest and base[k, j, i] == _AIR and (touch[k, j, i] & _TOUCHES) == wp.uint8(0):
+            held = int(0)
+            crowd = int(0)
+            room = float(0.0)
+            for c in range(k - planes + 1, k + planes):
+                for b in range(j - 1, j + 2):
+                    for a in range(i - 1, i + 2):
+                        if base[c, b, a] == _AIR:
+                            held += count[c, b, a]
+                            crowd = wp.max(crowd, count[c, b, a])
+                            room += capacity[c, b, a]
+            if (has < least or crowd > most) and float(held) >= FULL * float(at_rest) * room:
+                takers[wp.atomic_add(numbers, 0, 1)] = (k * count.shape[1] + j) * count.shape[2] + i
+
+
+@wp.func
+def emptiest(planes: int, i: int, j: int, k: int, start: int, here: int, inverse_dx: float, position: wp.array(dtype=wp.vec3)):
+    """Return which of the 2^dimension parts of a cell held the fewest of its particles `start` ... `start + here` when they were sorted."""
+    part = int(0)
+    fewest = int(1 << 30)
+    for q in range(2 << planes):
+        inside = int(0)
+        for p in range(start, start + here):
+            x = position[p] * inverse_dx + wp.vec3(1.0, 1.0, 1.0)
+            bits = wp.where(x[0] - float(i) >= 0.5, 1, 0) + wp.where(x[1] - float(j) >= 0.5, 2, 0)
+            if planes == 2:
+                bits += wp.where(x[2] - float(k) >= 0.5, 4, 0)
+            if bits == q:
+                inside += 1
+        if inside < fewest:
+            fewest = inside
+            part = q
+    return part
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.material.reseeding")
+def exchange_kernel(
+    planes: int, dk: int, dj: int, di: int, least: int, at_rest: int, most: int, seed: int, dx: float, inverse_dx: float,
+    takers: wp.array(dtype=wp.int32), offsets: wp.array(dtype=wp.int32), count: wp.array3d(dtype=wp.int32),
+    position: wp.array(dtype=wp.vec3), numbers: wp.array(dtype=wp.int32),
+):  # fmt: skip
+    """Let each cell that wants particles take some from the neighbor in one direction.
+
+    No race, though a cell may be the neighbor of another that takes: whoever gives holds more than `at_rest` before and no less after,
+    whoever takes holds less before and no more after.
+    """
+    cell = takers[wp.tid()]
+    i = cell % count.shape[2]
+    j = (cell // count.shape[2]) % count.shape[1]
+    k = cell // (count.shape[2] * count.shape[1])
+    has = count[k, j, i]
+    gives = count[k + dk, j + dj, i + di]
+    if gives <= at_rest or (has >= least and (has >= at_rest or gives <= most)):
+        return
+    start = offsets[cell]
+    here = offsets[cell + 1] - start
+    donor = offsets[cell + (dk * count.shape[1] + dj) * count.shape[2] + di]
+    first_part = emptiest(planes, i, j, k, start, here, inverse_dx, position)
+    taken = int(0)
+    while gives > at_rest and (has < least or (has < at_rest and gives > most)):
+        part = (first_part + has - here) % (2 << planes)
+        state = wp.rand_init(seed, cell * 64 + has)
+        x = float(i - 1) + 0.25 + 0.5 * float(part % 2) + 0.5 * JITTER * (wp.randf(state) - 0.5)
+        y = float(j - 1) + 0.25 + 0.5 * float((part // 2) % 2) + 0.5 * JITTER * (wp.randf(state) - 0.5)
+        z = float(k - 1) + 0.25 + 0.5 * float(part // 4) + 0.5 * JITTER * (wp.randf(state) - 0.5)
+        position[donor + gives - 1] = wp.vec3(x * dx, y * dx, wp.where(planes == 2, z * dx, 0.0))
+        gives -= 1
+        has += 1
+        taken += 1
+    count[k, j, i] = has
+    count[k + dk, j + dj, i + di] = gives
+    wp.atomic_add(numbers, 1, taken)

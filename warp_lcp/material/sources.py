@@ -1,0 +1,243 @@
+"""Sources: regions that material comes out of at a given velocity."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.grid.particles import MARGIN, Particles
+from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.material import sources_kernels as kernels
+from warp_lcp.material.boundary import Boundary, Faces
+from warp_lcp.operators.grid_poisson import SOLID
+
+NOW = 1e-9  # s: a time that a step has been cut to may be off by its rounding
+FILLED = 0.5  # of a full cell's particles: a source that starts fills cells that hold fewer
+JAMMED = 2.0  # cells that hold more than this share get no more
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where material comes from.
+
+    Args:
+        name: what messages call it.
+        contains: tells which points [m], shape (n, 3), lie in it, shape (n,).
+        velocity: of its material [m/s], shape (3,), not 0.
+        start: when it starts to run [s].
+        stop: when it no longer does [s].
+    """
+
+    name: str
+    contains: Callable[[np.ndarray], np.ndarray]
+    velocity: np.ndarray
+    start: float = 0.0
+    stop: float = np.inf
+
+    def runs(self, time: float) -> bool:
+        """Tell whether it runs from `time` [s] on."""
+        return self.start <= time + NOW < self.stop
+
+
+class Sources:
+    """Let material in through the cells whose centers lie in a source; so its area is that of their faces.
+
+    While a source runs, the faces of its cells have its velocity, and the pressure sees the cells as a solid that moves at it: what leaves
+    them is area times velocity, whatever is in the way. Material behind a source is not drawn in. Particles lie on a jittered lattice that
+    moves with the source; those that the lattice brings into the cells in a step are new. It is a function of time alone, so that an
+    interrupted run goes on as if it had not been. A source that starts fills its cells, as far as they are not full already.
+
+    Args:
+        grid: the grid.
+        boundary: solids and walls; with whole cells it has velocities.
+        sources: a cell belongs to the first that contains its center.
+        per_axis: particles along the edge of a cell.
+        jitter: width of their random displacement, a fraction of their distance.
+        random_seed: of the displacements.
+
+    Raises:
+        ValueError: a source has no open cell.
+    """
+
+    def __init__(
+        self, grid: StaggeredGrid, boundary: Boundary, sources: Sequence[Source], *, per_axis: int, jitter: float, random_seed: int
+    ) -> None:
+        """Find the cells."""
+        self.grid, self.boundary, self.sources = grid, boundary, tuple(sources)
+        self.per_axis, self.jitter, self.random_seed = per_axis, jitter, random_seed
+        owner = _owners(grid, boundary, self.sources)
+        cells = np.argwhere(owner >= 0)  # (k, j, i) from 0
+        self._slots = np.zeros(grid.shape, dtype=np.int32)
+        self._slots[tuple((cells + 1).T)] = np.arange(1, len(cells) + 1)
+        self._owner = owner[tuple(cells.T)].astype(np.int32)
+        self._boxes = [self._box(cells[self._owner == number]) for number in range(len(self.sources))]
+        device = grid.device
+        self._fields = [
+            wp.array(self._slots, dtype=wp.int32, device=device),
+            wp.array(self._owner, dtype=wp.int32, device=device),
+            wp.zeros(len(self.sources), dtype=wp.uint8, device=device),
+        ]
+        velocities = np.array([source.velocity for source in self.sources], dtype=np.float32)
+        self._velocities = wp.array(velocities, dtype=wp.vec3, device=device)
+        self._counts = wp.zeros(len(cells), dtype=wp.int32, device=device)
+        self._window: Window = grid.window((cells.min(axis=0) + 1)[::-1], (cells.max(axis=0) + 1)[::-1], grow=1)
+        self._moving_walls = boundary.velocity if not boundary.open else []
+
+    def next_event(self, time: float) -> float:
+        """Return when a source next starts or stops after `time` [s]; infinite if none does."""
+        return min((t for s in self.sources for t in (s.start, s.stop) if t > time + NOW), default=np.inf)
+
+    def supply(self, time: float, velocity: Faces, kind: wp.array) -> None:
+        """Give the faces of running sources their velocity and close their cells to the pressure, before it is solved for.
+
+        Args:
+            time: at the start of the step [s].
+            velocity: u* of each component [m/s] (updated).
+            kind: int8 of AIR, FLUID, SOLID (updated).
+        """
+        self._fields[2].assign(np.array([source.runs(time) for source in self.sources], dtype=np.uint8))
+        self._impose(velocity, supply=True, walls=self._moving_walls, known=[])
+        self._window.launch(kernels.occupy_kernel, [*self._fields, 0, kind])
+
+    def hold(self, velocity: Faces, known: Faces, shown: wp.array | None = None) -> None:
+        """Give the faces of the sources that `supply` found running their velocity again.
+
+        Args:
+            velocity: of each component [m/s] (updated).
+            known: int8 of each component (updated): 1 on those faces; or empty.
+            shown: int8 (updated): the sources' cells become FLUID.
+        """
+        self._impose(velocity, supply=False, walls=[], known=known)
+        if shown is not None:
+            self._window.launch(kernels.occupy_kernel, [*self._fields, 1, shown])
+
+    def emit(self, particles: Particles, before: float | None, now: float) -> int:
+        """Add the particles that have come in and return how many.
+
+        Args:
+            particles: the material (updated).
+            before: at the start of the step [s]; None: there has been no step.
+            now: at its end [s].
+        """
+        ran = [before is not None and source.runs(before) for source in self.sources]
+        runs = [source.runs(now) for source in self.sources]
+        if not any(ran + runs):
+            return 0
+        self._counts.zero_()
+        numbers = [1.0 / self.grid.spacing, *self.grid.counts]
+        wp.launch(
+            kernels.occupants_kernel,
+            particles.count,
+            [*numbers, self._fields[0], particles.position, self._counts],
+            device=self.grid.device,
+        )
+        held = self._counts.numpy() / self.per_axis**self.grid.dimension
+        emitted = 0
+        for number, source in enumerate(self.sources):
+            if ran[number] or runs[number]:
+                points = self._points(number, before if ran[number] else None, now, held)
+                particles.append(points, np.broadcast_to(source.velocity.astype(np.float32), points.shape))
+                emitted += len(points)
+        return emitted
+
+    def _points(self, number: int, before: float | None, now: float, held: np.ndarray) -> np.ndarray:
+        """Return the points [m] that a source's lattice has brought in since `before`, or all of them in cells that are not full."""
+        lattice, jitter = self._lattice(number, now)
+        points = self._at(number, lattice, jitter, now)
+        slot = self._slot(points, number)
+        new = slot > 0
+        if before is None:
+            new &= held[np.maximum(slot, 1) - 1] < FILLED
+        else:
+            new &= (held[np.maximum(slot, 1) - 1] < JAMMED) & (self._slot(self._at(number, lattice, jitter, before), number) == 0)
+        points = points[new].astype(np.float32)
+        dx, axes = self.grid.spacing, slice(self.grid.dimension)
+        size = np.array(self.grid.counts)[axes] * dx
+        np.clip(points[:, axes], 1.1 * MARGIN * dx, size - 1.1 * MARGIN * dx, out=points[:, axes])
+        return points[self.boundary.admits(points)] if len(points) else points
+
+    def _lattice(self, number: int, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the numbers of the lattice points that may lie in a source's cells, shape (n, 3), and their displacements."""
+        distance, dimension = self.grid.spacing / self.per_axis, self.grid.dimension
+        low, high = self._boxes[number]
+        way = self._way(number, time)
+        ranges = [
+            np.arange(np.floor((a - w) / distance) - 1, np.ceil((b - w) / distance) + 1) for a, b, w in zip(low, high, way, strict=True)
+        ]
+        if dimension == 2:
+            ranges[2] = np.zeros(1)
+        Z, Y, X = np.meshgrid(ranges[2], ranges[1], ranges[0], indexing="ij")
+        lattice = np.stack([X.ravel(), Y.ravel(), Z.ravel()], axis=1)
+        return lattice, self.jitter * (_uniform(lattice, self.random_seed + number) - 0.5)
+
+    def _at(self, number: int, lattice: np.ndarray, jitter: np.ndarray, time: float) -> np.ndarray:
+        """Return where lattice points are at a time [m]."""
+        points = (lattice + 0.5 + jitter) * (self.grid.spacing / self.per_axis) + self._way(number, time)
+        if self.grid.dimension == 2:
+            points[:, 2] = 0.0
+        return np.asarray(points)
+
+    def _way(self, number: int, time: float) -> np.ndarray:
+        source = self.sources[number]
+        return np.asarray(source.velocity * (time - source.start), dtype=np.float64)
+
+    def _slot(self, points: np.ndarray, number: int) -> np.ndarray:
+        """Return the slot of the source's cell that each point lies in, 0 if it lies in none."""
+        cells = np.floor(points / self.grid.spacing).astype(np.int64) + 1
+        if self.grid.dimension == 2:
+            cells[:, 2] = 1
+        np.clip(cells, 0, np.array(self.grid.shape[::-1]) - 1, out=cells)
+        slot = self._slots[cells[:, 2], cells[:, 1], cells[:, 0]]
+        return np.where((slot > 0) & (self._owner[np.maximum(slot, 1) - 1] == number), slot, 0)
+
+    def _box(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the low and the high corner [m] of cells (k, j, i)."""
+        return cells.min(axis=0)[::-1] * self.grid.spacing, (cells.max(axis=0)[::-1] + 1) * self.grid.spacing
+
+    def _impose(self, velocity: Faces, *, supply: bool, walls: Faces, known: Faces) -> None:
+        for axis, field in enumerate(velocity):
+            given = [field, walls[axis] if walls else None, known[axis] if known else None]
+            self._window.launch(kernels.impose_kernel, [axis, int(supply), *self._fields, self._velocities, *given])
+
+
+def _owners(grid: StaggeredGrid, boundary: Boundary, sources: Sequence[Source]) -> np.ndarray:
+    """Return the source that each open cell belongs to, -1 for none, shape (nz, ny, nx)."""
+    nz, ny, nx = (n - 2 for n in grid.shape)
+    K, J, I = np.meshgrid(np.arange(nz), np.arange(ny), np.arange(nx), indexing="ij")
+    centers = (np.stack([I.ravel(), J.ravel(), K.ravel()], axis=1) + 0.5) * grid.spacing
+    if grid.dimension == 2:
+        centers[:, 2] = 0.0
+    owner = np.full(len(centers), -1)
+    free = (grid.interior(boundary.base.numpy()) != SOLID).ravel()
+    for number, source in enumerate(sources):
+        mine = free & (owner < 0)
+        mine[mine] = source.contains(centers[mine])
+        if not mine.any():
+            raise ValueError(
+                f"{source.name} holds no open cell's center: it is too small for cells of {grid.spacing:.4g} m, or lies in solids, outside "
+                "the domain or in an earlier source"
+            )
+        owner[mine] = number
+    return owner.reshape(nz, ny, nx)
+
+
+def _uniform(lattice: np.ndarray, seed: int) -> np.ndarray:
+    """Return a number in [0, 1) for each coordinate that depends on nothing but the lattice point and the seed."""
+    # the finalizer of SplitMix64 after each word
+    state = np.full(len(lattice), (seed * 0x9E3779B97F4A7C15 + 1) % 2**64, dtype=np.uint64)
+    words = [*lattice.astype(np.int64).astype(np.uint64).T]
+    with np.errstate(over="ignore"):
+        for word in words:
+            state = _mixed(state ^ word)
+        columns = [_mixed(state + np.uint64((axis + 1) * 0x9E3779B97F4A7C15 % 2**64)) for axis in range(3)]
+    return np.stack(columns, axis=1).astype(np.float64) / 2.0**64
+
+
+def _mixed(word: np.ndarray) -> np.ndarray:
+    word = word + np.uint64(0x9E3779B97F4A7C15)
+    word = (word ^ (word >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    word = (word ^ (word >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return word ^ (word >> np.uint64(31))

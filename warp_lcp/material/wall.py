@@ -1,0 +1,123 @@
+"""Velocity around the material after the projection: into the air, and at walls that hold it or let it go.
+
+The order matters. 1. One layer is extrapolated from the projected faces. 2. Faces between AIR cells that particles gave weight keep their
+own velocity: extrapolating over spray would make a droplet hang above a pool. 3. Further layers are extrapolated from both. Closed faces
+have taken part and now carry the material's velocity, not the wall's. 4. Held cells give their closed faces the wall's normal velocity
+(not merely less of the inward one: a moving wall drags its material along); released and AIR cells lose only the part into the wall, so
+that the last particles can leave. 5. Faces inside solids follow the faces beside them, so that tangential flow is not slowed by a wall.
+"""
+
+import typing
+from collections.abc import Sequence
+
+import warp as wp
+
+from warp_lcp.grid.extrapolate import BLOCKED, extrapolate
+from warp_lcp.grid.staggered import CellRange, Window
+from warp_lcp.grid.transfer import TINY_WEIGHT
+from warp_lcp.material.contact import RELEASED
+from warp_lcp.operators.grid_poisson import FLUID, SOLID
+
+_FLUID = wp.constant(wp.int8(FLUID))
+_SOLID = wp.constant(wp.int8(SOLID))
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.material.wall")
+@typing.no_type_check
+def keep_spray_kernel(
+    cells: CellRange,
+    axis: int,
+    kind: wp.array3d(dtype=wp.int8),
+    weight: wp.array3d(dtype=wp.float32),
+    known: wp.array3d(dtype=wp.int8),
+):
+    """Open faces that are still unknown but carry weight become known, and so do the extrapolated ones."""
+    plane, row, chunk = wp.tid()
+    k = cells.k + plane
+    j = cells.j + row
+    first = cells.i + chunk * cells.grain
+    for i in range(first, wp.min(first + cells.grain, cells.end)):
+        mark = int(known[k, j, i])
+        if mark > 1:
+            known[k, j, i] = wp.int8(1)
+        if mark == 0 and weight[k, j, i] > TINY_WEIGHT:
+            # a face with weight is no face of the array's edge: its particles lie in the domain
+            below = kind[k - wp.where(axis == 2, 1, 0), j - wp.where(axis == 1, 1, 0), i - wp.where(axis == 0, 1, 0)]
+            if kind[k, j, i] != _SOLID and below != _SOLID:
+                known[k, j, i] = wp.int8(1)
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.material.wall")
+@typing.no_type_check
+def closed_face_kernel(
+    cells: CellRange,
+    axis: int,
+    kind: wp.array3d(dtype=wp.int8),
+    contact: wp.array3d(dtype=wp.uint8),
+    index: wp.array3d(dtype=wp.int32),
+    separating: wp.array(dtype=wp.uint8),
+    solid: wp.array3d(dtype=wp.float32),
+    field: wp.array3d(dtype=wp.float32),
+):
+    """Closed faces take the wall's normal velocity, or lose only the velocity into the wall."""
+    plane, row, chunk = wp.tid()
+    k = cells.k + plane
+    j = cells.j + row
+    first = cells.i + chunk * cells.grain
+    c = wp.max(k - wp.where(axis == 2, 1, 0), 0)
+    b = wp.max(j - wp.where(axis == 1, 1, 0), 0)
+    for i in range(first, wp.min(first + cells.grain, cells.end)):
+        a = wp.max(i - wp.where(axis == 0, 1, 0), 0)
+        here = index[k, j, i]
+        below = index[c, b, a]
+        if (here >= 0) != (below >= 0):
+            wall = wp.max(here, below)
+            outward = float(1.0)  # from the wall into the open
+            filled = kind[k, j, i] == _FLUID
+            leaving = int(contact[k, j, i]) == RELEASED
+            if here >= 0:
+                outward = -1.0
+                filled = kind[c, b, a] == _FLUID
+                leaving = int(contact[c, b, a]) == RELEASED
+            target = float(0.0)
+            if solid:
+                target = solid[k, j, i]
+            held = filled and (separating[wall] == wp.uint8(0) or not leaving)
+            if held or outward * (field[k, j, i] - target) < 0.0:
+                field[k, j, i] = target
+
+
+def extend_velocity(
+    window: Window,
+    velocity: Sequence[wp.array],
+    weights: Sequence[wp.array],
+    known: Sequence[wp.array],
+    kind: wp.array,
+    contact: wp.array,
+    index: wp.array,
+    separating: wp.array,
+    solid_velocity: Sequence[wp.array],
+    layers: int,
+) -> None:
+    """Continue the projected velocity into air and walls.
+
+    Args:
+        window: faces to consider.
+        velocity: each component [m/s] (updated): projected where `known`, the particles' average where there is weight.
+        weights: of the particles on each component's faces.
+        known: int8 of each component (updated): 1 on projected faces, 0 on others, -1 inside solids.
+        kind: int8 of AIR, FLUID, SOLID.
+        contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED.
+        index: int32: -1 in open cells, the wall's number elsewhere.
+        separating: uint8 a wall.
+        solid_velocity: of the solids on each component's faces [m/s], or empty if all stand still.
+        layers: how far into the air, in faces.
+    """
+    for axis, (field, weight, marks) in enumerate(zip(velocity, weights, known, strict=True)):
+        extrapolate(window, marks, field, 1)
+        window.launch(keep_spray_kernel, [axis, kind, weight, marks])
+        extrapolate(window, marks, field, layers)
+        solid = solid_velocity[axis] if solid_velocity else None
+        window.launch(closed_face_kernel, [axis, kind, contact, index, separating, solid, field])
+        # a particle's tent reaches faces inside a solid beside its cell, and in 3-D beside those
+        extrapolate(window, marks, field, len(velocity) - 1, start=layers + 1, fill=BLOCKED)

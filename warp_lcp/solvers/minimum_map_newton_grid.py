@@ -1,0 +1,145 @@
+"""Newton's method on the minimum map on grids, with the passes of `ProjectedMultigrid` over memory."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from warp_lcp.multigrid.hierarchy import Hierarchy
+from warp_lcp.operators.grid_poisson import GridPoisson
+from warp_lcp.problem import LCP
+from warp_lcp.solve import Precision, Step
+from warp_lcp.solvers import minimum_map_newton_grid_kernels as kernels
+from warp_lcp.solvers import projected_multigrid_kernels as engine
+from warp_lcp.solvers.projected_multigrid import AssessedResidual, MultigridWorkspace
+from warp_lcp.vectors import launch_spans
+
+if TYPE_CHECKING:
+    from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
+
+DECREASE = 1e-4  # share of a step by which the residual must fall
+
+
+class MinimumMapResidual(AssessedResidual):
+    """The natural residual, with the free set that the minimum map has there: unknowns with x - y / A_ii within their bounds.
+
+    Attributes:
+        away: whether unknowns that are held are not at their bounds yet.
+    """
+
+    def __init__(self, problem: LCP, A: GridPoisson, hierarchy: Hierarchy, *, rounded: bool) -> None:
+        super().__init__(problem, A, hierarchy, rounded=rounded)
+        planes, rows, _ = A.stencil.threads
+        self._away = wp.zeros(planes * rows, dtype=wp.uint8, device=A.device)  # rows with such unknowns
+        own = kernels.row_kernels(*self.storage, rounded=rounded)
+        self.row_kernels = SimpleNamespace(**{**vars(self.row_kernels), "assess": own.assess, "advance": own.advance})
+        self._hold, self._right_side = own.hold, own.right_side
+
+    def _assessed(self) -> list[Any]:
+        return [*super()._assessed(), self._away]
+
+    @property
+    def away(self) -> bool:
+        """Read it."""
+        return bool(self._away.numpy().any())
+
+    def hold(self, x: wp.array[Any]) -> None:
+        """Move held unknowns onto their bounds, and the right-hand side with them."""
+        p, s, R, finest = self.problem, self._A.stencil, self.row_sums, self._finest
+        inputs = [s.shape, s.grain, R, x, finest.b, *p.bounds.operands, self._away]
+        wp.launch(self._hold, s.threads, inputs, device=p.device)
+        s.wrap(x)
+        fields = [x, p.b, finest.stencil.d, finest.b, self.scalars, self._away]
+        inputs = [*s.operands, R, wp.vec3i(*map(int, s.periodic)), *fields]
+        wp.launch(self._right_side, s.threads, inputs, device=p.device)
+        self._away.zero_()
+
+
+class GridNewtonWorkspace(MultigridWorkspace):
+    """Memory of the method for one grid problem.
+
+    A Newton step holds what the minimum map does not call free, moves it onto its bounds, and solves on the rest by conjugate gradients
+    with a multigrid cycle. Each iteration moves x itself, projected, and evaluates the residual there, so that no correction is kept. The
+    linear solve ends when the residual is small enough, or as soon as an iterate calls other unknowns free: what it was to solve is not
+    the system any more. Conjugate gradients carry their direction on to the next system.
+    """
+
+    def __init__(self, problem: LCP, A: GridPoisson, settings: MinimumMapNewton) -> None:
+        super().__init__(problem, A, settings)  # type: ignore[arg-type]
+        self.residual = MinimumMapResidual(problem, A, self.hierarchy, rounded=self.precision is Precision.SINGLE)
+        self._newton, self._norms, self._target = settings, list[float](), 0.0
+
+    def start(self, *, warm: bool, tolerance: float) -> None:
+        """Forget the search direction and the residuals; the operator may have changed."""
+        self._norms, self._target = [], tolerance
+        super().start(warm=warm, tolerance=tolerance)
+
+    def wants_monotone_cycle(self) -> bool:
+        """Return whether the start is still cold, or Newton's steps have failed."""
+        return self._cycles_left > 0
+
+    def newton_step(self) -> Step:
+        """Solve on the free set, and shorten the step if the residual exceeds the largest of the last ones."""
+        residual, s = self.residual, self._newton
+        assert isinstance(residual, MinimumMapResidual)
+        self._norms = [*self._norms, residual.norm][-s.memory :]
+        wanted, active, iterations, limit = max(s.eta * residual.norm, self._target), residual.active, 0, max(self._norms)
+        if residual.away:
+            self._store()
+            residual.hold(self.x)
+        while True:
+            self.truncated_step()
+            iterations += 1
+            if residual.stale or not residual.norm > wanted or iterations >= s.max_linear_iterations:
+                break
+        if not residual.norm > (1 - DECREASE) * limit or not math.isfinite(residual.norm) or not self.bounded:
+            return Step("newton", iterations, active)
+        return self._shorten(limit, iterations, active)
+
+    def _store(self) -> None:
+        """Keep the best iterate in memory of its own: x is about to change by more than can be taken back."""
+        if not self._stored and self._past == 0:
+            if self._best is None:
+                self._best = wp.empty_like(self.x)
+            wp.copy(self._best, self.x)
+            self._stored = True
+        self._leave_undone()
+
+    def _leave_undone(self) -> None:
+        """Store the best iterate if it is one step back."""
+        if not self._stored and self._past == 1:
+            self._leave()
+            self._past -= 1
+
+    def _shorten(self, limit: float, iterations: int, active: int) -> Step:
+        """Take the longest of the halves of the last move that the safeguard allows; if there is none, projected cycles."""
+        residual, s = self.residual, self._newton
+        whole, best, length = float(residual.scalars.numpy()[int(engine.STEP)]), residual.norm, 1.0
+        scale = 1.0
+        self._store()
+        self._forget()
+        for _ in range(s.backtracks):
+            scale *= 0.5
+            self._set_length(length, scale, whole)
+            length = scale
+            norm = residual.evaluate(self.x)
+            if norm <= (1 - DECREASE * scale) * limit:
+                return Step("newton", iterations, active)
+            if norm < best:
+                best = norm
+        self._cycles_left, self._relapse = self._relapse, 2 * self._relapse
+        residual.classify = False
+        residual.evaluate(self.x)
+        return Step("monotone cycle", iterations + self.monotone_step().linear_iterations, active)
+
+    def _set_length(self, old: float, new: float, whole: float) -> None:
+        """Change how far x has moved along the last direction, in parts of the whole step."""
+        p, residual = self.problem, self.residual
+        residual.set(engine.STEP, (old - new) * whole)
+        inputs = [self.x, self._p, *p.bounds.operands, p.unknown, self.x, residual.scalars]
+        launch_spans(self._flat.undo, self._spans, inputs, [], p.device)
+        self._round(self.x)
+        residual.set(engine.STEP, new * whole)
