@@ -29,6 +29,7 @@ class Packing:
         relax: of what is too dense, the share that a step pushes out.
 
     Attributes:
+        base: that of the arguments.
         fraction: phi, float32.
         kind: int8 FLUID where a cell holds sand (phi > 0.02), AIR, SOLID.
         flags: uint8 bits of a cell, see `granular.yield_set`.
@@ -43,7 +44,7 @@ class Packing:
 
     def __init__(self, grid: StaggeredGrid, base: wp.array, capacity: wp.array, *, relax: float = 0.2) -> None:
         """Allocate the fields."""
-        self.grid, self._base, self._capacity, self.relax = grid, base, capacity, relax
+        self.grid, self.base, self._capacity, self.relax = grid, base, capacity, relax
         self.fraction, self.kind, self.flags, self.drive = grid.field(), grid.field(wp.int8), grid.field(wp.uint8), grid.field()
         wp.copy(self.kind, base)
         self.mass, self.inverse, self.start = grid.faces(), grid.faces(), grid.faces()
@@ -66,16 +67,16 @@ class Packing:
         """
         grid, dimension = self.grid, self.grid.dimension
         domain, nodes = grid.domain, self.nodes
-        domain.launch(kernels.fraction_kernel, [self._base, self._capacity, self.relax, density, self.fraction])
+        domain.launch(kernels.fraction_kernel, [self.base, self._capacity, self.relax, density, self.fraction])
         rate = grid.spacing / dt
-        domain.launch(kernels.cell_kernel, [self._base, self.fraction, grid.planes, rate, self.kind, self.flags, self.drive])
+        domain.launch(kernels.cell_kernel, [self.base, self.fraction, grid.planes, rate, self.kind, self.flags, self.drive])
         for axis in range(dimension):
             moving = solid[axis] if solid else None
             fields = [velocity[axis], moving, self.start[axis], self.mass[axis], self.inverse[axis]]
-            nodes.launch(kernels.face_kernel, [axis, self._base, self.fraction, *fields])
+            nodes.launch(kernels.face_kernel, [axis, self.base, self.fraction, *fields])
         for (alpha, beta), share in zip(SHEARS[dimension], self.share, strict=True):
             nodes.launch(
-                kernels.edge_kernel, [alpha, beta, self._base, self.flags, self.inverse[alpha], self.inverse[beta], share]
+                kernels.edge_kernel, [alpha, beta, self.base, self.flags, self.inverse[alpha], self.inverse[beta], share]
             )  # fmt: skip
         domain.launch(kernels.stiffness_kernel, [dimension, self.flags, *three(self.inverse), *three(self.share), self.stiff])
         domain.launch_rows(kernels.span_kernel, [self.flags, self._own])

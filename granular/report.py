@@ -38,7 +38,7 @@ class Outcome:
     Attributes:
         ratio: of each cell's friction to its bound, float32.
         contact: uint8 of HELD where sand has pressure, RELEASED where it has none, 0 elsewhere.
-        known: int8, 1 on each component's faces that the stresses act on.
+        known: int8, 1 on each component's faces that the stresses act on, -1 inside solids, 0 elsewhere.
     """
 
     def __init__(self, stress: Stress) -> None:
@@ -53,9 +53,8 @@ class Outcome:
         """Give the faces that stresses act on the velocity that they leave [m/s], and find `known` and `contact`."""
         stress, packing = self.stress, self.stress.packing
         for axis, field in enumerate(velocity):
-            packing.nodes.launch(
-                self._kernels.take, [packing.inverse[axis], stress.checked.u[axis], field, self.known[axis]]
-            )  # fmt: skip
+            fields = [packing.base, packing.inverse[axis], stress.checked.u[axis], field, self.known[axis]]
+            packing.grid.everywhere.launch(self._kernels.take, [axis, *fields])
         inputs = [wp.uint8(HELD), wp.uint8(RELEASED), packing.flags, stress.now, self.contact]
         packing.grid.domain.launch(self._kernels.contact, inputs)
 

@@ -7,7 +7,9 @@ from types import SimpleNamespace
 import warp as wp
 
 from granular.yield_set import SHAPE, native
+from warp_lcp.grid.extrapolate import BLOCKED
 from warp_lcp.grid.staggered import CellRange
+from warp_lcp.operators.grid_poisson import SOLID
 
 RATIO_YIELDS = 0.99  # of the bound, from which a cell counts as yielded
 REPORT_COLUMNS = 4  # of a row's sums: cells that carry shear, yielded ones, dissipation, largest fraction that the pressure's solution predicts
@@ -78,16 +80,25 @@ def report_kernels(dimension: int) -> SimpleNamespace:
         )  # fmt: skip
 
     @wp.kernel(enable_backward=False, module=f"granular.report_{dimension}d")
-    def take(cells: CellRange, inverse: _F32, found: _F64, velocity: _F32, known: wp.array3d(dtype=wp.int8)):
+    def take(
+        cells: CellRange, axis: int, base: wp.array3d(dtype=wp.int8), inverse: _F32, found: _F64, velocity: _F32,
+        known: wp.array3d(dtype=wp.int8),
+    ):  # fmt: skip
         plane, row, chunk = wp.tid()
         k = cells.k + plane
         j = cells.j + row
         first = cells.i + chunk * cells.grain
+        c = wp.max(k - wp.where(axis == 2, 1, 0), 0)
+        b = wp.max(j - wp.where(axis == 1, 1, 0), 0)
         for i in range(first, wp.min(first + cells.grain, cells.end)):
-            known[k, j, i] = wp.int8(0)
+            a = wp.max(i - wp.where(axis == 0, 1, 0), 0)
+            mark = wp.int8(0)
             if inverse[k, j, i] > 0.0:
                 velocity[k, j, i] = wp.float32(found[k, j, i])
-                known[k, j, i] = wp.int8(1)
+                mark = wp.int8(1)
+            elif base[k, j, i] == wp.int8(SOLID) and base[c, b, a] == wp.int8(SOLID):
+                mark = wp.int8(BLOCKED)
+            known[k, j, i] = mark
 
     @wp.kernel(enable_backward=False, module=f"granular.report_{dimension}d")
     def contact(cells: CellRange, held: wp.uint8, released: wp.uint8, flags: _U8, now: _STRESS, out: _U8):

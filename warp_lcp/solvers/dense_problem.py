@@ -18,6 +18,7 @@ from warp_lcp.result import SolveStatus
 from warp_lcp.solve import IterateInPlace, Precision, Step
 
 SEMIDEFINITE = 1e-10  # shift with which an equilibrated semi-definite matrix must have a Cholesky factor
+PROVABLE = 250_000  # entries of A up to which a linear program is asked whether there is a solution: seconds
 EQUILIBRATIONS = 8  # sweeps of Ruiz's iteration, which halves the logarithms of rows that differ
 RANK = 1e-12  # singular values below this part of the largest are zero to least-squares solutions (methods.md: all solved with it)
 
@@ -61,7 +62,7 @@ class DenseProblem:
         """
         S = equilibration(self.A)
         b, start = S * self.b, S * (self.A @ np.clip(0.0, self.lower, self.upper))
-        beta = _power_of_two(max(np.abs(b).max(), np.abs(start).max()) or 1.0)
+        beta = power_of_two(max(np.abs(b).max(), np.abs(start).max()) or 1.0)
         units = beta * S
         A = scipy.sparse.csr_array(self.A.multiply(S[:, None]).multiply(S)) if scipy.sparse.issparse(self.A) else S[:, None] * self.A * S
         return DenseProblem(self.rows, A, b / beta, self.lower / units, self.upper / units), units
@@ -118,7 +119,7 @@ def assemble(problem: LCP, rows: np.ndarray) -> np.ndarray:
     return matrix
 
 
-def _power_of_two(value: Any) -> Any:
+def power_of_two(value: Any) -> Any:
     """Return the nearest power of 2, on a logarithmic scale; 1 for 0."""
     return 2.0 ** np.round(np.log2(np.where(value > 0, value, 1.0)))
 
@@ -130,7 +131,7 @@ def equilibration(A: Any) -> np.ndarray:
     for _ in range(EQUILIBRATIONS):
         scaled = magnitude.multiply(S[:, None]).multiply(S).tocsr() if sparse else S[:, None] * magnitude * S
         rows, columns = (scaled.max(axis=k).toarray().ravel() if sparse else scaled.max(axis=k) for k in (1, 0))
-        S = S * _power_of_two(1 / np.sqrt(np.where(np.maximum(rows, columns) > 0, np.maximum(rows, columns), 1.0)))
+        S = S * power_of_two(1 / np.sqrt(np.where(np.maximum(rows, columns) > 0, np.maximum(rows, columns), 1.0)))
     return S
 
 
@@ -171,6 +172,13 @@ def inconsistent(data: DenseProblem) -> bool:
     limits = np.stack([data.lower, data.upper], axis=1)
     found = linprog(np.zeros(len(data.b)), **rows, bounds=limits, method="highs")
     return bool(found.status == 2)  # HiGHS: infeasible
+
+
+def proved_infeasible(problem: LCP) -> bool:
+    """Return whether `inconsistent` says so of a dense or sparse problem; False where that would take long."""
+    sparse = sparse_matrix(problem)
+    entries = sparse.nnz if sparse is not None else problem.layout.size**2
+    return entries <= PROVABLE and inconsistent(DenseProblem.read(problem, keep_sparse=True))
 
 
 def check_size(problem: LCP, method: str, most: int) -> int:

@@ -128,7 +128,7 @@ class FischerWorkspace(IterateInPlace, RoundedIterate):
         self.x, self.residual = layout.zeros(wp.float64), NaturalResidual(problem)
         if isinstance(problem.A, GridPoisson) and self.kink is not Kink.APPROXIMATION:
             newton = MinimumMapNewton(precision=settings.precision, monotone_cycles=settings.monotone_cycles, cycle=settings.cycle)
-            self.active_set = GridNewtonWorkspace(problem, problem.A, newton)
+            self.active_set = GridNewtonWorkspace(problem, problem.A, newton, serves=True)
             self.x, self.residual, self.scratch = self.active_set.x, self.active_set.residual, self.active_set.scratch
         self._from, self._shift = layout.zeros(wp.float64), layout.zeros(wp.float64)
         self.free = layout.zeros(wp.uint8)
@@ -161,7 +161,6 @@ class FischerWorkspace(IterateInPlace, RoundedIterate):
         self.system.refresh()
         if self.active_set is not None:
             self.active_set.floating = self.floating
-            self.active_set.keep()
             self.active_set.start(warm=warm, tolerance=tolerance)
         if self.floating is not None:  # what is singular: components none of whose unknowns is bounded
             p = self.problem
@@ -171,7 +170,6 @@ class FischerWorkspace(IterateInPlace, RoundedIterate):
     def monotone_step(self) -> Step:
         """Projected multigrid cycle on all unknowns."""
         assert self.active_set is not None
-        self.active_set.keep()
         return self.active_set.monotone_step()
 
     @property

@@ -14,8 +14,11 @@ from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.solve import IterateInPlace, Precision, RoundedIterate, Step
+from warp_lcp.solvers.equilibrated import EquilibratedWorkspace
+from warp_lcp.solvers.interior_point_grid import GridPath
 from warp_lcp.solvers.interior_point_kernels import kernels
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
+from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
 from warp_lcp.solvers.principal_system import GridSystem, principal_system
 from warp_lcp.vectors import Reduction, launch_spans
 
@@ -91,19 +94,23 @@ class InteriorPoint:
             if getattr(self, name) < least:
                 raise ValueError(f"{name} = {getattr(self, name)}: must be >= {least}")
 
-    def init(self, problem: LCP) -> InteriorPointWorkspace:
-        """Return a workspace."""
+    def init(self, problem: LCP) -> InteriorPointWorkspace | EquilibratedWorkspace:
+        """Return a workspace: for dense and sparse problems one that equilibrates them."""
+        if EquilibratedWorkspace.suits(problem):
+            return EquilibratedWorkspace(problem, Precision(self.precision), lambda scaled: InteriorPointWorkspace(scaled, self))
         return InteriorPointWorkspace(problem, self)
 
-    def step(self, problem: LCP, work: InteriorPointWorkspace, x: wp.array[Any]) -> Step:
+    def step(self, problem: LCP, work: Any, x: wp.array[Any]) -> Step:
         """Take a monotone cycle while the start is cold, a step along the path, or a Newton step after the crossover."""
+        if isinstance(work, EquilibratedWorkspace):
+            return work.step(self.step)
         if work.cycles_left > 0:
             work.cycles_left -= 1
-            return work.active_set.monotone_cycle(x)
+            return work.monotone_step(x)
         if not work.crossed and work.begun and work.residual.norm <= self.crossover * work.first_norm:
             work.cross()
         if work.crossed:
-            return work.active_set.newton_step(x)
+            return work.newton_step(x)
         if not work.begun:
             work.begin(x)
         return work.path_step(x)
@@ -121,6 +128,18 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
         self.problem, self.settings, self.precision = problem, settings, Precision(settings.precision)
         layout, device = problem.layout, problem.device
         self.x, self.residual = layout.zeros(wp.float64), NaturalResidual(problem)
+        self.active_set: GridNewtonWorkspace | NewtonWorkspace | None = None
+        newton = MinimumMapNewton(
+            precision=settings.precision, monotone_cycles=settings.monotone_cycles, max_linear_iterations=settings.max_linear_iterations,
+            cycle=settings.cycle,
+        )  # fmt: skip
+        if isinstance(problem.A, GridPoisson) and problem.bounded:
+            self.active_set = GridNewtonWorkspace(problem, problem.A, newton, serves=True)
+            self.x, self.scratch = self.active_set.x, self.active_set.scratch
+            self.residual = self.active_set.residual
+        elif problem.bounded and settings.crossover > 0:
+            self.active_set = NewtonWorkspace(problem, newton)
+            self.active_set.residual = self.residual
         self.system = principal_system(problem, self.precision.correction, bounded=False, settings=settings.cycle, shifted=problem.bounded)
         upper = problem.bounds.may_bind[1]
         self._w, self._s = layout.zeros(wp.float64), layout.zeros(wp.float64)
@@ -132,15 +151,14 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
         self._kernels = kernels(self.residual.diagonal.dtype, self.system.r.dtype, upper)
         self._rounded = layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
         self._carries = isinstance(self.system, GridSystem)  # conjugate gradients leave the residual in r
-        self.active_set: NewtonWorkspace = None  # type: ignore[assignment]
-        if problem.bounded and (settings.crossover > 0 or (settings.monotone_cycles > 0 and isinstance(problem.A, GridPoisson))):
-            newton = MinimumMapNewton(
-                precision=settings.precision, max_linear_iterations=settings.max_linear_iterations, cycle=settings.cycle
-            )
-            self.active_set = NewtonWorkspace(problem, newton)
-            self.active_set.residual = self.residual
+        self._passes: GridPath | None = None
+        if isinstance(self.system, GridSystem) and self.system.fused and problem.bounded and settings.mehrotra and self._rounded is None:
+            fields = [self._pairs, self.free, self.system.e, self._predicted]
+            self._passes = GridPath(self.residual, self.system.hierarchy, *fields)
         self.floating: Any = None
-        self.start(warm=False, tolerance=0.0)
+        self.cycles_left = self.steps = self.count = 0
+        self.near = self.begun = self.crossed = False
+        self.mu = self.target = self.first_norm = self.size = 0.0
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the path; the operator may have changed."""
@@ -156,10 +174,36 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
             self.active_set.floating = self.floating
             self.active_set.start(warm=not cold_grid, tolerance=tolerance)
 
+    def monotone_step(self, x: wp.array[Any]) -> Step:
+        """Projected multigrid cycle on all unknowns."""
+        assert isinstance(self.active_set, GridNewtonWorkspace)
+        return self.active_set.monotone_step()
+
     def cross(self) -> None:
         """Hand over to the active-set method."""
+        assert self.active_set is not None
         self.crossed = True
+        if isinstance(self.active_set, GridNewtonWorkspace):
+            self.active_set.classify()
         self.active_set.start(warm=True, tolerance=self.target)
+
+    def newton_step(self, x: wp.array[Any]) -> Step:
+        """Take a step of the active-set method."""
+        if isinstance(self.active_set, GridNewtonWorkspace):
+            work = self.active_set
+            return work.monotone_step() if work.wants_monotone_cycle() else work.newton_step()
+        assert self.active_set is not None
+        return self.active_set.newton_step(x)
+
+    @property
+    def is_grid(self) -> bool:
+        """Whether the residual is a grid's own, which does not keep y."""
+        return isinstance(self.active_set, GridNewtonWorkspace)
+
+    @property
+    def _fused(self) -> GridPath | None:
+        """What steps in one pass, where the problem allows that."""
+        return self._passes if self.floating is None and self.count else None
 
     def begin(self, x: wp.array[Any]) -> None:
         """Move x inside its bounds, and choose multipliers: by the size of b far from the path, by the residual near it."""
@@ -173,7 +217,9 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
             self._inside(x, least)
             self.residual.affine(x)
             self.mu = self._multipliers(least)[0] / self.count
-        self.begun = True
+        elif self.is_grid:
+            self.residual.affine(x)
+        self.begun, self.condensed = True, False
         if self.floating is not None:  # what is singular: components none of whose unknowns is bounded
             free, w, v = self.free.numpy() != 0, self._w.numpy(), self._v.numpy()
             self._without_bounds = wp.array((free & np.isinf(w) & np.isinf(v)).astype(np.uint8), device=p.device)
@@ -181,6 +227,8 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
     def path_step(self, x: wp.array[Any]) -> Step:
         """Solve for the direction, and go nearly as far along it as w, v, s and t stay positive."""
         s, self.steps = self.settings, self.steps + 1
+        if self._fused is not None:
+            return self._fused_step(self._fused, x)
         self.size = max(self.residual.norm, 1e-300)
         tau = 0.0 if s.mehrotra else self.mu / self.steps
         second = 0.0
@@ -191,9 +239,7 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
         iterations = self._solve(s.predictor_eta if s.mehrotra and self.count else s.eta)
         longest, products = self._ratios(second, tau)
         if s.mehrotra and self.count:
-            length = min(1.0, 1 / longest) if longest > 0 else 1.0
-            after = (1 - length) * self.mu + length**2 * products / self.count
-            tau, second = self.mu * min(1.0, max(0.0, after / self.mu)) ** 3, 1.0
+            tau, second = self._center(longest, products), 1.0
             fields = [self.residual.y, *self._pairs, self.free, self.system.e, self._predicted, self.system.r]
             self._flat(self._kernels.center, [*fields, wp.float64(self.size), wp.float64(tau), self._carries])
             self._project()
@@ -202,8 +248,35 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
         share = s.backoff if s.mehrotra else min(s.backoff, self.steps / (s.horizon + 1))
         length = min(1.0, share / longest) if longest > 0 else 1.0
         self._move(x, second, tau, length)
+        if self.is_grid:
+            NaturalResidual.evaluate(self.residual, x)
         name = "predictor-corrector" if s.mehrotra else "path"
         return Step(name, iterations, None, interim=not s.mehrotra and self.steps <= s.horizon)
+
+    def _fused_step(self, passes: GridPath, x: wp.array[Any]) -> Step:
+        """Do what `path_step` does by Mehrotra's rule in four passes over memory."""
+        s = self.settings
+        if not self.condensed:
+            self.size, self.condensed = max(self.residual.norm, 1e-300), True
+            passes.advance(x, (0.0, 0.0, 0.0, 0.0), 0.0, 1 / self.size)
+        passes.rebuild()
+        iterations = self.system.solve(s.predictor_eta * passes.norm, s.max_linear_iterations)[0]
+        longest, products = passes.ratios((self.size, 0.0, 0.0, 0.0))
+        tau = self._center(longest, products)
+        passes.center(self.size, tau)
+        iterations += self.system.solve(s.eta * passes.norm, s.max_linear_iterations)[0]
+        direction = (self.size, 1.0, 1.0, tau)
+        longest, _ = passes.ratios(direction)
+        self.size = max(self.residual.norm, 1e-300)
+        passes.advance(x, direction, min(1.0, s.backoff / longest) if longest > 0 else 1.0, 1 / self.size)
+        self.mu = passes.products / self.count
+        return Step("predictor-corrector", iterations, None)
+
+    def _center(self, longest: float, products: float) -> float:
+        """Return Mehrotra's tau: mu times the cube of what the predictor would leave of it."""
+        length = min(1.0, 1 / longest) if longest > 0 else 1.0
+        after = (1 - length) * self.mu + length**2 * products / self.count
+        return self.mu * min(1.0, max(0.0, after / self.mu)) ** 3
 
     @property
     def _pairs(self) -> list[wp.array[Any]]:

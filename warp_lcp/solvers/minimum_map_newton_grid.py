@@ -65,12 +65,18 @@ class GridNewtonWorkspace(MultigridWorkspace):
     with a multigrid cycle. Each iteration moves x itself, projected, and evaluates the residual there, so that no correction is kept. The
     linear solve ends when the residual is small enough, or as soon as an iterate calls other unknowns free: what it was to solve is not
     the system any more. Conjugate gradients carry their direction on to the next system.
+
+    Args:
+        problem: the problem.
+        A: its operator.
+        settings: the method.
+        serves: whether another method makes the cold start or ends with this one, on the same x and residual, and keeps the best iterate.
     """
 
-    def __init__(self, problem: LCP, A: GridPoisson, settings: MinimumMapNewton) -> None:
+    def __init__(self, problem: LCP, A: GridPoisson, settings: MinimumMapNewton, *, serves: bool = False) -> None:
         super().__init__(problem, A, settings)  # type: ignore[arg-type]
         self.residual = MinimumMapResidual(problem, A, self.hierarchy, rounded=self.precision is Precision.SINGLE)
-        self._newton, self._norms, self._target = settings, list[float](), 0.0
+        self._newton, self._norms, self._target, self._serves = settings, list[float](), 0.0, serves
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the search direction and the residuals; the operator may have changed."""
@@ -99,8 +105,23 @@ class GridNewtonWorkspace(MultigridWorkspace):
             return Step("newton", iterations, active)
         return self._shorten(limit, iterations, active)
 
+    def classify(self) -> None:
+        """Evaluate the residual and the active set at an x that another method has made."""
+        residual = self.residual
+        residual.set(engine.STEP, 0.0)
+        residual.set(engine.SIZE, residual.norm)
+        residual.classify = True
+        residual.evaluate(self.x)
+
+    def _leave(self) -> None:
+        """Store the best iterate before x leaves it behind."""
+        if not self._serves:
+            super()._leave()
+
     def _store(self) -> None:
         """Keep the best iterate in memory of its own: x is about to change by more than can be taken back."""
+        if self._serves:
+            return
         if not self._stored and self._past == 0:
             if self._best is None:
                 self._best = wp.empty_like(self.x)

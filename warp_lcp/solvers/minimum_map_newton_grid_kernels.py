@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Kernels of the minimum-map Newton method on grids: residual, active set and right-hand side in one pass; held unknowns to their bounds."""
+"""Kernels of the minimum-map Newton method on grids: residual, active set and right-hand side in one pass."""
 
 import functools
 from types import SimpleNamespace

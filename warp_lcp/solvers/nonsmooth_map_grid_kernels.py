@@ -76,8 +76,8 @@ def advance_kernel(variable: bool, d_type: Any, w_type: Any, real: Any, form: Fo
                 SIMD for (int i = begin; i < end; ++i) {{
                     {SIZES} {kink} {sides} {" ".join(made)}
                     const S qs = q > least_q ? q : least_q, inverse = (S)1/qs; const bool solved = inside & !(drop & kink);
-                    const S diagonal = solved ? (S)e_ + (S)size*p*inverse : (S)0, g = solved ? -f*inverse : (S)0;
-                    merit += f*f; D[i] = diagonal; r[i] = g; weighted += g*g/(diagonal > 0 ? diagonal : (S)1); }} }}); }}
+                    const S diagonal = solved ? (S)e_ + (S)size*p*inverse : (S)0, right = solved ? -f*inverse : (S)0;
+                    merit += f*f; D[i] = diagonal; r[i] = right; weighted += right*right/(diagonal > 0 ? diagonal : (S)1); }} }}); }}
         const double all[{COLUMNS}] = {{square, (double)merit, (double)weighted}};
         for (int c = 0; c < {COLUMNS}; ++c) out.data[c*threads + t] = all[c];"""
         )

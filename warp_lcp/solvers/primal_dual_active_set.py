@@ -164,10 +164,11 @@ class ActiveSetWorkspace(NewtonWorkspace):
         """Some pivots of the first unknown that violates its condition; interim until none does."""
         if self.resort is not None:
             return self._resort(x)
-        data = DenseProblem.read(self.problem)
+        own = DenseProblem.read(self.problem)
+        data, units = own.scaled()
         if self.places is None:
-            free, at = self.free.numpy()[data.rows] != 0, x.numpy()[data.rows]
-            self.places = np.where(free, FREE, np.where(at == data.upper, UPPER, LOWER))
+            free, at = self.free.numpy()[own.rows] != 0, x.numpy()[own.rows]
+            self.places = np.where(free, FREE, np.where(at == own.upper, UPPER, LOWER))
         pivots, most = 0, pivots_of(None, len(data.b)) * 8
         values, violated, singular = _basic_solution(data, self.places)
         while violated.size and pivots < most and not (singular and self.last_resort):
@@ -181,7 +182,7 @@ class ActiveSetWorkspace(NewtonWorkspace):
         if not np.isfinite(values).all() or (lost and not self.last_resort):
             return Step("least index", pivots, None, SolveStatus.STAGNATED)
         stored = x.numpy().copy()
-        stored[data.rows] = np.clip(values, data.lower, data.upper)
+        stored[own.rows] = units * np.clip(values, data.lower, data.upper)
         x.assign(stored)
         self._round(x)
         failure = None if violated.size else SolveStatus.STAGNATED  # counts only if the criteria are not met by rounding

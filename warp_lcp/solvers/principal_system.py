@@ -22,6 +22,7 @@ from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.operators.sum import SumOperator
 from warp_lcp.problem import LCP
 from warp_lcp.program import Launch, Program
+from warp_lcp.solvers.dense_problem import equilibration
 from warp_lcp.solvers.grid_conjugate_gradient import GridConjugateGradient
 from warp_lcp.solvers.principal_system_kernels import divide_kernel, kernels, mask_kernel, shift_kernel
 from warp_lcp.solvers.principal_system_norm import WeightedNorm
@@ -212,10 +213,20 @@ class DenseSystem:
 
 
 def _solve_or_least_squares(block: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """Return block^-1 r; where the block looks singular even in units in which its rows are alike, the least-squares solution there."""
+    solution = _factored(block, r)
+    if solution is None:
+        S = equilibration(block)
+        block, r = S[:, None] * block * S, S * r
+        solution = _factored(block, r)
+        solution = S * (np.linalg.lstsq(block, r, rcond=1e-12)[0] if solution is None else solution)
+    return solution
+
+
+def _factored(block: np.ndarray, r: np.ndarray) -> np.ndarray | None:
     factors, pivots, info = scipy.linalg.lapack.dgetrf(block)
-    pivot = np.abs(np.diag(factors))
-    if info != 0 or pivot.min() <= 1e-13 * np.abs(block).sum(axis=1).max():
-        return np.linalg.lstsq(block, r, rcond=1e-12)[0]
+    if info != 0 or np.abs(np.diag(factors)).min() <= 1e-13 * np.abs(block).sum(axis=1).max():
+        return None
     return scipy.linalg.lapack.dgetrs(factors, pivots, r)[0]
 
 

@@ -129,7 +129,8 @@ class IncompleteFactors:
     def apply(self) -> None:
         """Precondition."""
         if self._factors is not None:
-            self.z.numpy()[self._free] = self._factors.solve(self.r.numpy()[self._free].astype(np.float64))
+            with np.errstate(over="ignore"):  # the method sees that its iterate is not finite
+                self.z.numpy()[self._free] = self._factors.solve(self.r.numpy()[self._free].astype(np.float64))
 
     def _factor(self, block: Any) -> Any:
         size = float(np.abs(block.data).max(initial=0.0)) or 1.0

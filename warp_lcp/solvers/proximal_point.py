@@ -14,7 +14,7 @@ from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
 from warp_lcp.solve import FLOOR_MARGIN, Step
-from warp_lcp.solvers.dense_problem import DenseProblem, inconsistent
+from warp_lcp.solvers.dense_problem import proved_infeasible
 
 FIRST, FACTOR, LEAST = 1e-4, 0.1, 1e-10  # eps of the first center, its factor from center to center, and the smallest
 NEAR = 1e-3  # of a center's residual: what the regularized problem's may be when the next center is taken
@@ -22,7 +22,6 @@ MOST = 30  # steps for one center
 SMALL = 1000  # unknowns up to which a sparse matrix is taken as a dense one, for which least-index pivoting is there
 FALL = 0.5  # a center whose residual is above this part of the smallest so far is no progress
 IDLE = 3  # centers without progress before the end
-PROVEN = 2000  # unknowns up to which a linear program is asked whether there is a solution at all
 
 
 class ProximalPoint:
@@ -106,12 +105,8 @@ class ProximalPoint:
         self._idle += 1
         if solved and self._idle < IDLE:
             return None
-        proven = self._residual.norm > FLOOR_MARGIN * self._residual.rounding_floor(x, np.finfo(np.float64).eps) and self._has_none()
+        proven = self._residual.norm > FLOOR_MARGIN * self._residual.rounding_floor(x, np.finfo(np.float64).eps) and proved_infeasible(self._problem)
         return SolveStatus.INFEASIBLE if proven else SolveStatus.STAGNATED if solved else SolveStatus.NON_DESCENT
-
-    def _has_none(self) -> bool:
-        """Return whether it is known that the problem has no solution."""
-        return self._inner.layout.size <= PROVEN and inconsistent(DenseProblem.read(self._problem, keep_sparse=True))
 
     def _regularized(self) -> Any:
         """Return A + eps D."""

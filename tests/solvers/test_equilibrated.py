@@ -1,0 +1,125 @@
+"""Rows in units of their own, D A D with D from 1e-8 to 1e8, and problems without a solution: what second-order methods make of them."""
+
+import numpy as np
+import pytest
+import scipy.sparse
+import warp as wp
+
+import warp_lcp as wl
+from oracle import boxed, lemke
+from warp_lcp.solvers.equilibrated import EquilibratedWorkspace
+from warp_lcp.solvers.interior_point import InteriorPoint
+
+TIGHT = wl.StoppingCriteria(rtol=1e-10)
+N = 40
+TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
+METHODS = [InteriorPoint(), InteriorPoint(mehrotra=False), InteriorPoint(crossover=1e-2), wl.MinimumMapNewton(), wl.PrimalDualActiveSet()]
+
+
+def name(method):
+    return repr(method).partition(", cycle")[0][:80]
+
+
+def matrix(kind, rng):
+    if kind == "dense":
+        B = rng.standard_normal((N, N))
+        return B @ B.T / N + 0.1 * np.eye(N)
+    return scipy.sparse.diags_array([-1.0, 2.1, -1.0], offsets=[-1, 0, 1], shape=(N, N)).toarray()
+
+
+def problem(A, b, kind, lower=0.0, upper=np.inf):
+    operator = wl.DenseOperator(A, device="cpu") if kind == "dense" else wl.SparseOperator(scipy.sparse.csr_array(A), device="cpu")
+    return wl.LCP(operator, b, lower, upper)
+
+
+@pytest.mark.parametrize("method", METHODS, ids=name)
+@pytest.mark.parametrize("kind", ["dense", "sparse"])
+def test_extreme_rows(kind, method):
+    """Sixteen orders of magnitude between units, thirty-two between pivots: interior points once diverged, dense Newton found blocks singular."""
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        A, b, D = matrix(kind, rng), rng.standard_normal(N), 10 ** rng.uniform(-8, 8, N)
+        scaled = problem(D[:, None] * A * D, D * b, kind)
+        result = wl.solve(scaled, method)
+        assert result, (seed, result.status)
+        largest = D > D.max() / 100  # the criterion is in units of y: it tells these rows from 0
+        np.testing.assert_allclose(np.where(largest, (result.x.numpy() * D) < 1e-3, False)[largest], lemke(A, b)[largest] < 1e-3)
+
+
+@pytest.mark.parametrize("kind", ["dense", "sparse"])
+def test_the_same_steps_in_any_units(kind):
+    """D powers of 4, so that S takes them out exactly."""
+    rng = np.random.default_rng(107)
+    A, b, D = matrix(kind, rng), rng.standard_normal(N), 4.0 ** rng.integers(-13, 14, N)
+    x, high = lemke(A, b), np.full(N, 2.0)
+    histories = []
+    for lower, upper in ((0.0, np.inf), (-high / 10, high)):
+        plain, scaled = [], []
+        for units, residuals in ((np.ones(N), plain), (D, scaled)):
+            limits = (lower, upper) if np.isscalar(lower) else (lower / units, upper / units)
+            p = problem(units[:, None] * A * units, units * b, kind, *limits)
+            work = InteriorPoint().init(p)
+            result = wl.solve(p, InteriorPoint(), workspace=work, stopping=wl.StoppingCriteria(rtol=1e-30, max_iterations=9))
+            inner = work.inner
+            residuals.extend([inner.residual.evaluate(inner.x), result.x.numpy() * units])
+        histories.append((plain, scaled))
+    for plain, scaled in histories:
+        assert scaled[0] == pytest.approx(plain[0], rel=0.5, abs=1e-6)
+        np.testing.assert_allclose(scaled[1], plain[1], atol=1e-3)
+    np.testing.assert_allclose(histories[0][1][1], x, atol=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["dense", "sparse"])
+@pytest.mark.parametrize("b", [(-1.0, -1.0), (1.0, -1.0)])
+@pytest.mark.parametrize("precision", ["mixed", "double", "single"])
+def test_no_solution_is_proved(b, kind, precision):
+    """y_2 = -x_1 - 1 < 0 whatever x >= 0 is: iterates leave for infinity, and were once said to be not finite."""
+    result = wl.solve(problem(TURN, np.array(b), kind), InteriorPoint(precision=precision))
+    assert result.status is wl.SolveStatus.INFEASIBLE
+    assert np.isfinite(result.x.numpy()).all()
+    assert np.isfinite(result.residual)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_what_is_no_solution_is_not_called_infeasible_where_there_is_one(seed):
+    """Indefinite matrices, for which the method promises nothing; exhaustive search knows better."""
+    rng = np.random.default_rng(seed)
+    A, b = rng.standard_normal((4, 4)), rng.standard_normal(4)
+    result = wl.solve(problem(A + A.T, b, "dense"), InteriorPoint())
+    if boxed(A + A.T, b, np.zeros(4), np.full(4, np.inf)) is not None:
+        assert result.status is not wl.SolveStatus.INFEASIBLE
+    else:
+        assert not result
+    assert result.status is not wl.SolveStatus.NON_FINITE
+
+
+@pytest.mark.parametrize("kind", ["dense", "sparse"])
+def test_entries_bounds_and_b_may_change_in_place(kind):
+    rng = np.random.default_rng(109)
+    A, D = matrix(kind, rng), 10 ** rng.uniform(-3, 3, N)
+    b, upper = (wp.zeros(N, dtype=wp.float64, device="cpu") for _ in range(2))
+    upper.fill_(1.0)
+    p = problem(A, b, kind, 0.0, upper)
+    work = InteriorPoint().init(p)
+    assert isinstance(work, EquilibratedWorkspace)
+    for units in (np.ones(N), D, 1 / D) if kind == "sparse" else (np.ones(N), np.full(N, 2.0)):
+        values, right = A if kind == "dense" else units[:, None] * A * units, units * rng.standard_normal(N)
+        if kind == "sparse":
+            p.A.update(scipy.sparse.csr_array(values))
+        b.assign(right)
+        upper.assign(0.5 / units)
+        again = wl.solve(p, InteriorPoint(), workspace=work, stopping=TIGHT)
+        fresh = wl.solve(problem(values, right, kind, 0.0, 0.5 / units), InteriorPoint(), stopping=TIGHT)
+        assert again, again.status
+        assert again.iterations == fresh.iterations
+        np.testing.assert_allclose(again.x.numpy() * units, fresh.x.numpy() * units, atol=1e-6)
+
+
+def test_a_guess_and_rows_without_a_diagonal_entry():
+    rng = np.random.default_rng(113)
+    D = np.array([1e-5, 1e4])
+    A, b = D[:, None] * TURN * D, D * np.array([-1.0, 1.0])
+    for x0 in (None, rng.random(2) / D, np.ones(2) / D):
+        result = wl.solve(problem(A, b, "dense"), InteriorPoint(), x0=x0, stopping=TIGHT)
+        assert result, result.status
+        np.testing.assert_allclose(result.x.numpy() * D, [1.0, 1.0], atol=1e-4)

@@ -1,0 +1,132 @@
+"""A dense or sparse problem in units in which its rows are alike, for methods that start from one size of all rows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+import warp as wp
+
+from warp_lcp.operators.dense import DenseOperator
+from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.problem import LCP
+from warp_lcp.residual import NaturalResidual
+from warp_lcp.result import SolveStatus
+from warp_lcp.solve import IterateInPlace, Precision, RoundedIterate, Step
+from warp_lcp.solvers.dense_problem import equilibration, power_of_two, proved_infeasible
+from warp_lcp.solvers.equilibrated_kernels import multiply_kernel
+
+ALIKE = 4.0  # rows whose units differ by no more stay as they are
+WAIT = 6  # steps without a residual below FALL times the smallest after which it is asked whether there is a solution
+FALL = 0.9
+GROWN = 1e4  # growth of the residual after which it is
+EARLY = 10  # steps before which a residual says little: a path is joined far from the start
+
+
+class EquilibratedWorkspace(IterateInPlace, RoundedIterate):
+    """A method's workspace for S A S x' + S b, bounds l / S and u / S, and the problem's own iterate x = S x'.
+
+    S are powers of 2 near |a_ii|^(-1/2) (Jacobi's scaling), those of Ruiz's iteration where a diagonal entry is 0. A step whose x is not
+    finite is not taken: it ends the solve, with INFEASIBLE if a linear program proves that there is no solution, else with STAGNATED.
+
+    Args:
+        problem: with a dense or sparse operator.
+        precision: of the iterate.
+        make: returns the method's own workspace for the scaled problem.
+
+    Attributes:
+        inner: that workspace.
+    """
+
+    def __init__(self, problem: LCP, precision: Precision, make: Callable[[LCP], Any]) -> None:
+        self.problem, self.precision = problem, precision
+        layout, bounds = problem.layout, problem.bounds
+        self.x, self._units = layout.zeros(wp.float64), layout.zeros(wp.float64)
+        self.residual = NaturalResidual(problem)
+        self._rounded = layout.zeros(wp.float32) if precision is Precision.SINGLE else None
+        self.floating: Any = None
+        matrix = self._scaled()
+        made: Any = SparseOperator if scipy.sparse.issparse(matrix) else DenseOperator
+        sides = [layout.zeros(wp.float64) if bounds.varying[k] or bounds.values[k] not in (0.0, -np.inf, np.inf) else None for k in (0, 1)]
+        self._sides = sides
+        operator = made(matrix, device=problem.device, dtype=problem.A.dtype)
+        limits = [bounds.values[k] if side is None else side for k, side in enumerate(sides)]
+        self._inner = LCP(operator, layout.zeros(wp.float64), *limits)
+        self.inner = make(self._inner)
+        self._version = getattr(problem.A, "version", None)
+        self._smallest, self._waited, self._steps, self._asked = math.inf, 0, 0, False
+
+    @staticmethod
+    def suits(problem: LCP) -> bool:
+        """Return whether the problem's rows are at hand."""
+        return isinstance(problem.A, (DenseOperator, SparseOperator))
+
+    def start(self, *, warm: bool, tolerance: float) -> None:
+        """Take A, b and the bounds as they are now."""
+        inner, version = self._inner, getattr(self.problem.A, "version", None)
+        if version is None or version != self._version:
+            self._version = version
+            operator: Any = inner.A
+            if isinstance(operator, SparseOperator):
+                operator.update(self._scaled())
+            else:
+                operator.matrix.assign(self._scaled())
+                wp.copy(self.inner.residual.diagonal, operator.diagonal())
+        self._multiply(self.problem.b, inner.b)
+        for k, side in enumerate(self._sides):
+            if side is not None:
+                self._multiply(self.problem.bounds.as_field(k), side, inverse=True)
+        inner.bounds.refresh()
+        self._multiply(self.x, self.inner.x, inverse=True)
+        self.inner.floating = None
+        self.inner.residual.evaluate(self.inner.x)
+        self.inner.start(warm=warm, tolerance=tolerance * float(self._units.numpy().min()))
+        self._smallest, self._waited, self._steps, self._asked = math.inf, 0, 0, False
+
+    def step(self, advance: Callable[[LCP, Any, wp.array[Any]], Step]) -> Step:
+        """Take a step of the method on the scaled problem."""
+        inner = self.inner
+        inner.residual.evaluate(inner.x)
+        inner.residual.current = False
+        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is seen below
+            step = advance(self._inner, inner, inner.x)
+        self._multiply(inner.x, self.x)
+        self._round(self.x)
+        norm = self.residual.evaluate(self.x)
+        if not math.isfinite(norm):
+            self.restore()
+            self.residual.evaluate(self.x)
+            return Step(step.name, step.linear_iterations, None, self._ended())
+        self._steps += 1
+        self._waited = 0 if norm <= FALL * self._smallest else self._waited + 1
+        self._smallest = min(self._smallest, norm)
+        if not self._asked and (self._waited >= WAIT or norm > GROWN * self._smallest):
+            self._asked = True
+            if self._ended() is SolveStatus.INFEASIBLE:
+                return Step(step.name, step.linear_iterations, None, SolveStatus.INFEASIBLE)
+        return replace(step, interim=True) if self._steps <= EARLY else step
+
+    def _ended(self) -> SolveStatus:
+        """Return how a solve ends that leads nowhere."""
+        return SolveStatus.INFEASIBLE if proved_infeasible(self.problem) else SolveStatus.STAGNATED
+
+    def _scaled(self) -> Any:
+        """Set S, and return S A S on the host."""
+        A: Any = self.problem.A
+        matrix = A.matrix() if isinstance(A, SparseOperator) else A.matrix.numpy().astype(np.float64)
+        d = np.abs(matrix.diagonal())
+        S = power_of_two(1 / np.sqrt(d)) if d.all() else equilibration(matrix)
+        if S.max() <= ALIKE * S.min():
+            S = np.ones(len(S))
+        self._units.assign(S)
+        if not scipy.sparse.issparse(matrix):
+            return S[:, None] * matrix * S
+        matrix.data = np.repeat(S, np.diff(matrix.indptr)) * matrix.data * S[matrix.indices]
+        return matrix
+
+    def _multiply(self, field: wp.array[Any], out: wp.array[Any], *, inverse: bool = False) -> None:
+        wp.launch(multiply_kernel, field.size, [field, self._units, inverse, out], device=self.problem.device)
