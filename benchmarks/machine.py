@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 
 import fluids
+import granular
 import warp_lcp
 from benchmarks.record import MACHINE, SOURCE, Record
 from benchmarks.timing import Figure, in_turns
@@ -59,7 +60,7 @@ def copy_bandwidth(device: str, elements: int, repeat: int) -> dict[str, Figure]
 def source_digest() -> str:
     """Return a digest of the measured code, so that results of different states are told apart."""
     digest = hashlib.sha256()
-    for package in (warp_lcp, fluids):
+    for package in (warp_lcp, fluids, granular):
         root = Path(package.__path__[0])
         for path in sorted(root.rglob("*.py")):
             digest.update(str(path.relative_to(root)).encode() + path.read_bytes())

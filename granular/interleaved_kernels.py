@@ -106,9 +106,9 @@ WALL = SHAPE.replace(", row = k*s[2] + j*s[1]", "") + EDGES + WALL_FACE + """
     for (int entry = 0; entry < cells.shape[0]; ++entry) {
         const long long cell = cells.data[entry];
         if (!(flags_.data[cell] & HOLDS)) continue;
-        face(entry, now_.data, now_.data, numbers.data + WEIGHT, (T)omega,
+        face(entry, [&](long long at) { return (T)now_.data[at]; }, now_.data, numbers.data + WEIGHT, (T)omega,
             [&](int d, long long o) { return light(d, o); }, [&](int d, long long o) { return rate(d, o); },
-            [&](int d, long long o, long long slot, T share_, T value) {
+            [&](int d, long long o, long long slot, T share_, T value, T) {
                 const float old = now_.data[slot], fresh = (float)value;
                 now_.data[slot] = fresh;
                 shear(d, o, share_*((T)fresh - (T)old));

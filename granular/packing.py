@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from granular import packing_kernels as kernels
+from granular.periodic import PeriodicSides
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.operators.grid_poisson import SOLID
 
@@ -27,6 +28,7 @@ class Packing:
         base: int8, SOLID or AIR.
         capacity: float32, share of a cell's kernel that is open.
         relax: of what is too dense, the share that a step pushes out.
+        sides: of axes without an end, if there are any.
 
     Attributes:
         base: that of the arguments.
@@ -42,9 +44,9 @@ class Packing:
         nodes: the window of lower faces and edges of all cells and the domain's upper side.
     """
 
-    def __init__(self, grid: StaggeredGrid, base: wp.array, capacity: wp.array, *, relax: float = 0.2) -> None:
+    def __init__(self, grid: StaggeredGrid, base: wp.array, capacity: wp.array, *, relax: float = 0.2, sides: PeriodicSides | None = None) -> None:
         """Allocate the fields."""
-        self.grid, self.base, self._capacity, self.relax = grid, base, capacity, relax
+        self.grid, self.base, self._capacity, self.relax, self.sides = grid, base, capacity, relax, sides
         self.fraction, self.kind, self.flags, self.drive = grid.field(), grid.field(wp.int8), grid.field(wp.uint8), grid.field()
         wp.copy(self.kind, base)
         self.mass, self.inverse, self.start = grid.faces(), grid.faces(), grid.faces()
@@ -55,6 +57,8 @@ class Packing:
         low, high = grid.domain.low, grid.domain.high
         more = 1 if grid.dimension == 3 else 0
         self.nodes = Window(low, (high[0] + more, high[1] + 1, high[2] + 1), grid.device)
+        if sides is not None:  # what a row's neighbors hold may lie at the other end of it
+            self.spans.assign(np.full((*grid.shape[:2], 2), (low[2], high[2] + 1), dtype=np.int32))
 
     def update(self, density: wp.array, velocity: Sequence[wp.array], dt: float, solid: Sequence[wp.array] = ()) -> None:
         """Take sand as it is now.
@@ -68,23 +72,27 @@ class Packing:
         grid, dimension = self.grid, self.grid.dimension
         domain, nodes = grid.domain, self.nodes
         domain.launch(kernels.fraction_kernel, [self.base, self._capacity, self.relax, density, self.fraction])
+        if self.sides is not None:
+            self.sides.wrap(self.fraction)
         rate = grid.spacing / dt
         domain.launch(kernels.cell_kernel, [self.base, self.fraction, grid.planes, rate, self.kind, self.flags, self.drive])
+        if self.sides is not None:
+            self.sides.wrap(self.flags, self.kind)
         for axis in range(dimension):
             moving = solid[axis] if solid else None
             fields = [velocity[axis], moving, self.start[axis], self.mass[axis], self.inverse[axis]]
             nodes.launch(kernels.face_kernel, [axis, self.base, self.fraction, *fields])
+            if self.sides is not None:
+                self.sides.wrap(self.start[axis], self.mass[axis], self.inverse[axis])
         for (alpha, beta), share in zip(SHEARS[dimension], self.share, strict=True):
             nodes.launch(
                 kernels.edge_kernel, [alpha, beta, self.base, self.flags, self.inverse[alpha], self.inverse[beta], share]
             )  # fmt: skip
         domain.launch(kernels.stiffness_kernel, [dimension, self.flags, *three(self.inverse), *three(self.share), self.stiff])
+        if self.sides is not None:
+            return  # the spans are whole rows
         domain.launch_rows(kernels.span_kernel, [self.flags, self._own])
         nodes.launch_rows(kernels.widen_kernel, [self._own, self.spans])
-
-    def cells(self) -> int:
-        """Return the number of cells that hold sand."""
-        return int(np.count_nonzero(self.flags.numpy()))
 
 
 def three(fields: Sequence[wp.array]) -> list[wp.array | None]:

@@ -9,6 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from granular.materials import MATERIALS, Material, compression_slope, plane_strain_slope
+from granular.periodic import periodic_axes, periodic_sides
 from warp_lcp.driver.particle_scene import ParticleScene
 from warp_lcp.driver.scene import Complaint, Domain, Table, Time
 from warp_lcp.driver.shapes import (
@@ -151,7 +152,8 @@ Solid = Annotated[RoughBox | RoughSphere | RoughCapsule | RoughPlane | RoughMesh
 class SandScene(ParticleScene):
     """A scene of sand."""
 
-    later: ClassVar = {}
+    elsewhere: ClassVar = {"liquid": "fluids", "pressure": "fluids"}
+    palette: ClassVar = "sand"
     solve_bytes: ClassVar[int] = STRESS_BYTES[3]
 
     time: SandTime
@@ -179,6 +181,16 @@ class SandScene(ParticleScene):
     def materials(self) -> tuple[str, Sequence[MaterialProperties]]:
         """Return `sand` and its shapes."""
         return "sand", self.sand
+
+    @property
+    def endless(self) -> tuple[int, ...]:
+        """Return the axes without an end."""
+        return periodic_axes(self.domain.periodic)
+
+    @property
+    def open_sides(self) -> list[str]:
+        """Return the names of the domain's sides without a wall: open ones, and those of axes without an end."""
+        return [*self.domain.open, *periodic_sides(self.endless)]
 
     @property
     def preset(self) -> Material:
@@ -244,6 +256,8 @@ class SandScene(ParticleScene):
             found.append(Complaint(("domain", "open"), self.domain.open, "names a side of a periodic axis"))
         if closed and (self.density_correction or self.particles.reseed or self.source or self.drain):
             found.append(Complaint(("domain", "periodic"), periodic, "goes without density_correction, reseed, source and drain"))
+        if closed and self.solver.method == "interleaved-sweeps":
+            found.append(Complaint(("solver", "method"), self.solver.method, "knows no axis without an end: take accelerated-projection"))
         if wall != "separating" or any(solid.wall == "free-slip" for solid in self.solid):
             found.append(Complaint(("domain", "wall"), wall, 'must be "separating", of solids too: walls do not pull at sand; friction = 0 lets it slip'))
         if self.gauge is not None and not 0.0 < self.gauge.height < self.domain.size[1]:

@@ -12,6 +12,7 @@ import warp as wp
 import warp_lcp as wl
 from granular.coupled import METHODS, CoupledMethod, CoupledOutcome
 from granular.packing import Packing
+from granular.periodic import PeriodicSides
 from granular.report import Outcome
 from granular.scene import SandScene
 from granular.solids import SandSolids
@@ -21,7 +22,7 @@ from warp_lcp.driver.particle_simulation import ParticleSimulation, Row
 from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.simulator import Cells, Points, SimulationFailed
 from warp_lcp.grid.level_set import particle_density
-from warp_lcp.grid.particles import Particles
+from warp_lcp.grid.particles import Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.outlets import Outlets
@@ -58,6 +59,7 @@ class SandSimulation(ParticleSimulation):
         sources: where sand comes in.
         outlets: where it leaves.
         notes: facts for the start of a run.
+        sides: of axes without an end, if there are any.
 
     Attributes:
         packing: how densely the sand lies.
@@ -78,13 +80,15 @@ class SandSimulation(ParticleSimulation):
         sources: Sources | None = None,
         outlets: Outlets | None = None,
         notes: tuple[str, ...] = (),
+        sides: PeriodicSides | None = None,
     ) -> None:
         """Allocate the fields and find the sand's cells."""
         super().__init__(scene, grid, boundary, particles, sources=sources, outlets=outlets, notes=notes)
-        self.solids = solids
+        self.solids, self.sides = solids, sides
+        self._join = None if sides is None else sides.wrap
         self.method: CoupledMethod = METHODS[scene.solver.method]()
         self._base, self.density = grid.field(wp.int8), grid.field()
-        self.packing = Packing(grid, self._base, boundary.capacity)
+        self.packing = Packing(grid, self._base, boundary.capacity, sides=sides)
         self.stress = Stress(self.packing, solids.walls, box=scene.friction.model == "box")
         self.outcome = Outcome(self.stress)
         self._at_rest = scene.particles.per_axis**grid.dimension
@@ -93,9 +97,28 @@ class SandSimulation(ParticleSimulation):
 
     def mark(self) -> None:
         """Find the sand's cells, as frames show them before the first step."""
+        self._place_solids()
         wp.copy(self._base, self.solids.base)
-        particle_density(self.grid, self.particles, self.grid.everywhere, self._at_rest, self.density)
+        self._find_density(self.grid.everywhere)
         self.packing.update(self.density, self.velocity, 1.0)
+
+    def window(self, totals: ParticleTotals) -> Window:
+        """Return the cells that the particles can touch in a step."""
+        window = super().window(totals)
+        return window if self.sides is None else self.sides.widen(window)
+
+    def bring_to_faces(self, window: Window, dt: float) -> None:
+        """Bring the particles' velocities to the faces, and let gravity act on them for dt [s]."""
+        super().bring_to_faces(window, dt)
+        if self.sides is not None:
+            self.sides.average(self.velocity, self.weights, self._saved or ())
+
+    def carry(self, dt: float) -> tuple[int, int, int]:
+        """Move particles and solids by dt [s]. Return how many met a wall, were pushed by a solid, and are stuck inside one."""
+        met = super().carry(dt)
+        if self.sides is not None:
+            self.sides.carry(self.particles.position)
+        return met
 
     def step(self, dt: float) -> Row:
         """Advance by dt [s].
@@ -116,9 +139,7 @@ class SandSimulation(ParticleSimulation):
         self.bring_to_particles()
         below, most = self._mass_below(), self._most()
         row = self.move(dt)
-        if self.solids.moves:
-            self.solids.place(self.time)
-            self.stress.face(self.solids.walls)
+        self._place_solids()
         runout, height = self._front()
         first = solved.history[0][1]
         return self.logged(
@@ -193,13 +214,27 @@ class SandSimulation(ParticleSimulation):
         self.packing.fraction.assign(state["fraction"])
         self.outcome.ratio.assign(state["yield_ratio"])
         self._start = float(state["front_at_start"])
-        self.solids.place(float(self.time))
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue from `state`.
+
+        Raises:
+            ValueError: the arrays do not belong to this scene.
+        """
+        super().restore(state)
+        self._place_solids()
+
+    def _place_solids(self) -> None:
+        """Put the solids that move where they are now."""
+        if self.solids.moves:
+            self.solids.place(self.time)
+            self.stress.face(self.solids.walls)
 
     def _solve(self, window: Window, dt: float) -> CoupledOutcome:
         """Solve for the stresses and take over the velocity that they leave."""
         packing, stress, solids, scene = self.packing, self.stress, self.solids, self.scene
         with self.watch.stage("packing", self.density, packing.fraction, *self.velocity):
-            particle_density(self.grid, self.particles, window, self._at_rest, self.density)
+            self._find_density(window)
             wp.copy(self._base, solids.base)
             solids.begin_step(self.time, dt)
             if self.sources is not None:
@@ -222,13 +257,20 @@ class SandSimulation(ParticleSimulation):
             self.outcome.take(self.velocity)
         return solved
 
+    def _find_density(self, window: Window) -> None:
+        """Find the particles' density in the cells of a window."""
+        particle_density(self.grid, self.particles, window, self._at_rest, self.density)
+        if self.sides is not None:
+            self.sides.add(self.density)
+            self.sides.wrap(self.boundary.capacity)
+
     def _extend(self, window: Window) -> None:
         """Continue the velocity into air and walls."""
         outcome, solids = self.outcome, self.solids
         with self.watch.stage("extrapolation", *self.velocity, *self.weights, *outcome.known):
             extend_velocity(
                 window, self.velocity, self.weights, outcome.known, self.packing.kind, outcome.contact, solids.index, solids.separating,
-                solids.velocity, self.layers,
+                solids.velocity, self.layers, join=self._join,
             )  # fmt: skip
             if self.sources is not None:
                 self.sources.hold(self.velocity, [])
@@ -280,9 +322,11 @@ class GranularSimulator:
             raise ValueError("scene.simulator: granular needs a scene of sand")
         grid = StaggeredGrid(scene.cell_counts, scene.spacing, scene.dimension, device)
         boundary, warnings = make_boundary(scene, grid, folder)
-        solids = SandSolids(grid, placed_solids(scene, folder), boundary, scene.wall_frictions(), prescribed=bool(scene.source))
+        sides = PeriodicSides(grid, scene.endless) if scene.endless else None
+        placed, frictions = placed_solids(scene, folder), scene.wall_frictions()
+        solids = SandSolids(grid, placed, boundary, frictions, prescribed=bool(scene.source), sides=sides)
         particles, notes = make_particles(scene, grid, boundary, folder)
         sources, outlets = make_sources(scene, grid, boundary, folder), make_outlets(scene, grid, folder)
         return SandSimulation(
-            scene, grid, boundary, solids, particles, sources=sources, outlets=outlets, notes=(*warnings, *notes)
+            scene, grid, boundary, solids, particles, sources=sources, outlets=outlets, notes=(*warnings, *solids.notes, *notes), sides=sides
         )  # fmt: skip

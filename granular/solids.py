@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
+from granular.periodic import PeriodicSides
 from granular.stress import Walls
 from warp_lcp.grid.staggered import CellRange, StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid, voxelize
@@ -73,6 +74,7 @@ class SandSolids:
         boundary: where particles may go.
         friction: Coulomb's coefficient of the domain's walls and of each solid.
         prescribed: keep velocities on faces even if nothing moves: sources prescribe some.
+        sides: of axes without an end, if there are any.
 
     Attributes:
         index: int32, -1 in open cells, the wall's number elsewhere.
@@ -84,15 +86,16 @@ class SandSolids:
     """
 
     def __init__(
-        self, grid: StaggeredGrid, placed: Sequence[PlacedSolid], boundary: Boundary, friction: Sequence[float], *, prescribed: bool = False
-    ) -> None:
+        self, grid: StaggeredGrid, placed: Sequence[PlacedSolid], boundary: Boundary, friction: Sequence[float], *, prescribed: bool = False,
+        sides: PeriodicSides | None = None,
+    ) -> None:  # fmt: skip
         """Find the cells."""
-        self.grid, self._placed, self._boundary, self._friction = grid, tuple(placed), boundary, list(friction)
+        self.grid, self._placed, self._boundary, self._friction, self._sides = grid, tuple(placed), boundary, list(friction), sides
         self.base = grid.field(wp.int8)
         self.separating = wp.full(1 + len(placed), 1, dtype=wp.uint8, device=grid.device)
         self.velocity: Faces = grid.faces() if boundary.moves or prescribed else []
-        self.notes: tuple[str, ...] = ()
         self.place(0.0)
+        self.notes = self._thin_notes()
 
     @property
     def moves(self) -> bool:
@@ -110,11 +113,21 @@ class SandSolids:
         ]  # fmt: skip
         found = voxelize(
             grid.counts, grid.spacing, grid.dimension, now, wall_separating=True, device=grid.device,
-            open_sides=self._boundary.open_sides,
+            open_sides=self._boundary.open_sides, remarks=False,
         )  # fmt: skip
-        self.index, self.notes = found.index, found.notes
+        self.index, self._covered = found.index, found.covered
+        if self._sides is not None:
+            self._sides.wrap(self.index)
         grid.everywhere.launch(base_kernel, [self.index, self.base])
         self.walls = Walls(grid, self.index.numpy(), self._friction)
+
+    def _thin_notes(self) -> tuple[str, ...]:
+        """Return a warning for each solid that stands still and that no stress feels."""
+        return tuple(
+            f"{solid.name} holds no center of a cell of {self.grid.spacing:.4g} m: it stops particles, but bears no sand"
+            for solid, cells in zip(self._placed, self._covered, strict=True)
+            if not cells and solid.motion is None
+        )
 
     def begin_step(self, time: float, dt: float) -> None:
         """Find how fast the solids move in the step that starts at `time` [s] and lasts `dt` [s]."""
@@ -125,5 +138,8 @@ class SandSolids:
             for axis, field in enumerate(self.velocity):
                 inputs = [axis, grid.planes, grid.spacing, self.index, cut.turn, cut.shift, field]
                 grid.everywhere.launch(rigid_velocity_kernel, inputs)
+        else:
+            for field in self.velocity:  # a source that has stopped has left its own
+                field.zero_()
 
 

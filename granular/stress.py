@@ -10,13 +10,14 @@ import numpy as np
 import warp as wp
 
 from granular.packing import SHEARS, Packing, three, wall_faces
-from granular.stress_kernels import momentum_kernel, stress_kernels
-from granular.yield_set import COLUMNS, NUMBERS, STEP
+from granular.stress_kernels import BETA_X, NEXT_X, PERIOD, RESIDUAL_X, STATE, momentum_kernel, stress_kernels
+from granular.yield_set import COLUMNS, LOOKAHEAD, NUMBERS, PRESSURE_STEP, SHEAR_STEP
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.program import Launch, Program
 from warp_lcp.vectors import Reduction
 
 WALL_GRAIN = 256  # wall faces a CPU thread takes
+SHARE = 0.7**0.5  # by which a step of the friction, over its length, exceeds the natural residual: measured
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,14 @@ class Walls:
         grid: the grid.
         index: int, -1 in open cells, the wall's number elsewhere, shape of the grid's fields.
         friction: Coulomb's coefficient of each wall, >= 0; inf sticks.
+
+    Attributes:
+        count: faces.
+        cells: int32, flat index of each face's open cell.
+        sides: uint8, 2 axis + side.
+        walls: int32, the wall's number.
+        friction: float32, of each wall.
+        active: int32: how many faces sand touches, and which.
     """
 
     def __init__(self, grid: StaggeredGrid, index: np.ndarray, friction: Sequence[float]) -> None:
@@ -52,6 +61,15 @@ class Walls:
         self.cells = wp.array(cells, dtype=wp.int32, device=device)
         self.sides = wp.array(sides, dtype=wp.uint8, device=device)
         self.walls = wp.array(walls, dtype=wp.int32, device=device)
+        self._host = cells
+        self.active = wp.zeros(1 + self.count, dtype=wp.int32, device=device)
+
+    def activate(self, flags: np.ndarray) -> None:
+        """Find the faces whose cells hold sand: their number and their entries go to `active`."""
+        found = np.flatnonzero(flags.ravel()[self._host])
+        active = np.zeros(1 + self.count, dtype=np.int32)
+        active[0], active[1 : 1 + len(found)] = len(found), found
+        self.active.assign(active)
 
 
 class Velocity:
@@ -74,9 +92,13 @@ class Velocity:
         """Find velocity and rates of strain under a field of stresses."""
         p, edge, u, kernels = self.packing, three(self.edge), three(self.u), self.kernels
         share, window = three(p.share), p.nodes
+        if p.sides is not None:
+            p.sides.wrap(stress, launch=launch)
         window.launch(kernels.edge_stress, [p.spans, stress, *share, *edge], launch=launch)
         faces = [*three(p.start), *three(p.inverse), *u]
         window.launch(kernels.face_velocity, [p.spans, stress, share[0], *edge, *faces], launch=launch)
+        if p.sides is not None:
+            p.sides.wrap(*self.u, launch=launch)
         window.launch(kernels.edge_strain, [p.spans, share[0], *u, *edge], launch=launch)
 
 
@@ -108,16 +130,18 @@ class Stress:
         grid, self.packing, self.walls, self.box = packing.grid, packing, walls, box
         normals, shears = (3, 3) if grid.dimension == 3 else (1, 1)
         shape = (1 + normals + 4 * shears, *grid.shape)
-        self.now, self._next = (wp.zeros(shape, dtype=wp.float32, device=grid.device) for _ in range(2))
+        self.now, self._before, self._point = (wp.zeros(shape, dtype=wp.float32, device=grid.device) for _ in range(3))
         self.velocity, self.checked = Velocity(packing, wp.float32, box=box), Velocity(packing, wp.float64, box=box)
         self.numbers = wp.zeros(NUMBERS, dtype=wp.float32, device=grid.device)
-        self._momentum = wp.zeros(3, dtype=wp.float64, device=grid.device)
+        self._momentum = wp.zeros(STATE, dtype=wp.float64, device=grid.device)
         self._sums = wp.zeros(2 * COLUMNS, dtype=wp.float64, device=grid.device)
         threads = int(np.prod(packing.grid.shape[:2])) * grid.domain.chunks
         self._cell_sums = Reduction(grid.size, grid.device, self._sums, columns=COLUMNS, threads=threads)
         self._wall_sums: Reduction | None = None
         self._host = np.zeros(NUMBERS, dtype=np.float32)
-        self._program: Program | None = None
+        self._program: Program | None = None  # of an accelerated step
+        self._check: Program | None = None  # of the residual
+        self._cells = 1
         self.last_residual = 0.0, 0.0
         self.dt = 0.0
         self.face(walls)
@@ -125,7 +149,7 @@ class Stress:
     def face(self, walls: Walls) -> None:
         """Take other walls: solids have moved."""
         device = self.packing.grid.device
-        self.walls, self._program = walls, None
+        self.walls, self._program, self._check = walls, None, None
         self._grain = 1 if device.is_cuda else WALL_GRAIN
         threads = -(-walls.count // self._grain)
         self._wall_sums = Reduction(max(threads, 1), device, self._sums, columns=COLUMNS, threads=threads) if threads else None
@@ -139,60 +163,73 @@ class Stress:
             dt: time step [s].
             decay: factor of the last stresses; less than 1 damps patterns that exert no force.
         """
-        self._host = np.array([1.0, bound.k, bound.cohesion, bound.tension, *(gravity * dt)], dtype=np.float32)
+        self._host = np.array([bound.k, bound.cohesion, bound.tension, *(gravity * dt), 1.0, 1.0, 0.0], dtype=np.float32)
         self.numbers.assign(self._host)
         p = self.packing
-        ratio = decay * (dt / self.dt if self.dt > 0.0 else 0.0)
-        inputs = [p.flags, p.stiff, *three(p.share), ratio, self.now, self._next]
+        flags = p.flags.numpy()
+        self._cells = max(int(np.count_nonzero(p.grid.interior(flags))), 1)
+        self.walls.activate(flags)
+        inputs = [p.flags, p.stiff, *three(p.share), decay, self.now, self._before, self._point]
         p.grid.domain.launch(self.velocity.kernels.admit, inputs)
         self.dt = dt
 
-    def restart(self, step: float, most: float) -> None:
-        """Start a sequence of accelerated steps.
+    def restart(self, *, pressure_step: float, shear_step: float, lookahead: float, momentum: float) -> None:
+        """Start a sequence of steps with momentum.
 
         Args:
-            step: of the projected gradient, relative to the diagonal.
-            most: of the last change that is repeated.
+            pressure_step, shear_step: of the projected gradient, relative to the diagonal.
+            lookahead: where the gradient is taken, in units of the momentum's displacement.
+            momentum: the most of the last step that is repeated, at first.
         """
-        self._host[STEP] = step
+        self._host[[PRESSURE_STEP, SHEAR_STEP, LOOKAHEAD]] = pressure_step, shear_step, lookahead
         self.numbers.assign(self._host)
-        self._momentum.assign(np.array([1.0, 0.0, most]))
-        wp.copy(self._next, self.now)
+        state = np.zeros(STATE)
+        state[[BETA_X, BETA_X + 1]] = momentum
+        state[[NEXT_X, NEXT_X + 1]] = 0.25
+        self._momentum.assign(state)
+        wp.copy(self._point, self.now)
+        wp.copy(self._before, self.now)
 
-    def advance(self, steps: int) -> None:
-        """Take accelerated steps."""
+    def advance(self, periods: int) -> float:
+        """Take some periods of steps with momentum, see `PERIOD`; return an estimate of the natural residual [m/s]."""
         if self._program is None:
             self._program = Program(self.packing.grid.device)
-            self._record(self._program.launch)
-        for _ in range(steps):
+            for _ in range(PERIOD):
+                self._record(self._program.launch)
+        for _ in range(periods):
             self._program.run()
+        pressure, friction = self._momentum.numpy()[[RESIDUAL_X, RESIDUAL_X + 1]]
+        scale = 1.0 / math.sqrt(self._cells)
+        return scale * math.hypot(pressure / self._host[PRESSURE_STEP], SHARE * friction / self._host[SHEAR_STEP])
 
     def _record(self, launch: Launch) -> None:
-        self.velocity.find(self._next, launch=launch)
-        self._project(self.velocity, self._next, launch)
+        self.velocity.find(self._point, launch=launch)
+        self._project(self.velocity, launch)
         self._add_up(launch)
         launch(momentum_kernel, 1, [self._sums, self._momentum], device=self.packing.grid.device)
 
     def residual(self) -> tuple[float, float]:
         """Return the natural residual of pressure and friction [m/s], root mean squares over the cells that hold sand, in float64."""
-        self.checked.find(self.now)
-        self._project(self.checked, self.now, wp.launch)
-        self._add_up(wp.launch)
+        if self._check is None:
+            self._check = Program(self.packing.grid.device)
+            self.checked.find(self.now, launch=self._check.launch)
+            self._project(self.checked, self._check.launch)
+            self._add_up(self._check.launch)
+        self._check.run()
         sums = self._sums.numpy()
-        cells = max(self.packing.cells(), 1)
-        self.last_residual = math.sqrt(sums[0] / cells), math.sqrt((sums[1] + sums[2]) / cells)
+        self.last_residual = math.sqrt(sums[0] / self._cells), math.sqrt((sums[1] + sums[2]) / self._cells)
         return self.last_residual
 
-    def _project(self, velocity: Velocity, source: wp.array, launch: Launch) -> None:
+    def _project(self, velocity: Velocity, launch: Launch) -> None:
         p, walls, kernels = self.packing, self.walls, velocity.kernels
         grid, share, edge, inverse = p.grid, three(p.share), three(velocity.edge), three(p.inverse)
-        stress = [source, self.now, self._next]
+        stress = [self.now, self._before, self._point]
         fields = [p.drive, p.stiff, *share, *edge, *three(p.mass), *inverse, *three(velocity.u)]
         scalars = [self._momentum, self.numbers]
         inputs = [p.spans, p.flags, *stress, *fields, *scalars, self._cell_sums.partials, grid.domain.chunks]
         grid.domain.launch(kernels.step, inputs, launch=launch)
         if self._wall_sums is not None:
-            faces = [walls.cells, walls.sides, walls.walls, walls.friction, p.flags, p.fraction]
+            faces = [walls.cells, walls.sides, walls.walls, walls.friction, walls.active, p.fraction]
             inputs = [self._grain, *faces, *stress, *share, *edge, *inverse, *scalars, self._wall_sums.partials]
             launch(kernels.wall, self._wall_sums.threads, inputs, device=grid.device)
 

@@ -13,6 +13,12 @@ from granular.yield_set import COLUMNS, SHAPE, WALL_FACE, YIELD, native
 from warp_lcp.grid.staggered import CellRange
 
 
+# The momentum's state: steps done; the most of it for pressure and friction; that of this step; that of the next; estimates of the natural
+# residuals over the last PERIOD steps; sums over these.
+COUNT, BETA_X, NOW_X, NOW_S, NEXT_X, NEXT_S, RESIDUAL_X, SUMS, STATE = 0, 1, 3, 4, 5, 6, 7, 9, 17
+PERIOD = 5
+HIGH, LOW = 0.85, 0.5  # cosines above and below which the momentum grows and falls
+
 # The span of a row: cells that hold sand and the cells beside them.
 SPAN = """
     const int* span = spans_.data + 2*(k*(long long)spans_.shape[1] + j);
@@ -74,31 +80,39 @@ EDGE_STRAIN = SPAN + SHAPE + """
     }
 """
 
-# One projected step of every cell that holds sand: y - step gradient / diagonal, onto x >= floor and onto the yield set of the new x.
-# RESIDUAL: from the stresses themselves with step 1; the sum of squares of what they would move is the natural residual's.
+# One projected step of every cell that holds sand, with momentum: from y = x + beta (x - x_before) against the gradient over the diagonal,
+# onto x >= floor, and onto the yield set of the new x. `point` becomes where the next gradient is taken, x + lookahead beta (x - x_before).
+# Sums, of pressure (0, 1, 2) and of friction (3, 4, 5), in the metric of the diagonal: <e, s>, <e, e>, <s, s> with the error of the
+# projection e = x_new - y and the step s = x_new - x; 6, 7: estimates of the squared natural residuals of both.
+# RESIDUAL: from the stresses themselves with step 1, nothing is changed; sums 0 and 1 are the squared natural residuals.
 CELLS = """
     const long long thread = (k*(long long)flags_.shape[1] + j)*chunks + chunk;
     double* partial = partials.data;
     const long long columns = partials.shape[0]/COLUMNS;
-    partial[thread] = 0; partial[columns + thread] = 0;
+    for (int c = 0; c < COLUMNS; ++c) partial[c*columns + thread] = 0;
 """ + SPAN + SHAPE + YIELD + """
     const unsigned char* flags = flags_.data + row;
-    const float* y = y_.data + row; float* now = now_.data + row; float* next = next_.data + row;
+    float* now = now_.data + row; float* before = before_.data + row; float* point = point_.data + row;
     const float* drive = drive_.data + row; const float* stiff = stiff_.data + row;
     const float* share[3] = {share_x.data + row, share_y.data + (DIM == 3 ? row : 0), share_z.data + (DIM == 3 ? row : 0)};
     const T* rate[3] = {b_x.data + row, b_y.data + (DIM == 3 ? row : 0), b_z.data + (DIM == 3 ? row : 0)};
     const float* mass[3] = {mass_x.data + row, mass_y.data + row, mass_z.data + (DIM == 3 ? row : 0)};
     const float* inverse[3] = {inverse_x.data + row, inverse_y.data + row, inverse_z.data + (DIM == 3 ? row : 0)};
     const T* u[3] = {u_x.data + row, u_y.data + row, u_z.data + (DIM == 3 ? row : 0)};
-    const float beta = RESIDUAL ? 0.0f : (float)momentum.data[1];
-    const T step = (T)numbers.data[STEP], k_yield = (T)numbers.data[FRICTION], cohesion = (T)numbers.data[COHESION];
+    const T beta_x = RESIDUAL ? (T)0 : (T)momentum.data[NOW_X], beta_s = RESIDUAL ? (T)0 : (T)momentum.data[NOW_S];
+    const T ahead_x = (T)momentum.data[NEXT_X]*(T)numbers.data[LOOKAHEAD], ahead_s = (T)momentum.data[NEXT_S]*(T)numbers.data[LOOKAHEAD];
+    const T k_yield = (T)numbers.data[FRICTION], cohesion = (T)numbers.data[COHESION];
     const T least = -(T)numbers.data[TENSION];
-    const T pressure_step = RESIDUAL ? (T)1 : (T)step, stress_step = RESIDUAL ? (T)1 : (T)step;
-    double pressure_sum = 0, stress_sum = 0;
+    const T pressure_step = RESIDUAL ? (T)1 : (T)numbers.data[PRESSURE_STEP], stress_step = RESIDUAL ? (T)1 : (T)numbers.data[SHEAR_STEP];
+    auto start = [&](int c, long long i, T beta) {
+        const T x = (T)now[c*layer + i];
+        return RESIDUAL ? x : x + beta*(x - (T)before[c*layer + i]);
+    };
+    T x_es = 0, x_ee = 0, x_ss = 0, s_es = 0, s_ee = 0, s_ss = 0, x_residual = 0, s_residual = 0;
     SIMD for (int i = first; i < last; ++i) {
         const int sand = flags[i] & HOLDS, dense = flags[i] & SHEARS_HERE, firm = flags[i] & FIRM;
         T w = (T)drive[i], diagonal = 0, e[DIM], mean = 0;
-        for (int axis = 0; axis < DIM; ++axis) {
+        UNROLL for (int axis = 0; axis < DIM; ++axis) {
             const long long o = i + s[axis];
             w += (T)mass[axis][o]*u[axis][o] - (T)mass[axis][i]*u[axis][i];
             diagonal += (T)(mass[axis][o]*inverse[axis][o] + mass[axis][i]*inverse[axis][i]);
@@ -107,81 +121,95 @@ CELLS = """
         }
         mean *= (T)1/(T)DIM;
         const int loaded = (sand != 0) & (int)(diagonal > (T)0);
-        const T per = loaded ? pressure_step/larger(diagonal, (T)1e-6) : (T)0, x0 = (T)y[i] - per*w;
+        const T per = loaded ? pressure_step/larger(diagonal, (T)1e-6) : (T)0, y = start(0, i, beta_x), x0 = y - per*w;
         const T floor_ = firm ? least : (T)0, x = loaded ? larger(x0, floor_) : (T)0;
         const T radius = larger(k_yield*x + (dense ? cohesion : (T)0), (T)0), r = larger(radius, (T)LEAST_RADIUS);
         const int sheared = (dense != 0) & (int)(stiff[i] > 0.0f) & (int)(radius > (T)LEAST_RADIUS);
         const T soft = stiff[i] > 0.0f ? stress_step/(T)stiff[i] : (T)0;
         T n[NORMALS], normal2 = 0;
-        if (DIM == 2) { n[0] = (T)y[layer + i] + soft*(e[0] - e[1]); normal2 = n[0]*n[0]; }
-        else for (int c = 0; c < NORMALS; ++c) { n[c] = (T)y[(1 + c)*layer + i] + (T)2*soft*(e[c] - mean); normal2 += (T)0.5*n[c]*n[c]; }
+        if (DIM == 2) { n[0] = start(1, i, beta_s) + soft*(e[0] - e[1]); normal2 = n[0]*n[0]; }
+        else UNROLL for (int c = 0; c < NORMALS; ++c) { n[c] = start(1 + c, i, beta_s) + (T)2*soft*(e[c] - mean); normal2 += (T)0.5*n[c]*n[c]; }
         T b[SHEARS][4], largest[SHEARS][4], cap[SHEARS];
-        for (int d = 0; d < SHEARS; ++d) {
+        UNROLL for (int d = 0; d < SHEARS; ++d) {
             T m[4];
-            for (int q = 0; q < 4; ++q) {
+            UNROLL for (int q = 0; q < 4; ++q) {
                 const long long o = i + (q & 1)*s[ALPHA[d]] + (q >> 1)*s[BETA[d]];
                 const T part = share[d][o] > 0.0f ? (T)share[d][o] : (T)0;
-                b[d][q] = (T)y[(FIRST + 4*d + q)*layer + i] + (T)4*soft*part*rate[d][o];
+                b[d][q] = start(FIRST + 4*d + q, i, beta_s) + (T)4*soft*part*rate[d][o];
                 m[q] = part > (T)0 ? magnitude(b[d][q]) : (T)0;
             }
             sums(m[0], m[1], m[2], m[3], largest[d]);
         }
         const T shrink = yield(normal2, largest, r, cap), keep = sheared ? shrink : (T)0;
-        const double px = (double)x - (double)now[i];
-        double moved = 0;
-        auto put = [&](int c, T value, T weight) {
-            const float old = now[c*layer + i], fresh = (float)value;
-            if (RESIDUAL) { const double by = (double)value - (double)old; moved += (double)weight*by*by; }
-            else {
-                moved += (double)weight*((double)y[c*layer + i] - (double)fresh)*((double)fresh - (double)old);
-                now[c*layer + i] = fresh; next[c*layer + i] = fresh + beta*(fresh - old);
+        T es = 0, ee = 0, ss = 0;
+        auto put = [&](int c, T value, T from, T weight, T ahead, int held) {  // held: the copies on walls are the walls'
+            const long long at = c*layer + i;
+            const float old = now[at], earlier = before[at], ahead_of = point[at];
+            const T s_ = value - (T)old, e_ = value - from, share_ = held ? (T)0 : weight;
+            es += share_*e_*s_; ee += share_*e_*e_; ss += share_*s_*s_;
+            if (!RESIDUAL) {
+                now[at] = held ? old : (float)value;
+                before[at] = held ? earlier : old;
+                point[at] = held ? ahead_of : (float)(value + ahead*s_);
             }
         };
-        if (RESIDUAL) pressure_sum += px*px;
-        else pressure_sum += (double)diagonal*((double)y[i] - (double)x)*px;
-        for (int c = 0; c < NORMALS; ++c) put(1 + c, n[c]*keep, DIM == 2 ? (T)1 : (T)0.5);
-        for (int d = 0; d < SHEARS; ++d) for (int q = 0; q < 4; ++q) {
+        UNROLL for (int c = 0; c < NORMALS; ++c) put(1 + c, n[c]*keep, start(1 + c, i, beta_s), DIM == 2 ? (T)1 : (T)0.5, ahead_s, 0);
+        UNROLL for (int d = 0; d < SHEARS; ++d) UNROLL for (int q = 0; q < 4; ++q) {
             const long long o = i + (q & 1)*s[ALPHA[d]] + (q >> 1)*s[BETA[d]];
             const int c = FIRST + 4*d + q;
             const T limit = sheared ? cap[d] : (T)0, cut = larger(smaller(b[d][q], limit), -limit);
-            const int inner = share[d][o] > 0.0f;  // copies on walls are the walls'
-            put(c, inner ? cut : (T)now[c*layer + i], inner ? (T)0.25 : (T)0);
+            put(c, cut, start(c, i, beta_s), (T)0.25, ahead_s, share[d][o] < 0.0f);
         }
-        if (!RESIDUAL) { const float old = now[i], fresh = (float)x; now[i] = fresh; next[i] = fresh + beta*(fresh - old); }
-        stress_sum += RESIDUAL ? moved : (double)stiff[i]*moved;
+        s_es += (T)stiff[i]*es; s_ee += (T)stiff[i]*ee; s_ss += (T)stiff[i]*ss;
+        s_residual += RESIDUAL ? ss : ee;
+        es = 0; ee = 0; ss = 0;
+        put(0, x, y, (T)1, ahead_x, 0);
+        x_es += diagonal*es; x_ee += diagonal*ee; x_ss += diagonal*ss;
+        x_residual += RESIDUAL ? ss : ee;
     }
-    partial[thread] = pressure_sum; partial[columns + thread] = stress_sum;
+    if (RESIDUAL) { partial[thread] = x_residual; partial[columns + thread] = s_residual; return; }
+    const T found[COLUMNS] = {x_es, x_ee, x_ss, s_es, s_ee, s_ss, x_residual, s_residual};
+    for (int c = 0; c < COLUMNS; ++c) partial[c*columns + thread] = found[c];
 """
 
 # The same for wall faces: a step of their copies, after that of the cells.
 WALLS = SHAPE.replace(", row = k*s[2] + j*s[1]", "") + WALL_FACE + """
-    double moved = 0;
+    double es = 0, ee = 0, ss = 0, residual = 0;
     const float* inverse[3] = {inverse_x.data, inverse_y.data, inverse_z.data};
     const T* rates[3] = {b_x.data, b_y.data, b_z.data};
-    const T omega = RESIDUAL ? (T)1 : (T)numbers.data[STEP];
-    for (int entry = first; entry < last; ++entry) {
-        if (!(flags_.data[cells.data[entry]] & HOLDS)) continue;
-        face(entry, y_.data, now_.data, numbers.data + WEIGHT, omega,
-            [&](int d, long long o) {
-                const float* a = inverse[ALPHA[d]]; const float* b = inverse[BETA[d]];
-                return (T)(a[o] + a[o - s[BETA[d]]] + b[o] + b[o - s[ALPHA[d]]]);
-            },
-            [&](int d, long long o) { return rates[d][o]; },
-            [&](int, long long, long long slot, T, T value) {
-                const float old = now_.data[slot], fresh = (float)value;
-                if (RESIDUAL) { const double by = (double)value - (double)old; moved += 0.5*by*by; }
-                else { now_.data[slot] = fresh; next_.data[slot] = fresh + (float)momentum.data[1]*(fresh - old); }
+    const T omega = RESIDUAL ? (T)1 : (T)numbers.data[SHEAR_STEP], beta = RESIDUAL ? (T)0 : (T)momentum.data[NOW_S];
+    const T ahead = (T)momentum.data[NEXT_S]*(T)numbers.data[LOOKAHEAD];
+    auto light = [&](int d, long long o) {
+        const float* a = inverse[ALPHA[d]]; const float* b = inverse[BETA[d]];
+        return (T)(a[o] + a[o - s[BETA[d]]] + b[o] + b[o - s[ALPHA[d]]]);
+    };
+    auto start = [&](long long at) {
+        const T x = (T)now_.data[at];
+        return RESIDUAL ? x : x + beta*(x - (T)before_.data[at]);
+    };
+    const int end = last < active.data[0] ? last : active.data[0];
+    for (int m = first; m < end; ++m) {
+        face(active.data[1 + m], start, now_.data, numbers.data + WEIGHT, omega, light, [&](int d, long long o) { return rates[d][o]; },
+            [&](int, long long, long long slot, T, T value, T stiff) {
+                const T old = (T)now_.data[slot], s_ = value - old, e_ = value - start(slot);
+                es += 0.5*stiff*e_*s_; ee += 0.5*stiff*e_*e_; ss += 0.5*stiff*s_*s_;
+                residual += 0.5*(RESIDUAL ? s_*s_ : e_*e_);
+                if (!RESIDUAL) {
+                    before_.data[slot] = (float)old; now_.data[slot] = (float)value; point_.data[slot] = (float)(value + ahead*s_);
+                }
             });
     }
-    partials.data[chunk] = moved; partials.data[partials.shape[0]/COLUMNS + chunk] = 0;
+    const long long columns = partials.shape[0]/COLUMNS;
+    const double found[COLUMNS] = {RESIDUAL ? residual : 0, 0, 0, es, ee, ss, 0, residual};
+    for (int c = 0; c < COLUMNS; ++c) partials.data[c*columns + chunk] = found[c];
 """
 
 # What of the last stresses has a place now: pressure where there is sand, shear where a cell carries it, copies where they have a share.
 ADMIT = SHAPE + """
     const unsigned char* flags = flags_.data + row; const float* stiff = stiff_.data + row;
     const float* share[3] = {share_x.data + row, share_y.data + (DIM == 3 ? row : 0), share_z.data + (DIM == 3 ? row : 0)};
-    float* now = now_.data + row; float* next = next_.data + row;
-    auto put = [&](long long at, float value) { now[at] = value; next[at] = value; };
+    float* now = now_.data + row; float* before = before_.data + row; float* point = point_.data + row;
+    auto put = [&](long long at, float value) { now[at] = value; before[at] = value; point[at] = value; };
     for (int i = first; i < last; ++i) {
         const int sand = flags[i] & HOLDS, sheared = (flags[i] & SHEARS_HERE) && stiff[i] > 0.0f;
         put(i, sand ? now[i]*ratio : 0.0f);
@@ -205,7 +233,8 @@ def stress_kernels(dimension: int, real, residual: bool, box: bool) -> SimpleNam
     field = wp.array3d(dtype=real)
 
     def source(text: str) -> str:
-        return native(text, dimension, real, box=box, RESIDUAL=int(residual))
+        words = {"NOW_X": NOW_X, "NOW_S": NOW_S, "NEXT_X": NEXT_X, "NEXT_S": NEXT_S, "RESIDUAL": int(residual)}
+        return native(text, dimension, real, box=box, **words)
 
     @wp.func_native(source(EDGE_STRESS))
     def edge_stress_row(
@@ -259,7 +288,7 @@ def stress_kernels(dimension: int, real, residual: bool, box: bool) -> SimpleNam
 
     @wp.func_native(source(CELLS))
     def step_row(
-        spans_: _SPANS, flags_: _U8, y_: _STRESS, now_: _STRESS, next_: _STRESS, drive_: _F32, stiff_: _F32,
+        spans_: _SPANS, flags_: _U8, now_: _STRESS, before_: _STRESS, point_: _STRESS, drive_: _F32, stiff_: _F32,
         share_x: _F32, share_y: _F32, share_z: _F32, b_x: field, b_y: field, b_z: field, mass_x: _F32, mass_y: _F32, mass_z: _F32,
         inverse_x: _F32, inverse_y: _F32, inverse_z: _F32, u_x: field, u_y: field, u_z: field,
         momentum: wp.array(dtype=wp.float64), numbers: wp.array(dtype=wp.float32),
@@ -268,7 +297,7 @@ def stress_kernels(dimension: int, real, residual: bool, box: bool) -> SimpleNam
 
     @wp.kernel(enable_backward=False, module=name)
     def step(
-        cells: CellRange, spans: _SPANS, flags: _U8, y: _STRESS, now: _STRESS, after: _STRESS, drive: _F32, stiff: _F32,
+        cells: CellRange, spans: _SPANS, flags: _U8, now: _STRESS, before: _STRESS, point: _STRESS, drive: _F32, stiff: _F32,
         share_x: _F32, share_y: _F32, share_z: _F32, b_x: field, b_y: field, b_z: field, mass_x: _F32, mass_y: _F32, mass_z: _F32,
         inverse_x: _F32, inverse_y: _F32, inverse_z: _F32, u_x: field, u_y: field, u_z: field,
         momentum: wp.array(dtype=wp.float64), numbers: wp.array(dtype=wp.float32),
@@ -278,31 +307,31 @@ def stress_kernels(dimension: int, real, residual: bool, box: bool) -> SimpleNam
         first = cells.i + chunk * cells.grain
         last = wp.min(first + cells.grain, cells.end)
         step_row(
-            spans, flags, y, now, after, drive, stiff, share_x, share_y, share_z, b_x, b_y, b_z, mass_x, mass_y, mass_z,
+            spans, flags, now, before, point, drive, stiff, share_x, share_y, share_z, b_x, b_y, b_z, mass_x, mass_y, mass_z,
             inverse_x, inverse_y, inverse_z, u_x, u_y, u_z, momentum, numbers, partials, chunks, chunk,
             cells.k + plane, cells.j + row, first, last,
         )  # fmt: skip
 
     @wp.func_native(source(ADMIT))
     def admit_row(
-        flags_: _U8, stiff_: _F32, share_x: _F32, share_y: _F32, share_z: _F32, ratio: float, now_: _STRESS, next_: _STRESS,
+        flags_: _U8, stiff_: _F32, share_x: _F32, share_y: _F32, share_z: _F32, ratio: float, now_: _STRESS, before_: _STRESS, point_: _STRESS,
         k: int, j: int, first: int, last: int,
     ): ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module=name)
     def admit(
         cells: CellRange, flags: _U8, stiff: _F32, share_x: _F32, share_y: _F32, share_z: _F32, ratio: float,
-        now: _STRESS, after: _STRESS,
+        now: _STRESS, before: _STRESS, point: _STRESS,
     ):  # fmt: skip
         plane, row, chunk = wp.tid()
         first = cells.i + chunk * cells.grain
         last = wp.min(first + cells.grain, cells.end)
-        admit_row(flags, stiff, share_x, share_y, share_z, ratio, now, after, cells.k + plane, cells.j + row, first, last)
+        admit_row(flags, stiff, share_x, share_y, share_z, ratio, now, before, point, cells.k + plane, cells.j + row, first, last)
 
     @wp.func_native(source(WALLS))
     def wall_entries(
         cells: wp.array(dtype=wp.int32), sides: wp.array(dtype=wp.uint8), walls: wp.array(dtype=wp.int32),
-        friction: wp.array(dtype=wp.float32), flags_: _U8, fraction_: _F32, y_: _STRESS, now_: _STRESS, next_: _STRESS,
+        friction: wp.array(dtype=wp.float32), active: wp.array(dtype=wp.int32), fraction_: _F32, now_: _STRESS, before_: _STRESS, point_: _STRESS,
         share_x: _F32, share_y: _F32, share_z: _F32, b_x: field, b_y: field, b_z: field,
         inverse_x: _F32, inverse_y: _F32, inverse_z: _F32, momentum: wp.array(dtype=wp.float64), numbers: wp.array(dtype=wp.float32),
         partials: wp.array(dtype=wp.float64), chunk: int, first: int, last: int,
@@ -311,7 +340,7 @@ def stress_kernels(dimension: int, real, residual: bool, box: bool) -> SimpleNam
     @wp.kernel(enable_backward=False, module=name)
     def wall(
         grain: int, cells: wp.array(dtype=wp.int32), sides: wp.array(dtype=wp.uint8), walls: wp.array(dtype=wp.int32),
-        friction: wp.array(dtype=wp.float32), flags: _U8, fraction: _F32, y: _STRESS, now: _STRESS, after: _STRESS,
+        friction: wp.array(dtype=wp.float32), active: wp.array(dtype=wp.int32), fraction: _F32, now: _STRESS, before: _STRESS, point: _STRESS,
         share_x: _F32, share_y: _F32, share_z: _F32, b_x: field, b_y: field, b_z: field,
         inverse_x: _F32, inverse_y: _F32, inverse_z: _F32, momentum: wp.array(dtype=wp.float64), numbers: wp.array(dtype=wp.float32),
         partials: wp.array(dtype=wp.float64),
@@ -319,7 +348,7 @@ def stress_kernels(dimension: int, real, residual: bool, box: bool) -> SimpleNam
         chunk = wp.tid()
         first = chunk * grain
         wall_entries(
-            cells, sides, walls, friction, flags, fraction, y, now, after, share_x, share_y, share_z, b_x, b_y, b_z,
+            cells, sides, walls, friction, active, fraction, now, before, point, share_x, share_y, share_z, b_x, b_y, b_z,
             inverse_x, inverse_y, inverse_z, momentum, numbers, partials, chunk,
             first, wp.min(first + grain, cells.shape[0]),
         )  # fmt: skip
@@ -330,11 +359,34 @@ def stress_kernels(dimension: int, real, residual: bool, box: bool) -> SimpleNam
 
 
 @wp.kernel(enable_backward=False, module="granular.momentum")
-def momentum_kernel(sums: wp.array(dtype=wp.float64), momentum: wp.array(dtype=wp.float64)):
-    """t and beta <= momentum[2] of Nesterov's sequence; from the start again where the last step went against its extrapolation."""
-    t = momentum[0]
-    if sums[0] + sums[1] > wp.float64(0.0):
-        t = wp.float64(1.0)
-    after = wp.float64(0.5) * (wp.float64(1.0) + wp.sqrt(wp.float64(1.0) + wp.float64(4.0) * t * t))
-    momentum[0] = after
-    momentum[1] = wp.min((t - wp.float64(1.0)) / after, momentum[2])
+def momentum_kernel(sums: wp.array(dtype=wp.float64), state: wp.array(dtype=wp.float64)):
+    """Momentum of the next step but one; every few steps more or less of it, by the angle between the projection's error and the step.
+
+    cos = <e, s> / sqrt(<e, e> <s, s>) is near 1 where more momentum would help and small where the iterates flutter.
+    """
+    for c in range(COLUMNS):
+        value = sums[c] + sums[COLUMNS + c]
+        if c >= 6:
+            value = wp.sqrt(value)
+        state[SUMS + c] = state[SUMS + c] + value
+    count = state[COUNT] + wp.float64(1.0)
+    state[COUNT] = count
+    if state[COUNT] % wp.float64(PERIOD) == wp.float64(0.0):
+        for block in range(2):
+            at = SUMS + 3 * block
+            size = state[at + 1] * state[at + 2]
+            rest = wp.float64(1.0) - state[BETA_X + block]
+            if size > wp.float64(0.0):
+                cosine = state[at] / wp.sqrt(size)
+                if cosine > wp.float64(HIGH):
+                    rest = rest * wp.float64(0.8)
+                if cosine < wp.float64(LOW):
+                    rest = rest * wp.float64(1.8)
+            state[BETA_X + block] = wp.float64(1.0) - wp.clamp(rest, wp.float64(0.015), wp.float64(0.4))
+        state[RESIDUAL_X] = state[SUMS + 6] / wp.float64(PERIOD)
+        state[RESIDUAL_X + 1] = state[SUMS + 7] / wp.float64(PERIOD)
+        for c in range(COLUMNS):
+            state[SUMS + c] = wp.float64(0.0)
+    for block in range(2):
+        state[NOW_X + block] = state[NEXT_X + block]
+        state[NEXT_X + block] = wp.min(state[BETA_X + block], (count + wp.float64(1.0)) / (count + wp.float64(4.0)))

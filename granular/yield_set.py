@@ -13,10 +13,12 @@ from typing import Any
 
 from warp_lcp.native import C_TYPES, simd
 
-NEWTON = 4  # iterations for the multiplier of a yielding cell: the secular form is exact in one where all copies yield alike
-COLUMNS = 2  # of a row's sums
+NEWTON = 4  # iterations for the multiplier of a yielding cell: 3 are exact to 2e-6 of the bound, 4 to rounding
+COLUMNS = 8  # of a row's sums, see `granular.stress_kernels`
 
-STEP, FRICTION, COHESION, TENSION, WEIGHT, NUMBERS = 0, 1, 2, 3, 4, 7  # what a step of the method takes; weight: dt g, three entries
+# what kernels read: the yield set, dt g [m/s] (three entries), the steps of a method relative to the diagonal, and how far beyond the
+# stresses, in units of the momentum's displacement, it takes its gradient
+FRICTION, COHESION, TENSION, WEIGHT, PRESSURE_STEP, SHEAR_STEP, LOOKAHEAD, NUMBERS = 0, 1, 2, 3, 6, 7, 8, 9
 
 HOLDS = 1  # bits of a cell: it holds sand, and so a pressure,
 SHEARS_HERE = 2  # enough of it to carry shear,
@@ -24,8 +26,8 @@ FIRM = 4  # so much that cohesion may hold it together
 LEAST_RADIUS = 1e-30  # [m/s], of a yield set that holds only zero
 
 CONSTANTS = {
-    "NEWTON": NEWTON, "COLUMNS": COLUMNS, "LEAST_RADIUS": LEAST_RADIUS, "STEP": STEP, "FRICTION": FRICTION, "COHESION": COHESION,
-    "TENSION": TENSION, "WEIGHT": WEIGHT, "HOLDS": HOLDS, "SHEARS_HERE": SHEARS_HERE, "FIRM": FIRM,
+    "NEWTON": NEWTON, "COLUMNS": COLUMNS, "LEAST_RADIUS": LEAST_RADIUS, "FRICTION": FRICTION, "COHESION": COHESION,
+    "TENSION": TENSION, "WEIGHT": WEIGHT, "PRESSURE_STEP": PRESSURE_STEP, "SHEAR_STEP": SHEAR_STEP, "LOOKAHEAD": LOOKAHEAD, "HOLDS": HOLDS, "SHEARS_HERE": SHEARS_HERE, "FIRM": FIRM,
 }  # fmt: skip
 
 SHAPE = """
@@ -49,13 +51,16 @@ YIELD = """
             for (int d = 0; d < SHEARS; ++d) cap[d] = r;
             return smaller(r/larger(sqrt(normal2), (T)LEAST_RADIUS), (T)1);
         }
-        T mu = 0, size = 0;
-        for (int iteration = 0; iteration <= NEWTON; ++iteration) {
+        const T all = sqrt(normal2);
+        T mu = all/r - (T)1, size = 0;  // a lower bound: each part by itself must fit
+        UNROLL for (int d = 0; d < SHEARS; ++d) UNROLL for (int n = 1; n <= 4; ++n) mu = larger(mu, (T)0.25*(largest[d][n - 1]/r - (T)n));
+        mu = larger(mu, (T)0);
+        UNROLL for (int iteration = 0; iteration <= NEWTON; ++iteration) {
             const T shrink = (T)1/((T)1 + mu), a2 = normal2*shrink*shrink;
             T total = a2, slope = a2*shrink;
-            for (int d = 0; d < SHEARS; ++d) {
+            UNROLL for (int d = 0; d < SHEARS; ++d) {
                 T m = largest[d][0]/((T)1 + (T)4*mu), rate = (T)4/((T)1 + (T)4*mu);
-                for (int n = 2; n <= 4; ++n) {
+                UNROLL for (int n = 2; n <= 4; ++n) {
                     const T by = (T)1/((T)n + (T)4*mu), other = largest[d][n - 1]*by;
                     rate = other > m ? (T)4*by : rate;
                     m = larger(m, other);
@@ -71,7 +76,7 @@ YIELD = """
             }
         }
         const T onto = smaller(r/larger(size, (T)LEAST_RADIUS), (T)1);
-        for (int d = 0; d < SHEARS; ++d) cap[d] *= onto;
+        UNROLL for (int d = 0; d < SHEARS; ++d) cap[d] *= onto;
         return onto/((T)1 + mu);
     };
     // sums of the one, two, three, four largest
@@ -85,10 +90,11 @@ YIELD = """
 
 # Coulomb friction on a wall face of a cell: the copies on its edges, two of each shear, within mu times the normal load, in the metric
 # sum b_q^2 / 2. The load is that of the face: x - n and the weight of the half cell before it, or of all of it where there is no pressure.
-# `rate` and `light` tell an edge's rate of shear and the sum of 1 / mass around it; `store` gets the new value of each copy.
+# `rate` and `light` tell an edge's rate of shear and the sum of 1 / mass around it; `from` tells where a copy's step starts, `store` gets its
+# new value and the face's diagonal.
 WALL_FACE = """
     const float* shares[3] = {share_x.data, share_y.data, share_z.data};
-    auto face = [&](int entry, const float* from, const float* now, const float* weight, T omega, auto light, auto rate, auto store) {
+    auto face = [&](int entry, auto from, const float* now, const float* weight, T omega, auto light, auto rate, auto store) {
         const long long cell = cells.data[entry];
         const int axis = sides.data[entry] >> 1, side = sides.data[entry] & 1;
         const float x = now[cell], n = DIM == 3 ? now[(1 + axis)*layer + cell] : (axis == 0 ? 1.0f : -1.0f)*now[layer + cell];
@@ -111,7 +117,7 @@ WALL_FACE = """
         }
         if (!(stiffest > (T)0)) return;
         for (int t = 0; t < DIM - 1; ++t) for (int m = 0; m < 2; ++m) {
-            b[t][m] = share[t][m] > (T)0 ? (T)from[slot[t][m]] + omega*(T)2/stiffest*share[t][m]*rate(shear[t], at[t][m]) : (T)0;
+            b[t][m] = share[t][m] > (T)0 ? from(slot[t][m]) + omega*(T)2/stiffest*share[t][m]*rate(shear[t], at[t][m]) : (T)0;
             const T size = b[t][m] < (T)0 ? -b[t][m] : b[t][m];
             sum[t] += size; most[t] = size > most[t] ? size : most[t];
         }
@@ -136,7 +142,7 @@ WALL_FACE = """
         for (int t = 0; t < DIM - 1; ++t) for (int m = 0; m < 2; ++m) {
             if (!(share[t][m] > (T)0)) continue;
             const T limit = cap[t]*onto, cut = b[t][m] > limit ? limit : b[t][m] < -limit ? -limit : b[t][m];
-            store(shear[t], at[t][m], slot[t][m], share[t][m], cut);
+            store(shear[t], at[t][m], slot[t][m], share[t][m], cut, stiffest);
         }
     };
 """
@@ -144,6 +150,8 @@ WALL_FACE = """
 
 def native(source: str, dimension: int, real: Any, *, box: bool, **numbers: int) -> str:
     """Return the body of a native function for 2 or 3 dimensions and velocities of `real`; words in `numbers` become their values.
+
+    `UNROLL for` becomes a loop that is unrolled: a vectorized loop may have no other inside.
 
     Args:
         source: of the body.
@@ -155,4 +163,4 @@ def native(source: str, dimension: int, real: Any, *, box: bool, **numbers: int)
     source = f"typedef {C_TYPES[real]} T;\n" + source
     for word, value in (CONSTANTS | {"DIM": dimension, "BOX": int(box)} | numbers).items():
         source = re.sub(rf"\b{word}\b", str(value), source)
-    return simd(source)
+    return simd(source.replace("UNROLL ", "\n#ifndef __CUDA_ARCH__\n#pragma clang loop unroll(full)\n#endif\n"))

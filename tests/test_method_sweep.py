@@ -87,6 +87,9 @@ def faults(name, method, problem, precision):
     wrong = []
     if result.status is S.CONVERGED and not own <= RTOL[precision] * reference * (1 + 1e-6) + rounding:
         wrong.append(f"false CONVERGED: residual {own:.1e}, asked for {RTOL[precision] * reference:.1e}")
+    low, high = (v.astype(np.float32) if precision == "single" else v for v in (p.lower, p.upper))  # bounds are rounded as x is
+    if result and not ((x >= low) & (x <= high)).all():
+        wrong.append(f"CONVERGED {max((low - x).max(), (x - high).max()):.1e} outside the bounds")
     if result.status is not S.CONVERGED and own < 0.99 * RTOL[precision] * reference - rounding:
         wrong.append(f"{result.status.name} at a solution")
     if not abs(result.residual - own) <= 1e-3 * own + rounding:

@@ -15,7 +15,7 @@ from warp_lcp.driver.render import INSTALL, Page, parse_size, render_run
 from warp_lcp.driver.scene_file import dump_scene, load_scene
 from warp_lcp.driver.scenery import Outline
 from warp_lcp.driver.simulator import Cells, Points
-from warp_lcp.driver.stage import MARGIN, shaded
+from warp_lcp.driver.stage import MARGIN, SHADES, shaded
 
 RNG = np.random.default_rng(9127)
 WHITE = 255
@@ -329,7 +329,7 @@ def test_containers_do_not_hide_what_is_in_them(pyvista, make_run):
 def test_liquid_is_lit_from_above_and_drops_are_not():
     block = np.stack(np.meshgrid(*[np.arange(0.025, 1.0, 0.05)] * 3), axis=-1).reshape(-1, 3)
     drop = np.array([[3.0, 3.0, 3.0]])
-    light = shaded(np.concatenate([block, drop]), np.full((len(block) + 1, 3), 100.0), 0.1).mean(axis=1)
+    light = shaded(np.concatenate([block, drop]), np.full((len(block) + 1, 3), 100.0), 0.1, SHADES["water"]).mean(axis=1)
     middle = (np.abs(block[:, [0, 2]] - 0.5) < 0.1).all(axis=1)
     top, bottom, core = (light[:-1][middle & (np.abs(block[:, 1] - y) < 0.03)].mean() for y in (0.975, 0.025, 0.525))
     assert top > bottom + 20

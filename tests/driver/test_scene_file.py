@@ -22,7 +22,7 @@ def test_the_file_names_the_scene(scene_file):
     ("text", "expected"),
     [
         ("damm-break", "damm-break: no such file, and no such built-in scene; did you mean 'dam-break'?"),
-        ("x" * 9, "no such built-in scene; choose from ceiling-drop, dam-break"),
+        ("x" * 9, "no such built-in scene; choose from ceiling-drop, column-collapse"),
         ("missing.toml", "missing.toml: there is no such file"),
         ("folder/missing", "folder/missing: there is no such file"),
     ],
@@ -134,4 +134,5 @@ def test_built_in_scenes_are_valid(name):
 def test_the_promised_scenes_are_there():
     promised = {"dam-break-2d", "dam-break", "ceiling-drop", "splash-in-circle", "water-labyrinth", "splash-in-square", "mesh-obstacle"}
     promised |= {"wave-maker", "retracting-wall", "stirred-tank"}
+    promised |= {"column-collapse-2d", "column-collapse", "hourglass-2d", "hourglass", "pouring-pile", "sand-on-mesh"}
     assert promised <= built_in_scenes().keys()

@@ -99,17 +99,27 @@ def test_unknown_keys_suggest(changes, expected):
 @pytest.mark.parametrize(
     ("changes", "path"),
     [
-        ({"sand": [BOX]}, "sand"),
-        ({"domain.friction": 0.5}, "domain.friction"),
-        ({"domain.periodic": [True, False]}, "domain.periodic[0] = true"),
         ({"solver.preset": "standard"}, "solver.preset"),
         ({"output.surface": True}, "output.surface = true"),
         ({"solid": [{**BOX, "mass": 1.0}]}, "solid[0].mass"),
-        ({"solid": [{**BOX, "friction": 1.0}]}, "solid[0].friction"),
     ],
 )
 def test_what_comes_later_is_no_typo(changes, path):
     assert complaint(changes) == f"dam.toml: {path}: not available yet in this version"
+
+
+@pytest.mark.parametrize(
+    ("changes", "path"),
+    [
+        ({"sand": [BOX]}, "sand"),
+        ({"friction": {"model": "cone"}}, "friction"),
+        ({"domain.friction": 0.5}, "domain.friction"),
+        ({"domain.periodic": [True, False]}, "domain.periodic[0] = true"),
+        ({"solid": [{**BOX, "friction": 1.0}]}, "solid[0].friction"),
+    ],
+)
+def test_what_another_simulator_has_is_no_typo(changes, path):
+    assert complaint(changes) == f'dam.toml: {path}: needs scene.simulator = "granular"'
 
 
 def test_what_comes_later_may_be_off():

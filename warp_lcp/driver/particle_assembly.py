@@ -53,7 +53,7 @@ def make_boundary(
         ValueError: solids cut cells and there is a `wall_velocity`.
     """
     placed = placed_solids(scene, folder)
-    separating, sides = scene.domain.wall == "separating", side_bits(scene.domain.open)
+    separating, sides = scene.domain.wall == "separating", side_bits(scene.open_sides)
     if scene.domain.solids == "cut-cell":
         if wall_velocity is not None:
             raise ValueError('wall_velocity: only for solids = "voxel"; solids that cut cells have a motion')

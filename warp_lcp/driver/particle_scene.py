@@ -82,6 +82,11 @@ class ParticleScene(Scene):
     def materials(self) -> tuple[str, Sequence[MaterialProperties]]:
         """Return the key of the material's shapes in the file, such as `liquid`, and the shapes."""
 
+    @property
+    def open_sides(self) -> list[str]:
+        """Return the names of the domain's sides without a wall."""
+        return list(self.domain.open)
+
     def complaints(self) -> list[Complaint]:
         """Return what is wrong across keys."""
         key, materials = self.materials()

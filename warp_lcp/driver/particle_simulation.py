@@ -204,7 +204,7 @@ class ParticleSimulation(ABC):
             SimulationFailed: something is not finite, or a particle has left the domain.
         """
         with self.watch.stage("advection", self.particles.position, *self.velocity):
-            stopped, pushed, stuck = self.boundary.advect(self.velocity, dt, self.time + dt, self.particles.position)
+            stopped, pushed, stuck = self.carry(dt)
         exchanged = self._exchange(dt)
         after = self.checked_totals("after")
         rearranged = self._rearrange(after)
@@ -213,6 +213,10 @@ class ParticleSimulation(ABC):
         self.time += dt
         self.step_count += 1
         return self._totals_row(after, dt) | {"stopped": stopped, "pushed": pushed, "stuck": stuck} | rearranged | exchanged
+
+    def carry(self, dt: float) -> tuple[int, int, int]:
+        """Move particles and solids by dt [s]. Return how many met a wall, were pushed by a solid, and are stuck inside one."""
+        return self.boundary.advect(self.velocity, dt, self.time + dt, self.particles.position)
 
     def solve_row(self, result: wl.SolveResult | None) -> Row:
         """Return what the log says of a step's solve; nothing if there was none."""

@@ -18,7 +18,10 @@ from warp_lcp.driver.scene_file import check_shapes, load_scene
 SCALE_FRAMES = 16  # evenly spaced frames that fix the color scale of a run
 SCALE_VALUES = 50_000  # about how many values of each
 ROUND_NUMBERS = np.array([1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0])
-WATER = np.array([[14, 62, 138], [22, 106, 190], [58, 160, 224], [130, 208, 240], [206, 240, 250]])
+PALETTES = {  # of speeds, by `Scene.palette`
+    "water": np.array([[14, 62, 138], [22, 106, 190], [58, 160, 224], [130, 208, 240], [206, 240, 250]]),
+    "sand": np.array([[138, 92, 48], [178, 128, 72], [212, 170, 108], [236, 208, 156], [252, 242, 216]]),
+}
 VIRIDIS = np.array([[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]])
 
 
@@ -31,7 +34,12 @@ class Color(StrEnum):
 
     SPEED = "speed"
     PRESSURE = "pressure"
+    FRACTION = "fraction"
+    YIELD_RATIO = "yield_ratio"
     PLAIN = "plain"
+
+
+LABELS = {Color.FRACTION: "fraction of grains", Color.YIELD_RATIO: "yield ratio"}  # what sand's particles know besides
 
 
 @dataclass(frozen=True)
@@ -110,6 +118,8 @@ class Recording:
         points = np.asarray(mesh.points, dtype=np.float64)
         if self.color is Color.PRESSURE:
             values = self._pressure(number, points)
+        elif self.color in LABELS:
+            values = self._field(mesh.point_data, self.color)
         elif self.color is Color.SPEED:
             values = np.linalg.norm(self._field(mesh.point_data, "velocity"), axis=1)
         else:
@@ -120,12 +130,14 @@ class Recording:
     def scale(self) -> Scale:
         """Return the colors for the whole run: up to what 98 of 100 particles stay below, rounded up; the few above take the last color."""
         if self.color is Color.PLAIN:
-            return Scale("", -1.0, 1.0, WATER)
+            return Scale("", -1.0, 1.0, PALETTES[self.scene.palette])
         samples = [self.read(number)[1] for number in spread(self.numbers, SCALE_FRAMES)]
         low, high = np.percentile(np.concatenate([[0.0], *(values[:: len(values) // SCALE_VALUES + 1] for values in samples)]), [2.0, 98.0])
         high = _round_up(high)
         low = -_round_up(-low) if low < -0.01 * high else 0.0  # liquid that a wall holds has pressure below 0
-        return Scale("pressure [Pa]", low, high, VIRIDIS) if self.color is Color.PRESSURE else Scale("speed [m/s]", low, high, WATER)
+        if self.color is Color.SPEED:
+            return Scale("speed [m/s]", low, high, PALETTES[self.scene.palette])
+        return Scale(LABELS.get(self.color, "pressure [Pa]"), low, high, VIRIDIS)
 
     def particle_spacing(self) -> float:
         """Return how far apart neighbors are at the start [m], from the number of particles in the cells that hold some."""

@@ -53,7 +53,8 @@ class Time(Table):
 class Domain(Table):
     """[domain]: the box that everything happens in, and its grid."""
 
-    later: ClassVar = {"friction": ANY_VALUE, "periodic": frozenset({True})}
+    later: ClassVar = {"periodic": frozenset({True})}
+    elsewhere: ClassVar = {"friction": "granular", "periodic": "granular"}
     size: list[Length] = Field(min_length=2, max_length=3, description="the sides of the domain [m], [x, y] or [x, y, z]")
     resolution: int = Field(ge=2, le=4096, description="cells along the longest side")
     wall: Wall = Field(default="separating", description="whether material may let go of the domain's walls")
@@ -98,7 +99,8 @@ class Output(Table):
 class Scene(Table):
     """A scene file, read and checked. SI units; y is up; a domain of two sides is the x-y plane."""
 
-    later: ClassVar = {"sand": ANY_VALUE}
+    elsewhere: ClassVar = dict.fromkeys(("sand", "material", "friction", "gauge"), "granular")
+    palette: ClassVar[Literal["water", "sand"]] = "water"  # of its images
     scene: About
     time: Time
     domain: Domain

@@ -169,7 +169,8 @@ class Mesh(Shape):
 class SolidProperties(Shape):
     """What a solid has besides its shape; where solids have more, classes of their own derive from SolidBox, SolidSphere and so on."""
 
-    later: ClassVar = {"friction": ANY_VALUE, "mass": ANY_VALUE}
+    later: ClassVar = {"mass": ANY_VALUE}
+    elsewhere: ClassVar = {"friction": "granular"}
     wall: Wall | None = Field(default=None, description="whether material may let go of it; domain.wall unless given")
     motion: Motion | None = Field(default=None, description="how it moves, from where it is placed; it stands still unless given")
 

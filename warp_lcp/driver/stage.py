@@ -21,7 +21,7 @@ VIEW_ANGLE = 25.0  # degrees, over the height of an image
 MARGIN = 1.04
 THREE_QUARTERS = np.array([0.55, 0.5, 1.0]) / np.linalg.norm([0.55, 0.5, 1.0])  # from the domain to the camera
 LIGHT = np.array([0.25, 0.9, 0.45]) / np.linalg.norm([0.25, 0.9, 0.45])  # from the domain to the light
-SHADE = np.array([1.4, 1.0, 0.7])  # shadows of water are blue
+SHADES = {"water": np.array([1.4, 1.0, 0.7]), "sand": np.array([0.9, 1.1, 1.3])}  # shadows of water are blue, of sand brown
 GLINT = (LIGHT + THREE_QUARTERS) / np.linalg.norm(LIGHT + THREE_QUARTERS)  # the normal that mirrors the light into the camera
 
 DISC = """//VTK::Color::Impl
@@ -72,7 +72,8 @@ class Stage:
         self.plotter.remove_actor("particles", render=False)
         if len(points):
             cloud = pyvista.PolyData(points)
-            cloud["color"] = (colors if self.flat else shaded(points, colors, self.scene.spacing)).astype(np.uint8)
+            lit = colors if self.flat else shaded(points, colors, self.scene.spacing, SHADES[self.scene.palette])
+            cloud["color"] = lit.astype(np.uint8)
             actor = self.plotter.add_mesh(
                 cloud, name="particles", scalars="color", rgb=True, style="points_gaussian", emissive=False,
                 render_points_as_spheres=True, lighting=False, reset_camera=False, render=False,
@@ -108,7 +109,7 @@ class Stage:
         camera.view_angle = VIEW_ANGLE
 
 
-def shaded(points: np.ndarray, colors: np.ndarray, spacing: float) -> np.ndarray:
+def shaded(points: np.ndarray, colors: np.ndarray, spacing: float, shade: np.ndarray) -> np.ndarray:
     """Light particles as the smooth surface of the liquid that they make up, whose normals point down the gradient of their density.
 
     Particles inside the liquid, and single drops, keep their color.
@@ -117,6 +118,7 @@ def shaded(points: np.ndarray, colors: np.ndarray, spacing: float) -> np.ndarray
         points: [m], shape (n, 3).
         colors: 0 to 255, shape (n, 3).
         spacing: over which the density is averaged [m].
+        shade: how much of red, green and blue the dark takes away.
 
     Returns:
         Colors as `colors`.
@@ -134,5 +136,5 @@ def shaded(points: np.ndarray, colors: np.ndarray, spacing: float) -> np.ndarray
     facing = (normal @ LIGHT)[:, None]
     light = 0.72 + 0.22 * facing + 0.14 * np.maximum(facing, 0.0)
     glint = 0.35 * np.maximum(normal @ GLINT, 0.0)[:, None] ** 40
-    lit = np.clip(colors * (1.0 - flatness * SHADE * (1.0 - light)), 0.0, 255.0)
+    lit = np.clip(colors * (1.0 - flatness * shade * (1.0 - light)), 0.0, 255.0)
     return cast(np.ndarray, lit + flatness * glint * (255.0 - lit))

@@ -59,6 +59,8 @@ class Table(BaseModel):
 
     #: keys of models that later versions bring, each with the values that are refused until then (`ANY_VALUE`: the key itself).
     later: ClassVar[Mapping[str, frozenset[object]]] = {}
+    #: those among them that other simulators have already, with the simulator's name; and more keys that only those have.
+    elsewhere: ClassVar[Mapping[str, str]] = {}
 
 
 @dataclass(frozen=True)
@@ -167,14 +169,16 @@ def _problem(model: type[Table], error: ErrorDetails) -> Problem:
     kind, context = error["type"], error.get("ctx", {})
     place = _locate(model, error["loc"])
     later = place.owner.later if place.owner else {}
+    simulator = place.owner.elsewhere.get(place.key) if place.owner else None
+    refusal = f'needs scene.simulator = "{simulator}"' if simulator else NOT_YET
     if kind.startswith("union_tag"):
         return _unknown_variant(place, context["discriminator"].strip("'"), context.get("tag"))
     if kind == "extra_forbidden":
         known = _keys(place.owner) if place.owner else {}
-        return Problem(place.path, NOT_YET if place.key in later else f"unknown key; {nearest(place.key, known)}")
+        return Problem(place.path, refusal if simulator or place.key in later else f"unknown key; {nearest(place.key, known)}")
     value = "" if kind == "missing" or error["input"] is None else written(error["input"])
     if kind == "literal_error" and error["input"] in tuple(later.get(place.key, ANY_VALUE)):
-        return Problem(place.path, NOT_YET, value)
+        return Problem(place.path, refusal, value)
     if kind == "list_type" and place.below:
         return Problem(place.path, f"must be an array of tables, written [[{place.path}]]", value)
     message = MESSAGES[kind].format(**context) if kind in MESSAGES else error["msg"]

@@ -1,6 +1,7 @@
 """Velocity from known faces to the faces around them, a layer of faces at a time."""
 
 import typing
+from collections.abc import Callable
 
 import warp as wp
 
@@ -76,7 +77,10 @@ def layer_kernel(cells: CellRange, known: wp.array3d(dtype=wp.int8), field: wp.a
     fill_row(known, field, layer, fill, cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end))
 
 
-def extrapolate(window: Window, known: wp.array, field: wp.array, layers: int, *, start: int = 1, fill: int = UNKNOWN) -> None:
+def extrapolate(
+    window: Window, known: wp.array, field: wp.array, layers: int, *, start: int = 1, fill: int = UNKNOWN,
+    join: Callable[[wp.array, wp.array], None] | None = None,
+) -> None:  # fmt: skip
     """Give unknown faces the mean of their known neighbors, layer after layer.
 
     Args:
@@ -86,6 +90,7 @@ def extrapolate(window: Window, known: wp.array, field: wp.array, layers: int, *
         layers: how many layers to fill, >= 0.
         start: faces marked 1..start are sources of the first layer.
         fill: the mark of the faces to fill, `UNKNOWN` or `BLOCKED`.
+        join: called with known and field after each layer, where faces at two sides of the domain are the same.
 
     Raises:
         ValueError: the marks would not fit in int8.
@@ -94,3 +99,5 @@ def extrapolate(window: Window, known: wp.array, field: wp.array, layers: int, *
         raise ValueError(f"layers = {layers} after layer {start}: at most 127 layers fit in int8")
     for layer in range(start, start + layers):
         window.launch(layer_kernel, [known, field, layer, fill])
+        if join is not None:
+            join(known, field)

@@ -65,6 +65,7 @@ def voxelize(
     wall_separating: bool,
     device: wp.Device | str,
     open_sides: int = 0,
+    remarks: bool = True,
 ) -> VoxelSolids:
     """Give every cell whose center lies inside a solid to the first such solid.
 
@@ -76,9 +77,10 @@ def voxelize(
         wall_separating: whether liquid may leave the domain's wall.
         device: where the arrays live.
         open_sides: of `warp_lcp.grid.sides.side_bits`: beyond them cells are open.
+        remarks: make notes and refuse what makes no sense at the start of a run; False: solids are where they have moved to.
 
     Raises:
-        ValueError: a solid lies wholly outside the domain, or the solids leave no open cell.
+        ValueError: with `remarks`, a solid lies wholly outside the domain, or the solids leave no open cell.
     """
     nx, ny, nz = counts
     if dimension == 2 and nz != 1:
@@ -91,16 +93,17 @@ def voxelize(
     covered = wp.zeros(1 + len(solids), dtype=wp.int32, device=device)
     notes: list[str] = []
     for number, solid in enumerate(solids, start=1):
-        notes += placement_notes(solid.geometry, solid.name, counts, spacing, dimension)
-        notes += thin_notes(solid.geometry, solid.name, spacing, device)
+        if remarks:
+            notes += placement_notes(solid.geometry, solid.name, counts, spacing, dimension)
+            notes += thin_notes(solid.geometry, solid.name, spacing, device)
         _claim(index, covered, solid.geometry, number, spacing, dimension)
     claimed = covered.numpy()[1:]
     notes += [
         f"{solid.name} is too small for the grid: no center of a cell of {spacing:.4g} m lies inside it"
         for solid, cells in zip(solids, claimed, strict=True)
-        if not cells
+        if remarks and not cells
     ]
-    if solids and not (index.numpy()[1:-1, 1:-1, 1:-1] == OPEN).any():
+    if remarks and solids and not (index.numpy()[1:-1, 1:-1, 1:-1] == OPEN).any():
         raise ValueError(
             "the solids fill the whole domain: no open cell is left (is one inverted, or a plane's normal the wrong way round?)"
         )

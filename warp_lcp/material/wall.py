@@ -8,7 +8,7 @@ that the last particles can leave. 5. Faces inside solids follow the faces besid
 """
 
 import typing
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import warp as wp
 
@@ -98,6 +98,8 @@ def extend_velocity(
     separating: wp.array,
     solid_velocity: Sequence[wp.array],
     layers: int,
+    *,
+    join: Callable[[wp.array, wp.array], None] | None = None,
 ) -> None:
     """Continue the projected velocity into air and walls.
 
@@ -112,12 +114,17 @@ def extend_velocity(
         separating: uint8 a wall.
         solid_velocity: of the solids on each component's faces [m/s], or empty if all stand still.
         layers: how far into the air, in faces.
+        join: called with the marks and the velocity of a component after each layer, see `warp_lcp.grid.extrapolate`.
     """
     for axis, (field, weight, marks) in enumerate(zip(velocity, weights, known, strict=True)):
-        extrapolate(window, marks, field, 1)
+        extrapolate(window, marks, field, 1, join=join)
         window.launch(keep_spray_kernel, [axis, kind, weight, marks])
-        extrapolate(window, marks, field, layers)
+        if join is not None:
+            join(marks, field)
+        extrapolate(window, marks, field, layers, join=join)
         solid = solid_velocity[axis] if solid_velocity else None
         window.launch(closed_face_kernel, [axis, kind, contact, index, separating, solid, field])
+        if join is not None:
+            join(marks, field)
         # a particle's tent reaches faces inside a solid beside its cell, and in 3-D beside those
-        extrapolate(window, marks, field, len(velocity) - 1, start=layers + 1, fill=BLOCKED)
+        extrapolate(window, marks, field, len(velocity) - 1, start=layers + 1, fill=BLOCKED, join=join)

@@ -140,7 +140,18 @@ class SparseOperator:
             matrix = matrix + p @ scipy.sparse.diags_array(self.layout.load(shift, wp.float64, "shift").numpy())
         return SparseOperator(matrix, device=self.device, dtype=self.dtype)
 
-    def relax(self, x: Any, b: Any, lower: Any, upper: Any, omega: float, *, forward: bool = True, colored: bool | None = None) -> None:
+    def relax(
+        self,
+        x: Any,
+        b: Any,
+        lower: Any,
+        upper: Any,
+        omega: float,
+        *,
+        forward: bool = True,
+        colored: bool | None = None,
+        launch: Launch = wp.launch,
+    ) -> None:
         """Sweep x once, each unknown projected onto its bounds; rows with a zero diagonal are passed over.
 
         Args:
@@ -151,17 +162,18 @@ class SparseOperator:
             omega: relaxation factor.
             forward: rows, or colors, in ascending order; else descending.
             colored: color by color, all rows of a color at once, instead of row by row by one thread; on CUDA if None.
+            launch: launches or records.
         """
         found = kernels(self.dtype, x.dtype)
         before = [self.indptr, self.indices, self.values, self._diagonal, b, lower, upper, wp.float64(omega)]
         if not (self.device.is_cuda if colored is None else colored):
-            wp.launch(found.relax, 1, [*before, forward, self._no_rows, x, x.size], device=self.device)
+            launch(found.relax, 1, [*before, forward, self._no_rows, x, x.size], device=self.device)
             return
         rows, starts = self.colors
         colors = range(len(starts) - 1)
         for c in colors if forward else reversed(colors):
             spans = Spans.of(starts[c + 1] - starts[c], self.device)
-            launch_spans(found.relax_color, spans, [*before, rows, starts[c], x], [], self.device)
+            launch_spans(found.relax_color, spans, [*before, rows, starts[c], x], [], self.device, launch=launch)
 
     @cached_property
     def colors(self) -> tuple[wp.array[Any], list[int]]:

@@ -5,9 +5,7 @@ import warp as wp
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.equilibrated")
-def multiply_kernel(
-    field: wp.array(dtype=wp.float64), units: wp.array(dtype=wp.float64), inverse: bool, out: wp.array(dtype=wp.float64)
-):
+def multiply_kernel(field: wp.array(dtype=wp.float64), units: wp.array(dtype=wp.float64), inverse: bool, out: wp.array(dtype=wp.float64)):
     """Out = field units, or field / units; units are powers of 2, so that nothing is rounded, and infinities stay what they are."""
     i = wp.tid()
     if inverse:

@@ -36,7 +36,7 @@ class FischerNewton:
     f_i = lambda psi(a_i, y_i) + (1 - lambda) a_i+ y_i+ / scale, psi(a, b) = a + b - sqrt(a^2 + b^2), a = d (x - l), d = |A_ii|; two-sided
     rows take psi(a, -psi(-y, d (u - x))) ([Book] eq. 1.48), rows without bounds y. The step solves J dx = -f with J = diag(p d) +
     diag(q) A: divided by q it is the shifted system (A + D) dx = -f / q, D = d p / q, which multigrid preconditions on grids. The merit
-    f.f / 2 may not exceed the largest of the last ones. Iterates need not obey the bounds before the end.
+    f.f / 2 may not exceed the largest of the last ones. Iterates need not obey the bounds; what is returned as solved does.
 
     Dense problems (frictional contact, semi-definite A) are solved with factors of J on the host, in units in which A is equilibrated
     symmetrically and b is near 1, and what is returned is within the bounds. `safeguard` makes them a chain: at most 30 steps
@@ -202,11 +202,20 @@ class FischerWorkspace(IterateInPlace, RoundedIterate):
             wp.copy(self._from, x)
         length, _ = self._search.search(lambda t: self._trial(x, t * size), -2 * merit)
         if length > 0.0:
+            if self.residual.norm <= self.target:
+                self._project(x)
             return Step("fischer", iterations)
         self._scale = 0.0
         self._go(x, 0.0)
         self._evaluate(x)
         return self._fall_back(x, iterations)
+
+    def _project(self, x: wp.array[Any]) -> None:
+        """Move x onto its bounds, which it may miss by what the criteria allow; the solve goes on if they are not met there."""
+        self.residual.start(x, keep=True)
+        self._round(x)
+        self._evaluate(x)
+        self._scale = 0.0
 
     def _evaluate(self, x: wp.array[Any]) -> float:
         """Return the norm of the natural residual, and write y, which the grid's own evaluation leaves out."""

@@ -9,8 +9,10 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
+from warp_lcp.multigrid.aggregates import AggregateCycles
 from warp_lcp.multigrid.hierarchy import CycleSettings
 from warp_lcp.operators.grid_poisson import GridPoisson
+from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
@@ -22,6 +24,7 @@ from warp_lcp.solvers.proximal_point import ProximalPoint
 from warp_lcp.vectors import Reduction, launch_spans
 
 MOVED, SQUARE = 0, 3  # slots of the device scalars: cells moved, active, shifted, and the free residual's square
+LARGE = 1000  # unknowns from which a cold start on a sparse matrix takes projected cycles
 STALLED = 10  # steps without a smaller residual after which free blocks are taken for singular
 REGULARIZATIONS = (1e-8, 1e-4, 1e-2, 0.1, 1.0, 10.0, 100.0)  # of J'J, times its mean diagonal
 
@@ -34,15 +37,16 @@ class MinimumMapNewton:
     find the active set to within a few cells; a Newton step alone moves its boundary by about a layer a step. Each Newton correction is
     solved inexactly in the corrections' precision, and the step is shortened along its projection onto the bounds if the residual would
     exceed the largest of the last `memory` ones. Converges on a grid in a few steps; on other matrices A should be a P-matrix. Where it
-    is not, free blocks may be singular and steps lead nowhere: dense and sparse problems then go on by the proximal-point iteration, each of
-    whose problems, with A + eps D, is one of a P-matrix if A is positive semi-definite or any other P0-matrix. Where that gains nothing
-    either, the status says so: STAGNATED, or INFEASIBLE if a linear program proves it.
+    is not, free blocks may be singular and steps lead nowhere: dense and sparse problems then go on by the proximal-point iteration,
+    whose problems have A + eps D: a P-matrix if A is positive semi-definite, skew, or any other P0-matrix. Where that gains nothing
+    either, the status says so: STAGNATED, NON_DESCENT, or INFEASIBLE if a linear program proves it.
 
     Args:
         precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate rounded to float32 as well.
-        monotone_cycles: projected cycles of a cold start on a grid.
-        eta: each linear solve reduces its residual by this factor, its square once the active set has settled, or to
-            what the whole solve still needs.
+        monotone_cycles: projected cycles of a cold start on a grid; twice as many, on aggregates, where a large sparse matrix is nearly a
+            diagonally dominant M-matrix.
+        eta: each linear solve reduces its residual by this factor, or to what the whole solve still needs. On a grid it ends earlier if
+            an iterate calls other unknowns free; elsewhere it goes on to the factor's square once the active set has settled.
         max_linear_iterations: the most conjugate-gradient iterations of one step.
         backtracks: halvings of a step before it is given up.
         memory: residuals that a step may fall back to.
@@ -115,12 +119,16 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         self._kernels = kernels(self.residual.diagonal.dtype, self.system.r.dtype)
         self._rounded = layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
         self.floating: Any = None
-        self.start(warm=False, tolerance=0.0)
+        cycled = self.bounded and isinstance(problem.A, SparseOperator) and problem.A.unknowns >= LARGE
+        self.aggregates = AggregateCycles(problem.A) if cycled else None  # type: ignore[arg-type]
+        self.start(warm=True, tolerance=0.0)
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the active set; the operator may have changed."""
         cold_grid = isinstance(self.system, GridSystem) and self.bounded and not warm
         self.cycles_left = self.settings.monotone_cycles if cold_grid else 0
+        if self.aggregates is not None and not warm and self.settings.monotone_cycles > 0 and self.aggregates.refresh():
+            self.cycles_left = 2 * self.settings.monotone_cycles
         self.free.zero_()
         self.stale = True
         self.norms: list[float] = []
@@ -131,6 +139,10 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
     def monotone_cycle(self, x: wp.array[Any]) -> Step:
         """Projected cycle on all unknowns from x."""
         p, system = self.problem, self.system
+        if self.aggregates is not None:
+            self.aggregates.cycle(x, p.b, p.lower, p.upper)
+            self._round(x)
+            return Step("monotone cycle", 1, None)
         assert isinstance(system, GridSystem)
         self._flat(all_free_kernel, [p.unknown, self.free])
         if self.stale:

@@ -61,7 +61,7 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
                     const T e = unit*(T)d[k], f = e != 0 ? e : (T)1, l = lower(k), u = upper(k), v = y[k - begin];
                     const T below = f*(x[k] - l), above = f*(x[k] - u); const bool low = below < v, high = above > v;
                     const T least = low ? below : v, r0 = above > least ? above : least, r = m[k] == 1 ? r0 : (T)0;
-                    const bool held = classify & (e != 0) & (low | high);
+                    const bool held = classify & (m[k] == 1) & (low | high);
                     const bool there = x[k] == (low ? {near}l : {near}u);
                     const S at = ((e != 0) & !held) ? (S)(-v*inverse) : (S)0, mark = low ? -(S){MARK} : (S){MARK};
                     s += r*r; hold[k - begin] = held ? (there ? 1 : 3) : 0; g[k] = (held & !there) ? mark : at; }} }});

@@ -42,7 +42,7 @@ class PrimalDualActiveSet:
     Args:
         precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate rounded to float32 as well. Dense
             problems are solved in float64.
-        monotone_cycles: projected cycles of a cold start on a grid.
+        monotone_cycles: projected cycles of a cold start on a grid; see MinimumMapNewton for sparse matrices.
         eta: each linear solve reduces its residual by this factor, or to what the whole solve still needs.
         max_linear_iterations: the most conjugate-gradient iterations of one step.
         cycle: how multigrid cycles go.
@@ -138,11 +138,15 @@ class ActiveSetWorkspace(NewtonWorkspace):
         if self.floating is not None:
             self.floating.settle(x, p.lower, p.upper)
         self._round(x)
-        if watched and not self.residual.evaluate(x) <= BLOWN * self.first:  # the free block is all but singular
+        norm = self.residual.evaluate(x)
+        if watched and not norm <= BLOWN * self.first:  # the free block is all but singular
             wp.copy(x, self.trial)
             self.residual.evaluate(x)
             return self._resort(x)
-        return Step("active set", iterations, active)
+        if norm <= self.target:  # x may miss its bounds by what the criteria allow
+            self.residual.start(x, keep=True)
+            self._round(x)
+        return Step("active set", iterations, active, interim=watched and self._moved)  # whole steps may first take the residual up
 
     def _cycles(self, x: wp.array[Any]) -> bool:
         """Return whether the set has come again, now or before, without a residual much smaller than then."""
@@ -190,7 +194,7 @@ class ActiveSetWorkspace(NewtonWorkspace):
 
 
 def _basic_solution(data: DenseProblem, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Return x with y = 0 on the free unknowns, the others at their bounds; the indices that violate their condition; if x is not unique."""
+    """Return x with y = 0 on the free unknowns and the others at their bounds, what violates its condition, and if x is not unique."""
     singular = False
     x = np.where(places == LOWER, data.lower, np.where(places == UPPER, data.upper, 0.0))
     free = np.flatnonzero(places == FREE)

@@ -11,14 +11,13 @@ import warp as wp
 
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.krylov.gmres import GMRES
+from warp_lcp.multigrid.aggregates import suits_multigrid
 from warp_lcp.multigrid.algebraic import AlgebraicHierarchy, AlgebraicSettings
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.program import Launch
 from warp_lcp.solvers.principal_system_norm import WeightedNorm
 
-DOMINANT = 0.9  # share of rows that must be diagonally dominant for multigrid to serve an unsymmetric matrix
 DIRECT = 2000  # unknowns up to which factors are complete: that costs less than the iterations it saves
-POSITIVE = 0.1  # share of the off-diagonal entries' magnitude that may be positive there
 
 
 class SparsePreconditioner(Protocol):
@@ -150,16 +149,3 @@ class _Identity:
 
     def solve(self, r: np.ndarray) -> np.ndarray:
         return r
-
-
-def suits_multigrid(host: scipy.sparse.csr_array) -> bool:
-    """Return whether a matrix is near enough to a diagonally dominant M-matrix."""
-    d = host.diagonal()
-    if not (d > 0).all():
-        return False
-    off = (host - scipy.sparse.diags_array(d)).tocsr()
-    magnitude = np.abs(off).sum(axis=1)
-    total = float(magnitude.sum())
-    if total > 0 and float(off.data[off.data > 0].sum()) > POSITIVE * total:
-        return False
-    return float((magnitude <= 1.01 * d).mean()) >= DOMINANT

@@ -13,7 +13,7 @@ from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
-from warp_lcp.solve import FLOOR_MARGIN, Step
+from warp_lcp.solve import EPS, FLOOR_MARGIN, Step
 from warp_lcp.solvers.dense_problem import proved_infeasible
 
 FIRST, FACTOR, LEAST = 1e-4, 0.1, 1e-10  # eps of the first center, its factor from center to center, and the smallest
@@ -105,8 +105,10 @@ class ProximalPoint:
         self._idle += 1
         if solved and self._idle < IDLE:
             return None
-        proven = self._residual.norm > FLOOR_MARGIN * self._residual.rounding_floor(x, np.finfo(np.float64).eps) and proved_infeasible(self._problem)
-        return SolveStatus.INFEASIBLE if proven else SolveStatus.STAGNATED if solved else SolveStatus.NON_DESCENT
+        floor = FLOOR_MARGIN * self._residual.rounding_floor(x, EPS)
+        if norm > floor and proved_infeasible(self._problem):
+            return SolveStatus.INFEASIBLE
+        return SolveStatus.STAGNATED if solved else SolveStatus.NON_DESCENT
 
     def _regularized(self) -> Any:
         """Return A + eps D."""

@@ -1,0 +1,50 @@
+"""Scenes of a little sand, and how to run them."""
+
+from pathlib import Path
+from typing import Any
+
+from granular import SIMULATOR
+from granular.scene import SandScene
+from granular.simulator import SandSimulation
+
+GRAVITY = 9.81
+STEPS = 3000
+
+
+def box(low: list[float], high: list[float], **more: Any) -> dict[str, Any]:
+    """Return a box of sand or a solid one."""
+    return {"shape": "box", "min": low, "max": high, **more}
+
+
+def scene(*, size: list[float], resolution: int, sand: list[dict[str, Any]], **tables: Any) -> SandScene:
+    """Return a scene; `friction`, `solids`, `open` and `periodic` are of the domain, `cfl` is time.cfl, the rest are tables."""
+    domain = {key: tables.pop(key) for key in ("friction", "solids", "open", "periodic") if key in tables}
+    data: dict[str, Any] = {
+        "scene": {"simulator": "granular"},
+        "time": {"duration": 10.0, "cfl": tables.pop("cfl", 0.8)},
+        "domain": {"size": size, "resolution": resolution, **domain},
+        "sand": sand,
+    }
+    return SandScene.model_validate(data | tables)
+
+
+def create(model: SandScene, device: str = "cpu") -> SandSimulation:
+    """Return a simulation."""
+    return SIMULATOR.create(model, device=device, folder=Path())
+
+
+def column(dimension: int = 2, device: str = "cpu", **tables: Any) -> SandSimulation:
+    """Return a small column that collapses."""
+    size, high = [1.0, 0.5, 0.25], [0.375, 0.375, 0.25]
+    sand = [box([0.0] * dimension, high[:dimension])]
+    return create(scene(size=size[:dimension], resolution=16, sand=sand, **tables), device=device)
+
+
+def advance(simulation: SandSimulation, until: float, dt_max: float = 5e-3) -> list[dict[str, Any]]:
+    """Step to a time and return the rows of the log."""
+    rows: list[dict[str, Any]] = []
+    while simulation.time < until - 1e-9:
+        assert len(rows) < STEPS, "the time step has become too small to get anywhere"
+        dt = min(simulation.stable_dt(), dt_max, until - simulation.time)
+        rows.append({"dt": dt, **simulation.step(dt)})
+    return rows

@@ -1,0 +1,227 @@
+"""The passes over a grid that Newton-type methods make on the CPU: each against the same thing written out with a dense matrix."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warp_lcp as wl
+from oracle import assemble, natural_residual
+from warp_lcp.krylov import ConjugateGradient
+from warp_lcp.residual import NaturalResidual
+from warp_lcp.solvers.interior_point import InteriorPoint
+from warp_lcp.solvers.interior_point_grid import GridPath
+from warp_lcp.solvers.nonsmooth_map import Kink, NonsmoothMap, Reformulation
+from warp_lcp.solvers.nonsmooth_map_grid import GridMap
+from warp_lcp.solvers.principal_system import GridSystem
+
+SHAPE = (6, 7, 21)
+FACES = [{}, {"face_y": 3.0}, "arrays"]
+
+
+def scene(form, lower=0.0, upper=np.inf):
+    """A grid with AIR and SOLID, its dense matrix, and a problem on it."""
+    rng = np.random.default_rng(411)
+    cells = rng.choice([wl.AIR, wl.FLUID, wl.SOLID], size=SHAPE, p=[0.15, 0.75, 0.1])
+    faces = form
+    if form == "arrays":
+        faces = {f"face_{a}": 0.2 + rng.random([n + (i == j) for j, n in enumerate(SHAPE)]) for i, a in ((2, "x"), (1, "y"), (0, "z"))}
+    A = assemble(cells, [faces.get(f"face_{a}", 1.0) for a in "xyz"])
+    b = rng.standard_normal(SHAPE)
+    problem = wl.LCP(wl.GridPoisson(cells, device="cpu", dtype=wp.float64, **faces), b, lower, upper)
+    return SimpleNamespace(cells=cells, fluid=cells.ravel() == wl.FLUID, A=A, b=b.ravel(), problem=problem, rng=rng)
+
+
+def stored(s, values, dtype=wp.float64):
+    return s.problem.layout.load(np.asarray(values).reshape(SHAPE), dtype)
+
+
+def inner(field):
+    return field.numpy().reshape([n + 2 for n in SHAPE])[1:-1, 1:-1, 1:-1].ravel().astype(np.float64)
+
+
+@pytest.mark.parametrize("form", FACES, ids=str)
+@pytest.mark.parametrize("shifted", [False, True])
+def test_conjugate_gradients_solve_the_masked_and_shifted_system(form, shifted):
+    """A row of A p taken before the plane above is made, or a step of the wrong sign, would leave a residual; so would a lost shift."""
+    s = scene(form)
+    free = s.fluid & (s.rng.random(s.fluid.size) < 0.8)
+    shift = 10 ** s.rng.uniform(-2, 6, s.fluid.size) if shifted else np.zeros(s.fluid.size)
+    b = s.rng.standard_normal(s.fluid.size) * free
+    system = GridSystem(s.problem.A, wp.float64, bounded=False, shifted=shifted)
+    assert system.fused
+    system.restrict(stored(s, free, wp.uint8), stored(s, shift) if shifted else None)
+    for _ in range(2):  # again: nothing of the last solve may be left
+        system.r.assign(stored(s, b))
+        iterations, norm = system.solve(1e-11, 100)
+        e = inner(system.e)
+        np.testing.assert_array_equal(e[~free], 0.0)
+        M = (s.A + np.diag(shift))[np.ix_(free, free)]
+        left = M @ e[free] - b[free]
+        assert np.linalg.norm(left / np.sqrt(np.diag(M)) if shifted else left) <= 1e-10
+        assert norm <= 1e-11
+    weight = system._weight if shifted else None
+    plain = ConjugateGradient(system.hierarchy.finest.stencil.product, system, weight=weight)
+    system.r.assign(stored(s, b))
+    assert abs(plain.solve(1e-11, 100)[0] - iterations) <= 1
+
+
+def test_conjugate_gradients_stop_without_a_right_hand_side():
+    s = scene({})
+    system = GridSystem(s.problem.A, wp.float32, bounded=False)
+    system.restrict(stored(s, s.fluid, wp.uint8))
+    system.r.zero_()
+    assert system.solve(0.0, 50) == (1, 0.0)
+    assert not system.e.numpy().any()
+
+
+@pytest.mark.parametrize("form", FACES, ids=str)
+@pytest.mark.parametrize("upper", [np.inf, 0.4])
+@pytest.mark.parametrize("share", [1.0, 0.9])
+@pytest.mark.parametrize("real", [wp.float32, wp.float64])
+def test_a_fischer_step_is_its_move_its_residual_and_its_system(form, upper, share, real):
+    """Against the map's separate kernels, which other tests hold to finite differences, and the dense residual."""
+    s = scene(form, lower=np.where(np.arange(np.prod(SHAPE)) % 3, 0.0, -np.inf).reshape(SHAPE), upper=upper)
+    residual = NaturalResidual(s.problem)
+    kind = Reformulation.FISCHER if share == 1 else Reformulation.PENALIZED
+    map_ = NonsmoothMap(s.problem, residual, kind, share, real, Kink.PERTURBATION)
+    system = GridSystem(s.problem.A, real, bounded=False, shifted=True)
+    start, e = (s.rng.standard_normal(s.fluid.size) * s.fluid for _ in range(2))
+    e, step, scale = e.astype(np.float32).astype(np.float64), 0.3, 0.7
+    x, moved = stored(s, start), start + step * e
+    system.e.assign(stored(s, e, real))
+    passes = GridMap(map_, system.hierarchy, system.e)
+    merit = passes.advance(x, step, scale, 1)
+    np.testing.assert_allclose(inner(x), moved, rtol=1e-12, atol=1e-12)
+    lower, tol = np.where(np.arange(s.fluid.size) % 3, 0.0, -np.inf), 1e-5 if real is wp.float32 else 1e-12
+    l, u, f = lower[s.fluid], np.full(s.fluid.sum(), upper), np.ix_(s.fluid, s.fluid)
+    assert residual.norm == pytest.approx(natural_residual(s.A[f], s.b[s.fluid], l, u, moved[s.fluid]), rel=1e-12)
+    r, d, norm = inner(system.r), inner(system.hierarchy.finest.stencil.d), passes.norm
+    shift, free = s.problem.layout.zeros(wp.float64), s.problem.layout.zeros(wp.uint8)
+    residual.evaluate(x)
+    assert map_.condense(x, shift, system.r, free, scale, 1) == pytest.approx(merit, rel=10 * tol)
+    np.testing.assert_allclose(r, inner(system.r), rtol=10 * tol, atol=tol * np.abs(r).max())
+    np.testing.assert_allclose(d, (np.diag(s.A) + inner(shift)) * s.fluid, rtol=100 * tol, atol=tol)
+    assert norm == pytest.approx(np.sqrt(np.sum(r[s.fluid] ** 2 / np.where(d > 0, d, 1)[s.fluid])), rel=10 * tol)
+
+
+@pytest.mark.parametrize("form", FACES, ids=str)
+@pytest.mark.parametrize("upper", [np.inf, 2.0])
+def test_a_step_along_the_path_is_mehrotras(form, upper):
+    """Predictor, ratios, corrector and move from their formulas; a product with an infinite w must count for nothing."""
+    s = scene(form, lower=np.where(np.arange(np.prod(SHAPE)) % 3, 0.0, -np.inf).reshape(SHAPE), upper=upper)
+    n, fluid, rng, two = s.fluid.size, s.fluid, s.rng, np.isfinite(upper)
+    lower = np.where(np.arange(n) % 3, 0.0, -np.inf)
+    low, x = fluid & np.isfinite(lower), (0.2 + rng.random(n)) * fluid
+    w, sl = np.where(low, x - lower, np.inf), np.where(low, rng.random(n), 0.0)
+    v, t = (np.where(fluid, upper - x, np.inf), np.where(fluid, rng.random(n), 0.0)) if two else (np.full(n, np.inf), np.zeros(n))
+    size, tau, length, scale = 1.7, 0.05, 0.4, 0.6
+    e, a = (rng.standard_normal(n) * fluid * 0.1 for _ in range(2))
+    system = GridSystem(s.problem.A, wp.float64, bounded=False, shifted=True)
+    residual, predicted = NaturalResidual(s.problem), s.problem.layout.zeros(wp.float64)
+    W, S = stored(s, w), stored(s, sl)
+    pairs = [W, stored(s, v) if two else W, S, stored(s, t) if two else S]
+    path = GridPath(residual, system.hierarchy, pairs, stored(s, fluid, wp.uint8), system.e, predicted)
+    X = stored(s, x)
+
+    def condensed():
+        y, D = s.A @ inner(X) + s.b, sl / w + t / v
+        np.testing.assert_allclose(inner(system.r)[fluid], -scale * y[fluid], rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(inner(system.hierarchy.finest.stencil.d), (np.diag(s.A) + D) * fluid, rtol=1e-12)
+        weights = (np.diag(s.A) + D)[fluid]
+        assert path.norm == pytest.approx(np.sqrt(np.sum((scale * y[fluid]) ** 2 / np.where(weights > 0, weights, 1))), rel=1e-6)
+        f = np.ix_(fluid, fluid)
+        expected = natural_residual(s.A[f], s.b[fluid], lower[fluid], np.full(fluid.sum(), upper), inner(X)[fluid])
+        assert residual.norm == pytest.approx(expected, rel=1e-12)
+
+    path.advance(X, (0.0, 0.0, 0.0, 0.0), 0.0, scale)
+    condensed()
+    left = rng.standard_normal(n) * fluid  # of the predictor's residual
+    system.r.assign(stored(s, left))
+    system.e.assign(stored(s, a))
+    da = size * a
+    dsa, dta = -sl - sl / w * da, -t + t / v * da
+    longest, products = path.ratios((size, 0.0, 0.0, 0.0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rates = [-da / w, np.where(sl > 0, -dsa / sl, 0), da / v, np.where(t > 0, -dta / t, 0)]
+    assert longest == pytest.approx(max(r[fluid].max() for r in rates), rel=1e-12)
+    assert products == pytest.approx(np.sum((da * dsa - da * dta)[fluid]), rel=1e-10)
+    path.center(size, tau)
+    right = (left + ((tau - da * dsa) / w - (tau + da * dta) / v) / size) * fluid
+    np.testing.assert_allclose(inner(system.r), right, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(inner(predicted), a, rtol=1e-12)
+    system.e.assign(stored(s, e))
+    dx = size * e + da
+    ds = (tau - da * dsa) / w - sl - sl / w * dx
+    dt = (tau + da * dta) / v - t + t / v * dx
+    assert path.ratios((size, 1.0, 1.0, tau))[1] == pytest.approx(np.sum((dx * ds - dx * dt)[fluid]), rel=1e-10)
+    path.advance(X, (size, 1.0, 1.0, tau), length, scale)
+    x, w, sl, v, t = x + length * dx, w + length * dx, sl + length * ds, v - length * dx, t + length * dt
+    np.testing.assert_allclose(inner(X)[fluid], x[fluid], rtol=1e-12, atol=1e-12)
+    for field, expected in zip(pairs, (w, v, sl, t) if two else (w, w, sl, sl), strict=True):
+        np.testing.assert_allclose(inner(field)[fluid], expected[fluid], rtol=1e-10, atol=1e-12)
+    bounded = np.where(sl > 0, np.where(np.isfinite(w), w, 0) * sl, 0) + np.where(t > 0, np.where(np.isfinite(v), v, 0) * t, 0)
+    assert path.products == pytest.approx(bounded[fluid].sum(), rel=1e-10)
+    condensed()
+
+
+@pytest.mark.parametrize("precision", ["mixed", "single"])
+@pytest.mark.parametrize("periodic", [(False,) * 3, (True, True, True)])
+def test_what_the_minimum_map_holds_goes_to_its_bound(precision, periodic):
+    """The right-hand side must be that of the moved unknowns, in neighboring rows and across a periodic side as well."""
+    rng = np.random.default_rng(97)
+    cells = rng.choice([wl.AIR, wl.FLUID], size=SHAPE, p=[0.2, 0.8])
+    A, b, fluid = assemble(cells, periodic=periodic), rng.standard_normal(SHAPE).ravel(), cells.ravel() == wl.FLUID
+    lower, upper = -rng.random(SHAPE), rng.random(SHAPE)
+    problem = wl.LCP(wl.GridPoisson(cells, device="cpu", periodic=periodic), b.reshape(SHAPE), lower, upper)
+    work = wl.MinimumMapNewton(precision=precision).init(problem)
+    start = rng.uniform(-0.5, 0.5, SHAPE).astype(np.float32).astype(np.float64) * (cells == wl.FLUID)
+    residual = work.residual
+    residual.start(work.x, keep=False)
+    work.x.assign(problem.layout.load(start, wp.float64))
+    residual.classify = True
+    norm = residual.evaluate(work.x)
+    x, y, d = start.ravel(), A @ start.ravel() + b, np.where(np.diag(A) > 0, np.diag(A), 1.0)
+    l, u = lower.ravel(), upper.ravel()
+    r = d * (x - np.clip(x - y / d, l, u))
+    assert norm == pytest.approx(np.linalg.norm(r[fluid]), rel=1e-10)
+    low, high = fluid & (x - y / d < l), fluid & (x - y / d > u)
+    assert residual.away
+    assert residual.active == np.count_nonzero(low | high)
+    residual.hold(work.x)
+    rounded = (lambda a: a.astype(np.float32).astype(np.float64)) if precision == "single" else (lambda a: a)
+    x = np.where(low, rounded(l), np.where(high, rounded(u), x))
+    np.testing.assert_allclose(inner(work.x), x, rtol=0, atol=0)
+    free = fluid & ~low & ~high
+    expected = np.where(free, -(A @ x + b), 0.0) / residual.norm_of_b()
+    np.testing.assert_allclose(inner(work.hierarchy.finest.b), expected, rtol=1e-5, atol=1e-6)
+    assert not residual.away
+
+
+@pytest.mark.parametrize("crossover", [0.0, 1e-2])
+def test_unknowns_without_neighbors_are_solved_too(crossover):
+    """The interior-point method moves them off their bounds, where the method that it hands over to must not leave them."""
+    cells = np.full((9, 9, 9), wl.FLUID)
+    cells[0], cells[4:, :, 4] = wl.AIR, wl.SOLID
+    cells[5:8, 3:6, 3:6] = wl.SOLID
+    cells[6, 4, 4] = wl.FLUID
+    b = np.random.default_rng(5).standard_normal(cells.shape)
+    for sign, expected in ((1.0, 0.0), (-1.0, 0.7)):
+        b[6, 4, 4] = 0.5 * sign
+        problem = wl.LCP(wl.GridPoisson(cells, device="cpu"), b, 0.0, 0.7)
+        result = wl.solve(problem, InteriorPoint(crossover=crossover), stopping=wl.StoppingCriteria(rtol=1e-9, max_iterations=200))
+        assert result
+        assert result.x.numpy()[6, 4, 4] == pytest.approx(expected, abs=1e-7)
+
+
+@pytest.mark.parametrize("method", [wl.MinimumMapNewton(backtracks=0), wl.MinimumMapNewton(), wl.MinimumMapNewton(memory=1)], ids=str)
+def test_a_bad_guess_is_left_by_shorter_steps_or_projected_cycles(method):
+    """From a random warm start Newton's first steps raise the residual; the solution is that of a cold start all the same."""
+    s = scene({}, lower=-0.2, upper=0.3)
+    tight = wl.StoppingCriteria(rtol=1e-9)
+    cold = wl.solve(s.problem, method, stopping=tight)
+    warm = wl.solve(s.problem, method, stopping=tight, x0=s.rng.uniform(-0.2, 0.3, SHAPE))
+    assert cold
+    assert warm
+    np.testing.assert_allclose(warm.x.numpy(), cold.x.numpy(), atol=1e-7)
