@@ -17,6 +17,7 @@ LEAST_MASS = 0.1  # of a face, in units of a full one: lighter ones would make t
 DENSE = 0.5  # the fraction from which a cell carries shear
 SURFACE = 0.3  # the fraction from which a cell beside air counts as full: a partly filled one has no pressure, and so no friction
 FIRM_FRACTION = 0.9  # from which cohesion holds a cell together
+LANES = 16  # cells of a vector
 ROUNDING = 1e-6  # by which a fraction may differ from 1 and count as 1
 
 _F32 = wp.array3d(dtype=wp.float32)
@@ -233,7 +234,7 @@ def span_kernel(cells: CellRange, flags: _U8, own: wp.array3d(dtype=wp.int32)):
 @wp.kernel(**options)
 @typing.no_type_check
 def widen_kernel(cells: CellRange, own: wp.array3d(dtype=wp.int32), wide: wp.array3d(dtype=wp.int32)):
-    """The span of a row and the rows around it, a cell wider on both sides, within the range."""
+    """The span of a row and the rows around it, a cell wider on both sides, rounded up to whole vectors, within the range."""
     plane, row = wp.tid()
     k = cells.k + plane
     j = cells.j + row
@@ -248,5 +249,10 @@ def widen_kernel(cells: CellRange, own: wp.array3d(dtype=wp.int32), wide: wp.arr
         wide[k, j, 0] = 0
         wide[k, j, 1] = 0
     else:
-        wide[k, j, 0] = wp.max(low - 1, cells.i)
-        wide[k, j, 1] = wp.min(high + 1, cells.end)
+        low = wp.max(low - 1, cells.i)
+        high = wp.min(high + 1, cells.end)
+        # whole vectors of cells, which may lie on either side; what is left of a row takes as long as a vector
+        more = (high - low + LANES - 1) / LANES * LANES - (high - low)
+        right = wp.min(more, wp.max(cells.end - 1 - high, 0))
+        wide[k, j, 0] = wp.max(low - (more - right), cells.i)
+        wide[k, j, 1] = high + right

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from granular.checkerboard import damping_kernel
 from granular.packing import SHEARS, Packing, three, wall_faces
 from granular.stress_kernels import BETA_X, NEXT_X, PERIOD, RESIDUAL_X, STATE, momentum_kernel, stress_kernels
 from granular.yield_set import COLUMNS, LOOKAHEAD, NUMBERS, PRESSURE_STEP, SHEAR_STEP
@@ -171,6 +172,8 @@ class Stress:
         self.walls.activate(flags)
         inputs = [p.flags, p.stiff, *three(p.share), decay, self.now, self._before, self._point]
         p.grid.domain.launch(self.velocity.kernels.admit, inputs)
+        inputs = [p.flags, *three(p.share), self._point, self.now]
+        p.grid.domain.launch(damping_kernel(p.grid.dimension), inputs)
         self.dt = dt
 
     def restart(self, *, pressure_step: float, shear_step: float, lookahead: float, momentum: float) -> None:

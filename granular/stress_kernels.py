@@ -104,7 +104,7 @@ CELLS = """
     const T k_yield = (T)numbers.data[FRICTION], cohesion = (T)numbers.data[COHESION];
     const T least = -(T)numbers.data[TENSION];
     const T pressure_step = RESIDUAL ? (T)1 : (T)numbers.data[PRESSURE_STEP], stress_step = RESIDUAL ? (T)1 : (T)numbers.data[SHEAR_STEP];
-    auto start = [&](int c, long long i, T beta) {
+    auto start = [&](int c, long long i, T beta) INLINE {
         const T x = (T)now[c*layer + i];
         return RESIDUAL ? x : x + beta*(x - (T)before[c*layer + i]);
     };
@@ -142,7 +142,7 @@ CELLS = """
         }
         const T shrink = yield(normal2, largest, r, cap), keep = sheared ? shrink : (T)0;
         T es = 0, ee = 0, ss = 0;
-        auto put = [&](int c, T value, T from, T weight, T ahead, int held) {  // held: the copies on walls are the walls'
+        auto put = [&](int c, T value, T from, T weight, T ahead, int held) INLINE {  // held: the copies on walls are the walls'
             const long long at = c*layer + i;
             const float old = now[at], earlier = before[at], ahead_of = point[at];
             const T s_ = value - (T)old, e_ = value - from, share_ = held ? (T)0 : weight;

@@ -42,11 +42,11 @@ SHAPE = """
 # mu is the root of 1/r - 1/sqrt(|n|^2/2 + sum m^2), nearly linear in mu. The box of Narain et al.
 # bounds each part by itself instead: |n|^2 / 2 <= r^2, |b_q| <= r.
 YIELD = """
-    auto larger = [](T a, T b) { return a > b ? a : b; };
-    auto smaller = [](T a, T b) { return a < b ? a : b; };
-    auto magnitude = [](T a) { return a < (T)0 ? -a : a; };
+    auto larger = [](T a, T b) INLINE { return a > b ? a : b; };
+    auto smaller = [](T a, T b) INLINE { return a < b ? a : b; };
+    auto magnitude = [](T a) INLINE { return a < (T)0 ? -a : a; };
     // how much n shrinks, and the largest |b| of each shear
-    auto yield = [&](T normal2, const T (&largest)[SHEARS][4], T r, T (&cap)[SHEARS]) {
+    auto yield = [&](T normal2, const T (&largest)[SHEARS][4], T r, T (&cap)[SHEARS]) INLINE {
         if (BOX) {
             for (int d = 0; d < SHEARS; ++d) cap[d] = r;
             return smaller(r/larger(sqrt(normal2), (T)LEAST_RADIUS), (T)1);
@@ -80,7 +80,7 @@ YIELD = """
         return onto/((T)1 + mu);
     };
     // sums of the one, two, three, four largest
-    auto sums = [&](T a, T b, T c, T d, T (&out)[4]) {
+    auto sums = [&](T a, T b, T c, T d, T (&out)[4]) INLINE {
         const T ab = larger(a, b), ba = smaller(a, b), cd = larger(c, d), dc = smaller(c, d);
         const T low = smaller(ab, cd), high = larger(ba, dc);
         out[0] = larger(ab, cd); out[1] = out[0] + larger(low, high); out[2] = out[1] + smaller(low, high);
@@ -147,6 +147,15 @@ WALL_FACE = """
     };
 """
 
+# Vectorized loops may call nothing: small functions inside them must vanish, however large the loop grows.
+INLINE = """
+#ifdef __CUDA_ARCH__
+#define INLINE
+#else
+#define INLINE __attribute__((always_inline))
+#endif
+"""
+
 
 def native(source: str, dimension: int, real: Any, *, box: bool, **numbers: int) -> str:
     """Return the body of a native function for 2 or 3 dimensions and velocities of `real`; words in `numbers` become their values.
@@ -160,7 +169,7 @@ def native(source: str, dimension: int, real: Any, *, box: bool, **numbers: int)
         box: Narain's box instead of the cone.
         numbers: more words and their values.
     """
-    source = f"typedef {C_TYPES[real]} T;\n" + source
+    source = INLINE + f"typedef {C_TYPES[real]} T;\n" + source
     for word, value in (CONSTANTS | {"DIM": dimension, "BOX": int(box)} | numbers).items():
         source = re.sub(rf"\b{word}\b", str(value), source)
     return simd(source.replace("UNROLL ", "\n#ifndef __CUDA_ARCH__\n#pragma clang loop unroll(full)\n#endif\n"))

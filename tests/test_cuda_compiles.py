@@ -12,7 +12,8 @@ import warp as wp
 import fluids
 import granular
 import warp_lcp as wl
-from warp_lcp.grid import transfer_kernels
+from granular.periodic import ring_kernels
+from warp_lcp.grid import advection_kernels, distance_advection_kernels, transfer_kernels
 from warp_lcp.material.density_correction_kernels import displacement_kernel
 from warp_lcp.multigrid import CycleSettings
 from warp_lcp.solvers.mprgp import MPRGP
@@ -108,6 +109,11 @@ def test_all_kernels_compile_for_sm_80_and_sm_90(tmp_path):
     use_every_kernel()
     for cut in (False, True):
         displacement_kernel(cut)
+    for endless in (0, 1, 4, 5):
+        advection_kernels.advect_kernel(endless)
+        distance_advection_kernels.advect_kernel(endless)
+    for dtype in (wp.int8, wp.uint8, wp.int32, wp.float32, wp.float64):
+        ring_kernels(dtype)
     use_sparse_kernels()
     use_sweeping_kernels()
     use_gradient_projection_kernels()

@@ -59,13 +59,13 @@ def make_boundary(
             raise ValueError('wall_velocity: only for solids = "voxel"; solids that cut cells have a motion')
         cut = CutCells(grid, placed, wall_separating=separating, open_sides=sides)
         if not cut.whole_cells:
-            return CutBoundary(grid, cut), cut.notes
+            return CutBoundary(grid, cut, endless=scene.endless), cut.notes
     solids = voxelize(
         grid.counts, grid.spacing, grid.dimension, placed, wall_separating=separating, device=grid.device, open_sides=sides
     )  # fmt: skip
     if wall_velocity is None and scene.source:
         wall_velocity = np.zeros((1 + len(placed), 3))  # what a source's faces are given goes there
-    return WholeCells(grid, solids, wall_velocity, open_sides=sides), solids.notes
+    return WholeCells(grid, solids, wall_velocity, open_sides=sides, endless=scene.endless), solids.notes
 
 
 def seed_materials(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, folder: Path) -> tuple[np.ndarray, np.ndarray, list[str]]:

@@ -83,6 +83,11 @@ class ParticleScene(Scene):
         """Return the key of the material's shapes in the file, such as `liquid`, and the shapes."""
 
     @property
+    def endless(self) -> tuple[int, ...]:
+        """Return the axes without an end: what leaves at one side comes in at the other."""
+        return ()
+
+    @property
     def open_sides(self) -> list[str]:
         """Return the names of the domain's sides without a wall."""
         return list(self.domain.open)

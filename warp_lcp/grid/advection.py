@@ -32,7 +32,9 @@ def clearance(grid: StaggeredGrid, cells: wp.array) -> wp.array:
     return room
 
 
-def advect(grid: StaggeredGrid, fields: list[wp.array], room: wp.array, dt: float, position: wp.array, stopped: wp.array) -> None:
+def advect(
+    grid: StaggeredGrid, fields: list[wp.array], room: wp.array, dt: float, position: wp.array, stopped: wp.array, endless: int = 0
+) -> None:  # fmt: skip
     """Move particles through the grid's velocity for a time step.
 
     Args:
@@ -42,8 +44,10 @@ def advect(grid: StaggeredGrid, fields: list[wp.array], room: wp.array, dt: floa
         dt: time step [s].
         position: [m], shape (n,) (updated).
         stopped: int32, shape (1,): raised by the number of particles that a closed face stopped.
+        endless: has bit n set if axis n has no end: velocities beyond its sides are those at the other, as the ring's are. Particles may
+            end up there.
     """
     u, v, w = [*fields, None][:3]
     inverse = 1.0 / grid.spacing
     inputs = [grid.planes, grid.spacing, inverse, dt * inverse, position, u, v, w, room, stopped]
-    launch(advect_kernel, len(position), inputs, grid.device)
+    launch(advect_kernel(endless), len(position), inputs, grid.device)

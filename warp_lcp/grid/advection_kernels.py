@@ -1,6 +1,7 @@
 # mypy: ignore-errors
 """The kernel that moves particles, and the one that measures how far solids are."""
 
+import functools
 import typing
 
 import warp as wp
@@ -36,6 +37,9 @@ WALK = """
                 x[axis] -= (T)side*margin; rest[axis] = 0; ++stopped;
             } else {
                 cell[axis] += side;
+                if ((ENDLESS >> axis & 1) && (cell[axis] < 1 || cell[axis] > counts[axis])) {  // in again at the other side
+                    cell[axis] -= side*counts[axis]; x[axis] -= (T)(side*counts[axis]);
+                }
                 if (cell[axis] < 1 || cell[axis] > counts[axis]) {  // out through an open side: there is nothing to meet
                     for (int d = 0; d <= planes; ++d) to[d][m] = x[d] + rest[d];
                     hit[m] = stopped > 0;
@@ -94,24 +98,29 @@ ROOM = """
 """
 
 
-@wp.func_native(runge_kutta(ROOM + WALK + MOVE))
-def advect_some(
-    planes: int, dx: float, inverse_dx: float, h: float, x_: wp.array(dtype=wp.vec3), u_: wp.array3d(dtype=wp.float32),
-    v_: wp.array3d(dtype=wp.float32), w_: wp.array3d(dtype=wp.float32), room_: wp.array3d(dtype=wp.int8), first: int, last: int,
-) -> int: ...  # fmt: skip
+@functools.cache
+def advect_kernel(endless: int):
+    """Return the kernel for a domain whose axis n has no end where bit n is set."""
 
+    @wp.func_native(runge_kutta(ROOM + WALK + MOVE, endless))
+    def advect_some(
+        planes: int, dx: float, inverse_dx: float, h: float, x_: wp.array(dtype=wp.vec3), u_: wp.array3d(dtype=wp.float32),
+        v_: wp.array3d(dtype=wp.float32), w_: wp.array3d(dtype=wp.float32), room_: wp.array3d(dtype=wp.int8), first: int, last: int,
+    ) -> int: ...  # fmt: skip
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.advection")
-def advect_kernel(
-    count: int, grain: int, planes: int, dx: float, inverse_dx: float, h: float, position: wp.array(dtype=wp.vec3),
-    u: wp.array3d(dtype=wp.float32), v: wp.array3d(dtype=wp.float32), w: wp.array3d(dtype=wp.float32), room: wp.array3d(dtype=wp.int8),
-    stopped: wp.array(dtype=wp.int32),
-):  # fmt: skip
-    """One Runge-Kutta step of some particles; h is the time step in units of 1 / (velocity in cells)."""
-    first = wp.tid() * grain
-    hits = advect_some(planes, dx, inverse_dx, h, position, u, v, w, room, first, wp.min(first + grain, count))
-    if hits > 0:
-        wp.atomic_add(stopped, 0, hits)
+    @wp.kernel(enable_backward=False, module="warp_lcp.grid.advection" + (f"_{endless}" if endless else ""))
+    def advect_particles(
+        count: int, grain: int, planes: int, dx: float, inverse_dx: float, h: float, position: wp.array(dtype=wp.vec3),
+        u: wp.array3d(dtype=wp.float32), v: wp.array3d(dtype=wp.float32), w: wp.array3d(dtype=wp.float32), room: wp.array3d(dtype=wp.int8),
+        stopped: wp.array(dtype=wp.int32),
+    ):  # fmt: skip
+        """One Runge-Kutta step of some particles; h is the time step in units of 1 / (velocity in cells)."""
+        first = wp.tid() * grain
+        hits = advect_some(planes, dx, inverse_dx, h, position, u, v, w, room, first, wp.min(first + grain, count))
+        if hits > 0:
+            wp.atomic_add(stopped, 0, hits)
+
+    return advect_particles
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.clearance")

@@ -29,6 +29,7 @@ def advect_with_distance(
     stopped: wp.array,
     *,
     open_sides: int = 0,
+    endless: int = 0,
 ) -> None:
     """Move particles through the grid's velocity for a time step; nobody ends within MARGIN cells of a wall who did not start there.
 
@@ -44,11 +45,12 @@ def advect_with_distance(
         position: [m], shape (n,) (updated).
         stopped: int32, shape (1,): raised by the number of particles that met a wall.
         open_sides: of `warp_lcp.grid.sides.side_bits`: they stop nobody. Who crosses them ends on them or beyond.
+        endless: has bit n set if axis n has no end, see `warp_lcp.grid.advection.advect`; its sides are open, and alike.
     """
     u, v, w = [*fields, None][:3]
     inverse = 1.0 / grid.spacing
     inputs = [grid.planes, grid.spacing, inverse, dt * inverse, position, u, v, w, distance, open_sides, stopped]
-    launch(advect_kernel, len(position), inputs, grid.device)
+    launch(advect_kernel(endless), len(position), inputs, grid.device)
 
 
 def push_out(grid: StaggeredGrid, distance: wp.array, position: wp.array, moved: wp.array, left: wp.array, *, open_sides: int = 0) -> None:

@@ -1,6 +1,8 @@
 # mypy: ignore-errors
 """The kernels that move particles among walls given by their distance, and out of walls that have moved."""
 
+import functools
+
 import warp as wp
 
 from warp_lcp.grid.particle_loops import particle_loop
@@ -27,6 +29,7 @@ DISTANCE = """
     auto into_domain = [&](T* x) {
         for (int d = 0; d <= planes; ++d) {
             const T end = counts[d] + 1;
+            if (ENDLESS >> d & 1) { x[d] = x[d] < 1 ? x[d] + (T)counts[d] : x[d]; x[d] = x[d] < end ? x[d] : x[d] - (T)counts[d]; }
             x[d] = x[d] > 1 ? x[d] : (T)1; x[d] = x[d] < end ? x[d] : end;
         }
     };
@@ -88,7 +91,7 @@ PROJECT = """
                 y[d] += side ? (T)0.5 : (T)-0.5;
                 const T beyond = y[d];
                 into_domain(y);
-                s[side] = measure(y, g) - (beyond > y[d] ? beyond - y[d] : y[d] - beyond);
+                s[side] = measure(y, g) - ((ENDLESS >> d & 1) ? (T)0 : beyond > y[d] ? beyond - y[d] : y[d] - beyond);
             }
             n[d] = s[1] - s[0];
         }
@@ -303,32 +306,37 @@ def _named(source: str) -> str:
     return source
 
 
-@wp.func_native(runge_kutta(_named("DISTANCE PROJECT" + MARCH + MOVE)))
-def advect_some(
-    planes: int, dx: float, inverse_dx: float, h: float, x_: wp.array(dtype=wp.vec3), u_: wp.array3d(dtype=wp.float32),
-    v_: wp.array3d(dtype=wp.float32), w_: wp.array3d(dtype=wp.float32), distance_: wp.array3d(dtype=wp.float32), open_sides: int,
-    first: int, last: int,
-) -> int: ...  # fmt: skip
-
-
-@wp.func_native(particle_loop(BLOCK + _named(PUSH_OUT).replace("MARGIN", repr(MARGIN))))
+@wp.func_native(particle_loop(BLOCK + _named(PUSH_OUT).replace("MARGIN", repr(MARGIN)).replace("ENDLESS", "0")))
 def push_some(
     planes: int, dx: float, inverse_dx: float, x_: wp.array(dtype=wp.vec3), distance_: wp.array3d(dtype=wp.float32), open_sides: int,
     first: int, last: int,
 ) -> int: ...  # fmt: skip
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.distance_advection")
-def advect_kernel(
-    count: int, grain: int, planes: int, dx: float, inverse_dx: float, h: float, position: wp.array(dtype=wp.vec3),
-    u: wp.array3d(dtype=wp.float32), v: wp.array3d(dtype=wp.float32), w: wp.array3d(dtype=wp.float32),
-    distance: wp.array3d(dtype=wp.float32), open_sides: int, stopped: wp.array(dtype=wp.int32),
-):  # fmt: skip
-    """One Runge-Kutta step of some particles; h is the time step in units of 1 / (velocity in cells)."""
-    first = wp.tid() * grain
-    hits = advect_some(planes, dx, inverse_dx, h, position, u, v, w, distance, open_sides, first, wp.min(first + grain, count))
-    if hits > 0:
-        wp.atomic_add(stopped, 0, hits)
+@functools.cache
+def advect_kernel(endless: int):
+    """Return the kernel for a domain whose axis n has no end where bit n is set."""
+
+    @wp.func_native(runge_kutta(_named("DISTANCE PROJECT" + MARCH + MOVE), endless))
+    def advect_some(
+        planes: int, dx: float, inverse_dx: float, h: float, x_: wp.array(dtype=wp.vec3), u_: wp.array3d(dtype=wp.float32),
+        v_: wp.array3d(dtype=wp.float32), w_: wp.array3d(dtype=wp.float32), distance_: wp.array3d(dtype=wp.float32), open_sides: int,
+        first: int, last: int,
+    ) -> int: ...  # fmt: skip
+
+    @wp.kernel(enable_backward=False, module="warp_lcp.grid.distance_advection" + (f"_{endless}" if endless else ""))
+    def advect_particles(
+        count: int, grain: int, planes: int, dx: float, inverse_dx: float, h: float, position: wp.array(dtype=wp.vec3),
+        u: wp.array3d(dtype=wp.float32), v: wp.array3d(dtype=wp.float32), w: wp.array3d(dtype=wp.float32),
+        distance: wp.array3d(dtype=wp.float32), open_sides: int, stopped: wp.array(dtype=wp.int32),
+    ):  # fmt: skip
+        """One Runge-Kutta step of some particles; h is the time step in units of 1 / (velocity in cells)."""
+        first = wp.tid() * grain
+        hits = advect_some(planes, dx, inverse_dx, h, position, u, v, w, distance, open_sides, first, wp.min(first + grain, count))
+        if hits > 0:
+            wp.atomic_add(stopped, 0, hits)
+
+    return advect_particles
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.push_out")

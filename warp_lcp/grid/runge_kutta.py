@@ -9,7 +9,8 @@ from warp_lcp.native import BLOCK
 
 MARGIN = 1e-3  # how far from a wall particles stay, in cells: well above the rounding of float32 positions in 10^3 cells
 
-# Interpolate the velocity at grid coordinates; points outside the domain and NaN are brought inside.
+# Interpolate the velocity at grid coordinates; points outside the domain and NaN are brought inside, along axes without an end from the
+# other side.
 SAMPLE = """
     auto sample = [&](const Block& at, Block& result, int n) {
         const T ex = nx + 1, ey = ny + 1, ez = nz + 1;
@@ -18,6 +19,8 @@ SAMPLE = """
             const T hx = axis == 0 ? (T)0 : (T)0.5, hy = axis == 1 ? (T)0 : (T)0.5, hz = axis == 2 ? (T)0 : (T)0.5;
             SIMD for (int m = 0; m < n; ++m) {
                 T x = at[0][m], y = at[1][m], z = at[2][m];
+                if (ENDLESS & 1) { x = x < 1 ? x + (T)nx : x; x = x < ex ? x : x - (T)nx; }
+                if (ENDLESS & 4) { z = z < 1 ? z + (T)nz : z; z = z < ez ? z : z - (T)nz; }
                 x = x > 1 ? x : (T)1; y = y > 1 ? y : (T)1; z = z > 1 ? z : (T)1;
                 x = (x < ex ? x : ex) - hx; y = (y < ey ? y : ey) - hy; z = planes == 2 ? (z < ez ? z : ez) - hz : (T)1;
                 int i = (int)x, j = (int)y, k = (int)z;
@@ -64,11 +67,13 @@ LOOP = """
 """
 
 
-def runge_kutta(walls: str) -> str:
+def runge_kutta(walls: str, endless: int = 0) -> str:
     """Return the body of a native function that moves particles first <= p < last and returns how many were stopped.
 
     Args:
         walls: source of `prepare` and `move`. It finds planes, nx, ny, nz, the strides s1, s2 and up of a field, the Blocks `from` and
             `to` of grid coordinates, `hit`, `margin` and the array `list` to note particles in.
+        endless: has bit n set if axis n has no end; `walls` finds it as ENDLESS.
     """
-    return particle_loop(BLOCK + LOOP.replace("SAMPLE", SAMPLE).replace("WALLS", walls).replace("MARGIN", repr(MARGIN)))
+    source = LOOP.replace("SAMPLE", SAMPLE).replace("WALLS", walls).replace("MARGIN", repr(MARGIN))
+    return particle_loop(BLOCK + source.replace("ENDLESS", str(endless)))

@@ -5,6 +5,7 @@ Two forms with one face: `WholeCells`, whose cells are solid or open, and `CutBo
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -12,7 +13,7 @@ import warp as wp
 
 from warp_lcp.grid.advection import advect, clearance
 from warp_lcp.grid.level_set import whole_cell_capacity
-from warp_lcp.grid.sides import continue_beyond
+from warp_lcp.grid.sides import axis_bits, continue_beyond, repeated
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.voxelize import VoxelSolids
 from warp_lcp.material import boundary_kernels as kernels
@@ -74,6 +75,7 @@ class WholeCells:
         wall_velocity: velocity [m/s] of the domain's wall and of each solid, shape (1 + solids, 3), constant; the cells stay where they
             are. None: all stand still.
         open_sides: those that `solids` was made with.
+        endless: axes without an end, whose sides are open: what leaves at one comes in at the other.
 
     Raises:
         ValueError: `wall_velocity` has another shape.
@@ -82,7 +84,10 @@ class WholeCells:
     distance: wp.array | None = None
     moves = False
 
-    def __init__(self, grid: StaggeredGrid, solids: VoxelSolids, wall_velocity: np.ndarray | None = None, *, open_sides: int = 0) -> None:
+    def __init__(
+        self, grid: StaggeredGrid, solids: VoxelSolids, wall_velocity: np.ndarray | None = None, *, open_sides: int = 0,
+        endless: Sequence[int] = (),
+    ) -> None:  # fmt: skip
         """Allocate the fields."""
         self.grid, self.solids, self.open_sides = grid, solids, open_sides
         if wall_velocity is not None and np.shape(wall_velocity) != (len(solids.separating), 3):
@@ -92,6 +97,9 @@ class WholeCells:
         self.velocity: Faces = grid.faces() if wall_velocity is not None else []
         everywhere = Window((0, 0, 0), grid.shape, grid.device)
         everywhere.launch(kernels.base_kernel, [solids.index, self.base])
+        self._endless = axis_bits(endless)
+        if endless:
+            self.base.assign(repeated(self.base.numpy(), endless))
         grid.domain.launch(kernels.touch_kernel, [solids.index, solids.separating, grid.planes, self.touch])
         whole_cell_capacity(grid, self.base, self.capacity)
         continue_beyond(grid, open_sides, self.capacity)
@@ -117,12 +125,12 @@ class WholeCells:
     def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> tuple[int, int, int]:
         """Move particles, never into a SOLID cell."""
         self._stopped.zero_()
-        advect(self.grid, fields, self._room, dt, position, self._stopped)
+        advect(self.grid, fields, self._room, dt, position, self._stopped, self._endless)
         return int(self._stopped.numpy()[0]), 0, 0
 
     def displace(self, fields: Faces, position: wp.array) -> None:
         """Move particles by a displacement [m], never into a SOLID cell."""
-        advect(self.grid, fields, self._room, 1.0, position, self._stopped)
+        advect(self.grid, fields, self._room, 1.0, position, self._stopped, self._endless)
 
     def place(self, time: float) -> None:
         """Do nothing: the cells stay."""

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import warp as wp
 
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.distance_advection import MARGIN, advect_with_distance, push_out
 from warp_lcp.grid.motion import top_speed
+from warp_lcp.grid.sides import axis_bits
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material import boundary_kernels as kernels
 from warp_lcp.material.boundary import Faces
 from warp_lcp.material.cut_wall import extend_velocity_cut
+
+CLOSE = 1.0  # cells from a solid within which the sides of an axis without an end must be alike
+ALIKE = 1e-2  # cells
 
 
 class CutBoundary:
@@ -24,19 +30,25 @@ class CutBoundary:
     Args:
         grid: the grid.
         cut: the solids, with their capacity.
+        endless: axes without an end, whose sides are open: what leaves at one comes in at the other.
+
+    Raises:
+        ValueError: solids differ at the two sides of an axis without an end.
     """
 
-    def __init__(self, grid: StaggeredGrid, cut: CutCells) -> None:
+    def __init__(self, grid: StaggeredGrid, cut: CutCells, *, endless: Sequence[int] = ()) -> None:
         """Allocate the fields."""
         self.grid, self.cut, self.moves, self.open_sides = grid, cut, cut.moves, cut.open_sides
         self.base, self.open, self.capacity, self.distance = cut.base, cut.open, cut.capacity, cut.distance
         self.velocity: Faces = cut.velocity or []
         self.touch = grid.field(wp.uint8)
         self._scratch = grid.faces()
+        self._endless = axis_bits(endless)
         self._reachable = grid.field() if cut.moves else cut.distance  # distance where particles may go within a step
         self._counts = wp.zeros(3, dtype=wp.int32, device=grid.device)
         self._moving = [(solid.motion, solid.geometry.bounds()) for solid in cut.solids if solid.motion is not None]
         self._find_walls()
+        self._check_sides(endless)
 
     def top_speed(self, time: float, span: float) -> float:
         """Return how fast the solids move at most [m/s] from `time` to `time` + `span` [s]."""
@@ -62,8 +74,8 @@ class CutBoundary:
             wp.launch(
                 kernels.larger_kernel, self.grid.size, [self.cut.distance.flatten(), self._reachable.flatten()], device=self.grid.device
             )
-        sides = self.open_sides
-        advect_with_distance(self.grid, fields, self._reachable, dt, position, self._counts[0:1], open_sides=sides)
+        sides, ways = self.open_sides, {"open_sides": self.open_sides, "endless": self._endless}
+        advect_with_distance(self.grid, fields, self._reachable, dt, position, self._counts[0:1], **ways)
         if self.moves:
             push_out(self.grid, self.cut.distance, position, self._counts[1:2], self._counts[2:3], open_sides=sides)
         met, pushed, stuck = (int(n) for n in self._counts.numpy())
@@ -71,7 +83,8 @@ class CutBoundary:
 
     def displace(self, fields: Faces, position: wp.array) -> None:
         """Move particles by a displacement [m] among the solids where they are now."""
-        advect_with_distance(self.grid, fields, self.cut.distance, 1.0, position, self._counts[0:1], open_sides=self.open_sides)
+        ways = {"open_sides": self.open_sides, "endless": self._endless}
+        advect_with_distance(self.grid, fields, self.cut.distance, 1.0, position, self._counts[0:1], **ways)
 
     def place(self, time: float) -> None:
         """Put the solids where they are at `time` [s]."""
@@ -97,6 +110,14 @@ class CutBoundary:
         axes = slice(self.grid.dimension)
         side = np.minimum(coordinates - 1.0, np.array(self.grid.counts) + 1.0 - coordinates)[:, axes].min(axis=1)
         return np.asarray(np.minimum(between, side) >= MARGIN)
+
+    def _check_sides(self, endless: Sequence[int]) -> None:
+        """Refuse solids that differ where two sides are the same."""
+        distance = np.clip(self.distance.numpy(), -CLOSE, CLOSE)
+        for axis in endless:
+            lines = np.moveaxis(distance, 2 - axis, 0)
+            if np.abs(lines[1] - lines[-1]).max() > ALIKE:
+                raise ValueError(f"solids differ at the two sides of the periodic {'xyz'[axis]} axis: what reaches one must go on at the other")
 
     def _find_walls(self) -> None:
         self.touch.zero_()

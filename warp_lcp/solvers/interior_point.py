@@ -37,7 +37,9 @@ class InteriorPoint:
     tau = mu / k and goes the share k / (N + 1) of the way to the boundary in step k. All variables take one common step, without which
     the method does not converge for LCPs that are no quadratic programs.
 
-    A must be positive semi-definite (x'Ax >= 0; it need not be symmetric), else steps may become arbitrarily short. A float32 correction
+    A must be positive semi-definite (x'Ax >= 0; it need not be symmetric), else steps may become arbitrarily short. Dense and sparse
+    problems are solved in units in which rows are alike; where there is no solution, iterates leave for infinity: then, if A has at most
+    250,000 entries, a linear program is asked, and INFEASIBLE is proved. A float32 correction
     carries D up to 1e30: nothing is clamped. On grids the shifted systems are solved by conjugate gradients with multigrid, stopped on
     the norm of d^(-1/2) r, d the diagonal of A + D. `linear_iterations` counts their iterations.
 
@@ -211,9 +213,11 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
         self._inside(x, 0.0)
         self.count = int(self._multipliers(0.0)[1])
         if self.count:
-            unknowns = max(int(np.count_nonzero(p.unknown.numpy() == 1)), 1)
-            far = self.settings.start * self.residual.norm_of_b() / math.sqrt(unknowns)
-            least = NEAR * self.residual.norm / math.sqrt(self.count) if self.near else far
+            if self.near:
+                least = NEAR * self.residual.norm / math.sqrt(self.count)
+            else:
+                unknowns = max(int(np.count_nonzero(p.unknown.numpy() == 1)), 1)
+                least = self.settings.start * self.residual.norm_of_b() / math.sqrt(unknowns)
             self._inside(x, least)
             self.residual.affine(x)
             self.mu = self._multipliers(least)[0] / self.count

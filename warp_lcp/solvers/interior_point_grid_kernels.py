@@ -89,24 +89,28 @@ def kernels(variable: bool, d_type: Any, w_type: Any, real: Any, upper: bool) ->
         simd(
             f"""{pairs} const {S} *e = e_.data + p, *a = a_.data + p; long long longest = 0; double products = 0;
         {fetch("0", "n", w=8, s=8, e=4, **more)}
-        auto each = [&](auto whether) {{
-            const {S}* a = decltype(whether)::value ? a_.data + p : e; const double second = decltype(whether)::value;
+        auto note = [&](double m) {{  // bits of numbers above 0 are ordered as these are; compilers vectorize only this
+            const double most = m > 0 ? m : 0.0; const long long bits = __builtin_bit_cast(long long, most);
+            longest = bits > longest ? bits : longest; }};
+        if (second == 0) {{  // the predictor: ds = -s (1 + dx / w), dt = -t (1 - dx / v)
+            SIMD8 for (int i = 0; i < n; ++i) {{
+                const double dx = scale*(double)e[i], q = dx/w[i]{two(", o = dx/v[i]")}, next = s[i] > 0 ? 1 + q : 0.0;
+                {two("const double last = t[i] > 0 ? 1 - o : 0.0, k = o > last ? o : last;")}
+                const double m = -q > next ? -q : next; note({"m > k ? m : k" if upper else "m"});
+                products += dx*({two("t[i]*(1 - o) ")}- s[i]*(1 + q)); }}
+        }} else {{
             SIMD8 for (int i = 0; i < n; ++i) {{
                 {MULTIPLIERS}
                 {two(UPPER_MULTIPLIERS)}
                 const double first = -dx*iw, next = s[i] > 0 ? -ds/s[i] : 0.0, m = first > next ? first : next;
                 {two("const double third = dx*iv, last = t[i] > 0 ? -dt/t[i] : 0.0, k = third > last ? third : last;")}
-                const double found = {"m > k ? m : k" if upper else "m"}, most = found > 0 ? found : 0.0;
-                const long long bits = __builtin_bit_cast(long long, most);  // ordered as the doubles are; compilers vectorize only this
-                longest = bits > longest ? bits : longest;
-                products += dx*ds{two(" - dx*dt")}; }} }};
-        struct No {{ enum {{ value = 0 }}; }}; struct Yes {{ enum {{ value = 1 }}; }};
-        if (second0 != 0) each(Yes()); else each(No());
+                note({"m > k ? m : k" if upper else "m"}); products += dx*ds{two(" - dx*dt")}; }}
+        }}
         return wp::vec2d(__builtin_bit_cast(double, longest), products);"""
         )
     )
     def ratios_row(
-        w_: f64, v_: f64, s_: f64, t_: f64, a_: field, e_: field, scale: wp.float64, second0: wp.float64, joined: wp.float64,
+        w_: f64, v_: f64, s_: f64, t_: f64, a_: field, e_: field, scale: wp.float64, second: wp.float64, joined: wp.float64,
         tau: wp.float64, p: wp.int64, n: int,
     ) -> wp.vec2d: ...  # fmt: skip
 

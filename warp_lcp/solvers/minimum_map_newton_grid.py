@@ -127,30 +127,21 @@ class GridNewtonWorkspace(MultigridWorkspace):
                 self._best = wp.empty_like(self.x)
             wp.copy(self._best, self.x)
             self._stored = True
-        self._leave_undone()
-
-    def _leave_undone(self) -> None:
-        """Store the best iterate if it is one step back."""
-        if not self._stored and self._past == 1:
+        elif not self._stored and self._past == 1:
             self._leave()
-            self._past -= 1
+            self._past = 1  # that counted a step
 
     def _shorten(self, limit: float, iterations: int, active: int) -> Step:
         """Take the longest of the halves of the last move that the safeguard allows; if there is none, projected cycles."""
         residual, s = self.residual, self._newton
-        whole, best, length = float(residual.scalars.numpy()[int(engine.STEP)]), residual.norm, 1.0
-        scale = 1.0
+        whole, length = float(residual.scalars.numpy()[int(engine.STEP)]), 1.0
         self._store()
         self._forget()
         for _ in range(s.backtracks):
-            scale *= 0.5
-            self._set_length(length, scale, whole)
-            length = scale
-            norm = residual.evaluate(self.x)
-            if norm <= (1 - DECREASE * scale) * limit:
+            self._set_length(length, 0.5 * length, whole)
+            length *= 0.5
+            if residual.evaluate(self.x) <= (1 - DECREASE * length) * limit:
                 return Step("newton", iterations, active)
-            if norm < best:
-                best = norm
         self._cycles_left, self._relapse = self._relapse, 2 * self._relapse
         residual.classify = False
         residual.evaluate(self.x)
