@@ -108,6 +108,7 @@ class Suite:
 KERNELS = Suite("kernels", "each hot kernel on the finest grid against this machine's copy bandwidth, Numba and a plain Warp kernel")
 SOLVERS = Suite("solvers", "linear and LCP solves: set-up, iterations, time to a tolerance, memory; against PyAMG and SciPy", replays=True)
 RUN = Suite("run", "steps per second of built-in scenes, and what the particles cost")
+SAND = Suite("sand", "sand: the coupled methods at equal residual, the yield sets, steps of large scenes")
 VALIDATION = Suite(
     "validation",
     "liquids against known answers: rest, sloshing, ceiling, dam break, transfers, slopes, volume; with negative controls",

@@ -15,13 +15,16 @@ from granular.packing import three
 from granular.stress import Stress
 from granular.stress_kernels import PERIOD
 
+BETTER = 0.95  # of the best estimate: progress
+NEAR_BEST = 1.2
+
 
 @dataclass(frozen=True)
 class CoupledOutcome:
     """How a coupled solve ended.
 
     Attributes:
-        status: CONVERGED, MAX_ITERATIONS, DIVERGED or NON_FINITE.
+        status: CONVERGED, STAGNATED, MAX_ITERATIONS or NON_FINITE.
         iterations: steps of the method: all stresses once.
         pressure, friction: natural residual of either, root mean square over the cells that hold sand, in units of the scale.
         history: (iterations, residual) at each check.
@@ -74,6 +77,7 @@ class AcceleratedProjection:
         momentum: beta at the start of a solve.
         decay: of the stresses that a time step starts from.
         check_every: periods of steps between two looks at the estimate of the residual.
+        patience: steps without a better estimate after which the next that is nearly as good as the best is taken.
     """
 
     pressure_step: float = 1.0 / 1.2
@@ -82,6 +86,7 @@ class AcceleratedProjection:
     momentum: float = 0.85
     decay: float = 1.0
     check_every: int = 2
+    patience: int = 300
 
     def solve(self, stress: Stress, *, scale: float, tolerance: float, max_iterations: int) -> CoupledOutcome:
         """Solve from the stresses as they are."""
@@ -91,15 +96,19 @@ class AcceleratedProjection:
             pressure_step=self.pressure_step, shear_step=self.shear_step * (1.0 if flat else 0.5), lookahead=self.lookahead,
             momentum=self.momentum,
         )  # fmt: skip
-        aim = tolerance
-        while (status := _status(history, tolerance, max_iterations, done)) is None:
-            estimate = math.inf
-            while estimate > aim * scale and done < max_iterations:
+        aim, best, best_at = tolerance * scale, math.inf, 0
+        status = _status(history, tolerance, max_iterations, done)
+        while status is None:
+            estimate, stagnates = math.inf, False
+            while estimate > aim and done < max_iterations and not stagnates:
                 estimate = stress.advance(self.check_every)
                 done += self.check_every * PERIOD
-                if not math.isfinite(estimate):
-                    break
+                if not estimate < BETTER * best:
+                    stagnates = not math.isfinite(estimate) or (done - best_at >= self.patience and estimate < NEAR_BEST * best)
+                else:
+                    best, best_at = estimate, done
             history.append((done, math.hypot(*stress.residual()) / scale))
+            status = _status(history, tolerance, max_iterations, done) or (wl.SolveStatus.STAGNATED if stagnates else None)
             aim *= 0.8  # should the estimate have been too good
         pressure, friction = stress.last_residual
         return CoupledOutcome(status, done, pressure / scale, friction / scale, history)

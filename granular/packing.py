@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from granular import packing_kernels as kernels
-from granular.periodic import PeriodicSides
+from warp_lcp.grid.periodic import PeriodicSides
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.operators.grid_poisson import SOLID
 

@@ -9,7 +9,6 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from granular.materials import MATERIALS, Material, compression_slope, plane_strain_slope
-from granular.periodic import periodic_axes, periodic_sides
 from warp_lcp.driver.particle_scene import ParticleScene
 from warp_lcp.driver.scene import Complaint, Domain, Table, Time
 from warp_lcp.driver.shapes import (
@@ -185,12 +184,7 @@ class SandScene(ParticleScene):
     @property
     def endless(self) -> tuple[int, ...]:
         """Return the axes without an end."""
-        return periodic_axes(self.domain.periodic)
-
-    @property
-    def open_sides(self) -> list[str]:
-        """Return the names of the domain's sides without a wall: open ones, and those of axes without an end."""
-        return [*self.domain.open, *periodic_sides(self.endless)]
+        return tuple(axis for axis, endless in enumerate(self.domain.periodic or ()) if endless)
 
     @property
     def preset(self) -> Material:

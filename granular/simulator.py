@@ -12,7 +12,6 @@ import warp as wp
 import warp_lcp as wl
 from granular.coupled import METHODS, CoupledMethod, CoupledOutcome
 from granular.packing import Packing
-from granular.periodic import PeriodicSides
 from granular.report import Outcome
 from granular.scene import SandScene
 from granular.solids import SandSolids
@@ -59,7 +58,6 @@ class SandSimulation(ParticleSimulation):
         sources: where sand comes in.
         outlets: where it leaves.
         notes: facts for the start of a run.
-        sides: of axes without an end, if there are any.
 
     Attributes:
         packing: how densely the sand lies.
@@ -80,15 +78,14 @@ class SandSimulation(ParticleSimulation):
         sources: Sources | None = None,
         outlets: Outlets | None = None,
         notes: tuple[str, ...] = (),
-        sides: PeriodicSides | None = None,
     ) -> None:
         """Allocate the fields and find the sand's cells."""
         super().__init__(scene, grid, boundary, particles, sources=sources, outlets=outlets, notes=notes)
-        self.solids, self.sides = solids, sides
-        self._join = None if sides is None else sides.wrap
+        self.solids, self.sides = solids, boundary.sides
+        self._join = None if self.sides is None else self.sides.wrap
         self.method: CoupledMethod = METHODS[scene.solver.method]()
         self._base, self.density = grid.field(wp.int8), grid.field()
-        self.packing = Packing(grid, self._base, boundary.capacity, sides=sides)
+        self.packing = Packing(grid, self._base, boundary.capacity, sides=self.sides)
         self.stress = Stress(self.packing, solids.walls, box=scene.friction.model == "box")
         self.outcome = Outcome(self.stress)
         self._at_rest = scene.particles.per_axis**grid.dimension
@@ -262,7 +259,6 @@ class SandSimulation(ParticleSimulation):
         particle_density(self.grid, self.particles, window, self._at_rest, self.density)
         if self.sides is not None:
             self.sides.add(self.density)
-            self.sides.wrap(self.boundary.capacity)
 
     def _extend(self, window: Window) -> None:
         """Continue the velocity into air and walls."""
@@ -273,7 +269,7 @@ class SandSimulation(ParticleSimulation):
                 solids.velocity, self.layers, join=self._join,
             )  # fmt: skip
             if self.sources is not None:
-                self.sources.hold(self.velocity, [])
+                self.sources.hold(self.velocity, [], self.packing.kind)
 
     def _front(self) -> tuple[float, float]:
         """Return the 99th percentile of x and of y [m]."""
@@ -322,11 +318,9 @@ class GranularSimulator:
             raise ValueError("scene.simulator: granular needs a scene of sand")
         grid = StaggeredGrid(scene.cell_counts, scene.spacing, scene.dimension, device)
         boundary, warnings = make_boundary(scene, grid, folder)
-        sides = PeriodicSides(grid, scene.endless) if scene.endless else None
-        placed, frictions = placed_solids(scene, folder), scene.wall_frictions()
-        solids = SandSolids(grid, placed, boundary, frictions, prescribed=bool(scene.source), sides=sides)
+        solids = SandSolids(grid, placed_solids(scene, folder), boundary, scene.wall_frictions(), prescribed=bool(scene.source))
         particles, notes = make_particles(scene, grid, boundary, folder)
         sources, outlets = make_sources(scene, grid, boundary, folder), make_outlets(scene, grid, folder)
         return SandSimulation(
-            scene, grid, boundary, solids, particles, sources=sources, outlets=outlets, notes=(*warnings, *solids.notes, *notes), sides=sides
+            scene, grid, boundary, solids, particles, sources=sources, outlets=outlets, notes=(*warnings, *solids.notes, *notes)
         )  # fmt: skip

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from granular.periodic import PeriodicSides
 from granular.stress import Walls
 from warp_lcp.grid.staggered import CellRange, StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid, voxelize
@@ -74,7 +73,6 @@ class SandSolids:
         boundary: where particles may go.
         friction: Coulomb's coefficient of the domain's walls and of each solid.
         prescribed: keep velocities on faces even if nothing moves: sources prescribe some.
-        sides: of axes without an end, if there are any.
 
     Attributes:
         index: int32, -1 in open cells, the wall's number elsewhere.
@@ -86,11 +84,10 @@ class SandSolids:
     """
 
     def __init__(
-        self, grid: StaggeredGrid, placed: Sequence[PlacedSolid], boundary: Boundary, friction: Sequence[float], *, prescribed: bool = False,
-        sides: PeriodicSides | None = None,
-    ) -> None:  # fmt: skip
+        self, grid: StaggeredGrid, placed: Sequence[PlacedSolid], boundary: Boundary, friction: Sequence[float], *, prescribed: bool = False
+    ) -> None:
         """Find the cells."""
-        self.grid, self._placed, self._boundary, self._friction, self._sides = grid, tuple(placed), boundary, list(friction), sides
+        self.grid, self._placed, self._boundary, self._friction = grid, tuple(placed), boundary, list(friction)
         self.base = grid.field(wp.int8)
         self.separating = wp.full(1 + len(placed), 1, dtype=wp.uint8, device=grid.device)
         self.velocity: Faces = grid.faces() if boundary.moves or prescribed else []
@@ -116,8 +113,8 @@ class SandSolids:
             open_sides=self._boundary.open_sides, remarks=False,
         )  # fmt: skip
         self.index, self._covered = found.index, found.covered
-        if self._sides is not None:
-            self._sides.wrap(self.index)
+        if self._boundary.sides is not None:
+            self._boundary.sides.wrap(self.index)
         grid.everywhere.launch(base_kernel, [self.index, self.base])
         self.walls = Walls(grid, self.index.numpy(), self._friction)
 

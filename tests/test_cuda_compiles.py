@@ -12,7 +12,7 @@ import warp as wp
 import fluids
 import granular
 import warp_lcp as wl
-from granular.periodic import ring_kernels
+from warp_lcp.grid.periodic import ring_kernels
 from warp_lcp.grid import advection_kernels, distance_advection_kernels, transfer_kernels
 from warp_lcp.material.density_correction_kernels import displacement_kernel
 from warp_lcp.multigrid import CycleSettings

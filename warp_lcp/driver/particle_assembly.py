@@ -12,6 +12,7 @@ import warp_lcp as wl
 from warp_lcp.driver.particle_scene import ParticleScene
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.particles import Particles, seed
+from warp_lcp.grid.periodic import PeriodicSides, periodic_sides
 from warp_lcp.grid.sides import side_bits
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid
@@ -52,20 +53,21 @@ def make_boundary(
     Raises:
         ValueError: solids cut cells and there is a `wall_velocity`.
     """
-    placed = placed_solids(scene, folder)
-    separating, sides = scene.domain.wall == "separating", side_bits(scene.open_sides)
+    placed, around = placed_solids(scene, folder), PeriodicSides(grid, scene.endless) if scene.endless else None
+    separating, sides = scene.domain.wall == "separating", side_bits(scene.domain.open)
     if scene.domain.solids == "cut-cell":
         if wall_velocity is not None:
             raise ValueError('wall_velocity: only for solids = "voxel"; solids that cut cells have a motion')
         cut = CutCells(grid, placed, wall_separating=separating, open_sides=sides)
         if not cut.whole_cells:
-            return CutBoundary(grid, cut, endless=scene.endless), cut.notes
+            return CutBoundary(grid, cut, sides=around), cut.notes
     solids = voxelize(
-        grid.counts, grid.spacing, grid.dimension, placed, wall_separating=separating, device=grid.device, open_sides=sides
+        grid.counts, grid.spacing, grid.dimension, placed, wall_separating=separating, device=grid.device,
+        open_sides=sides | side_bits(periodic_sides(scene.endless)),
     )  # fmt: skip
     if wall_velocity is None and scene.source:
         wall_velocity = np.zeros((1 + len(placed), 3))  # what a source's faces are given goes there
-    return WholeCells(grid, solids, wall_velocity, open_sides=sides, endless=scene.endless), solids.notes
+    return WholeCells(grid, solids, wall_velocity, open_sides=sides, sides=around), solids.notes
 
 
 def seed_materials(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, folder: Path) -> tuple[np.ndarray, np.ndarray, list[str]]:

@@ -87,11 +87,6 @@ class ParticleScene(Scene):
         """Return the axes without an end: what leaves at one side comes in at the other."""
         return ()
 
-    @property
-    def open_sides(self) -> list[str]:
-        """Return the names of the domain's sides without a wall."""
-        return list(self.domain.open)
-
     def complaints(self) -> list[Complaint]:
         """Return what is wrong across keys."""
         key, materials = self.materials()

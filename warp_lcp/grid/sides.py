@@ -27,24 +27,6 @@ def side_bits(names: Iterable[str]) -> int:
     return bits
 
 
-def axis_bits(axes: Iterable[int]) -> int:
-    """Return a number that has bit n set for axis n.
-
-    >>> axis_bits([0, 2])
-    5
-    """
-    return sum(1 << axis for axis in set(axes))
-
-
-def repeated(field: np.ndarray, axes: Iterable[int]) -> np.ndarray:
-    """Return a field in the stored shape whose ring holds, beyond the sides of some axes, what lies at the other side."""
-    result = field.copy()
-    for axis in axes:
-        lines = np.moveaxis(result, 2 - axis, 0)
-        lines[0], lines[-1] = lines[-2], lines[1].copy()
-    return result
-
-
 def open_ring(shape: tuple[int, int, int], bits: int) -> np.ndarray:
     """Return which cells of the ring lie beyond open sides only, bool in the stored shape; a corner beyond a wall as well does not.
 

@@ -5,7 +5,6 @@ Two forms with one face: `WholeCells`, whose cells are solid or open, and `CutBo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -13,7 +12,8 @@ import warp as wp
 
 from warp_lcp.grid.advection import advect, clearance
 from warp_lcp.grid.level_set import whole_cell_capacity
-from warp_lcp.grid.sides import axis_bits, continue_beyond, repeated
+from warp_lcp.grid.periodic import PeriodicSides, with_periodic
+from warp_lcp.grid.sides import continue_beyond
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.voxelize import VoxelSolids
 from warp_lcp.material import boundary_kernels as kernels
@@ -26,7 +26,8 @@ class Boundary(Protocol):
     """Solids and the domain's walls.
 
     Attributes:
-        open_sides: of the domain, see `warp_lcp.grid.sides`.
+        sides: of axes without an end; None: there are none.
+        open_sides: of the domain, see `warp_lcp.grid.sides`; those of axes without an end are among them.
         base: int8 cells without material: SOLID or AIR. The ring is SOLID, or AIR beyond open sides.
         touch: uint8 a cell: TOUCHES if a face is not open, LETS_GO if the wall of such a face separates.
         open: float32 open fraction a_f of each component's lower faces; empty: a face is closed where a cell beside it is SOLID.
@@ -36,6 +37,7 @@ class Boundary(Protocol):
     """
 
     moves: bool  # whether a solid moves
+    sides: PeriodicSides | None
     open_sides: int
     base: wp.array
     touch: wp.array
@@ -74,8 +76,8 @@ class WholeCells:
         solids: which cells are solid, and whose walls separate.
         wall_velocity: velocity [m/s] of the domain's wall and of each solid, shape (1 + solids, 3), constant; the cells stay where they
             are. None: all stand still.
-        open_sides: those that `solids` was made with.
-        endless: axes without an end, whose sides are open: what leaves at one comes in at the other.
+        open_sides: those that `solids` was made with, but for the next.
+        sides: of axes without an end; `solids` has them open.
 
     Raises:
         ValueError: `wall_velocity` has another shape.
@@ -86,10 +88,11 @@ class WholeCells:
 
     def __init__(
         self, grid: StaggeredGrid, solids: VoxelSolids, wall_velocity: np.ndarray | None = None, *, open_sides: int = 0,
-        endless: Sequence[int] = (),
+        sides: PeriodicSides | None = None,
     ) -> None:  # fmt: skip
         """Allocate the fields."""
-        self.grid, self.solids, self.open_sides = grid, solids, open_sides
+        self.grid, self.solids, self.sides = grid, solids, sides
+        self.open_sides, self._endless = with_periodic(open_sides, sides), sides.bits if sides is not None else 0
         if wall_velocity is not None and np.shape(wall_velocity) != (len(solids.separating), 3):
             raise ValueError(f"wall_velocity has shape {np.shape(wall_velocity)}: expected ({len(solids.separating)}, 3)")
         self.base, self.touch, self.capacity = grid.field(wp.int8), grid.field(wp.uint8), grid.field()
@@ -97,12 +100,13 @@ class WholeCells:
         self.velocity: Faces = grid.faces() if wall_velocity is not None else []
         everywhere = Window((0, 0, 0), grid.shape, grid.device)
         everywhere.launch(kernels.base_kernel, [solids.index, self.base])
-        self._endless = axis_bits(endless)
-        if endless:
-            self.base.assign(repeated(self.base.numpy(), endless))
+        if sides is not None:
+            sides.wrap(self.base)
         grid.domain.launch(kernels.touch_kernel, [solids.index, solids.separating, grid.planes, self.touch])
         whole_cell_capacity(grid, self.base, self.capacity)
         continue_beyond(grid, open_sides, self.capacity)
+        if sides is not None:
+            sides.wrap(self.capacity)
         if wall_velocity is not None:
             walls = wp.array(np.asarray(wall_velocity, dtype=np.float32), dtype=wp.vec3, device=grid.device)
             for axis, field in enumerate(self.velocity):

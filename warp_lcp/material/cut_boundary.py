@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import warp as wp
 
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.distance_advection import MARGIN, advect_with_distance, push_out
 from warp_lcp.grid.motion import top_speed
-from warp_lcp.grid.sides import axis_bits
+from warp_lcp.grid.periodic import PeriodicSides, with_periodic
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material import boundary_kernels as kernels
 from warp_lcp.material.boundary import Faces
@@ -30,25 +28,25 @@ class CutBoundary:
     Args:
         grid: the grid.
         cut: the solids, with their capacity.
-        endless: axes without an end, whose sides are open: what leaves at one comes in at the other.
+        sides: of axes without an end, if there are any; `cut` has walls there.
 
     Raises:
         ValueError: solids differ at the two sides of an axis without an end.
     """
 
-    def __init__(self, grid: StaggeredGrid, cut: CutCells, *, endless: Sequence[int] = ()) -> None:
+    def __init__(self, grid: StaggeredGrid, cut: CutCells, *, sides: PeriodicSides | None = None) -> None:
         """Allocate the fields."""
-        self.grid, self.cut, self.moves, self.open_sides = grid, cut, cut.moves, cut.open_sides
+        self.grid, self.cut, self.moves, self.sides = grid, cut, cut.moves, sides
+        self.open_sides, self._endless = with_periodic(cut.open_sides, sides), sides.bits if sides is not None else 0
         self.base, self.open, self.capacity, self.distance = cut.base, cut.open, cut.capacity, cut.distance
         self.velocity: Faces = cut.velocity or []
         self.touch = grid.field(wp.uint8)
         self._scratch = grid.faces()
-        self._endless = axis_bits(endless)
         self._reachable = grid.field() if cut.moves else cut.distance  # distance where particles may go within a step
         self._counts = wp.zeros(3, dtype=wp.int32, device=grid.device)
         self._moving = [(solid.motion, solid.geometry.bounds()) for solid in cut.solids if solid.motion is not None]
         self._find_walls()
-        self._check_sides(endless)
+        self._join_sides()
 
     def top_speed(self, time: float, span: float) -> float:
         """Return how fast the solids move at most [m/s] from `time` to `time` + `span` [s]."""
@@ -91,6 +89,7 @@ class CutBoundary:
         if self.moves:
             self.cut.place(time)
             self._find_walls()
+            self._join_sides()
 
     def admits(self, points: np.ndarray) -> np.ndarray:
         """Tell which points [m] of the domain, shape (n, 3), keep the distance that particles keep from walls."""
@@ -111,10 +110,14 @@ class CutBoundary:
         side = np.minimum(coordinates - 1.0, np.array(self.grid.counts) + 1.0 - coordinates)[:, axes].min(axis=1)
         return np.asarray(np.minimum(between, side) >= MARGIN)
 
-    def _check_sides(self, endless: Sequence[int]) -> None:
-        """Refuse solids that differ where two sides are the same."""
+    def _join_sides(self) -> None:
+        """Add to the capacity of cells what their kernels reach beyond sides that are the same; refuse solids that differ there."""
+        if self.sides is None:
+            return
+        if self.capacity is not None:
+            self.sides.add(self.capacity)
         distance = np.clip(self.distance.numpy(), -CLOSE, CLOSE)
-        for axis in endless:
+        for axis in self.sides.axes:
             lines = np.moveaxis(distance, 2 - axis, 0)
             if np.abs(lines[1] - lines[-1]).max() > ALIKE:
                 raise ValueError(f"solids differ at the two sides of the periodic {'xyz'[axis]} axis: what reaches one must go on at the other")

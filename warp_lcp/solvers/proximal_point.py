@@ -17,11 +17,12 @@ from warp_lcp.solve import EPS, FLOOR_MARGIN, Step
 from warp_lcp.solvers.dense_problem import proved_infeasible
 
 FIRST, FACTOR, LEAST = 1e-4, 0.1, 1e-10  # eps of the first center, its factor from center to center, and the smallest
+RAISED, LARGEST = 100.0, 1.0  # factor of eps where a regularized problem is not solved, and the largest eps: larger ones are easier
 NEAR = 1e-3  # of a center's residual: what the regularized problem's may be when the next center is taken
-MOST = 30  # steps for one center
+MOST, FEWER = 30, 15  # steps for one center, before and after eps had to be raised
 SMALL = 1000  # unknowns up to which a sparse matrix is taken as a dense one, for which least-index pivoting is there
-FALL = 0.5  # a center whose residual is above this part of the smallest so far is no progress
-IDLE = 3  # centers without progress before the end
+FALL = 0.9  # a center whose residual is above this part of the smallest so far is no progress
+IDLE = 4  # centers without progress before the end
 
 
 class ProximalPoint:
@@ -29,8 +30,11 @@ class ProximalPoint:
 
     D is A's diagonal in magnitude, the largest entry of a row and column where that is 0. A + eps D is a P-matrix wherever A is a
     P0-matrix (positive semi-definite ones, skew ones), so that free blocks are regular and least-index pivoting is finite. Its solutions
-    tend to one of the problem's own if A is monotone and there is one. The regularized problems are solved by PrimalDualActiveSet; one that
-    it cannot solve is that of no P-matrix, and ends the iteration with NON_DESCENT.
+    tend to one of the problem's own if A is monotone and there is one. The regularized problems are solved by PrimalDualActiveSet; where
+    it fails, eps is raised, and does not fall again. Failure with eps = 1 ends the iteration with NON_DESCENT.
+
+    Made for a singular block here and there. Linear programs (A skew) of more than some dozens of unknowns come to residuals of 1e-2 or end
+    with NON_DESCENT: they are InteriorPoint's.
 
     Args:
         problem: with a dense or sparse operator.
@@ -55,7 +59,7 @@ class ProximalPoint:
         self._work = self._method.init(self._inner)
         self._work.last_resort = False
         self._work.floating = None
-        self._smallest, self._idle, self._steps, self._near = np.inf, 0, 0, 0.0
+        self._smallest, self._idle, self._steps, self._near, self._least = np.inf, 0, 0, 0.0, LEAST
 
     @staticmethod
     def suits(problem: LCP) -> bool:
@@ -73,7 +77,7 @@ class ProximalPoint:
         if not work.residual.current:
             work.residual.evaluate(x)
         failure = None
-        if work.residual.norm <= self._near or step.failure is not None or self._steps >= MOST:
+        if work.residual.norm <= self._near or step.failure is not None or self._steps >= (MOST if self._least == LEAST else FEWER):
             failure = self._assess(x)
         self._residual.current = False
         return Step("proximal point", step.linear_iterations, step.active, failure, interim=failure is None)
@@ -89,14 +93,21 @@ class ProximalPoint:
         else:
             operator.matrix.assign(self._regularized())
         inner.b.assign(self._b - self._eps * self._D * center)
+        self._center = center
         size = self._residual.evaluate(x)
         self._near = max(NEAR * size, 0.3 * self._tolerance)
         self._work.start(warm=True, tolerance=self._near)
 
     def _assess(self, x: wp.array[Any]) -> SolveStatus | None:
         """Prepare for the next center; return how the iteration ends if it has come no nearer to a solution for some."""
-        solved = self._work.residual.norm <= self._near
-        self._steps, self._eps = 0, max(LEAST, FACTOR * self._eps)
+        solved, self._steps = self._work.residual.norm <= self._near, 0
+        if not solved and self._eps < LARGEST:
+            if self._least == LEAST and proved_infeasible(self._problem):
+                return SolveStatus.INFEASIBLE
+            self._eps = self._least = min(LARGEST, RAISED * self._eps)
+            x.assign(self._center)
+            return None
+        self._eps = max(self._least, FACTOR * self._eps)
         x.assign(np.clip(x.numpy(), self._inner.lower.numpy(), self._inner.upper.numpy()))
         norm = self._residual.evaluate(x)
         if norm <= FALL * self._smallest:

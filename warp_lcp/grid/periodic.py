@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from warp_lcp.grid.runge_kutta import MARGIN
-from warp_lcp.grid.sides import SIDES
+from warp_lcp.grid.sides import SIDES, side_bits
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.program import Launch
@@ -16,18 +16,18 @@ from warp_lcp.program import Launch
 END = 0.6 * MARGIN  # cells from the upper side within which no particle may lie: a tent there would reach beyond what is stored
 
 
-def periodic_axes(periodic: Sequence[bool] | None) -> tuple[int, ...]:
-    """Return the axes that have no end, of a scene's domain.periodic.
-
-    >>> periodic_axes([True, False, True])
-    (0, 2)
-    """
-    return tuple(axis for axis, endless in enumerate(periodic or ()) if endless)
-
-
 def periodic_sides(axes: Sequence[int]) -> list[str]:
-    """Return the names of the sides of some axes, as `warp_lcp.grid.sides` has them."""
+    """Return the names of the sides of some axes, as `warp_lcp.grid.sides` has them.
+
+    >>> periodic_sides([2])
+    ['back', 'front']
+    """
     return [SIDES[2 * axis + side] for axis in axes for side in range(2)]
+
+
+def with_periodic(open_sides: int, sides: "PeriodicSides | None") -> int:
+    """Return the bits of sides that stop nobody: open ones, and those of axes without an end."""
+    return open_sides if sides is None else open_sides | side_bits(periodic_sides(sides.axes))
 
 
 class PeriodicSides:
@@ -39,11 +39,15 @@ class PeriodicSides:
     Args:
         grid: the grid.
         axes: those without an end, of 0 and 2.
+
+    Attributes:
+        bits: bit n is set if axis n has no end.
     """
 
     def __init__(self, grid: StaggeredGrid, axes: Sequence[int]) -> None:
         """Note the sides."""
         self.grid, self.axes = grid, tuple(axes)
+        self.bits = sum(1 << axis for axis in self.axes)
 
     def wrap(self, *fields: wp.array, launch: Launch = wp.launch) -> None:
         """Fill the ring of fields, in the stored shape or stacked in layers of it, from the other side."""
@@ -103,7 +107,7 @@ class PeriodicSides:
 def ring_kernels(dtype: typing.Any) -> SimpleNamespace:
     """Return the kernel that fills the ring of fields of a type."""
 
-    @wp.kernel(enable_backward=False, module=f"granular.periodic_{dtype.__name__}")
+    @wp.kernel(enable_backward=False, module=f"warp_lcp.grid.periodic_{dtype.__name__}")
     @typing.no_type_check
     def wrap(axis: int, count: int, plane: int, field: wp.array4d(dtype=dtype)):
         layer, a, b = wp.tid()
@@ -118,7 +122,7 @@ def ring_kernels(dtype: typing.Any) -> SimpleNamespace:
     return SimpleNamespace(wrap=wrap)
 
 
-@wp.kernel(enable_backward=False, module="granular.periodic")
+@wp.kernel(enable_backward=False, module="warp_lcp.grid.periodic")
 @typing.no_type_check
 def add_kernel(axis: int, count: int, plane: int, field: wp.array3d(dtype=wp.float32)):
     """Add the two ends of a line to the cells that they repeat."""
@@ -134,7 +138,7 @@ def add_kernel(axis: int, count: int, plane: int, field: wp.array3d(dtype=wp.flo
         field[count, a, b] = field[count, a, b] + low
 
 
-@wp.kernel(enable_backward=False, module="granular.periodic")
+@wp.kernel(enable_backward=False, module="warp_lcp.grid.periodic")
 @typing.no_type_check
 def average_kernel(
     axis: int, count: int, plane: int, weight: wp.array3d(dtype=wp.float32), field: wp.array3d(dtype=wp.float32),
@@ -165,7 +169,7 @@ def average_kernel(
         weight[k, j, i] = 0.0
 
 
-@wp.kernel(enable_backward=False, module="granular.periodic")
+@wp.kernel(enable_backward=False, module="warp_lcp.grid.periodic")
 @typing.no_type_check
 def carry_kernel(endless: wp.vec3i, axes: int, size: wp.vec3, spacing: float, position: wp.array(dtype=wp.vec3)):
     """Positions modulo the domain's size, off the very end of it; who has crossed keeps off the walls, which stopped nobody beyond."""

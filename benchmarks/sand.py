@@ -1,0 +1,201 @@
+"""Sand: the coupled methods at equal residual from the same states, the yield sets, and what a step costs."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.machine import machine
+from benchmarks.record import Lines, Record, Results, Table
+from benchmarks.timing import Figure, Options
+from granular import SIMULATOR
+from granular.coupled import METHODS, CoupledOutcome
+from granular.scene import SandScene
+from granular.simulator import SandSimulation
+
+TITLE = "Sand: pressure and friction together"
+STATES = {"falling": 0.1, "mid-flow": 0.25, "spreading": 0.4, "coming to rest": 0.8}  # [s] into the collapse
+TOLERANCE = 1e-3  # of the stresses, in units of rho g dx
+MOST = 4000  # iterations that a method may take here
+COLLAPSE_END = 1.2  # [s]
+STEPS = 20  # of the large scenes that are timed
+ROUNDS = (10, 20, 40, 80, 160, 320, 640, 1280)  # iterations at which the curves are taken
+
+
+def measure(options: Options, out: Path) -> Results:
+    """Compare the methods, then the yield sets, then time large steps."""
+    size = max(options.sizes, default=96)
+    records = [machine(options.device, elements=1 << 22, repeat=options.repeat)]
+    states, curves = _methods(size, options)
+    models = [_collapse(size, model, options) for model in ("cone", "box")]
+    steps = [_steps(name, scene, options) for name, scene in _large().items()]
+    tables = [_method_table(states), _model_table(models), _step_table(steps)]
+    chart = Lines("convergence", "Residual against seconds, mid-flow", "seconds", "residual [rho g dx]", curves)
+    return Results([*records, *states, *models, *steps], tables, [chart])
+
+
+def collapse(size: int, **tables: Any) -> SandScene:
+    """Return the collapse of a column twice as high as wide, `size` cells across the domain."""
+    scene: dict[str, Any] = {
+        "scene": {"simulator": "granular"},
+        "time": {"duration": COLLAPSE_END},
+        "domain": {"size": [1.2, 0.6], "resolution": size, "friction": math.tan(math.radians(30.0))},
+        "material": {"friction_angle": 30.0},
+        "sand": [{"shape": "box", "min": [0.0, 0.0], "max": [0.25, 0.5]}],
+    }
+    return SandScene.model_validate(scene | tables)
+
+
+def _large() -> dict[str, SandScene]:
+    """Return scenes whose steps are timed: 65,000 particles on 128^2 cells, 500,000 on 64^3."""
+    flat = {"size": [1.28, 1.28], "resolution": 128, "friction": 0.577}
+    deep = {"size": [0.64, 0.64, 0.64], "resolution": 64, "friction": 0.577}
+    column = [{"shape": "box", "min": [0.0, 0.0], "max": [0.5, 0.82]}]
+    block = [{"shape": "box", "min": [0.0, 0.0, 0.0], "max": [0.32, 0.48, 0.41]}]
+    gravity = {"gravity": [0.0, -9.81, 0.0]}
+    return {
+        "128^2, 65,000 particles": collapse(128, domain=flat, particles={"per_axis": 4}, sand=column),
+        "64^3, 500,000 particles": collapse(64, domain=deep, physics=gravity, sand=block),
+    }
+
+
+def _simulation(scene: SandScene, device: str) -> SandSimulation:
+    return SIMULATOR.create(scene, device=device, folder=Path())
+
+
+def _step(simulation: SandSimulation) -> dict[str, Any]:
+    return simulation.step(min(simulation.stable_dt(), simulation.scene.time.dt_max))
+
+
+class _Taken:
+    """In the place of a simulation's method: another one, its outcome and its seconds kept."""
+
+    def __init__(self, name: str, tolerance: float, most: int) -> None:
+        self.method, self.tolerance, self.most = METHODS[name](), tolerance, most
+        self.decay = self.method.decay
+        self.outcome: CoupledOutcome | None = None
+        self.seconds = 0.0
+
+    def solve(self, stress: Any, *, scale: float, tolerance: float, max_iterations: int) -> CoupledOutcome:
+        """Solve, and look at the clock."""
+        begun = time.perf_counter()
+        self.outcome = self.method.solve(stress, scale=scale, tolerance=self.tolerance, max_iterations=self.most)
+        self.seconds = time.perf_counter() - begun
+        return self.outcome
+
+
+def _solve(simulation: SandSimulation, state: dict[str, np.ndarray], name: str, tolerance: float, most: int) -> _Taken:
+    """Solve the step that follows a state."""
+    simulation.restore(state)
+    taken = _Taken(name, tolerance, most)
+    simulation.method = taken
+    _step(simulation)
+    return taken
+
+
+def _methods(size: int, options: Options) -> tuple[list[Record], dict[str, tuple[list[float], list[float]]]]:
+    """Return each method's iterations and seconds from each state, and their curves from the one mid-flow."""
+    records, curves = [], dict[str, tuple[list[float], list[float]]]()
+    simulation = _simulation(collapse(size), options.device)
+    usual = simulation.method
+    for label, moment in STATES.items():
+        options.say(f"methods: {label}")
+        simulation.method = usual
+        while simulation.time < moment:
+            _step(simulation)
+        state = simulation.state()
+        seconds: dict[str, list[float]] = {name: [] for name in METHODS}
+        found: dict[str, CoupledOutcome] = {}
+        for turn in range(options.repeat + 1):  # the first loads kernels
+            for name in METHODS:
+                taken = _solve(simulation, state, name, TOLERANCE, MOST)
+                assert taken.outcome is not None
+                found[name] = taken.outcome
+                if turn > 0:
+                    seconds[name].append(taken.seconds)
+        base = seconds["interleaved-sweeps"]
+        for name, outcome in found.items():
+            ratios = [a / b for a, b in zip(seconds[name], base, strict=True)]
+            figures = {
+                "seconds": Figure.of(seconds[name], "s"),
+                "ratio": Figure.of(ratios),
+                "iterations": Figure(outcome.iterations),
+                "residual": Figure(outcome.residual),
+            }
+            records.append(Record(f"{label}: {name}", figures, {"status": outcome.status.name}))
+            if label == "mid-flow":
+                curves[name] = _curve(simulation, state, name)
+        simulation.restore(state)
+    return records, curves
+
+
+def _curve(simulation: SandSimulation, state: dict[str, np.ndarray], name: str) -> tuple[list[float], list[float]]:
+    """Return seconds and residuals of solves that stop after some iterations."""
+    taken = [_solve(simulation, state, name, 1e-12, most) for most in ROUNDS]
+    return [t.seconds for t in taken], [t.outcome.residual for t in taken if t.outcome is not None]
+
+
+def _collapse(size: int, model: str, options: Options) -> Record:
+    """Run a whole collapse with a yield set."""
+    options.say(f"collapse: {model}")
+    simulation = _simulation(collapse(size, friction={"model": model}), options.device)
+    rows, begun = [], time.perf_counter()
+    while simulation.time < COLLAPSE_END:
+        rows.append(_step(simulation))
+    seconds = time.perf_counter() - begun
+    good = [row["coupled_residual"] <= TOLERANCE for row in rows]
+    figures = {
+        "seconds_per_step": Figure(seconds / len(rows), "s"),
+        "iterations": Figure(float(np.mean([row["staggering_iterations"] for row in rows]))),
+        "share_converged": Figure(float(np.mean(good))),
+        "runout": Figure(rows[-1]["runout"] / 0.25),
+        "max_speed": Figure(rows[-1]["max_speed"], "m/s"),
+        "kinetic_energy": Figure(rows[-1]["kinetic_energy"] / max(row["kinetic_energy"] for row in rows)),
+    }
+    return Record(f"collapse: {model}", figures)
+
+
+def _steps(name: str, scene: SandScene, options: Options) -> Record:
+    """Time steps of a large scene."""
+    options.say(f"steps: {name}")
+    simulation = _simulation(scene, options.device)
+    seconds, iterations = [], []
+    for number in range(STEPS + 1):
+        begun = time.perf_counter()
+        row = _step(simulation)
+        if number > 0:
+            seconds.append(time.perf_counter() - begun)
+            iterations.append(float(row["staggering_iterations"]))
+    figures = {"seconds": Figure.of(seconds, "s"), "iterations": Figure.of(iterations), "particles": Figure(simulation.particles.count)}
+    return Record(f"steps: {name}", figures)
+
+
+def _method_table(records: list[Record]) -> Table:
+    rows = [
+        [r.name, r.facts["status"], *(str(r.figures[k]) for k in ("iterations", "residual", "seconds", "ratio"))] for r in records
+    ]  # fmt: skip
+    columns = ["state: method", "status", "iterations", "residual", "seconds", "of interleaved sweeps"]
+    return Table(f"The step after a state of the collapse, to {TOLERANCE:g} rho g dx", columns, rows)
+
+
+def _model_table(records: list[Record]) -> Table:
+    keys = ["seconds_per_step", "iterations", "share_converged", "runout", "max_speed", "kinetic_energy"]
+    columns = [
+        "yield set",
+        "a step",
+        "iterations",
+        f"steps at {TOLERANCE:g}",
+        "runout / width",
+        "last top speed",
+        "last energy, of the most",
+    ]
+    return Table("The whole collapse", columns, [[r.name, *(str(r.figures[k]) for k in keys)] for r in records])
+
+
+def _step_table(records: list[Record]) -> Table:
+    rows = [[r.name, *(str(r.figures[k]) for k in ("particles", "seconds", "iterations"))] for r in records]
+    return Table("Steps of large scenes", ["scene", "particles", "a step", "iterations"], rows)

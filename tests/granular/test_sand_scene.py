@@ -1,0 +1,133 @@
+"""What a scene of sand may say, and what is told to whoever says something else."""
+
+import math
+from typing import Any
+
+import pytest
+from small_sands import box, scene
+
+from granular.scene import STICKS, SandScene
+from warp_lcp.driver.scene_file import load_scene
+from warp_lcp.driver.table import SceneError, validate
+
+FILE = """[scene]
+simulator = "granular"
+[time]
+duration = 1.0
+[domain]
+size = [1.0, 0.5]
+resolution = 16
+[[sand]]
+shape = "box"
+min = [0.0, 0.0]
+max = [0.5, 0.25]
+[[solid]]
+shape = "box"
+min = [0.75, 0.0]
+max = [1.0, 0.25]
+"""
+
+
+def complaint(tmp_path: Any, *overrides: str) -> str:
+    """Return what is said about a scene with these keys."""
+    file = tmp_path / "pile.toml"
+    file.write_text(FILE)
+    with pytest.raises(SceneError) as caught:
+        load_scene(file, overrides)
+    return str(caught.value).removeprefix(f"{file}: ")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "expected"),
+    [
+        ("material.name=mud", "material.name = \"mud\": must be 'dry-sand', 'gravel' or 'sugar'"),
+        ("material.friction_angle=0", "material.friction_angle = 0: must be greater than 0"),
+        ("material.friction_angle=60.0", "material.friction_angle = 60.0: must be less than 60"),
+        ("material.friction_angle=steep", 'material.friction_angle = "steep": must be a number'),
+        ("material.density=-1", "material.density = -1: must be greater than 0"),
+        ("material.max_fraction=1.0", "material.max_fraction = 1.0: must be less than 1"),
+        ("material.cohesion=-5", "material.cohesion = -5: must be at least 0"),
+        ("material.tensile_strength=-5", "material.tensile_strength = -5: must be at least 0"),
+        ("material.tensile_strength=100", "material.tensile_strength = 100.0: must be at most 0"),
+        ("material.angle_of=shear", "material.angle_of = \"shear\": must be 'plane-strain' or 'triaxial-compression'"),
+        ("material.wall_friction=-0.1", "material.wall_friction"),
+        ("material.colour=red", "material.colour: unknown key; choose from angle_of, cohesion"),
+        ("friction.model=sphere", "friction.model = \"sphere\": must be 'cone' or 'box'"),
+        ("domain.friction=rough", "domain.friction"),
+        ("domain.friction=11", "domain.friction"),
+        ("domain.wall=free-slip", 'domain.wall = "free-slip": must be "separating"'),
+        ("domain.periodic=[false, true]", "domain.periodic = [false, true]: may be true along x and z only"),
+        ("domain.periodic=[true]", "domain.periodic = [true]: must have 2 entries"),
+        ("solid.0.friction=-1", "solid[0].friction"),
+        ("solid.0.wall=free-slip", 'must be "separating"'),
+        ("sand.0.friction_angle=70", "sand[0].friction_angle = 70: must be less than 60"),
+        ("sand.0.cohesion=true", "sand[0].cohesion = true: must be a number"),
+        ("gauge.height=0.5", "gauge.height = 0.5: must lie in the domain, between 0 and 0.5 m"),
+        ("gauge.hight=0.2", "gauge.height: is missing"),
+        ("solver.method=psor", "solver.method = \"psor\": must be 'accelerated-projection' or 'interleaved-sweeps'"),
+        ("solver.tolerance=1", "solver.tolerance = 1: must be less than 1"),
+        ("solver.max_iterations=0", "solver.max_iterations = 0: must be at least 10"),
+        ("solver.precision=double", 'solver.precision = "double": must be \'single\''),
+        ("time.cfl=0", "time.cfl = 0: must be greater than 0"),
+        ("pressure.model=unilateral", 'pressure: needs scene.simulator = "fluids"'),
+        ("liquid=[]", "--set liquid=[]: must read section.key=value"),
+    ],
+)
+def test_what_is_refused(tmp_path: Any, overrides: str, expected: str) -> None:
+    assert expected in complaint(tmp_path, overrides)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "expected"),
+    [
+        (["material.density=1500", "physics.density=1600"], "material.density = 1500.0: differs from physics.density = 1600; give one of them"),
+        (["domain.periodic=[true, false]", 'domain.open=["left"]'], "names a side of a periodic axis"),
+        (["domain.periodic=[true, false]", "density_correction.every=1"], "goes without density_correction"),
+        (["material.cohesion=10", "material.tensile_strength=20"], "must be at most 17.32, the cohesion over the tangent of the friction angle"),
+    ],
+)
+def test_keys_that_contradict_each_other(tmp_path: Any, overrides: list[str], expected: str) -> None:
+    assert expected in complaint(tmp_path, *overrides)
+
+
+def test_sand_of_two_kinds_is_refused() -> None:
+    sand = [box([0.0, 0.0], [0.2, 0.2], friction_angle=30.0), box([0.5, 0.0], [0.7, 0.2], friction_angle=35.0)]
+    with pytest.raises(ValueError, match="must be 30 as in the other"):
+        scene(size=[1.0, 0.5], resolution=16, sand=sand)
+
+
+def test_no_sand_at_all_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"no \[\[source\]\] either"):
+        scene(size=[1.0, 0.5], resolution=16, sand=[])
+
+
+def test_a_material_gives_what_the_table_does_not() -> None:
+    """Gravel's own density and angle, and a wall friction in place of its own."""
+    data = {"scene": {"simulator": "granular"}, "time": {"duration": 1.0}, "domain": {"size": [1.0, 0.5], "resolution": 16}}
+    given = data | {"material": {"name": "gravel", "wall_friction": 0.1}, "sand": [box([0.0, 0.0], [0.2, 0.2])]}
+    model = validate(SandScene, given, "x")
+    assert (model.physics.density, model.friction_angle, model.max_fraction) == (1800.0, 40.0, 0.65)
+    assert model.wall_frictions() == [0.1]
+
+
+def test_walls_and_solids_have_their_own_friction() -> None:
+    solids = [box([0.5, 0.0], [0.6, 0.1], friction=0.0), box([0.7, 0.0], [0.8, 0.1], friction="stick"), box([0.9, 0.0], [1.0, 0.1])]
+    model = scene(size=[1.0, 0.5], resolution=16, sand=[box([0.0, 0.0], [0.2, 0.2])], solid=solids, friction=0.3)
+    assert model.wall_frictions() == [0.3, 0.0, STICKS, 0.3]
+
+
+def test_the_slope_of_the_yield_set() -> None:
+    """k = sin 30 in plane strain; in triaxial compression 2 sqrt(3) sin / (3 - sin), Drucker and Prager's outer cone; 2-D is plane strain."""
+    sand = [box([0.0, 0.0], [0.2, 0.2])]
+    assert scene(size=[1.0, 0.5], resolution=16, sand=sand).slope == pytest.approx(0.5)
+    triaxial = {"material": {"angle_of": "triaxial-compression"}}
+    assert scene(size=[1.0, 0.5], resolution=16, sand=sand, **triaxial).slope == pytest.approx(0.5)
+    deep = [box([0.0] * 3, [0.2] * 3)]
+    assert scene(size=[1.0, 0.5, 0.5], resolution=16, sand=deep, **triaxial).slope == pytest.approx(math.sqrt(3.0) / 2.5)
+
+
+def test_the_plan_tells_material_and_friction() -> None:
+    plan = dict(load_scene("column-collapse-2d").plan())
+    assert plan["material"].startswith("dry-sand, friction angle 30 degrees")
+    assert plan["friction"] == "cone, on walls 0.577"
+    assert plan["solver"].startswith("accelerated-projection to 0.001")

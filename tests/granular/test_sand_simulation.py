@@ -1,0 +1,193 @@
+"""Sand against answers that are known: free fall, weight, rest, and what no step may do."""
+
+import math
+
+import numpy as np
+import pytest
+from small_sands import GRAVITY, advance, box, column, create, scene
+
+from granular.simulator import SandSimulation
+from warp_lcp.driver.simulator import SimulationFailed
+
+DENSITY = 1600.0
+
+
+def vertical_load(simulation: SandSimulation) -> np.ndarray:
+    """Return -sigma_yy of the cells [Pa], shape (nz, ny, nx): sigma = -p + s, and s_yy = -a in 2-D."""
+    now = simulation.stress.now.numpy().astype(float)
+    deviator = -now[1] if simulation.grid.dimension == 2 else now[2]
+    planes = slice(1, 2) if simulation.grid.dimension == 2 else slice(1, -1)
+    return np.asarray((now[0] - deviator)[planes, 1:-1, 1:-1] * DENSITY * simulation.grid.spacing / simulation.stress.dt)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_grain_falls_freely(dimension: int) -> None:
+    """One particle is no packed sand: its velocity is the sum of g dt, to rounding, until it meets the floor."""
+    center = [0.26, 0.78, 0.26][:dimension]
+    grain = {"shape": "sphere", "center": center, "radius": 0.012}
+    simulation = create(
+        scene(size=[0.5, 1.0, 0.5][:dimension], resolution=32, sand=[grain], particles={"per_axis": 2, "jitter": 0.0}, friction=0.3)
+    )
+    assert simulation.particles.count == 1
+    sideways = np.array([0.7, 0.0, -0.3])[:dimension]
+    velocity = simulation.particles.velocity.numpy().copy()
+    velocity[:, :dimension] = sideways
+    simulation.particles.velocity.assign(velocity)
+    fallen = 0.0
+    while simulation.time < 0.2:
+        dt = min(simulation.stable_dt(), 5e-3)
+        fallen += GRAVITY * dt
+        row = simulation.step(dt)
+        assert row["dissipation"] == 0.0
+    expected = np.array([*sideways, 0.0])[:3]
+    expected[1] -= fallen
+    np.testing.assert_allclose(simulation.particles.velocity.numpy()[0], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_sand_lets_go_of_a_ceiling(dimension: int) -> None:
+    """A pressure that could be negative would hold it there."""
+    sand = [box([0.0, 0.25, 0.0][:dimension], [0.5, 0.5, 0.5][:dimension])]
+    simulation = create(scene(size=[0.5] * dimension, resolution=16, sand=sand, friction=0.0))
+    advance(simulation, 0.1)
+    velocity = simulation.particles.velocity.numpy()
+    assert np.median(velocity[:, 1]) == pytest.approx(-0.1 * GRAVITY, rel=0.05)
+    assert simulation.particles.position.numpy()[:, 1].max() < 0.5 - 0.3 * 0.5 * GRAVITY * 0.1**2
+    assert simulation.stress.now.numpy()[0].min() >= 0.0
+
+
+def settled(dimension: int, **tables: object) -> tuple[SandSimulation, list[dict[str, float]]]:
+    """Return sand that fills a box without friction on its walls to 3/4 and has come to rest."""
+    high = [0.5, 0.375, 0.5][:dimension]
+    model = scene(size=[0.5] * dimension, resolution=32 if dimension == 2 else 16, sand=[box([0.0] * dimension, high)], friction=0.0, **tables)
+    simulation = create(model)
+    return simulation, advance(simulation, 0.25)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_each_layer_bears_what_lies_on_it(dimension: int) -> None:
+    """Walls that do not rub take no weight, so the load of a row of cells is exactly the weight of what lies above their centers.
+
+    How a row shares it among its cells is undetermined in sand with friction, and varies: by a half and more.
+    """
+    simulation, rows = settled(dimension)
+    assert rows[-1]["max_speed"] < 0.03
+    load = vertical_load(simulation).mean(axis=(0, 2))
+    dx, fraction = simulation.grid.spacing, simulation.packing.fraction.numpy()
+    planes = slice(1, 2) if dimension == 2 else slice(1, -1)
+    phi = np.minimum(fraction[planes, 1:-1, 1:-1], 1.0).mean(axis=(0, 2))
+    above = np.cumsum(phi[::-1])[::-1] - 0.5 * phi
+    weight = DENSITY * GRAVITY * dx * above
+    deep = slice(0, int(0.3 / dx))
+    np.testing.assert_allclose(load[deep], weight[deep], rtol=0.05)
+    exact = DENSITY * GRAVITY * (0.375 - (np.arange(len(load)) + 0.5) * dx)  # rho g (h - y), if nothing had settled
+    np.testing.assert_allclose(load[deep], exact[deep], rtol=0.1)
+    mean = simulation.pressures()[planes, 1:-1, 1:-1].mean(axis=(0, 2))
+    np.testing.assert_allclose(mean[deep], exact[deep], rtol=0.25)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_floor_bears_the_weight(dimension: int) -> None:
+    """The load of the lowest cells and the weight of the half cell below their centers, summed over the floor."""
+    simulation, _ = settled(dimension)
+    dx = simulation.grid.spacing
+    floor = (vertical_load(simulation)[:, 0] + 0.5 * DENSITY * GRAVITY * dx).sum() * dx ** (dimension - 1)
+    weight = simulation.particles.count * simulation.particle_mass * GRAVITY
+    assert floor == pytest.approx(weight, rel=0.02)
+
+
+def test_walls_that_rub_carry_a_part_of_the_weight() -> None:
+    """Janssen: in a narrow silo the load below goes to a limit; without friction it is the whole weight."""
+    loads = []
+    for friction in (0.0, 0.6):
+        model = scene(size=[0.25, 1.0], resolution=64, sand=[box([0.0, 0.0], [0.25, 0.875])], friction=friction)
+        simulation = create(model)
+        advance(simulation, 0.3)
+        loads.append(vertical_load(simulation)[0, 0].mean() / (DENSITY * GRAVITY * 0.875))
+    assert loads[0] == pytest.approx(1.0, abs=0.05)
+    assert loads[1] < 0.7
+
+
+@pytest.mark.parametrize(("model", "method"), [("cone", "accelerated-projection"), ("box", "accelerated-projection"), ("cone", "interleaved-sweeps")])
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_what_every_step_keeps(dimension: int, model: str, method: str) -> None:
+    """Mass exactly; pressure only pushes; friction only takes energy; no cell is predicted to be too dense; energy falls."""
+    solver = {"method": method, "tolerance": 1e-3, "max_iterations": 4000 if dimension == 2 else 1000}
+    simulation = column(dimension, friction=0.4, solver=solver, density_correction={}) if model == "cone" else boxed(dimension, solver)
+    mass = simulation.particles.count * simulation.particle_mass
+    energy = math.inf
+    for _ in range(30):
+        row = simulation.step(min(simulation.stable_dt(), 5e-3))
+        assert row["mass"] == pytest.approx(mass, rel=1e-12)
+        assert row["coupled_residual"] <= 1e-3
+        assert row["dissipation"] >= 0.0
+        assert row["predicted_excess"] <= 2e-2
+        assert simulation.stress.now.numpy()[0].min() >= 0.0
+        assert 0.0 <= row["yielded"] <= 1.0
+        after = row["kinetic_energy"] + row["potential_energy"]
+        assert after <= energy + 1e-3 * mass * GRAVITY * simulation.grid.spacing
+        energy = after
+
+
+def boxed(dimension: int, solver: dict[str, object]) -> SandSimulation:
+    """Return the column with Narain's box; `friction` is a table of the scene here, not the domain's key."""
+    data = column(dimension, solver=solver).scene.model_dump(by_alias=True, exclude_none=True)
+    data["friction"] = {"model": "box"}
+    data["domain"]["friction"] = 0.4
+    data["density_correction"] = {}
+    from granular.scene import SandScene
+
+    return create(SandScene.model_validate(data))
+
+
+@pytest.mark.parametrize("degrees", [10.0, 35.0])
+def test_tilted_gravity_moves_a_slab_as_coulomb_says(degrees: float) -> None:
+    """A slab on a floor of friction 0.4 rests at 10 degrees; at 35 it slides with g (sin - mu cos): gravity, load and friction agree."""
+    mu, angle = 0.4, math.radians(degrees)
+    gravity = [GRAVITY * math.sin(angle), -GRAVITY * math.cos(angle)]
+    model = scene(
+        size=[2.0, 0.25], resolution=128, sand=[box([0.25, 0.0], [1.0, 0.09375])], friction=mu, physics={"gravity": gravity},
+        material={"friction_angle": 50.0},
+    )  # fmt: skip
+    simulation = create(model)
+    advance(simulation, 0.15)
+    position, velocity = simulation.particles.position.numpy(), simulation.particles.velocity.numpy()
+    inner = (position[:, 0] > np.quantile(position[:, 0], 0.3)) & (position[:, 0] < np.quantile(position[:, 0], 0.7))
+    expected = max(0.0, GRAVITY * (math.sin(angle) - mu * math.cos(angle)) * simulation.time)
+    assert velocity[inner, 0].mean() == pytest.approx(expected, rel=0.1, abs=0.03)
+
+
+def test_a_mirrored_scene_stays_mirrored() -> None:
+    """Nothing prefers a side, as far as the order of additions goes."""
+    found = []
+    for low, high in (([0.0, 0.0], [0.375, 0.375]), ([0.625, 0.0], [1.0, 0.375])):
+        simulation = create(scene(size=[1.0, 0.5], resolution=32, sand=[box(low, high)], friction=0.4, particles={"jitter": 0.0}))
+        advance(simulation, 0.3)
+        found.append(simulation.particles.position.numpy()[:, 0])
+    left, right = np.sort(found[0]), np.sort(1.0 - found[1])
+    assert np.abs(left - right).mean() < 0.2 / 32
+
+
+def test_a_pile_comes_to_rest_and_stays() -> None:
+    simulation = column(2, friction=0.577)
+    advance(simulation, 0.8)
+    front, height = simulation._front()
+    before = simulation.particles.position.numpy().copy()
+    advance(simulation, 1.3)
+    drift = np.linalg.norm(simulation.particles.position.numpy() - before, axis=1).mean()  # the order may change: an upper bound only
+    later = simulation._front()
+    assert later[0] - front < 0.5 * simulation.grid.spacing
+    assert height - later[1] < 0.5 * simulation.grid.spacing
+    assert np.linalg.norm(simulation.particles.velocity.numpy(), axis=1).mean() < 0.02
+    assert drift >= 0.0
+
+
+def test_sand_that_is_not_finite_ends_the_run() -> None:
+    simulation = column(2)
+    velocity = simulation.particles.velocity.numpy().copy()
+    velocity[3, 0] = np.nan
+    simulation.particles.velocity.assign(velocity)
+    with pytest.raises(SimulationFailed, match="velocity is not finite"):
+        simulation.step(1e-3)
+    with pytest.raises(ValueError, match="positive time"):
+        column(2).step(0.0)
