@@ -111,6 +111,6 @@ RUN = Suite("run", "steps per second of built-in scenes, and what the particles 
 SAND = Suite("sand", "sand: the coupled methods at equal residual, the yield sets, steps of large scenes")
 VALIDATION = Suite(
     "validation",
-    "liquids against known answers: rest, sloshing, ceiling, dam break, transfers, slopes, volume; with negative controls",
+    "liquids and sand against known answers: rest, sloshing, ceiling, dam break, transfers, slopes, volume, sand; with negative controls",
     False,
 )

@@ -1,4 +1,4 @@
-"""Physical checks of liquids with known answers, each with set-ups that are wrong on purpose and must fail it.
+"""Physical checks of liquids and sand with known answers, each with set-ups that are wrong on purpose and must fail it.
 
 `warp-lcp bench validation` runs them all. A check is a file: what must hold, at two resolutions, with its negative controls.
 """
@@ -10,10 +10,10 @@ from pathlib import Path
 from benchmarks.machine import machine
 from benchmarks.record import Results
 from benchmarks.timing import Options
-from benchmarks.validation import ceiling, dam_break, rest, slope, sloshing, transfers, volume
+from benchmarks.validation import ceiling, dam_break, inclined, rest, slope, sloshing, transfers, volume
 from benchmarks.validation.finding import Trial, table
 
-TITLE = "Liquids against known answers"
+TITLE = "Liquids and sand against known answers"
 CHECKS = {
     "transfers": transfers,
     "ceiling": ceiling,
@@ -22,6 +22,7 @@ CHECKS = {
     "sloshing": sloshing,
     "rest": rest,
     "volume": volume,
+    "inclined layer": inclined,
 }
 
 

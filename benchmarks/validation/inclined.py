@@ -2,10 +2,7 @@
 
 On a rough floor the friction is the sand's own, k = sin(friction angle) of the normal load; stiff sand slides on a smooth one with the
 wall's. Above the angle whose tangent that is, sand that runs goes on running; sand that has settled holds up to the friction angle itself,
-because it has pushed against itself along the slope. So the checks of running sand start it moving.
-
-The top half of the uppermost row of particles lies beyond the last cell that has a pressure, and does not press on the floor: with the
-quadratic spline 0.078 cells of it. The friction on n cells of depth is that much of n too small, first order in the spacing.
+because it has pushed against itself along the slope. So the checks of running sand start it moving. The rough floor holds the lowest row.
 """
 
 from __future__ import annotations
@@ -30,7 +27,6 @@ START = 0.5  # [m/s] of sand that runs
 ROUGH, SMOOTH = "stick", 0.5
 FRICTION_ANGLE, STIFF = 30.0, 50.0  # degrees
 COEFFICIENT = 0.5  # of both
-BESIDE = 0.078  # cells of depth that do not press on the floor
 ANGLES, SLIDES = (27.5, 29.0, 31.0, 35.0), (26.8, 30.0, 35.0)
 REST, SLAB_REST, BOX_FLOWS = 26.0, 26.3, 24.0  # degrees
 
@@ -51,14 +47,14 @@ def layer(cells: int, device: str = "cpu", angles: tuple[float, ...] = ANGLES) -
     """Let sand rest and run on a rough slope; the control is the box of Narain et al., which gives way where sand should rest."""
 
     def run(found: Findings) -> None:
-        early, late = rests(cells, REST, device)
-        found.add(f"{REST:g} degrees, settled: mean acceleration", late, high=0.01, unit="g")
-        found.add(f"{REST:g} degrees, settled: second half over first", late / early, high=1.0)
+        whole, late = rests(cells, REST, device)
+        found.add(f"{REST:g} degrees, settled: |mean acceleration|", abs(late), high=0.01, unit="g")
+        found.add(f"{REST:g} degrees, settled: speed in the end over g t", abs(whole), high=1e-3)
         ratios = []
         for angle in angles:
             ratio = runs(cells, angle, device) / accelerates(angle)
-            stuck, light = 1.0 / cells, _light(cells, angle)
-            found.add(f"{angle:g} degrees, running: acceleration over expected", ratio, low=0.94 - stuck, high=1.06 + light)
+            stuck = 1.0 / cells  # of the mean, the share of the row that the floor holds
+            found.add(f"{angle:g} degrees, running: acceleration over expected", ratio, low=0.94 - stuck, high=1.06)
             ratios.append(ratio * accelerates(angle) / GRAVITY)
         found.curves["layer"] = (list(angles), ratios)
         _, flows = rests(cells, BOX_FLOWS, device, friction={"model": "box"})
@@ -73,10 +69,10 @@ def slab(cells: int, device: str = "cpu", angles: tuple[float, ...] = SLIDES) ->
 
     def run(found: Findings) -> None:
         _, late = rests(cells, SLAB_REST, device, **tables)
-        found.add(f"{SLAB_REST:g} degrees: mean acceleration", late, high=0.01, unit="g")
+        found.add(f"{SLAB_REST:g} degrees: |mean acceleration|", abs(late), high=0.01, unit="g")
         for angle in angles:
             ratio = runs(cells, angle, device, speed=0.0, **tables) / accelerates(angle)
-            found.add(f"{angle:g} degrees: acceleration over expected", ratio, low=0.94, high=1.06 + _light(cells, angle))
+            found.add(f"{angle:g} degrees: acceleration over expected", ratio, low=0.94, high=1.06)
         _, slips = rests(cells, SLAB_REST, device, material={"friction_angle": STIFF}, floor=0.0)
         found.must_break("smooth floor: mean acceleration", slips, high=0.01, unit="g")
 
@@ -97,7 +93,7 @@ def runs(cells: int, angle: float, device: str = "cpu", *, speed: float = START,
 
 
 def rests(cells: int, angle: float, device: str = "cpu", **tables: Any) -> tuple[float, float]:
-    """Return how fast sand that has settled on the level gains speed on a slope [degrees], in the first and the second half [g]."""
+    """Return how fast sand that has settled on the level gains speed on a slope [degrees], in all and in the second half of RESTS [g]."""
     simulation = _create(cells, 0.0, device, 0.0, **tables)
     _watch(simulation, cells, SETTLES)
     simulation.particles.velocity.zero_()
@@ -106,8 +102,8 @@ def rests(cells: int, angle: float, device: str = "cpu", **tables: Any) -> tuple
     simulation.gravity = GRAVITY * np.array(_down(angle))
     time, mean = _watch(simulation, cells, RESTS)
     middle = len(time) // 2
-    first, last = mean[middle] / time[middle], (mean[-1] - mean[middle]) / (time[-1] - time[middle])
-    return float(first / GRAVITY), float(last / GRAVITY)
+    whole, late = mean[-1] / time[-1], (mean[-1] - mean[middle]) / (time[-1] - time[middle])
+    return float(whole / GRAVITY), float(late / GRAVITY)
 
 
 def _create(cells: int, angle: float, device: str, speed: float, floor: float | str = ROUGH, **tables: Any) -> SandSimulation:
@@ -137,8 +133,3 @@ def _watch(simulation: SandSimulation, cells: int, duration: float) -> tuple[np.
 def _down(angle: float) -> list[float]:
     """Return the direction of gravity in a domain whose x runs down a slope [degrees]."""
     return [math.sin(math.radians(angle)), -math.cos(math.radians(angle)), 0.0]
-
-
-def _light(cells: int, angle: float) -> float:
-    """Return what the sand that does not press on the floor adds to the acceleration, relative; a tenth more for rounding."""
-    return 1.1 * BESIDE / cells * COEFFICIENT * GRAVITY * math.cos(math.radians(angle)) / accelerates(angle)

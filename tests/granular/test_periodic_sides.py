@@ -12,8 +12,7 @@ from scipy.spatial import cKDTree
 from warp_lcp.grid.periodic import PeriodicSides
 from granular.scene import SandScene
 from granular.simulator import GranularSimulator, SandSimulation
-from warp_lcp.driver.scene import validate
-from warp_lcp.driver.scene import SceneError
+from warp_lcp.driver.scene import SceneError, validate
 from warp_lcp.grid.staggered import StaggeredGrid
 
 DX, DT = 0.02, 2e-3  # [m], [s]
@@ -94,10 +93,10 @@ def test_particles_come_in_again_and_keep_off_the_end() -> None:
     assert found[5, 1] == pytest.approx(1e-3 * DX)
 
 
-@pytest.mark.parametrize("transfer", ["apic", "flip"])
-def test_sand_that_starts_elsewhere_ends_elsewhere(transfer: str) -> None:
+@pytest.mark.parametrize(("transfer", "steps"), [("apic", 20), ("flip", 8)])
+def test_sand_that_starts_elsewhere_ends_elsewhere(transfer: str, steps: int) -> None:
     """A block that slides and collapses, once amid the grid, once across its sides: without a row of the ring they part within a step."""
-    count, steps = 12, 20
+    count = 12
 
     def run(shift: int) -> tuple[np.ndarray, np.ndarray]:
         sand = block([4, 0], [8, 8], count, shift, [0.5, 0.0])
@@ -113,9 +112,9 @@ def test_sand_that_starts_elsewhere_ends_elsewhere(transfer: str) -> None:
         there, moving = run(shift)
         distance, partner = cKDTree(at[:, :2], boxsize=[count * DX, 1.0]).query(there[:, :2])
         assert len(set(partner)) == len(at)
-        assert distance.max() < 2e-3 * DX
-        assert np.abs(moving - velocity[partner]).max() < 5e-3
-    assert np.ptp(at[:, 0]) > 4.2 * DX  # it has gone somewhere
+        assert distance.max() < 1e-3 * DX
+        assert np.abs(moving - velocity[partner]).max() < 1e-3
+    assert at[:, 0].mean() > (6 + 0.15 * steps / 8) * DX  # it has gone somewhere
 
 
 def test_the_same_in_three_dimensions() -> None:

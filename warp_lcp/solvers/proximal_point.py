@@ -59,7 +59,7 @@ class ProximalPoint:
         self._work = self._method.init(self._inner)
         self._work.last_resort = False
         self._work.floating = None
-        self._smallest, self._idle, self._steps, self._near, self._least = np.inf, 0, 0, 0.0, LEAST
+        self._smallest, self._idle, self._steps, self._near, self._least = residual.norm, 0, 0, 0.0, LEAST
 
     @staticmethod
     def suits(problem: LCP) -> bool:
@@ -101,19 +101,18 @@ class ProximalPoint:
     def _assess(self, x: wp.array[Any]) -> SolveStatus | None:
         """Prepare for the next center; return how the iteration ends if it has come no nearer to a solution for some."""
         solved, self._steps = self._work.residual.norm <= self._near, 0
+        x.assign(np.clip(x.numpy(), self._inner.lower.numpy(), self._inner.upper.numpy()))
+        norm = self._residual.evaluate(x)
+        if norm <= FALL * self._smallest:
+            self._smallest, self._idle, self._eps = norm, 0, max(self._least, FACTOR * self._eps)
+            return None
         if not solved and self._eps < LARGEST:
             if self._least == LEAST and proved_infeasible(self._problem):
                 return SolveStatus.INFEASIBLE
             self._eps = self._least = min(LARGEST, RAISED * self._eps)
             x.assign(self._center)
             return None
-        self._eps = max(self._least, FACTOR * self._eps)
-        x.assign(np.clip(x.numpy(), self._inner.lower.numpy(), self._inner.upper.numpy()))
-        norm = self._residual.evaluate(x)
-        if norm <= FALL * self._smallest:
-            self._smallest, self._idle = norm, 0
-            return None
-        self._idle += 1
+        self._eps, self._idle = max(self._least, FACTOR * self._eps), self._idle + 1
         if solved and self._idle < IDLE:
             return None
         floor = FLOOR_MARGIN * self._residual.rounding_floor(x, EPS)
