@@ -44,7 +44,9 @@ class Packing:
         nodes: the window of lower faces and edges of all cells and the domain's upper side.
     """
 
-    def __init__(self, grid: StaggeredGrid, base: wp.array, capacity: wp.array, *, relax: float = 0.2, sides: PeriodicSides | None = None) -> None:
+    def __init__(
+        self, grid: StaggeredGrid, base: wp.array, capacity: wp.array, *, relax: float = 0.2, sides: PeriodicSides | None = None
+    ) -> None:
         """Allocate the fields."""
         self.grid, self.base, self._capacity, self.relax, self.sides = grid, base, capacity, relax, sides
         self.fraction, self.kind, self.flags, self.drive = grid.field(), grid.field(wp.int8), grid.field(wp.uint8), grid.field()

@@ -172,6 +172,8 @@ class Stress:
         self.walls.activate(flags)
         inputs = [p.flags, p.stiff, *three(p.share), decay, self.now, self._before, self._point]
         p.grid.domain.launch(self.velocity.kernels.admit, inputs)
+        if p.sides is not None:
+            p.sides.wrap(self._point)
         inputs = [p.flags, *three(p.share), self._point, self.now]
         p.grid.domain.launch(damping_kernel(p.grid.dimension), inputs)
         self.dt = dt
@@ -220,7 +222,7 @@ class Stress:
             self._add_up(self._check.launch)
         self._check.run()
         sums = self._sums.numpy()
-        self.last_residual = math.sqrt(sums[0] / self._cells), math.sqrt((sums[1] + sums[2]) / self._cells)
+        self.last_residual = math.sqrt(sums[0] / self._cells), math.sqrt((sums[1] + sums[COLUMNS]) / self._cells)
         return self.last_residual
 
     def _project(self, velocity: Velocity, launch: Launch) -> None:

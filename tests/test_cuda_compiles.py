@@ -12,8 +12,12 @@ import warp as wp
 import fluids
 import granular
 import warp_lcp as wl
-from warp_lcp.grid.periodic import ring_kernels
+from granular.checkerboard import damping_kernel
+from granular.interleaved_kernels import interleaved_kernels
+from granular.report_kernels import report_kernels
+from granular.stress_kernels import stress_kernels
 from warp_lcp.grid import advection_kernels, distance_advection_kernels, transfer_kernels
+from warp_lcp.grid.periodic import ring_kernels
 from warp_lcp.material.density_correction_kernels import displacement_kernel
 from warp_lcp.multigrid import CycleSettings
 from warp_lcp.solvers.mprgp import MPRGP
@@ -102,6 +106,34 @@ def use_gradient_projection_kernels():
                 assert wl.solve(wl.LCP(A, -np.ones(A.shape)), MPRGP(precision=precision))
 
 
+def use_newton_kernels():
+    """Instantiate the kernels of Newton-type methods on grids, and of cold starts and scalings of sparse matrices."""
+    T = scipy.sparse.diags_array([-1.0, 2.01, -1.0], offsets=[-1, 0, 1], shape=(1200, 1200)).tocsr()
+    cells = np.ones((4, 4, 4), dtype=int)
+    cells[-1] = wl.AIR
+    for dtype in (wp.float32, wp.float64):
+        operators = [wl.SparseOperator(T, device="cpu", dtype=dtype)]
+        for faces in ({}, {"face_x": 2.0}, {"face_x": np.full((4, 4, 5), 0.5)}):
+            operators.append(wl.GridPoisson(cells, device="cpu", dtype=dtype, **faces))
+        for A in operators:
+            problem = wl.LCP(A, np.where(np.arange(np.prod(A.shape)).reshape(A.shape) % 2, -1.0, 1.0))
+            for precision in ("mixed", "double"):
+                for method in (wl.MinimumMapNewton, wl.FischerNewton, wl.InteriorPoint):
+                    assert wl.solve(problem, method(precision=precision), stopping=wl.StoppingCriteria(rtol=1e-4)), (A, method, precision)
+                assert wl.solve(problem, wl.InteriorPoint(precision=precision, crossover=1e-1), stopping=wl.StoppingCriteria(rtol=1e-4))
+
+
+def use_sand_kernels():
+    """Instantiate the kernels of sand in 2-D and 3-D, with both yield sets."""
+    for dimension in (2, 3):
+        damping_kernel(dimension)
+        report_kernels(dimension)
+        for box in (False, True):
+            interleaved_kernels(dimension, box)
+            stress_kernels(dimension, wp.float32, residual=False, box=box)
+            stress_kernels(dimension, wp.float64, residual=True, box=box)
+
+
 def test_all_kernels_compile_for_sm_80_and_sm_90(tmp_path):
     for package in (wl, fluids, granular):
         for found in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
@@ -117,6 +149,8 @@ def test_all_kernels_compile_for_sm_80_and_sm_90(tmp_path):
     use_sparse_kernels()
     use_sweeping_kernels()
     use_gradient_projection_kernels()
+    use_newton_kernels()
+    use_sand_kernels()
     from warp._src.context import user_modules
 
     names = sorted(name for name, module in user_modules.items() if name.startswith(("warp_lcp", "fluids", "granular")) and module.kernels)

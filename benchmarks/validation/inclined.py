@@ -35,9 +35,7 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
     """Run the check at its resolutions."""
     trials = [trial(n, device) for trial in (layer, slab) for n in RESOLUTIONS]
     curves = {f"{t.resolution}: {label}": curve for t in trials if t.check == "inclined layer" for label, curve in t.curves.items()}
-    exact = [
-        (math.degrees(a), accelerates(math.degrees(a)) / GRAVITY) for a in np.linspace(math.atan(COEFFICIENT), math.radians(36.0), 20)
-    ]
+    exact = [(math.degrees(a), accelerates(math.degrees(a)) / GRAVITY) for a in np.linspace(math.atan(COEFFICIENT), math.radians(36.0), 20)]
     curves["sin - cos / 2"] = ([x for x, _ in exact], [y for _, y in exact])
     title = "Acceleration of a layer that runs"
     return trials, [Lines("inclined-layer", title, "slope [degrees]", "a / g", curves, logarithmic_x=False, logarithmic_y=False)]

@@ -120,7 +120,9 @@ class CutBoundary:
         for axis in self.sides.axes:
             lines = np.moveaxis(distance, 2 - axis, 0)
             if np.abs(lines[1] - lines[-1]).max() > ALIKE:
-                raise ValueError(f"solids differ at the two sides of the periodic {'xyz'[axis]} axis: what reaches one must go on at the other")
+                raise ValueError(
+                    f"solids differ at the two sides of the periodic {'xyz'[axis]} axis: what reaches one must go on at the other"
+                )
 
     def _find_walls(self) -> None:
         self.touch.zero_()

@@ -1,0 +1,129 @@
+"""Masses of faces, places of shear stresses and faces of walls, against what is counted by hand and by NumPy."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+
+from granular.packing import Packing, wall_faces
+from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.operators.grid_poisson import SOLID
+
+DT, DX = 0.01, 0.1
+
+
+def packed(picture: list[str], **more: Any) -> Packing:
+    """Return the packing of a picture, top row first: '#' solid, '.' empty, 'o' dense sand, ':' sand of 0.4, '+' of 1.5."""
+    rows = picture[::-1]
+    grid = StaggeredGrid((len(rows[0]), len(rows), 1), DX, 2)
+    density, base = np.zeros(grid.shape, dtype=np.float32), np.full(grid.shape, SOLID, dtype=np.int8)
+    for j, row in enumerate(rows, start=1):
+        for i, mark in enumerate(row, start=1):
+            base[1, j, i] = SOLID if mark == "#" else 0
+            density[1, j, i] = {"#": 0.0, ".": 0.0, "o": 1.0, ":": 0.4, "+": 1.5}[mark]
+    one = wp.full(grid.shape, 1.0, dtype=wp.float32, device=grid.device)
+    packing = Packing(grid, wp.array(base, dtype=wp.int8, device=grid.device), one)
+    velocity = [wp.full(grid.shape, 2.0 + axis, dtype=wp.float32, device=grid.device) for axis in range(2)]
+    packing.update(wp.array(density, dtype=wp.float32, device=grid.device), velocity, DT, **more)
+    return packing
+
+
+def plane(field: wp.array) -> np.ndarray:
+    """Return the cells of a 2-D field with the domain's upper faces, the lowest row first."""
+    return np.asarray(field.numpy()[1, 1:, 1:])
+
+
+def test_a_face_has_the_mean_of_its_cells_as_mass() -> None:
+    packing = packed(["o.", "o:", "##"])
+    u, v = plane(packing.mass[0]), plane(packing.mass[1])
+    np.testing.assert_allclose(u[1:3], [[0.0, 0.7, 0.0], [0.0, 0.5, 0.0]], atol=1e-6)
+    np.testing.assert_allclose(v[1:4, :2], [[0.0, 0.0], [1.0, 0.2], [0.0, 0.0]], atol=1e-6)  # none on walls
+    for mass, inverse, start, given in zip(packing.mass, packing.inverse, packing.start, (2.0, 3.0), strict=True):
+        m, light = mass.numpy(), inverse.numpy()
+        np.testing.assert_allclose(light[m > 0.0], 1.0 / m[m > 0.0], rtol=1e-6)
+        assert not light[m == 0.0].any()
+        np.testing.assert_array_equal(start.numpy(), np.where(m > 0.0, given, 0.0).astype(np.float32))
+
+
+def test_a_solid_that_moves_sweeps_the_fraction_before_it() -> None:
+    shape = packed(["o:", "##"]).grid.shape
+    moving = [wp.full(shape, 0.5, dtype=wp.float32, device="cpu") for _ in range(2)]
+    packing = packed(["o:", "##"], solid=moving)
+    np.testing.assert_allclose(plane(packing.mass[1])[1, :2], [1.0, 0.4], atol=1e-6)
+    assert not plane(packing.inverse[1])[1].any()  # no stress moves it
+    np.testing.assert_array_equal(plane(packing.start[1])[1, :2], [0.5, 0.5])
+
+
+def test_only_a_share_of_what_is_too_dense_is_pushed_out() -> None:
+    packing = packed(["+"])
+    assert plane(packing.fraction)[0, 0] == pytest.approx(1.0 + 0.2 * 0.5)
+    assert plane(packing.drive)[0, 0] == pytest.approx(-0.1 * DX / DT, rel=1e-5)
+
+
+def test_surface_cells_count_as_full_and_loose_ones_do_not() -> None:
+    """(1 - phi) dx / dt is what a cell has room for; a partly filled cell beside air would have no pressure, and so no friction."""
+    packing = packed(["..", ":o", "oo"])
+    drive = plane(packing.drive)
+    assert drive[1, 0] == pytest.approx(0.0, abs=1e-6)
+    deep = packed([":::"] * 3)
+    assert plane(deep.drive)[1, 1] == pytest.approx(0.6 * DX / DT, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("picture", "expected"),
+    [
+        (["oo", "oo"], [[0.0, -0.5, 0.0], [-0.5, 0.25, -0.5], [0.0, -0.5, 0.0]]),  # none in the corners of the domain
+        (["oo", ":o"], [[0.0, -0.5, 0.0], [-0.5, 1 / 3, -0.5], [0.0, -0.5, 0.0]]),  # a loose cell bears no shear, but leans on walls
+        (["..", "oo"], [[0.0, -0.5, 0.0], [-1.0, 0.0, -1.0], [0.0, 0.0, 0.0]]),  # the surface itself bears none: the face above is empty
+    ],
+)
+def test_edges_share_shear_among_dense_cells(picture: list[str], expected: list[list[float]]) -> None:
+    packing = packed(picture)
+    np.testing.assert_allclose(plane(packing.share[0]), expected, atol=1e-6)
+
+
+def test_an_edge_of_an_empty_face_bears_no_shear() -> None:
+    packing = packed(["...", "...", "o.o"])
+    assert not (plane(packing.share[0])[1:] > 0.0).any()
+
+
+def test_copies_weigh_one_together() -> None:
+    """Each edge that carries shear has copies of weight 1 in all, so that equal copies are the edge's stress."""
+    random = np.random.default_rng(77)
+    rows = ["".join(random.choice(list("ooo:.#"), size=9)) for _ in range(8)]
+    packing = packed(rows)
+    share, flags, base = packing.share[0].numpy()[1], packing.flags.numpy()[1], packing.base.numpy()[1]
+    for j in range(1, 10):
+        for i in range(1, 11):
+            cells = [(j, i), (j, i - 1), (j - 1, i), (j - 1, i - 1)]
+            if share[j, i] > 0.0:
+                assert share[j, i] * sum(bool(flags[c] & 2) for c in cells) == pytest.approx(1.0)
+                assert not any(base[c] == SOLID for c in cells)
+            elif share[j, i] < 0.0:  # cells with a solid beside them, across the edge
+                touching = [
+                    flags[c] & 1 and base[c] != SOLID and ((base[c[0], 2 * i - 1 - c[1]] == SOLID) != (base[2 * j - 1 - c[0], c[1]] == SOLID))
+                    for c in cells
+                ]
+                assert -share[j, i] * sum(map(bool, touching)) == pytest.approx(1.0)
+                assert any(base[c] == SOLID for c in cells)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_wall_faces_lie_between_open_cells_and_solids(dimension: int) -> None:
+    random = np.random.default_rng(78)
+    shape = (5 if dimension == 3 else 3, 6, 7)
+    index = np.zeros(shape, dtype=np.int32)
+    index[1:-1, 1:-1, 1:-1] = random.choice([-1, -1, -1, 1, 2], size=np.subtract(shape, 2))
+    cells, sides, walls = wall_faces(index, dimension)
+    expected = set()
+    for cell in np.argwhere(index < 0):
+        for axis in range(dimension):
+            for side in range(2):
+                beyond = cell.copy()
+                beyond[2 - axis] += 2 * side - 1
+                if index[tuple(beyond)] >= 0:
+                    expected.add((int(np.ravel_multi_index(tuple(cell), shape)), 2 * axis + side, int(index[tuple(beyond)])))
+    assert set(zip(cells.tolist(), sides.tolist(), walls.tolist(), strict=True)) == expected
+    assert len(cells) == len(expected)
+    assert (np.diff(cells) >= 0).all()  # so that a cell's faces are one thread's, in one order
