@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -74,6 +75,15 @@ Chart = Bars | Lines
 
 
 @dataclass(frozen=True)
+class Sheet:
+    """Rows of a CSV file, as many as there are measurements."""
+
+    name: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True)
 class Results:
     """All that a suite found.
 
@@ -82,18 +92,26 @@ class Results:
         tables: for the report.
         charts: to draw.
         failures: what is not as it must be, a line each; the suite then ends with an error.
+        sheets: single measurements behind the records.
     """
 
     records: list[Record]
     tables: list[Table]
     charts: list[Chart] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
+    sheets: list[Sheet] = field(default_factory=list)
 
 
 def write_json(path: Path, records: Sequence[Record]) -> None:
     """Write records as a JSON list."""
     kept = [{"name": r.name, "figures": {k: f.as_dict() for k, f in r.figures.items()}, **r.facts} for r in records]
     path.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
+
+
+def write_csv(path: Path, sheet: Sheet) -> None:
+    """Write a sheet."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([sheet.columns, *sheet.rows])
 
 
 def read_json(path: Path) -> dict[str, Record]:

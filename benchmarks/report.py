@@ -1,4 +1,4 @@
-"""Write what a suite found: SUITE.json, SUITE.md and SUITE-*.png."""
+"""Write what a suite found: SUITE.json, SUITE.md, SUITE-*.csv and SUITE-*.png."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 from benchmarks.machine import present
 from benchmarks.plots import draw
-from benchmarks.record import MACHINE, Results, write_json, write_markdown
+from benchmarks.record import MACHINE, Results, write_csv, write_json, write_markdown
 from benchmarks.timing import Options
 
 
@@ -14,6 +14,8 @@ def write(name: str, title: str, results: Results, options: Options, out: Path) 
     """Write the files and return remarks for the user."""
     machine = next(r for r in results.records if r.name == MACHINE)
     write_json(out / f"{name}.json", results.records)
+    for sheet in results.sheets:
+        write_csv(out / f"{name}-{sheet.name}.csv", sheet)
     images = draw(results.charts, out, name)
     write_markdown(out / f"{name}.md", title, machine, results.tables, images)
     missing = [] if present("matplotlib") else ["no plots: Matplotlib is missing (pip install 'warp-lcp[peers]')"]

@@ -78,7 +78,7 @@ class Suite:
         process = subprocess.run([sys.executable, "-m", "benchmarks", *arguments], env={**os.environ, **ONE_THREAD}, check=False)
         if process.returncode != 0:
             raise RuntimeError(f"the suite {name} ended with exit code {process.returncode}")
-        return sorted(p for p in out.glob(f"{name}*") if p.suffix in (".json", ".md", ".png"))
+        return sorted(p for p in out.glob(f"{name}*") if p.suffix in (".json", ".md", ".csv", ".png"))
 
     def _check_replay(self, problems: Path | None, methods: tuple[str, ...], sizes: tuple[int, ...]) -> None:
         """Refuse what cannot be replayed, before a process is started for it."""

@@ -17,6 +17,7 @@ from granular.stress_kernels import PERIOD
 
 BETTER = 0.95  # of the best estimate: progress
 NEAR_BEST = 1.2
+NOTHING = 1e-3  # of the tolerance: nothing to solve, as in free fall
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,8 @@ class AcceleratedProjection:
         decay: of the stresses that a time step starts from.
         check_every: periods of steps between two looks at the estimate of the residual.
         patience: steps without a better estimate after which the next that is nearly as good as the best is taken.
+        least: steps that a solve takes, whatever its residual, unless that is next to nothing. Smooth errors hardly show in the residual
+            and add up from one time step to the next: without these steps, packed sand at rest creeps two to four times as far.
     """
 
     pressure_step: float = 1.0 / 1.2
@@ -87,6 +90,7 @@ class AcceleratedProjection:
     decay: float = 1.0
     check_every: int = 2
     patience: int = 300
+    least: int = 80
 
     def solve(self, stress: Stress, *, scale: float, tolerance: float, max_iterations: int) -> CoupledOutcome:
         """Solve from the stresses as they are."""
@@ -97,10 +101,11 @@ class AcceleratedProjection:
             momentum=self.momentum,
         )  # fmt: skip
         aim, best, best_at = tolerance * scale, math.inf, 0
-        status = _status(history, tolerance, max_iterations, done)
+        least = min(self.least, max_iterations) if history[0][1] > NOTHING * tolerance else 0
+        status = None if least > 0 and math.isfinite(history[0][1]) else _status(history, tolerance, max_iterations, done)
         while status is None:
             estimate, stagnates = math.inf, False
-            while estimate > aim and done < max_iterations and not stagnates:
+            while (estimate > aim or done < least) and done < max_iterations and not stagnates:
                 estimate = stress.advance(self.check_every)
                 done += self.check_every * PERIOD
                 if not estimate < BETTER * best:

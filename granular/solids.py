@@ -5,14 +5,13 @@ from __future__ import annotations
 import typing
 from collections.abc import Sequence
 
-import numpy as np
 import warp as wp
 
 from granular.stress import Walls
 from warp_lcp.grid.staggered import CellRange, StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid, voxelize
-from warp_lcp.material.cut_boundary import CutBoundary
 from warp_lcp.material.boundary import Boundary, Faces
+from warp_lcp.material.cut_boundary import CutBoundary
 from warp_lcp.operators.grid_poisson import AIR, SOLID
 
 _SOLID = wp.constant(wp.int8(SOLID))
@@ -138,5 +137,3 @@ class SandSolids:
         else:
             for field in self.velocity:  # a source that has stopped has left its own
                 field.zero_()
-
-

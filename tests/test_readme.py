@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from fluids.scene import LiquidScene
+from warp_lcp.driver.particle_scene import ParticleScene
 from warp_lcp.driver.scene_file import load_scene
 
 README = Path(__file__).parents[1] / "README.md"
@@ -28,7 +28,7 @@ def test_scene_examples_are_valid(text, tmp_path):
     file.write_text(text)
     assert tomllib.loads(text)
     scene = load_scene(str(file), [])
-    assert isinstance(scene, LiquidScene)
+    assert isinstance(scene, ParticleScene)
     assert scene.cell_counts[0] == scene.domain.resolution
 
 

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small_sands import box, create, scene
 
+from small_sands import box, create, scene
 from warp_lcp.driver.run import run_scene
 from warp_lcp.driver.scene_file import load_scene
 
@@ -118,7 +118,7 @@ def test_a_frame_after_restoring_is_that_before() -> None:
 
 
 def test_sand_goes_on_another_grid() -> None:
-    """Twice the cells along an axis, as many particles a cell, the same mass and momentum within the sampling, solids where they are now."""
+    """Twice the cells along an axis, as many particles a cell, the same mass within the sampling, solids where they are now."""
     tables = {"solid": [SLIDER], "solver": {"max_iterations": 60}}
     sand = [box([0.0, 0.0], [0.5, 0.25], velocity=[0.3, 0.0])]
     old = create(scene(size=[1.0, 0.5], resolution=32, sand=sand, **tables))

@@ -102,7 +102,9 @@ def test_copies_weigh_one_together() -> None:
                 assert not any(base[c] == SOLID for c in cells)
             elif share[j, i] < 0.0:  # cells with a solid beside them, across the edge
                 touching = [
-                    flags[c] & 1 and base[c] != SOLID and ((base[c[0], 2 * i - 1 - c[1]] == SOLID) != (base[2 * j - 1 - c[0], c[1]] == SOLID))
+                    flags[c] & 1
+                    and base[c] != SOLID
+                    and ((base[c[0], 2 * i - 1 - c[1]] == SOLID) != (base[2 * j - 1 - c[0], c[1]] == SOLID))
                     for c in cells
                 ]
                 assert -share[j, i] * sum(map(bool, touching)) == pytest.approx(1.0)

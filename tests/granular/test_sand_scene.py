@@ -4,9 +4,9 @@ import math
 from typing import Any
 
 import pytest
-from small_sands import box, scene
 
 from granular.scene import STICKS, SandScene
+from small_sands import box, scene
 from warp_lcp.driver.scene_file import load_scene
 from warp_lcp.driver.table import SceneError, validate
 
@@ -67,7 +67,7 @@ def complaint(tmp_path: Any, *overrides: str) -> str:
         ("solver.method=psor", "solver.method = \"psor\": must be 'accelerated-projection' or 'interleaved-sweeps'"),
         ("solver.tolerance=1", "solver.tolerance = 1: must be less than 1"),
         ("solver.max_iterations=0", "solver.max_iterations = 0: must be at least 10"),
-        ("solver.precision=double", 'solver.precision = "double": must be \'single\''),
+        ("solver.precision=double", "solver.precision = \"double\": must be 'single'"),
         ("time.cfl=0", "time.cfl = 0: must be greater than 0"),
         ("pressure.model=unilateral", 'pressure: needs scene.simulator = "fluids"'),
         ("liquid=[]", "--set liquid=[]: must read section.key=value"),
@@ -80,10 +80,16 @@ def test_what_is_refused(tmp_path: Any, overrides: str, expected: str) -> None:
 @pytest.mark.parametrize(
     ("overrides", "expected"),
     [
-        (["material.density=1500", "physics.density=1600"], "material.density = 1500.0: differs from physics.density = 1600; give one of them"),
+        (
+            ["material.density=1500", "physics.density=1600"],
+            "material.density = 1500.0: differs from physics.density = 1600; give one of them",
+        ),
         (["domain.periodic=[true, false]", 'domain.open=["left"]'], "names a side of a periodic axis"),
         (["domain.periodic=[true, false]", "density_correction.every=1"], "goes without density_correction"),
-        (["material.cohesion=10", "material.tensile_strength=20"], "must be at most 17.32, the cohesion over the tangent of the friction angle"),
+        (
+            ["material.cohesion=10", "material.tensile_strength=20"],
+            "must be at most 17.32, the cohesion over the tangent of the friction angle",
+        ),
     ],
 )
 def test_keys_that_contradict_each_other(tmp_path: Any, overrides: list[str], expected: str) -> None:
@@ -117,13 +123,24 @@ def test_walls_and_solids_have_their_own_friction() -> None:
 
 
 def test_the_slope_of_the_yield_set() -> None:
-    """k = sin 30 in plane strain; in triaxial compression 2 sqrt(3) sin / (3 - sin), Drucker and Prager's outer cone; 2-D is plane strain."""
+    """k = sin 30 in plane strain; in triaxial compression 2 sqrt(3) sin / (3 - sin), the outer cone; 2-D is plane strain."""
     sand = [box([0.0, 0.0], [0.2, 0.2])]
     assert scene(size=[1.0, 0.5], resolution=16, sand=sand).slope == pytest.approx(0.5)
     triaxial = {"material": {"angle_of": "triaxial-compression"}}
     assert scene(size=[1.0, 0.5], resolution=16, sand=sand, **triaxial).slope == pytest.approx(0.5)
     deep = [box([0.0] * 3, [0.2] * 3)]
     assert scene(size=[1.0, 0.5, 0.5], resolution=16, sand=deep, **triaxial).slope == pytest.approx(math.sqrt(3.0) / 2.5)
+
+
+def test_a_cone_that_would_bear_tension_is_refused() -> None:
+    """Beyond |s|_F = sqrt(2) sqrt(3) / 2 p the least principal stress of a sample that is pulled along an axis is below 0."""
+    sand = [box([0.0] * 3, [0.2] * 3)]
+    steep = {"material": {"angle_of": "triaxial-compression", "friction_angle": 37.0}}
+    with pytest.raises(ValueError, match=r"must be at most 36\.8"):
+        scene(size=[1.0, 0.5, 0.5], resolution=16, sand=sand, **steep)
+    k = scene(size=[1.0, 0.5, 0.5], resolution=16, sand=sand, material={**steep["material"], "friction_angle": 36.8}).slope
+    axial = math.sqrt(2.0) * k * math.sqrt(2.0 / 3.0)  # of the deviator, over p
+    assert 0.0 < 1.0 - axial < 0.01
 
 
 def test_the_plan_tells_material_and_friction() -> None:

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+
 from small_sands import GRAVITY, advance, box, create, scene
 
 TAP = box([0.25, 0.875], [0.5, 1.0], velocity=[0.0, -0.5])

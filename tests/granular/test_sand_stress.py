@@ -135,8 +135,8 @@ def shear_rate(u: list[np.ndarray], shear: int, edge: tuple[int, ...]) -> float:
 def nearest(point: np.ndarray, groups: list[np.ndarray], free: np.ndarray, metric: np.ndarray, radius: float) -> np.ndarray:
     """Return the point of { sum of free n^2 + sum over groups of max |z|^2 <= radius^2 } nearest in a metric.
 
-    With a multiplier mu of the set's bound, each group is cut to the size m that minimizes sum metric (|z| - m)_+^2 + mu m^2, and what counts
-    by itself shrinks; both by SciPy's root finder, and mu by it as well.
+    With a multiplier mu of the set's bound, each group is cut to the size m that minimizes sum metric (|z| - m)_+^2 + mu m^2, and what
+    counts by itself shrinks; SciPy's root finder gives each m, and mu.
 
     Args:
         point: to project.

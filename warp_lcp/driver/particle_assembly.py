@@ -166,7 +166,7 @@ def make_density_correction(scene: ParticleScene, grid: StaggeredGrid, boundary:
     solver = wl.ProjectedMultigrid(precision=scene.solver.precision)
     return DensityCorrection(
         grid, boundary, solver, particles_a_cell=count**grid.dimension, max_density=most, every=settings.every,
-        tolerance=settings.tolerance,
+        gain=scene.correction_gain, tolerance=settings.tolerance,
     )  # fmt: skip
 
 

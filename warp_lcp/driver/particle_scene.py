@@ -72,6 +72,7 @@ class ParticleScene(Scene):
     """
 
     solve_bytes: ClassVar[int] = 0  # a cell, of the fields of the solve that are there before the particles are made
+    correction_gain: ClassVar[float] = 1.0  # of the density correction
 
     particles: ParticleSettings = Field(default_factory=ParticleSettings)
     density_correction: DensityCorrectionSettings | None = None

@@ -9,6 +9,7 @@ import numpy as np
 import scipy.sparse
 import warp as wp
 
+from warp_lcp.affine_bounds import AffineBounds
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.grid_poisson import FLUID, GridPoisson
 from warp_lcp.operators.sparse import SparseOperator
@@ -24,6 +25,7 @@ FACTS = frozenset(
         "copositive",  # x'Ax >= 0 for x >= 0
         "positive-diagonal",
         "boxed",  # there are finite upper bounds
+        "affine",  # bounds depend on x
         "mixed",  # there are rows without bounds
         "strict",  # the known solution is strictly complementary
         "unique",  # there is one solution
@@ -40,8 +42,8 @@ class Problem:
         name: what it is, with its parameters.
         A: a GridPoisson, a scipy.sparse matrix or a numpy array.
         b: field of A's shape; 0 where a grid has no unknown.
-        lower: l, a field like b.
-        upper: u, a field like b.
+        lower: l, a field like b, or AffineBounds.
+        upper: u, likewise.
         solution: a solution, a field like b; None if none is known.
         facts: what holds, members of FACTS.
 
@@ -52,8 +54,8 @@ class Problem:
     name: str
     A: Any
     b: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
+    lower: Any
+    upper: Any
     solution: np.ndarray | None
     facts: frozenset[str]
 
@@ -98,8 +100,10 @@ class Problem:
         return Problem(f"{self.name} as dense", p.A.toarray(), p.b, p.lower, p.upper, p.solution, p.facts)
 
 
-def _number_or_field(bound: np.ndarray) -> float | np.ndarray:
+def _number_or_field(bound: Any) -> Any:
     """Return a bound that is the same everywhere as a number: methods are faster with it."""
+    if isinstance(bound, AffineBounds):
+        return bound
     first = float(bound.flat[0])
     return first if (bound == first).all() else bound
 

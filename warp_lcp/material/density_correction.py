@@ -60,6 +60,8 @@ class DensityCorrection:
         solver: settings of the method.
         particles_a_cell: of material at rest.
         max_density: rho_max, > 0. A material at rest whose particles lie at random would grow with 1.
+        gain: factor of what a cell holds too much, >= 1: a kernel spreads what a single cell gives away, so that its density falls by less
+            than the problem says.
         every: steps from one correction to the next.
         tolerance: relative residual at which a solve is done.
         max_iterations: of the method; the best iterate is taken then.
@@ -78,13 +80,14 @@ class DensityCorrection:
         *,
         particles_a_cell: int,
         max_density: float,
+        gain: float = 1.0,
         every: int = 1,
         tolerance: float = 1e-2,
         max_iterations: int = 20,
     ) -> None:
         """Allocate the fields."""
         self.grid, self.boundary, self.solver = grid, boundary, solver
-        self.particles_a_cell, self.max_density = particles_a_cell, max_density
+        self.particles_a_cell, self.max_density, self.gain = particles_a_cell, max_density, gain
         self.every = every
         self.tolerance, self.max_iterations = tolerance, max_iterations
         self.x, self._b = grid.field(wp.float64), grid.field(wp.float64)
@@ -126,7 +129,7 @@ class DensityCorrection:
         """Set up the problem; return how many cells are over-full, and the largest density."""
         b = self.boundary
         self.grid.domain.launch_rows(
-            kernels.prepare_kernel, [b.base, self.density, b.capacity, self.max_density, self._kind, self._b, self.x, self._sums]
+            kernels.prepare_kernel, [b.base, self.density, b.capacity, self.max_density, self.gain, self._kind, self._b, self.x, self._sums]
         )
         low, high = self.grid.domain.low, self.grid.domain.high
         sums = self._sums.numpy()[low[0] : high[0], low[1] : high[1]]

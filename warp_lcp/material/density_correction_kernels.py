@@ -24,7 +24,7 @@ PREPARE = """
         const int n = last - start < M ? last - start : M;
         SIMD8 for (int m = 0; m < n; ++m) {
             const int i = start + m, open = base[i] != SOLID, has = open & (int)(density[i] > 0.0f);
-            const float free = most*capacity[i] - density[i];
+            const float room = most*capacity[i] - density[i], free = room < 0.0f ? gain*room : room;
             kind[i] = has ? (signed char)FLUID : (open ? (signed char)AIR : (signed char)SOLID);
             b[i] = has ? (double)free : 0.0;
             x[i] = has & (int)(x[i] > 0.0) ? x[i] : 0.0;
@@ -69,18 +69,18 @@ def _source(body: str, **more: int) -> str:
 
 @wp.func_native(_source(PREPARE))
 def prepare_row(
-    base_: _I8, density_: _F32, capacity_: _F32, most: float, kind_: _I8, b_: _F64, x_: _F64, sums_: _F64,
+    base_: _I8, density_: _F32, capacity_: _F32, most: float, gain: float, kind_: _I8, b_: _F64, x_: _F64, sums_: _F64,
     k: int, j: int, first: int, last: int,
 ): ...  # fmt: skip
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.material.density_correction")
 def prepare_kernel(
-    cells: CellRange, base: _I8, density: _F32, capacity: _F32, most: float, kind: _I8, b: _F64, x: _F64, sums: _F64,
+    cells: CellRange, base: _I8, density: _F32, capacity: _F32, most: float, gain: float, kind: _I8, b: _F64, x: _F64, sums: _F64,
 ):  # fmt: skip
     """Unknowns, right-hand side and guess; a row's sums: [0] over-full cells, [1] 1 and the most above what fits."""
     plane, row = wp.tid()
-    prepare_row(base, density, capacity, most, kind, b, x, sums, cells.k + plane, cells.j + row, cells.i, cells.end)
+    prepare_row(base, density, capacity, most, gain, kind, b, x, sums, cells.k + plane, cells.j + row, cells.i, cells.end)
 
 
 @functools.cache

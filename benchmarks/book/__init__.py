@@ -1,0 +1,28 @@
+"""The experiments of [Book] appendix C, again: `warp-lcp bench solvers --suite book`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from benchmarks.book import convergence, robustness, sizes, starts
+from benchmarks.book.claims import claims
+from benchmarks.book.problems import Scale
+from benchmarks.machine import COPIED, machine
+from benchmarks.record import Results
+from benchmarks.timing import Options
+
+TITLE = "The book's experiments"
+
+
+def measure(options: Options, out: Path) -> Results:
+    """Make all experiments."""
+    scale = Scale.of(options)
+    where = machine(options.device, elements=min(COPIED, 64 * max(scale.sizes) ** 3), repeat=options.repeat)
+    parts = [part.measure(scale, options.device, options.say) for part in (sizes, convergence, robustness, starts)]
+    records = [r for p in parts for r in p.records]
+    return Results(
+        [where, *records],
+        [claims(records), *(t for p in parts for t in p.tables)],
+        [c for p in parts for c in p.charts],
+        sheets=[s for p in parts for s in p.sheets],
+    )

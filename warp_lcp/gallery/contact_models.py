@@ -1,0 +1,307 @@
+"""Coulomb friction at contacts as an LCP with a polyhedral cone, as a boxed problem, and as a proximal map ([Book] 1.3.5).
+
+All start from a `ContactSystem`: relative velocities at the contacts after impulses r, u = B r + q, whatever made them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+import scipy.sparse
+
+from warp_lcp.affine_bounds import AffineBounds
+from warp_lcp.gallery.problem import Problem
+
+
+@dataclass(frozen=True, eq=False)
+class ContactSystem:
+    """Velocities u = B r + q at k contacts and m further rows (joints) for impulses r.
+
+    The rows of a contact are consecutive: normal, then `dim - 1` tangents; joints follow the contacts.
+
+    Args:
+        name: what touches.
+        B: J M^-1 J', symmetric positive semi-definite [1/kg], scipy.sparse, shape (dim k + m, dim k + m).
+        q: velocities without impulses, with what removes errors of position [m/s], shape (dim k + m,).
+        friction: coefficient mu >= 0 of each contact, shape (k,).
+        lower: least impulse of each joint row [N s], shape (m,); none where -inf.
+        upper: the largest one.
+        dim: 3 in space, 2 in the plane.
+
+    Raises:
+        ValueError: shapes do not fit, or a coefficient is negative.
+    """
+
+    name: str
+    B: scipy.sparse.csr_array
+    q: np.ndarray
+    friction: np.ndarray
+    lower: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    upper: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    dim: int = 3
+
+    def __post_init__(self) -> None:
+        """Check shapes and signs."""
+        n = self.dim * len(self.friction) + len(self.lower)
+        if self.dim not in (2, 3):
+            raise ValueError(f"dim = {self.dim}: must be 2 or 3")
+        if self.B.shape != (n, n) or self.q.shape != (n,) or self.upper.shape != self.lower.shape:
+            raise ValueError(f"B has shape {self.B.shape}, q {self.q.shape}: expected {n} rows for {len(self.friction)} contacts")
+        if not (self.friction >= 0).all():
+            raise ValueError("friction holds a negative value or NaN")
+
+    @property
+    def contacts(self) -> int:
+        """Number of contacts."""
+        return len(self.friction)
+
+    @property
+    def normals(self) -> np.ndarray:
+        """Rows of the normal impulses, shape (k,)."""
+        return self.dim * np.arange(self.contacts)
+
+    @property
+    def tangents(self) -> np.ndarray:
+        """Rows of the tangential impulses, shape (k, dim - 1)."""
+        return self.normals[:, None] + np.arange(1, self.dim)
+
+    @property
+    def joints(self) -> np.ndarray:
+        """Rows of the joints, shape (m,)."""
+        return np.arange(self.dim * self.contacts, len(self.q))
+
+    def blocks(self, most: int = 5) -> list[np.ndarray]:
+        """Return the rows of each contact, then joints' rows: equations that follow each other, at most `most`, bounded ones alone."""
+        blocks = list(np.arange(self.dim * self.contacts).reshape(self.contacts, self.dim))
+        free = np.isinf(self.lower) & np.isinf(self.upper)
+        current: list[int] = []
+        for row, equation in zip(self.joints, free, strict=True):
+            if current and (not equation or len(current) == most):
+                blocks.append(np.array(current))
+                current = []
+            if equation:
+                current.append(int(row))
+            else:
+                blocks.append(np.array([row]))
+        return [*blocks, np.array(current)] if current else blocks
+
+    def staggered(self) -> list[np.ndarray]:
+        """Return the rows of normal impulses and joints, and those of friction: two blocks, or one where there is no contact."""
+        blocks = [np.concatenate([self.normals, self.joints]), self.tangents.ravel()]
+        return [block for block in blocks if block.size]
+
+    def residual(self, r: np.ndarray) -> float:
+        """Return the norm of the proximal map's defect at r with the circular cone, in m/s.
+
+        With u = B r + q and d a contact's mean diagonal of B: d (r_n - max(0, r_n - u_n / d)), and for friction the same with the
+        projection onto |r_t| <= mu r_n ([Book] 1.1.4, 1.3.5; the disk of the true normal impulse). 0 exactly where Coulomb's law holds:
+        r_n >= 0, u_n >= 0, r_n u_n = 0, and r_t is in the disk and opposite to u_t where that is not 0. Joint rows are clipped.
+        """
+        u, d = self.B @ r + self.q, np.abs(self.B.diagonal())
+        d = np.where(d > 0, d, 1.0)
+        k, rows = self.contacts, self.dim * self.contacts
+        scale = d[:rows].reshape(k, self.dim).mean(axis=1, keepdims=True)
+        free = (r[:rows].reshape(k, self.dim)) - u[:rows].reshape(k, self.dim) / scale
+        mine = r[:rows].reshape(k, self.dim)
+        defect = scale * (mine - project_cone(free, self.friction, mine[:, 0]))
+        j = self.joints
+        joint = d[j] * (r[j] - np.clip(r[j] - u[j] / d[j], self.lower, self.upper))
+        return float(np.sqrt(np.square(defect).sum() + np.square(joint).sum()))
+
+
+def project_cone(r: np.ndarray, friction: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Return (max(0, r_n), r_t projected onto the disk of radius mu max(0, normal)), shape (k, dim)."""
+    out = r.copy()
+    out[:, 0] = np.maximum(r[:, 0], 0.0)
+    radius, length = friction * np.maximum(normal, 0.0), np.linalg.norm(r[:, 1:], axis=1)
+    out[:, 1:] *= (radius / np.maximum(length, np.maximum(radius, 1e-300)))[:, None]
+    return out
+
+
+class ContactModel(Protocol):
+    """How friction becomes a problem."""
+
+    def problem(self, system: ContactSystem) -> Problem:
+        """Return the problem of a system."""
+
+    def impulses(self, system: ContactSystem, x: np.ndarray) -> np.ndarray:
+        """Return r of the problem's unknowns."""
+
+    def guess(self, system: ContactSystem, r: np.ndarray) -> np.ndarray:
+        """Return unknowns whose impulses are near r."""
+
+
+@dataclass(frozen=True)
+class BoxedModel:
+    """The interactive model: |r_t| <= mu r_n for each tangent alone, bounds affine in r_n ([Book] 1.3.5).
+
+    The cone has four sides and its friction up to sqrt(2) mu along diagonals, and friction does not oppose the slip exactly. The problem
+    is symmetric positive semi-definite, with n = dim k + m unknowns, and for methods that take affine bounds.
+    """
+
+    def problem(self, system: ContactSystem) -> Problem:
+        """Return the boxed problem."""
+        n, normal, mu = len(system.q), np.full(len(system.q), -1), np.zeros(len(system.q))
+        normal[system.tangents] = system.normals[:, None]
+        mu[system.tangents] = system.friction[:, None]
+        low, high = np.zeros(n), np.full(n, np.inf)
+        low[system.joints], high[system.joints] = system.lower, system.upper
+        lower, upper = AffineBounds.friction(normal, mu, low, high)
+        facts = {"symmetric", "semidefinite", "boxed", "affine"} | ({"mixed"} if np.isinf(system.lower).any() else set())
+        return Problem(f"{system.name}: boxed", system.B, system.q, lower, upper, None, frozenset(facts))
+
+    def impulses(self, system: ContactSystem, x: np.ndarray) -> np.ndarray:
+        """Return x: it is r."""
+        return x
+
+    def guess(self, system: ContactSystem, r: np.ndarray) -> np.ndarray:
+        """Return r within its bounds."""
+        x = r.copy()
+        x[system.joints] = np.clip(x[system.joints], system.lower, system.upper)
+        x[system.normals] = np.maximum(x[system.normals], 0.0)
+        radius = (system.friction * x[system.normals])[:, None]
+        x[system.tangents] = np.clip(x[system.tangents], -radius, radius)
+        return x
+
+
+@dataclass(frozen=True, eq=False)
+class FrozenBoxModel(BoxedModel):
+    """|r_t| <= mu s with normal impulses s that are given: bounds are constants, and any method for boxed problems may solve it.
+
+    Args:
+        normal: s of each contact [N s], shape (k,).
+    """
+
+    normal: np.ndarray = field(default_factory=lambda: np.zeros(0))
+
+    def problem(self, system: ContactSystem) -> Problem:
+        """Return the boxed problem with constant bounds."""
+        p = BoxedModel().problem(system)
+        at = np.zeros(len(p.b))
+        at[system.normals] = np.maximum(self.normal, 0.0)
+        facts = p.facts - {"affine"} | {"solvable"}
+        return Problem(f"{system.name}: frozen boxes", p.A, p.b, p.lower.at(at), p.upper.at(at), None, facts)
+
+
+@dataclass(frozen=True)
+class StewartTrinkleModel:
+    """The LCP of Stewart and Trinkle with a cone of K sides ([Book] 1.3.5, eqs. 1.146-1.147).
+
+    Friction is a sum of non-negative impulses along K unit vectors evenly around the normal; with beta, the slip speed, a contact has the
+    rows y_n = u_n, y_t = u_t + beta, y_beta = mu x_n - sum of x_t, each complementary to its x >= 0. The last sign makes it
+    [B_nn, B_nt, 0; B_tn, B_tt, e; mu, -e', 0]. Not symmetric, beta's diagonal is 0, copositive: Lemke's method and Newton-type methods.
+    Unknowns: (2 + K) k + m. The cone lies inside the circular one and touches it along the K vectors; its sides recede by the factor
+    cos(pi / K). In the plane the vectors are +-t, K = 2, whatever `directions` is.
+
+    Args:
+        directions: K, even and >= 4.
+
+    Raises:
+        ValueError: it is not.
+    """
+
+    directions: int = 4
+
+    def __post_init__(self) -> None:
+        """Check K."""
+        if self.directions < 4 or self.directions % 2:
+            raise ValueError(f"directions = {self.directions}: must be an even number >= 4")
+
+    def spread(self, dim: int) -> np.ndarray:
+        """Return normal and the K vectors as rows in a contact's frame, shape (1 + K, dim)."""
+        K = self.directions if dim == 3 else 2
+        angles = 2 * np.pi * np.arange(K) / K
+        around = np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, : dim - 1]
+        return np.block([[np.ones((1, 1)), np.zeros((1, dim - 1))], [np.zeros((K, 1)), around]])
+
+    def problem(self, system: ContactSystem) -> Problem:
+        """Return the LCP, mixed where joints have equations."""
+        k, m, spread = system.contacts, len(system.lower), self.spread(system.dim)
+        K = len(spread) - 1
+        joint = scipy.sparse.eye_array(m)
+        T = scipy.sparse.block_diag([scipy.sparse.kron(scipy.sparse.eye_array(k), np.vstack([spread, np.zeros(system.dim)])), joint])
+        beta = np.zeros((2 + K, 2 + K))
+        beta[1:-1, -1], beta[-1, 1:-1] = 1.0, -1.0
+        slope = np.zeros((2 + K, 2 + K))
+        slope[-1, 0] = 1.0
+        cones = scipy.sparse.kron(scipy.sparse.eye_array(k), beta) + scipy.sparse.kron(scipy.sparse.diags_array(system.friction), slope)
+        A = scipy.sparse.csr_array(T @ system.B @ T.T + scipy.sparse.block_diag([cones, scipy.sparse.csr_array((m, m))]))
+        n = A.shape[0]
+        lower, upper = np.zeros(n), np.full(n, np.inf)
+        lower[n - m :], upper[n - m :] = system.lower, system.upper
+        facts = {"copositive"} | ({"mixed"} if np.isinf(system.lower).any() else set())
+        facts |= {"boxed"} if np.isfinite(system.upper).any() else set()
+        return Problem(f"{system.name}: Stewart-Trinkle, {K} sides", A, T @ system.q, lower, upper, None, frozenset(facts))
+
+    def impulses(self, system: ContactSystem, x: np.ndarray) -> np.ndarray:
+        """Return r: friction is summed over the vectors."""
+        k, spread = system.contacts, self.spread(system.dim)
+        own = x[: k * (1 + len(spread))].reshape(k, -1)[:, :-1] @ spread
+        return np.concatenate([own.ravel(), x[k * (1 + len(spread)) :]])
+
+    def guess(self, system: ContactSystem, r: np.ndarray) -> np.ndarray:
+        """Return unknowns whose impulses are near r: friction split onto the two nearest vectors, beta from the slip at r."""
+        k, dim, spread = system.contacts, system.dim, self.spread(system.dim)
+        rows, own = dim * k, r[: dim * k].reshape(k, dim)
+        u = (system.B @ r + system.q)[:rows].reshape(k, dim)
+        x = np.zeros((k, 1 + len(spread)))
+        x[:, 0] = own[:, 0]
+        K = len(spread) - 1
+        if dim == 2:
+            x[:, 1], x[:, 2] = np.maximum(own[:, 1], 0.0), np.maximum(-own[:, 1], 0.0)
+        else:
+            turn = np.arctan2(own[:, 2], own[:, 1]) % (2 * np.pi) * K / (2 * np.pi)
+            before = np.floor(turn).astype(int) % K
+            length, rest = np.linalg.norm(own[:, 1:], axis=1), (turn - np.floor(turn)) * 2 * np.pi / K
+            each = np.arange(k)
+            x[each, 1 + before] = length * np.sin(2 * np.pi / K - rest) / np.sin(2 * np.pi / K)
+            x[each, 1 + (before + 1) % K] = length * np.sin(rest) / np.sin(2 * np.pi / K)
+        x[:, -1] = np.maximum((-u @ spread[1:].T).max(axis=1), 0.0)
+        return np.concatenate([x.ravel(), r[rows:]])
+
+
+def proximal_sweeps(
+    system: ContactSystem, *, tolerance: float = 1e-9, most: int = 1000, r0: np.ndarray | None = None
+) -> tuple[np.ndarray, float, int]:
+    """Solve the proximal-map form with the circular cone by Gauss-Seidel sweeps over contacts, on the host ([Book] 1.1.4, 1.3.5).
+
+    r_n <- max(0, r_n - u_n / B_nn), then r_t <- proj(r_t - u_t / rho) onto |r_t| <= mu r_n with rho the largest eigenvalue of the
+    contact's B_tt; joint rows <- clip(r - u / B_ii). No proof of convergence for mu > 0; the reference for the polyhedral cones here, in
+    systems of up to some hundred contacts.
+
+    Args:
+        system: what to solve.
+        tolerance: of `system.residual`, relative to that at r = 0.
+        most: sweeps.
+        r0: first impulses; 0 if None.
+
+    Returns:
+        r, the residual at r [m/s], and the number of sweeps.
+    """
+    dense = system.B.toarray()
+    r, k, dim = np.zeros(len(system.q)) if r0 is None else r0.copy(), system.contacts, system.dim
+    u = dense @ r + system.q
+    diagonal = np.where(np.diag(dense) > 0, np.diag(dense), 1.0)
+    rho = [float(np.linalg.eigvalsh(dense[t][:, t])[-1]) or 1.0 for t in system.tangents]
+    target = tolerance * system.residual(np.zeros_like(r))
+
+    def change(rows: np.ndarray, to: np.ndarray) -> None:
+        nonlocal u
+        u += dense[:, rows] @ (to - r[rows])
+        r[rows] = to
+
+    for sweep in range(1, most + 1):
+        for c in range(k):
+            n, t = dim * c, system.tangents[c]
+            change(np.array([n]), np.maximum(r[n : n + 1] - u[n] / diagonal[n], 0.0))
+            free, radius = r[t] - u[t] / rho[c], system.friction[c] * r[n]
+            length = float(np.linalg.norm(free))
+            change(t, free if length <= radius else free * (radius / length))
+        for row, low, high in zip(system.joints, system.lower, system.upper, strict=True):
+            change(np.array([row]), np.clip(r[row : row + 1] - u[row] / diagonal[row], low, high))
+        residual = system.residual(r)
+        if residual <= target:
+            return r, residual, sweep
+    return r, residual, most
