@@ -32,7 +32,9 @@ class Case:
         bounds: which unknowns have p >= 0.
         solver: settings of the method.
         device: Warp device.
-        full: whether reuse, warm starts, memory and time to tolerances are measured too.
+        full: whether reuse, warm starts and time to tolerances are measured too.
+        label: what the method is called; its class's name if empty.
+        reused: whether only reuse is, where `full` is False.
     """
 
     form: str
@@ -41,15 +43,23 @@ class Case:
     solver: Any
     device: str
     full: bool = True
+    label: str = ""
+    reused: bool = False
     samples: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     counts: dict[str, float] = field(default_factory=dict)
     history: list[wl.Record] = field(default_factory=list)
     _warm: Iterator[tuple[float, int]] | None = None
+    _kept: tuple[wl.LCP, Any] | None = None
+
+    @property
+    def method(self) -> str:
+        """What the method is called."""
+        return self.label or type(self.solver).__name__
 
     @property
     def name(self) -> str:
         """Unique among the cases."""
-        return f"{self.scene.n}^3 {self.form} {self.bounds} {type(self.solver).__name__}"
+        return f"{self.scene.n}^3 {self.form} {self.bounds} {self.method}"
 
     @property
     def cells(self) -> int:
@@ -81,6 +91,19 @@ class Case:
                 self.samples[part].append(end - begun)
             self.samples["setup"].append(times[3] - times[0])
             self.samples["total"].append(times[4] - times[0])
+
+    def cold_again(self, *, keep: bool) -> None:
+        """Solve cold with a workspace that has solved before."""
+        if self._kept is None:
+            problem, _ = self._in_place()
+            self._kept = problem, self.solver.init(problem)
+        problem, work = self._kept
+        begun = time.perf_counter()
+        result = wl.solve(problem, self.solver, stopping=wl.StoppingCriteria(rtol=RTOL), workspace=work)
+        wp.synchronize_device(self.device)
+        self.counts["reuse_iterations"] = result.iterations
+        if keep:
+            self.samples["reuse"].append(time.perf_counter() - begun)
 
     def again(self, *, keep: bool) -> None:
         """Solve with a workspace that has solved before: cold; by the method's bare loop; and warm after b changed by 1 %."""

@@ -24,6 +24,12 @@ PEER_SECONDS = 60.0  # [s] after which a peer is not asked again: at 256^3 PyAMG
 LARGE = 192  # cells a side beyond which only the engine on unit coefficients is measured: the rest takes minutes a round
 SCIPY_CELLS = 64  # cells a side up to which plain CG is waited for
 ENGINE = "ProjectedMultigrid"
+OTHERS = {
+    "MPRGP": wl.MPRGP(),
+    "FischerNewton": wl.FischerNewton(),
+    "InteriorPoint": wl.InteriorPoint(),
+    "InteriorPoint, crossover": wl.InteriorPoint(crossover=1e-2),
+}
 
 
 def measure(options: Options, out: Path) -> Results:
@@ -61,6 +67,8 @@ def _measure_size(n: int, options: Options) -> tuple[list[Case], dict[str, list[
             case.cold(keep=turn > 0)
             if case.full:
                 case.again(keep=turn > 0)
+            elif case.reused:
+                case.cold_again(keep=turn > 0)
         if turn > 0:
             for name, solve in solves.items():
                 if sum(p.total for p in peers[name]) < PEER_SECONDS:
@@ -73,7 +81,7 @@ def _measure_size(n: int, options: Options) -> tuple[list[Case], dict[str, list[
 
 
 def _cases(n: int, device: str) -> list[Case]:
-    """Return the cases of a size: the engine and Newton on unit coefficients, the engine on what is harder."""
+    """Return the cases of a size: the engine and other methods on unit coefficients, the engine on what is harder."""
     scene = splash(n)
     if n > LARGE:
         return [Case("unit", scene, bounds, wl.ProjectedMultigrid(), device) for bounds in BOUNDS]
@@ -81,6 +89,11 @@ def _cases(n: int, device: str) -> list[Case]:
     arrays = {f"face_{a}": np.full([n + (i == j) for j in range(3)], flat.faces.get(f"face_{a}", 1.0)) for i, a in enumerate("zyx")}
     both = [wl.ProjectedMultigrid(), wl.MinimumMapNewton()]
     cases = [Case("unit", scene, bounds, solver, device) for bounds in BOUNDS for solver in both]
+    cases += [
+        Case("unit", scene, bounds, solver, device, full=False, label=label, reused=True)
+        for label, solver in OTHERS.items()
+        for bounds in BOUNDS[1:]
+    ]
     cases += [Case("faces", cut_cells(scene), bounds, both[0], device) for bounds in BOUNDS]
     harder = {"cells 1:100": flat, "arrays 1:100": type(scene)(n, scene.cells, scene.b, scene.wall, arrays)}
     return cases + [Case(form, s, bounds, both[0], device, full=False) for form, s in harder.items() for bounds in BOUNDS[:2]]
@@ -92,12 +105,15 @@ def _records(n: int, cases: list[Case], peers: dict[str, list[PeerSolve]]) -> li
     pyamg = [p.total for p in peers.get("PyAMG SA-CG", [])]
     records = []
     for case in cases:
-        figures, method = case.figures(), type(case.solver).__name__
+        figures, method = case.figures(), case.method
         linear = by_name.get(f"{n}^3 {case.form} linear {method}", case)
         unit = by_name.get(f"{n}^3 unit {case.bounds} {method}", case)
         for label, other in (("over_linear", linear), ("over_unit", unit)):
             if other is not case:
                 figures[label] = ratios(case.samples["total"], other.samples["total"])
+        engine = by_name.get(f"{n}^3 {case.form} linear {ENGINE}", case)
+        if case.bounds != "linear" and case.samples["reuse"] and engine is not case:
+            figures["reuse_over_engine"] = ratios(case.samples["reuse"], engine.samples["reuse"])
         if linear is not case and case.samples["warm"]:
             figures["warm_over_linear"] = ratios(case.samples["warm"], linear.samples["warm"])
             figures["reuse_over_linear"] = ratios(case.samples["reuse"], linear.samples["reuse"])
@@ -126,7 +142,7 @@ def _curves(cases: list[Case]) -> dict[str, tuple[list[float], list[float]]]:
         if case.history and case.form == "unit":
             first = case.history[0].residual
             points = [(r.seconds, r.residual / first) for r in case.history if r.residual > 0]
-            curves[f"{case.bounds}, {type(case.solver).__name__}"] = ([t for t, _ in points], [r for _, r in points])
+            curves[f"{case.bounds}, {case.method}"] = ([t for t, _ in points], [r for _, r in points])
     return curves
 
 
@@ -157,8 +173,12 @@ def _times(n: int, records: list[Record]) -> Table:
 
 def _quality(n: int, records: list[Record]) -> Table:
     """Iterations, memory and ratios."""
-    ratio_names = ("over_linear", "warm_over_linear", "over_unit", "iterations_over_unit", "loop_over_bare")
+    ratio_names = ("over_linear", "reuse_over_engine", "warm_over_linear", "over_unit", "iterations_over_unit", "loop_over_bare")
     names = ("iterations", "linear_iterations", "warm_iterations", "residual", "bytes_per_cell", "resident_per_cell", *ratio_names)
     rows = [[r.name.partition(" ")[2], *("" if (v := r.value(f)) is None else f"{v:.3g}" for f in names)] for r in records]
-    remark = "bytes per cell: Warp arrays of operator, problem, workspace, b and bounds; resident: growth of the process's peak memory."
+    remark = (
+        "bytes per cell: Warp arrays of operator, problem, workspace, b and bounds; resident: growth of the process's peak memory. "
+        "over linear: to the same method's linear solve, set-up included; reuse over engine: to the linear solve by ProjectedMultigrid, "
+        "both cold with a workspace that has solved before."
+    )
     return Table(f"Iterations, memory and ratios at {n}^3", ["case", *(f.replace("_", " ") for f in names)], rows, remark)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from benchmarks.compare import comparison
@@ -26,12 +27,14 @@ class Suite:
         summary: what it measures.
         resizable: whether it can be asked for other sizes.
         replays: whether it can be asked for recorded problems.
+        groups: other cases of it by name, with what they are; their files are GROUP.json and so on.
     """
 
     name: str
     summary: str
     resizable: bool = True
     replays: bool = False
+    groups: Mapping[str, str] = field(default_factory=dict)
 
     def run(
         self,
@@ -42,6 +45,7 @@ class Suite:
         repeat: int = 5,
         problems: Path | None = None,
         methods: tuple[str, ...] = (),
+        group: str = "",
     ) -> list[Path]:
         """Measure and write the files.
 
@@ -52,6 +56,7 @@ class Suite:
             repeat: samples of each timing.
             problems: folder of recorded problems to measure methods on instead; the files are then replay.json and so on.
             methods: names of those methods; the suite's choice without any.
+            group: name of one of `groups`, to measure instead.
 
         Returns:
             The files.
@@ -67,6 +72,12 @@ class Suite:
         if min(sizes, default=8) < 8:
             raise ValueError(f"size = {min(sizes)}: must be >= 8 cells a side")
         name = self.name
+        if group and group not in self.groups:
+            known = f"choose from {', '.join(self.groups)}" if self.groups else "it has none; use solvers"
+            raise ValueError(f"--group {group}: the suite {self.name} has no such group; {known}")
+        if group and (problems is not None or methods):
+            raise ValueError("--group: cannot be combined with --problems and --method")
+        name = group or name
         if problems is not None or methods:
             self._check_replay(problems, methods, sizes)
             name = REPLAY
@@ -106,7 +117,12 @@ class Suite:
 
 
 KERNELS = Suite("kernels", "each hot kernel on the finest grid against this machine's copy bandwidth, Numba and a plain Warp kernel")
-SOLVERS = Suite("solvers", "linear and LCP solves: set-up, iterations, time to a tolerance, memory; against PyAMG and SciPy", replays=True)
+SOLVERS = Suite(
+    "solvers",
+    "linear and LCP solves: set-up, iterations, time to a tolerance, memory; against PyAMG and SciPy",
+    replays=True,
+    groups={"book": "the experiments of [Book] appendix C"},
+)
 RUN = Suite("run", "steps per second of built-in scenes, and what the particles cost")
 SAND = Suite("sand", "sand: the coupled methods at equal residual, the yield sets, steps of large scenes")
 VALIDATION = Suite(

@@ -10,21 +10,23 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from granular.yield_set import SHAPE, WALL_FACE, YIELD, native
+from granular.yield_set import FLUX, SHAPE, WALL_FACE, YIELD, native
 
 APART = 3  # cells along an axis, so that two threads change no velocity in common
 
-PRESSURE = SHAPE + """
+PRESSURE = SHAPE + FLUX + """
     const long long c = row + i;
     float* x = now_.data + c;
     if (!(flags_.data[c] & HOLDS)) return;
     const float* mass[3] = {mass_x.data, mass_y.data, mass_z.data}; const float* inverse[3] = {inverse_x.data, inverse_y.data, inverse_z.data};
     T* u[3] = {u_x.data, u_y.data, u_z.data};
     T w = (T)drive_.data[c], diagonal = 0;
+    const T full = fullness(w*(T)numbers.data[STEP_OF_CELL]);
     for (int axis = 0; axis < DIM; ++axis) {
         const long long o = c + s[axis];
-        w += (T)mass[axis][o]*u[axis][o] - (T)mass[axis][c]*u[axis][c];
-        diagonal += (T)(mass[axis][o]*inverse[axis][o] + mass[axis][c]*inverse[axis][c]);
+        const T beyond = passes((T)mass[axis][o], full), here = passes((T)mass[axis][c], full);
+        w += beyond*u[axis][o] - here*u[axis][c];
+        diagonal += beyond*(T)inverse[axis][o] + here*(T)inverse[axis][c];
     }
     if (!(diagonal > (T)0)) return;
     const T floor_ = flags_.data[c] & FIRM ? -(T)numbers.data[TENSION] : (T)0, to = (T)x[0] - (T)omega*w/diagonal;

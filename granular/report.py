@@ -58,11 +58,11 @@ class Outcome:
         inputs = [wp.uint8(HELD), wp.uint8(RELEASED), packing.flags, stress.now, self.contact]
         packing.grid.domain.launch(self._kernels.contact, inputs)
 
-    def report(self, dt: float) -> Report:
-        """Return the figures of a step of dt [s]."""
+    def report(self) -> Report:
+        """Return the figures of the last solve."""
         stress, p = self.stress, self.stress.packing
         fields = [*three(p.share), *three(stress.checked.edge), *three(stress.checked.u), *three(p.mass)]
-        inputs = [p.flags, stress.now, p.drive, *fields, stress.numbers, wp.float64(dt / p.grid.spacing), self.ratio, self._sums]
+        inputs = [p.flags, stress.now, p.drive, *fields, stress.numbers, self.ratio, self._sums]
         p.grid.domain.launch_rows(self._kernels.report, inputs)
         cells, yielded, taken, most = self._sums.numpy().reshape(REPORT_COLUMNS, self._rows)
         return Report(float(yielded.sum() / max(cells.sum(), 1.0)), float(taken.sum()), float(most.max()))

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from granular.yield_set import SHAPE, native
+from granular.yield_set import FLUX, SHAPE, native
 from warp_lcp.grid.extrapolate import BLOCKED
 from warp_lcp.grid.staggered import CellRange
 from warp_lcp.operators.grid_poisson import SOLID
@@ -14,7 +14,7 @@ from warp_lcp.operators.grid_poisson import SOLID
 RATIO_YIELDS = 0.99  # of the bound, from which a cell counts as yielded
 REPORT_COLUMNS = 4  # of a row's sums: cells that carry shear, yielded ones, dissipation, largest fraction that the pressure's solution predicts
 
-REPORT = SHAPE + """
+REPORT = SHAPE + FLUX + """
     const unsigned char* flags = flags_.data + row; const float* now = now_.data + row; const float* drive = drive_.data + row;
     const float* share[3] = {share_x.data + row, share_y.data + (DIM == 3 ? row : 0), share_z.data + (DIM == 3 ? row : 0)};
     const double* rate[3] = {b_x.data + row, b_y.data + (DIM == 3 ? row : 0), b_z.data + (DIM == 3 ? row : 0)};
@@ -24,10 +24,11 @@ REPORT = SHAPE + """
     double cells = 0, yielded = 0, taken = 0, most = 0;
     for (int i = first; i < last; ++i) {
         float size = 0; double e[3], mean = 0, w = drive[i];
+        const double full = fullness(w*numbers.data[STEP_OF_CELL]);
         for (int axis = 0; axis < DIM; ++axis) {
             const long long o = i + s[axis];
             e[axis] = u[axis][o] - u[axis][i]; mean += e[axis]/DIM;
-            w += mass[axis][o]*u[axis][o] - mass[axis][i]*u[axis][i];
+            w += passes(mass[axis][o], full)*u[axis][o] - passes(mass[axis][i], full)*u[axis][i];
         }
         if (DIM == 2) { const float a = now[layer + i]; size = a*a; taken += a*(e[0] - e[1]); }
         else for (int c = 0; c < NORMALS; ++c) { const float n = now[(1 + c)*layer + i]; size += 0.5f*n*n; taken += n*(e[c] - mean); }
@@ -45,7 +46,7 @@ REPORT = SHAPE + """
         const bool carries = (flags[i] & SHEARS_HERE) && bound > 1e-12f;
         ratio[i] = carries ? sqrt(size)/bound : 0.0f;
         cells += carries; yielded += carries && ratio[i] > (float)RATIO_YIELDS;
-        if (flags[i] & HOLDS) { const double over = -w*dt_over_dx; most = over > most ? over : most; }
+        if (flags[i] & HOLDS) { const double over = -w*numbers.data[STEP_OF_CELL]; most = over > most ? over : most; }
     }
     const long long rows = sums_.shape[0]/REPORT_COLUMNS, at = k*(long long)flags_.shape[1] + j;
     sums_.data[at] = cells; sums_.data[rows + at] = yielded; sums_.data[2*rows + at] = taken; sums_.data[3*rows + at] = most;
@@ -64,18 +65,18 @@ def report_kernels(dimension: int) -> SimpleNamespace:
     def report_row(
         flags_: _U8, now_: _STRESS, drive_: _F32, share_x: _F32, share_y: _F32, share_z: _F32, b_x: _F64, b_y: _F64, b_z: _F64,
         u_x: _F64, u_y: _F64, u_z: _F64, mass_x: _F32, mass_y: _F32, mass_z: _F32, numbers: wp.array(dtype=wp.float32),
-        dt_over_dx: wp.float64, ratio_: _F32, sums_: wp.array(dtype=wp.float64), k: int, j: int, first: int, last: int,
+        ratio_: _F32, sums_: wp.array(dtype=wp.float64), k: int, j: int, first: int, last: int,
     ): ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module=f"granular.report_{dimension}d")
     def report(
         cells: CellRange, flags: _U8, now: _STRESS, drive: _F32, share_x: _F32, share_y: _F32, share_z: _F32,
         b_x: _F64, b_y: _F64, b_z: _F64, u_x: _F64, u_y: _F64, u_z: _F64, mass_x: _F32, mass_y: _F32, mass_z: _F32,
-        numbers: wp.array(dtype=wp.float32), dt_over_dx: wp.float64, ratio: _F32, sums: wp.array(dtype=wp.float64),
+        numbers: wp.array(dtype=wp.float32), ratio: _F32, sums: wp.array(dtype=wp.float64),
     ):  # fmt: skip
         plane, row = wp.tid()
         report_row(
-            flags, now, drive, share_x, share_y, share_z, b_x, b_y, b_z, u_x, u_y, u_z, mass_x, mass_y, mass_z, numbers, dt_over_dx,
+            flags, now, drive, share_x, share_y, share_z, b_x, b_y, b_z, u_x, u_y, u_z, mass_x, mass_y, mass_z, numbers,
             ratio, sums, cells.k + plane, cells.j + row, cells.i, cells.end,
         )  # fmt: skip
 

@@ -71,7 +71,7 @@ class Friction(Table):
 
     model: Literal["cone", "box"] = Field(
         default="cone",
-        description="cone: alike in all directions; box: that of Narain et al. 2010, cheaper, but layers flow at slopes where they should rest",
+        description="cone: alike in all directions; box: that of Narain et al. 2010, cheaper, but layers flow where they should rest",
     )
 
 
@@ -221,7 +221,7 @@ class SandScene(ParticleScene):
         """Return Coulomb's coefficient of the domain's walls and of each solid."""
         general = self.preset.wall_friction if self.material.wall_friction is None else self.material.wall_friction
         domain = general if self.domain.friction is None else self.domain.friction
-        given = [domain, *(domain if s.friction is None else s.friction for s in self.solid)]  # type: ignore[attr-defined]
+        given = [domain, *(domain if s.friction is None else s.friction for s in self.solid)]
         return [STICKS if friction == "stick" else float(friction) for friction in given]
 
     def complaints(self) -> list[Complaint]:

@@ -131,7 +131,7 @@ class SandSimulation(ParticleSimulation):
         self.bring_to_faces(window, dt)
         solved = self._solve(window, dt)
         with self.watch.stage("diagnostics", self.packing.flags, self.stress.now):
-            report = self.outcome.report(dt)
+            report = self.outcome.report()
         self._extend(window)
         self.bring_to_particles()
         below, most = self._mass_below(), self._most()
@@ -291,6 +291,8 @@ class SandSimulation(ParticleSimulation):
 
     def _most(self) -> float:
         """Return the largest fraction of a cell, in units of the densest packing."""
+        if self.boundary.capacity is None:
+            return 0.0
         capacity = self.boundary.capacity.numpy()
         open_ = (self._base.numpy() != SOLID) & (capacity > 0.5)
         return float((self.density.numpy()[open_] / capacity[open_]).max(initial=0.0))

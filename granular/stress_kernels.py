@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from granular.yield_set import COLUMNS, SHAPE, WALL_FACE, YIELD, native
+from granular.yield_set import COLUMNS, FLUX, SHAPE, WALL_FACE, YIELD, native
 from warp_lcp.grid.staggered import CellRange
 
 
@@ -90,7 +90,7 @@ CELLS = """
     double* partial = partials.data;
     const long long columns = partials.shape[0]/COLUMNS;
     for (int c = 0; c < COLUMNS; ++c) partial[c*columns + thread] = 0;
-""" + SPAN + SHAPE + YIELD + """
+""" + SPAN + SHAPE + FLUX + YIELD + """
     const unsigned char* flags = flags_.data + row;
     float* now = now_.data + row; float* before = before_.data + row; float* point = point_.data + row;
     const float* drive = drive_.data + row; const float* stiff = stiff_.data + row;
@@ -111,11 +111,13 @@ CELLS = """
     T x_es = 0, x_ee = 0, x_ss = 0, s_es = 0, s_ee = 0, s_ss = 0, x_residual = 0, s_residual = 0;
     SIMD for (int i = first; i < last; ++i) {
         const int sand = flags[i] & HOLDS, dense = flags[i] & SHEARS_HERE, firm = flags[i] & FIRM;
+        const T full = fullness((T)drive[i]*(T)numbers.data[STEP_OF_CELL]);
         T w = (T)drive[i], diagonal = 0, e[DIM], mean = 0;
         UNROLL for (int axis = 0; axis < DIM; ++axis) {
             const long long o = i + s[axis];
-            w += (T)mass[axis][o]*u[axis][o] - (T)mass[axis][i]*u[axis][i];
-            diagonal += (T)(mass[axis][o]*inverse[axis][o] + mass[axis][i]*inverse[axis][i]);
+            const T beyond = passes((T)mass[axis][o], full), here = passes((T)mass[axis][i], full);
+            w += beyond*u[axis][o] - here*u[axis][i];
+            diagonal += beyond*(T)inverse[axis][o] + here*(T)inverse[axis][i];
             e[axis] = u[axis][o] - u[axis][i];
             mean += e[axis];
         }

@@ -16,18 +16,19 @@ from warp_lcp.native import C_TYPES, simd
 NEWTON = 4  # iterations for the multiplier of a yielding cell: 3 are exact to 2e-6 of the bound, 4 to rounding
 COLUMNS = 8  # of a row's sums, see `granular.stress_kernels`
 
-# what kernels read: the yield set, dt g [m/s] (three entries), the steps of a method relative to the diagonal, and how far beyond the
-# stresses, in units of the momentum's displacement, it takes its gradient
-FRICTION, COHESION, TENSION, WEIGHT, PRESSURE_STEP, SHEAR_STEP, LOOKAHEAD, NUMBERS = 0, 1, 2, 3, 6, 7, 8, 9
+# what kernels read: the yield set, dt g [m/s] (three entries), the steps of a method relative to the diagonal, how far beyond the
+# stresses, in units of the momentum's displacement, it takes its gradient, and dt / dx [s/m]
+FRICTION, COHESION, TENSION, WEIGHT, PRESSURE_STEP, SHEAR_STEP, LOOKAHEAD, STEP_OF_CELL, NUMBERS = 0, 1, 2, 3, 6, 7, 8, 9, 10
 
 HOLDS = 1  # bits of a cell: it holds sand, and so a pressure,
 SHEARS_HERE = 2  # enough of it to carry shear,
 FIRM = 4  # so much that cohesion may hold it together
+NEARLY = 0.05  # of a cell free, below which what passes its faces counts as volume, whatever its neighbors hold, see FLUX
 LEAST_RADIUS = 1e-30  # [m/s], of a yield set that holds only zero
 
 CONSTANTS = {
     "NEWTON": NEWTON, "COLUMNS": COLUMNS, "LEAST_RADIUS": LEAST_RADIUS, "FRICTION": FRICTION, "COHESION": COHESION,
-    "TENSION": TENSION, "WEIGHT": WEIGHT, "PRESSURE_STEP": PRESSURE_STEP, "SHEAR_STEP": SHEAR_STEP, "LOOKAHEAD": LOOKAHEAD, "HOLDS": HOLDS, "SHEARS_HERE": SHEARS_HERE, "FIRM": FIRM,
+    "TENSION": TENSION, "WEIGHT": WEIGHT, "PRESSURE_STEP": PRESSURE_STEP, "SHEAR_STEP": SHEAR_STEP, "LOOKAHEAD": LOOKAHEAD, "HOLDS": HOLDS, "SHEARS_HERE": SHEARS_HERE, "FIRM": FIRM, "STEP_OF_CELL": STEP_OF_CELL, "NEARLY": NEARLY,
 }  # fmt: skip
 
 SHAPE = """
@@ -35,6 +36,13 @@ SHAPE = """
     constexpr int ALPHA[3] = {0, 0, 1}, BETA[3] = {1, 2, 2};
     const long long nx = share_x.shape[2], layer = nx*share_x.shape[1]*share_x.shape[0];
     const long long s[3] = {1, nx, nx*share_x.shape[1]}, row = k*s[2] + j*s[1];
+"""
+
+# What passes a face counts by the face's mass: div(m u). A full cell cannot be compressed: it counts volume, div u, or else a block that
+# falls would be squeezed at its front, where lighter faces let less out than comes in from behind. `passes` goes from one to the other.
+FLUX = """
+    auto passes = [](T mass, T full) INLINE { return mass + full*((T)1 - mass); };
+    auto fullness = [](T free) INLINE { const T c = (T)1 - free*(T)(1.0/NEARLY); return c < (T)0 ? (T)0 : c > (T)1 ? (T)1 : c; };
 """
 
 # Nearest point of { |n|^2 / 2 + sum over shears of max_q b_q^2 <= r^2 } in the metric |n|^2 / 2 + sum of b_q^2 / 4. With a multiplier mu

@@ -43,8 +43,8 @@ def _sweeps(found: Mapping[str, Record]) -> tuple[str, str]:
     residual = _value(found, "robustness: contact, recipe: PGS", "residual")
     here = f"PGS to 1e-6 of the natural residual in 100 sweeps: {parts[0]} (recipe), {parts[1]} (planted), {parts[2]} (rigid bodies)"
     why = (
-        f"x'abs(y) < 1e-3 is no test of a solution: it accepts {_text(accepted, '.0f')} of Num4LCP's contact problems with natural residuals "
-        f"up to {_text(residual)} of the first one"
+        f"x'abs(y) < 1e-3 is no test of a solution: it accepts {_text(accepted, '.0f')} of Num4LCP's contact problems with "
+        f"natural residuals up to {_text(residual)} of the first one"
     )
     return here, why
 
@@ -70,8 +70,9 @@ def _minimum_map(found: Mapping[str, Record]) -> tuple[str, str]:
         parts.append(f"{found[name].facts['states']} ({kind})" if name in found else "none")
     solved = _solved(found, "robustness: contact, rigid bodies: minimum map, book")
     why = (
-        "the free block is singular, beta rows having no diagonal: steps do not descend, or are cut until the merit stands still (relative). "
-        f"The method of this library then goes on by the proximal-point iteration: {solved} of the rigid bodies' problems to 1e-6"
+        "the free block is singular, beta rows having no diagonal: steps do not descend, or are cut until the merit stands still "
+        f"(relative). The method of this library then goes on by the proximal-point iteration: {solved} of the rigid "
+        f"bodies' problems to 1e-6"
     )
     return "; ".join(parts), why
 

@@ -21,6 +21,7 @@ DEEP = 1e-10  # tolerance of the curves: far enough to see how fast a method is 
 DIRECT = 600  # unknowns up to which dense methods are waited for: at 1,000 pivoting takes half a minute
 FACTORS = (0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.6, 1.8, 1.9)
 SWEEPS = 2000
+ALL = 40  # iterations whose rows are all kept; of later ones, one in so many
 KINKS = ("random", "zero", "perturbation", "approximation")
 COLUMNS = ["experiment", "problem", "method", "iteration", "seconds", "relative residual", "step"]
 
@@ -49,9 +50,12 @@ class Curve:
         return None if self.solved is None else self.result.history[self.solved].seconds
 
     def rows(self, experiment: str, problem: str) -> list[list[str]]:
-        """Return the rows of the sheet."""
-        history = zip(self.result.history, self.residuals, strict=True)
-        return [[experiment, problem, self.name, str(h.iteration), f"{h.seconds:.3e}", f"{r:.3e}", h.step] for h, r in history]
+        """Return the rows of the sheet: all of the first iterations, some of those after them, the last one and the one that met RTOL."""
+        last, rows = len(self.residuals) - 1, []
+        for k, (h, r) in enumerate(zip(self.result.history, self.residuals, strict=True)):
+            if k <= ALL or k % ALL == 0 or k in (last, self.solved):
+                rows.append([experiment, problem, self.name, str(h.iteration), f"{h.seconds:.3e}", f"{r:.3e}", h.step])
+        return rows
 
 
 def measure(scale: Scale, device: str, say: Callable[[str], object]) -> Results:
@@ -166,14 +170,14 @@ def _kinks(scale: Scale, device: str, say: Callable[[str], object]) -> Results:
             figures = {"solved": Figure(len(steps)), "problems": Figure(few)} | ({"steps": Figure(mean)} if steps else {})
             records.append(Record(f"kinks: {label}: {name}", figures))
             cells_of_kind.append(f"{len(steps)} of {few}, {mean:.2f}" if steps else f"0 of {few}")
-            rows += [row for k, c in enumerate(of_kink) for row in c.rows("kinks", f"{label} {k}")]
+            rows += of_kink[0].rows("kinks", label)
         cells.append(cells_of_kind)
         if label in ("fluid, 7-point, planted", "contact, rigid bodies"):
             shown = [Curve(name, of_kink[0].result) for name, of_kink in curves.items()]
             charts.append(_per_iteration(f"kinks-{label.partition(',')[0]}", f"Kink strategies of Fischer-Newton: {label}", shown))
     remark = (
-        f"The book's Fischer-Newton (projected Armijo search, no fallback) on {few} problems of each kind: how many reach 1e-6 within 100 steps, "
-        "and the mean of their steps. A kink is met where x_i and y_i are both 0 to rounding; a start of 0 with b_i = 0 is one "
+        f"The book's Fischer-Newton (projected Armijo search, no fallback) on {few} problems of each kind: how many reach 1e-6 within 100 "
+        "steps, and the mean of their steps. A kink is met where x_i and y_i are both 0 to rounding; a start of 0 with b_i = 0 is one "
         "(the recipes make such rows), solutions that are strictly complementary have none."
     )
     table = Table("Kink strategies (fig. C.3)", ["problems", *KINKS, "penalized 0.95"], cells, remark)
@@ -206,8 +210,9 @@ def _factors(scale: Scale, device: str, say: Callable[[str], object]) -> Results
         rows += [row for c in shown for row in c.rows("relaxation factors", label)]
         charts.append(_per_iteration(f"psor-{number}", f"Relaxation factors of PSOR: {label}", shown))
     remark = (
-        f"Sweeps to 1e-6 (at most 50 for factors below 1, {SWEEPS} for others). Matrices are swept row by row, grids red-black. "
-        "The book's 1.4 is best where the domain is small or active unknowns are scattered over it; where they lie together the best factor "
+        f"Sweeps to 1e-6 (at most 50 for factors below 1, {SWEEPS} for others). Matrices are swept row by row, grids red-"
+        "black. The book's 1.4 is best where the domain is small or active unknowns are scattered over it; where they "
+        "lie together the best factor "
         "goes to 2 with the number of cells along a side, as without bounds."
     )
     table = Table("Relaxation factors of PSOR (fig. C.4)", ["problem", "best", *(f"{w:g}" for w in FACTORS)], cells, remark)

@@ -62,8 +62,10 @@ def recipe(A: Any, rng: np.random.Generator, name: str) -> Problem:
 
 
 def contact_matrix(contacts: int, rng: np.random.Generator) -> np.ndarray:
-    """Return Num4LCP's contact matrix: random symmetric 6 x 6 blocks, half of them zero, shifted to positive definite, with the pattern
-    of Stewart and Trinkle written over those that are left: no contact of bodies has it.
+    """Return Num4LCP's contact matrix, which no contact of bodies has.
+
+    Random symmetric 6 x 6 blocks, half of them zero, shifted to positive definite, with the pattern of Stewart and Trinkle written over
+    those that are left.
     """
     n = BLOCK * contacts
     R = rng.random((n, n))

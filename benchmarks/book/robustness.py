@@ -55,8 +55,9 @@ PUBLISHED: dict[tuple[str, str], tuple[str, str]] = {
 }
 REMARKS = {
     "fluid, recipe": (
-        "Num4LCP's problems. Its x is no solution: where x = 0 it sets b = 0, and y = A x is negative there, since A has no positive entries "
-        "off its diagonal. The true solution has the share of active unknowns given below, almost none, so these are linear systems, and "
+        "Num4LCP's problems. Its x is no solution: where x = 0 it sets b = 0, and y = A x is negative there, since A has no positive "
+        "entries off its diagonal. The true solution has the share of active unknowns given below, almost none, so "
+        "these are linear systems, and "
         "the matrix is a random banded one, no Poisson operator. Sweeps end by x'|y| < 1e-3, which says nothing about y < 0 where x = 0."
     ),
     "fluid, recipe's matrix, planted": (
@@ -68,9 +69,10 @@ REMARKS = {
         "in liquids they lie together at walls, and sweeps need hundreds of iterations (see the cost against size)."
     ),
     "contact, recipe": (
-        "Num4LCP's problems: blocks of a random positive definite matrix with the pattern of Stewart and Trinkle written over them. The book "
-        "has no line for PGS. Its test x'|y| < 1e-3 accepts iterates whose natural residual is far from 0: y < 0 where x = 0 costs "
-        "nothing there."
+        "Num4LCP's problems: blocks of a random positive definite matrix with the pattern of Stewart and Trinkle written over them. The "
+        "book has no line for PGS. Its test x'|y| < 1e-3 accepts iterates whose natural residual is far from 0: y < 0 where x = 0 costs "
+        "nothing there. Newton on the minimum map leads nowhere: its steps do not descend (non-descent), or are cut until the merit no "
+        "longer changes, which the book's relative test takes for an end; Num4LCP tests the descent first."
     ),
     "contact, recipe's matrix, planted": "The same matrices with a solution that is one, a quarter of it active, y = 0 on the others.",
     "contact, rigid bodies": "Impulses of random rigid bodies that touch: `warp_lcp.gallery.contact`. A = J M^-1 J' with its beta rows.",
@@ -146,5 +148,7 @@ def _table(kind: str, records: Sequence[Record], active: float) -> Table:
         solved = f"{r.value('solved'):.0f} of {r.value('problems'):.0f}"
         cells = [r.facts["method"], r.facts["states"], r.facts["iterations spread"], f"{r.value('residual'):.1e}", solved]
         rows.append([*cells, r.facts["steps spread"], *published])
-    remark = f"{REMARKS[kind]} Share of unknowns at zero in the solution: {active:.1%}. {GENERAL}"
+    remark = (
+        f"{REMARKS[kind]} Share of unknowns at zero in the solution: {active:.1%}. {GENERAL if kind == 'fluid, recipe' else ''}".rstrip()
+    )
     return Table(f"Robustness: {kind}", columns, rows, remark)

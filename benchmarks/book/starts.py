@@ -66,9 +66,10 @@ def _warm(scale: Scale, device: str, say: Callable[[str], object]) -> Results:
         records.append(Record(f"warm starting: {rule}: {name}: {label}", {"iterations": Figure(statistics.fmean(found))}))
         cells.append([rule, name, label, spread(found), ", ".join(f"{n} at {k}" for k, n in sorted(Counter(found).items()))])
     remark = (
-        f"{scale.problems} dense positive definite problems of {scale.dense} unknowns, eigenvalues evenly spaced in (0, 1]; from x = 0, and from "
-        f"{PGS_SWEEPS} sweeps of PGS. Relative 1e-6, absolute 1e-2, at most 30 iterations, counted as Num4LCP does: the first test is number 1, "
-        "so a start that is good enough counts 1. Num4LCP's rule leaves nearly no active unknowns here either."
+        f"{scale.problems} dense positive definite problems of {scale.dense} unknowns, eigenvalues evenly spaced in "
+        f"(0, 1]; from x = 0, and "
+        f"from {PGS_SWEEPS} sweeps of PGS. Relative 1e-6, absolute 1e-2, at most 30 iterations, counted as Num4LCP does: the first test is "
+        "number 1, so a start that is good enough counts 1. Num4LCP's rule leaves nearly no active unknowns here either."
     )
     columns = ["b", "method", "start", "iterations", "problems of a count"]
     shown: dict[str, tuple[list[float], list[float]]] = {}
@@ -127,8 +128,10 @@ def _overdetermined(scale: Scale, device: str, say: Callable[[str], object]) -> 
                     curve[0].append(zeros)
                     curve[1].append(100 * len(solved) / few)
     remark = (
-        f"{few} dense positive semi-definite problems of {scale.dense} unknowns for each share of zero eigenvalues. Book's test: relative 1e-4, absolute "
-        "1e-2, at most 100. Solvable: a linear program finds x >= 0 with A x + b >= 0, which is enough where A is positive semi-definite. "
+        f"{few} dense positive semi-definite problems of {scale.dense} unknowns for each share of zero eigenvalues. "
+        f"Book's test: relative 1e-4, "
+        "absolute 1e-2, at most 100. Solvable: a linear program finds x >= 0 with A x + b >= 0, which is enough where "
+        "A is positive semi-definite. "
         "Planted problems are; Num4LCP's x is no solution, and nothing sees to it that its problems have another one: with many zero "
         "eigenvalues they have none, so that where the book's Newton methods 'get into trouble' it is the problem that has no solution."
     )

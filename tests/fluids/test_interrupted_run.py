@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small_liquids import box, create, scene
 
+from small_liquids import box, create, scene
 from warp_lcp.driver.run import run_scene
 from warp_lcp.driver.scene_file import load_scene
 

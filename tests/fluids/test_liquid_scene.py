@@ -3,10 +3,10 @@ from typing import Any
 
 import pytest
 from pydantic import ValidationError
-from small_liquids import box, create, scene
 
 import fluids
 from fluids import LiquidScene
+from small_liquids import box, create, scene
 from warp_lcp.driver.scene import Scene
 
 LIQUID = [box([0.0, 0.0], [0.5, 0.25])]

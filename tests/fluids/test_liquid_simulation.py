@@ -3,9 +3,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_liquids import GRAVITY, advance, box, create, dam, scene
 
 from fluids import SIMULATOR, LiquidSimulation
+from small_liquids import GRAVITY, advance, box, create, dam, scene
 from warp_lcp.driver.simulator import Cells, Points, Profiled, SimulationFailed, Simulator, StepFailed, simulators
 from warp_lcp.grid.particles import Particles
 

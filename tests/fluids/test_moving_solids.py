@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 import warp as wp
-from small_liquids import GRAVITY, advance, box, create, scene
 
+from small_liquids import GRAVITY, advance, box, create, scene
 from warp_lcp.driver.simulator import SimulationFailed
 from warp_lcp.grid.motion import Pose
 

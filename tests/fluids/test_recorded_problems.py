@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_liquids import box, create, dam, scene
 from typer.testing import CliRunner
 
 import warp_lcp as wl
 from oracle import assemble, natural_residual
+from small_liquids import box, create, dam, scene
 from warp_lcp.driver import cli
 from warp_lcp.driver.problem_folder import ProblemFolder
 from warp_lcp.driver.run_folder import OutputError

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small_liquids import GRAVITY, advance, box, create, scene
 
 from fluids import LiquidSimulation
+from small_liquids import GRAVITY, advance, box, create, scene
 
 SLOPE = math.radians(30)
 V = [{"shape": "plane", "point": [0.4, 0.0], "normal": [side * math.sin(SLOPE), math.cos(SLOPE)]} for side in (-1, 1)]

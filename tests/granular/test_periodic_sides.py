@@ -112,7 +112,7 @@ def test_sand_that_starts_elsewhere_ends_elsewhere(transfer: str, steps: int) ->
         there, moving = run(shift)
         distance, partner = cKDTree(at[:, :2], boxsize=[count * DX, 1.0]).query(there[:, :2])
         assert len(set(partner)) == len(at)
-        assert distance.max() < 1e-3 * DX
+        assert distance.max() < 1e-2 * DX
         assert np.abs(moving - velocity[partner]).max() < 1e-3
     assert at[:, 0].mean() > (6 + 0.15 * steps / 8) * DX  # it has gone somewhere
 

@@ -181,10 +181,12 @@ def cell_move(case: Case, u: list[np.ndarray], cell: tuple[int, ...], *, box: bo
         return 0.0, 0.0
     mass, inverse, share = case.field("mass"), case.field("inverse"), case.field("share")
     stretch = []
+    full = float(np.clip(1.0 - w * DT / p.grid.spacing / 0.05, 0.0, 1.0))  # a full cell counts volume, a loose one mass
     for axis in range(dimension):
         low, high = cell, at(cell, step_along(axis))
-        w += mass[axis][high] * u[axis][high] - mass[axis][low] * u[axis][low]
-        diagonal += mass[axis][high] * inverse[axis][high] + mass[axis][low] * inverse[axis][low]
+        beyond, here = (mass[axis][face] + full * (1.0 - mass[axis][face]) for face in (high, low))
+        w += beyond * u[axis][high] - here * u[axis][low]
+        diagonal += beyond * inverse[axis][high] + here * inverse[axis][low]
         stretch.append(u[axis][high] - u[axis][low])
     dense, firm, stiff = bool(flags & 2), bool(flags & 4), float(p.stiff.numpy()[cell])
     x = max(now[(0, *cell)] - w / diagonal, -case.bound.tension if firm else 0.0) if diagonal > 0.0 else 0.0

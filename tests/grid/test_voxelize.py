@@ -134,6 +134,17 @@ def test_a_solid_outside_the_domain_is_refused(geometry, dimension):
         cells(counts, 0.1, dimension, placed(geometry))
 
 
+def test_a_solid_that_has_moved_may_be_anywhere():
+    """Outside the domain, or over all of it: without remarks neither is refused, and nothing is noted."""
+    outside = PlacedSolid(geometry=Sphere(center=[9.0, 9.0], radius=0.2), separating=True, name="ball")
+    found = voxelize((4, 4, 1), 0.25, 2, [outside], wall_separating=True, device="cpu", remarks=False)
+    assert (found.index.numpy()[1, 1:-1, 1:-1] == -1).all()
+    everywhere = PlacedSolid(geometry=Sphere(center=[0.5, 0.5], radius=9.0), separating=True, name="ball")
+    found = voxelize((4, 4, 1), 0.25, 2, [everywhere], wall_separating=True, device="cpu", remarks=False)
+    assert (found.index.numpy()[1, 1:-1, 1:-1] == 1).all()
+    assert found.notes == ()
+
+
 def test_a_mesh_that_misses_the_plane_of_two_dimensions_is_refused():
     mesh = TriangleMesh(surface=builtin_mesh("torus"), placement=Placement(translation=[0.5, 0.5, 0.2]))
     with pytest.raises(ValueError, match=r"misses the plane z = 0"):

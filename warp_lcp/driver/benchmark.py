@@ -25,8 +25,18 @@ class Benchmark(Protocol):
         repeat: int = 5,
         problems: Path | None = None,
         methods: tuple[str, ...] = (),
+        group: str = "",
     ) -> list[Path]:
-        """Measure, and return the files written to `out`: NAME.json, NAME.md and plots. `problems`: measure `methods` on these instead.
+        """Measure, and return the files written to `out`: NAME.json, NAME.md and plots.
+
+        Args:
+            device: Warp device.
+            out: folder of the files.
+            sizes: cells along a side; the suite's own without any.
+            repeat: samples of each timing.
+            problems: folder of recorded problems to measure `methods` on instead.
+            methods: their names.
+            group: other cases of the suite, to measure instead; the files then have that name.
 
         Raises:
             ValueError: an option is out of range.

@@ -205,6 +205,12 @@ def bench(
     method: Annotated[
         list[str] | None, typer.Option(metavar="NAME", help="With --problems: a method; may be repeated.", show_default=False)
     ] = None,
+    group: Annotated[
+        str,
+        typer.Option(
+            "--group", "--suite", metavar="GROUP", help="Other cases of SUITE: solvers has book, the book's appendix C.", show_default=False
+        ),
+    ] = "",
     compare: Annotated[
         tuple[Path, Path] | None,
         typer.Option(metavar="A.json B.json", help="Compare two results instead of measuring.", show_default=False),
@@ -220,8 +226,9 @@ def bench(
         if compare is not None:
             typer.echo(installed[suite].compare(*compare))
             return
-        replay: dict[str, Any] = {} if problems is None and not method else {"problems": problems, "methods": tuple(method or ())}
-        files = installed[suite].run(device=chosen, out=out, sizes=tuple(size or ()), repeat=repeat, **replay)
+        asked: dict[str, Any] = {} if problems is None and not method else {"problems": problems, "methods": tuple(method or ())}
+        asked |= {"group": group} if group else {}
+        files = installed[suite].run(device=chosen, out=out, sizes=tuple(size or ()), repeat=repeat, **asked)
     except ValueError as error:
         _end(str(error), WRONG_INPUT)
     except RuntimeError as error:

@@ -92,14 +92,14 @@ def detect(bodies: RigidBodies, planes: tuple[Plane, ...], margin: float, ignore
         for plane in planes:
             found += _on_plane(bodies, boxes, int(i), plane, margin)
     reach = np.array([shape.reach for shape in bodies.shapes]) + 0.5 * margin
-    for i in range(len(bodies)):
-        distance = np.linalg.norm(bodies.position[i + 1 :] - bodies.position[i], axis=1)
-        for j in i + 1 + np.flatnonzero(distance <= reach[i] + reach[i + 1 :]):
-            if (bodies.free[i] or bodies.free[j]) and (i, int(j)) not in ignored:
-                found += _between(bodies, boxes, i, int(j), margin)
+    for k in range(len(bodies)):
+        distance = np.linalg.norm(bodies.position[k + 1 :] - bodies.position[k], axis=1)
+        for other in (k + 1 + np.flatnonzero(distance <= reach[k] + reach[k + 1 :])).tolist():
+            if (bodies.free[k] or bodies.free[other]) and (k, other) not in ignored:
+                found += _between(bodies, boxes, k, other, margin)
     first, second, point, normal, gap = zip(*found, strict=True) if found else ((), (), (), (), ())
-    vectors = [np.array(v, dtype=np.float64).reshape(-1, 3) for v in (point, normal)]
-    return Contacts(np.array(first, dtype=int), np.array(second, dtype=int), *vectors, np.array(gap, dtype=np.float64))
+    points, normals = (np.array(v, dtype=np.float64).reshape(-1, 3) for v in (point, normal))
+    return Contacts(np.array(first, dtype=int), np.array(second, dtype=int), points, normals, np.array(gap, dtype=np.float64))
 
 
 def _boxes(bodies: RigidBodies, i: int) -> list[OrientedBox]:

@@ -14,6 +14,8 @@ import numpy as np
 from warp_lcp.gallery.contact_detection import Contacts
 from warp_lcp.gallery.contact_models import BoxedModel, ContactModel, ContactSystem
 from warp_lcp.gallery.rigid_world import Assembly, World
+from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.problem import LCP
 from warp_lcp.result import SolveStatus
 from warp_lcp.solve import Solver, solve
 from warp_lcp.solvers.psor import ProjectedSOR
@@ -166,9 +168,6 @@ class ContactStepper:
             return np.zeros_like(bodies.velocity)
         lower = np.concatenate([np.zeros(system.contacts), system.lower])
         upper = np.concatenate([np.full(system.contacts, np.inf), system.upper])
-        from warp_lcp.operators.sparse import SparseOperator
-        from warp_lcp.problem import LCP
-
         problem = LCP(SparseOperator(system.B[keep][:, keep], device=self.device), bias, lower, upper)
         stopping = StoppingCriteria(rtol=1e-3, max_iterations=50, patience=50)
         x = solve(problem, ProjectedSOR(omega=1.0), stopping=stopping).x.numpy()

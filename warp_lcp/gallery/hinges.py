@@ -71,8 +71,8 @@ class Hinge:
         frames = [(np.zeros(3), np.eye(3)) if i == WORLD else (bodies.position[i], bodies.rotation[i]) for i in (first, second)]
         anchors, axes, zeros = ([R.T @ v for _, R in frames] for v in (np.zeros(3), axis, zero))
         anchors = [R.T @ (np.asarray(anchor, dtype=np.float64) - x) for x, R in frames]
-        pairs = [(v[0], v[1]) for v in (anchors, axes, zeros)]
-        return Hinge(first, second, *pairs, limits=limits, motor_speed=motor_speed, motor_torque=motor_torque)
+        a, d, z = ((v[0], v[1]) for v in (anchors, axes, zeros))
+        return Hinge(first, second, a, d, z, limits, motor_speed, motor_torque)
 
     @property
     def pair(self) -> tuple[int, int]:

@@ -136,7 +136,12 @@ class RigidBodies:
     """
 
     def __init__(
-        self, shapes: Sequence[Shape], mass: Sequence[float], position: object, rotation: object = None, velocity: object = None
+        self,
+        shapes: Sequence[Shape],
+        mass: Sequence[float] | np.ndarray,
+        position: object,
+        rotation: object = None,
+        velocity: object = None,
     ) -> None:
         n = len(shapes)
         if n == 0:

@@ -77,9 +77,7 @@ class World:
             raise ValueError(f"dt = {dt}, rate = {rate}: must be > 0 and in [0, 1]")
         bodies, contacts = self.bodies, self.contacts() if contacts is None else contacts
         rows = [hinge.rows(bodies, dt, rate) for hinge in self.hinges]
-        J = scipy.sparse.csr_array(
-            scipy.sparse.vstack([contacts.jacobian(bodies), hinge_jacobian(self.hinges, rows, len(bodies))]).tocsr()
-        )
+        J = scipy.sparse.csr_array(scipy.sparse.vstack([contacts.jacobian(bodies), hinge_jacobian(self.hinges, rows, len(bodies))]).tocsr())
         M = bodies.inverse_mass()
         falling = bodies.velocity.copy()
         falling[bodies.free, :3] += dt * np.array(self.gravity)

@@ -13,7 +13,7 @@ from warp_lcp.problem import LCP
 from warp_lcp.solve import Precision, Step
 from warp_lcp.solvers.principal_system import principal_system
 from warp_lcp.solvers.psor import SweepWorkspace
-from warp_lcp.solvers.subspace_minimization_kernels import classify_kernel, free_square_kernel, kernels
+from warp_lcp.solvers.subspace_minimization_kernels import classify_kernel, follow_kernel, free_square_kernel, kernels
 from warp_lcp.solvers.sweep import sweep_for
 from warp_lcp.vectors import Reduction, launch_spans
 
@@ -29,6 +29,9 @@ class SubspaceMinimization:
     is inexact, as far as the whole one still needs. Its projected correction is halved until the energy x'A x / 2 + b'x or the residual
     falls, up to `backtracks` times; if neither falls, x stays what the sweeps made of it. The book takes full steps, whose "jaggyness"
     (fig. 2.10) is what this cures; `backtracks = -1` does as the book does.
+
+    Bounds may be affine in x: they are constants of each linear solve; held unknowns then move with their bounds, and only the residual
+    judges the step, as there is no energy.
 
     `linear_iterations` counts sweeps and preconditioned iterations.
 
@@ -48,6 +51,7 @@ class SubspaceMinimization:
 
     supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
     needs: ClassVar[str] = "what ProjectedSOR needs; regular principal blocks (dense: least squares otherwise)"
+    affine_bounds: ClassVar[bool] = True
 
     sweeps: int = 5
     solves: int = 2
@@ -102,6 +106,8 @@ class SubspaceWorkspace(SweepWorkspace):
         self.sweep = sweep_for(problem, self.diagonal, settings.omega)
         self.system = principal_system(problem, self.precision.correction, bounded=False, settings=settings.cycle)
         self.free, self._before = layout.zeros(wp.uint8), layout.zeros(wp.float64)
+        affine = problem.bounds.affine is not None
+        self._old_bounds = [layout.zeros(wp.float64) for _ in range(2)] if affine else []
         self._scalars = wp.zeros(5, dtype=wp.float64, device=problem.device)
         self._reduction = Reduction(layout.size, problem.device, self._scalars, columns=2)
         self._kernels = kernels(self.system.r.dtype)
@@ -116,6 +122,7 @@ class SubspaceWorkspace(SweepWorkspace):
     def classify(self, x: wp.array[Any]) -> tuple[int, int]:
         """Find the free set; return how many unknowns entered or left it, and how many are held."""
         p, r = self.problem, self._reduction
+        p.bounds.follow(x)
         before = [x, p.lower, p.upper, p.unknown, self.free]
         launch_spans(classify_kernel, r.spans, before, [r.threads, r.partials], p.device)
         r.add_up(MOVED, columns=2)
@@ -148,14 +155,20 @@ class SubspaceWorkspace(SweepWorkspace):
 
     def _correct(self, x: wp.array[Any], scale: float) -> None:
         p = self.problem
+        p.bounds.follow(self._before)
         self._flat(self._kernels.correct, [self._before, self.system.e, p.lower, p.upper, scale, x])
+        if self._old_bounds:
+            for old, bound in zip(self._old_bounds, (p.lower, p.upper), strict=True):
+                wp.copy(old, bound)
+            p.bounds.follow(x)
+            wp.launch(follow_kernel, x.size, [*self._old_bounds, p.lower, p.upper, x], device=x.device)
         if self.floating is not None:
             self.floating.settle(x, p.lower, p.upper)
         self.round_iterate()
 
     def _energy(self, x: wp.array[Any]) -> float:
-        """Return x'A x / 2 + b'x = x'(y + b) / 2, y being that of x; infinite if A is not symmetric and has none."""
-        if not self.problem.A.symmetric:
+        """Return x'A x / 2 + b'x = x'(y + b) / 2, y being that of x; infinite where there is none: A not symmetric, bounds affine."""
+        if not self.problem.A.symmetric or self._old_bounds:
             return np.inf
         self._reduction.dot(x, self.residual.y, XY)
         self._reduction.dot(x, self.problem.b, XB)

@@ -46,6 +46,18 @@ def free_square_kernel(y: f64, free: u8, n: int, chunk: int, stride: wp.int64, o
     out[t] = free_square_span(y, free, span_start(t, chunk), span_end(t, chunk, n), stride)
 
 
+@wp.kernel(enable_backward=False, module="warp_lcp.subspace_minimization")
+def follow_kernel(old_lower: f64, old_upper: f64, lower: f64, upper: f64, x: f64):
+    """Move x with bounds that have moved: what was at one stays at it, the rest is projected."""
+    i = wp.tid()
+    value = wp.clamp(x[i], lower[i], upper[i])
+    if old_lower[i] != lower[i] and x[i] <= old_lower[i]:
+        value = lower[i]
+    if old_upper[i] != upper[i] and x[i] >= old_upper[i]:
+        value = upper[i]
+    x[i] = value
+
+
 @functools.cache
 def kernels(real: Any) -> SimpleNamespace:
     """Return the kernels for corrections of type real."""

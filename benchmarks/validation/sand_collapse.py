@@ -1,0 +1,156 @@
+"""Collapsing columns of sand against the runouts that experiments found: Lube et al. 2005 and Lajeunesse et al. 2005."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from benchmarks.record import Chart, Lines
+from benchmarks.validation.finding import Findings, Trial, attempt
+from benchmarks.validation.sand_pit import FLOOR, FRICTION_ANGLE, GRAVITY, WIDTH, column, create, profile, runout, share_solved, steps
+
+CASES = {20: (0.5, 1.0, 2.0, 4.0, 8.0), 40: (0.5, 1.0, 2.0, 4.0)}  # aspects at each number of cells of a column's width
+CONTROLLED = 2.0  # the aspect of the negative controls
+WIDENED = 0.2  # of the experiments' range
+STOPS, STAYS = 3.5, 0.5  # [sqrt(height / g)]: when a pile has stopped; [s] that it is watched then
+CUBE = 48  # cells of the domain in 3-D
+
+
+@dataclass(frozen=True)
+class Collapse:
+    """What a column has become.
+
+    Attributes:
+        runout: of the front, in widths.
+        moved: how far the front went in the end of the run, in widths.
+        energy: kinetic, at the end, over the largest.
+        solved: share of the steps whose stresses are within the tolerance [%].
+        outline: x and y of the pile's surface, in widths.
+    """
+
+    runout: float
+    moved: float
+    energy: float
+    solved: float
+    outline: tuple[list[float], list[float]]
+
+
+def lube(aspect: float) -> float:
+    """Return the runout, in widths, that [Lube2005] found: 1.2 a, 1.9 a^(2/3) from 1.8 on."""
+    return 1.2 * aspect if aspect < 1.8 else 1.9 * aspect ** (2.0 / 3.0)
+
+
+def lajeunesse(aspect: float) -> float:
+    """Return the runout, in widths, that [Lajeunesse2005] found: 1.8 a, then 2.3 a^(2/3)."""
+    return min(1.8 * aspect, 2.3 * aspect ** (2.0 / 3.0))
+
+
+def envelope(aspect: float) -> tuple[float, float]:
+    """Return the least and the largest runout that the experiments allow."""
+    found = lube(aspect), lajeunesse(aspect)
+    return (1.0 - WIDENED) * min(found), (1.0 + WIDENED) * max(found)
+
+
+def check(device: str) -> tuple[list[Trial], list[Chart]]:
+    """Run the check at its resolutions."""
+    trials = [trial(cells, device) for cells in CASES] + [cube(device)]
+    a = np.geomspace(0.4, 10.0, 60)
+    laws = {"Lube et al. 2005": lube, "Lajeunesse et al. 2005": lajeunesse}
+    curves: dict[str, Any] = {name: (a.tolist(), [law(x) for x in a]) for name, law in laws.items()}
+    for label, side in (("20 % below both", 0), ("20 % above both", 1)):
+        curves[label] = (a.tolist(), [envelope(x)[side] for x in a])
+    shapes: dict[str, Any] = {}
+    for t in trials[: len(CASES)]:
+        curves[t.resolution] = t.curves.get("runout", ([], []))
+        shapes |= {f"{t.resolution}: {label}": c for label, c in t.curves.items() if label.startswith("a = ")}
+    return trials, [
+        Lines(
+            "sand-runout", "Runout of collapsing columns", "a = height / width", "runout / width", curves,
+            marked=frozenset(t.resolution for t in trials),
+        ),
+        Lines("sand-piles", "Piles", "x / width", "y / width", shapes, logarithmic_x=False, logarithmic_y=False),
+    ]  # fmt: skip
+
+
+def trial(cells: int, device: str = "cpu", aspects: tuple[float, ...] = (), *, controls: bool = True) -> Trial:
+    """Compare runouts with the experiments; the controls have half and twice their friction.
+
+    Args:
+        cells: of a column's width.
+        device: where it runs.
+        aspects: height over width; those of the check without any.
+        controls: run the negative controls too.
+    """
+
+    def run(found: Findings) -> None:
+        chosen, ways = aspects or CASES[cells], []
+        for aspect in chosen:
+            low, high = envelope(aspect)
+            c = collapse(aspect, cells, device)
+            ways.append(c.runout)
+            found.add(f"a = {aspect:g}: runout", c.runout, low=low, high=high, unit="widths")
+            found.add(f"a = {aspect:g}: way of the front in the last {STAYS:g} s", abs(c.moved), high=0.02, unit="widths")
+            found.add(f"a = {aspect:g}: kinetic energy in the end over the largest", c.energy, high=1e-3)
+            found.add(f"a = {aspect:g}: steps with stresses to 1e-3", c.solved, low=95.0, unit="%")
+            found.curves[f"a = {aspect:g}"] = c.outline
+        found.curves["runout"] = (list(chosen), ways)
+        low, high = envelope(CONTROLLED)
+        slope = math.tan(math.radians(FRICTION_ANGLE))
+        for label, factor in (("half", 0.5), ("twice", 2.0)) if controls else ():
+            angle = math.degrees(math.atan(factor * slope))
+            c = collapse(CONTROLLED, cells, device, length=12.0, angle=angle, floor=factor * slope)
+            found.must_break(f"{label} the friction, a = {CONTROLLED:g}: runout", c.runout, low=low, high=high, unit="widths")
+
+    return attempt("sand collapse", f"{cells} cells of width", run)
+
+
+def collapse(aspect: float, cells: int, device: str = "cpu", *, length: float = 0.0, **tables: Any) -> Collapse:
+    """Let a column collapse.
+
+    Args:
+        aspect: height over width.
+        cells: of the width.
+        device: where it runs.
+        length: of the domain [widths]; by the experiments without one.
+        tables: of the scene.
+    """
+    simulation = column(aspect, cells, length=length or 2.5 + 1.2 * envelope(aspect)[1], device=device, **tables)
+    stops = STOPS * math.sqrt(aspect * WIDTH / GRAVITY) + 0.2
+    rows = list(steps(simulation, stops))
+    before = runout(simulation)
+    rows += steps(simulation, stops + STAYS)
+    energies = [row["kinetic_energy"] for row in rows]
+    height = (profile(simulation)[1:-1] - FLOOR) / cells
+    pile = height > 0.0
+    x = (np.arange(len(height)) + 0.5) / cells
+    way = runout(simulation)
+    return Collapse(way, way - before, energies[-1] / max(energies), share_solved(rows), (x[pile].tolist(), height[pile].tolist()))
+
+
+def cube(device: str = "cpu", cells: int = CUBE) -> Trial:
+    """Let a square column collapse in 3-D: it must stop, as a round pile."""
+
+    def run(found: Findings) -> None:
+        size, width = 0.96, 0.28
+        low, high = 0.5 * (size - width), 0.5 * (size + width)
+        sand = {"shape": "box", "min": [low, 0.0, low], "max": [high, width, high]}
+        material = {"friction_angle": FRICTION_ANGLE, "angle_of": "triaxial-compression"}
+        simulation = create(
+            [size, 0.5 * size, size], cells, [sand], device=device, walls=math.tan(math.radians(FRICTION_ANGLE)), material=material,
+            density_correction={},
+        )  # fmt: skip
+        rows = list(steps(simulation, STOPS * math.sqrt(width / GRAVITY) + 0.2))
+        x = simulation.particles.position.numpy()[:, [0, 2]] - 0.5 * size
+        angle = 4.0 * np.arctan2(x[:, 1], x[:, 0])
+        far = np.linalg.norm(x, axis=1) > np.percentile(np.linalg.norm(x, axis=1), 95.0)
+        energies = [row["kinetic_energy"] for row in rows]
+        found.add("kinetic energy in the end over the largest", energies[-1] / max(energies), high=1e-3)
+        found.add("steps with stresses to 1e-3", share_solved(rows), low=95.0, unit="%")
+        found.add("|mean of exp(4 i angle)| of the 5 % farthest", float(np.abs(np.exp(1j * angle[far]).mean())), high=0.5)
+        found.add("99th percentile of |x| over half the width", float(np.percentile(np.abs(x), 99.0)) / (0.5 * width), low=1.2, high=2.5)
+        found.add("least dissipation of a step", min(row["dissipation"] for row in rows), low=0.0, unit="J")
+
+    return attempt("sand collapse", f"3-D, {cells} cells", run)

@@ -1,0 +1,200 @@
+"""Articulated figures: trees of hinges with limits, their end effectors and derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+Vector = np.ndarray
+Z = (0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class ArticulatedFigure:
+    """A tree of hinges: each turns its link about an axis that its parent's link carries ([Book] 1.3.4).
+
+    With R_j = R_parent Rot(axis_j, theta_j) and p_j = p_parent + R_parent offset_j, an end effector on link j is at p_j + R_j tip.
+
+    Args:
+        parents: of each hinge, the hinge before it on the way to the root; -1 for a hinge on the fixed root; parents come first.
+        axes: unit vectors in the parent's frame, shape (n, 3).
+        offsets: places of the hinges in the parent's frame [m], shape (n, 3).
+        effectors: the hinges whose links carry end effectors.
+        tips: places of the end effectors in their links' frames [m], shape (e, 3).
+        lower: least angles [rad], shape (n,), may be -inf.
+        upper: largest angles [rad], shape (n,), may be inf.
+        dimension: 3, or 2: figures in the x-y plane, all of whose axes are z.
+
+    Raises:
+        ValueError: a shape, a parent, an axis or a limit is wrong; the message names the argument.
+
+    Example:
+        >>> figure = planar_chain([2.0, 1.0])
+        >>> print(figure.positions(np.array([np.pi / 2, -np.pi / 2])).round(12))
+        [[1. 2.]]
+        >>> print(figure.jacobian(np.array([np.pi / 2, -np.pi / 2])).round(12))
+        [[-2.  0.]
+         [ 1.  1.]]
+    """
+
+    parents: tuple[int, ...]
+    axes: Vector
+    offsets: Vector
+    effectors: tuple[int, ...]
+    tips: Vector
+    lower: Vector
+    upper: Vector
+    dimension: int = 3
+
+    def __post_init__(self) -> None:
+        """Check the tree and the shapes."""
+        n, e = len(self.parents), len(self.effectors)
+        if n == 0 or not all(-1 <= parent < j for j, parent in enumerate(self.parents)):
+            raise ValueError(f"parents = {self.parents}: need one hinge at least, and each parent before its children")
+        for name, shape in (("axes", (n, 3)), ("offsets", (n, 3)), ("tips", (e, 3)), ("lower", (n,)), ("upper", (n,))):
+            if np.shape(getattr(self, name)) != shape:
+                raise ValueError(f"{name} has shape {np.shape(getattr(self, name))}: expected {shape}")
+        if e == 0 or not all(0 <= j < n for j in self.effectors):
+            raise ValueError(f"effectors = {self.effectors}: need one at least, each a hinge")
+        if not np.allclose(np.linalg.norm(self.axes, axis=1), 1):
+            raise ValueError("axes holds a vector that is no unit vector")
+        if not (self.lower <= self.upper).all():
+            raise ValueError("lower > upper, or a NaN, in the limits")
+        if self.dimension not in (2, 3) or (self.dimension == 2 and not np.allclose(self.axes, Z)):
+            raise ValueError(f"dimension = {self.dimension}: must be 3, or 2 with all axes along z")
+
+    @property
+    def hinges(self) -> int:
+        """How many angles there are."""
+        return len(self.parents)
+
+    @cached_property
+    def ancestors(self) -> Vector:
+        """Whether hinge j moves end effector i, shape (e, n), bool."""
+        moves = np.zeros((len(self.effectors), self.hinges), dtype=bool)
+        for i, j in enumerate(self.effectors):
+            while j >= 0:
+                moves[i, j] = True
+                j = self.parents[j]
+        return moves
+
+    @cached_property
+    def reach(self) -> float:
+        """The length of the longest way from the first hinge on it to an end effector [m]: what makes errors and angles comparable."""
+        links = np.linalg.norm(self.offsets, axis=1) * (np.array(self.parents) >= 0)
+        return float((self.ancestors @ links + np.linalg.norm(self.tips, axis=1)).max())
+
+    def _frames(self, theta: Vector) -> tuple[Vector, Vector, Vector]:
+        """Return the hinges' places (n, 3), their axes (n, 3) and the end effectors (e, 3), in the world."""
+        places, axes, turns = np.empty((self.hinges, 3)), np.empty((self.hinges, 3)), np.empty((self.hinges, 3, 3))
+        for j, parent in enumerate(self.parents):
+            R, p = (np.eye(3), np.zeros(3)) if parent < 0 else (turns[parent], places[parent])
+            places[j], axes[j] = p + R @ self.offsets[j], R @ self.axes[j]
+            turns[j] = R @ _rotation(self.axes[j], theta[j])
+        carriers = list(self.effectors)
+        return places, axes, places[carriers] + np.einsum("eij,ej->ei", turns[carriers], self.tips)
+
+    def positions(self, theta: Vector) -> Vector:
+        """Return f(theta), the end effectors' places [m], shape (e, dimension)."""
+        return self._frames(theta)[2][:, : self.dimension]
+
+    def skeleton(self, theta: Vector) -> tuple[Vector, Vector]:
+        """Return places of the hinges [m], shape (n, dimension), and of the end effectors, shape (e, dimension): what a picture needs."""
+        places, _, ends = self._frames(theta)
+        return places[:, : self.dimension], ends[:, : self.dimension]
+
+    def jacobian(self, theta: Vector) -> Vector:
+        """Return df/dtheta [m], shape (e dimension, n): a_j x (f_i - p_j) where hinge j moves effector i, else 0."""
+        places, axes, ends = self._frames(theta)
+        arms = np.cross(axes[None], ends[:, None] - places[None]) * self.ancestors[..., None]
+        return arms[..., : self.dimension].transpose(0, 2, 1).reshape(-1, self.hinges)
+
+    def curvature(self, theta: Vector, weights: Vector) -> Vector:
+        """Return sum_k w_k d^2 f_k / dtheta^2 [m^2], shape (n, n), symmetric.
+
+        d^2 f_i / dtheta_j dtheta_k = a_j x (a_k x (f_i - p_k)), j on k's way to the root or k itself, and k on effector i's.
+
+        Args:
+            theta: angles [rad], shape (n,).
+            weights: w [m], shape (e dimension,).
+        """
+        places, axes, ends = self._frames(theta)
+        w = np.zeros_like(ends)
+        w[:, : self.dimension] = weights.reshape(len(ends), -1)
+        arms = np.cross(axes[None], ends[:, None] - places[None]) * self.ancestors[..., None]
+        second = np.einsum("ekc,ejc->jk", arms, np.cross(w[:, None], axes[None]))  # w . (a_j x arm_k) = (w x a_j) . arm_k
+        above = np.zeros((self.hinges, self.hinges), dtype=bool)  # j is k or on its way to the root
+        for k, parent in enumerate(self.parents):
+            above[:, k] = above[:, parent] if parent >= 0 else False
+            above[k, k] = True
+        upper = np.where(above, second, 0.0)
+        return upper + upper.T - np.diag(np.diag(upper))
+
+
+def _rotation(axis: Vector, angle: float) -> Vector:
+    """Return the rotation about a unit vector (Rodrigues)."""
+    x, y, z = axis
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * (K @ K)
+
+
+def planar_chain(lengths: Sequence[float], *, lower: float | Vector = -2.0, upper: float | Vector = 2.0) -> ArticulatedFigure:
+    """Return a chain in the x-y plane that lies along x at theta = 0.
+
+    Args:
+        lengths: of the links [m].
+        lower: least angles [rad], a number or one a link.
+        upper: largest angles [rad], likewise.
+    """
+    n = len(lengths)
+    offsets = np.zeros((n, 3))
+    offsets[1:, 0] = lengths[:-1]
+    tips = np.array([[lengths[-1], 0.0, 0.0]])
+    limits = (np.broadcast_to(np.asarray(side, dtype=np.float64), (n,)) for side in (lower, upper))
+    return ArticulatedFigure(tuple(range(-1, n - 1)), np.tile(Z, (n, 1)), offsets, (n - 1,), tips, *limits, dimension=2)
+
+
+def spatial_chain(lengths: Sequence[float], *, lower: float | Vector = -2.0, upper: float | Vector = 2.0) -> ArticulatedFigure:
+    """Return a chain in space that lies along x at theta = 0; its hinges' axes are z, y, x, z, y, x and so on.
+
+    Args:
+        lengths: of the links [m].
+        lower: least angles [rad], a number or one a link.
+        upper: largest angles [rad], likewise.
+    """
+    flat = planar_chain(lengths, lower=lower, upper=upper)
+    axes = np.eye(3)[[2 - j % 3 for j in range(flat.hinges)]]
+    return ArticulatedFigure(flat.parents, axes, flat.offsets, flat.effectors, flat.tips, flat.lower, flat.upper)
+
+
+def branching_figure() -> ArticulatedFigure:
+    """Return the upper half of a body: a spine of 3 hinges, two arms of 5 and a head of 2; their ends are the three end effectors.
+
+    y is up at theta = 0, with the arms hanging out sideways; 1 m from hip to shoulders and to a hand; limits are a person's, roughly.
+    """
+    x, y, z = np.eye(3)
+    joints: list[tuple[int, Vector, Vector, float, float]] = [  # parent, axis, offset, limits
+        (-1, x, 0 * y, -0.4, 1.2),
+        (0, z, 0 * y, -0.6, 0.6),
+        (1, y, 0.5 * y, -0.8, 0.8),
+    ]
+    ends: list[tuple[int, Vector]] = []
+    for side in (-1.0, 1.0):
+        shoulder = len(joints)
+        low, high = sorted((-0.5 * side, 1.5 * side))
+        joints += [
+            (2, y, 0.5 * y + 0.2 * side * x, -1.5, 0.6) if side < 0 else (2, y, 0.5 * y + 0.2 * side * x, -0.6, 1.5),
+            (shoulder, z, 0 * y, low, high),
+            (shoulder + 1, x, 0 * y, -1.5, 1.5),
+            (shoulder + 2, y, 0.35 * side * x, -2.4, 0.0) if side < 0 else (shoulder + 2, y, 0.35 * side * x, 0.0, 2.4),
+            (shoulder + 3, z, 0.3 * side * x, -1.0, 1.0),
+        ]
+        ends.append((shoulder + 4, 0.15 * side * x))
+    joints += [(2, x, 0.6 * y, -0.7, 0.7), (len(joints), z, 0 * y, -0.5, 0.5)]
+    ends.append((len(joints) - 1, 0.25 * y))
+    parents, axes, offsets, lower, upper = zip(*joints, strict=True)
+    effectors, tips = zip(*ends, strict=True)
+    return ArticulatedFigure(parents, *map(np.array, (axes, offsets)), effectors, *map(np.array, (tips, lower, upper)))

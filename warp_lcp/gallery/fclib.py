@@ -1,0 +1,151 @@
+"""Frictional contact problems of the collection FCLIB, which are HDF5 files (extra `contact`: h5py).
+
+Layout, as FCLIB's own writer makes it (github.com/FrictionalContactLibrary/fclib, src/fclib.h and src/fclib.c):
+/fclib_local holds spacedim, matrices W and, together, V and R, and vectors/{q, mu, s}: u = W r + V l + q, V'r + R l + s = 0;
+/fclib_global holds spacedim, M, H and perhaps G, and vectors/{f, w, mu, b}: M v = H r + G l + f, u = H'v + w, G'v + b = 0.
+A matrix is a group of m, n, nz, nzmax, p, i, x: triplets (rows p, columns i) where nz >= 0, compressed columns where nz = -1, compressed
+rows where nz = -2. Rows of a contact are normal, then tangents. /solution/{r, l} may hold a solution.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.linalg
+
+from warp_lcp.gallery.contact_models import ContactSystem
+
+
+@dataclass(frozen=True, eq=False)
+class FclibProblem:
+    """What a file holds.
+
+    Args:
+        system: velocities at contacts for impulses; equations of l are its joint rows.
+        solution: impulses (r, l) that the file gives [N s], a vector like `system.q`; None without any.
+        title: of the problem; empty without any.
+    """
+
+    system: ContactSystem
+    solution: np.ndarray | None
+    title: str
+
+
+def read_fclib(path: Path | str) -> FclibProblem:
+    """Read a local or a global problem; a global one is reduced to its contacts by M's factors.
+
+    Raises:
+        ImportError: h5py is missing.
+        ValueError: the file is no FCLIB problem; the message names what is missing or wrong.
+    """
+    try:
+        import h5py
+    except ImportError as error:
+        raise ImportError("FCLIB files need h5py: pip install 'warp-lcp[contact]'") from error
+    path = Path(path)
+    try:
+        with h5py.File(path, "r") as file:
+            return _read(file, path)
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read as HDF5: {error}") from error
+
+
+def _read(file: Any, path: Path) -> FclibProblem:
+    """Return the problem of an open file."""
+    kind = next((name for name in ("fclib_local", "fclib_global") if name in file), None)
+    if kind is None:
+        raise ValueError(f"{path}: holds neither fclib_local nor fclib_global")
+    group = file[kind]
+    dim = int(_values(group, "spacedim", path)[0])
+    if dim not in (2, 3):
+        raise ValueError(f"{path}: spacedim = {dim}: must be 2 or 3")
+    B, q = (_local if kind == "fclib_local" else _global)(group, path)
+    mu = _values(group, "vectors/mu", path)
+    joints = len(q) - dim * len(mu)
+    if joints < 0:
+        raise ValueError(f"{path}: mu has {len(mu)} values for {len(q)} rows of {dim} a contact")
+    title = _text(group, "info/title")
+    free = np.full(joints, np.inf)
+    system = ContactSystem(title or path.stem, B, q, mu, -free, free, dim)
+    return FclibProblem(system, _solution(file, len(q), joints, path), title)
+
+
+def _local(group: Any, path: Path) -> tuple[scipy.sparse.csr_array, np.ndarray]:
+    """Return B = [W, V; V', R] and (q, s)."""
+    W, q = _matrix(group, "W", path), _values(group, "vectors/q", path)
+    if "V" not in group:
+        return _symmetric(W, path), q
+    V, R, s = _matrix(group, "V", path), _matrix(group, "R", path), _values(group, "vectors/s", path)
+    return _symmetric(scipy.sparse.block_array([[W, V], [V.T, R]]), path), np.concatenate([q, s])
+
+
+def _global(group: Any, path: Path) -> tuple[scipy.sparse.csr_array, np.ndarray]:
+    """Return B = C'M^-1 C and C'M^-1 f + (w, b) with C = (H, G)."""
+    M, H, f = _matrix(group, "M", path), _matrix(group, "H", path), _values(group, "vectors/f", path)
+    q = _values(group, "vectors/w", path)
+    C = H
+    if "G" in group:
+        C = scipy.sparse.csr_array(scipy.sparse.hstack([H, _matrix(group, "G", path)]))
+        q = np.concatenate([q, _values(group, "vectors/b", path)])
+    if M.shape != (len(f), len(f)) or C.shape != (len(f), len(q)):
+        raise ValueError(f"{path}: M has shape {M.shape}, H and G {C.shape}: do not fit f of {len(f)} and w and b of {len(q)} values")
+    solve = scipy.sparse.linalg.splu(scipy.sparse.csc_array(M)).solve
+    response = scipy.sparse.csr_array(np.asarray(solve(C.toarray())))
+    return _symmetric(C.T @ response, path), C.T @ np.asarray(solve(f)) + q
+
+
+def _matrix(group: Any, name: str, path: Path) -> scipy.sparse.csr_array:
+    """Return a matrix that is stored in one of FCLIB's three ways."""
+    if name not in group:
+        raise ValueError(f"{path}: {group.name} has no matrix {name}")
+    m, n, nz = (int(_values(group, f"{name}/{key}", path)[0]) for key in ("m", "n", "nz"))
+    p, i = (_values(group, f"{name}/{key}", path).astype(np.int64) for key in ("p", "i"))
+    x = _values(group, f"{name}/x", path)
+    try:
+        if nz >= 0:
+            return scipy.sparse.coo_array((x[:nz], (p[:nz], i[:nz])), shape=(m, n)).tocsr()
+        used = int(p[-1])
+        made = {-1: scipy.sparse.csc_array, -2: scipy.sparse.csr_array}.get(nz)
+        if made is None:
+            raise ValueError(f"nz = {nz}: must be >= 0, -1 or -2")
+        return scipy.sparse.csr_array(made((x[:used], i[:used], p), shape=(m, n)))
+    except (ValueError, IndexError) as error:
+        raise ValueError(f"{path}: {group.name}/{name} is no sparse matrix: {error}") from error
+
+
+def _symmetric(B: Any, path: Path) -> scipy.sparse.csr_array:
+    """Return B without what rounding has made unsymmetric."""
+    B = scipy.sparse.csr_array(B)
+    if B.shape[0] != B.shape[1] or abs(B - B.T).max() > 1e-6 * abs(B).max():
+        raise ValueError(f"{path}: the matrix of the contacts is not symmetric")
+    return scipy.sparse.csr_array(0.5 * (B + B.T))
+
+
+def _values(group: Any, name: str, path: Path) -> np.ndarray:
+    """Return a dataset as a vector."""
+    if name not in group:
+        raise ValueError(f"{path}: {group.name} has no {name}")
+    return np.atleast_1d(np.asarray(group[name][()])).ravel()
+
+
+def _text(group: Any, name: str) -> str:
+    """Return a string that a file may hold."""
+    if name not in group:
+        return ""
+    value = group[name][()]
+    return value.decode(errors="replace").rstrip("\0") if isinstance(value, bytes) else str(value)
+
+
+def _solution(file: Any, rows: int, joints: int, path: Path) -> np.ndarray | None:
+    """Return (r, l) of /solution."""
+    if "solution/r" not in file:
+        return None
+    r = _values(file, "solution/r", path)
+    r = np.concatenate([r, _values(file, "solution/l", path)]) if joints and "solution/l" in file else r
+    if len(r) != rows:
+        raise ValueError(f"{path}: the solution has {len(r)} values: expected {rows}")
+    return r

@@ -1,0 +1,236 @@
+"""Inverse kinematics with joint limits as a sequence of boxed LCPs ([Book] 1.3.4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from warp_lcp.gallery.articulated_figure import ArticulatedFigure
+from warp_lcp.operators.dense import DenseOperator
+from warp_lcp.problem import LCP
+from warp_lcp.result import SolveStatus
+from warp_lcp.solve import Solver, solve
+from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
+from warp_lcp.stopping import StoppingCriteria
+
+Vector = np.ndarray
+AGREES, DISAGREES = 0.75, 0.25  # shares of the model's decrease from which on the trust region grows, and below which it shrinks
+LEAST_RADIUS = 1e-13  # [rad]: smaller steps are rounding
+INNER = StoppingCriteria(rtol=1e-10, max_iterations=500)  # of each LCP
+DEFINITE = 1e-6  # of reach^2: the least eigenvalue that a model with curvature is shifted to, where its own is less
+
+
+@dataclass(frozen=True, eq=False)
+class StepProblem:
+    """A step's problem: minimize 1/2 d'H d + c'd, c = -J'(g - f), with the joint limits at theta + d and |d_i| <= radius.
+
+    Args:
+        H: the model's symmetric matrix [m^2], shape (n, n).
+        c: gradient of the objective [m^2], shape (n,).
+        lower: least step [rad], <= 0, shape (n,).
+        upper: largest step [rad], >= 0, shape (n,).
+    """
+
+    H: Vector
+    c: Vector
+    lower: Vector
+    upper: Vector
+
+    def boxed(self, *, device: Any = None) -> LCP:
+        """Return the boxed LCP in the step itself: y = H d + c, l <= d <= u."""
+        return LCP(DenseOperator(self.H, device=device), self.c, self.lower, self.upper)
+
+    def multipliers(self, *, device: Any = None) -> LCP:
+        """Return the book's LCP in the 2n multipliers of the limits ([Book] eq. 1.143-1.144), all of which must be finite.
+
+        With B = [I; -I]: H d + c = B'x, so that 0 <= x is complementary to B H^-1 B' x + (-l; u) - B H^-1 c >= 0. The matrix is positive
+        semi-definite of rank n: a limit's two rows are each other's negatives.
+
+        Raises:
+            ValueError: H is singular: without damping it is wherever there are more hinges than goals; or a bound is infinite.
+        """
+        if not np.isfinite([self.lower, self.upper]).all():
+            raise ValueError("lower and upper must be finite for a multiplier each")
+        B = np.concatenate([np.eye(len(self.c)), -np.eye(len(self.c))])
+        try:
+            solved = np.linalg.solve(self.H, np.column_stack([B.T, self.c]))
+        except np.linalg.LinAlgError:
+            raise ValueError("H is singular: damping must be positive") from None
+        M = B @ solved[:, :-1]
+        return LCP(DenseOperator(0.5 * (M + M.T), device=device), np.concatenate([-self.lower, self.upper]) - B @ solved[:, -1])
+
+    def step(self, x: Vector) -> Vector:
+        """Return the step that multipliers x of `multipliers` stand for: d = H^-1 (B'x - c)."""
+        n = len(self.c)
+        return np.linalg.solve(self.H, x[:n] - x[n:] - self.c)
+
+    def decrease(self, d: Vector) -> float:
+        """Return by how much the model falls [m^2]."""
+        return float(-d @ (self.c + 0.5 * (self.H @ d)))
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """What `InverseKinematics.solve` returns.
+
+    Args:
+        theta: angles [rad], shape (n,), within the limits.
+        objective: 1/2 |g - f(theta)|^2 [m^2].
+        projected_gradient: the measure of convergence [rad].
+        status: CONVERGED; MAX_ITERATIONS; or STAGNATED: no step above rounding lowers the objective.
+        iterations: LCPs solved, one an iteration.
+        rejected: how many of their steps did not lower the objective.
+        unsolved: how many of the LCPs did not converge.
+        overshoot: the most by which a solution of an LCP left its bounds [rad] before it was clipped to them.
+        history: objective at the start and after each iteration [m^2]; it never grows.
+    """
+
+    theta: Vector
+    objective: float
+    projected_gradient: float
+    status: SolveStatus
+    iterations: int
+    rejected: int
+    unsolved: int
+    overshoot: float
+    history: list[float]
+
+    def __bool__(self) -> bool:
+        """Whether a point of first-order optimality was found."""
+        return self.status is SolveStatus.CONVERGED
+
+
+@dataclass(frozen=True, kw_only=True)
+class InverseKinematics:
+    """Minimize 1/2 |g - f(theta)|^2 within joint limits, a boxed LCP a step ([Book] 1.3.4, eqs. 1.130-1.144).
+
+    The Gauss-Newton model at theta, (J'J + mu I) d - J'(g - f) = y with max(l - theta, -radius) <= d <= min(u - theta, radius), is solved
+    by any method. The book takes its steps as they are; here a step is taken only if the objective falls, and the box's radius follows how
+    well the model foretells it. Converged: |theta - clip(theta - grad / reach^2, l, u)| <= tolerance in the largest angle.
+
+    The damping mu keeps H definite, which most methods need, and shortens steps where J is nearly singular, at a price in iterations:
+    docs/theory.md has it measured. A goal out of reach leaves a residual, which Gauss-Newton's model does not know the curvature of:
+    `curvature` adds -sum_k (g - f)_k f_k'' and shifts the sum to be definite.
+
+    Args:
+        method: of the LCPs; with `multipliers` one for semi-definite A; MinimumMapNewton if None, with `multipliers` InteriorPoint would do.
+        damping: mu in units of reach^2, >= 0.
+        radius: first largest change of an angle in a step [rad], > 0.
+        tolerance: of the projected gradient [rad], > 0.
+        max_iterations: the most LCPs, >= 0.
+        curvature: model the objective's second derivative wholly.
+        multipliers: solve the book's LCP in the multipliers of the limits instead of the boxed one in the step.
+        device: Warp device of the LCPs; the default device if None.
+
+    Raises:
+        ValueError: an argument is outside its range.
+
+    Example:
+        >>> from warp_lcp.gallery.articulated_figure import planar_chain
+        >>> arm = planar_chain([1.0, 1.0], lower=np.array([-3.0, 0.0]), upper=np.array([3.0, 2.5]))  # an elbow that bends one way
+        >>> pose = InverseKinematics(device="cpu").solve(arm, np.array([[1.0, 1.0]]), start=np.array([0.3, 0.3]))
+        >>> print(pose.status.name, arm.positions(pose.theta).round(6), (pose.theta >= arm.lower).all())
+        CONVERGED [[1. 1.]] True
+    """
+
+    method: Solver = field(default_factory=MinimumMapNewton)
+    damping: float = 1e-4
+    radius: float = 0.5
+    tolerance: float = 1e-7
+    max_iterations: int = 500
+    curvature: bool = False
+    multipliers: bool = False
+    device: Any = None
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        if not (self.damping >= 0 and np.isfinite(self.damping)):
+            raise ValueError(f"damping = {self.damping}: must be finite and >= 0, in units of reach^2")
+        for name in ("radius", "tolerance"):
+            if not (getattr(self, name) > 0 and np.isfinite(getattr(self, name))):
+                raise ValueError(f"{name} = {getattr(self, name)}: must be finite and > 0, in radians")
+        if self.max_iterations < 0:
+            raise ValueError(f"max_iterations = {self.max_iterations}: must be >= 0")
+
+    def solve(self, figure: ArticulatedFigure, goals: Vector, start: Vector | None = None) -> Pose:
+        """Return a pose whose end effectors are as near to their goals as they come from the start.
+
+        Args:
+            figure: what moves.
+            goals: g [m], shape (e, dimension).
+            start: angles [rad], shape (n,), clipped to the limits; 0 clipped to them if None.
+
+        Raises:
+            ValueError: goals or start has a wrong shape or holds values that are not finite.
+        """
+        lower, upper, scale = figure.lower, figure.upper, figure.reach**2
+        theta = np.clip(_checked(np.zeros(figure.hinges) if start is None else start, (figure.hinges,), "start"), lower, upper)
+        goals = _checked(goals, (len(figure.effectors), figure.dimension), "goals")
+        error = (goals - figure.positions(theta)).ravel()
+        history, radius, rejected, unsolved, overshoot = [0.5 * float(error @ error)], self.radius, 0, 0, 0.0
+        status, gradient = None, -figure.jacobian(theta).T @ error
+        while status is None:
+            measure = float(np.abs(theta - np.clip(theta - gradient / scale, lower, upper)).max())
+            status = self._status(measure, radius, len(history) - 1)
+            if status is not None:
+                break
+            model = self._model(figure, theta, error, radius)
+            d, solved, beyond = self._step(model)
+            unsolved, overshoot = unsolved + (not solved), max(overshoot, beyond)
+            trial = np.clip(theta + d, lower, upper)
+            new = (goals - figure.positions(trial)).ravel()
+            fall, foretold = 0.5 * float((error - new) @ (error + new)), model.decrease(trial - theta)
+            if fall > 0 and 0.5 * float(new @ new) <= history[-1]:
+                theta, error, gradient = trial, new, -figure.jacobian(trial).T @ new
+            else:
+                rejected += 1
+            history.append(0.5 * float(error @ error))
+            radius = self._radius(radius, fall, foretold, float(np.abs(d).max()))
+        return Pose(theta, history[-1], measure, status, len(history) - 1, rejected, unsolved, overshoot, history)
+
+    def _status(self, measure: float, radius: float, iterations: int) -> SolveStatus | None:
+        """Return how the iteration ends now, None if it goes on."""
+        if measure <= self.tolerance:
+            return SolveStatus.CONVERGED
+        if iterations >= self.max_iterations:
+            return SolveStatus.MAX_ITERATIONS
+        return SolveStatus.STAGNATED if radius < LEAST_RADIUS else None
+
+    def _model(self, figure: ArticulatedFigure, theta: Vector, error: Vector, radius: float) -> StepProblem:
+        """Return the problem of a step from theta, where g - f is `error`."""
+        J, scale = figure.jacobian(theta), figure.reach**2
+        H, shift = J.T @ J, self.damping * scale
+        if self.curvature:
+            H = H - figure.curvature(theta, error)
+            shift += max(0.0, DEFINITE * scale - float(np.linalg.eigvalsh(H)[0]))
+        H = H + shift * np.eye(len(theta))
+        return StepProblem(H, -J.T @ error, np.maximum(figure.lower - theta, -radius), np.minimum(figure.upper - theta, radius))
+
+    def _step(self, model: StepProblem) -> tuple[Vector, bool, float]:
+        """Return a step within its bounds, whether its LCP converged, and by how much its solution left the bounds."""
+        problem = model.multipliers(device=self.device) if self.multipliers else model.boxed(device=self.device)
+        result = solve(problem, self.method, stopping=INNER)
+        x = result.x.numpy().astype(np.float64)
+        d = model.step(x) if self.multipliers else x
+        inside = np.clip(d, model.lower, model.upper)
+        return inside, bool(result), float(np.abs(d - inside).max())
+
+    def _radius(self, radius: float, fall: float, foretold: float, length: float) -> float:
+        """Return the trust region's next radius: half of the step where the model was wrong, twice the radius where it was right and short."""
+        if foretold <= 0 or fall < DISAGREES * foretold:
+            return 0.5 * min(radius, max(length, LEAST_RADIUS))
+        if fall > AGREES * foretold and length > 0.9 * radius:
+            return min(2 * radius, np.pi)
+        return radius
+
+
+def _checked(values: Any, shape: tuple[int, ...], name: str) -> Vector:
+    """Return finite numbers of a shape."""
+    values = np.asarray(values, dtype=np.float64)
+    if values.shape != shape:
+        raise ValueError(f"{name} has shape {values.shape}: expected {shape}")
+    if not np.isfinite(values).all():
+        raise ValueError(f"{name} holds values that are not finite")
+    return values
