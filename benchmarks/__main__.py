@@ -16,7 +16,7 @@ from benchmarks.timing import Options
 def main() -> None:
     """Measure a suite and write its files."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks")
-    parser.add_argument("suite", choices=["kernels", "solvers", "run", "sand", "validation", "replay", "book"])
+    parser.add_argument("suite", choices=["kernels", "solvers", "run", "sand", "contacts", "validation", "replay", "book"])
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--size", type=int, action="append", default=[])

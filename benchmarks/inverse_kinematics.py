@@ -74,11 +74,11 @@ def peer(target: Target, start: np.ndarray | None = None) -> scipy.optimize.Opti
     return scipy.optimize.least_squares(
         lambda theta: (figure.positions(theta) - target.goals).ravel(),
         np.clip(target.start if start is None else start, figure.lower + inside, figure.upper - inside),
-        lambda theta: figure.jacobian(theta),
+        figure.jacobian,
         bounds=(figure.lower, figure.upper),
-        ftol=1e-14,
-        xtol=1e-14,
-        gtol=1e-12 * figure.reach**2,
+        ftol=1e-11,
+        xtol=1e-12,
+        gtol=1e-10 * figure.reach**2,
         max_nfev=2000,
     )
 
@@ -159,8 +159,8 @@ def price_of_damping(count: int, curvature: bool, *, seed: int = 271) -> list[tu
     return rows
 
 
-def _print_comparison(count: int) -> None:
-    for model, counts in compare(count, MODELS).items():
+def _print_comparison(count: int, model: str | None = None) -> None:
+    for model, counts in compare(count, {name: s for name, s in MODELS.items() if model in (None, name)}).items():
         print(f"{model}: {sum(c.same for c in counts.values())} of {count} the same")
         for key, c in counts.items():
             print(f"  {key}: " + ", ".join(f"{name} {value:.3g}" for name, value in vars(c).items()))
@@ -195,12 +195,16 @@ def _print_methods(count: int) -> None:
 
 def main() -> None:
     """Print one of the studies."""
-    studies = {"compare": _print_comparison, "damping": _print_damping, "methods": _print_methods}
+    studies = {"damping": _print_damping, "methods": _print_methods}
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("study", choices=studies)
+    parser.add_argument("study", choices=["compare", *studies])
     parser.add_argument("count", type=int)
+    parser.add_argument("--model", choices=MODELS, help="of compare; both if it is not named")
     arguments = parser.parse_args()
-    studies[arguments.study](arguments.count)
+    if arguments.study == "compare":
+        _print_comparison(arguments.count, arguments.model)
+    else:
+        studies[arguments.study](arguments.count)
 
 
 if __name__ == "__main__":

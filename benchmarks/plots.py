@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 COLOR, LIMIT = "#3a6ea5", "#b3432b"
 MARKERS = 100  # points of a curve from which on they are not marked
+STYLES = ("-", "--", ":")  # of ten curves each, which have a color of their own
+CROWDED = 10  # curves from which on their names are beside the axes
 
 
 def draw(charts: Sequence[Chart], out: Path, prefix: str) -> list[Path]:
@@ -51,11 +53,11 @@ def _bars(axes: Axes, chart: Bars) -> None:
 
 
 def _lines(axes: Axes, chart: Lines) -> None:
-    for label, (x, y) in chart.curves.items():
+    for number, (label, (x, y)) in enumerate(chart.curves.items()):
         if label in chart.marked:
             axes.plot(x, y, marker="o", linestyle="none", fillstyle="none", color="black", label=label)
         else:
-            axes.plot(x, y, marker="." if len(x) < MARKERS else "", label=label)
+            axes.plot(x, y, marker="." if len(x) < MARKERS else "", linestyle=STYLES[number // 10 % len(STYLES)], label=label)
     if chart.logarithmic_y:
         axes.set_yscale("log")
     if chart.logarithmic_x:
@@ -63,4 +65,7 @@ def _lines(axes: Axes, chart: Lines) -> None:
     axes.set_xlabel(chart.x_label)
     axes.set_ylabel(chart.y_label)
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=7)
+    if len(chart.curves) < CROWDED:
+        axes.legend(fontsize=7)
+    else:
+        axes.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.01, 1.0))

@@ -125,6 +125,7 @@ SOLVERS = Suite(
 )
 RUN = Suite("run", "steps per second of built-in scenes, and what the particles cost")
 SAND = Suite("sand", "sand: the coupled methods at equal residual, the yield sets, steps of large scenes")
+CONTACTS = Suite("contacts", "rigid contacts: methods on the scenes of figures 2.9 and 2.11, NNCG against PGS at equal sweeps", False)
 VALIDATION = Suite(
     "validation",
     "liquids and sand against known answers: rest, sloshing, ceiling, dam break, transfers, slopes, volume, sand; with negative controls",

@@ -86,12 +86,13 @@ def measure(scale: Scale, device: str, say: Callable[[str], object]) -> Results:
         "Seconds to 1e-6 with a workspace that has solved before, the least of the samples; step: of one iteration of the method. "
         f"The exponent of seconds over unknowns is fitted from {LEAST} unknowns on. "
         f"PSOR 1.4, and 1.9 beyond {SWEPT} unknowns, are timed for {STEPS} sweeps as in the book: to 1e-6 they need hundreds or thousands, "
-        "a number that grows with the cells along a side, so that their cost to a tolerance grows faster than their step's."
+        "a number that grows with the cells along a side, so that their cost to a tolerance grows faster than their step's. The "
+        "largest grid does not fit into the caches, the others do: exponents above 1 of steps come from that."
     )
     contacts = "Cost against size: contacts of rigid bodies (fig. C.5b)"
     contacts_remark = (
         "Dense matrices of 6 unknowns a contact, factored anew in each step; the median of the problems. Exponents over all sizes: below "
-        "500 unknowns the cubic part does not dominate yet."
+        "500 unknowns the cubic part does not dominate yet. Without iterations: not all of the problems were solved."
     )
     parts = [("grid", fluid, fluid_remark, grids, LEAST), ("contact", contacts, contacts_remark, dense, 0)]
     records, tables, charts = list[Record](), list[Table](), list[Chart]()

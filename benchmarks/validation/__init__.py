@@ -10,7 +10,20 @@ from pathlib import Path
 from benchmarks.machine import machine
 from benchmarks.record import Results
 from benchmarks.timing import Options
-from benchmarks.validation import ceiling, dam_break, inclined, rest, slope, sloshing, transfers, volume
+from benchmarks.validation import (
+    ceiling,
+    dam_break,
+    inclined,
+    rest,
+    sand_collapse,
+    sand_hourglass,
+    sand_invariants,
+    sand_rest,
+    slope,
+    sloshing,
+    transfers,
+    volume,
+)
 from benchmarks.validation.finding import Trial, table
 
 TITLE = "Liquids and sand against known answers"
@@ -23,6 +36,10 @@ CHECKS = {
     "rest": rest,
     "volume": volume,
     "inclined layer": inclined,
+    "sand collapse": sand_collapse,
+    "sand hourglass": sand_hourglass,
+    "sand invariants": sand_invariants,
+    "sand rest": sand_rest,
 }
 
 

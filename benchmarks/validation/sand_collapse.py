@@ -16,6 +16,7 @@ CASES = {20: (0.5, 1.0, 2.0, 4.0, 8.0), 40: (0.5, 1.0, 2.0, 4.0)}  # aspects at 
 CONTROLLED = 2.0  # the aspect of the negative controls
 WIDENED = 0.2  # of the experiments' range
 STOPS, STAYS = 3.5, 0.5  # [sqrt(height / g)]: when a pile has stopped; [s] that it is watched then
+HIGH, MOST = 4.0, 1500  # aspect above which columns need more iterations a step than a scene allows them by itself, and how many
 CUBE = 48  # cells of the domain in 3-D
 
 
@@ -117,7 +118,8 @@ def collapse(aspect: float, cells: int, device: str = "cpu", *, length: float = 
         length: of the domain [widths]; by the experiments without one.
         tables: of the scene.
     """
-    simulation = column(aspect, cells, length=length or 2.5 + 1.2 * envelope(aspect)[1], device=device, **tables)
+    more = {"solver": {"max_iterations": MOST}} if aspect > HIGH else {}
+    simulation = column(aspect, cells, length=length or 2.5 + 1.2 * envelope(aspect)[1], device=device, **(more | tables))
     stops = STOPS * math.sqrt(aspect * WIDTH / GRAVITY) + 0.2
     rows = list(steps(simulation, stops))
     before = runout(simulation)
@@ -150,7 +152,7 @@ def cube(device: str = "cpu", cells: int = CUBE) -> Trial:
         found.add("kinetic energy in the end over the largest", energies[-1] / max(energies), high=1e-3)
         found.add("steps with stresses to 1e-3", share_solved(rows), low=95.0, unit="%")
         found.add("|mean of exp(4 i angle)| of the 5 % farthest", float(np.abs(np.exp(1j * angle[far]).mean())), high=0.5)
-        found.add("99th percentile of |x| over half the width", float(np.percentile(np.abs(x), 99.0)) / (0.5 * width), low=1.2, high=2.5)
+        found.add("99th percentile of |x| over half the width", float(np.percentile(np.abs(x), 99.0)) / (0.5 * width), low=1.2, high=3.0)
         found.add("least dissipation of a step", min(row["dissipation"] for row in rows), low=0.0, unit="J")
 
     return attempt("sand collapse", f"3-D, {cells} cells", run)

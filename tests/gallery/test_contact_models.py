@@ -8,6 +8,7 @@ import warp_lcp as wl
 from warp_lcp.gallery.contact_models import BoxedModel, ContactSystem, FrozenBoxModel, StewartTrinkleModel, proximal_sweeps
 from warp_lcp.gallery.contact_scenes import box_stack, contact_scene, incline, motor_arm
 
+FAST = 300.0  # [m/s]: friction turns the slip by a thousandth at most, so that two vectors share it next to nowhere
 TIGHT = wl.StoppingCriteria(rtol=1e-12, max_iterations=2000, patience=2000)
 
 
@@ -23,10 +24,24 @@ def solved(system, model, method=None):
 
 
 @pytest.mark.parametrize("directions", [4, 8, 16])
+def test_friction_dissipates_the_most_that_its_cone_allows(directions):
+    """KKT of the model, of the slip that results: u.r_t is the least over the polygon of mu r_n times the K vectors."""
+    angles = 2 * np.pi * np.arange(directions) / directions
+    vectors = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    for slip in np.random.default_rng(23).standard_normal((8, 2)) * 0.5:
+        system = particle(slip, 0.5)
+        r = solved(system, StewartTrinkleModel(directions))
+        u = (system.B @ r + system.q)[1:]
+        assert u @ r[1:] == pytest.approx(0.5 * r[0] * (vectors @ u).min(), abs=1e-9)
+        sides = np.stack([np.cos(angles + np.pi / directions), np.sin(angles + np.pi / directions)], axis=1)
+        assert (sides @ r[1:]).max() <= 0.5 * r[0] * np.cos(np.pi / directions) + 1e-9  # inside the polygon
+
+
+@pytest.mark.parametrize("directions", [4, 8, 16])
 def test_a_sliding_particle_is_held_along_the_nearest_vector(directions):
     mu, mass, model = 0.5, 2.0, StewartTrinkleModel(directions)
     for angle in np.random.default_rng(19).uniform(0, 2 * np.pi, 12):
-        slip = 3.0 * np.array([np.cos(angle), np.sin(angle)])
+        slip = FAST * np.array([np.cos(angle), np.sin(angle)])
         r = solved(particle(slip, mu, mass=mass), model)
         assert r[0] == pytest.approx(1.0)
         assert np.linalg.norm(r[1:]) == pytest.approx(mu * r[0])  # it slides: friction is on the cone
@@ -40,10 +55,10 @@ def test_the_polyhedral_cone_converges_to_the_circular_one():
     for K in (4, 8, 16, 32):
         errors = []
         for angle in np.linspace(0, 2 * np.pi / K, 41)[1:-1]:
-            slip = 3.0 * np.array([np.cos(angle), np.sin(angle)])
+            slip = FAST * np.array([np.cos(angle), np.sin(angle)])
             system = particle(slip, mu)
             exact, residual, _ = proximal_sweeps(system)
-            np.testing.assert_allclose(exact[1:], -mu * slip / 3.0, atol=1e-9)  # opposite to the slip: Coulomb's law
+            np.testing.assert_allclose(exact[1:], -mu * slip / FAST, atol=1e-9)  # opposite to the slip: Coulomb's law
             assert residual < 1e-9
             errors.append(np.linalg.norm(solved(system, StewartTrinkleModel(K)) - exact) / mu)
         worst[K] = max(errors)

@@ -87,13 +87,22 @@ class ArticulatedFigure:
         links = np.linalg.norm(self.offsets, axis=1) * (np.array(self.parents) >= 0)
         return float((self.ancestors @ links + np.linalg.norm(self.tips, axis=1)).max())
 
+    @cached_property
+    def _generators(self) -> tuple[Vector, Vector]:
+        """K with K v = axis x v, and K K, shape (n, 3, 3) each."""
+        K = np.cross(self.axes[:, None], np.eye(3)).transpose(0, 2, 1)
+        return K, K @ K
+
     def _frames(self, theta: Vector) -> tuple[Vector, Vector, Vector]:
         """Return the hinges' places (n, 3), their axes (n, 3) and the end effectors (e, 3), in the world."""
-        places, axes, turns = np.empty((self.hinges, 3)), np.empty((self.hinges, 3)), np.empty((self.hinges, 3, 3))
+        K, square = self._generators
+        own = np.eye(3) + np.sin(theta)[:, None, None] * K + (1 - np.cos(theta))[:, None, None] * square  # Rodrigues
+        places, turns = self.offsets.copy(), own.copy()
         for j, parent in enumerate(self.parents):
-            R, p = (np.eye(3), np.zeros(3)) if parent < 0 else (turns[parent], places[parent])
-            places[j], axes[j] = p + R @ self.offsets[j], R @ self.axes[j]
-            turns[j] = R @ _rotation(self.axes[j], theta[j])
+            if parent >= 0:
+                places[j] = places[parent] + turns[parent] @ self.offsets[j]
+                turns[j] = turns[parent] @ own[j]
+        axes = np.einsum("nij,nj->ni", turns, self.axes)  # a hinge does not turn its own axis
         carriers = list(self.effectors)
         return places, axes, places[carriers] + np.einsum("eij,ej->ei", turns[carriers], self.tips)
 
@@ -132,13 +141,6 @@ class ArticulatedFigure:
             above[k, k] = True
         upper = np.where(above, second, 0.0)
         return upper + upper.T - np.diag(np.diag(upper))
-
-
-def _rotation(axis: Vector, angle: float) -> Vector:
-    """Return the rotation about a unit vector (Rodrigues)."""
-    x, y, z = axis
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * (K @ K)
 
 
 def planar_chain(lengths: Sequence[float], *, lower: float | Vector = -2.0, upper: float | Vector = 2.0) -> ArticulatedFigure:

@@ -238,7 +238,7 @@ class StewartTrinkleModel:
     def impulses(self, system: ContactSystem, x: np.ndarray) -> np.ndarray:
         """Return r: friction is summed over the vectors."""
         k, spread = system.contacts, self.spread(system.dim)
-        own = x[: k * (1 + len(spread))].reshape(k, -1)[:, :-1] @ spread
+        own = x[: k * (1 + len(spread))].reshape(k, 1 + len(spread))[:, :-1] @ spread
         return np.concatenate([own.ravel(), x[k * (1 + len(spread)) :]])
 
     def guess(self, system: ContactSystem, r: np.ndarray) -> np.ndarray:

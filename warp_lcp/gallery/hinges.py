@@ -100,12 +100,14 @@ class Hinge:
         plus its distance to a limit over dt is >= 0 where x > 0; the motor's y is the rate less the wanted one, |x| <= torque dt.
         """
         (arm, anchor, axis, _), (other_arm, other_anchor, other_axis, _) = self._world(bodies, 0), self._world(bodies, 1)
+        apart = anchor - other_anchor
+        arm, other_arm = arm - 0.5 * apart, other_arm + 0.5 * apart  # one point for both impulses: they keep the angular momentum
         u = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
         u /= np.linalg.norm(u)
         linear = [np.concatenate([e, np.cross(arm, e), -e, -np.cross(other_arm, e)]) for e in np.eye(3)]
         across = np.array([u, np.cross(axis, u)])
         turn = np.array([np.concatenate([np.zeros(3), d, np.zeros(3), -d]) for d in (*across, axis)])
-        error = np.concatenate([anchor - other_anchor, -across @ np.cross(axis, other_axis)])
+        error = np.concatenate([apart, -across @ np.cross(axis, other_axis)])
         rows, bias = [*linear, *turn[:2]], list(rate / dt * error)
         low, high = [-np.inf] * 5, [np.inf] * 5
         angle = self.angle(bodies)

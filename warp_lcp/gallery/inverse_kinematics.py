@@ -12,7 +12,7 @@ from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem import LCP
 from warp_lcp.result import SolveStatus
 from warp_lcp.solve import Solver, solve
-from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
+from warp_lcp.solvers.incremental_pivoting import IncrementalPivoting
 from warp_lcp.stopping import StoppingCriteria
 
 Vector = np.ndarray
@@ -115,7 +115,7 @@ class InverseKinematics:
     `curvature` adds -sum_k (g - f)_k f_k'' and shifts the sum to be definite.
 
     Args:
-        method: of the LCPs; with `multipliers` one for semi-definite A; MinimumMapNewton if None, with `multipliers` InteriorPoint would do.
+        method: of the LCPs; the default takes any damping; with `multipliers` it must be one for semi-definite A.
         damping: mu in units of reach^2, >= 0.
         radius: first largest change of an angle in a step [rad], > 0.
         tolerance: of the projected gradient [rad], > 0.
@@ -135,7 +135,7 @@ class InverseKinematics:
         CONVERGED [[1. 1.]] True
     """
 
-    method: Solver = field(default_factory=MinimumMapNewton)
+    method: Solver = field(default_factory=IncrementalPivoting)
     damping: float = 1e-4
     radius: float = 0.5
     tolerance: float = 1e-7
@@ -218,7 +218,7 @@ class InverseKinematics:
         return inside, bool(result), float(np.abs(d - inside).max())
 
     def _radius(self, radius: float, fall: float, foretold: float, length: float) -> float:
-        """Return the trust region's next radius: half of the step where the model was wrong, twice the radius where it was right and short."""
+        """Return the next radius: half of the step where the model was wrong, twice the radius where it was right and short."""
         if foretold <= 0 or fall < DISAGREES * foretold:
             return 0.5 * min(radius, max(length, LEAST_RADIUS))
         if fall > AGREES * foretold and length > 0.9 * radius:

@@ -13,7 +13,7 @@ from warp_lcp.gallery.hinges import Hinge, hinge_jacobian
 from warp_lcp.gallery.rigid_bodies import RigidBodies
 
 GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2]
-MARGIN = 0.02  # of the smallest body's reach: gaps up to it are contacts, so that what approaches is stopped in time
+MARGIN = 0.02  # of the smallest body's reach: gaps up to it are contacts, besides those that the fastest bodies may close in a step
 SLOP = 0.002  # of the smallest body's reach: overlap that is left alone, so that resting contacts stay
 
 
@@ -54,10 +54,11 @@ class World:
         """Reach of the smallest body [m]."""
         return min(shape.reach for shape in self.bodies.shapes)
 
-    def contacts(self) -> Contacts:
-        """Return where bodies touch now, or nearly."""
+    def contacts(self, dt: float = 0.0) -> Contacts:
+        """Return where bodies touch now, or may within dt [s] if two of them meet at the largest speed of all."""
         ignored = self.ignored | {hinge.pair for hinge in self.hinges}
-        return detect(self.bodies, self.planes, MARGIN * self.size, ignored)
+        fastest = float(np.linalg.norm(self.bodies.velocity[:, :3], axis=1).max())
+        return detect(self.bodies, self.planes, MARGIN * self.size + 2 * dt * fastest, ignored)
 
     def assemble(self, dt: float, *, rate: float = 0.2, contacts: Contacts | None = None) -> Assembly:
         """Return the velocity problem of a step.
@@ -75,7 +76,7 @@ class World:
         """
         if not (dt > 0 and 0 <= rate <= 1):
             raise ValueError(f"dt = {dt}, rate = {rate}: must be > 0 and in [0, 1]")
-        bodies, contacts = self.bodies, self.contacts() if contacts is None else contacts
+        bodies, contacts = self.bodies, self.contacts(dt) if contacts is None else contacts
         rows = [hinge.rows(bodies, dt, rate) for hinge in self.hinges]
         J = scipy.sparse.csr_array(scipy.sparse.vstack([contacts.jacobian(bodies), hinge_jacobian(self.hinges, rows, len(bodies))]).tocsr())
         M = bodies.inverse_mass()

@@ -1,0 +1,200 @@
+"""Rigid contacts: methods on the scenes of figures 2.9 and 2.11, residual against sweeps and seconds as figures 2.10 and 2.12 have it."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import warp_lcp as wl
+from benchmarks.machine import machine
+from benchmarks.record import Chart, Lines, Record, Results, Table
+from benchmarks.timing import Figure, Options
+from warp_lcp.gallery.contact_models import BoxedModel, ContactModel, ContactSystem, StewartTrinkleModel
+from warp_lcp.gallery.contact_scenes import SCENES, SETTLING, heavy_on_light
+from warp_lcp.gallery.contact_stepper import ContactStepper
+from warp_lcp.gallery.rigid_world import World
+
+TITLE = "Rigid contacts: the scenes of figures 2.9 and 2.11"
+DT = 0.01  # [s]
+SWEEPS = 5000  # of PGS and NNCG, as in figure 2.12; other sweeping methods get as many, or what costs as much
+TOLERANCE = 1e-13  # of the residual at x = 0: curves end there
+RATIOS = (1.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)
+EQUAL = (200, 1000, 5000)  # sweeps at which NNCG and PGS are compared
+TARGET = 10.0  # how many times smaller the residual of NNCG should be than that of PGS
+STACKS = ("box-stack", "sphere-stack", "wall", "leaning-wall", "heavy-on-light")
+LARGEST_LCP = 1500  # unknowns of a Stewart-Trinkle problem up to which Lemke's method and Newton's are waited for
+
+BOXED: dict[str, Callable[[ContactSystem], tuple[Any, int]]] = {
+    "PGS": lambda s: (wl.ProjectedSOR(omega=1.0), SWEEPS),
+    "PSOR 1.4": lambda s: (wl.ProjectedSOR(omega=1.4), SWEEPS),
+    "NNCG": lambda s: (wl.NNCG(), SWEEPS),
+    "blocked Gauss-Seidel": lambda s: (wl.BlockedGaussSeidel(blocks=s.blocks()), SWEEPS),
+    "PGS-SM": lambda s: (wl.SubspaceMinimization(precision="double", backtracks=-1), 200),
+    "PGS-SM, safeguarded": lambda s: (wl.SubspaceMinimization(precision="double"), 200),
+    "staggering, pivoting": lambda s: (wl.Staggering(blocks=s.staggered(), solvers=wl.IncrementalPivoting(), eta=1e-8), 50),
+}
+LCP: dict[str, Callable[[ContactSystem], tuple[Any, int]]] = {
+    "Lemke": lambda s: (wl.Lemke(), 1000),
+    "Fischer-Newton": lambda s: (wl.FischerNewton(), 200),
+    "interior point": lambda s: (wl.InteriorPoint(precision="double"), 100),
+}
+
+
+def measure(options: Options, out: Path) -> Results:
+    """Solve every scene's problem by every method; then the heavy box at growing mass ratios by PGS and NNCG."""
+    records = [machine(options.device, elements=1 << 22, repeat=options.repeat)]
+    solves: list[Record] = []
+    charts: list[Chart] = []
+    rows: list[list[Any]] = []
+    for name in SCENES:
+        system = _system(name, options.device)
+        options.say(f"{name}: {system.contacts} contacts, {len(system.lower)} joint rows")
+        curves = _scene(name, system, options, solves, rows)
+        sweeps = {label: (x, y) for label, (x, y, _) in curves.items()}
+        seconds = {label: (t, y) for label, (_, y, t) in curves.items()}
+        unit = "residual / residual at x = 0"
+        charts.append(Lines(f"{name}-iterations", system.name, "sweeps, linear iterations, pivots or factorizations", unit, sweeps))
+        charts.append(Lines(f"{name}-seconds", system.name, "seconds", unit, seconds))
+    equal = _equal(options)
+    _write_csv(out / "contacts-history.csv", rows)
+    return Results([*records, *solves, *equal], [_finding(equal), _equal_table(equal), *_tables(solves)], charts)
+
+
+def _system(name: str, device: str) -> ContactSystem:
+    """Return the problem of a scene's next step, after it has settled where it needs to."""
+    world: World = SCENES[name]()
+    stepper = ContactStepper(world, wl.NNCG(), dt=DT, device=device)
+    for _ in range(SETTLING.get(name, 0)):
+        stepper.step()
+    return world.assemble(DT).system
+
+
+def _stop(most: int, tolerance: float = TOLERANCE) -> wl.StoppingCriteria:
+    """Return criteria that let a method go on whatever its residual does: spikes are part of the picture."""
+    return wl.StoppingCriteria(rtol=tolerance, max_iterations=most, patience=most, divergence=1e30)
+
+
+Curve = tuple[list[float], list[float], list[float]]
+
+
+def _scene(name: str, system: ContactSystem, options: Options, solves: list[Record], rows: list[list[Any]]) -> dict[str, Curve]:
+    """Solve a scene by all methods; return linear iterations, relative residuals and seconds of each."""
+    curves: dict[str, Curve] = {}
+    models: list[tuple[ContactModel, str, dict[str, Any]]] = [(BoxedModel(), "boxed", BOXED), (StewartTrinkleModel(4), "LCP", LCP)]
+    for model, kind, methods in models:
+        given = model.problem(system)
+        if kind == "LCP" and len(given.b) > LARGEST_LCP:
+            continue
+        problem = (given.dense() if kind == "LCP" else given).lcp(device=options.device)
+        for label, make in methods.items():
+            method, most = make(system)
+            facts = {"model": kind, "scene": name, "method": label}
+            try:
+                wl.solve(problem, method, stopping=_stop(1))  # loads kernels
+                result = wl.solve(problem, method, stopping=_stop(most))
+            except ValueError as error:
+                solves.append(Record(f"{name}: {label}", {}, facts | {"status": f"refused: {error}"}))
+                continue
+            first = result.history[0].residual
+            history = [(h.linear_iterations, h.residual / first, h.seconds) for h in result.history]
+            shown = [(n, r, t) for n, r, t in history if n > 0 and r > 0]
+            curves[f"{label} ({kind})"] = ([n for n, _, _ in shown], [r for _, r, _ in shown], [t for _, _, t in shown])
+            rows += [[name, kind, label, n, f"{r:.6e}", f"{t:.6f}"] for n, r, t in _thinned(history)]
+            cone = system.residual(model.impulses(system, result.x.numpy()))
+            figures = {
+                "residual": Figure(min(r for _, r, _ in history)),
+                "iterations": Figure(result.iterations),
+                "linear_iterations": Figure(result.linear_iterations),
+                "seconds": Figure(result.history[-1].seconds, "s"),
+                "cone_residual": Figure(cone, "m/s"),
+                "unknowns": Figure(len(given.b)),
+            }
+            for level in (1e-3, 1e-6, 1e-10):
+                reached = next(((n, t) for n, r, t in history if r <= level), None)
+                if reached is not None:
+                    figures |= {f"sweeps_to_{level:.0e}": Figure(reached[0]), f"seconds_to_{level:.0e}": Figure(reached[1], "s")}
+            solves.append(Record(f"{name}: {label}", figures, facts | {"status": result.status.name}))
+    return curves
+
+
+def _thinned(history: list[tuple[int, float, float]]) -> list[tuple[int, float, float]]:
+    """Return every step up to 50, then those that are some percent later: files stay small."""
+    kept, next_one = [], 0.0
+    for i, row in enumerate(history):
+        if i >= next_one or i == len(history) - 1:
+            kept.append(row)
+            next_one = i + 1 if i < 50 else 1.02 * i
+    return kept
+
+
+def _equal(options: Options) -> list[Record]:
+    """Return PGS and NNCG after equal sweeps, on the stacks and the heavy box at all mass ratios."""
+    systems = {name: _system(name, options.device) for name in STACKS if name != "heavy-on-light"}
+    systems |= {f"heavy-on-light, ratio {ratio:g}": heavy_on_light(ratio=ratio).assemble(DT).system for ratio in RATIOS}
+    frictionless = heavy_on_light(ratio=1000.0)
+    frictionless.friction = 0.0
+    systems["heavy-on-light, ratio 1000, no friction"] = frictionless.assemble(DT).system
+    records = []
+    for name, system in systems.items():
+        options.say(f"equal sweeps: {name}")
+        problem = BoxedModel().problem(system).lcp(device=options.device)
+        residuals = {}
+        for label, method in (("PGS", wl.ProjectedSOR(omega=1.0)), ("NNCG", wl.NNCG())):
+            history = wl.solve(problem, method, stopping=_stop(max(EQUAL))).history
+            residuals[label] = [history[min(n, len(history) - 1)].residual / history[0].residual for n in EQUAL]
+        figures: dict[str, Figure] = {}
+        for i, n in enumerate(EQUAL):
+            pgs, nncg = residuals["PGS"][i], residuals["NNCG"][i]
+            figures |= {f"PGS_{n}": Figure(pgs), f"NNCG_{n}": Figure(nncg), f"ratio_{n}": Figure(pgs / nncg if nncg > 0 else 1.0)}
+        records.append(Record(f"equal sweeps: {name}", figures, {"case": name}))
+    return records
+
+
+def _finding(records: list[Record]) -> Table:
+    """Return how often NNCG keeps what the book says of it, PGS not having converged itself."""
+    rows = []
+    for n in EQUAL:
+        open_ones = [r for r in records if (r.value(f"PGS_{n}") or 0.0) > 10 * TOLERANCE]
+        good = [r for r in open_ones if (r.value(f"ratio_{n}") or 0.0) >= TARGET]
+        missed = "; ".join(f"{r.facts['case']} ({r.value(f'ratio_{n}'):.2g} x)" for r in open_ones if r not in good)
+        rows.append([str(n), f"{len(good)} of {len(open_ones)}", missed or "none"])
+    remark = "Cases in which PGS has not converged to rounding itself by then. Residuals of the boxed model, relative to that at x = 0."
+    return Table(f"NNCG at least {TARGET:g} x below PGS at equal sweeps", ["sweeps", "cases", "missed by"], rows, remark)
+
+
+def _equal_table(records: list[Record]) -> Table:
+    names = [f"{label}_{n}" for n in EQUAL for label in ("PGS", "NNCG", "ratio")]
+    rows = [[r.facts["case"], *(f"{r.value(name):.2g}" for name in names)] for r in records]
+    return Table("PGS and NNCG at equal sweeps", ["case", *(name.replace("_", " ") for name in names)], rows)
+
+
+def _tables(solves: list[Record]) -> list[Table]:
+    """Return a table of each scene."""
+    columns = ["method", "model", "status", "unknowns", "least residual", "steps", "sweeps, pivots ...", "seconds"]
+    columns += ["sweeps to 1e-3", "to 1e-6", "to 1e-10", "seconds to 1e-6", "cone residual [m/s]"]
+    keys = ["unknowns", "residual", "iterations", "linear_iterations", "seconds"]
+    keys += ["sweeps_to_1e-03", "sweeps_to_1e-06", "sweeps_to_1e-10", "seconds_to_1e-06", "cone_residual"]
+    tables = []
+    for name in SCENES:
+        here = [r for r in solves if r.facts["scene"] == name]
+        rows = [
+            [r.facts["method"], r.facts["model"], r.facts["status"], *("" if (v := r.value(k)) is None else f"{v:.3g}" for k in keys)]
+            for r in here
+        ]
+        remark = (
+            "Residuals are relative to that at x = 0 in each model's own problem; the cone residual is that of Coulomb's law with the "
+            "circular cone, which the boxed model and the polyhedral one only approximate. Sweeps are products with A: of Lemke pivots, of "
+            "Newton factorizations, of staggering pivots."
+        )
+        tables.append(Table(name, columns, rows, remark if name == next(iter(SCENES)) else ""))
+    return tables
+
+
+def _write_csv(path: Path, rows: list[list[Any]]) -> None:
+    """Write all histories."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["scene", "model", "method", "linear_iterations", "relative_residual", "seconds"])
+        writer.writerows(rows)

@@ -1,0 +1,62 @@
+"""Pages of the site that are not Markdown files under docs: a hook of MkDocs.
+
+The notebook becomes a page, and so do the files of the repository that pages link to.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+NOTEBOOK = "first-steps.ipynb"
+OUTSIDE = re.compile(r"\]\(\.\./([^)#\s]+)(#[^)]*)?\)")  # a link from a page right under docs to a file of the repository
+
+
+def page_of_notebook(text: str) -> str:
+    """Return a notebook as Markdown: its text, its code and what the code printed."""
+    parts = []
+    for cell in json.loads(text)["cells"]:
+        source = "".join(cell["source"])
+        parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
+        parts.extend("```text\n" + "".join(output["text"]).rstrip("\n") + "\n```" for output in cell.get("outputs", ()))
+    return "\n\n".join(parts) + "\n"
+
+
+def outside_links(text: str) -> set[str]:
+    """Return the files of the repository, relative to its root, that a page right under docs links to."""
+    return {match[1] for match in OUTSIDE.finditer(text)}
+
+
+def inside(text: str) -> str:
+    """Return the page with those links made links within the site."""
+    return OUTSIDE.sub(r"](\1\2)", text)
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """Add the notebook's page, and the files outside docs that the navigation and the pages name, with what these show."""
+    from mkdocs.structure.files import File
+
+    docs = Path(config.docs_dir)
+    root = Path(config.config_file_path).parent
+    files.append(File.generated(config, NOTEBOOK.replace(".ipynb", ".md"), content=page_of_notebook((docs / NOTEBOOK).read_text())))
+    wanted = set().union(*(outside_links(page.read_text()) for page in docs.glob("*.md")))
+    wanted |= set(re.findall(r"(benchmarks/\S+\.md|[A-Z]+\.md)", json.dumps(config.nav)))
+    for name in sorted(wanted):
+        path = root / name
+        if path.suffix != ".md":
+            files.append(File.generated(config, name, abs_src_path=str(path)))
+            continue
+        text = path.read_text()
+        for shown in re.findall(r"\]\(([^):#\s]+)\)", text):
+            source = PurePosixPath(name).parent / shown
+            if (root / source).is_file() and not shown.endswith(".md") and files.get_file_from_path(str(source)) is None:
+                files.append(File.generated(config, str(source), abs_src_path=str(root / source)))
+        files.append(File.generated(config, name, content=text.replace("](docs/", "](")))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Make links out of docs links within the site."""
+    return inside(markdown) if "/" not in page.file.src_uri else markdown

@@ -1,0 +1,133 @@
+"""Every scene is a problem that methods solve to the same velocities; figures known by statics are met."""
+
+import numpy as np
+import pytest
+
+import warp_lcp as wl
+from warp_lcp.gallery.contact_models import BoxedModel, StewartTrinkleModel
+from warp_lcp.gallery.contact_scenes import (
+    SCENES,
+    arched_snake,
+    box_stack,
+    contact_scene,
+    gear_pyramid,
+    heavy_on_light,
+    incline,
+    motor_arm,
+    sphere_stack,
+    wall,
+)
+from warp_lcp.gallery.rigid_bodies import RigidBodies, Sphere
+from warp_lcp.gallery.rigid_world import World
+
+DT = 0.01
+SMALL = {"box-stack": 3, "wall": 2, "heavy-on-light": 1, "arched-snake": 5, "heavy-on-snake": 5, "leaning-wall": 2, "gear-pyramid": 2}
+TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=20_000, patience=20_000)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_scenes_are_problems_that_repeat(name):
+    problem, again = contact_scene(name, SMALL.get(name)), contact_scene(name, SMALL.get(name))
+    assert problem.name == again.name and np.array_equal(problem.b, again.b)
+    A = problem.A.toarray()
+    assert np.array_equal(A, A.T) and np.linalg.eigvalsh(A)[0] > -1e-12 * abs(A).max()
+    assert problem.kind == "sparse"
+    world = SCENES[name](SMALL.get(name, 2))
+    assert world.deepest() < 0.01 * world.size  # nothing begins inside something else
+    assert (
+        not np.array_equal(problem.A.toarray(), contact_scene(name, SMALL.get(name), seed=7).A.toarray())
+        or not np.array_equal(problem.b, contact_scene(name, SMALL.get(name), seed=7).b)
+        or name in ("arched-snake", "heavy-on-snake", "hanging-snake")
+    )  # whose limits alone are drawn
+
+
+@pytest.mark.parametrize("name", [n for n in SCENES if n not in ("driven-gears", "hanging-snake")])
+def test_lemke_and_newton_find_the_same_velocities(name):
+    """Impulses are not unique, velocities of these scenes are: methods that share nothing agree on them."""
+    world = SCENES[name](SMALL.get(name, 2))
+    assembly = world.assemble(DT)
+    system, model, found = assembly.system, StewartTrinkleModel(4), []
+    problem = model.problem(system).dense()
+    for method in (wl.Lemke(), wl.FischerNewton()):
+        result = wl.solve(problem.lcp(device="cpu"), method, stopping=wl.StoppingCriteria(rtol=1e-8, max_iterations=500, patience=500))
+        assert result, (method, result.status)
+        r = model.impulses(system, result.x.numpy())
+        u = system.B @ r + system.q
+        assert (r[system.normals] >= -1e-6).all() and (u[system.normals] >= -1e-6).all()
+        slip, radius = np.abs(r[system.tangents]).sum(axis=1), system.friction * r[system.normals]
+        assert (slip <= radius + 1e-6 * (1 + radius)).all()  # K = 4: the one-norm
+        found.append(assembly.velocity(r))
+    np.testing.assert_allclose(found[0], found[1], atol=2e-6)
+
+
+@pytest.mark.parametrize("world", [sphere_stack(4), box_stack(3), wall(3, columns=2), heavy_on_light(1, ratio=100.0)], ids=lambda w: w.name)
+def test_the_ground_carries_the_weight(world):
+    assembly = world.assemble(DT)
+    system = assembly.system
+    method = wl.SubspaceMinimization(precision="double", backtracks=-1)
+    result = wl.solve(BoxedModel().problem(system).lcp(device="cpu"), method, stopping=TIGHT)
+    assert result, result.status
+    r = result.x.numpy()
+    on_ground = assembly.contacts.second == -1
+    assert r[system.normals][on_ground].sum() == pytest.approx(world.bodies.mass.sum() * 9.81 * DT, rel=1e-7)
+    np.testing.assert_allclose(assembly.velocity(r), 0, atol=1e-8)
+
+
+@pytest.mark.parametrize("mu", [0.2, 0.5])
+@pytest.mark.parametrize("steeper", [0.95, 1.05, 1.5])
+def test_a_box_sticks_below_the_angle_of_friction_and_slides_above(mu, steeper):
+    angle = float(np.arctan(mu)) * steeper
+    world = incline(1, angle=angle, friction=mu)
+    assembly = world.assemble(DT)
+    for model, method in ((BoxedModel(), wl.ProjectedSOR(omega=1.0)), (StewartTrinkleModel(4), wl.Lemke())):
+        result = wl.solve(model.problem(assembly.system).dense().lcp(device="cpu"), method, stopping=TIGHT)
+        assert result, result.status
+        v = assembly.velocity(model.impulses(assembly.system, result.x.numpy()))[0]
+        speed = max(0.0, 9.81 * (np.sin(angle) - mu * np.cos(angle))) * DT
+        np.testing.assert_allclose(v[:3], speed * np.array([np.cos(angle), 0, -np.sin(angle)]), atol=1e-8)
+        np.testing.assert_allclose(v[3:], 0, atol=1e-7)
+
+
+def test_an_arch_presses_on_its_feet_and_closes():
+    world = arched_snake(7)
+    feet = world.contacts()
+    assert set(feet.first.tolist()) == {0, 6}
+    assert (feet.second == -1).all()
+    for hinge in world.hinges:
+        (_, a, _, _), (_, b, _, _) = hinge._world(world.bodies, 0), hinge._world(world.bodies, 1)
+        np.testing.assert_allclose(a, b, atol=1e-12)
+        assert hinge.angle(world.bodies) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_motors_turn_at_their_speed_as_far_as_their_torque_reaches():
+    for torque, reached in ((4000.0, True), (1.0, False)):
+        world = motor_arm(2, torque=torque)
+        assembly = world.assemble(DT)
+        result = wl.solve(BoxedModel().problem(assembly.system).lcp(device="cpu"), wl.ProjectedSOR(omega=1.0), stopping=TIGHT)
+        v = assembly.velocity(result.x.numpy())
+        rates = [v[1, 4], v[2, 4] - v[1, 4]]  # about y
+        wanted = [hinge.motor_speed for hinge in world.hinges]
+        if reached:
+            np.testing.assert_allclose(rates, wanted, atol=1e-6)
+        else:
+            assert abs(np.subtract(rates, wanted)).max() > 0.05
+            limits = np.isfinite(assembly.system.upper)
+            assert np.isclose(np.abs(result.x.numpy()[limits]), assembly.system.upper[limits]).any()
+
+
+def test_wrong_scenes_are_named():
+    with pytest.raises(ValueError, match="no such scene"):
+        contact_scene("castle")
+    for make in (
+        lambda: box_stack(0),
+        lambda: wall(1, columns=0),
+        lambda: arched_snake(2),
+        lambda: gear_pyramid(0),
+        lambda: incline(angle=2.0),
+    ):
+        with pytest.raises(ValueError, match="must be"):
+            make()
+    with pytest.raises(ValueError, match="must be odd"):
+        arched_snake(4)
+    with pytest.raises(ValueError, match="friction = -1"):
+        World("", RigidBodies([Sphere(1.0)], [1.0], [[0, 0, 1]]), friction=-1)

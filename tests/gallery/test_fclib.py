@@ -1,0 +1,119 @@
+"""FCLIB files written here as its own writer does: three kinds of matrices, local and global problems, solutions, what is wrong."""
+
+import numpy as np
+import pytest
+import scipy.sparse
+
+import warp_lcp as wl
+from warp_lcp.gallery.contact_models import BoxedModel
+from warp_lcp.gallery.contact_scenes import box_stack
+from warp_lcp.gallery.fclib import read_fclib
+
+h5py = pytest.importorskip("h5py")
+STORED = {"triplet": 0, "columns": -1, "rows": -2}
+
+
+def write_matrix(group, name, matrix, kind="triplet"):
+    g, m = group.create_group(name), scipy.sparse.coo_array(matrix)
+    if kind == "triplet":
+        nz, p, i, x = m.nnz, m.row, m.col, m.data
+    else:
+        c = m.tocsc() if kind == "columns" else m.tocsr()
+        nz, p, i, x = STORED[kind], c.indptr, c.indices, c.data
+    for key, value in (("nzmax", m.nnz), ("m", m.shape[0]), ("n", m.shape[1]), ("nz", nz)):
+        g[key] = np.array([value], dtype=np.int32)
+    g["p"], g["i"], g["x"] = p.astype(np.int32), i.astype(np.int32), x
+
+
+def write_local(path, W, q, mu, kind="triplet", dim=3, joints=None, solution=None):
+    with h5py.File(path, "w") as file:
+        group = file.create_group("fclib_local")
+        group["spacedim"] = np.array([dim], dtype=np.int32)
+        write_matrix(group, "W", W, kind)
+        group["vectors/q"], group["vectors/mu"] = q, mu
+        group["info/title"] = np.bytes_("a title")
+        if joints:
+            V, R, s = joints
+            write_matrix(group, "V", V, kind)
+            write_matrix(group, "R", R, kind)
+            group["vectors/s"] = s
+        if solution is not None:
+            file["solution/r"] = solution
+
+
+@pytest.mark.parametrize("kind", STORED)
+def test_local_problems_come_back(tmp_path, kind):
+    system = box_stack(2).assemble(0.01).system
+    method = wl.SubspaceMinimization(precision="double", backtracks=-1)
+    expected = wl.solve(BoxedModel().problem(system).lcp(device="cpu"), method).x.numpy()
+    write_local(tmp_path / "stack.hdf5", system.B, system.q, system.friction, kind, solution=expected)
+    read = read_fclib(tmp_path / "stack.hdf5")
+    assert read.title == read.system.name == "a title"
+    np.testing.assert_allclose(read.system.B.toarray(), system.B.toarray(), atol=1e-15)
+    np.testing.assert_array_equal(read.system.q, system.q)
+    np.testing.assert_array_equal(read.system.friction, system.friction)
+    np.testing.assert_array_equal(read.solution, expected)
+    assert wl.solve(BoxedModel().problem(read.system).lcp(device="cpu"), method)
+
+
+@pytest.mark.parametrize("kind", STORED)
+def test_unsymmetric_blocks_are_read_the_right_way_round(tmp_path, kind):
+    """V is not square: rows and columns in the wrong place show."""
+    rng = np.random.default_rng(17)
+    root = rng.standard_normal((8, 8))
+    full = root @ root.T
+    write_local(
+        tmp_path / "v.hdf5", full[:6, :6], np.arange(6.0), np.array([0.1, 0.2]), kind, joints=(full[:6, 6:], full[6:, 6:], [7.0, 8.0])
+    )
+    system = read_fclib(tmp_path / "v.hdf5").system
+    np.testing.assert_allclose(system.B.toarray(), full, atol=1e-14)
+    np.testing.assert_array_equal(system.q, [0, 1, 2, 3, 4, 5, 7, 8])
+    assert np.isinf(system.lower).all() and len(system.lower) == 2
+
+
+def test_a_global_problem_has_the_velocities_of_its_bodies(tmp_path):
+    """M v = H r + G l + f, u = H'v + w, G'v + b = 0, written out for random impulses."""
+    rng = np.random.default_rng(29)
+    root = rng.standard_normal((7, 7))
+    M, H, G = root @ root.T + np.eye(7), rng.standard_normal((7, 4)), rng.standard_normal((7, 1))
+    f, w, b = rng.standard_normal(7), rng.standard_normal(4), rng.standard_normal(1)
+    with h5py.File(tmp_path / "g.hdf5", "w") as file:
+        group = file.create_group("fclib_global")
+        group["spacedim"] = np.array([2], dtype=np.int32)
+        for name, value in (("M", M), ("H", H), ("G", G)):
+            write_matrix(group, name, value)
+        for name, value in (("f", f), ("w", w), ("b", b), ("mu", [0.3, 0.4])):
+            group[f"vectors/{name}"] = value
+    system = read_fclib(tmp_path / "g.hdf5").system
+    assert (system.dim, system.contacts, len(system.lower)) == (2, 2, 1)
+    x = rng.standard_normal(5)
+    v = np.linalg.solve(M, H @ x[:4] + G @ x[4:] + f)
+    np.testing.assert_allclose(system.B @ x + system.q, np.concatenate([H.T @ v + w, G.T @ v + b]), atol=1e-12)
+
+
+def test_wrong_files_are_named(tmp_path):
+    path = tmp_path / "wrong.hdf5"
+    path.write_text("no HDF5")
+    with pytest.raises(ValueError, match="cannot be read as HDF5"):
+        read_fclib(path)
+    with h5py.File(path, "w") as file:
+        file["else"] = 1.0
+    with pytest.raises(ValueError, match="neither fclib_local nor fclib_global"):
+        read_fclib(path)
+    unsymmetric = np.eye(3) + np.eye(3, k=1)
+    for W, mu, message in ((unsymmetric, [0.1], "not symmetric"), (np.eye(3), [0.1, 0.2], "mu has 2 values")):
+        write_local(path, W, np.zeros(3), np.array(mu))
+        with pytest.raises(ValueError, match=message):
+            read_fclib(path)
+    write_local(path, np.eye(3), np.zeros(3), np.array([0.1]))
+    with h5py.File(path, "a") as file:
+        file["fclib_local/W/nz"][0] = -7
+    with pytest.raises(ValueError, match="is no sparse matrix"):
+        read_fclib(path)
+    with h5py.File(path, "a") as file:
+        del file["fclib_local/W"]
+    with pytest.raises(ValueError, match="has no matrix W"):
+        read_fclib(path)
+    write_local(path, np.eye(3), np.zeros(3), np.array([0.1]), solution=np.zeros(2))
+    with pytest.raises(ValueError, match="the solution has 2 values"):
+        read_fclib(path)
