@@ -5,7 +5,7 @@ BIN = $(VENV)/bin
 
 OUT ?= out/dam-break
 
-.PHONY: demo test slow wheel-check clean
+.PHONY: demo test slow docs wheel-check clean
 
 demo: $(VENV)/.run
 	$(BIN)/warp-lcp run dam-break --out $(OUT) --force $(DEMO_ARGS)
@@ -19,6 +19,10 @@ test: $(VENV)/.dev
 
 slow: $(VENV)/.dev
 	$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)
+
+# The documentation's site, in build/site; a link or an anchor that leads nowhere ends it.
+docs: $(VENV)/.docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # A wheel holds everything a run needs: install it alone and run a built-in scene away from the source tree.
 wheel-check: $(VENV)/.run
@@ -37,6 +41,10 @@ $(VENV)/.run: pyproject.toml | $(VENV)/bin/python
 
 $(VENV)/.dev: pyproject.toml | $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --editable '.[dev,render]'
+	touch $@ $(VENV)/.run
+
+$(VENV)/.docs: pyproject.toml | $(VENV)/bin/python
+	$(BIN)/python -m pip install --quiet --editable '.[docs]'
 	touch $@ $(VENV)/.run
 
 clean:

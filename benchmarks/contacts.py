@@ -120,12 +120,12 @@ def _scene(name: str, system: ContactSystem, options: Options, solves: list[Reco
 
 
 def _thinned(history: list[tuple[int, float, float]]) -> list[tuple[int, float, float]]:
-    """Return every step up to 50, then those that are some percent later: files stay small."""
+    """Return every step up to 20, then those that are a tenth later: files stay small."""
     kept, next_one = [], 0.0
     for i, row in enumerate(history):
         if i >= next_one or i == len(history) - 1:
             kept.append(row)
-            next_one = i + 1 if i < 50 else 1.02 * i
+            next_one = i + 1 if i < 20 else 1.1 * i
     return kept
 
 

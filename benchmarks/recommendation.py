@@ -11,7 +11,7 @@ import argparse
 import csv
 import statistics
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,8 @@ from typing import Any
 import warp as wp
 
 import warp_lcp as wl
-from benchmarks.recommendation_problems import FAMILIES, make
+from benchmarks.recommendation_problems import DEVICE, FAMILIES, make
+from warp_lcp import gallery
 
 RESULTS = Path(__file__).parent / "results" / "amd-epyc"
 WITHIN = 1.5  # times the best measured method
@@ -75,7 +76,7 @@ def timed(lcp: wl.LCP, method: Any, accuracy: float, limit: float) -> tuple[str,
             raise TooSlow
 
     try:
-        result = wl.solve(lcp, method, stopping=wl.StoppingCriteria(rtol=accuracy, **LIMITS), callback=watch)  # type: ignore[arg-type]
+        result = wl.solve(lcp, method, stopping=wl.StoppingCriteria(rtol=accuracy, **LIMITS), callback=watch)
     except TooSlow:
         return "cut", time.process_time() - begun, 0
     except ValueError:
@@ -127,6 +128,8 @@ def write(path: Path, rows: Iterable[Row]) -> None:
 
 def load_kernels() -> None:
     """Run every method on a small problem of each kind of operator, so that no kernel is compiled while the clock runs."""
+    for n in range(1, 5):  # DirectEnumeration has a kernel for each
+        timed(gallery.definite(n).lcp(device=DEVICE), wl.DirectEnumeration(), 1e-4, 0.3)
     for family in ("tiny", "definite", "banded", "poisson-2d", "skewed", "sparse-unsymmetric", "scene-boxed", "bodies-in-liquid"):
         _, lcp, _ = make(family, 900)
         for method in ORDER:
@@ -146,8 +149,123 @@ def measure_all(path: Path, seeds: range, families: Sequence[str], seconds: floa
                 write(path, rows)
                 return False
             rows += measure(family, seed)
+            write(path, rows)
     write(path, rows)
     return True
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A choice beside what was measured on a problem.
+
+    Args:
+        rows: of the problem, all methods.
+        chosen: name of the recommended method.
+        default: name of the method that `wl.solve` takes without a word.
+        milliseconds: CPU time of the recommendation.
+    """
+
+    rows: tuple[Row, ...]
+    chosen: str
+    default: str
+    milliseconds: float
+
+    @property
+    def best(self) -> Row | None:
+        """The fastest row that converged, None if there is none."""
+        return min((row for row in self.rows if row.outcome == "CONVERGED"), key=lambda row: row.milliseconds, default=None)
+
+    def of(self, method: str) -> Row | None:
+        """Return a method's row."""
+        return next((row for row in self.rows if row.method == method), None)
+
+    def near(self, method: str, noise: float = NOISE) -> bool:
+        """Return whether a method is within WITHIN times the best, or no more than `noise` seconds slower."""
+        row, best = self.of(method), self.best
+        if row is None or best is None or row.outcome != "CONVERGED":
+            return False
+        return row.milliseconds <= max(WITHIN * best.milliseconds, best.milliseconds + 1e3 * noise)
+
+
+def judge(rows: Sequence[Row]) -> list[Verdict]:
+    """Ask for a recommendation for every measured problem."""
+    names = {cls: name for name, cls in wl.METHODS.items()}
+    problems: dict[tuple[str, int], list[Row]] = {}
+    for row in rows:
+        problems.setdefault((row.family, row.seed), []).append(row)
+    verdicts = []
+    for (family, seed), own in problems.items():
+        _, lcp, accuracy = make(family, seed)
+        begun = time.process_time()
+        chosen = wl.recommend(lcp, accuracy=accuracy).name
+        took = time.process_time() - begun
+        verdicts.append(Verdict(tuple(own), chosen, names[type(wl.default_method(lcp))], round(1e3 * took, 3)))
+    return verdicts
+
+
+def report(train: Sequence[Verdict], check: Sequence[Verdict]) -> str:
+    """Return the figures as Markdown."""
+    lines = [
+        "# How good `wl.recommend` is",
+        "",
+        "`python -m benchmarks.recommendation report`, from `recommendation-train.csv` and `recommendation-check.csv`: all methods of",
+        "`wl.METHODS` with their default settings, CPU time of set-up and solve on one core of a shared, busy AMD EPYC, the median of",
+        f"{REPEAT} in turns. A choice is right if it converges within {WITHIN} x the best method's time, or is no more than",
+        f"{1e3 * NOISE:g} ms slower. Direct methods of more than 1000 unknowns were not tried. The recommendation's own time is not counted.",
+        "",
+        "| problems | how many | solved by some method | recommended right | without the allowance | best >= 5 ms: right | default right |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for title, verdicts in (("rules made from", train), ("never seen", check)):
+        able = [v for v in verdicts if v.best is not None]
+        longer = [v for v in able if v.best is not None and v.best.milliseconds >= 5]
+        shares = [
+            _share(able, lambda v: v.near(v.chosen)),
+            _share(able, lambda v: v.near(v.chosen, 0.0)),
+            _share(longer, lambda v: v.near(v.chosen)),
+            _share(able, lambda v: v.near(v.default)),
+        ]
+        lines.append(f"| {title} | {len(verdicts)} | {len(able)} | {' | '.join(shares)} |")
+    able = [v for v in check if v.best is not None]
+    failed = [sum(_converged(v, name(v)) is None for v in able) for name in (lambda v: v.chosen, lambda v: v.default)]
+    both = [(a, b) for v in able if (a := _converged(v, v.chosen)) and (b := _converged(v, v.default))]
+    lines += [
+        "",
+        f"Of {len(able)} never seen problems that some method solves, {failed[0]} are not solved, or were cut off, by the recommended one and",
+        f"{failed[1]} by the default. Where both solve, the recommended one takes {sum(a for a, _ in both):.0f} ms in all and the default",
+        f"{sum(b for _, b in both):.0f} ms; the median of the ratio is {statistics.median(a / b for a, b in both):.2f}.",
+        f"A recommendation takes {statistics.median(v.milliseconds for v in check):.1f} ms (median), at most "
+        f"{max(v.milliseconds for v in check):.0f} ms; the best solves take {statistics.median(v.best.milliseconds for v in able if v.best):.1f} ms.",
+        "",
+        "## By family, never seen",
+        "",
+        "| family | right | recommended |",
+        "|---|---|---|",
+    ]
+    for family in FAMILIES:
+        own = [v for v in able if v.rows[0].family == family]
+        names = sorted({v.chosen for v in own})
+        lines.append(f"| {family} | {sum(v.near(v.chosen) for v in own)} of {len(own)} | {', '.join(names)} |")
+    lines += ["", "## Misses", "", "| problem | n | to | recommended | ms | best | ms |", "|---|---|---|---|---|---|---|"]
+    for v in able:
+        if not v.near(v.chosen) and v.best:
+            row, mine = v.rows[0], v.of(v.chosen)
+            took = "not tried" if mine is None else f"{mine.milliseconds:.1f}" if mine.outcome == "CONVERGED" else mine.outcome
+            lines.append(
+                f"| {row.name}, seed {row.seed} | {row.unknowns} | {row.accuracy:g} | {v.chosen} | {took} | {v.best.method} "
+                f"| {v.best.milliseconds:.1f} |"
+            )
+    return "\n".join(lines) + "\n"
+
+
+def _share(verdicts: Sequence[Verdict], right: Callable[[Verdict], bool]) -> str:
+    count = sum(map(right, verdicts))
+    return f"{count} of {len(verdicts)} ({count / max(len(verdicts), 1):.1%})"
+
+
+def _converged(verdict: Verdict, method: str) -> float | None:
+    row = verdict.of(method)
+    return row.milliseconds if row is not None and row.outcome == "CONVERGED" else None
 
 
 def main() -> None:
@@ -161,8 +279,15 @@ def main() -> None:
     measuring.add_argument("--families", nargs="*", default=list(FAMILIES))
     measuring.add_argument("--seconds", type=float, default=1e9, help="stop after these; the next call goes on")
     measuring.add_argument("--out", type=Path, default=RESULTS)
+    actions.add_parser("report").add_argument("--out", type=Path, default=RESULTS)
     arguments = parser.parse_args()
     wp.config.log_level = wp.LOG_ERROR
+    if arguments.action == "report":
+        found = [judge(read(arguments.out / f"recommendation-{name}.csv")) for name in ("train", "check")]
+        text = report(found[0], found[1])
+        (arguments.out / "recommendation.md").write_text(text, encoding="utf-8")
+        print(text)
+        return
     path = arguments.out / f"recommendation-{arguments.set}.csv"
     complete = measure_all(path, range(arguments.first, arguments.end), arguments.families, arguments.seconds)
     print(f"{path}: {len({(r.family, r.seed) for r in read(path)})} problems{'' if complete else ', not complete: call again'}")

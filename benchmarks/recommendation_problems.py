@@ -101,7 +101,7 @@ def sparse_unsymmetric(rng: np.random.Generator, seed: int) -> Problem:
 def scene(rng: np.random.Generator, seed: int, model: object) -> Problem:
     """Return a contact problem of a scene with bodies that rest or begin to move."""
     name = str(rng.choice([n for n in SCENES if n not in ("driven-gears",)]))
-    size = None if rng.random() < 0.4 else between(rng, 3, 8)
+    size = None if rng.random() < 0.4 else between(rng, 1, 3) * 2 + 1  # odd: an arch has a link on top
     return contact_scene(name, size, model=model, seed=seed)  # type: ignore[arg-type]
 
 

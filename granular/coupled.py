@@ -73,7 +73,8 @@ class AcceleratedProjection:
     the steps and c = 2, 2 in 2-D, 2, 4 in 3-D (the largest eigenvalue on a periodic grid); the defaults take four fifths of that.
 
     Args:
-        pressure_step, shear_step: relative to the diagonal; in 3-D the shear step is halved.
+        pressure_step: relative to the diagonal.
+        shear_step: relative to the diagonal; in 3-D it is halved.
         lookahead: the gradient is taken at x + lookahead beta (x - x_before), steps start from x + beta (x - x_before).
         momentum: beta at the start of a solve.
         decay: of the stresses that a time step starts from.
@@ -126,7 +127,8 @@ class InterleavedSweeps:
     Solving either to the end before the other converges far slower: both carry the same load, and each sweep must be able to hand it over.
 
     Args:
-        pressure_relaxation, friction_relaxation: of the sweeps; 1.3 or more stalls the friction.
+        pressure_relaxation: of the sweeps for the pressure.
+        friction_relaxation: of the sweeps for the friction, which 1.3 or more stalls.
         decay: of the stresses that a time step starts from.
         check_every: rounds between two looks at the residual.
     """

@@ -182,7 +182,8 @@ class Stress:
         """Start a sequence of steps with momentum.
 
         Args:
-            pressure_step, shear_step: of the projected gradient, relative to the diagonal.
+            pressure_step: of the projected gradient, relative to the diagonal.
+            shear_step: likewise, of the shear stresses.
             lookahead: where the gradient is taken, in units of the momentum's displacement.
             momentum: the most of the last step that is repeated, at first.
         """

@@ -7,6 +7,7 @@ import pytest
 
 import warp_lcp as wl
 from benchmarks import sweep_prices
+from code_blocks import blocks, run
 from warp_lcp.solvers.registry import grid_methods
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -48,12 +49,11 @@ def test_prices_name_methods():
     assert set(re.findall(r"^\| ([a-z-]+) \| (?:\d|refused|[A-Z_]{5})", TEXT, flags=re.M)) <= set(wl.METHODS)
 
 
-@pytest.mark.parametrize("code", re.findall(r"```python\n(.*?)```", TEXT, flags=re.S))
-def test_python_examples_run(code, capsys):
-    exec(compile(code, "methods.md", "exec"), {})
+# The tutorial has a test of its own.
+EXAMPLES = [(page, code) for page in sorted(DOCS.rglob("*.md")) if page.name != "tutorial.md" for code in blocks(page, "python")]
+
+
+@pytest.mark.parametrize(("page", "code"), EXAMPLES, ids=lambda value: value.stem if isinstance(value, Path) else "")
+def test_python_examples_run(page, code, capsys):
+    run(code, page)
     assert capsys.readouterr().out.startswith("CONVERGED")
-
-
-def test_links_lead_somewhere():
-    for target in re.findall(r"\]\(([^)#]+)\)", TEXT):
-        assert target.startswith("http") or (DOCS / target).exists(), target

@@ -15,6 +15,7 @@ from warp_lcp.operators import (
     SumOperator,
 )
 from warp_lcp.problem import LCP
+from warp_lcp.recommend import Budget, Recommendation, recommend
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import Record, SolveResult, SolveStatus
 from warp_lcp.solve import Precision, Step
@@ -68,6 +69,7 @@ __all__ = [
     "AffineBounds",
     "BatchResult",
     "BlockedGaussSeidel",
+    "Budget",
     "CoupledBlock",
     "CoupledResult",
     "DenseOperator",
@@ -89,6 +91,7 @@ __all__ = [
     "ProjectedMultigrid",
     "ProjectedSOR",
     "QuadraticProgram",
+    "Recommendation",
     "Record",
     "SolveResult",
     "SolveStatus",
@@ -102,6 +105,7 @@ __all__ = [
     "advised_omega",
     "default_method",
     "enumerate_batch",
+    "recommend",
     "solve",
     "solve_coupled",
 ]

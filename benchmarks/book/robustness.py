@@ -58,9 +58,8 @@ REMARKS = {
         "Num4LCP's problems. Its x is no solution: where x = 0 it sets b = 0, and y = A x is negative there, since A has no positive "
         "entries off its diagonal. The true solution has the share of active unknowns given below, almost none, so "
         "these are linear systems, and the matrix is a random banded one, no Poisson operator. Sweeps end by x'|y| < 1e-3, which says "
-        "nothing about y < 0 where x = 0. "
-        "A matrix is shifted only if it is not positive definite: one of the first hundred has eigenvalues from 0.002 to 1.8 which "
-        "sweeps do not solve in 100 iterations."
+        "nothing about y < 0 where x = 0. A matrix is shifted only if it is not positive definite: one of the first hundred is left "
+        "with eigenvalues from 0.002 to 1.8, too wide a range for 100 sweeps."
     ),
     "fluid, recipe's matrix, planted": (
         "The same matrices with a solution that is one, a quarter of it active. Active unknowns hold x fast all over the domain: sweeps "

@@ -128,9 +128,10 @@ def _overdetermined(scale: Scale, device: str, say: Callable[[str], object]) -> 
                     curve[1].append(100 * len(solved) / few)
     remark = (
         f"{few} dense positive semi-definite problems of {scale.dense} unknowns for each share of zero eigenvalues. "
-        "Book's test: relative 1e-4, absolute 1e-2, at most 100. Solvable: a linear program finds x >= 0 with A x + b >= 0, which is enough "
-        "where A is positive semi-definite. Planted problems are; Num4LCP's x is no solution, and nothing sees to it that its problems have another one: with many zero "
-        "eigenvalues they have none, so that where the book's Newton methods 'get into trouble' it is the problem that has no solution."
+        "Book's test: relative 1e-4, absolute 1e-2, at most 100. Solvable: a linear program finds x >= 0 with A x + b >= 0, which is "
+        "enough where A is positive semi-definite. Planted problems are; Num4LCP's x is no solution, and nothing sees to it that its "
+        "problems have another one: with many zero eigenvalues they have none, so that where the "
+        "book's Newton methods 'get into trouble' it is the problem that has no solution."
     )
     columns = ["b", "zero eigenvalues", "solvable", "method", "book's test", "residual there", "to 1e-6", "steps"]
     charts: list[Chart] = [

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from warp_lcp.driver.simulator import installed_simulators
+from warp_lcp.driver.scene_file import installed_simulators
 
 PAGE = Path(__file__).parents[1] / "scenes.md"
 MATERIALS = {"fluids": "liquid", "granular": "sand"}
@@ -16,11 +16,12 @@ HEAD = """# Scene files
 
 <!-- Written by docs/generate/scene_keys.py from `warp-lcp schema`; do not edit. -->
 
-A scene is a TOML file in SI units. y is up; a domain of two lengths is 2-D, the x-y plane. The [tutorial](tutorial.md) writes two from nothing;
-`warp-lcp check` says what is wrong with one; `warp-lcp schema` prints what this page says for editors (`--simulator granular`: for sand).
+A scene is a TOML file in SI units. y is up; a domain of two lengths is 2-D, the x-y plane. The [tutorial](tutorial.md) writes two from
+nothing; `warp-lcp check` says what is wrong with one; `warp-lcp schema` prints what this page says, for editors (`--simulator granular`:
+for sand).
 
-A key with a default may be left out. A key that no table has is refused, and the message names the nearest one. `--set table.key=value` on the
-command line overrides a key.
+A key with a default may be left out. A key that no table has is refused, and the message names the nearest one. `--set table.key=value` on
+the command line overrides a key.
 """
 
 

@@ -11,6 +11,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 NOTEBOOK = "first-steps.ipynb"
+PAGE = "first-steps.md"
 OUTSIDE = re.compile(r"\]\(\.\./([^)#\s]+)(#[^)]*)?\)")  # a link from a page right under docs to a file of the repository
 
 
@@ -40,7 +41,7 @@ def on_files(files: Any, config: Any) -> Any:
 
     docs = Path(config.docs_dir)
     root = Path(config.config_file_path).parent
-    files.append(File.generated(config, NOTEBOOK.replace(".ipynb", ".md"), content=page_of_notebook((docs / NOTEBOOK).read_text())))
+    files.append(File.generated(config, PAGE, content=page_of_notebook((docs / NOTEBOOK).read_text())))
     wanted = set().union(*(outside_links(page.read_text()) for page in docs.glob("*.md")))
     wanted |= set(re.findall(r"(benchmarks/\S+\.md|[A-Z]+\.md)", json.dumps(config.nav)))
     for name in sorted(wanted):
@@ -58,5 +59,5 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Make links out of docs links within the site."""
-    return inside(markdown) if "/" not in page.file.src_uri else markdown
+    """Make links out of docs, and to the notebook, links within the site."""
+    return inside(markdown).replace(f"]({NOTEBOOK})", f"]({PAGE})") if "/" not in page.file.src_uri else markdown

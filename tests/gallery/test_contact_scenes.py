@@ -131,3 +131,20 @@ def test_wrong_scenes_are_named():
         arched_snake(4)
     with pytest.raises(ValueError, match="friction = -1"):
         World("", RigidBodies([Sphere(1.0)], [1.0], [[0, 0, 1]]), friction=-1)
+
+
+@pytest.mark.parametrize("world", [box_stack(10), heavy_on_light(2, ratio=1000.0)], ids=lambda w: w.name)
+def test_nncg_beats_sweeps_on_stacks_and_mass_ratios(world):
+    """[Book] fig. 2.12. Friction that is projected by bounds of before the move along p loses this: 2 x on the heavy box."""
+    problem = BoxedModel().problem(world.assemble(DT).system).lcp(device="cpu")
+    stopping = wl.StoppingCriteria(rtol=1e-13, max_iterations=1000, patience=1000)
+    sweeps, nncg = (wl.solve(problem, method, stopping=stopping).residual for method in (wl.ProjectedSOR(omega=1.0), wl.NNCG()))
+    assert nncg < sweeps / 100
+
+
+def test_subspace_minimization_with_affine_bounds_solves_stacks():
+    """Held friction that stayed where it was while its normal impulse moved would end at the residual of sweeps, 1e-3."""
+    problem = BoxedModel().problem(box_stack(10).assemble(DT).system).lcp(device="cpu")
+    result = wl.solve(problem, wl.SubspaceMinimization(precision="double", backtracks=-1), stopping=TIGHT)
+    assert result, result.status
+    assert result.linear_iterations < 1000

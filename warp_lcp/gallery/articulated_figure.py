@@ -155,8 +155,8 @@ def planar_chain(lengths: Sequence[float], *, lower: float | Vector = -2.0, uppe
     offsets = np.zeros((n, 3))
     offsets[1:, 0] = lengths[:-1]
     tips = np.array([[lengths[-1], 0.0, 0.0]])
-    limits = (np.broadcast_to(np.asarray(side, dtype=np.float64), (n,)) for side in (lower, upper))
-    return ArticulatedFigure(tuple(range(-1, n - 1)), np.tile(Z, (n, 1)), offsets, (n - 1,), tips, *limits, dimension=2)
+    low, high = (np.broadcast_to(np.asarray(side, dtype=np.float64), (n,)) for side in (lower, upper))
+    return ArticulatedFigure(tuple(range(-1, n - 1)), np.tile(Z, (n, 1)), offsets, (n - 1,), tips, low, high, dimension=2)
 
 
 def spatial_chain(lengths: Sequence[float], *, lower: float | Vector = -2.0, upper: float | Vector = 2.0) -> ArticulatedFigure:
@@ -199,4 +199,6 @@ def branching_figure() -> ArticulatedFigure:
     ends.append((len(joints) - 1, 0.25 * y))
     parents, axes, offsets, lower, upper = zip(*joints, strict=True)
     effectors, tips = zip(*ends, strict=True)
-    return ArticulatedFigure(parents, *map(np.array, (axes, offsets)), effectors, *map(np.array, (tips, lower, upper)))
+    return ArticulatedFigure(
+        parents, np.array(axes), np.array(offsets), effectors, np.array(tips), np.array(lower), np.array(upper), dimension=3
+    )

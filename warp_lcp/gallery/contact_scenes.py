@@ -11,10 +11,12 @@ import numpy as np
 
 from warp_lcp.gallery.contact_detection import Plane
 from warp_lcp.gallery.contact_models import BoxedModel, ContactModel
+from warp_lcp.gallery.contact_stepper import ContactStepper
 from warp_lcp.gallery.hinges import Hinge
 from warp_lcp.gallery.problem import Problem
 from warp_lcp.gallery.rigid_bodies import FIXED, Box, Gear, RigidBodies, Shape, Sphere, rotation
 from warp_lcp.gallery.rigid_world import GRAVITY, World
+from warp_lcp.solvers.nncg import NNCG
 
 DENSITY = 1000.0  # [kg/m^3]
 Y_AXIS = np.array([0.0, 1.0, 0.0])
@@ -308,9 +310,6 @@ def contact_scene(
         raise ValueError(f"name = {name!r}: no such scene; choose from {', '.join(SCENES)}")
     world = SCENES[name](seed=seed) if size is None else SCENES[name](size, seed=seed)
     if steps > 0:
-        from warp_lcp.gallery.contact_stepper import ContactStepper
-        from warp_lcp.solvers.nncg import NNCG
-
         stepper = ContactStepper(world, NNCG(), dt=dt)
         for _ in range(steps):
             stepper.step()

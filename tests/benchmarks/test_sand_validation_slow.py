@@ -1,0 +1,26 @@
+"""What the checks of sand measure at more than the suite's resolutions: the suite itself runs in `test_validation_slow`."""
+
+import pytest
+
+from benchmarks.validation import sand_collapse, sand_hourglass, sand_rest
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("aspect", [1.0, 2.0])
+def test_the_runout_hardly_depends_on_the_grid(aspect: float) -> None:
+    runouts = [sand_collapse.collapse(aspect, cells).runout for cells in (20, 40)]
+    assert runouts[1] == pytest.approx(runouts[0], rel=0.25)
+
+
+@pytest.mark.slow
+def test_sand_runs_out_alike_on_a_finer_grid() -> None:
+    """A slot of 8 cells and one of 16 half as large: the law's delta, of a cell or so, is all that is between them."""
+    coarse, fine = (sand_hourglass.sand(8 * n, n) for n in (1, 2))
+    root = [float(d.rate.mean()) ** (2.0 / 3.0) for d in (coarse, fine)]
+    assert 1.0 < root[1] / root[0] < (16.0 - 2.0) / (16.0 - 4.0)  # (16 - delta) / (16 - 2 delta) for delta from 0 to 2 cells
+
+
+@pytest.mark.slow
+def test_the_inside_of_a_pile_rests_on_a_finer_grid() -> None:
+    ((_, deep),) = sand_rest.rest(40, "cpu", 1)
+    assert deep < sand_rest.DEEP

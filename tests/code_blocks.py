@@ -1,0 +1,38 @@
+"""What tests read out of Markdown: code blocks, headings with their anchors, links."""
+
+import re
+import unicodedata
+from pathlib import Path
+
+FENCE = re.compile(r"^```.*?^```$", flags=re.S | re.M)
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    """Return the code blocks of a language."""
+    return re.findall(rf"```{language}\n(.*?)```", page.read_text(), flags=re.S)
+
+
+def prose(page: Path) -> str:
+    """Return a page without its code blocks."""
+    return FENCE.sub("", page.read_text())
+
+
+def run(code: str, page: Path) -> None:
+    """Run a block in a name space of its own."""
+    exec(compile(code, page.name, "exec"), {})
+
+
+def links(page: Path) -> list[str]:
+    """Return the targets of a page's links and pictures."""
+    return re.findall(r"\]\(([^)\s]+)\)", re.sub(r"`[^`\n]*`", "", prose(page)))
+
+
+def anchors(page: Path) -> set[str]:
+    """Return the anchors of a page's headings, as Python-Markdown makes them (and others where headings are plain)."""
+    found: dict[str, int] = {}
+    for heading in re.findall(r"^#+ (.*)$", prose(page), flags=re.M):
+        plain = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", heading).replace("`", "")
+        text = unicodedata.normalize("NFKD", plain).encode("ascii", "ignore").decode()
+        slug = re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", text).strip().lower())
+        found[slug] = found.get(slug, 0) + 1
+    return {slug if count == 0 else f"{slug}_{count}" for slug, many in found.items() for count in range(many)}

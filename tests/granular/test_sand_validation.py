@@ -1,0 +1,74 @@
+"""Collapses, hourglasses and piles at rest, small; all resolutions and negative controls are in the suite `validation`."""
+
+import numpy as np
+import pytest
+
+from benchmarks.validation import sand_collapse, sand_hourglass, sand_invariants, sand_pit, sand_rest
+
+
+def test_the_envelope_is_that_of_the_experiments() -> None:
+    """Numbers from the papers' laws; were one read with the other's power, a = 8 would be off by a third."""
+    for aspect, low, high in ((0.5, 0.6, 0.9), (1.0, 1.2, 1.8), (2.0, 3.02, 3.6), (4.0, 4.79, 5.8), (8.0, 7.6, 9.2)):
+        assert sand_collapse.lube(aspect) == pytest.approx(low, abs=0.01)
+        assert sand_collapse.lajeunesse(aspect) == pytest.approx(high, abs=0.01)
+        assert sand_collapse.envelope(aspect) == pytest.approx((0.8 * low, 1.2 * high), abs=0.02)
+
+
+def test_a_column_runs_as_far_as_in_experiments_and_stops() -> None:
+    trial = sand_collapse.trial(12, aspects=(1.0,), controls=False)
+    assert trial.failures() == []
+
+
+def test_half_the_friction_runs_too_far() -> None:
+    angle = float(np.degrees(np.arctan(0.5 * sand_pit.WALL_FRICTION)))
+    c = sand_collapse.collapse(2.0, 10, length=12.0, angle=angle, floor=0.5 * sand_pit.WALL_FRICTION)
+    assert c.runout > sand_collapse.envelope(2.0)[1]
+
+
+def test_sand_runs_out_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Were the discharge that of a liquid it would fall by 15 % as the fill does."""
+    monkeypatch.setattr(sand_hourglass, "SPACING", 0.01)
+    d = sand_hourglass.sand(8, 1)
+    assert d.spread < 8.0
+    assert d.rate.mean() == pytest.approx((9.81 * (0.08 - 0.013) ** 3) ** 0.5, rel=0.35)
+
+
+def test_rates_are_areas_over_times() -> None:
+    time = np.linspace(0.0, 10.0, 200)
+    width = sand_hourglass.WIDTH
+    fill, rate = sand_hourglass._rates(time, 2.0 * width**2 - 0.01 * time, 1.5, 1.2, 3)
+    assert fill == pytest.approx([1.45, 1.35, 1.25])
+    assert rate == pytest.approx(np.full(3, 0.01))
+    _, root = sand_hourglass._rates(time, width**2 * (1.5 - 0.06 * time) ** 2, 1.5, 0.9, 4)
+    assert (np.diff(root) < 0.0).all()
+
+
+def test_a_collapse_keeps_its_invariants() -> None:
+    trial = sand_invariants.trial(12, duration=0.6)
+    assert [line for line in trial.failures() if "densest" not in line] == []
+    assert trial.findings[-1].control
+    assert trial.findings[-1].passed
+
+
+def test_a_pile_at_rest_hardly_moves_inside() -> None:
+    (whole, deep), *_ = sand_rest.rest(10, "cpu", 1)
+    assert deep < sand_rest.DEEP
+    assert whole < 3.0 * sand_rest.ALL  # few cells have a large share of them in the surface
+
+
+def test_drift_is_the_way_of_each_particle_whatever_their_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Particles move by a rigid shift and are shuffled at every step: were they followed by number, they would seem to go far."""
+    simulation = sand_pit.create([0.2, 0.1], 20, [{"shape": "box", "min": [0.0, 0.0], "max": [0.1, 0.08]}])
+    random = np.random.default_rng(1)
+
+    def shift(s: sand_pit.SandSimulation, until: float):
+        for _ in range(5):
+            moved = s.particles.position.numpy() + np.array([1e-4, 0.0, 0.0], dtype=np.float32)
+            s.particles.position.assign(moved[random.permutation(len(moved))])
+            s.time += 0.1
+            yield {}
+
+    monkeypatch.setattr(sand_pit, "steps", shift)
+    whole, deep = sand_pit.drift(simulation, 0.5, 0.1)
+    assert whole == pytest.approx(5e-4 / 0.5 / 0.1, rel=1e-3)
+    assert deep == pytest.approx(whole, rel=1e-3)

@@ -1,0 +1,110 @@
+"""The documentation as a whole, without a network and without MkDocs: links, anchors, names, citations, what is generated."""
+
+import importlib
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+
+import warp_lcp as wl
+from code_blocks import anchors, links, prose
+from warp_lcp import gallery
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = [*sorted(DOCS.rglob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"]
+SITE = (ROOT / "mkdocs.yml").read_text()
+NAMED = re.findall(r"^::: ([\w.]+)$", "\n".join(page.read_text() for page in (DOCS / "api").glob("*.md")), flags=re.M)
+
+
+def relative(page):
+    return str(page.relative_to(ROOT))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=relative)
+def test_links_and_anchors_lead_somewhere(page):
+    for link in links(page):
+        if re.match(r"(https?|mailto):", link):
+            continue
+        target, _, anchor = link.partition("#")
+        assert not target.startswith("/"), link
+        file = (page.parent / target).resolve() if target else page
+        assert file.exists(), f"{link}: there is no {target}"
+        assert file.is_relative_to(ROOT), link
+        if anchor:
+            assert anchor in anchors(file), f"{link}: {file.name} has no such heading"
+
+
+def test_the_link_test_sees_what_is_wrong(tmp_path):
+    """Headings in code are none, links in code are none, and repeated headings are counted."""
+    page = tmp_path / "page.md"
+    page.write_text("# A `b` c: d\n\n```sh\n# no heading\n[x](y)\n```\n\n## Same\n\n## Same\n\n[in](other.md#a) and `[not](this)`\n")
+    assert anchors(page) == {"a-b-c-d", "same", "same_1"}
+    assert links(page) == ["other.md#a"]
+
+
+def test_every_page_is_in_the_navigation():
+    named = set(re.findall(r"[\w/.-]+\.md", SITE))
+    assert {str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md")} <= named
+    for name in named - {"first-steps.md"}:
+        assert (DOCS / name).is_file() or (ROOT / name).is_file(), name
+
+
+def test_pages_name_no_place_of_a_machine():
+    texts = [*(page.read_text() for page in PAGES), SITE, (DOCS / "first-steps.ipynb").read_text()]
+    for text in texts:
+        assert not re.search(r"(?<![\w.])/(home|root|work|tmp|Users)/", text)
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_the_reference_names_what_exists(name):
+    module, _, attribute = name.rpartition(".")
+    if importlib.util.find_spec(name.split(".")[0]) and attribute and attribute[0].islower():
+        try:
+            found = importlib.import_module(name)
+        except ModuleNotFoundError:
+            found = getattr(importlib.import_module(module), attribute)
+    else:
+        found = getattr(importlib.import_module(module), attribute)
+    assert found.__doc__
+
+
+def test_the_reference_has_every_public_name():
+    short = {name.rpartition(".")[2] for name in NAMED}
+    constants = {"AIR", "FLUID", "SOLID", "METHODS", "Precision", "Step"}
+    assert set(wl.__all__) - constants <= short
+    assert {getattr(gallery, name).__module__ for name in set(gallery.__all__) - {"FACTS", "FAMILIES"}} <= set(NAMED)
+
+
+def test_the_page_of_scene_files_is_up_to_date():
+    spec = importlib.util.spec_from_file_location("scene_keys", DOCS / "generate" / "scene_keys.py")
+    scene_keys = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(scene_keys)
+    assert scene_keys.PAGE.read_text() == scene_keys.page(), "run: python docs/generate/scene_keys.py"
+
+
+def test_the_page_of_scene_files_has_every_key():
+    """From the schemas themselves, not by way of the generator."""
+    from warp_lcp.driver.scene_file import installed_simulators
+
+    text = (DOCS / "scenes.md").read_text()
+    for simulator in installed_simulators().values():
+        schema = simulator.scene_model.model_json_schema(by_alias=True)
+        keys = {key for definition in schema["$defs"].values() for key in definition["properties"]} - {"kind", "shape", "reseed"}
+        assert {key for key in keys if f"| `{key}` |" not in text} == set()
+        assert all(f"[{table}]" in text for table in schema["properties"])
+
+
+CITATION = re.compile(r"([A-Z][a-z]+(?:-[A-Z][a-z]+)*)(?: et al\.)?,? \(?((?:19|20)\d\d)\b")
+NOT_NAMES = {"Since", "In", "From", "November", "Claypool"}
+
+
+def test_what_is_cited_is_in_the_bibliography():
+    entries = prose(DOCS / "bibliography.md").replace("\n  ", " ").splitlines()
+    sources = [path for package in ("warp_lcp", "fluids", "granular", "benchmarks") for path in (ROOT / package).rglob("*.py")]
+    cited = {match for path in [*sources, *PAGES] for match in CITATION.findall(path.read_text())}
+    cited = {(name, year) for name, year in cited if name not in NOT_NAMES and int(year) < 2026}
+    assert ("Rockafellar", "1976") in cited
+    missing = {(name, year) for name, year in cited if not any(name in entry and f"{year}" in entry for entry in entries)}
+    assert missing == set()

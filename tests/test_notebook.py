@@ -1,0 +1,46 @@
+"""The notebook runs without Jupyter, prints what it holds as printed, and names no place of the machine it was made on."""
+
+import importlib.util
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+def load(name):
+    spec = importlib.util.spec_from_file_location(name, DOCS / "generate" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def notebook():
+    return json.loads((DOCS / "first-steps.ipynb").read_text())
+
+
+def test_cells_print_what_the_notebook_holds(notebook):
+    outputs = load("notebook_outputs")
+    printed = outputs.printed(notebook)
+    assert sum(bool(text) for text in printed) == 5
+    assert printed == outputs.kept(notebook)
+
+
+def test_the_notebook_is_clean(notebook):
+    """No counts of execution, no errors, no pictures, no paths: a change of the text changes the text alone."""
+    for cell in notebook["cells"]:
+        assert cell.get("execution_count") is None
+        assert all(output["output_type"] == "stream" and output["name"] == "stdout" for output in cell.get("outputs", ()))
+        assert not re.search(r"(^|[\s'\"])(/\w+/|[A-Z]:\\|~/)", "".join("".join(output["text"]) for output in cell.get("outputs", ())))
+    assert notebook["nbformat"] == 4
+    assert set(notebook["metadata"]["language_info"]) == {"name"}
+
+
+def test_the_page_shows_code_and_what_it_prints(notebook):
+    page = load("site_pages").page_of_notebook(json.dumps(notebook))
+    assert page.startswith("# First steps\n")
+    assert page.count("```python\n") == sum(cell["cell_type"] == "code" for cell in notebook["cells"])
+    assert page.count("```text\n") == 5

@@ -1,0 +1,68 @@
+"""Every block of the tutorial works as it stands: its Python, its scenes and its commands."""
+
+import csv
+import json
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from code_blocks import blocks, run
+from warp_lcp.driver.cli import app
+
+TUTORIAL = Path(__file__).parents[1] / "docs" / "tutorial.md"
+SCENES = blocks(TUTORIAL, "toml")
+COMMANDS = [
+    shlex.split(line, comments=True)[1:] for block in blocks(TUTORIAL, "sh") for line in block.splitlines() if re.match(r"warp-lcp ", line)
+]
+SHORTER = ["--set", "time.duration=0.05", "--set", "domain.resolution=24"]  # the text's films take longer
+
+
+def invoke(*words):
+    outcome = CliRunner().invoke(app, list(words))
+    assert outcome.exit_code == 0, outcome.output
+    return outcome.output
+
+
+@pytest.mark.parametrize("code", blocks(TUTORIAL, "python"))
+def test_python_examples_run(code, capsys):
+    run(code, TUTORIAL)
+    out = capsys.readouterr().out
+    assert out.startswith("CONVERGED") or "not rough" in code
+
+
+def test_the_text_says_what_the_first_problem_prints(capsys):
+    run(blocks(TUTORIAL, "python")[0], TUTORIAL)
+    assert f"`{capsys.readouterr().out.strip()}`" in TUTORIAL.read_text()
+
+
+def test_there_are_scenes_of_both_materials():
+    assert [re.search(r'simulator = "(\w+)"', text)[1] for text in SCENES] == ["fluids", "fluids", "granular"]
+
+
+@pytest.mark.parametrize("text", SCENES)
+def test_scenes_run(text, tmp_path):
+    scene = tmp_path / "scene.toml"
+    scene.write_text(text)
+    invoke("check", str(scene))
+    invoke("run", str(scene), "--out", str(tmp_path / "out"), *SHORTER)
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["status"] == "finished"
+    with (tmp_path / "out" / "log.csv").open() as log:
+        assert list(csv.DictReader(log))
+    assert (tmp_path / "out" / "particles.pvd").is_file()
+    assert (tmp_path / "out" / "grid.pvd").is_file()
+
+
+def test_commands_work(tmp_path, monkeypatch):
+    """In the text's order, in one folder that holds the scenes under the names the text gives them."""
+    monkeypatch.chdir(tmp_path)
+    Path("water.toml").write_text(SCENES[0])
+    Path("sand.toml").write_text(SCENES[2])
+    assert [words[0] for words in COMMANDS] == ["check", "run", "render", "run", "render"]
+    for words in COMMANDS:
+        if words[0] == "render":
+            pytest.importorskip("pyvista")
+        invoke(*words, *(SHORTER if words[0] == "run" else []))
+    assert {path.name for path in tmp_path.iterdir()} == {"water.toml", "sand.toml", "water", "sand"}

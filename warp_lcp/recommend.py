@@ -1,0 +1,412 @@
+"""Which method to take for a problem, and why: rules read off measurements, `benchmarks.recommendation`."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from warp_lcp.problem import LCP
+from warp_lcp.solve import Solver, solve
+from warp_lcp.solvers.registry import METHODS
+from warp_lcp.stopping import StoppingCriteria
+from warp_lcp.traits import TRIAL, Traits, traits_of
+
+ACCURACIES = {"rough": 1e-2, "usual": 1e-6, "exact": 1e-10}
+SWEEPS_ON_GRIDS, SWEEPS_ON_SPARSE = 25, 40  # fewer are faster than a multigrid cycle's set-up and some cycles, or than systems with A
+MOST_SMALL = 100  # unknowns up to which systems on the free ones cost less than many sweeps, whatever the matrix
+MOST_PIVOTED = 250  # unknowns from which Lemke's pivots of O(n^2), about n / 4 of them, take longer than Newton's systems
+LONGEST = 5000  # steps of a method that sweeps: the prediction may be too low
+FEW = 4  # unknowns that all sets of bounds are tried for
+# stored numbers of 8 bytes that a method holds besides A: for each entry of a dense A, and for each unknown
+MEMORY = {
+    "minimum-map-newton": (2.0, 30.0),
+    "primal-dual-active-set": (2.0, 30.0),
+    "fischer-newton": (3.0, 40.0),
+    "interior-point": (3.0, 40.0),
+    "quadratic-program": (4.0, 40.0),
+    "lemke": (8.0, 40.0),
+    "subspace-minimization": (2.0, 30.0),
+    "projected-multigrid": (0.0, 30.0),
+}
+LEAN = (0.0, 8.0)  # methods that hold some fields only
+
+
+@dataclass(frozen=True, kw_only=True)
+class Budget:
+    """What a solve may cost; what is None does not matter.
+
+    Args:
+        seconds: wall time on this machine, > 0 [s].
+        iterations: steps of the method, an integer >= 1.
+        bytes: memory besides the problem's own, an integer >= 1.
+
+    Raises:
+        ValueError: nothing is given, or something outside its range.
+
+    Example:
+        >>> Budget(iterations=0)
+        Traceback (most recent call last):
+        ...
+        ValueError: iterations = 0: must be an integer >= 1
+    """
+
+    seconds: float | None = None
+    iterations: int | None = None
+    bytes: int | None = None
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        if self.seconds is None and self.iterations is None and self.bytes is None:
+            raise ValueError("budget: give seconds, iterations or bytes")
+        if self.seconds is not None and not (_is_number(self.seconds) and 0 < self.seconds < math.inf):
+            raise ValueError(f"seconds = {self.seconds!r}: must be a finite number > 0")
+        for name in ("iterations", "bytes"):
+            value = getattr(self, name)
+            if value is not None and not (isinstance(value, int) and not isinstance(value, bool) and value >= 1):
+                raise ValueError(f"{name} = {value!r}: must be an integer >= 1")
+
+
+@dataclass(frozen=True)
+class Recommendation:
+    """A method for a problem.
+
+    Args:
+        name: of the method in METHODS.
+        method: the method with its settings.
+        stopping: criteria for the accuracy asked for, with a limit of steps that the method can be expected to need.
+        reasons: why, a sentence each.
+        expected: what the solve is expected to take, None where that is not known.
+        alternatives: names of the methods to try if this one fails or is too slow, the likeliest first.
+        traits: what the decision rests on.
+    """
+
+    name: str
+    method: Solver
+    stopping: StoppingCriteria
+    reasons: tuple[str, ...]
+    expected: str | None
+    alternatives: tuple[str, ...]
+    traits: Traits
+
+
+@dataclass(frozen=True)
+class Rule:
+    """One line of the decision list.
+
+    Args:
+        method: name in METHODS.
+        when: what it is for, the beginning of a sentence.
+        why: the end of that sentence.
+        applies: whether it does.
+        steps: the tenth, the median and the ninetieth percentile of the steps it took on the training problems; None where the trial tells.
+        alternatives: other names.
+    """
+
+    method: str
+    when: str
+    why: str
+    applies: Callable[[Traits], bool]
+    steps: tuple[int, int, int] | None
+    alternatives: tuple[str, ...]
+
+
+def _sweep_price(t: Traits) -> float:
+    """Return what the sweeps of ProjectedSOR cost, in microseconds of an AMD EPYC's core: launches and host, then entries."""
+    return t.sweeps * (140 + 0.005 * t.entries)
+
+
+def _block_price(t: Traits) -> float:
+    """Return what those of BlockedGaussSeidel cost."""
+    return t.block_sweeps * (140 + 0.03 * t.entries)
+
+
+def _few_sweeps(t: Traits) -> bool:
+    most = SWEEPS_ON_GRIDS if t.kind == "grid" else SWEEPS_ON_SPARSE
+    if _singular(t):  # the rate of the first sweeps does not last
+        return False
+    return t.kind in ("grid", "sparse") and t.sweeps <= most and _sweep_price(t) <= _block_price(t)
+
+
+def _few_block_sweeps(t: Traits) -> bool:
+    most = {"grid": SWEEPS_ON_GRIDS / 2, "sparse": SWEEPS_ON_SPARSE / 2}.get(t.kind, 2)
+    return t.block_sweeps <= most and _block_price(t) < _sweep_price(t)
+
+
+def _singular(t: Traits) -> bool:
+    return t.symmetric and t.definiteness in ("semidefinite", "indefinite") and t.diagonal != "negative"
+
+
+def _has_piqp() -> bool:
+    return importlib.util.find_spec("piqp") is not None
+
+
+RULES: tuple[Rule, ...] = (
+    Rule(
+        "subspace-minimization",
+        "Bounds that are affine in x, as friction has them, with few unknowns,",
+        "are for methods that sweep, and small systems on the free unknowns speed those up",
+        lambda t: t.bounds == "affine" and t.unknowns <= MOST_SMALL,
+        (2, 8, 18),
+        ("nncg", "blocked-gauss-seidel", "psor"),
+    ),
+    Rule(
+        "nncg",
+        "Bounds that are affine in x, with many unknowns,",
+        "are for methods that sweep, and conjugate gradients speed those up",
+        lambda t: t.bounds == "affine",
+        None,
+        ("psor", "blocked-gauss-seidel", "staggering"),
+    ),
+    Rule(
+        "minimum-map-newton",
+        "An operator that shows no rows",
+        "cannot be swept; Newton's method needs the fewest products",
+        lambda t: t.kind == "operator",
+        (5, 7, 9),
+        ("primal-dual-active-set", "mprgp", "fischer-newton"),
+    ),
+    Rule(
+        "blocked-gauss-seidel",
+        "Where the trial says that a few sweeps over small blocks are enough",
+        "they cost less than systems with A",
+        _few_block_sweeps,
+        None,
+        ("psor", "minimum-map-newton"),
+    ),
+    Rule(
+        "direct-enumeration",
+        f"At most {FEW} unknowns",
+        "have few sets of bounds: trying them all is sure and as fast as anything",
+        lambda t: t.unknowns <= FEW and t.kind != "operator",
+        (1, 1, 1),
+        ("lemke", "primal-dual-active-set"),
+    ),
+    Rule(
+        "psor",
+        "Where the trial says that a few sweeps are enough",
+        "they cost less than setting up a multigrid hierarchy",
+        _few_sweeps,
+        None,
+        ("nncg", "minimum-map-newton"),
+    ),
+    Rule(
+        "projected-multigrid",
+        "On a grid",
+        "the number of multigrid cycles hardly depends on its size",
+        lambda t: t.kind == "grid",
+        (5, 8, 11),
+        ("minimum-map-newton", "mprgp"),
+    ),
+    Rule(
+        "lemke",
+        "Zeros on the diagonal, as the slip speeds of friction cones have them, with few unknowns",
+        "are for pivots: Lemke's method is sure where A is copositive",
+        lambda t: t.diagonal != "positive" and not t.symmetric and t.unknowns <= MOST_PIVOTED,
+        (1, 4, 6),
+        ("fischer-newton", "interior-point"),
+    ),
+    Rule(
+        "interior-point",
+        "Zeros on the diagonal of a sparse matrix",
+        "are no obstacle to interior points, whose systems are shifted",
+        lambda t: t.diagonal != "positive" and not t.symmetric and t.kind == "sparse",
+        (7, 9, 14),
+        ("fischer-newton", "minimum-map-newton"),
+    ),
+    Rule(
+        "fischer-newton",
+        "Zeros on the diagonal of a dense matrix",
+        "are no obstacle to Fischer and Burmeister's function",
+        lambda t: t.diagonal != "positive" and not t.symmetric,
+        (5, 9, 12),
+        ("interior-point", "lemke"),
+    ),
+    Rule(
+        "quadratic-program",
+        "A symmetric singular matrix",
+        "makes a convex quadratic program, which PIQP solves without regular blocks",
+        lambda t: _singular(t) and t.definiteness == "semidefinite" and _has_piqp(),
+        (1, 1, 1),
+        ("interior-point", "fischer-newton", "minimum-map-newton"),
+    ),
+    Rule(
+        "interior-point",
+        "A symmetric singular matrix",
+        "has singular blocks for Newton's method, and interior points shift theirs",
+        _singular,
+        (7, 11, 14),
+        ("fischer-newton", "minimum-map-newton"),
+    ),
+    Rule(
+        "subspace-minimization",
+        "A sparse symmetric matrix that is no M-matrix",
+        "lets sweeps find the active set, and conjugate gradients the rest",
+        lambda t: t.kind == "sparse" and t.symmetric and not t.m_matrix and t.unknowns > MOST_SMALL,
+        (1, 4, 8),
+        ("nncg", "primal-dual-active-set", "mprgp"),
+    ),
+    Rule(
+        "minimum-map-newton",
+        "Any other matrix",
+        "takes a few systems on the free unknowns",
+        lambda t: True,
+        (2, 4, 9),
+        ("primal-dual-active-set", "interior-point", "fischer-newton", "lemke"),
+    ),
+)
+
+
+def recommend(problem: LCP, *, accuracy: float | str = "usual", budget: Budget | None = None) -> Recommendation:
+    """Return a method for a problem, with reasons.
+
+    The rules decide by what A and the bounds look like and by a trial of some sweeps; that costs about as much as a short solve, so ask
+    once for problems of one kind. They were made from times of all methods on one core of an AMD EPYC, and hold for the CPU; docs
+    "Choosing a method" gives the decision list and how often it is right.
+
+    Args:
+        problem: the LCP; it is not changed.
+        accuracy: relative residual wanted, in (0, 1), or "rough" (1e-2), "usual" (1e-6) or "exact" (1e-10).
+        budget: what the solve may cost; None: whatever it takes.
+
+    Raises:
+        ValueError: an argument is of another kind or outside its range.
+
+    Example:
+        >>> import numpy as np, warp_lcp as wl
+        >>> problem = wl.LCP(wl.DenseOperator(np.diag([2.0] * 8) - np.eye(8, k=1), device="cpu"), -np.ones(8))
+        >>> advice = recommend(problem, accuracy=1e-8)
+        >>> print(advice.name, wl.solve(problem, advice.method, stopping=advice.stopping).status.name)
+        minimum-map-newton CONVERGED
+    """
+    if not isinstance(problem, LCP):
+        raise ValueError(f"problem is a {type(problem).__name__}: expected an LCP")
+    if not (budget is None or isinstance(budget, Budget)):
+        raise ValueError(f"budget = {budget!r}: expected Budget(seconds=...), Budget(iterations=...) or Budget(bytes=...)")
+    rtol = _relative(accuracy)
+    traits = traits_of(problem, rtol)
+    rule = next(rule for rule in RULES if rule.applies(traits))
+    return _within(_from_rule(rule, traits, rtol), budget, problem) if budget else _from_rule(rule, traits, rtol)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _relative(accuracy: float | str) -> float:
+    """Return a relative residual for a word or a number."""
+    if isinstance(accuracy, str):
+        if accuracy not in ACCURACIES:
+            raise ValueError(f"accuracy = {accuracy!r}: must be one of {', '.join(map(repr, ACCURACIES))} or a number in (0, 1)")
+        return ACCURACIES[accuracy]
+    if not (_is_number(accuracy) and 0 < accuracy < 1):
+        raise ValueError(f"accuracy = {accuracy!r}: must be a relative residual in (0, 1), or one of {', '.join(map(repr, ACCURACIES))}")
+    return float(accuracy)
+
+
+def _from_rule(rule: Rule, t: Traits, rtol: float) -> Recommendation:
+    """Return what a rule says."""
+    sweeps = {"psor": t.sweeps, "nncg": t.sweeps, "blocked-gauss-seidel": t.block_sweeps}.get(rule.method)
+    expected, limit = None, LONGEST
+    if rule.steps is not None:
+        low, median, high = rule.steps
+        expected = f"{low} to {high} steps, {median} at the median of the training problems"
+        limit = max(100, 10 * high)
+    elif sweeps is not None and math.isfinite(sweeps):
+        expected = f"about {math.ceil(sweeps)} sweeps, by the rate of the first {TRIAL}"
+    reasons = (f"{rule.when} {rule.why}.", _portrait(t))
+    stopping = StoppingCriteria(rtol=rtol, max_iterations=limit, patience=max(30, limit // 10))
+    return Recommendation(rule.method, METHODS[rule.method](), stopping, reasons, expected, _able(rule.alternatives, t), t)
+
+
+def _able(names: tuple[str, ...], t: Traits) -> tuple[str, ...]:
+    """Return the names of the methods that take such a problem."""
+    kind = "grid" if t.kind == "operator" else t.kind
+    fits = [n for n in names if kind in METHODS[n].supports and t.unknowns <= getattr(METHODS[n], "most_unknowns", t.unknowns)]
+    if t.bounds == "affine":
+        fits = [n for n in fits if getattr(METHODS[n], "affine_bounds", False)]
+    return tuple(fits)
+
+
+def _portrait(t: Traits) -> str:
+    """Return a sentence about the problem."""
+    shape = "symmetric" if t.symmetric else "unsymmetric"
+    known = "of unknown definiteness" if t.definiteness == "unknown" else t.definiteness
+    bounds = {"none": "no bounds", "one-sided": "bounds on one side", "box": "bounds on both sides", "affine": "bounds affine in x"}[
+        t.bounds
+    ]
+    signs = ", with the signs of an M-matrix" if t.m_matrix else ""
+    return f"A is of kind {t.kind} with {t.unknowns} unknowns, {shape}, {known}{signs}; there are {bounds}."
+
+
+def memory_of(name: str, t: Traits) -> int:
+    """Return about how many bytes a method holds besides the problem's own arrays."""
+    square, fields = MEMORY.get(name, LEAN)
+    entries = t.entries if t.kind in ("dense", "sparse") else 0
+    return int(8 * (square * entries + fields * t.unknowns))
+
+
+def _within(first: Recommendation, budget: Budget, problem: LCP) -> Recommendation:
+    """Return a recommendation that respects a budget, or says that it cannot."""
+    found, t = first, first.traits
+    if budget.bytes is not None and memory_of(found.name, t) > budget.bytes:
+        lean = next((n for n in _able(("psor", "accelerated-projected-gradient", "projected-jacobi"), t) if _starts(n, problem)), None)
+        if lean is None or memory_of(lean, t) > budget.bytes:
+            found = _said(found, f"No method fits into {budget.bytes} bytes; this one takes about {memory_of(found.name, t)}.")
+        else:
+            why = f"{found.name} takes about {memory_of(found.name, t)} bytes of the {budget.bytes} allowed; {lean} holds some fields only."
+            found = _instead(found, lean, why)
+    if budget.iterations is not None:
+        sweeps = {"psor": t.sweeps, "nncg": t.sweeps, "blocked-gauss-seidel": t.block_sweeps}.get(found.name)
+        if budget.bytes is None and sweeps is not None and sweeps > budget.iterations:
+            others = ((rule, rule.steps[1]) for rule in RULES if rule.steps is not None and rule.applies(t))
+            fewer = next(((rule, steps) for rule, steps in others if steps <= budget.iterations), None)
+            if fewer is not None:
+                why = f"{found.name} would take {sweeps:.0f} of the {budget.iterations} steps allowed, {fewer[0].method} about {fewer[1]}."
+                found = _said(_from_rule(fewer[0], t, found.stopping.rtol), why)
+        found = replace(found, stopping=replace(found.stopping, max_iterations=budget.iterations))
+    return found if budget.seconds is None else _in_time(found, budget.seconds, problem)
+
+
+def _in_time(found: Recommendation, seconds: float, problem: LCP) -> Recommendation:
+    """Return a recommendation whose first step ends in time: sweeps improve x from the first one on."""
+    begun = time.perf_counter()
+    solved = _tried(found.name, problem, 1)
+    took = time.perf_counter() - begun
+    if solved and took <= seconds:
+        return _said(found, f"Its set-up and first step took {took:.2g} s of the {seconds:g} s allowed.")
+    if not _able(("psor",), found.traits) or not _starts("psor", problem):
+        return _said(found, f"Its set-up and first step took {took:.2g} s, more than the {seconds:g} s allowed; no sweep is possible here.")
+    begun = time.perf_counter()
+    _tried("psor", problem, TRIAL)
+    sweep = (time.perf_counter() - begun) / TRIAL
+    many = max(1, int(seconds / sweep))
+    why = f"{found.name} took {took:.2g} s for its first step, more than the {seconds:g} s allowed: {many} sweeps fit, each is of use."
+    cheaper = _instead(found, "psor", why)
+    return replace(cheaper, stopping=replace(cheaper.stopping, max_iterations=min(many, cheaper.stopping.max_iterations)))
+
+
+def _starts(name: str, problem: LCP) -> bool:
+    return _tried(name, problem, 0)
+
+
+def _tried(name: str, problem: LCP, steps: int) -> bool:
+    """Make some steps and return whether the method takes the problem."""
+    try:
+        solve(problem, METHODS[name](), stopping=StoppingCriteria(max_iterations=steps))
+    except ValueError:
+        return False
+    return True
+
+
+def _said(found: Recommendation, reason: str) -> Recommendation:
+    return replace(found, reasons=(*found.reasons, reason))
+
+
+def _instead(found: Recommendation, name: str, reason: str) -> Recommendation:
+    """Return another method for the same criteria, with the limit of steps of a method that sweeps."""
+    stopping = replace(found.stopping, max_iterations=LONGEST, patience=LONGEST // 10)
+    changed = replace(found, name=name, method=METHODS[name](), stopping=stopping, expected=None)
+    return _said(replace(changed, alternatives=(found.name, *(n for n in found.alternatives if n != name))), reason)
