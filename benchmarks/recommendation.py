@@ -213,7 +213,7 @@ def report(train: Sequence[Verdict], check: Sequence[Verdict]) -> str:
         f"{REPEAT} in turns. A choice is right if it converges within {WITHIN} x the best method's time, or is no more than",
         f"{1e3 * NOISE:g} ms slower. Direct methods of more than 1000 unknowns were not tried. The recommendation's own time is not counted.",
         "",
-        "| problems | how many | solved by some method | recommended right | without the allowance | best >= 5 ms: right | default right |",
+        "| problems | all | solved by any | recommended right | without the allowance | best takes >= 5 ms: right | default right |",
         "|---|---|---|---|---|---|---|",
     ]
     for title, verdicts in (("rules made from", train), ("never seen", check)):
@@ -231,10 +231,10 @@ def report(train: Sequence[Verdict], check: Sequence[Verdict]) -> str:
     both = [(a, b) for v in able if (a := _converged(v, v.chosen)) and (b := _converged(v, v.default))]
     lines += [
         "",
-        f"Of {len(able)} never seen problems that some method solves, {failed[0]} are not solved, or were cut off, by the recommended one and",
-        f"{failed[1]} by the default. Where both solve, the recommended one takes {sum(a for a, _ in both):.0f} ms in all and the default",
+        f"Of {len(able)} never seen problems that some method solves, {failed[0]} are not solved, or were cut off, by the recommended one",
+        f"and {failed[1]} by the default. Where both solve, the recommended one takes {sum(a for a, _ in both):.0f} ms in all and the default",
         f"{sum(b for _, b in both):.0f} ms; the median of the ratio is {statistics.median(a / b for a, b in both):.2f}.",
-        f"A recommendation takes {statistics.median(v.milliseconds for v in check):.1f} ms (median), at most "
+        f"A recommendation takes {statistics.median(v.milliseconds for v in check):.1f} ms (median), at most",
         f"{max(v.milliseconds for v in check):.0f} ms; the best solves take {statistics.median(v.best.milliseconds for v in able if v.best):.1f} ms.",
         "",
         "## By family, never seen",

@@ -20,18 +20,19 @@ MOST_SMALL = 100  # unknowns up to which systems on the free ones cost less than
 MOST_PIVOTED = 250  # unknowns from which Lemke's pivots of O(n^2), about n / 4 of them, take longer than Newton's systems
 LONGEST = 5000  # steps of a method that sweeps: the prediction may be too low
 FEW = 4  # unknowns that all sets of bounds are tried for
-# stored numbers of 8 bytes that a method holds besides A: for each entry of a dense A, and for each unknown
+# numbers of 8 bytes that a method holds besides A, for each entry of a matrix and for each unknown: those of workspaces on 300 and 600
+# dense, 5,000 and 20,000 sparse and 34,000 grid unknowns, rounded up; factors of dense matrices, which are made anew each step, included
 MEMORY = {
     "minimum-map-newton": (2.0, 30.0),
     "primal-dual-active-set": (2.0, 30.0),
-    "fischer-newton": (3.0, 40.0),
+    "fischer-newton": (3.0, 30.0),
     "interior-point": (3.0, 40.0),
     "quadratic-program": (4.0, 40.0),
     "lemke": (8.0, 40.0),
     "subspace-minimization": (2.0, 30.0),
-    "projected-multigrid": (0.0, 30.0),
+    "projected-multigrid": (0.0, 12.0),
 }
-LEAN = (0.0, 8.0)  # methods that hold some fields only
+LEAN = (0.0, 18.0)  # methods that hold some fields only
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,195 @@
+"""`wl.recommend`: what it recommends converges; what it says of a matrix is checked against NumPy's eigenvalues."""
+
+import numpy as np
+import pytest
+import scipy.sparse
+
+import warp_lcp as wl
+from benchmarks.recommendation_problems import FAMILIES, make
+from oracle import natural_residual
+from warp_lcp import gallery
+from warp_lcp.recommend import MEMORY, RULES, memory_of
+from warp_lcp.traits import traits_of
+
+SEEDS = range(700, 703)  # neither those of the rules nor those of the published check
+COUNTED = [family for family in FAMILIES if not family.startswith("scene")]  # contacts at rest are tried below
+NO_INDEFINITE = np.diag([1.0, 1.0, 1.0, 1.0, 1.0])
+
+
+@pytest.mark.parametrize("family", COUNTED)
+def test_recommended_methods_converge(family):
+    """60 problems in all, each to the accuracy asked for, within the limit of steps that comes with the recommendation."""
+    for seed in SEEDS:
+        name, lcp, accuracy = make(family, seed)
+        advice = wl.recommend(lcp, accuracy=accuracy)
+        result = wl.solve(lcp, advice.method, stopping=advice.stopping)
+        assert result, f"{name}: {advice.name} ends {result.status.name} at {result.relative_residual:.1e}"
+        assert result.relative_residual <= accuracy
+        assert set(advice.alternatives) <= set(wl.METHODS) - {advice.name}
+        assert len(advice.reasons) >= 2
+        assert all(reason.endswith(".") for reason in advice.reasons)
+
+
+def test_there_are_sixty():
+    assert len(COUNTED) * len(SEEDS) >= 60
+
+
+@pytest.mark.parametrize("family", [family for family in FAMILIES if family.startswith("scene")])
+def test_contacts_get_a_method_that_takes_them(family):
+    """Most scenes converge; friction in boxes has no proof, and scenes pulled by joints are ill conditioned."""
+    for seed in SEEDS:
+        _, lcp, _ = make(family, seed)
+        advice = wl.recommend(lcp, accuracy="rough")
+        assert advice.stopping.rtol == 1e-2
+        if lcp.bounds.affine is not None:
+            assert advice.method.affine_bounds
+            assert all(wl.METHODS[name].affine_bounds for name in advice.alternatives)
+        assert wl.solve(lcp, advice.method, stopping=advice.stopping).relative_residual < 1
+
+
+def test_the_answer_is_one_by_another_codes_residual():
+    problem = gallery.semidefinite(40, zeros=0.4, seed=91)
+    lcp = problem.lcp(device="cpu")
+    before = lcp.b.numpy().copy()
+    advice = wl.recommend(lcp, accuracy=1e-8)
+    assert np.array_equal(lcp.b.numpy(), before)
+    x = wl.solve(lcp, advice.method, stopping=advice.stopping).x.numpy()
+    start = natural_residual(problem.A, problem.b, problem.lower, problem.upper, np.clip(np.zeros(40), problem.lower, problem.upper))
+    assert natural_residual(problem.A, problem.b, problem.lower, problem.upper, x) <= 1e-8 * start * (1 + 1e-6)
+
+
+def eigenvalue_verdict(A):
+    """What the least eigenvalue of the symmetric part says; the matrices below have none between 0 and 1e-4 in size."""
+    least = np.linalg.eigvalsh(0.5 * (A + A.T))[0]
+    return "indefinite" if least < -1e-6 else "semidefinite" if least < 1e-6 else "definite"
+
+
+def random_matrix(seed):
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(5, 30))
+    B = rng.standard_normal((n, n - n // 3 if seed % 3 == 0 else n))
+    A = B @ B.T + (0.05 * np.eye(n) if seed % 3 else 0.0)
+    if seed % 4 == 0:
+        C = rng.standard_normal((n, n))
+        A = A + C - C.T  # x'Ax is the same
+    return A - 3.0 * np.outer(v := np.eye(n)[0] + np.eye(n)[1], v) if seed % 5 == 0 else A
+
+
+@pytest.mark.parametrize("seed", range(17, 37))
+def test_definiteness_is_that_of_the_eigenvalues(seed):
+    A = random_matrix(seed)
+    expected = eigenvalue_verdict(A)
+    for matrix in (A, scipy.sparse.csr_array(A)):
+        t = traits_of(wl.LCP(matrix, np.ones(len(A))), 1e-4)
+        assert t.definiteness == expected
+        assert t.symmetric == np.allclose(A, A.T)
+        assert t.unknowns == len(A)
+
+
+def test_signs_and_dominance_make_an_m_matrix():
+    L = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(9, 9)).tocsr()
+    assert traits_of(wl.LCP(L, np.ones(9)), 1e-2).m_matrix
+    wrong = L.copy()
+    wrong[3, 4] = wrong[4, 3] = 0.1  # dominant still, of the other sign
+    assert not traits_of(wl.LCP(wrong, np.ones(9)), 1e-2).m_matrix
+    wrong[3, 4] = wrong[4, 3] = -1.5  # the sign, without dominance
+    assert not traits_of(wl.LCP(wrong, np.ones(9)), 1e-2).m_matrix
+
+
+def test_bounds_and_diagonals_are_named():
+    A = np.array([[2.0, 1.0], [-1.0, 0.0]])
+    assert traits_of(wl.LCP(A, np.ones(2)), 0.1).diagonal == "zero"
+    assert traits_of(wl.LCP(-NO_INDEFINITE, np.ones(5), 0.0, 1.0), 0.1).diagonal == "negative"
+    kinds = {"none": (-np.inf, np.inf), "one-sided": (0.0, np.inf), "box": (0.0, 1.0)}
+    for kind, (lower, upper) in kinds.items():
+        assert traits_of(wl.LCP(NO_INDEFINITE, np.ones(5), lower, upper), 0.1).bounds == kind
+    low, high = wl.AffineBounds.friction([-1, 0, -1, 2, -1], 0.5)
+    assert traits_of(wl.LCP(NO_INDEFINITE, -np.ones(5), low, high), 0.1).bounds == "affine"
+
+
+def test_the_trial_foresees_how_many_sweeps():
+    """To a factor of 2, where the rate has settled; a rate taken over another number of sweeps would be far off."""
+    for problem in (gallery.banded(400, seed=77), gallery.poisson((12, 12), seed=77, device="cpu")):
+        lcp = problem.lcp(device="cpu")
+        sweeps = wl.solve(lcp, wl.ProjectedSOR(), stopping=wl.StoppingCriteria(rtol=1e-8, max_iterations=1000)).iterations
+        assert sweeps > 10
+        assert sweeps / 2 <= traits_of(lcp, 1e-8).sweeps <= 2 * sweeps
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"accuracy": "perfect"}, "accuracy = 'perfect': must be one of 'rough', 'usual', 'exact'"),
+        ({"accuracy": 1}, "must be a relative residual in"),
+        ({"accuracy": True}, "must be a relative residual in"),
+        ({"accuracy": float("nan")}, "must be a relative residual in"),
+        ({"accuracy": None}, "must be a relative residual in"),
+        ({"budget": 3}, "budget = 3: expected Budget"),
+        ({"budget": "3 s"}, "expected Budget"),
+    ],
+)
+def test_wrong_arguments_are_named(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        wl.recommend(wl.LCP(NO_INDEFINITE, np.ones(5)), **arguments)
+
+
+def test_a_problem_is_expected():
+    with pytest.raises(ValueError, match="problem is a ndarray: expected an LCP"):
+        wl.recommend(NO_INDEFINITE)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({}, "give seconds, iterations or bytes"),
+        ({"seconds": 0}, "seconds = 0: must be a finite number > 0"),
+        ({"seconds": "1"}, "seconds = '1'"),
+        ({"iterations": 1.5}, "iterations = 1.5: must be an integer >= 1"),
+        ({"bytes": -1}, "bytes = -1: must be an integer >= 1"),
+        ({"iterations": True}, "iterations = True"),
+    ],
+)
+def test_wrong_budgets_are_named(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        wl.Budget(**wrong)
+
+
+def test_a_budget_of_steps_is_a_limit_and_changes_the_method():
+    lcp = gallery.banded(3000, seed=78).lcp(device="cpu")
+    free = wl.recommend(lcp, accuracy=1e-8)
+    assert free.name == "psor"
+    few = wl.recommend(lcp, accuracy=1e-8, budget=wl.Budget(iterations=8))
+    assert few.name == "minimum-map-newton"
+    assert few.stopping.max_iterations == 8
+    assert "of the 8 steps allowed" in few.reasons[-1]
+    assert wl.solve(lcp, few.method, stopping=few.stopping)
+
+
+def test_a_budget_of_memory_leaves_out_factors():
+    lcp = gallery.definite(200, seed=79).lcp(device="cpu")
+    free = wl.recommend(lcp)
+    assert free.name == "minimum-map-newton"
+    lean = wl.recommend(lcp, budget=wl.Budget(bytes=100_000))
+    assert lean.name == "psor"
+    assert lean.alternatives[0] == free.name
+    assert memory_of("psor", free.traits) <= 100_000 < memory_of(free.name, free.traits)
+    assert "No method fits" in wl.recommend(lcp, budget=wl.Budget(bytes=10)).reasons[-1]
+
+
+def test_a_budget_of_seconds_is_tried():
+    lcp = gallery.definite(300, seed=80).lcp(device="cpu")
+    hurried = wl.recommend(lcp, budget=wl.Budget(seconds=1e-7))
+    assert hurried.name == "psor"
+    assert hurried.stopping.max_iterations == 1
+    assert wl.recommend(lcp, budget=wl.Budget(seconds=1e4)).name == "minimum-map-newton"
+    slow = gallery.contact(3, seed=80).lcp(device="cpu")  # beta rows: no sweep helps, but one can start
+    assert wl.recommend(slow, budget=wl.Budget(seconds=1e4)).name == "lemke"
+
+
+def test_rules_name_methods_and_the_last_one_takes_all():
+    for rule in RULES:
+        assert rule.method in wl.METHODS
+        assert set(rule.alternatives) <= set(wl.METHODS)
+        assert rule.steps is None or list(rule.steps) == sorted(rule.steps)
+    assert RULES[-1].applies(traits_of(wl.LCP(NO_INDEFINITE, np.ones(5)), 0.1))
+    assert set(MEMORY) <= set(wl.METHODS)
