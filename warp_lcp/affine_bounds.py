@@ -19,7 +19,7 @@ class AffineBounds:
     """One side of bounds: constant_i + coefficient_i x_j with j = index_i, and constant_i where index_i = -1.
 
     Given to `LCP` as `lower` or `upper`. The unknown x_j that a bound depends on must itself have constant bounds. Methods that evaluate
-    their bounds at the iterate take such problems (ProjectedSOR, ProjectedJacobi, BlockedGaussSeidel, NNCG, Staggering); others refuse.
+    their bounds at the iterate take such problems (sweeps, NNCG, SubspaceMinimization, Staggering); others refuse.
     With them the problem is a quasi-variational inequality, which may have no solution or several, and no convergence proof covers it.
 
     Args:

@@ -15,9 +15,14 @@ from warp_lcp.stopping import StoppingCriteria
 from warp_lcp.traits import TRIAL, Traits, traits_of
 
 ACCURACIES = {"rough": 1e-2, "usual": 1e-6, "exact": 1e-10}
-SWEEPS_ON_GRIDS, SWEEPS_ON_SPARSE = 25, 40  # fewer are faster than a multigrid cycle's set-up and some cycles, or than systems with A
+SURE_SWEEPS = 12  # so few that a rate which does not last makes no difference
+SWEEPS_ON_GRIDS, SWEEPS_ON_SPARSE = 25, 50  # fewer are faster than a multigrid cycle's set-up and some cycles, or than systems with A
 MOST_SMALL = 100  # unknowns up to which systems on the free ones cost less than many sweeps, whatever the matrix
-MOST_PIVOTED = 250  # unknowns from which Lemke's pivots of O(n^2), about n / 4 of them, take longer than Newton's systems
+MOST_PIVOTED = 400  # unknowns from which Lemke's pivots of O(n^2), about n / 4 of them, take longer than Newton's systems
+MOST_INNER = 1000  # unknowns of a friction cone from which interior points are slower than active sets
+FEWER = 60  # unknowns up to which a dense matrix is so small that launches and the host decide
+MOST_RESTING = 150  # unknowns of contacts at rest
+AT_REST = 0.6  # share of zeros in b
 LONGEST = 5000  # steps of a method that sweeps: the prediction may be too low
 FEW = 4  # unknowns that all sets of bounds are tried for
 # numbers of 8 bytes that a method holds besides A, for each entry of a matrix and for each unknown: those of workspaces on 300 and 600
@@ -125,19 +130,27 @@ def _block_price(t: Traits) -> float:
 
 
 def _few_sweeps(t: Traits) -> bool:
-    most = SWEEPS_ON_GRIDS if t.kind == "grid" else SWEEPS_ON_SPARSE
-    if _singular(t):  # the rate of the first sweeps does not last
+    if t.bounds == "none" and t.kind == "grid":  # nothing cuts smooth errors off, which sweeps leave
         return False
-    return t.kind in ("grid", "sparse") and t.sweeps <= most and _sweep_price(t) <= _block_price(t)
+    if not t.m_matrix:  # the rate of the first sweeps does not last
+        return t.sweeps <= SURE_SWEEPS and (t.kind == "sparse" or _singular(t))
+    most = {"grid": SWEEPS_ON_GRIDS, "sparse": SWEEPS_ON_SPARSE}.get(t.kind, 0)
+    return t.sweeps <= most and _sweep_price(t) <= _block_price(t)
 
 
 def _few_block_sweeps(t: Traits) -> bool:
-    most = {"grid": SWEEPS_ON_GRIDS / 2, "sparse": SWEEPS_ON_SPARSE / 2}.get(t.kind, 2)
+    if _pivotable(t) or (t.bounds == "none" and t.kind == "grid"):
+        return False
+    most = {"grid": SWEEPS_ON_GRIDS / 2, "sparse": SWEEPS_ON_SPARSE / 2}.get(t.kind, 5 if _singular(t) else 2)
     return t.block_sweeps <= most and _block_price(t) < _sweep_price(t)
 
 
 def _singular(t: Traits) -> bool:
     return t.symmetric and t.definiteness in ("semidefinite", "indefinite") and t.diagonal != "negative"
+
+
+def _pivotable(t: Traits) -> bool:
+    return t.diagonal != "positive" and not t.symmetric
 
 
 def _has_piqp() -> bool:
@@ -146,11 +159,19 @@ def _has_piqp() -> bool:
 
 RULES: tuple[Rule, ...] = (
     Rule(
+        "blocked-gauss-seidel",
+        "Bounds that are affine in x, as friction has them, where the trial says that a few sweeps are enough,",
+        "are for methods that sweep, best over small blocks",
+        lambda t: t.bounds == "affine" and t.block_sweeps <= SURE_SWEEPS,
+        None,
+        ("nncg", "subspace-minimization", "psor"),
+    ),
+    Rule(
         "subspace-minimization",
-        "Bounds that are affine in x, as friction has them, with few unknowns,",
+        "Bounds that are affine in x, with few unknowns,",
         "are for methods that sweep, and small systems on the free unknowns speed those up",
         lambda t: t.bounds == "affine" and t.unknowns <= MOST_SMALL,
-        (2, 8, 18),
+        (2, 4, 18),
         ("nncg", "blocked-gauss-seidel", "psor"),
     ),
     Rule(
@@ -166,12 +187,12 @@ RULES: tuple[Rule, ...] = (
         "An operator that shows no rows",
         "cannot be swept; Newton's method needs the fewest products",
         lambda t: t.kind == "operator",
-        (5, 7, 9),
+        (4, 6, 8),
         ("primal-dual-active-set", "mprgp", "fischer-newton"),
     ),
     Rule(
         "blocked-gauss-seidel",
-        "Where the trial says that a few sweeps over small blocks are enough",
+        "Where the trial says that a few sweeps over small blocks are enough,",
         "they cost less than systems with A",
         _few_block_sweeps,
         None,
@@ -187,7 +208,7 @@ RULES: tuple[Rule, ...] = (
     ),
     Rule(
         "psor",
-        "Where the trial says that a few sweeps are enough",
+        "Where the trial says that a few sweeps are enough,",
         "they cost less than setting up a multigrid hierarchy",
         _few_sweeps,
         None,
@@ -198,32 +219,48 @@ RULES: tuple[Rule, ...] = (
         "On a grid",
         "the number of multigrid cycles hardly depends on its size",
         lambda t: t.kind == "grid",
-        (5, 8, 11),
+        (3, 7, 8),
         ("minimum-map-newton", "mprgp"),
+    ),
+    Rule(
+        "minimum-map-newton",
+        "Zeros on the diagonal of contacts at rest, whose b is mostly 0,",
+        "leave little to find: Newton's method is there in a few steps",
+        lambda t: _pivotable(t) and t.quiet >= AT_REST and t.kind == "dense" and t.unknowns <= MOST_RESTING,
+        (1, 1, 8),
+        ("primal-dual-active-set", "lemke", "fischer-newton", "interior-point"),
     ),
     Rule(
         "lemke",
         "Zeros on the diagonal, as the slip speeds of friction cones have them, with few unknowns",
         "are for pivots: Lemke's method is sure where A is copositive",
-        lambda t: t.diagonal != "positive" and not t.symmetric and t.unknowns <= MOST_PIVOTED,
-        (1, 4, 6),
+        lambda t: _pivotable(t) and t.unknowns <= (MOST_PIVOTED if t.kind == "sparse" else FEWER),
+        (1, 4, 5),
         ("fischer-newton", "interior-point"),
     ),
     Rule(
         "interior-point",
         "Zeros on the diagonal of a sparse matrix",
         "are no obstacle to interior points, whose systems are shifted",
-        lambda t: t.diagonal != "positive" and not t.symmetric and t.kind == "sparse",
-        (7, 9, 14),
+        lambda t: _pivotable(t) and t.kind == "sparse" and t.unknowns <= MOST_INNER,
+        (4, 7, 8),
         ("fischer-newton", "minimum-map-newton"),
     ),
     Rule(
         "fischer-newton",
         "Zeros on the diagonal of a dense matrix",
         "are no obstacle to Fischer and Burmeister's function",
-        lambda t: t.diagonal != "positive" and not t.symmetric,
-        (5, 9, 12),
+        lambda t: _pivotable(t) and t.kind == "dense",
+        (5, 8, 12),
         ("interior-point", "lemke"),
+    ),
+    Rule(
+        "primal-dual-active-set",
+        "A sparse symmetric singular matrix",
+        "takes an active-set method that goes on by proximal points",
+        lambda t: _singular(t) and t.kind == "sparse",
+        (2, 10, 39),
+        ("fischer-newton", "interior-point", "mprgp"),
     ),
     Rule(
         "quadratic-program",
@@ -246,15 +283,31 @@ RULES: tuple[Rule, ...] = (
         "A sparse symmetric matrix that is no M-matrix",
         "lets sweeps find the active set, and conjugate gradients the rest",
         lambda t: t.kind == "sparse" and t.symmetric and not t.m_matrix and t.unknowns > MOST_SMALL,
-        (1, 4, 8),
+        (3, 5, 6),
         ("nncg", "primal-dual-active-set", "mprgp"),
+    ),
+    Rule(
+        "lemke",
+        "A sparse symmetric matrix of few unknowns that is no M-matrix",
+        "takes few pivots",
+        lambda t: t.kind == "sparse" and t.symmetric and not t.m_matrix and t.unknowns <= FEWER,
+        (2, 2, 12),
+        ("incremental-pivoting", "primal-dual-active-set"),
+    ),
+    Rule(
+        "subspace-minimization",
+        "A dense symmetric matrix of few unknowns that is no M-matrix",
+        "lets sweeps find the active set in less than Newton's steps take",
+        lambda t: t.kind == "dense" and t.symmetric and not t.m_matrix and t.unknowns <= FEWER and t.bounds != "none",
+        (1, 1, 2),
+        ("minimum-map-newton", "quadratic-program", "lemke"),
     ),
     Rule(
         "minimum-map-newton",
         "Any other matrix",
         "takes a few systems on the free unknowns",
         lambda t: True,
-        (2, 4, 9),
+        (1, 3, 9),
         ("primal-dual-active-set", "interior-point", "fischer-newton", "lemke"),
     ),
 )

@@ -41,6 +41,7 @@ class Traits:
         sweeps: how many sweeps of `ProjectedSOR` the accuracy would take, extrapolated from the rate of the first ones; inf where they
             do not converge or are not possible.
         block_sweeps: the same of `BlockedGaussSeidel`; 1 or 2 where unknowns are coupled in small blocks alone.
+        quiet: share of the unknowns with b_i = 0: of contacts at rest, most.
     """
 
     kind: str
@@ -53,6 +54,7 @@ class Traits:
     bounds: str
     sweeps: float
     block_sweeps: float
+    quiet: float = 0.0
 
 
 def traits_of(problem: LCP, accuracy: float) -> Traits:
@@ -77,8 +79,10 @@ def traits_of(problem: LCP, accuracy: float) -> Traits:
         host = A.matrix() if isinstance(A, SparseOperator) else A.matrix.numpy()  # type: ignore[attr-defined]
         m_matrix, definiteness = _of_matrix(host, A.symmetric, d)
     entries = {"sparse": getattr(A, "nnz", 0), "dense": unknowns**2}.get(kind, 7 * unknowns)
+    b = np.abs(problem.b.numpy().ravel()[problem.unknown.numpy().ravel() == 1])
+    quiet = float((b <= 1e-9 * b.max()).mean())
     trials = [sweeps_to(problem, accuracy, method) for method in (ProjectedSOR(), BlockedGaussSeidel())]
-    return Traits(kind, unknowns, entries, A.symmetric, sign, m_matrix, definiteness, bounds_of(problem), trials[0], trials[1])
+    return Traits(kind, unknowns, entries, A.symmetric, sign, m_matrix, definiteness, bounds_of(problem), trials[0], trials[1], quiet)
 
 
 def bounds_of(problem: LCP) -> str:

@@ -71,8 +71,8 @@ def _minimum_map(found: Mapping[str, Record]) -> tuple[str, str]:
     solved = _solved(found, "robustness: contact, rigid bodies: minimum map, book")
     why = (
         "steps do not descend, or are cut until the merit stands still (relative, which is no solution). Steps solved exactly, of a map "
-        "scaled by A_ii, reach the absolute test in some, Num4LCP's by GMRES in none. The library's method then goes on by the proximal-point "
-        f"iteration: {solved} of the rigid bodies' problems to 1e-6"
+        "scaled by A_ii, reach the absolute test in some, Num4LCP's by GMRES in none. The library's method then goes on by the "
+        f"proximal-point iteration: {solved} of the rigid bodies' problems to 1e-6"
     )
     return "; ".join(parts), why
 

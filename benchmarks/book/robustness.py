@@ -72,8 +72,8 @@ REMARKS = {
     "contact, recipe": (
         "Num4LCP's problems: blocks of a random positive definite matrix with the pattern of Stewart and Trinkle written over them. The "
         "book has no line for PGS. Its test x'|y| < 1e-3 accepts iterates whose natural residual is far from 0: y < 0 where x = 0 costs "
-        "nothing there. Newton on the minimum map often leads nowhere: its steps do not descend (non-descent), or are cut until the merit no "
-        "longer changes, which the book's relative test takes for an end; Num4LCP tests the descent first."
+        "nothing there. Newton on the minimum map often leads nowhere: its steps do not descend (non-descent), or are cut until the merit "
+        "no longer changes, which the book's relative test takes for an end; Num4LCP tests the descent first."
     ),
     "contact, recipe's matrix, planted": "The same matrices with a solution that is one, a quarter of it active, y = 0 on the others.",
     "contact, rigid bodies": "Impulses of random rigid bodies that touch: `warp_lcp.gallery.contact`. A = J M^-1 J' with its beta rows.",

@@ -16,7 +16,7 @@ CASES = {20: (0.5, 1.0, 2.0, 4.0, 8.0), 40: (0.5, 1.0, 2.0, 4.0)}  # aspects at 
 CONTROLLED = 2.0  # the aspect of the negative controls
 WIDENED = 0.2  # of the experiments' range
 STOPS, STAYS = 3.5, 0.5  # [sqrt(height / g)]: when a pile has stopped; [s] that it is watched then
-HIGH, MOST = 4.0, 1500  # aspect above which columns need more iterations a step than a scene allows them by itself, and how many
+HIGH, MOST = 80, 1500  # cells of height from which columns need more iterations a step than a scene allows by itself; how many
 CUBE = 48  # cells of the domain in 3-D
 
 
@@ -118,7 +118,7 @@ def collapse(aspect: float, cells: int, device: str = "cpu", *, length: float = 
         length: of the domain [widths]; by the experiments without one.
         tables: of the scene.
     """
-    more = {"solver": {"max_iterations": MOST}} if aspect > HIGH else {}
+    more = {"solver": {"max_iterations": MOST}} if aspect * cells >= HIGH else {}
     simulation = column(aspect, cells, length=length or 2.5 + 1.2 * envelope(aspect)[1], device=device, **(more | tables))
     stops = STOPS * math.sqrt(aspect * WIDTH / GRAVITY) + 0.2
     rows = list(steps(simulation, stops))
@@ -133,12 +133,12 @@ def collapse(aspect: float, cells: int, device: str = "cpu", *, length: float = 
 
 
 def cube(device: str = "cpu", cells: int = CUBE) -> Trial:
-    """Let a square column collapse in 3-D: it must stop, as a round pile."""
+    """Let a square column collapse in 3-D: it must stop, as a round pile that reaches as far as those of round columns do."""
 
     def run(found: Findings) -> None:
         size, width = 0.96, 0.28
-        low, high = 0.5 * (size - width), 0.5 * (size + width)
-        sand = {"shape": "box", "min": [low, 0.0, low], "max": [high, width, high]}
+        near, end = 0.5 * (size - width), 0.5 * (size + width)
+        sand = {"shape": "box", "min": [near, 0.0, near], "max": [end, width, end]}
         material = {"friction_angle": FRICTION_ANGLE, "angle_of": "triaxial-compression"}
         simulation = create(
             [size, 0.5 * size, size], cells, [sand], device=device, walls=math.tan(math.radians(FRICTION_ANGLE)), material=material,
@@ -152,7 +152,11 @@ def cube(device: str = "cpu", cells: int = CUBE) -> Trial:
         found.add("kinetic energy in the end over the largest", energies[-1] / max(energies), high=1e-3)
         found.add("steps with stresses to 1e-3", share_solved(rows), low=95.0, unit="%")
         found.add("|mean of exp(4 i angle)| of the 5 % farthest", float(np.abs(np.exp(1j * angle[far]).mean())), high=0.5)
-        found.add("99th percentile of |x| over half the width", float(np.percentile(np.abs(x), 99.0)) / (0.5 * width), low=1.2, high=3.0)
+        radius = width / math.sqrt(math.pi)  # of a round column of the same area
+        aspect = width / radius
+        low, high = (1.0 - WIDENED) * 1.6 * math.sqrt(aspect), (1.0 + WIDENED) * 2.0 * math.sqrt(aspect)  # [Lube2004], [Lajeunesse2004]
+        way = float(np.percentile(np.linalg.norm(x, axis=1), 99.0)) / radius - 1.0
+        found.add(f"a = {aspect:.2f}: runout", way, low=low, high=high, unit="radii")
         found.add("least dissipation of a step", min(row["dissipation"] for row in rows), low=0.0, unit="J")
 
     return attempt("sand collapse", f"3-D, {cells} cells", run)

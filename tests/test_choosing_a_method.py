@@ -1,0 +1,74 @@
+"""The page on choosing a method says what the code does: its list is the rules, its claims about matrices are tried out."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+import warp_lcp as wl
+from benchmarks.method_exponents import MATRICES, outcome
+from warp_lcp import reformulate
+from warp_lcp.recommend import RULES
+
+DOCS = Path(__file__).parents[1] / "docs"
+TEXT = (DOCS / "choosing-a-method.md").read_text()
+
+
+def section(title):
+    """The text under a heading."""
+    return re.search(rf"^## {re.escape(title)}.*?\n(.*?)(?=^## |\Z)", TEXT, flags=re.M | re.S).group(1)
+
+
+def table(title):
+    """First cells, without quotes, and the other cells of a section's table."""
+    rows = [[cell.strip() for cell in line.strip("| ").split("|")] for line in section(title).splitlines() if line.startswith("| ")]
+    return rows[0], {row[0].strip("`"): row[1:] for row in rows[1:]}
+
+
+def test_the_decision_list_is_the_rules():
+    lines = re.findall(r"^\d+\. (.*)$", section("The decision list"), flags=re.M)
+    assert lines == [f"{rule.when} {rule.why}: `{rule.method}`." for rule in RULES]
+
+
+def test_every_method_is_named_and_no_other():
+    named = set(re.findall(r"`([a-z]+(?:-[a-z]+)*)`", TEXT)) - {"accuracy", "budget"}
+    assert named == set(wl.METHODS)
+
+
+def test_costs_are_of_methods():
+    _, rows = table("Table 3.1")
+    assert set(rows) == set(wl.METHODS) - {"direct-enumeration"}
+    for dense, grid in rows.values():
+        assert all(cell == "-" or re.fullmatch(r"-?\d\.\d, -?\d\.\d \(\d+ steps, \d+ ms\)", cell) for cell in (dense, grid))
+
+
+HEADER, CLAIMS = table("Table 3.3")
+
+
+@pytest.mark.parametrize("name", CLAIMS)
+def test_claims_about_matrices_hold(name):
+    if name == "quadratic-program":
+        pytest.importorskip("piqp")
+    assert HEADER[1:] == list(MATRICES)
+    assert [outcome(name, make()) for make in MATRICES.values()] == CLAIMS[name]
+
+
+def test_all_dense_methods_have_claims():
+    assert set(CLAIMS) == set(wl.METHODS) - {"direct-enumeration", "projected-multigrid"}
+
+
+def test_reformulations_live_where_it_says():
+    named = set(re.findall(r"`reformulate\.(\w+)`", section("Table 3.4")))
+    public = {name for name in vars(reformulate) if re.fullmatch(r"\w+_to_\w+", name) and not name.startswith("_")}
+    assert named == public
+
+
+@pytest.mark.parametrize("code", re.findall(r"```python\n(.*?)```", TEXT, flags=re.S))
+def test_the_example_runs(code, capsys):
+    exec(compile(code, "choosing-a-method.md", "exec"), {})
+    assert capsys.readouterr().out.startswith("CONVERGED")
+
+
+def test_links_lead_somewhere():
+    for target in re.findall(r"\]\(([^)#]+)", TEXT):
+        assert (DOCS / target).exists(), target
