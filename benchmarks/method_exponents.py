@@ -40,7 +40,7 @@ def outcome(name: str, problem: Problem) -> str:
     """Return how a method ends on a problem: "solved", "refuses" or a status."""
     method = wl.METHODS[name]
     try:
-        result = wl.solve(problem.lcp(device="cpu"), method(), stopping=wl.StoppingCriteria(rtol=1e-6, **LIMITS))  # type: ignore[arg-type]
+        result = wl.solve(problem.lcp(device="cpu"), method(), stopping=wl.StoppingCriteria(rtol=1e-6, **LIMITS))
     except ValueError:
         return "refuses"
     return "solved" if result else result.status.name
