@@ -16,7 +16,9 @@ from warp_lcp.grid.staggered import CellRange
 
 DAMPED = 0.15  # of the pattern in a step
 
-DAMP = SHAPE + """
+DAMP = (
+    SHAPE
+    + """
     const unsigned char* flags = flags_.data + row; const float* from = from_.data + row; float* now = now_.data + row;
     const float* share[3] = {share_x.data + row, share_y.data + (DIM == 3 ? row : 0), share_z.data + (DIM == 3 ? row : 0)};
     for (int i = first; i < last; ++i) {
@@ -28,7 +30,8 @@ DAMP = SHAPE + """
             const float weight = (a ? -0.25f : 0.5f)*(b ? -0.25f : 0.5f)*(DIM == 2 ? 1.0f : c ? -0.25f : 0.5f);
             pattern += weight*from[o];
         }
-        for (int d = 0; d < SHEARS; ++d) for (int q = 0; q < 4; ++q) deep = deep && share[d][i + (q & 1)*s[ALPHA[d]] + (q >> 1)*s[BETA[d]]] > 0.0f;
+        for (int d = 0; d < SHEARS; ++d) for (int q = 0; q < 4; ++q)
+            deep = deep && share[d][i + (q & 1)*s[ALPHA[d]] + (q >> 1)*s[BETA[d]]] > 0.0f;
         const float by = (float)DAMPED*pattern;
         if (!deep || from[i] < by) continue;
         now[i] = from[i] - by;
@@ -36,6 +39,7 @@ DAMP = SHAPE + """
             now[(FIRST + 4*d + q)*layer + i] += (DIM == 3 ? 0.5f : 1.0f)*((q == 0 || q == 3) ? by : -by);
     }
 """
+)
 
 _F32, _U8, _STRESS = wp.array3d(dtype=wp.float32), wp.array3d(dtype=wp.uint8), wp.array4d(dtype=wp.float32)
 

@@ -63,14 +63,14 @@ class CoupledMethod(Protocol):
 class AcceleratedProjection:
     """Projected gradient steps on pressure and friction together, with momentum (Polyak's heavy ball).
 
-    Each step moves all stresses against their gradient, scaled by the problem's diagonal, and projects: x onto x >= 0, the friction onto the
-    yield set of the new x. Pressure and friction have momenta of their own, which grow where steps go on in one direction and fall where
-    they flutter: the friction's bound depends on the pressure but not the other way round, so that the problem has no energy to descend and
-    too much momentum makes it oscillate where sand is nearly rigid. No theorem promises convergence: the residual that is reported is
-    that of the stresses, recomputed in float64.
+    Each step moves all stresses against their gradient, scaled by the problem's diagonal, and projects: x onto x >= 0, the friction onto
+    the yield set of the new x. Pressure and friction have momenta of their own, which grow where steps go on in one direction and fall
+    where they flutter: the friction's bound depends on the pressure but not the other way round, so that the problem has no energy to
+    descend and too much momentum makes it oscillate where sand is nearly rigid. No theorem promises convergence: the residual that is
+    reported is that of the stresses, recomputed in float64.
 
-    With diagonals D_x and D_s of a full packing, steps are stable while c_x a_x + c_s a_s < 2 (1 + beta) / (1 + 2 lookahead beta), where a are
-    the steps and c = 2, 2 in 2-D, 2, 4 in 3-D (the largest eigenvalue on a periodic grid); the defaults take four fifths of that.
+    With diagonals D_x and D_s of a full packing, steps are stable while c_x a_x + c_s a_s < 2 (1 + beta) / (1 + 2 lookahead beta), where
+    a are the steps and c = 2, 2 in 2-D, 2, 4 in 3-D (the largest eigenvalue on a periodic grid); the defaults take four fifths of that.
 
     Args:
         pressure_step: relative to the diagonal.

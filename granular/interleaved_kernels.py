@@ -14,11 +14,15 @@ from granular.yield_set import FLUX, SHAPE, WALL_FACE, YIELD, native
 
 APART = 3  # cells along an axis, so that two threads change no velocity in common
 
-PRESSURE = SHAPE + FLUX + """
+PRESSURE = (
+    SHAPE
+    + FLUX
+    + """
     const long long c = row + i;
     float* x = now_.data + c;
     if (!(flags_.data[c] & HOLDS)) return;
-    const float* mass[3] = {mass_x.data, mass_y.data, mass_z.data}; const float* inverse[3] = {inverse_x.data, inverse_y.data, inverse_z.data};
+    const float* mass[3] = {mass_x.data, mass_y.data, mass_z.data};
+    const float* inverse[3] = {inverse_x.data, inverse_y.data, inverse_z.data};
     T* u[3] = {u_x.data, u_y.data, u_z.data};
     T w = (T)drive_.data[c], diagonal = 0;
     const T full = fullness(w*(T)numbers.data[STEP_OF_CELL]);
@@ -37,6 +41,7 @@ PRESSURE = SHAPE + FLUX + """
         u[axis][c] -= (T)inverse[axis][c]*by;
     }
 """
+)
 
 EDGES = """
     const float* inverse[3] = {inverse_x.data, inverse_y.data, inverse_z.data};
@@ -57,11 +62,16 @@ EDGES = """
     };
 """
 
-CELL = SHAPE + YIELD + EDGES + """
+CELL = (
+    SHAPE
+    + YIELD
+    + EDGES
+    + """
     const long long c = row + i;
     if (!(flags_.data[c] & SHEARS_HERE) || !(stiff_.data[c] > 0.0f)) return;
     float* now = now_.data + c;
-    const T x = (T)now[0], radius = larger((T)numbers.data[FRICTION]*x + (T)numbers.data[COHESION], (T)0), r = larger(radius, (T)LEAST_RADIUS);
+    const T x = (T)now[0], radius = larger((T)numbers.data[FRICTION]*x + (T)numbers.data[COHESION], (T)0);
+    const T r = larger(radius, (T)LEAST_RADIUS);
     T e[3] = {0, 0, 0}, mean = 0, diagonal = 0;
     for (int axis = 0; axis < DIM; ++axis) {
         e[axis] = u[axis][c + s[axis]] - u[axis][c]; mean += e[axis]/(T)DIM;
@@ -103,8 +113,13 @@ CELL = SHAPE + YIELD + EDGES + """
         shear(d, at[d][q], by);
     }
 """
+)
 
-WALL = SHAPE.replace(", row = k*s[2] + j*s[1]", "") + EDGES + WALL_FACE + """
+WALL = (
+    SHAPE.replace(", row = k*s[2] + j*s[1]", "")
+    + EDGES
+    + WALL_FACE
+    + """
     for (int entry = 0; entry < cells.shape[0]; ++entry) {
         const long long cell = cells.data[entry];
         if (!(flags_.data[cell] & HOLDS)) continue;
@@ -117,6 +132,7 @@ WALL = SHAPE.replace(", row = k*s[2] + j*s[1]", "") + EDGES + WALL_FACE + """
             });
     }
 """
+)
 
 _F32, _U8 = wp.array3d(dtype=wp.float32), wp.array3d(dtype=wp.uint8)
 _STRESS = wp.array4d(dtype=wp.float32)

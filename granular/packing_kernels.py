@@ -96,10 +96,11 @@ def face_kernel(
 ):  # fmt: skip
     """Mass of a face in units of a full one, its inverse, and the velocity that the stress acts on.
 
-    A face beside a solid cannot be moved: inverse 0. Its mass is the fraction of the open cell where the solid moves (it sweeps sand along),
-    and its velocity the solid's. A face of no mass stays out of it: 0 in all three. A cell that is filled less than the surface has no
-    pressure: a face between it and one that has bears all of it, not half. Else half of it would weigh on nothing, the pressure and thus
-    the friction below would be too small by what lies in it, and the uppermost row would slide off slopes that it should rest on.
+    A face beside a solid cannot be moved: inverse 0. Its mass is the fraction of the open cell where the solid moves (it sweeps sand
+    along), and its velocity the solid's. A face of no mass stays out of it: 0 in all three. A cell that is filled less than the surface
+    has no pressure: a face between it and one that has bears all of it, not half. Else half of it would weigh on nothing, the pressure
+    and thus the friction below would be too small by what lies in it, and the uppermost row would slide off slopes that it should rest
+    on.
     """
     plane, row, chunk = wp.tid()
     k = cells.k + plane

@@ -12,9 +12,14 @@ from warp_lcp.grid.staggered import CellRange
 from warp_lcp.operators.grid_poisson import SOLID
 
 RATIO_YIELDS = 0.99  # of the bound, from which a cell counts as yielded
-REPORT_COLUMNS = 4  # of a row's sums: cells that carry shear, yielded ones, dissipation, largest fraction that the pressure's solution predicts
+REPORT_COLUMNS = (
+    4  # of a row's sums: cells that carry shear, yielded ones, dissipation, largest fraction that the pressure's solution predicts
+)
 
-REPORT = SHAPE + FLUX + """
+REPORT = (
+    SHAPE
+    + FLUX
+    + """
     const unsigned char* flags = flags_.data + row; const float* now = now_.data + row; const float* drive = drive_.data + row;
     const float* share[3] = {share_x.data + row, share_y.data + (DIM == 3 ? row : 0), share_z.data + (DIM == 3 ? row : 0)};
     const double* rate[3] = {b_x.data + row, b_y.data + (DIM == 3 ? row : 0), b_z.data + (DIM == 3 ? row : 0)};
@@ -51,6 +56,7 @@ REPORT = SHAPE + FLUX + """
     const long long rows = sums_.shape[0]/REPORT_COLUMNS, at = k*(long long)flags_.shape[1] + j;
     sums_.data[at] = cells; sums_.data[rows + at] = yielded; sums_.data[2*rows + at] = taken; sums_.data[3*rows + at] = most;
 """
+)
 
 _F32, _F64, _U8 = (wp.array3d(dtype=t) for t in (wp.float32, wp.float64, wp.uint8))
 _STRESS = wp.array4d(dtype=wp.float32)

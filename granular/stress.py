@@ -110,9 +110,9 @@ class Stress:
 
         0 <= x  complementary to  w = (1 - phi) dx / dt + div(m' u) >= 0,   s = the nearest point of the yield set of x to s + r E u,
 
-    for any r > 0, m' = m in loose cells and 1 in full ones [Narain, Golas & Lin 2010; Daviet & Bertails-Descoubes 2016]: sand is never denser than 1, and friction takes as much
-    energy as it can. In a cell |n|^2 / 2 + sum over shears of max_q b_q^2 <= (k x + cohesion)^2. On a face of a solid the shear
-    stress is within mu times the normal load (Coulomb).
+    for any r > 0, m' = m in loose cells and 1 in full ones [Narain, Golas & Lin 2010; Daviet & Bertails-Descoubes 2016]: sand is never
+    denser than 1, and friction takes as much energy as it can. In a cell |n|^2 / 2 + sum over shears of max_q b_q^2 <= (k x + cohesion)^2.
+    On a face of a solid the shear stress is within mu times the normal load (Coulomb).
 
     Args:
         packing: where sand is.
@@ -164,7 +164,9 @@ class Stress:
             dt: time step [s].
             decay: factor of the last stresses; less than 1 damps patterns that exert no force.
         """
-        self._host = np.array([bound.k, bound.cohesion, bound.tension, *(gravity * dt), 1.0, 1.0, 0.0, dt / self.packing.grid.spacing], dtype=np.float32)
+        self._host = np.array(
+            [bound.k, bound.cohesion, bound.tension, *(gravity * dt), 1.0, 1.0, 0.0, dt / self.packing.grid.spacing], dtype=np.float32
+        )
         self.numbers.assign(self._host)
         p = self.packing
         flags = p.flags.numpy()

@@ -12,7 +12,6 @@ import warp as wp
 from granular.yield_set import COLUMNS, FLUX, SHAPE, WALL_FACE, YIELD, native
 from warp_lcp.grid.staggered import CellRange
 
-
 # The momentum's state: steps done; the most of it for pressure and friction; that of this step; that of the next; estimates of the natural
 # residuals over the last PERIOD steps; sums over these.
 COUNT, BETA_X, NOW_X, NOW_S, NEXT_X, NEXT_S, RESIDUAL_X, SUMS, STATE = 0, 1, 3, 4, 5, 6, 7, 9, 17
@@ -28,7 +27,10 @@ SPAN = """
 """
 
 # The shear of an edge: the mean of its copies.
-EDGE_STRESS = SPAN + SHAPE + """
+EDGE_STRESS = (
+    SPAN
+    + SHAPE
+    + """
     const float* y = y_.data + FIRST*layer;
     const float* share[3] = {share_x.data + row, share_y.data + (DIM == 3 ? row : 0), share_z.data + (DIM == 3 ? row : 0)};
     T* out[3] = {b_x.data + row, b_y.data + (DIM == 3 ? row : 0), b_z.data + (DIM == 3 ? row : 0)};
@@ -43,9 +45,13 @@ EDGE_STRESS = SPAN + SHAPE + """
         }
     }
 """
+)
 
 # The velocity that a stress leaves: u = u* + (div sigma) / mass, sigma = -x + s.
-FACE_VELOCITY = SPAN + SHAPE + """
+FACE_VELOCITY = (
+    SPAN
+    + SHAPE
+    + """
     const float* y = y_.data + row;
     const T* b[3] = {b_x.data + row, b_y.data + (DIM == 3 ? row : 0), b_z.data + (DIM == 3 ? row : 0)};
     const float* start[3] = {start_x.data + row, start_y.data + row, start_z.data + (DIM == 3 ? row : 0)};
@@ -68,9 +74,13 @@ FACE_VELOCITY = SPAN + SHAPE + """
         }
     }
 """
+)
 
 # Twice the shear rate of an edge, times dx.
-EDGE_STRAIN = SPAN + SHAPE + """
+EDGE_STRAIN = (
+    SPAN
+    + SHAPE
+    + """
     const T* u[3] = {u_x.data + row, u_y.data + row, u_z.data + (DIM == 3 ? row : 0)};
     T* out[3] = {b_x.data + row, b_y.data + (DIM == 3 ? row : 0), b_z.data + (DIM == 3 ? row : 0)};
     for (int d = 0; d < SHEARS; ++d) {
@@ -79,18 +89,25 @@ EDGE_STRAIN = SPAN + SHAPE + """
         SIMD for (int i = first; i < last; ++i) rate[i] = (ua[i] - ua[i - sb]) + (ub[i] - ub[i - sa]);
     }
 """
+)
 
 # One projected step of every cell that holds sand, with momentum: from y = x + beta (x - x_before) against the gradient over the diagonal,
 # onto x >= floor, and onto the yield set of the new x. `point` becomes where the next gradient is taken, x + lookahead beta (x - x_before).
 # Sums, of pressure (0, 1, 2) and of friction (3, 4, 5), in the metric of the diagonal: <e, s>, <e, e>, <s, s> with the error of the
 # projection e = x_new - y and the step s = x_new - x; 6, 7: estimates of the squared natural residuals of both.
 # RESIDUAL: from the stresses themselves with step 1, nothing is changed; sums 0 and 1 are the squared natural residuals.
-CELLS = """
+CELLS = (
+    """
     const long long thread = (k*(long long)flags_.shape[1] + j)*chunks + chunk;
     double* partial = partials.data;
     const long long columns = partials.shape[0]/COLUMNS;
     for (int c = 0; c < COLUMNS; ++c) partial[c*columns + thread] = 0;
-""" + SPAN + SHAPE + FLUX + YIELD + """
+"""
+    + SPAN
+    + SHAPE
+    + FLUX
+    + YIELD
+    + """
     const unsigned char* flags = flags_.data + row;
     float* now = now_.data + row; float* before = before_.data + row; float* point = point_.data + row;
     const float* drive = drive_.data + row; const float* stiff = stiff_.data + row;
@@ -130,7 +147,10 @@ CELLS = """
         const T soft = stiff[i] > 0.0f ? stress_step/(T)stiff[i] : (T)0;
         T n[NORMALS], normal2 = 0;
         if (DIM == 2) { n[0] = start(1, i, beta_s) + soft*(e[0] - e[1]); normal2 = n[0]*n[0]; }
-        else UNROLL for (int c = 0; c < NORMALS; ++c) { n[c] = start(1 + c, i, beta_s) + (T)2*soft*(e[c] - mean); normal2 += (T)0.5*n[c]*n[c]; }
+        else UNROLL for (int c = 0; c < NORMALS; ++c) {
+            n[c] = start(1 + c, i, beta_s) + (T)2*soft*(e[c] - mean);
+            normal2 += (T)0.5*n[c]*n[c];
+        }
         T b[SHEARS][4], largest[SHEARS][4], cap[SHEARS];
         UNROLL for (int d = 0; d < SHEARS; ++d) {
             T m[4];
@@ -173,9 +193,13 @@ CELLS = """
     const T found[COLUMNS] = {x_es, x_ee, x_ss, s_es, s_ee, s_ss, x_residual, s_residual};
     for (int c = 0; c < COLUMNS; ++c) partial[c*columns + thread] = found[c];
 """
+)
 
 # The same for wall faces: a step of their copies, after that of the cells.
-WALLS = SHAPE.replace(", row = k*s[2] + j*s[1]", "") + WALL_FACE + """
+WALLS = (
+    SHAPE.replace(", row = k*s[2] + j*s[1]", "")
+    + WALL_FACE
+    + """
     double es = 0, ee = 0, ss = 0, residual = 0;
     const float* inverse[3] = {inverse_x.data, inverse_y.data, inverse_z.data};
     const T* rates[3] = {b_x.data, b_y.data, b_z.data};
@@ -205,9 +229,12 @@ WALLS = SHAPE.replace(", row = k*s[2] + j*s[1]", "") + WALL_FACE + """
     const double found[COLUMNS] = {RESIDUAL ? residual : 0, 0, 0, es, ee, ss, 0, residual};
     for (int c = 0; c < COLUMNS; ++c) partials.data[c*columns + chunk] = found[c];
 """
+)
 
 # What of the last stresses has a place now: pressure where there is sand, shear where a cell carries it, copies where they have a share.
-ADMIT = SHAPE + """
+ADMIT = (
+    SHAPE
+    + """
     const unsigned char* flags = flags_.data + row; const float* stiff = stiff_.data + row;
     const float* share[3] = {share_x.data + row, share_y.data + (DIM == 3 ? row : 0), share_z.data + (DIM == 3 ? row : 0)};
     float* now = now_.data + row; float* before = before_.data + row; float* point = point_.data + row;
@@ -223,6 +250,7 @@ ADMIT = SHAPE + """
         }
     }
 """
+)
 
 _F32, _F64, _U8 = (wp.array3d(dtype=t) for t in (wp.float32, wp.float64, wp.uint8))
 _STRESS, _SPANS = wp.array4d(dtype=wp.float32), wp.array3d(dtype=wp.int32)
@@ -280,9 +308,7 @@ def stress_kernels(dimension: int, real, residual: bool, box: bool) -> SimpleNam
     ): ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module=name)
-    def edge_strain(
-        cells: CellRange, spans: _SPANS, share_x: _F32, u_x: field, u_y: field, u_z: field, b_x: field, b_y: field, b_z: field
-    ):
+    def edge_strain(cells: CellRange, spans: _SPANS, share_x: _F32, u_x: field, u_y: field, u_z: field, b_x: field, b_y: field, b_z: field):
         plane, row, chunk = wp.tid()
         first = cells.i + chunk * cells.grain
         last = wp.min(first + cells.grain, cells.end)
@@ -316,7 +342,8 @@ def stress_kernels(dimension: int, real, residual: bool, box: bool) -> SimpleNam
 
     @wp.func_native(source(ADMIT))
     def admit_row(
-        flags_: _U8, stiff_: _F32, share_x: _F32, share_y: _F32, share_z: _F32, ratio: float, now_: _STRESS, before_: _STRESS, point_: _STRESS,
+        flags_: _U8, stiff_: _F32, share_x: _F32, share_y: _F32, share_z: _F32, ratio: float,
+        now_: _STRESS, before_: _STRESS, point_: _STRESS,
         k: int, j: int, first: int, last: int,
     ): ...  # fmt: skip
 
@@ -333,7 +360,8 @@ def stress_kernels(dimension: int, real, residual: bool, box: bool) -> SimpleNam
     @wp.func_native(source(WALLS))
     def wall_entries(
         cells: wp.array(dtype=wp.int32), sides: wp.array(dtype=wp.uint8), walls: wp.array(dtype=wp.int32),
-        friction: wp.array(dtype=wp.float32), active: wp.array(dtype=wp.int32), fraction_: _F32, now_: _STRESS, before_: _STRESS, point_: _STRESS,
+        friction: wp.array(dtype=wp.float32), active: wp.array(dtype=wp.int32), fraction_: _F32,
+        now_: _STRESS, before_: _STRESS, point_: _STRESS,
         share_x: _F32, share_y: _F32, share_z: _F32, b_x: field, b_y: field, b_z: field,
         inverse_x: _F32, inverse_y: _F32, inverse_z: _F32, momentum: wp.array(dtype=wp.float64), numbers: wp.array(dtype=wp.float32),
         partials: wp.array(dtype=wp.float64), chunk: int, first: int, last: int,
@@ -342,7 +370,8 @@ def stress_kernels(dimension: int, real, residual: bool, box: bool) -> SimpleNam
     @wp.kernel(enable_backward=False, module=name)
     def wall(
         grain: int, cells: wp.array(dtype=wp.int32), sides: wp.array(dtype=wp.uint8), walls: wp.array(dtype=wp.int32),
-        friction: wp.array(dtype=wp.float32), active: wp.array(dtype=wp.int32), fraction: _F32, now: _STRESS, before: _STRESS, point: _STRESS,
+        friction: wp.array(dtype=wp.float32), active: wp.array(dtype=wp.int32), fraction: _F32,
+        now: _STRESS, before: _STRESS, point: _STRESS,
         share_x: _F32, share_y: _F32, share_z: _F32, b_x: field, b_y: field, b_z: field,
         inverse_x: _F32, inverse_y: _F32, inverse_z: _F32, momentum: wp.array(dtype=wp.float64), numbers: wp.array(dtype=wp.float32),
         partials: wp.array(dtype=wp.float64),

@@ -28,7 +28,8 @@ LEAST_RADIUS = 1e-30  # [m/s], of a yield set that holds only zero
 
 CONSTANTS = {
     "NEWTON": NEWTON, "COLUMNS": COLUMNS, "LEAST_RADIUS": LEAST_RADIUS, "FRICTION": FRICTION, "COHESION": COHESION,
-    "TENSION": TENSION, "WEIGHT": WEIGHT, "PRESSURE_STEP": PRESSURE_STEP, "SHEAR_STEP": SHEAR_STEP, "LOOKAHEAD": LOOKAHEAD, "HOLDS": HOLDS, "SHEARS_HERE": SHEARS_HERE, "FIRM": FIRM, "STEP_OF_CELL": STEP_OF_CELL, "NEARLY": NEARLY,
+    "TENSION": TENSION, "WEIGHT": WEIGHT, "PRESSURE_STEP": PRESSURE_STEP, "SHEAR_STEP": SHEAR_STEP, "LOOKAHEAD": LOOKAHEAD,
+    "HOLDS": HOLDS, "SHEARS_HERE": SHEARS_HERE, "FIRM": FIRM, "STEP_OF_CELL": STEP_OF_CELL, "NEARLY": NEARLY,
 }  # fmt: skip
 
 SHAPE = """
@@ -97,9 +98,9 @@ YIELD = """
 """
 
 # Coulomb friction on a wall face of a cell: the copies on its edges, two of each shear, within mu times the normal load, in the metric
-# sum b_q^2 / 2. The load is that of the face: x - n and the weight of the half cell before it, or of all of it where there is no pressure.
-# `rate` and `light` tell an edge's rate of shear and the sum of 1 / mass around it; `from` tells where a copy's step starts, `store` gets its
-# new value and the face's diagonal.
+# sum b_q^2 / 2. The load is that of the face: x - n and the weight of the half cell before it, or of all of it where there is no
+# pressure. `rate` and `light` tell an edge's rate of shear and the sum of 1 / mass around it; `from` tells where a copy's step starts,
+# `store` gets its new value and the face's diagonal.
 WALL_FACE = """
     const float* shares[3] = {share_x.data, share_y.data, share_z.data};
     auto face = [&](int entry, auto from, const float* now, const float* weight, T omega, auto light, auto rate, auto store) {
