@@ -71,7 +71,7 @@ class Friction(Table):
 
     model: Literal["cone", "box"] = Field(
         default="cone",
-        description="cone: alike in all directions; box: that of Narain et al. 2010, cheaper, but layers flow where they should rest",
+        description="cone: alike in all directions; box: that of Narain et al. 2010, whose layers flow where they should rest",
     )
 
 
