@@ -109,7 +109,8 @@ def _linear(found: Mapping[str, Record]) -> tuple[str, str]:
     here = ", ".join(f"{m} {_text(_value(found, f'cost: grid: {m}', 'solve exponent'))}" for m in methods)
     return (
         f"exponents to 1e-6 on grids: {here}",
-        "no Jacobian is assembled and multigrid preconditions; over 1: likely the caches, which the largest grid leaves, and InteriorPoint takes more steps",
+        "no Jacobian is assembled and multigrid preconditions; over 1: likely the caches, which the largest grid leaves, and InteriorPoint "
+        "takes more steps",
     )
 
 
