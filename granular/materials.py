@@ -52,7 +52,7 @@ def compression_slope(angle: float) -> float:
 
     Derived from |s|_F = sqrt(2/3) q and q = 6 sin / (3 - sin) p, where q is the difference of the principal stresses.
 
-    >>> round(compression_slope(22.208), 3)
+    >>> round(compression_slope(22.23), 3)
     0.5
     """
     sine = math.sin(math.radians(angle))

@@ -83,12 +83,3 @@ def test_the_mass_does_not_depend_on_the_sampling(per_axis: int) -> None:
     row = simulation.step(0.001)
     assert row["particles"] == 8 * 4 * per_axis**2
     assert row["mass"] == pytest.approx(500.0 * 0.5 * 0.25)
-
-
-def test_sand_is_refused_for_now() -> None:
-    import granular
-
-    assert granular.SIMULATOR.name == "granular"
-    assert granular.SIMULATOR.scene_model is Scene
-    with pytest.raises(ValueError, match="granular is not available yet in this version"):
-        granular.SIMULATOR.create(small(), device="cpu", folder=Path())
