@@ -1,0 +1,74 @@
+"""What friction takes, and the pattern that takes nothing, against the forces on the faces."""
+
+import numpy as np
+import pytest
+import warp as wp
+from test_sand_stress import Case, make, velocity
+
+from granular.checkerboard import DAMPED, damping_kernel
+from granular.packing import Packing
+from granular.report import Outcome
+from granular.stress import Stress, Walls, YieldSet
+from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.operators.grid_poisson import SOLID
+
+
+def without_trace(case: Case) -> np.ndarray:
+    """Return the stresses with a deviator that is one: normal parts that add up to 0 (in 2-D they do by themselves)."""
+    now = case.stress.now.numpy()
+    if case.dimension == 3:
+        now[1:4] -= now[1:4].mean(axis=0)
+    return now
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("seed", [11, 12])
+def test_dissipation_is_the_power_of_friction(dimension: int, seed: int) -> None:
+    """Sum of s : grad u = - sum over faces of u . div s: a wrong sign, axis or weight in either would part them."""
+    case = make(dimension, seed)
+    now = without_trace(case)
+    case.stress.now.assign(now)
+    case.stress.residual()
+    found = Outcome(case.stress).report().dissipation
+    u = velocity(case)
+    friction = now.copy()
+    friction[0] = 0.0
+    case.stress.now.assign(friction)
+    power = 0.0
+    for axis, moved in enumerate(velocity(case)):
+        inverse = case.field("inverse")[axis]
+        on = inverse > 0.0
+        force = (moved - case.field("start")[axis])[on] / inverse[on]
+        power -= float(u[axis][on] @ force)
+    assert abs(power) > 1e-2
+    assert found == pytest.approx(power, rel=1e-4)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_checkerboard_that_is_damped_moves_nothing(dimension: int) -> None:
+    """Taking the pattern from the pressure and giving it to the shears leaves the velocity of faces amid sand: other signs would not."""
+    grid = StaggeredGrid((10, 10, 10 if dimension == 3 else 1), 0.1, dimension)
+    index = np.zeros(grid.shape, dtype=np.int32)
+    index[1:-1, 1:-1, 1:-1] = -1
+    base = wp.array(np.where(index >= 0, SOLID, 0).astype(np.int8), dtype=wp.int8, device=grid.device)
+    one = wp.full(grid.shape, 1.0, dtype=wp.float32, device=grid.device)
+    packing = Packing(grid, base, one)
+    packing.update(one, grid.faces(), 0.01)
+    stress = Stress(packing, Walls(grid, index, [0.0]))
+    k, j, i = np.indices(grid.shape)
+    checkers = (-1.0) ** (i + j + (k if dimension == 3 else 0))
+    start = np.zeros(stress.now.shape, dtype=np.float32)
+    start[0] = (index < 0) * (5.0 + 0.5 * checkers)
+    stress.begin(YieldSet(0.5), np.zeros(3), 0.01)
+    stress.now.assign(start)
+    stress.residual()
+    before = [field.numpy().copy() for field in stress.checked.u]
+    shares = [*packing.share, None, None][:3]
+    grid.domain.launch(damping_kernel(dimension), [packing.flags, *shares, wp.clone(stress.now), stress.now])
+    stress.residual()
+    deep = (slice(5, 7) if dimension == 3 else slice(1, 2), slice(5, 7), slice(5, 7))
+    taken = start[0][deep] - stress.now.numpy()[0][deep]
+    np.testing.assert_allclose(taken, DAMPED * 0.5 * checkers[deep], rtol=1e-4)
+    for old, field in zip(before, stress.checked.u, strict=True):
+        assert np.abs(old[deep]).max() > 0.9  # the checkerboard pushes each face by twice its height
+        np.testing.assert_allclose(field.numpy()[deep], old[deep], atol=1e-5)
