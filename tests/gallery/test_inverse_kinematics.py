@@ -112,7 +112,7 @@ def agree(counts, count, share=0.95):
     assert max(c.overshoot for c in parts) <= OUTSIDE
     assert sum(c.grew for c in parts) == 0
     assert sum(c.same for c in parts) >= share * count
-    assert sum(c.converged for c in parts) >= 0.98 * count
+    assert sum(c.converged for c in parts) >= 0.95 * count
 
 
 def test_random_targets_beside_scipy():
@@ -125,7 +125,7 @@ def test_random_targets_beside_scipy():
 @pytest.mark.slow
 def test_a_thousand_random_targets_beside_scipy():
     for model, counts in compare(1000, MODELS).items():
-        agree(counts, 1000, 0.95 if model == "Gauss-Newton" else 0.9)
+        agree(counts, 1000, 0.95 if model == "Gauss-Newton" else 0.94)
 
 
 def test_the_price_of_damping():
