@@ -15,7 +15,7 @@ from fluids.scene import LiquidScene
 from warp_lcp.driver.particle_assembly import make_boundary, make_outlets, make_particles, make_sources
 from warp_lcp.driver.particle_simulation import ParticleSimulation, Row
 from warp_lcp.driver.scene import Scene
-from warp_lcp.driver.simulator import Cells, Points, SimulationFailed, StepFailed
+from warp_lcp.driver.simulator import Cells, Part, SimulationFailed, StepFailed
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary
@@ -98,7 +98,7 @@ class LiquidSimulation(ParticleSimulation):
         """
         return "active", "max_divergence", "volume"
 
-    def frame(self) -> list[Points | Cells]:
+    def frame(self) -> list[Part]:
         """Return the particles (velocity, speed) and the liquid's cells of the last solve (pressure [Pa], wall and released flags)."""
         cells = self.projection.fluid_cells()
         at = tuple(cells.T)

@@ -19,7 +19,7 @@ from granular.stress import Stress, YieldSet
 from warp_lcp.driver.particle_assembly import make_boundary, make_outlets, make_particles, make_sources, placed_solids
 from warp_lcp.driver.particle_simulation import ParticleSimulation, Row
 from warp_lcp.driver.scene import Scene
-from warp_lcp.driver.simulator import Cells, Points, SimulationFailed
+from warp_lcp.driver.simulator import Cells, Part, SimulationFailed
 from warp_lcp.grid.level_set import particle_density
 from warp_lcp.grid.particles import Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
@@ -170,7 +170,7 @@ class SandSimulation(ParticleSimulation):
         """
         return (*COLUMNS, "flow_rate") if self.scene.gauge or self.scene.drain or self.scene.domain.open else COLUMNS
 
-    def frame(self) -> list[Points | Cells]:
+    def frame(self) -> list[Part]:
         """Return the particles and the cells that hold sand, with fraction of grains, pressure [Pa] and yield ratio of the last solve."""
         grid, points = self.grid, self.points()
         fields = {

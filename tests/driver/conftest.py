@@ -10,7 +10,7 @@ import pytest
 
 from warp_lcp.driver import simulator as plug_ins
 from warp_lcp.driver.scene import Scene
-from warp_lcp.driver.simulator import Cells, Points
+from warp_lcp.driver.simulator import Cells, Part, Points
 
 MINIMAL = """
 [scene]
@@ -55,7 +55,7 @@ class Dots:
     def columns(self) -> tuple[str, ...]:
         return ("max_speed", "solve_status", "volume")
 
-    def frame(self) -> list[Points | Cells]:
+    def frame(self) -> list[Part]:
         points = np.column_stack([self.position, np.zeros(len(self.position))]).astype(np.float32)
         index = np.unique(np.clip(points * 8, 0, 7).astype(np.int32), axis=0)
         return [

@@ -15,14 +15,14 @@ import numpy as np
 
 from warp_lcp.driver.atomic import replacing, write_text
 from warp_lcp.driver.profile import NoStopwatch, Stopwatch
-from warp_lcp.driver.simulator import Cells, Points
+from warp_lcp.driver.simulator import Cells, Part, Points, Surface
 
 FRAME_FILE = re.compile(r"(?P<name>[a-z][a-z_]*)_(?P<index>\d{6,})\.vtu")
 
 # Corners of a cell in VTK's order for quadrilaterals (the first four) and hexahedra, as x, y, z.
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
 BASE64 = 4 / 3  # what the encoding adds to the bytes
-VTK_TYPES = {1: 1, 4: 9, 8: 12}  # vertex, quadrilateral and hexahedron by their corners
+VTK_TYPES = {1: 1, 2: 3, 3: 5, 4: 9, 8: 12}  # vertex, line, triangle, quadrilateral and hexahedron by their corners
 WAITING = 2  # frames in memory, the one being written included
 
 
@@ -35,7 +35,7 @@ class FrameFolder:
         self.frames = folder / "frames"
         self._times: dict[str, list[tuple[float, str]]] = {}
 
-    def write(self, index: int, time: float, frame: list[Points | Cells]) -> list[Path]:
+    def write(self, index: int, time: float, frame: list[Part]) -> list[Path]:
         """Write a frame and add it to the collections.
 
         Args:
@@ -99,7 +99,7 @@ class FrameWriter:
         self._failed = False
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="frames")
 
-    def put(self, index: int, time: float, frame: list[Points | Cells]) -> None:
+    def put(self, index: int, time: float, frame: list[Part]) -> None:
         """Hand over a frame, whose arrays nobody changes any more; wait if there are too many already.
 
         Raises:
@@ -142,7 +142,7 @@ class FrameWriter:
         self._pending[0].result()
         self._pending.popleft()
 
-    def _write(self, index: int, time: float, frame: list[Points | Cells]) -> None:
+    def _write(self, index: int, time: float, frame: list[Part]) -> None:
         if self._failed:  # a run that ends at this frame must not leave a later one
             return
         self._failed = True
@@ -152,12 +152,12 @@ class FrameWriter:
         self._failed, self.newest = False, index
 
 
-def write_vtu(path: Path, part: Points | Cells) -> None:
+def write_vtu(path: Path, part: Part) -> None:
     """Write a part of a frame as a VTU file: binary, uncompressed (compression takes three times as long as writing), atomically.
 
     Args:
         path: the file.
-        part: points become vertices; cells become quadrilaterals or hexahedra that share their corners.
+        part: points become vertices, surfaces triangles or lines; cells become quadrilaterals or hexahedra that share their corners.
 
     Raises:
         OSError: the file cannot be written.
@@ -167,19 +167,23 @@ def write_vtu(path: Path, part: Points | Cells) -> None:
     fields = {name: _writable(name, values, size) for name, values in part.fields.items()}
     if isinstance(part, Points):
         points, corners = _writable("points", part.points, size), np.arange(size, dtype=np.int32)[:, None]
+    elif isinstance(part, Surface):
+        points, corners = _writable("points", part.points, size), part.corners.astype(np.int32, copy=False)
     else:
         points, corners = _corners(part)
     with replacing(path) as temporary, open(temporary, "wb") as file:
-        file.writelines(_vtu(points, corners, fields, "PointData" if isinstance(part, Points) else "CellData"))
+        file.writelines(_vtu(points, corners, fields, "CellData" if isinstance(part, Cells) else "PointData"))
 
 
-def frame_bytes(frame: list[Points | Cells]) -> int:
+def frame_bytes(frame: list[Part]) -> int:
     """Return about how many bytes the files of a frame take; no less for points, a little more for cells that share corners."""
     total = 0.0
     for part in frame:
         fields = sum(values.nbytes for values in part.fields.values())
         if isinstance(part, Points):
             total += fields + part.points.nbytes + len(part.points) * (4 + 4 + 8)  # connectivity, offset, type
+        elif isinstance(part, Surface):
+            total += fields + part.points.nbytes + len(part.corners) * (4 * part.corners.shape[1] + 4 + 8)
         else:
             corners = 2**part.dimension
             total += fields + len(part.index) * (4 * corners + 4 + 8 + 2 * 12)  # and about two corner points a cell
@@ -194,8 +198,8 @@ def collection(entries: list[tuple[float, str]]) -> str:
     return "\n".join([*head, *lines, "  </Collection>", "</VTKFile>", ""])
 
 
-def _size(part: Points | Cells) -> int:
-    return len(part.points if isinstance(part, Points) else part.index)
+def _size(part: Part) -> int:
+    return len(part.index if isinstance(part, Cells) else part.points)
 
 
 def _writable(name: str, values: np.ndarray, size: int) -> np.ndarray:

@@ -18,7 +18,19 @@ from warp_lcp.driver.profile import NoStopwatch, Profile, Stopwatch
 from warp_lcp.driver.progress import Observer
 from warp_lcp.driver.run_folder import Continuation, OutputError, RunFolder, RunRecord
 from warp_lcp.driver.scene import Scene, Time
-from warp_lcp.driver.simulator import Cells, Points, Profiled, Recorded, Resampled, Simulation, SimulationFailed, StepFailed, simulators
+from warp_lcp.driver.simulator import (
+    Cells,
+    Part,
+    Points,
+    Profiled,
+    Recorded,
+    Resampled,
+    Simulation,
+    SimulationFailed,
+    StepFailed,
+    Surface,
+    simulators,
+)
 from warp_lcp.driver.table import Problem, SceneError
 
 RETRIES = 6  # halvings of dt: a step 64 times shorter that still fails has another cause than its length
@@ -179,13 +191,13 @@ class _Run:
                 self._try_to(self._write_profile)
         return self.record
 
-    def _check_space(self, last: int, frame: list[Points | Cells]) -> None:
+    def _check_space(self, last: int, frame: list[Part]) -> None:
         frames = max(0, last - self._frames_done() + 1)
         state = sum(array.nbytes for array in self.simulation.state().values())
         states = self.output.checkpoints_kept + 1  # the one being written too
         self.folder.check_space(int(SPACE_MARGIN * (frame_bytes(frame) * frames + states * state)))
 
-    def _start(self, last: int, frame: list[Points | Cells]) -> Log:
+    def _start(self, last: int, frame: list[Part]) -> Log:
         """Write what there is before the first step."""
         self.folder.start(self.record)
         log = Log(self.folder.log, self._columns())
@@ -269,13 +281,13 @@ class _Run:
             frame += 1
         return frame
 
-    def _frame(self) -> list[Points | Cells]:
+    def _frame(self) -> list[Part]:
         """Return what the scene wants to see of the simulation now."""
-        wanted = {Points: self.output.particles, Cells: self.output.grid}
+        wanted = {Points: self.output.particles, Cells: self.output.grid, Surface: True}
         with self.watch.stage("frames"):
             return [part for part in self.simulation.frame() if wanted[type(part)]] if any(wanted.values()) else []
 
-    def _write_frame(self, index: int, last: int, frame: list[Points | Cells]) -> None:
+    def _write_frame(self, index: int, last: int, frame: list[Part]) -> None:
         with self.watch.stage("frames"):
             self.writer.put(index, self.time.frame_time(index), frame)
         self.observer.frame(index, last)

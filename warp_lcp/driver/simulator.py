@@ -48,6 +48,23 @@ class Cells:
     fields: dict[str, np.ndarray] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class Surface:
+    """A frame of a surface: triangles, in 2-D the segments of an outline.
+
+    `points` [m], shape (n, 3); `corners` of the triangles among them, shape (m, 3), counterclockwise seen from outside, or of the segments,
+    shape (m, 2), with the inside on the left; `fields` at the points, of shape (n,) or (n, 3).
+    """
+
+    name: str
+    points: np.ndarray
+    corners: np.ndarray
+    fields: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+Part = Points | Cells | Surface  # of a frame
+
+
 class Simulation(Protocol):
     """A simulation in progress: state on a device and the rule for one step."""
 
@@ -68,7 +85,7 @@ class Simulation(Protocol):
     def columns(self) -> tuple[str, ...]:
         """Return the names of the log's columns that `step` fills, in order, after `step`, `time`, `dt` and before `seconds`."""
 
-    def frame(self) -> list[Points | Cells]:
+    def frame(self) -> list[Part]:
         """Return what a frame shows, as host arrays that no later step changes: they are written while the simulation goes on."""
 
     def state(self) -> dict[str, np.ndarray]:
