@@ -12,11 +12,15 @@ import warp as wp
 from benchmarks import launches
 from benchmarks.timing import Options
 
+SUITES = (
+    "kernels", "solvers", "scaling", "peers", "run", "sand", "implicit_mpm", "contacts", "validation", "replay", "book", "guard",
+)  # fmt: skip
+
 
 def main() -> None:
     """Measure a suite and write its files."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks")
-    parser.add_argument("suite", choices=["kernels", "solvers", "run", "sand", "contacts", "validation", "replay", "book"])
+    parser.add_argument("suite", choices=SUITES)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--size", type=int, action="append", default=[])

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
-from benchmarks.record import MACHINE, read_json
+from benchmarks.record import MACHINE, Record, read_json
+from benchmarks.side_by_side import device, plain, side_by_side
 from benchmarks.timing import Figure
+
+ALLOWED = 0.25  # share of a ratio to a peer that may be lost
+# ratios of a peer's time to ours, of the same rounds: what is compared across states of the code and across machines
+TO_PEERS = ("pyamg_over_this", "over_engine", "over_ours", "over Numba product", "over Numba product, constant diagonal")
 
 
 def bounds(old: Figure, new: Figure) -> tuple[float, float]:
@@ -20,6 +26,18 @@ def verdict(low: float, high: float) -> str:
     if low > 1:
         return "more"
     return "less" if high < 1 else "within noise"
+
+
+def losses(old: Mapping[str, Record], new: Mapping[str, Record], allowed: float = ALLOWED) -> list[str]:
+    """Return the ratios to peers that fell by more than `allowed`, whatever samples of the two are taken; a line each."""
+    found = []
+    for name in (n for n in old if n in new):
+        for label in (f for f in TO_PEERS if f in old[name].figures and f in new[name].figures):
+            before, after = old[name].figures[label], new[name].figures[label]
+            low, high = bounds(before, after)
+            if high < 1 - allowed:
+                found.append(f"{name}: {label} {before} fell to {after}, to [{low:.2f}, {high:.2f}] of it")
+    return found
 
 
 def comparison(old: Path, new: Path) -> str:
@@ -42,6 +60,12 @@ def comparison(old: Path, new: Path) -> str:
             lines.append(f"{name:<72} {label:<18} {numbers}  {noise:<17} {verdict(low, high)}")
     if len(lines) == 1:
         raise ValueError(f"{old} and {new} have no figure in common")
+    lost = losses(before, after)
+    lines += [f"lost against a peer: {line}" for line in lost]
+    if not lost and any(f in r.figures for r in after.values() for f in TO_PEERS):
+        lines.append(f"no ratio to a peer fell by more than {100 * ALLOWED:.0f} % beyond noise")
+    if device(before) != device(after) and all(MACHINE in r and "copy" in r[MACHINE].figures for r in (before, after)):
+        lines += ["", f"A is {old}, B is {new}:", plain(side_by_side(before, after))]
     machines = [r[MACHINE].facts.get("hardware", {}).get("cpu") if MACHINE in r else None for r in (before, after)]
     if machines[0] != machines[1]:
         lines.append(f"not the same machine: {machines[0]} and {machines[1]}; compare ratios to peers, not seconds")

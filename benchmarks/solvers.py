@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +12,10 @@ import warp_lcp as wl
 from benchmarks.cases import RTOL, Case
 from benchmarks.host import host_overhead
 from benchmarks.machine import COPIED, machine, present
+from benchmarks.peers.linear import pyamg_aggregation, scipy_cg
+from benchmarks.peers.peer import Answer, Question
 from benchmarks.problems import BOUNDS, anisotropic, cut_cells, splash
 from benchmarks.record import Bars, Lines, Record, Results, Table
-from benchmarks.solver_peers import PeerSolve, pyamg_solve, scipy_solve
 from benchmarks.targets import targets
 from benchmarks.timing import Figure, Options, ratios
 
@@ -30,6 +31,21 @@ OTHERS = {
     "InteriorPoint": wl.InteriorPoint(),
     "InteriorPoint, crossover": wl.InteriorPoint(crossover=1e-2),
 }
+
+
+@dataclass(frozen=True)
+class PeerSolve:
+    """One solve of a peer: seconds of set-up and solve [s], iterations, and the relative residual, recomputed."""
+
+    setup: float
+    solve: float
+    iterations: int
+    residual: float
+
+    @property
+    def total(self) -> float:
+        """Set-up and solve [s]."""
+        return self.setup + self.solve
 
 
 def measure(options: Options, out: Path) -> Results:
@@ -53,13 +69,12 @@ def measure(options: Options, out: Path) -> Results:
 def _measure_size(n: int, options: Options) -> tuple[list[Case], dict[str, list[PeerSolve]]]:
     """Measure one sample of every case and peer in each round."""
     cases = _cases(n, options.device)
-    scene = splash(n)
-    A, b = scene.matrix(), scene.b[scene.cells == wl.FLUID]
-    solves: dict[str, Callable[[], PeerSolve]] = {}
+    question = Question(splash(n), "linear")
+    solves: dict[str, Callable[[Question, float], Answer]] = {}
     if present("pyamg"):
-        solves["PyAMG SA-CG"] = partial(pyamg_solve, A, b, RTOL)
+        solves["PyAMG SA-CG"] = pyamg_aggregation
     if n <= SCIPY_CELLS:
-        solves["SciPy CG"] = partial(scipy_solve, A, b, RTOL)
+        solves["SciPy CG"] = scipy_cg
     peers: dict[str, list[PeerSolve]] = {name: [] for name in solves}
     for turn in range(options.repeat + 1):  # the first one loads kernels
         options.say(f"solvers at {n}^3, round {turn} of {options.repeat}")
@@ -72,7 +87,8 @@ def _measure_size(n: int, options: Options) -> tuple[list[Case], dict[str, list[
         if turn > 0:
             for name, solve in solves.items():
                 if sum(p.total for p in peers[name]) < PEER_SECONDS:
-                    peers[name].append(solve())
+                    answer = solve(question, RTOL)
+                    peers[name].append(PeerSolve(answer.setup, answer.solve, answer.iterations, question.residual(answer.x)))
     for case in cases:
         if case.full:
             case.to_tolerances()

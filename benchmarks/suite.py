@@ -123,8 +123,14 @@ SOLVERS = Suite(
     replays=True,
     groups={"book": "the experiments of [Book] appendix C"},
 )
+SCALING = Suite("scaling", "linear and LCP solves from 32^3 up to what memory holds: seconds to three tolerances, bytes a cell, exponents")
+PEERS = Suite("peers", "the same problems by PyAMG, AMGCL, SciPy, PETSc, OSQP, PIQP, Clarabel, Warp's CG, as far as they are there")
 RUN = Suite("run", "steps per second of built-in scenes, and what the particles cost")
-SAND = Suite("sand", "sand: the coupled methods at equal residual, the yield sets, steps of large scenes")
+SAND = Suite(
+    "sand",
+    "sand: the coupled methods at equal residual, the yield sets, steps of large scenes",
+    groups={"implicit_mpm": "steps of a column collapse against newton's implicit material point method"},
+)
 CONTACTS = Suite("contacts", "rigid contacts: methods on the scenes of figures 2.9 and 2.11, NNCG against PGS at equal sweeps", False)
 VALIDATION = Suite(
     "validation",

@@ -5,33 +5,50 @@ from __future__ import annotations
 import warp as wp
 
 import warp_lcp as wl
+from fluids.coupling import BodyCoupling
 from fluids.pressure import PressureProjection
 from fluids.scene import LiquidScene
 from fluids.surface import FreeSurface, GhostFluidSurface, WholeCellSurface
 from fluids.unilateral import UnilateralPressure
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.material.boundary import Boundary
+from warp_lcp.material.cut_boundary import CutBoundary
+from warp_lcp.material.narrow_band import NarrowBand
+from warp_lcp.rigid.bodies import RigidBodies
 
 
-def make_surface(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary) -> FreeSurface:
-    """Return the free surface that a scene asks for."""
+def make_surface(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, band: NarrowBand | None) -> FreeSurface:
+    """Return the free surface that a scene asks for, around particles that are everywhere or in a band."""
     count = scene.particles.per_axis**grid.dimension
     if scene.pressure.surface == "ghost-fluid":
-        return GhostFluidSurface(grid, boundary, particles_a_cell=count, smoothing=scene.pressure.smoothing)
+        return GhostFluidSurface(grid, boundary, particles_a_cell=count, smoothing=scene.pressure.smoothing, band=band)
     return WholeCellSurface(grid, boundary, particles_a_cell=count)
 
 
 def make_pressure(
-    scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, surface: FreeSurface, weights: list[wp.array]
+    scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, surface: FreeSurface, weights: list[wp.array], bodies: RigidBodies | None
 ) -> PressureProjection:
-    """Return the pressure that a scene asks for; `weights` are those of the particles on each component's faces."""
+    """Return the pressure that a scene asks for, of liquid and the bodies in it.
+
+    Args:
+        scene: the scene.
+        grid: its grid.
+        boundary: its solids.
+        surface: the free surface.
+        weights: those of the particles on each component's faces.
+        bodies: those that the liquid moves, among the solids; None: there are none.
+    """
     settings = scene.solver
     solver = wl.METHODS[settings.method](precision=settings.precision)
+    coupling = None
+    if bodies is not None:
+        assert isinstance(boundary, CutBoundary), "a scene with bodies has cut cells"
+        coupling = BodyCoupling(grid, boundary, bodies, scene.physics.density)
     if isinstance(surface, GhostFluidSurface) and scene.pressure.model == "unilateral":
         return UnilateralPressure(
             grid, boundary, solver, level_set=surface.level_set, weights=weights, tolerance=settings.tolerance,
-            max_iterations=settings.max_iterations,
+            max_iterations=settings.max_iterations, coupling=coupling,
         )  # fmt: skip
     return PressureProjection(
-        grid, boundary, solver, tolerance=settings.tolerance, max_iterations=settings.max_iterations, phi=surface.phi
-    )  # fmt: skip
+        grid, boundary, solver, tolerance=settings.tolerance, max_iterations=settings.max_iterations, phi=surface.phi, coupling=coupling
+    )

@@ -11,6 +11,7 @@ import warp as wp
 
 import warp_lcp as wl
 from fluids import pressure_kernels as kernels
+from fluids.coupling import BodyCoupling
 from warp_lcp.gallery import recorded
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary
@@ -58,6 +59,7 @@ class PressureProjection:
         tolerance: relative residual at which a solve is done.
         max_iterations: of the method a solve may take.
         phi: float32 distance to the free surface at cell centers [cells], < 0 exactly in FLUID cells; None: it lies on the cells' faces.
+        coupling: with bodies that the pressure moves, whose term A then has too; None: there are none.
 
     Attributes:
         kind: int8 of AIR, FLUID, SOLID, which the caller marks.
@@ -76,9 +78,10 @@ class PressureProjection:
         tolerance: float,
         max_iterations: int = 100,
         phi: wp.array | None = None,
+        coupling: BodyCoupling | None = None,
     ) -> None:
         """Allocate the fields."""
-        self.grid, self.boundary, self.solver, self._phi = grid, boundary, solver, phi
+        self.grid, self.boundary, self.solver, self._phi, self.coupling = grid, boundary, solver, phi, coupling
         self.tolerance, self.max_iterations = tolerance, max_iterations
         self._kernels = kernels.pressure_kernels(bool(boundary.open), bool(boundary.velocity), phi is not None)
         self.kind, self.shown, self.contact = grid.field(wp.int8), grid.field(wp.int8), grid.field(wp.uint8)
@@ -111,7 +114,7 @@ class PressureProjection:
         fields = [self.pressure, ratio, self._b, self._lower, self._start, self._shift]
         inputs = [*three(velocity), self.kind, self.boundary.touch, *self._faces(), *fields]
         self.grid.domain.launch(self._kernels.prepare, inputs)
-        self._operator.update(self.kind)
+        self._update(self.kind)
         return unknowns
 
     def leave(self, dt: float) -> Projection:
@@ -126,8 +129,18 @@ class PressureProjection:
         faces = {f"face_{axis}": field for axis, field in zip("xyz", self.boundary.open, strict=False)}
         cells = self.grid.interior(self.kind.numpy())
         self._operator = wl.GridPoisson(cells, shift=self._shift, device=self.grid.device, **faces)
-        self._problem = wl.LCP(self._operator, self._b, self._lower, np.inf)
+        self._problem = wl.LCP(self._joined(), self._b, self._lower, np.inf)
         self._work = self.solver.init(self._problem)
+
+    def _joined(self) -> wl.GridPoisson | wl.SumOperator:
+        """Return the operator, with the bodies' term if there are bodies."""
+        return self._operator if self.coupling is None else self.coupling.join(self._operator)
+
+    def _update(self, cells: wp.array) -> None:
+        """Take the cells, and where bodies meet them."""
+        self._operator.update(cells)
+        if self.coupling is not None:
+            self.coupling.take(cells)
 
     def _faces(self) -> list[Any]:
         """Return what the kernels take of solids and surface."""
@@ -147,6 +160,11 @@ class PressureProjection:
         assert self._problem is not None, "prepare comes first"
         result = wl.solve(self._problem, self.solver, stopping=criteria, x0=self._start, workspace=self._work)
         return result, criteria
+
+    def push_bodies(self, result: wl.SolveResult) -> None:
+        """Give the bodies the impulses of a result's pressure, if there are bodies."""
+        if self.coupling is not None:
+            self.coupling.push(result.x)
 
     def criteria(self, speed: float, unknowns: int) -> wl.StoppingCriteria:
         """Return when a solve is done.

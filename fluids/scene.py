@@ -16,6 +16,7 @@ PRESSURE_BYTES = 92  # fields of the pressure solve
 LEVEL_SET_BYTES = 19  # more for a surface between cells, or slivers
 SMOOTHING_BYTES = 12
 UNILATERAL_BYTES = 5
+COUPLED_METHODS = ("projected-multigrid", "minimum-map-newton", "primal-dual-active-set")  # for A + U W U', see `fluids.coupling`
 
 
 class Pressure(Table):
@@ -36,6 +37,7 @@ class LiquidScene(ParticleScene):
     """A scene of liquid."""
 
     solve_bytes: ClassVar[int] = PRESSURE_BYTES
+    carried_by_grid: ClassVar[bool] = True
 
     pressure: Pressure = Field(default_factory=Pressure)
     liquid: list[Liquid] = Field(default_factory=list)
@@ -47,10 +49,22 @@ class LiquidScene(ParticleScene):
     def complaints(self) -> list[Complaint]:
         """Return what is wrong across keys."""
         found = super().complaints()
+        if self.solver.method not in COUPLED_METHODS and any(solid.is_body for solid in self.solid):
+            message = f"does not take the rigid bodies' part of the matrix, which has products only; with bodies: {', '.join(COUPLED_METHODS)}"
+            found.append(Complaint(("solver", "method"), self.solver.method, message))
         if self.pressure.model == "unilateral" and self.pressure.surface == "voxel":
             found.append(
                 Complaint(("pressure", "surface"), "voxel", 'has no meaning for model = "unilateral", whose pressure needs no surface')
             )
+        if self.solver.method not in COUPLED_METHODS and any(solid.is_body for solid in self.solid):
+            message = f"does not take the rigid bodies' part of the matrix, which has products only; with bodies: {', '.join(COUPLED_METHODS)}"
+            found.append(Complaint(("solver", "method"), self.solver.method, message))
+        if self.pressure.model == "unilateral" and self.particles.narrow_band is not None:
+            message = 'has no meaning for model = "unilateral", whose liquid may come apart anywhere inside'
+            found.append(Complaint(("particles", "narrow_band"), None, message))
+        elif self.pressure.surface == "voxel" and self.particles.narrow_band is not None:
+            message = 'needs surface = "ghost-fluid", which tells how full cells are'
+            found.append(Complaint(("particles", "narrow_band"), None, message))
         return found
 
     def own_memory_parts(self) -> dict[str, int]:

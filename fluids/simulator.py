@@ -12,7 +12,15 @@ import warp_lcp as wl
 from fluids.assembly import make_pressure, make_surface
 from fluids.pressure import Projection
 from fluids.scene import LiquidScene
-from warp_lcp.driver.particle_assembly import make_boundary, make_outlets, make_particles, make_sources
+from warp_lcp.driver.particle_assembly import (
+    make_bodies,
+    make_boundary,
+    make_narrow_band,
+    make_outlets,
+    make_particles,
+    make_sources,
+    placed_solids,
+)
 from warp_lcp.driver.particle_simulation import ParticleSimulation, Row
 from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.simulator import Cells, Part, SimulationFailed, StepFailed
@@ -20,8 +28,10 @@ from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.contact import RELEASED, TOUCHES_NOTHING
+from warp_lcp.material.narrow_band import NarrowBand
 from warp_lcp.material.outlets import Outlets
 from warp_lcp.material.sources import Sources
+from warp_lcp.rigid.bodies import RigidBodies
 
 
 class LiquidSimulation(ParticleSimulation):
@@ -34,6 +44,8 @@ class LiquidSimulation(ParticleSimulation):
         particles: the liquid at the start.
         sources: where liquid comes in.
         outlets: where it leaves.
+        bodies: solids that it moves.
+        band: where its particles are, if not everywhere.
         notes: facts for the start of a run.
 
     Attributes:
@@ -53,13 +65,15 @@ class LiquidSimulation(ParticleSimulation):
         *,
         sources: Sources | None = None,
         outlets: Outlets | None = None,
+        bodies: RigidBodies | None = None,
+        band: NarrowBand | None = None,
         notes: Sequence[str] = (),
     ) -> None:
         """Allocate the fields and find the liquid's cells."""
-        super().__init__(scene, grid, boundary, particles, sources=sources, outlets=outlets, notes=notes)
+        super().__init__(scene, grid, boundary, particles, sources=sources, outlets=outlets, bodies=bodies, band=band, notes=notes)
         self.record: Callable[[Mapping[str, np.ndarray]], object] | None = None
-        self.surface = make_surface(scene, grid, boundary)
-        self.projection = make_pressure(scene, grid, boundary, self.surface, self.weights)
+        self.surface = make_surface(scene, grid, boundary, band)
+        self.projection = make_pressure(scene, grid, boundary, self.surface, self.weights, bodies)
         self.reach = max(self.layers, 2 * scene.pressure.smoothing)
         self.mark()
 
@@ -85,6 +99,9 @@ class LiquidSimulation(ParticleSimulation):
         with self.watch.stage("diagnostics", self.projection.kind):
             volume = self.surface.volume(projected.unknowns)  # at the start of the step, before solids move
         self.extend(window, self.projection.known, self.projection.kind, self.projection.contact)
+        if self.projection.coupling is not None:
+            self.projection.coupling.hold(self.velocity, self.projection.known)
+        self.exchange(window, self.projection.kind, self.surface.phi, self.projection.contact)
         self.bring_to_particles()
         row = self.move(dt) | self.solve_row(projected.result)
         outflow = projected.max_outflow / self.grid.spacing
@@ -99,7 +116,10 @@ class LiquidSimulation(ParticleSimulation):
         return "active", "max_divergence", "volume"
 
     def frame(self) -> list[Part]:
-        """Return the particles (velocity, speed) and the liquid's cells of the last solve (pressure [Pa], wall and released flags)."""
+        """Return the particles (velocity, speed) and the liquid's cells of the last solve (pressure [Pa], wall and released flags).
+
+        And the liquid's surface and volume, if the scene wants them.
+        """
         cells = self.projection.fluid_cells()
         at = tuple(cells.T)
         contact = self.projection.contact.numpy()[at]
@@ -108,7 +128,13 @@ class LiquidSimulation(ParticleSimulation):
             "wall": (contact != TOUCHES_NOTHING).astype(np.uint8),
             "released": (contact == RELEASED).astype(np.uint8),
         }
-        return [self.points(), Cells("grid", cells[:, ::-1] - 1, self.grid.spacing, self.grid.dimension, fields)]
+        return [
+            self.points(),
+            Cells("grid", cells[:, ::-1] - 1, self.grid.spacing, self.grid.dimension, fields, self.grid.counts),
+            *self.surfaces(),
+            *self.volumes(),
+            *self.body_surfaces(),
+        ]
 
     def own_state(self) -> dict[str, np.ndarray]:
         """Return what the next pressure starts from, and what a frame shows of the last."""
@@ -138,7 +164,12 @@ class LiquidSimulation(ParticleSimulation):
         with watch.stage("pressure solve", *projection.fields()):
             result, criteria = projection.solve(speed, unknowns)
         if not result:
+            self.restore_bodies()
             self._explain(result)
+        if self.bodies is not None:
+            with watch.stage("bodies"):
+                projection.push_bodies(result)
+                self.boundary.begin_step(self.time, dt)  # their velocities are others now
         with watch.stage("projection", *self.velocity, *projection.known, projection.pressure, projection.kind, projection.contact):
             return self._held(projection.project(self.velocity, dt, window, result, criteria, unknowns))
 
@@ -195,7 +226,11 @@ class FluidsSimulator:
         if not isinstance(scene, LiquidScene):
             raise ValueError("scene.simulator: fluids needs a scene of liquid")
         grid = StaggeredGrid(scene.cell_counts, scene.spacing, scene.dimension, device)
-        boundary, warnings = make_boundary(scene, grid, folder, wall_velocity)
-        particles, notes = make_particles(scene, grid, boundary, folder)
+        solids = placed_solids(scene, folder)
+        bodies = make_bodies(scene, solids)
+        boundary, warnings = make_boundary(scene, grid, folder, wall_velocity, solids=solids)
+        band, without = make_narrow_band(scene, grid, boundary, folder)
+        particles, notes = make_particles(scene, grid, boundary, folder, without)
         sources, outlets = make_sources(scene, grid, boundary, folder), make_outlets(scene, grid, folder)
-        return LiquidSimulation(scene, grid, boundary, particles, sources=sources, outlets=outlets, notes=[*warnings, *notes])
+        notes = [*warnings, *notes]
+        return LiquidSimulation(scene, grid, boundary, particles, sources=sources, outlets=outlets, bodies=bodies, band=band, notes=notes)

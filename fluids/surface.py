@@ -13,6 +13,7 @@ from warp_lcp.grid.level_set import LevelSet
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary
+from warp_lcp.material.narrow_band import NarrowBand
 
 SLIVER = 0.35  # a cell whose open share is smaller may hold no particle though liquid fills it: the level set decides
 REACH = 2  # layers that u* is continued into cells of the level set whose faces no particle gave weight
@@ -82,11 +83,14 @@ class GhostFluidSurface:
         boundary: solids and walls.
         particles_a_cell: of liquid at rest.
         smoothing: binomial passes over the density: quieter, and less accurate in thin sheets.
+        band: where the particles are, if not everywhere.
     """
 
-    def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int, smoothing: int = 0) -> None:
+    def __init__(
+        self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int, smoothing: int = 0, band: NarrowBand | None = None
+    ) -> None:
         """Allocate the level set."""
-        self.grid, self.boundary = grid, boundary
+        self.grid, self.boundary, self.band = grid, boundary, band
         self.level_set = LevelSet(grid, particles_a_cell=particles_a_cell, smoothing=smoothing)
         self.phi: wp.array | None = self.level_set.phi
         self._window = grid.everywhere
@@ -94,7 +98,8 @@ class GhostFluidSurface:
     def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
         """Write the cells' kinds: FLUID below the surface."""
         self._window = window
-        self.level_set.update(particles, window, self.boundary.capacity, self.boundary.base)
+        fill = self.band.fill if self.band is not None else None
+        self.level_set.update(particles, window, self.boundary.capacity, self.boundary.base, fill=fill)
         wp.copy(kind, self.boundary.base)
         window.launch(kernels.mark_inside_kernel, [self.level_set.phi, self.boundary.capacity, 2.0, kind])
 

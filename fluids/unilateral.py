@@ -10,6 +10,7 @@ import warp as wp
 
 import warp_lcp as wl
 from fluids import unilateral_kernels as kernels
+from fluids.coupling import BodyCoupling
 from fluids.pressure import PressureProjection, Projection, three
 from warp_lcp.grid.level_set import LevelSet
 from warp_lcp.grid.staggered import StaggeredGrid, Window
@@ -60,6 +61,7 @@ class UnilateralPressure(PressureProjection):
         tolerance: relative residual at which a solve is done.
         max_iterations: of the method a solve may take.
         max_density: rho_max, > 0.
+        coupling: with bodies that the pressure moves, with rho_max as its share; None: there are none.
 
     Attributes: as of `PressureProjection`; `kind` says where the level set lies in the liquid.
     """
@@ -75,9 +77,10 @@ class UnilateralPressure(PressureProjection):
         tolerance: float,
         max_iterations: int = 100,
         max_density: float = MAX_DENSITY,
+        coupling: BodyCoupling | None = None,
     ) -> None:
         """Allocate the fields."""
-        super().__init__(grid, boundary, solver, tolerance=tolerance, max_iterations=max_iterations)
+        super().__init__(grid, boundary, solver, tolerance=tolerance, max_iterations=max_iterations, coupling=coupling)
         if max_density <= 0.0:
             raise ValueError(f"max_density = {max_density}: must be positive")
         self._weights = list(weights)
@@ -109,7 +112,7 @@ class UnilateralPressure(PressureProjection):
         if unknowns and self._problem is None:
             self._make_problem()
         if unknowns:
-            self._operator.update(self._cells)
+            self._update(self._cells)
         return unknowns
 
     def unknowns(self) -> int:
@@ -152,7 +155,7 @@ class UnilateralPressure(PressureProjection):
         faces = {f"face_{axis}": field for axis, field in zip("xyz", self.boundary.open, strict=False)}
         cells = self.grid.interior(self._cells.numpy())
         self._operator = wl.GridPoisson(cells, shift=self._shift, device=self.grid.device, **faces)
-        self._problem = wl.LCP(self._operator, self._b, 0.0, np.inf)
+        self._problem = wl.LCP(self._joined(), self._b, 0.0, np.inf)
         self._work = self.solver.init(self._problem)
 
     def _sides(self, velocity: Sequence[wp.array]) -> list[Any]:

@@ -12,6 +12,8 @@ from granular.materials import MATERIALS, Material, compression_slope, plane_str
 from warp_lcp.driver.particle_scene import ParticleScene
 from warp_lcp.driver.scene import Complaint, Domain, Table, Time
 from warp_lcp.driver.shapes import (
+    FRICTIONS,
+    STICKS,
     Box,
     Capsule,
     MaterialProperties,
@@ -23,17 +25,14 @@ from warp_lcp.driver.shapes import (
     SolidPlane,
     SolidSphere,
     Sphere,
+    WallFriction,
 )
-from warp_lcp.driver.table import ANY_VALUE
 
 STRESS_BYTES = {2: 160, 3: 330}  # a cell: the coupled solve's fields
 STEEPEST = math.sqrt(0.75)  # slope of a cone in 3-D, from which it holds stresses with tension: that of 36.87 degrees in compression
 STEEPEST_ANGLE = 36.8  # degrees
-STICKS = 1e6  # Coulomb's coefficient of a wall that sand sticks to, as long as it presses against it
 
 Angle = Annotated[float, Field(gt=0, lt=60)]
-WallFriction = Annotated[float, Field(ge=0, le=10)] | Literal["stick"]
-PLACES = "a number from 0 (free slip) to 10, or stick"
 
 
 class SandTime(Time):
@@ -47,7 +46,9 @@ class SandDomain(Domain):
     """[domain], with friction on its walls, and sides that sand leaves to come in on the other."""
 
     later: ClassVar = {}
-    friction: WallFriction | None = Field(default=None, description=f"of the domain's walls: {PLACES}; material.wall_friction unless given")
+    friction: WallFriction | None = Field(
+        default=None, description=f"of the domain's walls: {FRICTIONS}; material.wall_friction unless given"
+    )
     periodic: list[bool] | None = Field(default=None, description="which axes have no end, [x, y] or [x, y, z]; not y")  # type: ignore[assignment]
 
 
@@ -58,7 +59,7 @@ class MaterialTable(Table):
     friction_angle: Angle | None = Field(default=None, description="degrees, in plane strain")
     density: float | None = Field(default=None, gt=0, description="at the densest, air included [kg/m^3]")
     max_fraction: float | None = Field(default=None, gt=0, lt=1, description="of space that grains fill at the densest")
-    wall_friction: WallFriction | None = Field(default=None, description=f"against solids: {PLACES}")
+    wall_friction: WallFriction | None = Field(default=None, description=f"against solids: {FRICTIONS}")
     cohesion: float = Field(default=0.0, ge=0, description="the shear stress it bears without pressure, over cos(friction angle) [Pa]")
     tensile_strength: float = Field(default=0.0, ge=0, description="the tension it bears where it is densely packed [Pa]")
     angle_of: Literal["plane-strain", "triaxial-compression"] = Field(
@@ -120,10 +121,9 @@ class SandMesh(SandProperties, Mesh):
 
 
 class RoughSolid(Table):
-    """What a solid among sand has besides what all have."""
+    """What a solid among sand has of its own."""
 
-    later: ClassVar = {"mass": ANY_VALUE}
-    friction: WallFriction | None = Field(default=None, description=f"of its surface: {PLACES}; domain.friction unless given")
+    rubs: ClassVar[bool] = True
 
 
 class RoughBox(RoughSolid, SolidBox):
@@ -224,6 +224,10 @@ class SandScene(ParticleScene):
         given = [domain, *(domain if s.friction is None else s.friction for s in self.solid)]
         return [STICKS if friction == "stick" else float(friction) for friction in given]
 
+    def body_frictions(self) -> list[float]:
+        """Return Coulomb's coefficient of each solid's surface."""
+        return self.wall_frictions()[1:]
+
     def complaints(self) -> list[Complaint]:
         """Return what is wrong across keys."""
         found = super().complaints()
@@ -262,6 +266,8 @@ class SandScene(ParticleScene):
             found.append(Complaint(("domain", "periodic"), periodic, "goes without density_correction, reseed, source and drain"))
         if closed and self.solver.method == "interleaved-sweeps":
             found.append(Complaint(("solver", "method"), self.solver.method, "knows no axis without an end: take accelerated-projection"))
+        if any(solid.is_body for solid in self.solid):
+            found += self._body_complaints(bool(closed))
         if wall != "separating" or any(solid.wall == "free-slip" for solid in self.solid):
             found.append(
                 Complaint(
@@ -272,6 +278,15 @@ class SandScene(ParticleScene):
             found.append(
                 Complaint(("gauge", "height"), self.gauge.height, f"must lie in the domain, between 0 and {self.domain.size[1]:g} m")
             )
+        return found
+
+    def _body_complaints(self, closed: bool) -> list[Complaint]:
+        """Return what does not go with rigid bodies; closed: an axis has no end."""
+        found = []
+        if self.solver.method == "interleaved-sweeps":
+            found.append(Complaint(("solver", "method"), self.solver.method, "moves no rigid bodies: take accelerated-projection"))
+        if closed:
+            found.append(Complaint(("domain", "periodic"), self.domain.periodic, "goes without rigid bodies"))
         return found
 
     def plan(self) -> list[tuple[str, str]]:

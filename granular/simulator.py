@@ -10,13 +10,14 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
+from granular.bodies import SandBodies
 from granular.coupled import METHODS, CoupledMethod, CoupledOutcome
 from granular.packing import Packing
 from granular.report import Outcome
 from granular.scene import SandScene
 from granular.solids import SandSolids
 from granular.stress import Stress, YieldSet
-from warp_lcp.driver.particle_assembly import make_boundary, make_outlets, make_particles, make_sources, placed_solids
+from warp_lcp.driver.particle_assembly import make_bodies, make_boundary, make_outlets, make_particles, make_sources, placed_solids
 from warp_lcp.driver.particle_simulation import ParticleSimulation, Row
 from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.simulator import Cells, Part, SimulationFailed
@@ -28,6 +29,7 @@ from warp_lcp.material.outlets import Outlets
 from warp_lcp.material.sources import Sources
 from warp_lcp.material.wall import extend_velocity
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
+from warp_lcp.rigid.bodies import RigidBodies
 
 FRONT = 99.0  # percentile of the particles that runout and height are of
 STANDING = 0.05  # of sqrt(g dx): a scale for the residual where there is no gravity
@@ -57,11 +59,13 @@ class SandSimulation(ParticleSimulation):
         particles: the sand at the start.
         sources: where sand comes in.
         outlets: where it leaves.
+        bodies: solids that it moves.
         notes: facts for the start of a run.
 
     Attributes:
         packing: how densely the sand lies.
         stress: what it bears.
+        carried: the bodies as the stresses meet them; None: there are none.
         outcome: of the last solve.
     """
 
@@ -77,16 +81,18 @@ class SandSimulation(ParticleSimulation):
         *,
         sources: Sources | None = None,
         outlets: Outlets | None = None,
+        bodies: RigidBodies | None = None,
         notes: tuple[str, ...] = (),
     ) -> None:
         """Allocate the fields and find the sand's cells."""
-        super().__init__(scene, grid, boundary, particles, sources=sources, outlets=outlets, notes=notes)
+        super().__init__(scene, grid, boundary, particles, sources=sources, outlets=outlets, bodies=bodies, notes=notes)
         self.solids, self.sides = solids, boundary.sides
         self._join = None if self.sides is None else self.sides.wrap
         self.method: CoupledMethod = METHODS[scene.solver.method]()
         self._base, self.density = grid.field(wp.int8), grid.field()
         self.packing = Packing(grid, self._base, boundary.capacity, sides=self.sides)
-        self.stress = Stress(self.packing, solids.walls, box=scene.friction.model == "box")
+        self.carried = None if bodies is None else SandBodies(grid, bodies.numbers)
+        self.stress = Stress(self.packing, solids.walls, box=scene.friction.model == "box", bodies=self.carried)
         self.outcome = Outcome(self.stress)
         self._at_rest = scene.particles.per_axis**grid.dimension
         self._start = self._front()[0]
@@ -171,7 +177,10 @@ class SandSimulation(ParticleSimulation):
         return (*COLUMNS, "flow_rate") if self.scene.gauge or self.scene.drain or self.scene.domain.open else COLUMNS
 
     def frame(self) -> list[Part]:
-        """Return the particles and the cells that hold sand, with fraction of grains, pressure [Pa] and yield ratio of the last solve."""
+        """Return the particles and the cells that hold sand, with fraction of grains, pressure [Pa] and yield ratio of the last solve.
+
+        And the sand's surface and volume, if the scene wants them.
+        """
         grid, points = self.grid, self.points()
         fields = {
             "fraction": self.packing.fraction.numpy() * self.scene.max_fraction,
@@ -184,7 +193,13 @@ class SandSimulation(ParticleSimulation):
         cells = np.argwhere(self.packing.kind.numpy() == FLUID)
         at = tuple(cells.T)
         shown = {name: field[at] for name, field in fields.items()}
-        return [points, Cells("grid", cells[:, ::-1] - 1, grid.spacing, grid.dimension, shown)]
+        return [
+            points,
+            Cells("grid", cells[:, ::-1] - 1, grid.spacing, grid.dimension, shown, grid.counts),
+            *self.surfaces(),
+            *self.volumes(),
+            *self.body_surfaces(),
+        ]
 
     def pressures(self) -> np.ndarray:
         """Return the pressure p = rho dx x / dt [Pa] of the last solve, in the stored shape; zeros before the first."""
@@ -226,6 +241,9 @@ class SandSimulation(ParticleSimulation):
         if self.solids.moves:
             self.solids.place(self.time)
             self.stress.face(self.solids.walls)
+            if self.carried is not None and self.bodies is not None:
+                centers = np.array([body.position for body in self.bodies.bodies])
+                self.carried.place(self.solids.index.numpy(), centers, self.solids.walls)
 
     def _solve(self, window: Window, dt: float) -> CoupledOutcome:
         """Solve for the stresses and take over the velocity that they leave."""
@@ -238,6 +256,7 @@ class SandSimulation(ParticleSimulation):
                 self.sources.supply(self.time, self.velocity, self._base)
                 self.sources.hold(solids.velocity, [])
             packing.update(self.density, self.velocity, dt, solids.velocity)
+            self._begin_bodies()
         impulse = dt / (scene.physics.density * self.grid.spacing)  # of a stress of 1 Pa
         angle = math.radians(scene.friction_angle)
         bound = YieldSet(scene.slope, scene.cohesion * math.cos(angle) * impulse, scene.material.tensile_strength * impulse)
@@ -249,10 +268,33 @@ class SandSimulation(ParticleSimulation):
                 stress, scale=scale, tolerance=scene.solver.tolerance, max_iterations=scene.solver.max_iterations
             )  # fmt: skip
         if solved.status is wl.SolveStatus.NON_FINITE:
+            self.restore_bodies()
             raise SimulationFailed(f"step {self.step_count}: the stresses are not finite after {solved.iterations} iterations")
         with self.watch.stage("projection", *self.velocity):
             self.outcome.take(self.velocity)
+            self._push_bodies(dt)
         return solved
+
+    def _begin_bodies(self) -> None:
+        """Tell the stresses how the bodies move and how easily."""
+        if self.carried is None or self.bodies is None:
+            return
+        dimension, bodies = self.grid.dimension, self.bodies.bodies
+        self.carried.begin(
+            self.packing, self.velocity, self.weights, density=self.scene.physics.density,
+            velocity=np.array([body.velocities(dimension) for body in bodies]),
+            inverse_mass=np.array([body.inverse_mass(dimension) for body in bodies]),
+        )  # fmt: skip
+
+    def _push_bodies(self, dt: float) -> None:
+        """Give the bodies what the sand has done to them, and the faces beside them the velocity that this leaves."""
+        if self.carried is None or self.bodies is None:
+            return
+        for body, impulse in zip(self.bodies.bodies, self.carried.impulses(), strict=True):
+            body.apply_impulse(impulse)
+        self.solids.begin_step(self.time, dt)
+        if self.sources is not None:
+            self.sources.hold(self.solids.velocity, [])
 
     def _find_density(self, window: Window) -> None:
         """Find the particles' density in the cells of a window."""
@@ -319,10 +361,13 @@ class GranularSimulator:
         if not isinstance(scene, SandScene):
             raise ValueError("scene.simulator: granular needs a scene of sand")
         grid = StaggeredGrid(scene.cell_counts, scene.spacing, scene.dimension, device)
-        boundary, warnings = make_boundary(scene, grid, folder)
-        solids = SandSolids(grid, placed_solids(scene, folder), boundary, scene.wall_frictions(), prescribed=bool(scene.source))
+        placed = placed_solids(scene, folder)
+        bodies = make_bodies(scene, placed)
+        boundary, warnings = make_boundary(scene, grid, folder, solids=placed)
+        solids = SandSolids(grid, placed, boundary, scene.wall_frictions(), prescribed=bool(scene.source))
         particles, notes = make_particles(scene, grid, boundary, folder)
         sources, outlets = make_sources(scene, grid, boundary, folder), make_outlets(scene, grid, folder)
         return SandSimulation(
-            scene, grid, boundary, solids, particles, sources=sources, outlets=outlets, notes=(*warnings, *solids.notes, *notes)
+            scene, grid, boundary, solids, particles, sources=sources, outlets=outlets, bodies=bodies,
+            notes=(*warnings, *solids.notes, *notes),
         )  # fmt: skip

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from granular.bodies import SandBodies
 from granular.checkerboard import damping_kernel
 from granular.packing import SHEARS, Packing, three, wall_faces
 from granular.stress_kernels import BETA_X, NEXT_X, PERIOD, RESIDUAL_X, STATE, momentum_kernel, stress_kernels
@@ -84,13 +85,20 @@ class Velocity:
     def __init__(self, packing: Packing, real: type, *, box: bool) -> None:
         """Allocate the fields."""
         grid = packing.grid
-        self.packing, self.real = packing, real
+        self.packing, self.real, self.box = packing, real, box
         self.u = grid.faces(real)
         self.edge = [grid.field(real) for _ in SHEARS[grid.dimension]]
         self.kernels = stress_kernels(grid.dimension, real, residual=real is wp.float64, box=box)
 
-    def find(self, stress: wp.array, *, launch: Launch = wp.launch) -> None:
-        """Find velocity and rates of strain under a field of stresses."""
+    def find(self, stress: wp.array, *, launch: Launch = wp.launch, bodies: SandBodies | None = None, respond: bool = False) -> None:
+        """Find velocity and rates of strain under a field of stresses.
+
+        Args:
+            stress: the stresses.
+            launch: launches or records.
+            bodies: whose faces get the velocity that they have.
+            respond: first give the bodies the velocity that the stresses leave.
+        """
         p, edge, u, kernels = self.packing, three(self.edge), three(self.u), self.kernels
         share, window = three(p.share), p.nodes
         if p.sides is not None:
@@ -98,6 +106,10 @@ class Velocity:
         window.launch(kernels.edge_stress, [p.spans, stress, *share, *edge], launch=launch)
         faces = [*three(p.start), *three(p.inverse), *u]
         window.launch(kernels.face_velocity, [p.spans, stress, share[0], *edge, *faces], launch=launch)
+        if bodies is not None:
+            if respond:
+                bodies.respond(p, stress, launch, implicit=False)
+            bodies.move(self, launch)
         if p.sides is not None:
             p.sides.wrap(*self.u, launch=launch)
         window.launch(kernels.edge_strain, [p.spans, share[0], *u, *edge], launch=launch)
@@ -118,6 +130,7 @@ class Stress:
         packing: where sand is.
         walls: its faces with solids.
         box: bound each part of the friction by itself, as Narain et al. do; else the cone.
+        bodies: those that the stresses move, if there are any.
 
     Attributes:
         now: the stresses, see `granular.yield_set`, float32.
@@ -126,9 +139,9 @@ class Stress:
         last_residual: that of pressure and friction [m/s].
     """
 
-    def __init__(self, packing: Packing, walls: Walls, *, box: bool = False) -> None:
+    def __init__(self, packing: Packing, walls: Walls, *, box: bool = False, bodies: SandBodies | None = None) -> None:
         """Allocate the fields."""
-        grid, self.packing, self.walls, self.box = packing.grid, packing, walls, box
+        grid, self.packing, self.walls, self.box, self.bodies = packing.grid, packing, walls, box, bodies
         normals, shears = (3, 3) if grid.dimension == 3 else (1, 1)
         shape = (1 + normals + 4 * shears, *grid.shape)
         self.now, self._before, self._point = (wp.zeros(shape, dtype=wp.float32, device=grid.device) for _ in range(3))
@@ -174,6 +187,8 @@ class Stress:
         self.walls.activate(flags)
         inputs = [p.flags, p.stiff, *three(p.share), decay, self.now, self._before, self._point]
         p.grid.domain.launch(self.velocity.kernels.admit, inputs)
+        if self.bodies is not None:
+            self.bodies.forget([self.now, self._before, self._point])
         if p.sides is not None:
             p.sides.wrap(self._point)
         inputs = [p.flags, *three(p.share), self._point, self.now]
@@ -197,6 +212,8 @@ class Stress:
         self._momentum.assign(state)
         wp.copy(self._point, self.now)
         wp.copy(self._before, self.now)
+        if self.bodies is not None:
+            self.bodies.prepare(self.packing, self.numbers, pressure_step=pressure_step, shear_step=shear_step)
 
     def advance(self, periods: int) -> float:
         """Take some periods of steps with momentum, see `PERIOD`; return an estimate of the natural residual [m/s]."""
@@ -211,7 +228,10 @@ class Stress:
         return scale * math.hypot(pressure / self._host[PRESSURE_STEP], SHARE * friction / self._host[SHEAR_STEP])
 
     def _record(self, launch: Launch) -> None:
-        self.velocity.find(self._point, launch=launch)
+        self.velocity.find(self._point, launch=launch, bodies=self.bodies)
+        if self.bodies is not None:
+            stress = [self.now, self._before, self._point]
+            self.bodies.search(self.packing, self.velocity, stress, self._momentum, self.numbers, launch)
         self._project(self.velocity, launch)
         self._add_up(launch)
         launch(momentum_kernel, 1, [self._sums, self._momentum], device=self.packing.grid.device)
@@ -220,7 +240,7 @@ class Stress:
         """Return the natural residual of pressure and friction [m/s], root mean squares over the cells that hold sand, in float64."""
         if self._check is None:
             self._check = Program(self.packing.grid.device)
-            self.checked.find(self.now, launch=self._check.launch)
+            self.checked.find(self.now, launch=self._check.launch, bodies=self.bodies, respond=True)
             self._project(self.checked, self._check.launch)
             self._add_up(self._check.launch)
         self._check.run()

@@ -96,12 +96,13 @@ EDGE_STRAIN = (
 # Sums, of pressure (0, 1, 2) and of friction (3, 4, 5), in the metric of the diagonal: <e, s>, <e, e>, <s, s> with the error of the
 # projection e = x_new - y and the step s = x_new - x; 6, 7: estimates of the squared natural residuals of both.
 # RESIDUAL: from the stresses themselves with step 1, nothing is changed; sums 0 and 1 are the squared natural residuals.
+# TRIAL: no sums, and the new stresses go to `point` alone, which a step no longer needs once it knows the velocity there.
 CELLS = (
     """
     const long long thread = (k*(long long)flags_.shape[1] + j)*chunks + chunk;
     double* partial = partials.data;
     const long long columns = partials.shape[0]/COLUMNS;
-    for (int c = 0; c < COLUMNS; ++c) partial[c*columns + thread] = 0;
+    if (!TRIAL) for (int c = 0; c < COLUMNS; ++c) partial[c*columns + thread] = 0;
 """
     + SPAN
     + SHAPE
@@ -169,7 +170,8 @@ CELLS = (
             const float old = now[at], earlier = before[at], ahead_of = point[at];
             const T s_ = value - (T)old, e_ = value - from, share_ = held ? (T)0 : weight;
             es += share_*e_*s_; ee += share_*e_*e_; ss += share_*s_*s_;
-            if (!RESIDUAL) {
+            if (TRIAL) point[at] = held ? ahead_of : (float)value;
+            else if (!RESIDUAL) {
                 now[at] = held ? old : (float)value;
                 before[at] = held ? earlier : old;
                 point[at] = held ? ahead_of : (float)(value + ahead*s_);
@@ -189,13 +191,14 @@ CELLS = (
         x_es += diagonal*es; x_ee += diagonal*ee; x_ss += diagonal*ss;
         x_residual += RESIDUAL ? ss : ee;
     }
+    if (TRIAL) return;
     if (RESIDUAL) { partial[thread] = x_residual; partial[columns + thread] = s_residual; return; }
     const T found[COLUMNS] = {x_es, x_ee, x_ss, s_es, s_ee, s_ss, x_residual, s_residual};
     for (int c = 0; c < COLUMNS; ++c) partial[c*columns + thread] = found[c];
 """
 )
 
-# The same for wall faces: a step of their copies, after that of the cells.
+# The same for wall faces: a step of their copies, after that of the cells. TRIAL: after one that has left its stresses in `point`.
 WALLS = (
     SHAPE.replace(", row = k*s[2] + j*s[1]", "")
     + WALL_FACE
@@ -215,8 +218,9 @@ WALLS = (
     };
     const int end = last < active.data[0] ? last : active.data[0];
     for (int m = first; m < end; ++m) {
-        face(active.data[1 + m], start, now_.data, numbers.data + WEIGHT, omega, light, [&](int d, long long o) { return rates[d][o]; },
+        face(active.data[1 + m], start, TRIAL ? point_.data : now_.data, numbers.data + WEIGHT, omega, light, [&](int d, long long o) { return rates[d][o]; },
             [&](int, long long, long long slot, T, T value, T stiff) {
+                if (TRIAL) { point_.data[slot] = (float)value; return; }
                 const T old = (T)now_.data[slot], s_ = value - old, e_ = value - start(slot);
                 es += 0.5*stiff*e_*s_; ee += 0.5*stiff*e_*e_; ss += 0.5*stiff*s_*s_;
                 residual += 0.5*(RESIDUAL ? s_*s_ : e_*e_);
@@ -225,6 +229,7 @@ WALLS = (
                 }
             });
     }
+    if (TRIAL) return;
     const long long columns = partials.shape[0]/COLUMNS;
     const double found[COLUMNS] = {RESIDUAL ? residual : 0, 0, 0, es, ee, ss, 0, residual};
     for (int c = 0; c < COLUMNS; ++c) partials.data[c*columns + chunk] = found[c];
@@ -256,6 +261,12 @@ _F32, _F64, _U8 = (wp.array3d(dtype=t) for t in (wp.float32, wp.float64, wp.uint
 _STRESS, _SPANS = wp.array4d(dtype=wp.float32), wp.array3d(dtype=wp.int32)
 
 
+def step_source(text: str, dimension: int, real, *, box: bool, residual: bool = False, trial: bool = False) -> str:
+    """Return native code for 2 or 3 dimensions: of a step, of what the natural residual would move, or of a trial step."""
+    words = {"NOW_X": NOW_X, "NOW_S": NOW_S, "NEXT_X": NEXT_X, "NEXT_S": NEXT_S, "RESIDUAL": int(residual), "TRIAL": int(trial)}
+    return native(text, dimension, real, box=box, **words)
+
+
 @functools.cache
 def stress_kernels(dimension: int, real, residual: bool, box: bool) -> SimpleNamespace:
     """Return the kernels for 2 or 3 dimensions, velocities of `real`; steps, or what the natural residual would move."""
@@ -263,8 +274,7 @@ def stress_kernels(dimension: int, real, residual: bool, box: bool) -> SimpleNam
     field = wp.array3d(dtype=real)
 
     def source(text: str) -> str:
-        words = {"NOW_X": NOW_X, "NOW_S": NOW_S, "NEXT_X": NEXT_X, "NEXT_S": NEXT_S, "RESIDUAL": int(residual)}
-        return native(text, dimension, real, box=box, **words)
+        return step_source(text, dimension, real, box=box, residual=residual)
 
     @wp.func_native(source(EDGE_STRESS))
     def edge_stress_row(

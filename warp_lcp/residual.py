@@ -33,6 +33,7 @@ class NaturalResidual:
         stencil = getattr(problem.A, "stencil", None)
         self.diagonal = stencil.d if stencil else layout.load(problem.A.diagonal(), problem.A.dtype)
         self.unit = float(stencil.unit) if stencil else 1.0
+        self._diagonal_of = None if stencil else getattr(problem.A, "version", None)  # of an operator whose diagonal is a copy
         self._sums = wp.zeros(2, dtype=wp.float64, device=layout.device)
         self._reduction = Reduction(layout.size, layout.device, self._sums)
 
@@ -66,6 +67,9 @@ class NaturalResidual:
     def start(self, x: wp.array[Any], *, keep: bool) -> None:
         """Set x to clip(x, l, u), or to clip(0, l, u), and to 0 where there is no unknown."""
         p = self.problem
+        if self._diagonal_of is not None and self._diagonal_of != p.A.version:  # type: ignore[attr-defined]
+            self._diagonal_of = p.A.version  # type: ignore[attr-defined]
+            wp.copy(self.diagonal, p.layout.load(p.A.diagonal(), p.A.dtype))
         for _ in range(1 if p.bounds.affine is None else 2):  # bounds that depend on x: at x as it is, then at x within its bounds
             p.bounds.follow(x)
             launch_spans(start_kernel, self._reduction.spans, [x, *p.bounds.operands, p.unknown, keep], [], p.device)

@@ -7,8 +7,9 @@ import meshio
 import numpy as np
 import pytest
 
-from warp_lcp.driver.frames import WAITING, FrameFolder, FrameWriter, frame_bytes, write_vtu
-from warp_lcp.driver.simulator import Cells, Points
+from warp_lcp.driver.frames import WAITING, FrameFolder, FrameWriter, frame_bytes
+from warp_lcp.driver.simulator import Cells, Points, Surface
+from warp_lcp.driver.vtu import write_vtu
 
 RNG = np.random.default_rng(5807)
 
@@ -51,6 +52,64 @@ def test_cells_share_corners(tmp_path, dimension, kind, corners):
     np.testing.assert_allclose(mesh.points[mesh.cells_dict[kind]].mean(axis=1), (cells.index + middle) * 0.25)
     np.testing.assert_array_equal(mesh.cell_data["pressure"][0], np.arange(4.0))
     np.testing.assert_array_equal(mesh.cell_data["wall"][0], [1, 0, 1, 0])
+
+
+def some_surface(dimension: int) -> Surface:
+    """A tetrahedron, or a square in 2-D, seen from outside."""
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]] if dimension == 3 else [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    corners = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]] if dimension == 3 else [[0, 1], [1, 2], [2, 3], [3, 0]]
+    fields = {"velocity": RNG.random((4, 3)).astype(np.float32), "body": np.arange(4)}
+    return Surface("surface", points.astype(np.float32), np.array(corners, dtype=np.int32), fields)
+
+
+@pytest.mark.parametrize(("dimension", "kind"), [(2, "line"), (3, "triangle")])
+def test_surfaces_round_trip(tmp_path, dimension, kind):
+    surface = some_surface(dimension)
+    write_vtu(tmp_path / "a.vtu", surface)
+    mesh = meshio.read(tmp_path / "a.vtu")
+    np.testing.assert_array_equal(mesh.points, surface.points)
+    np.testing.assert_array_equal(mesh.cells_dict[kind], surface.corners)
+    for name, values in surface.fields.items():
+        np.testing.assert_array_equal(mesh.point_data[name], values)
+
+
+def test_vtk_finds_the_volume_inside_a_surface(tmp_path):
+    pyvista = pytest.importorskip("pyvista", reason="VTK reads the files back")
+    write_vtu(tmp_path / "a.vtu", some_surface(3))
+    mesh = pyvista.read(tmp_path / "a.vtu").extract_surface(algorithm="dataset_surface")
+    assert mesh.is_all_triangles
+    np.testing.assert_allclose(mesh.volume, 1 / 6)  # VTK's sign: triangles are counterclockwise from outside
+    outward = mesh.compute_normals(point_normals=False, consistent_normals=False, auto_orient_normals=False).cell_data["Normals"]
+    assert (np.einsum("ij,ij->i", outward, mesh.cell_centers().points - 0.25) > 0).all()
+    write_vtu(tmp_path / "b.vtu", some_surface(2))
+    outline = pyvista.read(tmp_path / "b.vtu")
+    np.testing.assert_allclose(outline.compute_cell_sizes()["Length"], 1.0)
+    assert set(outline.celltypes) == {pyvista.CellType.LINE}
+
+
+def test_vtk_opens_a_collection(tmp_path):
+    pyvista = pytest.importorskip("pyvista", reason="VTK reads the files back")
+    folder = FrameFolder(tmp_path)
+    for index in range(3):
+        folder.write(index, index / 7, [some_points(4 + index), some_surface(3)])
+    for name, sizes in [("particles", [4, 5, 6]), ("surface", [4, 4, 4])]:
+        reader = pyvista.get_reader(tmp_path / f"{name}.pvd")
+        assert reader.time_values == [0.0, 1 / 7, 2 / 7]
+        for index, size in enumerate(sizes):
+            reader.set_active_time_point(index)
+            assert reader.read()[0].n_points == size
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 65536, 65537, 65538, 200_000])
+def test_arrays_of_every_length_survive_their_pieces(tmp_path, count):
+    points = Points("particles", RNG.random((count, 3)).astype(np.float32), {"kind": np.arange(count, dtype=np.uint8)})
+    write_vtu(tmp_path / "a.vtu", points)
+    pyvista = pytest.importorskip("pyvista", reason="VTK reads the files back")
+    cloud = pyvista.read(tmp_path / "a.vtu")
+    np.testing.assert_array_equal(cloud.points.reshape(-1, 3), points.points)
+    np.testing.assert_array_equal(cloud.point_data["kind"], points.fields["kind"])
+    if count:
+        np.testing.assert_array_equal(meshio.read(tmp_path / "a.vtu").points, points.points)
 
 
 @pytest.mark.parametrize(

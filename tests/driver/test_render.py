@@ -9,13 +9,15 @@ import warp as wp
 from typer.testing import CliRunner, Result
 
 from warp_lcp.driver import cli
+from warp_lcp.driver.camera import MARGIN
 from warp_lcp.driver.frames import FrameFolder
+from warp_lcp.driver.page import Page
 from warp_lcp.driver.recording import Color, Recording, RenderError, Scale, _round_up, spread
-from warp_lcp.driver.render import INSTALL, Page, parse_size, render_run
+from warp_lcp.driver.render import INSTALL, Looks, parse_size, render_run
 from warp_lcp.driver.scene_file import dump_scene, load_scene
 from warp_lcp.driver.scenery import Outline
 from warp_lcp.driver.simulator import Cells, Points
-from warp_lcp.driver.stage import MARGIN, SHADES, shaded
+from warp_lcp.driver.stage import Stage, shaded
 
 RNG = np.random.default_rng(9127)
 WHITE = 255
@@ -71,8 +73,8 @@ def pixels(path: Path) -> np.ndarray:
         return np.asarray(image, dtype=int)
 
 
-def draw(folder: Path, **options) -> list[np.ndarray]:
-    return [pixels(path) for path in render_run(folder, size=(400, 300), **options)]
+def draw(folder: Path, **looks) -> list[np.ndarray]:
+    return [pixels(path) for path in render_run(folder, looks=Looks(size=(400, 300), **looks))]
 
 
 def is_blue(image: np.ndarray) -> np.ndarray:
@@ -151,9 +153,9 @@ def test_a_sheet_shows_evenly_spaced_frames(pyvista, make_run):
     assert result.stdout.strip() == str(folder / "images" / "sheet.png")
     image = pixels(folder / "images" / "sheet.png")
     assert image.shape[1] == 600
-    page = Page(Recording(folder, Color.SPEED), (600, 480), 6)
+    page = Page(Recording(folder, Color.SPEED), (600, 480), 6, Stage)
     (width, height), columns = page.tile, page.columns
-    page.stage.close()
+    page.painter.close()
     areas = []
     for place in range(6):
         top = page.line + place // columns * (height + page.caption) + page.caption
@@ -165,20 +167,20 @@ def test_a_sheet_shows_evenly_spaced_frames(pyvista, make_run):
 
 def test_discs_have_the_size_of_the_particles(pyvista, make_run):
     folder = make_run([drops(30)])
-    page = Page(Recording(folder, Color.SPEED), (400, 300), 1)
+    page = Page(Recording(folder, Color.SPEED), (400, 300), 1, Stage)
     image = np.asarray(page.draw([0]), dtype=int)[page.line :]
-    page.stage.close()
+    page.painter.close()
     pixel = MARGIN / page.tile[1]  # [m]; the height is what limits a square domain here
-    assert page.stage.radius == pytest.approx(0.6 * 0.1)
-    assert is_blue(image).sum() * pixel**2 == pytest.approx(30 * np.pi * page.stage.radius**2, rel=0.25)  # neighbors overlap
+    assert page.painter.radius == pytest.approx(0.6 * 0.1)
+    assert is_blue(image).sum() * pixel**2 == pytest.approx(30 * np.pi * page.painter.radius**2, rel=0.25)  # neighbors overlap
     assert (image[2:-2, 2:40] == WHITE).all()
 
 
 def test_discs_lie_where_the_particles_are(pyvista, make_run):
     folder = make_run([([0.25, 0.75, 0.0], [1.0, 0.0, 0.0])])
-    page = Page(Recording(folder, Color.SPEED), (400, 300), 1)
+    page = Page(Recording(folder, Color.SPEED), (400, 300), 1, Stage)
     image = np.asarray(page.draw([0]), dtype=int)[page.line :]
-    page.stage.close()
+    page.painter.close()
     width, height = page.tile
     center = np.argwhere(is_blue(image)).mean(axis=0) + 0.5
     expected = [height / 2 - 0.25 * height / MARGIN, width / 2 - 0.25 * height / MARGIN]
@@ -187,9 +189,9 @@ def test_discs_lie_where_the_particles_are(pyvista, make_run):
 
 def test_flat_solids_are_filled_gray(pyvista, make_run):
     folder = make_run([([0.5, 0.5, 0.0], [1.0, 0.0, 0.0])], DISC)
-    page = Page(Recording(folder, Color.SPEED), (400, 300), 1)
+    page = Page(Recording(folder, Color.SPEED), (400, 300), 1, Stage)
     image = np.asarray(page.draw([0]), dtype=int)[page.line :]
-    page.stage.close()
+    page.painter.close()
     gray = (np.ptp(image, axis=-1) < 16) & (image[..., 0] > 150) & (image[..., 0] < 230)  # lighter than the outlines
     assert gray.sum() * (MARGIN / page.tile[1]) ** 2 == pytest.approx(1.0 - np.pi * 0.4**2, rel=0.03)
 
@@ -212,8 +214,8 @@ def test_pressure_and_plain_colors(pyvista, make_run):
     folder = make_run([(points, np.zeros((2, 3)))])
     recording = Recording(folder, Color.PRESSURE)
     np.testing.assert_allclose(recording.read(0)[1], [100.0, 800.0])
-    assert recording.scale().label == "pressure [Pa]"
-    assert Recording(folder, Color.PLAIN).scale().label == ""
+    assert recording.scale.label == "pressure [Pa]"
+    assert Recording(folder, Color.PLAIN).scale.label == ""
     pressure, plain = draw(folder, color=Color.PRESSURE)[0], draw(folder, color=Color.PLAIN)[0]
     assert (pressure[:20] < 200).sum() > (plain[:20] < 200).sum()  # its legend
     assert is_blue(plain[25:]).sum() > is_blue(pressure[25:]).sum()
@@ -291,7 +293,7 @@ def test_a_flat_solid_stands_where_it_is_at_the_time_of_a_frame(pyvista, make_ru
     wall = '[[solid]]\nshape = "box"\nmin = [0.9, 0.0]\nmax = [1.0, 1.0]\n'
     disc = f'[[solid]]\nshape = "sphere"\ncenter = [0.2, 0.6]\nradius = 0.1\nmotion = {motion}\n'
     folder = make_run([([0.05, 0.05, 0.0], [1.0, 0.0, 0.0])] * 5, disc + wall, solids="cut-cell")
-    page = Page(Recording(folder, Color.SPEED), (400, 300), 1)
+    page = Page(Recording(folder, Color.SPEED), (400, 300), 1, Stage)
     pixel = MARGIN / page.tile[1]  # [m]
     low = 0.5 * (np.array(page.tile) * pixel - 1.0)  # [m] from the image's left and lower edge to the domain's corner
     for frame, expected in ((0, [0.2, 0.6]), (1, [0.4, 0.55]), (4, [0.6, 0.5]), (0, [0.2, 0.6])):
@@ -303,16 +305,16 @@ def test_a_flat_solid_stands_where_it_is_at_the_time_of_a_frame(pyvista, make_ru
         np.testing.assert_allclose([x[ours].mean(), y[ours].mean()], expected, atol=pixel)
         assert ours.sum() * pixel**2 == pytest.approx(np.pi * 0.1**2, rel=0.1)  # and nothing is left where it was
         assert (x[~ours] > 0.9).mean() > 0.8  # the wall stands
-    page.stage.close()
+    page.painter.close()
 
 
 def test_a_solid_in_a_room_is_drawn_anew_in_every_frame(pyvista, make_run):
     motion = '{ kind = "translation", velocity = [0.0, 8.0, 0.0] }'
     text = f"[[solid]]\n{SOLIDS['sphere']}\nmotion = {motion}\n"
     folder = make_run([([0.9, 0.9, 0.9], [1.0, 0.0, 0.0])] * 4, text, size=ROOM, solids="cut-cell")
-    page = Page(Recording(folder, Color.PLAIN), (400, 300), 1)
+    page = Page(Recording(folder, Color.PLAIN), (400, 300), 1, Stage)
     images = [np.asarray(page.draw([frame]), dtype=int)[page.line :] for frame in (0, 1, 3, 0)]
-    page.stage.close()
+    page.painter.close()
     assert (images[0] != images[1]).any()
     np.testing.assert_array_equal(images[0], images[3])
     gray = [((np.ptp(image, axis=-1) < 16) & (image < 215).all(axis=-1)).sum() for image in images]
@@ -329,7 +331,7 @@ def test_containers_do_not_hide_what_is_in_them(pyvista, make_run):
 def test_liquid_is_lit_from_above_and_drops_are_not():
     block = np.stack(np.meshgrid(*[np.arange(0.025, 1.0, 0.05)] * 3), axis=-1).reshape(-1, 3)
     drop = np.array([[3.0, 3.0, 3.0]])
-    light = shaded(np.concatenate([block, drop]), np.full((len(block) + 1, 3), 100.0), 0.1, SHADES["water"]).mean(axis=1)
+    light = shaded(np.concatenate([block, drop]), np.full((len(block) + 1, 3), 100.0), 0.1, "water").mean(axis=1)
     middle = (np.abs(block[:, [0, 2]] - 0.5) < 0.1).all(axis=1)
     top, bottom, core = (light[:-1][middle & (np.abs(block[:, 1] - y) < 0.03)].mean() for y in (0.975, 0.025, 0.525))
     assert top > bottom + 20
@@ -347,7 +349,7 @@ def test_negative_pressure_extends_the_scale(pyvista, make_run):
     folder = make_run([([[0.5, 0.5, 0.0]] * 50, np.zeros((50, 3)))])
     recording = Recording(folder, Color.PRESSURE)
     recording.read = lambda number: (np.zeros((50, 3)), np.linspace(-90.0, 200.0, 50))  # type: ignore[method-assign]
-    scale = recording.scale()
+    scale = recording.scale
     assert scale.low == -100.0
     assert scale.high == 200.0
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from warp_lcp.driver import frames as frames_module
 from warp_lcp.driver import run as run_module
+from warp_lcp.driver import vtu as vtu_module
 from warp_lcp.driver.checkpoint import CheckpointFolder
 from warp_lcp.driver.frames import FrameFolder
 from warp_lcp.driver.profile import NoStopwatch, Profile
@@ -305,7 +305,7 @@ def test_steps_longer_than_the_cfl_number_allows_are_reported_once(dots, scene_f
 
 def test_a_full_disk_ends_the_run_with_earlier_files_intact(scene_file, tmp_path, monkeypatch):
     out = tmp_path / "out"
-    write, parts = frames_module._vtu, []
+    write, parts = vtu_module._vtu, []
 
     def full(*arguments: Any) -> Any:
         parts.append(arguments)
@@ -314,7 +314,7 @@ def test_a_full_disk_ends_the_run_with_earlier_files_intact(scene_file, tmp_path
             raise OSError(errno.ENOSPC, "No space left on device")
         yield from write(*arguments)
 
-    monkeypatch.setattr(frames_module, "_vtu", full)
+    monkeypatch.setattr(vtu_module, "_vtu", full)
     result = go(scene_file, out)
     assert result.status == "failed"
     assert result.reason.startswith("the disk is full")

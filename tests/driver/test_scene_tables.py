@@ -100,8 +100,6 @@ def test_unknown_keys_suggest(changes, expected):
     ("changes", "path"),
     [
         ({"solver.preset": "standard"}, "solver.preset"),
-        ({"output.surface": True}, "output.surface = true"),
-        ({"solid": [{**BOX, "mass": 1.0}]}, "solid[0].mass"),
     ],
 )
 def test_what_comes_later_is_no_typo(changes, path):
@@ -115,7 +113,6 @@ def test_what_comes_later_is_no_typo(changes, path):
         ({"friction": {"model": "cone"}}, "friction"),
         ({"domain.friction": 0.5}, "domain.friction"),
         ({"domain.periodic": [True, False]}, "domain.periodic[0] = true"),
-        ({"solid": [{**BOX, "friction": 1.0}]}, "solid[0].friction"),
     ],
 )
 def test_what_another_simulator_has_is_no_typo(changes, path):
@@ -123,7 +120,7 @@ def test_what_another_simulator_has_is_no_typo(changes, path):
 
 
 def test_what_comes_later_may_be_off():
-    scene = build({"domain.periodic": [False, False], "output.surface": False})
+    scene = build({"domain.periodic": [False, False]})
     assert scene.domain.periodic == [False, False]
     assert complaint({"domain.periodic": [False]}) == "dam.toml: domain.periodic = [false]: must have 2 entries"
 

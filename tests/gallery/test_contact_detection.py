@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from warp_lcp.gallery.box_contacts import OrientedBox, box_box
 from warp_lcp.gallery.contact_detection import GROUND, Plane, detect
 from warp_lcp.gallery.rigid_bodies import FIXED, Box, RigidBodies, Sphere
+from warp_lcp.rigid.box_contacts import OrientedBox, box_box
 
 GROUND_PLANE = (Plane((0.0, 0.0, 1.0)),)
 

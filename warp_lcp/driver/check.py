@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 from warp_lcp.driver.devices import free_memory
+from warp_lcp.driver.particle_scene import ParticleScene
 from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.scene_file import check_shapes, load_scene
 from warp_lcp.driver.table import Problem, SceneError
@@ -22,6 +24,7 @@ def check_scene(path_or_name: str, overrides: Sequence[str] = ()) -> tuple[Scene
     """
     scene = load_scene(path_or_name, overrides)
     check_shapes(scene, path_or_name)
+    _check_bodies(scene, path_or_name)
     return scene, [("scene", scene.scene.name), ("simulator", scene.scene.simulator), *scene.plan()]
 
 
@@ -44,3 +47,15 @@ def check_memory(scene: Scene, device: str) -> None:
             f"{device}; lower domain.resolution, or run it anyway with --force-memory"
         )
         raise SceneError(scene.scene.name, [Problem("domain.resolution", message, str(scene.domain.resolution))])
+
+
+def _check_bodies(scene: Scene, source: str) -> None:
+    """Refuse rigid bodies that overlap each other, walls or other solids."""
+    if not isinstance(scene, ParticleScene) or not any(solid.is_body for solid in scene.solid):
+        return
+    from warp_lcp.driver.particle_assembly import make_bodies, placed_solids
+
+    try:
+        make_bodies(scene, placed_solids(scene, Path.cwd()))
+    except ValueError as error:
+        raise SceneError(source, [Problem("solid", str(error))]) from error

@@ -1,4 +1,4 @@
-"""The command line: `warp-lcp run | render | check | scenes | schema | solve | bench | info`."""
+"""The command line: `warp-lcp run | render | view | check | scenes | schema | solve | bench | info`."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ from warp_lcp.driver.benchmark import benchmarks
 from warp_lcp.driver.calibrate import step_seconds
 from warp_lcp.driver.check import check_memory, check_scene
 from warp_lcp.driver.devices import DeviceError, choose_device, cuda_driver, devices
+from warp_lcp.driver.film import check_rate
 from warp_lcp.driver.profile import Profile
 from warp_lcp.driver.progress import Bar, Lines
-from warp_lcp.driver.recording import Color, RenderError
-from warp_lcp.driver.render import parse_size, render_run
+from warp_lcp.driver.recording import Color, RenderError, Show
+from warp_lcp.driver.render import Looks, film_run, parse_size, render_run
 from warp_lcp.driver.run import run_scene
 from warp_lcp.driver.run_folder import OutputError, RunRecord
 from warp_lcp.driver.scene_file import built_in_scenes, installed_simulators, load_scene
@@ -30,6 +31,7 @@ from warp_lcp.driver.simulator import SimulationFailed, StepFailed
 from warp_lcp.driver.solve_file import ProblemError, solve_files, write_vector
 from warp_lcp.driver.table import SceneError, nearest
 from warp_lcp.driver.versions import shadowing_distributions, versions
+from warp_lcp.driver.viewer import view_run
 
 FAILED = 1
 WRONG_INPUT = 2
@@ -50,6 +52,17 @@ SetOption = Annotated[
     typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Override a key of the scene; may be repeated. Arrays: liquid.0.max=[1,1]."),
 ]
 
+RunArgument = Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a run.")]
+ShowOption = Annotated[
+    Show | None, typer.Option(help="What is drawn; the surface where the run wrote one, else particles.", show_default=False)
+]
+ColorOption = Annotated[
+    Color | None, typer.Option(help="What colors the particles, on one scale for the whole run; speed unless given.", show_default=False)
+]
+CameraOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="camera.KEY=VALUE", help="Override a key of the scene's table [camera]; may be repeated."),
+]
 ForceMemory = Annotated[bool, typer.Option("--force-memory", help="Run even what will not fit into the device's free memory.")]
 
 
@@ -101,23 +114,58 @@ def run(
 
 @app.command()
 def render(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a run.")],
+    folder: RunArgument,
     frame: Annotated[
         list[int] | None, typer.Option(metavar="N", help="Draw frame N, counted from the end if negative; may be repeated.")
     ] = None,
     size: Annotated[str, typer.Option(metavar="WxH", help="Pixels of an image; a sheet may be less high.")] = "1280x720",
     out: Annotated[Path | None, typer.Option(help="The images' folder; DIR/images unless given.", show_default=False)] = None,
-    color: Annotated[Color, typer.Option(help="What colors the particles, on one scale for the whole run.")] = Color.SPEED,
+    show: ShowOption = None,
+    color: ColorOption = None,
     sheet: Annotated[bool, typer.Option("--sheet", help="Draw the frames, or six of them, side by side into sheet.png.")] = False,
+    film: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draw all frames into FILE, an .mp4 or a .gif that repeats.", show_default=False)
+    ] = None,
+    fps: Annotated[float | None, typer.Option(help="Frames a second of the film; the scene's unless given.", show_default=False)] = None,
+    cut: Annotated[bool, typer.Option("--slice", help="Draw a section with Matplotlib, which needs no pyvista.")] = False,
+    at: Annotated[
+        float | None, typer.Option(metavar="Z", help="Where a 3-D run is cut [m]; in its middle unless given.", show_default=False)
+    ] = None,
+    overrides: CameraOption = None,
 ) -> None:
-    """Draw a run's frames as PNG images (needs pyvista: the extra `render`)."""
+    """Draw a run's frames as PNG images or as a film (needs the extra `render`)."""
     images = []
-    devices()  # starts Warp, which samples 2-D solids, without its native messages
+    devices()  # starts Warp, which draws surfaces and samples 2-D solids, without its native messages
     with _wrong_input(), Console(stderr=True).status("drawing") as status:
-        for image in render_run(folder, frames=frame or (), size=parse_size(size), out=out, color=color, sheet=sheet):
+        looks = Looks(size=parse_size(size), color=color, show=show, cut=cut, at=at, overrides=overrides or ())
+        if film is not None:
+            if frame or sheet or out:
+                raise RenderError("--film: shows all frames in one file; leave out --frame, --sheet and --out")
+            count = 0
+            for number in film_run(folder, film, looks=looks, rate=check_rate(fps)):
+                status.update(f"drew frame {number}")
+                count += 1
+            typer.echo(f"{film}: {count} frames")
+            return
+        if fps is not None:
+            raise RenderError("--fps: is of a film; give --film")
+        for image in render_run(folder, frames=frame or (), looks=looks, out=out, sheet=sheet):
             images.append(image)
             status.update(f"drew {image.name}")
     typer.echo(f"{images[0]}" if len(images) == 1 else f"{len(images)} images, {images[0]} to {images[-1].name}")
+
+
+@app.command()
+def view(
+    folder: RunArgument,
+    show: ShowOption = None,
+    color: ColorOption = None,
+    overrides: CameraOption = None,
+) -> None:
+    """Show a run's frames in a window: Space plays, the arrow keys step, the mouse turns (needs a display and the extra `render`)."""
+    devices()
+    with _wrong_input():
+        view_run(folder, Looks(color=color, show=show, overrides=overrides or ()))
 
 
 @app.command()
@@ -194,7 +242,7 @@ def solve(
 
 @app.command()
 def bench(
-    suite: Annotated[str, typer.Argument(metavar="SUITE", help="What to measure: kernels, solvers or run; or validation.")],
+    suite: Annotated[str, typer.Argument(metavar="SUITE", help="kernels, solvers, scaling, peers, run, sand, contacts or validation.")],
     device: Annotated[str, typer.Option(help="cpu or cuda:N.")] = "cpu",
     out: Annotated[Path, typer.Option(help="The folder of SUITE.json, SUITE.md and the plots.")] = Path("out/bench"),
     size: Annotated[list[int] | None, typer.Option(metavar="N", help="Cells along a side; may be repeated.", show_default=False)] = None,

@@ -16,7 +16,9 @@ from warp_lcp.driver.shapes import BUILTIN
 from warp_lcp.driver.table import Problem, SceneError, written
 
 RESOLUTION = "domain.resolution"
-MAY_CHANGE = "scene.name, scene.description, time.duration, time.cfl, time.dt_max, time.dt_min, [solver], [output] and domain.resolution"
+MAY_CHANGE = (
+    "scene.name, scene.description, time.duration, time.cfl, time.dt_max, time.dt_min, [solver], [output], [camera] and domain.resolution"
+)
 
 
 class Change(Enum):
@@ -29,7 +31,7 @@ class Change(Enum):
 
 
 RULES = (
-    (re.compile(r"scene\.(name|description)|time\.duration|output\..*"), Change.SAME_STEPS),
+    (re.compile(r"scene\.(name|description)|time\.duration|(output|camera)\..*"), Change.SAME_STEPS),
     (re.compile(r"solver\..*|time\.(cfl|dt_max|dt_min)"), Change.OTHER_STEPS),
     (re.compile(re.escape(RESOLUTION)), Change.RESAMPLED),
 )

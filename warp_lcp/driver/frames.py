@@ -1,37 +1,42 @@
-"""Frames as ParaView opens them: VTU files, and PVD collections that give each its time."""
+"""Frames as ParaView opens them: VTU or VTI files, and PVD collections that give each its time; volumes as NanoVDB, surfaces as PLY too."""
 
 from __future__ import annotations
 
-import base64
 import re
 from collections import deque
-from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Literal, Self
 
-import numpy as np
-
-from warp_lcp.driver.atomic import replacing, write_text
+from warp_lcp.driver.atomic import write_text
+from warp_lcp.driver.nvdb import nvdb_bytes, write_nvdb
+from warp_lcp.driver.ply import ply_bytes, write_ply
 from warp_lcp.driver.profile import NoStopwatch, Stopwatch
-from warp_lcp.driver.simulator import Cells, Part, Points, Surface
+from warp_lcp.driver.simulator import Cells, Part, Surface, Volume
+from warp_lcp.driver.vti import vti_bytes, write_vti
+from warp_lcp.driver.vtu import vtu_bytes, write_vtu
 
-FRAME_FILE = re.compile(r"(?P<name>[a-z][a-z_]*)_(?P<index>\d{6,})\.vtu")
-
-# Corners of a cell in VTK's order for quadrilaterals (the first four) and hexahedra, as x, y, z.
-CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
-BASE64 = 4 / 3  # what the encoding adds to the bytes
-VTK_TYPES = {1: 1, 2: 3, 3: 5, 4: 9, 8: 12}  # vertex, line, triangle, quadrilateral and hexahedron by their corners
+FRAME_FILE = re.compile(r"(?P<name>[a-z][a-z_]*)_(?P<index>\d{6,})\.(?P<format>vtu|vti|ply|nvdb)")
+COLLECTED = ("vtu", "vti")  # what ParaView opens as a series
 WAITING = 2  # frames in memory, the one being written included
+
+GridFormat = Literal["vtu", "vti"]
 
 
 class FrameFolder:
-    """The frames of one run: `frames/<name>_<index>.vtu` and `<name>.pvd` beside the folder."""
+    """The frames of one run: `frames/<name>_<index>.vtu` (or .vti, .nvdb) and, but for volumes, `<name>.pvd` beside the folder.
 
-    def __init__(self, folder: Path) -> None:
+    Args:
+        folder: of the run.
+        grid_format: of the cells.
+        surface_ply: write surfaces as PLY files too.
+    """
+
+    def __init__(self, folder: Path, grid_format: GridFormat = "vtu", *, surface_ply: bool = False) -> None:
         """Look at a run's folder; nothing is written before the first frame."""
         self.folder = folder
+        self.grid_format, self.surface_ply = grid_format, surface_ply
         self.frames = folder / "frames"
         self._times: dict[str, list[tuple[float, str]]] = {}
 
@@ -52,12 +57,16 @@ class FrameFolder:
         self.frames.mkdir(exist_ok=True)
         files = []
         for part in frame:
-            file = self.frames / f"{part.name}_{index:06d}.vtu"
-            write_vtu(file, part)
+            file = self._write(self.frames / f"{part.name}_{index:06d}", part)
+            files.append(file)
+            if self.surface_ply and isinstance(part, Surface):
+                files.append(file.with_suffix(".ply"))
+                write_ply(files[-1], part)
+            if isinstance(part, Volume):
+                continue
             times = self._times.setdefault(part.name, [])
             times.append((time, f"frames/{file.name}"))
             write_text(self.folder / f"{part.name}.pvd", collection(times))
-            files.append(file)
         return files
 
     def resume(self, times: list[float]) -> None:
@@ -70,17 +79,30 @@ class FrameFolder:
             OSError: a file cannot be deleted or written.
         """
         self._times.clear()
-        for file in sorted(self.frames.glob("*.vtu")):
+        for file in sorted(self.frames.iterdir() if self.frames.is_dir() else []):
             match = FRAME_FILE.fullmatch(file.name)
             if match is None:
                 continue
             index = int(match["index"])
             if index >= len(times):
                 file.unlink()
-            else:
+            elif match["format"] in COLLECTED:
                 self._times.setdefault(match["name"], []).append((times[index], f"frames/{file.name}"))
         for name, entries in self._times.items():
             write_text(self.folder / f"{name}.pvd", collection(entries))
+
+    def _write(self, path: Path, part: Part) -> Path:
+        """Write a part to a path that gets the suffix of its format."""
+        if isinstance(part, Volume):
+            file = path.with_suffix(".nvdb")
+            write_nvdb(file, part)
+        elif isinstance(part, Cells) and self.grid_format == "vti":
+            file = path.with_suffix(".vti")
+            write_vti(file, part)
+        else:
+            file = path.with_suffix(".vtu")
+            write_vtu(file, part)
+        return file
 
 
 class FrameWriter:
@@ -152,43 +174,16 @@ class FrameWriter:
         self._failed, self.newest = False, index
 
 
-def write_vtu(path: Path, part: Part) -> None:
-    """Write a part of a frame as a VTU file: binary, uncompressed (compression takes three times as long as writing), atomically.
+def frame_bytes(frame: list[Part], grid_format: GridFormat = "vtu", *, surface_ply: bool = False) -> int:
+    """Return about how many bytes the files of a frame take; rather more than less.
 
     Args:
-        path: the file.
-        part: points become vertices, surfaces triangles or lines; cells become quadrilaterals or hexahedra that share their corners.
-
-    Raises:
-        OSError: the file cannot be written.
-        ValueError: a field has another length than the points or cells.
+        frame: what it shows.
+        grid_format: of the cells.
+        surface_ply: count the PLY files of surfaces.
     """
-    size = _size(part)
-    fields = {name: _writable(name, values, size) for name, values in part.fields.items()}
-    if isinstance(part, Points):
-        points, corners = _writable("points", part.points, size), np.arange(size, dtype=np.int32)[:, None]
-    elif isinstance(part, Surface):
-        points, corners = _writable("points", part.points, size), part.corners.astype(np.int32, copy=False)
-    else:
-        points, corners = _corners(part)
-    with replacing(path) as temporary, open(temporary, "wb") as file:
-        file.writelines(_vtu(points, corners, fields, "CellData" if isinstance(part, Cells) else "PointData"))
-
-
-def frame_bytes(frame: list[Part]) -> int:
-    """Return about how many bytes the files of a frame take; no less for points, a little more for cells that share corners."""
-    total = 0.0
-    for part in frame:
-        fields = sum(values.nbytes for values in part.fields.values())
-        if isinstance(part, Points):
-            total += fields + part.points.nbytes + len(part.points) * (4 + 4 + 8)  # connectivity, offset, type
-        elif isinstance(part, Surface):
-            total += fields + part.points.nbytes + len(part.corners) * (4 * part.corners.shape[1] + 4 + 8)
-        else:
-            corners = 2**part.dimension
-            total += fields + len(part.index) * (4 * corners + 4 + 8 + 2 * 12)  # and about two corner points a cell
-        total += 2000
-    return int(BASE64 * total)
+    more = sum(ply_bytes(part) for part in frame if surface_ply and isinstance(part, Surface))
+    return more + sum(_bytes(part, grid_format) for part in frame)
 
 
 def collection(entries: list[tuple[float, str]]) -> str:
@@ -198,65 +193,7 @@ def collection(entries: list[tuple[float, str]]) -> str:
     return "\n".join([*head, *lines, "  </Collection>", "</VTKFile>", ""])
 
 
-def _size(part: Part) -> int:
-    return len(part.index if isinstance(part, Cells) else part.points)
-
-
-def _writable(name: str, values: np.ndarray, size: int) -> np.ndarray:
-    """Return a field in a type that VTU has (there are no booleans and no half floats)."""
-    if len(values) != size:
-        raise ValueError(f"field {name!r} has {len(values)} entries for {size} points or cells")
-    if values.dtype == np.bool_:
-        values = values.astype(np.uint8)
-    elif values.dtype == np.float16:
-        values = values.astype(np.float32)
-    return np.ascontiguousarray(values)
-
-
-def _corners(cells: Cells) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corner points [m] (float32, shape (m, 3)) and each cell's corners among them, shape (n, 4) or (n, 8)."""
-    if len(cells.index) == 0:
-        return np.zeros((0, 3), dtype=np.float32), np.zeros((0, 2**cells.dimension), dtype=np.int32)
-    low = cells.index.min(axis=0)
-    shape = cells.index.max(axis=0) - low + 2
-    corners = cells.index[:, None, :] - low + CORNERS[: 2**cells.dimension]
-    flat = np.ravel_multi_index(tuple(np.moveaxis(corners, -1, 0)), tuple(shape))
-    used = np.zeros(shape.prod(), dtype=bool)  # a table over the bounding box: much faster than sorting the corners
-    used[flat] = True
-    number = np.cumsum(used, dtype=np.int32) - 1
-    lattice = np.stack(np.unravel_index(np.flatnonzero(used), tuple(shape)), axis=-1) + low
-    if cells.dimension == 2:
-        lattice[:, 2] = 0
-    return (lattice * cells.spacing).astype(np.float32), number[flat]
-
-
-def _vtu(points: np.ndarray, corners: np.ndarray, fields: dict[str, np.ndarray], where: str) -> Iterator[bytes]:
-    """Yield the parts of a VTU file. One without points still names its fields, so that a viewer finds them in every frame."""
-    count, each = corners.shape
-    kinds = np.full(count, VTK_TYPES[each], dtype=np.uint8)
-    yield (
-        b'<?xml version="1.0"?>\n<VTKFile type="UnstructuredGrid" version="0.1" byte_order="LittleEndian" header_type="UInt64">\n'
-        b"<UnstructuredGrid>\n"
-    )
-    yield f'<Piece NumberOfPoints="{len(points)}" NumberOfCells="{count}">\n<Points>\n'.encode()
-    yield from _data_array("Points", points)
-    yield b"</Points>\n<Cells>\n"
-    yield from _data_array("connectivity", corners.reshape(-1))
-    yield from _data_array("offsets", np.arange(each, each * count + 1, each, dtype=np.int32))
-    yield from _data_array("types", kinds)
-    yield f"</Cells>\n<{where}>\n".encode()
-    for name, values in fields.items():
-        yield from _data_array(name, values)
-    yield f"</{where}>\n</Piece>\n</UnstructuredGrid>\n</VTKFile>\n".encode()
-
-
-def _data_array(name: str, values: np.ndarray) -> Iterator[bytes]:
-    little = values.astype(values.dtype.newbyteorder("<"), copy=False)
-    components = f' NumberOfComponents="{values.shape[1]}"' if values.ndim == 2 else ""
-    yield f'<DataArray type="{_vtu_type(values.dtype)}" Name="{name}"{components} format="binary">'.encode()
-    yield base64.b64encode(np.uint64(little.nbytes).astype("<u8").tobytes() + little.tobytes())
-    yield b"</DataArray>\n"
-
-
-def _vtu_type(dtype: np.dtype) -> str:
-    return {"f": "Float", "i": "Int", "u": "UInt"}[dtype.kind] + str(8 * dtype.itemsize)
+def _bytes(part: Part, grid_format: GridFormat) -> int:
+    if isinstance(part, Volume):
+        return nvdb_bytes(part)
+    return vti_bytes(part) if isinstance(part, Cells) and grid_format == "vti" else vtu_bytes(part)

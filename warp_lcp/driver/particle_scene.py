@@ -10,9 +10,11 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
+from warp_lcp.driver.particle_volume import VOLUME_BYTES
 from warp_lcp.driver.scene import Scene
-from warp_lcp.driver.shapes import Drain, MaterialProperties, Source
+from warp_lcp.driver.shapes import BODY_FRICTION, STICKS, Drain, MaterialProperties, Source
 from warp_lcp.driver.table import Complaint, Table
+from warp_lcp.grid.surface_mesh import MESH_LATTICE_BYTES, MESH_POINT_BYTES, MESH_SOLID_BYTES
 
 # Measured at 96^3 as the growth of a process on the CPU, first step included.
 GRID_BYTES = 36  # fields of the grid, a cell
@@ -21,6 +23,8 @@ MOVING_BYTES = 30
 SOURCE_BYTES = 8
 CORRECTION_BYTES, CUT_CORRECTION_BYTES = 54, 22  # the density correction's fields and method, and more where cells are cut
 RESEED_BYTES = 13
+BAND_BYTES = 24
+SPREAD = 2.0  # how much a narrow band may grow as its surface does: 1.3 times in a double dam break, 1.7 in a dam break in 3-D
 PLANES = 2.5  # that a 2-D cell counts for: its fields have three, the solver's one
 VECTOR_BYTES, KEY_BYTES = 12, 16  # a particle's vectors, one of them spare, and its sort keys
 SEEDING_BYTES = 136  # a particle on the host, while the material is made and the solver is not
@@ -35,6 +39,12 @@ class Reseed(Table):
     max: int | None = Field(default=None, ge=1, description="particles in a cell, more are handed on; twice those at rest unless given")
 
 
+class NarrowBandSettings(Table):
+    """[particles.narrow_band]: particles near the surface only, the grid carries what lies deeper; off unless the table is there."""
+
+    width: float = Field(default=4.0, ge=3, description="cells below the surface that hold particles")
+
+
 class ParticleSettings(Table):
     """[particles]: how the material is sampled and how its velocity moves between particles and grid."""
 
@@ -44,6 +54,7 @@ class ParticleSettings(Table):
     jitter: float = Field(default=0.25, ge=0, le=1, description="random displacement at the start, a fraction of the particles' distance")
     seed: int = Field(default=2015, ge=0, description="of the random displacements")
     reseed: Reseed | None = None
+    narrow_band: NarrowBandSettings | None = None
 
     def reseed_range(self, dimension: int) -> tuple[int, int]:
         """Return the fewest and the most particles of a cell that reseeding leaves alone."""
@@ -73,6 +84,7 @@ class ParticleScene(Scene):
 
     solve_bytes: ClassVar[int] = 0  # a cell, of the fields of the solve that are there before the particles are made
     correction_gain: ClassVar[float] = 1.0  # of the density correction
+    carried_by_grid: ClassVar[bool] = False  # whether the grid can carry the material without particles
 
     particles: ParticleSettings = Field(default_factory=ParticleSettings)
     density_correction: DensityCorrectionSettings | None = None
@@ -94,6 +106,9 @@ class ParticleScene(Scene):
         found = [] if materials or self.source else [Complaint((key,), None, "is missing, and there is no [[source]] either")]
         found += self.shape_complaints(key, materials, inside=True)
         found += self.shape_complaints("source", self.source, inside=True) + self.shape_complaints("drain", self.drain, inside=True)
+        if self.particles.narrow_band is not None and not self.carried_by_grid:
+            message = "is for liquids only: sand deep inside has a state that its particles alone know"
+            found.append(Complaint(("particles", "narrow_band"), None, message))
         return super().complaints() + found + self._reseed_complaints()
 
     def _reseed_complaints(self) -> list[Complaint]:
@@ -105,6 +120,11 @@ class ParticleScene(Scene):
         message = f"must be at {word} the {at_rest} particles of a cell at rest"
         return [Complaint(("particles", "reseed", key), value, message)]
 
+    def body_frictions(self) -> list[float]:
+        """Return Coulomb's coefficient of each solid's surface against bodies and walls."""
+        given = [BODY_FRICTION if solid.friction is None else solid.friction for solid in self.solid]
+        return [STICKS if friction == "stick" else float(friction) for friction in given]
+
     def particle_estimate(self, *, later: bool = True) -> int:
         """Return about how many particles the scene has at most: meshes and slanted shapes count as the boxes around them.
 
@@ -115,7 +135,19 @@ class ParticleScene(Scene):
         """
         let_in = sum(self._source_volume(source, later=later) for source in self.source)
         volume = min(sum(self.enclosed_volume(shape) for shape in self.materials()[1]) + let_in, math.prod(self.domain.size))
+        if self.particles.narrow_band is not None:
+            band = sum(self._band_volume(shape, self.particles.narrow_band.width) for shape in self.materials()[1])
+            volume = min(volume, (SPREAD if later else 1.0) * (band + let_in))
         return round(volume / self.spacing**self.dimension * self.particles.per_axis**self.dimension)
+
+    def _band_volume(self, shape: MaterialProperties, width: float) -> float:
+        """Return the part of the box around a shape that is no deeper than a band below a free side [m^3; m^2 in 2-D]."""
+        size, deep = np.array(self.domain.size), width * self.spacing
+        bounds = shape.bounds(self.dimension)
+        low, high = (np.zeros_like(size), size) if bounds is None else (corner[: self.dimension] for corner in bounds)
+        low, high = np.maximum(low, 0.0), np.minimum(high, size)
+        inner = high - low - deep * ((low > 0.0).astype(float) + (high < size))
+        return float(np.maximum(high - low, 0.0).prod() - np.maximum(inner, 0.0).prod())
 
     def _source_volume(self, source: Source, *, later: bool) -> float:
         """Return an upper bound of what a source holds and lets in, or of what it holds at the start [m^3; m^2 in 2-D]."""
@@ -145,6 +177,9 @@ class ParticleScene(Scene):
     def _rearrangement(self) -> list[tuple[str, str]]:
         """Return what moves particles apart from the flow."""
         lines, correction, reseed = [], self.density_correction, self.particles.reseed
+        band = self.particles.narrow_band
+        if band is not None:
+            lines.append(("narrow band", f"particles within {band.width:g} cells of the surface, the grid carries the rest"))
         if correction is not None:
             most = correction.largest(self.particles.per_axis)
             lines.append(("density", f"at most {most:.4g} of that at rest, corrected {_steps(correction.every)}"))
@@ -156,7 +191,7 @@ class ParticleScene(Scene):
     def memory_parts(self) -> dict[str, int]:
         """Return about how much memory each part of a run takes at most on its device [bytes]; parts that it does not have are left out."""
         cells, settings, cut = self.counted_cells, self.particles, self.cuts_cells
-        moving = any(solid.motion is not None for solid in self.solid)
+        moving = any(solid.moves for solid in self.solid)
         vectors = 3 + (self.dimension if settings.transfer == "apic" else 0)
         parts = {
             "grid": cells * (GRID_BYTES + 4 * self.dimension * (settings.transfer == "flip")),
@@ -164,10 +199,20 @@ class ParticleScene(Scene):
             "solids": cells * (CUT_BYTES * cut + MOVING_BYTES * moving),
             "density correction": cells * (CORRECTION_BYTES + CUT_CORRECTION_BYTES * cut) * (self.density_correction is not None),
             "reseeding": cells * RESEED_BYTES * (settings.reseed is not None),
+            "narrow band": cells * BAND_BYTES * (settings.narrow_band is not None),
             "sources": cells * SOURCE_BYTES * bool(self.source),
+            "volume": cells * VOLUME_BYTES * self.output.volume,
+            "surface mesh": self.output.surface * self._surface_bytes(),
             "particles": self.particle_estimate() * (VECTOR_BYTES * vectors + KEY_BYTES),
         }
         return {name: count for name, count in parts.items() if count}
+
+    def _surface_bytes(self) -> int:
+        """Return what the lattice of a surface mesh takes, and a mesh as large as the domain's sides [bytes]."""
+        nx, ny, nz = (n * (self.output.surface_resolution or self.particles.per_axis) for n in self.cell_counts)
+        cells = nx * ny * (nz if self.dimension == 3 else 3)
+        points = 2 * (nx * ny + ny * nz + nz * nx) if self.dimension == 3 else 2 * (nx + ny)
+        return cells * (MESH_LATTICE_BYTES + MESH_SOLID_BYTES * bool(self.solid)) + points * MESH_POINT_BYTES
 
     def own_memory_parts(self) -> dict[str, int]:
         """Return what the material's own models take at most on the device [bytes]; parts that a scene does not have count 0."""

@@ -10,18 +10,21 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.driver.particle_assembly import make_density_correction, make_reseeding
+from warp_lcp.driver.particle_assembly import make_density_correction, make_particle_volume, make_reseeding, make_surface_mesh
 from warp_lcp.driver.particle_scene import ParticleScene
 from warp_lcp.driver.profile import NoStopwatch, Stopwatch
-from warp_lcp.driver.simulator import Points, SimulationFailed
+from warp_lcp.driver.simulator import Points, SimulationFailed, Surface, Volume
 from warp_lcp.grid.particles import MARGIN, Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.surface_mesh import Interior, faces_from_particles, sample
 from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.gravity import accelerate
+from warp_lcp.material.narrow_band import NarrowBand, without_band
 from warp_lcp.material.outlets import Outlets
 from warp_lcp.material.resample import resampled, resampling_notes
 from warp_lcp.material.sources import Sources
+from warp_lcp.rigid.bodies import RigidBodies
 
 Row = dict[str, float | int | str | None]  # of the log
 
@@ -51,8 +54,11 @@ class ParticleSimulation(ABC):
     `bring_to_particles` and `move`, and returns `logged` of what the log gets. Nothing before `move` changes the state but for the
     particles' order, so that a solve may fail.
 
-    With `boundary`, `particles`, `sources` and `outlets` of `warp_lcp.driver.particle_assembly` it has a Simulation's clock, time step,
-    checkpoints, resampling, notes and columns; `step` and `frame` are the subclass's.
+    Rigid bodies take part by themselves: `begin_step` starts their step and `move` ends it. In between the subclass gives them the impulses
+    of its solve, or calls `restore_bodies` if it fails.
+
+    With `boundary`, `particles`, `sources`, `outlets` and `bodies` of `warp_lcp.driver.particle_assembly` it has a Simulation's clock, time
+    step, checkpoints, resampling, notes and columns; `step` and `frame` are the subclass's.
 
     Args:
         scene: what to simulate.
@@ -61,6 +67,8 @@ class ParticleSimulation(ABC):
         particles: the material at the start.
         sources: where material comes in.
         outlets: where it leaves.
+        bodies: solids of `boundary` that the material moves.
+        band: where its particles are, if not everywhere.
         notes: facts for the start of a run.
 
     Attributes:
@@ -85,19 +93,24 @@ class ParticleSimulation(ABC):
         *,
         sources: Sources | None = None,
         outlets: Outlets | None = None,
+        bodies: RigidBodies | None = None,
+        band: NarrowBand | None = None,
         notes: Sequence[str] = (),
     ) -> None:
         """Allocate the fields, fill the sources that run at the start and sort the particles."""
         self.scene, self.grid, self.boundary, self.particles = scene, grid, boundary, particles
-        self.sources, self.outlets = sources, outlets
+        self.sources, self.outlets, self.bodies, self.band = sources, outlets, bodies, band
         self.time, self.step_count = 0.0, 0
         self.watch: Stopwatch = NoStopwatch()
+        self._faces_know = False  # the velocity of the particles, around them
         self._notes = list(notes)
         self.gravity = np.array([*scene.physics.gravity, 0.0][:3])
         self.particle_mass = scene.physics.density * grid.cell_volume / scene.particles.per_axis**grid.dimension
         self.velocity, self.weights = grid.faces(), grid.faces()
         self._saved = grid.faces() if scene.particles.transfer == "flip" else None
         self.reseeding, self.correction = make_reseeding(scene, grid, boundary), make_density_correction(scene, grid, boundary)
+        self.surface_mesh = make_surface_mesh(scene, grid, boundary)
+        self.particle_volume = make_particle_volume(scene, grid, boundary)
         self.layers = self.reach = math.ceil(scene.time.cfl) + 2
         if sources is not None:
             sources.emit(particles, None, self.time)
@@ -126,7 +139,7 @@ class ParticleSimulation(ABC):
         """
         cfl, dx = self.scene.time.cfl, self.grid.spacing
         with self.watch.stage("diagnostics", self.particles.position, self.particles.velocity):
-            totals = self.particles.totals()
+            totals = self.particles.totals() if self.band is None else self.band.with_interior(self.particles.totals())
         solids = self.boundary.top_speed(self.time, self.scene.time.dt_max)
         speed = max(totals.max_speed, solids) + math.sqrt(cfl * float(np.linalg.norm(self.gravity)) * dx)
         event = min((part.next_event(self.time) for part in (self.sources, self.outlets) if part is not None), default=math.inf)
@@ -147,7 +160,15 @@ class ParticleSimulation(ABC):
         totals = self.checked_totals("at the start of")
         with self.watch.stage("sort", *self.particles.arrays().values()):
             self.particles.arrange(self.step_count)
+        if self.bodies is not None:
+            with self.watch.stage("bodies"):
+                self.bodies.begin_step(self.time, dt, self.gravity)
         return totals
+
+    def restore_bodies(self) -> None:
+        """Put the rigid bodies back to where they were before `begin_step`, as a solve has failed."""
+        if self.bodies is not None:
+            self.bodies.restore_step()
 
     def window(self, totals: ParticleTotals) -> Window:
         """Return the cells that the particles can touch in a step."""
@@ -166,6 +187,8 @@ class ParticleSimulation(ABC):
                 self.grid, particles.position, particles.velocity, particles.affine, self.velocity, self.weights, window=window,
                 offsets=particles.offsets,
             )  # fmt: skip
+            if self.band is not None:
+                self.band.blend(window, self.velocity, self.weights)
             for field, saved in zip(self.velocity, self._saved or (), strict=False):
                 wp.copy(saved, field)
             accelerate(window, self.velocity, self.weights, self.gravity * dt)
@@ -185,9 +208,17 @@ class ParticleSimulation(ABC):
             if self.sources is not None:
                 self.sources.hold(self.velocity, [])
 
+    def exchange(self, window: Window, kind: wp.array, phi: wp.array | None, contact: wp.array) -> None:
+        """Exchange particles with the interior, if there is one; arguments as of `warp_lcp.material.narrow_band.NarrowBand`."""
+        if self.band is not None:
+            with self.watch.stage("narrow band", *self.particles.arrays().values(), self.band.depth):
+                self.band.exchange(self.particles, window, kind, phi, contact, self.step_count, self._saved or ())
+                self._moved_within = window
+
     def bring_to_particles(self) -> None:
         """Give the particles the velocity of the faces."""
         particles = self.particles
+        self._faces_know = True
         with self.watch.stage("grid-to-particles", *particles.arrays().values(), *self.velocity):
             flip = self.scene.particles.flip_ratio if self._saved else 0.0
             faces_to_particles(
@@ -205,6 +236,9 @@ class ParticleSimulation(ABC):
         """
         with self.watch.stage("advection", self.particles.position, *self.velocity):
             stopped, pushed, stuck = self.carry(dt)
+        if self.band is not None:
+            with self.watch.stage("narrow band", self.band.depth, *self.velocity):
+                self.band.carry(self._moved_within, self.velocity, dt)
         exchanged = self._exchange(dt)
         after = self.checked_totals("after")
         rearranged = self._rearrange(after)
@@ -216,6 +250,10 @@ class ParticleSimulation(ABC):
 
     def carry(self, dt: float) -> tuple[int, int, int]:
         """Move particles and solids by dt [s]. Return how many met a wall, were pushed by a solid, and are stuck inside one."""
+        if self.bodies is not None:
+            self.bodies.end_step(dt)
+            if trouble := self.bodies.trouble(self.scene.domain.size, self.scene.endless):
+                raise SimulationFailed(f"step {self.step_count}: {trouble}")
         return self.boundary.advect(self.velocity, dt, self.time + dt, self.particles.position)
 
     def solve_row(self, result: wl.SolveResult | None) -> Row:
@@ -232,7 +270,8 @@ class ParticleSimulation(ABC):
 
     def logged(self, row: Row) -> Row:
         """Return the entries of a row that the log has columns for, in their order."""
-        return {name: row.get(name) for name in self.columns()}
+        bodies = self.bodies.row() if self.bodies is not None else {}
+        return {name: (row | bodies).get(name) for name in self.columns()}
 
     def columns(self) -> tuple[str, ...]:
         """Return the names of the log's columns.
@@ -242,7 +281,10 @@ class ParticleSimulation(ABC):
         up to 1. stopped: particles that met a wall; pushed: those that a moving solid swept along; stuck: those inside solids that found
         no way out, between solids that close, say. max_density: before the density correction of the step, of material at rest 1;
         reseeded: particles that went to a neighboring cell; emitted, drained, departed: those that sources have added in the step, that
-        drains have swallowed, and that have left through open sides.
+        drains have swallowed, and that have left through open sides. Rigid bodies, numbered from 0 in the order of the scene's solids,
+        have body0_x, body0_y, body0_z [m], the center of mass; body0_vx, body0_vy, body0_vz [m/s]; 2-D: body0_angle [degrees], how far it
+        has turned, and body0_spin [degrees/s]; 3-D: body0_wx, body0_wy, body0_wz [degrees/s], the angular velocity. contacts: points where
+        bodies touch walls or each other, or nearly do.
         """
         columns = (*COLUMNS, *self.own_columns(), "stopped")
         columns = (*columns, "pushed", "stuck") if self.boundary.moves else columns
@@ -250,19 +292,46 @@ class ParticleSimulation(ABC):
             columns = (*columns, "reseeded")
         columns = (*columns, *CORRECTION_COLUMNS) if self.correction is not None else columns
         exchanged = {"emitted": self.scene.source, "drained": self.scene.drain, "departed": self.scene.domain.open}
-        return (*columns, *(name for name, used in exchanged.items() if used))
+        columns = (*columns, *(name for name, used in exchanged.items() if used))
+        return (*columns, *self.bodies.columns()) if self.bodies is not None else columns
 
     def points(self) -> Points:
         """Return the particles as a frame shows them, with velocity and speed [m/s]."""
         position, velocity = self.particles.position.numpy().copy(), self.particles.velocity.numpy().copy()
         return Points("particles", position, {"velocity": velocity, "speed": np.linalg.norm(velocity, axis=1)})
 
+    def surfaces(self) -> list[Surface]:
+        """Return the material's surface as a frame shows it, with the velocity [m/s] of the particles around it, if the scene wants it."""
+        if self.surface_mesh is None:
+            return []
+        position = self.particles.position
+        with self.watch.stage("surface mesh", position):
+            band = self.band
+            mesh = self.surface_mesh.find(position, Interior(band.depth, band.full, self.boundary.base) if band is not None else None)
+            if not self._faces_know:  # the next step overwrites what the faces are given here
+                faces_from_particles(self.grid, position, self.particles.velocity, self.velocity, self.weights)
+            velocity = sample(self.grid, self.velocity, mesh.points)
+            return [Surface("surface", mesh.points.numpy().copy(), mesh.corners.numpy().copy(), {"velocity": velocity.numpy().copy()})]
+
+    def volumes(self) -> list[Volume]:
+        """Return the material's level set and density as a frame shows them, if the scene wants them."""
+        return [] if self.particle_volume is None else self.particle_volume.measure(self.particles)
+
+    def body_surfaces(self) -> list[Surface]:
+        """Return the rigid bodies as a frame shows them, if there are any: `body`, its number, and velocity [m/s]."""
+        if self.bodies is None:
+            return []
+        surface = self.bodies.surfaces()
+        return [Surface("bodies", surface.points, surface.corners, surface.fields)]
+
     def state(self) -> dict[str, np.ndarray]:
         """Return what `restore` needs to continue bit for bit on the CPU."""
         particles = {name: array.numpy().copy() for name, array in self.particles.arrays().items()}
         clock = {"time": np.array(self.time), "step_count": np.array(self.step_count), "signature": self._signature()}
         correction = {"density_correction": self.correction.x.numpy().copy()} if self.correction is not None else {}
-        return clock | particles | self.own_state() | correction
+        bodies = self.bodies.state() if self.bodies is not None else {}
+        band = self.band.state() if self.band is not None else {}
+        return clock | particles | self.own_state() | band | correction | bodies
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from `state`.
@@ -276,9 +345,11 @@ class ParticleSimulation(ABC):
             raise ValueError(f"the state lacks {', '.join(missing)}: it does not belong to this scene")
         if not np.array_equal(state["signature"], expected["signature"]):
             raise ValueError("the state's grid, spacing, number of particles a cell or transfer differ from this scene's")
+        if self.band is None and "interior" in state:
+            raise ValueError("the state's particles are a narrow band: this scene has no particles.narrow_band")
         for name, value in expected.items():
             given = np.asarray(state[name])
-            if name in self.particles.arrays() and (self.sources or self.outlets):
+            if name in self.particles.arrays() and (self.sources or self.outlets or self.band):
                 value = np.empty((len(state["position"]), 3), dtype=value.dtype)  # their number changes
             if given.shape != value.shape or given.dtype != value.dtype:
                 found, wanted = f"{given.dtype}{given.shape}", f"{value.dtype}{value.shape}"
@@ -288,10 +359,15 @@ class ParticleSimulation(ABC):
         if not self.boundary.moves and not np.array_equal(state["cells"] == wl.SOLID, expected["cells"] == wl.SOLID):
             raise ValueError("the state's solids are not this scene's")
         self.particles.assign(state)
+        self._faces_know = False
         self.restore_own({name: np.asarray(state[name]) for name in self.own_state()})
         if self.correction is not None:
             self.correction.x.assign(state["density_correction"])
+        if self.band is not None:
+            self.band.restore(state)
         self.time, self.step_count = float(state["time"]), int(state["step_count"])
+        if self.bodies is not None:
+            self.bodies.restore(state)
         self.boundary.place(self.time)
 
     def resample(self, state: Mapping[str, np.ndarray]) -> list[str]:
@@ -305,13 +381,21 @@ class ParticleSimulation(ABC):
         if not np.array_equal(before[[3, 5, 6]], now[[3, 5, 6]]) or not np.allclose(*(side[: self.grid.dimension] for side in size)):
             raise ValueError("the state's domain, number of particles a cell or transfer differ from this scene's")
         self.time, self.step_count = float(state["time"]), int(state["step_count"])
+        if self.bodies is not None:
+            if "bodies" not in state:
+                raise ValueError("the state has no bodies: it does not belong to this scene")
+            self.bodies.restore(state)
         self.boundary.place(self.time)
         settings, wanted = self.scene.particles, self.particles.arrays().keys()
+        state = without_band(state, float(before[4]), settings.seed)
         arrays, moved = resampled(
             {name: np.asarray(state[name]) for name in wanted}, self.grid, self._admits, spacing=float(before[4]),
             per_axis=settings.per_axis, random_seed=settings.seed + self.step_count,
         )  # fmt: skip
         self.particles.assign(arrays)
+        self._faces_know = False
+        if self.band is not None:
+            self.band.forget()
         self.particles.sort()
         self.mark()
         return resampling_notes(len(state["position"]), self.particles.count, moved, float(before[4]), self.grid)
@@ -337,7 +421,7 @@ class ParticleSimulation(ABC):
         size = np.array(self.grid.counts) * self.grid.spacing
         end = size - 0.5 * MARGIN * self.grid.spacing  # a tent at the very end would reach beyond what is stored
         if totals.finite and (totals.low[axes] >= 0.0).all() and (totals.high[axes] <= end[axes]).all():
-            return totals
+            return totals if self.band is None else self.band.with_interior(totals)
         position, velocity = self.particles.position.numpy(), self.particles.velocity.numpy()
         if totals.bad_velocities:
             field, bad = "velocity", ~((velocity.astype(np.float64) ** 2).sum(axis=1) <= np.finfo(np.float32).max)
@@ -361,7 +445,8 @@ class ParticleSimulation(ABC):
         correction = self.correction
         if correction is not None and self.step_count % correction.every == 0:
             with self.watch.stage("density correction", particles.position, correction.density, correction.x, *correction.displacement):
-                done = correction.apply(particles, self.window(totals))
+                fill = self.band.fill_interior if self.band is not None else None
+                done = correction.apply(particles, self.window(totals), fill=fill)
             row["density_status"] = done.result.status.name if done.result is not None else "NOTHING_TO_DO"
             row["density_iterations"] = done.result.iterations if done.result is not None else 0
             row["max_density"] = done.max_density
@@ -382,7 +467,7 @@ class ParticleSimulation(ABC):
     def _totals_row(self, totals: ParticleTotals, dt: float) -> Row:
         mass = totals.count * self.particle_mass
         return {
-            "particles": totals.count,
+            "particles": self.particles.count,
             "mass": mass,
             "kinetic_energy": 0.5 * mass * totals.mean_square_speed,
             "potential_energy": -mass * float(self.gravity @ totals.center),

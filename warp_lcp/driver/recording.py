@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,13 +15,15 @@ import numpy as np
 from warp_lcp.driver.frames import FRAME_FILE
 from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.scene_file import check_shapes, load_scene
+from warp_lcp.driver.simulator import Cells, Surface
+from warp_lcp.driver.vti import read_vti
 
 SCALE_FRAMES = 16  # evenly spaced frames that fix the color scale of a run
 SCALE_VALUES = 50_000  # about how many values of each
 ROUND_NUMBERS = np.array([1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0])
 PALETTES = {  # of speeds, by `Scene.palette`
     "water": np.array([[14, 62, 138], [22, 106, 190], [58, 160, 224], [130, 208, 240], [206, 240, 250]]),
-    "sand": np.array([[138, 92, 48], [178, 128, 72], [212, 170, 108], [236, 208, 156], [252, 242, 216]]),
+    "sand": np.array([[176, 130, 80], [202, 158, 104], [224, 188, 134], [242, 218, 172], [254, 246, 226]]),
 }
 VIRIDIS = np.array([[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]])
 
@@ -39,7 +42,36 @@ class Color(StrEnum):
     PLAIN = "plain"
 
 
+class Show(StrEnum):
+    """What of the material images show."""
+
+    PARTICLES = "particles"
+    SURFACE = "surface"
+    BOTH = "both"
+
+
 LABELS = {Color.FRACTION: "fraction of grains", Color.YIELD_RATIO: "yield ratio"}  # what sand's particles know besides
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What an image of a frame shows.
+
+    Args:
+        time: [s].
+        points: of the particles [m], shape (n, 3).
+        values: that color them, shape (n,).
+        surface: of the material; None: not shown.
+        bodies: the surfaces of rigid bodies where they are, with the field `body`; None: the scene has none.
+        cells: with what fills them; None: not shown.
+    """
+
+    time: float
+    points: np.ndarray
+    values: np.ndarray
+    surface: Surface | None = None
+    bodies: Surface | None = None
+    cells: Cells | None = None
 
 
 @dataclass(frozen=True)
@@ -69,27 +101,38 @@ class Recording:
 
     Args:
         folder: of the run.
-        color: what is to be read besides the positions.
+        color: what is to be read besides the positions; speed unless given.
+        show: what is to be read; particles if a color is given, else the surface where there is one, else particles.
+        overrides: of the scene's table [camera], such as `camera.position=[1, 2, 3]`.
+        cells: read the cells too, where the run wrote them; then their pressure is the color unless another is given.
 
     Raises:
         RenderError: the folder is no run's, or has no such frames.
         SceneError: its scene cannot be read.
     """
 
-    def __init__(self, folder: Path, color: Color) -> None:
+    def __init__(
+        self, folder: Path, color: Color | None = None, show: Show | None = None, overrides: Sequence[str] = (), *, cells: bool = False
+    ) -> None:
         """Look which frames there are."""
         if not (folder / "scene.toml").is_file():
             why = "it has no scene.toml" if folder.is_dir() else "there is no such folder"
             raise RenderError(f"{folder}: is not the folder of a run: {why}")
+        for override in overrides:
+            if not override.startswith("camera."):
+                raise RenderError(f"--set {override}: only keys of [camera] can be set for images of a run")
         self.folder = folder
-        self.color = color
-        self.scene: Scene = load_scene(folder / "scene.toml")
+        self.scene: Scene = load_scene(folder / "scene.toml", overrides)
         check_shapes(self.scene, str(folder / "scene.toml"))
-        self.numbers = self._numbers("particles")
-        if not self.numbers:
-            why = "" if self.scene.output.particles else "; the scene's output.particles is false"
-            raise RenderError(f"{folder}: holds no frames of particles{why}")
-        if color is Color.PRESSURE and not set(self.numbers) <= set(self._numbers("grid")):
+        self.cells = cells
+        if cells and color is None and show is not Show.SURFACE:
+            color = Color.PRESSURE if self._numbers("grid") else Color.SPEED
+        self.show = show or (Show.SURFACE if color is None and self._numbers("surface") else Show.PARTICLES)
+        if self.show is Show.SURFACE and color not in (None, Color.PLAIN):
+            raise RenderError(f"--color {color} is for particles, which --show surface leaves out; choose both or particles")
+        self.color = Color.PLAIN if self.show is Show.SURFACE else color or Color.SPEED
+        self.numbers = self._shown_numbers()
+        if self.color is Color.PRESSURE and not set(self.numbers) <= set(self._numbers("grid")):
             raise RenderError(f"{folder}: --color pressure needs a frame of cells for each of particles; choose speed or plain")
 
     def chosen(self, frames: Sequence[int]) -> list[int]:
@@ -105,6 +148,18 @@ class Recording:
                 raise RenderError(f"--frame {frame}: there is no such frame; the run has {self.numbers[0]} to {self.numbers[-1]}")
             found.add(number)
         return sorted(found) or self.numbers
+
+    def frame(self, number: int) -> Frame:
+        """Return what an image of a frame shows.
+
+        Raises:
+            RenderError: a file cannot be read, or lacks a field.
+        """
+        points, values = (np.zeros((0, 3)), np.zeros(0)) if self.show is Show.SURFACE else self.read(number)
+        surface = self._surface("surface", number) if self.show is not Show.PARTICLES else None
+        bodies = self._surface("bodies", number) if self._file("bodies", number).is_file() else None
+        filled = self._cells(number) if self.cells and self._file("grid", number).is_file() else None
+        return Frame(self.scene.time.frame_time(number), points, values, surface, bodies, filled)
 
     def read(self, number: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the particles of a frame, those with finite numbers: positions [m], shape (n, 3), and what colors them, shape (n,).
@@ -127,9 +182,10 @@ class Recording:
         finite = np.isfinite(points).all(axis=1) & np.isfinite(values)
         return points[finite], values[finite]
 
+    @cached_property
     def scale(self) -> Scale:
         """Return the colors for the whole run: up to what 98 of 100 particles stay below, rounded up; the few above take the last color."""
-        if self.color is Color.PLAIN:
+        if self.color is Color.PLAIN or not self._numbers("particles"):
             return Scale("", -1.0, 1.0, PALETTES[self.scene.palette])
         samples = [self.read(number)[1] for number in spread(self.numbers, SCALE_FRAMES)]
         low, high = np.percentile(np.concatenate([[0.0], *(values[:: len(values) // SCALE_VALUES + 1] for values in samples)]), [2.0, 98.0])
@@ -141,18 +197,59 @@ class Recording:
 
     def particle_spacing(self) -> float:
         """Return how far apart neighbors are at the start [m], from the number of particles in the cells that hold some."""
-        points, _ = self.read(self.numbers[0])
+        points = self.read(self.numbers[0])[0] if self.show is not Show.SURFACE else np.zeros((0, 3))
         if not len(points):
             return self.scene.spacing
         cells = np.unique(np.floor(points / self.scene.spacing), axis=0)
         return float(self.scene.spacing * (len(cells) / len(points)) ** (1.0 / self.scene.dimension))
 
     def _numbers(self, name: str) -> list[int]:
-        matches = [FRAME_FILE.fullmatch(file.name) for file in (self.folder / "frames").glob(f"{name}_*.vtu")]
+        matches = [FRAME_FILE.fullmatch(file.name) for file in (self.folder / "frames").glob(f"{name}_*.vt[ui]")]
         return sorted(int(match["index"]) for match in matches if match and match["name"] == name)
 
+    def _shown_numbers(self) -> list[int]:
+        """Return the numbers of the frames that have all that is shown."""
+        parts = ("surface", "particles") if self.show is Show.BOTH else ("surface",) if self.show is Show.SURFACE else ("particles",)
+        found = {part: self._numbers(part) for part in parts}
+        for part, numbers in found.items():
+            if not numbers:
+                why = "" if getattr(self.scene.output, part) else f"; the scene's output.{part} is false"
+                raise RenderError(f"{self.folder}: holds no frames of {'a surface' if part == 'surface' else part}{why}")
+        numbers = sorted(set.intersection(*map(set, found.values())))
+        if not numbers:
+            raise RenderError(f"{self.folder}: holds no frame of both {' and '.join(parts)}")
+        return numbers
+
+    def _surface(self, name: str, number: int) -> Surface:
+        """Return a surface, those of its triangles or segments whose points are finite."""
+        file = self._file(name, number)
+        mesh = _read(file)
+        if mesh is None:
+            return Surface(name, np.zeros((0, 3)), np.zeros((0, self.scene.dimension), dtype=np.int32))
+        corners = mesh.cells_dict.get("triangle" if self.scene.dimension == 3 else "line")
+        if corners is None:
+            raise RenderError(f"{file}: has no {'triangles' if self.scene.dimension == 3 else 'segments'}")
+        points = np.asarray(mesh.points, dtype=np.float64)
+        finite = np.isfinite(points[corners]).all(axis=(1, 2))
+        return Surface(name, np.where(np.isfinite(points), points, 0.0), np.asarray(corners[finite], dtype=np.int32), dict(mesh.point_data))
+
+    def _cells(self, number: int) -> Cells | None:
+        """Return the cells of a frame with their fields."""
+        file = self._file("grid", number)
+        if file.suffix == ".vti":
+            return _read_image(file)
+        mesh = _read(file)
+        if mesh is None:
+            return None
+        block = mesh.cells[0].data
+        fields = {name: np.asarray(values[0]) for name, values in mesh.cell_data.items()}
+        index = np.floor(mesh.points[block].mean(axis=1) / self.scene.spacing).astype(int)
+        return Cells("grid", index, self.scene.spacing, self.scene.dimension, fields)
+
     def _file(self, name: str, number: int) -> Path:
-        return self.folder / "frames" / f"{name}_{number:06d}.vtu"
+        path = self.folder / "frames" / f"{name}_{number:06d}"
+        image = path.with_suffix(".vti")
+        return image if image.is_file() else path.with_suffix(".vtu")
 
     def _field(self, fields: dict[str, Any], name: str) -> np.ndarray:
         if name not in fields:
@@ -161,12 +258,11 @@ class Recording:
 
     def _pressure(self, number: int, points: np.ndarray) -> np.ndarray:
         """Return the pressure of each particle's cell [Pa], 0 where the frame has no such cell."""
-        mesh = _read(self._file("grid", number))
+        cells = self._cells(number)
         counts = np.array(self.scene.cell_counts)
         table = np.zeros(counts)
-        if mesh is not None:
-            low_corners = mesh.points[mesh.cells[0].data[:, 0]] / self.scene.spacing
-            table[tuple(np.rint(low_corners).astype(int).T)] = self._field(mesh.cell_data, "pressure")[0]
+        if cells is not None:
+            table[tuple(cells.index.T)] = self._field(cells.fields, "pressure")
         cell = np.clip(np.floor(np.nan_to_num(points) / self.scene.spacing), 0, counts - 1).astype(int)
         return cast(np.ndarray, table[tuple(cell.T)])
 
@@ -187,6 +283,16 @@ def _read(file: Path) -> meshio.Mesh | None:
     except OSError as error:
         raise RenderError(f"{file}: cannot be read: {error.strerror}") from error
     except (meshio.ReadError, ValueError, AttributeError, KeyError) as error:
+        raise RenderError(f"{file}: is not a readable frame") from error
+
+
+def _read_image(file: Path) -> Cells:
+    """Return the cells of a frame that is an image."""
+    try:
+        return read_vti(file)
+    except OSError as error:
+        raise RenderError(f"{file}: cannot be read: {error.strerror}") from error
+    except ValueError as error:
         raise RenderError(f"{file}: is not a readable frame") from error
 
 

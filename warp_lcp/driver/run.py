@@ -29,6 +29,7 @@ from warp_lcp.driver.simulator import (
     SimulationFailed,
     StepFailed,
     Surface,
+    Volume,
     simulators,
 )
 from warp_lcp.driver.table import Problem, SceneError
@@ -156,6 +157,7 @@ class _Run:
         if isinstance(simulation, Profiled):
             simulation.watch = self.watch
         self.writer = FrameWriter(folder.frames, self.watch)
+        self._has_bodies = any(solid.is_body for solid in scene.solid)  # whose surfaces are part of every frame
         self._begun = clock.perf_counter()
         self._first_step = 0
         self._below_dt_min = False
@@ -195,7 +197,8 @@ class _Run:
         frames = max(0, last - self._frames_done() + 1)
         state = sum(array.nbytes for array in self.simulation.state().values())
         states = self.output.checkpoints_kept + 1  # the one being written too
-        self.folder.check_space(int(SPACE_MARGIN * (frame_bytes(frame) * frames + states * state)))
+        each = frame_bytes(frame, self.output.grid_format, surface_ply=self.output.surface_ply)
+        self.folder.check_space(int(SPACE_MARGIN * (each * frames + states * state)))
 
     def _start(self, last: int, frame: list[Part]) -> Log:
         """Write what there is before the first step."""
@@ -283,9 +286,12 @@ class _Run:
 
     def _frame(self) -> list[Part]:
         """Return what the scene wants to see of the simulation now."""
-        wanted = {Points: self.output.particles, Cells: self.output.grid, Surface: True}
+        output = self.output
+        if not (output.particles or output.grid or output.surface or output.volume or self._has_bodies):
+            return []
+        wanted = {Points: output.particles, Cells: output.grid, Surface: True, Volume: True}
         with self.watch.stage("frames"):
-            return [part for part in self.simulation.frame() if wanted[type(part)]] if any(wanted.values()) else []
+            return [part for part in self.simulation.frame() if wanted[type(part)]]
 
     def _write_frame(self, index: int, last: int, frame: list[Part]) -> None:
         with self.watch.stage("frames"):

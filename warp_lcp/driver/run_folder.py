@@ -108,7 +108,7 @@ class RunFolder:
         self.scene = scene
         self.mesh_files = mesh_digests(scene)
         self.log = path / "log.csv"
-        self.frames = FrameFolder(path)
+        self.frames = FrameFolder(path, scene.output.grid_format, surface_ply=scene.output.surface_ply)
         self.checkpoints = CheckpointFolder(path / CHECKPOINTS, fingerprint(scene, self.mesh_files), keys(scene))
 
     @contextmanager

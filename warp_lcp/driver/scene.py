@@ -9,6 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
+from warp_lcp.driver.camera import Camera
 from warp_lcp.driver.shapes import Liquid, Shape, Solid, Wall
 from warp_lcp.driver.table import ANY_VALUE, Complaint, Problem, SceneError, Table, Vector, refuse, validate
 from warp_lcp.grid.sides import SIDES
@@ -87,10 +88,20 @@ class Solver(Table):
 class Output(Table):
     """[output]: what the run's folder gets."""
 
-    later: ClassVar = {"surface": frozenset({True})}
     particles: bool = Field(default=True, description="write a frame of particles")
     grid: bool = Field(default=True, description="write a frame of cells")
-    surface: Literal[False] = Field(default=False, description="write the liquid's surface")
+    surface: bool = Field(default=False, description="write a frame of the material's surface: closed triangles, in 2-D segments")
+    surface_resolution: int | None = Field(
+        default=None, ge=1, le=8, description="surface points along the edge of a cell; as many as particles unless given"
+    )
+    surface_smoothing: float = Field(
+        default=1.5, ge=0.5, le=10, description="how far the surface smooths over the particles [their distances]"
+    )
+    surface_ply: bool = Field(default=False, description="write surfaces as PLY files too, for modelers such as Blender")
+    grid_format: Literal["vtu", "vti"] = Field(
+        default="vtu", description="of the cells' files: vtu, which meshio reads too, or vti, smaller and faster where cells are many"
+    )
+    volume: bool = Field(default=False, description="write level set and density as NanoVDB files, of 3-D scenes")
     checkpoint_every: int = Field(default=50, ge=0, description="steps between checkpoints; 0: not by steps")
     checkpoint_minutes: float | None = Field(default=None, gt=0, description="the most minutes of real time between checkpoints")
     checkpoints_kept: int = Field(default=3, ge=1, description="how many of the newest checkpoints stay")
@@ -108,6 +119,7 @@ class Scene(Table):
     solver: Solver = Field(default_factory=Solver)
     solid: list[Solid] = Field(default_factory=list)
     output: Output = Field(default_factory=Output)
+    camera: Camera = Field(default_factory=Camera)
 
     @model_validator(mode="before")
     @classmethod
@@ -149,7 +161,11 @@ class Scene(Table):
             found.append(Complaint(("physics", "gravity"), self.physics.gravity, message))
         if self.time.dt_min > self.time.dt_max:
             found.append(Complaint(("time", "dt_min"), self.time.dt_min, f"must not exceed time.dt_max = {self.time.dt_max}"))
-        return found + self.shape_complaints("solid", self.solid) + self._motion_complaints() + self._side_complaints()
+        found += [Complaint(("camera", *c.place), c.value, c.message) for c in self.camera.complaints(self.dimension, self.domain.size)]
+        if self.output.volume and self.dimension == 2:
+            found.append(Complaint(("output", "volume"), True, "needs a 3-D domain; domain.size has 2 entries"))
+        found += self.shape_complaints("solid", self.solid) + self._motion_complaints() + self._side_complaints()
+        return found + self._outside_complaints()
 
     def shape_complaints(self, key: str, shapes: Sequence[Shape], *, inside: bool = False) -> list[Complaint]:
         """Return what is wrong with an array of shapes.
@@ -188,11 +204,13 @@ class Scene(Table):
         """Return what a run would do, as pairs of a word and a line. Subclasses append theirs, such as particles and memory."""
         cells = self.cell_counts[: self.dimension]
         moving = ", ".join(f"solid {index} {solid.motion.kind}" for index, solid in enumerate(self.solid) if solid.motion)
+        bodies = ", ".join(self._body_line(index, solid) for index, solid in enumerate(self.solid) if solid.is_body)
         return [
             ("grid", f"{' x '.join(map(str, cells))} = {math.prod(cells):,} cells of {self.spacing:.6g} m"),
             ("walls", ", ".join([self.domain.wall, *(f"solid {i} {s.wall}" for i, s in enumerate(self.solid) if s.wall)])),
             *([("open", ", ".join(self.domain.open))] if self.domain.open else []),
             *([("moving", moving)] if moving else []),
+            *([("bodies", bodies)] if bodies else []),
             ("time", f"{self.time.duration:g} s in steps of at most {self.time.dt_max:g} s, CFL {self.time.cfl:g}"),
             ("frames", f"{self.time.frame_count + 1} at {self.time.frames_per_second:g} per second"),
             ("solver", f"{self.solver.method} to {self.solver.tolerance:g}, {self.solver.precision} precision"),
@@ -207,11 +225,29 @@ class Scene(Table):
                 found.append(Complaint(("domain", "open", index), side, "is a side of a 3-D domain; domain.size has 2 entries"))
         return found
 
+    def _outside_complaints(self) -> list[Complaint]:
+        """Return which rigid bodies lie wholly outside the domain, as far as their keys tell."""
+        return [
+            Complaint(("solid", index), None, f"lies outside the domain, which reaches from the origin to {self.domain.size} m")
+            for index, solid in enumerate(self.solid)
+            if solid.is_body and not solid.complaints(self.dimension) and self.enclosed_volume(solid) == 0.0
+        ]
+
     def _motion_complaints(self) -> list[Complaint]:
         if self.domain.solids == "cut-cell":
             return []
         message = 'needs domain.solids = "cut-cell": solids that fill whole cells cannot move'
-        return [Complaint(("solid", index, "motion"), None, message) for index, solid in enumerate(self.solid) if solid.motion]
+        return [
+            Complaint(("solid", index, key), None, message)
+            for index, solid in enumerate(self.solid)
+            for key in ("motion", "mass", "density")
+            if getattr(solid, key) is not None
+        ]
+
+    def _body_line(self, index: int, solid: Solid) -> str:
+        """Return what a rigid body is, for the plan."""
+        unit = "kg" if self.dimension == 3 else "kg/m"
+        return f"solid {index} {solid.shape} of " + (f"{solid.mass:g} {unit}" if solid.mass is not None else f"{solid.density:g} kg/m^3")
 
     def _grid_complaints(self) -> list[Complaint]:
         found = []

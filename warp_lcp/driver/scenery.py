@@ -35,8 +35,9 @@ class Scenery(ABC):
         self._passing: list[str] = []  # names of what was drawn for a time
         self._draw_domain()
         dimension = scene.dimension
-        self._keep([solid for solid in scene.solid if not solid.motion])
-        self._moving = [(solid.motion.to_motion(dimension), self._prepared(solid)) for solid in scene.solid if solid.motion]
+        solids = prescribed_solids(scene)
+        self._keep([solid for solid in solids if not solid.motion])
+        self._moving = [(solid.motion.to_motion(dimension), self._prepared(solid)) for solid in solids if solid.motion]
 
     def place(self, time: float) -> None:
         """Draw the solids that move where they are at a time [s]."""
@@ -206,6 +207,11 @@ class Outline:
         mesh = self.mesh.copy()
         mesh.points = placement.apply(mesh.points)
         return mesh if self.shape.invert else _clipped(mesh, size)
+
+
+def prescribed_solids(scene: Scene) -> list[Any]:
+    """Return the solids whose places the scene tells; where the others, rigid bodies, are only frames know."""
+    return [solid for solid in scene.solid if getattr(solid, "mass", None) is None and getattr(solid, "density", None) is None]
 
 
 def _clipped(mesh: Any, size: np.ndarray, *, closed: bool = True) -> Any:

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from warp_lcp.driver.motions import Motion
-from warp_lcp.driver.table import ANY_VALUE, Angles, Complaint, Table, Vector
+from warp_lcp.driver.table import Angles, Complaint, Table, Vector
 
 if TYPE_CHECKING:
     from warp_lcp.grid.solids import Geometry, Placement
@@ -18,6 +18,10 @@ if TYPE_CHECKING:
 BUILTIN = "builtin:"  # how the name of a mesh that the project generates begins
 
 Wall = Literal["separating", "free-slip"]
+WallFriction = Annotated[float, Field(ge=0, le=10)] | Literal["stick"]
+FRICTIONS = "a number from 0 (free slip) to 10, or stick"
+STICKS = 1e6  # Coulomb's coefficient of a wall that holds what presses against it
+BODY_FRICTION = 0.5  # of a rigid body unless its scene says otherwise
 
 
 class Shape(Table):
@@ -62,8 +66,7 @@ class Shape(Table):
     def complaints(self, dimension: int) -> list[Complaint]:
         """Return what is wrong with the shape in a scene of 2 or 3 dimensions."""
         wanted = {name: dimension for name, value in self if isinstance(value, list)}
-        if "rotate" in wanted:
-            wanted["rotate"] = 1 if dimension == 2 else 3
+        wanted |= {name: 1 if dimension == 2 else 3 for name in ("rotate", "angular_velocity") if name in wanted}
         return [
             Complaint((type(self).model_fields[name].alias or name,), value, f"must have {count} entries in {dimension}-D")
             for name, count in wanted.items()
@@ -169,15 +172,61 @@ class Mesh(Shape):
 class SolidProperties(Shape):
     """What a solid has besides its shape; where solids have more, classes of their own derive from SolidBox, SolidSphere and so on."""
 
-    later: ClassVar = {"mass": ANY_VALUE}
-    elsewhere: ClassVar = {"friction": "granular"}
+    rubs: ClassVar[bool] = False  # whether the material rubs against solids that stand
     wall: Wall | None = Field(default=None, description="whether material may let go of it; domain.wall unless given")
     motion: Motion | None = Field(default=None, description="how it moves, from where it is placed; it stands still unless given")
+    mass: float | None = Field(default=None, gt=0, description="makes it a rigid body that the material moves [kg; kg/m in 2-D]")
+    density: float | None = Field(default=None, gt=0, description="in place of mass: of the solid, filled evenly [kg/m^3]")
+    velocity: Vector | None = Field(default=None, description="of a rigid body at the start [m/s]; at rest unless given")
+    angular_velocity: Angles | None = Field(
+        default=None,
+        description="of a rigid body at the start [degrees/s]: a number in 2-D, [x, y, z] in 3-D; 0 unless given",
+    )
+    friction: WallFriction | None = Field(
+        default=None,
+        description=f"of its surface, against sand and between bodies and walls: {FRICTIONS}; domain.friction unless given, "
+        f"{BODY_FRICTION:g} for a rigid body in a liquid",
+    )
+    restitution: float = Field(default=0.0, ge=0, le=1, description="of a rigid body: the part of the speed of an impact that comes back")
+
+    @property
+    def is_body(self) -> bool:
+        """Return whether it is a rigid body."""
+        return self.mass is not None or self.density is not None
+
+    @property
+    def moves(self) -> bool:
+        """Return whether it does not stand still."""
+        return self.is_body or self.motion is not None
 
     def complaints(self, dimension: int) -> list[Complaint]:
         """Return what is wrong with the solid in a scene of 2 or 3 dimensions."""
         moves = self.motion.complaints(dimension) if self.motion else []
-        return super().complaints(dimension) + [Complaint(("motion", *c.place), c.value, c.message) for c in moves]
+        found = super().complaints(dimension) + [Complaint(("motion", *c.place), c.value, c.message) for c in moves]
+        return found + (self._body_complaints() if self.is_body else self._still_complaints())
+
+    def _body_complaints(self) -> list[Complaint]:
+        """Return what is wrong with a rigid body."""
+        key = "mass" if self.mass is not None else "density"
+        found = []
+        if self.mass is not None and self.density is not None:
+            found.append(Complaint(("density",), self.density, "goes without mass: give one of them"))
+        if self.motion is not None:
+            found.append(Complaint(("motion",), None, f"goes without {key}: a rigid body moves as forces ask"))
+        if self.invert:
+            found.append(Complaint(("invert",), True, f"goes without {key}: everything but a shape has no mass"))
+        if self.shape == "plane":
+            found.append(Complaint((key,), getattr(self, key), "not for a plane: a half space has no mass"))
+        return found
+
+    def _still_complaints(self) -> list[Complaint]:
+        """Return which keys need a rigid body."""
+        given: dict[str, object] = {"velocity": self.velocity, "angular_velocity": self.angular_velocity, "restitution": self.restitution or None}
+        message = "needs mass or density, which make the solid a rigid body"
+        found = [Complaint((name,), value, message) for name, value in given.items() if value is not None]
+        if self.friction is not None and not self.rubs:
+            found.append(Complaint(("friction",), self.friction, f"{message}: a liquid does not rub against solids"))
+        return found
 
 
 class MaterialProperties(Shape):

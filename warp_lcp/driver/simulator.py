@@ -38,7 +38,8 @@ class Points:
 class Cells:
     """A frame of equal axis-aligned cells. `index` (n, 3): integer x, y, z of each cell, whose low corner lies at index * spacing [m].
 
-    `dimension` 2 makes quadrilaterals in the plane z = 0, 3 makes voxels. `fields` have shape (n,) or (n, 3).
+    `dimension` 2 makes quadrilaterals in the plane z = 0, 3 makes voxels. `fields` have shape (n,) or (n, 3). `counts`: cells of the whole
+    grid along x, y and z, which an image of it has in every frame.
     """
 
     name: str
@@ -46,6 +47,7 @@ class Cells:
     spacing: float
     dimension: int
     fields: dict[str, np.ndarray] = field(default_factory=dict)
+    counts: tuple[int, int, int] | None = None
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,21 @@ class Surface:
     fields: dict[str, np.ndarray] = field(default_factory=dict)
 
 
-Part = Points | Cells | Surface  # of a frame
+@dataclass(frozen=True)
+class Volume:
+    """A frame of values at the centers of a 3-D grid's cells.
+
+    `values`: float32, shape (nz, ny, nx); `spacing` of the cells [m], the first of which has its low corner at the origin; `band`: of a
+    signed distance [m], < 0 inside, how far from the surface it is known; None: a density, >= 0.
+    """
+
+    name: str
+    values: np.ndarray
+    spacing: float
+    band: float | None = None
+
+
+Part = Points | Cells | Surface | Volume  # of a frame
 
 
 class Simulation(Protocol):

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse
 
-from warp_lcp.gallery.box_contacts import OrientedBox, box_box
 from warp_lcp.gallery.rigid_bodies import RigidBodies, Sphere
+from warp_lcp.rigid.box_contacts import OrientedBox, box_box
 
 GROUND = -1  # the body that a plane belongs to
 

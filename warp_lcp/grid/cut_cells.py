@@ -13,7 +13,7 @@ import warp as wp
 
 from warp_lcp.grid import cut_cells_kernels as kernels
 from warp_lcp.grid.capacity_kernels import integrate_kernel
-from warp_lcp.grid.motion import Motion
+from warp_lcp.grid.motion import Motion, RigidMotion
 from warp_lcp.grid.node_distance import NodeDistances, NodeSampler, nodes_near
 from warp_lcp.grid.sides import SIDES, continue_beyond, open_ring
 from warp_lcp.grid.solid_notes import placement_notes, repair_notes, thin_notes
@@ -126,7 +126,8 @@ class CutCells:
     def set_velocity(self, time: float, dt: float) -> None:
         """Fill the velocity: the way of the solids' points from one time to another, divided by the time between.
 
-        So the volume that a wall sweeps is its displacement's, whatever the motion is like within the step.
+        So the volume that a wall sweeps is its displacement's, whatever the motion is like within the step. Bodies that the material moves
+        have the velocities of their state: those are what it changes, and no rotation of such a field changes a volume.
 
         Args:
             time: at which the solids were placed [s].
@@ -141,6 +142,9 @@ class CutCells:
             raise ValueError("dt = 0: a velocity needs two different times")
         turn, shift = np.zeros((len(self.names), 3, 3)), np.zeros((len(self.names), 3))
         for number, _, motion in self._moving():
+            if isinstance(motion, RigidMotion):
+                turn[number], shift[number] = motion.velocity_field()
+                continue
             way = motion.pose(time + dt).after(motion.pose(time).inverse())
             turn[number], shift[number] = (way.rotation - np.eye(3)) / dt, way.translation / dt
         self.turn.assign(turn.astype(np.float32))
@@ -160,6 +164,30 @@ class CutCells:
             inputs = [grid.planes, axis, grid.spacing, *solids, field]
             window.launch(kernels.velocity_kernel, inputs)
         self._moved_from = self._moved_to
+
+    @property
+    def standing(self) -> wp.array:
+        """Float32 distance to the nearest solid that stands still, at nodes [cells]."""
+        return self._standing.near
+
+    @property
+    def near_solids(self) -> list[wp.array]:
+        """Distances to a node's two nearest solids and their numbers: near, owner, next_near, next_owner."""
+        return self._nodes.arrays
+
+    @property
+    def moving_numbers(self) -> wp.array:
+        """Uint8 of shape (1 + solids,): whether each moves."""
+        return self._moving_numbers
+
+    def moving_block(self) -> tuple[list[int], list[int]] | None:
+        """Return the low and high cell (x, y, z), both included, of a block with all cells beside solids that move, if there are any."""
+        if not self._moved_to:
+            return None
+        low = np.min([block[0] for block in self._moved_to], axis=0) - 1
+        high = np.max([block[1] for block in self._moved_to], axis=0)
+        first, last = np.maximum(low, 1), np.minimum(high, self.grid.counts)
+        return (first.tolist(), last.tolist()) if (first <= last).all() else None
 
     def _moving(self) -> list[tuple[int, Geometry, Motion]]:
         """Return the solids that move, with their numbers, as the scene places them."""

@@ -249,6 +249,65 @@ def least_moving(k: int, j: int, i: int, near: _F32, owner: _I16, next_near: _F3
     return solid, d
 
 
+@wp.func
+@typing.no_type_check
+def moving_part(
+    axis: int,
+    planes: int,
+    k: int,
+    j: int,
+    i: int,
+    near: _F32,
+    owner: _I16,
+    next_near: _F32,
+    next_owner: _I16,
+    standing: _F32,
+    open: _F32,
+    wall: _I16,
+    moving: wp.array(dtype=wp.uint8),
+):
+    """Return the moving solid that covers a face, 0 if none does, and its part of what is not open.
+
+    What the solids that stand still cover rests, and so does a face of the domain but for the part that a moving solid covers: of a
+    piston that slides over a floor, the part above the floor displaces liquid.
+    """
+    free = open[k, j, i]
+    solid = int(0)
+    part = float(0.0)
+    if free < 1.0:
+        dj = wp.where(axis == 0, 1, 0)
+        di = 1 - dj
+        dk = planes - 1
+        ej = wp.where(axis == 2, 1, 0)
+        if axis == 2:
+            dk = 0
+        solid = int(wall[k, j, i])
+        least = float(1.0e30)
+        if moving[wp.max(solid, 0)] == wp.uint8(0):  # the corners are (0), along (di, dj, 0), and along (0, ej, dk)
+            solid = 0
+            for n in range(4):
+                a = n & 1
+                b = n >> 1
+                found, d = least_moving(k + b * dk, j + a * dj + b * ej, i + a * di, near, owner, next_near, next_owner, moving)
+                if found > 0 and d < least:
+                    least = d
+                    solid = found
+        if solid > 0:
+            if wall[k, j, i] == wp.int16(0):
+                free = open_area(near[k, j, i], near[k, j + dj, i + di], near[k + dk, j + dj + ej, i + di], near[k + dk, j + ej, i])
+                closed = float(1.0)
+            else:
+                closed = 1.0 - free
+            at_rest = 1.0 - open_area(
+                standing[k, j, i],
+                standing[k, j + dj, i + di],
+                standing[k + dk, j + dj + ej, i + di],
+                standing[k + dk, j + ej, i],
+            )
+            part = wp.clamp((1.0 - free - at_rest) / closed, 0.0, 1.0)
+    return wp.max(solid, 0), part
+
+
 @wp.kernel(**options)
 @typing.no_type_check
 def velocity_kernel(
@@ -268,52 +327,18 @@ def velocity_kernel(
     shift: wp.array(dtype=wp.vec3),
     velocity: _F32,
 ):
-    """Fill the mean velocity of what is not open of each face [m/s], at its center turn x + shift of a solid that moves.
-
-    What the solids that stand still cover rests, and so does a face of the domain but for the part that a moving solid covers: of a
-    piston that slides over a floor, the part above the floor displaces liquid.
-    """
+    """Fill the mean velocity of what is not open of each face [m/s], at its center turn x + shift of a solid that moves."""
     plane, row, chunk = wp.tid()
     k = cells.k + plane
     j = cells.j + row
     first = cells.i + chunk * cells.grain
-    dj = wp.where(axis == 0, 1, 0)
-    di = 1 - dj
-    dk = planes - 1
-    ej = wp.where(axis == 2, 1, 0)
-    if axis == 2:
-        dk = 0
     for i in range(first, wp.min(first + cells.grain, cells.end)):
         value = float(0.0)
-        free = open[k, j, i]
-        if free < 1.0:
-            solid = int(wall[k, j, i])
-            least = float(1.0e30)
-            if moving[wp.max(solid, 0)] == wp.uint8(0):  # the corners are (0), along (di, dj, 0), and along (0, ej, dk)
-                solid = 0
-                for n in range(4):
-                    a = n & 1
-                    b = n >> 1
-                    found, d = least_moving(k + b * dk, j + a * dj + b * ej, i + a * di, near, owner, next_near, next_owner, moving)
-                    if found > 0 and d < least:
-                        least = d
-                        solid = found
-            if solid > 0:
-                if wall[k, j, i] == wp.int16(0):
-                    free = open_area(near[k, j, i], near[k, j + dj, i + di], near[k + dk, j + dj + ej, i + di], near[k + dk, j + ej, i])
-                    closed = float(1.0)
-                else:
-                    closed = 1.0 - free
-                at_rest = 1.0 - open_area(
-                    standing[k, j, i],
-                    standing[k, j + dj, i + di],
-                    standing[k + dk, j + dj + ej, i + di],
-                    standing[k + dk, j + ej, i],
-                )
-                part = wp.clamp((1.0 - free - at_rest) / closed, 0.0, 1.0)
-                x = wp.vec3(float(i) - 0.5, float(j) - 0.5, float(k) - 0.5) * spacing
-                x[axis] = x[axis] - 0.5 * spacing
-                if planes == 1:
-                    x[2] = 0.0
-                value = part * (wp.dot(turn[solid][axis], x) + shift[solid][axis])
+        solid, part = moving_part(axis, planes, k, j, i, near, owner, next_near, next_owner, standing, open, wall, moving)
+        if solid > 0:
+            x = wp.vec3(float(i) - 0.5, float(j) - 0.5, float(k) - 0.5) * spacing
+            x[axis] = x[axis] - 0.5 * spacing
+            if planes == 1:
+                x[2] = 0.0
+            value = part * (wp.dot(turn[solid][axis], x) + shift[solid][axis])
         velocity[k, j, i] = value

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import warp as wp
@@ -15,6 +16,7 @@ from warp_lcp.grid.staggered import StaggeredGrid, Window
 
 REACH = 1.5  # half the width of a cell's kernel, in cells: beyond it a plane leaves no trace
 QUANTILE = 3.7191  # of the normal distribution at 1 - level_set_kernels.TAIL
+Fill = Callable[[Window, wp.array], None]
 PARTS = {2: 4, 3: 2}  # points an axis that a cell on the surface is sampled at
 
 
@@ -60,7 +62,7 @@ class LevelSet:
         self._sums = wp.zeros(grid.shape[:2], dtype=wp.float64, device=grid.device)
         self._filled: Window | None = None
 
-    def update(self, particles: Particles, window: Window, capacity: wp.array | None, base: wp.array) -> None:
+    def update(self, particles: Particles, window: Window, capacity: wp.array | None, base: wp.array, *, fill: Fill | None = None) -> None:
         """Take the particles where they are now.
 
         Args:
@@ -70,9 +72,12 @@ class LevelSet:
                 then stays out of reach of the density.
             capacity: share of each cell's kernel that is open, float32; None: 1 everywhere.
             base: int8, SOLID in cells that hold no liquid.
+            fill: adds to the density in a window what no particle stands for.
         """
         grid = self.grid
         particle_density(grid, particles, window, self.particles_a_cell, self.density)
+        if fill is not None:
+            fill(window, self.density)
         density, smooth = self.density, None
         if self.smoothing:
             for field in self._scratch[:2]:  # a pass looks one cell beyond the window, where an earlier update may have left something

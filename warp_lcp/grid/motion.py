@@ -84,6 +84,14 @@ class Motion(Protocol):
         """Return the change of place at `time` [s] that takes the solid as its scene places it to where it is."""
 
 
+@runtime_checkable
+class RigidMotion(Motion, Protocol):
+    """A motion that forces change: its velocities are a state."""
+
+    def velocity_field(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return turn, shape (3, 3) [1/s], and shift, shape (3,) [m/s]: a point x of the solid moves at turn x + shift."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Translation:
     """Move at a constant velocity between two times, and rest before and after.

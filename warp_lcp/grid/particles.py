@@ -138,6 +138,12 @@ class Particles:
         for gradient in self.affine:
             gradient[before:].zero_()  # sorting may have left anything behind the particles in use
 
+    def make_room(self, count: int) -> int:
+        """Add particles behind the others and return the number of the first; the caller gives them position, velocity and gradient."""
+        before = self.count
+        self._resize(before + count)
+        return before
+
     @property
     def marks(self) -> wp.array:
         """Scratch memory for `remove`, int32, shape (count,)."""

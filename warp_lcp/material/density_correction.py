@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.grid.level_set import particle_density
+from warp_lcp.grid.level_set import Fill, particle_density
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material import density_correction_kernels as kernels
@@ -98,16 +98,19 @@ class DensityCorrection:
         self._shift = wp.full(grid.shape, SHIFT, dtype=wp.float32, device=grid.device) if boundary.open else None
         self._problem: wl.LCP | None = None  # built when there is material: an empty problem is refused
 
-    def apply(self, particles: Particles, window: Window) -> Correction:
+    def apply(self, particles: Particles, window: Window, *, fill: Fill | None = None) -> Correction:
         """Correct the particles' positions.
 
         Args:
             particles: the material (moved). If they are indexed they are sorted first.
             window: cells that hold all particles, with two to spare on each side.
+            fill: adds to the density in a window what no particle stands for.
         """
         if particles.offsets is not None:
             particles.sort()  # they have moved: gathering needs the order, and gives the same bits on every run
         particle_density(self.grid, particles, window, self.particles_a_cell, self.density)
+        if fill is not None:
+            fill(window, self.density)
         over_full, most = self._prepare()
         if over_full == 0:
             self.x.zero_()

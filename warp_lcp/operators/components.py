@@ -39,6 +39,19 @@ class FloatingComponents:
         self._held = wp.zeros(self.count, dtype=wp.int32, device=device)
         self._net: np.ndarray = np.zeros(self.count)
 
+    def without(self, gone: np.ndarray) -> FloatingComponents | None:
+        """Return the components but for those that something holds after all, None if none is left.
+
+        Args:
+            gone: bool of shape (count,).
+        """
+        if not gone.any():
+            return self
+        if gone.all():
+            return None
+        number = np.where(gone, -1, np.cumsum(~gone) - 1).astype(np.int32)
+        return FloatingComponents(np.where(self.label >= 0, number[self.label], -1).astype(np.int32), self.device)
+
     def unattainable(self, b: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any]) -> float:
         """Return a norm that the natural residual cannot go below; 0 if b is compatible everywhere.
 

@@ -7,13 +7,16 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.field_set import FieldSet
 from warp_lcp.layout import Layout, layout_of
+from warp_lcp.operators.low_rank_columns import BlockColumns
 from warp_lcp.operators.low_rank_kernels import weigh_kernel
+from warp_lcp.program import Launch
 
 
 class LowRankOperator:
     """U W U' x, with a few columns U and a small matrix W; usually a term of a SumOperator, A + U W U'.
+
+    Only the rows of U that are not 0 are stored, and a product costs no more than they do.
 
     Args:
         columns: U; its first axes are a field's, its last one counts the columns: (n, k) for vectors, (nz, ny, nx, k) for grids.
@@ -23,6 +26,10 @@ class LowRankOperator:
 
     Attributes:
         symmetric: whether W equals its transpose.
+        rank: number of columns.
+        columns: the rows of U that are not 0, `warp_lcp.operators.low_rank_columns.BlockColumns`.
+        weights: W, float64, shape (k, k); `update` changes it.
+        version: how often columns and weights have been taken.
 
     Raises:
         ValueError: shapes do not match, there is no column, or a value is not finite.
@@ -31,45 +38,94 @@ class LowRankOperator:
     def __init__(self, columns: Any, weights: Any, *, device: Any = None, dtype: Any = wp.float64) -> None:
         if dtype not in (wp.float32, wp.float64):
             raise ValueError(f"dtype = {dtype}: must be wp.float32 or wp.float64")
-        U, W = np.asarray(columns, dtype=np.float64), np.asarray(weights, dtype=np.float64)
+        U = np.asarray(columns, dtype=np.float64)
         if U.ndim < 2 or U.size == 0:
             raise ValueError(f"columns has shape {U.shape}: expected a field's shape and the number of columns, both positive")
-        k = U.shape[-1]
-        W = np.diag(W) if W.ndim == 1 else W
-        if W.shape != (k, k):
-            raise ValueError(f"weights has shape {np.shape(weights)}: expected {(k,)} or {(k, k)} for {k} columns")
-        for name, array in (("columns", U), ("weights", W)):
-            if not np.isfinite(array).all():
-                raise ValueError(f"{name} holds a value that is not finite")
-        self.shape, self.device, self.dtype = U.shape[:-1], wp.get_device(device), dtype
-        self.symmetric = bool(np.allclose(W, W.T, rtol=1e-14, atol=0.0))
-        self.rank = k
-        self._columns, self._weights = U, W
-        self._store(Layout(self.shape, self.device))
+        if not np.isfinite(U).all():
+            raise ValueError("columns holds a value that is not finite")
+        layout = Layout(U.shape[:-1], wp.get_device(device))
+        U = U.reshape(layout.size, -1)
+        stored = BlockColumns(layout.size, 1, U.shape[1], dtype, layout.device)
+        rows = np.flatnonzero(U.any(axis=1))
+        stored.assign(rows, np.zeros(len(rows), dtype=np.int32), U[rows])
+        self._make(layout, stored, weights)
+
+    @classmethod
+    def of_blocks(cls, A: Any, columns: BlockColumns, weights: Any) -> LowRankOperator:
+        """Return the operator of columns that are stored already, as the fields of an operator A are.
+
+        Its entries may be rewritten in place; `update` says so.
+
+        Raises:
+            ValueError: the columns' size is not that of A's stored fields, or the weights do not fit.
+        """
+        layout = layout_of(A)
+        if columns.size != layout.size:
+            raise ValueError(f"columns are for fields of {columns.size} elements: A stores {layout.size}")
+        made = cls.__new__(cls)
+        made._make(layout, columns, weights)
+        return made
+
+    def update(self, weights: Any = None) -> None:
+        """Take other weights, and what the columns have become in place.
+
+        Args:
+            weights: as of the constructor; None: they stay.
+
+        Raises:
+            ValueError: they have another shape, or are not finite.
+        """
+        if weights is not None:
+            W = self._checked_weights(weights)
+            self.symmetric = _is_symmetric(W)
+            self.weights.assign(W)
+            self._transposed.assign(np.ascontiguousarray(W.T))
+        self.version += 1
 
     def stored_like(self, A: Any) -> LowRankOperator:
-        """Return the same operator for fields that are stored as A's are.
+        """Return the same operator for fields that are stored as A's are; itself if its are.
 
         Raises:
             ValueError: A's fields have another shape.
         """
         if tuple(A.shape) != self.shape:
             raise ValueError(f"A has shape {tuple(A.shape)}: expected {self.shape}")
-        twin = LowRankOperator(self._columns, self._weights, device=self.device, dtype=self.dtype)
-        twin._store(layout_of(A))
-        return twin
+        layout = layout_of(A)
+        if layout.stored_shape == self.layout.stored_shape:
+            return self
+        old, place = self.columns, layout.target(np.arange(layout.size).reshape(layout.stored_shape), np.empty(self.shape)).ravel()
+        rows, blocks, values = old.entries()
+        moved = BlockColumns(layout.size, old.rank // old.width, old.width, old.dtype, old.device)
+        moved.assign(place[rows], blocks, values)
+        return LowRankOperator.of_blocks(A, moved, self.weights.numpy())
 
     def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
         """Return U W U' x, x of the operator's shape or stored."""
-        return self._product(x, out, self._W)
+        return self._product(x, out, self.weights)
 
     def apply_transpose(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
         """Return U W' U' x."""
-        return self._product(x, out, self._WT)
+        return self._product(x, out, self._transposed)
+
+    def add(
+        self, x: wp.array[Any], base: wp.array[Any], out: wp.array[Any], *, mask: wp.array[Any] | None = None, transposed: bool = False,
+        launch: Launch = wp.launch,
+    ) -> None:  # fmt: skip
+        """Out = base + U W U' x on U's rows where `mask` (uint8) is not 0; other rows of `out` stay. All are flat stored fields."""
+        W = self._transposed if transposed else self.weights
+        launch(weigh_kernel, self.rank, [W, self.columns.gather(x, launch=launch), self._weighed], device=self.device)
+        self.columns.scatter(self._weighed, base, out, mask=mask, launch=launch)
+
+    def stored_diagonal(self, out: wp.array[Any]) -> None:
+        """Add the diagonal to a flat stored field of type wp.float64."""
+        self.columns.add_diagonal(self.weights.flatten(), out)
 
     def diagonal(self) -> wp.array[Any]:
         """Return the diagonal, a field of the operator's shape."""
-        return wp.array(np.einsum("...j,jk,...k->...", self._columns, self._weights, self._columns), dtype=self.dtype, device=self.device)
+        stored = self.layout.zeros(wp.float64)
+        self.stored_diagonal(stored)
+        field = self.layout.unload(stored)
+        return field if self.dtype is wp.float64 else wp.array(field.numpy(), dtype=self.dtype, device=self.device)
 
     def masked(self, free: Any, shift: Any = None) -> LowRankOperator:
         """Return P U W U' P, P the restriction to `free` (non-zero entries).
@@ -79,19 +135,31 @@ class LowRankOperator:
         """
         if shift is not None:
             raise ValueError("shift: U W U' + D is not of low rank; mask SumOperator(A, this) instead")
-        inside = self.layout.unload(self.layout.load(free, wp.uint8, "free")).numpy() != 0
-        twin = LowRankOperator(self._columns * inside[..., None], self._weights, device=self.device, dtype=self.dtype)
-        twin._store(self.layout)
-        return twin
+        inside = self.layout.load(free, wp.uint8, "free").numpy() != 0
+        old = self.columns
+        rows, blocks, values = old.entries()
+        kept = inside[rows]
+        columns = BlockColumns(old.size, old.rank // old.width, old.width, old.dtype, old.device)
+        columns.assign(rows[kept], blocks[kept], values[kept])
+        return LowRankOperator.of_blocks(self, columns, self.weights.numpy())
 
-    def _store(self, layout: Layout) -> None:
-        """Lay the columns out as fields of a layout."""
-        self.layout = layout
-        self._U = FieldSet(self.rank, layout.size, self.dtype, self.device)
-        stored = [layout.load(np.ascontiguousarray(self._columns[..., j]), self.dtype).numpy().ravel() for j in range(self.rank)]
-        self._U.values.assign(np.concatenate(stored))
-        self._W, self._WT = (wp.array(W.copy(), dtype=wp.float64, device=self.device) for W in (self._weights, self._weights.T))
+    def _make(self, layout: Layout, columns: BlockColumns, weights: Any) -> None:
+        self.layout, self.columns = layout, columns
+        self.shape, self.device, self.dtype, self.rank, self.version = layout.shape, layout.device, columns.dtype, columns.rank, 0
+        W = self._checked_weights(weights)
+        self.symmetric = _is_symmetric(W)
+        self.weights, self._transposed = (wp.array(V.copy(), dtype=wp.float64, device=self.device) for V in (W, W.T))
         self._weighed = wp.zeros(self.rank, dtype=wp.float64, device=self.device)
+
+    def _checked_weights(self, weights: Any) -> np.ndarray:
+        """Return W as a host matrix."""
+        W, k = np.asarray(weights, dtype=np.float64), self.rank
+        W = np.diag(W) if W.ndim == 1 else W
+        if W.shape != (k, k):
+            raise ValueError(f"weights has shape {np.shape(weights)}: expected {(k,)} or {(k, k)} for {k} columns")
+        if not np.isfinite(W).all():
+            raise ValueError("weights holds a value that is not finite")
+        return W
 
     def _product(self, x: wp.array[Any], out: wp.array[Any] | None, W: wp.array[Any]) -> wp.array[Any]:
         if x.size != self.layout.size:
@@ -104,6 +172,9 @@ class LowRankOperator:
             return out
         out = wp.zeros_like(x) if out is None else out
         out.zero_()
-        wp.launch(weigh_kernel, self.rank, [W, self._U.dots(x.flatten()), self._weighed], device=self.device)
-        self._U.add(self._weighed, out.flatten())
+        self.add(x.flatten(), out.flatten(), out.flatten(), transposed=W is self._transposed)
         return out
+
+
+def _is_symmetric(W: np.ndarray) -> bool:
+    return bool(np.allclose(W, W.T, rtol=1e-14, atol=0.0))

@@ -8,11 +8,13 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.layout import layout_of
+from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.operators.low_rank_kernels import add_kernel
 from warp_lcp.operators.protocol import Operator
 from warp_lcp.problem import as_operator
 
+FELT = 1e-5  # of the sum of a column's sizes over a component: open fractions are of float32
 
 class SumOperator:
     """(A + B) x = A x + B x.
@@ -84,6 +86,29 @@ class SumOperator:
         d = self.first.diagonal().numpy().astype(np.float64) + self.second.diagonal().numpy()
         return wp.array(d, dtype=self.dtype, device=self.device)
 
+    def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
+        """Out = A x + B x + b; flat stored fields of one type."""
+        plain, low = (self.second, self.first) if isinstance(self.first, LowRankOperator) else (self.first, self.second)
+        if isinstance(low, LowRankOperator) and hasattr(plain, "apply_plus"):
+            plain.apply_plus(x, b, out)
+            low.add(x, out, out)
+            return
+        stored = self.layout.stored_shape
+        self.apply(x.reshape(stored), out.reshape(stored))
+        wp.launch(add_kernel, out.size, [b, out], device=self.device)
+
+    def floating_components(self, scratch: Any = None) -> Any:
+        """Return the components on which the sum is singular; None if there are none, or a term does not know its own.
+
+        The constants of a component are a null space as long as no column of a LowRankOperator feels them: a body that closes off a
+        chamber as a piston does is moved by the pressure in it.
+        """
+        for A, B in ((self.first, self.second), (self.second, self.first)):
+            if isinstance(B, LowRankOperator) and hasattr(A, "floating_components"):
+                found = A.floating_components(scratch)
+                return None if found is None else found.without(_felt(found.label, found.count, B))
+        return None
+
     def masked(self, free: Any, shift: Any = None) -> SumOperator:
         """Return P (A + B) P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift)."""
         if isinstance(self.first, LowRankOperator):  # it cannot take a shift
@@ -101,10 +126,35 @@ class SumOperator:
         return out
 
     def _add_fields(self, x: wp.array[Any], out: wp.array[Any], *, transposed: bool) -> None:
+        plain, low = (self.second, self.first) if isinstance(self.first, LowRankOperator) else (self.first, self.second)
+        (plain.apply_transpose if transposed else plain.apply)(x, out)
+        if isinstance(low, LowRankOperator) and x.size == low.layout.size:
+            low.add(x.flatten(), out.flatten(), out.flatten(), transposed=transposed)
+            return
         key = (x.dtype, tuple(x.shape))
         if key not in self._scratch:
             self._scratch[key] = wp.zeros_like(x)
         other = self._scratch[key]
-        for A, target in ((self.first, out), (self.second, other)):
-            (A.apply_transpose if transposed else A.apply)(x, target)
+        (low.apply_transpose if transposed else low.apply)(x, other)
         wp.launch(add_kernel, out.size, [other.flatten(), out.flatten()], device=self.device)
+
+
+def grid_and_low_rank(A: Any) -> tuple[GridPoisson, LowRankOperator] | None:
+    """Return the terms of a symmetric sum of a grid operator and one of low rank, None if A is something else."""
+    if isinstance(A, SumOperator) and A.symmetric:
+        for grid, low in ((A.first, A.second), (A.second, A.first)):
+            if isinstance(grid, GridPoisson) and isinstance(low, LowRankOperator):
+                return grid, low
+    return None
+
+
+def _felt(label: np.ndarray, count: int, low: LowRankOperator) -> np.ndarray:
+    """Return for each component whether a column's sum over it is more than what rounding leaves."""
+    rows, blocks, values = low.columns.entries()
+    at, k = label[rows], low.columns.width
+    sums, sizes = np.zeros((count, low.rank)), np.zeros((count, low.rank))
+    inside = at >= 0
+    columns = (blocks[inside, None] * k + np.arange(k)).astype(np.int64)
+    np.add.at(sums, (at[inside, None], columns), values[inside])
+    np.add.at(sizes, (at[inside, None], columns), np.abs(values[inside]))
+    return np.asarray((np.abs(sums) > FELT * sizes).any(axis=1))

@@ -14,7 +14,7 @@ from warp_lcp.problem import LCP
 from warp_lcp.solve import Precision, Step
 from warp_lcp.solvers import minimum_map_newton_grid_kernels as kernels
 from warp_lcp.solvers import projected_multigrid_kernels as engine
-from warp_lcp.solvers.projected_multigrid import AssessedResidual, MultigridWorkspace
+from warp_lcp.solvers.projected_multigrid_workspace import AssessedResidual, MultigridWorkspace
 from warp_lcp.vectors import launch_spans
 
 if TYPE_CHECKING:

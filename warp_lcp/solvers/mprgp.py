@@ -21,7 +21,7 @@ from warp_lcp.solvers import projected_multigrid_kernels as engine
 from warp_lcp.solvers.minimum_map_newton_kernels import all_free_kernel
 from warp_lcp.solvers.principal_system import DiagonalSystem, principal_system
 from warp_lcp.solvers.principal_system_sparse import SparseSystem
-from warp_lcp.solvers.projected_multigrid import PLANES_A_THREAD
+from warp_lcp.solvers.projected_multigrid_workspace import PLANES_A_THREAD
 from warp_lcp.vectors import Reduction, launch_spans
 
 SINGLE_SLACK = 1.2e-7  # a bound that float32 rounds is met within this part of it

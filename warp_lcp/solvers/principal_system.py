@@ -19,12 +19,13 @@ from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.operators.sum import SumOperator
+from warp_lcp.operators.sum import SumOperator, grid_and_low_rank
 from warp_lcp.problem import LCP
 from warp_lcp.program import Launch, Program
 from warp_lcp.solvers.dense_problem import equilibration
 from warp_lcp.solvers.grid_conjugate_gradient import GridConjugateGradient
-from warp_lcp.solvers.principal_system_kernels import divide_kernel, kernels, mask_kernel, shift_kernel
+from warp_lcp.solvers.principal_system_kernels import divide_kernel, mask_kernel, shift_kernel
+from warp_lcp.solvers.principal_system_low_rank import LowRankCorrection
 from warp_lcp.solvers.principal_system_norm import WeightedNorm
 from warp_lcp.solvers.principal_system_sparse import SparseSystem
 from warp_lcp.vectors import launch_spans
@@ -124,13 +125,14 @@ class GridSystem:
 
 
 class CoupledGridSystem:
-    """Conjugate gradients on a grid operator plus a symmetric one that has products only, preconditioned by the grid's multigrid."""
+    """Conjugate gradients on a grid operator plus one of low rank, preconditioned by the grid's multigrid, corrected for the columns."""
 
     def __init__(
-        self, A: SumOperator, grid: GridPoisson, rest: Any, real: Any, *, settings: CycleSettings | None = None, shifted: bool = False
+        self, A: SumOperator, grid: GridPoisson, low: LowRankOperator, real: Any, *, settings: CycleSettings | None, shifted: bool
     ) -> None:
-        self._grid, self._rest, self._A = GridSystem(grid, real, bounded=False, settings=settings, shifted=shifted), rest, A
+        self._grid, self._low, self._A = GridSystem(grid, real, bounded=False, settings=settings, shifted=shifted), low, A
         self.r, self.z = self._grid.r, self._grid.z
+        self._correction, self._begins = LowRankCorrection(low, self._grid.hierarchy), True
         self._extra = wp.zeros_like(self.r)
         self._free: wp.array[Any] | None = None
         self._weight = wp.zeros_like(self.r) if shifted else None
@@ -144,6 +146,7 @@ class CoupledGridSystem:
         """Take the grid's rows again if they changed."""
         self._grid.refresh()
         self._take_diagonal()
+        self._begins = True
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
         """Take another free set and shift."""
@@ -152,6 +155,10 @@ class CoupledGridSystem:
         if self._weight is not None:
             inputs = [self._own, wp.float64(1.0), free, self._no_shift if shift is None else shift, self._extra, self._weight]
             launch_spans(shift_kernel(wp.float64, self.r.dtype), self._norm.spans, inputs, [], self.r.device)
+        wp.copy(self._extra, self.r)
+        self._correction.renew(begins=self._begins)
+        wp.copy(self.r, self._extra)
+        self._begins = False
 
     def norm(self) -> float:
         """Return the norm of r."""
@@ -162,13 +169,14 @@ class CoupledGridSystem:
         return self._krylov.solve(tolerance, max_iterations)
 
     def apply(self) -> None:
-        """Precondition: one cycle of the grid's multigrid."""
+        """Precondition: one cycle of the grid's multigrid, corrected."""
+        self._correction.begin()
         self._grid.apply()
+        self._correction.end()
 
     def _product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
         self._grid.hierarchy.finest.stencil.product(p, q)
-        self._rest.apply(p, self._extra)
-        launch_spans(kernels(q.dtype).add_free, self._norm.spans, [self._extra, self._free, q], [], q.device)
+        self._low.add(p, q, q, mask=self._free)
 
     def _take_diagonal(self) -> None:
         if self._weight is not None:
@@ -292,8 +300,7 @@ def principal_system(
         return DenseSystem(A)
     if isinstance(A, SparseOperator):
         return SparseSystem(A, real, shifted=shifted)
-    if isinstance(A, SumOperator) and A.symmetric:
-        for grid, rest in ((A.first, A.second), (A.second, A.first)):
-            if isinstance(grid, GridPoisson) and isinstance(rest, LowRankOperator):
-                return CoupledGridSystem(A, grid, rest, real, settings=settings, shifted=shifted)
+    terms = grid_and_low_rank(A)
+    if terms is not None:
+        return CoupledGridSystem(A, *terms, real, settings=settings, shifted=shifted)  # type: ignore[arg-type]
     return DiagonalSystem(problem, shifted=shifted)

@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-import numpy as np
 import warp as wp
 
-from warp_lcp.multigrid.hierarchy import CycleSettings, Hierarchy
+from warp_lcp.multigrid.hierarchy import CycleSettings
 from warp_lcp.operators.grid_poisson import GridPoisson
+from warp_lcp.operators.sum import grid_and_low_rank
 from warp_lcp.problem import LCP
-from warp_lcp.program import Launch, Program
-from warp_lcp.residual import NaturalResidual
-from warp_lcp.solve import Precision, RoundedIterate, Step
-from warp_lcp.solvers import projected_multigrid_kernels as kernels
-from warp_lcp.vectors import Reduction, launch_spans
-
-LEAP = 10.0  # a residual that exceeds the least one by this factor says that the free set was a bad guess: CG's own rises are smaller
-# planes that a thread sums over: on CUDA, a place for the sums of every cell would cost more memory than the rest of the method
-PLANES_A_THREAD = {"cpu": 1, "cuda": 16}
+from warp_lcp.solve import Precision, Step
+from warp_lcp.solvers.projected_multigrid_coupled import CoupledWorkspace
+from warp_lcp.solvers.projected_multigrid_workspace import MultigridWorkspace
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,12 +51,15 @@ class ProjectedMultigrid:
             if getattr(self, name) < least:
                 raise ValueError(f"{name} = {getattr(self, name)}: must be >= {least}")
 
-    def init(self, problem: LCP) -> MultigridWorkspace:
+    def init(self, problem: LCP) -> MultigridWorkspace | CoupledWorkspace:
         """Return a workspace.
 
         Raises:
             ValueError: A is not a grid operator.
         """
+        terms = grid_and_low_rank(problem.A)
+        if terms is not None:
+            return CoupledWorkspace(problem, *terms, self)
         if not isinstance(problem.A, GridPoisson):
             raise ValueError(f"{type(problem.A).__name__} is no grid operator: ProjectedMultigrid needs one; MinimumMapNewton takes others")
         return MultigridWorkspace(problem, problem.A, self)
@@ -73,301 +69,3 @@ class ProjectedMultigrid:
         if work.wants_monotone_cycle():
             return work.monotone_step()
         return work.truncated_step()
-
-
-class AssessedResidual(NaturalResidual):
-    """The natural residual, evaluated together with the free set and the right-hand side on it.
-
-    Attributes:
-        classify: whether unknowns at a bound leave the free set.
-        stale: whether the free set has changed since the hierarchy was built.
-        active: unknowns held.
-        storage: form and types that choose the kernels.
-    """
-
-    def __init__(self, problem: LCP, A: GridPoisson, hierarchy: Hierarchy, *, rounded: bool) -> None:
-        super().__init__(problem)
-        self._A, self._finest, self._hierarchy, self._version = A, hierarchy.finest, hierarchy, A.version
-        s = A.stencil
-        planes, rows, chunks = s.threads
-        slab = PLANES_A_THREAD["cuda" if A.device.is_cuda else "cpu"]
-        self.threads = (-(-planes // slab), rows, chunks)
-        R = self.row_sums = kernels.RowSums()
-        R.planes, R.all_planes, R.rows, R.chunks, R.threads = slab, planes, rows, chunks, math.prod(self.threads)
-        R.changed = self._finest.changed.flatten()
-        self.scalars = wp.zeros(kernels.SLOTS, dtype=wp.float64, device=A.device)
-        self.sums = Reduction(problem.layout.size, A.device, self.scalars, columns=4, threads=R.threads)
-        self.storage = (*s.storage, self._finest.stencil.d.dtype, hierarchy.real)
-        self.row_kernels = kernels.row_kernels(*self.storage, rounded=rounded)
-        self.classify, self.stale, self.active, self._norm_of_b = False, True, 0, 0.0
-
-    def start(self, x: wp.array[Any], *, keep: bool) -> None:
-        """Set x to clip(x, l, u) or clip(0, l, u); a guess is classified, a cold start is not."""
-        if self._version != self._A.version:
-            self._version, self.stale = self._A.version, True
-            self._hierarchy.refresh()
-        super().start(x, keep=keep)
-        self.classify = keep
-        if not keep:
-            self._norm_of_b = super().norm_of_b()
-            self.set(kernels.SIZE, self._norm_of_b or 1.0)
-            self.set(kernels.STEP, 0.0)
-
-    def norm_of_b(self) -> float:
-        """Return ||b|| over the unknowns."""
-        return self._norm_of_b
-
-    def evaluate(self, x: wp.array[Any]) -> float:
-        """Compute the norm of the natural residual at x, the free set and the right-hand side."""
-        self.assess(x)
-        return self.read()
-
-    def assess(self, x: wp.array[Any], *, launch: Launch = wp.launch) -> None:
-        """Launch the evaluation."""
-        p, s = self.problem, self._A.stencil
-        s.wrap(x, launch=launch)
-        inputs = [*s.operands, self.row_sums, x, *self._assessed()]
-        launch(self.row_kernels.assess, self.threads, inputs, device=p.device)
-        self.sums.add_up(int(kernels.NORM), columns=3, launch=launch)
-
-    def update(self, x: wp.array[Any], direction: wp.array[Any], *, launch: Launch = wp.launch) -> None:
-        """Launch the step from x along the direction that the cycle's correction gives."""
-        p, s = self.problem, self._A.stencil
-        inputs = [s.shape, s.grain, x, self._finest.x, direction, *p.bounds.operands, self.scalars]
-        launch(self.row_kernels.update, s.threads, inputs, device=p.device)
-
-    def advance(self, x: wp.array[Any], direction: wp.array[Any], *, launch: Launch = wp.launch) -> None:
-        """Launch the step and the evaluation where it ends: one launch on the CPU, unless ghost cells must be filled between."""
-        p, s = self.problem, self._A.stencil
-        if p.device.is_cuda or any(s.periodic):
-            self.update(x, direction, launch=launch)
-            self.assess(x, launch=launch)
-            return
-        inputs = [*s.operands[:-1], self.row_sums, x, self._finest.x, direction, *self._assessed()]
-        launch(self.row_kernels.advance, 1, inputs, device=p.device)
-        self.sums.add_up(int(kernels.NORM), columns=3, launch=launch)
-
-    def _assessed(self) -> list[Any]:
-        """Return what the evaluation takes besides the stencil and x."""
-        p, finest = self.problem, self._finest
-        fields = [p.b, *p.bounds.operands, p.unknown, finest.stencil.d, finest.b]
-        return [*fields, self.scalars, self.classify, self.sums.partials]
-
-    def read(self) -> float:
-        """Read what the evaluation found; a step that is not finite was not taken, and its residual is no number."""
-        scalars = self.scalars.numpy()
-        square, moved, active = scalars[:3]
-        self.norm, self.current, self.active = float(np.sqrt(square)), True, int(active)
-        if not math.isfinite(scalars[int(kernels.STEP)]):
-            self.norm = math.nan
-        self.stale = self.stale or moved > 0
-        return self.norm
-
-    def set(self, slot: int, value: float) -> None:
-        """Write a scalar."""
-        self.scalars[int(slot) : int(slot) + 1].fill_(value)
-
-
-class MultigridWorkspace(RoundedIterate):
-    """Memory of the method for one problem.
-
-    x is moved in place. The best iterate is not stored while it is x, nor when x is one step past it, for a step can be taken back; it
-    is when the residual has risen and goes on from there.
-    """
-
-    def __init__(self, problem: LCP, A: GridPoisson, settings: ProjectedMultigrid) -> None:
-        self.problem, self.A, self.settings, self.precision = problem, A, settings, Precision(settings.precision)
-        self.bounded = problem.bounded
-        real = self.precision.correction
-        self.x, self._p = problem.layout.zeros(wp.float64), problem.layout.zeros(real)
-        # a projected cycle forgets the search direction, so its lower bounds may lie in that memory: finite numbers, and 0 off the unknowns
-        upper = problem.layout.zeros(real) if problem.bounds.may_bind[1] else wp.empty(0, dtype=real, device=A.device)
-        self.hierarchy = Hierarchy(A.stencil, real, bounded=self.bounded, settings=settings.cycle, bounds=(self._p, upper))
-        self.residual = AssessedResidual(problem, A, self.hierarchy, rounded=self.precision is Precision.SINGLE)
-        self._flat = kernels.flat_kernels(real)
-        self._spans = self.residual._reduction.spans
-        self._rounded = problem.layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
-        self._programs: dict[tuple[Any, ...], Program] = {}  # truncated cycles
-        self._mask: wp.array[Any] | None = None
-        self.scratch = self._scratch() if real is wp.float32 else None
-        self.floating: Any = None
-        self._best: wp.array[Any] | None = None
-        self._past, self._stored = 0, False  # steps since the best iterate; whether it is in memory of its own
-        self._cycles_left, self._rises, self._relapse, self._least = 0, 0, 1, math.inf
-
-    def _scratch(self) -> tuple[wp.array[Any], wp.array[Any]]:
-        """Return what is free between cycles, as fields of four bytes and of one byte a cell."""
-        x, t = self.hierarchy.finest.x, self.hierarchy.finest.t
-        return t, wp.array(ptr=x.ptr, dtype=wp.uint8, shape=x.shape, device=x.device)
-
-    def keep(self) -> None:
-        """Remember x as the best iterate."""
-        self._past, self._stored = 0, False
-        self._least = min(self._least, self.residual.norm)
-
-    def restore(self) -> None:
-        """Make x the best iterate again."""
-        if self._stored:
-            wp.copy(self.x, self._best)
-        elif self._past == 1:
-            self._undo(self.x)
-        self.residual.set(kernels.STEP, 0.0)
-        self.keep()
-
-    def _leave(self) -> None:
-        """Store the best iterate before x leaves it behind: it was x, or one step ago."""
-        exact = self.floating is None and self._rounded is None  # else x is more than a step from it
-        if not self._stored and self._past == (1 if exact else 0):
-            if self._best is None:
-                self._best = wp.empty_like(self.x)
-            if exact:
-                self._undo(self._best)
-            else:
-                wp.copy(self._best, self.x)
-            self._stored = True
-        self._past += 1
-
-    def _undo(self, out: wp.array[Any]) -> None:
-        """Write where the last step began."""
-        p = self.problem
-        inputs = [self.x, self._p, *p.bounds.operands, p.unknown, out, self.residual.scalars]
-        launch_spans(self._flat.undo, self._spans, inputs, [], p.device)
-
-    def start(self, *, warm: bool, tolerance: float) -> None:
-        """Forget the search direction; the operator may have changed."""
-        self._cycles_left = self.settings.monotone_cycles if self.bounded and not warm else 0
-        self._rises, self._relapse, self._least = 0, 1, self.residual.norm
-        self._forget()
-        self.hierarchy.finest.x[: self.x.size // 4 + 1].zero_()  # its bytes were scratch memory
-        size = float(self.residual.scalars.numpy()[int(kernels.SIZE)])
-        rescale = not 1e-6 < self.residual.norm / size < 1e6  # corrections in float32 would overflow, or vanish
-        if rescale:
-            self.residual.set(kernels.SIZE, self.residual.norm)
-        if self.floating is not None:
-            self._classify_next()
-            self.residual.evaluate(self.x)
-            self._project()
-        elif rescale:
-            self._classify_next()
-            self.residual.evaluate(self.x)
-        elif self._cycles_left == 0 and not self.residual.classify and self.bounded:
-            self.residual.classify = True
-            self.residual.evaluate(self.x)
-
-    def wants_monotone_cycle(self) -> bool:
-        """Return whether the next step is a projected cycle."""
-        leapt = self.residual.norm > LEAP * self._least
-        if self._cycles_left == 0 and self.bounded and (leapt or self._rises >= self.settings.patience):
-            if leapt:
-                self.restore()
-            self._rises = 0
-            self._forget()
-            # an active set can go round in a circle, projected cycles never do: each time it takes twice as many of them
-            self._cycles_left, self._relapse = self._relapse, 2 * self._relapse
-            self.residual.classify = False
-            self.residual.evaluate(self.x)
-        return self._cycles_left > 0
-
-    def monotone_step(self) -> Step:
-        """Projected cycle on all unknowns."""
-        p, finest, last = self.problem, self.hierarchy.finest, self.residual.norm
-        self._rebuild()
-        self._leave()
-        before = [self.x, *p.bounds.operands, p.unknown, finest.lower, finest.upper, self.residual.scalars]
-        launch_spans(self._flat.gaps, self._spans, before, [], p.device)
-        self.hierarchy.monotone_cycle.run()
-        wp.launch(kernels.plan_whole_step_kernel, 1, [self.residual.scalars], device=p.device)
-        self._cycles_left -= 1
-        self._classify_next()
-        self._advance()
-        self.residual.read()
-        self._count_rises(last)
-        return Step("monotone cycle", 1, None)
-
-    def truncated_step(self) -> Step:
-        """One linear cycle on the free unknowns, made conjugate to the last direction, projected."""
-        last, active = self.residual.norm, self.residual.active
-        self._rebuild()
-        self._leave()
-        self.residual.classify = True
-        if self.floating is None and self._rounded is None:
-            self._program().run()
-        else:
-            self.hierarchy.cycle.run()
-            self._measure()
-            self._advance(settle=True)
-        self.residual.read()
-        if self.floating is not None:
-            self._project()
-        self._count_rises(last)
-        return Step("truncated cycle", 1, active)
-
-    def _program(self) -> Program:
-        """Return the launches of a truncated cycle; bounds in place may be coded now and not in the next solve."""
-        lower, least, upper, most, code = self.problem.bounds.operands
-        key = (lower.ptr, float(least), upper.ptr, float(most), code.ptr)
-        program = self._programs.get(key)
-        if program is None:
-            program = self._programs[key] = Program(self.A.device)
-            self._correct(program)
-            self.residual.advance(self.x, self._p, launch=program.launch)
-        return program
-
-    def _correct(self, program: Program) -> None:
-        """Record a cycle, the measuring of its correction and the plan of the step; on the CPU the cycle's last leg measures."""
-        residual, hierarchy, device = self.residual, self.hierarchy, self.A.device
-        if hierarchy.open_cycle is None:
-            program.extend(hierarchy.cycle)
-            self._measure(launch=program.launch)
-            return
-        program.extend(hierarchy.open_cycle)
-        inputs = [*hierarchy.last_leg(), residual.row_sums, self._p, residual.sums.partials]
-        program.launch(kernels.climb_kernel(*residual.storage), 1, inputs, device=device)
-        residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=program.launch)
-        program.launch(kernels.plan_step_kernel, 1, [residual.scalars], device=device)
-
-    def _measure(self, *, launch: Launch = wp.launch) -> None:
-        """Measure the cycle's correction and plan the step."""
-        residual, finest, device = self.residual, self.hierarchy.finest, self.A.device
-        finest.stencil.wrap(finest.x, launch=launch)
-        fields = [finest.x, self._p, finest.b, residual.sums.partials]
-        inputs = [*finest.operands, finest.stencil.grain, residual.row_sums, *fields]
-        launch(residual.row_kernels.measure, residual.threads, inputs, device=device)
-        residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=launch)
-        launch(kernels.plan_step_kernel, 1, [residual.scalars], device=device)
-
-    def _advance(self, *, settle: bool = False) -> None:
-        """Take the planned step and evaluate the residual there."""
-        p = self.problem
-        if self.floating is None and self._rounded is None:
-            self.residual.advance(self.x, self._p)
-            return
-        self.residual.update(self.x, self._p)
-        if self.floating is not None and settle:
-            self.floating.settle(self.x, p.lower, p.upper)
-        self._round(self.x)
-        self.residual.assess(self.x)
-
-    def _rebuild(self) -> None:
-        if self.residual.stale:
-            self.hierarchy.rebuild_changed()
-            self.residual.stale = False
-
-    def _classify_next(self) -> None:
-        """Unknowns at their bounds leave the free set unless a projected cycle comes next."""
-        self.residual.classify = self._cycles_left == 0
-
-    def _count_rises(self, last: float) -> None:
-        self._rises = self._rises + 1 if self.residual.norm > last else 0
-
-    def _forget(self) -> None:
-        """Drop the search direction."""
-        self.residual.set(kernels.CARRY, 0.0)
-
-    def _project(self) -> None:
-        """Keep the right-hand side compatible on singular components."""
-        free = self.hierarchy.finest.stencil.d
-        if self._mask is None:
-            self._mask = self.problem.layout.zeros(wp.uint8)
-        wp.launch(kernels.free_mask_kernel, free.size, [free, self._mask], device=self.A.device)
-        self.floating.project(self.hierarchy.finest.b, self._mask)

@@ -1,0 +1,105 @@
+"""What a peer is asked: the same problem, the same residual, the same tolerance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sp
+
+from benchmarks.problems import Splash
+from warp_lcp.operators.grid_poisson import FLUID
+
+
+@dataclass(frozen=True)
+class Question:
+    """The problem y = A x + b, x >= lower, on the FLUID cells of a scene, assembled.
+
+    Args:
+        scene: the scene.
+        bounds: `linear`, `walls`, `everywhere`.
+    """
+
+    scene: Splash
+    bounds: str
+
+    @cached_property
+    def matrix(self) -> sp.csr_array:
+        """A, float64, with 32-bit indices: peers convert others at their own expense."""
+        A = self.scene.matrix()
+        A.indptr, A.indices = A.indptr.astype(np.int32), A.indices.astype(np.int32)
+        return A
+
+    @cached_property
+    def where(self) -> np.ndarray:
+        """Index of each unknown among the cells, shape (unknowns,)."""
+        return np.flatnonzero(self.scene.cells == FLUID)
+
+    @cached_property
+    def b(self) -> np.ndarray:
+        """Shape (unknowns,)."""
+        return self.scene.b.ravel()[self.where]
+
+    @cached_property
+    def lower(self) -> np.ndarray:
+        """Shape (unknowns,); -inf where there is no bound."""
+        return np.broadcast_to(self.scene.lower(self.bounds), self.scene.b.shape).ravel()[self.where]
+
+    def residual(self, x: np.ndarray) -> float:
+        """Return the relative natural residual of x, in float64: that of every result of this project, by other code."""
+        d = np.abs(self.matrix.diagonal())
+
+        def norm(x: np.ndarray) -> float:
+            y = self.matrix @ x + self.b
+            return float(np.linalg.norm(d * (x - np.maximum(x - y / d, self.lower))))
+
+        return norm(x) / norm(np.maximum(np.zeros_like(x), self.lower))
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a peer found.
+
+    Args:
+        x: shape (unknowns,).
+        setup: of what could be reused for another b [s].
+        solve: of the rest [s].
+        iterations: of the method.
+        linear_iterations: within them.
+    """
+
+    x: np.ndarray
+    setup: float
+    solve: float
+    iterations: int
+    linear_iterations: int | None = None
+
+    @property
+    def total(self) -> float:
+        """Set-up and solve [s]."""
+        return self.setup + self.solve
+
+
+@dataclass(frozen=True)
+class Peer:
+    """Another solver of the same problem.
+
+    Args:
+        name: what tables call it.
+        library: distribution it is of.
+        solve: solves to its own idea of a tolerance; the harness tightens that until `Question.residual` agrees.
+        bounds: which problems it solves.
+        most: cells a side beyond which it is not asked.
+        settings: what was set.
+        precision: of its vectors.
+    """
+
+    name: str
+    library: str
+    solve: Callable[[Question, float], Answer]
+    bounds: tuple[str, ...] = ("linear",)
+    most: int = 1 << 20
+    settings: str = "defaults"
+    precision: str = "float64"

@@ -1,0 +1,128 @@
+"""Runs the built-in scenes, draws each and writes docs/gallery.md: `python docs/generate/gallery.py [--scene NAME]... [--work DIR]`.
+
+Scenes that were not asked for keep their picture and their figures, which docs/gallery/figures.json holds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tomllib
+from datetime import date
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from benchmarks.machine import cpu_model
+
+DOCS = Path(__file__).parents[1]
+PAGE, FOLDER = DOCS / "gallery.md", DOCS / "gallery"
+FIGURES = FOLDER / "figures.json"
+PICTURES = 3  # of a sheet: early, in the middle, late
+WIDTH = 1200  # pixels
+SETTINGS = {"fluids": ("output.surface=true",), "granular": ()}  # of 3-D scenes, besides their own
+SURFACE = ("--show", "surface")
+
+HEAD = """# Gallery
+
+<!-- Written by docs/generate/gallery.py from runs of the scenes; do not edit. -->
+
+Every built-in scene: what a run shows, the commands that make the picture, what the run took. `warp-lcp scenes` lists them, `warp-lcp run
+NAME` runs one, `warp-lcp check NAME` says before how large it is. Copy one with `--set` changes or start from its file:
+{device}, {date}; one process, first run's compilation included in neither time nor memory of the fields. Memory is the process's largest,
+about {base} MB of it the program itself.
+"""
+
+
+def scene_text(name: str) -> str:
+    """Return a built-in scene's file."""
+    return (files("warp_lcp.driver.scenes") / f"{name}.toml").read_text()
+
+
+def scene_names() -> list[str]:
+    """Return the built-in scenes, liquids first."""
+    names = [Path(entry.name).stem for entry in files("warp_lcp.driver.scenes").iterdir() if entry.name.endswith(".toml")]
+    return sorted(names, key=lambda name: (tomllib.loads(scene_text(name))["scene"]["simulator"], name))
+
+
+def commands(name: str) -> tuple[list[str], list[str]]:
+    """Return the command that runs a scene and the one that draws it, without folders."""
+    scene = tomllib.loads(scene_text(name))
+    simulator = scene["scene"]["simulator"]
+    deep = len(scene["domain"]["size"]) == 3
+    settings = SETTINGS[simulator] if deep else ()
+    run = ["warp-lcp", "run", name, *(word for setting in settings for word in ("--set", setting))]
+    draw = ["warp-lcp", "render", f"out/{name}", "--sheet"]
+    return run, draw + (list(SURFACE) if settings else [])
+
+
+def measured(command: list[str]) -> int:
+    """Run a command; return the most memory that it held [bytes]."""
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise SystemExit(f"{' '.join(command)}: exit code {process.returncode}")
+    return usage.ru_maxrss * 1024
+
+
+def show(name: str, work: Path) -> dict[str, Any]:
+    """Run a scene, keep its picture and return its figures."""
+    program = Path(sys.executable).parent / "warp-lcp"
+    out, (run, draw) = work / name, commands(name)
+    memory = measured([str(program), *run[1:], "--out", str(out), "--force"])
+    end = json.loads((out / "run.json").read_text())
+    last = end["frames"]
+    chosen = [word for part in range(1, PICTURES + 1) for word in ("--frame", str(round(last * part / (PICTURES + 1) * 4 / 3)))]
+    measured([str(program), "render", str(out), *draw[3:], *chosen, "--size", f"{WIDTH}x{WIDTH}"])
+    FOLDER.mkdir(exist_ok=True)
+    picture = Image.open(out / "images" / "sheet.png").convert("RGB")
+    picture.save(FOLDER / f"{name}.webp", quality=82, method=6)
+    return {
+        "seconds": end["seconds"],
+        "steps": end["steps"],
+        "frames": last + 1,
+        "megabytes": round(memory / 2**20),
+        "note": end["warnings"][0],
+    }
+
+
+def entry(name: str, figures: dict[str, Any]) -> str:
+    """Return what the page says of a scene."""
+    about = tomllib.loads(scene_text(name))["scene"]
+    run, draw = commands(name)
+    size = figures["note"].split(" m,")[0]
+    took = f"{figures['seconds']:.0f} s for {figures['steps']} steps and {figures['frames']} frames, {figures['megabytes']} MB; {size}"
+    block = f"```sh\n{' '.join(run)} --out out/{name}\n{' '.join(draw)}\n```"
+    return f"## {name}\n\n![{about['description']}](gallery/{name}.webp)\n\n{about['description']}. {took}.\n\n{block}\n"
+
+
+def page(figures: dict[str, Any]) -> str:
+    """Return the page."""
+    head = HEAD.format(device=figures["device"], date=figures["date"], base=figures["program megabytes"])
+    return "\n".join([head, *(entry(name, figures["scenes"][name]) for name in scene_names())])
+
+
+def main() -> None:
+    """Run the scenes asked for, all unless any is named."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--scene", action="append", choices=scene_names(), help="may be repeated")
+    parser.add_argument("--work", type=Path, default=Path("out/gallery"), help="where the runs go")
+    asked = parser.parse_args()
+    figures = json.loads(FIGURES.read_text()) if FIGURES.is_file() else {"scenes": {}}
+    figures |= {"device": cpu_model(), "date": date.today().isoformat()}
+    figures["program megabytes"] = round(measured([sys.executable, "-c", "import warp as wp, fluids; wp.init()"]) / 2**20)
+    for name in asked.scene or scene_names():
+        figures["scenes"][name] = show(name, asked.work)
+        print(name, figures["scenes"][name], flush=True)
+        FIGURES.write_text(json.dumps(figures, indent=1, sort_keys=True) + "\n")
+    PAGE.write_text(page(figures))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,114 @@
+"""Rigid bodies in the pressure's problem: what their motions displace, and what the pressure does to them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import scipy.linalg
+import warp as wp
+
+import warp_lcp as wl
+from fluids import coupling_kernels as kernels
+from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.material.cut_boundary import CutBoundary
+from warp_lcp.operators.low_rank_columns import BlockColumns
+from warp_lcp.rigid.bodies import RigidBodies
+
+SPARE = 1.5  # room for entries, times those there are when there is none left
+
+
+class BodyCoupling:
+    """Move bodies and liquid by one pressure [Batty, Bertails & Bridson 2007].
+
+    A body's velocity is V* + M^-1 I after the pressure's impulse I = rho dx^d U'x, x = dt p / (rho dx), and the outflow of a cell gains
+    U V: U_iq is the sum over the faces of cell i of s_f (1 - a_f) times the velocity of unit motion q at the face's center, s_f = +-1
+    outward. So with b from V* the outflow is
+
+        y = b + (A + rho dx^d U M^-1 U') x,
+
+    symmetric and positive semi-definite like A. What pushes the liquid pushes the body back on the same faces: momentum is exchanged
+    without loss, and so is energy but for what y leaves.
+
+    Args:
+        grid: the grid.
+        boundary: its solids, with the bodies among them.
+        bodies: the bodies.
+        density: of the liquid [kg/m^3].
+        share: factor on U V in the outflow, where the problem is one of masses, see `fluids.unilateral`.
+    """
+
+    def __init__(self, grid: StaggeredGrid, boundary: CutBoundary, bodies: RigidBodies, density: float, *, share: float = 1.0) -> None:
+        self.grid, self.boundary, self.bodies = grid, boundary, bodies
+        self._scale, self._share = density * grid.cell_volume, share
+        self.width = 3 if grid.dimension == 2 else 6
+        self.columns = BlockColumns(grid.size, len(bodies.bodies), self.width, wp.float64, grid.device)
+        body = np.full(1 + len(boundary.cut.solids), -1, dtype=np.int32)
+        body[bodies.numbers] = np.arange(len(bodies.bodies))
+        cut, S = boundary.cut, kernels.Solids()
+        S.planes, S.bodies, S.spacing = grid.planes, len(bodies.bodies), grid.spacing
+        S.near, S.owner, S.next_near, S.next_owner = cut.near_solids
+        S.standing, S.moving = cut.standing, cut.moving_numbers
+        S.open_x, S.open_y, S.open_z = (*cut.open, *cut.open[:1])[:3]
+        S.wall_x, S.wall_y, S.wall_z = (*cut.wall, *cut.wall[:1])[:3]
+        S.body = wp.array(body, dtype=wp.int32, device=grid.device)
+        S.center = wp.zeros(len(bodies.bodies), dtype=wp.vec3d, device=grid.device)
+        self._solids = S
+        rows = grid.shape[0] * grid.shape[1]
+        self._counts, self._offsets = (wp.zeros(rows, dtype=wp.int32, device=grid.device) for _ in range(2))
+        self._low: wl.LowRankOperator | None = None
+
+    def join(self, A: wl.GridPoisson) -> wl.SumOperator:
+        """Return the operator of liquid and bodies, A + rho dx^d U M^-1 U', which `take` keeps up to date."""
+        self._low = wl.LowRankOperator.of_blocks(A, self.columns, self._weights())
+        return wl.SumOperator(A, self._low)
+
+    def take(self, kind: wp.array) -> None:
+        """Find U for bodies where the solids are placed and M^-1 as it is now.
+
+        Args:
+            kind: int8 of AIR, FLUID, SOLID.
+        """
+        grid, S, rows = self.grid, self._solids, self.grid.shape[1]
+        S.center.assign(np.array([body.position for body in self.bodies.bodies]))
+        block = self.boundary.cut.moving_block()
+        self._counts.zero_()
+        total = 0
+        if block is not None:
+            window = grid.window(*block)
+            window.launch_rows(kernels.count_kernel, [S, kind, rows, self._counts])
+            wp.utils.array_scan(self._counts, self._offsets, inclusive=False)
+            total = int(self._offsets.numpy()[-1]) + int(self._counts.numpy()[-1])
+        if total > self.columns.capacity:
+            self.columns.reserve(round(SPARE * total))
+        if total:
+            entries = [self.columns.rows, self.columns.blocks, self.columns.values]
+            window.launch_rows(kernels.fill_kernel, [S, kind, rows, self.width, self._offsets, *entries])
+        self.columns.count.fill_(total)
+        if self._low is not None:
+            self._low.update(self._weights())
+
+    def push(self, x: wp.array) -> None:
+        """Give the bodies the impulses of a pressure x = dt p / (rho dx) [m/s], a stored field."""
+        sums = self.columns.gather(x.flatten()).numpy()
+        for body, impulse in zip(self.bodies.bodies, self._scale * sums.reshape(-1, self.width), strict=True):
+            body.apply_impulse(impulse)
+
+    def hold(self, velocity: Sequence[wp.array], known: Sequence[wp.array]) -> None:
+        """Let particles that a body has buried move with it: beneath it, on a floor, gravity alone would act on them for ever.
+
+        Args:
+            velocity: of each component [m/s] (updated on closed faces that no liquid is near).
+            known: int8, > 0 where the velocity has been continued to.
+        """
+        block = self.boundary.cut.moving_block()
+        if block is None:
+            return
+        window, boundary = self.grid.window(*block, grow=1), self.boundary
+        for fields in zip(boundary.open, boundary.velocity, known, velocity, strict=True):
+            window.launch(kernels.enclosed_kernel, list(fields))
+
+    def _weights(self) -> np.ndarray:
+        """Return rho dx^d M^-1."""
+        inverses = [body.inverse_mass(self.grid.dimension) for body in self.bodies.bodies]
+        return self._share * self._scale * np.asarray(scipy.linalg.block_diag(*inverses))

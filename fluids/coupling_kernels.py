@@ -1,0 +1,184 @@
+"""Kernels that find how the motions of rigid bodies displace the liquid of the cells beside them."""
+
+import typing
+
+import warp as wp
+
+from warp_lcp.grid.cut_cells_kernels import moving_part
+from warp_lcp.grid.staggered import CellRange
+from warp_lcp.operators.grid_poisson import FLUID
+
+_FLUID = wp.constant(wp.int8(FLUID))
+_F32 = wp.array3d(dtype=wp.float32)
+_I16 = wp.array3d(dtype=wp.int16)
+_I8 = wp.array3d(dtype=wp.int8)
+_I32 = wp.array(dtype=wp.int32)
+_F64 = wp.array(dtype=wp.float64)
+
+options: dict[str, typing.Any] = {"enable_backward": False, "module": "fluids.coupling"}
+
+
+@wp.struct
+class Solids:
+    """What solids leave open, see `warp_lcp.grid.cut_cells`."""
+
+    planes: int
+    bodies: int
+    spacing: wp.float64
+    near: _F32
+    owner: _I16
+    next_near: _F32
+    next_owner: _I16
+    standing: _F32
+    moving: wp.array(dtype=wp.uint8)
+    open_x: _F32
+    open_y: _F32
+    open_z: _F32
+    wall_x: _I16
+    wall_y: _I16
+    wall_z: _I16
+    body: _I32  # of a wall's number; -1: it is none
+    center: wp.array(dtype=wp.vec3d)  # of mass of each body [m]
+
+
+@wp.func
+@typing.no_type_check
+def body_on_face(S: Solids, axis: int, k: int, j: int, i: int):
+    """Return the body that covers a face, -1 if none does, and the share of the face that it covers."""
+    solid = int(0)
+    part = float(0.0)
+    free = float(1.0)
+    if axis == 0:
+        free = S.open_x[k, j, i]
+        solid, part = moving_part(
+            0, S.planes, k, j, i, S.near, S.owner, S.next_near, S.next_owner, S.standing, S.open_x, S.wall_x, S.moving
+        )
+    elif axis == 1:
+        free = S.open_y[k, j, i]
+        solid, part = moving_part(
+            1, S.planes, k, j, i, S.near, S.owner, S.next_near, S.next_owner, S.standing, S.open_y, S.wall_y, S.moving
+        )
+    else:
+        free = S.open_z[k, j, i]
+        solid, part = moving_part(
+            2, S.planes, k, j, i, S.near, S.owner, S.next_near, S.next_owner, S.standing, S.open_z, S.wall_z, S.moving
+        )
+    share = (wp.float64(1.0) - wp.float64(free)) * wp.float64(part)
+    body = S.body[solid]
+    if share == wp.float64(0.0):
+        body = -1
+    return body, share
+
+
+@wp.func
+@typing.no_type_check
+def beside_a_wall(S: Solids, k: int, j: int, i: int):
+    """Return whether a face of a cell is not open."""
+    a = wp.min(wp.min(S.open_x[k, j, i], S.open_x[k, j, i + 1]), wp.min(S.open_y[k, j, i], S.open_y[k, j + 1, i]))
+    if S.planes == 2:
+        a = wp.min(a, wp.min(S.open_z[k, j, i], S.open_z[k + 1, j, i]))
+    return a < 1.0
+
+
+@wp.func
+@typing.no_type_check
+def side(S: Solids, n: int, k: int, j: int, i: int):
+    """Return body and share on side n = 2 axis + (0: low, 1: high) of a cell."""
+    axis = n >> 1
+    high = n & 1
+    return body_on_face(
+        S, axis, k + wp.where(axis == 2, high, 0), j + wp.where(axis == 1, high, 0), i + wp.where(axis == 0, high, 0)
+    )
+
+
+@wp.kernel(**options)
+@typing.no_type_check
+def count_kernel(cells: CellRange, S: Solids, kind: _I8, rows: int, counts: _I32):
+    """Count the pairs of a FLUID cell and a body beside it in a row."""
+    plane, row = wp.tid()
+    k = cells.k + plane
+    j = cells.j + row
+    found = int(0)
+    for i in range(cells.i, cells.end):
+        if kind[k, j, i] == _FLUID:
+            if beside_a_wall(S, k, j, i):
+                last = int(-1)
+                for _ in range(S.bodies):
+                    least = int(S.bodies)
+                    for n in range(2 * (S.planes + 1)):
+                        body, _share = side(S, n, k, j, i)
+                        if body > last and body < least:
+                            least = body
+                    if least == S.bodies:
+                        break
+                    found += 1
+                    last = least
+    counts[k * rows + j] = found
+
+
+@wp.kernel(**options)
+@typing.no_type_check
+def fill_kernel(
+    cells: CellRange, S: Solids, kind: _I8, rows: int, columns: int, offsets: _I32, index: _I32, block: _I32, values: _F64
+):
+    """Write the entries of a row: what a cell's outflow gains by unit motions of a body, (vx, vy, wz) or (vx, vy, vz, wx, wy, wz)."""
+    plane, row = wp.tid()
+    k = cells.k + plane
+    j = cells.j + row
+    e = offsets[k * rows + j]
+    for i in range(cells.i, cells.end):
+        if kind[k, j, i] == _FLUID:
+            if beside_a_wall(S, k, j, i):
+                last = int(-1)
+                for _ in range(S.bodies):
+                    least = int(S.bodies)
+                    for n in range(2 * (S.planes + 1)):
+                        body, _share = side(S, n, k, j, i)
+                        if body > last and body < least:
+                            least = body
+                    if least == S.bodies:
+                        break
+                    last = least
+                    move = wp.vec3d()
+                    turn = wp.vec3d()
+                    for n in range(2 * (S.planes + 1)):
+                        body, share = side(S, n, k, j, i)
+                        if body == least:
+                            axis = n >> 1
+                            high = n & 1
+                            half = wp.float64(0.5)
+                            x = wp.vec3d(wp.float64(i) - half, wp.float64(j) - half, wp.float64(k) - half)
+                            x[axis] = x[axis] + wp.float64(high) - half
+                            r = x * S.spacing - S.center[least]
+                            if S.planes == 1:
+                                r[2] = wp.float64(0.0)
+                            normal = wp.vec3d()
+                            normal[axis] = share * wp.float64(2 * high - 1)
+                            move += normal
+                            turn += wp.cross(r, normal)
+                    index[e] = (k * rows + j) * kind.shape[2] + i
+                    block[e] = least
+                    at = e * columns
+                    values[at] = move[0]
+                    values[at + 1] = move[1]
+                    if S.planes == 1:
+                        values[at + 2] = turn[2]
+                    else:
+                        values[at + 2] = move[2]
+                        values[at + 3] = turn[0]
+                        values[at + 4] = turn[1]
+                        values[at + 5] = turn[2]
+                    e += 1
+
+
+@wp.kernel(**options)
+@typing.no_type_check
+def enclosed_kernel(cells: CellRange, open: _F32, solid: _F32, known: _I8, velocity: _F32):
+    """Give closed faces that nothing has reached the velocity of the solid there [m/s]."""
+    plane, row, chunk = wp.tid()
+    k = cells.k + plane
+    j = cells.j + row
+    first = cells.i + chunk * cells.grain
+    for i in range(first, wp.min(first + cells.grain, cells.end)):
+        if known[k, j, i] <= wp.int8(0) and open[k, j, i] == 0.0:
+            velocity[k, j, i] = solid[k, j, i]

@@ -1,0 +1,240 @@
+"""Rigid bodies that sand moves: their velocity follows from the stresses within the coupled solve."""
+
+from __future__ import annotations
+
+import typing
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from granular.bodies_kernels import body_kernels, force_kernel, forget_kernel, layer_kernel, lightness_kernel, respond_kernel, stiffness_kernel
+from granular.body_faces import BodyFaces, entries_near, find_body_faces, unowned_copies
+from granular.packing import Packing, three
+from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.program import Launch
+
+if typing.TYPE_CHECKING:
+    from granular.stress import Velocity, Walls
+
+ROUNDS = 2  # trial steps before a step: one is exact while all stresses around a body are free, two where half of them are
+GRAIN = {False: 1024, True: 64}  # cells or edges whose forces a thread adds up, on the CPU and on CUDA
+NUMBERS = {2: 3, 3: 6}  # degrees of freedom of a body
+FIRST = {2: 2, 3: 4}  # layer of the first copy of a shear
+
+
+class SandBodies:
+    """Rigid bodies as the stresses meet them.
+
+    With F = - sum of rows times stresses, see `granular.body_faces`, a body leaves the solve with V = V* + rho dx^d M^-1 F. That adds
+    R M^-1 R' to the matrix of the stresses: a light body's part of it is far larger than sand's own. So a step of the stresses takes it
+    implicitly: it is the projected step whose own stresses give the bodies the velocity that it was taken with, a step in the metric
+    D + R M^-1 R' instead of D. That velocity is the root of a monotone equation in k numbers a body, found by a few trial steps of the
+    cells and wall faces beside bodies, each followed by V <- V - (1 + W G)^-1 (V - V* - W F), W = rho dx^d M^-1 and G = R D^-1 R' the
+    most that F can fall with V. So the number of steps does not depend on the bodies' mass.
+
+    The sand between a body's face and the centers of the cells before it has the face's velocity: its mass, half a cell's, is added to the
+    body's, and what gravity and its own motion bring along to V*. Without it a body would neither bear nor drag along that layer.
+
+    Args:
+        grid: the grid.
+        numbers: the wall's number of each body, 1 + index of its solid.
+
+    Attributes:
+        freedoms: k, degrees of freedom of a body.
+        velocity: V of each, float64, shape (bodies, k) [m/s, 1/s]; after `Stress.residual` that which the stresses leave.
+    """
+
+    def __init__(self, grid: StaggeredGrid, numbers: Sequence[int]) -> None:
+        """Allocate what does not depend on where the bodies are."""
+        self.grid, self.numbers, self.freedoms = grid, tuple(numbers), NUMBERS[grid.dimension]
+        count, k, device = len(self.numbers), self.freedoms, grid.device
+        self.velocity, self._force, self._start, self._error = (
+            wp.zeros((count, k), dtype=wp.float64, device=device) for _ in range(4)
+        )
+        self._response, self._correction = (wp.zeros((count, k, k), dtype=wp.float64, device=device) for _ in range(2))
+        _, rows, columns = grid.shape
+        self._strides = wp.vec3i(1, columns, columns * rows)
+        self._nothing = wp.zeros(1, dtype=wp.float64, device=device)  # sums that trial steps do not make
+        self.faces: BodyFaces | None = None
+
+    def place(self, index: np.ndarray, centers: np.ndarray, walls: Walls) -> None:
+        """Find where the bodies meet sand.
+
+        Args:
+            index: int, -1 in open cells, the wall's number elsewhere; shape of the grid's fields.
+            centers: of mass [m], shape (bodies, 3).
+            walls: the faces between sand and solids.
+        """
+        grid, device = self.grid, self.grid.device
+        self.faces = found = find_body_faces(grid, index, self.numbers, centers)
+        self._walls = walls
+        self._entries, cells = entries_near(grid, found, walls.cells.numpy(), walls.sides.numpy())
+
+        def ints(values: np.ndarray) -> wp.array:
+            return wp.array(values.astype(np.int32), dtype=wp.int32, device=device)
+
+        def small(values: np.ndarray) -> wp.array:
+            return wp.array(values.astype(np.uint8), dtype=wp.uint8, device=device)
+
+        def reals(values: np.ndarray) -> wp.array:
+            return wp.array(np.ascontiguousarray(values), dtype=wp.float64, device=device)
+
+        self._face = [ints(found.face), small(found.face_axis), ints(found.face_body), reals(found.face_row)]
+        self._cell, self._cell_row = ints(found.cell), reals(found.cell_row)
+        self._edge, self._edge_shear, self._edge_row = ints(found.edge), small(found.edge_shear), reals(found.edge_row)
+        copies, homes = unowned_copies(grid, index, found)
+        self._unowned = ints((FIRST[grid.dimension] + copies) * grid.size + homes)
+        self._trial = ints(cells)
+        self._active = wp.zeros(1 + len(self._entries), dtype=wp.int32, device=device)
+        spans, parts = self._parts(found)
+        self._spans, self._owned = (wp.array(table.astype(np.int32), dtype=wp.int32, device=device) for table in (spans, parts))
+        self._partial = wp.zeros((len(spans), self.freedoms), dtype=wp.float64, device=device)
+
+    def begin(
+        self, packing: Packing, sand: Sequence[wp.array], weights: Sequence[wp.array], *, velocity: np.ndarray, inverse_mass: np.ndarray,
+        density: float,
+    ) -> None:  # fmt: skip
+        """Start a time step.
+
+        Args:
+            packing: where sand is.
+            sand: velocity u* of each component [m/s], gravity included, on the bodies' faces as well.
+            weights: of the particles on each component's faces; where they are 0, so is `sand`.
+            velocity: V* of each body, shape (bodies, k) [m/s, 1/s].
+            inverse_mass: M^-1 of each, shape (bodies, k, k).
+            density: of sand at its densest [kg/m^3].
+        """
+        assert self.faces is not None
+        self._scale, rows, owner = density * self.grid.cell_volume, self.faces.face_row, self.faces.face_body
+        layer = wp.zeros(len(rows), dtype=wp.vec2d, device=self.grid.device)
+        fields = [*_flat(packing.mass), *_flat(sand), *_flat(weights)]
+        wp.launch(layer_kernel, len(rows), [*self._face[:2], *fields, layer], device=self.grid.device)
+        mass, speed = layer.numpy().T
+        self._layer_mass, self._layer_momentum = np.zeros_like(inverse_mass), np.zeros_like(velocity)
+        np.add.at(self._layer_mass, owner, mass[:, None, None] * rows[:, :, None] * rows[:, None, :])
+        np.add.at(self._layer_momentum, owner, (mass * speed)[:, None] * rows)
+        alone = inverse_mass * self._scale
+        heavier = np.linalg.inv(np.eye(self.freedoms) + alone @ self._layer_mass)
+        self._host_response = heavier @ alone
+        start = np.einsum("bqr,br->bq", heavier, velocity + np.einsum("bqr,br->bq", alone, self._layer_momentum))
+        self._start.assign(start)
+        self.velocity.assign(start)
+        self._response.assign(self._host_response)
+        held = self._entries[packing.flags.numpy().ravel()[self._walls.cells.numpy()[self._entries]] != 0]
+        active = np.zeros(1 + len(self._entries), dtype=np.int32)
+        active[0], active[1 : 1 + len(held)] = len(held), held
+        self._active.assign(active)
+
+    def forget(self, stress: Sequence[wp.array]) -> None:
+        """Take stresses from where only the edge of a body is near: now, before, point."""
+        if len(self._unowned):
+            wp.launch(forget_kernel, len(self._unowned), [self._unowned, *(s.flatten() for s in stress)], device=self.grid.device)
+
+    def prepare(self, packing: Packing, numbers: wp.array, *, pressure_step: float, shear_step: float) -> None:
+        """Find how much of a mismatch of the velocity a trial step corrects.
+
+        Args:
+            packing: where sand is.
+            numbers: of the stresses, see `granular.yield_set`.
+            pressure_step: of the projected gradient, relative to the diagonal.
+            shear_step: likewise, of the shear stresses.
+        """
+        found, device, dimension = self.faces, self.grid.device, self.grid.dimension
+        assert found is not None
+        fields = [*_flat(packing.mass), *_flat(packing.inverse)]
+        cells = wp.zeros(len(found.cell), dtype=wp.vec2d, device=device)
+        inputs = [self._strides, dimension, self._cell, packing.flags.flatten(), packing.drive.flatten(), packing.stiff.flatten()]
+        wp.launch(stiffness_kernel, len(found.cell), [*inputs, *fields, numbers, cells], device=device)
+        edges = wp.zeros(len(found.edge), dtype=wp.float64, device=device)
+        inputs = [self._strides, self._edge, self._edge_shear, *_flat(packing.share), *fields[3:], edges]
+        wp.launch(lightness_kernel, len(found.edge), inputs, device=device)
+        pressure, shear = (cells.numpy() * found.cell_share[:, None]).T
+        along = found.cell_row.sum(axis=1)
+        if dimension == 2:
+            deviator, factor = (found.cell_row[:, 0] - found.cell_row[:, 1])[:, None], 1.0
+        else:
+            deviator, factor = found.cell_row - along[:, None] / 3.0, 2.0
+        steepest = np.zeros_like(self._host_response)
+        for weight, rows, owner in (
+            (pressure_step * pressure, along[:, None], found.cell_body),
+            (factor * shear_step * shear, deviator, found.cell_body),
+            (shear_step * edges.numpy() * found.edge_share, found.edge_row[:, None], found.edge_body),
+        ):
+            np.add.at(steepest, owner, np.einsum("n,naq,nar->nqr", weight, rows, rows))
+        identity = np.eye(self.freedoms)
+        self._correction.assign(np.linalg.inv(identity + self._host_response @ steepest))
+
+    def impulses(self) -> np.ndarray:
+        """Return what the sand has done to each body since V*, shape (bodies, k) [kg m/s, kg m^2/s; 2-D: per m].
+
+        That is of the stresses of the last `Stress.residual`, and of the layer of sand that moves with the body.
+        """
+        layer = self._layer_momentum - np.einsum("bqr,br->bq", self._layer_mass, self.velocity.numpy())
+        return np.asarray((self._force.numpy() + layer) * self._scale)
+
+    def move(self, velocity: Velocity, launch: Launch) -> None:
+        """Give the bodies' faces their velocity."""
+        kernel = body_kernels(self.grid.dimension, velocity.real, velocity.box).move
+        if len(self._face[0]):
+            launch(kernel, len(self._face[0]), [*self._face, self.velocity, *_flat(velocity.u)], device=self.grid.device)
+
+    def respond(self, packing: Packing, stress: wp.array, launch: Launch, *, implicit: bool) -> None:
+        """Find what stresses do to the bodies and the velocity that they leave, or a step towards it."""
+        grid, device, k = self.grid, self.grid.device, self.freedoms
+        shares = _flat(packing.share)
+        rows = [self._cell, self._cell_row, self._edge, self._edge_shear, self._edge_row]
+        inputs = [grid.dimension, grid.size, k, self._spans, stress.flatten(), *rows, self._strides, *shares, self._partial]
+        if self._spans.shape[0]:
+            launch(force_kernel, self._spans.shape[0], inputs, device=device)
+        inputs = [int(implicit), k, self._owned, self._partial, self._start, self._response, self._correction]
+        launch(respond_kernel, len(self.numbers), [*inputs, self._force, self._error, self.velocity], device=device)
+
+    def search(
+        self, packing: Packing, velocity: Velocity, stress: list[wp.array], momentum: wp.array, numbers: wp.array, launch: Launch
+    ) -> None:
+        """Find the velocity with which a step of the stresses is implicit; faces and edges beside the bodies get it.
+
+        Args:
+            packing: where sand is.
+            velocity: what a step is taken with, at the bodies' last velocity.
+            stress: now, before, point; the last is overwritten beside bodies.
+            momentum: of the steps.
+            numbers: of the stresses.
+            launch: records.
+        """
+        p, device, walls = packing, self.grid.device, self._walls
+        kernels = body_kernels(self.grid.dimension, velocity.real, velocity.box)
+        share, edge, inverse, u = three(p.share), three(velocity.edge), three(p.inverse), three(velocity.u)
+        cells = [self._trial, p.spans, p.flags, *stress, p.drive, p.stiff, *share, *edge, *three(p.mass), *inverse, *u]
+        faces = [walls.cells, walls.sides, walls.walls, walls.friction, self._active, p.fraction]
+        entries = [*faces, *stress, *share, *edge, *inverse]
+        scalars = [momentum, numbers, self._nothing]
+        edges = [self._edge, self._edge_shear, self._strides, *_flat(velocity.u), *_flat(velocity.edge)]
+        for _ in range(ROUNDS if len(self._trial) else 0):
+            launch(kernels.trial, len(self._trial), [*cells, *scalars], device=device)
+            if len(self._entries):
+                launch(kernels.trial_wall, len(self._entries), [*entries, *scalars], device=device)
+            self.respond(packing, stress[2], launch, implicit=True)
+            self.move(velocity, launch)
+            if len(self._edge):
+                launch(kernels.strain, len(self._edge), edges, device=device)
+
+    def _parts(self, found: BodyFaces) -> tuple[np.ndarray, np.ndarray]:
+        """Return runs of the lists of cells and edges that a thread adds up, first and last of both, and each body's runs."""
+        grain, spans, parts = GRAIN[self.grid.device.is_cuda], [], []
+        for body in range(len(self.numbers)):
+            first = len(spans)
+            for column, owner in ((0, found.cell_body), (2, found.edge_body)):
+                low, high = np.searchsorted(owner, [body, body + 1])
+                for start in range(low, high, grain):
+                    run = [0, 0, 0, 0]
+                    run[column : column + 2] = start, min(start + grain, high)
+                    spans.append(run)
+            parts.append([first, len(spans)])
+        return np.array(spans).reshape(-1, 4), np.array(parts).reshape(-1, 2)
+
+
+def _flat(fields: Sequence[wp.array]) -> list[wp.array | None]:
+    """Return three flat views, None where there are fewer."""
+    return three([field.flatten() for field in fields])

@@ -1,0 +1,205 @@
+"""Where rigid bodies meet sand on the grid: their faces, and how their motion strains the cells and edges around them.
+
+A body of k degrees of freedom V (2-D: vx, vy, wz; 3-D: vx, vy, vz, wx, wy, wz; about its center of mass) has the velocity J_f V on face f,
+J_f the velocity of unit motions at the face's center along its axis. It changes the differences of velocity across an open cell, and the
+rates of shear of an edge, by rows times V; what the stresses do to the body is minus the same rows times the stresses. So sand and bodies
+exchange momentum and angular momentum without loss: the sum of the forces on all faces of sand and of a body is zero, and so is that of
+their torques, since the rates of strain of a rigid motion are.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from granular.packing import SHEARS
+from warp_lcp.grid.staggered import StaggeredGrid
+
+
+@dataclass(frozen=True)
+class BodyFaces:
+    """The bodies' faces near open cells, and the rows of the cells and edges that they touch, each ordered by body.
+
+    Attributes:
+        face, face_axis, face_body: flat index, axis and body of each face, shape (f,).
+        face_row: J of each face, [1] and [m], shape (f, k).
+        cell, cell_body: flat index and body of each pair of an open cell and a body beside it, shape (c,).
+        cell_row: difference of velocity along each axis across the cell, high less low, in units of V, shape (c, dimension, k).
+        cell_share: bodies beside the cell, shape (c,).
+        edge, edge_shear, edge_body: flat index, shear and body of each pair of an edge and a body beside it, shape (e,).
+        edge_row: rate of shear in units of V, shape (e, k).
+        edge_share: bodies beside the edge, shape (e,).
+    """
+
+    face: np.ndarray
+    face_axis: np.ndarray
+    face_body: np.ndarray
+    face_row: np.ndarray
+    cell: np.ndarray
+    cell_body: np.ndarray
+    cell_row: np.ndarray
+    cell_share: np.ndarray
+    edge: np.ndarray
+    edge_shear: np.ndarray
+    edge_body: np.ndarray
+    edge_row: np.ndarray
+    edge_share: np.ndarray
+
+
+def find_body_faces(grid: StaggeredGrid, index: np.ndarray, numbers: Sequence[int], centers: np.ndarray) -> BodyFaces:
+    """Return where bodies meet open cells.
+
+    A face between two solids belongs to that of the higher number.
+
+    Args:
+        grid: the grid.
+        index: int, -1 in open cells, the wall's number elsewhere; shape of the grid's fields.
+        numbers: the wall's number of each body.
+        centers: of mass of each body [m], shape (bodies, 3).
+    """
+    strides = _strides(grid)
+    faces = [_faces(grid, index, axis, np.asarray(numbers, dtype=int)) for axis in range(grid.dimension)]
+    rows = [_face_rows(grid, flat, axis, np.asarray(centers, dtype=float)[body]) for axis, (flat, body) in enumerate(faces)]
+    axis_of = np.repeat(np.arange(grid.dimension), [len(flat) for flat, _ in faces])
+    face, body, row = (np.concatenate(parts) for parts in zip(*((f, b, r) for (f, b), r in zip(faces, rows, strict=True)), strict=True))
+    order = np.lexsort((face, axis_of, body))
+    face, body, row, axis_of = face[order], body[order], row[order], axis_of[order]
+    cells = _cells(grid, index, face, axis_of, body, row, strides)
+    edges = _edges(grid, face, axis_of, body, row, strides)
+    return BodyFaces(face, axis_of, body, row, *cells, *edges)
+
+
+def entries_near(
+    grid: StaggeredGrid, faces: BodyFaces, cells: np.ndarray, sides: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return which wall faces have an edge beside a body, and all cells whose stresses a body's velocity reaches.
+
+    Args:
+        grid: the grid.
+        faces: of the bodies.
+        cells: flat index of the open cell of each wall face.
+        sides: 2 axis + side of each.
+    """
+    strides, near = _strides(grid), np.zeros(len(cells), dtype=bool)
+    for d, (alpha, beta) in enumerate(SHEARS[grid.dimension]):
+        touched = np.zeros(grid.size, dtype=bool)
+        touched[faces.edge[faces.edge_shear == d]] = True
+        for axis, other in ((alpha, beta), (beta, alpha)):
+            own = np.flatnonzero(sides >> 1 == axis)
+            first = cells[own].astype(np.int64) + (sides[own] & 1).astype(np.int64) * strides[axis]
+            near[own] |= touched[first] | touched[first + strides[other]]
+    entries = np.flatnonzero(near)
+    return entries, np.unique(np.concatenate([faces.cell, cells[entries]]))
+
+
+def unowned_copies(grid: StaggeredGrid, index: np.ndarray, faces: BodyFaces) -> tuple[np.ndarray, np.ndarray]:
+    """Return the copies of shears on edges beside bodies that belong to no wall face: (shear, 4) as one number, and the cell.
+
+    A cell that touches a solid with its edge alone may have left a stress there before a body came that near. Nothing bounds it now.
+    """
+    strides, solid = _strides(grid), index.ravel() >= 0
+    copies, cells = [], []
+    for d, (alpha, beta) in enumerate(SHEARS[grid.dimension]):
+        edges = np.unique(faces.edge[faces.edge_shear == d])
+        for q in range(4):
+            cell = edges - (q & 1) * strides[alpha] - (q >> 1) * strides[beta]
+            along_alpha = cell + (strides[alpha] if q & 1 else -strides[alpha])
+            along_beta = cell + (strides[beta] if q >> 1 else -strides[beta])
+            cell = cell[~solid[cell] & (solid[along_alpha] == solid[along_beta])]
+            copies.append(np.full(len(cell), 4 * d + q))
+            cells.append(cell)
+    return np.concatenate(copies), np.concatenate(cells)
+
+
+def _strides(grid: StaggeredGrid) -> tuple[int, int, int]:
+    _, rows, columns = grid.shape
+    return 1, columns, columns * rows
+
+
+def _faces(grid: StaggeredGrid, index: np.ndarray, axis: int, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the flat indices of the bodies' faces of one axis that an open cell is near, and their bodies."""
+    owner = np.full(int(max(index.max(initial=0), numbers.max(initial=0))) + 2, -1)
+    owner[numbers + 1] = np.arange(len(numbers))
+    held = owner[index + 1] >= 0
+    if not held.any():
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    box = []  # around all bodies, so that the rest of the grid costs nothing
+    for place, size in enumerate(index.shape):
+        along = np.flatnonzero(held.any(axis=tuple(a for a in range(3) if a != place)))
+        box.append(slice(max(along[0] - 2, 0), min(along[-1] + 4, size)))
+    if grid.dimension == 2:
+        box[0] = slice(1, 2)
+    part, place = index[tuple(box)], 2 - axis
+    open_ = np.pad(part < 0, [(0, 0) if grid.dimension == 2 and a == 0 else (1, 1) for a in range(3)])
+    near = np.zeros(part.shape, dtype=bool)
+    for shift in itertools.product(*(range(1) if grid.dimension == 2 and a == 0 else range(3) for a in range(3))):
+        near |= open_[tuple(slice(s, s + n) for s, n in zip(shift, part.shape, strict=True))]
+    here = tuple(slice(1, None) if a == place else slice(None) for a in range(3))
+    before = tuple(slice(None, -1) if a == place else slice(None) for a in range(3))
+    body = owner[np.maximum(part[here], part[before]) + 1]
+    at = np.argwhere((body >= 0) & (near[here] | near[before]))
+    found = body[tuple(at.T)]
+    at += np.array([b.start for b in box]) + np.eye(3, dtype=int)[place]
+    return np.ravel_multi_index(tuple(at.T), index.shape).astype(np.int64), found.astype(np.int64)
+
+
+def _face_rows(grid: StaggeredGrid, flat: np.ndarray, axis: int, centers: np.ndarray) -> np.ndarray:
+    """Return J of faces of one axis."""
+    k, j, i = np.unravel_index(flat, grid.shape)
+    place = np.stack([i, j, k], axis=1) - 0.5
+    place[:, axis] -= 0.5
+    arm = place * grid.spacing - centers
+    one = np.eye(3)[axis]
+    turn = np.cross(arm, one)  # (e_m x arm) . one = e_m . (arm x one)
+    linear = np.tile(one[: grid.dimension], (len(flat), 1))
+    return np.concatenate([linear, turn[:, 2:] if grid.dimension == 2 else turn], axis=1)
+
+
+def _cells(
+    grid: StaggeredGrid, index: np.ndarray, face: np.ndarray, axis_of: np.ndarray, body: np.ndarray, row: np.ndarray, strides: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return pairs of open cells and bodies beside them, their rows, and how many bodies a cell has."""
+    inner = np.zeros(index.shape, dtype=bool)
+    inner[1:-1, 1:-1, 1:-1] = index[1:-1, 1:-1, 1:-1] < 0
+    open_, step = inner.ravel(), np.array(strides)[axis_of]
+    parts = []
+    for cell, sign in ((face, -1.0), (face - step, 1.0)):  # a face is the low one of a cell and the high one of that before
+        at = np.flatnonzero(open_[cell])
+        rows = np.zeros((len(at), grid.dimension, row.shape[1]))
+        rows[np.arange(len(at)), axis_of[at]] = sign * row[at]
+        parts.append((cell[at], body[at], rows))
+    return _summed(grid, *(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
+def _edges(
+    grid: StaggeredGrid, face: np.ndarray, axis_of: np.ndarray, body: np.ndarray, row: np.ndarray, strides: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return pairs of edges and bodies beside them, their rows, and how many bodies an edge has.
+
+    The rate of shear of an edge is u_a - u_a(one cell back along b) + u_b - u_b(one cell back along a).
+    """
+    shears, found = [], []
+    for d, (alpha, beta) in enumerate(SHEARS[grid.dimension]):
+        parts = []
+        for axis, other in ((alpha, beta), (beta, alpha)):
+            own = np.flatnonzero(axis_of == axis)
+            parts += [(face[own], body[own], row[own]), (face[own] + strides[other], body[own], -row[own])]
+        summed = _summed(grid, *(np.concatenate(part) for part in zip(*parts, strict=True)))
+        found.append(summed)
+        shears.append(np.full(len(summed[0]), d))
+    edge, owner, rows, share = (np.concatenate(part) for part in zip(*found, strict=True))
+    order = np.argsort(owner, kind="stable")
+    return edge[order], np.concatenate(shears)[order], owner[order], rows[order], share[order]
+
+
+def _summed(grid: StaggeredGrid, place: np.ndarray, body: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return places, bodies and the sums of the rows of each pair, by body, and how many bodies a place has."""
+    pairs, which = np.unique(body * grid.size + place, return_inverse=True)
+    total = np.zeros((len(pairs), *rows.shape[1:]))
+    np.add.at(total, which.ravel(), rows)
+    places = pairs % grid.size
+    _, same, share = np.unique(places, return_inverse=True, return_counts=True)
+    return places, pairs // grid.size, total, share[same.ravel()] if len(pairs) else np.zeros(0, dtype=np.int64)

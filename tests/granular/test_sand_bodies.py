@@ -1,0 +1,213 @@
+"""Rigid bodies in sand: what floats, what sinks, what slides, what the sand below bears."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from granular.scene import SandScene
+from granular.simulator import GranularSimulator, SandSimulation
+from warp_lcp.driver.scene_file import load_scene
+from warp_lcp.driver.simulator import SimulationFailed, Surface
+
+G, DENSITY = 9.81, 1500.0
+
+
+def start(solids: list[dict[str, Any]], *, size: list[float], depth: float, resolution: int, **tables: Any) -> SandSimulation:
+    """Return a simulation of bodies over a bed of sand.
+
+    Args:
+        solids: the tables [[solid]].
+        size: of the domain [m].
+        depth: of the bed [m].
+        resolution: cells along the longest side.
+        tables: other tables of the scene.
+    """
+    flat = len(size) == 2
+    bed = {"shape": "box", "min": [0.0] * len(size), "max": [size[0], depth, *size[2:]]}
+    scene = {
+        "scene": {"simulator": "granular"},
+        "time": {"duration": 1.0, "frames_per_second": 20},
+        "domain": {"size": size, "resolution": resolution, "friction": 0.5},
+        "physics": {"density": DENSITY, "gravity": [0.0, -G] if flat else [0.0, -G, 0.0]},
+        "sand": [bed],
+        "solid": solids,
+    }
+    for name, table in tables.items():
+        scene[name] = {**scene.get(name, {}), **table} if isinstance(table, dict) else table
+    return GranularSimulator().create(SandScene.model_validate(scene), device="cpu", folder=Path())
+
+
+def run(simulation: SandSimulation, until: float) -> list[dict[str, Any]]:
+    """Step to a time [s], return the log."""
+    rows: list[dict[str, Any]] = []
+    while simulation.time < until - 1e-9:
+        rows.append(simulation.step(min(simulation.stable_dt(), simulation.scene.time.dt_max, until - simulation.time)))
+    return rows
+
+
+def ball(center: list[float], radius: float, density: float, **more: Any) -> dict[str, Any]:
+    return {"shape": "sphere", "center": center, "radius": radius, "density": density, **more}
+
+
+def box(low: list[float], high: list[float], density: float, **more: Any) -> dict[str, Any]:
+    return {"shape": "box", "min": low, "max": high, "density": density, **more}
+
+
+def height(simulation: SandSimulation) -> float:
+    assert simulation.bodies is not None
+    return float(simulation.bodies.bodies[0].position[1])
+
+
+def test_a_light_ball_stays_on_top_and_a_heavy_one_digs_in_and_stops() -> None:
+    """A fifth of sand's density leaves a shallow dent; five times as dense, it sinks by most of its radius, and then stands."""
+    depths, speeds = [], []
+    for density in (0.2 * DENSITY, 5.0 * DENSITY):
+        simulation = start([ball([0.3, 0.28], 0.06, density)], size=[0.6, 0.4], depth=0.2, resolution=48)
+        run(simulation, 0.35)
+        before = height(simulation)
+        run(simulation, 0.4)
+        depths.append(0.2 - (height(simulation) - 0.06))
+        speeds.append((before - height(simulation)) / 0.05)
+    assert 0.0 <= depths[0] < 0.016  # a cell is 0.0125 m
+    assert 0.03 < depths[1] < 0.09
+    assert abs(speeds[0]) < 0.01 and abs(speeds[1]) < 0.04  # [m/s]; they fell with up to 0.6
+
+
+def test_sand_bears_a_block_and_the_floor_bears_both() -> None:
+    """A block on smooth-walled sand stays where it is, and the floor's pressure is the weight of sand and block."""
+    loads, forces, simulations = [], [], []
+    for solids in ([box([0.2, 0.2], [0.4, 0.3], 2.0 * DENSITY, friction=0.5)], []):
+        simulation = start(solids, size=[0.6, 0.4], depth=0.2, resolution=48, domain={"friction": 0.0})
+        run(simulation, 0.3)
+        floor, given = [], []
+        for _ in range(20):
+            simulation.step(simulation.scene.time.dt_max)
+            pressure, deviator = simulation.stress.now.numpy()[:2, 1, 1, 1:-1]  # on the floor lies p - s_yy = p + a
+            floor.append((pressure + deviator).sum() * DENSITY * simulation.grid.spacing**2 / simulation.stress.dt)
+            if simulation.carried is not None:
+                given.append(simulation.carried.impulses()[0] / simulation.stress.dt)
+        loads.append(float(np.mean(floor)))
+        forces += [np.mean(given, axis=0)] if given else []
+        simulations.append(simulation)
+    weight = 2.0 * DENSITY * 0.2 * 0.1 * G
+    assert loads[0] - loads[1] == pytest.approx(weight, rel=0.05)
+    assert loads[1] == pytest.approx(DENSITY * 0.6 * 0.2 * G, rel=0.05)  # but for the half cell below the stresses
+    np.testing.assert_allclose(forces[0][:2], [0.0, weight], atol=0.01 * weight)
+    assert abs(forces[0][2]) < 0.001 * weight * 0.2
+    body = simulations[0].bodies
+    assert body is not None
+    assert np.abs(body.bodies[0].velocity).max() < 0.01
+    assert abs(body.bodies[0].position[0] - 0.3) < 1e-3 and 0.238 < body.bodies[0].position[1] <= 0.2505
+    assert abs(np.degrees(body.bodies[0].angle)) < 0.5
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.25, 0.7])
+def test_a_block_on_a_slope_of_firm_sand_slides_as_coulomb_says(friction: float) -> None:
+    """On 25 degrees it speeds up by g (sin - mu cos), or stays where friction is more than the slope."""
+    slope = np.radians(25.0)
+    gravity = [G * float(np.sin(slope)), -G * float(np.cos(slope))]
+    block = box([0.1, 0.15], [0.4, 0.25], DENSITY, friction=friction)
+    simulation = start(
+        [block], size=[0.9, 0.35], depth=0.15, resolution=54, physics={"gravity": gravity, "density": DENSITY}, material={"friction_angle": 50.0}
+    )  # fmt: skip
+    run(simulation, 0.06)  # it falls a part of a cell first
+    assert simulation.bodies is not None
+    before = simulation.bodies.bodies[0].velocity[0]
+    run(simulation, 0.2)
+    gained = (simulation.bodies.bodies[0].velocity[0] - before) / 0.14
+    expected = G * (np.sin(slope) - friction * np.cos(slope))
+    if expected > 0.0:
+        assert gained == pytest.approx(expected, rel=0.15)
+    else:
+        assert simulation.bodies.bodies[0].velocity[0] < 0.05
+
+
+def test_momentum_of_sand_and_body_without_gravity() -> None:
+    """A block of sand that flies into a body in the open gives it what it loses."""
+    target = ball([0.42, 0.2], 0.06, DENSITY)
+    simulation = start(
+        [target], size=[0.8, 0.4], depth=0.1, resolution=64, physics={"gravity": [0.0, 0.0], "density": DENSITY},
+        sand=[{"shape": "box", "min": [0.1, 0.14], "max": [0.3, 0.24], "velocity": [1.0, 0.0]}],
+    )  # fmt: skip
+    assert simulation.bodies is not None
+
+    def momentum() -> tuple[float, float]:
+        body = simulation.bodies.bodies[0].momentum  # type: ignore[union-attr]
+        sand = simulation.particles.velocity.numpy().sum(axis=0) * simulation.particle_mass
+        return float(sand[0] + body[0]), float(body[0])
+
+    first, _ = momentum()
+    run(simulation, 0.16)
+    last, taken = momentum()
+    assert taken > 0.2 * first
+    assert last == pytest.approx(first, rel=0.05)
+
+
+def test_three_dimensions() -> None:
+    """A light ball rests on sand in 3-D; one pushed sideways rolls forward."""
+    simulation = start(
+        [ball([0.12, 0.128, 0.1], 0.05, 400.0, velocity=[0.5, 0.0, 0.0], friction=0.8)], size=[0.3, 0.2, 0.2], depth=0.08, resolution=24
+    )
+    run(simulation, 0.1)
+    assert simulation.bodies is not None
+    body = simulation.bodies.bodies[0]
+    assert 0.115 < body.position[1] < 0.13
+    assert body.position[0] > 0.14 and 0.0 < body.velocity[0] < 0.5
+    assert body.angular_velocity[2] < -1.0  # forward over sand: about -z
+    assert abs(body.angular_velocity[0]) + abs(body.angular_velocity[1]) < 0.2 * abs(body.angular_velocity[2])
+    surfaces = [part for part in simulation.frame() if isinstance(part, Surface) and part.name == "bodies"]
+    assert len(surfaces) == 1
+
+
+def test_continues_bit_for_bit() -> None:
+    """A state restored into a fresh simulation goes on as if nothing had happened."""
+    solids = [ball([0.3, 0.26], 0.05, 3000.0), box([0.4, 0.21], [0.5, 0.28], 500.0)]
+
+    def make() -> SandSimulation:
+        return start(solids, size=[0.6, 0.4], depth=0.2, resolution=30)
+
+    first, second = make(), make()
+    for _ in range(8):
+        first.step(0.004)
+    second.restore(first.state())
+    for _ in range(4):
+        first.step(0.004)
+        second.step(0.004)
+    after = second.state()
+    for name, value in first.state().items():
+        assert np.array_equal(value, after[name]), name
+
+
+def test_a_failed_solve_leaves_the_bodies_where_they_were(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A step whose stresses are not finite gives the bodies neither gravity nor a push."""
+    simulation = start([ball([0.3, 0.27], 0.05, 3000.0)], size=[0.6, 0.4], depth=0.2, resolution=30)
+    simulation.step(0.004)
+    assert simulation.bodies is not None
+    before = simulation.bodies.state()["bodies"].copy()
+    monkeypatch.setattr(simulation.stress, "residual", lambda: (float("nan"), 0.0))
+    with pytest.raises(SimulationFailed, match="not finite"):
+        simulation.step(0.004)
+    assert np.array_equal(simulation.bodies.state()["bodies"], before)
+
+
+@pytest.mark.parametrize(
+    ("table", "key"),
+    [({"solver": {"method": "interleaved-sweeps"}}, "method"), ({"domain": {"periodic": [True, False]}}, "periodic")],
+)
+def test_scenes_that_bodies_do_not_go_with(table: dict[str, Any], key: str) -> None:
+    with pytest.raises(ValidationError, match=key):
+        start([ball([0.3, 0.27], 0.05, 3000.0)], size=[0.6, 0.4], depth=0.2, resolution=30, **table)
+
+
+@pytest.mark.parametrize("name", ["balls-on-sand-2d", "carried-box-2d"])
+def test_built_in_scenes(name: str) -> None:
+    """They start, and bodies fall as freely as they should."""
+    scene = load_scene(name)
+    simulation = GranularSimulator().create(scene, device="cpu", folder=Path())
+    rows = [simulation.step(0.004) for _ in range(3)]
+    assert simulation.bodies is not None
+    assert len(simulation.bodies.bodies) == len(scene.solid) >= 2
+    assert -3.1 * 0.004 * G < rows[-1]["body1_vy"] < 0.0

@@ -1,0 +1,225 @@
+"""What sand's stresses do to rigid bodies: third law, signs, and the coupled solve from light bodies to heavy ones."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import warp as wp
+
+from granular.bodies import SandBodies
+from granular.coupled import AcceleratedProjection
+from granular.packing import Packing
+from granular.stress import Stress, Walls, YieldSet
+from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.operators.grid_poisson import SOLID
+
+DT, DX, DENSITY, FRICTION, GRAVITY = 0.005, 0.01, 1500.0, 0.5, np.array([0.0, -9.81, 0.0])
+SCALE = 9.81 * DT
+
+
+@dataclass
+class Case:
+    """Blocks in sand, some of them bodies."""
+
+    stress: Stress
+    packing: Packing
+    bodies: SandBodies | None
+    centers: np.ndarray
+    masses: np.ndarray
+
+    @property
+    def dimension(self) -> int:
+        return self.packing.grid.dimension
+
+    def begin(self, velocity: np.ndarray, inverse_mass: np.ndarray) -> None:
+        """Start a step of the bodies in sand that falls."""
+        assert self.bodies is not None
+        fields = [wp.full(self.packing.grid.shape, float(g * DT), dtype=wp.float32) for g in GRAVITY[: self.dimension]]
+        weights = [wp.full(self.packing.grid.shape, 1.0, dtype=wp.float32) for _ in fields]
+        self.bodies.begin(self.packing, fields, weights, velocity=velocity, inverse_mass=inverse_mass, density=DENSITY)
+
+    def solve(self, tolerance: float = 1e-3):
+        return AcceleratedProjection().solve(self.stress, scale=SCALE, tolerance=tolerance, max_iterations=2000)
+
+
+def make(dimension: int, counts: tuple[int, ...], blocks: list[tuple], *, ratio: float | None, depth: int, sand: tuple[int, int] | None = None) -> Case:
+    """Return sand of a depth [cells] around blocks of a density ratio; None: they stand still.
+
+    Args:
+        dimension: 2 or 3.
+        counts: cells along x, y (and z).
+        blocks: first and one past the last cell (x, y, z) of each, counted from 0.
+        ratio: of the blocks' density to sand's.
+        depth: rows of sand.
+        sand: first and one past the last column that holds sand; None: all.
+    """
+    grid = StaggeredGrid((*counts, 1)[:3], DX, dimension)
+    index = np.zeros(grid.shape, dtype=np.int32)
+    index[1:-1, 1:-1, 1:-1] = -1
+    centers, masses, inertias = [], [], []
+    for number, (low, high) in enumerate(blocks, start=1):
+        index[tuple(slice(a + 1, b + 1) for a, b in zip(low[::-1], high[::-1], strict=True))] = number
+        size = (np.array(high) - low)[:dimension] * DX
+        centers.append((np.add(low, high) / 2 * DX) * (np.arange(3) < dimension))
+        masses.append((ratio or 1.0) * DENSITY * float(np.prod(size)))
+        squares = size**2
+        inertias.append(masses[-1] / 12.0 * (np.array([squares.sum()]) if dimension == 2 else squares.sum() - squares))
+    density = np.zeros(grid.shape, dtype=np.float32)
+    columns = slice(1, -1) if sand is None else slice(1 + sand[0], 1 + sand[1])
+    density[1:-1, 1 : 1 + depth, columns] = 1.0
+    density[index >= 0] = 0.0
+    base = wp.array(np.where(index >= 0, SOLID, 0).astype(np.int8), dtype=wp.int8)
+    packing = Packing(grid, base, wp.full(grid.shape, 1.0, dtype=wp.float32))
+    u = [wp.full(grid.shape, float(g * DT), dtype=wp.float32) for g in GRAVITY[:dimension]]
+    packing.update(wp.array(density, dtype=wp.float32), u, DT, grid.faces())
+    walls = Walls(grid, index, [FRICTION] * (1 + len(blocks)))
+    bodies = None if ratio is None else SandBodies(grid, range(1, 1 + len(blocks)))
+    if bodies is not None:
+        bodies.place(index, np.array(centers), walls)
+        k = bodies.freedoms
+        start = np.tile(np.concatenate([GRAVITY[:dimension] * DT, np.zeros(k - dimension)]), (len(blocks), 1))
+        inverse = np.array([np.diag(1.0 / np.concatenate([[m] * dimension, i])) for m, i in zip(masses, inertias, strict=True)])
+    case = Case(Stress(packing, walls, bodies=bodies), packing, bodies, np.array(centers), np.array(masses))
+    if bodies is not None:
+        case.begin(start, inverse)
+    case.stress.begin(YieldSet(0.5), GRAVITY, DT)
+    return case
+
+
+def face_centers(grid: StaggeredGrid, axis: int) -> np.ndarray:
+    """Return where the lower faces of an axis are [m], shape (*grid.shape, 3)."""
+    k, j, i = np.indices(grid.shape)
+    place = np.stack([i, j, k], axis=-1) - 0.5
+    place[..., axis] -= 0.5
+    if grid.dimension == 2:
+        place[..., 2] = 0.0
+    return place * grid.spacing
+
+
+def beside_bodies(case: Case, axis: int) -> np.ndarray:
+    """Return which faces of an axis are bodies', shape of the grid's fields."""
+    assert case.bodies is not None and case.bodies.faces is not None
+    found, faces = np.zeros(case.packing.grid.size, dtype=bool), case.bodies.faces
+    found[faces.face[faces.face_axis == axis]] = True
+    return found.reshape(case.packing.grid.shape)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_what_a_body_gets_is_what_sand_loses(dimension: int) -> None:
+    """Momentum and angular momentum of sand and two bodies stay what they are under any stresses that reach no wall."""
+    third = (10,) * (dimension - 2)
+    low, high = ((3, 3, 4), (5, 6, 6)), ((5, 5, 3), (8, 7, 6))
+    flat = [tuple((*corner[:2], (0, 1)[end]) for end, corner in enumerate(block)) for block in (low, high)]
+    case = make(dimension, (11, 10, *third), [low, high] if dimension == 3 else flat, ratio=0.3, depth=10)
+    grid, random, now = case.packing.grid, np.random.default_rng(811), case.stress.now.numpy()
+    inner = tuple(slice(3, -3) if n > 3 else slice(None) for n in grid.shape)
+    values = np.zeros_like(now)
+    values[(slice(None), *inner)] = random.normal(scale=0.3, size=now[(slice(None), *inner)].shape)
+    values[:, case.packing.base.numpy() == SOLID] = 0.0
+    case.stress.now.assign(values)
+    case.stress.residual()
+    assert case.bodies is not None
+    given = case.bodies.impulses() / (DENSITY * grid.cell_volume)  # as the grid's momenta, in units of a full face's mass
+    assert (np.abs(given) > 1e-4).all()  # [m/s, m^2/s]: both bodies are pushed and turned
+    push, turn = np.zeros(3), np.zeros(3)
+    for axis, u in enumerate(case.stress.checked.u):
+        free, mass = case.packing.inverse[axis].numpy() > 0.0, case.packing.mass[axis].numpy()
+        gained = (u.numpy() - GRAVITY[axis] * DT) * np.where(free, mass, 0.5 * mass)  # half a cell before a body moves with it
+        gained[~(free | beside_bodies(case, axis))] = 0.0
+        push[axis] = gained.sum()
+        turn += (np.cross(face_centers(grid, axis), np.eye(3)[axis]) * gained[..., None]).sum(axis=(0, 1, 2))
+    for number, center in enumerate(case.centers):
+        force, torque = np.zeros(3), np.zeros(3)
+        force[:dimension] = given[number, :dimension]
+        torque[(3 - (1 if dimension == 2 else 3)) :] = given[number, dimension:]
+        push, turn = push + force, turn + torque + np.cross(center, force)
+    assert np.abs(push).max() < 2e-7 * np.abs(given).max() * grid.size**0.5  # sums of float32 masses
+    assert np.abs(turn).max() < 2e-7 * np.abs(given).max() * grid.size**0.5
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_pressure_pushes_away_and_off_center_pressure_turns(dimension: int) -> None:
+    """A pressure below a block pushes it up; one to the right of its center turns it to the left."""
+    third = (9,) * (dimension - 2)
+    case = make(dimension, (11, 9, *third), [((3, 4, 3 * (dimension - 2)), (8, 6, 1 if dimension == 2 else 6))], ratio=1.0, depth=9)
+    now = np.zeros_like(case.stress.now.numpy())
+    now[0, 1 if dimension == 2 else 5, 4, 8] = 0.2  # the cell below the block's right end, one plane of three
+    case.stress.now.assign(now)
+    case.stress.residual()
+    assert case.bodies is not None
+    # half a cell of sand before each face of the block moves along with it
+    size = np.array([5.0, 2.0, 3.0])[:dimension]
+    mass = np.prod(size) + np.prod(size) / size[1]
+    velocity = case.bodies.velocity.numpy()[0]
+    assert velocity[1] == pytest.approx(-SCALE + 0.2 / mass, rel=1e-6)
+    assert velocity[0] == pytest.approx(0.0, abs=1e-12) and velocity[-1] > 0.0
+    np.testing.assert_allclose(velocity[2:-1], 0.0, atol=1e-12)
+    gained = case.bodies.impulses()[0, 1] / case.masses[0]
+    assert gained == pytest.approx(0.2 / mass, rel=1e-5)
+
+
+def test_sand_that_slides_over_a_plate_takes_it_along() -> None:
+    """Friction carries a plate that a smooth floor holds up the way the sand on it goes, by no more than Coulomb allows."""
+    case = make(2, (32, 8), [((3, 0, 0), (29, 2, 1))], ratio=1.0, depth=5, sand=(6, 26))
+    speed, start = 3.0 * SCALE, case.packing.start[0].numpy().copy()
+    start[case.packing.inverse[0].numpy() > 0.0] = speed
+    case.packing.start[0].assign(start)
+    assert case.bodies is not None
+    held = np.diag([1.0 / case.masses[0], 0.0, 0.0])[None]
+    case.begin(np.zeros((1, 3)), held)
+    case.solve(1e-4)
+    vx, vy, spin = case.bodies.velocity.numpy()[0]
+    push, load, turn = case.bodies.impulses()[0] / (DENSITY * DX**2)
+    assert vx > 0.05 * SCALE and vy == spin == 0.0
+    assert -load == pytest.approx(20 * 3 * SCALE, rel=0.1)  # the weight of the sand on it, in units of a cell's
+    assert FRICTION * -load * 0.95 < push < FRICTION * -load * 21 / 20  # 20 faces have 21 edges
+    assert turn < 0.0
+
+
+@pytest.mark.parametrize("ratio", [1e-3, 0.05, 1.0])
+def test_number_of_iterations_does_not_depend_on_lightness(ratio: int) -> None:
+    """A block half in the sand comes to rest in nearly the iterations that one that stands still takes."""
+    blocks = [((11, 6, 0), (17, 12, 1))]
+    still = make(2, (28, 20), blocks, ratio=None, depth=9).solve()
+    case = make(2, (28, 20), blocks, ratio=ratio, depth=9)
+    solved = case.solve()
+    assert bool(solved.residual <= 1e-3)
+    assert solved.iterations <= 1.5 * still.iterations
+    assert case.bodies is not None
+    velocity = case.bodies.velocity.numpy()[0]
+    assert np.abs(velocity[:2]).max() < 0.08 * SCALE and abs(velocity[2]) * 3 * DX < 0.02 * SCALE
+    weight = case.masses[0] * SCALE
+    assert case.bodies.impulses()[0, 1] == pytest.approx(weight, rel=0.08)
+
+
+def test_velocity_is_what_the_impulse_leaves_and_sand_sees_it() -> None:
+    """After a solve V = V* + M^-1 impulse, and the faces beside the body have it."""
+    case = make(2, (28, 20), [((11, 6, 0), (17, 12, 1))], ratio=40.0, depth=9)
+    case.solve()
+    assert case.bodies is not None
+    velocity = case.bodies.velocity.numpy()[0]
+    impulse = case.bodies.impulses()[0]
+    assert velocity[1] == pytest.approx(-SCALE + impulse[1] / case.masses[0], rel=1e-12)
+    assert -SCALE < velocity[1] < -0.2 * SCALE  # it sinks, but slower than in free fall
+    below = case.stress.checked.u[1].numpy()[1, 7, 12:18]
+    np.testing.assert_allclose(below, velocity[1] + velocity[2] * (np.arange(-2.5, 3.0) * DX), rtol=1e-6)
+
+
+def test_two_light_bodies_in_touch_through_sand() -> None:
+    """Light blocks one cell of sand apart, and under a heavier one: trial steps that ignored either would diverge."""
+    case = make(2, (30, 22), [((9, 4, 0), (14, 9, 1)), ((15, 4, 0), (20, 9, 1)), ((10, 10, 0), (19, 14, 1))], ratio=5e-3, depth=12)
+    solved = case.solve()
+    assert solved.residual <= 1e-3
+    assert case.bodies is not None
+    assert np.abs(case.bodies.velocity.numpy()[:, :2]).max() < 0.3 * SCALE
+
+
+def test_bodies_far_from_sand_and_outside_change_nothing() -> None:
+    """A body in the air falls; one that is nowhere in the grid takes no part."""
+    case = make(2, (28, 24), [((11, 17, 0), (17, 21, 1))], ratio=0.1, depth=9)
+    case.solve()
+    assert case.bodies is not None
+    np.testing.assert_allclose(case.bodies.velocity.numpy()[0], [0.0, -SCALE, 0.0], atol=1e-12)
+    empty = SandBodies(case.packing.grid, [1])
+    empty.place(np.where(case.packing.base.numpy() == SOLID, 0, -1), np.zeros((1, 3)), case.stress.walls)
+    assert empty.faces is not None and len(empty.faces.face) == 0

@@ -1,0 +1,368 @@
+"""Bodies against walls, solids and each other: rest, slope, stack and impact, by what mechanics says of them."""
+
+import numpy as np
+import pytest
+from bodies_at_hand import GRAVITY, SIDES, bodies_of, run
+
+from warp_lcp.grid.motion import Rotation, Translation
+from warp_lcp.grid.solids import Box, Capsule, Placement, Plane, Sphere, TriangleMesh
+from warp_lcp.grid.triangle_mesh import builtin_mesh
+from warp_lcp.grid.voxelize import PlacedSolid
+from warp_lcp.rigid.contacts import between
+from warp_lcp.rigid.surroundings import Obstacle
+
+G = 9.81
+
+
+def box(low, high, dimension, rotate=0.0):
+    """Return a box, in space from 0.4 to 0.6 along z, turned by an angle about z."""
+    if dimension == 3:
+        low, high = [*low, 0.4], [*high, 0.6]
+    angles = [rotate] if dimension == 2 else [0.0, 0.0, rotate]
+    return Box(lower=low, upper=high, placement=Placement.from_degrees(1.0, angles, [0.0] * dimension, dimension))
+
+
+def solid(geometry, motion=None):
+    return PlacedSolid(geometry=geometry, separating=True, name="solid[0]", motion=motion)
+
+
+def drift(bodies, duration, **settings):
+    """Run, and return how far any body moved, and turned, meanwhile."""
+    before = [(body.position.copy(), body.rotation.copy()) for body in bodies.bodies]
+    run(bodies, duration, **settings)
+    moves = [np.linalg.norm(body.position - position) for body, (position, _) in zip(bodies.bodies, before, strict=True)]
+    turns = [np.abs(body.rotation - rotation).max() for body, (_, rotation) in zip(bodies.bodies, before, strict=True)]
+    return max(moves), max(turns)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_dropped_box_rests_on_the_floor_without_drift(dimension):
+    bodies = bodies_of([box([0.4, 0.1], [0.6, 0.25], dimension)], dimension)
+    run(bodies, 1.0)
+    assert bodies.bodies[0].position[1] == pytest.approx(0.075, abs=1e-7)
+    moved, turned = drift(bodies, 5.0)
+    assert moved < 2e-8
+    assert turned < 1e-7
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_stack_of_two_stands(dimension):
+    """The upper one overhangs; they start a little apart."""
+    bodies = bodies_of([box([0.4, 0.01], [0.6, 0.15], dimension), box([0.47, 0.17], [0.62, 0.3], dimension)], dimension)
+    run(bodies, 1.0)
+    heights = [body.position[1] for body in bodies.bodies]
+    np.testing.assert_allclose(heights, [0.07, 0.14 + 0.065], atol=1e-6)
+    moved, turned = drift(bodies, 5.0)
+    assert moved < 1e-6
+    assert turned < 1e-6
+
+
+def test_a_box_on_one_of_the_same_size_stands():
+    """Corners meet corners, where a distance has no direction."""
+    bodies = bodies_of([box([0.4, 0.0], [0.6, 0.1], 2), box([0.4, 0.1], [0.6, 0.2], 2)], 2)
+    moved, _ = drift(bodies, 2.0)
+    assert moved < 1e-6
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize(("slope", "slides"), [(0.38, False), (0.42, True)])
+def test_a_box_on_a_slope_slides_beyond_the_angle_of_friction(dimension, slope, slides):
+    """In space along a diagonal, where boxes of friction would hold more than the cone."""
+    bodies = bodies_of([box([0.1, 0.0], [0.3, 0.1], dimension)], dimension, friction=0.4)
+    angle = np.arctan(slope)
+    along = np.array([1.0, 0.0, 0.0]) if dimension == 2 else np.array([1.0, 0.0, 1.0]) / np.sqrt(2.0)
+    gravity = G * (np.sin(angle) * along - np.cos(angle) * np.array([0.0, 1.0, 0.0]))
+    start, time = bodies.bodies[0].position.copy(), 0.5
+    run(bodies, time, gravity=gravity)
+    way = (bodies.bodies[0].position - start) @ along
+    if not slides:
+        assert abs(way) < 1e-8
+        return
+    pull = G * (np.sin(angle) - 0.4 * np.cos(angle))
+    assert bodies.bodies[0].velocity @ along == pytest.approx(pull * time, rel=1e-6)
+    assert way == pytest.approx(0.5 * pull * time * (time + 0.01), rel=1e-6)  # symplectic Euler in steps of 0.01
+
+
+@pytest.mark.parametrize("restitution", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("shapes", ["balls", "boxes", "capsule and box"])
+def test_an_impact_keeps_the_momentum_and_returns_the_speed(restitution, shapes):
+    made = {
+        "balls": [Sphere(center=[0.3, 0.5], radius=0.1), Sphere(center=[0.7, 0.5], radius=0.15)],
+        "boxes": [box([0.2, 0.4], [0.4, 0.6], 2), box([0.6, 0.45], [0.7, 0.55], 2)],
+        "capsule and box": [Capsule(start=[0.3, 0.4], end=[0.3, 0.6], radius=0.05), box([0.6, 0.4], [0.7, 0.6], 2)],
+    }[shapes]
+    bodies = bodies_of(made, 2, open_sides=SIDES, restitution=restitution, settings=[{"velocity": np.array([2.0, 0.0, 0.0])}, {}])
+    one, other = bodies.bodies
+    momentum, energy = one.momentum + other.momentum, bodies.kinetic_energy()
+    run(bodies, 0.35, dt=0.007, gravity=np.zeros(3))
+    np.testing.assert_allclose(one.momentum + other.momentum, momentum, atol=1e-9)
+    assert other.velocity[0] - one.velocity[0] == pytest.approx(2.0 * restitution, abs=1e-6)
+    m, n = one.properties.mass, other.properties.mass
+    lost = 0.5 * m * n / (m + n) * 4.0 * (1.0 - restitution**2)
+    assert energy - bodies.kinetic_energy() == pytest.approx(lost, rel=1e-6, abs=1e-6)
+
+
+def test_an_oblique_impact_keeps_momentum_and_angular_momentum():
+    """In space, with spin and friction."""
+    made = [Sphere(center=[0.3, 0.45, 0.5], radius=0.1), box([0.5, 0.4], [0.7, 0.6], 3, 0.0)]
+    start = [{"velocity": np.array([3.0, 0.3, 0.2]), "angular_velocity": np.array([0.0, 5.0, -10.0])}, {}]
+    bodies = bodies_of(made, 3, restitution=0.7, settings=start, open_sides=SIDES)
+
+    def total():
+        return (
+            sum(b.momentum for b in bodies.bodies),
+            sum(b.angular_momentum + np.cross(b.position, b.momentum) for b in bodies.bodies),
+        )
+
+    linear, angular = total()
+    energies = run(bodies, 0.3, dt=0.005, gravity=np.zeros(3))
+    now = total()
+    np.testing.assert_allclose(now[0], linear, atol=1e-9)
+    np.testing.assert_allclose(now[1], angular, atol=2e-2 * np.linalg.norm(angular))  # the arms are those of the gap before the impact
+    assert energies[-1] < energies[0]
+    assert np.linalg.norm(bodies.bodies[1].velocity) > 0.1
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_ball_bounces_to_the_square_of_its_restitution(dimension):
+    bodies = bodies_of([Sphere(center=[0.5, 0.6, 0.5][:dimension], radius=0.1)], dimension, restitution=0.8)
+    heights = []
+    for _ in range(600):
+        run(bodies, 0.001, dt=0.001)
+        heights.append(bodies.bodies[0].position[1] - 0.1)
+    bottom = int(np.argmin(heights))
+    assert max(heights[bottom:]) == pytest.approx(0.64 * 0.5, rel=2e-2)
+
+
+def test_a_bouncing_ball_comes_to_rest():
+    bodies = bodies_of([Sphere(center=[0.5, 0.3], radius=0.1)], 2, restitution=0.5)
+    run(bodies, 3.0)
+    moved, _ = drift(bodies, 1.0)
+    assert moved < 1e-9
+    assert bodies.bodies[0].position[1] == pytest.approx(0.1, abs=1e-6)
+
+
+def test_a_ball_rolls_down_a_slope():
+    """Without slip: a disc accelerates by 2/3 of the slope's pull."""
+    bodies = bodies_of([Sphere(center=[0.1, 0.1], radius=0.1)], 2, friction=1.0)
+    angle = 0.3
+    run(bodies, 0.5, gravity=G * np.array([np.sin(angle), -np.cos(angle), 0.0]))
+    disc = bodies.bodies[0]
+    assert disc.velocity[0] == pytest.approx(G * np.sin(angle) / 1.5 * 0.5, rel=1e-6)
+    assert disc.angular_velocity[2] == pytest.approx(-disc.velocity[0] / 0.1, rel=1e-6)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_an_overlap_is_removed_without_speed(dimension):
+    bodies = bodies_of([box([0.4, 0.0], [0.6, 0.1], dimension)], dimension)
+    bodies.bodies[0].position[1] -= 2e-3
+    energies = run(bodies, 0.5)
+    assert energies.max() < 1e-12
+    assert bodies.bodies[0].position[1] == pytest.approx(0.05, abs=5e-6)
+
+
+def test_a_tumbling_box_never_gains_energy():
+    bodies = bodies_of(
+        [Box(lower=[0.4, 0.4, 0.4], upper=[0.6, 0.5, 0.55], placement=Placement.from_degrees(1.0, [20.0, 10.0, 15.0], [0.0] * 3, 3))], 3
+    )
+    total = []
+    for _ in range(300):
+        run(bodies, 0.005, dt=0.005)
+        total.append(bodies.kinetic_energy() + bodies.potential_energy(GRAVITY))
+    weight = bodies.bodies[0].properties.mass * G
+    assert np.diff(total).max() < weight * 1e-3 * 0.1  # a thousandth of its size in height
+    assert bodies.kinetic_energy() < 1e-6 * weight
+
+
+@pytest.mark.parametrize(
+    ("shape", "rest"),
+    [
+        (TriangleMesh(surface=builtin_mesh("torus"), placement=Placement.from_degrees(0.3, [90.0, 0.0, 0.0], [0.5, 0.1, 0.5], 3)), 0.045),
+        (Capsule(start=[0.4, 0.2, 0.5], end=[0.6, 0.2, 0.5], radius=0.05), 0.05),
+    ],
+)
+def test_round_bodies_rest_on_a_box(shape, rest):
+    table = Box(lower=[0.2, -0.1, 0.2], upper=[0.8, 0.03, 0.8])
+    bodies = bodies_of([shape], 3, solids=[solid(table)])
+    run(bodies, 1.0)
+    assert bodies.bodies[0].position[1] == pytest.approx(0.03 + rest, abs=2e-3 * rest)
+    moved, _ = drift(bodies, 1.0)
+    assert moved < 1e-5
+
+
+def test_a_cut_of_a_mesh_rests_in_the_plane():
+    """The torus is cut into a ring: it stands on its outside."""
+    ring = TriangleMesh(surface=builtin_mesh("torus"), placement=Placement.from_degrees(0.4, [0.0], [0.5, 0.3], 2))
+    bodies = bodies_of([ring], 2, solids=[solid(Box(lower=[0.0, 0.0], upper=[1.0, 0.05]))])
+    run(bodies, 1.0)
+    assert bodies.bodies[0].position[1] == pytest.approx(0.25, abs=1e-3)
+
+
+def test_a_small_ball_rests_inside_a_ring():
+    """The distance to the cut of a mesh is that in the plane, also inside its hole."""
+    ring = TriangleMesh(surface=builtin_mesh("torus"), placement=Placement.from_degrees(0.8, [0.0], [0.5, 0.5], 2))
+    bodies = bodies_of([Sphere(center=[0.5, 0.5], radius=0.05)], 2, solids=[solid(ring)])
+    run(bodies, 1.0)
+    assert bodies.bodies[0].position[1] == pytest.approx(0.5 - 0.8 * 0.2 + 0.05, abs=1e-3)
+
+
+def test_a_body_rides_on_a_plate():
+    plate = Box(lower=[0.2, 0.1], upper=[0.8, 0.2])
+    lift = Translation(velocity=[0.1, 0.2], start=0.0, stop=1.0)
+    bodies = bodies_of([box([0.4, 0.2], [0.5, 0.3], 2)], 2, solids=[solid(plate, lift)], friction=0.8)
+    run(bodies, 0.5)
+    np.testing.assert_allclose(bodies.bodies[0].velocity[:2], [0.1, 0.2], atol=1e-6)
+    np.testing.assert_allclose(bodies.bodies[0].position[:2], [0.5, 0.35], atol=5e-3)
+
+
+def test_a_turning_paddle_throws_a_ball():
+    paddle = Box(lower=[0.2, 0.48], upper=[0.8, 0.52])
+    spin = Rotation(rate=180.0, center=[0.5, 0.5])
+    bodies = bodies_of([Sphere(center=[0.7, 0.58], radius=0.05)], 2, solids=[solid(paddle, spin)])
+    run(bodies, 0.1, gravity=np.zeros(3))
+    assert bodies.bodies[0].velocity[1] > 0.9 * np.pi * 0.2
+
+
+def test_a_plane_and_an_inverted_box_are_walls():
+    ramp = Plane(point=[0.5, 0.3], normal=[-1.0, 1.0])
+    room = Box(lower=[0.2, 0.2], upper=[0.9, 0.9], invert=True)
+    for other, least in ((solid(ramp), 0.0), (solid(room), 0.2)):
+        bodies = bodies_of([Sphere(center=[0.3, 0.6], radius=0.05)], 2, solids=[other], friction=0.0)
+        run(bodies, 1.0)
+        x, y = bodies.bodies[0].position[:2]
+        assert y >= least + 0.05 - 1e-6
+        assert x >= 0.05 - 1e-6
+        if not least:
+            assert (np.array([x, y]) - [0.5, 0.3]) @ [-1, 1] / np.sqrt(2) >= 0.05 - 1e-6
+
+
+def test_open_sides_have_no_wall():
+    bodies = bodies_of([Sphere(center=[0.5, 0.5], radius=0.1)], 2, open_sides=0b0100)  # the bottom
+    run(bodies, 1.0)
+    assert bodies.bodies[0].position[1] == pytest.approx(0.5 - 0.5 * G * 1.01, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("shapes", "says"),
+    [
+        ([Sphere(center=[0.05, 0.5], radius=0.1)], "wall"),
+        ([Sphere(center=[0.5, 0.5], radius=0.1), Sphere(center=[0.6, 0.5], radius=0.1)], "body 0"),
+    ],
+)
+def test_bodies_that_overlap_at_the_start_are_refused(shapes, says):
+    with pytest.raises(ValueError, match=says):
+        bodies_of(shapes, 2)
+    with pytest.raises(ValueError, match=r"solid\[0\]"):
+        bodies_of([box([0.4, 0.4], [0.6, 0.6], 2)], 2, solids=[solid(Sphere(center=[0.5, 0.65], radius=0.1))])
+
+
+def test_contacts_point_from_the_other_to_the_one():
+    """Every kind of pair, on both sides: the way along the normal parts them."""
+    rng = np.random.default_rng(5150)
+    shapes = [
+        Box(lower=[-0.1, -0.1, -0.1], upper=[0.1, 0.1, 0.1]),
+        Sphere(center=[0.0, 0.0, 0.0], radius=0.1),
+        Capsule(start=[-0.05, 0.0, 0.0], end=[0.05, 0.0, 0.0], radius=0.08),
+        TriangleMesh(surface=builtin_mesh("torus"), placement=Placement.from_degrees(0.3, [0.0] * 3, [0.0] * 3, 3)),
+    ]
+    from warp_lcp.grid.motion import Pose
+    from warp_lcp.rigid.contact_shape import ContactShape
+
+    made = [ContactShape.of(shape, 3) for shape in shapes]
+    for one in made:
+        for other in made:
+            way = rng.normal(size=3)
+            way /= np.linalg.norm(way)
+            at = Pose(np.eye(3), 0.17 * way)
+            touch = between(one, at, other, Pose.identity(), 1.0, 3)
+            assert len(touch) > 0
+            deepest = int(touch.gap.argmin())
+            np.testing.assert_allclose(np.linalg.norm(touch.normal, axis=1), 1.0, atol=1e-6)
+            apart = Pose(np.eye(3), 0.17 * way + 0.01 * touch.normal[deepest])
+            after = between(one, apart, other, Pose.identity(), 1.0, 3)
+            assert after.gap.min() > touch.gap.min() + 0.002
+            assert after.gap.min() < touch.gap.min() + 0.0105
+
+
+def test_obstacles_need_no_name_to_be_found():
+    assert Obstacle(name="wall").pose(1.0).translation.tolist() == [0.0, 0.0, 0.0]
+
+
+def begun(dimension=2, **settings):
+    """Return a box at rest on the floor, and its weight's impulse, in a step that has begun."""
+    bodies = bodies_of([box([0.4, 0.0], [0.6, 0.1], dimension)], dimension, **settings)
+    bodies.begin_step(0.0, 0.01, GRAVITY)
+    return bodies, bodies.bodies[0], bodies.bodies[0].properties.mass * G * 0.01
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_body_on_the_floor_answers_to_the_material_as_the_floor_does(dimension):
+    _, body, weight = begun(dimension)
+    inverse = body.inverse_mass(dimension)
+    assert np.abs(inverse).max() < 1e-9 * np.abs(body.free_inverse_mass(dimension)).max()
+    push = np.zeros(3 * dimension - 3)
+    push[1] = 0.5 * weight
+    body.apply_impulse(push)
+    np.testing.assert_allclose(body.velocity, 0.0, atol=1e-9)
+
+
+def test_without_friction_it_slides_but_does_not_sink():
+    _, body, _ = begun(friction=0.0)
+    inverse, free = body.inverse_mass(2), body.free_inverse_mass(2)
+    assert inverse[0, 0] == pytest.approx(free[0, 0])
+    assert abs(inverse[1, 1]) < 1e-9 * free[1, 1]
+    np.testing.assert_allclose(inverse, inverse.T)
+
+
+@pytest.mark.parametrize(("share", "speed"), [(0.5, 0.0), (1.5, 0.5)])
+def test_a_material_lifts_a_body_off_the_floor_if_it_bears_its_weight(share, speed):
+    bodies, body, weight = begun()
+    body.apply_impulse(np.array([0.0, share * weight, 0.0]))
+    bodies.end_step(0.01)
+    np.testing.assert_allclose(body.velocity, [0.0, speed * G * 0.01, 0.0], atol=1e-8)
+    assert body.hold is None
+
+
+def test_in_the_air_impulses_act_in_full():
+    bodies = bodies_of([box([0.4, 0.5], [0.6, 0.6], 2)], 2)
+    body = bodies.bodies[0]
+    bodies.begin_step(0.0, 0.01, GRAVITY)
+    impulse, before, inverse = np.array([1.0, 2.0, 0.3]), body.velocities(2), body.inverse_mass(2)
+    body.apply_impulse(impulse)
+    after = body.velocities(2)
+    np.testing.assert_allclose(after, before + inverse @ impulse)
+    bodies.end_step(0.01)
+    np.testing.assert_allclose(body.velocities(2), after)
+    np.testing.assert_allclose(body.position, [0.5 + 0.01 * after[0], 0.55 + 0.01 * after[1], 0.0])
+
+
+def test_a_step_undone_leaves_nothing():
+    bodies, body, weight = begun()
+    start = bodies_of([box([0.4, 0.0], [0.6, 0.1], 2)], 2).state()["bodies"]
+    body.apply_impulse(np.array([weight, weight, weight]))
+    bodies.restore_step()
+    np.testing.assert_array_equal(bodies.state()["bodies"], start)
+    assert body.hold is None
+    with pytest.raises(RuntimeError, match="begin_step"):
+        bodies.end_step(0.01)
+
+
+def test_a_smooth_body_slides_away_under_a_rough_one():
+    """As far as both surfaces rub: the coefficient is the geometric mean."""
+    made = [box([0.3, 0.0], [0.6, 0.1], 2), box([0.35, 0.1], [0.55, 0.25], 2)]
+    bodies = bodies_of(made, 2, settings=[{"friction": 0.0}, {"friction": 1.0}])
+    bodies.begin_step(0.0, 0.01, GRAVITY)
+    bodies.bodies[0].apply_impulse(np.array([1.0, 0.0, 0.0]))
+    bodies.end_step(0.01)
+    assert bodies.bodies[0].velocity[0] == pytest.approx(1.0 / 15.0)
+    assert bodies.bodies[1].velocity[0] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_side_of_an_axis_without_an_end_stops_the_run():
+    bodies = bodies_of([Sphere(center=[0.85, 0.5], radius=0.1)], 2, open_sides=SIDES, velocity=np.array([1.0, 0.0, 0.0]))
+    assert bodies.trouble([1.0, 1.0], (0,)) is None
+    run(bodies, 0.06)
+    assert bodies.trouble([1.0, 1.0], ()) is None
+    assert "periodic x axis" in bodies.trouble([1.0, 1.0], (0,))
+    bodies.bodies[0].momentum[0] = np.inf
+    assert "not finite" in bodies.trouble([1.0, 1.0], ())

@@ -1,0 +1,138 @@
+"""Free motion of a body: what is kept, what a fine reference says, and that poses are those of advance."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from warp_lcp.grid.motion import Motion
+from warp_lcp.rigid.body import BodyMotion, RigidBody
+from warp_lcp.rigid.mass_properties import MassProperties
+
+CENTER = np.array([0.3, -0.2, 0.7])
+UNEVEN = np.diag([1.0, 2.0, 3.0])
+
+
+def body(inertia=UNEVEN, **kwargs):
+    return RigidBody(MassProperties(mass=2.0, center=CENTER, inertia=inertia), name="body", **kwargs)
+
+
+def tumbling():
+    """Near the middle axis, about which a free rotation is unstable."""
+    turn = Rotation.from_rotvec([0.3, -0.5, 0.2]).as_matrix()
+    return body(turn @ UNEVEN @ turn.T, angular_velocity=turn @ np.array([0.05, 4.0, -0.03]), velocity=np.array([1.0, 2.0, -0.5]))
+
+
+def test_angular_momentum_is_kept_exactly_and_energy_does_not_drift():
+    top = tumbling()
+    momenta, energies = top.angular_momentum.copy(), []
+    start = top.kinetic_energy
+    for _ in range(4000):
+        top.advance(0.01)
+        energies.append(top.kinetic_energy / start - 1.0)
+    assert (top.angular_momentum == momenta).all()
+    assert np.abs(energies).max() < 2e-4  # of the second order in the step
+    assert abs(np.mean(energies[-500:]) - np.mean(energies[:500])) < 2e-5
+    assert np.abs(top.rotation @ top.rotation.T - np.eye(3)).max() < 1e-14
+
+
+def test_a_free_top_follows_a_fine_reference():
+    """Euler's equations in the body's axes, with quaternions, by a method of high order: it flips over more than once."""
+    top = tumbling()
+    inertia = top.properties.inertia
+    inverse = np.linalg.inv(inertia)
+
+    def rates(_, state):
+        w, q = state[:3], state[3:]
+        spin = np.array([[0, w[2], -w[1], w[0]], [-w[2], 0, w[0], w[1]], [w[1], -w[0], 0, w[2]], [-w[0], -w[1], -w[2], 0]])
+        return np.concatenate([inverse @ -np.cross(w, inertia @ w), 0.5 * spin @ q])
+
+    end = 4.0
+    start = np.concatenate([top.angular_velocity, [0.0, 0.0, 0.0, 1.0]])
+    reference = solve_ivp(rates, (0.0, end), start, method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+    wanted = Rotation.from_quat(reference[3:]).as_matrix()
+    errors = []
+    for steps in (400, 800):
+        top = tumbling()
+        for _ in range(steps):
+            top.advance(end / steps)
+        errors.append(np.abs(top.rotation - wanted).max())
+    assert errors[0] < 0.05
+    assert errors[0] / errors[1] == pytest.approx(4.0, abs=0.6)
+    np.testing.assert_allclose(top.position, CENTER + end * np.array([1.0, 2.0, -0.5]), atol=1e-12)
+
+
+def test_poses_are_those_of_advance():
+    top = tumbling()
+    motion = BodyMotion(top)
+    assert isinstance(motion, Motion)
+    points = np.random.default_rng(3456).normal(size=(5, 3))
+    np.testing.assert_array_equal(motion.pose(0.0).apply(points), points)
+    for step in range(3):
+        dt = 0.02 + 0.01 * step
+        before, predicted = motion.pose(top.time), motion.pose(top.time + dt)
+        way = predicted.after(before.inverse())
+        field = (way.apply(points) - points) / dt  # what solids take for their velocity
+        top.advance(dt)
+        now = motion.pose(top.time)
+        np.testing.assert_allclose(predicted.rotation, now.rotation, atol=1e-13)
+        np.testing.assert_allclose(predicted.translation, now.translation, atol=1e-13)
+        np.testing.assert_allclose(now.apply(before.inverse().apply(points)) - points, dt * field, atol=1e-13)
+
+
+def test_the_center_of_mass_goes_where_its_pose_does():
+    top = tumbling()
+    top.advance(0.3)
+    np.testing.assert_allclose(BodyMotion(top).pose(top.time).apply(CENTER), top.position, atol=1e-15)
+
+
+def test_steps_back_in_time_undo_steps():
+    top = tumbling()
+    for dt in (0.05, -0.05):
+        top.advance(dt)
+    np.testing.assert_allclose(top.rotation, np.eye(3), atol=1e-14)
+    np.testing.assert_allclose(top.position, CENTER, atol=1e-15)
+
+
+def test_an_impulse_changes_velocities_by_the_inverse_mass():
+    rng = np.random.default_rng(8123)
+    for dimension, k in ((2, 3), (3, 6)):
+        top = tumbling() if dimension == 3 else body(angular_velocity=np.array([0.0, 0.0, 2.0]))
+        top.advance(0.4)
+        impulse, before = rng.normal(size=k), top.velocities(dimension)
+        inverse = top.inverse_mass(dimension)
+        top.apply_impulse(impulse)
+        np.testing.assert_allclose(top.velocities(dimension) - before, inverse @ impulse, atol=1e-13)
+        assert (np.linalg.eigvalsh(inverse) > 0.0).all()
+
+
+def test_gravity_gives_the_velocity_of_fall():
+    ball = body(velocity=np.array([1.0, 0.0, 0.0]))
+    ball.accelerate(np.array([0.0, -9.81, 0.0]), 0.1)
+    np.testing.assert_allclose(ball.velocity, [1.0, -0.981, 0.0])
+    assert not ball.angular_velocity.any()
+
+
+def test_whole_turns_are_counted_in_the_plane():
+    disc = body(np.eye(3), angular_velocity=np.array([0.0, 0.0, 20.0]))
+    for _ in range(100):
+        disc.advance(0.01)
+    assert disc.angle == pytest.approx(20.0)
+    np.testing.assert_allclose(disc.rotation[:2, :2], [[np.cos(20), -np.sin(20)], [np.sin(20), np.cos(20)]], atol=1e-12)
+
+
+def test_a_state_is_restored_bit_for_bit():
+    one, other = tumbling(), body()
+    one.advance(0.1)
+    other.properties = one.properties
+    other.restore(one.state())
+    for dt in (0.01, 0.02):
+        one.advance(dt)
+        other.advance(dt)
+    assert (one.state() == other.state()).all()
+
+
+@pytest.mark.parametrize("bad", [{"friction": -0.1}, {"friction": np.inf}, {"restitution": 1.5}, {"restitution": -0.1}])
+def test_coefficients_out_of_range_are_refused(bad):
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        body(**bad)

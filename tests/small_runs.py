@@ -1,0 +1,78 @@
+"""Folders of runs written by hand, with surfaces and bodies, for tests of their images."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from warp_lcp.driver.frames import FrameFolder
+from warp_lcp.driver.scene_file import dump_scene, load_scene
+from warp_lcp.driver.simulator import Part, Surface
+
+
+def write_run(folder: Path, frames: Sequence[list[Part]], text: str = "", size: Sequence[float] = (1.0, 1.0)) -> Path:
+    """Write a run of the simulator `dots`: 10 cells along a side of 1 m, 20 frames a second."""
+    folder.mkdir()
+    source = folder / "source.toml"
+    source.write_text(
+        '[scene]\nsimulator = "dots"\nname = "drops"\n[time]\nduration = 1.0\nframes_per_second = 20\n'
+        f'[domain]\nsize = {list(size)}\nresolution = 10\nsolids = "cut-cell"\n{text}'
+    )
+    (folder / "scene.toml").write_text(dump_scene(load_scene(source)))
+    writer = FrameFolder(folder)
+    for index, parts in enumerate(frames):
+        writer.write(index, index / 20, parts)
+    return folder
+
+
+def ball(center: Sequence[float], radius: float, name: str = "surface", body: int | None = None) -> Surface:
+    """Return a sphere of triangles, counterclockwise seen from outside; in 2-D (two coordinates) a circle, its inside on the left."""
+    if len(center) == 2:
+        angle = np.linspace(0.0, 2.0 * np.pi, 97)[:-1]
+        points = np.stack([center[0] + radius * np.cos(angle), center[1] + radius * np.sin(angle), np.zeros(96)], axis=-1)
+        corners = np.stack([np.arange(96), np.roll(np.arange(96), -1)], axis=-1)
+    else:
+        points, corners = sphere()
+        points = np.asarray(center) + radius * points
+    fields = {"velocity": np.zeros_like(points)}
+    if body is not None:
+        fields["body"] = np.full(len(points), body, dtype=np.int32)
+    return Surface(name, points.astype(np.float32), corners.astype(np.int32), fields)
+
+
+def box(low: Sequence[float], high: Sequence[float], name: str = "surface") -> Surface:
+    """Return a box of twelve triangles whose corners belong to one side each, so that its normals are those of the sides."""
+    points, corners = [], []
+    for axis in range(3):
+        for side in range(2):
+            u, v = (axis + 1) % 3, (axis + 2) % 3
+            quad = np.zeros((4, 3))
+            quad[:, axis] = (low, high)[side][axis]
+            quad[:, u] = np.array([low[u], high[u], high[u], low[u]])
+            quad[:, v] = np.array([low[v], low[v], high[v], high[v]])
+            order = np.array([[0, 1, 2], [0, 2, 3]]) if side else np.array([[0, 2, 1], [0, 3, 2]])
+            corners.append(order + len(points))
+            points.extend(quad)
+    return Surface(name, np.array(points, dtype=np.float32), np.concatenate(corners).astype(np.int32))
+
+
+def sphere() -> tuple[np.ndarray, np.ndarray]:
+    """Return a unit sphere: an octahedron whose triangles were divided four times."""
+    points = [tuple(row) for sign in (1.0, -1.0) for row in sign * np.eye(3)]
+    corners = [(0, 1, 2), (1, 3, 2), (3, 4, 2), (4, 0, 2), (1, 0, 5), (3, 1, 5), (4, 3, 5), (0, 4, 5)]
+    for _ in range(4):
+        number = {point: index for index, point in enumerate(points)}
+        divided = []
+        for a, b, c in corners:
+            middles = []
+            for p, q in ((a, b), (b, c), (c, a)):
+                middle = np.add(points[p], points[q])
+                key = tuple(np.round(middle / np.linalg.norm(middle), 12))
+                if key not in number:
+                    number[key] = len(points)
+                    points.append(key)
+                middles.append(number[key])
+            ab, bc, ca = middles
+            divided += [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+        corners = divided
+    return np.array(points), np.array(corners)

@@ -1,0 +1,124 @@
+"""VTI files: cells as an image, in which those that are not shown are hidden."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from warp_lcp.driver.atomic import replacing
+from warp_lcp.driver.simulator import Cells
+from warp_lcp.driver.vtk_xml import LENGTH_BYTES, attributes, length, opening, raw, writable
+
+HIDDEN = 32  # vtkDataSetAttributes::HIDDENCELL
+GHOSTS = "vtkGhostType"  # the array by whose name VTK knows which cells are hidden
+APPENDED = b'<AppendedData encoding="raw">\n_'
+XML_BYTES = 1000
+
+
+def write_vti(path: Path, cells: Cells) -> None:
+    """Write cells as a VTI file: fields over the whole grid (0 in hidden cells), raw bytes behind the text, atomically.
+
+    Args:
+        path: the file.
+        cells: the cells that are shown; without `counts` the image is the box around them.
+
+    Raises:
+        OSError: the file cannot be written.
+        ValueError: a field has another length than the cells, or a cell lies outside the grid.
+    """
+    fields = {name: writable(name, values, len(cells.index)) for name, values in cells.fields.items()}
+    low, counts = _box(cells)
+    at = [np.subtract(column, first, dtype=np.int64) for column, first in zip(cells.index.T, low, strict=True)]
+    if any(len(column) and (column.min() < 0 or column.max() >= count) for column, count in zip(at, counts, strict=True)):
+        raise ValueError(f"the grid of {' x '.join(map(str, counts))} cells does not hold all cells of {cells.name!r}")
+    flat = (at[2] * counts[1] + at[1]) * counts[0] + at[0]
+    hidden = np.full(counts.prod(), HIDDEN, dtype=np.uint8)
+    hidden[flat] = 0
+    arrays = {name: _dense(values, flat, len(hidden)) for name, values in fields.items()}
+    end = low + counts
+    if cells.dimension == 2:
+        end[2] = low[2]  # an image of pixels has no extent along z
+    with replacing(path) as temporary, open(temporary, "wb") as file:
+        file.writelines(_vti(low, end, cells.spacing, {**arrays, GHOSTS: hidden}))
+
+
+def vti_bytes(cells: Cells) -> int:
+    """Return how many bytes the file of cells takes, or a little more."""
+    each = sum(values.itemsize * values[:1].size if len(values) else 8 for values in cells.fields.values())
+    return XML_BYTES + int(_box(cells)[1].prod()) * (each + 1)
+
+
+def read_vti(path: Path) -> Cells:
+    """Return the cells that a file of `write_vti` shows; without `counts`, which it does not tell from the box around the cells.
+
+    Args:
+        path: the file; its name up to the last _ is the cells'.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: it is no such file, or cut short.
+    """
+    text, mark, data = path.read_bytes().partition(APPENDED)
+    if not mark:
+        raise ValueError(f"{path}: no file of cells with raw bytes")
+    try:
+        image = ElementTree.fromstring(text + b"</VTKFile>").find("ImageData")
+    except ElementTree.ParseError as error:
+        raise ValueError(f"{path}: not XML") from error
+    if image is None:
+        raise ValueError(f"{path}: no image")
+    extent = np.array(image.get("WholeExtent", "").split(), dtype=int).reshape(3, 2)
+    spacing = float(image.get("Spacing", "").split()[0])
+    arrays = {str(array.get("Name")): _array(array, data) for array in image.iter("DataArray")}
+    low, counts = extent[:, 0], np.maximum(extent[:, 1] - extent[:, 0], 1)
+    shown = np.flatnonzero(arrays.pop(GHOSTS) == 0)
+    index = np.stack(np.unravel_index(shown, tuple(counts), order="F"), axis=-1) + low
+    fields = {name: values[shown] for name, values in arrays.items()}
+    return Cells(path.stem.rpartition("_")[0], index, spacing, 2 if extent[2, 0] == extent[2, 1] else 3, fields)
+
+
+def _array(array: ElementTree.Element, data: bytes) -> np.ndarray:
+    """Return an array, shape (n,) or (n, components), from the bytes behind the text."""
+    kind, _, bits = str(array.get("type")).rpartition("t")
+    dtype = np.dtype(f"<{kind[0].lower()}{int(bits) // 8}")
+    begin, components = int(str(array.get("offset"))), int(array.get("NumberOfComponents", 1))
+    size = int.from_bytes(data[begin : begin + LENGTH_BYTES], "little")
+    values = np.frombuffer(data, dtype, size // dtype.itemsize, begin + LENGTH_BYTES)
+    return values.reshape(-1, components) if components > 1 else values
+
+
+def _box(cells: Cells) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first cell of the image and the numbers of cells along x, y and z."""
+    if cells.counts is not None:
+        return np.zeros(3, dtype=int), np.array(cells.counts)
+    if len(cells.index) == 0:
+        return np.zeros(3, dtype=int), np.ones(3, dtype=int)  # VTK has no image without a cell
+    low = cells.index.min(axis=0)
+    return low, cells.index.max(axis=0) - low + 1
+
+
+def _dense(values: np.ndarray, flat: np.ndarray, size: int) -> np.ndarray:
+    """Return a field over all cells of the image, 0 in hidden ones."""
+    dense = np.zeros((size, *values.shape[1:]), dtype=values.dtype)
+    dense[flat] = values
+    return dense
+
+
+def _vti(low: np.ndarray, end: np.ndarray, spacing: float, arrays: dict[str, np.ndarray]) -> Iterator[bytes | memoryview]:
+    """Yield the parts of a VTI file."""
+    extent = " ".join(f"{a} {b}" for a, b in zip(low, end, strict=True))
+    yield opening("ImageData")
+    yield f'<ImageData WholeExtent="{extent}" Origin="0 0 0" Spacing="{spacing} {spacing} {spacing}">\n'.encode()
+    yield f'<Piece Extent="{extent}">\n<CellData>\n'.encode()
+    offset = 0
+    for name, values in arrays.items():
+        yield f'<DataArray {attributes(name, values)} format="appended" offset="{offset}"/>\n'.encode()
+        offset += LENGTH_BYTES + values.nbytes
+    yield b"</CellData>\n</Piece>\n</ImageData>\n" + APPENDED
+    for values in arrays.values():
+        yield length(values)
+        yield raw(values)
+    yield b"\n</AppendedData>\n</VTKFile>\n"

@@ -1,0 +1,123 @@
+"""The triangles of marching cubes [Lorensen and Cline 1987], worked out from the cube instead of typed in.
+
+Corner c of a cell lies at (c & 1, c >> 1 & 1, c >> 2 & 1), x first; bit c of a case is set if the corner is inside. Edge 4 a + b runs along
+axis a from the b-th of the four corners that are low along it. On a face each run of inside corners is cut off by a segment, so that two
+cells see the same segments on the face between them: the surface is closed. No triangle has an edge within a face that is no segment,
+so that each of its edges belongs to two triangles.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+
+import numpy as np
+
+MOST = 5  # triangles of a cell
+EDGES = tuple((corner, corner | 1 << axis) for axis in range(3) for corner in range(8) if not corner >> axis & 1)
+Edge = int
+Loop = tuple[Edge, ...]
+Cut = tuple[float, tuple[tuple[Edge, Edge, Edge], ...]]  # a length, and triangles
+
+
+@functools.cache
+def _faces() -> list[tuple[int, int, int, int]]:
+    """Return the corners of the cell's faces, counterclockwise seen from outside."""
+    faces = []
+    for axis in range(3):
+        u, v = 1 << (axis + 1) % 3, 1 << (axis + 2) % 3
+        low = (0, v, u | v, u)
+        faces += [low, tuple(corner | 1 << axis for corner in reversed(low))]
+    return [(f[0], f[1], f[2], f[3]) for f in faces]
+
+
+def _edge(a: int, b: int) -> Edge:
+    return EDGES.index((min(a, b), max(a, b)))
+
+
+def _segments(case: int, face: tuple[int, int, int, int]) -> list[tuple[Edge, Edge]]:
+    """Return what cuts off the runs of inside corners of a face, each from the edge before a run to the edge after it."""
+    inside = [bool(case >> corner & 1) for corner in face]
+    found = []
+    for n in range(4):
+        if inside[n] and not inside[n - 1]:
+            last = n
+            while inside[(last + 1) % 4]:
+                last = (last + 1) % 4
+            found.append((_edge(face[n - 1], face[n]), _edge(face[last], face[(last + 1) % 4])))
+    return found
+
+
+def _loops(case: int) -> list[Loop]:
+    """Return the closed lines in which the surface meets the cell's faces, counterclockwise seen from outside the material."""
+    follows = dict(itertools.chain(*(_segments(case, face) for face in _faces())))
+    loops = []
+    while follows:
+        first, edge = next(iter(follows.items()))
+        loop = [first]
+        del follows[first]
+        while edge != first:
+            loop.append(edge)
+            edge = follows.pop(edge)
+        loops.append(tuple(loop))
+    return loops
+
+
+@functools.cache
+def _on_one_face(a: Edge, b: Edge) -> bool:
+    corners = set(EDGES[a] + EDGES[b])
+    return any(corners <= set(face) for face in _faces())
+
+
+@functools.cache
+def _midpoint(edge: Edge) -> np.ndarray:
+    return np.array([[corner >> axis & 1 for axis in range(3)] for corner in EDGES[edge]]).mean(axis=0)
+
+
+@functools.cache
+def _cut(loop: Loop) -> Cut | None:
+    """Return the triangulation of a loop with the shortest diagonals, and their length; None: all have a diagonal within a face."""
+    if len(loop) == 3:
+        return 0.0, ((loop[0], loop[1], loop[2]),)
+    best = None
+    for middle in range(1, len(loop) - 1):  # the corner opposite to the side between the loop's ends
+        parts: list[Cut] = [(0.0, ((loop[0], loop[middle], loop[-1]),))]
+        for part in (loop[: middle + 1], loop[middle:]):
+            if len(part) < 3:
+                continue
+            found = None if _on_one_face(part[0], part[-1]) else _cut(part)
+            if found is None:
+                break
+            parts.append((found[0] + float(np.linalg.norm(_midpoint(part[0]) - _midpoint(part[-1]))), found[1]))
+        else:
+            length = sum(part[0] for part in parts)
+            if best is None or length < best[0] - 1e-9:
+                best = length, tuple(itertools.chain(*(part[1] for part in parts)))
+    return best
+
+
+@functools.cache
+def triangle_table() -> np.ndarray:
+    """Return the triangles of each case as edges, int8, shape (256, 1 + 3 MOST): their number, then three edges each."""
+    table = np.full((256, 1 + 3 * MOST), -1, dtype=np.int8)
+    for case in range(256):
+        triangles: list[Edge] = []
+        for loop in _loops(case):
+            found = _cut(loop)
+            assert found is not None  # true of all 256 cases
+            triangles += itertools.chain(*found[1])
+        table[case, 0] = len(triangles) // 3
+        table[case, 1 : 1 + len(triangles)] = triangles
+    return table
+
+
+@functools.cache
+def segment_table() -> np.ndarray:
+    """Return the segments of a square's cases as edges, int8, shape (16, 5): their number, then two edges each, the inside on the left."""
+    table = np.full((16, 5), -1, dtype=np.int8)
+    low = _faces()[4]  # z = 0, seen from below
+    for case in range(16):
+        ends = [edge for segment in _segments(case, low) for edge in segment]
+        table[case, 0] = len(ends) // 2
+        table[case, 1 : 1 + len(ends)] = ends
+    return table

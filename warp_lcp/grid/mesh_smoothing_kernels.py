@@ -1,0 +1,112 @@
+# mypy: ignore-errors
+"""Kernels that smooth a closed surface."""
+
+import typing
+
+import warp as wp
+
+from warp_lcp.grid.particle_loops import particle_loop
+
+TOUCHING = 0.015  # lattice cells from the domain's side: points that close the surface there are 0.01 off its other sides
+NEAR = 0.25  # lattice cells: a point on a solid, as accurately as a distance that is linear between nodes can tell
+
+_options = {"enable_backward": False, "module": "warp_lcp.grid.mesh_smoothing"}
+
+# A closed surface has each edge once in either direction, so that each neighbor is added once; an outline's points have two neighbors
+NEIGHBORS = """
+    const int size = corners_.shape[1];
+    const int* corners = corners_.data; const float* points = (const float*)points_.data; float* sums = sums_.data;
+    auto add = [](float& element, float value) {
+    #ifdef __CUDA_ARCH__
+        atomicAdd(&element, value);
+    #else
+        element += value;
+    #endif
+    };
+    auto see = [&](long long here, long long there) {
+        for (int a = 0; a < 3; ++a) add(sums[4*here + a], points[3*there + a]);
+        add(sums[4*here + 3], 1.0f);
+    };
+    for (long long t = first; t < last; ++t) {
+        const int* c = corners + size*t;
+        see(c[0], c[1]);
+        if (size == 2) { see(c[1], c[0]); continue; }
+        see(c[1], c[2]);
+        see(c[2], c[0]);
+    }
+"""
+
+
+@wp.func_native(particle_loop(NEIGHBORS))
+@typing.no_type_check
+def see_neighbors(
+    corners_: wp.array2d(dtype=wp.int32), points_: wp.array(dtype=wp.vec3), sums_: wp.array2d(dtype=wp.float32), first: int, last: int
+): ...
+
+
+@wp.kernel(**_options)
+@typing.no_type_check
+def neighbor_kernel(
+    count: int, grain: int, corners: wp.array2d(dtype=wp.int32), points: wp.array(dtype=wp.vec3), sums: wp.array2d(dtype=wp.float32)
+):
+    """Add up the neighbors of each point."""
+    first = wp.tid() * grain
+    see_neighbors(corners, points, sums, first, wp.min(first + grain, count))
+
+
+@wp.kernel(**_options)
+@typing.no_type_check
+def hold_kernel(
+    planes: int,
+    dx: float,
+    points: wp.array(dtype=wp.vec3),
+    room: wp.array3d(dtype=wp.float32),
+    counts: wp.vec3,
+    held: wp.array(dtype=wp.uint8),
+):
+    """Mark points that stay: those on the domain's sides, so that these end in an edge, and on solids."""
+    p = wp.tid()
+    x = points[p] / dx
+    stays = bool(False)
+    for axis in range(planes + 1):
+        if x[axis] < TOUCHING or x[axis] > counts[axis] - TOUCHING:
+            stays = True
+    if room:
+        i = int(x[0] + 0.5)
+        j = int(x[1] + 0.5)
+        k = int(1)
+        fz = float(0.0)
+        up = int(0)
+        if planes == 2:
+            k = int(x[2] + 0.5)
+            fz = x[2] + 0.5 - float(k)
+            up = int(1)
+        fx = x[0] + 0.5 - float(i)
+        fy = x[1] + 0.5 - float(j)
+        low = wp.lerp(wp.lerp(room[k, j, i], room[k, j, i + 1], fx), wp.lerp(room[k, j + 1, i], room[k, j + 1, i + 1], fx), fy)
+        high = wp.lerp(
+            wp.lerp(room[k + up, j, i], room[k + up, j, i + 1], fx), wp.lerp(room[k + up, j + 1, i], room[k + up, j + 1, i + 1], fx), fy
+        )
+        if wp.lerp(low, high, fz) < NEAR:
+            stays = True
+    held[p] = wp.where(stays, wp.uint8(1), wp.uint8(0))
+
+
+@wp.kernel(**_options)
+@typing.no_type_check
+def move_kernel(
+    share: float, most: float, sums: wp.array2d(dtype=wp.float32), held: wp.array(dtype=wp.uint8), size: wp.vec3,
+    start: wp.array(dtype=wp.vec3), points: wp.array(dtype=wp.vec3),
+):  # fmt: skip
+    """Move a point a share of the way to the mean of its neighbors, within the domain and not too far from where it started."""
+    p = wp.tid()
+    if held[p] != wp.uint8(0):
+        return
+    x = points[p]
+    for axis in range(3):
+        x[axis] += share * (sums[p, axis] / sums[p, 3] - x[axis])
+    way = x - start[p]
+    far = wp.length(way)
+    if far > most:
+        x = start[p] + (most / far) * way
+    points[p] = wp.vec3(wp.clamp(x[0], 0.0, size[0]), wp.clamp(x[1], 0.0, size[1]), wp.clamp(x[2], 0.0, size[2]))

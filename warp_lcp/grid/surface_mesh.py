@@ -1,0 +1,210 @@
+"""The surface that pictures show: closed, smooth over the particles, flat along walls, with single drops and thin sheets kept."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import warp as wp
+
+from warp_lcp.grid import surface_mesh_kernels as kernels
+from warp_lcp.grid.extrapolate import extrapolate
+from warp_lcp.grid.level_set_kernels import binomial_kernel, scatter_kernel
+from warp_lcp.grid.marching_cubes import MarchingCubes, Mesh
+from warp_lcp.grid.mesh_smoothing import smooth as smooth_mesh
+from warp_lcp.grid.particle_loops import launch
+from warp_lcp.grid.runge_kutta import MARGIN
+from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
+
+SHARPEST = (
+    0.5  # particle distances: the standard deviation of the narrowest kernel that has no gaps, the B-spline of particles on a lattice
+)
+EXTENDED = 2  # layers that the distance is continued into solids, and the velocity into air
+CROWD = 0.1  # the largest smoothed share that a lone particle is taken to have: kernels as narrow as particles cannot tell it from others
+ROUNDS = 3  # of smoothing the mesh: facets as large as lattice cells are gone, and 0.1 % of the volume
+MESH_LATTICE_BYTES, MESH_SOLID_BYTES = 12, 9  # a lattice cell, and more where there are solids
+MESH_POINT_BYTES = 80  # a point, its triangles and its velocity included
+
+
+@dataclass(frozen=True)
+class Obstacles:
+    """Solids inside the domain.
+
+    Attributes:
+        base: int8, SOLID in cells that hold no material.
+        distance: signed distance at the cells' low corners [cells], float32, > 0 in the open; None: solids are whole cells.
+        moves: whether they may be somewhere else each time.
+    """
+
+    base: wp.array
+    distance: wp.array | None
+    moves: bool
+
+
+@dataclass(frozen=True)
+class Interior:
+    """Where material is full though no particle stands for it.
+
+    Attributes:
+        depth: below the surface [cells], float32, one value a cell.
+        least: cells at least so deep are full.
+        base: int8, SOLID in cells that hold no material.
+    """
+
+    depth: wp.array
+    least: float
+    base: wp.array
+
+
+class SurfaceMesh:
+    """Wrap particles in a surface.
+
+    On a lattice, finer than the grid, the particles' density is smoothed over `smoothing` particle distances and divided by what solids and
+    walls leave of the kernel: the filled share. Where it is 1/2 there is the surface: unbiased for a plane and flat at walls that the
+    plane meets at a right angle; a ball of radius R shrinks by smoothing^2 / R [particle distances]. Where particles have few others
+    around them, in drops, filaments and sheets too thin for the kernel, a narrow kernel is added to the share with a weight that grows as
+    the smoothed share falls, so that a drop of one particle is still there. The surface is cut along walls, solids and the domain's sides.
+
+    Args:
+        grid: the grid.
+        per_axis: particles along the edge of a full cell at rest.
+        resolution: lattice cells along the edge of a cell; as many as particles unless given, which is as fine as particles can tell.
+        smoothing: standard deviation of the kernel [particle distances], at least that of the narrow one, 1/2.
+        obstacles: solids; None: there are none but the domain's walls.
+
+    Raises:
+        ValueError: an argument is out of range.
+    """
+
+    def __init__(
+        self, grid: StaggeredGrid, *, per_axis: int, resolution: int | None = None, smoothing: float = 1.5,
+        obstacles: Obstacles | None = None,
+    ) -> None:  # fmt: skip
+        """Allocate the lattice."""
+        parts = per_axis if resolution is None else resolution
+        if per_axis < 1 or parts < 1:
+            raise ValueError(f"per_axis = {per_axis}, resolution = {resolution}: must be at least 1")
+        if not (math.isfinite(smoothing) and smoothing >= SHARPEST):
+            raise ValueError(f"smoothing = {smoothing}: must be at least {SHARPEST} particle distances")
+        nx, ny, nz = grid.counts
+        counts = (nx * parts, ny * parts, nz * parts if grid.dimension == 3 else 1)
+        self.grid, self.obstacles, self._parts = grid, obstacles, parts
+        self.lattice = StaggeredGrid(counts, grid.spacing / parts, grid.dimension, grid.device)
+        distance = parts / per_axis  # of particles at rest, in lattice cells
+        self._each = distance**grid.dimension
+        self._thin_passes, self._passes = (max(0, round(2.0 * ((sigma * distance) ** 2 - 0.25))) for sigma in (SHARPEST, smoothing))
+        self._spread = math.sqrt(0.25 + 0.5 * self._passes)
+        # A drop of one particle has at least 2^-dimension of its narrow kernel on one lattice node: that shall be the share 1/2.
+        self._most = 2.0 ** (grid.dimension - 1)
+        alone = min(self._each * (2.0 * math.pi * self._spread**2) ** (-0.5 * grid.dimension), CROWD)
+        self._gain = self._most / ((kernels.THIN / alone) ** kernels.POWER - 1.0)
+        self._fields = [self.lattice.field() for _ in range(3)]
+        self._room = self.lattice.field() if obstacles else None
+        self._capacity = self.lattice.field() if obstacles else None
+        self._known = self.lattice.field(wp.int8) if obstacles else None
+        self._cubes = MarchingCubes(self.lattice)
+        self._placed = False
+
+    def find(self, position: wp.array, interior: Interior | None = None) -> Mesh:
+        """Return the surface around particles; on CUDA sums over particles, and so the last bits, may differ from run to run.
+
+        Args:
+            position: [m], shape (n,), vectors; z = 0 in 2-D.
+            interior: what there is besides the particles.
+        """
+        lattice = self.lattice
+        if self.obstacles is not None and (self.obstacles.moves or not self._placed):
+            self._place(self.obstacles)
+        raw, first, second = self._fields
+        raw.zero_()
+        numbers = [lattice.planes, 1.0 / lattice.spacing, self._each]
+        launch(scatter_kernel, len(position), [*numbers, position, raw], lattice.device)
+        self._mirror(raw, fold=True)
+        if interior is not None:
+            inputs = [lattice.planes, self._parts, interior.least, interior.depth, interior.base, raw]
+            lattice.domain.launch(kernels.fill_kernel, inputs)
+            self._mirror(raw)
+        smooth = self._smoothed(raw, first, second, self._passes)
+        thin, phi = (field for field in self._fields if field is not smooth)
+        thin.zero_()
+        launch(
+            kernels.boost_kernel, len(position), [*numbers, self._gain, self._most, position, smooth, self._capacity, thin], lattice.device
+        )
+        self._mirror(thin, fold=True)
+        if self._thin_passes:
+            done = self._smoothed(thin, phi, thin, self._thin_passes)
+            thin, phi = done, phi if done is thin else thin
+        window = lattice.everywhere
+        window.launch(kernels.distance_kernel, [lattice.planes, self._spread, smooth, thin, self._capacity, phi, self._known])
+        if self._room is not None:
+            extrapolate(window, self._known, phi, EXTENDED)
+            window.launch(kernels.carve_kernel, [self._room, phi])
+        mesh = self._cubes.contour(phi, smooth.view(wp.int32))
+        smooth_mesh(mesh, lattice, self._room, ROUNDS)
+        return mesh
+
+    def _place(self, obstacles: Obstacles) -> None:
+        """Find what the solids leave of each kernel."""
+        lattice, domain = self.lattice, self.lattice.domain
+        room, capacity = self._room, self._capacity
+        if obstacles.distance is not None:
+            domain.launch(kernels.room_kernel, [lattice.planes, self._parts, obstacles.distance, room])
+        else:
+            domain.launch(kernels.whole_cell_room_kernel, [lattice.planes, self._parts, obstacles.base, room])
+        self._mirror(room)
+        lattice.everywhere.launch(kernels.open_share_kernel, [room, capacity])
+        done = self._smoothed(
+            capacity, self._fields[0], self._fields[1], self._passes + 1
+        )  # what a cell's own extent adds to the kernel, about
+        wp.copy(capacity, done)
+        self._placed = True
+
+    def _smoothed(self, source: wp.array, first: wp.array, second: wp.array, passes: int) -> wp.array:
+        """Return the source after binomial passes (1, 2, 1)/4, mirrored at the domain's sides; in one of the two other fields."""
+        for _ in range(passes):
+            self.lattice.everywhere.launch(binomial_kernel, [self.lattice.planes, source, first])
+            self._mirror(first)
+            source, first, second = first, second, first
+        return source
+
+    def _mirror(self, field: wp.array | None, *, fold: bool = False) -> None:
+        """Continue a field beyond the domain's sides as in a mirror; `fold`: after folding in what has been added there."""
+        shape = self.lattice.shape
+        for axis in range(self.lattice.dimension):
+            lines = [n for plane, n in enumerate(shape) if plane != 2 - axis]
+            wp.launch(kernels.mirror_kernel, lines, [axis, fold, field], device=self.lattice.device)
+
+
+def faces_from_particles(
+    grid: StaggeredGrid, position: wp.array, velocity: wp.array, fields: list[wp.array], weights: list[wp.array]
+) -> None:
+    """Bring the particles' velocity to the faces around them, and `EXTENDED` layers farther.
+
+    Args:
+        grid: the grid.
+        position: [m], shape (n,), vectors.
+        velocity: [m/s], shape (n,), vectors.
+        fields: velocity of each component on the faces [m/s] (written).
+        weights: a field a component (written), scratch memory.
+    """
+    particles_to_faces(grid, position, velocity, [], fields, weights)
+    known = grid.field(wp.int8)
+    for field, weight in zip(fields, weights, strict=True):
+        grid.everywhere.launch(kernels.known_kernel, [weight, known])
+        extrapolate(grid.everywhere, known, field, EXTENDED)
+
+
+def sample(grid: StaggeredGrid, fields: list[wp.array], points: wp.array) -> wp.array:
+    """Return the velocity [m/s] at points, wp.vec3, shape (m,).
+
+    Args:
+        grid: the grid.
+        fields: velocity of each component on the faces [m/s].
+        points: [m], shape (m,), vectors.
+    """
+    sampled, within = (wp.zeros(len(points), dtype=wp.vec3, device=grid.device) for _ in range(2))
+    size = wp.vec3(*((n - MARGIN) * grid.spacing for n in grid.counts))  # as near to the far sides as particles may come
+    wp.launch(kernels.clamp_kernel, len(points), [points, size, within], device=grid.device)
+    faces_to_particles(grid, fields, within, sampled, [])
+    return sampled

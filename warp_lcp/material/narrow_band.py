@@ -1,0 +1,357 @@
+"""Particles near the surface only: deeper down the grid's velocity and a depth carry the liquid.
+
+The idea is that of narrow band FLIP [Ferstl et al. 2016]; the scheme is derived here. In a liquid that fills its space nothing is told
+by particles deep inside: their density is that at rest, and their velocity is the flow's, which the grid holds. Let d(x) be the depth,
+the distance to the surface [cells], and W the band's width.
+
+1. Where. A step starts with the depth d* that the last one has carried along, so {d* > W} is where no particle is: it is liquid that
+   was deeper than W and moved with the flow. Cells with d* >= D = min(2, W / 2) count as full, all others as full as their particles
+   say, which reach beyond any kernel around these. So the surface is the particles' alone, and no error of d* builds up: after the
+   solve d is measured anew as a chamfer distance from the cells of air, whose level set gives the part of a cell; solids are no shore.
+2. How fast. On faces deeper than W - 1 the velocity u* is the last step's, carried along by a semi-Lagrangian step of third order
+   (`warp_lcp.grid.semi_lagrangian`); on those above W - 2 it is the particles' mean, in between it goes over linearly. Gravity and
+   pressure act on both alike.
+3. Exchange. Particles deeper than W go. The band's last layer, W - 1 < d <= W, and what was {d* > W - 1} and is now shallower, gets fresh
+   particles on a jittered lattice in each step: a reservoir of even density, out of which the flow takes exactly what it carries away, so
+   that no cell is ever filled up by a guess. They take their velocity and its gradient from the grid, as all others do at that time.
+4. Mass. H counts the particles that the interior stands for: those that went in less those that came out. What the fresh layer holds
+   and what the density correction sees there is H by the particles that {d* > W} would hold at rest, within a tenth of 1: particles and
+   H are as many as without a band, so that liquid lost to one side is pushed back by the correction as it would be without.
+
+Particles also stay within W of where liquid leaves a wall, where solids cut cells or move, and of sources, drains and open sides.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.grid.particles import Particles, ParticleTotals
+from warp_lcp.grid.semi_lagrangian import CENTERS, carry_field
+from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.transfer import faces_to_particles
+from warp_lcp.material import narrow_band_kernels as kernels
+from warp_lcp.material.boundary import Boundary
+from warp_lcp.material.resample import PLASTIC
+from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
+
+BEYOND = 3.0  # cells below the band that depths are told apart: what is carried into it must have a slope
+DEEP = 2.0  # cells below the surface from which on a cell counts as full whatever particles say
+REACH = 1.5  # of a cell's kernel, in cells
+UNEVEN = 0.1  # how far the interior's density may differ from that at rest
+
+
+@dataclass(frozen=True)
+class Interior:
+    """Sums over the cells without particles.
+
+    Attributes:
+        cells: how many there are.
+        mean_square_speed: [m^2/s^2].
+        center: mean position [m], shape (3,).
+        low: smallest coordinates of cell centers [m], shape (3,).
+        high: largest coordinates of cell centers [m], shape (3,).
+        max_speed: [m/s].
+    """
+
+    cells: int
+    mean_square_speed: float
+    center: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    max_speed: float
+
+
+class NarrowBand:
+    """Carry the liquid deeper than a band without particles.
+
+    A step calls `blend` when the particles' velocity is on the faces, `fill` where their density is taken, `exchange` between the solve and
+    the way back to the particles, and `carry` when they have moved.
+
+    Args:
+        grid: the grid.
+        boundary: solids and walls.
+        width: of the band [cells], >= 3.
+        per_axis: particles along the edge of a cell.
+        jitter: width of fresh particles' random displacement, a fraction of their distance.
+        random_seed: of the displacements.
+        keep: which cells hold particles whatever their depth, bool of the stored shape; None: none.
+
+    Attributes:
+        depth: d* [cells], float32; 0 in air. More than `width` where there are no particles.
+        velocity: of each component's faces, carried along with it [m/s].
+        held: H, particles that the interior stands for; negative if the band has got more than there was.
+        interior: sums over the cells without particles.
+        full: depth from which on cells count as full [cells].
+        fresh: particles that the last exchange has put into the band.
+
+    Raises:
+        ValueError: the width is too small.
+    """
+
+    def __init__(
+        self, grid: StaggeredGrid, boundary: Boundary, *, width: float, per_axis: int, jitter: float, random_seed: int,
+        keep: np.ndarray | None = None,
+    ) -> None:  # fmt: skip
+        """Allocate the fields: no interior yet."""
+        if not width >= 3.0:
+            raise ValueError(f"width = {width}: must be at least 3 cells")
+        self.grid, self.boundary, self.width = grid, boundary, float(width)
+        self.per_axis, self.jitter, self.random_seed = per_axis, jitter, random_seed
+        self.particles_a_cell = per_axis**grid.dimension
+        self.full = min(DEEP, 0.5 * self.width)
+        self.depth, self._now, self.velocity = grid.field(), grid.field(), grid.faces()
+        self._keep = wp.array(keep.astype(np.int8), dtype=wp.int8, device=grid.device) if keep is not None else None
+        self._total = wp.zeros(grid.size, dtype=wp.int32, device=grid.device)
+        self._changed = wp.zeros(1, dtype=wp.int32, device=grid.device)
+        self._seeds = random_seed % 2**31 - 1
+        self._steps = np.append(PLASTIC[grid.dimension] ** -np.arange(1.0, grid.dimension + 1), 0.0)[:3]
+        self._sums = wp.zeros((*grid.shape[:2], kernels.COLUMNS), dtype=wp.float64, device=grid.device)
+        self.held = self.fresh = 0
+        self.interior = self._summed(grid.everywhere)
+
+    @property
+    def density(self) -> float:
+        """Of the interior, in units of that at rest, within `UNEVEN` of 1."""
+        room = self.particles_a_cell * self.interior.cells
+        return min(max(self.held / room, 1.0 - UNEVEN), 1.0 + UNEVEN) if room else 1.0
+
+    def start(self, owner: np.ndarray, velocities: np.ndarray) -> np.ndarray:
+        """Begin with the liquid's cells and return those without particles.
+
+        Args:
+            owner: number of the liquid in each cell, -1: none, shape (nz, ny, nx).
+            velocities: of the liquids [m/s], shape (n, 3).
+
+        Returns:
+            bool, shape (nz, ny, nx).
+        """
+        grid, padded = self.grid, np.full(self.grid.shape, -1)
+        padded[1:-1, 1:-1, 1:-1] = owner
+        base = self.boundary.base.numpy()
+        kind = wp.array(np.where(base == SOLID, SOLID, np.where(padded >= 0, FLUID, AIR)).astype(np.int8), device=grid.device)
+        self._measure(grid.everywhere, kind, None, grid.field(wp.uint8))
+        wp.copy(self.depth, self._now)
+        deep = (self.depth.numpy() > self.width) & (padded >= 0)
+        self.held = int(deep.sum()) * self.particles_a_cell
+        for axis, field in enumerate(self.velocity):
+            speed = np.where(padded >= 0, velocities[padded, axis], np.nan)
+            both = np.stack([speed, np.roll(speed, 1, axis=2 - axis)])
+            known = np.isfinite(both)
+            field.assign((np.where(known, both, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)).astype(np.float32))
+        self.interior = self._summed(grid.everywhere)
+        return np.asarray(grid.interior(deep))
+
+    def blend(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array]) -> None:
+        """Put the carried velocity on deep faces.
+
+        Args:
+            window: faces that material can reach.
+            velocity: of each component [m/s] (updated).
+            weights: of the particles on each component's faces (updated).
+        """
+        start, full = self.width - 2.0, float(self.particles_a_cell)
+        for axis, (carried, field, weight) in enumerate(zip(self.velocity, velocity, weights, strict=True)):
+            window.launch(kernels.blend_kernel, [axis, start, full, self.depth, self.boundary.base, carried, field, weight])
+
+    def fill(self, window: Window, density: wp.array) -> None:
+        """Make deep cells as full as at rest, as a surface sees them.
+
+        Args:
+            window: cells that material can reach.
+            density: of the particles, in units of that at rest (updated).
+        """
+        window.launch(kernels.fill_kernel, [self.full, 1.0, self.depth, self.boundary.capacity, density])
+
+    def fill_interior(self, window: Window, density: wp.array) -> None:
+        """Give cells whose kernels particles do not fill the interior's density.
+
+        Args:
+            window: cells that material can reach.
+            density: of the particles, in units of that at rest (updated).
+        """
+        least = max(self.width - REACH, self.full)
+        window.launch(kernels.fill_kernel, [least, self.density, self.depth, self.boundary.capacity, density])
+
+    def exchange(
+        self, particles: Particles, window: Window, kind: wp.array, phi: wp.array | None, contact: wp.array, step: int,
+        saved: Sequence[wp.array] = (),
+    ) -> None:  # fmt: skip
+        """Measure the depth, remove particles deeper than the band and renew those at its inner edge.
+
+        The new ones have no velocity yet but for FLIP; `warp_lcp.grid.transfer.faces_to_particles` gives it to them.
+
+        Args:
+            particles: the liquid (updated); `key` holds its cells.
+            window: cells that material can touch.
+            kind: int8 of AIR, FLUID, SOLID.
+            phi: float32 distance to the surface [cells]; None: it lies on the cells' faces.
+            contact: uint8, RELEASED where liquid leaves a wall.
+            step: number of the step, which the random part of new places depends on.
+            saved: velocity as it came from the particles [m/s], for FLIP.
+        """
+        grid, each, rule = self.grid, self.particles_a_cell * self.density, [self.full, self.width]
+        self._measure(window, kind, phi, contact)
+        depths = [self._now, self.depth]
+        if particles.count:
+            marks = particles.marks
+            wp.launch(
+                kernels.leave_kernel, particles.count, [*rule, particles.key, *(d.flatten() for d in depths), marks], device=grid.device
+            )
+            self.held += particles.remove(marks)
+        self._total.zero_()
+        shift = (self._steps * step) % 1.0
+        quota = [*rule, each, self._seeds, float(shift[0]), self.boundary.base, *depths, self._total.reshape(grid.shape)]
+        window.launch(kernels.quota_kernel, quota)
+        wp.utils.array_scan(self._total, self._total, inclusive=True)
+        self.fresh = int(self._total[-1:].numpy()[0])
+        if self.fresh:
+            self._seed(particles, window, shift, saved)
+            self.held -= self.fresh
+
+    def carry(self, window: Window, velocity: list[wp.array], dt: float) -> None:
+        """Carry depth and velocity along for a time step.
+
+        Args:
+            window: cells that material can touch.
+            velocity: of each component on the faces [m/s].
+            dt: time step [s].
+        """
+        self.depth.zero_()
+        more = {"level": self._now, "least": 0.0}
+        carry_field(self.grid, window, velocity, dt, self._now, self.depth, axis=CENTERS, **more)
+        for axis, (field, out) in enumerate(zip(velocity, self.velocity, strict=True)):
+            out.zero_()
+            carry_field(self.grid, window, velocity, dt, field, out, axis=axis, **more)
+        self.interior = self._summed(window)
+
+    def with_interior(self, totals: ParticleTotals) -> ParticleTotals:
+        """Return sums over the particles and those that the interior stands for.
+
+        They are counted as H, and weighted as at rest: what H differs by is spread over all the liquid. Its center would otherwise move
+        with every particle that the band has more or less than its share.
+        """
+        inside, count = self.interior, totals.count + self.held
+        if inside.cells == 0 or count <= 0:
+            return replace(totals, count=max(count, 0))
+        at_rest = self.particles_a_cell * inside.cells
+        share = at_rest / (totals.count + at_rest)
+        return replace(
+            totals,
+            count=count,
+            mean_square_speed=(1.0 - share) * totals.mean_square_speed + share * inside.mean_square_speed,
+            center=(1.0 - share) * totals.center + share * inside.center,
+            low=np.minimum(totals.low, inside.low) if totals.count else inside.low,
+            high=np.maximum(totals.high, inside.high) if totals.count else inside.high,
+            max_speed=max(totals.max_speed, inside.max_speed),
+        )
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return what the next step starts from; zeros where nobody looks, so that it packs well."""
+        depth = self.depth.numpy()
+        wanted = depth > min(self.width - BEYOND, self.full - 1.0)
+        faces = {}
+        for axis, field in enumerate(self.velocity):
+            near = wanted | np.roll(wanted, 1, axis=2 - axis)
+            faces[f"interior_velocity_{axis}"] = np.where(near, field.numpy(), np.float32(0.0))
+        return {"depth": np.where(wanted, depth, np.float32(0.0)), "interior": np.array([self.held, self.width])} | faces
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue from `state`.
+
+        Raises:
+            ValueError: the band had another width.
+        """
+        held, width = state["interior"]
+        if width != self.width:
+            raise ValueError(f"the state's narrow band is {width:g} cells wide: this scene's is {self.width:g}")
+        self.depth.assign(state["depth"])
+        for axis, field in enumerate(self.velocity):
+            field.assign(state[f"interior_velocity_{axis}"])
+        self.held = int(held)
+        self.interior = self._summed(self.grid.everywhere)
+
+    def forget(self) -> None:
+        """Begin with particles everywhere; the next exchange removes those deeper than the band."""
+        for field in (self.depth, *self.velocity):
+            field.zero_()
+        self.held = 0
+        self.interior = self._summed(self.grid.everywhere)
+
+    def _measure(self, window: Window, kind: wp.array, phi: wp.array | None, contact: wp.array) -> None:
+        """Find how deep cells lie, up to `BEYOND` below the band."""
+        planes, most = self.grid.planes, self.width + BEYOND
+        inputs = [planes, most, kind, phi, contact, self._keep, self.boundary.distance, self._now]
+        self.grid.everywhere.launch(kernels.shore_kernel, inputs)
+        last = window.high[0] - 1, window.high[1] - 1
+        for number in range(math.ceil(most) + 1):
+            if self.grid.device.is_cpu:
+                self._changed.zero_()
+            window.launch(kernels.relax_kernel, [planes, *((0, 0) if number % 2 else last), self._now, self._changed])
+            if self.grid.device.is_cpu and self._changed.numpy()[0] == 0:  # rows one after the other are done in three passes or so
+                break
+
+    def _seed(self, particles: Particles, window: Window, shift: np.ndarray, saved: Sequence[wp.array]) -> None:
+        """Put fresh particles behind the others."""
+        grid, first = self.grid, particles.make_room(self.fresh)
+        numbers = [grid.planes, self.per_axis, self.jitter, self._seeds, wp.vec3(*shift), grid.spacing, first, *grid.shape[1:]]
+        window.launch(kernels.seed_kernel, [*numbers, self._total, particles.position])
+        if saved:
+            tail = particles.position[first:], particles.velocity[first:]
+            faces_to_particles(grid, list(saved), *tail, [])
+
+    def _summed(self, window: Window) -> Interior:
+        """Add up the cells without particles."""
+        u, v, w = [*self.velocity, None][:3]
+        inputs = [self.grid.planes, self.width, self.boundary.base, self.depth, u, v, w, self._sums]
+        low = [max(a, b) for a, b in zip(window.low, self.grid.domain.low, strict=True)]
+        high = [min(a, b) for a, b in zip(window.high, self.grid.domain.high, strict=True)]
+        Window((low[0], low[1], low[2]), (high[0], high[1], high[2]), window.device).launch_rows(kernels.sum_kernel, inputs)
+        rows = self._sums.numpy()[low[0] : high[0], low[1] : high[1]].reshape(-1, kernels.COLUMNS)
+        cells, dx = int(rows[:, 0].sum()), self.grid.spacing
+        if cells == 0:
+            return Interior(0, 0.0, np.zeros(3), np.zeros(3), np.zeros(3), 0.0)
+        center, lowest, highest = rows[:, 2:5].sum(axis=0) / cells, rows[:, 6:9].min(axis=0), rows[:, 9:12].max(axis=0)
+        places = (np.stack([center, lowest, highest]) - 0.5) * dx
+        places[:, self.grid.dimension :] = 0.0
+        squares, fastest = float(rows[:, 1].sum()) / cells, float(rows[:, 5].max())
+        return Interior(cells, squares, places[0], places[1], places[2], math.sqrt(fastest))
+
+
+def without_band(state: Mapping[str, np.ndarray], spacing: float, random_seed: int) -> Mapping[str, np.ndarray]:
+    """Return a simulation's state with particles where its band had none, as many as the interior stands for; any other as it is.
+
+    Args:
+        state: arrays of the particles and, if there was a band, of `NarrowBand.state`.
+        spacing: of its grid [m].
+        random_seed: of the places.
+    """
+    if "interior" not in state or state["interior"][0] <= 0:
+        return state
+    held, width = int(state["interior"][0]), float(state["interior"][1])
+    solid = state["cells"] == SOLID
+    k, j, i = np.nonzero((state["depth"] > width) & ~solid)
+    if len(i) == 0:
+        return state
+    faces = [state[f"interior_velocity_{axis}"] for axis in range(3) if f"interior_velocity_{axis}" in state]
+    dimension = len(faces)
+    ends = np.arange(len(i) + 1) * held // len(i)
+    cell = np.repeat(np.arange(len(i)), np.diff(ends))
+    steps, shift = PLASTIC[dimension] ** -np.arange(1.0, dimension + 1), np.random.default_rng(random_seed).random(dimension)
+    place = (shift + np.arange(held)[:, None] * steps) % 1.0
+    position, velocity = np.zeros((held, 3)), np.zeros((held, 3))
+    position[:, :dimension] = np.stack([i, j, k], axis=1)[cell, :dimension] - 1.0 + np.clip(place, kernels.INSET, 1.0 - kernels.INSET)
+    more = {}
+    for axis, field in enumerate(faces):
+        low = field[k, j, i]
+        change = field[k + (axis == 2), j + (axis == 1), i + (axis == 0)] - low
+        velocity[:, axis] = low[cell] + place[:, axis] * change[cell]
+        gradient = np.zeros((held, 3))
+        gradient[:, axis] = change[cell] / spacing
+        more[f"affine_{axis}"] = gradient
+    added = {"position": position * spacing, "velocity": velocity} | more
+    return {name: np.concatenate([v, added[name].astype(v.dtype)]) if name in added else v for name, v in state.items()}

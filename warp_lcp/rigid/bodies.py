@@ -1,0 +1,236 @@
+"""All rigid bodies of a scene: their time step, between the material's solve and the walls."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from warp_lcp.grid.solids import Geometry
+from warp_lcp.rigid.body import BodyMotion, RigidBody
+from warp_lcp.rigid.contact_shape import ContactShape
+from warp_lcp.rigid.contact_solve import ContactSolve, Touching
+from warp_lcp.rigid.outline import BodySurface, body_surface
+from warp_lcp.rigid.surroundings import Surroundings
+
+STATE = 20  # numbers of a body's state
+IN_PLANE = ("x", "y", "vx", "vy", "angle", "spin")
+IN_SPACE = ("x", "y", "z", "vx", "vy", "vz", "wx", "wy", "wz")
+
+
+@dataclass(frozen=True)
+class _Begun:
+    """What `begin_step` leaves for the rest of a step.
+
+    Args:
+        states: of the bodies before it.
+        free: momenta without contacts, shape (n, 6).
+        touching: where bodies touch.
+        impulses: of the contacts if no material pushes.
+    """
+
+    states: np.ndarray
+    free: np.ndarray
+    touching: Touching
+    impulses: np.ndarray
+
+
+class RigidBodies:
+    """The bodies of a scene, which a material, walls and each other push.
+
+    A step is `begin_step`, the material's solve with `RigidBody.apply_impulse`, and `end_step`; `restore_step` in its place if the solve
+    fails. `begin_step` leaves the velocities V* that contacts allow before the material pushes. `end_step` starts again from gravity and
+    what the material gave and solves for the contacts once more: what a wall had to bear is not what it had to bear before.
+
+    Args:
+        bodies: in the order of their solids.
+        geometries: the shape of each as the scene places it.
+        numbers: the wall number of each, 1 + the index of its solid.
+        surroundings: what else they may touch.
+        dimension: 2 or 3.
+
+    Attributes:
+        motions: a `BodyMotion` of each, for the solids.
+        time: of the state [s].
+        contacts: points where bodies touched in the last step.
+        contact_residual: of their problem, relative to that of no impulses.
+
+    Raises:
+        ValueError: a body is not wholly inside the domain, or overlaps another body or a solid.
+    """
+
+    def __init__(
+        self,
+        bodies: Sequence[RigidBody],
+        geometries: Sequence[Geometry],
+        numbers: Sequence[int],
+        surroundings: Surroundings,
+        dimension: int,
+    ) -> None:
+        """Prepare the shapes for contact, and check that bodies start apart."""
+        self.bodies, self.numbers, self.dimension = list(bodies), list(numbers), dimension
+        self.motions = [BodyMotion(body) for body in bodies]
+        self.surroundings, self._geometries = surroundings, list(geometries)
+        self.shapes = [ContactShape.of(geometry, dimension) for geometry in geometries]
+        self._solve = ContactSolve(self.bodies, self.shapes, surroundings, dimension)
+        self._surfaces: list[BodySurface] | None = None
+        self._begun: _Begun | None = None
+        self.contacts, self.contact_residual = 0, 0.0
+        self._solve.check_start(self.time)
+
+    @property
+    def time(self) -> float:
+        """Time of the state [s]."""
+        return self.bodies[0].time
+
+    def begin_step(self, time: float, dt: float, gravity: np.ndarray) -> None:
+        """Let gravity act, and contacts; hold bodies that rest against walls and solids that the scene moves or that stand.
+
+        Held directions answer to no impulse of the material (see `RigidBody.inverse_mass`): it meets a body on the floor as it meets the
+        floor. `end_step` decides anew whether contacts bear.
+
+        Args:
+            time: of the state [s].
+            dt: time step [s], > 0.
+            gravity: [m/s^2], shape (3,).
+        """
+        self.restore_step()
+        gravity = np.asarray(gravity, dtype=np.float64)
+        for body in self.bodies:
+            body.time = time
+        states = self._states()
+        touching = self._solve.find(time, dt, gravity)
+        for body in self.bodies:
+            body.release()
+            body.accelerate(gravity, dt)
+        free = self._momenta()
+        impulses = self._solve.push_apart(touching)
+        self._solve.hold(touching, impulses)
+        self._begun = _Begun(states, free, touching, impulses)
+
+    def end_step(self, dt: float) -> None:
+        """Solve for the contacts with what the material gave, then move and turn the bodies.
+
+        Args:
+            dt: of `begin_step` [s].
+
+        Raises:
+            RuntimeError: there was no `begin_step`.
+        """
+        begun = self._begun
+        if begun is None:
+            raise RuntimeError("end_step: there was no begin_step")
+        if any(body.given.any() for body in self.bodies):
+            for body, momenta in zip(self.bodies, begun.free, strict=True):
+                body.momentum, body.angular_momentum = momenta[:3] + body.given[:3], momenta[3:] + body.given[3:]
+            self._solve.push_apart(begun.touching, begun.impulses)
+        self.contacts, self.contact_residual = len(begun.touching), self._solve.residual
+        ways = self._solve.separation(begun.touching, dt)
+        for body, way in zip(self.bodies, ways, strict=True):
+            body.release()
+            body.advance(dt)
+            if way.any():
+                body.shift(way)
+        self._begun = None
+
+    def restore_step(self) -> None:
+        """Undo `begin_step`, if a step has begun."""
+        if self._begun is not None:
+            for body, state in zip(self.bodies, self._begun.states, strict=True):
+                body.restore(state)
+            self._begun = None
+
+    def trouble(self, size: Sequence[float], endless: Sequence[int]) -> str | None:
+        """Return what makes it impossible to go on, if something does: a body that is not finite, or one that meets its own image.
+
+        Args:
+            size: of the domain [m].
+            endless: axes without an end, at whose sides solids must be alike.
+        """
+        for body, shape, motion in zip(self.bodies, self.shapes, self.motions, strict=True):
+            if not np.isfinite(body.state()).all():
+                return f"{body.name} has a velocity that is not finite"
+            points = motion.pose(body.time).apply(shape.points)
+            for axis in endless:
+                if points[:, axis].min() - shape.radius < 0.0 or points[:, axis].max() + shape.radius > size[axis]:
+                    return f"{body.name} has reached a side of the periodic {'xyz'[axis]} axis, which rigid bodies cannot cross"
+        return None
+
+    def top_speed(self, span: float, gravity: float = 0.0) -> float:
+        """Return how fast a point of a body may become [m/s] in the time to come.
+
+        Args:
+            span: what is looked ahead [s].
+            gravity: its size [m/s^2].
+        """
+        return max(body_speed(body, shape) for body, shape in zip(self.bodies, self.shapes, strict=True)) + span * gravity
+
+    def kinetic_energy(self) -> float:
+        """Return the energy of motion and spin [J; J/m in 2-D]."""
+        return sum(body.kinetic_energy for body in self.bodies)
+
+    def potential_energy(self, gravity: np.ndarray) -> float:
+        """Return the energy of height [J; J/m in 2-D], 0 at the origin."""
+        return -sum(body.properties.mass * float(body.position @ gravity) for body in self.bodies)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return what `restore` needs to continue bit for bit."""
+        return {"bodies": self._states()}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue from `state`.
+
+        Raises:
+            ValueError: it is of other bodies.
+        """
+        states = np.asarray(state["bodies"], dtype=np.float64)
+        if states.shape != (len(self.bodies), STATE):
+            raise ValueError(f"the state's bodies have shape {states.shape}: this scene has {(len(self.bodies), STATE)}")
+        self._begun = None
+        for body, values in zip(self.bodies, states, strict=True):
+            body.restore(values)
+
+    def columns(self) -> tuple[str, ...]:
+        """Return the names of the log's columns: place, velocity and turn of each body, numbered from 0.
+
+        x, y, z: the center of mass [m]; vx, vy, vz: its velocity [m/s]; 2-D: angle and spin, how far it has turned [degrees] and how fast
+        it turns [degrees/s]; 3-D: wx, wy, wz, the angular velocity [degrees/s]. contacts: points where bodies touch or nearly do.
+        """
+        names = IN_PLANE if self.dimension == 2 else IN_SPACE
+        return (*(f"body{number}_{name}" for number in range(len(self.bodies)) for name in names), "contacts")
+
+    def row(self) -> dict[str, float | int]:
+        """Return the entries of the columns."""
+        values: list[float] = []
+        for body in self.bodies:
+            spin = np.degrees(body.angular_velocity)
+            if self.dimension == 2:
+                values += [*body.position[:2], *body.velocity[:2], np.degrees(body.angle), spin[2]]
+            else:
+                values += [*body.position, *body.velocity, *spin]
+        numbers = [float(value) for value in values]
+        return dict(zip(self.columns(), [*numbers, self.contacts], strict=True))
+
+    def surfaces(self) -> BodySurface:
+        """Return the surfaces of all bodies as they are, for a frame; fields: `body`, counted from 0, and `velocity` [m/s]."""
+        if self._surfaces is None:
+            self._surfaces = [body_surface(geometry, self.dimension) for geometry in self._geometries]
+        placed = []
+        for number, (body, motion, surface) in enumerate(zip(self.bodies, self.motions, self._surfaces, strict=True)):
+            points = motion.pose(body.time).apply(surface.points)
+            velocity = body.velocity + np.cross(body.angular_velocity, points - body.position)
+            fields = {"body": np.full(len(points), number, dtype=np.int32), "velocity": velocity.astype(np.float32)}
+            placed.append(BodySurface(points.astype(np.float32), surface.corners, fields))
+        return BodySurface.joined(placed)
+
+    def _states(self) -> np.ndarray:
+        return np.array([body.state() for body in self.bodies])
+
+    def _momenta(self) -> np.ndarray:
+        return np.array([np.concatenate([body.momentum, body.angular_momentum]) for body in self.bodies])
+
+
+def body_speed(body: RigidBody, shape: ContactShape) -> float:
+    """Return the most that a point of a body may move at now [m/s]."""
+    return float(np.linalg.norm(body.velocity) + np.linalg.norm(body.angular_velocity) * shape.reach(body.properties.center))

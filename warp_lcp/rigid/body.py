@@ -1,0 +1,220 @@
+"""A rigid body: its state, its motion, and the poses that solids take from it."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from warp_lcp.grid.motion import Pose
+from warp_lcp.rigid.mass_properties import MassProperties
+
+SAME_TURN = 1e-15  # [rad]: half a step's turn that no longer changes
+MOST_ROUNDS = 60  # of the fixed point; a step turns a body by far less than a radian, and each round by a factor of that less
+
+
+class RigidBody:
+    """A body that forces move. Velocities follow from the momenta, which nothing but impulses changes.
+
+    Args:
+        properties: mass, center and inertia as the scene places the body.
+        name: what messages call it.
+        friction: Coulomb's coefficient, >= 0.
+        restitution: the part of the speed of an impact that comes back, in [0, 1].
+        velocity: of the center of mass at the start [m/s], shape (3,).
+        angular_velocity: at the start [rad/s], shape (3,).
+
+    Attributes:
+        position: of the center of mass [m], shape (3,).
+        rotation: from where the scene placed it, shape (3, 3).
+        momentum: [kg m/s], shape (3,).
+        angular_momentum: about the center of mass, in the world's axes [kg m^2/s], shape (3,).
+        angle: by how much it has turned about z [rad], as many turns as they are; of meaning in 2-D.
+        time: of the state [s].
+        hold: what contacts leave of an impulse, shape (k, k); None: all of it. See `RigidBodies.begin_step`.
+        given: impulses since `hold` was set, as they were given, shape (6,): force and torque.
+
+    Raises:
+        ValueError: friction or restitution is out of range.
+    """
+
+    def __init__(
+        self,
+        properties: MassProperties,
+        *,
+        name: str,
+        friction: float = 0.5,
+        restitution: float = 0.0,
+        velocity: np.ndarray | None = None,
+        angular_velocity: np.ndarray | None = None,
+    ) -> None:
+        """Place the body where the scene does."""
+        if not 0.0 <= friction < np.inf:
+            raise ValueError(f"friction = {friction}: must be >= 0 and finite")
+        if not 0.0 <= restitution <= 1.0:
+            raise ValueError(f"restitution = {restitution}: must be in [0, 1]")
+        self.properties, self.name, self.friction, self.restitution = properties, name, friction, restitution
+        self.position, self.rotation = properties.center.copy(), np.eye(3)
+        self.momentum = properties.mass * _three(velocity)
+        self.angular_momentum = properties.inertia @ _three(angular_velocity)
+        self.angle, self.time = 0.0, 0.0
+        self.hold: np.ndarray | None = None
+        self.given = np.zeros(6)
+
+    @property
+    def velocity(self) -> np.ndarray:
+        """Velocity of the center of mass [m/s], shape (3,)."""
+        return self.momentum / self.properties.mass
+
+    @property
+    def angular_velocity(self) -> np.ndarray:
+        """Angular velocity in the world's axes [rad/s], shape (3,)."""
+        return _spin(self.properties, self.rotation, self.angular_momentum)
+
+    @property
+    def inertia(self) -> np.ndarray:
+        """Inertia about the center of mass as the body is turned [kg m^2], shape (3, 3)."""
+        return cast(np.ndarray, self.rotation @ self.properties.inertia @ self.rotation.T)
+
+    @property
+    def kinetic_energy(self) -> float:
+        """Energy of motion and spin [J]."""
+        return 0.5 * float(self.momentum @ self.velocity + self.angular_momentum @ self.angular_velocity)
+
+    def free_inverse_mass(self, dimension: int) -> np.ndarray:
+        """Return block diag(1/m, I^-1), shape (k, k): k = 3 in 2-D (vx, vy, wz), 6 in 3-D (vx, vy, vz, wx, wy, wz)."""
+        result = np.zeros((6, 6))
+        result[:3, :3] = np.eye(3) / self.properties.mass
+        R = self.rotation
+        result[3:, 3:] = R @ np.linalg.inv(self.properties.inertia) @ R.T
+        return result if dimension == 3 else result[np.ix_(PLANAR, PLANAR)]
+
+    def inverse_mass(self, dimension: int) -> np.ndarray:
+        """Return how velocities answer to impulses, shape (k, k), symmetric positive semi-definite.
+
+        That is block diag(1/m, I^-1), less what contacts with walls take while they hold the body (between `RigidBodies.begin_step` and
+        `end_step`): 0 along directions in which it cannot move.
+        """
+        free = self.free_inverse_mass(dimension)
+        if self.hold is None:
+            return free
+        held = free @ self.hold
+        return cast(np.ndarray, 0.5 * (held + held.T))
+
+    def velocities(self, dimension: int) -> np.ndarray:
+        """Return (vx, vy, wz) in 2-D, (vx, vy, vz, wx, wy, wz) in 3-D [m/s, rad/s]."""
+        both = np.concatenate([self.velocity, self.angular_velocity])
+        return both if dimension == 3 else both[PLANAR]
+
+    def accelerate(self, gravity: np.ndarray, dt: float) -> None:
+        """Let gravity [m/s^2], shape (3,), act for dt [s]."""
+        self.momentum = self.momentum + self.properties.mass * dt * np.asarray(gravity, dtype=np.float64)
+
+    def apply_impulse(self, impulse: np.ndarray) -> None:
+        """Add an impulse on the center of mass and one of torque [N s, N m s], shape (k,), less what contacts with walls take."""
+        impulse = np.asarray(impulse, dtype=np.float64)
+        self.given = self.given + in_space(impulse)
+        self.push(impulse if self.hold is None else self.hold @ impulse)
+
+    def push(self, impulse: np.ndarray) -> None:
+        """Add an impulse and one of torque [N s, N m s], shape (k,), whatever holds the body."""
+        six = in_space(impulse)
+        self.momentum = self.momentum + six[:3]
+        self.angular_momentum = self.angular_momentum + six[3:]
+
+    def advance(self, dt: float) -> None:
+        """Move along the velocities for dt [s]; momenta stay what they are."""
+        self.position, self.rotation = self.after(dt)
+        self.angle += dt * float(self.angular_velocity[2])
+        self.time += dt
+
+    def shift(self, way: np.ndarray) -> None:
+        """Move by a small way (m, rad), shape (k,), without a velocity."""
+        six = in_space(way)
+        self.position = self.position + six[:3]
+        self.rotation = _turn(six[3:]) @ self.rotation
+        self.angle += float(six[5])
+
+    def after(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return position [m] and rotation that the present momenta lead to in dt [s].
+
+        The turn is about the angular velocity in the middle of the step, whose inertia is that of half the turn (the implicit midpoint
+        rule on rotations): angular momentum is kept exactly, and the energy of a free rotation does not drift, as the rule is its own
+        inverse backwards in time.
+        """
+        half = 0.5 * dt * self.angular_velocity
+        for _ in range(MOST_ROUNDS):
+            before = half
+            half = 0.5 * dt * _spin(self.properties, _turn(half) @ self.rotation, self.angular_momentum)
+            if np.abs(half - before).max() <= SAME_TURN:
+                break
+        u, _, vt = np.linalg.svd(_turn(2.0 * half) @ self.rotation)  # the nearest rotation: rounding does not pile up
+        return self.position + dt * self.velocity, u @ vt
+
+    def state(self) -> np.ndarray:
+        """Return everything that changes, shape (20,)."""
+        return np.concatenate(
+            [self.position, self.rotation.ravel(), self.momentum, self.angular_momentum, [self.angle, self.time]]
+        )  # fmt: skip
+
+    def restore(self, state: np.ndarray) -> None:
+        """Continue from `state`."""
+        self.position, self.rotation = state[:3].copy(), state[3:12].reshape(3, 3).copy()
+        self.momentum, self.angular_momentum = state[12:15].copy(), state[15:18].copy()
+        self.angle, self.time = float(state[18]), float(state[19])
+        self.release()
+
+    def release(self) -> None:
+        """Forget what holds the body and what it was given."""
+        self.hold, self.given = None, np.zeros(6)
+
+
+class BodyMotion:
+    """The motion of a body as solids follow it; implements `warp_lcp.grid.motion.Motion`.
+
+    Args:
+        body: which.
+    """
+
+    def __init__(self, body: RigidBody) -> None:
+        """Follow a body."""
+        self.body = body
+
+    def pose(self, time: float) -> Pose:
+        """Return the pose at a time [s]: the body's at the time of its state, later the one that its velocities lead to by then."""
+        body = self.body
+        position, rotation = (body.position, body.rotation) if time == body.time else body.after(time - body.time)
+        center = body.properties.center
+        return Pose.about(center, rotation, position - center)
+
+    def velocity_field(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return turn, shape (3, 3) [1/s], and shift, shape (3,) [m/s]: the body's point x moves at turn x + shift now."""
+        x, y, z = self.body.angular_velocity
+        turn = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        return turn, self.body.velocity - turn @ self.body.position
+
+
+PLANAR = [0, 1, 5]  # vx, vy, wz among the six
+
+
+def in_space(values: np.ndarray) -> np.ndarray:
+    """Return a velocity, impulse or way of three (2-D) or six entries as one of six."""
+    if len(values) == 6:
+        return np.asarray(values, dtype=np.float64)
+    six = np.zeros(6)
+    six[PLANAR] = values
+    return six
+
+
+def _spin(properties: MassProperties, rotation: np.ndarray, angular_momentum: np.ndarray) -> np.ndarray:
+    """Return R I^-1 R' L."""
+    return cast(np.ndarray, rotation @ np.linalg.solve(properties.inertia, rotation.T @ angular_momentum))
+
+
+def _turn(vector: np.ndarray) -> np.ndarray:
+    return cast(np.ndarray, Rotation.from_rotvec(vector).as_matrix())
+
+
+def _three(vector: np.ndarray | None) -> np.ndarray:
+    return np.zeros(3) if vector is None else np.array(vector, dtype=np.float64)

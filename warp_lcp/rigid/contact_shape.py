@@ -1,0 +1,198 @@
+"""Shapes as contacts see them: points of the surface of one, and the signed distance and its direction of the other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+from scipy.spatial import ConvexHull
+
+from warp_lcp.grid.solids import Box, Capsule, Geometry, Sphere, TriangleMesh
+from warp_lcp.rigid.box_contacts import OrientedBox
+from warp_lcp.rigid.outline import mesh_outline
+
+Distance = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]  # of points [m], shape (n, 3): distances [m] and directions outward
+
+ALONG = np.linspace(0.0, 1.0, 9)  # points along an edge of a box or the axis of a capsule
+MOST_POINTS = 1500  # of a mesh
+DIFFERENCE = 2e-3  # of a mesh's size: for its direction; its distance is a float32
+ON_SURFACE = 1e-9  # of a shape's size, within which the way to the nearest point has no direction
+THICK = 1.0  # half the thickness of a 2-D box in the plane's contacts, of its sides
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ContactShape:
+    """A shape where its scene places it.
+
+    Args:
+        points: the surface is `radius` away from them: shape (n, 3) [m].
+        radius: [m].
+        distance: signed distance and its gradient.
+        box: the shape if it is a box; in 2-D a thick one.
+        size: about half its extent [m].
+        closed: whether the inside has an end; contacts with others than such need points of theirs.
+    """
+
+    points: np.ndarray
+    radius: float
+    distance: Distance
+    size: float
+    box: OrientedBox | None = None
+    closed: bool = True
+
+    @classmethod
+    def of(cls, geometry: Geometry, dimension: int) -> ContactShape:
+        """Return the shape of a box, sphere, capsule or mesh; inverted ones have no points.
+
+        Raises:
+            ValueError: it is none of these.
+        """
+        builders = {Box: _box, Sphere: _sphere, Capsule: _capsule, TriangleMesh: _mesh}
+        if type(geometry) not in builders:
+            raise ValueError(f"{type(geometry).__name__.lower()}: bodies touch boxes, spheres, capsules, meshes and planes")
+        shape: ContactShape = builders[type(geometry)](geometry, dimension)
+        if not getattr(geometry, "invert", False):
+            return shape
+
+        def outside(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            distance, direction = shape.distance(points)
+            return -distance, -direction
+
+        return cls(points=np.zeros((0, 3)), radius=0.0, distance=outside, size=shape.size, closed=False)
+
+    def reach(self, center: np.ndarray) -> float:
+        """Return the largest distance of a point of the shape from a center [m]."""
+        return float(np.linalg.norm(self.points - center, axis=1).max(initial=0.0)) + self.radius
+
+
+def _box(shape: Box, dimension: int) -> ContactShape:
+    place = shape.placement
+    lower, upper = (np.array([*corner, 0.0][:3]) for corner in (shape.lower, shape.upper))
+    center, half = place.apply((0.5 * (lower + upper))[None])[0], 0.5 * place.scale * (upper - lower)
+    R = place.rotation
+    signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in ((-1, 1) if dimension == 3 else (0,))], dtype=np.float64)
+    corners = signs * half
+    points = [corners]
+    if dimension == 3:
+        for a in range(3):  # edges along each axis
+            low = corners[signs[:, a] < 0]
+            points += [low + share * 2.0 * half * np.eye(3)[a] for share in ALONG[1:-1]]
+    flat = half[:dimension]
+
+    def distance(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        local = ((points - center) @ R)[:, :dimension]
+        beyond = np.abs(local) - flat
+        out, deepest = np.maximum(beyond, 0.0), beyond.argmax(axis=1)
+        length = np.linalg.norm(out, axis=1)
+        inside = length <= ON_SURFACE * flat.max()
+        each = np.arange(len(local))
+        direction = np.where(inside[:, None], np.eye(dimension)[deepest], out / np.where(inside, 1.0, length)[:, None])
+        direction *= np.where(local < 0.0, -1.0, 1.0)
+        signed = np.where(inside, beyond[each, deepest], length)
+        return signed, direction @ R[:, :dimension].T
+
+    thick = np.array([*flat, THICK * flat.max()][:3])
+    return ContactShape(
+        points=center + np.concatenate(points) @ R.T, radius=0.0, distance=distance, size=float(flat.max()),
+        box=OrientedBox(center, R.copy(), thick),
+    )  # fmt: skip
+
+
+def _sphere(shape: Sphere, dimension: int) -> ContactShape:
+    center = shape.placement.apply(np.array([[*shape.center, 0.0][:3]]))
+    return _around(center, center, np.zeros(1), shape.radius * shape.placement.scale)
+
+
+def _capsule(shape: Capsule, dimension: int) -> ContactShape:
+    ends = shape.placement.apply(np.array([[*end, 0.0][:3] for end in (shape.start, shape.end)]))
+    return _around(ends[:1], ends[1:], ALONG, shape.radius * shape.placement.scale)
+
+
+def _around(start: np.ndarray, end: np.ndarray, along: np.ndarray, radius: float) -> ContactShape:
+    """Return all points within a radius of a segment."""
+    axis = (end - start)[0]
+    square = float(axis @ axis)
+    other = np.array([0.0, 1.0, 0.0]) if not square else np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+
+    def distance(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        share = np.clip((points - start) @ axis / square, 0.0, 1.0) if square else np.zeros(len(points))
+        way = points - start - share[:, None] * axis
+        length = np.linalg.norm(way, axis=1)
+        middle = length <= ON_SURFACE * radius
+        direction = np.where(middle[:, None], other / np.linalg.norm(other), way / np.where(middle, 1.0, length)[:, None])
+        return length - radius, direction
+
+    return ContactShape(
+        points=start + along[:, None] * axis, radius=radius, distance=distance, size=radius + 0.5 * float(np.sqrt(square))
+    )  # fmt: skip
+
+
+def _mesh(shape: TriangleMesh, dimension: int) -> ContactShape:
+    return _polygon(shape) if dimension == 2 else _surface(shape)
+
+
+def _polygon(shape: TriangleMesh) -> ContactShape:
+    """Return the cut of a mesh by z = 0, whose distance is that in the plane."""
+    segments = mesh_outline(shape)
+    if not len(segments):
+        raise ValueError("the mesh does not meet the plane z = 0")
+    start, way = segments[:, 0, :2], segments[:, 1, :2] - segments[:, 0, :2]
+    squares = np.square(way).sum(axis=1)
+    keep = squares > 0.0
+    start, way, squares = start[keep], way[keep], squares[keep]
+    size = 0.5 * float(np.ptp(start, axis=0).max())
+    normals = np.stack([way[:, 1], -way[:, 0]], axis=1) / np.sqrt(squares)[:, None]
+
+    def distance(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        from_start = points[:, None, :2] - start
+        share = np.clip((from_start * way).sum(axis=2) / squares, 0.0, 1.0)
+        ways = from_start - share[..., None] * way
+        lengths = np.linalg.norm(ways, axis=2)
+        each, nearest = np.arange(len(points)), lengths.argmin(axis=1)
+        a, b = from_start, from_start - way  # the outline winds around the points inside by 2 pi
+        turns = np.arctan2(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0], (a * b).sum(axis=2)).sum(axis=1)
+        length, sign = lengths[each, nearest], np.where(np.abs(turns) > np.pi, -1.0, 1.0)
+        on = length <= ON_SURFACE * size
+        direction = np.where(on[:, None], normals[nearest], sign[:, None] * ways[each, nearest] / np.where(on, 1.0, length)[:, None])
+        return sign * length, np.column_stack([direction, np.zeros(len(points))])
+
+    middles = start + 0.5 * way
+    points = np.concatenate([start, middles]) if len(start) < 8 else start
+    return ContactShape(points=np.column_stack([points, np.zeros(len(points))]), radius=0.0, distance=distance, size=size)
+
+
+def _surface(shape: TriangleMesh) -> ContactShape:
+    vertices, triangles = shape.placement.apply(shape.surface.vertices), shape.surface.triangles
+    size = 0.5 * float(np.ptp(vertices, axis=0).max())
+    step = DIFFERENCE * size
+
+    def distance(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if not len(points):
+            return np.zeros(0), np.zeros((0, 3))
+        around = points[None] + step * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])[:, None]
+        asked = wp.array(around.reshape(-1, 3).astype(np.float32), dtype=wp.vec3, device="cpu")
+        out = wp.empty(len(asked), dtype=wp.float32, device="cpu")
+        shape.signed_distance(asked, out)
+        values = out.numpy().astype(np.float64).reshape(7, -1)
+        slope = (values[1:4] - values[4:]).T
+        length = np.linalg.norm(slope, axis=1)
+        return values[0], slope / np.where(length > 0.0, length, 1.0)[:, None]
+
+    return ContactShape(points=_spread(vertices, triangles), radius=0.0, distance=distance, size=size)
+
+
+def _spread(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Return at most `MOST_POINTS` points of a surface: the corners of its hull first, then others, and middles of long edges."""
+    hull = ConvexHull(vertices).vertices
+    rest = np.setdiff1d(np.arange(len(vertices)), hull)
+    points = np.concatenate([vertices[hull], vertices[rest]])
+    edges = np.unique(np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1), axis=0)
+    if len(points) > MOST_POINTS:
+        kept = min(len(hull), MOST_POINTS // 2)
+        others = points[len(hull) :]
+        return np.concatenate([points[: len(hull)][:: -(-len(hull) // kept)], others[:: max(1, -(-len(others) // (MOST_POINTS - kept)))]])
+    pieces = max(1, min(len(ALONG) - 1, (MOST_POINTS - len(points)) // len(edges) + 1))
+    a, b = vertices[edges[:, 0]], vertices[edges[:, 1]]
+    return np.concatenate([points, *(a + n / pieces * (b - a) for n in range(1, pieces))])

@@ -1,0 +1,138 @@
+"""Mass, center of mass and inertia of a scene's shapes of uniform density, in space and in the plane."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from warp_lcp.grid.solids import Box, Capsule, Geometry, Placement, Sphere, TriangleMesh
+from warp_lcp.rigid.outline import mesh_outline
+
+ROUND = 1e-9  # relative: an inertia that is less symmetric is none
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MassProperties:
+    """What a body's motion depends on.
+
+    Args:
+        mass: [kg]; 2-D: [kg/m], per meter of depth.
+        center: of mass [m], shape (3,), z = 0 in 2-D.
+        inertia: about the center [kg m^2], shape (3, 3), symmetric positive definite; 2-D: [kg m], and only its zz counts.
+
+    Raises:
+        ValueError: a value is not finite, the mass is not positive or the inertia is not symmetric positive definite.
+    """
+
+    mass: float
+    center: np.ndarray
+    inertia: np.ndarray
+
+    def __post_init__(self) -> None:
+        """Check the values and store them as float64."""
+        center, inertia = np.array(self.center, dtype=np.float64), np.array(self.inertia, dtype=np.float64)
+        if not (math.isfinite(self.mass) and self.mass > 0.0):
+            raise ValueError(f"mass = {self.mass}: must be positive and finite")
+        if center.shape != (3,) or not np.isfinite(center).all():
+            raise ValueError(f"center must be 3 finite numbers, not {center.tolist()}")
+        if inertia.shape != (3, 3) or not np.isfinite(inertia).all():
+            raise ValueError("inertia must be a finite 3 x 3 matrix")
+        if np.abs(inertia - inertia.T).max() > ROUND * np.abs(inertia).max() or np.linalg.eigvalsh(inertia)[0] <= 0.0:
+            raise ValueError("inertia must be symmetric positive definite")
+        for name, array in (("center", center), ("inertia", inertia)):
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+
+
+def mass_properties(geometry: Geometry, dimension: int, *, mass: float | None = None, density: float | None = None) -> MassProperties:
+    """Return the mass properties of a shape filled evenly, as it is placed.
+
+    Boxes, spheres and capsules by their closed forms; meshes by the integrals of 1, x and x x' over the tetrahedra between the origin and
+    their triangles, in 2-D over the triangles between the origin and the segments of their cut by z = 0, which are exact.
+
+    Args:
+        geometry: a box, sphere, capsule or mesh, not inverted.
+        dimension: 2 or 3.
+        mass: [kg]; 2-D: [kg/m].
+        density: [kg/m^3]; one of mass and density.
+
+    Raises:
+        ValueError: both or none of mass and density, or a shape without a volume of its own.
+    """
+    if (mass is None) == (density is None):
+        raise ValueError("give either mass or density")
+    if getattr(geometry, "invert", False) or not isinstance(geometry, (Box, Sphere, Capsule, TriangleMesh)):
+        raise ValueError(f"{type(geometry).__name__.lower()}: a shape without an end has no mass")
+    if isinstance(geometry, TriangleMesh):
+        volume, center, inertia = _mesh(geometry, dimension)
+    else:
+        volume, center, inertia = _placed(geometry.placement, dimension, *_closed_form(geometry, dimension))
+    if not volume > 0.0:
+        raise ValueError("the shape has no volume in the plane z = 0" if dimension == 2 else "the shape has no volume")
+    uniform = density if density is not None else (mass or 0.0) / volume
+    return MassProperties(mass=uniform * volume, center=center, inertia=uniform * inertia)
+
+
+def _closed_form(shape: Box | Sphere | Capsule, dimension: int) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return volume, center and inertia at density 1 in the shape's own coordinates."""
+    if isinstance(shape, Box):
+        lower, upper = (np.array([*corner, 0.0][:3]) for corner in (shape.lower, shape.upper))
+        sides = (upper - lower)[:dimension]
+        volume, squares = float(sides.prod()), np.square(sides) * float(sides.prod()) / 12.0
+        inertia = np.eye(3) * squares.sum() if dimension == 2 else np.diag(squares.sum() - squares)
+        return volume, 0.5 * (lower + upper), inertia
+    if isinstance(shape, Sphere):
+        r = shape.radius
+        volume = math.pi * r**2 if dimension == 2 else 4.0 / 3.0 * math.pi * r**3
+        return volume, np.array([*shape.center, 0.0][:3]), np.eye(3) * volume * r**2 * (0.5 if dimension == 2 else 0.4)
+    start, end = (np.array([*point, 0.0][:3]) for point in (shape.start, shape.end))
+    length, r, center = float(np.linalg.norm(end - start)), shape.radius, 0.5 * (start + end)
+    h = 0.5 * length
+    if dimension == 2:  # a rectangle and two half discs, whose centers of mass are 4 r / (3 pi) from their diameters
+        middle, caps = 2.0 * r * length, math.pi * r**2
+        about = middle * (length**2 + 4.0 * r**2) / 12.0 + caps * (0.5 * r**2 + h**2 + 8.0 * h * r / (3.0 * math.pi))
+        return middle + caps, center, about * np.eye(3)
+    middle, caps = math.pi * r**2 * length, 4.0 / 3.0 * math.pi * r**3  # half balls: 3 r / 8 from the plane that cuts them
+    along = 0.5 * middle * r**2 + 0.4 * caps * r**2
+    across = middle * (length**2 / 12.0 + 0.25 * r**2) + caps * (0.4 * r**2 + h**2 + 0.75 * h * r)
+    axis = (end - start) / length
+    return middle + caps, center, across * np.eye(3) + (along - across) * np.outer(axis, axis)
+
+
+def _placed(
+    placement: Placement, dimension: int, volume: float, center: np.ndarray, inertia: np.ndarray
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return volume, center and inertia at density 1 after a placement."""
+    scale, R = placement.scale, placement.rotation
+    return volume * scale**dimension, placement.apply(center[None])[0], scale ** (dimension + 2) * R @ inertia @ R.T
+
+
+def _mesh(mesh: TriangleMesh, dimension: int) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return volume, center and inertia at density 1 of a mesh as placed, or of its cut by z = 0."""
+    vertices = mesh.placement.apply(mesh.surface.vertices)
+    if dimension == 2:
+        segments = mesh_outline(mesh)
+        if not len(segments):
+            return 0.0, np.zeros(3), np.eye(3)
+        corners = segments
+    else:
+        corners = vertices[mesh.surface.triangles]
+    origin = corners.reshape(-1, 3).mean(axis=0)  # near the shape: far from it the terms would cancel
+    corners = corners - origin
+    total = corners.sum(axis=1)
+    if dimension == 2:
+        p, q = corners[:, 0], corners[:, 1]
+        parts = 0.5 * (p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0])
+    else:
+        parts = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0
+    volume = float(parts.sum())
+    if not volume > 0.0:
+        return 0.0, origin, np.eye(3)
+    center = parts @ total / ((dimension + 1) * volume)
+    # of a simplex with a corner at the origin: its volume times (sum of v v' + (sum of v)(sum of v)') over (d + 1)(d + 2)
+    squares = np.einsum("i,ikj,ikl->jl", parts, corners, corners) + np.einsum("i,ij,il->jl", parts, total, total)
+    second = squares / ((dimension + 1) * (dimension + 2)) - volume * np.outer(center, center)
+    inertia = np.trace(second) * np.eye(3) - (second if dimension == 3 else 0.0)
+    return volume, origin + center, 0.5 * (inertia + inertia.T)

@@ -1,0 +1,80 @@
+"""What bodies may touch besides each other: the domain's walls, and solids that stand or that the scene moves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from warp_lcp.grid.motion import Motion, Pose
+from warp_lcp.grid.solids import Box, Plane
+from warp_lcp.grid.voxelize import PlacedSolid
+from warp_lcp.rigid.contact_shape import ContactShape
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Obstacle:
+    """A solid that no impulse moves.
+
+    Args:
+        name: what messages call it.
+        shape: its surface as placed; None: it consists of planes.
+        points: of the planes that bound it [m], shape (m, 3).
+        normals: of those planes, into the open, shape (m, 3).
+        motion: where it is over time; None: it stands.
+    """
+
+    name: str
+    shape: ContactShape | None = None
+    points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    normals: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    motion: Motion | None = None
+
+    def pose(self, time: float) -> Pose:
+        """Return where it is at a time [s]."""
+        return Pose.identity() if self.motion is None else self.motion.pose(time)
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """All that bodies may touch besides each other."""
+
+    obstacles: tuple[Obstacle, ...] = ()
+
+
+def domain_walls(size: Sequence[float], *, open_sides: int = 0, endless: Sequence[int] = ()) -> Obstacle:
+    """Return the walls of a box from the origin to `size` [m], shape (2,) or (3,).
+
+    Args:
+        size: of the domain.
+        open_sides: of `warp_lcp.grid.sides.side_bits`: there is no wall.
+        endless: axes without an end: no walls either.
+    """
+    points, normals = [], []
+    for axis, length in enumerate(size):
+        for end in (0, 1):
+            if axis in endless or open_sides >> (2 * axis + end) & 1:
+                continue
+            point, normal = np.zeros(3), np.zeros(3)
+            point[axis], normal[axis] = end * length, 1.0 - 2.0 * end
+            points.append(point)
+            normals.append(normal)
+    shape = (-1, 3)
+    return Obstacle(name="the domain's wall", points=np.reshape(points, shape), normals=np.reshape(normals, shape))
+
+
+def obstacle(solid: PlacedSolid, dimension: int) -> Obstacle:
+    """Return a solid of a scene as bodies meet it: half spaces and the outside of a box by their planes, others by their distance."""
+    shape = solid.geometry
+    if isinstance(shape, Plane):
+        flip = -1.0 if shape.invert else 1.0
+        point = shape.placement.apply(np.array([[*shape.point, 0.0][:3]]))
+        normal = flip * (shape.placement.rotation @ np.array([*shape.normal, 0.0][:3]))
+        return Obstacle(name=solid.name, points=point, normals=normal[None], motion=solid.motion)
+    if isinstance(shape, Box) and shape.invert:
+        corners = np.array([[*corner, 0.0][:3] for corner in (shape.lower, shape.upper)])
+        normals = np.concatenate([np.eye(3)[:dimension], -np.eye(3)[:dimension]])
+        points = shape.placement.apply(np.repeat(corners, dimension, axis=0))
+        return Obstacle(name=solid.name, points=points, normals=normals @ shape.placement.rotation.T, motion=solid.motion)
+    return Obstacle(name=solid.name, shape=ContactShape.of(shape, dimension), motion=solid.motion)

@@ -1,0 +1,137 @@
+"""Projected multigrid on a grid operator plus one of low rank: a liquid that carries rigid bodies."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from warp_lcp.multigrid.hierarchy import Hierarchy
+from warp_lcp.operators.grid_poisson import GridPoisson
+from warp_lcp.operators.low_rank import LowRankOperator
+from warp_lcp.problem import LCP
+from warp_lcp.program import Launch, Program
+from warp_lcp.solve import Precision, Step
+from warp_lcp.solvers import principal_system_low_rank_kernels as coupling
+from warp_lcp.solvers import projected_multigrid_kernels as kernels
+from warp_lcp.solvers.principal_system_low_rank import LowRankCorrection
+from warp_lcp.solvers.projected_multigrid_workspace import AssessedResidual, MultigridWorkspace
+from warp_lcp.vectors import launch_spans
+
+if TYPE_CHECKING:
+    from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
+
+
+class CoupledResidual(AssessedResidual):
+    """The natural residual of y = A x + (b + U W U' x): the term in brackets changes on U's rows only and takes b's place.
+
+    Its d_i are the diagonal of A alone, which is no larger.
+    """
+
+    def __init__(self, problem: LCP, A: GridPoisson, low: LowRankOperator, hierarchy: Hierarchy, *, rounded: bool) -> None:
+        super().__init__(problem, A, hierarchy, rounded=rounded)
+        self.diagonal, self.unit, self._diagonal_of = A.stencil.d, float(A.stencil.unit), None
+        self._low, self._b = low, wp.zeros_like(problem.b)
+        self._low_version = -1
+
+    def start(self, x: wp.array[Any], *, keep: bool) -> None:
+        """Set x to its start; take b."""
+        wp.copy(self._b, self.problem.b)
+        if self._low_version != self._low.version:
+            self._low_version, self.stale = self._low.version, True
+        super().start(x, keep=keep)
+
+    def assess(self, x: wp.array[Any], *, launch: Launch = wp.launch) -> None:
+        """Launch the evaluation."""
+        self._low.add(x, self.problem.b, self._b, launch=launch)
+        super().assess(x, launch=launch)
+
+    def advance(self, x: wp.array[Any], direction: wp.array[Any], *, launch: Launch = wp.launch) -> None:
+        """Launch the step and the evaluation where it ends; U'x is needed between them."""
+        self.update(x, direction, launch=launch)
+        self.assess(x, launch=launch)
+
+    def _assessed(self) -> list[Any]:
+        fields = super()._assessed()
+        return [self._b, *fields[1:]]
+
+
+class CoupledWorkspace(MultigridWorkspace):
+    """Memory of the method for one problem of a grid and bodies."""
+
+    residual: CoupledResidual
+
+    def __init__(self, problem: LCP, A: GridPoisson, low: LowRankOperator, settings: ProjectedMultigrid) -> None:
+        super().__init__(problem, A, settings)
+        self._low = low
+        rounded = self.precision is Precision.SINGLE
+        self.residual = CoupledResidual(problem, A, low, self.hierarchy, rounded=rounded)
+        self.correction = LowRankCorrection(low, self.hierarchy)
+        self._along = wp.zeros(low.rank, dtype=wp.float64, device=problem.device)  # U'p
+        self._fresh = True  # whether the correction is still that of the last solve
+
+    def start(self, *, warm: bool, tolerance: float) -> None:
+        """Forget the search direction; operator and bodies may have changed."""
+        super().start(warm=warm, tolerance=tolerance)
+        self._fresh = True
+
+    def monotone_step(self) -> Step:
+        """Projected cycle of the grid on all unknowns, and as much of it as lowers the energy of grid and bodies most."""
+        p, finest, last = self.problem, self.hierarchy.finest, self.residual.norm
+        self._rebuild()
+        self._leave()
+        before = [self.x, *p.bounds.operands, p.unknown, finest.lower, finest.upper, self.residual.scalars]
+        launch_spans(self._flat.gaps, self._spans, before, [], p.device)
+        self.hierarchy.monotone_cycle.run()
+        self._sum_products()
+        wp.launch(coupling.plan_bounded_step_kernel, 1, [self.residual.scalars], device=p.device)
+        self._cycles_left -= 1
+        self._classify_next()
+        self._advance()
+        self.residual.read()
+        self._count_rises(last)
+        return Step("monotone cycle", 1, None)
+
+    def _rebuild(self) -> None:
+        """Follow the free set, with the correction too."""
+        stale = self.residual.stale
+        super()._rebuild()
+        if not (stale or self._fresh) or self._cycles_left > 0:
+            return
+        begins, self._fresh = self._fresh, False
+        if self.correction.renew(begins=begins):  # its right-hand side was overwritten
+            self.residual.assess(self.x)
+            if self.floating is not None:
+                self._project()
+
+    def _cycle(self) -> None:
+        """Run a cycle on the residual."""
+        self.correction.begin()
+        super()._cycle()
+
+    def _program_key(self) -> tuple[Any, ...]:
+        return (*super()._program_key(), *self.correction.key)
+
+    def _correct(self, program: Program) -> None:
+        """Record a cycle, its correction, the measuring and the plan of the step."""
+        self.correction.begin(launch=program.launch)
+        program.extend(self.hierarchy.cycle)
+        self._measure(launch=program.launch)
+
+    def _measure(self, *, launch: Launch = wp.launch) -> None:
+        """Correct the cycle's z for the bodies, measure it and plan the step."""
+        self.correction.end(launch=launch)
+        self._sum_products(launch=launch)
+        launch(kernels.plan_step_kernel, 1, [self.residual.scalars], device=self.A.device)
+
+    def _sum_products(self, *, launch: Launch = wp.launch) -> None:
+        """Sum the products that beta and the step need, with A + U W U'."""
+        residual, finest, device, columns = self.residual, self.hierarchy.finest, self.A.device, self._low.columns
+        finest.stencil.wrap(finest.x, launch=launch)
+        fields = [finest.x, self._p, finest.b, residual.sums.partials]
+        inputs = [*finest.operands, finest.stencil.grain, residual.row_sums, *fields]
+        launch(residual.row_kernels.measure, residual.threads, inputs, device=device)
+        residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=launch)
+        launch(coupling.copy_kernel, self._low.rank, [columns.gather(self._p, launch=launch), self._along], device=device)
+        inputs = [self._low.weights.flatten(), columns.gather(finest.x, launch=launch), self._along, self._low.rank, residual.scalars]
+        launch(coupling.add_products_kernel, 1, inputs, device=device)
