@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import typing
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 import warp as wp
 
-from granular.bodies_kernels import body_kernels, force_kernel, forget_kernel, layer_kernel, lightness_kernel, respond_kernel, stiffness_kernel
+from granular.bodies_kernels import (
+    body_kernels,
+    force_kernel,
+    forget_kernel,
+    layer_kernel,
+    lightness_kernel,
+    respond_kernel,
+    stiffness_kernel,
+)
 from granular.body_faces import BodyFaces, entries_near, find_body_faces, unowned_copies
 from granular.packing import Packing, three
 from warp_lcp.grid.staggered import StaggeredGrid
@@ -49,14 +58,16 @@ class SandBodies:
         """Allocate what does not depend on where the bodies are."""
         self.grid, self.numbers, self.freedoms = grid, tuple(numbers), NUMBERS[grid.dimension]
         count, k, device = len(self.numbers), self.freedoms, grid.device
-        self.velocity, self._force, self._start, self._error = (
-            wp.zeros((count, k), dtype=wp.float64, device=device) for _ in range(4)
-        )
+        self.velocity, self._force, self._start, self._error = (wp.zeros((count, k), dtype=wp.float64, device=device) for _ in range(4))
         self._response, self._correction = (wp.zeros((count, k, k), dtype=wp.float64, device=device) for _ in range(2))
         _, rows, columns = grid.shape
         self._strides = wp.vec3i(1, columns, columns * rows)
         self._nothing = wp.zeros(1, dtype=wp.float64, device=device)  # sums that trial steps do not make
         self.faces: BodyFaces | None = None
+        self._walls: Walls
+        self._face: list[wp.array] = []
+        self._cell_row: wp.array | None = None
+        self._edge_row: wp.array | None = None
 
     def place(self, index: np.ndarray, centers: np.ndarray, walls: Walls) -> None:
         """Find where the bodies meet sand.
@@ -64,10 +75,17 @@ class SandBodies:
         Args:
             index: int, -1 in open cells, the wall's number elsewhere; shape of the grid's fields.
             centers: of mass [m], shape (bodies, 3).
-            walls: the faces between sand and solids.
+            walls: the faces between sand and solids, the same object as long as `index` is the same.
         """
         grid, device = self.grid, self.grid.device
-        self.faces = found = find_body_faces(grid, index, self.numbers, centers)
+        found = find_body_faces(grid, index, self.numbers, centers)
+        if self.faces is not None and walls is self._walls:  # the same cells: what is recorded stays valid
+            self.faces = found
+            arrays = (self._face[3], self._cell_row, self._edge_row)
+            for array, rows in zip(arrays, (found.face_row, found.cell_row, found.edge_row), strict=True):
+                array.assign(rows)
+            return
+        self.faces = found
         self._walls = walls
         self._entries, cells = entries_near(grid, found, walls.cells.numpy(), walls.sides.numpy())
 
@@ -111,9 +129,9 @@ class SandBodies:
         fields = [*_flat(packing.mass), *_flat(sand), *_flat(weights)]
         wp.launch(layer_kernel, len(rows), [*self._face[:2], *fields, layer], device=self.grid.device)
         mass, speed = layer.numpy().T
-        self._layer_mass, self._layer_momentum = np.zeros_like(inverse_mass), np.zeros_like(velocity)
-        np.add.at(self._layer_mass, owner, mass[:, None, None] * rows[:, :, None] * rows[:, None, :])
-        np.add.at(self._layer_momentum, owner, (mass * speed)[:, None] * rows)
+        count = len(self.numbers)
+        self._layer_mass = _products(mass, rows[:, None], owner, count)
+        self._layer_momentum = np.stack([np.bincount(owner, mass * speed * row, count) for row in rows.T], axis=1)
         alone = inverse_mass * self._scale
         heavier = np.linalg.inv(np.eye(self.freedoms) + alone @ self._layer_mass)
         self._host_response = heavier @ alone
@@ -155,13 +173,10 @@ class SandBodies:
             deviator, factor = (found.cell_row[:, 0] - found.cell_row[:, 1])[:, None], 1.0
         else:
             deviator, factor = found.cell_row - along[:, None] / 3.0, 2.0
-        steepest = np.zeros_like(self._host_response)
-        for weight, rows, owner in (
-            (pressure_step * pressure, along[:, None], found.cell_body),
-            (factor * shear_step * shear, deviator, found.cell_body),
-            (shear_step * edges.numpy() * found.edge_share, found.edge_row[:, None], found.edge_body),
-        ):
-            np.add.at(steepest, owner, np.einsum("n,naq,nar->nqr", weight, rows, rows))
+        count = len(self.numbers)
+        steepest = _products(pressure_step * pressure, along[:, None], found.cell_body, count)
+        steepest += _products(factor * shear_step * shear, deviator, found.cell_body, count)
+        steepest += _products(shear_step * edges.numpy() * found.edge_share, found.edge_row[:, None], found.edge_body, count)
         identity = np.eye(self.freedoms)
         self._correction.assign(np.linalg.inv(identity + self._host_response @ steepest))
 
@@ -222,7 +237,9 @@ class SandBodies:
 
     def _parts(self, found: BodyFaces) -> tuple[np.ndarray, np.ndarray]:
         """Return runs of the lists of cells and edges that a thread adds up, first and last of both, and each body's runs."""
-        grain, spans, parts = GRAIN[self.grid.device.is_cuda], [], []
+        grain = GRAIN[self.grid.device.is_cuda]
+        spans: list[list[int]] = []
+        parts: list[list[int]] = []
         for body in range(len(self.numbers)):
             first = len(spans)
             for column, owner in ((0, found.cell_body), (2, found.edge_body)):
@@ -233,6 +250,23 @@ class SandBodies:
                     spans.append(run)
             parts.append([first, len(spans)])
         return np.array(spans).reshape(-1, 4), np.array(parts).reshape(-1, 2)
+
+
+def _products(weight: np.ndarray, rows: np.ndarray, owner: np.ndarray, count: int) -> np.ndarray:
+    """Return the sums of weight row' row over the rows of each owner, shape (count, k, k).
+
+    Args:
+        weight: shape (n,).
+        rows: shape (n, several, k).
+        owner: of each, ascending, shape (n,).
+        count: of owners.
+    """
+    ends = np.searchsorted(owner, np.arange(count + 1))
+    found = np.zeros((count, rows.shape[2], rows.shape[2]))
+    for body, (low, high) in enumerate(pairwise(ends)):
+        part = rows[low:high]
+        found[body] = np.tensordot(weight[low:high, None, None] * part, part, axes=((0, 1), (0, 1)))
+    return found
 
 
 def _flat(fields: Sequence[wp.array]) -> list[wp.array | None]:

@@ -18,6 +18,8 @@ import numpy as np
 from granular.packing import SHEARS
 from warp_lcp.grid.staggered import StaggeredGrid
 
+Rows = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # places, bodies, rows of each pair, bodies of the place
+
 
 @dataclass(frozen=True)
 class BodyFaces:
@@ -72,9 +74,7 @@ def find_body_faces(grid: StaggeredGrid, index: np.ndarray, numbers: Sequence[in
     return BodyFaces(face, axis_of, body, row, *cells, *edges)
 
 
-def entries_near(
-    grid: StaggeredGrid, faces: BodyFaces, cells: np.ndarray, sides: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def entries_near(grid: StaggeredGrid, faces: BodyFaces, cells: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return which wall faces have an edge beside a body, and all cells whose stresses a body's velocity reaches.
 
     Args:
@@ -143,7 +143,8 @@ def _faces(grid: StaggeredGrid, index: np.ndarray, axis: int, numbers: np.ndarra
     at = np.argwhere((body >= 0) & (near[here] | near[before]))
     found = body[tuple(at.T)]
     at += np.array([b.start for b in box]) + np.eye(3, dtype=int)[place]
-    return np.ravel_multi_index(tuple(at.T), index.shape).astype(np.int64), found.astype(np.int64)
+    flat = np.asarray(np.ravel_multi_index(tuple(at.T), index.shape), dtype=np.int64)
+    return flat, np.asarray(found, dtype=np.int64)
 
 
 def _face_rows(grid: StaggeredGrid, flat: np.ndarray, axis: int, centers: np.ndarray) -> np.ndarray:
@@ -160,7 +161,7 @@ def _face_rows(grid: StaggeredGrid, flat: np.ndarray, axis: int, centers: np.nda
 
 def _cells(
     grid: StaggeredGrid, index: np.ndarray, face: np.ndarray, axis_of: np.ndarray, body: np.ndarray, row: np.ndarray, strides: Sequence[int]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+) -> Rows:
     """Return pairs of open cells and bodies beside them, their rows, and how many bodies a cell has."""
     inner = np.zeros(index.shape, dtype=bool)
     inner[1:-1, 1:-1, 1:-1] = index[1:-1, 1:-1, 1:-1] < 0
@@ -195,7 +196,7 @@ def _edges(
     return edge[order], np.concatenate(shears)[order], owner[order], rows[order], share[order]
 
 
-def _summed(grid: StaggeredGrid, place: np.ndarray, body: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, ...]:
+def _summed(grid: StaggeredGrid, place: np.ndarray, body: np.ndarray, rows: np.ndarray) -> Rows:
     """Return places, bodies and the sums of the rows of each pair, by body, and how many bodies a place has."""
     pairs, which = np.unique(body * grid.size + place, return_inverse=True)
     total = np.zeros((len(pairs), *rows.shape[1:]))

@@ -240,7 +240,8 @@ class SandSimulation(ParticleSimulation):
         """Put the solids that move where they are now."""
         if self.solids.moves:
             self.solids.place(self.time)
-            self.stress.face(self.solids.walls)
+            if self.solids.walls is not self.stress.walls:
+                self.stress.face(self.solids.walls)
             if self.carried is not None and self.bodies is not None:
                 centers = np.array([body.position for body in self.bodies.bodies])
                 self.carried.place(self.solids.index.numpy(), centers, self.solids.walls)

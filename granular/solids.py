@@ -5,6 +5,7 @@ from __future__ import annotations
 import typing
 from collections.abc import Sequence
 
+import numpy as np
 import warp as wp
 
 from granular.stress import Walls
@@ -78,7 +79,7 @@ class SandSolids:
         base: int8, SOLID or AIR.
         velocity: of the solids on each component's faces [m/s]; empty if they stand still.
         separating: uint8 of each wall: all ones.
-        walls: the faces between open cells and solids.
+        walls: the faces between open cells and solids; another object where cells have changed.
         notes: warnings worth a line at the start of a run.
     """
 
@@ -90,6 +91,7 @@ class SandSolids:
         self.base = grid.field(wp.int8)
         self.separating = wp.full(1 + len(placed), 1, dtype=wp.uint8, device=grid.device)
         self.velocity: Faces = grid.faces() if boundary.moves or prescribed else []
+        self._cells: np.ndarray | None = None  # `index` as `walls` know it
         self.place(0.0)
         self.notes = self._thin_notes()
 
@@ -115,7 +117,9 @@ class SandSolids:
         if self._boundary.sides is not None:
             self._boundary.sides.wrap(self.index)
         grid.everywhere.launch(base_kernel, [self.index, self.base])
-        self.walls = Walls(grid, self.index.numpy(), self._friction)
+        cells = self.index.numpy()
+        if self._cells is None or not np.array_equal(cells, self._cells):  # else what is recorded for these walls stays valid
+            self._cells, self.walls = cells.copy(), Walls(grid, cells, self._friction)
 
     def _thin_notes(self) -> tuple[str, ...]:
         """Return a warning for each solid that stands still and that no stress feels."""

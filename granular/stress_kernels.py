@@ -218,7 +218,8 @@ WALLS = (
     };
     const int end = last < active.data[0] ? last : active.data[0];
     for (int m = first; m < end; ++m) {
-        face(active.data[1 + m], start, TRIAL ? point_.data : now_.data, numbers.data + WEIGHT, omega, light, [&](int d, long long o) { return rates[d][o]; },
+        face(active.data[1 + m], start, TRIAL ? point_.data : now_.data, numbers.data + WEIGHT, omega, light,
+            [&](int d, long long o) { return rates[d][o]; },
             [&](int, long long, long long slot, T, T value, T stiff) {
                 if (TRIAL) { point_.data[slot] = (float)value; return; }
                 const T old = (T)now_.data[slot], s_ = value - old, e_ = value - start(slot);

@@ -18,6 +18,8 @@ from granular.report_kernels import report_kernels
 from granular.stress_kernels import stress_kernels
 from warp_lcp.grid import advection_kernels, distance_advection_kernels, transfer_kernels
 from warp_lcp.grid.periodic import ring_kernels
+from warp_lcp.grid.semi_lagrangian import CENTERS
+from warp_lcp.grid.semi_lagrangian_kernels import carry_kernels
 from warp_lcp.material.density_correction_kernels import displacement_kernel
 from warp_lcp.multigrid import CycleSettings
 from warp_lcp.solvers.mprgp import MPRGP
@@ -144,6 +146,8 @@ def test_all_kernels_compile_for_sm_80_and_sm_90(tmp_path):
     for endless in (0, 1, 4, 5):
         advection_kernels.advect_kernel(endless)
         distance_advection_kernels.advect_kernel(endless)
+    for axis in (0, 1, 2, CENTERS):
+        carry_kernels(axis)
     for dtype in (wp.int8, wp.uint8, wp.int32, wp.float32, wp.float64):
         ring_kernels(dtype)
     use_sparse_kernels()

@@ -62,9 +62,7 @@ def _run(request: Request, positions: np.ndarray, steps: list[float], ear: Ear) 
         model = builder.finalize(device=device)
         for name, value in {"friction": request["friction"], "tensile_yield_ratio": 0.0, "yield_stress": 0.0}.items():
             getattr(model.mpm, name).fill_(value)
-        config = SolverImplicitMPM.Config(
-            voxel_size=request["dx"], tolerance=request["tolerance"], max_iterations=request["max_iterations"]
-        )
+        config = SolverImplicitMPM.Config(voxel_size=request["dx"], **request["settings"])
         solver = SolverImplicitMPM(model, config=config, verbose=True)
         now, then = model.state(), model.state()
         seconds, iterations = [], []

@@ -26,12 +26,14 @@ class GrainBox(MaterialProperties, Box):
 class RoughBox(SolidBox):
     """A solid box with friction."""
 
+    rubs = True
     friction: float | None = Field(default=None, ge=0)
 
 
 class RoughPlane(SolidPlane):
     """A solid half space with friction."""
 
+    rubs = True
     friction: float | None = Field(default=None, ge=0)
 
 

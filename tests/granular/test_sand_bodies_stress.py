@@ -42,7 +42,9 @@ class Case:
         return AcceleratedProjection().solve(self.stress, scale=SCALE, tolerance=tolerance, max_iterations=2000)
 
 
-def make(dimension: int, counts: tuple[int, ...], blocks: list[tuple], *, ratio: float | None, depth: int, sand: tuple[int, int] | None = None) -> Case:
+def make(
+    dimension: int, counts: tuple[int, ...], blocks: list[tuple], *, ratio: float | None, depth: int, sand: tuple[int, int] | None = None
+) -> Case:
     """Return sand of a depth [cells] around blocks of a density ratio; None: they stand still.
 
     Args:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import warp as wp
-from mesh_checks import assert_closed, enclosed, pieces
 
+from mesh_checks import assert_closed, enclosed, pieces
 from warp_lcp.grid.marching_cubes import MarchingCubes
 from warp_lcp.grid.marching_cubes_table import EDGES, segment_table, triangle_table
 from warp_lcp.grid.staggered import StaggeredGrid

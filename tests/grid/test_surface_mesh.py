@@ -5,8 +5,8 @@ import itertools
 import numpy as np
 import pytest
 import warp as wp
-from mesh_checks import assert_closed, enclosed, pieces
 
+from mesh_checks import assert_closed, enclosed, pieces
 from warp_lcp.grid.level_set import LevelSet
 from warp_lcp.grid.particles import Particles, lattice
 from warp_lcp.grid.staggered import StaggeredGrid

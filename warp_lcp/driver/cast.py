@@ -10,7 +10,7 @@ from warp_lcp.driver.simulator import Surface
 
 BODY_COLORS = ["#e07a3f", "#d9b23c", "#7fa650", "#b9586b", "#8d6fb0", "#4d9a94", "#c98f63", "#6f7f95"]
 BODY_EDGE = "#4a3b33"
-LIGHTER = 0.5  # of the way to white: every other quarter of a ball
+LIGHTER = 0.5  # of the way to white: every other eighth of a ball
 BOX_POINTS = 8
 ROUND = 1e-3  # how much the distances from the middle of what is round may differ, relative
 SURFACE_LOOKS: dict[str, dict[str, Any]] = {  # of a surface that is drawn as it is
@@ -26,12 +26,13 @@ class Cast:
         plotter: pyvista's.
         flat: whether the scene is 2-D.
         line_width: of outlines [pixels].
-        at_first: the bodies in the run's first frame, which tells the quarters of balls; None: there are none.
+        behind: z of a 2-D surface [m].
+        at_first: the bodies in the run's first frame, which tells the eighths of balls; None: there are none.
     """
 
-    def __init__(self, plotter: Any, *, flat: bool, line_width: float, at_first: Surface | None = None) -> None:
+    def __init__(self, plotter: Any, *, flat: bool, line_width: float, behind: float, at_first: Surface | None) -> None:
         """Begin with nobody on the stage."""
-        self.plotter, self.flat, self.line_width, self.at_first = plotter, flat, line_width, at_first
+        self.plotter, self.flat, self.line_width, self.behind, self.at_first = plotter, flat, line_width, behind, at_first
         self._bodies = 0
 
     def place_bodies(self, bodies: Surface | None) -> None:
@@ -50,30 +51,30 @@ class Cast:
             self._bodies = number + 1
 
     def place_surface(self, surface: Surface, palette: str) -> None:
-        """Draw the surface of a material as it is."""
+        """Draw the surface of a material as it is; in 2-D fill it, behind the solids."""
         self.plotter.remove_actor("surface", render=False)
         if not len(surface.corners):
             return
         mesh = self._mesh(surface.points, surface.corners)
-        looks = (
-            {"color": SURFACE_LOOKS[palette]["color"], "line_width": self.line_width}
-            if self.flat
-            else {"smooth_shading": True, **SURFACE_LOOKS[palette]}
-        )
+        if self.flat:
+            mesh = mesh.clean().triangulate_contours().translate((0.0, 0.0, self.behind))
+            looks = {"color": SURFACE_LOOKS[palette]["color"], "lighting": False}
+        else:
+            looks = {"smooth_shading": True, **SURFACE_LOOKS[palette]}
         self.plotter.add_mesh(mesh, name="surface", reset_camera=False, render=False, **looks)
 
     def _draw_solid(self, number: int, points: np.ndarray, corners: np.ndarray, color: str) -> None:
-        """Draw a body; a ball in quarters of two shades, which show how it turns."""
-        from matplotlib.colors import to_rgb
+        """Draw a body; a ball in eighths of two shades, which show how it turns."""
+        from matplotlib.colors import to_hex, to_rgb
 
         mesh = self._mesh(points, corners)
         looks: dict[str, Any] = {"color": color, "smooth_shading": True, "split_sharp_edges": True}
         if self.at_first is not None and len(self.at_first.points) == len(points) and is_round(points, corners):
-            middles = self.at_first.points[corners].mean(axis=1)
-            sides = middles - middles.mean(axis=0) > 0.0
-            shades = np.array([to_rgb(color), LIGHTER + (1.0 - LIGHTER) * np.array(to_rgb(color))])
-            mesh["shade"] = (255.0 * shades[(sides[:, 0] ^ sides[:, 1] ^ sides[:, 2]).astype(int)]).astype(np.uint8)
-            looks = {"scalars": "shade", "rgb": True, "smooth_shading": True}
+            own = self.at_first.points[np.unique(corners)]
+            mesh["side"] = np.prod(own - 0.5 * (own.min(axis=0) + own.max(axis=0)), axis=1)  # changes its sign between eighths
+            pale = LIGHTER + (1.0 - LIGHTER) * np.array(to_rgb(color))
+            looks = {"scalars": "side", "cmap": [color, to_hex(pale)], "n_colors": 2, "smooth_shading": True, "show_scalar_bar": False}
+            looks["clim"] = np.abs(mesh["side"]).max() * np.array([-1.0, 1.0])
         self.plotter.add_mesh(
             mesh, name=f"body {number}", ambient=0.45, specular=0.25, specular_power=30.0, reset_camera=False, render=False, **looks
         )

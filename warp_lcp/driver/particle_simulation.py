@@ -213,7 +213,6 @@ class ParticleSimulation(ABC):
         if self.band is not None:
             with self.watch.stage("narrow band", *self.particles.arrays().values(), self.band.depth):
                 self.band.exchange(self.particles, window, kind, phi, contact, self.step_count, self._saved or ())
-                self._moved_within = window
 
     def bring_to_particles(self) -> None:
         """Give the particles the velocity of the faces."""
@@ -238,7 +237,7 @@ class ParticleSimulation(ABC):
             stopped, pushed, stuck = self.carry(dt)
         if self.band is not None:
             with self.watch.stage("narrow band", self.band.depth, *self.velocity):
-                self.band.carry(self._moved_within, self.velocity, dt)
+                self.band.carry(self.velocity, dt)
         exchanged = self._exchange(dt)
         after = self.checked_totals("after")
         rearranged = self._rearrange(after)
@@ -277,6 +276,8 @@ class ParticleSimulation(ABC):
         """Return the names of the log's columns.
 
         SI units; in 2-D mass and energies are per meter of depth. Energies are the particles' own; potential_energy is 0 at the origin.
+        With a narrow band mass, energies and center count the interior, particles does not; interior_density is that of the interior, in
+        units of that at rest, if the mass is to be what it was.
         solve_residual is relative to the right-hand side's, which in free fall is rounding noise that is not iterated on: it may then be
         up to 1. stopped: particles that met a wall; pushed: those that a moving solid swept along; stuck: those inside solids that found
         no way out, between solids that close, say. max_density: before the density correction of the step, of material at rest 1;
@@ -288,6 +289,7 @@ class ParticleSimulation(ABC):
         """
         columns = (*COLUMNS, *self.own_columns(), "stopped")
         columns = (*columns, "pushed", "stuck") if self.boundary.moves else columns
+        columns = (*columns, "interior_density") if self.band is not None else columns
         if self.reseeding is not None:
             columns = (*columns, "reseeded")
         columns = (*columns, *CORRECTION_COLUMNS) if self.correction is not None else columns
@@ -298,24 +300,24 @@ class ParticleSimulation(ABC):
     def points(self) -> Points:
         """Return the particles as a frame shows them, with velocity and speed [m/s]."""
         position, velocity = self.particles.position.numpy().copy(), self.particles.velocity.numpy().copy()
-        return Points("particles", position, {"velocity": velocity, "speed": np.linalg.norm(velocity, axis=1)})
+        return Points("particles", position, {"velocity": velocity, "speed": np.sqrt(np.einsum("ij,ij->i", velocity, velocity))})
 
     def surfaces(self) -> list[Surface]:
         """Return the material's surface as a frame shows it, with the velocity [m/s] of the particles around it, if the scene wants it."""
         if self.surface_mesh is None:
             return []
         position = self.particles.position
-        with self.watch.stage("surface mesh", position):
-            band = self.band
-            mesh = self.surface_mesh.find(position, Interior(band.depth, band.full, self.boundary.base) if band is not None else None)
-            if not self._faces_know:  # the next step overwrites what the faces are given here
-                faces_from_particles(self.grid, position, self.particles.velocity, self.velocity, self.weights)
-            velocity = sample(self.grid, self.velocity, mesh.points)
-            return [Surface("surface", mesh.points.numpy().copy(), mesh.corners.numpy().copy(), {"velocity": velocity.numpy().copy()})]
+        band = self.band
+        mesh = self.surface_mesh.find(position, Interior(band.depth, band.full, self.boundary.base) if band is not None else None)
+        if not self._faces_know:  # the next step overwrites what the faces are given here
+            faces_from_particles(self.grid, position, self.particles.velocity, self.velocity, self.weights)
+        velocity = sample(self.grid, self.velocity, mesh.points)
+        return [Surface("surface", mesh.points.numpy().copy(), mesh.corners.numpy().copy(), {"velocity": velocity.numpy().copy()})]
 
     def volumes(self) -> list[Volume]:
         """Return the material's level set and density as a frame shows them, if the scene wants them."""
-        return [] if self.particle_volume is None else self.particle_volume.measure(self.particles)
+        fill = self.band.fill if self.band is not None else None
+        return [] if self.particle_volume is None else self.particle_volume.measure(self.particles, fill=fill)
 
     def body_surfaces(self) -> list[Surface]:
         """Return the rigid bodies as a frame shows them, if there are any: `body`, its number, and velocity [m/s]."""
@@ -474,6 +476,7 @@ class ParticleSimulation(ABC):
             "center_of_mass_y": float(totals.center[1]),
             "max_speed": totals.max_speed,
             "cfl": totals.max_speed * dt / self.grid.spacing,
+            "interior_density": self.band.mean_density if self.band is not None else None,
         }
 
     def _admits(self, points: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from warp_lcp.driver.simulator import Volume
-from warp_lcp.grid.level_set import LevelSet
+from warp_lcp.grid.level_set import Fill, LevelSet
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.material.boundary import Boundary
@@ -27,16 +27,17 @@ class ParticleVolume:
         self._grid, self._boundary = grid, boundary
         self._level_set = LevelSet(grid, particles_a_cell=particles_a_cell)
 
-    def measure(self, particles: Particles) -> list[Volume]:
+    def measure(self, particles: Particles, *, fill: Fill | None = None) -> list[Volume]:
         """Return the volumes `level_set`, the distance to the surface [m], < 0 inside, and `density`, in units of that at rest.
 
         Args:
             particles: of the material; where it is needed, on CUDA, they are sorted, as the next step would do.
+            fill: adds to the density in a window what no particle stands for.
         """
         if particles.offsets is not None:
             particles.sort()
         grid, level_set = self._grid, self._level_set
-        level_set.update(particles, grid.everywhere, self._boundary.capacity, self._boundary.base)
+        level_set.update(particles, grid.everywhere, self._boundary.capacity, self._boundary.base, fill=fill)
         spacing, band = grid.spacing, level_set.limit * grid.spacing
         distance = grid.interior(level_set.phi.numpy()) * np.float32(spacing)
         density = grid.interior(level_set.density.numpy()).copy()

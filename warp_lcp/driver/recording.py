@@ -157,9 +157,16 @@ class Recording:
         """
         points, values = (np.zeros((0, 3)), np.zeros(0)) if self.show is Show.SURFACE else self.read(number)
         surface = self._surface("surface", number) if self.show is not Show.PARTICLES else None
-        bodies = self._surface("bodies", number) if self._file("bodies", number).is_file() else None
         filled = self._cells(number) if self.cells and self._file("grid", number).is_file() else None
-        return Frame(self.scene.time.frame_time(number), points, values, surface, bodies, filled)
+        return Frame(self.scene.time.frame_time(number), points, values, surface, self.bodies(number), filled)
+
+    def bodies(self, number: int) -> Surface | None:
+        """Return the surfaces of the rigid bodies in a frame; None if the run has none.
+
+        Raises:
+            RenderError: the file cannot be read.
+        """
+        return self._surface("bodies", number) if self._file("bodies", number).is_file() else None
 
     def read(self, number: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the particles of a frame, those with finite numbers: positions [m], shape (n, 3), and what colors them, shape (n,).

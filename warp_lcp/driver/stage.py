@@ -63,7 +63,9 @@ class Stage:
             light = pyvista.Light(position=tuple(position), focal_point=(0, 0, 0), light_type=kind, intensity=intensity)
             self.plotter.add_light(light)
         self.scenery = (FlatScenery if self.flat else RoomScenery)(self.plotter, scene, 2 * samples)
-        self.cast = Cast(self.plotter, flat=self.flat, line_width=1.5 * samples, at_first=recording.frame(recording.numbers[0]).bodies)
+        at_first = recording.bodies(recording.numbers[0])
+        behind = -2e-3 * max(scene.domain.size)  # of solids that are drawn a little behind the particles
+        self.cast = Cast(self.plotter, flat=self.flat, line_width=1.5 * samples, behind=behind, at_first=at_first)
         self.view = viewpoint(scene, size[0] / size[1])
         camera = self.plotter.camera
         camera.position, camera.focal_point, camera.up = tuple(self.view.position), tuple(self.view.focus), tuple(self.view.up)
@@ -74,7 +76,7 @@ class Stage:
         self.scenery.place(frame.time)
         self._place_particles(frame)
         self.cast.place_bodies(frame.bodies)
-        if frame.surface is not None and (self.on_screen or self.scene.palette == "sand"):
+        if frame.surface is not None and (self.on_screen or (self.scene.palette == "sand" and not self.flat)):
             self.cast.place_surface(frame.surface, self.scene.palette)
 
     def draw(self, frame: Frame) -> Image:

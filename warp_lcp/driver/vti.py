@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
@@ -31,18 +32,16 @@ def write_vti(path: Path, cells: Cells) -> None:
     """
     fields = {name: writable(name, values, len(cells.index)) for name, values in cells.fields.items()}
     low, counts = _box(cells)
-    at = [np.subtract(column, first, dtype=np.int64) for column, first in zip(cells.index.T, low, strict=True)]
-    if any(len(column) and (column.min() < 0 or column.max() >= count) for column, count in zip(at, counts, strict=True)):
+    columns = cells.index.T
+    if len(cells.index) and any(c.min() < a or c.max() >= a + n for c, a, n in zip(columns, low, counts, strict=True)):
         raise ValueError(f"the grid of {' x '.join(map(str, counts))} cells does not hold all cells of {cells.name!r}")
-    flat = (at[2] * counts[1] + at[1]) * counts[0] + at[0]
-    hidden = np.full(counts.prod(), HIDDEN, dtype=np.uint8)
-    hidden[flat] = 0
-    arrays = {name: _dense(values, flat, len(hidden)) for name, values in fields.items()}
+    x, y, z = (column - first for column, first in zip(columns, low, strict=True))
+    flat = (z * counts[1] + y) * counts[0] + x
     end = low + counts
     if cells.dimension == 2:
         end[2] = low[2]  # an image of pixels has no extent along z
     with replacing(path) as temporary, open(temporary, "wb") as file:
-        file.writelines(_vti(low, end, cells.spacing, {**arrays, GHOSTS: hidden}))
+        file.writelines(_vti(low, end, cells.spacing, fields, flat, int(counts.prod())))
 
 
 def vti_bytes(cells: Cells) -> int:
@@ -100,25 +99,36 @@ def _box(cells: Cells) -> tuple[np.ndarray, np.ndarray]:
     return low, cells.index.max(axis=0) - low + 1
 
 
-def _dense(values: np.ndarray, flat: np.ndarray, size: int) -> np.ndarray:
-    """Return a field over all cells of the image, 0 in hidden ones."""
-    dense = np.zeros((size, *values.shape[1:]), dtype=values.dtype)
-    dense[flat] = values
-    return dense
+def _vti(
+    low: np.ndarray, end: np.ndarray, spacing: float, fields: dict[str, np.ndarray], flat: np.ndarray, size: int
+) -> Iterator[bytes | memoryview]:
+    """Yield the parts of a VTI file; one field at a time is in memory as all cells of the image have it.
 
-
-def _vti(low: np.ndarray, end: np.ndarray, spacing: float, arrays: dict[str, np.ndarray]) -> Iterator[bytes | memoryview]:
-    """Yield the parts of a VTI file."""
+    Args:
+        low: first corner of the image [cells].
+        end: its last corner.
+        spacing: of the cells [m].
+        fields: of the cells that are shown.
+        flat: their numbers in the image.
+        size: cells of the image.
+    """
+    hidden = np.zeros(1, dtype=np.uint8)
     extent = " ".join(f"{a} {b}" for a, b in zip(low, end, strict=True))
     yield opening("ImageData")
     yield f'<ImageData WholeExtent="{extent}" Origin="0 0 0" Spacing="{spacing} {spacing} {spacing}">\n'.encode()
     yield f'<Piece Extent="{extent}">\n<CellData>\n'.encode()
     offset = 0
-    for name, values in arrays.items():
+    for name, values in {**fields, GHOSTS: hidden}.items():
         yield f'<DataArray {attributes(name, values)} format="appended" offset="{offset}"/>\n'.encode()
-        offset += LENGTH_BYTES + values.nbytes
+        offset += LENGTH_BYTES + size * math.prod(values.shape[1:]) * values.itemsize
     yield b"</CellData>\n</Piece>\n</ImageData>\n" + APPENDED
-    for values in arrays.values():
-        yield length(values)
-        yield raw(values)
+    for values in fields.values():
+        dense = np.zeros((size, *values.shape[1:]), dtype=values.dtype)
+        dense[flat] = values
+        yield length(dense)
+        yield raw(dense)
+    hidden = np.full(size, HIDDEN, dtype=np.uint8)
+    hidden[flat] = 0
+    yield length(hidden)
+    yield raw(hidden)
     yield b"\n</AppendedData>\n</VTKFile>\n"

@@ -48,7 +48,7 @@ COUNT = """
     elements_.data[k_row*points_.shape[1] + j_row] = elements;
 """
 
-# Edges along a side of the domain, half a cell from it, count as if they were on it: so the surface meets a wall on the wall, at a sharp edge.
+# Edges along a side of the domain, half a cell from it, count as if they were on it: the surface meets a wall on the wall, in a sharp edge.
 # What closes it there, the points between the nodes beside a side and the ring, lies on the side too, just off the sides' common edges.
 POINT = """
     float* out = (float*)out_.data;

@@ -1,4 +1,4 @@
-"""The triangles of marching cubes [Lorensen and Cline 1987], worked out from the cube instead of typed in.
+"""The triangles of marching cubes, worked out from the cube instead of typed in.
 
 Corner c of a cell lies at (c & 1, c >> 1 & 1, c >> 2 & 1), x first; bit c of a case is set if the corner is inside. Edge 4 a + b runs along
 axis a from the b-th of the four corners that are low along it. On a face each run of inside corners is cut off by a segment, so that two

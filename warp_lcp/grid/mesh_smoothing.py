@@ -1,4 +1,4 @@
-"""Smooth a closed surface without shrinking it [Taubin 1995]: a step of Laplacian smoothing, then a slightly longer one back."""
+"""Smooth a closed surface without shrinking it, as Taubin does: a step of Laplacian smoothing, then a slightly longer one back."""
 
 from __future__ import annotations
 

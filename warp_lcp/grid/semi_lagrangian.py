@@ -2,8 +2,8 @@
 
 f(x, t + dt) = f(y, t), where y is found by a step of Ralston's third-order method back along the velocity, the one that particles take
 forward, so that both go the same way. A velocity is interpolated by cubics through four nodes along each axis (Catmull and Rom's), kept
-within the range of the 2^dimension nodes around y: a wave of 16 cells loses up to 0.06 % of its amplitude a step, with linear
-interpolation 1.9 %. A distance is interpolated linearly, which is exact where it is one to a plane.
+within the range of the 2^dimension nodes around y: a wave of 16 cells that moves by 0.4 cells a step has 87 % of its height
+after 80 steps, with linear interpolation 23 %. A distance is interpolated linearly, which is exact where it is one to a plane.
 """
 
 from __future__ import annotations

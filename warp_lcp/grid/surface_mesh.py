@@ -17,9 +17,7 @@ from warp_lcp.grid.runge_kutta import MARGIN
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
 
-SHARPEST = (
-    0.5  # particle distances: the standard deviation of the narrowest kernel that has no gaps, the B-spline of particles on a lattice
-)
+SHARPEST = 0.5  # particle distances: standard deviation of the narrowest kernel that has no gaps, the quadratic B-spline
 EXTENDED = 2  # layers that the distance is continued into solids, and the velocity into air
 CROWD = 0.1  # the largest smoothed share that a lone particle is taken to have: kernels as narrow as particles cannot tell it from others
 ROUNDS = 3  # of smoothing the mesh: facets as large as lattice cells are gone, and 0.1 % of the volume
@@ -62,9 +60,10 @@ class SurfaceMesh:
 
     On a lattice, finer than the grid, the particles' density is smoothed over `smoothing` particle distances and divided by what solids and
     walls leave of the kernel: the filled share. Where it is 1/2 there is the surface: unbiased for a plane and flat at walls that the
-    plane meets at a right angle; a ball of radius R shrinks by smoothing^2 / R [particle distances]. Where particles have few others
+    plane meets at a right angle; a ball of radius R shrinks by up to smoothing^2 / R [particle distances]. Where particles have few others
     around them, in drops, filaments and sheets too thin for the kernel, a narrow kernel is added to the share with a weight that grows as
-    the smoothed share falls, so that a drop of one particle is still there. The surface is cut along walls, solids and the domain's sides.
+    the smoothed share falls, so that a drop of one particle is still there. The surface is cut along walls, solids and
+    the domain's sides, those that are open or periodic too.
 
     Args:
         grid: the grid.
@@ -154,10 +153,8 @@ class SurfaceMesh:
             domain.launch(kernels.whole_cell_room_kernel, [lattice.planes, self._parts, obstacles.base, room])
         self._mirror(room)
         lattice.everywhere.launch(kernels.open_share_kernel, [room, capacity])
-        done = self._smoothed(
-            capacity, self._fields[0], self._fields[1], self._passes + 1
-        )  # what a cell's own extent adds to the kernel, about
-        wp.copy(capacity, done)
+        passes = self._passes + 1  # a cell's own extent widens the kernel by about as much
+        wp.copy(capacity, self._smoothed(capacity, self._fields[0], self._fields[1], passes))
         self._placed = True
 
     def _smoothed(self, source: wp.array, first: wp.array, second: wp.array, passes: int) -> wp.array:

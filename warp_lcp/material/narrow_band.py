@@ -112,13 +112,19 @@ class NarrowBand:
         self._steps = np.append(PLASTIC[grid.dimension] ** -np.arange(1.0, grid.dimension + 1), 0.0)[:3]
         self._sums = wp.zeros((*grid.shape[:2], kernels.COLUMNS), dtype=wp.float64, device=grid.device)
         self.held = self.fresh = 0
+        self._window = grid.everywhere
         self.interior = self._summed(grid.everywhere)
 
     @property
+    def mean_density(self) -> float | None:
+        """H by what the interior would hold at rest; None: there is no interior."""
+        return self.held / (self.particles_a_cell * self.interior.cells) if self.interior.cells else None
+
+    @property
     def density(self) -> float:
-        """Of the interior, in units of that at rest, within `UNEVEN` of 1."""
-        room = self.particles_a_cell * self.interior.cells
-        return min(max(self.held / room, 1.0 - UNEVEN), 1.0 + UNEVEN) if room else 1.0
+        """Of fresh particles and of the interior as the density correction sees it, in units of that at rest."""
+        mean = self.mean_density
+        return min(max(mean, 1.0 - UNEVEN), 1.0 + UNEVEN) if mean is not None else 1.0
 
     def start(self, owner: np.ndarray, velocities: np.ndarray) -> np.ndarray:
         """Begin with the liquid's cells and return those without particles.
@@ -194,6 +200,7 @@ class NarrowBand:
             step: number of the step, which the random part of new places depends on.
             saved: velocity as it came from the particles [m/s], for FLIP.
         """
+        self._window = window
         grid, each, rule = self.grid, self.particles_a_cell * self.density, [self.full, self.width]
         self._measure(window, kind, phi, contact)
         depths = [self._now, self.depth]
@@ -213,14 +220,14 @@ class NarrowBand:
             self._seed(particles, window, shift, saved)
             self.held -= self.fresh
 
-    def carry(self, window: Window, velocity: list[wp.array], dt: float) -> None:
-        """Carry depth and velocity along for a time step.
+    def carry(self, velocity: list[wp.array], dt: float) -> None:
+        """Carry depth and velocity along for a time step, in the window of the last exchange.
 
         Args:
-            window: cells that material can touch.
             velocity: of each component on the faces [m/s].
             dt: time step [s].
         """
+        window = self._window
         self.depth.zero_()
         more = {"level": self._now, "least": 0.0}
         carry_field(self.grid, window, velocity, dt, self._now, self.depth, axis=CENTERS, **more)

@@ -213,7 +213,8 @@ def _spin(properties: MassProperties, rotation: np.ndarray, angular_momentum: np
 
 
 def _turn(vector: np.ndarray) -> np.ndarray:
-    return cast(np.ndarray, Rotation.from_rotvec(vector).as_matrix())
+    """Return the matrix of a turn by |vector| [rad] about it."""
+    return Rotation.from_rotvec(vector).as_matrix()
 
 
 def _three(vector: np.ndarray | None) -> np.ndarray:

@@ -49,10 +49,16 @@ class ContactShape:
         Raises:
             ValueError: it is none of these.
         """
-        builders = {Box: _box, Sphere: _sphere, Capsule: _capsule, TriangleMesh: _mesh}
-        if type(geometry) not in builders:
+        if isinstance(geometry, Box):
+            shape = _box(geometry, dimension)
+        elif isinstance(geometry, Sphere):
+            shape = _sphere(geometry)
+        elif isinstance(geometry, Capsule):
+            shape = _capsule(geometry)
+        elif isinstance(geometry, TriangleMesh):
+            shape = _polygon(geometry) if dimension == 2 else _surface(geometry)
+        else:
             raise ValueError(f"{type(geometry).__name__.lower()}: bodies touch boxes, spheres, capsules, meshes and planes")
-        shape: ContactShape = builders[type(geometry)](geometry, dimension)
         if not getattr(geometry, "invert", False):
             return shape
 
@@ -100,12 +106,12 @@ def _box(shape: Box, dimension: int) -> ContactShape:
     )  # fmt: skip
 
 
-def _sphere(shape: Sphere, dimension: int) -> ContactShape:
+def _sphere(shape: Sphere) -> ContactShape:
     center = shape.placement.apply(np.array([[*shape.center, 0.0][:3]]))
     return _around(center, center, np.zeros(1), shape.radius * shape.placement.scale)
 
 
-def _capsule(shape: Capsule, dimension: int) -> ContactShape:
+def _capsule(shape: Capsule) -> ContactShape:
     ends = shape.placement.apply(np.array([[*end, 0.0][:3] for end in (shape.start, shape.end)]))
     return _around(ends[:1], ends[1:], ALONG, shape.radius * shape.placement.scale)
 
@@ -127,10 +133,6 @@ def _around(start: np.ndarray, end: np.ndarray, along: np.ndarray, radius: float
     return ContactShape(
         points=start + along[:, None] * axis, radius=radius, distance=distance, size=radius + 0.5 * float(np.sqrt(square))
     )  # fmt: skip
-
-
-def _mesh(shape: TriangleMesh, dimension: int) -> ContactShape:
-    return _polygon(shape) if dimension == 2 else _surface(shape)
 
 
 def _polygon(shape: TriangleMesh) -> ContactShape:

@@ -27,7 +27,8 @@ RATE = 0.3  # part of a larger overlap that a step removes
 START_OVERLAP = 1e-3  # of a body's size, with which it may start: files round their numbers
 BOUNCE = 2.0  # of gravity's speed in a step: slower impacts do not bounce, so that bodies come to rest
 BEARS = 1e-6  # of the largest impulse of a body: contacts with less do not hold it
-TOLERANCE, SWEEPS = 1e-8, 1000  # of the velocities that contacts must change; rest then drifts by 1e-9 of a size in a second
+TOLERANCE, SWEEPS = 1e-7, 400  # of the velocities that contacts must change: a stack then drifts by 1e-7 of its size in a second
+APART_TOLERANCE, APART_SWEEPS = 1e-2, 30  # for overlaps, which take several steps anyway
 ALONG_SLIP = 1e-6  # of gravity's speed in a step: a slower slip has no direction
 SIDEWAYS = 1e-6  # of gravity, along a contact's plane
 
@@ -156,7 +157,7 @@ class ContactSolve:
             return still
         W = self._inverse_mass()
         b = np.where(deep, RATE * gap, np.maximum(gap, 0.0))
-        x = self._solved(J @ W @ J.T, b, (0.0, np.inf), keep=self.residual)
+        x = self._solved(J @ W @ J.T, b, (0.0, np.inf), apart=True)
         return list((W @ (J.T @ x)).reshape(n, dofs))
 
     def hold(self, touching: Touching, impulses: np.ndarray) -> None:
@@ -176,14 +177,14 @@ class ContactSolve:
             W = body.free_inverse_mass(dim)
             body.hold = np.eye(dofs) - J.T @ np.linalg.pinv(J @ W @ J.T, rcond=1e-9, hermitian=True) @ J @ W
 
-    def _solved(
-        self, B: np.ndarray, b: np.ndarray, bounds: Any, *, start: np.ndarray | None = None, keep: float | None = None
-    ) -> np.ndarray:
+    def _solved(self, B: np.ndarray, b: np.ndarray, bounds: Any, *, start: np.ndarray | None = None, apart: bool = False) -> np.ndarray:
         """Return the solution of a problem of contacts; one that is not reached is taken as it is."""
         problem = LCP(DenseOperator(0.5 * (B + B.T), device="cpu"), b, *bounds)
-        stopping = StoppingCriteria(rtol=TOLERANCE, max_iterations=SWEEPS, patience=SWEEPS)
+        rtol, most = (APART_TOLERANCE, APART_SWEEPS) if apart else (TOLERANCE, SWEEPS)
+        stopping = StoppingCriteria(rtol=rtol, max_iterations=most, patience=most)
         result = solve(problem, NNCG(precision="double"), stopping=stopping, x0=start)
-        self.residual = result.relative_residual if keep is None else keep
+        if not apart:
+            self.residual = result.relative_residual
         return np.asarray(result.x.numpy())
 
     def _assembled(self, found: list[tuple[int, int, Touch, Motion | None]], time: float, dt: float, gravity: np.ndarray) -> Touching:

@@ -83,7 +83,8 @@ def body_surface(geometry: Geometry, dimension: int) -> BodySurface:
         points, corners = _box(geometry, dimension)
     elif isinstance(geometry, (Sphere, Capsule)):
         ends = (geometry.center, geometry.center) if isinstance(geometry, Sphere) else (geometry.start, geometry.end)
-        points, corners = _round(*(np.array([*end, 0.0][:3]) for end in ends), geometry.radius, dimension)
+        start, end = (np.array([*point, 0.0][:3]) for point in ends)
+        points, corners = _round(start, end, geometry.radius, dimension)
     else:
         raise ValueError(f"{type(geometry).__name__.lower()}: no surface that ends")
     return BodySurface(geometry.placement.apply(points), corners)
