@@ -13,7 +13,8 @@ from benchmarks import launches
 from benchmarks.timing import Options
 
 SUITES = (
-    "kernels", "solvers", "scaling", "peers", "run", "sand", "implicit_mpm", "contacts", "validation", "replay", "book", "guard",
+    "kernels", "solvers", "scaling", "peers", "run", "sand", "implicit_mpm", "contacts", "validation", "narrow_band", "replay", "book",
+    "guard",
 )  # fmt: skip
 
 
@@ -35,7 +36,10 @@ def main() -> None:
         given.device, tuple(given.size), given.repeat, lambda text: sys.stderr.write(f"{text}\n"), given.problems, tuple(given.method)
     )
     given.out.mkdir(parents=True, exist_ok=True)
-    results = suite.measure(options, given.out)
+    try:
+        results = suite.measure(options, given.out)
+    except MemoryError as error:
+        sys.exit(f"out of memory: {error}")
     for line in report.write(given.suite, suite.TITLE, results, options, given.out):
         options.say(line)
     for line in results.failures:

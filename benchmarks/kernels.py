@@ -16,7 +16,7 @@ import warp as wp
 import warp_lcp as wl
 from benchmarks.kernel_peers import numba_products, plain_product
 from benchmarks.launches import Launch, Traffic, distinct, listen, stored_sizes, traffic
-from benchmarks.machine import COPIED, machine
+from benchmarks.machine import COPIED, machine, present
 from benchmarks.problems import Splash, basin
 from benchmarks.record import Bars, Record, Results, Table
 from benchmarks.timing import Figure, Options, in_turns, ratios
@@ -39,6 +39,8 @@ PEER_ROUNDS = 3
 def measure(options: Options, out: Path) -> Results:
     """Measure all kernels at the sizes asked for."""
     sizes = options.sizes or SIZES
+    if not present("numba"):
+        options.say("Numba is missing: pip install 'warp-lcp[peers]'")
     records = [machine(options.device, elements=min(COPIED, 64 * max(sizes) ** 3), repeat=options.repeat)]
     for n in sizes:
         for form in FORMS:

@@ -181,11 +181,16 @@ def _left_out(left_out: dict[int, str]) -> Table:
 
 
 def _charts(records: Sequence[Record], growth: Sequence[Record]) -> list[Chart]:
-    """Return the seconds to 1e-6 over the unknowns, with the slope that is to be met."""
+    """Return the seconds to 1e-6 over the unknowns, and those a cell."""
     curves: dict[str, tuple[list[float], list[float]]] = {}
     for g in growth:
         here = [r for r in records if r.facts["bounds"] == g.facts["bounds"] and "to_1e-06" in r.figures]
         fitted = g.value("exponent_to_1e-06")
         label = g.facts["bounds"] + ("" if fitted is None else f", exponent {fitted:.2f}")
         curves[label] = [r.value("unknowns") or 0.0 for r in here], [r.value("to_1e-06") or 0.0 for r in here]
-    return [Lines("seconds", "Cold solves to 1e-6, set-up included", "unknowns", "s", curves)]
+    per_cell: dict[str, tuple[list[float], list[float]]] = {}
+    for bounds in BOUNDS:
+        here = [r for r in records if r.facts["bounds"] == bounds and "per_cell" in r.figures]
+        per_cell[bounds] = [r.facts["n"] for r in here], [r.value("per_cell") or 0.0 for r in here]
+    title = "Cold solves to 1e-6, set-up included"
+    return [Lines("seconds", title, "unknowns", "s", curves), Lines("per-cell", title, "cells a side", "ns a cell", per_cell)]

@@ -125,7 +125,11 @@ SOLVERS = Suite(
 )
 SCALING = Suite("scaling", "linear and LCP solves from 32^3 up to what memory holds: seconds to three tolerances, bytes a cell, exponents")
 PEERS = Suite("peers", "the same problems by PyAMG, AMGCL, SciPy, PETSc, OSQP, PIQP, Clarabel, Warp's CG, as far as they are there")
-RUN = Suite("run", "steps per second of built-in scenes, and what the particles cost")
+RUN = Suite(
+    "run",
+    "steps per second of built-in scenes, and what the particles cost",
+    groups={"narrow_band": "memory and steps with particles in a narrow band, and with particles everywhere"},
+)
 SAND = Suite(
     "sand",
     "sand: the coupled methods at equal residual, the yield sets, steps of large scenes",

@@ -26,7 +26,7 @@ from warp_lcp.program import Launch
 if typing.TYPE_CHECKING:
     from granular.stress import Velocity, Walls
 
-ROUNDS = 2  # trial steps before a step: one is exact while all stresses around a body are free, two where half of them are
+ROUNDS = 2  # trial steps before a step: one is exact while all stresses around a body are free; a second took a sixth of the steps less
 GRAIN = {False: 1024, True: 64}  # cells or edges whose forces a thread adds up, on the CPU and on CUDA
 NUMBERS = {2: 3, 3: 6}  # degrees of freedom of a body
 FIRST = {2: 2, 3: 4}  # layer of the first copy of a shear

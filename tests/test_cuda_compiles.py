@@ -12,6 +12,7 @@ import warp as wp
 import fluids
 import granular
 import warp_lcp as wl
+from granular.bodies_kernels import body_kernels
 from granular.checkerboard import damping_kernel
 from granular.interleaved_kernels import interleaved_kernels
 from granular.report_kernels import report_kernels
@@ -125,6 +126,22 @@ def use_newton_kernels():
                 assert wl.solve(problem, wl.InteriorPoint(precision=precision, crossover=1e-1), stopping=wl.StoppingCriteria(rtol=1e-4))
 
 
+def use_coupled_kernels():
+    """Instantiate the kernels of grids with a term of low rank, heavy enough that the preconditioner is corrected for it."""
+    cells = np.ones((4, 4, 4), dtype=int)
+    cells[-1] = wl.AIR
+    columns = np.zeros((4, 4, 4, 2))
+    columns[1, 1:3, 1:3] = [[[1.0, 0.5], [-1.0, 0.5]], [[1.0, -0.5], [-1.0, 0.2]]]
+    for dtype in (wp.float32, wp.float64):
+        low = wl.LowRankOperator(columns, [100.0, 100.0], device="cpu", dtype=dtype)
+        for faces in ({}, {"face_x": 2.0}, {"face_x": np.full((4, 4, 5), 0.5)}):
+            A = wl.SumOperator(wl.GridPoisson(cells, device="cpu", dtype=dtype, **faces), low)
+            for precision in ("mixed", "double"):
+                for method in (wl.ProjectedMultigrid, wl.MinimumMapNewton):
+                    problem = wl.LCP(A, np.linspace(-1.0, 0.5, 64).reshape(cells.shape))
+                    assert wl.solve(problem, method(precision=precision), stopping=wl.StoppingCriteria(rtol=1e-4))
+
+
 def use_sand_kernels():
     """Instantiate the kernels of sand in 2-D and 3-D, with both yield sets."""
     for dimension in (2, 3):
@@ -134,6 +151,8 @@ def use_sand_kernels():
             interleaved_kernels(dimension, box)
             stress_kernels(dimension, wp.float32, residual=False, box=box)
             stress_kernels(dimension, wp.float64, residual=True, box=box)
+            for real in (wp.float32, wp.float64):
+                body_kernels(dimension, real, box)
 
 
 def test_all_kernels_compile_for_sm_80_and_sm_90(tmp_path):
@@ -154,6 +173,7 @@ def test_all_kernels_compile_for_sm_80_and_sm_90(tmp_path):
     use_sweeping_kernels()
     use_gradient_projection_kernels()
     use_newton_kernels()
+    use_coupled_kernels()
     use_sand_kernels()
     from warp._src.context import user_modules
 

@@ -13,6 +13,7 @@ from benchmarks.timing import Options
 from benchmarks.validation import (
     ceiling,
     dam_break,
+    floating,
     inclined,
     rest,
     sand_collapse,
@@ -35,6 +36,7 @@ CHECKS = {
     "sloshing": sloshing,
     "rest": rest,
     "volume": volume,
+    "floating": floating,
     "inclined layer": inclined,
     "sand collapse": sand_collapse,
     "sand hourglass": sand_hourglass,

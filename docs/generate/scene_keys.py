@@ -156,6 +156,21 @@ def motion_section(schema: Definition) -> str:
     return "\n".join(parts)
 
 
+BODIES = """## Rigid bodies
+
+A `[[solid]]` with `mass` or `density` is a rigid body: gravity, the material and other bodies move it. Its shape is filled evenly; 2-D
+masses are those of a meter of depth, and a mesh is its cut by z = 0. It starts where its shape is placed, apart from the domain's walls
+and other solids.
+
+Bodies touch the domain's walls, where it has some, solids that stand or have a `motion`, and each other. Coulomb's coefficient is the
+body's `friction`; of two bodies it is the geometric mean, and the greater `restitution` counts. They cannot cross the sides of periodic
+axes.
+
+The log has the place, velocity and turn of each body, numbered from 0 in the order of the solids: `body0_x`, `body0_vx`, in 2-D
+`body0_angle` and `body0_spin` (degrees, degrees/s), in 3-D `body0_wx` and so on (degrees/s). Frames have their surfaces, `bodies.pvd`.
+"""
+
+
 def array_section(schema: Definition, name: str) -> str:
     """Return the keys of an array besides those of its shape."""
     definition = shapes_of(schema, name)["box"]
@@ -174,7 +189,7 @@ def page() -> str:
     parts = [HEAD, "## Every scene\n", *(section(3, name, tables["fluids"][name]) for name in shared)]
     alike = [name for name in arrays_of(first) if name in arrays_of(second) and shapes_of(first, name) == shapes_of(second, name)]
     parts += [array_section(first, name) for name in alike]
-    parts += [shape_section(first), motion_section(first)]
+    parts += [shape_section(first), motion_section(first), BODIES]
     for simulator, material in MATERIALS.items():
         schema = schemas[simulator]
         parts.append(f'## {material.capitalize()}\n\n`scene.simulator = "{simulator}"`.\n')

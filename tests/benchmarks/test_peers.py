@@ -11,12 +11,14 @@ from typer.testing import CliRunner
 
 import warp_lcp as wl
 from benchmarks import chart
+from benchmarks.implicit_mpm import NEWTON
 from benchmarks.peers import foreign, linear, quadratic, suite
 from benchmarks.peers.foreign import Home, PeerFailed, Worker
 from benchmarks.peers.peer import Answer, Peer, Question
 from benchmarks.peers.roster import PETSC, roster
 from benchmarks.problems import splash
-from benchmarks.record import Record, write_json
+from benchmarks.record import Record, read_json, write_json
+from benchmarks.suite import Suite
 from benchmarks.timing import Figure
 from benchmarks.workers import exchange
 from warp_lcp.driver import cli
@@ -193,6 +195,30 @@ def test_suite_without_foreign_peers(tmp_path, monkeypatch):
     assert pyamg["figures"]["over_engine"]["value"] == pytest.approx(ratio)
     text = (tmp_path / "peers.md").read_text()
     assert "| linear: PETSc's CG+MG | >= 3 x | not measured here |  |" in text
+
+
+def test_sand_without_newton(tmp_path, monkeypatch):
+    monkeypatch.setenv("WARP_LCP_NEWTON_PYTHON", "/no/such/python")
+    arguments = ["bench", "sand", "--group", "implicit_mpm", "--out", str(tmp_path), "--repeat", "1", "--size", "16"]
+    result = CliRunner().invoke(cli.app, arguments)
+    assert result.exit_code == 0, result.stderr
+    records = read_json(tmp_path / "implicit_mpm.json")
+    ours, theirs = records["16 cells: warp_lcp"], records["16 cells: newton, defaults"]
+    assert theirs.facts["remark"].startswith("missing: /no/such/python, which WARP_LCP_NEWTON_PYTHON names, does not import newton")
+    assert ours.value("runout") > 0.05  # the column has spread
+    assert ours.value("height") < 0.25
+    assert "| newton's step (dense grid) over ours | >= 1 x | not measured here |  |" in (tmp_path / "implicit_mpm.md").read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(NEWTON.interpreter() is None, reason="no interpreter imports newton")
+def test_newton_computes_the_same_collapse(tmp_path):
+    Suite("sand", "", groups={"implicit_mpm": ""}).run(device="cpu", out=tmp_path, sizes=(32,), repeat=1, group="implicit_mpm")
+    records = read_json(tmp_path / "implicit_mpm.json")
+    ours = records["32 cells: warp_lcp"]
+    for name in ("32 cells: newton, defaults", "32 cells: newton, dense grid"):
+        assert records[name].value("runout") == pytest.approx(ours.value("runout"), rel=0.1)
+        assert records[name].value("height") == pytest.approx(ours.value("height"), rel=0.1)
 
 
 def test_chart_takes_the_largest_size_with_peers(tmp_path):

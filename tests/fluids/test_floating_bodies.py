@@ -181,7 +181,7 @@ def test_bodies_of_all_weights_in_one_tank():
     assert all(row["solve_status"] == "CONVERGED" for row in rows)
     assert max(row["solve_iterations"] for row in rows) <= 30
     speeds = [rows[-1][f"body{n}_vy"] for n in range(len(densities))]
-    assert min(speeds[:2]) > 0.2  # at the equator of the disc that floats half in the water, and above it, walls let go
+    assert min(speeds[:2]) > 0.2
     assert speeds[2] < 0.1
     assert speeds[3] > speeds[4] > -9.81 * 0.06 - 0.01
 
@@ -198,15 +198,21 @@ def test_a_failed_step_leaves_the_bodies_as_they_were():
     simulation.step(0.01)
 
 
+def light_raft():
+    """A body that the preconditioner is corrected for."""
+    raft = box([0.3, 0.42], [0.7, 0.55], density=20.0)
+    return create(scene(size=[1.0, 1.0], resolution=32, liquid=[box([0.0, 0.0], [1.0, 0.5])], solid=[raft]))
+
+
 def test_a_run_goes_on_bit_for_bit_from_a_state():
     rows = []
-    first, second = crowded(2), crowded(2)
+    first, second = (light_raft() for _ in range(2))
     advance(first, 0.04)
     state = first.state()
     second.restore(state)
     for simulation in (first, second):
-        simulation.projection._make_problem()  # what a preconditioner remembers of earlier steps is no part of a state
-        rows.append(advance(simulation, 0.06))
+        rows.append(advance(simulation, 0.08))
+    assert [row["solve_iterations"] for row in rows[0]] == [row["solve_iterations"] for row in rows[1]]
     np.testing.assert_array_equal(first.particles.position.numpy(), second.particles.position.numpy())
     np.testing.assert_array_equal(first.bodies.state()["bodies"], second.bodies.state()["bodies"])
 

@@ -126,6 +126,24 @@ def test_a_block_on_a_slope_of_firm_sand_slides_as_coulomb_says(friction: float)
         assert simulation.bodies.bodies[0].velocity[0] < 0.05
 
 
+def test_densities_from_a_thousandth_of_sands_to_a_thousand_times_it() -> None:
+    """A ball half sunk needs about as many iterations as a solid that stands there, however light; none is thrown about."""
+    iterations, sunk = {}, {}
+    for ratio in (None, 1e-3, 1.0, 1e3):
+        solid = ball([0.3, 0.2], 0.06, DENSITY * (ratio or 1.0))
+        if ratio is None:
+            del solid["density"]
+        simulation = start([solid], size=[0.6, 0.4], depth=0.2, resolution=48)
+        rows = [simulation.step(0.002) for _ in range(12)]
+        iterations[ratio] = sum(row["solve_iterations"] for row in rows)
+        assert max(row["max_speed"] for row in rows) < 1.0
+        if simulation.bodies is not None:
+            sunk[ratio] = 0.2 - height(simulation)
+            assert np.abs(simulation.bodies.bodies[0].velocity).max() < 12 * 0.002 * G
+    assert max(iterations[1e-3], iterations[1.0]) < 1.5 * iterations[None]
+    assert sunk[1e-3] < sunk[1.0] < 1e-3 < sunk[1e3] < 0.5 * G * 0.024**2 * 1.1
+
+
 def test_momentum_of_sand_and_body_without_gravity() -> None:
     """A block of sand that flies into a body in the open gives it what it loses."""
     target = ball([0.42, 0.2], 0.06, DENSITY)

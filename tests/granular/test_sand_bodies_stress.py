@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+import warp_lcp as wl
 from granular.bodies import SandBodies
 from granular.coupled import AcceleratedProjection
 from granular.packing import Packing
@@ -43,7 +44,14 @@ class Case:
 
 
 def make(
-    dimension: int, counts: tuple[int, ...], blocks: list[tuple], *, ratio: float | None, depth: int, sand: tuple[int, int] | None = None
+    dimension: int,
+    counts: tuple[int, ...],
+    blocks: list[tuple],
+    *,
+    ratio: float | None,
+    depth: int,
+    sand: tuple[int, int] | None = None,
+    friction: float = FRICTION,
 ) -> Case:
     """Return sand of a depth [cells] around blocks of a density ratio; None: they stand still.
 
@@ -54,6 +62,7 @@ def make(
         ratio: of the blocks' density to sand's.
         depth: rows of sand.
         sand: first and one past the last column that holds sand; None: all.
+        friction: of all walls.
     """
     grid = StaggeredGrid((*counts, 1)[:3], DX, dimension)
     index = np.zeros(grid.shape, dtype=np.int32)
@@ -74,7 +83,7 @@ def make(
     packing = Packing(grid, base, wp.full(grid.shape, 1.0, dtype=wp.float32))
     u = [wp.full(grid.shape, float(g * DT), dtype=wp.float32) for g in GRAVITY[:dimension]]
     packing.update(wp.array(density, dtype=wp.float32), u, DT, grid.faces())
-    walls = Walls(grid, index, [FRICTION] * (1 + len(blocks)))
+    walls = Walls(grid, index, [friction] * (1 + len(blocks)))
     bodies = None if ratio is None else SandBodies(grid, range(1, 1 + len(blocks)))
     if bodies is not None:
         bodies.place(index, np.array(centers), walls)
@@ -222,6 +231,75 @@ def test_bodies_far_from_sand_and_outside_change_nothing() -> None:
     case.solve()
     assert case.bodies is not None
     np.testing.assert_allclose(case.bodies.velocity.numpy()[0], [0.0, -SCALE, 0.0], atol=1e-12)
-    empty = SandBodies(case.packing.grid, [1])
-    empty.place(np.where(case.packing.base.numpy() == SOLID, 0, -1), np.zeros((1, 3)), case.stress.walls)
-    assert empty.faces is not None and len(empty.faces.face) == 0
+    index = np.where(case.packing.base.numpy() == SOLID, 0, -1)
+    case.bodies = case.stress.bodies = gone = SandBodies(case.packing.grid, [1])
+    gone.place(index, np.zeros((1, 3)), case.stress.walls)
+    assert gone.faces is not None and len(gone.faces.face) == 0
+    case.begin(np.array([[0.1, 0.2, 0.3]]), np.eye(3)[None])
+    case.stress.face(case.stress.walls)
+    case.solve()
+    assert gone.velocity.numpy()[0].tolist() == [0.1, 0.2, 0.3]
+    assert not gone.impulses().any()
+
+
+def test_without_friction_it_is_the_linear_complementarity_problem_with_the_bodies_matrix() -> None:
+    """Pressure and velocity are those of y = b + (A + R W R') x, built here face by face and solved by Lemke's method."""
+    case = make(2, (7, 6), [((2, 1, 0), (5, 3, 1))], ratio=2.5, depth=4, friction=0.0)
+    packing, bodies = case.packing, case.bodies
+    assert bodies is not None
+    flags, base = packing.flags.numpy(), packing.base.numpy()
+    cells = [tuple(c) for c in np.argwhere(flags > 0)]
+    assert (packing.drive.numpy()[flags > 0] == 0.0).all()  # full cells: volumes count
+    number = {c: n for n, c in enumerate(cells)}
+    mass, inverse, start = ([f.numpy().astype(float) for f in fields] for fields in (packing.mass, packing.inverse, packing.start))
+    n, center = len(cells), case.centers[0]
+    size = np.array([3.0, 2.0]) * DX
+    body = np.diag([case.masses[0], case.masses[0], case.masses[0] / 12.0 * (size**2).sum()]) / (DENSITY * DX**2)
+    momentum = body @ [0.0, -SCALE, 0.0]
+    div, b, rows = np.zeros((n, n)), np.zeros(n), np.zeros((n, 3))  # of the pressure's velocity, of the start's, of the body's
+    for c in cells:
+        for axis in range(2):
+            for side in range(2):
+                face = np.array(c)
+                face[2 - axis] += side
+                other = np.array(c)
+                other[2 - axis] += 2 * side - 1
+                face, other, out = tuple(face), tuple(other), 2 * side - 1
+                if base[other] == SOLID:
+                    place = face_centers(packing.grid, axis)[face] - center
+                    unit = np.array([1.0, 0.0, -place[1]]) if axis == 0 else np.array([0.0, 1.0, place[0]])
+                    if 1 <= other[2] <= 7 and 1 <= other[1] <= 6:  # not the domain's wall
+                        rows[number[c]] += out * unit
+                        body += 0.5 * mass[axis][face] * np.outer(unit, unit)
+                        momentum += 0.5 * mass[axis][face] * unit * (GRAVITY[axis] * DT)
+                    continue
+                b[number[c]] += out * start[axis][face]
+                div[number[c], number[c]] += inverse[axis][face]
+                if other in number:
+                    div[number[c], number[other]] -= inverse[axis][face]
+    inverse_body = np.linalg.inv(body)
+    matrix = div + rows @ inverse_body @ rows.T
+    b += rows @ inverse_body @ momentum
+    lcp = wl.LCP(wl.DenseOperator(matrix, device="cpu", dtype=wp.float64), b)
+    x = wl.solve(lcp, wl.Lemke(), stopping=wl.StoppingCriteria(rtol=1e-10)).x.numpy()
+    case.stress.begin(YieldSet(0.0), GRAVITY, DT)
+    assert case.solve(1e-6).residual <= 1e-6
+    np.testing.assert_allclose(case.stress.now.numpy()[0][tuple(np.array(cells).T)], x, atol=2e-4 * SCALE)
+    np.testing.assert_allclose(bodies.velocity.numpy()[0], inverse_body @ (momentum + rows.T @ x), atol=2e-4 * SCALE)
+    assert x.max() > 3.0 * SCALE
+
+
+def test_a_step_is_implicit_in_the_bodies_velocity(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With enough trial steps, the stresses of a step leave the bodies the very velocity that the step was taken with."""
+    left = []
+    for rounds in (1, 60):
+        monkeypatch.setattr("granular.bodies.ROUNDS", rounds)
+        case = make(2, (28, 20), [((11, 6, 0), (17, 12, 1))], ratio=0.02, depth=9)
+        assert case.bodies is not None
+        case.stress.residual()
+        case.stress.restart(pressure_step=1 / 1.2, shear_step=1 / 2.5, lookahead=0.15, momentum=0.85)
+        case.stress.advance(8)
+        taken = case.bodies.velocity.numpy().copy()
+        case.bodies.respond(case.packing, case.stress.now, wp.launch, implicit=False)
+        left.append(float(np.abs(case.bodies.velocity.numpy() - taken)[0, :2].max()))
+    assert left[1] < 1e-5 * SCALE < left[0]

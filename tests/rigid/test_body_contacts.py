@@ -118,7 +118,7 @@ def test_an_oblique_impact_keeps_momentum_and_angular_momentum():
     energies = run(bodies, 0.3, dt=0.005, gravity=np.zeros(3))
     now = total()
     np.testing.assert_allclose(now[0], linear, atol=1e-9)
-    np.testing.assert_allclose(now[1], angular, atol=2e-2 * np.linalg.norm(angular))  # the arms are those of the gap before the impact
+    np.testing.assert_allclose(now[1], angular, atol=1e-9)
     assert energies[-1] < energies[0]
     assert np.linalg.norm(bodies.bodies[1].velocity) > 0.1
 
@@ -303,7 +303,7 @@ def test_a_body_on_the_floor_answers_to_the_material_as_the_floor_does(dimension
     push = np.zeros(3 * dimension - 3)
     push[1] = 0.5 * weight
     body.apply_impulse(push)
-    np.testing.assert_allclose(body.velocity, 0.0, atol=1e-9)
+    np.testing.assert_allclose(body.velocity, 0.0, atol=1e-7)  # gravity gives 0.1 in the step
 
 
 def test_without_friction_it_slides_but_does_not_sink():

@@ -211,7 +211,7 @@ class Outline:
 
 def prescribed_solids(scene: Scene) -> list[Any]:
     """Return the solids whose places the scene tells; where the others, rigid bodies, are only frames know."""
-    return [solid for solid in scene.solid if getattr(solid, "mass", None) is None and getattr(solid, "density", None) is None]
+    return [solid for solid in scene.solid if not solid.is_body]
 
 
 def _clipped(mesh: Any, size: np.ndarray, *, closed: bool = True) -> Any:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 SAMPLES = 2  # per pixel and direction: images are drawn larger and averaged down, since splats have no other anti-aliasing
+SMALL = 0.25  # radius of particles that a surface is shown around, over their spacing
 BACKDROP = "#c9d5df"  # at the bottom, fading into white, below water, which white behind it would hide
 SHADING_CELLS = 4e6  # of the density that shades a liquid, to bound its memory
 
@@ -53,7 +54,8 @@ class Stage:
         self.flat = scene.dimension == 2
         self.on_screen = plotter is not None
         self.scale = recording.scale
-        self.radius = (0.6 if self.flat else 0.8) * recording.particle_spacing()
+        share = SMALL if recording.show is Show.BOTH else 0.6 if self.flat else 0.8
+        self.radius = share * recording.particle_spacing()
         samples = 1 if self.on_screen else SAMPLES
         self.plotter = plotter or pyvista.Plotter(off_screen=True, window_size=[samples * side for side in size], lighting="none")
         self.plotter.render_window.SetMultiSamples(8 if self.on_screen else 0)  # 0 is three times as fast in software; SAMPLES smooths too

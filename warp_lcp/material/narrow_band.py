@@ -201,18 +201,17 @@ class NarrowBand:
             saved: velocity as it came from the particles [m/s], for FLIP.
         """
         self._window = window
-        grid, each, rule = self.grid, self.particles_a_cell * self.density, [self.full, self.width]
+        grid, each = self.grid, self.particles_a_cell * self.density
         self._measure(window, kind, phi, contact)
         depths = [self._now, self.depth]
         if particles.count:
             marks = particles.marks
-            wp.launch(
-                kernels.leave_kernel, particles.count, [*rule, particles.key, *(d.flatten() for d in depths), marks], device=grid.device
-            )
+            flat = [depth.flatten() for depth in depths]
+            wp.launch(kernels.leave_kernel, particles.count, [self.width, particles.key, *flat, marks], device=grid.device)
             self.held += particles.remove(marks)
         self._total.zero_()
         shift = (self._steps * step) % 1.0
-        quota = [*rule, each, self._seeds, float(shift[0]), self.boundary.base, *depths, self._total.reshape(grid.shape)]
+        quota = [self.width, each, self._seeds, float(shift[0]), self.boundary.base, *depths, self._total.reshape(grid.shape)]
         window.launch(kernels.quota_kernel, quota)
         wp.utils.array_scan(self._total, self._total, inclusive=True)
         self.fresh = int(self._total[-1:].numpy()[0])

@@ -157,9 +157,9 @@ def blend_kernel(
 
 
 @wp.func
-def renewed(now: float, before: float, shallow: float, width: float):
-    """Tell whether a cell gets fresh particles: at the band's inner edge, or where it was without."""
-    return now <= width and now >= shallow and wp.max(now, before) > width - 1.0
+def renewed(now: float, before: float, width: float):
+    """Tell whether a cell gets fresh particles: at the band's inner edge, or where it was without, however near a new surface is."""
+    return now <= width and (now > width - 1.0 or (now >= 0.0 and before > width - 1.0))
 
 
 @wp.func
@@ -170,7 +170,7 @@ def fraction(x: float):
 
 @wp.kernel(enable_backward=False, module="warp_lcp.material.narrow_band")
 def quota_kernel(
-    cells: CellRange, shallow: float, width: float, particles: float, seed: int, shift: float, base: _I8, depth: _F32, before: _F32,
+    cells: CellRange, width: float, particles: float, seed: int, shift: float, base: _I8, depth: _F32, before: _F32,
     quota: _I32,
 ):  # fmt: skip
     """Find how many fresh particles each cell gets: so many on average, over the cells and, as `shift` goes on, over the steps."""
@@ -180,7 +180,7 @@ def quota_kernel(
     first = cells.i + chunk * cells.grain
     for i in range(first, wp.min(first + cells.grain, cells.end)):
         count = int(0)
-        if base[k, j, i] != _SOLID and renewed(depth[k, j, i], before[k, j, i], shallow, width):
+        if base[k, j, i] != _SOLID and renewed(depth[k, j, i], before[k, j, i], width):
             cell = (k * depth.shape[1] + j) * depth.shape[2] + i
             count = int(particles + 0.9999 * fraction(wp.randf(wp.rand_init(seed, cell)) + shift))
         quota[k, j, i] = count
@@ -188,14 +188,14 @@ def quota_kernel(
 
 @wp.kernel(enable_backward=False, module="warp_lcp.material.narrow_band")
 def leave_kernel(
-    shallow: float, width: float, key: wp.array(dtype=wp.int32), depth: wp.array(dtype=wp.float32), before: wp.array(dtype=wp.float32),
+    width: float, key: wp.array(dtype=wp.int32), depth: wp.array(dtype=wp.float32), before: wp.array(dtype=wp.float32),
     marks: wp.array(dtype=wp.int32),
 ):  # fmt: skip
     """Mark the particles of cells deeper than the band, and of those that get fresh ones."""
     p = wp.tid()
     cell = key[p]
     now = depth[cell]
-    marks[p] = wp.where(now > width or renewed(now, before[cell], shallow, width), 1, 0)
+    marks[p] = wp.where(now > width or renewed(now, before[cell], width), 1, 0)
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.material.narrow_band")

@@ -209,7 +209,7 @@ def in_space(values: np.ndarray) -> np.ndarray:
 
 def _spin(properties: MassProperties, rotation: np.ndarray, angular_momentum: np.ndarray) -> np.ndarray:
     """Return R I^-1 R' L."""
-    return cast(np.ndarray, rotation @ np.linalg.solve(properties.inertia, rotation.T @ angular_momentum))
+    return rotation @ np.linalg.solve(properties.inertia, rotation.T @ angular_momentum)
 
 
 def _turn(vector: np.ndarray) -> np.ndarray:

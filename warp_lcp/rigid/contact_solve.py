@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from warp_lcp.affine_bounds import AffineBounds
 from warp_lcp.grid.motion import Motion, Pose
@@ -16,7 +17,8 @@ from warp_lcp.rigid.body import PLANAR, BodyMotion, RigidBody
 from warp_lcp.rigid.contact_shape import ContactShape
 from warp_lcp.rigid.contacts import Touch, between, on_planes
 from warp_lcp.rigid.surroundings import Surroundings
-from warp_lcp.solve import solve
+from warp_lcp.solve import Solver, solve
+from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel
 from warp_lcp.solvers.nncg import NNCG
 from warp_lcp.stopping import StoppingCriteria
 
@@ -27,8 +29,11 @@ RATE = 0.3  # part of a larger overlap that a step removes
 START_OVERLAP = 1e-3  # of a body's size, with which it may start: files round their numbers
 BOUNCE = 2.0  # of gravity's speed in a step: slower impacts do not bounce, so that bodies come to rest
 BEARS = 1e-6  # of the largest impulse of a body: contacts with less do not hold it
-TOLERANCE, SWEEPS = 1e-7, 400  # of the velocities that contacts must change: a stack then drifts by 1e-7 of its size in a second
-APART_TOLERANCE, APART_SWEEPS = 1e-2, 30  # for overlaps, which take several steps anyway
+EXACT = StoppingCriteria(
+    rtol=1e-7, max_iterations=400, patience=400
+)  # of the velocities that contacts must change: a stack then drifts by 1e-7 of its size in a second
+ROUGH = StoppingCriteria(rtol=1e-2, max_iterations=30, patience=30)  # for overlaps, which take several steps anyway
+ONE_BLOCK = 6  # unknowns that are solved exactly, as of the two contacts of a box in the plane
 ALONG_SLIP = 1e-6  # of gravity's speed in a step: a slower slip has no direction
 SIDEWAYS = 1e-6  # of gravity, along a contact's plane
 
@@ -134,10 +139,7 @@ class ContactSolve:
         J = touching.J
         b = J @ self._velocities() + touching.wall
         b[::dim] -= touching.target
-        normal, mu = np.full(dim * k, -1), np.zeros(dim * k)
-        tangents = dim * np.arange(k)[:, None] + np.arange(1, dim)
-        normal[tangents], mu[tangents] = dim * np.arange(k)[:, None], touching.friction[:, None]
-        r = self._solved(J @ W @ J.T, b, AffineBounds.friction(normal, mu, 0.0, np.inf), start=start)
+        r, self.residual = solve_contacts(J @ W @ J.T, b, touching.friction, dim, stopping=EXACT, start=start)
         self._give(J.T @ r)
         return r
 
@@ -157,7 +159,7 @@ class ContactSolve:
             return still
         W = self._inverse_mass()
         b = np.where(deep, RATE * gap, np.maximum(gap, 0.0))
-        x = self._solved(J @ W @ J.T, b, (0.0, np.inf), apart=True)
+        x, _ = solve_contacts(J @ W @ J.T, b, np.zeros(len(b)), 1, stopping=ROUGH)
         return list((W @ (J.T @ x)).reshape(n, dofs))
 
     def hold(self, touching: Touching, impulses: np.ndarray) -> None:
@@ -176,16 +178,6 @@ class ContactSolve:
             J = touching.J[held][:, number * dofs : (number + 1) * dofs]
             W = body.free_inverse_mass(dim)
             body.hold = np.eye(dofs) - J.T @ np.linalg.pinv(J @ W @ J.T, rcond=1e-9, hermitian=True) @ J @ W
-
-    def _solved(self, B: np.ndarray, b: np.ndarray, bounds: Any, *, start: np.ndarray | None = None, apart: bool = False) -> np.ndarray:
-        """Return the solution of a problem of contacts; one that is not reached is taken as it is."""
-        problem = LCP(DenseOperator(0.5 * (B + B.T), device="cpu"), b, *bounds)
-        rtol, most = (APART_TOLERANCE, APART_SWEEPS) if apart else (TOLERANCE, SWEEPS)
-        stopping = StoppingCriteria(rtol=rtol, max_iterations=most, patience=most)
-        result = solve(problem, NNCG(precision="double"), stopping=stopping, x0=start)
-        if not apart:
-            self.residual = result.relative_residual
-        return np.asarray(result.x.numpy())
 
     def _assembled(self, found: list[tuple[int, int, Touch, Motion | None]], time: float, dt: float, gravity: np.ndarray) -> Touching:
         """Return the contacts with their Jacobian."""
@@ -272,6 +264,39 @@ class ContactSolve:
     def _give(self, impulses: np.ndarray) -> None:
         for body, impulse in zip(self.bodies, impulses.reshape(len(self.bodies), -1), strict=True):
             body.push(impulse)
+
+
+def solve_contacts(
+    B: np.ndarray, b: np.ndarray, friction: np.ndarray, dimension: int, *, stopping: StoppingCriteria, start: np.ndarray | None = None
+) -> tuple[np.ndarray, float]:
+    """Return impulses of contacts and the largest residual of a problem, relative to that of none.
+
+    Bodies that touch no other, by way of others neither, are problems of their own: small ones are solved exactly, others by nonlinear
+    conjugate gradients on projected sweeps. One that is not reached is taken as it is.
+
+    Args:
+        B: velocities at contacts from impulses, the rows of a contact consecutive: normal, then tangents; shape (n, n).
+        b: velocities without impulses, less those that are the least [m/s], shape (n,).
+        friction: Coulomb's coefficient of each contact, shape (n / dimension,).
+        dimension: rows of a contact; 1: there is no friction.
+        stopping: when a problem is done.
+        start: impulses to start from; none if None.
+    """
+    x, residual = np.zeros(len(b)), 0.0
+    B = 0.5 * (B + B.T)
+    contact = np.arange(len(b)) // dimension
+    count, island = connected_components((B != 0.0) | (contact[:, None] == contact), directed=False)
+    for number in range(count):
+        rows = np.flatnonzero(island == number)
+        tangential = np.arange(len(rows)) % dimension > 0
+        normal = np.where(tangential, np.arange(len(rows)) // dimension * dimension, -1)
+        bounds = AffineBounds.friction(normal, friction[contact[rows]], 0.0, np.inf) if dimension > 1 else (0.0, np.inf)
+        problem = LCP(DenseOperator(B[np.ix_(rows, rows)], device="cpu"), b[rows], *bounds)
+        exact = len(rows) <= ONE_BLOCK
+        method: Solver = BlockedGaussSeidel(blocks=len(rows), precision="double") if exact else NNCG(precision="double")
+        result = solve(problem, method, stopping=stopping, x0=None if start is None else start[rows])
+        x[rows], residual = result.x.numpy(), max(residual, result.relative_residual)
+    return x, residual
 
 
 def _carried(motion: Motion | None, points: np.ndarray, time: float, dt: float) -> np.ndarray:

@@ -14,11 +14,11 @@ from warp_lcp.program import Launch
 from warp_lcp.solvers import principal_system_low_rank_kernels as kernels
 from warp_lcp.vectors import Reduction
 
-STRONG = 1.0  # added over own inertia from which a column is corrected for: others move eigenvalues by a factor of two at most
-FELT = 0.3  # the same of a mode of the columns in slots
-CHANGED = 2.0  # factor by which a column's square may change before it is looked at again
+STRONG = 2.0  # added over own inertia, as estimated, from which a column is corrected for: others move eigenvalues by a small factor
+SPREAD = 0.115  # U_q' A^-1 U_q / (U_q' U_q) over rows^(1 / (dimension - 1)): of a disc and of a sphere
+FELT = 0.3  # added over own inertia of a mode of the columns corrected for, from which it counts
+CHANGED = 2.0  # factor by which a column's square may change before its potential is renewed
 SKEW = 0.3  # the most that potentials may be unsymmetric
-RENEWED = 2  # columns that a solve renews
 
 
 class LowRankCorrection:
@@ -32,10 +32,10 @@ class LowRankCorrection:
     whatever W is. Conjugate gradients without it meet an eigenvalue 1 + W_qq U_q' A^-1 U_q a column: the mass of liquid that a body
     moves with it over its own mass, 1000 for the lightest.
 
-    In this form M is symmetric and positive definite for any Z with an S like that. So Z is kept from solve to solve, where bodies move
-    by parts of a cell and the free set changes a little, and renewed a few columns at a time. Columns with a small ratio are left alone,
-    they cost nothing. Columns in slots may depend on each other, where few cells touch a body: the inverses are those on the modes of
-    W^(1/2) S W^(1/2) that are felt.
+    In this form M is symmetric and positive definite for any Z with an S like that: Z is made when a solve begins, a cycle a column, and
+    again only where the free set has changed much. Columns with a small ratio are left alone, they cost nothing. Those corrected for may
+    depend on each other, where few cells touch a body: the inverses are those on the modes of W^(1/2) S W^(1/2) that are felt. Nothing is
+    kept from one solve to the next, so that results do not depend on what was solved before.
 
     Args:
         low: U W U'.
@@ -49,16 +49,15 @@ class LowRankCorrection:
         self._low, self._hierarchy, self._columns = low, hierarchy, low.columns
         n, device = low.rank, hierarchy.device
         self._G, self._S, self._E = (wp.zeros(n * n, dtype=wp.float64, device=device) for _ in range(3))
-        self._sums, self._squares, self._kept, self._force, self._t = (wp.zeros(n, dtype=wp.float64, device=device) for _ in range(5))
+        self._sums, self._kept, self._force, self._t = (wp.zeros(n, dtype=wp.float64, device=device) for _ in range(4))
+        self._squares = wp.zeros(n + n // low.columns.width, dtype=wp.float64, device=device)
         self._of_slot = wp.zeros(n, dtype=wp.int32, device=device)
         self._size = hierarchy.finest.x.size
         self._Z = wp.zeros(0, dtype=hierarchy.real, device=device)
         self._threads = math.prod(hierarchy.finest.stencil.threads)
         self._dots: Reduction | None = None
         self._slot_columns = list[int]()
-        self._added = np.zeros(n)  # U_q' B U_q
-        self._seen = np.zeros(n)  # U_q' U_q when that was computed
-        self._age = np.zeros(n, dtype=np.int64)  # solves since then
+        self._seen = np.zeros(n)  # U_q' U_q when a potential was made
 
     @property
     def slots(self) -> int:
@@ -71,40 +70,33 @@ class LowRankCorrection:
         return self.slots, self._Z.ptr or 0, self._columns.rows.ptr
 
     def renew(self, *, begins: bool) -> bool:
-        """Take the free set as it is now: choose the columns to correct for, and renew potentials, a cycle each.
+        """Take the free set as it is now: choose the columns to correct for, and make potentials, a cycle each.
 
         Args:
-            begins: whether a solve begins, which renews the oldest potentials.
+            begins: whether a solve begins.
 
         Returns:
             Whether the finest right-hand side was lost.
         """
-        low, finest = self._low, self._hierarchy.finest
+        low, finest, W = self._low, self._hierarchy.finest, self._low.weights.numpy()
         inputs = [*self._entries, low.rank, finest.stencil.d, self._squares]
         wp.launch(self._kernels.squares, 1, inputs, device=low.device)
-        squares, W = self._squares.numpy().copy(), low.weights.numpy()
-        changed = (squares > CHANGED * self._seen) | (squares < self._seen / CHANGED)
-        self._age[changed] = np.iinfo(np.int32).max
+        found, width = self._squares.numpy().copy(), self._columns.width
+        squares, rows = found[: low.rank], np.repeat(found[low.rank :], width)
+        power = 1.0 / max(sum(n > 1 for n in self._hierarchy.finest.stencil.padding.counts) - 1, 1)
+        strong = [int(q) for q in np.flatnonzero(np.diag(W) * SPREAD * rows**power * squares >= STRONG)]
         if begins:
-            self._age[self._slot_columns] += 1
-        lost = False
-        for q in np.flatnonzero(changed):
-            if int(q) not in self._slot_columns:
-                self._potential(int(q), squares)
-                lost = True
-        strong = [int(q) for q in np.flatnonzero(np.diag(W) * self._added >= STRONG)]
+            self._seen[:] = 0.0
         if strong != self._slot_columns:
             self._choose(strong)
-        stale = [q for q in strong if self._age[q] > 0]
-        if begins:
-            oldest = sorted(stale, key=lambda q: -self._age[q])
-            stale = [q for n, q in enumerate(oldest) if n < RENEWED or changed[q]]
-        else:
-            stale = [q for q in stale if self._age[q] > len(W) or changed[q]]
-        lost = self._fill(stale, squares) or lost
-        if strong and not self._invert(W):
-            lost = self._fill([q for q in strong if self._age[q] > 0], squares) or lost
+        seen = self._seen
+        stale = [q for q in strong if not seen[q] / CHANGED <= squares[q] <= seen[q] * CHANGED]
+        self._fill(stale, squares)
+        lost = bool(stale)
+        if strong and not self._invert(W) and len(stale) < len(strong):
+            self._fill([q for q in strong if q not in stale], squares)
             self._invert(W)
+            lost = True
         return lost
 
     def begin(self, *, launch: Launch = wp.launch) -> None:
@@ -142,41 +134,33 @@ class LowRankCorrection:
         return [u.rows, u.blocks, u.values, u.count, u.width]
 
     def _choose(self, strong: list[int]) -> None:
-        """Give these columns slots; those that have one keep their potentials, the others' must be filled."""
-        old, low = {q: slot for slot, q in enumerate(self._slot_columns)}, self._low
-        before, n = wp.clone(self._Z), self._size
-        if len(strong) * n > before.size:
+        """Give these columns slots; those that have one keep their potentials, the others' must be made."""
+        old, low, n = {q: slot for slot, q in enumerate(self._slot_columns)}, self._low, self._size
+        kept = [q for q in strong if q in old and self._seen[q] > 0.0]
+        before = wp.clone(self._Z) if kept else self._Z
+        if len(strong) * n > self._Z.size:
             self._Z = wp.zeros(len(strong) * n, dtype=before.dtype, device=before.device)
-        self._slot_columns = strong
         order = np.zeros(low.rank, dtype=np.int32)
         order[: len(strong)] = strong
         self._of_slot.assign(order)
+        self._slot_columns = strong
         self._dots = Reduction(n, low.device, self._sums, columns=len(strong), threads=self._threads) if strong else None
-        for slot, q in enumerate(strong):
-            if q in old:
-                wp.copy(self._Z, before, dest_offset=slot * n, src_offset=old[q] * n, count=n)
-            else:
-                self._age[q] = np.iinfo(np.int32).max
+        for q in kept:
+            wp.copy(self._Z, before, dest_offset=strong.index(q) * n, src_offset=old[q] * n, count=n)
+        self._seen[[q for q in range(low.rank) if q not in kept]] = 0.0
 
-    def _fill(self, columns: list[int], squares: np.ndarray) -> bool:
-        """Compute potentials of columns in slots; return whether there were any."""
+    def _fill(self, columns: list[int], squares: np.ndarray) -> None:
+        """Make the potentials B U_q of columns."""
+        finest, n = self._hierarchy.finest, self._size
         for q in columns:
-            self._potential(q, squares)
-            slot = self._slot_columns.index(q)
-            wp.copy(self._Z, self._hierarchy.finest.x, dest_offset=slot * self._size, count=self._size)
-        return bool(columns)
-
-    def _potential(self, column: int, squares: np.ndarray) -> None:
-        """Compute B U_q in the finest x, and what of it decides whether the column is strong."""
-        finest = self._hierarchy.finest
-        finest.b.zero_()
-        unit = np.zeros(self._low.rank)
-        unit[column] = 1.0
-        self._force.assign(unit)
-        self._spread(1.0, wp.launch)
-        self._hierarchy.cycle.run()
-        self._added[column] = self._columns.gather(finest.x).numpy()[column]
-        self._seen[column], self._age[column] = squares[column], 0
+            finest.b.zero_()
+            unit = np.zeros(self._low.rank)
+            unit[q] = 1.0
+            self._force.assign(unit)
+            self._spread(1.0, wp.launch)
+            self._hierarchy.cycle.run()
+            wp.copy(self._Z, finest.x, dest_offset=self._slot_columns.index(q) * n, count=n)
+            self._seen[q] = squares[q]
 
     def _invert(self, W: np.ndarray) -> bool:
         """Write the inverses of S and E on the modes that are felt; return whether S is as symmetric as it should be."""

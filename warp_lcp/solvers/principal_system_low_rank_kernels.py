@@ -75,7 +75,8 @@ def plan_bounded_step_kernel(scalars: F64):
 def kernels(value_type: Any, d_type: Any, real: Any) -> SimpleNamespace:
     """Return the kernels for columns, a diagonal and corrections of these types.
 
-    `spread` adds U f to a right-hand side on the unknowns, d != 0. `reduce` makes U'Z on them, `squares` the diagonal of U'U, `dots` Z'r.
+    `spread` adds U f to a right-hand side on the unknowns, d != 0. `reduce` makes U'Z on them, `squares` the diagonal of U'U and then the
+    rows of each block, `dots` Z'r.
     `subtract` takes the sum of t_s Z_s off z there. Z's fields are in m slots.
     """
     name = f"warp_lcp.low_rank_correction.{value_type.__name__}_{d_type.__name__}_{real.__name__}"
@@ -110,9 +111,10 @@ def kernels(value_type: Any, d_type: Any, real: Any) -> SimpleNamespace:
     ): ...  # fmt: skip
 
     @wp.func_native(
-        """for (int q = 0; q < rank; ++q) out.data[q] = 0;
+        """for (int q = 0; q < rank + rank/width; ++q) out.data[q] = 0;
         for (int e = 0; e < count; ++e) {
             if (d_.data[rows.data[e]] == 0) continue;
+            out.data[rank + blocks.data[e]] += 1;
             for (int q = 0; q < width; ++q) {
                 const double u = (double)u_.data[(long long)e*width + q];
                 out.data[blocks.data[e]*width + q] += u*u; } }
@@ -147,15 +149,11 @@ def kernels(value_type: Any, d_type: Any, real: Any) -> SimpleNamespace:
     def subtract_row(d_: d_array, Z_: field, t_: F64, z_: field, m: int, size: wp.int64, p: wp.int64, n: int): ...
 
     @wp.kernel(enable_backward=False, module=name)
-    def spread(
-        rows: I32, blocks: I32, u: values, count: I32, width: int, d: d_array, f: F64, sign: wp.float64, b: field, threads: int
-    ):
+    def spread(rows: I32, blocks: I32, u: values, count: I32, width: int, d: d_array, f: F64, sign: wp.float64, b: field, threads: int):
         spread_entries(rows, blocks, u, count[0], width, d, f, sign, b, wp.tid(), threads)
 
     @wp.kernel(enable_backward=False, module=name)
-    def reduce(
-        rows: I32, blocks: I32, u: values, count: I32, width: int, rank: int, d: d_array, Z: field, size: wp.int64, m: int, G: F64
-    ):
+    def reduce(rows: I32, blocks: I32, u: values, count: I32, width: int, rank: int, d: d_array, Z: field, size: wp.int64, m: int, G: F64):
         reduce_slot(rows, blocks, u, count[0], width, rank, d, Z, size, wp.tid(), m, G)
 
     @wp.kernel(enable_backward=False, module=name)

@@ -1,0 +1,132 @@
+"""Families of right-hand sides and bounds: scales, degenerate solutions, all or none at a bound, tolerances below rounding."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from benchmarks.extremes.case import BELOW_ROUNDING, EITHER, PRECISIONS, Case, Expected, Promise
+from benchmarks.extremes.problem import GridProblem
+from benchmarks.extremes.shapes import AIR, FLUID, SEED, both, noise, pool, same
+
+SHAPE = (40, 44)
+EXACT_OR_FLOOR = Promise(Expected.EITHER, frozenset({"FLOOR"}))
+
+
+def scales() -> Iterator[Case]:
+    """Yield right-hand sides from 0 to 1e30, and spikes."""
+    family = "scales of b"
+    yield from both(family, "b = 0", lambda: pool(SHAPE, b=np.zeros(SHAPE)))
+    yield from both(family, "b = -0.0", lambda: pool(SHAPE, b=np.full(SHAPE, -0.0)))
+    for scale in (1e-30, 1e-15, 1e15, 1e30):
+        yield from both(family, f"b of {scale:g}", lambda s=scale: pool(SHAPE, b=s * noise(SHAPE)))
+        yield from both(family, f"b and bounds of {scale:g}", lambda s=scale: boxed(s))
+    yield from both(family, "one cell of b at 1e12", lambda: spike(1e12))
+    yield from both(family, "b over 30 decades", lambda: pool(SHAPE, b=noise(SHAPE) * 10 ** np.random.default_rng(SEED + 11).uniform(-15, 15, SHAPE)))
+    yield from both(family, "bounds at 1e30", lambda: pool(SHAPE, lower=-1e30, upper=1e30))
+    yield from both(family, "b of 1e-30 beside a bound of 1e10", tiny_beside_huge)
+
+
+def boxed(scale: float) -> GridProblem:
+    """Return a pool with a box of the scale of b."""
+    return pool(SHAPE, b=scale * noise(SHAPE), lower=-0.1 * scale, upper=0.2 * scale)
+
+
+def spike(height: float) -> GridProblem:
+    """Return a pool with one huge entry in b."""
+    b = noise(SHAPE)
+    b[17, 19] = -height
+    return pool(SHAPE, b=b)
+
+
+def tiny_beside_huge() -> GridProblem:
+    """Return a bound far beyond what b can do, so that one cell pushes all others."""
+    lower = np.full(SHAPE, -np.inf)
+    lower[20, 20] = 1e10
+    return pool(SHAPE, b=1e-30 * noise(SHAPE), lower=lower)
+
+
+def degenerate() -> Iterator[Case]:
+    """Yield solutions with x_i = l_i and y_i = 0 on many cells, and sets that hold all or nothing."""
+    family = "active sets"
+    for share in (0.1, 0.5, 0.9):
+        yield from both(family, f"x = y = 0 on {share:.0%} of the cells", lambda s=share: planted(s))
+    yield from both(family, "x = y = 0 on all cells but one", lambda: planted(1.0))
+    yield from both(family, "all active", lambda: pool(SHAPE, b=np.abs(noise(SHAPE)) + 0.01, lower=0.0))
+    yield from both(family, "all active but one", all_but_one)
+    yield from both(family, "none active", lambda: pool(SHAPE, b=-np.abs(noise(SHAPE)) - 0.01, lower=0.0))
+    yield from both(family, "l = u everywhere", lambda: pool(SHAPE, lower=0.5, upper=0.5))
+    yield from both(family, "l = u on half of the cells", half_fixed)
+    yield from both(family, "box of 1e-12", lambda: pool(SHAPE, lower=-1e-12, upper=1e-12))
+    yield from both(family, "b = 0 on half of the cells", lambda: pool(SHAPE, b=np.where(noise(SHAPE) > 0, 0.0, noise(SHAPE, SEED + 12))))
+    yield from both(family, "equal b everywhere", lambda: pool(SHAPE, b=np.full(SHAPE, -1.0), lower=0.0, upper=50.0))
+    yield from both(family, "lower bounds of noise, l > 0", lambda: pool(SHAPE, lower=np.abs(noise(SHAPE, SEED + 13))))
+    yield from both(family, "upper bounds only", lambda: pool(SHAPE, lower=-np.inf, upper=0.0))
+    yield from both(family, "checkerboard of bounds", lambda: pool(SHAPE, lower=np.where(np.indices(SHAPE).sum(axis=0) % 2 == 0, 0.0, -np.inf)))
+    yield from both(family, "resting under a ceiling", ceiling)
+    for far in (1e6, 1e20, -1e20):
+        yield from both(family, f"start at {far:g}", lambda: pool(SHAPE), x0=np.full(SHAPE, far))
+
+
+def planted(share: float) -> GridProblem:
+    """Return b whose solution has x = y = 0 on a share of the cells."""
+    chance = np.random.default_rng(SEED + 14)
+    cells = pool(SHAPE).cells
+    inside = cells == FLUID
+    x = np.where(inside & (chance.random(SHAPE) >= share), chance.uniform(0.1, 1.0, SHAPE), 0.0)
+    x[5, 5] = 1.0
+    y = np.where(inside & (x == 0) & (chance.random(SHAPE) > 0.9) & (share < 1), chance.uniform(0.1, 1.0, SHAPE), 0.0)
+    made = GridProblem(cells=cells, b=np.zeros(SHAPE))
+    b = np.zeros(SHAPE)
+    b[inside] = y[inside] - made.exact().matrix @ x[inside]
+    return GridProblem(cells=cells, b=b)
+
+
+def all_but_one() -> GridProblem:
+    """Return b that pushes one cell away from its bound."""
+    b = np.ones(SHAPE)
+    b[11, 12] = -2.0
+    return pool(SHAPE, b=b, lower=0.0)
+
+
+def half_fixed() -> GridProblem:
+    """Return bounds that leave every second cell no room."""
+    odd = np.indices(SHAPE).sum(axis=0) % 2 == 1
+    return pool(SHAPE, lower=np.where(odd, 0.3, -np.inf), upper=np.where(odd, 0.3, np.inf))
+
+
+def ceiling() -> GridProblem:
+    """Return liquid at rest up to a ceiling that separates: y = 0 there, x = 0 to rounding."""
+    cells = np.full(SHAPE, FLUID)
+    cells[-1, -6:] = AIR
+    b = np.zeros(SHAPE)
+    b[0], b[-2] = -0.1, 0.1
+    b[-2, -6:] = 0.1
+    return GridProblem(cells=cells, b=b, lower=np.where(np.indices(SHAPE)[0] >= 38, 0.0, -np.inf))
+
+
+def tolerances() -> Iterator[Case]:
+    """Yield tolerances that no arithmetic reaches: FLOOR, not CONVERGED and not an endless loop."""
+    family = "tolerances"
+    for rtol in (1e-15, 1e-17, 0.0):
+        for name, shape in (("2-D", (64, 66)), ("3-D", (17, 18, 19))):
+            promises: dict[str, Promise] = same(BELOW_ROUNDING if rtol < 1e-16 else EXACT_OR_FLOOR)  # type: ignore[assignment]
+            yield from both(
+                family, f"rtol = {rtol:g}, {name}", lambda s=shape: pool(s), promises=promises, stopping={"rtol": rtol, "max_iterations": 500}
+            )
+    yield from both(family, "rtol = 1e-12, single stops", lambda: pool((64, 66)), promises={"single": BELOW_ROUNDING}, stopping={"rtol": 1e-12})
+    yield from both(family, "atol = 1e30", lambda: pool(SHAPE), stopping={"atol": 1e30})
+    stopped = Promise(Expected.STOPPED, frozenset({"MAX_ITERATIONS"}))
+    for limit in (0, 1):
+        yield from both(family, f"{limit} iterations", lambda: pool(SHAPE), promises=same(stopped), stopping={"max_iterations": limit})
+    yield from both(family, "1024x1024 to 1e-12", lambda: pool((1024, 1024)), promises=dict.fromkeys(PRECISIONS, EITHER), stopping={"rtol": 1e-12}, budget=120.0)
+
+
+def check_case_names(cases: list[Any]) -> None:
+    """Refuse two cases of one name."""
+    names = [f"{case.family}: {case.name}" for case in cases]
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        raise ValueError(f"cases that share a name: {sorted(twice)}")

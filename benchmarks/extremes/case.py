@@ -1,0 +1,299 @@
+"""A hostile case, what it must come to, what it came to, and whether that is as it must be."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from enum import Enum
+from types import FrameType
+from typing import Any, Protocol
+
+import numpy as np
+import warp as wp
+
+import warp_lcp as wl
+from benchmarks.extremes.problem import Problem
+
+PRECISIONS = ("single", "mixed", "double")
+RTOL = {"single": 1e-3, "mixed": 1e-8, "double": 1e-8}
+BUDGET = 10.0  # seconds of a case, on a machine that others use too; usual ones take milliseconds
+LAST_CALL = 6.0  # multiples of the budget after which a case is interrupted
+MAX_ITERATIONS = 200
+AGREES = 1e-3  # of a residual: how far what a result says may be from what is found, besides rounding
+REFUSED = "refused"
+HONEST = frozenset({"FLOOR", "STAGNATED", "MAX_ITERATIONS"})  # the precision does not go further, or not in this time
+
+
+class Expected(Enum):
+    """What a case must come to."""
+
+    SOLVED = "solved to tolerance"
+    REFUSED = "refused before the start"
+    STOPPED = "stopped with an honest status"
+    EITHER = "solved, or stopped with an honest status"  # where the precision decides
+    DONE = "steps taken, or ended with a message"
+    CAUGHT = "caught by the checks"  # of a solver that is wrong on purpose
+
+
+@dataclass(frozen=True)
+class Promise:
+    """What a case must come to.
+
+    Args:
+        expected: kind.
+        statuses: the statuses it may stop with.
+        names: what the message of a refusal must contain.
+    """
+
+    expected: Expected
+    statuses: frozenset[str] = frozenset()
+    names: str = ""
+
+    def __str__(self) -> str:
+        """Return it in words."""
+        detail = "/".join(sorted(self.statuses)) or self.names
+        return f"{self.expected.value} ({detail})" if detail else self.expected.value
+
+
+SOLVED = Promise(Expected.SOLVED)
+EITHER = Promise(Expected.EITHER, HONEST)
+INFEASIBLE = Promise(Expected.STOPPED, frozenset({"INFEASIBLE"}))
+BELOW_ROUNDING = Promise(Expected.STOPPED, frozenset({"FLOOR"}))
+
+
+def refusal(names: str) -> Promise:
+    """Return the promise of a ValueError whose message contains `names`."""
+    return Promise(Expected.REFUSED, names=names)
+
+
+@dataclass
+class Attempt:
+    """What a case came to.
+
+    Args:
+        status: of the result, or `refused`, or what a simulation says.
+        residual: independent and relative; None where there is none.
+        seconds: wall time [s].
+        message: of a refusal or a failed step.
+        faults: what is wrong whatever was expected.
+        met: whether the independent residual meets the tolerance.
+    """
+
+    status: str
+    residual: float | None = None
+    seconds: float = 0.0
+    message: str = ""
+    faults: list[str] = field(default_factory=list)
+    met: bool = False
+
+
+class Case(Protocol):
+    """What can be attempted."""
+
+    family: str
+    name: str
+    budget: float
+
+    def promise(self, precision: str) -> Promise:
+        """Return what it must come to."""
+
+    def attempt(self, precision: str, device: str) -> Attempt:
+        """Try."""
+
+
+class OverBudgetError(Exception):
+    """A case takes longer than it may."""
+
+
+@contextmanager
+def interrupted_after(seconds: float) -> Iterator[None]:
+    """Interrupt what takes longer, at the next instruction of Python."""
+
+    def ring(number: int, frame: FrameType | None) -> None:
+        raise OverBudgetError
+
+    before = signal.signal(signal.SIGALRM, ring)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+@dataclass(frozen=True)
+class SolveCase:
+    """A problem given to a method.
+
+    Args:
+        family: the cases that share an expectation.
+        name: unique in its family.
+        problem: makes the problem.
+        method: of `wl.METHODS`.
+        promises: by precision; SOLVED where there is none.
+        options: of the method.
+        stopping: criteria besides rtol and max_iterations, or instead of them.
+        x0: a guess.
+        budget: seconds that a precision may take.
+        solve: stands in for `wl.solve`, where something wrong is to be caught.
+    """
+
+    family: str
+    name: str
+    problem: Callable[[], Problem]
+    method: str = "projected-multigrid"
+    promises: Mapping[str, Promise] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict)
+    stopping: Mapping[str, Any] = field(default_factory=dict)
+    x0: np.ndarray | None = None
+    budget: float = BUDGET
+    solve: Callable[..., wl.SolveResult] = wl.solve
+
+    def promise(self, precision: str) -> Promise:
+        """Return what it must come to."""
+        return self.promises.get(precision, SOLVED)
+
+    def attempt(self, precision: str, device: str) -> Attempt:
+        """Solve, and compare what the result says with the independent residual."""
+        storage = wp.float32 if precision == "single" else wp.float64
+        criteria = {"rtol": RTOL[precision], "max_iterations": MAX_ITERATIONS} | self.stopping
+        problem = self.problem()
+        begun = time.perf_counter()
+        try:
+            solver = wl.METHODS[self.method](precision=precision, **self.options)
+            lcp = problem.lcp(device, storage)
+            result = self.solve(lcp, solver, stopping=wl.StoppingCriteria(**criteria), x0=self.x0)
+        except ValueError as refused:
+            return Attempt(REFUSED, seconds=time.perf_counter() - begun, message=str(refused))
+        wp.synchronize_device(device)
+        seconds = time.perf_counter() - begun
+        return checked(problem, result, criteria, seconds, precision)
+
+
+def checked(problem: Problem, result: wl.SolveResult, criteria: Mapping[str, Any], seconds: float, precision: str) -> Attempt:
+    """Return the attempt that a result is, with all that NumPy finds wrong about it."""
+    exact, x = problem.exact(), problem.unknowns(result.x.numpy())
+    if not np.isfinite(x).all():
+        return Attempt(result.status.name, None, seconds, faults=["x is not finite"])
+    own, reference = exact.residual(x), exact.residual(exact.start)
+    rounding = 32 * np.finfo(np.float64).eps * exact.sizes(x)
+    if problem.rounded(wp.float32 if precision == "single" else wp.float64):
+        rounding += 4 * float(np.finfo(np.float32).eps) * exact.sizes(x)
+    wanted = max(criteria["rtol"] * reference, criteria.get("atol", 0.0))
+    met = own <= wanted * (1 + 1e-6) + rounding
+    faults = []
+    if result and not met:
+        faults.append(f"CONVERGED at a residual of {own:.1e}, asked for {wanted:.1e}")
+    if not abs(result.residual - own) <= AGREES * own + rounding and np.isfinite(own):
+        faults.append(f"says the residual is {result.residual:.3e}, it is {own:.3e}")
+    slack = float(np.finfo(np.float32).eps) * np.abs(x) if precision == "single" else 0.0  # bounds are rounded as x is
+    beyond = np.maximum(exact.lower - x, x - exact.upper) - slack
+    if result and (beyond > 0).any():
+        faults.append(f"x is {beyond.max():.1e} outside its bounds")
+    if not result and own < 0.99 * wanted - rounding:
+        faults.append(f"{result.status.name} at a solution")
+    return Attempt(result.status.name, own / reference if reference > 0 else own, seconds, faults=faults, met=met)
+
+
+@dataclass(frozen=True)
+class RefusalCase:
+    """A call that must raise ValueError before anything is solved.
+
+    Args:
+        family: the cases that share an expectation.
+        name: unique in its family.
+        call: takes device and precision.
+        names: what the message must contain: the argument.
+        budget: seconds it may take.
+    """
+
+    family: str
+    name: str
+    call: Callable[[str, str], object]
+    names: str
+    budget: float = BUDGET
+
+    def promise(self, precision: str) -> Promise:
+        """Return the refusal."""
+        return refusal(self.names)
+
+    def attempt(self, precision: str, device: str) -> Attempt:
+        """Call."""
+        begun = time.perf_counter()
+        try:
+            made = self.call(device, precision)
+        except ValueError as refused:
+            return Attempt(REFUSED, seconds=time.perf_counter() - begun, message=str(refused))
+        status = made.status.name if isinstance(made, wl.SolveResult) else "accepted"
+        return Attempt(status, seconds=time.perf_counter() - begun)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A case in one precision: what was expected, what came, and what is wrong with that."""
+
+    case: Case
+    precision: str
+    promise: Promise
+    attempt: Attempt
+    wrong: Sequence[str]
+
+    @property
+    def name(self) -> str:
+        """Unique among the verdicts."""
+        return f"{self.case.family}: {self.case.name}, {self.precision}"
+
+    @property
+    def outcome(self) -> str:
+        """What it came to, in words."""
+        return "as expected" if not self.wrong else "; ".join(self.wrong)
+
+
+def judge(case: Case, precision: str, device: str) -> Verdict:
+    """Attempt a case and say what is wrong with what it comes to; one over its budget is tried again, kernels compile in the first."""
+    promise = case.promise(precision)
+    attempt = _in_time(case, precision, device)
+    if attempt.seconds > case.budget and attempt.status != "out of time":
+        attempt = _in_time(case, precision, device)
+    wrong = violations(promise, attempt)
+    if attempt.seconds > case.budget:
+        wrong.append(f"{attempt.seconds:.1f} s, its budget is {case.budget:g} s")
+    return Verdict(case, precision, promise, attempt, wrong)
+
+
+def _in_time(case: Case, precision: str, device: str) -> Attempt:
+    begun = time.perf_counter()
+    try:
+        with interrupted_after(LAST_CALL * case.budget + 60.0):  # a minute for compilers
+            return case.attempt(precision, device)
+    except OverBudgetError:
+        return Attempt("out of time", seconds=time.perf_counter() - begun)
+
+
+def violations(promise: Promise, attempt: Attempt) -> list[str]:
+    """Return what is wrong with an attempt for a promise."""
+    wrong, status = list(attempt.faults), attempt.status
+    expected = promise.expected
+    if expected is Expected.CAUGHT:
+        return [] if wrong or status != "CONVERGED" else ["a wrong solver passes"]
+    if expected is Expected.REFUSED:
+        if status != REFUSED:
+            wrong.append(f"{status}, not refused")
+        elif promise.names not in attempt.message:
+            wrong.append(f"the message does not name {promise.names}: {attempt.message}")
+    elif status == REFUSED:
+        wrong.append(f"refused: {attempt.message}")
+    elif expected is Expected.SOLVED and not (status == "CONVERGED" and attempt.met):
+        wrong.append(f"{status}{_at(attempt)}, not solved")
+    elif expected is Expected.STOPPED and status not in promise.statuses:
+        wrong.append(f"{status}{_at(attempt)}, not {'/'.join(sorted(promise.statuses))}")
+    elif expected in (Expected.EITHER, Expected.DONE) and status not in promise.statuses | {"CONVERGED", "done"}:
+        wrong.append(f"{status}{_at(attempt)} {attempt.message}".rstrip())
+    return wrong
+
+
+def _at(attempt: Attempt) -> str:
+    return "" if attempt.residual is None else f" at {attempt.residual:.1e}"

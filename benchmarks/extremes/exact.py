@@ -1,0 +1,116 @@
+"""A x + b of hostile problems and its natural residual, assembled anew in float64: no code of the library takes part.
+
+r_i = d_i (x_i - clip(x_i - y_i / d_i, l_i, u_i)) with d_i = |A_ii|, 1 where that is 0. Norms are scaled by their largest entry, so that
+squares neither overflow nor vanish.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+
+AIR, FLUID, SOLID = 0, 1, 2
+AXES = "xyz"
+
+
+@dataclass(frozen=True)
+class Exact:
+    """The equations of the unknowns alone, in float64.
+
+    Args:
+        matrix: shape (n, n).
+        b: shape (n,), units of y.
+        lower: shape (n,).
+        upper: shape (n,).
+        columns: U of a term U W U', shape (n, k); none if None.
+        weights: W, shape (k, k).
+    """
+
+    matrix: Any
+    b: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    columns: np.ndarray | None = None
+    weights: np.ndarray | None = None
+
+    @property
+    def start(self) -> np.ndarray:
+        """clip(0, l, u)."""
+        return np.clip(np.zeros(len(self.b)), self.lower, self.upper)
+
+    def diagonal(self) -> np.ndarray:
+        """Return |A_ii|, 1 where that is 0."""
+        d = np.asarray(self.matrix.diagonal(), dtype=np.float64)
+        if self.columns is not None and self.weights is not None:
+            d = d + np.einsum("ij,jk,ik->i", self.columns, self.weights, self.columns)
+        return np.where(d == 0.0, 1.0, np.abs(d))
+
+    def residual(self, x: np.ndarray) -> float:
+        """Return the norm of the natural residual at x, shape (n,)."""
+        d = self.diagonal()
+        y = self.matrix @ x + self.b
+        if self.columns is not None:
+            y = y + self.columns @ (self.weights @ (self.columns.T @ x))
+        return norm(d * (x - np.clip(x - y / d, self.lower, self.upper)))
+
+    def sizes(self, x: np.ndarray) -> float:
+        """Return || |A| |x| + |b| ||: what rounding errors of a residual are in proportion to."""
+        size = abs(self.matrix) @ np.abs(x) + np.abs(self.b)
+        if self.columns is not None and self.weights is not None:
+            size = size + np.abs(self.columns) @ (np.abs(self.weights) @ (np.abs(self.columns).T @ np.abs(x)))
+        return norm(size)
+
+
+def norm(values: np.ndarray) -> float:
+    """Return the 2-norm; inf or NaN where a value is."""
+    largest = float(np.abs(values).max(initial=0.0))
+    if largest == 0.0 or not np.isfinite(largest):
+        return largest
+    return largest * float(np.linalg.norm(values / largest))
+
+
+def stencil(
+    cells: np.ndarray, faces: Mapping[str, Any], shift: Any = None, periodic: tuple[bool, ...] = (False, False, False)
+) -> tuple[scipy.sparse.csr_array, np.ndarray]:
+    """Return the matrix of the FLUID cells and which cells those are, flat, from the definition face by face.
+
+    A face has the coefficient c, adds c to the diagonal of each FLUID cell beside it and -c between two; SOLID on a side closes it, and so
+    does the array's end unless the axis is periodic.
+
+    Args:
+        cells: AIR, FLUID, SOLID, shape (nz, ny, nx) or (ny, nx).
+        faces: `face_x`, `face_y`, `face_z`: numbers or arrays with one face more along their axis; 1 where there is none.
+        shift: added to the diagonal, a number or shape of `cells`.
+        periodic: whether x, y, z wrap around.
+    """
+    grid = cells.reshape((1,) * (3 - cells.ndim) + cells.shape)
+    index = np.arange(grid.size).reshape(grid.shape)
+    d = np.zeros(grid.size) if shift is None else np.broadcast_to(shift, cells.shape).astype(np.float64).ravel().copy()
+    rows, columns, values = [], [], []
+    for axis in range(cells.ndim):
+        ax, count = 2 - axis, grid.shape[2 - axis]
+        wraps = axis < len(periodic) and periodic[axis] and count > 1
+        below = np.arange(-1 if wraps else 0, count - 1)
+        face = np.asarray(faces.get(f"face_{AXES[axis]}", 1.0), dtype=np.float64)
+        shape = [n + (q == ax) for q, n in enumerate(grid.shape)]
+        c = np.broadcast_to(face.reshape(shape if face.ndim else ()), shape).take(below + 1, ax).ravel()
+        p, q = index.take(below % count, ax).ravel(), index.take(below + 1, ax).ravel()
+        types = grid.ravel()
+        is_open = (types[p] != SOLID) & (types[q] != SOLID)
+        p, q, c = p[is_open], q[is_open], c[is_open]
+        np.add.at(d, p, c)
+        np.add.at(d, q, c)
+        between = (types[p] == FLUID) & (types[q] == FLUID)
+        rows += [p[between], q[between]]
+        columns += [q[between], p[between]]
+        values += [-c[between], -c[between]]
+    fluid = grid.ravel() == FLUID
+    number = np.cumsum(fluid) - 1
+    n = int(fluid.sum())
+    at = (number[np.concatenate(rows)], number[np.concatenate(columns)])
+    coupling = scipy.sparse.coo_array((np.concatenate(values), at), shape=(n, n)).tocsr()
+    return (coupling + scipy.sparse.diags_array(d[fluid])).tocsr(), fluid

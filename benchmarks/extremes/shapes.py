@@ -1,0 +1,198 @@
+"""Families of grids: sizes and masks that leave little or nothing to multigrid."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
+
+import warp_lcp as wl
+from benchmarks.extremes.case import INFEASIBLE, PRECISIONS, Case, Promise, RefusalCase, SolveCase
+from benchmarks.extremes.exact import stencil
+from benchmarks.extremes.problem import GridProblem
+
+AIR, FLUID, SOLID = wl.AIR, wl.FLUID, wl.SOLID
+SEED = 7919
+METHODS = ("projected-multigrid", "minimum-map-newton")
+LARGE_BUDGET = 60.0  # of 10^6 unknowns
+
+
+def same(promise: Promise) -> Mapping[str, Promise]:
+    """Return the promise for every precision."""
+    return dict.fromkeys(PRECISIONS, promise)
+
+
+def both(family: str, name: str, make: Callable[[], Any], **more: Any) -> Iterator[SolveCase]:
+    """Yield the case for both methods that must take everything."""
+    for method in METHODS:
+        yield SolveCase(family, f"{name}, {method}", make, method, **more)
+
+
+def noise(shape: tuple[int, ...], seed: int = SEED) -> np.ndarray:
+    """Return normal noise of zero mean as a right-hand side."""
+    b = np.random.default_rng(seed).standard_normal(shape)
+    return b - b.mean()
+
+
+def pool(shape: tuple[int, ...], **more: Any) -> GridProblem:
+    """Return liquid with AIR as its topmost layer along y, walls that hold and pull nothing: half of the cells p >= 0."""
+    cells = np.full(shape, FLUID)
+    cells[(..., -1, slice(None))] = AIR
+    lower = np.where(np.random.default_rng(SEED + 1).random(shape) < 0.5, 0.0, -np.inf)
+    return GridProblem(cells=cells, **({"b": noise(shape), "lower": lower} | more))
+
+
+def grounded(shape: tuple[int, ...]) -> GridProblem:
+    """Return a grid without room for AIR, held by a shift in its first cell."""
+    shift = np.zeros(shape)
+    shift.flat[0] = 1.0
+    return GridProblem(cells=np.full(shape, FLUID), b=noise(shape) if np.prod(shape) > 1 else np.full(shape, -1.5), shift=shift)
+
+
+def sizes() -> Iterator[Case]:
+    """Yield grids of one cell, one layer, prime sizes, 10^6 cells and long ones."""
+    family = "sizes"
+    for shape in ((1, 1), (1, 1, 1), (1, 2), (2, 1), (1, 1, 7), (1, 7, 1), (7, 1, 1), (1, 1, 4096), (4096, 1, 1), (1, 13, 17)):
+        yield from both(family, "x".join(map(str, shape)), lambda shape=shape: grounded(shape))
+    for shape in ((2, 2), (3, 1), (127, 131), (1, 127, 131), (31, 37, 41), (2, 3, 5)):
+        yield from both(family, "x".join(map(str, shape)) + " below air", lambda shape=shape: pool(shape))
+    for shape in ((3, 3000), (3000, 3), (2, 2000), (2, 2, 2000), (2000, 2, 2), (3, 2000, 3)):
+        yield from both(family, "1:1000, " + "x".join(map(str, shape)), lambda shape=shape: pool(shape))
+    yield from both(family, "1024x1024", lambda: pool((1024, 1024)), budget=LARGE_BUDGET)
+    yield from both(family, "1024x1024 with noise as mask", lambda: sponge((1024, 1024), 0.75), budget=LARGE_BUDGET)
+    yield from both(family, "2-D like 3-D of one layer, periodic", lambda: pool((1, 61, 67), periodic=(True, False, False)))
+
+
+def sponge(shape: tuple[int, ...], liquid: float) -> GridProblem:
+    """Return cells of random type, and b that every component without AIR or bound can meet."""
+    chance = np.random.default_rng(SEED + 2)
+    cells = chance.choice([AIR, FLUID, SOLID], shape, p=[(1 - liquid) / 2, liquid, (1 - liquid) / 2])
+    return GridProblem(cells=cells, b=without_inflow(cells, chance.standard_normal(shape)), lower=0.0)
+
+
+def without_inflow(cells: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return b raised on each pool without air so far that it adds up to 0.01 a cell: p >= 0 has a solution then, and else has none."""
+    matrix, fluid = stencil(cells, {})
+    count, label = scipy.sparse.csgraph.connected_components(matrix, directed=False)
+    held = np.bincount(label, np.asarray(matrix.sum(axis=1)).ravel(), count) > 0.5
+    mean = np.bincount(label, b.ravel()[fluid], count) / np.bincount(label, minlength=count)
+    raised = b.copy().ravel()
+    raised[fluid] += np.where(held | (mean >= 0), 0.0, 0.01 - mean)[label]
+    return raised.reshape(b.shape)
+
+
+def masks() -> Iterator[Case]:
+    """Yield grids of few or no unknowns, checkerboards, needles and walls of one cell."""
+    family = "masks"
+    for name, kind in (("solid", SOLID), ("air", AIR)):
+        yield RefusalCase(
+            family, f"all {name}", lambda device, p, kind=kind: wl.LCP(wl.GridPoisson(np.full((4, 5), kind), device=device), np.zeros((4, 5))), "A "
+        )
+    for name, around in (("air", AIR), ("solid", SOLID)):
+        for shape in ((3, 3), (5, 5, 5)):
+            for b in (-1.0, 1.0, 0.0):
+                if not (around == SOLID and b < 0):
+                    yield from both(family, f"one cell in {name}, {len(shape)}-D, b = {b:g}", lambda a=around, s=shape, b=b: single(s, a, b))
+    yield from both(family, "one cell in solid, b = -1", lambda: single((3, 3), SOLID, -1.0), promises=same(INFEASIBLE))
+    for shape in ((40, 41), (12, 13, 14)):
+        for other in (AIR, SOLID):
+            name = f"checkerboard of liquid and {'air' if other == AIR else 'solid'}, {len(shape)}-D"
+            yield from both(family, name, lambda s=shape, o=other: checkerboard(s, o))
+    yield from both(family, "labyrinth 65x65", lambda: labyrinth(65))
+    yield from both(family, "labyrinth 33x33 without bounds", lambda: labyrinth(33, lower=-np.inf))
+    yield from both(family, "two pools joined by a needle", lambda: needle(64))
+    yield from both(family, "chambers behind walls of one cell", lambda: chambers(59))
+    yield from both(family, "one air cell in 64x64", lambda: punctured((64, 64)))
+    yield from both(family, "one air cell in 24x24x24", lambda: punctured((24, 24, 24)))
+    for liquid in (0.1, 0.5, 0.9):
+        yield from both(family, f"sponge, {liquid:.0%} liquid", lambda liquid=liquid: sponge((67, 71), liquid))
+    yield from both(family, "3-D sponge, 60% liquid", lambda: sponge((19, 23, 29), 0.6))
+
+
+def single(shape: tuple[int, ...], around: int, b: float) -> GridProblem:
+    """Return one liquid cell in the middle."""
+    cells = np.full(shape, around)
+    cells[tuple(n // 2 for n in shape)] = FLUID
+    return GridProblem(cells=cells, b=np.full(shape, b))
+
+
+def checkerboard(shape: tuple[int, ...], other: int) -> GridProblem:
+    """Return liquid in every second cell; among solid ones each is closed off, so that b >= 0 there."""
+    odd = np.indices(shape).sum(axis=0) % 2 == 1
+    b = noise(shape)
+    return GridProblem(cells=np.where(odd, FLUID, other), b=np.abs(b) if other == SOLID else b)
+
+
+def labyrinth(n: int, **more: Any) -> GridProblem:
+    """Return one channel of liquid a cell wide, in bends from the bottom to the top, where it meets air."""
+    cells = np.full((n, n), FLUID)
+    cells[1::2] = SOLID
+    cells[1::4, -1] = FLUID
+    cells[3::4, 0] = FLUID
+    cells[-1] = AIR
+    return GridProblem(cells=cells, b=noise((n, n)), **more)
+
+
+def needle(n: int) -> GridProblem:
+    """Return a pool without air, joined to one with air by a channel that is a cell wide and half the grid long."""
+    cells = np.full((n, 2 * n), FLUID)
+    cells[:, n // 2 : n + n // 2] = SOLID
+    cells[n // 3, n // 2 : n + n // 2] = FLUID
+    cells[-1, n + n // 2 :] = AIR
+    return GridProblem(cells=cells, b=noise(cells.shape), lower=np.where(np.indices(cells.shape)[0] == 0, 0.0, -np.inf))
+
+
+def chambers(n: int) -> GridProblem:
+    """Return chambers of five cells with walls of one, a hole of one cell in each wall, and air in one of them."""
+    cells = np.full((n, n), FLUID)
+    cells[5::6], cells[:, 5::6] = SOLID, SOLID
+    cells[5::6, 2::6], cells[2::6, 5::6] = FLUID, FLUID
+    cells[:5, :5] = AIR
+    return GridProblem(cells=cells, b=noise((n, n)), lower=np.where(noise((n, n), SEED + 3) > 0, 0.0, -np.inf))
+
+
+def punctured(shape: tuple[int, ...]) -> GridProblem:
+    """Return liquid all over but for one cell of air, which alone makes the matrix regular."""
+    cells = np.full(shape, FLUID)
+    cells[tuple(n // 3 for n in shape)] = AIR
+    return GridProblem(cells=cells, b=noise(shape), lower=-np.inf)
+
+
+def closed_pools() -> Iterator[Case]:
+    """Yield liquid without air: b that adds up to 0 can be met, others only where a bound lets go."""
+    family = "closed pools"
+    for shape in ((48, 53), (17, 18, 19)):
+        full = np.full(shape, FLUID)
+        name = f"{len(shape)}-D"
+        for method in METHODS:
+            yield SolveCase(family, f"compatible, {name}, {method}", lambda f=full: GridProblem(cells=f, b=noise(f.shape), lower=-np.inf), method)
+            for sign in (1.0, -1.0):
+                off = f"{'outflow' if sign > 0 else 'inflow'}, {name}, {method}"
+                b = noise(shape) + sign * 0.1
+                yield SolveCase(
+                    family, f"incompatible {off}", lambda f=full, b=b: GridProblem(cells=f, b=b, lower=-np.inf), method, same(INFEASIBLE)
+                )
+                promises = {} if sign > 0 else same(INFEASIBLE)
+                yield SolveCase(family, f"p >= 0, {off}", lambda f=full, b=b: GridProblem(cells=f, b=b), method, promises)
+    yield from both(family, "one of 40 is incompatible", lambda: many_pools(0.05), promises=same(INFEASIBLE))
+    yield from both(family, "40 compatible ones", lambda: many_pools(0.0))
+    yield from both(family, "boxed, inflow", lambda: GridProblem(cells=np.full((9, 9), FLUID), b=noise((9, 9)) - 0.2, lower=-1.0, upper=1.0))
+    yield from both(family, "incompatible by rounding only", lambda: GridProblem(cells=np.full((64, 64), FLUID), b=noise((64, 64)) * 1e6, lower=-np.inf))
+    yield from both(
+        family, "periodic in x and y, compatible",
+        lambda: GridProblem(cells=np.full((31, 32), FLUID), b=noise((31, 32)), lower=-np.inf, periodic=(True, True, False)),
+    )  # fmt: skip
+
+
+def many_pools(net: float) -> GridProblem:
+    """Return 40 pools in a row behind solid walls, b of zero mean in each but for `net` in the last."""
+    cells = np.full((8, 40 * 7), FLUID)
+    cells[:, 6::7] = SOLID
+    b = np.where(cells == FLUID, noise(cells.shape), 0.0)
+    for at in range(0, cells.shape[1], 7):
+        b[:, at : at + 6] -= b[:, at : at + 6].mean()
+    b[:, -7:-1] += net
+    return GridProblem(cells=cells, b=b, lower=-np.inf)

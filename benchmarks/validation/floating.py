@@ -1,0 +1,189 @@
+"""Rigid bodies in a liquid: displacement at rest, added mass, momentum, and solves that do not depend on what bodies weigh."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from benchmarks.record import Chart
+from benchmarks.validation.finding import Findings, Trial, attempt
+from benchmarks.validation.tank import DENSITY, GRAVITY, SUB_CELL, VOXEL, box, create, steps
+from fluids import LiquidSimulation
+from warp_lcp.grid.staggered import Window
+
+WIDE = 6  # diameters of the body that the closed tank has
+CELLS = {2: (16, 24), 3: (10, 14)}  # a diameter
+RATIOS = {2: (0.01, 0.5, 3.0), 3: (0.1, 3.0)}  # of the body's density over the liquid's
+STEP = 1e-3  # [s]: the acceleration is that of the first step, from rest
+FLOATS = {2: ((48, 0.6), (64, 0.6), (96, 0.3)), 3: ((32, 0.6),)}  # cells of the tank's side and ratios of densities
+SETTLES = {2: 6.0, 3: 3.0}  # [s]
+BOX = 0.3, 0.2  # [m]: width and height of what floats
+EXTREMES = (1e-3, 1e-2, 0.1, 1.0, 10.0, 100.0, 1e3)
+
+
+def check(device: str) -> tuple[list[Trial], list[Chart]]:
+    """Run the check at its resolutions."""
+    trials = [accelerations(dimension, cells, device) for dimension in (2, 3) for cells in CELLS[dimension]]
+    trials += [displacement(dimension, *case, device) for dimension in (2, 3) for case in FLOATS[dimension]]
+    trials += [momentum(dimension, device) for dimension in (2, 3)]
+    return [*trials, *(iterations(cells, device) for cells in (24, 32))], []
+
+
+def accelerations(dimension: int, cells: int, device: str) -> Trial:
+    """Compare the first acceleration of a disc or sphere with that of potential flow."""
+
+    def run(found: Findings) -> None:
+        for ratio in RATIOS[dimension]:
+            expected = acceleration(dimension, ratio)
+            found.add(
+                f"ratio {ratio:g}: a over expected", _first_speed(dimension, cells, ratio, device) / STEP / expected, low=0.95, high=1.05
+            )
+        light = min(RATIOS[dimension])
+        apart = _first_speed(dimension, cells, light, device, together=False) / STEP / acceleration(dimension, light)
+        found.must_break(f"solved one after the other, ratio {light:g}: a over expected", apart, low=0.95, high=1.05)
+
+    return attempt("floating", f"{dimension}-D, {cells} cells a diameter", run)
+
+
+def acceleration(dimension: int, ratio: float) -> float:
+    """Return the acceleration [m/s^2] from rest of a disc or sphere in a closed tank that is `WIDE` diameters wide.
+
+    (1 - ratio) g / (ratio + C) with the added mass C of a disc in a round tank, (1 + q^2) / (1 - q^2), or of a sphere,
+    (1 + 2 q^3) / (2 - 2 q^3), q = 1 / WIDE (Lamb, Hydrodynamics, 6th ed., art. 93): the square tank's are like them.
+    """
+    q = 1.0 / WIDE
+    added = (1.0 + q**2) / (1.0 - q**2) if dimension == 2 else 0.5 * (1.0 + 2.0 * q**3) / (1.0 - q**3)
+    return (1.0 - ratio) * GRAVITY / (ratio + added)
+
+
+def _first_speed(dimension: int, cells: int, ratio: float, device: str, *, together: bool = True) -> float:
+    """Return a body's vertical speed after a step; not `together`: the liquid is solved as if it did not move the body."""
+    ball = {"shape": "sphere", "center": [0.5] * dimension, "radius": 0.5 / WIDE, "density": DENSITY * ratio}
+    simulation = create(
+        SUB_CELL, size=[1.0] * dimension, resolution=cells * WIDE, liquid=[box([0.0] * dimension, [1.0] * dimension)], wall="free-slip",
+        solid=[ball], solver={"tolerance": 1e-6}, device=device, **_down(dimension),
+    )  # fmt: skip
+    if not together:
+        coupling = simulation.projection.coupling
+        assert coupling is not None
+        coupling._share = 0.0
+    return float(simulation.step(STEP)["body0_vy"])  # type: ignore[arg-type]
+
+
+def displacement(dimension: int, cells: int, ratio: float, device: str) -> Trial:
+    """Let a box bob, and compare the mean of what it displaces with its mass."""
+
+    def run(found: Findings) -> None:
+        width, height = BOX
+        side = 1.0 if dimension == 2 else 0.8
+        center, level = 0.5 * side, 0.45
+        bottom = level - 0.85 * ratio * height
+        low, high = [center - 0.5 * width, bottom, center - 0.5 * width], [center + 0.5 * width, bottom + height, center + 0.5 * width]
+        raft = box(low[:dimension], high[:dimension], density=DENSITY * ratio)
+        simulation = create(
+            SUB_CELL, size=[side] * dimension, resolution=cells, liquid=[box([0.0] * dimension, [side, level, side][:dimension])],
+            solid=[raft], density_correction={}, device=device, **_down(dimension),
+        )  # fmt: skip
+        depths = []
+        for row in steps(simulation, SETTLES[dimension]):
+            if simulation.time > 0.4 * SETTLES[dimension]:
+                depths.append(water_level(simulation, width) - (float(row["body0_y"]) - 0.5 * height))
+        draft = ratio * height
+        found.add("mean displacement over the box's mass", float(np.mean(depths)) / draft, low=0.98, high=1.02)
+        found.must_break("of a box a twentieth heavier", float(np.mean(depths)) / (1.05 * draft), low=0.98, high=1.02)
+
+    return attempt("floating", f"{dimension}-D, {cells} cells, a box of {ratio:g} times the liquid's density", run)
+
+
+def water_level(simulation: LiquidSimulation, width: float) -> float:
+    """Return the mean height of the free surface [m] in the columns that are more than `width` / 4 away from the body."""
+    dx, body = simulation.grid.spacing, simulation.bodies.bodies[0].position  # type: ignore[union-attr]
+    phi = simulation.grid.interior(simulation.surface.phi.numpy())  # type: ignore[union-attr]
+    z, x = (np.arange(n) * dx + 0.5 * dx for n in (phi.shape[0], phi.shape[2]))
+    near = np.abs(x[None, :] - body[0]) < 0.75 * width
+    if simulation.grid.dimension == 3:
+        near = near & (np.abs(z[:, None] - body[2]) < 0.75 * width)
+    crosses = (phi[:, :-1] < 0.0) & (phi[:, 1:] >= 0.0)
+    low, high = phi[:, :-1], phi[:, 1:]
+    heights = np.where(crosses, (np.arange(phi.shape[1] - 1)[None, :, None] + 0.5 + low / np.where(crosses, low - high, 1.0)) * dx, np.nan)
+    heights = np.where(near[:, None, :], np.nan, heights)
+    return float(np.nanmean(heights))
+
+
+def momentum(dimension: int, device: str) -> Trial:
+    """Let liquid fly against a body far from walls: what the body gains is what the liquid loses, whatever the solve leaves."""
+
+    def run(found: Findings) -> None:
+        for ratio in (0.01, 1.0, 100.0):
+            lost, exchanged = exchange(dimension, ratio, device)
+            found.add(f"ratio {ratio:g}: momentum lost over exchanged", lost / exchanged, high=1e-4)
+        found.must_break(
+            "solved one after the other: energy over that before", exchange(dimension, 0.01, device, together=False)[0], high=1.0
+        )
+
+    return attempt("floating", f"{dimension}-D, an impact", run)
+
+
+def exchange(dimension: int, ratio: float, device: str, *, together: bool = True) -> tuple[float, float]:
+    """Return the momentum that a step's projection loses and that it exchanges; not `together`: kinetic energy after over before, and 0."""
+    body = box([0.46, 0.4, 0.4][:dimension], [0.61, 0.57, 0.57][:dimension], density=DENSITY * ratio)
+    fast = box([0.25, 0.3, 0.3][:dimension], [0.55, 0.6, 0.6][:dimension], velocity=[1.0, 0.2, -0.3][:dimension])
+    simulation = create(
+        VOXEL, size=[1.0] * dimension, resolution=20, liquid=[fast], solid=[body], device=device, physics={"gravity": [0.0] * dimension},
+        domain={"size": [1.0] * dimension, "resolution": 20, "solids": "cut-cell"}, solver={"tolerance": 1e-6},
+    )  # fmt: skip
+    coupling, bodies = simulation.projection.coupling, simulation.bodies
+    assert coupling is not None and bodies is not None
+    if not together:
+        coupling._share = 0.0
+    begun = simulation.begin_step(0.01)
+    window: Window = simulation.window(begun)
+    simulation.bring_to_faces(window, 0.01)
+    simulation.surface.mark(simulation.particles, window, simulation.projection.kind)
+    simulation.surface.complete(window, simulation.velocity, simulation.weights, simulation.projection.known)
+    before = [field.numpy().astype(np.float64) for field in simulation.velocity]
+    start = bodies.bodies[0].momentum.copy()
+    energy = bodies.bodies[0].kinetic_energy
+    simulation._project(window, 0.01, simulation.top_speed(begun, 0.01))
+    wet = np.zeros(simulation.grid.shape, dtype=bool)
+    wet[tuple(simulation.projection.fluid_cells().T)] = True
+    scale, gained, energies = DENSITY * simulation.grid.cell_volume, bodies.bodies[0].momentum - start, np.zeros(2)
+    total = gained.copy()
+    for axis, (open_, old, field) in enumerate(zip(simulation.boundary.open, before, simulation.velocity, strict=True)):
+        share, new = open_.numpy() * (wet | np.roll(wet, 1, axis=2 - axis)), field.numpy().astype(np.float64)
+        total[axis] += scale * float((share * (new - old)).sum())
+        energies += [0.5 * scale * float((share * u**2).sum()) for u in (old, new)]
+    if not together:
+        return (energies[1] + bodies.bodies[0].kinetic_energy) / (energies[0] + energy), 0.0
+    return float(np.linalg.norm(total)), float(np.linalg.norm(gained))
+
+
+def iterations(cells: int, device: str) -> Trial:
+    """Count the iterations of the first step of bodies of all weights under water."""
+
+    def run(found: Findings) -> None:
+        counts = {ratio: _iterations(cells, ratio, device, corrected=True) for ratio in EXTREMES}
+        for ratio, count in counts.items():
+            found.add(f"ratio {ratio:g}: iterations over those at 1", count / counts[1.0], high=1.5)
+        plain = _iterations(cells, min(EXTREMES), device, corrected=False)
+        found.must_break(f"uncorrected, ratio {min(EXTREMES):g}: iterations over those at 1", plain / counts[1.0], high=1.5)
+
+    return attempt("floating", f"{cells}^3 cells, bodies of all weights", run)
+
+
+def _iterations(cells: int, ratio: float, device: str, *, corrected: bool) -> int:
+    """Return the iterations of the first step from rest."""
+    raft = box([0.3, 0.3, 0.35], [0.7, 0.45, 0.6], density=DENSITY * ratio, wall="free-slip")
+    simulation = create(
+        SUB_CELL, size=[1.0] * 3, resolution=cells, liquid=[box([0.0] * 3, [1.0, 0.7, 1.0])], solid=[raft],
+        solver={"tolerance": 1e-6}, device=device, **_down(3),
+    )  # fmt: skip
+    if not corrected:
+        simulation.projection._make_problem()
+        simulation.projection._work.correction.renew = lambda begins: False
+    return int(simulation.step(2e-3)["solve_iterations"])  # type: ignore[arg-type]
+
+
+def _down(dimension: int) -> dict[str, Any]:
+    return {"physics": {"gravity": [0.0, -GRAVITY, 0.0][:dimension]}}
