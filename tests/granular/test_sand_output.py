@@ -78,13 +78,13 @@ def test_images_may_show_what_sand_bears(folder: Path, color: Color, label: str)
     recording = Recording(folder, color)
     points, values = recording.read(recording.numbers[-1])
     assert len(points) == len(values) > 0
-    scale = recording.scale()
+    scale = recording.scale
     assert scale.label == label
     assert scale.low == 0.0 < scale.high
 
 
 def test_sand_has_colors_of_its_own(folder: Path) -> None:
-    red, _, blue = Recording(folder, Color.SPEED).scale().colors(np.array([0.5])).T
+    red, _, blue = Recording(folder, Color.SPEED).scale.colors(np.array([0.5])).T
     assert red > blue
 
 

@@ -29,11 +29,10 @@ RATE = 0.3  # part of a larger overlap that a step removes
 START_OVERLAP = 1e-3  # of a body's size, with which it may start: files round their numbers
 BOUNCE = 2.0  # of gravity's speed in a step: slower impacts do not bounce, so that bodies come to rest
 BEARS = 1e-6  # of the largest impulse of a body: contacts with less do not hold it
-EXACT = StoppingCriteria(
-    rtol=1e-7, max_iterations=400, patience=400
-)  # of the velocities that contacts must change: a stack then drifts by 1e-7 of its size in a second
+EXACT = StoppingCriteria(rtol=1e-7, max_iterations=400, patience=400)  # a stack then drifts by 1e-7 of its size in a second
 ROUGH = StoppingCriteria(rtol=1e-2, max_iterations=30, patience=30)  # for overlaps, which take several steps anyway
 ONE_BLOCK = 6  # unknowns that are solved exactly, as of the two contacts of a box in the plane
+YIELDS = 1e-6  # of B, along tangents: how friction is shared between contacts then is unique, and rest creeps by 1e-7 m/s at most
 ALONG_SLIP = 1e-6  # of gravity's speed in a step: a slower slip has no direction
 SIDEWAYS = 1e-6  # of gravity, along a contact's plane
 
@@ -283,8 +282,8 @@ def solve_contacts(
         start: impulses to start from; none if None.
     """
     x, residual = np.zeros(len(b)), 0.0
-    B = 0.5 * (B + B.T)
     contact = np.arange(len(b)) // dimension
+    B = 0.5 * (B + B.T) + np.diag(np.where(np.arange(len(b)) % dimension > 0, YIELDS * np.diag(B), 0.0))
     count, island = connected_components((B != 0.0) | (contact[:, None] == contact), directed=False)
     for number in range(count):
         rows = np.flatnonzero(island == number)
