@@ -23,8 +23,8 @@ from warp_lcp.driver.devices import free_memory
 
 TITLE = "Cost of a solve against the size of the grid"
 CPU_SIZES, CUDA_SIZES = (32, 64, 128, 256), (32, 64, 128, 256, 512, 1024)
-SOLVE_BYTES = 55  # a cell: operator, problem, workspace, b, bounds and the result, on the device
-SCENE_BYTES = 60  # a cell: the scene and the fields that it is made with, in the host's memory
+SOLVE_BYTES = 60  # a cell: operator, problem, workspace, b, bounds, the result and what making them takes; 59 at 128^3
+SCENE_BYTES = 60  # a cell, in the memory of the host: the scene, the fields that it is made with (41 at 128^3) and the bounds
 ASYMPTOTIC = 64  # cells a side from which on the growth is fitted: below, launches cost more than cells
 FIGURES = tuple(f"to_{t:.0e}" for t in TOLERANCES)
 FIELD_BYTES = 8  # of copying a float32 field: a read and a write

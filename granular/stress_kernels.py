@@ -39,7 +39,7 @@ EDGE_STRESS = (
         const float* c0 = y + 4*d*layer + row; const float* c1 = c0 + layer - sa;
         const float* c2 = c0 + 2*layer - sb; const float* c3 = c0 + 3*layer - sa - sb;
         const float* weight = share[d]; T* b = out[d];
-        SIMD for (int i = first; i < last; ++i) {
+        MASKED for (int i = first; i < last; ++i) {
             const T w = weight[i] < 0.0f ? -weight[i] : weight[i];
             b[i] = w*(((T)c0[i] + (T)c1[i]) + ((T)c2[i] + (T)c3[i]));
         }
@@ -67,7 +67,7 @@ FACE_VELOCITY = (
         const float* from = start[axis]; const float* light = inverse[axis]; T* u = out[axis];
         if ((axis != 2 && k > share_x.shape[0] - 2) || (axis != 1 && j > share_x.shape[1] - 2)) continue;  // beyond the domain's last face
         const int end = axis == 0 || last < nx - 1 ? last : (int)nx - 1;
-        SIMD for (int i = first; i < end; ++i) {
+        MASKED for (int i = first; i < end; ++i) {
             const T normal = (sign*(T)n[i] - (T)y[i]) - (sign*(T)n[i - sa] - (T)y[i - sa]);
             const T shear = (b0[i + t0] - b0[i]) + (b1[i + t1] - b1[i]);
             u[i] = (T)from[i] + (T)light[i]*(normal + shear);
@@ -86,7 +86,7 @@ EDGE_STRAIN = (
     for (int d = 0; d < SHEARS; ++d) {
         const long long sa = s[ALPHA[d]], sb = s[BETA[d]];
         const T* ua = u[ALPHA[d]]; const T* ub = u[BETA[d]]; T* rate = out[d];
-        SIMD for (int i = first; i < last; ++i) rate[i] = (ua[i] - ua[i - sb]) + (ub[i] - ub[i - sa]);
+        MASKED for (int i = first; i < last; ++i) rate[i] = (ua[i] - ua[i - sb]) + (ub[i] - ub[i - sa]);
     }
 """
 )
@@ -127,7 +127,7 @@ CELLS = (
         return RESIDUAL ? x : x + beta*(x - (T)before[c*layer + i]);
     };
     T x_es = 0, x_ee = 0, x_ss = 0, s_es = 0, s_ee = 0, s_ss = 0, x_residual = 0, s_residual = 0;
-    SIMD for (int i = first; i < last; ++i) {
+    MASKED for (int i = first; i < last; ++i) {
         const int sand = flags[i] & HOLDS, dense = flags[i] & SHEARS_HERE, firm = flags[i] & FIRM;
         const T full = fullness((T)drive[i]*(T)numbers.data[STEP_OF_CELL]);
         T w = (T)drive[i], diagonal = 0, e[DIM], mean = 0;

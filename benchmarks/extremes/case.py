@@ -24,7 +24,7 @@ LAST_CALL = 6.0  # multiples of the budget after which a case is interrupted
 MAX_ITERATIONS = 200
 AGREES = 1e-3  # of a residual: how far what a result says may be from what is found, besides rounding
 REFUSED = "refused"
-HONEST = frozenset({"FLOOR", "STAGNATED", "MAX_ITERATIONS"})  # the precision does not go further, or not in this time
+HONEST = frozenset({"FLOOR", "STAGNATED", "MAX_ITERATIONS", "NON_DESCENT"})  # the precision does not go further, or not in this time
 
 
 class Expected(Enum):

@@ -78,8 +78,10 @@ class GridProblem:
 
     def rounded(self, storage: Any) -> bool:
         """Return whether coefficients are arrays or unequal."""
-        equal = all(np.ndim(f) == 0 for f in self.faces.values()) and len({float(f) for f in self.faces.values()}) <= 1
-        return storage is wp.float32 and (not equal or self.shift is not None)
+        if storage is wp.float64:
+            return False
+        faces = [self.faces.get(f"face_{axis}", 1.0) for axis in "xyz"[: self.cells.ndim]]
+        return self.shift is not None or any(np.ndim(f) > 0 for f in faces) or len({float(f) for f in faces}) > 1
 
 
 @dataclass(frozen=True, kw_only=True)

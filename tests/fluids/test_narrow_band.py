@@ -120,6 +120,37 @@ def test_a_block_in_free_flight_keeps_its_shape(dimension):
     assert filled == pytest.approx(ball, rel=0.05)
 
 
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_ceiling_lets_go(dimension):
+    """Under a separating ceiling a new surface opens where there were no particles: the block falls as one, and keeps its volume."""
+    low, high = [0.2, 0.5, 0.05][:dimension], [0.8, 1.0, 0.45][:dimension]
+    simulation = tank(dimension, 40, liquid=[box(low, high)])
+    volume = simulation.surface.volume(0)
+    assert without(simulation).interior.cells > 0
+    rows = advance(simulation, 0.2)
+    assert rows[-1]["max_speed"] == pytest.approx(GRAVITY * 0.2, rel=1e-3)
+    assert rows[-1]["kinetic_energy"] == pytest.approx(0.5 * rows[-1]["mass"] * (GRAVITY * 0.2) ** 2, rel=1e-3)
+    assert rows[-1]["volume"] == pytest.approx(volume, rel=0.01)
+    reference = advance(tank(dimension, 40, liquid=[box(low, high)], particles={}), 0.2)
+    assert rows[-1]["center_of_mass_y"] == pytest.approx(reference[-1]["center_of_mass_y"], abs=0.25 / 40)  # of whole cells
+
+
+def test_a_body_dives_into_the_interior():
+    """Particles are around a solid before it gets there; none is lost, and the liquid keeps its volume."""
+    plunge = {"kind": "translation", "velocity": [0.0, -1.0]}
+    particles = {"transfer": "apic", **BAND}
+    disk = {"shape": "sphere", "center": [0.5, 0.92], "radius": 0.06, "motion": plunge}
+    simulation, other = (tank(2, 48, solid=[disk], particles=p, density_correction={}) for p in (particles, {}))
+    rows, reference = advance(simulation, 0.5), advance(other, 0.5)
+    assert without(simulation).interior.cells > 0
+    assert rows[-1]["mass"] == reference[-1]["mass"]
+    assert rows[-1]["volume"] == pytest.approx(reference[-1]["volume"], rel=0.01)
+    near = np.hypot(*(simulation.particles.position.numpy()[:, :2] - [0.5, 0.42]).T)
+    all_of_them = np.hypot(*(other.particles.position.numpy()[:, :2] - [0.5, 0.42]).T)
+    ring = [np.count_nonzero((distance > 0.06) & (distance < 0.06 + 2.0 / 48)) for distance in (near, all_of_them)]
+    assert ring[0] == pytest.approx(ring[1], rel=0.15)
+
+
 def sloshing(particles: dict[str, Any], end: float) -> list[dict[str, Any]]:
     """Return the log of a standing wave, half a wavelength in a tank 1 m wide and 0.5 m deep."""
     n = 64

@@ -120,6 +120,8 @@ def _record_problems(simulation: Simulation, scene: Scene, folder: Path, *, more
     """Have a simulation write the problem of each step into a folder."""
     if not isinstance(simulation, Recorded):
         raise OutputError(f"--record-problems: the simulator {scene.scene.simulator} has no problems to show")
+    if any(solid.is_body for solid in scene.solid):
+        raise OutputError("--record-problems: the files have no place for the part of the matrix that rigid bodies add; take them out")
     simulation.record = ProblemFolder(folder, more=more).write
 
 

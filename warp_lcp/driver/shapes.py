@@ -221,7 +221,11 @@ class SolidProperties(Shape):
 
     def _still_complaints(self) -> list[Complaint]:
         """Return which keys need a rigid body."""
-        given: dict[str, object] = {"velocity": self.velocity, "angular_velocity": self.angular_velocity, "restitution": self.restitution or None}
+        given: dict[str, object] = {
+            "velocity": self.velocity,
+            "angular_velocity": self.angular_velocity,
+            "restitution": self.restitution or None,
+        }
         message = "needs mass or density, which make the solid a rigid body"
         found = [Complaint((name,), value, message) for name, value in given.items() if value is not None]
         if self.friction is not None and not self.rubs:

@@ -50,7 +50,7 @@ class Interior:
     """Sums over the cells without particles.
 
     Attributes:
-        cells: how many there are; those at the band's edge count in part.
+        cells: how many there are.
         mean_square_speed: [m^2/s^2].
         center: mean position [m], shape (3,).
         low: smallest coordinates of cell centers [m], shape (3,).
@@ -58,7 +58,7 @@ class Interior:
         max_speed: [m/s].
     """
 
-    cells: float
+    cells: int
     mean_square_speed: float
     center: np.ndarray
     low: np.ndarray
@@ -242,7 +242,7 @@ class NarrowBand:
         with every particle that the band has more or less than its share.
         """
         inside, count = self.interior, totals.count + self.held
-        if inside.cells == 0.0 or count <= 0:
+        if inside.cells == 0 or count <= 0:
             return replace(totals, count=max(count, 0))
         at_rest = self.particles_a_cell * inside.cells
         share = at_rest / (totals.count + at_rest)
@@ -318,9 +318,9 @@ class NarrowBand:
         high = [min(a, b) for a, b in zip(window.high, self.grid.domain.high, strict=True)]
         Window((low[0], low[1], low[2]), (high[0], high[1], high[2]), window.device).launch_rows(kernels.sum_kernel, inputs)
         rows = self._sums.numpy()[low[0] : high[0], low[1] : high[1]].reshape(-1, kernels.COLUMNS)
-        cells, dx = float(rows[:, 0].sum()), self.grid.spacing
-        if cells == 0.0:
-            return Interior(0.0, 0.0, np.zeros(3), np.zeros(3), np.zeros(3), 0.0)
+        cells, dx = int(rows[:, 0].sum()), self.grid.spacing
+        if cells == 0:
+            return Interior(0, 0.0, np.zeros(3), np.zeros(3), np.zeros(3), 0.0)
         center, lowest, highest = rows[:, 2:5].sum(axis=0) / cells, rows[:, 6:9].min(axis=0), rows[:, 9:12].max(axis=0)
         places = (np.stack([center, lowest, highest]) - 0.5) * dx
         places[:, self.grid.dimension :] = 0.0

@@ -231,42 +231,40 @@ def seed_kernel(
 def sum_kernel(
     cells: CellRange, planes: int, width: float, base: _I8, depth: _F32, u: _F32, v: _F32, w: _F32, sums: wp.array3d(dtype=wp.float64),
 ):  # fmt: skip
-    """Add up a row's cells deeper than the band; those at its edge count in part, so that sums change steadily as the depth does.
+    """Add up a row's cells deeper than the band.
 
     [0] cells, [1] |u|^2, [2-4] indices (i, j, k), [5] largest |u|^2, [6-8] lowest, [9-11] highest indices.
     """
     plane, row = wp.tid()
     k = cells.k + plane
     j = cells.j + row
-    count = wp.float64(0.0)
+    count = int(0)
     squares = wp.float64(0.0)
-    along = wp.float64(0.0)
+    along = int(0)
     fastest = float(0.0)
     low = int(1 << 30)
     high = int(-1)
     for i in range(cells.i, cells.end):
-        share = wp.float64(wp.clamp(depth[k, j, i] - width + 0.5, 0.0, 1.0))
-        if share > wp.float64(0.0) and base[k, j, i] != _SOLID:
-            count += share
-            along += share * wp.float64(i)
+        if depth[k, j, i] > width and base[k, j, i] != _SOLID:
+            count += 1
+            along += i
             low = wp.min(low, i)
             high = wp.max(high, i)
             square = 0.5 * (u[k, j, i] * u[k, j, i] + u[k, j, i + 1] * u[k, j, i + 1])
             square += 0.5 * (v[k, j, i] * v[k, j, i] + v[k, j + 1, i] * v[k, j + 1, i])
             if planes == 2:
                 square += 0.5 * (w[k, j, i] * w[k, j, i] + w[k + 1, j, i] * w[k + 1, j, i])
-            squares += share * wp.float64(square)
+            squares += wp.float64(square)
             fastest = wp.max(fastest, square)
-    some = high >= 0
-    sums[k, j, 0] = count
+    sums[k, j, 0] = wp.float64(count)
     sums[k, j, 1] = squares
-    sums[k, j, 2] = along
-    sums[k, j, 3] = count * wp.float64(j)
-    sums[k, j, 4] = count * wp.float64(k)
+    sums[k, j, 2] = wp.float64(along)
+    sums[k, j, 3] = wp.float64(count * j)
+    sums[k, j, 4] = wp.float64(count * k)
     sums[k, j, 5] = wp.float64(fastest)
     sums[k, j, 6] = wp.float64(low)
-    sums[k, j, 7] = wp.float64(wp.where(some, j, 1 << 30))
-    sums[k, j, 8] = wp.float64(wp.where(some, k, 1 << 30))
+    sums[k, j, 7] = wp.float64(wp.where(count > 0, j, 1 << 30))
+    sums[k, j, 8] = wp.float64(wp.where(count > 0, k, 1 << 30))
     sums[k, j, 9] = wp.float64(high)
-    sums[k, j, 10] = wp.float64(wp.where(some, j, -1))
-    sums[k, j, 11] = wp.float64(wp.where(some, k, -1))
+    sums[k, j, 10] = wp.float64(wp.where(count > 0, j, -1))
+    sums[k, j, 11] = wp.float64(wp.where(count > 0, k, -1))
