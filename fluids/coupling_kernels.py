@@ -86,9 +86,7 @@ def side(S: Solids, n: int, k: int, j: int, i: int):
     """Return body and share on side n = 2 axis + (0: low, 1: high) of a cell."""
     axis = n >> 1
     high = n & 1
-    return body_on_face(
-        S, axis, k + wp.where(axis == 2, high, 0), j + wp.where(axis == 1, high, 0), i + wp.where(axis == 0, high, 0)
-    )
+    return body_on_face(S, axis, k + wp.where(axis == 2, high, 0), j + wp.where(axis == 1, high, 0), i + wp.where(axis == 0, high, 0))
 
 
 @wp.kernel(**options)
@@ -118,9 +116,7 @@ def count_kernel(cells: CellRange, S: Solids, kind: _I8, rows: int, counts: _I32
 
 @wp.kernel(**options)
 @typing.no_type_check
-def fill_kernel(
-    cells: CellRange, S: Solids, kind: _I8, rows: int, columns: int, offsets: _I32, index: _I32, block: _I32, values: _F64
-):
+def fill_kernel(cells: CellRange, S: Solids, kind: _I8, rows: int, columns: int, offsets: _I32, index: _I32, block: _I32, values: _F64):
     """Write the entries of a row: what a cell's outflow gains by unit motions of a body, (vx, vy, wz) or (vx, vy, vz, wx, wy, wz)."""
     plane, row = wp.tid()
     k = cells.k + plane

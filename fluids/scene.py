@@ -16,6 +16,7 @@ PRESSURE_BYTES = 92  # fields of the pressure solve
 LEVEL_SET_BYTES = 19  # more for a surface between cells, or slivers
 SMOOTHING_BYTES = 12
 UNILATERAL_BYTES = 5
+BODY_BYTES, POTENTIAL_BYTES = 8, 4  # of a right-hand side that bodies change, and a motion of a body, if it is light
 COUPLED_METHODS = ("projected-multigrid", "minimum-map-newton", "primal-dual-active-set")  # for A + U W U', see `fluids.coupling`
 
 
@@ -50,14 +51,18 @@ class LiquidScene(ParticleScene):
         """Return what is wrong across keys."""
         found = super().complaints()
         if self.solver.method not in COUPLED_METHODS and any(solid.is_body for solid in self.solid):
-            message = f"does not take the rigid bodies' part of the matrix, which has products only; with bodies: {', '.join(COUPLED_METHODS)}"
+            message = (
+                f"does not take the rigid bodies' part of the matrix, which has products only; with bodies: {', '.join(COUPLED_METHODS)}"
+            )
             found.append(Complaint(("solver", "method"), self.solver.method, message))
         if self.pressure.model == "unilateral" and self.pressure.surface == "voxel":
             found.append(
                 Complaint(("pressure", "surface"), "voxel", 'has no meaning for model = "unilateral", whose pressure needs no surface')
             )
         if self.solver.method not in COUPLED_METHODS and any(solid.is_body for solid in self.solid):
-            message = f"does not take the rigid bodies' part of the matrix, which has products only; with bodies: {', '.join(COUPLED_METHODS)}"
+            message = (
+                f"does not take the rigid bodies' part of the matrix, which has products only; with bodies: {', '.join(COUPLED_METHODS)}"
+            )
             found.append(Complaint(("solver", "method"), self.solver.method, message))
         if self.pressure.model == "unilateral" and self.particles.narrow_band is not None:
             message = 'has no meaning for model = "unilateral", whose liquid may come apart anywhere inside'
@@ -70,8 +75,10 @@ class LiquidScene(ParticleScene):
     def own_memory_parts(self) -> dict[str, int]:
         """Return what pressure and surface take at most on the device [bytes]."""
         cells, level_set = self.counted_cells, self.pressure.surface == "ghost-fluid"
+        motions = sum(solid.is_body for solid in self.solid) * (3 if self.dimension == 2 else 6)
         return {
             "pressure": cells * (PRESSURE_BYTES + UNILATERAL_BYTES * (self.pressure.model == "unilateral")),
+            "bodies": cells * (BODY_BYTES * bool(motions) + POTENTIAL_BYTES * motions),
             "surface": cells
             * (LEVEL_SET_BYTES * (level_set or self.cuts_cells) + SMOOTHING_BYTES * (level_set and self.pressure.smoothing > 0)),
         }

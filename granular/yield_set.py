@@ -60,33 +60,37 @@ YIELD = """
             for (int d = 0; d < SHEARS; ++d) cap[d] = r;
             return smaller(r/larger(sqrt(normal2), (T)LEAST_RADIUS), (T)1);
         }
-        const T all = sqrt(normal2);
-        T mu = all/r - (T)1, size = 0;  // a lower bound: each part by itself must fit
-        UNROLL for (int d = 0; d < SHEARS; ++d) UNROLL for (int n = 1; n <= 4; ++n) mu = larger(mu, (T)0.25*(largest[d][n - 1]/r - (T)n));
+        const T inverse_r = (T)1/r, all = sqrt(normal2);
+        T mu = all*inverse_r - (T)1, size = 0;  // a lower bound: each part by itself must fit
+        UNROLL for (int d = 0; d < SHEARS; ++d) UNROLL for (int n = 1; n <= 4; ++n) mu = larger(mu, (T)0.25*(largest[d][n - 1]*inverse_r - (T)n));
         mu = larger(mu, (T)0);
+        T shrink = 0;
         UNROLL for (int iteration = 0; iteration <= NEWTON; ++iteration) {
-            const T shrink = (T)1/((T)1 + mu), a2 = normal2*shrink*shrink;
+            shrink = (T)1/((T)1 + mu);
+            T by[4];
+            UNROLL for (int n = 1; n <= 4; ++n) by[n - 1] = (T)1/((T)n + (T)4*mu);
+            const T a2 = normal2*shrink*shrink;
             T total = a2, slope = a2*shrink;
             UNROLL for (int d = 0; d < SHEARS; ++d) {
-                T m = largest[d][0]/((T)1 + (T)4*mu), rate = (T)4/((T)1 + (T)4*mu);
-                UNROLL for (int n = 2; n <= 4; ++n) {
-                    const T by = (T)1/((T)n + (T)4*mu), other = largest[d][n - 1]*by;
-                    rate = other > m ? (T)4*by : rate;
+                T m = largest[d][0]*by[0], rate = by[0];
+                UNROLL for (int n = 1; n < 4; ++n) {
+                    const T other = largest[d][n]*by[n];
+                    rate = other > m ? by[n] : rate;
                     m = larger(m, other);
                 }
                 cap[d] = m;
                 total += m*m;
-                slope += m*m*rate;
+                slope += m*m*(T)4*rate;
             }
             size = sqrt(total);
             if (iteration < NEWTON) {
-                const T step = (size/r - (T)1)*total/larger(slope, (T)LEAST_RADIUS);
+                const T step = (size*inverse_r - (T)1)*total/larger(slope, (T)LEAST_RADIUS);
                 mu = larger(mu + step, (T)0);
             }
         }
         const T onto = smaller(r/larger(size, (T)LEAST_RADIUS), (T)1);
         UNROLL for (int d = 0; d < SHEARS; ++d) cap[d] *= onto;
-        return onto/((T)1 + mu);
+        return onto*shrink;
     };
     // sums of the one, two, three, four largest
     auto sums = [&](T a, T b, T c, T d, T (&out)[4]) INLINE {

@@ -21,6 +21,7 @@ from warp_lcp.stopping import StoppingCriteria
 from warp_lcp.vectors import convert
 
 EPS = float(np.finfo(np.float64).eps)
+SMALLEST = 1e-138  # a norm from which on residuals 16 digits smaller have squares that float64 holds
 FLOOR_MARGIN = 8.0  # a stagnated residual within this multiple of the rounding estimate is called the precision's floor
 
 
@@ -212,6 +213,7 @@ class _Loop:
             self._record(0, Step("start", 0))
             self._keep(0)
             return self._finish(SolveStatus.NON_FINITE, 0)
+        self._refuse_vanishing()
         if self.reference <= 4 * EPS * residual.norm_of_b():
             self._record(0, Step("start", 0))
             self._keep(0)
@@ -227,6 +229,7 @@ class _Loop:
             residual.evaluate(self.work.x)
         self._record(0, Step("start", 0))
         self._keep(0)
+        self.tolerance = self.stopping.tolerance(self.reference, self.history[0].residual)
         if lost > self.tolerance:
             return self._finish(SolveStatus.INFEASIBLE, 0)
         self.work.start(warm=guess is not None, tolerance=self.tolerance)
@@ -246,6 +249,19 @@ class _Loop:
                 self._keep(iteration)
             status = self._status(iteration, step.failure, interim=step.interim)
         return self._finish(status, iteration)
+
+    def _refuse_vanishing(self) -> None:
+        """Refuse data so small that squares of residuals are 0: anything would look like a solution."""
+        norm = max(self.reference, self.residual.norm_of_b())
+        if norm >= SMALLEST or self.stopping.atol >= SMALLEST:
+            return
+        inside = self.problem.unknown.numpy() == 1
+        for name, field in (("b", self.problem.b), ("lower, upper", self.work.x)):
+            largest = float(np.abs(field.numpy()[inside]).max(initial=0.0))
+            if 0.0 < largest < SMALLEST:
+                raise ValueError(
+                    f"{name}: values up to {largest:.1e} only, whose squares vanish in float64; multiply b and the bounds by one factor"
+                )
 
     def _guess(self, x0: Array) -> wp.array[Any]:
         """Return a guess as a stored field that is not the iterate itself."""

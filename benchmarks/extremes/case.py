@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -97,6 +98,10 @@ class Case(Protocol):
     name: str
     budget: float
 
+    @property
+    def precisions(self) -> tuple[str, ...]:
+        """Those in which it is tried."""
+
     def promise(self, precision: str) -> Promise:
         """Return what it must come to."""
 
@@ -156,6 +161,15 @@ class SolveCase:
         """Return what it must come to."""
         return self.promises.get(precision, SOLVED)
 
+    @property
+    def precisions(self) -> tuple[str, ...]:
+        """Those the method has; "double" of one that has no choice."""
+        return PRECISIONS if "precision" in self._fields else ("double",)
+
+    @property
+    def _fields(self) -> set[str]:
+        return {field.name for field in dataclasses.fields(wl.METHODS[self.method])}
+
     def attempt(self, precision: str, device: str) -> Attempt:
         """Solve, and compare what the result says with the independent residual."""
         storage = wp.float32 if precision == "single" else wp.float64
@@ -163,7 +177,8 @@ class SolveCase:
         problem = self.problem()
         begun = time.perf_counter()
         try:
-            solver = wl.METHODS[self.method](precision=precision, **self.options)
+            chosen = {"precision": precision} if "precision" in self._fields else {}
+            solver = wl.METHODS[self.method](**chosen, **self.options)
             lcp = problem.lcp(device, storage)
             result = self.solve(lcp, solver, stopping=wl.StoppingCriteria(**criteria), x0=self.x0)
         except ValueError as refused:
@@ -215,6 +230,7 @@ class RefusalCase:
     call: Callable[[str, str], object]
     names: str
     budget: float = BUDGET
+    precisions: tuple[str, ...] = PRECISIONS
 
     def promise(self, precision: str) -> Promise:
         """Return the refusal."""

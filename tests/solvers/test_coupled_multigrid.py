@@ -114,7 +114,7 @@ def test_iterations_where_walls_let_go(bodies, device):
 
 def test_a_plain_preconditioner_is_not_enough(device):
     """The correction is what the counts above are due to."""
-    cells, columns, A, grid = tank(24, 1, 1e-3, device)
+    cells, columns, A, _ = tank(24, 1, 1e-3, device)
     problem = wl.LCP(A, falls(cells, columns)[0], -np.inf)
     counts = []
     for corrected in (True, False):
@@ -129,7 +129,7 @@ def test_a_plain_preconditioner_is_not_enough(device):
 
 
 def test_the_correction_is_symmetric_positive_definite_and_inverts_light_modes(device):
-    cells, _, A, grid = tank(12, 2, 1e-2, device)
+    cells, _, A, _ = tank(12, 2, 1e-2, device)
     problem = wl.LCP(A, np.where(cells == wl.FLUID, -1.0, 0.0), -np.inf)
     work = wl.ProjectedMultigrid(precision="double").init(problem)
     x = work.x
@@ -172,7 +172,7 @@ def test_the_correction_is_symmetric_positive_definite_and_inverts_light_modes(d
 
 @pytest.mark.parametrize("net", [0.0, 1.0])
 def test_a_closed_box_full_of_liquid_is_solved_if_b_is_compatible(net, device):
-    cells, columns, A, _ = tank(12, 1, 0.5, device)
+    cells, _, A, _ = tank(12, 1, 0.5, device)
     cells[cells == wl.AIR] = wl.FLUID
     A = wl.SumOperator(wl.GridPoisson(cells, device=device, dtype=wp.float64), A.second.stored_like(A.second))
     fluid = cells == wl.FLUID

@@ -40,7 +40,7 @@ class Reseed(Table):
 
 
 class NarrowBandSettings(Table):
-    """[particles.narrow_band]: particles near the surface only, the grid carries what lies deeper; off unless the table is there."""
+    """[particles.narrow_band]: particles, in frames too, near the surface only, the grid carries what lies deeper; off unless there."""
 
     width: float = Field(default=4.0, ge=3, description="cells below the surface that hold particles")
 

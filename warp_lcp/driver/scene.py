@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, WrapValidator, model_validator
+from pydantic_core import PydanticKnownError
 
 from warp_lcp.driver.camera import Camera
 from warp_lcp.driver.shapes import Liquid, Shape, Solid, Wall
@@ -20,6 +21,25 @@ __all__ = ["Complaint", "Liquid", "Problem", "Scene", "SceneError", "Shape", "So
 Length = Annotated[float, Field(gt=0)]
 
 GridMethod = Literal[grid_methods()]
+
+
+def _tolerance(value: Any, handler: Callable[[Any], float | str]) -> float | str:
+    """Return a number in (0, 1) or "auto"; a wrong one is refused as any other number is, without a word of the alternative's type."""
+    if value == "auto":
+        return "auto"
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not number:
+        raise PydanticKnownError("float_type")
+    if value >= 1.0:
+        raise PydanticKnownError("less_than", {"lt": 1.0})
+    if value <= 0.0:
+        raise PydanticKnownError("greater_than", {"gt": 0.0})
+    return handler(float(value))
+
+
+Tolerance = Annotated[
+    Annotated[float, Field(gt=0, lt=1)] | Literal["auto"], WrapValidator(_tolerance, json_schema_input_type=float | Literal["auto"])
+]
 
 WHOLE_CELLS = 1e-6  # how far a side may be from a whole number of cells, relative
 
@@ -80,7 +100,10 @@ class Solver(Table):
 
     later: ClassVar = {"preset": ANY_VALUE}
     method: GridMethod = Field(default="projected-multigrid", description="projected-multigrid is the fastest")
-    tolerance: float = Field(default=1e-4, gt=0, lt=1, description="the relative residual to reach")
+    tolerance: Tolerance = Field(
+        default=1e-4,
+        description='the relative residual to reach; "auto": what leaves a tenth of the error that the time step makes',
+    )
     precision: Literal["mixed", "single", "double"] = Field(default="mixed", description="of the method's arithmetic")
     max_iterations: int = Field(default=100, ge=1, description="iterations before the step counts as failed")
 
@@ -213,7 +236,7 @@ class Scene(Table):
             *([("bodies", bodies)] if bodies else []),
             ("time", f"{self.time.duration:g} s in steps of at most {self.time.dt_max:g} s, CFL {self.time.cfl:g}"),
             ("frames", f"{self.time.frame_count + 1} at {self.time.frames_per_second:g} per second"),
-            ("solver", f"{self.solver.method} to {self.solver.tolerance:g}, {self.solver.precision} precision"),
+            ("solver", f"{self.solver.method} to {_shown(self.solver.tolerance)}, {self.solver.precision} precision"),
         ]
 
     def _side_complaints(self) -> list[Complaint]:
@@ -260,3 +283,8 @@ class Scene(Table):
         if self.domain.periodic is not None and len(self.domain.periodic) != self.dimension:
             found.append(Complaint(("domain", "periodic"), self.domain.periodic, f"must have {self.dimension} entries"))
         return found
+
+
+def _shown(tolerance: float | str) -> str:
+    """Return a solver's tolerance in words."""
+    return f"{tolerance:g}" if isinstance(tolerance, float) else "a tenth of the time step's error"

@@ -11,14 +11,17 @@ the distance to the surface [cells], and W the band's width.
 2. How fast. On faces deeper than W - 1 the velocity u* is the last step's, carried along by a semi-Lagrangian step of third order
    (`warp_lcp.grid.semi_lagrangian`); on those above W - 2 it is the particles' mean, in between it goes over linearly. Gravity and
    pressure act on both alike.
-3. Exchange. Particles deeper than W go. The band's last layer, W - 1 < d <= W, and what was {d* > W - 1} and is now shallower, gets fresh
-   particles on a jittered lattice in each step: a reservoir of even density, out of which the flow takes exactly what it carries away, so
-   that no cell is ever filled up by a guess. They take their velocity and its gradient from the grid, as all others do at that time.
+3. Exchange. Particles deeper than W go. The band's last layer, W - 1 < d <= W, and what was {d* > W - 1} and is now shallower (a wall has
+   let go of it, say), gets fresh particles in each step: a reservoir of even density, out of which the flow takes exactly what it carries
+   away. Their lattice moves on through the cell by irrational steps, so that in the mean over steps every place is as likely: on a lattice
+   that stays no particle ever is where a slow flow could take it along, and cells filled up to a count lose 10 % to the same bias. They
+   take their velocity and its gradient from the grid, as all others do at that time.
 4. Mass. H counts the particles that the interior stands for: those that went in less those that came out. What the fresh layer holds
    and what the density correction sees there is H by the particles that {d* > W} would hold at rest, within a tenth of 1: particles and
    H are as many as without a band, so that liquid lost to one side is pushed back by the correction as it would be without.
 
-Particles also stay within W of where liquid leaves a wall, where solids cut cells or move, and of sources, drains and open sides.
+In sums the interior counts by whole cells, so that a log's center of mass may be off by a part of a cell, and its potential energy by as
+much. Particles also stay within W of where liquid leaves a wall, where solids cut cells or move, and of sources, drains and open sides.
 """
 
 from __future__ import annotations

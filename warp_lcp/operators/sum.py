@@ -16,6 +16,7 @@ from warp_lcp.problem import as_operator
 
 FELT = 1e-5  # of the sum of a column's sizes over a component: open fractions are of float32
 
+
 class SumOperator:
     """(A + B) x = A x + B x.
 
