@@ -10,7 +10,8 @@ from pydantic import Field, model_validator
 
 from granular.materials import MATERIALS, Material, compression_slope, plane_strain_slope
 from warp_lcp.driver.particle_scene import ParticleScene
-from warp_lcp.driver.scene import Complaint, Domain, Table, Time
+from warp_lcp.driver.presets import PresetName
+from warp_lcp.driver.scene import PRESET_KEY, Complaint, Domain, Table, Time
 from warp_lcp.driver.shapes import (
     FRICTIONS,
     STICKS,
@@ -85,6 +86,7 @@ class Gauge(Table):
 class SandSolver(Table):
     """[solver]: the method for pressure and friction together."""
 
+    preset: PresetName | None = Field(default=None, description=PRESET_KEY)
     method: Literal["accelerated-projection", "interleaved-sweeps"] = Field(
         default="accelerated-projection", description="interleaved-sweeps is the textbook's, several times slower"
     )

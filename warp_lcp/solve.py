@@ -252,8 +252,7 @@ class _Loop:
 
     def _refuse_vanishing(self) -> None:
         """Refuse data so small that squares of residuals are 0: anything would look like a solution."""
-        norm = max(self.reference, self.residual.norm_of_b())
-        if norm >= SMALLEST or self.stopping.atol >= SMALLEST:
+        if max(self.reference, self.stopping.atol) >= SMALLEST or self.residual.norm_of_b() >= SMALLEST:
             return
         inside = self.problem.unknown.numpy() == 1
         for name, field in (("b", self.problem.b), ("lower, upper", self.work.x)):

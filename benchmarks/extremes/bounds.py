@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.extremes.case import BELOW_ROUNDING, EITHER, PRECISIONS, Case, Expected, Promise
+from benchmarks.extremes.case import BELOW_ROUNDING, EITHER, PRECISIONS, Case, Expected, Promise, refusal
 from benchmarks.extremes.problem import GridProblem
 from benchmarks.extremes.shapes import AIR, FLUID, SEED, both, noise, pool, same
 
 SHAPE = (40, 44)
+OVERFLOWS = Promise(Expected.STOPPED, frozenset({"NON_FINITE"}))
 EXACT_OR_FLOOR = Promise(Expected.EITHER, frozenset({"FLOOR"}))
 
 
@@ -23,6 +24,9 @@ def scales() -> Iterator[Case]:
     for scale in (1e-30, 1e-15, 1e15, 1e30):
         yield from both(family, f"b of {scale:g}", lambda s=scale: pool(SHAPE, b=s * noise(SHAPE)))
         yield from both(family, f"b and bounds of {scale:g}", lambda s=scale: boxed(s))
+    for scale in (1e-160, 1e-310):
+        yield from both(family, f"b of {scale:g}", lambda s=scale: pool(SHAPE, b=s * noise(SHAPE)), promises=same(refusal("b: values up to")))
+    yield from both(family, "b of 1e160", lambda: pool(SHAPE, b=1e160 * noise(SHAPE)), promises=same(OVERFLOWS))
     yield from both(family, "one cell of b at 1e12", lambda: spike(1e12))
     yield from both(family, "b over 30 decades", lambda: pool(SHAPE, b=noise(SHAPE) * 10 ** np.random.default_rng(SEED + 11).uniform(-15, 15, SHAPE)))
     yield from both(family, "bounds at 1e30", lambda: pool(SHAPE, lower=-1e30, upper=1e30))

@@ -11,8 +11,9 @@ from pydantic import Field, WrapValidator, model_validator
 from pydantic_core import PydanticKnownError
 
 from warp_lcp.driver.camera import Camera
+from warp_lcp.driver.presets import PresetName, fill_in, preset_line
 from warp_lcp.driver.shapes import Liquid, Shape, Solid, Wall
-from warp_lcp.driver.table import ANY_VALUE, Complaint, Problem, SceneError, Table, Vector, refuse, validate
+from warp_lcp.driver.table import Complaint, Problem, SceneError, Table, Vector, refuse, validate
 from warp_lcp.grid.sides import SIDES
 from warp_lcp.solvers.registry import grid_methods
 
@@ -40,6 +41,8 @@ def _tolerance(value: Any, handler: Callable[[Any], float | str]) -> float | str
 Tolerance = Annotated[
     Annotated[float, Field(gt=0, lt=1)] | Literal["auto"], WrapValidator(_tolerance, json_schema_input_type=float | Literal["auto"])
 ]
+
+PRESET_KEY = "sets time step, tolerance and more, where the scene does not; none unless given"
 
 WHOLE_CELLS = 1e-6  # how far a side may be from a whole number of cells, relative
 
@@ -98,7 +101,7 @@ class Physics(Table):
 class Solver(Table):
     """[solver]: the method for the complementarity problem of every step, and how far it goes."""
 
-    later: ClassVar = {"preset": ANY_VALUE}
+    preset: PresetName | None = Field(default=None, description=PRESET_KEY)
     method: GridMethod = Field(default="projected-multigrid", description="projected-multigrid is the fastest")
     tolerance: Tolerance = Field(
         default=1e-4,
@@ -154,6 +157,12 @@ class Scene(Table):
             gravity = [0.0, -9.81, 0.0] if isinstance(size, list) and len(size) == 3 else [0.0, -9.81]
             return {**data, "physics": {"gravity": gravity, **physics}}
         return data
+
+    @model_validator(mode="before")
+    @classmethod
+    def _preset_fills_in(cls, data: Any) -> Any:
+        """Take from `solver.preset` what the scene does not say."""
+        return fill_in(cls, data) if isinstance(data, dict) else data
 
     @model_validator(mode="after")
     def _check_across_tables(self) -> Self:
@@ -228,7 +237,9 @@ class Scene(Table):
         cells = self.cell_counts[: self.dimension]
         moving = ", ".join(f"solid {index} {solid.motion.kind}" for index, solid in enumerate(self.solid) if solid.motion)
         bodies = ", ".join(self._body_line(index, solid) for index, solid in enumerate(self.solid) if solid.is_body)
+        preset = preset_line(self)
         return [
+            *([("preset", preset)] if preset else []),
             ("grid", f"{' x '.join(map(str, cells))} = {math.prod(cells):,} cells of {self.spacing:.6g} m"),
             ("walls", ", ".join([self.domain.wall, *(f"solid {i} {s.wall}" for i, s in enumerate(self.solid) if s.wall)])),
             *([("open", ", ".join(self.domain.open))] if self.domain.open else []),
