@@ -13,8 +13,8 @@ from benchmarks import launches
 from benchmarks.timing import Options
 
 SUITES = (
-    "kernels", "solvers", "scaling", "peers", "run", "sand", "implicit_mpm", "contacts", "validation", "narrow_band", "replay", "book",
-    "guard",
+    "kernels", "solvers", "scaling", "floor", "peers", "run", "sand", "implicit_mpm", "contacts", "validation", "narrow_band", "replay",
+    "book", "guard", "extremes",
 )  # fmt: skip
 
 

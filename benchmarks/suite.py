@@ -89,7 +89,7 @@ class Suite:
         process = subprocess.run([sys.executable, "-m", "benchmarks", *arguments], env={**os.environ, **ONE_THREAD}, check=False)
         if process.returncode != 0:
             raise RuntimeError(f"the suite {name} ended with exit code {process.returncode}")
-        return sorted(p for p in out.glob(f"{name}*") if p.suffix in (".json", ".md", ".csv", ".png"))
+        return sorted(p for p in out.glob(f"{name}*") if p.suffix in (".json", ".md", ".csv", ".png", ".html"))
 
     def _check_replay(self, problems: Path | None, methods: tuple[str, ...], sizes: tuple[int, ...]) -> None:
         """Refuse what cannot be replayed, before a process is started for it."""
@@ -123,7 +123,11 @@ SOLVERS = Suite(
     replays=True,
     groups={"book": "the experiments of [Book] appendix C"},
 )
-SCALING = Suite("scaling", "linear and LCP solves from 32^3 up to what memory holds: seconds to three tolerances, bytes a cell, exponents")
+SCALING = Suite(
+    "scaling",
+    "linear and LCP solves from 32^3 up to what memory holds: seconds to three tolerances, bytes a cell, exponents",
+    groups={"floor": "the smallest residual that each precision reaches, up to 256^3"},
+)
 PEERS = Suite("peers", "the same problems by PyAMG, AMGCL, SciPy, PETSc, OSQP, PIQP, Clarabel, Warp's CG, as far as they are there")
 RUN = Suite(
     "run",
@@ -141,3 +145,4 @@ VALIDATION = Suite(
     "liquids and sand against known answers: rest, sloshing, ceiling, dam break, transfers, slopes, volume, sand; with negative controls",
     False,
 )
+EXTREMES = Suite("extremes", "hostile problems and scenes: solved, refused or stopped as is fixed beforehand, checked by NumPy and SciPy", False)

@@ -1,0 +1,114 @@
+"""Hostile cases with an outcome that is fixed beforehand, judged by NumPy and SciPy in float64; `warp-lcp bench extremes` runs them all.
+
+A case is solved to its tolerance, refused before the start with a message that names the argument, or stopped with a status that says so.
+Solvers that are wrong on purpose are among the cases: the checks must catch each of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from benchmarks.extremes import bounds, broken, coefficients, matrices, refused, shapes, simulations
+from benchmarks.extremes.case import PRECISIONS, Case, Expected, Verdict, judge
+from benchmarks.machine import machine
+from benchmarks.record import Record, Results, Table
+from benchmarks.timing import Figure, Options
+
+TITLE = "Extremes: hostile problems and scenes, and what they come to"
+FAMILIES = (
+    shapes.sizes, shapes.masks, shapes.closed_pools, coefficients.slivers, coefficients.contrasts, coefficients.bodies, bounds.scales,
+    bounds.degenerate, bounds.tolerances, matrices.singular, matrices.cycling, refused.wrong_arguments, simulations.steps_and_forces,
+    simulations.particles_anywhere, broken.wrong_solvers,
+)  # fmt: skip
+
+
+def cases() -> Iterator[Case]:
+    """Yield all cases, family by family.
+
+    Raises:
+        ValueError: two cases share a name.
+    """
+    seen = set[tuple[str, str]]()
+    for family in FAMILIES:
+        for case in family():
+            if (case.family, case.name) in seen:
+                raise ValueError(f"two cases are called {case.family}: {case.name}")
+            seen.add((case.family, case.name))
+            yield case
+
+
+def measure(options: Options, out: Path) -> Results:
+    """Try every case in each of its precisions."""
+    verdicts: list[Verdict] = []
+    family = ""
+    for case in cases():
+        if case.family != family:
+            family = case.family
+            options.say(f"{family} ...")
+        for precision in case.precisions:
+            verdicts.append(judge(case, precision, options.device))
+            if verdicts[-1].wrong:
+                options.say(f"{verdicts[-1].name}: {verdicts[-1].outcome}")
+    records = [machine(options.device, elements=1 << 22, repeat=options.repeat), *(record(v) for v in verdicts)]
+    failures = [f"{v.name}: {v.outcome} (expected: {v.promise})" for v in verdicts if v.wrong]
+    return Results(records, [families(verdicts), table(verdicts)], failures=failures)
+
+
+def record(verdict: Verdict) -> Record:
+    """Return what the file keeps."""
+    attempt = verdict.attempt
+    figures = {"seconds": Figure(attempt.seconds, "s")}
+    if attempt.residual is not None:
+        figures["residual"] = Figure(attempt.residual)
+    facts = {
+        "family": verdict.case.family,
+        "precision": verdict.precision,
+        "expected": str(verdict.promise),
+        "outcome": verdict.outcome,
+        "status": attempt.status,
+        "residual": attempt.residual,
+        "seconds": attempt.seconds,
+        "budget": verdict.case.budget,
+        "message": attempt.message or None,
+        "passed": not verdict.wrong,
+    }
+    return Record(verdict.name, figures, facts)
+
+
+def families(verdicts: Sequence[Verdict]) -> Table:
+    """Return how many cases of each family are as they must be."""
+    rows = []
+    for family in dict.fromkeys(v.case.family for v in verdicts):
+        own = [v for v in verdicts if v.case.family == family]
+        counts = [sum(v.promise.expected is kind for v in own) for kind in Expected]
+        kinds = ", ".join(f"{n} {kind.value}" for n, kind in zip(counts, Expected, strict=True) if n)
+        wrong, slowest = sum(bool(v.wrong) for v in own), max(v.attempt.seconds for v in own)
+        rows.append([family, str(len({v.case.name for v in own})), str(len(own)), kinds, str(wrong), f"{slowest:.2f}"])
+    total = len({(v.case.family, v.case.name) for v in verdicts})
+    wrong_ones, seconds = sum(bool(v.wrong) for v in verdicts), sum(v.attempt.seconds for v in verdicts)
+    remark = f"{total} cases, {len(verdicts)} attempts in {seconds:.0f} s, {wrong_ones} not as they must be."
+    return Table("Families", ("family", "cases", "attempts", "expected", "not as they must be", "slowest [s]"), rows, remark)
+
+
+def table(verdicts: Sequence[Verdict]) -> Table:
+    """Return a row a case, with status, relative residual and seconds in each precision."""
+    rows = []
+    by_case: dict[tuple[str, str], list[Verdict]] = {}
+    for v in verdicts:
+        by_case.setdefault((v.case.family, v.case.name), []).append(v)
+    for (family, name), own in by_case.items():
+        tried = {v.precision: v for v in own}
+        wrong = [f"{v.precision}: {v.outcome}" for v in own if v.wrong]
+        expected = "; ".join(dict.fromkeys(str(v.promise) for v in own))
+        rows.append([family, name, expected, *(_cell(tried.get(p)) for p in PRECISIONS), "; ".join(wrong) or "yes"])
+    remark = "Status, residual relative to that of clip(0, l, u), seconds. It is computed by NumPy and SciPy from cells and faces."
+    return Table("Cases", ("family", "case", "expected", *PRECISIONS, "as it must be?"), rows, remark)
+
+
+def _cell(verdict: Verdict | None) -> str:
+    if verdict is None:
+        return "-"
+    attempt = verdict.attempt
+    residual = "" if attempt.residual is None else f" {attempt.residual:.1e}"
+    return f"{attempt.status}{residual}, {attempt.seconds:.2g} s"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
@@ -25,10 +24,14 @@ def scales() -> Iterator[Case]:
         yield from both(family, f"b of {scale:g}", lambda s=scale: pool(SHAPE, b=s * noise(SHAPE)))
         yield from both(family, f"b and bounds of {scale:g}", lambda s=scale: boxed(s))
     for scale in (1e-160, 1e-310):
-        yield from both(family, f"b of {scale:g}", lambda s=scale: pool(SHAPE, b=s * noise(SHAPE)), promises=same(refusal("b: values up to")))
+        yield from both(
+            family, f"b of {scale:g}", lambda s=scale: pool(SHAPE, b=s * noise(SHAPE)), promises=same(refusal("b: values up to"))
+        )
     yield from both(family, "b of 1e160", lambda: pool(SHAPE, b=1e160 * noise(SHAPE)), promises=same(OVERFLOWS))
     yield from both(family, "one cell of b at 1e12", lambda: spike(1e12))
-    yield from both(family, "b over 30 decades", lambda: pool(SHAPE, b=noise(SHAPE) * 10 ** np.random.default_rng(SEED + 11).uniform(-15, 15, SHAPE)))
+    yield from both(
+        family, "b over 30 decades", lambda: pool(SHAPE, b=noise(SHAPE) * 10 ** np.random.default_rng(SEED + 11).uniform(-15, 15, SHAPE))
+    )
     yield from both(family, "bounds at 1e30", lambda: pool(SHAPE, lower=-1e30, upper=1e30))
     yield from both(family, "b of 1e-30 beside a bound of 1e10", tiny_beside_huge)
 
@@ -68,7 +71,9 @@ def degenerate() -> Iterator[Case]:
     yield from both(family, "equal b everywhere", lambda: pool(SHAPE, b=np.full(SHAPE, -1.0), lower=0.0, upper=50.0))
     yield from both(family, "lower bounds of noise, l > 0", lambda: pool(SHAPE, lower=np.abs(noise(SHAPE, SEED + 13))))
     yield from both(family, "upper bounds only", lambda: pool(SHAPE, lower=-np.inf, upper=0.0))
-    yield from both(family, "checkerboard of bounds", lambda: pool(SHAPE, lower=np.where(np.indices(SHAPE).sum(axis=0) % 2 == 0, 0.0, -np.inf)))
+    yield from both(
+        family, "checkerboard of bounds", lambda: pool(SHAPE, lower=np.where(np.indices(SHAPE).sum(axis=0) % 2 == 0, 0.0, -np.inf))
+    )
     yield from both(family, "resting under a ceiling", ceiling)
     for far in (1e6, 1e20, -1e20):
         yield from both(family, f"start at {far:g}", lambda: pool(SHAPE), x0=np.full(SHAPE, far))
@@ -118,19 +123,19 @@ def tolerances() -> Iterator[Case]:
         for name, shape in (("2-D", (64, 66)), ("3-D", (17, 18, 19))):
             promises: dict[str, Promise] = same(BELOW_ROUNDING if rtol < 1e-16 else EXACT_OR_FLOOR)  # type: ignore[assignment]
             yield from both(
-                family, f"rtol = {rtol:g}, {name}", lambda s=shape: pool(s), promises=promises, stopping={"rtol": rtol, "max_iterations": 500}
+                family,
+                f"rtol = {rtol:g}, {name}",
+                lambda s=shape: pool(s),
+                promises=promises,
+                stopping={"rtol": rtol, "max_iterations": 500},
             )
-    yield from both(family, "rtol = 1e-12, single stops", lambda: pool((64, 66)), promises={"single": BELOW_ROUNDING}, stopping={"rtol": 1e-12})
+    yield from both(
+        family, "rtol = 1e-12, single stops", lambda: pool((64, 66)), promises={"single": BELOW_ROUNDING}, stopping={"rtol": 1e-12}
+    )
     yield from both(family, "atol = 1e30", lambda: pool(SHAPE), stopping={"atol": 1e30})
     stopped = Promise(Expected.STOPPED, frozenset({"MAX_ITERATIONS"}))
     for limit in (0, 1):
         yield from both(family, f"{limit} iterations", lambda: pool(SHAPE), promises=same(stopped), stopping={"max_iterations": limit})
-    yield from both(family, "256x256 to 1e-13", lambda: pool((256, 256)), promises=dict.fromkeys(PRECISIONS, EITHER), stopping={"rtol": 1e-13})
-
-
-def check_case_names(cases: list[Any]) -> None:
-    """Refuse two cases of one name."""
-    names = [f"{case.family}: {case.name}" for case in cases]
-    twice = {name for name in names if names.count(name) > 1}
-    if twice:
-        raise ValueError(f"cases that share a name: {sorted(twice)}")
+    yield from both(
+        family, "256x256 to 1e-13", lambda: pool((256, 256)), promises=dict.fromkeys(PRECISIONS, EITHER), stopping={"rtol": 1e-13}
+    )

@@ -72,5 +72,3 @@ def wrong_solvers() -> Iterator[Case]:
     for name, solve in SOLVERS.items():
         yield SolveCase("wrong on purpose", f"{name}, 2-D", lambda: pool((24, 25)), promises=CAUGHT, solve=solve)
         yield SolveCase("wrong on purpose", f"{name}, 1-D", lambda: grounded((1, 40)), "minimum-map-newton", promises=CAUGHT, solve=solve)
-
-

@@ -14,6 +14,9 @@ from benchmarks.extremes.shapes import AIR, FLUID, SEED, SOLID, both, noise, poo
 SHAPES = ((48, 53), (17, 18, 19))
 ROUGH = {"rtol": 1e-6}  # where the matrix's own rounding is felt: 12 decades beside each other
 SINGLE_MAY_STOP = {"single": EITHER}
+MIXED_MAY_STOP = {"single": EITHER, "mixed": EITHER}
+# Documented limits: corrections of float32 know a cell's diagonal to 6e-8 of it, and what holds a light region to less than the contrast
+LARGEST_CONTRAST = 1e4
 
 
 def faces_of(shape: tuple[int, ...], value: Any) -> dict[str, np.ndarray]:
@@ -94,8 +97,9 @@ def contrasts() -> Iterator[Case]:
     """Yield coefficients over 12 decades, densities to 10^8 to 1, and cells a thousand times flatter than wide."""
     family = "contrasts"
     for ratio in (1e2, 1e4, 1e6, 1e8):
-        yield from both(family, f"layers of density 1:{ratio:g}", lambda r=ratio: layered(r), promises=SINGLE_MAY_STOP, stopping=ROUGH)
-        yield from both(family, f"bubbles of density 1:{ratio:g}", lambda r=ratio: bubbles(r), promises=SINGLE_MAY_STOP, stopping=ROUGH)
+        promises = SINGLE_MAY_STOP if ratio <= LARGEST_CONTRAST else MIXED_MAY_STOP
+        yield from both(family, f"layers of density 1:{ratio:g}", lambda r=ratio: layered(r), promises=promises, stopping=ROUGH)
+        yield from both(family, f"bubbles of density 1:{ratio:g}", lambda r=ratio: bubbles(r), promises=promises, stopping=ROUGH)
     for shape in SHAPES:
         for decades in (4, 12):
             name = f"coefficients over {decades} decades, {len(shape)}-D"
@@ -151,14 +155,17 @@ def bodies() -> Iterator[Case]:
     """Yield rigid bodies in the liquid, as a term U W U' of masses from 10^-8 to 10^8 of the liquid's."""
     family = "rigid bodies"
     for inverse in (1e-8, 1e-4, 1.0, 1e4, 1e8):
-        yield from both(family, f"one body, 1/mass = {inverse:g}", lambda w=inverse: swimming([w]), promises=SINGLE_MAY_STOP, stopping=ROUGH)
+        promises = SINGLE_MAY_STOP if inverse <= 1e4 else MIXED_MAY_STOP
+        yield from both(family, f"one body, 1/mass = {inverse:g}", lambda w=inverse: swimming([w]), promises=promises, stopping=ROUGH)
     mixed = [1e-8, 1e8, 1.0, 1e4]
-    yield from both(family, "four, 1/mass from 1e-8 to 1e8", lambda: swimming(mixed), promises=SINGLE_MAY_STOP, stopping=ROUGH)
+    yield from both(family, "four, 1/mass from 1e-8 to 1e8", lambda: swimming(mixed), promises=MIXED_MAY_STOP, stopping=ROUGH)
     yield from both(family, "held: W = 0", lambda: swimming([0.0, 0.0]))
-    yield from both(family, "light bodies, 3-D", lambda: swimming_3d([1e8, 1e8]), promises=SINGLE_MAY_STOP, stopping=ROUGH)
+    for inverse in (1e2, 1e4, 1e8):
+        promises = SINGLE_MAY_STOP if inverse <= 1e4 else MIXED_MAY_STOP
+        yield from both(family, f"two, 1/mass = {inverse:g}, 3-D", lambda w=inverse: swimming_3d([w, w]), promises=promises, stopping=ROUGH)
     yield from both(family, "heavy bodies, 3-D", lambda: swimming_3d([1e-8, 1e-8]))
-    yield from both(family, "a column that touches nothing", lambda: with_empty_column())
-    yield from both(family, "two equal columns", lambda: doubled_column())
+    yield from both(family, "a column that touches nothing", with_empty_column)
+    yield from both(family, "two equal columns", doubled_column)
     yield from both(family, "a piston closes a chamber", piston)
 
 

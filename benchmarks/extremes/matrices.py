@@ -28,17 +28,42 @@ def singular() -> Iterator[Case]:
     family = "zero eigenvalues"
     convex = ("minimum-map-newton", "mprgp", "interior-point", "incremental-pivoting", "lemke")
     for rank in (1, N // 2, N - 1):
-        yield from given(family, f"dense of rank {rank}, b in its range", lambda r=rank: in_range(r), convex, promises=same(EITHER) if rank == 1 else {"single": EITHER})
-    yield from given(family, "sparse, constants are a null space", ring, ("minimum-map-newton", "mprgp", "incremental-pivoting"), promises={"single": EITHER})
-    yield from given(family, "A = 0, b >= 0", lambda: MatrixProblem(matrix=np.zeros((3, 3)), b=np.array([0.0, 1.0, 2.0])), ("minimum-map-newton", "lemke", "psor"))
+        yield from given(
+            family,
+            f"dense of rank {rank}, b in its range",
+            lambda r=rank: in_range(r),
+            convex,
+            promises=same(EITHER) if rank == 1 else {"single": EITHER},
+        )
+    yield from given(
+        family,
+        "sparse, constants are a null space",
+        ring,
+        ("minimum-map-newton", "mprgp", "incremental-pivoting"),
+        promises={"single": EITHER},
+    )
+    yield from given(
+        family,
+        "A = 0, b >= 0",
+        lambda: MatrixProblem(matrix=np.zeros((3, 3)), b=np.array([0.0, 1.0, 2.0])),
+        ("minimum-map-newton", "lemke", "psor"),
+    )
     yield from given(
         family, "A = 0, b < 0", lambda: MatrixProblem(matrix=np.zeros((3, 3)), b=np.array([0.0, 1.0, -2.0])), ("minimum-map-newton", "lemke"),
         promises=same(INFEASIBLE),
     )  # fmt: skip
     for b, promises in ((1.0, {}), (-1.0, same(INFEASIBLE))):
-        yield from given(family, f"sparse with an empty row, b = {b:g} there", lambda b=b: empty_row(b), ("minimum-map-newton",), promises=promises)
+        yield from given(
+            family, f"sparse with an empty row, b = {b:g} there", lambda b=b: empty_row(b), ("minimum-map-newton",), promises=promises
+        )
     for small in (1e-8, 1e-14, 1e-300):
-        yield from given(family, f"smallest eigenvalue {small:g}", lambda s=small: nearly(s), ("minimum-map-newton", "incremental-pivoting"), promises=same(EITHER))
+        yield from given(
+            family,
+            f"smallest eigenvalue {small:g}",
+            lambda s=small: nearly(s),
+            ("minimum-map-newton", "incremental-pivoting"),
+            promises=same(EITHER),
+        )
     for size in (1e-30, 1e30):
         matrix = np.array([[2.0, -1.0], [-1.0, 2.0]]) * size
         yield from given(
@@ -94,8 +119,20 @@ def cycling() -> Iterator[Case]:
             x0[:: n if start == "first" else 2] = 1.0
             yield from given(family, f"cyclic, {n} unknowns, {start} start", lambda n=n: circulant(n), ("minimum-map-newton",), x0=x0)
     for n in (8, 16):
-        yield from given(family, f"Murty's, {n} unknowns", lambda n=n: murty(n), ("minimum-map-newton", "lemke"), but={"lemke": same(EITHER)} if n > 8 else {})
-        yield from given(family, f"Fathi's, {n} unknowns", lambda n=n: fathi(n), ("minimum-map-newton", "incremental-pivoting", "lemke"), promises={"single": EITHER})
+        yield from given(
+            family,
+            f"Murty's, {n} unknowns",
+            lambda n=n: murty(n),
+            ("minimum-map-newton", "lemke"),
+            but={"lemke": same(EITHER)} if n > 8 else {},
+        )
+        yield from given(
+            family,
+            f"Fathi's, {n} unknowns",
+            lambda n=n: fathi(n),
+            ("minimum-map-newton", "incremental-pivoting", "lemke"),
+            promises={"single": EITHER},
+        )
     for seed in range(4):
         yield from given(family, f"unsymmetric, random {seed}", lambda s=seed: unsymmetric(s), robust)
 
@@ -122,5 +159,3 @@ def unsymmetric(seed: int) -> MatrixProblem:
     chance = np.random.default_rng(SEED + 30 + seed)
     B, C = chance.standard_normal((2, N, N))
     return MatrixProblem(matrix=B @ B.T / N + np.eye(N) + 2 * (C - C.T) / np.sqrt(N), b=chance.standard_normal(N))
-
-

@@ -21,7 +21,9 @@ def wrong_arguments() -> Iterator[Case]:
     for bad in (np.nan, np.inf, -np.inf):
         for name, call in NOT_FINITE.items():
             if not (name == "lower" and bad == -np.inf) and not (name == "upper" and bad == np.inf):
-                yield RefusalCase("not finite", f"{bad} in {name}", lambda device, p, c=call, v=bad: c(device, p, v), name.replace(",", "").split()[0])
+                yield RefusalCase(
+                    "not finite", f"{bad} in {name}", lambda device, p, c=call, v=bad: c(device, p, v), name.replace(",", "").split()[0]
+                )
     for name, (names, simple) in WRONG.items():
         yield RefusalCase("wrong arguments", name, simple, names)
 
@@ -86,6 +88,9 @@ WRONG: dict[str, tuple[str, Callable[[str, str], object]]] = {
     "rtol = 1": ("rtol", lambda device, p: wl.StoppingCriteria(rtol=1.0)),
     "max_iterations = -1": ("max_iterations", lambda device, p: wl.StoppingCriteria(max_iterations=-1)),
     "patience = 0": ("patience", lambda device, p: wl.StoppingCriteria(patience=0)),
-    "precision = half": ("precision", lambda device, p: wl.solve(wl.LCP(grid(device), np.ones(SHAPE)), wl.ProjectedMultigrid(precision="half"))),
+    "precision = half": (
+        "precision",
+        lambda device, p: wl.solve(wl.LCP(grid(device), np.ones(SHAPE)), wl.ProjectedMultigrid(precision="half")),
+    ),
     "entries beyond float32": ("matrix", lambda device, p: wl.DenseOperator(np.full((2, 2), 1e200), device=device, dtype=wp.float32)),
 }

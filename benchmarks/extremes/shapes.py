@@ -10,7 +10,7 @@ import scipy.sparse
 import scipy.sparse.csgraph
 
 import warp_lcp as wl
-from benchmarks.extremes.case import INFEASIBLE, PRECISIONS, Case, Promise, RefusalCase, SolveCase
+from benchmarks.extremes.case import EITHER, INFEASIBLE, PRECISIONS, Case, Promise, RefusalCase, SolveCase
 from benchmarks.extremes.exact import stencil
 from benchmarks.extremes.problem import GridProblem
 
@@ -60,7 +60,7 @@ def sizes() -> Iterator[Case]:
     for shape in ((2, 2), (3, 1), (127, 131), (1, 127, 131), (31, 37, 41), (2, 3, 5)):
         yield from both(family, "x".join(map(str, shape)) + " below air", lambda shape=shape: pool(shape))
     for shape in ((3, 3000), (3000, 3), (2, 2000), (2, 2, 2000), (2000, 2, 2), (3, 2000, 3)):
-        yield from both(family, "1:1000, " + "x".join(map(str, shape)), lambda shape=shape: pool(shape))
+        yield from both(family, "1:1000, " + "x".join(map(str, shape)), lambda shape=shape: pool(shape), promises={"single": EITHER})
     yield from both(family, "1024x1024", lambda: pool((1024, 1024)), budget=LARGE_BUDGET)
     yield from both(family, "1024x1024 with noise as mask", lambda: sponge((1024, 1024), 0.75), budget=LARGE_BUDGET)
     yield from both(family, "2-D like 3-D of one layer, periodic", lambda: pool((1, 61, 67), periodic=(True, False, False)))
@@ -89,19 +89,25 @@ def masks() -> Iterator[Case]:
     family = "masks"
     for name, kind in (("solid", SOLID), ("air", AIR)):
         yield RefusalCase(
-            family, f"all {name}", lambda device, p, kind=kind: wl.LCP(wl.GridPoisson(np.full((4, 5), kind), device=device), np.zeros((4, 5))), "A "
+            family,
+            f"all {name}",
+            lambda device, p, kind=kind: wl.LCP(wl.GridPoisson(np.full((4, 5), kind), device=device), np.zeros((4, 5))),
+            "A ",
         )
     for name, around in (("air", AIR), ("solid", SOLID)):
         for shape in ((3, 3), (5, 5, 5)):
             for b in (-1.0, 1.0, 0.0):
                 if not (around == SOLID and b < 0):
-                    yield from both(family, f"one cell in {name}, {len(shape)}-D, b = {b:g}", lambda a=around, s=shape, b=b: single(s, a, b))
+                    yield from both(
+                        family, f"one cell in {name}, {len(shape)}-D, b = {b:g}", lambda a=around, s=shape, b=b: single(s, a, b)
+                    )
     yield from both(family, "one cell in solid, b = -1", lambda: single((3, 3), SOLID, -1.0), promises=same(INFEASIBLE))
     for shape in ((40, 41), (12, 13, 14)):
         for other in (AIR, SOLID):
             name = f"checkerboard of liquid and {'air' if other == AIR else 'solid'}, {len(shape)}-D"
             yield from both(family, name, lambda s=shape, o=other: checkerboard(s, o))
-    yield from both(family, "labyrinth 65x65", lambda: labyrinth(65))
+    yield SolveCase(family, "labyrinth 65x65, minimum-map-newton", lambda: labyrinth(65), "minimum-map-newton")
+    yield SolveCase(family, "labyrinth 65x65, projected-multigrid", lambda: labyrinth(65), promises=same(EITHER))  # LIMITS
     yield from both(family, "labyrinth 33x33 without bounds", lambda: labyrinth(33, lower=-np.inf))
     yield from both(family, "two pools joined by a needle", lambda: needle(64))
     yield from both(family, "chambers behind walls of one cell", lambda: chambers(59))
@@ -168,7 +174,9 @@ def closed_pools() -> Iterator[Case]:
         full = np.full(shape, FLUID)
         name = f"{len(shape)}-D"
         for method in METHODS:
-            yield SolveCase(family, f"compatible, {name}, {method}", lambda f=full: GridProblem(cells=f, b=noise(f.shape), lower=-np.inf), method)
+            yield SolveCase(
+                family, f"compatible, {name}, {method}", lambda f=full: GridProblem(cells=f, b=noise(f.shape), lower=-np.inf), method
+            )
             for sign in (1.0, -1.0):
                 off = f"{'outflow' if sign > 0 else 'inflow'}, {name}, {method}"
                 b = noise(shape) + sign * 0.1
@@ -179,8 +187,12 @@ def closed_pools() -> Iterator[Case]:
                 yield SolveCase(family, f"p >= 0, {off}", lambda f=full, b=b: GridProblem(cells=f, b=b), method, promises)
     yield from both(family, "one of 40 is incompatible", lambda: many_pools(0.05), promises=same(INFEASIBLE))
     yield from both(family, "40 compatible ones", lambda: many_pools(0.0))
-    yield from both(family, "boxed, inflow", lambda: GridProblem(cells=np.full((9, 9), FLUID), b=noise((9, 9)) - 0.2, lower=-1.0, upper=1.0))
-    yield from both(family, "incompatible by rounding only", lambda: GridProblem(cells=np.full((64, 64), FLUID), b=noise((64, 64)) * 1e6, lower=-np.inf))
+    yield from both(
+        family, "boxed, inflow", lambda: GridProblem(cells=np.full((9, 9), FLUID), b=noise((9, 9)) - 0.2, lower=-1.0, upper=1.0)
+    )
+    yield from both(
+        family, "incompatible by rounding only", lambda: GridProblem(cells=np.full((64, 64), FLUID), b=noise((64, 64)) * 1e6, lower=-np.inf)
+    )
     yield from both(
         family, "periodic in x and y, compatible",
         lambda: GridProblem(cells=np.full((31, 32), FLUID), b=noise((31, 32)), lower=-np.inf, periodic=(True, True, False)),

@@ -2,11 +2,12 @@
 
 import json
 import time
+from typing import ClassVar
 
 import pytest
 import warp as wp
 
-from warp_lcp.driver.profile import NoStopwatch, Profile
+from warp_lcp.driver.profile import KERNELS, NoStopwatch, Profile
 
 
 def test_stages_add_up():
@@ -69,6 +70,37 @@ def test_the_file_has_every_stage(tmp_path):
     assert (data["device"], data["steps"], data["seconds"]) == ("cpu", 7, 1.5)
     assert [stage["stage"] for stage in data["stages"]] == ["a"]
     assert data["stages"][0].keys() == {"stage", "beside", "calls", "seconds", "first_seconds", "bytes"}
+
+
+def test_kernels_that_load_are_a_stage_of_their_own():
+    @wp.kernel(module="unique")
+    def fill(a: wp.array(dtype=wp.float32)):
+        a[wp.tid()] = 3.0
+
+    class Said:
+        messages: ClassVar[list[str]] = []
+
+        def say(self, message, *_, **__):
+            self.messages.append(message)
+
+        debug = info = warning = error = say
+
+    profile, field = Profile("cpu"), wp.zeros(4, dtype=wp.float32, device="cpu")
+    with wp.ScopedLogger(Said()), wp.ScopedLogLevel(wp.LOG_WARNING), profile.kernels_apart():
+        level = wp.config.log_level
+        begun = time.perf_counter()
+        with profile.stage("fill"):
+            wp.launch(fill, 4, [field], device="cpu")
+        seconds = time.perf_counter() - begun
+        wp.get_logger().info("not asked for")
+        wp.get_logger().error("heard")
+    kernels, stage = profile.stages[KERNELS], profile.stages["fill"]
+    assert level == wp.LOG_INFO
+    assert kernels.calls == 1
+    assert kernels.seconds > 0.0
+    assert 0.0 <= stage.seconds <= seconds - 0.99 * kernels.seconds
+    assert Said.messages == ["heard"]
+    assert profile.table(1, seconds)[1].startswith(KERNELS)
 
 
 def test_without_a_profile_nothing_is_measured(monkeypatch, tmp_path):

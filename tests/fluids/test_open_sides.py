@@ -105,3 +105,11 @@ def test_a_pool_drains_over_an_open_side_as_a_dam_breaks(dimension: int, cut: bo
 def test_what_sides_may_not_be(sides: Any, message: str) -> None:
     with pytest.raises(ValidationError, match=message):
         opened(scene(size=[1.0, 1.0], resolution=8, liquid=[box([0.0, 0.0], [0.5, 0.5])]), sides)
+
+
+def test_what_the_density_correction_pushes_out_has_left() -> None:
+    model = scene(size=[1.0, 0.5], resolution=32, liquid=[box([0.0, 0.0], [0.5, 0.4])], density_correction={"every": 1})
+    simulation = create(opened(model, ["left"]))
+    count = simulation.particles.count
+    rows = advance(simulation, 0.5)
+    assert sum(row["departed"] for row in rows) == count - simulation.particles.count > 0

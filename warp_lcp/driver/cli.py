@@ -1,4 +1,4 @@
-"""The command line: `warp-lcp run | render | view | check | scenes | schema | solve | bench | info`."""
+"""The command line: `warp-lcp run | render | view | check | tune | scenes | schema | solve | bench | info`."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from warp_lcp.driver.calibrate import step_seconds
 from warp_lcp.driver.check import check_memory, check_scene
 from warp_lcp.driver.devices import DeviceError, choose_device, cuda_driver, devices
 from warp_lcp.driver.film import check_rate
+from warp_lcp.driver.presets import PresetName
 from warp_lcp.driver.profile import Profile
 from warp_lcp.driver.progress import Bar, Lines
 from warp_lcp.driver.recording import Color, RenderError, Show
@@ -30,6 +31,7 @@ from warp_lcp.driver.scene_file import built_in_scenes, installed_simulators, lo
 from warp_lcp.driver.simulator import SimulationFailed, StepFailed
 from warp_lcp.driver.solve_file import ProblemError, solve_files, write_vector
 from warp_lcp.driver.table import SceneError, nearest
+from warp_lcp.driver.tune import FRAMES, Tuning, tune, write_tuned
 from warp_lcp.driver.versions import shadowing_distributions, versions
 from warp_lcp.driver.viewer import view_run
 
@@ -192,6 +194,36 @@ def check(
     _print_pairs([("seconds a step", f"about {seconds:.3g} on {chosen}, the median of {steps}")])
 
 
+@app.command("tune")
+def tune_scene(
+    scene: SceneArgument,
+    accuracy: Annotated[PresetName, typer.Option(help="How near to the reference run: a preset's distance from it.")] = "standard",
+    frames: Annotated[int, typer.Option(min=1, metavar="N", help="Frames of each trial run.")] = FRAMES,
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Where the tuned scene goes.", show_default=False)] = None,
+    device: Annotated[str | None, typer.Option(help="cpu or cuda:N, which is to run the scene.", show_default=False)] = None,
+    overrides: SetOption = None,
+) -> None:
+    """Measure which settings of a scene are the fastest for an accuracy, on its first frames."""
+    with _wrong_input():
+        chosen = choose_device(device)
+        loaded = load_scene(scene, overrides or ())
+        if out is not None and (out.is_dir() or not out.parent.is_dir()):
+            raise OutputError(f"--out {out}: must be a file in a folder that is there")
+        check_memory(loaded, chosen)
+        console = Console(stderr=True)
+        say = lambda text: console.print(text, markup=False, highlight=False, soft_wrap=True)  # noqa: E731
+        try:
+            tuning = tune(loaded, accuracy=accuracy, device=chosen, frames=frames, say=say)
+        except (StepFailed, SimulationFailed) as error:
+            _end(str(error), FAILED)
+        if out is not None:
+            try:
+                write_tuned(out, tuning, accuracy, chosen)
+            except OSError as error:
+                raise OutputError(f"--out {out}: {error}") from error
+    _print_tuning(tuning, accuracy, chosen)
+
+
 @app.command()
 def scenes() -> None:
     """List the built-in scenes."""
@@ -295,6 +327,19 @@ def info() -> None:
         typer.echo(f"warning: the distribution {other} installs a package that has a simulator's name; uninstall it", err=True)
     with _wrong_input():
         _print_pairs([(f"simulator {name}", simulator.summary) for name, simulator in installed_simulators().items()])
+
+
+def _print_tuning(tuning: Tuning, accuracy: str, device: str) -> None:
+    """Say what was measured, and which settings are the fastest."""
+    rows = tuning.rows()
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    for row in rows:
+        typer.echo("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    typer.echo(f"{tuning.frames} frames on {device}; distance: share of the mass elsewhere than in a run of {tuning.reference.steps} steps")
+    best = tuning.chosen
+    if not tuning.met:
+        typer.echo(f"nothing that was tried meets {accuracy}, a distance of at most {tuning.bound:g}; the nearest:")
+    typer.echo(f"{accuracy}: {best.words()}: {best.seconds:.3g} s, distance {best.distance:.4f} (at most {tuning.bound:g})")
 
 
 def _print_pairs(pairs: list[tuple[str, str]]) -> None:

@@ -242,6 +242,8 @@ class ParticleSimulation(ABC):
         after = self.checked_totals("after")
         rearranged = self._rearrange(after)
         if rearranged:
+            if self.outlets is not None:  # the density correction may push particles out through open sides
+                exchanged["departed"] += self.outlets.remove_departed(self.particles)
             after = self.checked_totals("after the density correction of")
         self.time += dt
         self.step_count += 1
@@ -454,7 +456,7 @@ class ParticleSimulation(ABC):
             row["max_density"] = done.max_density
         return row
 
-    def _exchange(self, dt: float) -> Row:
+    def _exchange(self, dt: float) -> dict[str, int]:
         """Remove the particles that have left in the step and add those that have come in; return what the log says of it."""
         drained = departed = emitted = 0
         if self.outlets is None and self.sources is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -15,6 +16,8 @@ import warp as wp
 from warp_lcp.driver.atomic import write_text
 
 PROFILE = "profile.json"
+KERNELS = "kernels, loaded"  # the stage of modules that Warp compiles, or finds compiled
+LOADED = re.compile(r"Module .* took ([0-9.]+) ms")  # what Warp says of each
 NOTHING = nullcontext()
 
 
@@ -59,7 +62,7 @@ class Stage:
         beside: it ran on a thread of its own.
         calls: how often it was entered.
         seconds: in all.
-        first_seconds: of the first call, which may load kernels.
+        first_seconds: of the first call, which may allocate.
         bytes: what it had to read or write at least: its arrays, each counted once a call, or its files.
     """
 
@@ -76,6 +79,40 @@ class Stage:
         self.seconds += seconds
 
 
+class LoadedKernels:
+    """A logger for Warp that adds up the time kernels take to be compiled and loaded; what else Warp says goes where it went.
+
+    Attributes:
+        loads: of modules.
+    """
+
+    def __init__(self) -> None:
+        """Begin with nothing."""
+        self.loads = Stage()
+        self._logger, self._level = wp.get_logger(), wp.config.log_level
+
+    def debug(self, message: str) -> None:
+        """Pass a message on."""
+        if self._level <= wp.LOG_DEBUG:
+            self._logger.debug(message)
+
+    def info(self, message: str) -> None:
+        """Pass a message on, and count it if it tells of a module."""
+        if found := LOADED.search(message):
+            self.loads.add(float(found[1]) * 1e-3)
+        if self._level <= wp.LOG_INFO:
+            self._logger.info(message)
+
+    def warning(self, message: str, category: type[Warning] | None = None, stacklevel: int = 1) -> None:
+        """Pass a message on."""
+        if self._level <= wp.LOG_WARNING:
+            self._logger.warning(message, category, stacklevel=stacklevel + 1)
+
+    def error(self, message: str) -> None:
+        """Pass a message on."""
+        self._logger.error(message)
+
+
 class Profile:
     """Measure stages on a device, which is waited for at the begin and the end of each.
 
@@ -90,18 +127,27 @@ class Profile:
         """Begin with nothing."""
         self.stages: dict[str, Stage] = {}
         self._device = wp.get_device(device)
+        self._loads = Stage()
+
+    @contextmanager
+    def kernels_apart(self) -> Iterator[None]:
+        """Count the time that kernels take to be compiled and loaded as a stage of its own, not as that of the stage that needs them."""
+        kernels = LoadedKernels()
+        self.stages[KERNELS] = self._loads = kernels.loads
+        with wp.ScopedLogger(kernels), wp.ScopedLogLevel(min(wp.config.log_level, wp.LOG_INFO)):
+            yield
 
     @contextmanager
     def stage(self, name: str, *arrays: wp.array | None) -> Iterator[None]:
         """Measure a stage of the run's own thread."""
         self._wait()
-        begun = time.perf_counter()
+        loading, begun = self._loads.seconds, time.perf_counter()
         try:
             yield
         finally:
             self._wait()
             stage = self.stages.setdefault(name, Stage())
-            stage.add(time.perf_counter() - begun)
+            stage.add(time.perf_counter() - begun - (self._loads.seconds - loading))
             stage.bytes += sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays if array is not None)
 
     @contextmanager

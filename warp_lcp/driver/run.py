@@ -6,7 +6,7 @@ import errno
 import math
 import time as clock
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, nullcontext
 from pathlib import Path
 
 from warp_lcp.driver.check import check_memory
@@ -95,7 +95,9 @@ def run_scene(
         for note in record.warnings:
             observer.note(note)
         checkpoint = continued.checkpoint if continued else None
-        return _Run(scene, simulation, folder, record, observer, profile).execute(last_frame, stop, resumed=checkpoint is not None)
+        run = _Run(scene, simulation, folder, record, observer, profile)
+        with profile.kernels_apart() if profile else nullcontext():
+            return run.execute(last_frame, stop, resumed=checkpoint is not None)
 
 
 def _create(scene: Scene, device: str, continued: Continuation | None) -> tuple[Simulation, list[str]]:

@@ -72,11 +72,7 @@ class Outlets:
         Returns:
             How many drains have swallowed, and how many have left through open sides.
         """
-        departed = drained = 0
-        if self.open_sides and particles.count:
-            marks = particles.marks
-            mark_gone(self.grid, self.open_sides, particles.position, marks)
-            departed = particles.remove(marks)
+        departed, drained = self.remove_departed(particles), 0
         drains = [drain for drain in self.drains if drain.runs(time)]
         if drains and particles.count:
             marks = particles.marks
@@ -89,3 +85,11 @@ class Outlets:
                 wp.launch(mark_inside_kernel, particles.count, [distance, marks], device=self.grid.device)
             drained = particles.remove(marks)
         return drained, departed
+
+    def remove_departed(self, particles: Particles) -> int:
+        """Remove the particles that have crossed an open side, and return how many."""
+        if not (self.open_sides and particles.count):
+            return 0
+        marks = particles.marks
+        mark_gone(self.grid, self.open_sides, particles.position, marks)
+        return particles.remove(marks)
