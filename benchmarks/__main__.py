@@ -14,7 +14,7 @@ from benchmarks.timing import Options
 
 SUITES = (
     "kernels", "solvers", "scaling", "floor", "peers", "run", "sand", "implicit_mpm", "contacts", "validation", "narrow_band", "replay",
-    "book", "guard", "extremes",
+    "book", "guard", "tradeoff", "tuning", "extremes",
 )  # fmt: skip
 
 
@@ -28,12 +28,14 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=5)
     parser.add_argument("--problems", type=Path)
     parser.add_argument("--method", action="append", default=[])
+    parser.add_argument("--scene", default="")
     given = parser.parse_args()
     wp.config.log_level = wp.LOG_ERROR
     launches.install()  # before anything imports warp_lcp
     suite, report = importlib.import_module(f"benchmarks.{given.suite}"), importlib.import_module("benchmarks.report")
     options = Options(
-        given.device, tuple(given.size), given.repeat, lambda text: sys.stderr.write(f"{text}\n"), given.problems, tuple(given.method)
+        given.device, tuple(given.size), given.repeat, lambda text: sys.stderr.write(f"{text}\n"), given.problems, tuple(given.method),
+        given.scene,
     )
     given.out.mkdir(parents=True, exist_ok=True)
     try:

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 import warp_lcp as wl
 from benchmarks.machine import COPIED, machine
@@ -166,7 +165,9 @@ def _table(floors: list[Floor]) -> Table:
 
 def _failures(floors: list[Floor]) -> list[str]:
     """Return where mixed precision does not get there, or a solve tells another residual than x has."""
-    lines = [f"{f.n}^3, {f.bounds}: mixed precision ends at {f.relative:.2e}" for f in floors if f.precision == "mixed" and f.relative > ASKED]
+    lines = [
+        f"{f.n}^3, {f.bounds}: mixed precision ends at {f.relative:.2e}" for f in floors if f.precision == "mixed" and f.relative > ASKED
+    ]
     for f in floors:
         # at the floor x has few digits that count: rounding in two orders of summation differs by a share of the floor itself
         if not math.isclose(f.relative, f.told, rel_tol=0.5):

@@ -18,8 +18,8 @@ STYLES = ("-", "--", ":")  # of ten curves each, which have a color of their own
 CROWDED = 10  # curves from which on their names are beside the axes
 
 
-def draw(charts: Sequence[Chart], out: Path, prefix: str) -> list[Path]:
-    """Write a PNG file for each chart; none where Matplotlib is missing."""
+def draw(charts: Sequence[Chart], out: Path, prefix: str, *, vector: bool = False) -> list[Path]:
+    """Write a PNG file for each chart, and an SVG file if asked for; return the PNG files, none where Matplotlib is missing."""
     if not present("matplotlib"):
         return []
     from matplotlib.figure import Figure as Canvas
@@ -37,6 +37,8 @@ def draw(charts: Sequence[Chart], out: Path, prefix: str) -> list[Path]:
         canvas.suptitle(chart.title, fontsize=10)
         images.append(out / f"{prefix}-{chart.name}.png")
         canvas.savefig(images[-1])
+        if vector:
+            canvas.savefig(images[-1].with_suffix(".svg"), metadata={"Date": None})
     return images
 
 

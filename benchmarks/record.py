@@ -93,6 +93,8 @@ class Results:
         charts: to draw.
         failures: what is not as it must be, a line each; the suite then ends with an error.
         sheets: single measurements behind the records.
+        page: all of it as an HTML page; empty for a suite without one.
+        vector: draw the charts as SVG files too.
     """
 
     records: list[Record]
@@ -100,6 +102,8 @@ class Results:
     charts: list[Chart] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
     sheets: list[Sheet] = field(default_factory=list)
+    page: str = ""
+    vector: bool = False
 
 
 def write_json(path: Path, records: Sequence[Record]) -> None:

@@ -27,6 +27,7 @@ class Suite:
         summary: what it measures.
         resizable: whether it can be asked for other sizes.
         replays: whether it can be asked for recorded problems.
+        scenes: whether it can be asked for a scene.
         groups: other cases of it by name, with what they are; their files are GROUP.json and so on.
     """
 
@@ -34,6 +35,7 @@ class Suite:
     summary: str
     resizable: bool = True
     replays: bool = False
+    scenes: bool = False
     groups: Mapping[str, str] = field(default_factory=dict)
 
     def run(
@@ -46,6 +48,7 @@ class Suite:
         problems: Path | None = None,
         methods: tuple[str, ...] = (),
         group: str = "",
+        scene: str = "",
     ) -> list[Path]:
         """Measure and write the files.
 
@@ -57,6 +60,7 @@ class Suite:
             problems: folder of recorded problems to measure methods on instead; the files are then replay.json and so on.
             methods: names of those methods; the suite's choice without any.
             group: name of one of `groups`, to measure instead.
+            scene: the only one to measure, its name or file.
 
         Returns:
             The files.
@@ -77,11 +81,14 @@ class Suite:
             raise ValueError(f"--group {group}: the suite {self.name} has no such group; {known}")
         if group and (problems is not None or methods):
             raise ValueError("--group: cannot be combined with --problems and --method")
+        if scene and not self.scenes:
+            raise ValueError(f"{scene}: the suite {self.name} has scenes of its own; use tradeoff")
         name = group or name
         if problems is not None or methods:
             self._check_replay(problems, methods, sizes)
             name = REPLAY
         arguments = [name, "--device", device, "--out", str(out), "--repeat", str(repeat)]
+        arguments += ["--scene", scene] if scene else []
         for size in sizes:
             arguments += ["--size", str(size)]
         arguments += [part for method in methods for part in ("--method", method)]
@@ -89,7 +96,7 @@ class Suite:
         process = subprocess.run([sys.executable, "-m", "benchmarks", *arguments], env={**os.environ, **ONE_THREAD}, check=False)
         if process.returncode != 0:
             raise RuntimeError(f"the suite {name} ended with exit code {process.returncode}")
-        return sorted(p for p in out.glob(f"{name}*") if p.suffix in (".json", ".md", ".csv", ".png", ".html"))
+        return sorted(p for p in out.glob(f"{name}*") if p.suffix in (".json", ".md", ".csv", ".png", ".svg", ".html"))
 
     def _check_replay(self, problems: Path | None, methods: tuple[str, ...], sizes: tuple[int, ...]) -> None:
         """Refuse what cannot be replayed, before a process is started for it."""
@@ -140,6 +147,12 @@ SAND = Suite(
     groups={"implicit_mpm": "steps of a column collapse against newton's implicit material point method"},
 )
 CONTACTS = Suite("contacts", "rigid contacts: methods on the scenes of figures 2.9 and 2.11, NNCG against PGS at equal sweeps", False)
+TRADEOFF = Suite(
+    "tradeoff",
+    "what accuracy costs: seconds, iterations and bytes of runs and solves against residuals, errors and what a user sees",
+    scenes=True,
+    groups={"tuning": "what `warp-lcp tune` finds against the best of all settings, on scenes that the presets were not made on"},
+)
 VALIDATION = Suite(
     "validation",
     "liquids and sand against known answers: rest, sloshing, ceiling, dam break, transfers, slopes, volume, sand; with negative controls",

@@ -22,6 +22,7 @@ class Options:
         say: takes a line about progress.
         problems: folder of recorded problems, for the suite `replay`.
         methods: names of those it tries; empty for its own.
+        scene: the one to measure, its name or file; empty for the suite's own.
     """
 
     device: str
@@ -30,6 +31,7 @@ class Options:
     say: Callable[[str], object]
     problems: Path | None = None
     methods: tuple[str, ...] = ()
+    scene: str = ""
 
 
 @dataclass(frozen=True)

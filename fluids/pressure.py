@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import warp as wp
@@ -12,6 +12,7 @@ import warp as wp
 import warp_lcp as wl
 from fluids import pressure_kernels as kernels
 from fluids.coupling import BodyCoupling
+from fluids.tolerance import TimeErrorTolerance
 from warp_lcp.gallery import recorded
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary
@@ -56,7 +57,7 @@ class PressureProjection:
         grid: the grid.
         boundary: solids and walls.
         solver: settings of the method, for example `wl.MinimumMapNewton()`.
-        tolerance: relative residual at which a solve is done.
+        tolerance: relative residual at which a solve is done; "auto": see `fluids.tolerance`.
         max_iterations: of the method a solve may take.
         phi: float32 distance to the free surface at cell centers [cells], < 0 exactly in FLUID cells; None: it lies on the cells' faces.
         coupling: with bodies that the pressure moves, whose term A then has too; None: there are none.
@@ -67,6 +68,7 @@ class PressureProjection:
         pressure: last accepted x [m/s], float64.
         contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED.
         known: int8, one field a component: which faces the last projection made valid, see `warp_lcp.grid.extrapolate`.
+        automatic: what sets the tolerance from step to step, if something does.
     """
 
     def __init__(
@@ -75,7 +77,7 @@ class PressureProjection:
         boundary: Boundary,
         solver: Any,
         *,
-        tolerance: float,
+        tolerance: float | Literal["auto"],
         max_iterations: int = 100,
         phi: wp.array | None = None,
         coupling: BodyCoupling | None = None,
@@ -83,6 +85,7 @@ class PressureProjection:
         """Allocate the fields."""
         self.grid, self.boundary, self.solver, self._phi, self.coupling = grid, boundary, solver, phi, coupling
         self.tolerance, self.max_iterations = tolerance, max_iterations
+        self.automatic = TimeErrorTolerance(grid.size, grid.device) if tolerance == "auto" else None
         self._kernels = kernels.pressure_kernels(bool(boundary.open), bool(boundary.velocity), phi is not None)
         self.kind, self.shown, self.contact = grid.field(wp.int8), grid.field(wp.int8), grid.field(wp.uint8)
         self.pressure, self.known = grid.field(wp.float64), grid.faces(wp.int8)
@@ -159,6 +162,8 @@ class PressureProjection:
         criteria = self.criteria(speed, unknowns)
         assert self._problem is not None, "prepare comes first"
         result = wl.solve(self._problem, self.solver, stopping=criteria, x0=self._start, workspace=self._work)
+        if self.automatic is not None and result:
+            self.automatic.measure(self._problem.A, result, criteria, [self._start, self._b], unknowns)
         return result, criteria
 
     def push_bodies(self, result: wl.SolveResult) -> None:
@@ -175,7 +180,10 @@ class PressureProjection:
             speed: scale of u* [m/s].
             unknowns: of `prepare`.
         """
-        return wl.StoppingCriteria(rtol=self.tolerance, atol=ROUNDING * speed * unknowns**0.5, max_iterations=self.max_iterations)
+        atol = ROUNDING * speed * unknowns**0.5
+        if self.automatic is not None:
+            return self.automatic.criteria(warm=self._dt > 0.0, atol=atol, max_iterations=self.max_iterations)
+        return wl.StoppingCriteria(rtol=float(self.tolerance), atol=atol, max_iterations=self.max_iterations)
 
     def recorded(self, speed: float, unknowns: int) -> dict[str, np.ndarray]:
         """Return the prepared problem as `warp_lcp.gallery.recorded` describes it, without what the simulation knows: step, time, dt.
@@ -186,7 +194,7 @@ class PressureProjection:
         """
         assert self._problem is not None, "prepare comes first"
         criteria = self.criteria(speed, unknowns)
-        numbers = {"tolerance": criteria.rtol, "absolute_tolerance": criteria.atol, "spacing": self.grid.spacing}
+        numbers = {"tolerance": max(criteria.rtol, criteria.guess_rtol), "absolute_tolerance": criteria.atol, "spacing": self.grid.spacing}
         return recorded.arrays(self._problem, self._start) | {name: np.array(value) for name, value in numbers.items()}
 
     def fields(self) -> list[wp.array]:
@@ -214,7 +222,7 @@ class PressureProjection:
             window.launch(self._kernels.subtract_gradient, [axis, self.pressure, self.kind, *self._faces(), field, self.known[axis]])
         reference = result.residual / result.relative_residual if result.relative_residual > 0.0 else 0.0
         # the criteria bound a 2-norm; what a cell may carry of it is the root mean square
-        threshold = RELEASE_FACTOR * criteria.tolerance(reference) / max(unknowns, 1) ** 0.5
+        threshold = RELEASE_FACTOR * criteria.tolerance(reference, result.history[0].residual) / max(unknowns, 1) ** 0.5
         fields = [self.pressure, threshold, self.contact, self._sums]
         inputs = [*three(velocity), self.kind, self.boundary.touch, *self._faces(), *fields]
         self.grid.domain.launch_rows(self._kernels.contact, inputs)

@@ -105,15 +105,20 @@ class LiquidSimulation(ParticleSimulation):
         self.bring_to_particles()
         row = self.move(dt) | self.solve_row(projected.result)
         outflow = projected.max_outflow / self.grid.spacing
+        automatic = self.projection.automatic
+        if automatic is not None and projected.result is not None:
+            row |= {"tolerance": automatic.used, "time_error": automatic.time_error}
         return self.logged(row | {"active": projected.released, "max_divergence": outflow, "volume": volume})
 
     def own_columns(self) -> tuple[str, ...]:
         """Return the names of the pressure's columns and the volume's.
 
         active: wall cells that let go; max_divergence [1/s]: of the other FLUID cells after the projection; volume [m^3; m^2 in 2-D]:
-        counts FLUID cells, or lies inside the surface where that is finer than cells.
+        counts FLUID cells, or lies inside the surface where that is finer than cells. With an automatic tolerance: tolerance, the relative
+        residual that the step was held to, and time_error [m/s], the error in the velocity that its length makes.
         """
-        return "active", "max_divergence", "volume"
+        columns = ("active", "max_divergence", "volume")
+        return columns if self.projection.automatic is None else (*columns, "tolerance", "time_error")
 
     def frame(self) -> list[Part]:
         """Return the particles (velocity, speed) and the liquid's cells of the last solve (pressure [Pa], wall and released flags).
@@ -199,7 +204,7 @@ class LiquidSimulation(ParticleSimulation):
             )
         raise StepFailed(
             f"step {self.step_count}: the pressure solve ended with {result.status.name} after {result.iterations} iterations at a "
-            f"relative residual of {result.relative_residual:.2e} (tolerance {self.projection.tolerance:.1e}): {result.status.value}"
+            f"relative residual of {result.relative_residual:.2e} (tolerance {self.projection.tolerance}): {result.status.value}"
         )
 
 

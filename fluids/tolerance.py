@@ -9,7 +9,6 @@ import warp as wp
 
 import warp_lcp as wl
 from fluids.tolerance_kernels import change_kernel
-from warp_lcp.native import Spans
 from warp_lcp.vectors import Reduction, launch_spans
 
 FRACTION = 0.1  # of the time step's error that the solve may leave; measured on five scenes, see docs/models.md
@@ -33,7 +32,7 @@ class TimeErrorTolerance:
     rounding noise, which the absolute tolerance covers.
 
     Args:
-        unknowns_stored: elements of a stored field.
+        size: elements of a stored field.
         device: where they live.
 
     Attributes:
@@ -41,14 +40,11 @@ class TimeErrorTolerance:
         time_error: of the last step, root mean square over the cells [m/s]; None: no pressure came before.
     """
 
-    def __init__(self, unknowns_stored: int, device: wp.Device) -> None:
-        self.used, self.time_error = FIRST, None
-        self._spans = Spans.of(unknowns_stored, device)
+    def __init__(self, size: int, device: wp.Device) -> None:
+        self.used = FIRST
+        self.time_error: float | None = None
         self._sum = wp.zeros(1, dtype=wp.float64, device=device)
-        self._reduction = Reduction(unknowns_stored, device, self._sum)
-
-    used: float
-    time_error: float | None
+        self._reduction = Reduction(size, device, self._sum)
 
     def criteria(self, *, warm: bool, atol: float, max_iterations: int) -> wl.StoppingCriteria:
         """Return when a solve is done.
@@ -62,28 +58,24 @@ class TimeErrorTolerance:
             return wl.StoppingCriteria(rtol=FIRST, atol=atol, max_iterations=max_iterations)
         return wl.StoppingCriteria(rtol=LEAST, guess_rtol=0.5 * FRACTION, atol=atol, max_iterations=max_iterations)
 
-    def measure(self, A: Any, result: wl.SolveResult, criteria: wl.StoppingCriteria, start: wp.array, scratch: wp.array) -> None:
+    def measure(self, A: Any, result: wl.SolveResult, criteria: wl.StoppingCriteria, fields: list[wp.array], unknowns: int) -> None:
         """Find the step's error in time from a result.
 
         Args:
             A: the operator.
             result: of the solve.
             criteria: of the solve.
-            start: its first guess, a stored float64 field (overwritten).
-            scratch: another one (overwritten).
+            fields: its first guess and another stored float64 field (both overwritten).
+            unknowns: of the problem.
         """
         reference = result.residual / result.relative_residual if result.relative_residual > 0.0 else 0.0
         self.used = criteria.tolerance(reference, result.history[0].residual) / reference if reference > 0.0 else 0.0
         if criteria.guess_rtol == 0.0:
             self.time_error = None
             return
-        change, product = start.flatten(), scratch.flatten()
-        launch_spans(change_kernel, self._spans, [result.x.flatten(), change], [], start.device)
+        change, product = (field.flatten() for field in fields)
+        launch_spans(change_kernel, self._reduction.spans, [result.x.flatten(), change], [], change.device)
         A.apply(change, product)
         self._reduction.dot(change, product, 0)
         square = max(float(self._sum.numpy()[0]), 0.0)
-        self.time_error = 0.5 * float(np.sqrt(square / max(self._unknowns(A), 1)))
-
-    @staticmethod
-    def _unknowns(A: Any) -> int:
-        return int(A.unknowns)
+        self.time_error = 0.5 * float(np.sqrt(square / max(unknowns, 1)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import warp as wp
@@ -74,7 +74,7 @@ class UnilateralPressure(PressureProjection):
         *,
         level_set: LevelSet,
         weights: Sequence[wp.array],
-        tolerance: float,
+        tolerance: float | Literal["auto"],
         max_iterations: int = 100,
         max_density: float = MAX_DENSITY,
         coupling: BodyCoupling | None = None,

@@ -62,13 +62,14 @@ YIELD = """
         }
         const T inverse_r = (T)1/r, all = sqrt(normal2);
         T mu = all*inverse_r - (T)1, size = 0;  // a lower bound: each part by itself must fit
-        UNROLL for (int d = 0; d < SHEARS; ++d) UNROLL for (int n = 1; n <= 4; ++n) mu = larger(mu, (T)0.25*(largest[d][n - 1]*inverse_r - (T)n));
+        UNROLL for (int d = 0; d < SHEARS; ++d) UNROLL for (int n = 0; n < 4; ++n)
+            mu = larger(mu, (T)0.25*(largest[d][n]*inverse_r - (T)(n + 1)));
         mu = larger(mu, (T)0);
         T shrink = 0;
         UNROLL for (int iteration = 0; iteration <= NEWTON; ++iteration) {
             shrink = (T)1/((T)1 + mu);
             T by[4];
-            UNROLL for (int n = 1; n <= 4; ++n) by[n - 1] = (T)1/((T)n + (T)4*mu);
+            UNROLL for (int n = 0; n < 4; ++n) by[n] = (T)1/((T)(n + 1) + (T)4*mu);
             const T a2 = normal2*shrink*shrink;
             T total = a2, slope = a2*shrink;
             UNROLL for (int d = 0; d < SHEARS; ++d) {

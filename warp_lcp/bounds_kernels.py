@@ -18,9 +18,9 @@ f64, u8 = wp.array(dtype=wp.float64), wp.array(dtype=wp.uint8)
     const unsigned char lower = l_value > -inf, upper = u_value < inf ? 2 : 0;
     if (l && u) { EACH {
         const bool a = l[i] == l_value, b = u[i] == u_value;
-        other += (a | (l[i] == -inf)) & (b | (u[i] == inf)) ? 0.0 : 1.0; code[i] = (a ? 1 : 0) | (b ? 2 : 0); }
-    } else if (l) { EACH { const bool a = l[i] == l_value; other += a | (l[i] == -inf) ? 0.0 : 1.0; code[i] = (a ? 1 : 0) | upper; }
-    } else { EACH { const bool b = u[i] == u_value; other += b | (u[i] == inf) ? 0.0 : 1.0; code[i] = lower | (b ? 2 : 0); } }
+        other += ((a | (l[i] == -inf)) & (b | (u[i] == inf))) ? 0.0 : 1.0; code[i] = (a ? 1 : 0) | (b ? 2 : 0); }
+    } else if (l) { EACH { const bool a = l[i] == l_value; other += (a | (l[i] == -inf)) ? 0.0 : 1.0; code[i] = (a ? 1 : 0) | upper; }
+    } else { EACH { const bool b = u[i] == u_value; other += (b | (u[i] == inf)) ? 0.0 : 1.0; code[i] = lower | (b ? 2 : 0); } }
     return other;"""
     )
 )
@@ -43,7 +43,7 @@ def encode_kernel(
     simd(
         """const double* v = field_.data + row*n; unsigned char* code = code_.data + p; double other = 0;
     SIMD for (long long k = 0; k < n; ++k) {
-        const bool a = v[k] == value, none = v[k] == infinite; other += a | none ? 0.0 : 1.0; code[k] += a & !none ? bit : 0; }
+        const bool a = v[k] == value, none = v[k] == infinite; other += (a | none) ? 0.0 : 1.0; code[k] += (a & !none) ? bit : 0; }
     return other;"""
     )
 )

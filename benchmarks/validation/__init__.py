@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
 
 from benchmarks.machine import machine
@@ -26,6 +27,7 @@ from benchmarks.validation import (
     volume,
 )
 from benchmarks.validation.finding import Trial, table
+from benchmarks.validation.html_page import Section, page
 
 TITLE = "Liquids and sand against known answers"
 CHECKS = {
@@ -44,17 +46,27 @@ CHECKS = {
     "sand rest": sand_rest,
 }
 
+KNOWN = {  # why a check is known not to hold everywhere; the report says so where it does not
+    "rest": "single particles that leave a tilted free surface run down above it, beyond 10 % of sqrt(g dx)",
+    "sand collapse": "the square column in 3-D runs out 2 % too little, and at a = 4 with 40 cells 11 % of the steps miss 1e-3",
+    "sand hourglass": "stresses in deep sand that yields everywhere are solved to 2e-3 rho g dx, not 1e-3",
+    "sand invariants": "single steps at 40 cells leave a cell at 1.11 of the densest",
+    "sand rest": "the surface slides a little for a second or two after the stop",
+}
+
 
 def measure(options: Options, out: Path) -> Results:
     """Run all checks."""
-    trials: list[Trial] = []
-    charts = []
+    sections: list[Section] = []
     for name, module in CHECKS.items():
         options.say(f"{name} ...")
         found, drawn = module.check(options.device)
         options.say(f"{name}: {sum(t.passed for t in found)} of {len(found)} as they must be, {sum(t.seconds for t in found):.0f} s")
-        trials += found
-        charts += [chart for chart in drawn if chart.curves]
-    records = [machine(options.device, elements=1 << 22, repeat=options.repeat), *(t.record() for t in trials)]
+        charts = [chart for chart in drawn if chart.curves]
+        sections.append(Section(name, inspect.getdoc(module) or "", found, charts, KNOWN.get(name, "")))
+    where = machine(options.device, elements=1 << 22, repeat=options.repeat)
+    trials: list[Trial] = [t for s in sections for t in s.trials]
+    records = [where, *(t.record() for t in trials)]
     failures = [line for t in trials for line in t.failures()]
-    return Results(records, [table(trials)], charts, failures)
+    charts = [chart for s in sections for chart in s.charts]
+    return Results(records, [table(trials)], charts, failures, page=page(TITLE, where, sections))

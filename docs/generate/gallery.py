@@ -63,7 +63,7 @@ def commands(name: str) -> tuple[list[str], list[str]]:
 
 def measured(command: list[str]) -> int:
     """Run a command; return the most memory that it held [bytes]."""
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:

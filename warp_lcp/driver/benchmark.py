@@ -26,6 +26,7 @@ class Benchmark(Protocol):
         problems: Path | None = None,
         methods: tuple[str, ...] = (),
         group: str = "",
+        scene: str = "",
     ) -> list[Path]:
         """Measure, and return the files written to `out`: NAME.json, NAME.md and plots.
 
@@ -37,6 +38,7 @@ class Benchmark(Protocol):
             problems: folder of recorded problems to measure `methods` on instead.
             methods: their names.
             group: other cases of the suite, to measure instead; the files then have that name.
+            scene: the only one to measure, of a suite that runs scenes; a name or a file.
 
         Raises:
             ValueError: an option is out of range.

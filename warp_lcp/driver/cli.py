@@ -274,7 +274,10 @@ def solve(
 
 @app.command()
 def bench(
-    suite: Annotated[str, typer.Argument(metavar="SUITE", help="kernels, solvers, scaling, peers, run, sand, contacts or validation.")],
+    suite: Annotated[str, typer.Argument(metavar="SUITE", help="kernels, solvers, scaling, peers, run, sand, contacts, tradeoff or validation.")],
+    scene: Annotated[
+        str | None, typer.Argument(metavar="[SCENE]", help="The scene of tradeoff; its own unless given.", show_default=False)
+    ] = None,
     device: Annotated[str, typer.Option(help="cpu or cuda:N.")] = "cpu",
     out: Annotated[Path, typer.Option(help="The folder of SUITE.json, SUITE.md and the plots.")] = Path("out/bench"),
     size: Annotated[list[int] | None, typer.Option(metavar="N", help="Cells along a side; may be repeated.", show_default=False)] = None,
@@ -307,7 +310,7 @@ def bench(
             typer.echo(installed[suite].compare(*compare))
             return
         asked: dict[str, Any] = {} if problems is None and not method else {"problems": problems, "methods": tuple(method or ())}
-        asked |= {"group": group} if group else {}
+        asked |= ({"group": group} if group else {}) | ({"scene": scene} if scene else {})
         files = installed[suite].run(device=chosen, out=out, sizes=tuple(size or ()), repeat=repeat, **asked)
     except ValueError as error:
         _end(str(error), WRONG_INPUT)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -100,7 +100,9 @@ def look_times(scene: Scene, frames: int) -> list[float]:
     return [scene.time.frame_time(n) for n in range(last, 0, -every)][::-1]
 
 
-def trial(scene: Scene, *, device: str, frames: int, box: float | None = None) -> Trial:
+def trial(
+    scene: Scene, *, device: str, frames: int, box: float | None = None, inspect: Callable[[Simulation], object] | None = None
+) -> Trial:
     """Run a scene's first frames.
 
     Args:
@@ -108,6 +110,7 @@ def trial(scene: Scene, *, device: str, frames: int, box: float | None = None) -
         device: a Warp device.
         frames: how many.
         box: edge of the boxes that mass is summed in [m]; two cells unless given.
+        inspect: is shown the simulation at the end.
 
     Raises:
         SceneError: the scene cannot be simulated, or shows no particles.
@@ -118,7 +121,11 @@ def trial(scene: Scene, *, device: str, frames: int, box: float | None = None) -
         simulation = simulators()[scene.scene.simulator].create(scene, device=device, folder=Path.cwd())
     except ValueError as error:
         raise SceneError(scene.scene.name, [Problem("", str(error))]) from error
-    return _Trial(scene, simulation, device, box or BIN * scene.spacing).run(look_times(scene, frames), min(frames, scene.time.frame_count))
+    ran = _Trial(scene, simulation, device, box or BIN * scene.spacing)
+    found = ran.run(look_times(scene, frames), min(frames, scene.time.frame_count))
+    if inspect is not None:
+        inspect(simulation)
+    return found
 
 
 class _Trial:

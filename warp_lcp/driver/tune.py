@@ -17,6 +17,7 @@ from warp_lcp.driver.trial import Trial, trial
 
 FRAMES = 18  # of the calibration, unless asked for otherwise: that many `warp-lcp bench tradeoff` compares
 CLOSE = 1.25  # settings that take at most so many times the shortest time are timed again, in turns
+SAME = 1.05  # times the shortest: noise of a timing, within which the nearer to the reference is taken
 ROUNDS = 2  # more timings of those
 CORRECTED_EVERY = (4, 2, 1)  # steps between two density corrections, where the scene has them
 
@@ -67,13 +68,18 @@ class Tuning:
     frames: int
 
     def rows(self) -> list[tuple[str, ...]]:
-        """Return a table of what was tried: settings, seconds, steps, distance, differences of energy and front from the reference."""
-        rows: list[tuple[str, ...]] = [("settings", "seconds", "steps", "distance", "energy", "front [m]", "volume")]
+        """Return a table of what was tried: settings, seconds, steps and distance.
+
+        Also the differences of energy (relative) and front from the reference, the growth of the volume, or how densely sand was packed.
+        """
+        packed = self.reference.packing is not None
+        rows: list[tuple[str, ...]] = [
+            ("seconds", "steps", "distance", "energy", "front [m]", "packing" if packed else "volume", "settings")
+        ]
         for c in self.tried:
             energy, front = c.trial.energy_error(self.reference), c.trial.front_error(self.reference)
-            drift = c.trial.volume_drift
-            seen = (f"{c.distance:.4f}", f"{energy:.3f}", f"{front:+.3f}", "" if drift is None else f"{drift:+.3f}")
-            rows.append((c.words(), f"{c.seconds:.3g}", str(c.trial.steps), *seen))
+            last = f"{c.trial.packing or 0.0:.3f}" if packed else f"{c.trial.volume_drift or 0.0:+.3f}"
+            rows.append((f"{c.seconds:.3g}", str(c.trial.steps), f"{c.distance:.4f}", f"{energy:.3f}", f"{front:+.3f}", last, c.words()))
         return rows
 
 
@@ -157,7 +163,8 @@ class _Search:
             for c in close:
                 again = trial(changed(self.scene, c.settings), device=self.device, frames=self.frames)
                 c.seconds = min(c.seconds, again.seconds)
-        return min(close, key=lambda c: c.seconds), True
+        shortest = min(c.seconds for c in close)
+        return min((c for c in close if c.seconds <= SAME * shortest), key=lambda c: c.distance), True
 
     def _has(self, key: str) -> bool:
         return getattr(self.scene, key.partition(".")[0]) is not None

@@ -280,7 +280,7 @@ def flat_kernels(real: Any) -> SimpleNamespace:
         with_bounds([&](auto lower, auto upper) {
             EACH {
                 const double l = lower(i), u = upper(i), v = x[i] - step*(double)q[i], w = v < l ? l : v, c = w > u ? u : w;
-                o[i] = (m_.data[i] == 1) & (q[i] != 0) & (v - v == 0) ? c : x[i]; } });"""
+                o[i] = ((m_.data[i] == 1) & (q[i] != 0) & (v - v == 0)) ? c : x[i]; } });"""
         )
     )
     def undo_span(

@@ -1,0 +1,64 @@
+"""What accuracy costs: seconds, iterations and bytes against residuals, errors, and what a user sees of a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from benchmarks.machine import machine
+from benchmarks.record import Record, Results
+from benchmarks.timing import Options
+from benchmarks.tradeoff.charts import preset_table, run_charts, run_sheet, run_table, solve_charts, solve_table
+from benchmarks.tradeoff.runs import FRAMES, Run, Runs
+from benchmarks.tradeoff.settings import Setting, settings_of
+from benchmarks.tradeoff.solves import measure_solves
+from benchmarks.tradeoff.steps import measure_steps
+from warp_lcp.driver.presets import PRESETS, price_table
+from warp_lcp.driver.scene_file import load_scene
+from warp_lcp.driver.simulator import StepFailed
+
+TITLE = "What accuracy costs"
+SCENES = {"dam-break": 32, "column-collapse-2d": 48}  # cells along the longest side
+QUICK = 16  # cells: below, runs are a check of the suite, and short
+QUICK_FRAMES = 3
+
+
+def measure(options: Options, out: Path) -> Results:
+    """Run the scenes with all settings."""
+    records = [machine(options.device, elements=1 << 22, repeat=options.repeat)]
+    results = Results(records, [], [], vector=True)
+    for name in [options.scene] if options.scene else SCENES:
+        resolution = max(options.sizes, default=SCENES.get(name) or load_scene(name).domain.resolution)
+        frames = FRAMES if resolution > QUICK else QUICK_FRAMES
+        _measure_scene(name, resolution, frames, options, results)
+    return results
+
+
+def _measure_scene(name: str, resolution: int, frames: int, options: Options, results: Results) -> None:
+    """Add what a scene shows to the results."""
+    runs = Runs(name, resolution, frames, options)
+    scene = runs.scene()
+    settings = settings_of(scene.scene.simulator)
+    presets = [Setting(f"preset {preset}", _overrides(scene.scene.simulator, preset)) for preset in PRESETS]
+    measured = runs.measure([*presets, *settings])
+    own = [_record(scene.scene.name, run, runs) for run in measured]
+    if not any(run.trial for run in measured):
+        raise StepFailed(f"{name}: no setting ran: {measured[0].failed}")
+    solves = measure_steps(scene, options, frames) if scene.scene.simulator == "granular" else measure_solves(scene, options, frames)
+    results.records.extend([*own, *solves])
+    results.tables.extend([preset_table(scene.scene.name, own), run_table(scene.scene.name, own), solve_table(scene.scene.name, solves)])
+    results.charts.extend([*run_charts(scene.scene.name, own), *solve_charts(scene.scene.name, solves)])
+    results.sheets.append(run_sheet(scene.scene.name, [*own, *solves]))
+
+
+def _overrides(simulator: str, preset: str) -> tuple[str, ...]:
+    """Return a preset's settings but for those of models that a scene may not have."""
+    settings = price_table()[simulator].presets[preset].settings
+    return tuple(f"{key}={value:g}" for key, value in settings.items() if not key.startswith("density_correction"))
+
+
+def _record(scene: str, run: Run, runs: Runs) -> Record:
+    facts = {"scene": scene, "kind": "run", "curve": run.setting.curve, "settings": run.setting.name}
+    facts |= {"device": runs.options.device, "frames": runs.frames, "resolution": round(run.setting.scale * runs.resolution)}
+    facts |= {"failed": run.failed} if run.failed else {}
+    return Record(f"{scene} {run.setting.curve}: {run.setting.name}", runs.figures(run), facts)
+

@@ -1,0 +1,129 @@
+"""Tables, sheets and charts of what accuracy costs."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+
+from benchmarks.record import Chart, Lines, Record, Sheet, Table
+from benchmarks.tradeoff.runs import front_of
+
+PARETO = "Pareto front"
+SEEN = {
+    "distance": "mass elsewhere than in the reference run of this resolution [share]",
+    "distance_to_finest": "mass elsewhere than in the finest reference run [share]",
+    "energy_error": "largest error of the energy [share]",
+    "front_error": "error of the front at the end [m]",
+    "volume_drift": "growth of the volume [share]",
+    "packing": "densest cell, less 1",
+}
+SOLVED = {"residual": "relative residual, recomputed in float64", "error": "error against a converged float64 solution"}
+FIGURES = ("seconds", "steps", "iterations", "linear_iterations", "bytes", "residual", *SEEN, "front", "penetration", "error")
+SMALLEST = 1e-16  # that a logarithmic axis shows
+
+
+def run_charts(scene: str, records: Sequence[Record]) -> list[Chart]:
+    """Return a chart for each thing that a user sees: its error over the seconds of a run, the Pareto front marked."""
+    return [chart for figure, label in SEEN.items() for chart in _charts(scene, records, figure, label, "run")]
+
+
+def solve_charts(scene: str, records: Sequence[Record]) -> list[Chart]:
+    """Return residual and error over the seconds of the solves, the Pareto front marked."""
+    named = [
+        Record(r.name, r.figures, {**r.facts, "curve": f"{r.facts['method']}, {r.facts['precision']}"})
+        for r in records
+        if r.facts["kind"] == "solve"
+    ]
+    return [chart for figure, label in SOLVED.items() for chart in _charts(scene, named, figure, label, "solve")]
+
+
+def _charts(scene: str, records: Sequence[Record], figure: str, label: str, kind: str) -> list[Chart]:
+    """Return the chart of a figure over seconds, none where no record has it."""
+    curves: dict[str, tuple[list[float], list[float]]] = defaultdict(lambda: ([], []))
+    points = []
+    for r in records:
+        seconds, error = r.value("seconds"), r.value(figure)
+        if seconds is None or error is None:
+            continue
+        point = (seconds, max(abs(error - (figure == "packing")), SMALLEST))
+        points.append(point)
+        for axis, value in zip(curves[str(r.facts["curve"])], point, strict=True):
+            axis.append(value)
+    if not points:
+        return []
+    best = [points[i] for i in front_of(points)]
+    curves[PARETO] = ([p[0] for p in best], [p[1] for p in best])
+    name = f"{scene}-{kind}-{figure.replace('_', '-')}"
+    return [Lines(name, f"{scene}: {label}", f"seconds of a {kind}", label, curves, marked=frozenset({PARETO}))]
+
+
+def run_sheet(scene: str, records: Sequence[Record]) -> Sheet:
+    """Return every setting with all its figures; an empty cell is not known."""
+    facts = ("kind", "curve", "settings", "method", "precision", "tolerance", "resolution", "device", "status", "failed")
+    rows = []
+    for r in records:
+        values = [r.value(figure) for figure in FIGURES]
+        rows.append([r.name, *(str(r.facts.get(f, "")) for f in facts), *("" if v is None else f"{v:.6g}" for v in values)])
+    return Sheet(scene, ["name", *facts, *FIGURES], rows)
+
+
+def run_table(scene: str, records: Sequence[Record]) -> Table:
+    """Return the runs, the Pareto front of seconds and distance marked."""
+    ran = [r for r in records if r.figures]
+    best = {id(ran[i]) for i in front_of([(r.figures["seconds"].value, r.figures["distance"].value) for r in ran])}
+    columns = ["settings", "", "seconds", "steps", "iterations", "MB", "distance", "to the finest", "energy", "front [m]", "volume", "packing"]
+    rows = []
+    for r in records:
+        name = f"{r.facts['curve']}: {r.facts['settings']}"
+        if not r.figures:
+            rows.append([name, "failed", *[""] * (len(columns) - 3), str(r.facts["failed"])[:120]])
+            continue
+        f = {key: figure.value for key, figure in r.figures.items()}
+        seen = [f"{f['distance']:.4f}", f"{f['distance_to_finest']:.4f}", f"{f['energy_error']:.4f}", f"{f['front_error']:+.4f}"]
+        more = [f"{f[key]:+.4f}" if key in f else "" for key in ("volume_drift", "packing")]
+        cost = [f"{f['seconds']:.3f}", f"{f['steps']:.0f}", f"{f['iterations']:.0f}", f"{f['bytes'] / 1e6:.1f}"]
+        rows.append([name, "Pareto" if id(r) in best else "", *cost, *seen, *more])
+    remark = (
+        "seconds: the least of all rounds, of the steps alone. distance: share of the mass that is elsewhere than in a run of the same "
+        "resolution with the smallest steps and tolerance, in boxes of two cells of the scene, the mean over the frames compared; to the "
+        "finest: than in such a run of twice the resolution. energy, front: largest relative and last difference from the former. volume: "
+        "its growth. packing: of the densest cell of sand."
+    )
+    return Table(f"{scene}: runs", columns, rows, remark)
+
+
+def solve_table(scene: str, records: Sequence[Record]) -> Table:
+    """Return the solves, the Pareto front of seconds and error marked."""
+    solved = [r for r in records if r.facts["kind"] == "solve"]
+    best = {id(solved[i]) for i in front_of([(r.figures["seconds"].value, r.figures["error"].value) for r in solved])}
+    rows = []
+    for r in solved:
+        f = {key: figure.value for key, figure in r.figures.items()}
+        size = f"{f['bytes'] / 1e6:.1f}" if "bytes" in f else ""
+        rows.append([
+            str(r.facts["method"]), str(r.facts["precision"]), f"{r.facts['tolerance']:g}", "Pareto" if id(r) in best else "",
+            f"{f['seconds']:.4f}", f"{f['iterations']:.0f}", size, f"{f['residual']:.2e}", f"{f['error']:.2e}", str(r.facts.get("status", "")),
+        ])  # fmt: skip
+    reference = next(r for r in records if r.facts["kind"] == "reference")
+    remark = (
+        "Liquid: problems recorded in a run, from its own first guess; error: relative, in the energy norm, against a float64 solution of "
+        f"relative residual {reference.value('residual'):.1e}. Sand: whole steps from states of a run; error: root mean square of the "
+        "particles' velocity difference over g dt, residual in units of rho g dx."
+    )
+    columns = ["method", "precision", "tolerance", "", "seconds", "iterations", "MB", "residual", "error", "status"]
+    return Table(f"{scene}: solves", columns, rows, remark)
+
+
+def preset_table(scene: str, records: Sequence[Record]) -> Table:
+    """Return what the presets cost and lose."""
+    presets = [r for r in records if str(r.facts["curve"]).startswith("preset ") and r.figures]
+    slowest = max((r.figures["seconds"].value for r in presets), default=0.0)
+    rows = []
+    for r in presets:
+        f = {key: figure.value for key, figure in r.figures.items()}
+        last = f.get("volume_drift", f.get("packing", 0.0))
+        seen = [f"{f['distance']:.4f}", f"{f['energy_error']:.4f}", f"{f['front_error']:+.4f}", f"{last:+.4f}"]
+        name = str(r.facts["curve"]).removeprefix("preset ")
+        rows.append([name, str(r.facts["settings"]), f"{f['seconds']:.3f}", f"{slowest / f['seconds']:.1f}", *seen])
+    columns = ["preset", "settings", "seconds", "times faster", "distance", "energy", "front [m]", "volume or packing"]
+    return Table(f"{scene}: presets", columns, rows, "At the same resolution; columns as below.")
