@@ -13,8 +13,8 @@ from benchmarks import launches
 from benchmarks.timing import Options
 
 SUITES = (
-    "kernels", "solvers", "scaling", "floor", "peers", "run", "sand", "implicit_mpm", "contacts", "validation", "narrow_band", "replay",
-    "book", "guard", "tradeoff", "tuning", "extremes",
+    "kernels", "solvers", "scaling", "floor", "peers", "run", "sand", "implicit_mpm", "contacts", "models", "automatic_tolerance",
+    "validation", "narrow_band", "replay", "book", "guard", "tradeoff", "tuning", "extremes",
 )  # fmt: skip
 
 
@@ -34,7 +34,12 @@ def main() -> None:
     launches.install()  # before anything imports warp_lcp
     suite, report = importlib.import_module(f"benchmarks.{given.suite}"), importlib.import_module("benchmarks.report")
     options = Options(
-        given.device, tuple(given.size), given.repeat, lambda text: sys.stderr.write(f"{text}\n"), given.problems, tuple(given.method),
+        given.device,
+        tuple(given.size),
+        given.repeat,
+        lambda text: sys.stderr.write(f"{text}\n"),
+        given.problems,
+        tuple(given.method),
         given.scene,
     )
     given.out.mkdir(parents=True, exist_ok=True)

@@ -131,12 +131,13 @@ def _charts(floors: list[Floor]) -> list[Chart]:
             curves[f"{precision}, {bounds}"] = [f.n for f in found], [f.relative for f in found]
     sizes = sorted({f.n for f in floors})
     curves[f"{ASKED:g}"] = sizes, [ASKED] * len(sizes)
+    marked = frozenset(label for label in curves if label.startswith("double"))  # it would hide the others
     largest = {
         f"{f.precision}, {f.bounds}": (list(range(len(f.history))), f.history) for f in floors if f.n == max(sizes)
     }  # fmt: skip
     return [
-        Lines("sizes", "Smallest relative residual", "cells a side", "residual / residual at 0", curves),
-        Lines("history", f"Residuals at {max(sizes)}^3", "steps", "residual / residual at 0", largest, logarithmic_x=False),
+        Lines("sizes", "Smallest relative residual", "cells a side", "residual / residual at 0", curves, marked=marked),
+        Lines("history", f"Residuals at {max(sizes)}^3", "steps", "residual / residual at 0", largest, logarithmic_x=False, marked=marked),
     ]
 
 

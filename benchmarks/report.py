@@ -1,4 +1,4 @@
-"""Write what a suite found: SUITE.json, SUITE.md, SUITE-*.csv, SUITE-*.png and, for some, SUITE.html."""
+"""Write what a suite found: SUITE.json, SUITE.md, SUITE-*.csv, SUITE-*.png and, for some, SUITE-report.html."""
 
 from __future__ import annotations
 
@@ -19,6 +19,6 @@ def write(name: str, title: str, results: Results, options: Options, out: Path) 
     images = draw(results.charts, out, name, vector=results.vector)
     write_markdown(out / f"{name}.md", title, machine, results.tables, images)
     if results.page:
-        (out / f"{name}.html").write_text(results.page, encoding="utf-8")
+        (out / f"{name}-report.html").write_text(results.page, encoding="utf-8")
     missing = [] if present("matplotlib") else ["no plots: Matplotlib is missing (pip install 'warp-lcp[peers]')"]
-    return [*missing, f"wrote {out / name}.json, {name}.md{f', {name}.html' if results.page else ''} and {len(images)} plots"]
+    return [*missing, f"wrote {out / name}.json, {name}.md{f', {name}-report.html' if results.page else ''} and {len(images)} plots"]

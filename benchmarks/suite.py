@@ -147,6 +147,11 @@ SAND = Suite(
     groups={"implicit_mpm": "steps of a column collapse against newton's implicit material point method"},
 )
 CONTACTS = Suite("contacts", "rigid contacts: methods on the scenes of figures 2.9 and 2.11, NNCG against PGS at equal sweeps", False)
+MODELS = Suite(
+    "models",
+    "what each model that a scene can turn on adds to a step and to memory: the prices that `warp-lcp check` tells",
+    groups={"automatic_tolerance": "the tolerance that follows the time step against fixed ones, on five scenes"},
+)
 TRADEOFF = Suite(
     "tradeoff",
     "what accuracy costs: seconds, iterations and bytes of runs and solves against residuals, errors and what a user sees",
@@ -155,7 +160,9 @@ TRADEOFF = Suite(
 )
 VALIDATION = Suite(
     "validation",
-    "liquids and sand against known answers: rest, sloshing, ceiling, dam break, transfers, slopes, volume, sand; with negative controls",
+    "liquids, sand and bodies against known answers, with negative controls: rest, sloshing, ceiling, dam break, floating, piles and more",
     False,
 )
-EXTREMES = Suite("extremes", "hostile problems and scenes: solved, refused or stopped as is fixed beforehand, checked by NumPy and SciPy", False)
+EXTREMES = Suite(
+    "extremes", "hostile problems and scenes: solved, refused or stopped as is fixed beforehand, checked by NumPy and SciPy", False
+)

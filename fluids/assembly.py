@@ -8,7 +8,7 @@ import warp_lcp as wl
 from fluids.coupling import BodyCoupling
 from fluids.pressure import PressureProjection
 from fluids.scene import LiquidScene
-from fluids.surface import FreeSurface, GhostFluidSurface, WholeCellSurface
+from fluids.surface import FreeSurface, GhostFluidSurface, NoSurface, WholeCellSurface
 from fluids.unilateral import UnilateralPressure
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.material.boundary import Boundary
@@ -19,6 +19,8 @@ from warp_lcp.rigid.bodies import RigidBodies
 
 def make_surface(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, band: NarrowBand | None) -> FreeSurface:
     """Return the free surface that a scene asks for, around particles that are everywhere or in a band."""
+    if _stays_full(scene, boundary):
+        return NoSurface(grid, boundary)
     count = scene.particles.per_axis**grid.dimension
     if scene.pressure.surface == "ghost-fluid":
         return GhostFluidSurface(grid, boundary, particles_a_cell=count, smoothing=scene.pressure.smoothing, band=band)
@@ -50,5 +52,11 @@ def make_pressure(
             max_iterations=settings.max_iterations, coupling=coupling,
         )  # fmt: skip
     return PressureProjection(
-        grid, boundary, solver, tolerance=settings.tolerance, max_iterations=settings.max_iterations, phi=surface.phi, coupling=coupling
-    )
+        grid, boundary, solver, tolerance=settings.tolerance, max_iterations=settings.max_iterations, phi=surface.phi, coupling=coupling,
+        lets_go=scene.lets_go,
+    )  # fmt: skip
+
+
+def _stays_full(scene: LiquidScene, boundary: Boundary) -> bool:
+    """Return whether every cell is liquid for ever: walls that a caller moves might make room."""
+    return scene.stays_full and not boundary.velocity

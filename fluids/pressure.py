@@ -61,6 +61,7 @@ class PressureProjection:
         max_iterations: of the method a solve may take.
         phi: float32 distance to the free surface at cell centers [cells], < 0 exactly in FLUID cells; None: it lies on the cells' faces.
         coupling: with bodies that the pressure moves, whose term A then has too; None: there are none.
+        lets_go: whether a wall separates; else y = 0 on all cells, and no bounds are stored.
 
     Attributes:
         kind: int8 of AIR, FLUID, SOLID, which the caller marks.
@@ -81,21 +82,22 @@ class PressureProjection:
         max_iterations: int = 100,
         phi: wp.array | None = None,
         coupling: BodyCoupling | None = None,
+        lets_go: bool = True,
     ) -> None:
         """Allocate the fields."""
         self.grid, self.boundary, self.solver, self._phi, self.coupling = grid, boundary, solver, phi, coupling
         self.tolerance, self.max_iterations = tolerance, max_iterations
         self.automatic = TimeErrorTolerance(grid.size, grid.device) if tolerance == "auto" else None
-        self._kernels = kernels.pressure_kernels(bool(boundary.open), bool(boundary.velocity), phi is not None)
+        self._kernels = kernels.pressure_kernels(bool(boundary.open), bool(boundary.velocity), phi is not None, lets_go)
         self.kind, self.shown, self.contact = grid.field(wp.int8), grid.field(wp.int8), grid.field(wp.uint8)
         self.pressure, self.known = grid.field(wp.float64), grid.faces(wp.int8)
         wp.copy(self.kind, boundary.base)
-        self._b, self._lower, self._start = (grid.field(wp.float64) for _ in range(3))
-        self._lower.fill_(-np.inf)
+        self._b, self._start = (grid.field(wp.float64) for _ in range(2))
+        self._lower = wp.full(grid.shape, -np.inf, dtype=wp.float64, device=grid.device) if lets_go else None
         self._shift = grid.field() if phi is not None or boundary.open_sides else None
         self._sums = wp.zeros((*grid.shape[:2], 2), dtype=wp.float64, device=grid.device)
         self._problem: wl.LCP | None = None  # built when there is liquid: an empty problem is refused
-        self._dt = 0.0
+        self._dt = self._ratio = 0.0  # of the last step [s]; of this step's length to that
 
     def show(self) -> None:
         """Show `kind` in frames though nothing has been projected yet."""
@@ -113,7 +115,7 @@ class PressureProjection:
             self._make_problem()
         if self._problem is None:
             return 0
-        ratio = dt / self._dt if self._dt > 0.0 else 0.0
+        ratio = self._ratio = dt / self._dt if self._dt > 0.0 else 0.0
         fields = [self.pressure, ratio, self._b, self._lower, self._start, self._shift]
         inputs = [*three(velocity), self.kind, self.boundary.touch, *self._faces(), *fields]
         self.grid.domain.launch(self._kernels.prepare, inputs)
@@ -132,7 +134,7 @@ class PressureProjection:
         faces = {f"face_{axis}": field for axis, field in zip("xyz", self.boundary.open, strict=False)}
         cells = self.grid.interior(self.kind.numpy())
         self._operator = wl.GridPoisson(cells, shift=self._shift, device=self.grid.device, **faces)
-        self._problem = wl.LCP(self._joined(), self._b, self._lower, np.inf)
+        self._problem = wl.LCP(self._joined(), self._b, -np.inf if self._lower is None else self._lower, np.inf)
         self._work = self.solver.init(self._problem)
 
     def _joined(self) -> wl.GridPoisson | wl.SumOperator:
@@ -182,7 +184,7 @@ class PressureProjection:
         """
         atol = ROUNDING * speed * unknowns**0.5
         if self.automatic is not None:
-            return self.automatic.criteria(warm=self._dt > 0.0, atol=atol, max_iterations=self.max_iterations)
+            return self.automatic.criteria(self._ratio, unknowns, atol=atol, max_iterations=self.max_iterations)
         return wl.StoppingCriteria(rtol=float(self.tolerance), atol=atol, max_iterations=self.max_iterations)
 
     def recorded(self, speed: float, unknowns: int) -> dict[str, np.ndarray]:
@@ -194,12 +196,12 @@ class PressureProjection:
         """
         assert self._problem is not None, "prepare comes first"
         criteria = self.criteria(speed, unknowns)
-        numbers = {"tolerance": max(criteria.rtol, criteria.guess_rtol), "absolute_tolerance": criteria.atol, "spacing": self.grid.spacing}
+        numbers = {"tolerance": criteria.rtol, "absolute_tolerance": criteria.atol, "spacing": self.grid.spacing}
         return recorded.arrays(self._problem, self._start) | {name: np.array(value) for name, value in numbers.items()}
 
     def fields(self) -> list[wp.array]:
         """Return the fields of the problem: its cells, right-hand side, lower bound and first guess."""
-        return [self.kind, self._b, self._lower, self._start]
+        return [self.kind, self._b, *([] if self._lower is None else [self._lower]), self._start]
 
     def project(
         self, velocity: Sequence[wp.array], dt: float, window: Window, result: wl.SolveResult, criteria: wl.StoppingCriteria, unknowns: int
@@ -222,7 +224,7 @@ class PressureProjection:
             window.launch(self._kernels.subtract_gradient, [axis, self.pressure, self.kind, *self._faces(), field, self.known[axis]])
         reference = result.residual / result.relative_residual if result.relative_residual > 0.0 else 0.0
         # the criteria bound a 2-norm; what a cell may carry of it is the root mean square
-        threshold = RELEASE_FACTOR * criteria.tolerance(reference, result.history[0].residual) / max(unknowns, 1) ** 0.5
+        threshold = RELEASE_FACTOR * criteria.tolerance(reference) / max(unknowns, 1) ** 0.5
         fields = [self.pressure, threshold, self.contact, self._sums]
         inputs = [*three(velocity), self.kind, self.boundary.touch, *self._faces(), *fields]
         self.grid.domain.launch_rows(self._kernels.contact, inputs)
@@ -249,6 +251,7 @@ class PressureProjection:
             "pressure_dt": np.array(self._dt),
             "cells": self.shown.numpy().copy(),
             "contact": self.contact.numpy().copy(),
+            "time_error": np.array([-1.0, 0.0]) if self.automatic is None else self.automatic.state(),
         }
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
@@ -257,6 +260,8 @@ class PressureProjection:
         self.shown.assign(state["cells"])
         self.contact.assign(state["contact"])
         self._dt = float(state["pressure_dt"])
+        if self.automatic is not None:
+            self.automatic.restore(state["time_error"])
 
     def pressures(self, density: float) -> np.ndarray:
         """Return the pressure p = rho dx x / dt [Pa] in the stored shape; zeros before the first step."""

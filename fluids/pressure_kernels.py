@@ -51,12 +51,12 @@ FACE = """
 PREPARE = """
     const float* u = u_.data + row; const float* v = v_.data + row; const float* w = planes == 2 ? w_.data + row : u;
     const unsigned char* touch = touch_.data + row; const double* last = last_.data + row;
-    double* b = b_.data + row; double* lower = lower_.data + row; double* start = start_.data + row;
+    double* b = b_.data + row; double* lower = lower_.data + (BOUNDED ? row : 0); double* start = start_.data + row;
     SIMD8 for (int i = first; i < last_cell; ++i) {
         const int fluid = kind[i] == FLUID;
-        const double y = outflow(u, v, w, i), bound = (touch[i] & LETS_GO) ? 0.0 : -INFINITY, x = last[i]*ratio;
+        const double y = outflow(u, v, w, i), bound = BOUNDED && (touch[i] & LETS_GO) ? 0.0 : -INFINITY, x = last[i]*ratio;
         b[i] = fluid ? y : 0.0;
-        lower[i] = fluid ? bound : -INFINITY;
+        if (BOUNDED) lower[i] = fluid ? bound : -INFINITY;
         start[i] = fluid ? (x < bound ? bound : x) : 0.0;
     }
     // What the diagonal of a FLUID cell has more than the operator knows: air nearer than a cell away, and the air beyond open sides.
@@ -100,7 +100,7 @@ CONTACT = """
         SIMD8 for (int m = 0; m < n; ++m) {
             const int i = from + m, fluid = kind[i] == FLUID;
             const double y = outflow(u, v, w, i), size = y < 0.0 ? -y : y;
-            const int leaving = fluid & ((touch[i] & LETS_GO) != 0) & (x[i] <= 0.0) & (y > threshold);
+            const int leaving = BOUNDED & fluid & ((touch[i] & LETS_GO) != 0) & (x[i] <= 0.0) & (y > threshold);
             contact[i] = leaving ? RELEASED : ((fluid & (touch[i] & TOUCHES)) ? HELD : 0);
             leaves[m] = leaving;
             rest[m] = (fluid & !leaving) ? size : 0.0;
@@ -122,24 +122,25 @@ _CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR, "TOUCHES": TOUCHES, "L
 _F32, _F64, _I8, _U8 = (wp.array3d(dtype=t) for t in (wp.float32, wp.float64, wp.int8, wp.uint8))
 
 
-def _source(body: str, *, cut: bool = False, moving: bool = False, ghost: bool = False) -> str:
+def _source(body: str, *, cut: bool = False, moving: bool = False, ghost: bool = False, bounded: bool = True) -> str:
     """Return a native function's body with its constants."""
-    values = _CONSTANTS | {"CUT": int(cut), "MOVING": int(moving), "GHOST": int(ghost)}
+    values = _CONSTANTS | {"CUT": int(cut), "MOVING": int(moving), "GHOST": int(ghost), "BOUNDED": int(bounded)}
     names = "".join(f"constexpr int {name} = {value}; " for name, value in values.items())
     return simd(BLOCK + names + f"constexpr double THETA_MIN = {THETA_MIN};" + body)
 
 
 @functools.cache
-def pressure_kernels(cut: bool, moving: bool, ghost: bool) -> SimpleNamespace:
+def pressure_kernels(cut: bool, moving: bool, ghost: bool, bounded: bool = True) -> SimpleNamespace:
     """Return `prepare`, `subtract_gradient` and `contact`.
 
     Args:
         cut: whether faces have open fractions.
         moving: whether solids have velocities.
         ghost: whether the free surface lies between cells.
+        bounded: whether a wall lets go; else there is no lower bound.
     """
-    module = "fluids.pressure" + "_cut" * cut + "_moving" * moving + "_ghost" * ghost
-    flags = {"cut": cut, "moving": moving, "ghost": ghost}
+    module = "fluids.pressure" + "_cut" * cut + "_moving" * moving + "_ghost" * ghost + "_equations" * (not bounded)
+    flags = {"cut": cut, "moving": moving, "ghost": ghost, "bounded": bounded}
 
     @wp.func_native(_source(ROW + FACE + PREPARE, **flags))
     def prepare_row(

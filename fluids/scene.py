@@ -7,12 +7,14 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
+from warp_lcp.driver.models import Model
 from warp_lcp.driver.particle_scene import ParticleScene
 from warp_lcp.driver.scene import Complaint, Liquid, Table
 from warp_lcp.driver.shapes import MaterialProperties
 
 # Measured at 96^3 as the growth of a process on the CPU, first step included; bytes a cell.
 PRESSURE_BYTES = 92  # fields of the pressure solve
+BOUND_BYTES = 9  # of them, those of walls that separate
 LEVEL_SET_BYTES = 19  # more for a surface between cells, or slivers
 SMOOTHING_BYTES = 12
 UNILATERAL_BYTES = 5
@@ -72,13 +74,54 @@ class LiquidScene(ParticleScene):
             found.append(Complaint(("particles", "narrow_band"), None, message))
         return found
 
+    def models(self) -> list[Model]:
+        """Return the models that the scene turns on, and those that it asks for but cannot need."""
+        full, ghost = self.stays_full, self.pressure.surface == "ghost-fluid"
+        closed = "liquid fills a closed box for ever: there is no surface"
+        found = []
+        if self.pressure.model == "unilateral":
+            found.append(Model("unilateral pressure", 'pressure.model = "unilateral"'))
+        elif self.lets_go:
+            found.append(Model("separating walls", "liquid may let go of domain.wall or a solid: bounds on the pressure"))
+        elif self.domain.wall == "separating":
+            found.append(Model("separating walls", "the domain has no wall: equations without bounds", built=False))
+        if ghost:
+            found.append(Model("ghost-fluid surface", closed if full else 'pressure.surface = "ghost-fluid"', built=not full))
+        if self.pressure.smoothing and ghost:
+            found.append(Model("smoothing", closed if full else "pressure.smoothing", built=not full))
+        if self.solver.tolerance == "auto":
+            found.append(Model("automatic tolerance", 'solver.tolerance = "auto"'))
+        return [*found, *super().models()]
+
+    @property
+    def stays_full(self) -> bool:
+        """Return whether liquid fills the domain but for solids that stand still, so that there never is a surface."""
+        openings = self.domain.open or self.source or self.drain or any(solid.moves for solid in self.solid)
+        return not openings and self.particles.narrow_band is None and self.pressure.model == "incompressible" and self._filled()
+
+    def _filled(self) -> bool:
+        """Return whether a box of liquid holds the whole domain."""
+        for liquid in self.liquid:
+            bounds = liquid.bounds(self.dimension) if liquid.shape == "box" and liquid.rotate is None and not liquid.invert else None
+            if bounds is not None and all(bounds[0][a] <= 0.0 and bounds[1][a] >= side for a, side in enumerate(self.domain.size)):
+                return True
+        return False
+
+    @property
+    def lets_go(self) -> bool:
+        """Return whether a wall that is there separates."""
+        walls = self.domain.wall == "separating" and len(self.domain.open) < 2 * self.dimension
+        return walls or any((solid.wall or self.domain.wall) == "separating" for solid in self.solid)
+
     def own_memory_parts(self) -> dict[str, int]:
         """Return what pressure and surface take at most on the device [bytes]."""
         cells, level_set = self.counted_cells, self.pressure.surface == "ghost-fluid"
+        bounded = self.lets_go or self.pressure.model == "unilateral"
         motions = sum(solid.is_body for solid in self.solid) * (3 if self.dimension == 2 else 6)
         return {
-            "pressure": cells * (PRESSURE_BYTES + UNILATERAL_BYTES * (self.pressure.model == "unilateral")),
+            "pressure": cells * (PRESSURE_BYTES - BOUND_BYTES * (not bounded) + UNILATERAL_BYTES * (self.pressure.model == "unilateral")),
             "bodies": cells * (BODY_BYTES * bool(motions) + POTENTIAL_BYTES * motions),
             "surface": cells
+            * (not self.stays_full)
             * (LEVEL_SET_BYTES * (level_set or self.cuts_cells) + SMOOTHING_BYTES * (level_set and self.pressure.smoothing > 0)),
         }

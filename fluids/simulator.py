@@ -96,19 +96,25 @@ class LiquidSimulation(ParticleSimulation):
         window = self.window(before)
         self.bring_to_faces(window, dt)
         projected = self._project(window, dt, self.top_speed(before, dt))
-        with self.watch.stage("diagnostics", self.projection.kind):
-            volume = self.surface.volume(projected.unknowns)  # at the start of the step, before solids move
+        measured = self._measured(projected)  # before solids move
         self.extend(window, self.projection.known, self.projection.kind, self.projection.contact)
         if self.projection.coupling is not None:
             self.projection.coupling.hold(self.velocity, self.projection.known)
         self.exchange(window, self.projection.kind, self.surface.phi, self.projection.contact)
         self.bring_to_particles()
         row = self.move(dt) | self.solve_row(projected.result)
-        outflow = projected.max_outflow / self.grid.spacing
         automatic = self.projection.automatic
         if automatic is not None and projected.result is not None:
             row |= {"tolerance": automatic.used, "time_error": automatic.time_error}
-        return self.logged(row | {"active": projected.released, "max_divergence": outflow, "volume": volume})
+        return self.logged(row | {"active": projected.released} | measured)
+
+    def _measured(self, projected: Projection) -> Row:
+        """Return what the log alone wants to know of the liquid at the start of the step."""
+        if not self.scene.output.diagnostics:
+            return {}
+        with self.watch.stage("diagnostics", self.projection.kind):
+            volume = self.surface.volume(projected.unknowns)
+        return {"max_divergence": projected.max_outflow / self.grid.spacing, "volume": volume}
 
     def own_columns(self) -> tuple[str, ...]:
         """Return the names of the pressure's columns and the volume's.
@@ -117,7 +123,7 @@ class LiquidSimulation(ParticleSimulation):
         counts FLUID cells, or lies inside the surface where that is finer than cells. With an automatic tolerance: tolerance, the relative
         residual that the step was held to, and time_error [m/s], the error in the velocity that its length makes.
         """
-        columns = ("active", "max_divergence", "volume")
+        columns = ("active", "max_divergence", "volume") if self.scene.output.diagnostics else ("active",)
         return columns if self.projection.automatic is None else (*columns, "tolerance", "time_error")
 
     def frame(self) -> list[Part]:

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
+import numpy as np
 import warp as wp
 
+import warp_lcp as wl
 from fluids import surface_kernels as kernels
 from warp_lcp.grid.extrapolate import extrapolate
 from warp_lcp.grid.level_set import LevelSet
@@ -16,6 +18,7 @@ from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.narrow_band import NarrowBand
 
 SLIVER = 0.35  # a cell whose open share is smaller may hold no particle though liquid fills it: the level set decides
+SAMPLES = 8  # points along the edge of a cut cell, of a volume that is found once
 REACH = 2  # layers that u* is continued into cells of the level set whose faces no particle gave weight
 
 
@@ -75,6 +78,31 @@ class WholeCellSurface:
         return cells * self.grid.cell_volume
 
 
+class NoSurface:
+    """Every open cell is liquid, and stays so: a closed box full of it has no surface, whatever was asked for."""
+
+    phi = None
+
+    def __init__(self, grid: StaggeredGrid, boundary: Boundary) -> None:
+        """Find the cells and their volume."""
+        kind = boundary.base.numpy().copy()
+        kind[kind == wl.AIR] = wl.FLUID
+        self._kind = wp.array(kind, dtype=wp.int8, device=grid.device)
+        self._volume = float(_open_shares(grid, boundary)[grid.interior(kind) == wl.FLUID].sum()) * grid.cell_volume
+
+    def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
+        """Write the cells' kinds."""
+        wp.copy(kind, self._kind)
+
+    def complete(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
+        """Give u* to faces between particles."""
+        _complete(window, velocity, weights, known)
+
+    def volume(self, cells: int) -> float:
+        """Return the volume that solids leave."""
+        return self._volume
+
+
 class GhostFluidSurface:
     """The zero of a level set that the particles' density gives: air begins between the cells' centers [Gibou et al. 2002].
 
@@ -117,3 +145,29 @@ def _complete(window: Window, velocity: Sequence[wp.array], weights: Sequence[wp
         marks.zero_()
         window.launch(kernels.weighted_kernel, [weight, marks])
         extrapolate(window, marks, field, REACH)
+
+
+def _open_shares(grid: StaggeredGrid, boundary: Boundary) -> np.ndarray:
+    """Return which share of each cell no solid takes, shape (nz, ny, nx), from the distance to solids at the cells' corners."""
+    nx, ny, nz = grid.counts
+    if boundary.distance is None:
+        return np.ones((nz, ny, nx))
+    axes = range(3 - grid.dimension, 3)
+    distance = boundary.distance.numpy().astype(np.float64)
+    distance = distance[1 : nz + (grid.dimension == 3) + 1, 1 : ny + 2, 1 : nx + 2]
+    corners = np.stack([_corner(distance, corner) for corner in np.ndindex(*(2 for _ in axes))])
+    shares = (corners.mean(axis=0) > 0.0).astype(np.float64)
+    cut = (corners.min(axis=0) < 0.0) & (corners.max(axis=0) > 0.0)
+    values = corners[:, cut].reshape(*(2 for _ in axes), -1)
+    low = (np.arange(SAMPLES) + 0.5) / SAMPLES
+    for _ in axes:  # from corners to points inside, one axis after the other; the one in turn goes last
+        values = np.moveaxis(np.tensordot(np.stack([1.0 - low, low]), values, axes=(0, 0)), 0, -2)
+    shares[cut] = (values > 0.0).mean(axis=tuple(range(values.ndim - 1)))
+    return shares
+
+
+def _corner(distance: np.ndarray, corner: tuple[int, ...]) -> np.ndarray:
+    """Return the values at one corner of every cell, 0 or 1 along each axis."""
+    whole = (0,) * (3 - len(corner)) + corner
+    count = [n - (axis >= 3 - len(corner)) for axis, n in enumerate(distance.shape)]
+    return distance[tuple(slice(low, low + n) for low, n in zip(whole, count, strict=True))]

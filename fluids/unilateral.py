@@ -102,7 +102,7 @@ class UnilateralPressure(PressureProjection):
             velocity: u* of each component [m/s].
             dt: time step [s].
         """
-        ratio = dt / self._dt if self._dt > 0.0 else 0.0
+        ratio = self._ratio = dt / self._dt if self._dt > 0.0 else 0.0
         self._setting.rate = wp.float64(self.grid.spacing / dt)
         least = SHIFT if self.boundary.open else 0.0
         self.grid.domain.launch(kernels.limit_kernel, [self._setting, *three(velocity), *three(self.boundary.open)])

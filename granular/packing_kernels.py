@@ -151,6 +151,9 @@ def edge_kernel(
         f1 = inverse_alpha[k - kb, j - jb, i]
         g0 = inverse_beta[k, j, i]
         g1 = inverse_beta[k - ka, j - ja, i - ia]
+        if f0 + f1 + g0 + g1 == 0.0:  # most edges: nothing to move
+            share[k, j, i] = 0.0
+            continue
         s00 = base[k, j, i] == _SOLID
         s10 = base[k - ka, j - ja, i - ia] == _SOLID
         s01 = base[k - kb, j - jb, i] == _SOLID
@@ -164,7 +167,7 @@ def edge_kernel(
             dense = (p00 & SHEARS_HERE) + (p10 & SHEARS_HERE) + (p01 & SHEARS_HERE) + (p11 & SHEARS_HERE)
             if dense > 0 and f0 > 0.0 and f1 > 0.0 and g0 > 0.0 and g1 > 0.0:
                 weight = float(SHEARS_HERE) / float(dense)
-        elif f0 + f1 + g0 + g1 > 0.0:
+        else:
             count = int(0)
             if not s00 and (s10 != s01):
                 count += p00 & HOLDS

@@ -28,6 +28,7 @@ REPORT = (
     float* ratio = ratio_.data + row;
     double cells = 0, yielded = 0, taken = 0, most = 0;
     for (int i = first; i < last; ++i) {
+        if (!flags[i]) { ratio[i] = 0; continue; }  // no sand, no stress
         float size = 0; double e[3], mean = 0, w = drive[i];
         const double full = fullness(w*numbers.data[STEP_OF_CELL]);
         for (int axis = 0; axis < DIM; ++axis) {

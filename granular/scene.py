@@ -6,7 +6,8 @@ import math
 from collections.abc import Sequence
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
+from pydantic_core import PydanticCustomError
 
 from granular.materials import MATERIALS, Material, compression_slope, plane_strain_slope
 from warp_lcp.driver.particle_scene import ParticleScene
@@ -83,6 +84,14 @@ class Gauge(Table):
     height: float = Field(description="above the domain's floor [m]")
 
 
+def _not_automatic(value: Any) -> Any:
+    """Refuse "auto", which liquids have."""
+    if value == "auto":
+        message = "is for liquids only: sand's tolerance is in units of rho g dx already, what a cell of sand weighs; 1e-3 unless given"
+        raise PydanticCustomError("cross_check", "{message}", {"message": message})
+    return value
+
+
 class SandSolver(Table):
     """[solver]: the method for pressure and friction together."""
 
@@ -90,7 +99,9 @@ class SandSolver(Table):
     method: Literal["accelerated-projection", "interleaved-sweeps"] = Field(
         default="accelerated-projection", description="interleaved-sweeps is the textbook's, several times slower"
     )
-    tolerance: float = Field(default=1e-3, gt=0, lt=1, description="of the stresses, root mean square in units of rho g dx")
+    tolerance: Annotated[float, BeforeValidator(_not_automatic)] = Field(
+        default=1e-3, gt=0, lt=1, description="of the stresses, root mean square in units of rho g dx"
+    )
     max_iterations: int = Field(default=600, ge=10, description="iterations after which a step takes the stresses as they are")
     precision: Literal["single"] = Field(default="single", description="of the stresses; residuals are double")
 

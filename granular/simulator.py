@@ -43,6 +43,7 @@ COLUMNS = (
     "runout",
     "height",
 )  # fmt: skip
+DIAGNOSTICS = ("yielded", "dissipation", "predicted_excess")  # of them, those that nothing else needs
 
 
 class SandSimulation(ParticleSimulation):
@@ -136,8 +137,7 @@ class SandSimulation(ParticleSimulation):
         window = self.window(before)
         self.bring_to_faces(window, dt)
         solved = self._solve(window, dt)
-        with self.watch.stage("diagnostics", self.packing.flags, self.stress.now):
-            report = self.outcome.report()
+        measured = self._measured()
         self._extend(window)
         self.bring_to_particles()
         below, most = self._mass_below(), self._most()
@@ -154,15 +154,22 @@ class SandSimulation(ParticleSimulation):
                 "solve_residual": solved.residual / first if first > 0.0 else 0.0,
                 "coupled_residual": solved.residual,
                 "staggering_iterations": solved.iterations,
-                "yielded": report.yielded,
-                "dissipation": report.dissipation * self.scene.physics.density * self.grid.cell_volume,
-                "predicted_excess": report.predicted,
                 "max_fraction": most,
                 "runout": runout - self._start,
                 "height": height,
                 "flow_rate": self._flow_rate(below, row, dt),
             }
+            | measured
         )
+
+    def _measured(self) -> Row:
+        """Return what the log alone wants to know of the stresses."""
+        if not self.scene.output.diagnostics:
+            return {}
+        with self.watch.stage("diagnostics", self.packing.flags, self.stress.now):
+            report = self.outcome.report()
+        scale = self.scene.physics.density * self.grid.cell_volume
+        return {"yielded": report.yielded, "dissipation": report.dissipation * scale, "predicted_excess": report.predicted}
 
     def own_columns(self) -> tuple[str, ...]:
         """Return the names of the columns of the stresses and of the sand's shape.
@@ -174,7 +181,8 @@ class SandSimulation(ParticleSimulation):
         step, in units of the densest packing; runout [m]: 99th percentile of x less that at the start; height [m]: 99th percentile of y;
         flow_rate [kg/s; kg/(s m) in 2-D]: what fell below the gauge, or without one what left through drains and open sides.
         """
-        return (*COLUMNS, "flow_rate") if self.scene.gauge or self.scene.drain or self.scene.domain.open else COLUMNS
+        columns = tuple(name for name in COLUMNS if self.scene.output.diagnostics or name not in DIAGNOSTICS)
+        return (*columns, "flow_rate") if self.scene.gauge or self.scene.drain or self.scene.domain.open else columns
 
     def frame(self) -> list[Part]:
         """Return the particles and the cells that hold sand, with fraction of grains, pressure [Pa] and yield ratio of the last solve.

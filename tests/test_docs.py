@@ -1,4 +1,4 @@
-"""The documentation's table of methods is what the registry says, and its examples work as they stand."""
+"""The documentation's table of methods is what the registry says, and its examples and tables of scenes work as they stand."""
 
 import re
 from pathlib import Path
@@ -8,6 +8,7 @@ import pytest
 import warp_lcp as wl
 from benchmarks import sweep_prices
 from code_blocks import blocks, run
+from warp_lcp.driver.scene_file import load_scene
 from warp_lcp.solvers.registry import grid_methods
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -57,3 +58,27 @@ EXAMPLES = [(page, code) for page in sorted(DOCS.rglob("*.md")) if page.name != 
 def test_python_examples_run(page, code, capsys):
     run(code, page)
     assert capsys.readouterr().out.startswith("CONVERGED")
+
+
+TABLES = [(page, text) for page in sorted(DOCS.glob("*.md")) if page.name != "tutorial.md" for text in blocks(page, "toml")]
+SCENE = """
+[scene]
+simulator = "fluids"
+[time]
+duration = 1.0
+[domain]
+size = [2.0, 1.0, 1.0]
+resolution = 32
+[[liquid]]
+shape = "box"
+min = [0.0, 0.0, 0.0]
+max = [1.0, 0.5, 1.0]
+"""
+
+
+@pytest.mark.parametrize(("page", "text"), TABLES, ids=lambda value: value.stem if isinstance(value, Path) else "")
+def test_tables_of_scenes_are_valid(page, text, tmp_path):
+    """What pages show is a table of a scene, or a scene."""
+    file = tmp_path / "scene.toml"
+    file.write_text(text if "[scene]" in text else SCENE + text)
+    load_scene(str(file), [])

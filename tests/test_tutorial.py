@@ -39,7 +39,7 @@ def test_the_text_says_what_the_first_problem_prints(capsys):
 
 
 def test_there_are_scenes_of_both_materials():
-    assert [re.search(r'simulator = "(\w+)"', text)[1] for text in SCENES] == ["fluids", "fluids", "granular"]
+    assert [re.search(r'simulator = "(\w+)"', text)[1] for text in SCENES] == ["fluids", "fluids", "granular", "fluids"]
 
 
 @pytest.mark.parametrize("text", SCENES)
@@ -60,9 +60,25 @@ def test_commands_work(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("water.toml").write_text(SCENES[0])
     Path("sand.toml").write_text(SCENES[2])
-    assert [words[0] for words in COMMANDS] == ["check", "run", "render", "run", "render"]
+    Path("crate.toml").write_text(SCENES[3])
+    assert [words[0] for words in COMMANDS] == ["check", "run", "render", "run", "render", "run", "render", "render"]
     for words in COMMANDS:
         if words[0] == "render":
             pytest.importorskip("pyvista")
         invoke(*words, *(SHORTER if words[0] == "run" else []))
-    assert {path.name for path in tmp_path.iterdir()} == {"water.toml", "sand.toml", "water", "sand"}
+    names = ("water", "sand", "crate")
+    assert {path.name for path in tmp_path.iterdir()} == {*names, *(f"{name}.toml" for name in names), "crate.gif"}
+    assert (tmp_path / "crate" / "images" / "sheet.png").is_file()
+
+
+def test_the_scene_with_a_body_has_one(tmp_path):
+    """At the text's own resolution, until the crate meets the water."""
+    scene = tmp_path / "crate.toml"
+    scene.write_text(SCENES[3])
+    invoke("run", str(scene), "--out", str(tmp_path / "out"), "--frames", "4")
+    with (tmp_path / "out" / "log.csv").open() as log:
+        rows = list(csv.DictReader(log))
+    assert float(rows[-1]["body0_y"]) < 0.35 - 0.04
+    assert float(rows[-1]["body0_angle"]) > 3.0
+    assert (tmp_path / "out" / "bodies.pvd").is_file()
+    assert (tmp_path / "out" / "surface.pvd").is_file()

@@ -14,7 +14,10 @@ class SolveStatus(Enum):
     """How a solve ended. The value says what it means and what to try next."""
 
     CONVERGED = "the recomputed residual meets the criteria"
-    MAX_ITERATIONS = "the iteration limit came first: raise max_iterations, start warmer, or take a faster method"
+    MAX_ITERATIONS = (
+        "the iteration limit came first: raise max_iterations, start warmer, or take a faster method; "
+        "where coefficients differ by more than 1e5, precision='double'"
+    )
     STAGNATED = "no smaller residual in the last `patience` steps: take another method or precision='double'"
     FLOOR = "the precision's floor is reached before the tolerance: loosen rtol or use precision='double'"
     LOCAL_MINIMUM = "the merit function has a stationary point that is no solution: start elsewhere or take another method"

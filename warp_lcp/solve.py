@@ -229,7 +229,6 @@ class _Loop:
             residual.evaluate(self.work.x)
         self._record(0, Step("start", 0))
         self._keep(0)
-        self.tolerance = self.stopping.tolerance(self.reference, self.history[0].residual)
         if lost > self.tolerance:
             return self._finish(SolveStatus.INFEASIBLE, 0)
         self.work.start(warm=guess is not None, tolerance=self.tolerance)

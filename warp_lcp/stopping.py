@@ -8,13 +8,11 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, kw_only=True)
 class StoppingCriteria:
-    """Say when a solve is done: ||r|| <= max(atol, rtol ||r(clip(0, l, u))||, guess_rtol ||r(x0)||), r the natural residual in float64.
+    """Say when a solve is done: ||r|| <= max(atol, rtol ||r(clip(0, l, u))||), r the natural residual in float64.
 
     Args:
         rtol: relative tolerance, in [0, 1).
         atol: absolute tolerance >= 0, in the units of y.
-        guess_rtol: tolerance relative to the residual of the first guess x0, in [0, 1); to that of clip(0, l, u) without a guess or
-            where the guess is worse. 0: the guess does not matter.
         max_iterations: the most steps of the method, >= 0; the limit is honored exactly.
         patience: steps without a new smallest residual after which the solve has stagnated, >= 1.
         divergence: the solve has diverged when the residual exceeds this multiple of the first one, > 1.
@@ -33,16 +31,14 @@ class StoppingCriteria:
 
     rtol: float = 1e-6
     atol: float = 0.0
-    guess_rtol: float = 0.0
     max_iterations: int = 100
     patience: int = 30
     divergence: float = 1e8
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        for name in ("rtol", "guess_rtol"):
-            if not 0 <= getattr(self, name) < 1:
-                raise ValueError(f"{name} = {getattr(self, name)}: must be in [0, 1)")
+        if not 0 <= self.rtol < 1:
+            raise ValueError(f"rtol = {self.rtol}: must be in [0, 1)")
         if not (self.atol >= 0 and math.isfinite(self.atol)):
             raise ValueError(f"atol = {self.atol}: must be finite and >= 0, in the units of y")
         for name, least in (("max_iterations", 0), ("patience", 1)):
@@ -52,6 +48,6 @@ class StoppingCriteria:
         if not self.divergence > 1:
             raise ValueError(f"divergence = {self.divergence}: must be > 1")
 
-    def tolerance(self, reference: float, guess: float = math.inf) -> float:
-        """Return the absolute tolerance for the residual norms of clip(0, l, u) and of the first guess."""
-        return max(self.atol, self.rtol * reference, self.guess_rtol * min(reference, guess))
+    def tolerance(self, reference: float) -> float:
+        """Return the absolute tolerance for a reference residual norm."""
+        return max(self.atol, self.rtol * reference)

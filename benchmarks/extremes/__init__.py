@@ -19,7 +19,7 @@ TITLE = "Extremes: hostile problems and scenes, and what they come to"
 FAMILIES = (
     shapes.sizes, shapes.masks, shapes.closed_pools, coefficients.slivers, coefficients.contrasts, coefficients.bodies, bounds.scales,
     bounds.degenerate, bounds.tolerances, matrices.singular, matrices.cycling, refused.wrong_arguments, simulations.steps_and_forces,
-    simulations.particles_anywhere, broken.wrong_solvers,
+    simulations.solids_and_depth, simulations.particles_anywhere, broken.wrong_solvers,
 )  # fmt: skip
 
 

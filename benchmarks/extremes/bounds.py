@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
@@ -21,12 +22,10 @@ def scales() -> Iterator[Case]:
     yield from both(family, "b = 0", lambda: pool(SHAPE, b=np.zeros(SHAPE)))
     yield from both(family, "b = -0.0", lambda: pool(SHAPE, b=np.full(SHAPE, -0.0)))
     for scale in (1e-30, 1e-15, 1e15, 1e30):
-        yield from both(family, f"b of {scale:g}", lambda s=scale: pool(SHAPE, b=s * noise(SHAPE)))
-        yield from both(family, f"b and bounds of {scale:g}", lambda s=scale: boxed(s))
+        yield from both(family, f"b of {scale:g}", partial(pool, SHAPE, b=scale * noise(SHAPE)))
+        yield from both(family, f"b and bounds of {scale:g}", partial(boxed, scale))
     for scale in (1e-160, 1e-310):
-        yield from both(
-            family, f"b of {scale:g}", lambda s=scale: pool(SHAPE, b=s * noise(SHAPE)), promises=same(refusal("b: values up to"))
-        )
+        yield from both(family, f"b of {scale:g}", partial(pool, SHAPE, b=scale * noise(SHAPE)), promises=same(refusal("b: values up to")))
     yield from both(family, "b of 1e160", lambda: pool(SHAPE, b=1e160 * noise(SHAPE)), promises=same(OVERFLOWS))
     yield from both(family, "one cell of b at 1e12", lambda: spike(1e12))
     yield from both(
@@ -59,7 +58,7 @@ def degenerate() -> Iterator[Case]:
     """Yield solutions with x_i = l_i and y_i = 0 on many cells, and sets that hold all or nothing."""
     family = "active sets"
     for share in (0.1, 0.5, 0.9):
-        yield from both(family, f"x = y = 0 on {share:.0%} of the cells", lambda s=share: planted(s))
+        yield from both(family, f"x = y = 0 on {share:.0%} of the cells", partial(planted, share))
     yield from both(family, "x = y = 0 on all cells but one", lambda: planted(1.0))
     yield from both(family, "all active", lambda: pool(SHAPE, b=np.abs(noise(SHAPE)) + 0.01, lower=0.0))
     yield from both(family, "all active but one", all_but_one)
@@ -125,7 +124,7 @@ def tolerances() -> Iterator[Case]:
             yield from both(
                 family,
                 f"rtol = {rtol:g}, {name}",
-                lambda s=shape: pool(s),
+                partial(pool, shape),
                 promises=promises,
                 stopping={"rtol": rtol, "max_iterations": 500},
             )

@@ -42,24 +42,24 @@ class Exact:
         """clip(0, l, u)."""
         return np.clip(np.zeros(len(self.b)), self.lower, self.upper)
 
-    def diagonal(self) -> np.ndarray:
-        """Return |A_ii|, 1 where that is 0."""
+    def diagonal(self, *, bodies: bool = True) -> np.ndarray:
+        """Return |A_ii|, 1 where that is 0; without the term of bodies if so asked."""
         d = np.asarray(self.matrix.diagonal(), dtype=np.float64)
-        if self.columns is not None and self.weights is not None:
+        if bodies and self.columns is not None and self.weights is not None:
             d = d + np.einsum("ij,jk,ik->i", self.columns, self.weights, self.columns)
         return np.where(d == 0.0, 1.0, np.abs(d))
 
-    def residual(self, x: np.ndarray) -> float:
-        """Return the norm of the natural residual at x, shape (n,)."""
-        d = self.diagonal()
+    def residual(self, x: np.ndarray, *, bodies: bool = True) -> float:
+        """Return the norm of the natural residual at x, shape (n,); `bodies` as of `diagonal`, which scales it alone."""
+        d = self.diagonal(bodies=bodies)
         y = self.matrix @ x + self.b
         if self.columns is not None:
             y = y + self.columns @ (self.weights @ (self.columns.T @ x))
         return norm(d * (x - np.clip(x - y / d, self.lower, self.upper)))
 
     def sizes(self, x: np.ndarray) -> float:
-        """Return || |A| |x| + |b| ||: what rounding errors of a residual are in proportion to."""
-        size = abs(self.matrix) @ np.abs(x) + np.abs(self.b)
+        """Return || (d + |A|) |x| + |b| ||: what rounding errors of a residual are in proportion to."""
+        size = abs(self.matrix) @ np.abs(x) + self.diagonal() * np.abs(x) + np.abs(self.b)
         if self.columns is not None and self.weights is not None:
             size = size + np.abs(self.columns) @ (np.abs(self.weights) @ (np.abs(self.columns).T @ np.abs(x)))
         return norm(size)

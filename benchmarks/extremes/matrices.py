@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ def singular() -> Iterator[Case]:
         yield from given(
             family,
             f"dense of rank {rank}, b in its range",
-            lambda r=rank: in_range(r),
+            partial(in_range, rank),
             convex,
             promises=same(EITHER) if rank == 1 else {"single": EITHER},
         )
@@ -49,25 +50,28 @@ def singular() -> Iterator[Case]:
         ("minimum-map-newton", "lemke", "psor"),
     )
     yield from given(
-        family, "A = 0, b < 0", lambda: MatrixProblem(matrix=np.zeros((3, 3)), b=np.array([0.0, 1.0, -2.0])), ("minimum-map-newton", "lemke"),
+        family,
+        "A = 0, b < 0",
+        lambda: MatrixProblem(matrix=np.zeros((3, 3)), b=np.array([0.0, 1.0, -2.0])),
+        ("minimum-map-newton", "lemke"),
         promises=same(INFEASIBLE),
-    )  # fmt: skip
+    )
     for b, promises in ((1.0, {}), (-1.0, same(INFEASIBLE))):
         yield from given(
-            family, f"sparse with an empty row, b = {b:g} there", lambda b=b: empty_row(b), ("minimum-map-newton",), promises=promises
+            family, f"sparse with an empty row, b = {b:g} there", partial(empty_row, b), ("minimum-map-newton",), promises=promises
         )
     for small in (1e-8, 1e-14, 1e-300):
         yield from given(
             family,
             f"smallest eigenvalue {small:g}",
-            lambda s=small: nearly(s),
+            partial(nearly, small),
             ("minimum-map-newton", "incremental-pivoting"),
             promises=same(EITHER),
         )
     for size in (1e-30, 1e30):
         matrix = np.array([[2.0, -1.0], [-1.0, 2.0]]) * size
         yield from given(
-            family, f"entries of {size:g}", lambda m=matrix, s=size: MatrixProblem(matrix=m, b=np.array([0.5, -2.5]) * s),
+            family, f"entries of {size:g}", partial(MatrixProblem, matrix=matrix, b=np.array([0.5, -2.5]) * size),
             ("minimum-map-newton", "incremental-pivoting", "lemke"), promises={"single": EITHER},
         )  # fmt: skip
 
@@ -113,28 +117,28 @@ def cycling() -> Iterator[Case]:
     family = "P-matrices"
     robust = ("minimum-map-newton", "fischer-newton", "lemke")
     for n in (3, 4, 5, 6, 7, 9, 12, 30):
-        yield from given(family, f"cyclic, {n} unknowns", lambda n=n: circulant(n), robust)
+        yield from given(family, f"cyclic, {n} unknowns", partial(circulant, n), robust)
         for start in ("first", "alternating"):
             x0 = np.zeros(n)
             x0[:: n if start == "first" else 2] = 1.0
-            yield from given(family, f"cyclic, {n} unknowns, {start} start", lambda n=n: circulant(n), ("minimum-map-newton",), x0=x0)
+            yield from given(family, f"cyclic, {n} unknowns, {start} start", partial(circulant, n), ("minimum-map-newton",), x0=x0)
     for n in (8, 16):
         yield from given(
             family,
             f"Murty's, {n} unknowns",
-            lambda n=n: murty(n),
+            partial(murty, n),
             ("minimum-map-newton", "lemke"),
             but={"lemke": same(EITHER)} if n > 8 else {},
         )
         yield from given(
             family,
             f"Fathi's, {n} unknowns",
-            lambda n=n: fathi(n),
+            partial(fathi, n),
             ("minimum-map-newton", "incremental-pivoting", "lemke"),
             promises={"single": EITHER},
         )
     for seed in range(4):
-        yield from given(family, f"unsymmetric, random {seed}", lambda s=seed: unsymmetric(s), robust)
+        yield from given(family, f"unsymmetric, random {seed}", partial(unsymmetric, seed), robust)
 
 
 def circulant(n: int) -> MatrixProblem:

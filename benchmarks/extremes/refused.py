@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,9 +22,7 @@ def wrong_arguments() -> Iterator[Case]:
     for bad in (np.nan, np.inf, -np.inf):
         for name, call in NOT_FINITE.items():
             if not (name == "lower" and bad == -np.inf) and not (name == "upper" and bad == np.inf):
-                yield RefusalCase(
-                    "not finite", f"{bad} in {name}", lambda device, p, c=call, v=bad: c(device, p, v), name.replace(",", "").split()[0]
-                )
+                yield RefusalCase("not finite", f"{bad} in {name}", partial(call, v=bad), name.replace(",", "").split()[0])
     for name, (names, simple) in WRONG.items():
         yield RefusalCase("wrong arguments", name, simple, names)
 
@@ -52,7 +51,7 @@ def low_rank(device: str, columns: Any, weights: Any) -> wl.SumOperator:
     return wl.SumOperator(grid(device), wl.LowRankOperator(columns, weights, device=device))
 
 
-NOT_FINITE: dict[str, Callable[[str, str, float], object]] = {
+NOT_FINITE: dict[str, Callable[..., object]] = {
     "b": lambda device, p, v: run(device, p, b=spoiled(SHAPE, v)),
     "lower": lambda device, p, v: run(device, p, lower=spoiled(SHAPE, v)),
     "upper": lambda device, p, v: run(device, p, upper=spoiled(SHAPE, v)),

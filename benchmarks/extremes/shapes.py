@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -56,11 +57,11 @@ def sizes() -> Iterator[Case]:
     """Yield grids of one cell, one layer, prime sizes, 10^6 cells and long ones."""
     family = "sizes"
     for shape in ((1, 1), (1, 1, 1), (1, 2), (2, 1), (1, 1, 7), (1, 7, 1), (7, 1, 1), (1, 1, 4096), (4096, 1, 1), (1, 13, 17)):
-        yield from both(family, "x".join(map(str, shape)), lambda shape=shape: grounded(shape))
+        yield from both(family, "x".join(map(str, shape)), partial(grounded, shape))
     for shape in ((2, 2), (3, 1), (127, 131), (1, 127, 131), (31, 37, 41), (2, 3, 5)):
-        yield from both(family, "x".join(map(str, shape)) + " below air", lambda shape=shape: pool(shape))
+        yield from both(family, "x".join(map(str, shape)) + " below air", partial(pool, shape))
     for shape in ((3, 3000), (3000, 3), (2, 2000), (2, 2, 2000), (2000, 2, 2), (3, 2000, 3)):
-        yield from both(family, "1:1000, " + "x".join(map(str, shape)), lambda shape=shape: pool(shape), promises={"single": EITHER})
+        yield from both(family, "1:1000, " + "x".join(map(str, shape)), partial(pool, shape), promises={"single": EITHER})
     yield from both(family, "1024x1024", lambda: pool((1024, 1024)), budget=LARGE_BUDGET)
     yield from both(family, "1024x1024 with noise as mask", lambda: sponge((1024, 1024), 0.75), budget=LARGE_BUDGET)
     yield from both(family, "2-D like 3-D of one layer, periodic", lambda: pool((1, 61, 67), periodic=(True, False, False)))
@@ -88,24 +89,17 @@ def masks() -> Iterator[Case]:
     """Yield grids of few or no unknowns, checkerboards, needles and walls of one cell."""
     family = "masks"
     for name, kind in (("solid", SOLID), ("air", AIR)):
-        yield RefusalCase(
-            family,
-            f"all {name}",
-            lambda device, p, kind=kind: wl.LCP(wl.GridPoisson(np.full((4, 5), kind), device=device), np.zeros((4, 5))),
-            "A ",
-        )
+        yield RefusalCase(family, f"all {name}", partial(without_unknowns, kind), "A ")
     for name, around in (("air", AIR), ("solid", SOLID)):
         for shape in ((3, 3), (5, 5, 5)):
             for b in (-1.0, 1.0, 0.0):
                 if not (around == SOLID and b < 0):
-                    yield from both(
-                        family, f"one cell in {name}, {len(shape)}-D, b = {b:g}", lambda a=around, s=shape, b=b: single(s, a, b)
-                    )
+                    yield from both(family, f"one cell in {name}, {len(shape)}-D, b = {b:g}", partial(single, shape, around, b))
     yield from both(family, "one cell in solid, b = -1", lambda: single((3, 3), SOLID, -1.0), promises=same(INFEASIBLE))
     for shape in ((40, 41), (12, 13, 14)):
         for other in (AIR, SOLID):
             name = f"checkerboard of liquid and {'air' if other == AIR else 'solid'}, {len(shape)}-D"
-            yield from both(family, name, lambda s=shape, o=other: checkerboard(s, o))
+            yield from both(family, name, partial(checkerboard, shape, other))
     yield SolveCase(family, "labyrinth 65x65, minimum-map-newton", lambda: labyrinth(65), "minimum-map-newton")
     yield SolveCase(family, "labyrinth 65x65, projected-multigrid", lambda: labyrinth(65), promises=same(EITHER))  # LIMITS
     yield from both(family, "labyrinth 33x33 without bounds", lambda: labyrinth(33, lower=-np.inf))
@@ -114,8 +108,13 @@ def masks() -> Iterator[Case]:
     yield from both(family, "one air cell in 64x64", lambda: punctured((64, 64)))
     yield from both(family, "one air cell in 24x24x24", lambda: punctured((24, 24, 24)))
     for liquid in (0.1, 0.5, 0.9):
-        yield from both(family, f"sponge, {liquid:.0%} liquid", lambda liquid=liquid: sponge((67, 71), liquid))
+        yield from both(family, f"sponge, {liquid:.0%} liquid", partial(sponge, (67, 71), liquid))
     yield from both(family, "3-D sponge, 60% liquid", lambda: sponge((19, 23, 29), 0.6))
+
+
+def without_unknowns(kind: int, device: str, precision: str) -> wl.LCP:
+    """Return a problem of cells none of which is liquid."""
+    return wl.LCP(wl.GridPoisson(np.full((4, 5), kind), device=device), np.zeros((4, 5)))
 
 
 def single(shape: tuple[int, ...], around: int, b: float) -> GridProblem:
@@ -175,16 +174,16 @@ def closed_pools() -> Iterator[Case]:
         name = f"{len(shape)}-D"
         for method in METHODS:
             yield SolveCase(
-                family, f"compatible, {name}, {method}", lambda f=full: GridProblem(cells=f, b=noise(f.shape), lower=-np.inf), method
+                family, f"compatible, {name}, {method}", partial(GridProblem, cells=full, b=noise(full.shape), lower=-np.inf), method
             )
             for sign in (1.0, -1.0):
                 off = f"{'outflow' if sign > 0 else 'inflow'}, {name}, {method}"
                 b = noise(shape) + sign * 0.1
                 yield SolveCase(
-                    family, f"incompatible {off}", lambda f=full, b=b: GridProblem(cells=f, b=b, lower=-np.inf), method, same(INFEASIBLE)
+                    family, f"incompatible {off}", partial(GridProblem, cells=full, b=b, lower=-np.inf), method, same(INFEASIBLE)
                 )
                 promises = {} if sign > 0 else same(INFEASIBLE)
-                yield SolveCase(family, f"p >= 0, {off}", lambda f=full, b=b: GridProblem(cells=f, b=b), method, promises)
+                yield SolveCase(family, f"p >= 0, {off}", partial(GridProblem, cells=full, b=b), method, promises)
     yield from both(family, "one of 40 is incompatible", lambda: many_pools(0.05), promises=same(INFEASIBLE))
     yield from both(family, "40 compatible ones", lambda: many_pools(0.0))
     yield from both(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from benchmarks.machine import machine
 from benchmarks.record import Record, Results
@@ -57,8 +58,12 @@ def _overrides(simulator: str, preset: str) -> tuple[str, ...]:
 
 
 def _record(scene: str, run: Run, runs: Runs) -> Record:
-    facts = {"scene": scene, "kind": "run", "curve": run.setting.curve, "settings": run.setting.name}
-    facts |= {"device": runs.options.device, "frames": runs.frames, "resolution": round(run.setting.scale * runs.resolution)}
+    facts: dict[str, Any] = {"scene": scene, "kind": "run", "curve": run.setting.curve, "settings": run.setting.name}
+    facts |= {
+        "device": runs.options.device,
+        "frames": runs.frames,
+        "resolution": round(run.setting.scale * runs.resolution),
+        "scale": run.setting.scale,
+    }
     facts |= {"failed": run.failed} if run.failed else {}
     return Record(f"{scene} {run.setting.curve}: {run.setting.name}", runs.figures(run), facts)
-

@@ -9,6 +9,7 @@ from benchmarks.record import Chart, Lines, Record, Sheet, Table
 from benchmarks.tradeoff.runs import front_of
 
 PARETO = "Pareto front"
+FINEST = "distance_to_finest"
 SEEN = {
     "distance": "mass elsewhere than in the reference run of this resolution [share]",
     "distance_to_finest": "mass elsewhere than in the finest reference run [share]",
@@ -23,8 +24,12 @@ SMALLEST = 1e-16  # that a logarithmic axis shows
 
 
 def run_charts(scene: str, records: Sequence[Record]) -> list[Chart]:
-    """Return a chart for each thing that a user sees: its error over the seconds of a run, the Pareto front marked."""
-    return [chart for figure, label in SEEN.items() for chart in _charts(scene, records, figure, label, "run")]
+    """Return a chart for each thing that a user sees: its error over the seconds of a run, the Pareto front marked.
+
+    Runs of other resolutions, whose own references are others, count only where all are compared with one, the finest.
+    """
+    own = [r for r in records if r.facts["scale"] == 1.0]
+    return [chart for name, label in SEEN.items() for chart in _charts(scene, records if name == FINEST else own, name, label, "run")]
 
 
 def solve_charts(scene: str, records: Sequence[Record]) -> list[Chart]:
@@ -70,11 +75,26 @@ def run_sheet(scene: str, records: Sequence[Record]) -> Sheet:
 def run_table(scene: str, records: Sequence[Record]) -> Table:
     """Return the runs, the Pareto front of seconds and distance marked."""
     ran = [r for r in records if r.figures]
-    best = {id(ran[i]) for i in front_of([(r.figures["seconds"].value, r.figures["distance"].value) for r in ran])}
-    columns = ["settings", "", "seconds", "steps", "iterations", "MB", "distance", "to the finest", "energy", "front [m]", "volume", "packing"]
+    own = [r for r in ran if r.facts["scale"] == 1.0]
+    best, best_of_all = _front(own, "distance"), _front(ran, FINEST)
+    columns = [
+        "settings",
+        "",
+        "seconds",
+        "steps",
+        "iterations",
+        "MB",
+        "distance",
+        "to the finest",
+        "energy",
+        "front [m]",
+        "volume",
+        "packing",
+    ]
     rows = []
     for r in records:
-        name = f"{r.facts['curve']}: {r.facts['settings']}"
+        preset = str(r.facts["curve"]).startswith("preset ")
+        name = f"{r.facts['curve']}: {r.facts['settings']}" if preset else str(r.facts["settings"])
         if not r.figures:
             rows.append([name, "failed", *[""] * (len(columns) - 3), str(r.facts["failed"])[:120]])
             continue
@@ -82,28 +102,37 @@ def run_table(scene: str, records: Sequence[Record]) -> Table:
         seen = [f"{f['distance']:.4f}", f"{f['distance_to_finest']:.4f}", f"{f['energy_error']:.4f}", f"{f['front_error']:+.4f}"]
         more = [f"{f[key]:+.4f}" if key in f else "" for key in ("volume_drift", "packing")]
         cost = [f"{f['seconds']:.3f}", f"{f['steps']:.0f}", f"{f['iterations']:.0f}", f"{f['bytes'] / 1e6:.1f}"]
-        rows.append([name, "Pareto" if id(r) in best else "", *cost, *seen, *more])
+        rows.append([name, _mark(r, best, best_of_all), *cost, *seen, *more])
     remark = (
         "seconds: the least of all rounds, of the steps alone. distance: share of the mass that is elsewhere than in a run of the same "
         "resolution with the smallest steps and tolerance, in boxes of two cells of the scene, the mean over the frames compared; to the "
-        "finest: than in such a run of twice the resolution. energy, front: largest relative and last difference from the former. volume: "
-        "its growth. packing: of the densest cell of sand."
+        "finest: than in such a run of twice the resolution. Pareto: no other setting of this resolution is faster and nearer to its "
+        "reference; Pareto, all: no other one at all is faster and nearer to the finest. energy, front: largest relative and last "
+        "difference from the reference. volume: its growth. packing: of the densest cell of sand."
     )
     return Table(f"{scene}: runs", columns, rows, remark)
+
+
+def _front(records: Sequence[Record], figure: str) -> set[str]:
+    """Return the names of the records on the Pareto front of seconds and a figure."""
+    return {records[i].name for i in front_of([(r.figures["seconds"].value, r.figures[figure].value) for r in records])}
+
+
+def _mark(record: Record, best: set[str], best_of_all: set[str]) -> str:
+    return ", ".join(["Pareto"] * (record.name in best) + ["Pareto, all"] * (record.name in best_of_all))
 
 
 def solve_table(scene: str, records: Sequence[Record]) -> Table:
     """Return the solves, the Pareto front of seconds and error marked."""
     solved = [r for r in records if r.facts["kind"] == "solve"]
-    best = {id(solved[i]) for i in front_of([(r.figures["seconds"].value, r.figures["error"].value) for r in solved])}
+    best = _front(solved, "error")
     rows = []
     for r in solved:
         f = {key: figure.value for key, figure in r.figures.items()}
         size = f"{f['bytes'] / 1e6:.1f}" if "bytes" in f else ""
-        rows.append([
-            str(r.facts["method"]), str(r.facts["precision"]), f"{r.facts['tolerance']:g}", "Pareto" if id(r) in best else "",
-            f"{f['seconds']:.4f}", f"{f['iterations']:.0f}", size, f"{f['residual']:.2e}", f"{f['error']:.2e}", str(r.facts.get("status", "")),
-        ])  # fmt: skip
+        named = [str(r.facts["method"]), str(r.facts["precision"]), f"{r.facts['tolerance']:g}", "Pareto" if r.name in best else ""]
+        cost = [f"{f['seconds']:.4f}", f"{f['iterations']:.0f}", size]
+        rows.append([*named, *cost, f"{f['residual']:.2e}", f"{f['error']:.2e}", str(r.facts.get("status", ""))])
     reference = next(r for r in records if r.facts["kind"] == "reference")
     remark = (
         "Liquid: problems recorded in a run, from its own first guess; error: relative, in the energy norm, against a float64 solution of "

@@ -96,13 +96,17 @@ class Runs:
         """Return the run of the smallest steps and tolerance at a resolution."""
         scene = self.scene(scale=scale)
         self.options.say(f"{self.name}: reference at resolution {scene.domain.resolution}")
-        return trial(changed(scene, price_table()[scene.scene.simulator].reference), device=self.options.device, frames=self.frames, box=self.box)
+        return trial(
+            changed(scene, price_table()[scene.scene.simulator].reference), device=self.options.device, frames=self.frames, box=self.box
+        )
 
     def _add(self, run: Run) -> None:
         """Run a setting once more."""
         gc.collect()
         before, after = array_bytes(), []
         try:
+            if not run.seconds:  # loads kernels
+                trial(self.scene(run.setting.overrides, run.setting.scale), device=self.options.device, frames=1, box=self.box)
             scene = self.scene(run.setting.overrides, run.setting.scale)
             ran = trial(scene, device=self.options.device, frames=self.frames, box=self.box, inspect=lambda _: after.append(array_bytes()))
         except (SceneError, StepFailed, SimulationFailed) as error:

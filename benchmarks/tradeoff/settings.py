@@ -67,7 +67,9 @@ def _liquid() -> Iterator[Setting]:
             yield Setting(f"{precision} precision", (*_step(step), _tolerance(1e-4), f"solver.precision={precision}"))
     for method in grid_methods():
         if method != "projected-multigrid":
-            yield Setting("other methods", (*_step(LIQUID_STEPS[2]), _tolerance(1e-4), f"solver.method={method}", "solver.max_iterations=2000"))
+            yield Setting(
+                "other methods", (*_step(LIQUID_STEPS[2]), _tolerance(1e-4), f"solver.method={method}", "solver.max_iterations=2000")
+            )
     for tolerance in (1e-2, 1e-4):
         for step in LIQUID_STEPS[1:4]:
             yield Setting(f"unilateral, tolerance {tolerance:g}", (*_step(step), _tolerance(tolerance), "pressure.model=unilateral"))
@@ -86,12 +88,14 @@ def _sand() -> Iterator[Setting]:
                 yield Setting(f"resolution x {scale:g}, tolerance {tolerance:g}", (*_step(step), _tolerance(tolerance)), scale)
     for tolerance in (1e-1, 1e-2, 1e-3):
         for step in SAND_STEPS[1:4:2]:
-            yield Setting("interleaved sweeps", (*_step(step), _tolerance(tolerance), "solver.method=interleaved-sweeps"))
+            yield Setting(
+                f"interleaved sweeps, tolerance {tolerance:g}", (*_step(step), _tolerance(tolerance), "solver.method=interleaved-sweeps")
+            )
     for step in SAND_STEPS[1:4]:
         yield Setting("friction in a box", (*_step(step), _tolerance(1e-3), "friction.model=box"))
     for iterations in (20, 40):
         for step in SAND_STEPS[1:4:2]:
-            yield Setting("few iterations", (*_step(step), _tolerance(1e-3), f"solver.max_iterations={iterations}"))
+            yield Setting(f"{iterations} iterations", (*_step(step), _tolerance(1e-3), f"solver.max_iterations={iterations}"))
     yield from _particles(SAND_STEPS[1:4:2], 1e-3, (2, 4, 8))
 
 
@@ -100,9 +104,9 @@ def _particles(steps: tuple[Step, ...], tolerance: float, corrections: tuple[int
     for step in steps:
         base = (*_step(step), _tolerance(tolerance))
         for per_axis in (1, 3):
-            yield Setting("particles a cell", (*base, f"particles.per_axis={per_axis}"))
+            yield Setting(f"{per_axis} particles along a cell", (*base, f"particles.per_axis={per_axis}"))
         for transfer in ("pic", "flip"):
-            yield Setting("transfers", (*base, f"particles.transfer={transfer}"))
+            yield Setting(f"transfer {transfer}", (*base, f"particles.transfer={transfer}"))
         for every in corrections:
-            yield Setting("density correction", (*base, f"density_correction.every={every}"))
+            yield Setting(f"density correction every {every}", (*base, f"density_correction.every={every}"))
         yield Setting("reseeding", (*base, "particles.reseed.every=2"))

@@ -31,7 +31,9 @@ def measure_steps(scene: Scene, options: Options, frames: int) -> list[Record]:
     states = _states(scene, options.device, frames)
     exact = [_step(changed(scene, EXACT), state, options.device) for state in states]
     residual = max(row["coupled_residual"] for _, row, _ in exact)
-    records = [Record(f"{scene.scene.name} step reference", {"residual": Figure(residual)}, {"scene": scene.scene.name, "kind": "reference"})]
+    records = [
+        Record(f"{scene.scene.name} step reference", {"residual": Figure(residual)}, {"scene": scene.scene.name, "kind": "reference"})
+    ]
     gravity = float(np.linalg.norm(scene.physics.gravity)) or 1.0
     for method in METHODS:
         for tolerance in TOLERANCES:
@@ -58,7 +60,7 @@ def _states(scene: Scene, device: str, frames: int) -> list[State]:
     """Return states of a run and the length of the step that it took from each."""
     simulation = simulators()[scene.scene.simulator].create(scene, device=device, folder=Path.cwd())
     wanted = {round(frames * (n + 1) / (STATES + 1)) for n in range(STATES)}
-    found = []
+    found: list[State] = []
     for frame in range(1, max(wanted) + 1):
         end = scene.time.frame_time(frame)
         while end - simulation.time > 1e-9:

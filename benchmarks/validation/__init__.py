@@ -1,4 +1,4 @@
-"""Physical checks of liquids and sand with known answers, each with set-ups that are wrong on purpose and must fail it.
+"""Physical checks of liquids, sand and bodies with known answers, each with set-ups that are wrong on purpose and must fail it.
 
 `warp-lcp bench validation` runs them all. A check is a file: what must hold, at two resolutions, with its negative controls.
 """
@@ -29,7 +29,7 @@ from benchmarks.validation import (
 from benchmarks.validation.finding import Trial, table
 from benchmarks.validation.html_page import Section, page
 
-TITLE = "Liquids and sand against known answers"
+TITLE = "Liquids, sand and rigid bodies against known answers"
 CHECKS = {
     "transfers": transfers,
     "ceiling": ceiling,

@@ -14,9 +14,9 @@ from benchmarks.record import Chart, Lines, Record
 from benchmarks.validation.finding import Finding, Trial
 
 STYLE = """
-:root { color-scheme: light; }
+:root { color-scheme: light; font-size: 15px; }
 body { margin: 0 auto; max-width: 62rem; padding: 1rem 1.5rem 3rem; background: #fff; color: #1c2733;
-  font: 15px/1.5 system-ui, "Segoe UI", "DejaVu Sans", Arial, sans-serif; }
+  font: 1rem/1.5 system-ui, "Segoe UI", "DejaVu Sans", Arial, sans-serif; }
 h1 { font-size: 1.7rem; margin: 0.6rem 0 0.2rem; }
 h2 { font-size: 1.2rem; margin: 2.4rem 0 0.3rem; padding-top: 0.6rem; border-top: 1px solid #d5dce3; }
 p { max-width: 50rem; }
@@ -37,8 +37,9 @@ svg.chart { width: 100%; max-width: 46rem; height: auto; font: 12px system-ui, "
 svg.chart text { fill: #1c2733; } svg.chart .chart-title { font-size: 13px; font-weight: 600; }
 svg.chart .grid { stroke: #e1e6eb; } svg.chart .axes { fill: none; stroke: #4a5866; } svg.chart .curve { fill: none; stroke-width: 1.6; }
 @page { size: A4; margin: 14mm; }
-@media print { body { max-width: none; padding: 0; font-size: 11px; } a { color: inherit; text-decoration: none; }
-  tr, .note { break-inside: avoid; } h2 { break-after: avoid; } thead { display: table-header-group; }
+@media print { :root { font-size: 10.5px; } body { max-width: none; padding: 0; } svg.chart { max-width: 38rem; }
+  a { color: inherit; text-decoration: none; }
+  tr, .note { break-inside: avoid; } h2, h2 + p, thead, tr.resolution { break-after: avoid; } thead { display: table-header-group; }
   tr.resolution td, tr.control td, .note { -webkit-print-color-adjust: exact; print-color-adjust: exact; } }
 """
 

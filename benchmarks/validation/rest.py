@@ -82,7 +82,7 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
 
 
 def whole_cells(resolution: int, device: str) -> Trial:
-    """Rest with a surface and solids of whole cells."""
+    """Rest with a surface and solids of whole cells; the controls are a pool that gravity tilts, and a surface within the cells."""
 
     def run(found: Findings) -> None:
         for case, tables in CASES.items():
@@ -92,6 +92,10 @@ def whole_cells(resolution: int, device: str) -> Trial:
                 found.add(f"{case}: bias of the pressure", rest.bias, low=0.48, high=0.52, unit="rho g dx")
             if case == "pool":
                 found.curves["profile"] = _normalized(rest)
+        tilted = settle(resolution, device, VOXEL, AVERAGED, liquid=POOL, physics=tank.tilted(TILT))
+        found.must_break("level pool under tilted gravity: largest speed", tilted.largest(0.0, AVERAGED), high=1e-3)
+        within = settle(resolution, device, SUB_CELL, 2 * AVERAGED, **CASES["pool"])
+        found.must_break("sub-cell pool: bias of the pressure", within.bias, low=0.48, high=0.52, unit="rho g dx")
 
     return attempt("rest", f"{resolution} cells, {VOXEL.name}", run)
 

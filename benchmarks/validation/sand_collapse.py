@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks.record import Chart, Lines
 from benchmarks.validation.finding import Findings, Trial, attempt
-from benchmarks.validation.sand_pit import FLOOR, FRICTION_ANGLE, GRAVITY, WIDTH, column, create, profile, runout, share_solved, steps
+from benchmarks.validation.sand_pit import FLOOR, FRICTION_ANGLE, GRAVITY, WIDTH, Row, column, create, profile, runout, share_solved, steps
 
 CASES = {20: (0.5, 1.0, 2.0, 4.0, 8.0), 40: (0.5, 1.0, 2.0, 4.0)}  # aspects at each number of cells of a column's width
 CONTROLLED = 2.0  # the aspect of the negative controls
@@ -18,6 +18,7 @@ WIDENED = 0.2  # of the experiments' range
 STOPS, STAYS = 3.5, 0.5  # [sqrt(height / g)]: when a pile has stopped; [s] that it is watched then
 HIGH, MOST = 80, 1500  # cells of height from which columns need more iterations a step than a scene allows by itself; how many
 CUBE = 48  # cells of the domain in 3-D
+CUBE_DOMAIN, CUBE_WIDTH = 0.96, 0.28  # [m]: of the domain, and of the cube that collapses there
 
 
 @dataclass(frozen=True)
@@ -133,30 +134,44 @@ def collapse(aspect: float, cells: int, device: str = "cpu", *, length: float = 
 
 
 def cube(device: str = "cpu", cells: int = CUBE) -> Trial:
-    """Let a square column collapse in 3-D: it must stop, as a round pile that reaches as far as those of round columns do."""
+    """Let a square column collapse in 3-D: it must stop, as a round pile that reaches as far as those of round columns do.
+
+    The control has twice the friction; sand with half of it would meet the walls.
+    """
 
     def run(found: Findings) -> None:
-        size, width = 0.96, 0.28
-        near, end = 0.5 * (size - width), 0.5 * (size + width)
-        sand = {"shape": "box", "min": [near, 0.0, near], "max": [end, width, end]}
-        material = {"friction_angle": FRICTION_ANGLE, "angle_of": "triaxial-compression"}
-        simulation = create(
-            [size, 0.5 * size, size], cells, [sand], device=device, walls=math.tan(math.radians(FRICTION_ANGLE)), material=material,
-            density_correction={},
-        )  # fmt: skip
-        rows = list(steps(simulation, STOPS * math.sqrt(width / GRAVITY) + 0.2))
-        x = simulation.particles.position.numpy()[:, [0, 2]] - 0.5 * size
+        x, rows = _fallen_cube(FRICTION_ANGLE, cells, device)
         angle = 4.0 * np.arctan2(x[:, 1], x[:, 0])
         far = np.linalg.norm(x, axis=1) > np.percentile(np.linalg.norm(x, axis=1), 95.0)
         energies = [row["kinetic_energy"] for row in rows]
         found.add("kinetic energy in the end over the largest", energies[-1] / max(energies), high=1e-3)
         found.add("steps with stresses to 1e-3", share_solved(rows), low=95.0, unit="%")
         found.add("|mean of exp(4 i angle)| of the 5 % farthest", float(np.abs(np.exp(1j * angle[far]).mean())), high=0.5)
-        radius = width / math.sqrt(math.pi)  # of a round column of the same area
-        aspect = width / radius
+        radius = CUBE_WIDTH / math.sqrt(math.pi)  # of a round column of the same area
+        aspect = CUBE_WIDTH / radius
         low, high = (1.0 - WIDENED) * 1.6 * math.sqrt(aspect), (1.0 + WIDENED) * 2.0 * math.sqrt(aspect)  # [Lube2004], [Lajeunesse2004]
-        way = float(np.percentile(np.linalg.norm(x, axis=1), 99.0)) / radius - 1.0
-        found.add(f"a = {aspect:.2f}: runout", way, low=low, high=high, unit="radii")
+        found.add(f"a = {aspect:.2f}: runout", _reach(x) / radius - 1.0, low=low, high=high, unit="radii")
         found.add("least dissipation of a step", min(row["dissipation"] for row in rows), low=0.0, unit="J")
+        steep = math.degrees(math.atan(2.0 * math.tan(math.radians(FRICTION_ANGLE))))
+        x, _ = _fallen_cube(steep, cells, device)
+        found.must_break(f"twice the friction, a = {aspect:.2f}: runout", _reach(x) / radius - 1.0, low=low, high=high, unit="radii")
 
     return attempt("sand collapse", f"3-D, {cells} cells", run)
+
+
+def _fallen_cube(friction_angle: float, cells: int, device: str) -> tuple[np.ndarray, list[Row]]:
+    """Return where the particles of a cube of sand lie, from its axis, shape (n, 2) [m], and the rows of the log."""
+    near, end = 0.5 * (CUBE_DOMAIN - CUBE_WIDTH), 0.5 * (CUBE_DOMAIN + CUBE_WIDTH)
+    sand = {"shape": "box", "min": [near, 0.0, near], "max": [end, CUBE_WIDTH, end]}
+    material = {"friction_angle": friction_angle, "angle_of": "triaxial-compression"}
+    simulation = create(
+        [CUBE_DOMAIN, 0.5 * CUBE_DOMAIN, CUBE_DOMAIN], cells, [sand], device=device, walls=math.tan(math.radians(friction_angle)),
+        material=material, density_correction={},
+    )  # fmt: skip
+    rows = list(steps(simulation, STOPS * math.sqrt(CUBE_WIDTH / GRAVITY) + 0.2))
+    return simulation.particles.position.numpy()[:, [0, 2]] - 0.5 * CUBE_DOMAIN, rows
+
+
+def _reach(x: np.ndarray) -> float:
+    """Return how far from the axis the front is [m]."""
+    return float(np.percentile(np.linalg.norm(x, axis=1), 99.0))

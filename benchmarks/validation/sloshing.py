@@ -26,10 +26,11 @@ POINTS = 257  # of the surface at the start
 def check(device: str) -> tuple[list[Trial], list[Chart]]:
     """Run the check at its resolutions."""
     trials = [trial(n, device) for n in RESOLUTIONS]
-    errors = [next((f.value for f in t.findings if f.what == "error of the period"), math.nan) for t in trials]
+    errors, stairs = ([_error(t, control=control) for t in trials] for control in (False, True))
 
     def refined(found: Findings) -> None:
         found.add("error of the period", errors[1], high=max(errors[0], 0.5), unit="%")
+        found.must_break("whole cells: error of the period", stairs[1], high=max(errors[0], 0.5), unit="%")
 
     comparison = attempt("sloshing", f"{RESOLUTIONS[1]} against {RESOLUTIONS[0]} cells", refined)
     time = np.linspace(0.0, PERIODS * PERIOD, 400)
@@ -38,6 +39,11 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
         curves |= t.curves
     chart = Lines("sloshing", "First mode of the elevation", "t [s]", "amplitude / start", curves, logarithmic_x=False, logarithmic_y=False)
     return [*trials, comparison], [chart]
+
+
+def _error(trial: Trial, *, control: bool) -> float:
+    """Return the error of the period that a trial found [%], NaN if it could not."""
+    return next((f.value for f in trial.findings if f.control is control), math.nan)
 
 
 def trial(cells: int, device: str, numerics: Numerics = SUB_CELL) -> Trial:

@@ -135,6 +135,9 @@ def _orders(found: Findings, device: str) -> None:
     found.add(f"Zalesak's disk, {TURN_STEPS[-1]} steps: largest error over the slot's width", turns[-1] / 0.05, high=0.01)
     errors = [vortex_error(n, device) for n in VORTEX_GRIDS]
     found.add("rotating blob in a vortex: order in space", order(errors), low=1.8, high=2.4)
+    found.must_break("Euler's steps, one turn: order in time", order([euler_error(steps) for steps in TURN_STEPS]), low=2.7, high=3.3)
+    collocated = [vortex_error(n, device, off=0.5) for n in VORTEX_GRIDS]
+    found.must_break("fields half a cell off: order in space", order(collocated), low=1.8, high=2.4)
     found.curves["Zalesak's disk, steps a turn"] = (TURN_STEPS, turns)
     found.curves["vortex, cells a side"] = (VORTEX_GRIDS, errors)
 
@@ -148,27 +151,43 @@ def zalesak_error(steps: int, device: str, n: int = 64) -> float:
     return float(np.linalg.norm(moved - start, axis=1).max())
 
 
-def vortex_error(n: int, device: str) -> float:
-    """Return the largest error [m] of a ring of particles in a vortex whose angular velocity falls off with the radius."""
+def euler_error(steps: int) -> float:
+    """Return the largest error [m] of the same disk's farthest point after a turn of Euler's steps."""
+    growth = abs(1.0 + 2.0j * math.pi / steps) ** steps
+    turned = steps * math.atan(2.0 * math.pi / steps)
+    return math.hypot(0.15, 0.25) * abs(growth * complex(math.cos(turned), math.sin(turned)) - 1.0)
+
+
+def vortex_error(n: int, device: str, *, off: float = 0.0) -> float:
+    """Return the largest error [m] of a ring of particles in a vortex whose angular velocity falls off with the radius.
+
+    Args:
+        n: cells a side.
+        device: where it runs.
+        off: cells by which the fields are sampled off their faces, along both axes.
+    """
     angle = np.linspace(0.0, 2.0 * math.pi, 97)[:-1]
     start = CENTER + np.stack([0.15 * np.cos(angle), 0.15 * np.sin(angle), 0.0 * angle], axis=1)
 
     def rate(r: np.ndarray) -> np.ndarray:
         return np.exp(-((r / VORTEX_SIZE) ** 2))
 
-    moved = carried(start, n, VORTEX_TIME / VORTEX_STEPS, VORTEX_STEPS, rate, device)
+    moved = carried(start, n, VORTEX_TIME / VORTEX_STEPS, VORTEX_STEPS, rate, device, off)
     turn = VORTEX_TIME * float(rate(np.array(0.15)))
     exact = CENTER + np.stack([0.15 * np.cos(angle + turn), 0.15 * np.sin(angle + turn), 0.0 * angle], axis=1)
     return float(np.linalg.norm(moved - exact, axis=1).max())
 
 
-def carried(start: np.ndarray, n: int, dt: float, count: int, rate: Any, device: str) -> np.ndarray:
-    """Return where particles are [m] after `count` steps in a steady field that turns about the center with rate(r) [rad/s]."""
+def carried(start: np.ndarray, n: int, dt: float, count: int, rate: Any, device: str, off: float = 0.0) -> np.ndarray:
+    """Return where particles are [m] after `count` steps in a steady field that turns about the center with rate(r) [rad/s].
+
+    The field is sampled `off` cells beside its faces.
+    """
     grid = StaggeredGrid((n, n, 1), 1.0 / n, 2, device)
     j, i = np.meshgrid(np.arange(n + 2), np.arange(n + 2), indexing="ij")
     fields = grid.faces()
     for axis, field in enumerate(fields):
-        x, y = (i - (0.5 if axis else 1.0)) / n - 0.5, (j - (1.0 if axis else 0.5)) / n - 0.5
+        x, y = (i + off - (0.5 if axis else 1.0)) / n - 0.5, (j + off - (1.0 if axis else 0.5)) / n - 0.5
         turning = rate(np.hypot(x, y)) * (x if axis else -y)
         field.assign(np.broadcast_to(turning, grid.shape).astype(np.float32))
     cells = np.full(grid.shape, wl.SOLID, np.int8)

@@ -24,7 +24,7 @@ DOCS = Path(__file__).parents[1]
 PAGE, FOLDER = DOCS / "gallery.md", DOCS / "gallery"
 FIGURES = FOLDER / "figures.json"
 PICTURES = 3  # of a sheet: early, in the middle, late
-WIDTH = 1200  # pixels
+SIZE = "1500x480"  # pixels: one row
 SETTINGS = {"fluids": ("output.surface=true",), "granular": ()}  # of 3-D scenes, besides their own
 SURFACE = ("--show", "surface")
 
@@ -79,7 +79,7 @@ def show(name: str, work: Path) -> dict[str, Any]:
     end = json.loads((out / "run.json").read_text())
     last = end["frames"]
     chosen = [word for part in range(1, PICTURES + 1) for word in ("--frame", str(round(last * part / (PICTURES + 1) * 4 / 3)))]
-    measured([str(program), "render", str(out), *draw[3:], *chosen, "--size", f"{WIDTH}x{WIDTH}"])
+    measured([str(program), "render", str(out), *draw[3:], *chosen, "--size", SIZE])
     FOLDER.mkdir(exist_ok=True)
     picture = Image.open(out / "images" / "sheet.png").convert("RGB")
     picture.save(FOLDER / f"{name}.webp", quality=82, method=6)

@@ -232,6 +232,9 @@ def test_a_failed_check_ends_the_process_with_1_after_its_files(tmp_path: Path, 
     assert records["waves, 8 cells"]["passed"] is (error < 1.0)
     assert "| waves | 8 cells | error |" in (tmp_path / "validation.md").read_text()
     assert (tmp_path / "validation-waves.png").is_file()
+    page = (tmp_path / "validation-report.html").read_text(encoding="utf-8")
+    assert f"{int(error < 1.0)} of 1 figures keep their tolerance" in page
+    assert "<polyline" in page
 
 
 def test_its_resolutions_are_its_own(tmp_path: Path) -> None:

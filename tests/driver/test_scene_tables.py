@@ -99,16 +99,6 @@ def test_unknown_keys_suggest(changes, expected):
 @pytest.mark.parametrize(
     ("changes", "path"),
     [
-        ({"solver.preset": "standard"}, "solver.preset"),
-    ],
-)
-def test_what_comes_later_is_no_typo(changes, path):
-    assert complaint(changes) == f"dam.toml: {path}: not available yet in this version"
-
-
-@pytest.mark.parametrize(
-    ("changes", "path"),
-    [
         ({"sand": [BOX]}, "sand"),
         ({"friction": {"model": "cone"}}, "friction"),
         ({"domain.friction": 0.5}, "domain.friction"),

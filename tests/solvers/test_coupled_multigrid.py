@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
-from oracle import assemble, lemke
+from oracle import assemble, lemke, natural_residual
 from warp_lcp.solvers.principal_system_low_rank import LowRankCorrection
 from warp_lcp.solvers.projected_multigrid_coupled import CoupledWorkspace
 
@@ -204,3 +204,27 @@ def test_bodies_may_come_and_go_in_place(device):
     fresh = wl.solve(problem, wl.MinimumMapNewton(), stopping=stopping)
     assert without and result and fresh
     np.testing.assert_allclose(result.x.numpy(), fresh.x.numpy(), atol=1e-4)
+
+
+@pytest.mark.parametrize(("weight", "precision"), [(1e4, "mixed"), (1e6, "mixed"), (1e8, "double")])
+def test_bodies_that_weigh_next_to_nothing_where_walls_let_go(weight, precision):
+    """Projections leap there, projected cycles of the grid hardly move: the active set went round in a circle, and the solve stagnated."""
+    rng = np.random.default_rng(7919)
+    cells, U = np.ones((14, 15, 24), dtype=int), np.zeros((14, 15, 24, 2))
+    cells[:, -1] = wl.AIR
+    for body, i in enumerate((4, 14)):
+        cells[5:8, 5:8, i : i + 3] = wl.SOLID
+        U[5:8, 4, i : i + 3, body], U[5:8, 8, i : i + 3, body] = 1.0, -1.0
+    b, fluid = rng.standard_normal(cells.shape), cells.ravel() == wl.FLUID
+    lower = np.where(rng.random(cells.shape) < 0.5, 0.0, -np.inf)
+    A = wl.SumOperator(wl.GridPoisson(cells, device="cpu", dtype=wp.float64), wl.LowRankOperator(U, [weight] * 2, device="cpu"))
+    criteria = wl.StoppingCriteria(rtol=1e-6)
+    for _ in range(2):
+        result = wl.solve(wl.LCP(A, b, lower), wl.ProjectedMultigrid(precision=precision), stopping=criteria)
+        assert result, result.status
+        assert result.iterations <= 40
+    u = U.reshape(-1, 2)[fluid]
+    matrix = assemble(cells)[np.ix_(fluid, fluid)] + weight * u @ u.T
+    fields = b.ravel()[fluid], lower.ravel()[fluid], np.full(fluid.sum(), np.inf)
+    own = natural_residual(matrix, *fields, result.x.numpy().ravel()[fluid])
+    assert own <= 1.1e-6 * natural_residual(matrix, *fields, np.zeros(fluid.sum()))

@@ -20,6 +20,7 @@ from warp_lcp.driver.calibrate import step_seconds
 from warp_lcp.driver.check import check_memory, check_scene
 from warp_lcp.driver.devices import DeviceError, choose_device, cuda_driver, devices
 from warp_lcp.driver.film import check_rate
+from warp_lcp.driver.particle_scene import ParticleScene
 from warp_lcp.driver.presets import PresetName
 from warp_lcp.driver.profile import Profile
 from warp_lcp.driver.progress import Bar, Lines
@@ -192,6 +193,8 @@ def check(
         except (StepFailed, SimulationFailed) as error:
             _end(str(error), FAILED)
     _print_pairs([("seconds a step", f"about {seconds:.3g} on {chosen}, the median of {steps}")])
+    if isinstance(loaded, ParticleScene):
+        _print_pairs(loaded.model_plan(seconds))
 
 
 @app.command("tune")
@@ -274,7 +277,9 @@ def solve(
 
 @app.command()
 def bench(
-    suite: Annotated[str, typer.Argument(metavar="SUITE", help="kernels, solvers, scaling, peers, run, sand, contacts, tradeoff or validation.")],
+    suite: Annotated[
+        str, typer.Argument(metavar="SUITE", help="kernels, solvers, scaling, peers, run, sand, contacts, tradeoff or validation.")
+    ],
     scene: Annotated[
         str | None, typer.Argument(metavar="[SCENE]", help="The scene of tradeoff; its own unless given.", show_default=False)
     ] = None,
@@ -305,6 +310,8 @@ def bench(
         _end(f"{suite}: no such suite; {nearest(suite, installed)}", WRONG_INPUT)
     with _wrong_input():
         chosen = choose_device(device)
+        if scene:
+            load_scene(scene)
     try:
         if compare is not None:
             typer.echo(installed[suite].compare(*compare))
@@ -341,8 +348,10 @@ def _print_tuning(tuning: Tuning, accuracy: str, device: str) -> None:
     typer.echo(f"{tuning.frames} frames on {device}; distance: share of the mass elsewhere than in a run of {tuning.reference.steps} steps")
     best = tuning.chosen
     if not tuning.met:
-        typer.echo(f"nothing that was tried meets {accuracy}, a distance of at most {tuning.bound:g}; the nearest:")
-    typer.echo(f"{accuracy}: {best.words()}: {best.seconds:.3g} s, distance {best.distance:.4f} (at most {tuning.bound:g})")
+        typer.echo(f"nothing that was tried is as near as {accuracy} asks; the nearest:")
+    volume, most = best.trial.volume_error(tuning.reference), tuning.preset
+    bounds = f"distance {best.distance:.4f} (at most {most.distance:g}), volume or packing {volume:.3f} (at most {most.volume:g})"
+    typer.echo(f"{accuracy}: {best.words()}: {best.seconds:.3g} s, {bounds}")
 
 
 def _print_pairs(pairs: list[tuple[str, str]]) -> None:

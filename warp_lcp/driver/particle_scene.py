@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
+from warp_lcp.driver.models import Model, model_lines, prices
 from warp_lcp.driver.particle_volume import VOLUME_BYTES
 from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.shapes import BODY_FRICTION, STICKS, Drain, MaterialProperties, Source
@@ -95,6 +96,27 @@ class ParticleScene(Scene):
     def materials(self) -> tuple[str, Sequence[MaterialProperties]]:
         """Return the key of the material's shapes in the file, such as `liquid`, and the shapes."""
 
+    def models(self) -> list[Model]:
+        """Return the models that the scene turns on, and those that it asks for but cannot need. Subclasses add their own."""
+        moving = [number for number, solid in enumerate(self.solid) if solid.motion is not None]
+        bodies = [number for number, solid in enumerate(self.solid) if solid.is_body]
+        settings, output = self.particles, self.output
+        used = {
+            "cut cells": _solids(range(len(self.solid)), "reaches through cells") if self.cuts_cells else "",
+            "moving solids": _solids(moving, "moves") if moving else "",
+            "rigid bodies": _solids(bodies, "has a mass") if bodies else "",
+            "FLIP": 'particles.transfer = "flip"' if settings.transfer == "flip" else "",
+            "density correction": "[density_correction]" if self.density_correction is not None else "",
+            "reseeding": "[particles.reseed]" if settings.reseed is not None else "",
+            "narrow band": "[particles.narrow_band]" if settings.narrow_band is not None else "",
+            "sources": "[[source]]" if self.source else "",
+            "outlets": "[[drain]] or domain.open" if self.drain or self.domain.open else "",
+            "surface mesh": "output.surface" if output.surface else "",
+            "volume": "output.volume" if output.volume else "",
+            "diagnostics": "output.diagnostics" if output.diagnostics else "",
+        }
+        return [Model(name, why) for name, why in used.items() if why]
+
     @property
     def endless(self) -> tuple[int, ...]:
         """Return the axes without an end: what leaves at one side comes in at the other."""
@@ -170,9 +192,20 @@ class ParticleScene(Scene):
             *super().plan(),
             ("particles", f"{at_first}at most {particles:,}, {settings.per_axis**self.dimension} a cell, {settings.transfer}"),
             *self._rearrangement(),
+            *self.model_plan(),
             ("memory", f"about {_megabytes(self.memory_estimate())} MB"),
             *((f"  {name}", f"{_megabytes(count)} MB") for name, count in self.memory_parts().items()),
         ]
+
+    def model_plan(self, measured: float | None = None) -> list[tuple[str, str]]:
+        """Return the models in words, with their shares of memory and time.
+
+        Args:
+            measured: how long a step takes on the machine at hand [s]; None: as where the prices were measured.
+        """
+        cells, particles = math.prod(self.cell_counts), self.particle_estimate()
+        listed = prices(self.scene.simulator, self.dimension)
+        return model_lines(self.models(), listed, cells, particles, memory=sum(self.memory_parts().values()), measured=measured)
 
     def _rearrangement(self) -> list[tuple[str, str]]:
         """Return what moves particles apart from the flow."""
@@ -244,3 +277,8 @@ def _megabytes(count: int) -> str:
 def _steps(every: int) -> str:
     """Return how often, in words."""
     return "every step" if every == 1 else f"every {every} steps"
+
+
+def _solids(numbers: Iterable[int], what: str) -> str:
+    """Return that some solids do something, in words."""
+    return ", ".join(f"solid {number}" for number in numbers) + f" {what}"

@@ -25,10 +25,12 @@ class Preset:
 
     Attributes:
         distance: the largest share of the mass that may be elsewhere than in the simulator's reference run.
+        volume: the largest difference from that run in the growth of a liquid's volume, or in how densely sand is packed.
         settings: the scene's keys that it gives values to, by `section.key`.
     """
 
     distance: float
+    volume: float
     settings: Settings
 
 
@@ -55,7 +57,7 @@ def price_table() -> Mapping[str, Prices]:
     read = tomllib.loads((files("warp_lcp.driver") / TABLE).read_text(encoding="utf-8"))
     found = {}
     for simulator, part in read.items():
-        presets = {name: Preset(part[name]["distance"], _flat(part[name])) for name in PRESETS}
+        presets: dict[str, Preset] = {name: Preset(part[name]["distance"], part[name]["volume"], _flat(part[name])) for name in PRESETS}
         steps = tuple((cfl, dt_max) for cfl, dt_max in part["steps"])
         found[simulator] = Prices(presets, _flat(part["reference"]), steps, tuple(part["tolerances"]))
     return found

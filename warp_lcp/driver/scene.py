@@ -128,6 +128,9 @@ class Output(Table):
         default="vtu", description="of the cells' files: vtu, which meshio reads too, or vti, smaller and faster where cells are many"
     )
     volume: bool = Field(default=False, description="write level set and density as NanoVDB files, of 3-D scenes")
+    diagnostics: bool = Field(
+        default=True, description="measure what only the log shows: volume and divergence of liquid, yielding and dissipation of sand"
+    )
     checkpoint_every: int = Field(default=50, ge=0, description="steps between checkpoints; 0: not by steps")
     checkpoint_minutes: float | None = Field(default=None, gt=0, description="the most minutes of real time between checkpoints")
     checkpoints_kept: int = Field(default=3, ge=1, description="how many of the newest checkpoints stay")

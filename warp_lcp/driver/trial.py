@@ -88,6 +88,13 @@ class Trial:
         differences = [abs(a.energy - b.energy) for a, b in zip(self.looks, reference.looks, strict=True)]
         return max(differences) / scale if scale > 0.0 else 0.0
 
+    def volume_error(self, reference: Trial) -> float:
+        """Return the difference from a reference in the growth of the volume, or in how densely sand was packed; 0 if not known."""
+        for own, other in ((self.volume_drift, reference.volume_drift), (self.packing, reference.packing)):
+            if own is not None and other is not None:
+                return abs(own - other)
+        return 0.0
+
     def front_error(self, reference: Trial) -> float:
         """Return the front's lead over a reference's at the end [m]."""
         return self.looks[-1].front - reference.looks[-1].front
@@ -138,7 +145,7 @@ class _Trial:
 
     def run(self, times: Sequence[float], frames: int) -> Trial:
         """Step to the last frame and look at `times` [s]."""
-        looks = []
+        looks: list[Look] = []
         for frame in range(1, frames + 1):
             end = self.scene.time.frame_time(frame)
             while end - self.simulation.time > SAME_TIME / self.scene.time.frames_per_second:
@@ -147,7 +154,7 @@ class _Trial:
                     looks.append(self._look())  # the first step tells energy and mass
             if any(abs(end - time) < SAME_TIME for time in times):
                 looks.append(self._look())
-        volumes = [float(row["volume"]) for row in self.rows if row.get("volume") is not None]
+        volumes = self._known("volume")
         return Trial(
             self.seconds, len(self.rows), self._sum("solve_iterations"), self._sum("linear_iterations"), tuple(looks),
             volume=(volumes[0], volumes[-1]) if volumes else None,
@@ -193,8 +200,11 @@ class _Trial:
         return sum(int(row.get(name) or 0) for row in self.rows)
 
     def _most(self, name: str) -> float | None:
-        values = [float(row[name]) for row in self.rows if row.get(name) is not None]
-        return max(values) if values else None
+        return max(self._known(name), default=None)
+
+    def _known(self, name: str) -> list[float]:
+        """Return a column of the log without its empty cells."""
+        return [float(value) for row in self.rows if (value := row.get(name)) is not None]
 
 
 def spread(points: np.ndarray, size: Sequence[float], box: float) -> np.ndarray:

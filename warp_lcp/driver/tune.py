@@ -51,7 +51,7 @@ class Tuning:
         scene: with the settings chosen.
         chosen: those settings and what they take.
         met: whether they meet the accuracy; False: not even the finest do, which are chosen.
-        bound: the largest distance that the accuracy allows.
+        preset: whose bounds the accuracy is.
         reference: the run that the others were compared with.
         tried: all settings that ran, in the order of the trials.
         failed: settings whose run ended, and why.
@@ -61,7 +61,7 @@ class Tuning:
     scene: Scene
     chosen: Candidate
     met: bool
-    bound: float
+    preset: Preset
     reference: Trial
     tried: list[Candidate]
     failed: list[str]
@@ -88,9 +88,10 @@ def tune(
 ) -> Tuning:
     """Measure which settings take the least time for an accuracy.
 
-    An accuracy is a bound of the distance from a reference run at the same resolution, see `warp_lcp.driver.presets`: that of the preset of
-    its name. Longer time steps take less time and lie further away, so the longest that meets the bound is found by bisection, with the
-    preset's tolerance; then the loosest tolerance, and the rarest density correction, that keep it. The fastest few are timed again in turns.
+    An accuracy bounds the distance from a reference run at the same resolution, and the volume's difference from it: those of the preset of
+    its name, see `warp_lcp.driver.presets`. Longer time steps take less time and lie further away, so the longest that meets the bounds
+    is found by bisection, with the preset's tolerance; then the loosest tolerance, and the rarest density correction, that keep them. The
+    fastest few are timed again in turns.
 
     Args:
         scene: whose first frames are run, with everything that it says but for those settings.
@@ -110,7 +111,12 @@ def tune(
     search = _Search(scene, prices, prices.presets[accuracy], device, min(frames, scene.time.frame_count), say)
     chosen, met = search.run()
     tuned = changed(scene, chosen.settings)
-    return Tuning(tuned, chosen, met, search.preset.distance, search.reference, search.tried, search.failed, search.frames)
+    return Tuning(tuned, chosen, met, search.preset, search.reference, search.tried, search.failed, search.frames)
+
+
+def near_enough(own: Trial, reference: Trial, preset: Preset) -> bool:
+    """Return whether a run is as near to the reference as a preset's accuracy asks."""
+    return own.distance(reference) <= preset.distance and own.volume_error(reference) <= preset.volume
 
 
 def write_tuned(path: Path, tuning: Tuning, accuracy: str, device: str) -> None:
@@ -119,10 +125,11 @@ def write_tuned(path: Path, tuning: Tuning, accuracy: str, device: str) -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    words = "meets" if tuning.met else "does not meet"
+    words, bounds = "meets" if tuning.met else "does not meet", tuning.preset
     head = [
         f"# Tuned for {accuracy} accuracy on {device}: {tuning.chosen.words()}",
-        f"# It {words} the distance {tuning.bound:g} of that accuracy on {tuning.frames} frames. What was measured:",
+        f"# It {words} the bounds of that accuracy, a distance of {bounds.distance:g} and {bounds.volume:g} of volume or packing,",
+        f"# on {tuning.frames} frames. What was measured:",
         *(f"#   {', '.join(row)}" for row in tuning.rows()),
     ]
     write_text(path, "\n".join(head) + "\n" + dump_scene(tuning.scene).removeprefix(HEADER))
@@ -152,11 +159,11 @@ class _Search:
             settings = {**start, **_step_settings(self.prices.steps[step])}
             for key, values in (("solver.tolerance", self.prices.tolerances), ("density_correction.every", CORRECTED_EVERY)):
                 settings = self._loosest(settings, key, values)
-        met = [c for c in self.tried if c.distance <= self.preset.distance]
+        met = [c for c in self.tried if near_enough(c.trial, self.reference, self.preset)]
         if not met:
             if not self.tried:
                 raise SimulationFailed(f"no settings ran to the end of frame {self.frames}: {self.failed[-1]}")
-            return min(self.tried, key=lambda c: c.distance), False
+            return min(self.tried, key=lambda c: max(c.distance / self.preset.distance, self._volume(c) / self.preset.volume)), False
         shortest = min(c.seconds for c in met)
         close = [c for c in met if c.seconds <= CLOSE * shortest]
         for _ in range(ROUNDS if len(close) > 1 else 0):
@@ -165,6 +172,9 @@ class _Search:
                 c.seconds = min(c.seconds, again.seconds)
         shortest = min(c.seconds for c in close)
         return min((c for c in close if c.seconds <= SAME * shortest), key=lambda c: c.distance), True
+
+    def _volume(self, candidate: Candidate) -> float:
+        return candidate.trial.volume_error(self.reference)
 
     def _has(self, key: str) -> bool:
         return getattr(self.scene, key.partition(".")[0]) is not None
@@ -182,7 +192,7 @@ class _Search:
         return low if low < len(steps) else None
 
     def _loosest(self, settings: dict[str, Any], key: str, values: tuple[float, ...]) -> dict[str, Any]:
-        """Return the settings with the loosest of the values, loose ones first, that meets the bound; as they are where none looser does."""
+        """Return the settings with the loosest of the values, loose ones first, that meets the bounds; as they are where none does."""
         for value in values:
             if not self._has(key) or value == settings.get(key):
                 break
@@ -195,7 +205,7 @@ class _Search:
         if key not in self._known:
             self._known[key] = self._try(settings)
         found = self._known[key]
-        return found is not None and found.distance <= self.preset.distance
+        return found is not None and near_enough(found.trial, self.reference, self.preset)
 
     def _try(self, settings: dict[str, Any]) -> Candidate | None:
         """Run the first frames with some settings; None: that failed."""

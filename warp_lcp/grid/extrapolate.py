@@ -45,13 +45,13 @@ FILL_ROW = """
     for (int start = from; start < end; start += M) {
         const int n = end - start < M ? end - start : M;
         unsigned char fills[M], any = 0;
-        SIMD for (int m = 0; m < n; ++m) { const unsigned char w = wanted(start + m, now, now); fills[m] = w; any |= w; }
+        MASKED for (int m = 0; m < n; ++m) { const unsigned char w = wanted(start + m, now, now); fills[m] = w; any |= w; }
         if (!any) continue;
-        SIMD for (int m = 0; m < n; ++m) {
+        MASKED for (int m = 0; m < n; ++m) {
             const float value = mean(start + m, now, now);
             field[start + m] = fills[m] ? value : field[start + m];
         }
-        SIMD for (int m = 0; m < n; ++m) known[start + m] = fills[m] ? (signed char)(now + 1) : known[start + m];
+        MASKED for (int m = 0; m < n; ++m) known[start + m] = fills[m] ? (signed char)(now + 1) : known[start + m];
     }
     if (last == nx && nx > 1) fill_one(nx - 1);
     #endif

@@ -15,6 +15,7 @@ from warp_lcp.rigid.outline import BodySurface, body_surface
 from warp_lcp.rigid.surroundings import Surroundings
 
 STATE = 20  # numbers of a body's state
+CONTACT = 8  # numbers of a contact's memory
 IN_PLANE = ("x", "y", "vx", "vy", "angle", "spin")
 IN_SPACE = ("x", "y", "z", "vx", "vy", "vz", "wx", "wy", "wz")
 
@@ -121,17 +122,19 @@ class RigidBodies:
         begun = self._begun
         if begun is None:
             raise RuntimeError("end_step: there was no begin_step")
+        impulses = begun.impulses
         if any(body.given.any() for body in self.bodies):
             for body, momenta in zip(self.bodies, begun.free, strict=True):
                 body.momentum, body.angular_momentum = momenta[:3] + body.given[:3], momenta[3:] + body.given[3:]
-            self._solve.push_apart(begun.touching, begun.impulses)
+            impulses = self._solve.push_apart(begun.touching, begun.impulses)
+        self._solve.memory.keep(begun.touching, impulses, self.bodies)
         self.contacts, self.contact_residual = len(begun.touching), self._solve.residual
         ways = self._solve.separation(begun.touching, dt)
-        for body, way in zip(self.bodies, ways, strict=True):
+        for number, body in enumerate(self.bodies):
             body.release()
             body.advance(dt)
-            if way.any():
-                body.shift(way)
+            if ways is not None and ways[number].any():
+                body.shift(ways[number])
         self._begun = None
 
     def restore_step(self) -> None:
@@ -176,7 +179,7 @@ class RigidBodies:
 
     def state(self) -> dict[str, np.ndarray]:
         """Return what `restore` needs to continue bit for bit."""
-        return {"bodies": self._states()}
+        return {"bodies": self._states(), "body_contacts": self._solve.memory.values.copy()}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from `state`.
@@ -188,6 +191,7 @@ class RigidBodies:
         if states.shape != (len(self.bodies), STATE):
             raise ValueError(f"the state's bodies have shape {states.shape}: this scene has {(len(self.bodies), STATE)}")
         self._begun = None
+        self._solve.memory.values = np.array(state["body_contacts"], dtype=np.float64).reshape(-1, CONTACT)
         for body, values in zip(self.bodies, states, strict=True):
             body.restore(values)
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from typing import cast
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from warp_lcp.grid.motion import Pose
 from warp_lcp.rigid.mass_properties import MassProperties
 
 SAME_TURN = 1e-15  # [rad]: half a step's turn that no longer changes
+SMALL_TURN = 1e-5  # [rad]: its third power is nothing beside 1
 MOST_ROUNDS = 60  # of the fixed point; a step turns a body by far less than a radian, and each round by a factor of that less
 
 
@@ -26,6 +27,7 @@ class RigidBody:
         angular_velocity: at the start [rad/s], shape (3,).
 
     Attributes:
+        inverse_inertia: I^-1 as the scene places the body [1 / (kg m^2)], shape (3, 3).
         position: of the center of mass [m], shape (3,).
         rotation: from where the scene placed it, shape (3, 3).
         momentum: [kg m/s], shape (3,).
@@ -55,6 +57,7 @@ class RigidBody:
         if not 0.0 <= restitution <= 1.0:
             raise ValueError(f"restitution = {restitution}: must be in [0, 1]")
         self.properties, self.name, self.friction, self.restitution = properties, name, friction, restitution
+        self.inverse_inertia = np.linalg.inv(properties.inertia)
         self.position, self.rotation = properties.center.copy(), np.eye(3)
         self.momentum = properties.mass * _three(velocity)
         self.angular_momentum = properties.inertia @ _three(angular_velocity)
@@ -70,7 +73,7 @@ class RigidBody:
     @property
     def angular_velocity(self) -> np.ndarray:
         """Angular velocity in the world's axes [rad/s], shape (3,)."""
-        return _spin(self.properties, self.rotation, self.angular_momentum)
+        return self._spin(self.rotation)
 
     @property
     def inertia(self) -> np.ndarray:
@@ -84,11 +87,10 @@ class RigidBody:
 
     def free_inverse_mass(self, dimension: int) -> np.ndarray:
         """Return block diag(1/m, I^-1), shape (k, k): k = 3 in 2-D (vx, vy, wz), 6 in 3-D (vx, vy, vz, wx, wy, wz)."""
-        result = np.zeros((6, 6))
-        result[:3, :3] = np.eye(3) / self.properties.mass
-        R = self.rotation
-        result[3:, 3:] = R @ np.linalg.inv(self.properties.inertia) @ R.T
-        return result if dimension == 3 else result[np.ix_(PLANAR, PLANAR)]
+        result, R = np.zeros((6, 6)), self.rotation
+        result[AXES, AXES] = 1.0 / self.properties.mass
+        result[3:, 3:] = R @ self.inverse_inertia @ R.T
+        return result if dimension == 3 else result[PLANAR][:, PLANAR]
 
     def inverse_mass(self, dimension: int) -> np.ndarray:
         """Return how velocities answer to impulses, shape (k, k), symmetric positive semi-definite.
@@ -146,7 +148,7 @@ class RigidBody:
         half = 0.5 * dt * self.angular_velocity
         for _ in range(MOST_ROUNDS):
             before = half
-            half = 0.5 * dt * _spin(self.properties, _turn(half) @ self.rotation, self.angular_momentum)
+            half = 0.5 * dt * self._spin(_turn(half) @ self.rotation)
             if np.abs(half - before).max() <= SAME_TURN:
                 break
         u, _, vt = np.linalg.svd(_turn(2.0 * half) @ self.rotation)  # the nearest rotation: rounding does not pile up
@@ -168,6 +170,10 @@ class RigidBody:
     def release(self) -> None:
         """Forget what holds the body and what it was given."""
         self.hold, self.given = None, np.zeros(6)
+
+    def _spin(self, rotation: np.ndarray) -> np.ndarray:
+        """Return R I^-1 R' L [rad/s]."""
+        return cast(np.ndarray, rotation @ (self.inverse_inertia @ (rotation.T @ self.angular_momentum)))
 
 
 class BodyMotion:
@@ -195,6 +201,7 @@ class BodyMotion:
         return turn, self.body.velocity - turn @ self.body.position
 
 
+AXES = [0, 1, 2]
 PLANAR = [0, 1, 5]  # vx, vy, wz among the six
 
 
@@ -207,14 +214,14 @@ def in_space(values: np.ndarray) -> np.ndarray:
     return six
 
 
-def _spin(properties: MassProperties, rotation: np.ndarray, angular_momentum: np.ndarray) -> np.ndarray:
-    """Return R I^-1 R' L."""
-    return rotation @ np.linalg.solve(properties.inertia, rotation.T @ angular_momentum)
-
-
 def _turn(vector: np.ndarray) -> np.ndarray:
-    """Return the matrix of a turn by |vector| [rad] about it."""
-    return Rotation.from_rotvec(vector).as_matrix()
+    """Return the matrix of a turn by |vector| [rad] about it (Rodrigues' formula)."""
+    x, y, z = vector.tolist()
+    angle = math.sqrt(x * x + y * y + z * z)
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    if angle < SMALL_TURN:
+        return cast(np.ndarray, np.eye(3) + K + 0.5 * K @ K)
+    return cast(np.ndarray, np.eye(3) + math.sin(angle) / angle * K + 0.5 * (math.sin(0.5 * angle) / (0.5 * angle)) ** 2 * K @ K)
 
 
 def _three(vector: np.ndarray | None) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import warp as wp
@@ -33,6 +33,9 @@ class ContactShape:
         box: the shape if it is a box; in 2-D a thick one.
         size: about half its extent [m].
         closed: whether the inside has an end; contacts with others than such need points of theirs.
+
+    Attributes:
+        low, high: bounds of the closed ones [m], shape (3,).
     """
 
     points: np.ndarray
@@ -41,6 +44,14 @@ class ContactShape:
     size: float
     box: OrientedBox | None = None
     closed: bool = True
+    low: np.ndarray = field(init=False)
+    high: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Find the bounds."""
+        points = self.points if len(self.points) else np.zeros((1, 3))
+        object.__setattr__(self, "low", points.min(axis=0) - self.radius)
+        object.__setattr__(self, "high", points.max(axis=0) + self.radius)
 
     @classmethod
     def of(cls, geometry: Geometry, dimension: int) -> ContactShape:

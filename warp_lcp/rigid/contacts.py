@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,7 +16,7 @@ FLAT = {2: 2, 3: 4}  # contacts of a pair with about one normal: a flat rest nee
 MOST = {2: 4, 3: 8}  # contacts of a pair
 OTHER_SIDE = 0.1  # of normals' difference: contacts of sides that differ by less count as of one
 SAME = 1e-6  # of a shape's size: points of contact this close are one
-LOWER = 20.0  # so many times the gap must a point be farther from the others to count more than one with less
+LOWER = 60.0  # so many times the gap must a point be farther from the others to count more than one with less
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +53,18 @@ class Touch:
         return cls(*(np.concatenate([getattr(touch, name) for touch in touches]) for name in ("point", "normal", "gap")))
 
 
-def on_planes(shape: ContactShape, pose: Pose, points: np.ndarray, normals: np.ndarray, margin: float, dimension: int) -> Touch:
+class Place(NamedTuple):
+    """Where a body is: p becomes rotation @ p + translation; a `Pose` that nobody gave, so that nobody checks it."""
+
+    rotation: np.ndarray
+    translation: np.ndarray
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        """Return points [m], shape (n, 3), after the change of place."""
+        return np.asarray(points @ self.rotation.T + self.translation)
+
+
+def on_planes(shape: ContactShape, pose: Pose | Place, points: np.ndarray, normals: np.ndarray, margin: float, dimension: int) -> Touch:
     """Return where a shape touches planes.
 
     Args:
@@ -75,7 +87,7 @@ def on_planes(shape: ContactShape, pose: Pose, points: np.ndarray, normals: np.n
     return Touch.joined(found)
 
 
-def between(one: ContactShape, at: Pose, other: ContactShape, there: Pose, margin: float, dimension: int) -> Touch:
+def between(one: ContactShape, at: Pose | Place, other: ContactShape, there: Pose | Place, margin: float, dimension: int) -> Touch:
     """Return where two shapes touch, normals from the other to the one.
 
     Boxes by the axis along which they overlap least; others by points of either surface and the distance to the other one.
@@ -100,14 +112,13 @@ def between(one: ContactShape, at: Pose, other: ContactShape, there: Pose, margi
     return spread(Touch.joined(found), size, dimension)
 
 
-def _points_of(one: ContactShape, at: Pose, other: ContactShape, there: Pose, margin: float) -> Touch:
+def _points_of(one: ContactShape, at: Pose | Place, other: ContactShape, there: Pose | Place, margin: float) -> Touch:
     """Return the points of one shape that are near the other."""
     centers = at.apply(one.points)
-    local = there.inverse().apply(centers)
-    if other.closed and len(local) > 1 and len(other.points):  # most points are far away
-        low, high = other.points.min(axis=0) - other.radius, other.points.max(axis=0) + other.radius
+    local = (centers - there.translation) @ there.rotation
+    if other.closed and len(local) > 1:  # most points are far away
         reach = margin + one.radius
-        near = ((local >= low - reach) & (local <= high + reach)).all(axis=1)
+        near = ((local >= other.low - reach) & (local <= other.high + reach)).all(axis=1)
         centers, local = centers[near], local[near]
     if not len(local):
         return Touch.joined([])
@@ -118,7 +129,7 @@ def _points_of(one: ContactShape, at: Pose, other: ContactShape, there: Pose, ma
     return Touch(centers[near] - (one.radius + 0.5 * gap[near])[:, None] * normal, normal, gap[near])
 
 
-def _moved(box: OrientedBox, pose: Pose) -> OrientedBox:
+def _moved(box: OrientedBox, pose: Pose | Place) -> OrientedBox:
     return OrientedBox(pose.apply(box.center[None])[0], pose.rotation @ box.rotation, box.half)
 
 

@@ -14,12 +14,15 @@ from warp_lcp.program import Launch, Program
 from warp_lcp.solve import Precision, Step
 from warp_lcp.solvers import principal_system_low_rank_kernels as coupling
 from warp_lcp.solvers import projected_multigrid_kernels as kernels
+from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
 from warp_lcp.solvers.principal_system_low_rank import LowRankCorrection
 from warp_lcp.solvers.projected_multigrid_workspace import AssessedResidual, MultigridWorkspace
 from warp_lcp.vectors import launch_spans
 
 if TYPE_CHECKING:
     from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
+
+RELAPSES = 4  # monotone cycles in a row that a relapse asks for, from which on steps are Newton's
 
 
 class CoupledResidual(AssessedResidual):
@@ -69,14 +72,26 @@ class CoupledWorkspace(MultigridWorkspace):
         self.correction = LowRankCorrection(low, self.hierarchy)
         self._along = wp.zeros(low.rank, dtype=wp.float64, device=problem.device)  # U'p
         self._fresh = True  # whether the correction is still that of the last solve
+        self._newton: NewtonWorkspace | None = None
+        self._searches, self._tolerance = False, 0.0  # whether steps are Newton's
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the search direction; operator and bodies may have changed."""
         super().start(warm=warm, tolerance=tolerance)
-        self._fresh = True
+        self._fresh, self._searches, self._tolerance = True, False, tolerance
+
+    def wants_monotone_cycle(self) -> bool:
+        """Return whether the next step is none of truncated multigrid."""
+        return self._searches or super().wants_monotone_cycle()
 
     def monotone_step(self) -> Step:
-        """Projected cycle of the grid on all unknowns, and as much of it as lowers the energy of grid and bodies most."""
+        """Projected cycle of the grid on all unknowns, and as much of it as lowers the energy of grid and bodies most.
+
+        Where the free set keeps going round in circles, a Newton step instead, which searches along its path: what a projection does to
+        the force on a body that weighs next to nothing is a leap each time, and the energy lets projected cycles of the grid hardly move.
+        """
+        if self._searches or self._relapse > RELAPSES:
+            return self._newton_step()
         p, finest, last = self.problem, self.hierarchy.finest, self.residual.norm
         self._rebuild()
         self._leave()
@@ -91,6 +106,33 @@ class CoupledWorkspace(MultigridWorkspace):
         self.residual.read()
         self._count_rises(last)
         return Step("monotone cycle", 1, None)
+
+    def _newton_step(self) -> Step:
+        """Take a step of Newton's method on the minimum map, whose memory is made when the first solve needs it."""
+        p, settings = self.problem, MinimumMapNewton(precision=self.precision.value, cycle=self.settings.cycle)
+        if self._newton is None:
+            made = settings.init(p)
+            assert isinstance(made, NewtonWorkspace)
+            self._newton = made
+        newton = self._newton
+        if not self._searches:
+            self.restore()
+            self._searches, newton.floating = True, self.floating
+            wp.copy(newton.x, self.x)
+            newton.residual.evaluate(newton.x)
+            newton.start(warm=True, tolerance=self._tolerance)
+        if self._past == 0 and not self._stored:
+            self._best = wp.empty_like(self.x) if self._best is None else self._best
+            wp.copy(self._best, self.x)
+            self._stored = True
+        self._past += 1
+        newton.residual.current = False
+        done = settings.step(p, newton, newton.x)
+        if not newton.residual.current:
+            newton.residual.evaluate(newton.x)
+        wp.copy(self.x, newton.x)
+        self.residual.evaluate(self.x)
+        return done
 
     def _rebuild(self) -> None:
         """Follow the free set, with the correction too."""

@@ -1,0 +1,305 @@
+"""What each model that a scene can turn on adds to a step and to memory: the list of prices that `warp-lcp check` tells runs by.
+
+python -m benchmarks.models          # also writes warp_lcp/driver/models.toml and docs/models.md, in a checkout
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import importlib
+import math
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+import warp as wp
+
+from benchmarks.machine import machine
+from benchmarks.memory import array_bytes
+from benchmarks.record import Record, Results, Table
+from benchmarks.timing import Figure, Options
+from warp_lcp.driver.models import TABLE
+from warp_lcp.driver.profile import Profile
+from warp_lcp.driver.simulator import simulators
+from warp_lcp.driver.table import validate
+
+TITLE = "What models cost"
+RESOLUTION = {2: 128, 3: 48}  # cells along the longest side of the reference scenes
+WARM = 3  # steps that are not timed
+STAGES = ("sort", "particles-to-grid", "grid-to-particles", "advection", "diagnostics")  # whose time is the particles'
+QUIET = {"diagnostics": False}
+Tables = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Offer:
+    """A model: tables of the reference scene with it, and of the nearest scene without; those left out are the reference's.
+
+    Args:
+        on: with it.
+        off: without it.
+        unit: what its price is counted by, `cell` or `particle`.
+        frames: it works when a frame is made, not in a step.
+    """
+
+    on: Tables
+    off: Tables = field(default_factory=dict)
+    unit: str = "cell"
+    frames: bool = False
+
+
+def offers(simulator: str, dimension: int) -> dict[str, Offer]:
+    """Return the models of a simulator by name."""
+    ball = {"shape": "sphere", "center": [0.72, 0.16, 0.25][:dimension], "radius": 0.1}
+    swaying = ball | {"motion": {"kind": "sinusoid", "amplitude": [0.02, 0.0, 0.0][:dimension], "period": 1.0}}
+    both = {
+        "cut cells": Offer({"solid": [ball]}, {"solid": [ball], "domain": {"solids": "voxel"}}),
+        "moving solids": Offer({"solid": [swaying]}, {"solid": [ball]}),
+        "rigid bodies": Offer({"solid": [ball | {"density": 700.0}]}, {"solid": [ball]}),
+        "density correction": Offer({"density_correction": {}}),
+        "reseeding": Offer({"particles": {"reseed": {"every": 1}}}, unit="particle"),
+        "diagnostics": Offer({"output": {}}),
+        "surface mesh": Offer({"output": QUIET | {"surface": True}}, frames=True),
+    }
+    if simulator == "granular":
+        return both
+    level_set: Tables = {"pressure": {}}
+    liquid = {
+        "separating walls": Offer({"domain": {"wall": "separating"}}),
+        "ghost-fluid surface": Offer(level_set),
+        "smoothing": Offer({"pressure": {"smoothing": 2}}, level_set),
+        "unilateral pressure": Offer({"pressure": {"model": "unilateral"}}, level_set),
+        "automatic tolerance": Offer({"solver": {"tolerance": "auto"}}, {"solver": {"tolerance": 1e-2}}),
+        "narrow band": Offer(level_set | {"particles": {"narrow_band": {"width": 4.0}}}, level_set),
+        "FLIP": Offer({"particles": {"transfer": "flip"}}, {"particles": {"transfer": "pic"}}, unit="particle"),
+    }
+    return liquid | both
+
+
+def create(simulator: str, dimension: int, tables: Tables, size: int, device: str) -> Any:
+    """Return the reference scene, a column in a box twice as long as high, with some tables changed."""
+    scene: Tables = {
+        "scene": {"simulator": simulator, "name": "reference"},
+        "time": {"duration": 10.0},
+        "domain": {"size": [1.0, 0.5, 0.5][:dimension], "resolution": size},
+        "output": QUIET,
+    }
+    if simulator == "fluids":
+        scene["domain"]["wall"] = "free-slip"
+        scene["pressure"] = {"surface": "voxel"}
+    scene["liquid" if simulator == "fluids" else "sand"] = [
+        {"shape": "box", "min": [0.0] * dimension, "max": [0.55, 0.4, 0.5][:dimension]},
+    ]
+    merged = scene | {name: scene["domain"] | value if name == "domain" else value for name, value in tables.items()}
+    plug_in = simulators()[simulator]
+    return plug_in.create(validate(plug_in.scene_model, merged, "reference"), device=device, folder=Path.cwd())
+
+
+def step_seconds(simulation: Any) -> float:
+    """Return the seconds of one short step: all scenes stay alike."""
+    return step_seconds_of(simulation, min(simulation.stable_dt(), 2e-3))[0]
+
+
+def step_seconds_of(simulation: Any, dt: float) -> tuple[float, dict[str, Any]]:
+    """Return the seconds of a step and its row: the processor's own seconds on a CPU, which other programs take no part of."""
+    device = simulation.grid.device
+    clock = time.perf_counter if device.is_cuda else time.process_time
+    wp.synchronize_device(device)
+    begun = clock()
+    row = simulation.step(dt)
+    wp.synchronize_device(device)
+    return clock() - begun, row
+
+
+@dataclass
+class Sample:
+    """A scene that is measured: its bytes and the least seconds of a step."""
+
+    simulation: Any
+    bytes: int
+    seconds: float = math.inf
+
+
+def measure_all(simulator: str, dimension: int, options: Options) -> tuple[dict[str, Sample], Sample]:
+    """Return the scenes of all offers by their tables' text, and the reference itself; steps are taken in turns."""
+    size = max(options.sizes, default=RESOLUTION[dimension])
+    wanted: list[Tables] = [{}]
+    for offer in offers(simulator, dimension).values():
+        wanted += [offer.on, offer.off]
+    create(simulator, dimension, {}, size, options.device).step(1e-3)  # what is loaded once is no scene's
+    samples: dict[str, Sample] = {}
+    for tables in wanted:
+        if str(tables) in samples:
+            continue
+        gc.collect()
+        before = array_bytes()
+        simulation = create(simulator, dimension, tables, size, options.device)
+        for _ in range(WARM):
+            step_seconds(simulation)
+        simulation.surfaces()
+        gc.collect()
+        samples[str(tables)] = Sample(simulation, array_bytes() - before)
+    for _ in range(4 * options.repeat):
+        for sample in samples.values():
+            sample.seconds = min(sample.seconds, step_seconds(sample.simulation))
+    return samples, samples[str({})]
+
+
+def particle_share(sample: Sample) -> float:
+    """Return which part of a step's time goes with the particles, the rest with the cells."""
+    profile = Profile(str(sample.simulation.grid.device))
+    sample.simulation.watch = profile
+    for _ in range(WARM):
+        step_seconds(sample.simulation)
+    spent = {name: stage.seconds for name, stage in profile.stages.items()}
+    return sum(spent.get(name, 0.0) for name in STAGES) / sum(spent.values())
+
+
+def records_of(simulator: str, dimension: int, options: Options) -> list[Record]:
+    """Measure a simulator's models."""
+    options.say(f"{simulator}, {dimension}-D")
+    samples, base = measure_all(simulator, dimension, options)
+    cells, particles = math.prod(base.simulation.grid.counts), base.simulation.particles.count
+    share = particle_share(base)
+    prefix = f"{simulator} {dimension}d"
+    figures = {
+        "step": Figure(base.seconds, "s"),
+        "cell_seconds": Figure((1.0 - share) * base.seconds / cells, "s"),
+        "particle_seconds": Figure(share * base.seconds / particles, "s"),
+        "cell_bytes": Figure(base.bytes / cells, "B"),
+    }
+    facts = {"cells": cells, "particles": particles}
+    found = [Record(f"{prefix}: base", figures, facts)]
+    for name, offer in offers(simulator, dimension).items():
+        on, off = samples[str(offer.on)], samples[str(offer.off)]
+        count = cells if offer.unit == "cell" else particles
+        added = 0.0 if offer.frames else on.seconds - off.seconds
+        figures = {
+            "step": Figure(added, "s"),
+            f"{offer.unit}_seconds": Figure(added / count, "s"),
+            f"{offer.unit}_bytes": Figure((on.bytes - off.bytes) / count, "B"),
+        }
+        found.append(Record(f"{prefix}: {name}", figures, facts | {"frames": offer.frames}))
+    return found
+
+
+def measure(options: Options, out: Path) -> Results:
+    """Measure all models of both simulators."""
+    records = [machine(options.device, elements=1 << 22, repeat=options.repeat)]
+    tables = []
+    for simulator in ("fluids", "granular"):
+        for dimension in (3, 2):
+            found = records_of(simulator, dimension, options)
+            records += found
+            tables.append(table_of(simulator, dimension, found))
+    return Results(records, tables)
+
+
+def table_of(simulator: str, dimension: int, records: list[Record]) -> Table:
+    """Return the prices of a simulator's models, as a reader wants them."""
+    base = records[0]
+    whole = base.figures["step"].value
+    rows = []
+    for record in records:
+        name, step = record.name.split(": ")[1], record.figures["step"].value
+        unit = "particle" if "particle_bytes" in record.figures else "cell"
+        added = "in frames only" if record.facts.get("frames") else f"{1e3 * step:.2f}"
+        part = "" if record.facts.get("frames") else f"{100.0 * step / whole:.0f} %"
+        rows.append([name, added, part, f"{record.figures[f'{unit}_bytes'].value:.1f} a {unit}"])
+    what = "liquid" if simulator == "fluids" else "sand"
+    remark = (
+        f"A column of {what}, {base.facts['cells']:,} cells and {base.facts['particles']:,} particles. `base` is the scene without any "
+        "model, particles and all; the others say what they add to it."
+    )
+    return Table(f"{what.capitalize()}, {dimension}-D", ["model", "ms a step", "of base", "bytes"], rows, remark)
+
+
+def price_list(records: list[Record]) -> Mapping[str, Any]:
+    """Return what `warp_lcp/driver/models.toml` holds: by simulator, dimension and model what a `warp_lcp.driver.models.Price` has."""
+    listed: dict[str, Any] = {}
+    for record in records:
+        where, separator, name = record.name.partition(": ")
+        if not separator:
+            continue
+        simulator, dimension = where.split()
+        price = {key: float(f"{figure.value:.3g}") for key, figure in record.figures.items() if key.endswith(("_seconds", "_bytes"))}
+        listed.setdefault(simulator, {}).setdefault(dimension, {})[name] = price
+    return listed
+
+
+PAGE = """# What models cost
+
+<!-- Written by `python -m benchmarks.models`; do not edit. -->
+
+A scene has what it asks for and nothing else: a model that is off loads no kernel, allocates no byte and logs no column (a test for each of
+them proves it). `warp-lcp check SCENE` says which models a scene turns on and why, and what they take of its memory and of a step, by the
+prices below; `--calibrate` takes a few steps and scales them to the machine at hand. What a scene asks for but cannot need is not built,
+and the plan says so:
+
+- where no wall separates, or no side has a wall, the pressure is the solution of equations: no bounds are stored or tested;
+- a closed box full of liquid has no free surface, and no level set is made for one;
+- 2-D scenes have no third component of anything.
+
+`warp-lcp bench models` measures them anew. The seconds are those of one core of {machine}.
+
+{tables}
+
+## A tolerance that follows the time step
+
+With `[solver] tolerance = "auto"` (liquids) a solve stops when the velocity error that it leaves is a tenth of the error that the step's
+length makes anyway. The step takes the acceleration by the pressure as constant, so its error in the velocity is to first order half of
+what that acceleration changes by from one step to the next: 1/2 ||G (x - x0)||, with x = dt p / (rho dx), x0 the last step's pressure over
+this step and G the gradient, and ||G e||^2 = e'A e. It is measured after each solve, in one product with A, and counts for the next step,
+times (dt / dt_last)^2 where that is shorter.
+
+What multigrid cycles leave is as short as the cells, where A is of order one: in 446 steps of four scenes the velocity error was 0.12 to
+1.0 times the residual. So the solve ends when the residual (root mean square over the cells) is a tenth of the time error, or rounding
+noise where a liquid rests or falls freely. It is at most a tenth of the residual at zero pressure as the step before had it, and at least
+1e-6 of it. The first two steps, before which there is no change to measure, go to 1e-4.
+
+The log then has the columns `tolerance`, the relative residual that a step was held to, and `time_error` [m/s]. Sand has no such tolerance:
+its own is in units of a cell's weight.
+
+{automatic}
+"""
+
+
+def write_page(page: Path, results: Results, automatic: Table) -> None:
+    """Write the page of the documentation."""
+    tables = "\n\n".join(f"## {table.title}\n\n{_markdown(table)}" for table in results.tables)
+    machine = str(results.records[0].facts["hardware"]["cpu"])
+    page.write_text(PAGE.format(machine=machine, tables=tables, automatic=_markdown(automatic)), "utf-8")
+
+
+def _markdown(table: Table) -> str:
+    return "\n".join([table.remark, "", _row(table.columns), _row(["---"] * len(table.columns)), *map(_row, table.rows)])
+
+
+def _row(cells: Any) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def main() -> None:
+    """Measure, and write the price list and the page."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--repeat", type=int, default=5)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--page", type=Path, default=Path("docs/models.md"))
+    given = parser.parse_args()
+    wp.config.log_level = wp.LOG_ERROR
+    options = Options(given.device, (), given.repeat, lambda text: sys.stderr.write(f"{text}\n"))
+    results = measure(options, Path())
+    compared = importlib.import_module("benchmarks.automatic_tolerance").measure(options, Path())
+    head = "# What models add to a step and to memory, by simulator and dimension; written by `python -m benchmarks.models`.\n\n"
+    Path(str(files("warp_lcp.driver") / TABLE)).write_text(head + tomli_w.dumps(price_list(results.records)), "utf-8")
+    write_page(given.page, results, compared.tables[0])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,140 @@
+"""What accuracy costs: the settings, the Pareto front, and small suites."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from benchmarks import report, tradeoff, tuning
+from benchmarks.timing import Options
+from benchmarks.tradeoff import solves, steps
+from benchmarks.tradeoff.runs import Runs, front_of
+from benchmarks.tradeoff.settings import Setting, settings_of
+from warp_lcp.driver import cli
+from warp_lcp.driver.scene_file import load_scene
+
+
+def options(**changes: object) -> Options:
+    return Options(**({"device": "cpu", "sizes": (16,), "repeat": 1, "say": lambda text: None} | changes))  # type: ignore[arg-type]
+
+
+def test_the_pareto_front_against_all_pairs() -> None:
+    rng = np.random.default_rng(8123)
+    for _ in range(20):
+        points = [(float(x), float(y)) for x, y in rng.integers(0, 12, (40, 2))]
+        best = {p for p in points if not any(q != p and q[0] <= p[0] and q[1] <= p[1] for q in points)}
+        found = [points[i] for i in front_of(points)]
+        assert set(found) == best
+        assert found == sorted(best)
+
+
+@pytest.mark.parametrize("name", tradeoff.SCENES)
+def test_there_are_sixty_settings_that_the_scene_takes(name: str) -> None:
+    settings = settings_of(load_scene(name).scene.simulator)
+    assert len(settings) >= 60
+    assert len({setting.name for setting in settings}) == len(settings)
+    for setting in settings:
+        resolution = round(setting.scale * tradeoff.SCENES[name])
+        assert load_scene(name, [f"domain.resolution={resolution}", *setting.overrides]).domain.resolution == resolution
+
+
+def test_axes_that_are_compared() -> None:
+    words = " ".join(setting.name for setting in settings_of("fluids"))
+    for key in ("time.cfl", "solver.tolerance", "solver.precision", "solver.method", "pressure.model", "pressure.surface", "resolution x"):
+        assert key in words
+    with pytest.raises(ValueError, match="simulator smoke: has no settings"):
+        settings_of("smoke")
+
+
+def test_a_run_is_compared_with_its_own_reference_and_the_finest() -> None:
+    runs = Runs("dam-break-2d", 16, 3, options())
+    long, short = runs.measure([Setting("a", ("time.dt_max=0.04", "time.cfl=8")), Setting("b", ("time.dt_max=0.004", "time.cfl=0.5"))])
+    for run in (long, short):
+        assert len(run.seconds) == 1
+        assert run.bytes > 16 * 8 * 50  # fields of the grid alone
+    far, near = runs.figures(long), runs.figures(short)
+    assert far["distance"].value > near["distance"].value > 0.0
+    assert near["distance_to_finest"].value > near["distance"].value  # the grid's own error
+    assert far["steps"].value < near["steps"].value
+    refused = runs.measure([Setting("c", ("time.cfl=1", "liquid.0.max=[9.0]"))])[0]
+    assert refused.trial is None
+    assert "liquid" in refused.failed
+    assert runs.figures(refused) == {}
+
+
+@pytest.fixture
+def few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make the suite small."""
+    kept = [Setting(f"cfl {cfl:g}", (f"time.cfl={cfl:g}", f"time.dt_max={0.005 * cfl:g}")) for cfl in (4.0, 1.0)]
+    monkeypatch.setattr(tradeoff, "settings_of", lambda simulator: kept)
+    monkeypatch.setattr(solves, "grid_methods", lambda: ("projected-multigrid", "psor"))
+    monkeypatch.setattr(solves, "TOLERANCES", (1e-1, 1e-3, 1e-5))
+    monkeypatch.setattr(steps, "TOLERANCES", (1e-1, 1e-5))
+    monkeypatch.setattr(steps, "METHODS", ("accelerated-projection",))
+
+
+@pytest.mark.parametrize("scene", ["dam-break-2d", "column-collapse-2d"])
+def test_the_files_of_a_small_suite(scene: str, few: None, tmp_path: Path) -> None:
+    asked = options(scene=scene)
+    results = tradeoff.measure(asked, tmp_path)
+    report.write("tradeoff", tradeoff.TITLE, results, asked, tmp_path)
+    records = {r["name"]: r for r in json.loads((tmp_path / "tradeoff.json").read_text())}
+    ran = [r for r in records.values() if r.get("kind") == "run"]
+    assert len(ran) == 5
+    assert all(r["figures"]["seconds"]["value"] > 0.0 and r["resolution"] == 16 for r in ran)
+    solved = [r for r in records.values() if r.get("kind") == "solve"]
+    curves: dict[tuple[str, str], list[float]] = {}
+    for r in solved:
+        assert r["figures"]["residual"]["value"] <= (1.1 * r["tolerance"] if scene.startswith("dam") else 0.1)
+        curves.setdefault((r["method"], r["precision"]), []).append(r["figures"]["error"]["value"])
+    for errors in curves.values():
+        assert errors[-1] < 0.1 * errors[0]
+    pages = {path.suffix for path in tmp_path.glob(f"tradeoff-{scene}*")}
+    assert pages == {".png", ".svg", ".csv"}
+    with (tmp_path / f"tradeoff-{scene}.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(ran) + len(solved) + 1
+    text = (tmp_path / "tradeoff.md").read_text()
+    assert "| Pareto" in text
+    assert f"## {scene}: presets" in text
+
+
+def test_the_problems_reference_has_converged(few: None) -> None:
+    records = solves.measure_solves(load_scene("dam-break-2d", ["domain.resolution=16"]), options(), 3)
+    assert records[0].figures["residual"].value < 1e-11
+
+
+def test_tuning_is_compared_with_all_settings(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(tuning, "FRAMES", 3)
+    monkeypatch.setattr(tuning, "tune", lambda scene, **asked: real(scene, frames=3, **asked))
+    monkeypatch.setattr(tuning, "_all_settings", lambda *given: list(every(*given))[::9])
+    results = tuning.measure(options(scene="dam-break-2d"), tmp_path)
+    figures = results.records[1].figures
+    assert figures["swept"].value == 5
+    assert figures["ratio"].value >= 1.0  # the tuned settings are among those that the best is sought in
+    assert figures["distance"].value <= figures["bound"].value
+
+
+real, every = tuning.tune, tuning._all_settings
+
+
+def test_a_scene_is_for_suites_that_run_some() -> None:
+    result = CliRunner().invoke(cli.app, ["bench", "kernels", "dam-break"])
+    assert result.exit_code == 2
+    assert "dam-break: the suite kernels has scenes of its own" in result.stderr
+    result = CliRunner().invoke(cli.app, ["bench", "tradeoff", "dam-brake"])
+    assert result.exit_code == 2
+    assert "did you mean 'dam-break'?" in result.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", tradeoff.SCENES)
+def test_the_whole_suite_at_a_small_size(scene: str, tmp_path: Path) -> None:
+    result = CliRunner().invoke(cli.app, ["bench", "tradeoff", scene, "--size", "16", "--repeat", "1", "--out", str(tmp_path)])
+    assert result.exit_code == 0, result.stderr
+    records = json.loads((tmp_path / "tradeoff.json").read_text())
+    ran = [r for r in records if r.get("kind") == "run" and r["figures"]]
+    assert len(ran) >= 55

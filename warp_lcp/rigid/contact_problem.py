@@ -1,0 +1,112 @@
+"""The complementarity problem of contacts: Coulomb friction in boxes, so that bounds are affine, on bodies that touch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from warp_lcp.affine_bounds import AffineBounds
+from warp_lcp.operators.dense import DenseOperator
+from warp_lcp.problem import LCP
+from warp_lcp.rigid.contact_kernels import solve_islands
+from warp_lcp.stopping import StoppingCriteria
+
+YIELDS = 1e-6  # of B, along tangents: how friction is shared between contacts then is unique, and rest creeps by 1e-7 m/s at most
+
+
+@dataclass(frozen=True, eq=False)
+class ContactProblem:
+    """y = B x + b with x_n >= 0 and |x_t| <= mu x_n at k contacts; a contact's rows are its normal and its tangents.
+
+    B = J J' + YIELDS diag(J J') along tangents, J = what velocities of bodies make at contacts, times a factor of the inverse masses.
+
+    Args:
+        first: body of each contact, shape (k,).
+        second: the other one, `bodies` where it is none, shape (k,).
+        one: rows of J for the first body, shape (k, rows, q).
+        other: for the second, shape (k, rows, q).
+        b: velocities without impulses, less those that are the least [m/s], shape (k, rows).
+        friction: Coulomb's coefficient, shape (k,).
+        bodies: their number.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    one: np.ndarray
+    other: np.ndarray
+    b: np.ndarray
+    friction: np.ndarray
+    bodies: int
+
+    def yields(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the diagonal of B and what it has besides that of J J', shape (k rows,) each."""
+        own = np.square(self.one).sum(axis=2) + np.square(self.other).sum(axis=2)
+        more = YIELDS * own
+        more[:, 0] = 0.0
+        return (own + more).ravel(), more.ravel()
+
+    def matrix(self) -> np.ndarray:
+        """Return B, shape (k rows, k rows)."""
+        k, rows, q = self.one.shape
+        J = np.zeros((k, rows, self.bodies + 1, q))
+        each = np.arange(k)
+        J[each, :, self.first] = self.one
+        J[each, :, self.second] += self.other
+        J = J.reshape(k * rows, -1)
+        return np.asarray(J @ J.T + np.diag(self.yields()[1]))
+
+    def lcp(self) -> LCP:
+        """Return the problem as any method of the package takes it."""
+        k, rows = self.b.shape
+        place = np.arange(k * rows)
+        normal = np.where(place % rows > 0, place - place % rows, -1)
+        bounds = AffineBounds.friction(normal, np.repeat(self.friction, rows), 0.0, np.inf)
+        return LCP(DenseOperator(self.matrix(), device="cpu"), self.b.ravel(), *bounds)
+
+    def islands(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the contacts sorted by groups of bodies that touch each other, and where each group begins."""
+        pairs = self.second < self.bodies
+        links = coo_array((np.ones(int(pairs.sum())), (self.first[pairs], self.second[pairs])), shape=(self.bodies, self.bodies))
+        group = connected_components(links, directed=False)[1][self.first] if pairs.any() else self.first
+        order = np.argsort(group, kind="stable")
+        starts = np.flatnonzero(np.diff(group[order], prepend=-1))
+        return order, np.append(starts, len(order))
+
+    def solve(self, stopping: StoppingCriteria, start: np.ndarray | None = None) -> tuple[np.ndarray, float]:
+        """Return impulses, shape (k, rows), and the largest residual of an island, relative to that of no impulses, by NNCG.
+
+        An island that does not reach the tolerance is taken at its least residual, which says so.
+
+        Args:
+            stopping: `rtol` and `max_iterations` count.
+            start: impulses to start from, shape (k, rows); none if None.
+        """
+        k, rows, q = self.one.shape
+        order, starts = self.islands()
+        diagonal, more = (values.reshape(k, rows)[order] for values in self.yields())
+        x = np.zeros(k * rows) if start is None else start[order].ravel()
+        residual, J = np.zeros(len(starts) - 1), np.concatenate([self.one[order], self.other[order]], axis=2)
+        w = np.zeros((self.bodies + 1) * q)
+        fields = [J, self.b[order], more, diagonal, self.friction[order]]
+        inputs: list[Any] = [_real(field) for field in fields]
+        inputs += [_index(self.first[order]), _index(self.second[order]), q, rows, _index(starts)]
+        inputs += [wp.float64(stopping.rtol), stopping.max_iterations, _real(w), *(_real(np.zeros(k * rows)) for _ in range(3))]
+        out = [_real(x), _real(residual)]
+        wp.launch(solve_islands, len(residual), [*inputs, *out], device="cpu")
+        result = np.empty((k, rows))
+        result[order] = x.reshape(k, rows)
+        return result, float(residual.max(initial=0.0))
+
+
+def _real(values: np.ndarray) -> wp.array[Any]:
+    """Return float64 values as Warp sees them, in the same memory."""
+    return wp.array(np.ascontiguousarray(values).ravel(), dtype=wp.float64, device="cpu", copy=False)
+
+
+def _index(values: np.ndarray) -> wp.array[Any]:
+    return wp.array(values.astype(np.int32), dtype=wp.int32, device="cpu", copy=False)

@@ -1,0 +1,97 @@
+"""The contacts of a step, and what is remembered of them for the next one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from warp_lcp.rigid.body import RigidBody
+
+SAME_PLACE = 0.05  # of a body's size: a contact this close to one of the last step starts from its impulse
+
+
+@dataclass(frozen=True, eq=False)
+class Touching:
+    """The contacts of a step, k of them; a contact's rows are its normal and `dimension` - 1 tangents. q: velocities of a body.
+
+    Args:
+        first: body that the normal points into, shape (k,).
+        second: body that it comes from, the number of bodies where that is none, shape (k,).
+        point: in the world [m], shape (k, 3).
+        frames: normal and tangents, shape (k, dimension, 3).
+        gap: [m], shape (k,).
+        size: of the smaller body [m], shape (k,).
+        friction: Coulomb's coefficient, shape (k,).
+        one: relative velocities of the first body's velocities, shape (k, dimension, q).
+        other: of the second's, 0 where that is none.
+        wall: what surroundings that move add to them [m/s], shape (k, dimension).
+        target: normal velocity that is the least [m/s]: what closes the gap, or bounces, shape (k,).
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    point: np.ndarray
+    frames: np.ndarray
+    gap: np.ndarray
+    size: np.ndarray
+    friction: np.ndarray
+    one: np.ndarray
+    other: np.ndarray
+    wall: np.ndarray
+    target: np.ndarray
+
+    def __len__(self) -> int:
+        """Return the number of contacts."""
+        return len(self.gap)
+
+    def velocities(self, of_bodies: np.ndarray) -> np.ndarray:
+        """Return relative velocities at contacts [m/s], shape (k, dimension), from those of the bodies, shape (n, q)."""
+        V = np.vstack([of_bodies, np.zeros(of_bodies.shape[1])])
+        both = (self.one @ V[self.first][:, :, None] + self.other @ V[self.second][:, :, None])[:, :, 0]
+        return np.asarray(both + self.wall)
+
+    def on_bodies(self, impulses: np.ndarray, count: int) -> np.ndarray:
+        """Return what impulses of contacts, shape (k, rows) with rows <= dimension, add up to at each body, shape (count, q)."""
+        rows = impulses.shape[1]
+        total = np.zeros((count + 1, self.one.shape[2]))
+        np.add.at(total, self.first, (impulses[:, None] @ self.one[:, :rows])[:, 0])
+        np.add.at(total, self.second, (impulses[:, None] @ self.other[:, :rows])[:, 0])
+        return total[:-1]
+
+
+class ContactMemory:
+    """Impulses of the last step's contacts, from which those of the next one start.
+
+    Attributes:
+        values: first and second body, place in the first body's own axes [m], impulse in the world's [N s]; shape (k, 8).
+    """
+
+    def __init__(self) -> None:
+        """Remember nothing."""
+        self.values = np.zeros((0, 8))
+
+    def keep(self, touching: Touching, impulses: np.ndarray, bodies: Sequence[RigidBody]) -> None:
+        """Remember impulses, shape (k, dimension)."""
+        world = (impulses[:, None] @ touching.frames)[:, 0]
+        self.values = np.column_stack([touching.first, touching.second, _places(touching, bodies), world])
+
+    def recall(self, touching: Touching, bodies: Sequence[RigidBody]) -> np.ndarray:
+        """Return impulses to start from, shape (k, dimension): those of the nearest contact of the same two, once each."""
+        start, old = np.zeros(touching.wall.shape), self.values
+        if not len(old) or not len(touching):
+            return start
+        places = _places(touching, bodies)
+        same = (touching.first[:, None] == old[:, 0]) & (touching.second[:, None] == old[:, 1])
+        way = np.where(same, np.linalg.norm(places[:, None] - old[:, 2:5], axis=2), np.inf)
+        nearest, each = way.argmin(axis=1), np.arange(len(places))
+        known = (way[each, nearest] < SAME_PLACE * touching.size) & (way.argmin(axis=0)[nearest] == each)
+        start[known] = (touching.frames[known] @ old[nearest[known], 5:, None])[:, :, 0]
+        return start
+
+
+def _places(touching: Touching, bodies: Sequence[RigidBody]) -> np.ndarray:
+    """Return contacts in the axes of their first bodies [m], shape (k, 3)."""
+    at, turned = (np.array([getattr(body, name) for body in bodies]) for name in ("position", "rotation"))
+    return np.asarray(((touching.point - at[touching.first])[:, None] @ turned[touching.first])[:, 0])
