@@ -128,6 +128,7 @@ def table(records: list[Record]) -> Table:
         ])  # fmt: skip
     remark = (
         f"Errors: the largest of those in front position, volume and energy against a run to {EXACT}, root mean square over {MOMENTS} "
-        f"moments. Best fixed: the one of {', '.join(FIXED)} that takes the fewest iterations and is as exact as auto, to {100 * (NOISE - 1):.0f} %."
+        f"moments. Best fixed: the one of {', '.join(FIXED)} that takes the fewest iterations and is as exact as auto, to "
+        f"{100 * (NOISE - 1):.0f} %."
     )
     return Table("Automatic and fixed tolerances", columns, rows, remark)

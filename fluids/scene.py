@@ -61,11 +61,6 @@ class LiquidScene(ParticleScene):
             found.append(
                 Complaint(("pressure", "surface"), "voxel", 'has no meaning for model = "unilateral", whose pressure needs no surface')
             )
-        if self.solver.method not in COUPLED_METHODS and any(solid.is_body for solid in self.solid):
-            message = (
-                f"does not take the rigid bodies' part of the matrix, which has products only; with bodies: {', '.join(COUPLED_METHODS)}"
-            )
-            found.append(Complaint(("solver", "method"), self.solver.method, message))
         if self.pressure.model == "unilateral" and self.particles.narrow_band is not None:
             message = 'has no meaning for model = "unilateral", whose liquid may come apart anywhere inside'
             found.append(Complaint(("particles", "narrow_band"), None, message))

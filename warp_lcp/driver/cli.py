@@ -64,7 +64,7 @@ ColorOption = Annotated[
 ]
 CameraOption = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="camera.KEY=VALUE", help="Override a key of the scene's table [camera]; may be repeated."),
+    typer.Option("--set", metavar="camera.KEY=VALUE", help="Override a key of the scene's table camera; may be repeated."),
 ]
 ForceMemory = Annotated[bool, typer.Option("--force-memory", help="Run even what will not fit into the device's free memory.")]
 
@@ -132,7 +132,7 @@ def render(
     fps: Annotated[float | None, typer.Option(help="Frames a second of the film; the scene's unless given.", show_default=False)] = None,
     cut: Annotated[bool, typer.Option("--slice", help="Draw a section with Matplotlib, which needs no pyvista.")] = False,
     at: Annotated[
-        float | None, typer.Option(metavar="Z", help="Where a 3-D run is cut [m]; in its middle unless given.", show_default=False)
+        float | None, typer.Option(metavar="Z", help="Where a 3-D run is cut, in meters; in its middle unless given.", show_default=False)
     ] = None,
     overrides: CameraOption = None,
 ) -> None:
