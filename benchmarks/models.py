@@ -34,6 +34,7 @@ RESOLUTION = {2: 128, 3: 48}  # cells along the longest side of the reference sc
 WARM = 3  # steps that are not timed
 STAGES = ("sort", "particles-to-grid", "grid-to-particles", "advection", "diagnostics")  # whose time is the particles'
 QUIET = {"diagnostics": False}
+REFERENCE = "{}"  # the tables of the reference scene, as text
 Tables = dict[str, Any]
 
 
@@ -126,9 +127,8 @@ class Sample:
     seconds: float = math.inf
 
 
-def measure_all(simulator: str, dimension: int, options: Options) -> tuple[dict[str, Sample], Sample]:
-    """Return the scenes of all offers by their tables' text, and the reference itself; steps are taken in turns."""
-    size = max(options.sizes, default=RESOLUTION[dimension])
+def measure_all(simulator: str, dimension: int, size: int, options: Options) -> dict[str, Sample]:
+    """Return the scenes of all offers by their tables' text, the reference among them; steps are taken in turns."""
     wanted: list[Tables] = [{}]
     for offer in offers(simulator, dimension).values():
         wanted += [offer.on, offer.off]
@@ -148,7 +148,14 @@ def measure_all(simulator: str, dimension: int, options: Options) -> tuple[dict[
     for _ in range(4 * options.repeat):
         for sample in samples.values():
             sample.seconds = min(sample.seconds, step_seconds(sample.simulation))
-    return samples, samples[str({})]
+    return samples
+
+
+def split(seconds: float, half: float, dimension: int) -> tuple[float, float]:
+    """Return which part of the seconds does not depend on the size, given those of half the resolution, and which grows with it."""
+    ratio = 2**dimension
+    fixed = min(max((ratio * half - seconds) / (ratio - 1), 0.0), max(seconds, 0.0))
+    return fixed, max(seconds - fixed, 0.0)
 
 
 def particle_share(sample: Sample) -> float:
@@ -164,28 +171,33 @@ def particle_share(sample: Sample) -> float:
 def records_of(simulator: str, dimension: int, options: Options) -> list[Record]:
     """Measure a simulator's models."""
     options.say(f"{simulator}, {dimension}-D")
-    samples, base = measure_all(simulator, dimension, options)
+    size = max(options.sizes, default=RESOLUTION[dimension])
+    samples, halves = (measure_all(simulator, dimension, n, options) for n in (size, size // 2))
+    base = samples[REFERENCE]
     cells, particles = math.prod(base.simulation.grid.counts), base.simulation.particles.count
     share = particle_share(base)
-    prefix = f"{simulator} {dimension}d"
+    fixed, growing = split(base.seconds, halves[REFERENCE].seconds, dimension)
     figures = {
         "step": Figure(base.seconds, "s"),
-        "cell_seconds": Figure((1.0 - share) * base.seconds / cells, "s"),
-        "particle_seconds": Figure(share * base.seconds / particles, "s"),
+        "fixed_seconds": Figure(fixed, "s"),
+        "cell_seconds": Figure((1.0 - share) * growing / cells, "s"),
+        "particle_seconds": Figure(share * growing / particles, "s"),
         "cell_bytes": Figure(base.bytes / cells, "B"),
     }
     facts = {"cells": cells, "particles": particles}
-    found = [Record(f"{prefix}: base", figures, facts)]
+    found = [Record(f"{simulator} {dimension}d: base", figures, facts)]
     for name, offer in offers(simulator, dimension).items():
-        on, off = samples[str(offer.on)], samples[str(offer.off)]
+        on, off = str(offer.on), str(offer.off)
         count = cells if offer.unit == "cell" else particles
-        added = 0.0 if offer.frames else on.seconds - off.seconds
+        added, added_half = (s[on].seconds - s[off].seconds for s in (samples, halves))
+        fixed, growing = (0.0, 0.0) if offer.frames else split(added, added_half, dimension)
         figures = {
             "step": Figure(added, "s"),
-            f"{offer.unit}_seconds": Figure(added / count, "s"),
-            f"{offer.unit}_bytes": Figure((on.bytes - off.bytes) / count, "B"),
+            "fixed_seconds": Figure(fixed, "s"),
+            f"{offer.unit}_seconds": Figure(growing / count, "s"),
+            f"{offer.unit}_bytes": Figure((samples[on].bytes - samples[off].bytes) / count, "B"),
         }
-        found.append(Record(f"{prefix}: {name}", figures, facts | {"frames": offer.frames}))
+        found.append(Record(f"{simulator} {dimension}d: {name}", figures, facts | {"frames": offer.frames}))
     return found
 
 
@@ -215,7 +227,7 @@ def table_of(simulator: str, dimension: int, records: list[Record]) -> Table:
     what = "liquid" if simulator == "fluids" else "sand"
     remark = (
         f"A column of {what}, {base.facts['cells']:,} cells and {base.facts['particles']:,} particles. `base` is the scene without any "
-        "model, particles and all; the others say what they add to it."
+        "model, particles and all; the others say what they add to it, to some percent of it: differences of short times."
     )
     return Table(f"{what.capitalize()}, {dimension}-D", ["model", "ms a step", "of base", "bytes"], rows, remark)
 

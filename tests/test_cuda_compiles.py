@@ -1,6 +1,7 @@
 """Every kernel compiles for CUDA without a GPU: a machine with one must meet no surprise."""
 
 import importlib
+import itertools
 import pkgutil
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import warp as wp
 import fluids
 import granular
 import warp_lcp as wl
+from fluids.pressure_kernels import pressure_kernels
 from granular.bodies_kernels import body_kernels
 from granular.checkerboard import damping_kernel
 from granular.interleaved_kernels import interleaved_kernels
@@ -165,6 +167,8 @@ def test_all_kernels_compile_for_sm_80_and_sm_90(tmp_path):
     for endless in (0, 1, 4, 5):
         advection_kernels.advect_kernel(endless)
         distance_advection_kernels.advect_kernel(endless)
+    for variant in itertools.product((False, True), repeat=4):
+        pressure_kernels(*variant)
     for axis in (0, 1, 2, CENTERS):
         carry_kernels(axis)
     for dtype in (wp.int8, wp.uint8, wp.int32, wp.float32, wp.float64):

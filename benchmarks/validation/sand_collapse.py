@@ -160,7 +160,7 @@ def cube(device: str = "cpu", cells: int = CUBE) -> Trial:
         found.add("kinetic energy in the end over the largest", energies[-1] / max(energies), high=1e-3)
         found.add("steps with stresses to 1e-3", share_solved(rows), low=95.0, unit="%")
         found.add("|mean of exp(4 i angle)| of the 5 % farthest", _squareness(x), high=0.5)
-        found.must_break("before it falls: that", _squareness(start), high=0.5)
+        found.must_break("before it falls: |mean of exp(4 i angle)|", _squareness(start), high=0.5)
         radius = CUBE_WIDTH / math.sqrt(math.pi)  # of a round column of the same area
         aspect = CUBE_WIDTH / radius
         low, high = (1.0 - WIDENED) * 1.6 * math.sqrt(aspect), (1.0 + WIDENED) * 2.0 * math.sqrt(aspect)  # [Lube2004], [Lajeunesse2004]

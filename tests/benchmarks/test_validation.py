@@ -201,6 +201,16 @@ def test_round_trips_keep_what_they_must() -> None:
     assert trial.record().facts["controls_failed_as_they_must"]
 
 
+def test_the_advection_has_its_orders_and_worse_ones_do_not() -> None:
+    trial = transfers.check("cpu")[0][-1]
+    assert trial.failures() == []
+    assert [f.what for f in trial.findings if f.control] == [
+        "control: Euler's steps, one turn: order in time",
+        "control: fields half a cell off: order in space",
+    ]
+    assert transfers.euler_error(1000) == pytest.approx(2.0 * np.pi**2 * np.hypot(0.15, 0.25) / 1000, rel=0.02)
+
+
 @pytest.mark.parametrize(("numerics", "shape"), [(VOXEL, "flat"), (SUB_CELL, "slanted")])
 def test_a_block_lets_go_of_the_ceiling_and_its_controls_do_not(numerics: Numerics, shape: str) -> None:
     trial = ceiling.trial(24, "cpu", numerics, shape)

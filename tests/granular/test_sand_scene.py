@@ -66,6 +66,7 @@ def complaint(tmp_path: Any, *overrides: str) -> str:
         ("gauge.hight=0.2", "gauge.height: is missing"),
         ("solver.method=psor", "solver.method = \"psor\": must be 'accelerated-projection' or 'interleaved-sweeps'"),
         ("solver.tolerance=1", "solver.tolerance = 1: must be less than 1"),
+        ("solver.tolerance=auto", 'solver.tolerance = "auto": is for liquids only'),
         ("solver.max_iterations=0", "solver.max_iterations = 0: must be at least 10"),
         ("solver.precision=double", "solver.precision = \"double\": must be 'single'"),
         ("time.cfl=0", "time.cfl = 0: must be greater than 0"),

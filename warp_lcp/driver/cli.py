@@ -278,7 +278,7 @@ def solve(
 @app.command()
 def bench(
     suite: Annotated[
-        str, typer.Argument(metavar="SUITE", help="kernels, solvers, scaling, peers, run, sand, contacts, tradeoff or validation.")
+        str, typer.Argument(metavar="SUITE", help="kernels, solvers, scaling, peers, run, sand, contacts, models, tradeoff or validation.")
     ],
     scene: Annotated[
         str | None, typer.Argument(metavar="[SCENE]", help="The scene of tradeoff; its own unless given.", show_default=False)

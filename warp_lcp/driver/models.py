@@ -31,12 +31,14 @@ class Price:
     """What a model adds, measured on one processor core.
 
     Args:
+        fixed_seconds: of a step, however small the scene [s]: launches and what the host does.
         cell_seconds: of a step, a cell of the domain [s].
         particle_seconds: of a step, a particle [s].
         cell_bytes: of memory, a cell.
         particle_bytes: of memory, a particle.
     """
 
+    fixed_seconds: float = 0.0
     cell_seconds: float = 0.0
     particle_seconds: float = 0.0
     cell_bytes: float = 0.0
@@ -44,7 +46,7 @@ class Price:
 
     def seconds(self, cells: int, particles: int) -> float:
         """Return what it adds to a step [s]."""
-        return self.cell_seconds * cells + self.particle_seconds * particles
+        return self.fixed_seconds + self.cell_seconds * cells + self.particle_seconds * particles
 
     def bytes(self, cells: int, particles: int) -> int:
         """Return what it adds to memory."""

@@ -191,7 +191,7 @@ class RigidBodies:
         if states.shape != (len(self.bodies), STATE):
             raise ValueError(f"the state's bodies have shape {states.shape}: this scene has {(len(self.bodies), STATE)}")
         self._begun = None
-        self._solve.memory.values = np.array(state["body_contacts"], dtype=np.float64).reshape(-1, CONTACT)
+        self._solve.memory.values = np.array(state.get("body_contacts", []), dtype=np.float64).reshape(-1, CONTACT)
         for body, values in zip(self.bodies, states, strict=True):
             body.restore(values)
 

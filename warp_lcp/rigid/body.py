@@ -27,7 +27,6 @@ class RigidBody:
         angular_velocity: at the start [rad/s], shape (3,).
 
     Attributes:
-        inverse_inertia: I^-1 as the scene places the body [1 / (kg m^2)], shape (3, 3).
         position: of the center of mass [m], shape (3,).
         rotation: from where the scene placed it, shape (3, 3).
         momentum: [kg m/s], shape (3,).
@@ -57,7 +56,6 @@ class RigidBody:
         if not 0.0 <= restitution <= 1.0:
             raise ValueError(f"restitution = {restitution}: must be in [0, 1]")
         self.properties, self.name, self.friction, self.restitution = properties, name, friction, restitution
-        self.inverse_inertia = np.linalg.inv(properties.inertia)
         self.position, self.rotation = properties.center.copy(), np.eye(3)
         self.momentum = properties.mass * _three(velocity)
         self.angular_momentum = properties.inertia @ _three(angular_velocity)
@@ -89,7 +87,7 @@ class RigidBody:
         """Return block diag(1/m, I^-1), shape (k, k): k = 3 in 2-D (vx, vy, wz), 6 in 3-D (vx, vy, vz, wx, wy, wz)."""
         result, R = np.zeros((6, 6)), self.rotation
         result[AXES, AXES] = 1.0 / self.properties.mass
-        result[3:, 3:] = R @ self.inverse_inertia @ R.T
+        result[3:, 3:] = R @ self.properties.inverse_inertia @ R.T
         return result if dimension == 3 else result[PLANAR][:, PLANAR]
 
     def inverse_mass(self, dimension: int) -> np.ndarray:
@@ -173,7 +171,7 @@ class RigidBody:
 
     def _spin(self, rotation: np.ndarray) -> np.ndarray:
         """Return R I^-1 R' L [rad/s]."""
-        return cast(np.ndarray, rotation @ (self.inverse_inertia @ (rotation.T @ self.angular_momentum)))
+        return cast(np.ndarray, rotation @ (self.properties.inverse_inertia @ (rotation.T @ self.angular_momentum)))
 
 
 class BodyMotion:

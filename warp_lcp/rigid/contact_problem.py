@@ -57,8 +57,8 @@ class ContactProblem:
         each = np.arange(k)
         J[each, :, self.first] = self.one
         J[each, :, self.second] += self.other
-        J = J.reshape(k * rows, -1)
-        return np.asarray(J @ J.T + np.diag(self.yields()[1]))
+        flat = J.reshape(k * rows, -1)
+        return np.asarray(flat @ flat.T + np.diag(self.yields()[1]))
 
     def lcp(self) -> LCP:
         """Return the problem as any method of the package takes it."""

@@ -51,7 +51,7 @@ class ContactSolve:
         self._friction = np.array([body.friction for body in bodies])
         self._bounce = np.array([body.restitution for body in bodies])
         self._masses = np.array([body.properties.mass for body in bodies])
-        self._inverse_inertias = np.array([body.inverse_inertia for body in bodies])
+        self._inverse_inertias = np.array([body.properties.inverse_inertia for body in bodies])
         self._roots_of_inertias = np.linalg.cholesky(self._inverse_inertias)
 
     def check_start(self, time: float) -> None:
@@ -206,7 +206,7 @@ class ContactSolve:
 
 
 def _rows(arms: np.ndarray, frames: np.ndarray, dimension: int) -> np.ndarray:
-    """Return the velocities along frames of points of a body that are `arms` from its center, of its velocities, shape (k, dimension, q)."""
+    """Return the velocities along frames of points `arms` from a body's center, of its velocities, shape (k, dimension, q)."""
     both = np.concatenate([frames, np.cross(arms[:, None], frames)], axis=2)
     return both if dimension == 3 else both[:, :, PLANAR]
 

@@ -16,7 +16,10 @@ FLAT = {2: 2, 3: 4}  # contacts of a pair with about one normal: a flat rest nee
 MOST = {2: 4, 3: 8}  # contacts of a pair
 OTHER_SIDE = 0.1  # of normals' difference: contacts of sides that differ by less count as of one
 SAME = 1e-6  # of a shape's size: points of contact this close are one
-LOWER = 60.0  # so many times the gap must a point be farther from the others to count more than one with less
+LOWER = 20.0  # so many times the gap must a point be farther from the others to count more than one with less
+MUCH_LOWER = 200.0  # for those that come on top where others lie lower: what a round rim rests on is not what it may tip over
+MORE = 2  # of these, at most
+LEVEL = 1e-4  # of the smaller shape's size: gaps that differ by less are of one height
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +154,7 @@ def _boxes(a: OrientedBox, b: OrientedBox, margin: float, dimension: int) -> Tou
 def spread(touch: Touch, size: float, dimension: int) -> Touch:
     """Return the deepest of a pair's points and others that are low and far from each other, as many as hold a body.
 
-    Where all have about one normal that is two points in 2-D and four in 3-D.
+    Where all have about one normal that is two points in 2-D and four in 3-D, and up to two more if some of these are higher than others.
 
     Args:
         touch: the points.
@@ -160,18 +163,18 @@ def spread(touch: Touch, size: float, dimension: int) -> Touch:
     """
     if len(touch) < 2:
         return touch
-    above = LOWER * (touch.gap - touch.gap.min())
+    above = touch.gap - touch.gap.min()
     chosen = [int(touch.gap.argmin())]
     way = np.linalg.norm(touch.point - touch.point[chosen[0]], axis=1)
     side = np.linalg.norm(touch.normal - touch.normal[chosen[0]], axis=1)
-    while len(chosen) < MOST[dimension]:
-        usable = (way > SAME * size) | (side > OTHER_SIDE)
-        if len(chosen) >= FLAT[dimension]:
-            usable &= side > OTHER_SIDE
-        if not usable.any():
-            break
-        following = int(np.where(usable, way + size * side - above, -np.inf).argmax())
-        chosen.append(following)
-        way = np.minimum(way, np.linalg.norm(touch.point - touch.point[following], axis=1))
-        side = np.minimum(side, np.linalg.norm(touch.normal - touch.normal[following], axis=1))
+    for lower, flat in ((LOWER, FLAT[dimension]), (MUCH_LOWER, FLAT[dimension] + MORE)):
+        allowed = above < (above[chosen].max() - LEVEL * size if lower == MUCH_LOWER else np.inf)
+        while len(chosen) < MOST[dimension]:
+            usable = allowed & ((side > OTHER_SIDE) | ((way > SAME * size) & (len(chosen) < flat)))
+            if not usable.any():
+                break
+            following = int(np.where(usable, way + size * side - lower * above, -np.inf).argmax())
+            chosen.append(following)
+            way = np.minimum(way, np.linalg.norm(touch.point - touch.point[following], axis=1))
+            side = np.minimum(side, np.linalg.norm(touch.normal - touch.normal[following], axis=1))
     return touch.where(np.array(chosen))

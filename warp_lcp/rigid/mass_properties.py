@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -29,6 +30,11 @@ class MassProperties:
     mass: float
     center: np.ndarray
     inertia: np.ndarray
+
+    @cached_property
+    def inverse_inertia(self) -> np.ndarray:
+        """I^-1 [1 / (kg m^2)], shape (3, 3)."""
+        return np.linalg.inv(self.inertia)
 
     def __post_init__(self) -> None:
         """Check the values and store them as float64."""
