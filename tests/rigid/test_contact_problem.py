@@ -98,7 +98,7 @@ def test_a_state_with_contacts_is_continued_bit_for_bit():
         run(bodies, 0.05)
     for name, values in through.state().items():
         np.testing.assert_array_equal(values, later.state()[name], err_msg=name)
-    assert len(through.state()["body_contacts"]) >= 12
+    assert np.count_nonzero(through.state()["body_contacts"][:, 0] >= 0) >= 12
 
 
 def test_a_warm_start_takes_what_the_last_step_found():

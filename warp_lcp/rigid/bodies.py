@@ -15,7 +15,6 @@ from warp_lcp.rigid.outline import BodySurface, body_surface
 from warp_lcp.rigid.surroundings import Surroundings
 
 STATE = 20  # numbers of a body's state
-CONTACT = 8  # numbers of a contact's memory
 IN_PLANE = ("x", "y", "vx", "vy", "angle", "spin")
 IN_SPACE = ("x", "y", "z", "vx", "vy", "vz", "wx", "wy", "wz")
 
@@ -179,7 +178,7 @@ class RigidBodies:
 
     def state(self) -> dict[str, np.ndarray]:
         """Return what `restore` needs to continue bit for bit."""
-        return {"bodies": self._states(), "body_contacts": self._solve.memory.values.copy()}
+        return {"bodies": self._states(), "body_contacts": self._solve.memory.state()}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from `state`.
@@ -191,7 +190,7 @@ class RigidBodies:
         if states.shape != (len(self.bodies), STATE):
             raise ValueError(f"the state's bodies have shape {states.shape}: this scene has {(len(self.bodies), STATE)}")
         self._begun = None
-        self._solve.memory.values = np.array(state.get("body_contacts", []), dtype=np.float64).reshape(-1, CONTACT)
+        self._solve.memory.restore(state.get("body_contacts", np.zeros((0, 8))))
         for body, values in zip(self.bodies, states, strict=True):
             body.restore(values)
 

@@ -44,7 +44,7 @@ class ContactSolve:
 
     def __init__(self, bodies: Sequence[RigidBody], shapes: Sequence[ContactShape], surroundings: Surroundings, dimension: int) -> None:
         self.bodies, self.shapes, self.surroundings, self.dimension = list(bodies), list(shapes), surroundings, dimension
-        self.residual, self.memory = 0.0, ContactMemory()
+        self.residual, self.memory = 0.0, ContactMemory(len(self.bodies))
         self._near = Neighborhood(self.bodies, self.shapes, surroundings, dimension)
         self._reach = np.array([shape.reach(body.properties.center) for body, shape in zip(bodies, shapes, strict=True)])
         self._size = np.array([shape.size for shape in shapes])
@@ -83,7 +83,8 @@ class ContactSolve:
         ways = AHEAD * dt * (speeds + spins * self._reach + falls)
         brought = [AHEAD * self._obstacle_way(obstacle.motion, time, dt) for obstacle in self.surroundings.obstacles]
         near = NEAR * float(self._size.min())
-        return self._assembled(self._near.find(time, ways, near + np.array(brought), near), time, dt, gravity)
+        found = self._near.find(time, ways, near + np.array(brought), near)
+        return self._assembled(found, time, dt, gravity) if found else Touching.none(self.dimension)
 
     def push_apart(self, touching: Touching, start: np.ndarray | None = None) -> np.ndarray:
         """Solve for the impulses of contacts and give them to the bodies; return them [N s], shape (k, dimension).

@@ -10,6 +10,7 @@ import numpy as np
 from warp_lcp.rigid.body import RigidBody
 
 SAME_PLACE = 0.05  # of a body's size: a contact this close to one of the last step starts from its impulse
+KEPT = 32  # contacts remembered for each body, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +43,13 @@ class Touching:
     wall: np.ndarray
     target: np.ndarray
 
+    @classmethod
+    def none(cls, dimension: int) -> Touching:
+        """Return no contacts."""
+        ints, reals, rows = np.zeros(0, dtype=int), np.zeros(0), np.zeros((0, dimension, 3 * dimension - 3))
+        frames, wall = np.zeros((0, dimension, 3)), np.zeros((0, dimension))
+        return cls(ints, ints, np.zeros((0, 3)), frames, reals, reals, reals, rows, rows, wall, reals)
+
     def __len__(self) -> int:
         """Return the number of contacts."""
         return len(self.gap)
@@ -68,14 +76,23 @@ class ContactMemory:
         values: first and second body, place in the first body's own axes [m], impulse in the world's [N s]; shape (k, 8).
     """
 
-    def __init__(self) -> None:
+    def __init__(self, bodies: int) -> None:
         """Remember nothing."""
-        self.values = np.zeros((0, 8))
+        self.values, self._most = np.zeros((0, 8)), KEPT * bodies
+
+    def state(self) -> np.ndarray:
+        """Return the values with rows of -1 for those that there are not: of one shape, whatever bodies touch."""
+        return np.concatenate([self.values, np.full((self._most - len(self.values), 8), -1.0)])
+
+    def restore(self, state: np.ndarray) -> None:
+        """Continue from `state`; an empty one is no memory."""
+        values = np.array(state, dtype=np.float64).reshape(-1, 8)
+        self.values = values[values[:, 0] >= 0.0]
 
     def keep(self, touching: Touching, impulses: np.ndarray, bodies: Sequence[RigidBody]) -> None:
         """Remember impulses, shape (k, dimension)."""
         world = (impulses[:, None] @ touching.frames)[:, 0]
-        self.values = np.column_stack([touching.first, touching.second, _places(touching, bodies), world])
+        self.values = np.column_stack([touching.first, touching.second, _places(touching, bodies), world])[: self._most]
 
     def recall(self, touching: Touching, bodies: Sequence[RigidBody]) -> np.ndarray:
         """Return impulses to start from, shape (k, dimension): those of the nearest contact of the same two, once each."""
