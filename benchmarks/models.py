@@ -76,7 +76,7 @@ def offers(simulator: str, dimension: int) -> dict[str, Offer]:
         "ghost-fluid surface": Offer(level_set),
         "smoothing": Offer({"pressure": {"smoothing": 2}}, level_set),
         "unilateral pressure": Offer({"pressure": {"model": "unilateral"}}, level_set),
-        "automatic tolerance": Offer({"solver": {"tolerance": "auto"}}, {"solver": {"tolerance": 1e-2}}),
+        "automatic tolerance": Offer({"solver": {"tolerance": "auto"}}),
         "narrow band": Offer(level_set | {"particles": {"narrow_band": {"width": 4.0}}}, level_set),
         "FLIP": Offer({"particles": {"transfer": "flip"}}, {"particles": {"transfer": "pic"}}, unit="particle"),
     }

@@ -9,7 +9,7 @@ import warp as wp
 
 import warp_lcp as wl
 from fluids.tolerance_kernels import change_kernel
-from warp_lcp.vectors import Reduction, launch_spans
+from warp_lcp.vectors import Reduction, convert, launch_spans
 
 FRACTION = 0.1  # of the time step's error that the solve may leave
 FIRST = 1e-4  # relative residual of the first steps, before which there is no change to measure: a liquid that is at rest shall stay so
@@ -84,7 +84,11 @@ class TimeErrorTolerance:
             self.time_error = None
             return
         change, product = (field.flatten() for field in fields)
-        launch_spans(change_kernel, self._reduction.spans, [result.x.flatten(), change], [], change.device)
+        x = result.x.flatten()
+        if x.dtype is not wp.float64:  # of a method in single precision
+            convert(x, product)
+            x = product
+        launch_spans(change_kernel, self._reduction.spans, [x, change], [], change.device)
         A.apply(change, product)
         self._reduction.dot(change, product, 0)
         self.time_error = 0.5 * float(np.sqrt(max(float(self._sum.numpy()[0]), 0.0) / max(unknowns, 1)))

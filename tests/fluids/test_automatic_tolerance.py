@@ -99,6 +99,11 @@ def test_a_run_that_is_continued_takes_the_same_steps() -> None:
     assert [again.step(3e-3) for _ in range(3)] == rows
 
 
+def test_precisions_measure_the_same_error() -> None:
+    mixed, single = (advance(dam(solver=AUTO | {"precision": precision}), 0.1) for precision in ("mixed", "single"))
+    assert [row["time_error"] for row in single[1:6]] == pytest.approx([row["time_error"] for row in mixed[1:6]], rel=0.05, abs=1e-5)
+
+
 def test_bodies_count_in_the_error() -> None:
     ball = {"shape": "sphere", "center": [0.6, 0.2], "radius": 0.1, "density": 500.0}
     rows = advance(dam(solver=AUTO, solid=[ball]), 0.1)
