@@ -29,7 +29,7 @@ class TimeErrorTolerance:
     next step, times (dt / dt_last)^2 where that is shorter.
 
     What a solve leaves is e with residual r = A e. Multigrid cycles leave errors that are as short as the cells, on which A is of order
-    one: measured in 446 steps of dam-break-2d, splash-in-circle, mesh-obstacle and wave-maker, ||G e|| = 0.12 to 1.0 ||r|| after one to
+    one: looked at in forty steps of dam-break-2d, splash-in-circle, mesh-obstacle and wave-maker, ||G e|| = 0.12 to 1.0 ||r|| after one to
     six cycles. So a solve is done when ||r|| <= FRACTION time error, which costs nothing to test.
 
     Liquid at rest and in free fall has residuals of rounding noise, which the absolute tolerance covers.
