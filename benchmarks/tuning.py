@@ -19,7 +19,13 @@ from warp_lcp.driver.trial import trial
 from warp_lcp.driver.tune import CORRECTED_EVERY, FRAMES, Tuning, near_enough, tune
 
 TITLE = "Tuned settings against the best of all"
-SCENES = {"mesh-obstacle": 30, "retracting-wall": 60, "sand-on-mesh": 24}  # cells along the longest side
+SCENES = {
+    "retracting-wall": 60,
+    "ceiling-drop": 32,
+    "inclined-layer": 32,
+    "mesh-obstacle": 20,
+    "sand-on-mesh": 16,
+}  # cells along the longest side
 ACCURACY: PresetName = "standard"
 MOST = 1.2  # times the best
 NEAR = 1.5  # times the shortest: what is timed again
@@ -62,10 +68,13 @@ def measure(options: Options, out: Path) -> Results:
             "swept": Figure(len(swept)),
         }
         records.append(Record(name, figures, {"tuned_settings": own.words(), "best_settings": best.words(), "met": tuning.met}))
-        rows.append([name, own.words(), f"{own.seconds:.3f}", f"{own.distance:.4f}", f"{len(tuning.tried)}", best.words(),
-                     f"{best.seconds:.3f}", f"{best.distance:.4f}", f"{len(swept)}", f"{ratio:.2f}"])  # fmt: skip
-        if not tuning.met or ratio > MOST:
-            failures.append(f"{name}: tuning takes {ratio:.2f} times the best, or misses its bounds")
+        verdict = f"{ratio:.2f}" if tuning.met else "nothing near enough"
+        found = [own.words(), f"{own.seconds:.3f}", f"{own.distance:.4f}", f"{len(tuning.tried)}"]
+        rows.append([name, *found, best.words(), f"{best.seconds:.3f}", f"{best.distance:.4f}", f"{len(swept)}", verdict])
+        if tuning.met and ratio > MOST:
+            failures.append(f"{name}: tuning takes {ratio:.2f} times the best")
+        if not tuning.met and any(s.met for s in swept):
+            failures.append(f"{name}: tuning found nothing near enough, though there is")
     columns = ["scene", "tuned", "seconds", "distance", "trials", "best of all", "seconds", "distance", "settings", "ratio"]
     remark = f"Accuracy {ACCURACY}; the ratio must be at most {MOST:g}. Seconds: the least of all timings, in turns."
     return Results(records, [Table(TITLE, columns, rows, remark)], failures=failures)

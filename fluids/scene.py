@@ -59,13 +59,15 @@ class LiquidScene(ParticleScene):
             found.append(Complaint(("solver", "method"), self.solver.method, message))
         if self.pressure.model == "unilateral" and self.pressure.surface == "voxel":
             found.append(
-                Complaint(("pressure", "surface"), "voxel", 'has no meaning for model = "unilateral", whose pressure needs no surface')
+                Complaint(
+                    ("pressure", "surface"), "voxel", 'has no meaning for pressure.model = "unilateral", whose pressure needs no surface'
+                )
             )
         if self.pressure.model == "unilateral" and self.particles.narrow_band is not None:
-            message = 'has no meaning for model = "unilateral", whose liquid may come apart anywhere inside'
+            message = 'has no meaning for pressure.model = "unilateral", whose liquid may come apart anywhere inside'
             found.append(Complaint(("particles", "narrow_band"), None, message))
         elif self.pressure.surface == "voxel" and self.particles.narrow_band is not None:
-            message = 'needs surface = "ghost-fluid", which tells how full cells are'
+            message = 'needs pressure.surface = "ghost-fluid", which tells how full cells are'
             found.append(Complaint(("particles", "narrow_band"), None, message))
         return found
 

@@ -91,7 +91,12 @@ def test_the_page_of_scene_files_has_every_key():
     text = (DOCS / "scenes.md").read_text()
     for simulator in installed_simulators().values():
         schema = simulator.scene_model.model_json_schema(by_alias=True)
-        keys = {key for definition in schema["$defs"].values() for key in definition["properties"]} - {"kind", "shape", "reseed", "narrow_band"}
+        keys = {key for definition in schema["$defs"].values() for key in definition["properties"]} - {
+            "kind",
+            "shape",
+            "reseed",
+            "narrow_band",
+        }
         assert {key for key in keys if f"| `{key}` |" not in text} == set()
         assert all(f"[{table}]" in text for table in schema["properties"])
 

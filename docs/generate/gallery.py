@@ -33,9 +33,9 @@ HEAD = """# Gallery
 <!-- Written by docs/generate/gallery.py from runs of the scenes; do not edit. -->
 
 Every built-in scene: what a run shows, the commands that make the picture, what the run took. `warp-lcp scenes` lists them, `warp-lcp run
-NAME` runs one, `warp-lcp check NAME` says before how large it is. Copy one with `--set` changes or start from its file:
-{device}, {date}; one process, first run's compilation included in neither time nor memory of the fields. Memory is the process's largest,
-about {base} MB of it the program itself.
+NAME` runs one, `warp-lcp check NAME` says before how large it is, `--set` changes a key. Times on one core of a shared
+{device}, {date}, frames included, kernels compiled before (a first run compiles for some seconds). Memory is the process's largest,
+about {base} MB of it the program itself. Pictures of liquids in 3-D are of their surface, the others of particles.
 """
 
 
@@ -98,8 +98,9 @@ def entry(name: str, figures: dict[str, Any]) -> str:
     run, draw = commands(name)
     size = figures["note"].split(" m,")[0]
     took = f"{figures['seconds']:.0f} s for {figures['steps']} steps and {figures['frames']} frames, {figures['megabytes']} MB; {size}"
+    description = about["description"][0].upper() + about["description"][1:]
     block = f"```sh\n{' '.join(run)} --out out/{name}\n{' '.join(draw)}\n```"
-    return f"## {name}\n\n![{about['description']}](gallery/{name}.webp)\n\n{about['description']}. {took}.\n\n{block}\n"
+    return f"## {name}\n\n![{description}](gallery/{name}.webp)\n\n{description}. {took}.\n\n{block}\n"
 
 
 def page(figures: dict[str, Any]) -> str:

@@ -71,9 +71,7 @@ def test_fuzzed_grid_problems(drawn, method, precision):
     assert attempt.faults == []
     possible = solvable(problem)
     if possible is False:
-        assert attempt.status == "INFEASIBLE" or (
-            attempt.status == "CONVERGED" and attempt.met
-        )  # what is lost is small
+        assert attempt.status == "INFEASIBLE" or (attempt.status == "CONVERGED" and attempt.met)  # what is lost is small
     elif possible:
         beyond = precision == "single" and decades > TAME and np.abs(problem.b).max() > 1e25  # x may be no float32 number
         assert attempt.status in HONEST | {"CONVERGED"} | ({"NON_FINITE"} if beyond else set())

@@ -57,7 +57,7 @@ def made(*solids: dict[str, Any], **more: Any) -> Any:
         ({"angular_velocity": 9.0}, "solid[0].angular_velocity = [9.0]: needs mass or density, which make the solid a rigid body"),
         ({"restitution": 0.5}, "solid[0].restitution = 0.5: needs mass or density, which make the solid a rigid body"),
         ({"mass": 1.0, "velocity": [1.0, 0.0, 0.0]}, "solid[0].velocity = [1.0, 0.0, 0.0]: must have 2 entries in 2-D"),
-        ({"mass": 1.0, "angular_velocity": SPIN}, "solid[0].angular_velocity = [10.0, 20.0, 30.0]: must have 1 entries in 2-D"),
+        ({"mass": 1.0, "angular_velocity": SPIN}, "solid[0].angular_velocity = [10.0, 20.0, 30.0]: must be one number in 2-D"),
         ({"mass": 1.0, "translate": [2.0, 0.0]}, "solid[0]: lies outside the domain, which reaches from the origin to [1.0, 1.0] m"),
     ],
 )

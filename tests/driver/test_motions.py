@@ -97,7 +97,10 @@ def test_motions_become_poses(motion, time, point, expected):
             {"kind": "keyframes", "times": [0, 1], "rotate": [0, 90]},
             ".center: is missing: the point [m] to turn about, since there is rotate",
         ),
-        ({"kind": "keyframes", "times": [0, 1], "rotate": [0, [1, 2]], "center": [0, 0]}, ".rotate[1] = [1.0, 2.0]: must have 1 entries"),
+        (
+            {"kind": "keyframes", "times": [0, 1], "rotate": [0, [1, 2]], "center": [0, 0]},
+            ".rotate[1] = [1.0, 2.0]: must be one number in 2-D",
+        ),
         (
             {"kind": "keyframes", "times": [0, 1], "translate": [[0, 0]] * 2, "interpolation": "cubic"},
             ".interpolation = \"cubic\": must be 'linear' or 'smooth'",

@@ -129,7 +129,7 @@ def test_all_errors_are_listed():
         ({"radius": 1.0}, "solid[0].shape: is missing; choose from box, capsule, mesh, plane, sphere"),
         ({**BOX, "max": [0.4, 0.0]}, "solid[0].max = [0.4, 0.0]: must be greater than min = [0.0, 0.0] along every axis"),
         ({**BOX, "max": [0.4, 0.4, 0.4]}, "solid[0].max = [0.4, 0.4, 0.4]: must have 2 entries in 2-D"),
-        ({**BOX, "rotate": [0.0, 90.0, 0.0]}, "solid[0].rotate = [0.0, 90.0, 0.0]: must have 1 entries in 2-D"),
+        ({**BOX, "rotate": [0.0, 90.0, 0.0]}, "solid[0].rotate = [0.0, 90.0, 0.0]: must be one number in 2-D"),
         ({**BOX, "scale": 0}, "solid[0].scale = 0: must be greater than 0"),
         ({"shape": "sphere", "center": [0, 0], "radius": -1}, "solid[0].radius = -1: must be greater than 0 (a length [m])"),
         ({"shape": "capsule", "from": [0, 0], "radius": 1}, "solid[0].to: is missing (the other end of the axis [m])"),

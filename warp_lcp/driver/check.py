@@ -58,4 +58,4 @@ def _check_bodies(scene: Scene, source: str) -> None:
     try:
         make_bodies(scene, placed_solids(scene, Path.cwd()))
     except ValueError as error:
-        raise SceneError(source, [Problem("solid", str(error))]) from error
+        raise SceneError(source, [Problem("", str(error))]) from error

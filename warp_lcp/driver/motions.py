@@ -161,7 +161,7 @@ class KeyframesMotion(PrescribedMotion):
             if rows is not None and len(rows) != len(self.times):
                 found.append(Complaint((name,), rows, f"must have {len(self.times)} entries, one for each time"))
             found += [
-                Complaint((name, index), row, f"must have {width} entries in {dimension}-D")
+                Complaint((name, index), row, f"must {counted(width)} in {dimension}-D")
                 for index, row in enumerate(rows or ())
                 if len(row) != width
             ]

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, ValidationError, ValidatorFunctionWrapHandler, WrapValidator
+from pydantic_core import PydanticCustomError
 
 from warp_lcp.driver.motions import Motion
-from warp_lcp.driver.table import Angles, Complaint, Table, Vector
+from warp_lcp.driver.table import Angles, Complaint, Table, Vector, counted
 
 if TYPE_CHECKING:
     from warp_lcp.grid.solids import Geometry, Placement
@@ -18,7 +19,20 @@ if TYPE_CHECKING:
 BUILTIN = "builtin:"  # how the name of a mesh that the project generates begins
 
 Wall = Literal["separating", "free-slip"]
-WallFriction = Annotated[float, Field(ge=0, le=10)] | Literal["stick"]
+
+
+def _wall_friction(value: Any, handler: ValidatorFunctionWrapHandler) -> float | str:
+    """Return a number from 0 to 10 or "stick"; a wrong one is refused once, and not by each alternative."""
+    try:
+        friction: float | str = handler(value)
+    except ValidationError as error:
+        raise PydanticCustomError("friction", 'must be a number from 0 to 10, or "stick"') from error
+    return friction
+
+
+WallFriction = Annotated[
+    Annotated[float, Field(ge=0, le=10)] | Literal["stick"], WrapValidator(_wall_friction, json_schema_input_type=float | Literal["stick"])
+]
 FRICTIONS = "a number from 0 (free slip) to 10, or stick"
 STICKS = 1e6  # Coulomb's coefficient of a wall that holds what presses against it
 BODY_FRICTION = 0.5  # of a rigid body unless its scene says otherwise
@@ -68,7 +82,7 @@ class Shape(Table):
         wanted = {name: dimension for name, value in self if isinstance(value, list)}
         wanted |= {name: 1 if dimension == 2 else 3 for name in ("rotate", "angular_velocity") if name in wanted}
         return [
-            Complaint((type(self).model_fields[name].alias or name,), value, f"must have {count} entries in {dimension}-D")
+            Complaint((type(self).model_fields[name].alias or name,), value, f"must {counted(count)} in {dimension}-D")
             for name, count in wanted.items()
             if len(value := getattr(self, name)) != count
         ]

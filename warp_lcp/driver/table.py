@@ -212,6 +212,11 @@ def _variants(tables: tuple[type[Table], ...]) -> dict[str, type[Table]]:
     return {table.model_fields[key].default: table for table in tables for key in VARIANT_KEYS if key in table.model_fields}
 
 
+def counted(count: int) -> str:
+    """Return what must be true of a list of so many numbers, where one number alone needs no list."""
+    return "be one number" if count == 1 else f"have {count} entries"
+
+
 def written(value: object) -> str:
     """Return a value as a scene file would show it, cut to a line."""
     text = json.dumps(value, default=str, ensure_ascii=False)
