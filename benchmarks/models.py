@@ -270,7 +270,7 @@ what that acceleration changes by from one step to the next: 1/2 ||G (x - x0)||,
 this step and G the gradient, and ||G e||^2 = e'A e. It is measured after each solve, in one product with A, and counts for the next step,
 times (dt / dt_last)^2 where that is shorter.
 
-What multigrid cycles leave is as short as the cells, where A is of order one: in forty steps looked at of four scenes the velocity error was 0.12 to
+What multigrid cycles leave is as short as the cells, where A is of order one: in forty steps of four scenes the velocity error was 0.12 to
 1.0 times the residual. So the solve ends when the residual (root mean square over the cells) is a tenth of the time error, or rounding
 noise where a liquid rests or falls freely. It is at most a tenth of the residual at zero pressure as the step before had it, and at least
 1e-6 of it. The first two steps, before which there is no change to measure, go to 1e-4.

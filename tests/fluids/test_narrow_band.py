@@ -293,7 +293,7 @@ def test_refusals():
         tank(particles={"narrow_band": {"width": 2.0}})
     with pytest.raises(ValidationError, match="may come apart anywhere inside"):
         tank(pressure={"model": "unilateral"})
-    with pytest.raises(ValidationError, match='needs pressure.surface = "ghost-fluid"'):
+    with pytest.raises(ValidationError, match=r'needs pressure\.surface = "ghost-fluid"'):
         tank(pressure={"surface": "voxel"})
     sand = {
         "scene": {"simulator": "granular"},

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from warp_lcp.driver.table import Angles, Complaint, Table, Vector
+from warp_lcp.driver.table import Angles, Complaint, Table, Vector, counted
 
 if TYPE_CHECKING:
     from warp_lcp.grid import motion
