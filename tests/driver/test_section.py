@@ -99,6 +99,17 @@ def test_surfaces_and_bodies_are_outlined(dots, tmp_path):
     assert ((image != plain).any(axis=-1)).sum() > 150  # the surface
 
 
+def test_a_surface_alone_is_drawn_over_plain_cells(dots, tmp_path):
+    _, cells = material(3)
+    surface = ball([0.5, 0.5, 0.5], 0.3)
+    folder = write_run(tmp_path / "run", [[cells, surface]], size=(1.0, 1.0, 1.0))
+    (image,), (asked,) = draw(folder), draw(folder, show=Show.SURFACE)
+    assert (image[..., 2] - image[..., 0] > 80).sum() > 150  # the surface's outline
+    np.testing.assert_array_equal(image, asked)
+    with pytest.raises(RenderError, match="holds no frames of particles"):
+        draw(folder, color=Color.SPEED)
+
+
 def test_a_film_and_a_sheet_of_sections(dots, tmp_path):
     folder = write_run(tmp_path / "run", [material(2, column) for column in (2, 4, 6)])
     assert call(folder, "--slice", "--sheet", "--size", "600x300").exit_code == 0

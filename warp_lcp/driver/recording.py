@@ -104,7 +104,8 @@ class Recording:
         color: what is to be read besides the positions; speed unless given.
         show: what is to be read; particles if a color is given, else the surface where there is one, else particles.
         overrides: of the scene's table [camera], such as `camera.position=[1, 2, 3]`.
-        cells: read the cells too, where the run wrote them; then their pressure is the color unless another is given.
+        cells: read the cells too, where the run wrote them; then their pressure is the color unless another is given, or the surface is all
+            that there is of the material.
 
     Raises:
         RenderError: the folder is no run's, or has no such frames.
@@ -125,7 +126,8 @@ class Recording:
         self.scene: Scene = load_scene(folder / "scene.toml", overrides)
         check_shapes(self.scene, str(folder / "scene.toml"))
         self.cells = cells
-        if cells and color is None and show is not Show.SURFACE:
+        surface_alone = bool(self._numbers("surface")) and not self._numbers("particles")
+        if cells and color is None and show is not Show.SURFACE and not surface_alone:
             color = Color.PRESSURE if self._numbers("grid") else Color.SPEED
         self.show = show or (Show.SURFACE if color is None and self._numbers("surface") else Show.PARTICLES)
         if self.show is Show.SURFACE and color not in (None, Color.PLAIN):
