@@ -81,4 +81,4 @@ def test_tables_of_scenes_are_valid(page, text, tmp_path):
     """What pages show is a table of a scene, or a scene."""
     file = tmp_path / "scene.toml"
     file.write_text(text if "[scene]" in text else SCENE + text)
-    load_scene(str(file), [])
+    assert load_scene(str(file), []).time.duration > 0.0
