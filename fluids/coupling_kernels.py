@@ -89,6 +89,18 @@ def side(S: Solids, n: int, k: int, j: int, i: int):
     return body_on_face(S, axis, k + wp.where(axis == 2, high, 0), j + wp.where(axis == 1, high, 0), i + wp.where(axis == 0, high, 0))
 
 
+@wp.func
+@typing.no_type_check
+def next_body(S: Solids, last: int, k: int, j: int, i: int):
+    """Return the least body after `last` beside a cell; the number of bodies if there is none."""
+    least = int(S.bodies)
+    for n in range(2 * (S.planes + 1)):
+        body, _share = side(S, n, k, j, i)
+        if body > last and body < least:
+            least = body
+    return least
+
+
 @wp.kernel(**options)
 @typing.no_type_check
 def count_kernel(cells: CellRange, S: Solids, kind: _I8, rows: int, counts: _I32):
@@ -102,11 +114,7 @@ def count_kernel(cells: CellRange, S: Solids, kind: _I8, rows: int, counts: _I32
             if beside_a_wall(S, k, j, i):
                 last = int(-1)
                 for _ in range(S.bodies):
-                    least = int(S.bodies)
-                    for n in range(2 * (S.planes + 1)):
-                        body, _share = side(S, n, k, j, i)
-                        if body > last and body < least:
-                            least = body
+                    least = next_body(S, last, k, j, i)
                     if least == S.bodies:
                         break
                     found += 1
@@ -127,11 +135,7 @@ def fill_kernel(cells: CellRange, S: Solids, kind: _I8, rows: int, columns: int,
             if beside_a_wall(S, k, j, i):
                 last = int(-1)
                 for _ in range(S.bodies):
-                    least = int(S.bodies)
-                    for n in range(2 * (S.planes + 1)):
-                        body, _share = side(S, n, k, j, i)
-                        if body > last and body < least:
-                            least = body
+                    least = next_body(S, last, k, j, i)
                     if least == S.bodies:
                         break
                     last = least
