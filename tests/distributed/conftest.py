@@ -1,0 +1,56 @@
+"""Programs on ranks: tests here start them by mpiexec, and are skipped where MPI or PETSc is missing."""
+
+import subprocess
+import textwrap
+
+import pytest
+
+from warp_lcp.distributed import launch
+
+SECONDS = 120.0  # a run that takes longer hangs
+
+
+@pytest.fixture
+def mpi(tmp_path):
+    """Run this interpreter on n ranks: `mpi(2, "-m", "module", "--option")`, or `mpi(2, TEXT, *arguments)` with a program's text.
+
+    Text is what has a line break in it; it is written into a file in `tmp_path`, which is the working folder of all runs.
+
+    Args:
+        n: ranks.
+        arguments: of the interpreter, any type that `str` turns into text; or a program and its arguments.
+        exit_code: what the run must end with; None for anything.
+        seconds: time limit.
+        environment: variables to add.
+
+    Returns:
+        subprocess.CompletedProcess with the text of `stdout` (of all ranks, their lines in any order) and `stderr`.
+    """
+    why = launch.missing()
+    if why:
+        pytest.skip(why)
+
+    def run(n, *arguments, exit_code=0, seconds=SECONDS, environment=None):
+        words = [str(a) for a in arguments]
+        if "\n" in words[0]:
+            program = tmp_path / "program.py"
+            program.write_text(textwrap.dedent(words[0]))
+            words[0] = str(program)
+        process = subprocess.Popen(
+            launch.command(n, *words), env=launch.environment() | (environment or {}), cwd=tmp_path, text=True,
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        )  # fmt: skip
+        try:
+            out, errors = process.communicate(timeout=seconds)
+        except subprocess.TimeoutExpired:
+            process.terminate()  # mpiexec ends its ranks then
+            try:
+                out, errors = process.communicate(timeout=10.0)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                out, errors = process.communicate()
+            pytest.fail(f"{n} ranks did not end within {seconds} s\n{out}\n{errors}")
+        assert exit_code is None or process.returncode == exit_code, f"exit code {process.returncode}\n{out}\n{errors}"
+        return subprocess.CompletedProcess(process.args, process.returncode, out, errors)
+
+    return run

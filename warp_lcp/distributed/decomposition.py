@@ -1,0 +1,166 @@
+"""How a grid's cells are shared by the ranks: boxes, one a rank, whose cuts lie where coarse cells end."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from warp_lcp.distributed.ranks import Ranks, petsc
+
+UNEVEN = 1.125  # the largest part may exceed an even share by this factor, so that cuts lie at multiples of large powers of two
+
+Triple = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class Box:
+    """Cells from `low` up to `high`, exclusive, along x, y, z."""
+
+    low: Triple
+    high: Triple
+
+    @property
+    def counts(self) -> Triple:
+        """Cells along x, y, z; 0 where the box is empty."""
+        nx, ny, nz = (max(h - l, 0) for l, h in zip(self.low, self.high, strict=True))
+        return nx, ny, nz
+
+    @property
+    def cells(self) -> int:
+        """How many cells it has."""
+        return math.prod(self.counts)
+
+    @property
+    def slices(self) -> tuple[slice, slice, slice]:
+        """Where it lies in an array (nz, ny, nx) of all cells."""
+        x, y, z = (slice(l, h) for l, h in zip(self.low, self.high, strict=True))
+        return z, y, x
+
+    def grown(self, width: int) -> Box:
+        """Return the box with so many cells more on all sides."""
+        return self._mapped(lambda l: l - width, lambda h: h + width)
+
+    def common(self, other: Box) -> Box:
+        """Return the cells that are in both."""
+        low, high = (tuple(f(a, b) for a, b in zip(s, o, strict=True)) for f, s, o in ((max, self.low, other.low), (min, self.high, other.high)))
+        return Box(low, high)  # type: ignore[arg-type]
+
+    def moved(self, by: Sequence[int], sign: int = 1) -> Box:
+        """Return the box moved by so many cells along x, y, z, or back."""
+        low, high = (tuple(a + sign * b for a, b in zip(corner, by, strict=True)) for corner in (self.low, self.high))
+        return Box(low, high)  # type: ignore[arg-type]
+
+    def _mapped(self, low: Any, high: Any) -> Box:
+        return Box(tuple(map(low, self.low)), tuple(map(high, self.high)))  # type: ignore[arg-type]
+
+
+class Decomposition:
+    """Boxes of a grid's cells, one a rank, as a DMDA of PETSc has them.
+
+    Args:
+        counts: cells (nx, ny, nz) of the whole grid; nz = 1 in 2-D.
+        ranks: who share them.
+        processes: ranks along x, y, z; None: those with the least cells at cuts.
+        cuts: cells of each box along x, y, z; None: even ones, with cuts at multiples of a power of two.
+
+    Attributes:
+        boxes: of all ranks.
+
+    Raises:
+        ValueError: there are more ranks than the grid can be cut for; the same on all ranks.
+    """
+
+    def __init__(
+        self, counts: Triple, ranks: Ranks, *, processes: Triple | None = None, cuts: Sequence[Sequence[int]] | None = None
+    ) -> None:
+        self.counts, self.ranks = counts, ranks
+        self.processes = processes or _processes(counts, ranks.size)
+        if math.prod(self.processes) != ranks.size:
+            raise ValueError(f"processes = {self.processes}: their product must be the number of ranks, {ranks.size}")
+        self.parts = [list(c) for c in cuts] if cuts else [parts(n, p) for n, p in zip(counts, self.processes, strict=True)]
+        starts = [[0, *itertools.accumulate(part)] for part in self.parts]
+        self.boxes = [self._box(starts, place) for place in map(self.place, range(ranks.size))]
+
+    def place(self, rank: int) -> Triple:
+        """Return where a rank is among the ranks along x, y, z, as DMDA numbers them."""
+        px, py, _ = self.processes
+        return rank % px, rank // px % py, rank // (px * py)
+
+    @property
+    def box(self) -> Box:
+        """This rank's cells."""
+        return self.boxes[self.ranks.rank]
+
+    @property
+    def cut_axes(self) -> tuple[int, ...]:
+        """Axes along which there is more than one rank."""
+        return tuple(axis for axis, p in enumerate(self.processes) if p > 1)
+
+    def neighbor(self, axis: int, side: int) -> int | None:
+        """Return the rank beyond this one's lower (0) or upper (1) side along an axis; None where the domain ends."""
+        place = list(self.place(self.ranks.rank))
+        place[axis] += 2 * side - 1
+        if not 0 <= place[axis] < self.processes[axis]:
+            return None
+        px, py, _ = self.processes
+        return place[0] + px * (place[1] + py * place[2])
+
+    def coarser(self, factors: Triple) -> Decomposition | None:
+        """Return the boxes of aggregates of so many cells along x, y, z; None if an aggregate would be cut, or a rank left without."""
+        new = []
+        for n, part, factor in zip(self.counts, self.parts, factors, strict=True):
+            if len(part) > 1 and (any(m % factor for m in part[:-1]) or -(-part[-1] // factor) < 1 or min(part) < factor):
+                return None
+            new.append([-(-m // factor) for m in part])
+        nx, ny, nz = (-(-n // f) for n, f in zip(self.counts, factors, strict=True))
+        return Decomposition((nx, ny, nz), self.ranks, processes=self.processes, cuts=new)
+
+    @cached_property
+    def dmda(self) -> Any:
+        """The same as a DMDA of PETSc: one number a cell, 7-point stencils."""
+        PETSc = petsc()
+        return PETSc.DMDA().create(
+            dim=3, dof=1, sizes=self.counts, proc_sizes=self.processes, ownership_ranges=self.parts, stencil_width=1,
+            stencil_type=PETSc.DMDA.StencilType.STAR, comm=self.ranks.comm,
+        )  # fmt: skip
+
+    @staticmethod
+    def _box(starts: list[list[int]], place: Triple) -> Box:
+        low = tuple(s[p] for s, p in zip(starts, place, strict=True))
+        high = tuple(s[p + 1] for s, p in zip(starts, place, strict=True))
+        return Box(low, high)  # type: ignore[arg-type]
+
+
+def parts(n: int, p: int) -> list[int]:
+    """Return how many of n cells each of p ranks has: about as many, with cuts at multiples of a power of two.
+
+    >>> parts(129, 2), parts(100, 3)
+    ([64, 65], [32, 32, 36])
+    """
+    even, step = n / p, 1 << max(n.bit_length() - 1, 0)
+    while step > 1:
+        cuts = [0, *(step * round(i * even / step) for i in range(1, p)), n]
+        sizes = [b - a for a, b in itertools.pairwise(cuts)]
+        if min(sizes) > 0 and max(sizes) <= UNEVEN * math.ceil(even):
+            return sizes
+        step //= 2
+    return [n * (i + 1) // p - n * i // p for i in range(p)]
+
+
+def _processes(counts: Triple, size: int) -> Triple:
+    """Return the ranks along x, y, z with the least cells at cuts; of equal ones those that cut z, whose planes lie in one piece."""
+    found = []
+    for px in (d for d in range(1, size + 1) if size % d == 0):
+        for py in (d for d in range(1, size // px + 1) if size // px % d == 0):
+            p = px, py, size // (px * py)
+            if all(a <= n for a, n in zip(p, counts, strict=True)):
+                nx, ny, nz = counts
+                found.append(((px - 1) * ny * nz + (py - 1) * nx * nz + (p[2] - 1) * nx * ny, px, py, p))
+    if not found:
+        most = max(s for s in range(1, size) if any(a * b <= s for a, b in [(1, 1)]))
+        raise ValueError(f"{size} ranks for {' x '.join(map(str, counts))} cells: there must be a cell for each, at most {min(most, math.prod(counts))} ranks")
+    return min(found)[3]

@@ -1,0 +1,142 @@
+"""Ghost cells at the cuts between ranks, filled by PETSc."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.distributed.decomposition import Box, Decomposition
+from warp_lcp.distributed.ranks import petsc
+
+
+class Halo:
+    """Fills ghost cells of fields that each rank stores for its box, with so many of them on all sides.
+
+    A star forest of PETSc says which cell of which rank each ghost cell repeats, in the DMDA's boxes: neighbors send each other what they
+    have at their sides, edges and corners in one message each. Elements of 1, 2, 4 and 8 bytes of any meaning travel. Ghost cells at the
+    domain's own sides keep what they hold.
+
+    Args:
+        decomposition: the boxes.
+        width: ghost cells.
+
+    Raises:
+        ValueError: a box has fewer cells along a cut axis than the width; on all ranks.
+    """
+
+    def __init__(self, decomposition: Decomposition, width: int) -> None:
+        self.decomposition, self.width = decomposition, width
+        for axis in decomposition.cut_axes:
+            least = min(decomposition.parts[axis])
+            if least < width:
+                raise ValueError(
+                    f"a box of {least} cells along {'xyz'[axis]}, but {width} ghost cells: at most "
+                    f"{max(decomposition.counts[axis] // width, 1)} ranks fit along that axis"
+                )
+        nx, ny, nz = (n + 2 * width for n in decomposition.box.counts)
+        self.shape = nz, ny, nx
+        self._forest = _forest(decomposition, width) if decomposition.ranks.size > 1 else None
+        self._staging: dict[Any, np.ndarray] = {}
+
+    def fill(self, field: wp.array[Any] | np.ndarray) -> None:
+        """Fill the ghost cells of a contiguous field of `shape`, or of that many elements; collective."""
+        if self._forest is None:
+            return
+        if isinstance(field, wp.array) and field.device.is_cuda:
+            self._fill_through_host(field.reshape(self.shape))
+            return
+        exchange(self._forest, field.numpy() if isinstance(field, wp.array) else field)
+
+    def _fill_through_host(self, field: wp.array[Any]) -> None:
+        """Fill a field on a device: what lies within the width of the cuts goes through the host's memory, PETSc needs no CUDA then."""
+        host = self._staging.setdefault(field.dtype, np.zeros(self.shape, dtype=wp.dtype_to_numpy(field.dtype)))
+        for inner in self._slabs(ghost=False):
+            host[inner] = field[inner].numpy()
+        exchange(self._forest, host)
+        for outer in self._slabs(ghost=True):
+            wp.copy(field[outer], wp.array(np.ascontiguousarray(host[outer]), dtype=field.dtype, device="cpu"))
+
+    def _slabs(self, *, ghost: bool) -> list[tuple[slice, ...]]:
+        """Return the slabs of a stored field beside this rank's cuts: ghost cells, or the cells that other ranks' ghost cells repeat."""
+        found, w = [], self.width
+        for axis in self.decomposition.cut_axes:
+            for side in range(2):
+                if self.decomposition.neighbor(axis, side) is None:
+                    continue
+                n = self.shape[2 - axis]
+                first = (0 if ghost else w) if side == 0 else (n - w if ghost else n - 2 * w)
+                slab = [slice(None)] * 3
+                slab[2 - axis] = slice(first, first + w)
+                found.append(tuple(slab))
+        return found
+
+
+class Gathering:
+    """Collects what the ranks store for their boxes into one field of the whole grid on every rank; both have one layer of ghost cells.
+
+    Args:
+        decomposition: the boxes.
+    """
+
+    def __init__(self, decomposition: Decomposition) -> None:
+        self.decomposition = decomposition
+        whole = Box((0, 0, 0), decomposition.counts)
+        leaves, remotes = [], []
+        for rank, box in enumerate(decomposition.boxes):
+            leaves.append(_elements(box, whole.grown(1)))
+            remotes.append(_remote(rank, _elements(box, box.grown(1))))
+        roots = decomposition.box.grown(1).cells
+        self._forest = petsc().SF().create(comm=decomposition.ranks.comm)
+        self._forest.setGraph(roots, np.concatenate(leaves).astype(np.int32), np.concatenate(remotes))
+        low = decomposition.box.moved((1, 1, 1))
+        self._inner, self._mine = (slice(1, -1),) * 3, low.slices
+        nx, ny, nz = decomposition.box.counts
+        self._shape, self._whole = (nz + 2, ny + 2, nx + 2), tuple(n + 2 for n in reversed(decomposition.counts))
+
+    def collect(self, mine: wp.array[Any], whole: wp.array[Any]) -> None:
+        """Write the ranks' cells to the whole grid's field on every rank."""
+        source, target = mine.numpy(), whole.numpy()
+        exchange(self._forest, source, target)
+        if whole.device.is_cuda:
+            whole.assign(target)
+
+    def take(self, whole: wp.array[Any], mine: wp.array[Any]) -> None:
+        """Write this rank's part of the whole grid's field to its own."""
+        wp.copy(mine.reshape(self._shape)[self._inner], whole.reshape(self._whole)[self._mine])
+
+
+def exchange(forest: Any, roots: np.ndarray, leaves: np.ndarray | None = None) -> None:
+    """Copy roots to leaves over a star forest; leaves may lie in the same array."""
+    from mpi4py import MPI  # noqa: PLC0415
+
+    units = {1: MPI.SIGNED_CHAR, 2: MPI.SHORT, 4: MPI.INT, 8: MPI.DOUBLE}
+    unit, target = units[roots.dtype.itemsize], roots if leaves is None else leaves
+    forest.bcastBegin(unit, roots, target, MPI.REPLACE)
+    forest.bcastEnd(unit, roots, target, MPI.REPLACE)
+
+
+def _forest(decomposition: Decomposition, width: int) -> Any:
+    """Return the star forest whose leaves are this rank's ghost cells and whose roots are the cells that they repeat."""
+    around, mine = decomposition.box.grown(width), decomposition.ranks.rank
+    leaves, remotes = [np.empty(0, dtype=np.int64)], [np.empty((0, 2), dtype=np.int32)]
+    for rank, box in enumerate(decomposition.boxes):
+        shared = around.common(box)
+        if rank != mine and shared.cells:
+            leaves.append(_elements(shared, around))
+            remotes.append(_remote(rank, _elements(shared, box.grown(width))))
+    forest = petsc().SF().create(comm=decomposition.ranks.comm)
+    forest.setGraph(around.cells, np.concatenate(leaves).astype(np.int32), np.concatenate(remotes))
+    return forest
+
+
+def _elements(box: Box, within: Box) -> np.ndarray:
+    """Return where a box's cells lie in a flat array of the cells of another box."""
+    nx, ny, _ = within.counts
+    x, y, z = (np.arange(l, h) - o for l, h, o in zip(box.low, box.high, within.low, strict=True))
+    return ((z[:, None, None] * ny + y[:, None]) * nx + x).ravel()
+
+
+def _remote(rank: int, elements: np.ndarray) -> np.ndarray:
+    return np.stack([np.full(len(elements), rank), elements], axis=1).astype(np.int32)

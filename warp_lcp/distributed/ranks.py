@@ -1,0 +1,114 @@
+"""The processes that share a problem, and what they find out about each other."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+HOW_TO_INSTALL = (
+    "the PETSc engine needs petsc4py and mpi4py: pip install 'warp-lcp[distributed]', or on Debian and Ubuntu apt-get install "
+    "python3-petsc4py python3-mpi4py openmpi-bin, a virtual environment of the system's Python with --system-site-packages and numpy < 2, "
+    "and PETSC_DIR set to a folder like /usr/lib/petscdir/petsc3.18/x86_64-linux-gnu-real"
+)
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """The ranks of a communicator. All methods are collective: every rank calls them, in the same order, and gets the same answer.
+
+    Sums are made in the order of the ranks from what each has sent to all, so that every rank has the same bits and takes the same
+    decisions.
+
+    Args:
+        comm: of mpi4py.
+    """
+
+    comm: Any
+
+    @classmethod
+    def world(cls) -> Ranks:
+        """Return the ranks that `mpiexec` has started.
+
+        Raises:
+            ImportError: petsc4py or mpi4py cannot be imported; the message says how to install them.
+        """
+        return cls(petsc().COMM_WORLD.tompi4py())
+
+    @property
+    def rank(self) -> int:
+        """This process's number, from 0."""
+        return int(self.comm.rank)
+
+    @property
+    def size(self) -> int:
+        """How many there are."""
+        return int(self.comm.size)
+
+    @property
+    def first(self) -> bool:
+        """Whether this is the rank that speaks for all."""
+        return self.rank == 0
+
+    def gather(self, values: Any) -> np.ndarray:
+        """Return numbers of every rank, which each has equally many of, shape (ranks, *values.shape)."""
+        mine = np.ascontiguousarray(values)
+        if self.size == 1:
+            return mine[None].copy()
+        everyone = np.empty((self.size, *mine.shape), dtype=mine.dtype)
+        self.comm.Allgather(mine, everyone)
+        return everyone
+
+    def sum(self, values: Any) -> Any:
+        """Return sums over the ranks of a number or an array."""
+        return self._shaped(self.gather(values).sum(axis=0), values)
+
+    def max(self, values: Any) -> Any:
+        """Return the largest of the ranks' numbers, entry by entry; NaN where one is."""
+        return self._shaped(self.gather(values).max(axis=0), values)
+
+    def min(self, values: Any) -> Any:
+        """Return the smallest of the ranks' numbers, entry by entry; NaN where one is."""
+        return self._shaped(self.gather(values).min(axis=0), values)
+
+    def any(self, condition: bool) -> bool:
+        """Return whether it holds on some rank."""
+        return bool(self.gather(np.uint8(bool(condition))).any())
+
+    def join(self, key: bytes) -> bytes:
+        """Return a key of 16 bytes that stands for those of all ranks."""
+        mine = np.frombuffer(hashlib.blake2b(key, digest_size=16).digest(), dtype=np.uint8)
+        return hashlib.blake2b(self.gather(mine).tobytes(), digest_size=16).digest()
+
+    def agree(self, name: str, value: Any) -> None:
+        """Check that a value, of a type that can be pickled, is the same on all ranks.
+
+        Raises:
+            ValueError: it is not; on all ranks.
+        """
+        mine = np.frombuffer(hashlib.blake2b(pickle.dumps(value), digest_size=16).digest(), dtype=np.uint8)
+        found = self.gather(mine)
+        others = np.flatnonzero((found != found[0]).any(axis=1))
+        if others.size:
+            raise ValueError(f"{name} on rank {others[0]} is not what it is on rank 0: start all ranks with the same command and files")
+
+    @staticmethod
+    def _shaped(found: np.ndarray, values: Any) -> Any:
+        return found if np.ndim(values) else found.item()
+
+
+def petsc() -> Any:
+    """Return the module PETSc, with MPI started.
+
+    Raises:
+        ImportError: petsc4py or mpi4py cannot be imported; the message says how to install them.
+    """
+    try:
+        import mpi4py  # noqa: F401, PLC0415
+        from petsc4py import PETSc  # noqa: PLC0415
+    except ImportError as error:
+        raise ImportError(f"{HOW_TO_INSTALL} ({error})") from error
+    return PETSc
