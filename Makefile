@@ -2,10 +2,11 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
+MPI_VENV ?= .venv-mpi
 
 OUT ?= out/dam-break
 
-.PHONY: demo test slow docs wheel-check clean
+.PHONY: demo test test-distributed slow docs wheel-check clean
 
 demo: $(VENV)/.run
 	$(BIN)/warp-lcp run dam-break --out $(OUT) --force $(DEMO_ARGS)
@@ -16,6 +17,14 @@ test: $(VENV)/.dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+# The tests on several ranks, in an environment of the system's Python with Debian's MPI and PETSc (installed by apt-get if this is root).
+test-distributed:
+	@if why=$$(.ci/mpi-environment $(MPI_VENV)); then \
+		$(MPI_VENV)/bin/python -m pytest tests/distributed $(PYTEST_ARGS); \
+	else \
+		echo "no tests on several ranks: $$why"; \
+	fi
 
 slow: $(VENV)/.dev
 	$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)
@@ -48,4 +57,4 @@ $(VENV)/.docs: pyproject.toml | $(VENV)/bin/python
 	touch $@ $(VENV)/.run
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info
+	rm -rf $(VENV) $(MPI_VENV) build dist *.egg-info

@@ -53,7 +53,13 @@ def check_storable(values: np.ndarray, dtype: Any, name: str) -> None:
 
 
 class Layout:
-    """Fields stored as they are."""
+    """Fields stored as they are.
+
+    Attributes:
+        across: who stores the other parts of the fields, see `warp_lcp.vectors.Across`; None: nobody.
+    """
+
+    across: Any = None
 
     def __init__(self, shape: tuple[int, ...], device: wp.Device) -> None:
         self.shape, self.device = tuple(shape), device
@@ -142,8 +148,9 @@ class Padding:
 class PaddedLayout(Layout):
     """Grid fields (nz, ny, nx) or (ny, nx) stored with one layer of ghost cells, so that a stencil needs no bounds tests."""
 
-    def __init__(self, shape: tuple[int, ...], device: wp.Device) -> None:
+    def __init__(self, shape: tuple[int, ...], device: wp.Device, across: Any = None) -> None:
         super().__init__(shape, device)
+        self.across = across
         nz, ny, nx = shape if len(shape) == 3 else (1, *shape)
         self.padding = Padding((nz, ny, nx))
         self.stored_shape = self.padding.shape

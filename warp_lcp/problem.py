@@ -103,7 +103,8 @@ class LCP:
         counts = wp.zeros((6, spans.threads), dtype=wp.float64, device=self.device)
         inputs = [field, *bounds.operands, self.unknown, spans.n, spans.chunk, spans.stride, spans.threads, counts.flatten()]
         wp.launch(check_kernel, spans.threads, inputs, device=self.device)
-        return [int(n) for n in counts.numpy().sum(axis=1)]
+        found = counts.numpy().sum(axis=1)
+        return [int(n) for n in (found if self.layout.across is None else self.layout.across.sum(found))]
 
     def _check(self) -> None:
         """Refuse data that no method could use."""

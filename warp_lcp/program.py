@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import groupby
 from typing import Any, Protocol
 
 import warp as wp
@@ -24,11 +27,28 @@ class Launch(Protocol):
         """Launch or record."""
 
 
+class Task:
+    """What the host does between launches: exchange with other processes, say."""
+
+    def __init__(self, function: Callable[[], object]) -> None:
+        self.launch = function
+
+
+def perform(function: Callable[[], object], launch: Launch) -> None:
+    """Call a function now if `launch` launches now, else record the call between the launches."""
+    program = getattr(launch, "__self__", None)
+    if isinstance(program, Program):
+        program.record(function)
+    else:
+        function()
+
+
 class Program:
     """A sequence of kernel launches with fixed arguments.
 
     Functions that launch take `launch: Launch = wp.launch`; handed `program.launch`, they record instead. The first run loads every
-    kernel, so that later a graph can be captured: at once on CUDA, where launches cost most, after some runs on the CPU.
+    kernel, so that later a graph can be captured: at once on CUDA, where launches cost most, after some runs on the CPU. Where the host
+    has tasks between launches, see `perform`, there is a graph for each stretch without one.
 
     Args:
         device: where the kernels run.
@@ -38,7 +58,7 @@ class Program:
         self.device = device
         self._commands: list[Any] = []
         self._arguments: list[Any] = []  # a recorded launch holds addresses only
-        self._runs = 0
+        self._runs, self._replaced = 0, False
         self._graph: Any = None
         self._loops: dict[int, Any] = {}  # graphs by the address of their condition
 
@@ -50,6 +70,10 @@ class Program:
         """Record a launch."""
         self._arguments.append(inputs)
         self._commands.append(wp.launch(kernel, dim, inputs, device=device, block_dim=block_dim, record_cmd=True))
+
+    def record(self, function: Callable[[], object]) -> None:
+        """Record a task of the host."""
+        self._commands.append(Task(function))
 
     def extend(self, other: Program) -> None:
         """Append the launches of another program."""
@@ -63,10 +87,12 @@ class Program:
             return
         self._launch()
         self._runs += 1
-        if self._runs >= (1 if self.device.is_cuda else CPU_RUNS_BEFORE_CAPTURE):
-            with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
-                self._launch()
-            self._graph = capture.graph
+        if self._runs < (1 if self.device.is_cuda else CPU_RUNS_BEFORE_CAPTURE) or self._replaced:
+            return
+        if self._has_tasks:
+            self._replace()
+        else:
+            self._graph = self._captured(self._commands)
 
     def run_while(self, condition: wp.array[Any]) -> None:
         """Launch everything again and again while the condition is not 0; the launches update it.
@@ -76,7 +102,7 @@ class Program:
         Args:
             condition: shape (1,), wp.int32.
         """
-        if self._runs == 0 or not loops_on_device(self.device):  # the first run loads the kernels
+        if self._runs == 0 or self._has_tasks or not loops_on_device(self.device):  # the first run loads the kernels
             wp.capture_while(condition, self.run)
             return
         if condition.ptr not in self._loops:
@@ -84,6 +110,25 @@ class Program:
                 wp.capture_while(condition, self._launch)
             self._loops[condition.ptr] = capture.graph
         wp.capture_launch(self._loops[condition.ptr])
+
+    @property
+    def _has_tasks(self) -> bool:
+        return any(isinstance(command, Task) for command in self._commands)
+
+    def _captured(self, commands: Sequence[Any]) -> Any:
+        """Return the graph of some launches."""
+        with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
+            for command in commands:
+                command.launch()
+        return capture.graph
+
+    def _replace(self) -> None:
+        """Make a graph of every stretch of launches between tasks."""
+        commands: list[Any] = []
+        for is_task, stretch in groupby(self._commands, lambda command: isinstance(command, Task)):
+            stretch = list(stretch)
+            commands += stretch if is_task or len(stretch) == 1 else [Task(partial(wp.capture_launch, self._captured(stretch)))]
+        self._commands, self._replaced = commands, True
 
     def _launch(self) -> None:
         for command in self._commands:

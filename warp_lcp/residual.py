@@ -35,7 +35,7 @@ class NaturalResidual:
         self.unit = float(stencil.unit) if stencil else 1.0
         self._diagonal_of = None if stencil else getattr(problem.A, "version", None)  # of an operator whose diagonal is a copy
         self._sums = wp.zeros(2, dtype=wp.float64, device=layout.device)
-        self._reduction = Reduction(layout.size, layout.device, self._sums)
+        self._reduction = Reduction(layout.size, layout.device, self._sums, across=layout.across)
 
     @cached_property
     def y(self) -> wp.array[Any]:
@@ -101,4 +101,6 @@ class NaturalResidual:
         """Return an estimate of the residual that rounding x to `epsilon` leaves: epsilon || 2 |d x| + |b| ||."""
         inside = self.problem.unknown.numpy() == 1
         d = np.abs(self.diagonal.numpy()[inside].astype(np.float64)) * self.unit
-        return float(epsilon * np.linalg.norm(2 * d * np.abs(x.numpy()[inside]) + np.abs(self.problem.b.numpy()[inside])))
+        parts = 2 * d * np.abs(x.numpy()[inside]) + np.abs(self.problem.b.numpy()[inside])
+        across = self.problem.layout.across
+        return float(epsilon * (np.linalg.norm(parts) if across is None else np.sqrt(across.sum(float(parts @ parts)))))

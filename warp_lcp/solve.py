@@ -161,6 +161,8 @@ def solve(
         raise ValueError(f"stopping is a {type(stopping).__name__}: expected StoppingCriteria(rtol=...)")
     if problem.bounds.affine is not None and not getattr(solver, "affine_bounds", False):
         raise ValueError(f"{type(solver).__name__} takes no bounds that are affine in x: take ProjectedSOR or another sweeping method")
+    if problem.layout.across is not None and not getattr(solver, "distributed", False):
+        raise ValueError(f"{type(solver).__name__} does not work on several ranks: take ProjectedMultigrid, MinimumMapNewton or one with PETSc")
     work = solver.init(problem) if workspace is None else _checked(workspace, problem, solver)
     return _Loop(problem, solver, stopping or StoppingCriteria(), work, callback).run(x0)
 
@@ -255,7 +257,8 @@ class _Loop:
             return
         inside = self.problem.unknown.numpy() == 1
         for name, field in (("b", self.problem.b), ("lower, upper", self.work.x)):
-            largest = float(np.abs(field.numpy()[inside]).max(initial=0.0))
+            largest, across = float(np.abs(field.numpy()[inside]).max(initial=0.0)), self.problem.layout.across
+            largest = largest if across is None else across.max(largest)
             if 0.0 < largest < SMALLEST:
                 raise ValueError(
                     f"{name}: values up to {largest:.1e} only, whose squares vanish in float64; multiply b and the bounds by one factor"

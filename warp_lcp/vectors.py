@@ -5,13 +5,30 @@ Every operator stores its fields as flat arrays (see `warp_lcp.layout`), so that
 
 from __future__ import annotations
 
-from typing import Any
+from functools import partial
+from typing import Any, Protocol
 
 import warp as wp
 
 from warp_lcp.native import CUDA_BLOCK, CUDA_SEGMENTS, Spans
-from warp_lcp.program import Launch
+from warp_lcp.program import Launch, perform
 from warp_lcp.vector_kernels import add_up_kernel, kernels
+
+
+class Across(Protocol):
+    """Who else has a part of the unknowns: the ranks of a distributed problem. All methods are collective, with one answer for all."""
+
+    def sum(self, values: Any) -> Any:
+        """Return sums over all parts, entry by entry."""
+
+    def max(self, values: Any) -> Any:
+        """Return the largest over all parts, entry by entry."""
+
+    def any(self, condition: bool) -> bool:
+        """Return whether it holds in some part."""
+
+    def join(self, key: bytes) -> bytes:
+        """Return a key that stands for the keys of all parts."""
 
 
 class Reduction:
@@ -23,10 +40,20 @@ class Reduction:
         scalars: device array that receives the sums, shape (slots,), float64.
         columns: the most sums that one pass makes.
         threads: threads of that pass; those of a flat kernel unless given.
+        across: who has the other parts of the fields; None: nobody.
     """
 
-    def __init__(self, n: int, device: wp.Device, scalars: wp.array[wp.float64], *, columns: int = 1, threads: int | None = None) -> None:
-        self.spans, self.scalars, self.columns = Spans.of(n, device), scalars, columns
+    def __init__(
+        self,
+        n: int,
+        device: wp.Device,
+        scalars: wp.array[wp.float64],
+        *,
+        columns: int = 1,
+        threads: int | None = None,
+        across: Across | None = None,
+    ) -> None:
+        self.spans, self.scalars, self.columns, self._across = Spans.of(n, device), scalars, columns, across
         self.threads = threads or self.spans.threads
         self.block = min(CUDA_BLOCK, self.threads) if device.is_cuda else 1
         self.partials = wp.zeros(columns * self.threads, dtype=wp.float64, device=device)
@@ -43,11 +70,18 @@ class Reduction:
             source, n = self._folded, self._segments
         inputs = [source, n, self.block, 1, self.scalars, slot]
         launch(add_up_kernel, columns * self.block, inputs, device=device, block_dim=self.block)
+        if self._across is not None:
+            perform(partial(_add_across, self._across, self.scalars[slot : slot + columns]), launch)
 
     def dot(self, a: wp.array[Any], b: wp.array[Any], slot: int, *, launch: Launch = wp.launch) -> None:
         """Write a.b to scalars[slot]."""
         launch_spans(kernels(a.dtype, b.dtype).dot, self.spans, [a, b], [self.partials], a.device, launch=launch)
         self.add_up(slot, launch=launch)
+
+
+def _add_across(across: Across, sums: wp.array[wp.float64]) -> None:
+    """Add what the others have summed."""
+    sums.assign(across.sum(sums.numpy()))
 
 
 def launch_spans(

@@ -9,6 +9,8 @@ from warp_lcp.distributed import launch
 
 SECONDS = 120.0  # a run that takes longer hangs
 
+launch.find_petsc()
+
 
 @pytest.fixture
 def mpi(tmp_path):

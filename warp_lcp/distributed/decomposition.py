@@ -46,7 +46,8 @@ class Box:
 
     def common(self, other: Box) -> Box:
         """Return the cells that are in both."""
-        low, high = (tuple(f(a, b) for a, b in zip(s, o, strict=True)) for f, s, o in ((max, self.low, other.low), (min, self.high, other.high)))
+        low = tuple(max(a, b) for a, b in zip(self.low, other.low, strict=True))
+        high = tuple(min(a, b) for a, b in zip(self.high, other.high, strict=True))
         return Box(low, high)  # type: ignore[arg-type]
 
     def moved(self, by: Sequence[int], sign: int = 1) -> Box:
@@ -161,6 +162,7 @@ def _processes(counts: Triple, size: int) -> Triple:
                 nx, ny, nz = counts
                 found.append(((px - 1) * ny * nz + (py - 1) * nx * nz + (p[2] - 1) * nx * ny, px, py, p))
     if not found:
-        most = max(s for s in range(1, size) if any(a * b <= s for a, b in [(1, 1)]))
-        raise ValueError(f"{size} ranks for {' x '.join(map(str, counts))} cells: there must be a cell for each, at most {min(most, math.prod(counts))} ranks")
+        raise ValueError(
+            f"{size} ranks cannot share {' x '.join(map(str, counts))} cells: start fewer, or a number with factors up to {max(counts)}"
+        )
     return min(found)[3]

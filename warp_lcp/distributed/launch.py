@@ -30,10 +30,28 @@ def on_ranks() -> bool:
     return any(name in os.environ for name in OF_A_RANK)
 
 
+def find_petsc() -> None:
+    """Let this interpreter find Debian's petsc4py: it lies beside the build of PETSc that PETSC_DIR names when Python starts.
+
+    Does nothing where petsc4py is found already, where PETSC_DIR is set, and in an interpreter without Debian's mpi4py.
+    """
+    if "PETSC_DIR" in os.environ or importlib.util.find_spec("petsc4py") or not importlib.util.find_spec("mpi4py"):
+        return
+    for directory in debian_petsc():
+        os.environ["PETSC_DIR"] = directory
+        sys.path.append(os.path.join(directory, "lib", "python3", "dist-packages"))
+
+
+def debian_petsc() -> list[str]:
+    """Return Debian's newest build of PETSc as a list of one directory, an empty one without any."""
+    return sorted(glob.glob(DEBIAN_PETSC))[-1:]
+
+
 def missing() -> str:
     """Return why this interpreter starts no programs on ranks, "" if it does."""
     if shutil.which("mpiexec") is None:
         return f"no mpiexec: {INSTALL}"
+    find_petsc()
     lacking = [name for name in ("petsc4py", "mpi4py") if importlib.util.find_spec(name) is None]
     return f"no {' and no '.join(lacking)}: {INSTALL}" if lacking else ""
 
@@ -44,8 +62,12 @@ def command(ranks: int, *arguments: str) -> list[str]:
 
 
 def environment(given: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Return an environment for that command: `given` (this process's unless given), and where it is silent one thread a rank,
-    any number of ranks and Debian's PETSc."""
-    found = sorted(glob.glob(DEBIAN_PETSC))
-    debian = {"PETSC_DIR": found[-1]} if found else {}
-    return {**debian, **ONE_THREAD, **OPEN_MPI, **(os.environ if given is None else given)}
+    """Return an environment for that command: one thread a rank, any number of ranks and Debian's PETSc where `given` is silent.
+
+    Args:
+        given: variables that stay as they are; this process's own if None.
+    """
+    found = {**ONE_THREAD, **OPEN_MPI}
+    if debian_petsc():
+        found["PETSC_DIR"] = debian_petsc()[0]
+    return found | dict(os.environ if given is None else given)

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from warp_lcp.distributed.launch import find_petsc
+
 HOW_TO_INSTALL = (
     "the PETSc engine needs petsc4py and mpi4py: pip install 'warp-lcp[distributed]', or on Debian and Ubuntu apt-get install "
     "python3-petsc4py python3-mpi4py openmpi-bin, a virtual environment of the system's Python with --system-site-packages and numpy < 2, "
@@ -106,6 +108,7 @@ def petsc() -> Any:
     Raises:
         ImportError: petsc4py or mpi4py cannot be imported; the message says how to install them.
     """
+    find_petsc()
     try:
         import mpi4py  # noqa: F401, PLC0415
         from petsc4py import PETSc  # noqa: PLC0415

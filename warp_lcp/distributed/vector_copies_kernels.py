@@ -14,7 +14,8 @@ from warp_lcp.native import C_TYPES, simd
 def copy_kernels(d_type: Any, real: Any) -> SimpleNamespace:
     """Return `enter` (vector to field) and `leave` (field to vector) for a diagonal and fields of these types.
 
-    Rows with a diagonal of 0 are no unknowns: they enter as 0, and leave with what another vector holds there.
+    Rows with a diagonal of 0 are no unknowns: they enter as 0, and leave with what another vector holds there, or as 0
+    if that is empty.
     """
     name = f"warp_lcp.vector_copies.{d_type.__name__}_{real.__name__}"
     d_array, field, f64, T = wp.array(dtype=d_type), wp.array(dtype=real), wp.array(dtype=wp.float64), C_TYPES[real]
@@ -29,8 +30,13 @@ def copy_kernels(d_type: Any, real: Any) -> SimpleNamespace:
 
     @wp.func_native(
         simd(
-            f"""const {T}* x = x_.data + p; const auto* d = d_.data + p; const double* o = others_.data + q; double* v = v_.data + q;
-        SIMD for (int k = 0; k < n; ++k) {{ const double e = scale*(double)x[k], held = o[k]; v[k] = d[k] != 0 ? e : held; }}"""
+            f"""const {T}* x = x_.data + p; const auto* d = d_.data + p; double* v = v_.data + q;
+        if (others_.data) {{
+            const double* o = others_.data + q;
+            SIMD for (int k = 0; k < n; ++k) {{ const double e = scale*(double)x[k], held = o[k]; v[k] = d[k] != 0 ? e : held; }}
+        }} else {{
+            SIMD for (int k = 0; k < n; ++k) {{ const double e = scale*(double)x[k]; v[k] = d[k] != 0 ? e : 0.0; }}
+        }}"""
         )
     )
     def leave_row(x_: field, d_: d_array, others_: f64, v_: f64, scale: wp.float64, q: wp.int64, p: wp.int64, n: int): ...

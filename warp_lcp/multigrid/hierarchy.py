@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -132,6 +132,8 @@ class Hierarchy:
         shifted: whether the finest diagonal is a number of type `real` even where the operator only counts faces, so that a shift fits.
         bounds: memory of the finest level's bounds, where the caller has fields that a projected cycle may overwrite; an empty upper one if
             corrections have no upper bounds.
+        shrunk: by how much the cells of the finest level are fewer than those of the last level above it that cycles visit more than once,
+            where it is a level of a larger hierarchy.
     """
 
     def __init__(
@@ -143,6 +145,7 @@ class Hierarchy:
         settings: CycleSettings | None = None,
         bounds: Pair | None = None,
         shifted: bool = False,
+        shrunk: float = 1.0,
     ) -> None:
         self.settings, self.real, self._source = settings or CycleSettings(), real, stencil
         self.device = stencil.device
@@ -152,22 +155,31 @@ class Hierarchy:
             weights = tuple(wp.zeros(w.size, dtype=real, device=w.device) for w in weights)
         d = wp.zeros(stencil.d.size, dtype=d_type, device=self.device)
         unit = stencil.unit if d_type is wp.uint8 else 1.0
-        finest = Stencil(stencil.padding, d, weights, stencil.coefficients, unit, stencil.periodic, stencil.spans)
+        finest = Stencil(stencil.padding, d, weights, stencil.coefficients, unit, stencil.periodic, stencil.spans, ghosts=stencil.ghosts)
         self._strength = mean_weights(stencil)
         self.levels = [Level(finest, real, bounded=bounded, bounds=bounds)]
+        self.finest.shrunk = shrunk
+        self._add_levels(bounded=bounded)
+        self._prepare_coarsest()
+        signed = finest.weights is not None and finest.spans is not None
+        self._signs = wp.zeros(finest.padding.counts[:2], dtype=wp.uint64, device=self.device) if signed else None  # of rows of weights
+        self._descents: dict[tuple[int, bool, bool], Program] = {}
+        self.refresh()
+
+    def _add_levels(self, *, bounded: bool) -> None:
+        """Coarsen until a dense inverse is cheap."""
         most = self.settings.coarsest_cuda if self.device.is_cuda else self.settings.coarsest_cpu
         while math.prod(self.levels[-1].stencil.padding.counts) > most:
             self.levels.append(self._coarser(self.levels[-1], bounded=bounded))
+
+    def _prepare_coarsest(self) -> None:
+        """Make what solves on the coarsest levels."""
         m = math.prod(self.levels[-1].stencil.padding.counts)
         self._matrix, self._inverse = (wp.zeros((m, m), dtype=wp.float64, device=self.device) for _ in range(2))
         cells = self.settings.one_launch_cuda if self.device.is_cuda else self.settings.one_launch_cpu
-        signed = finest.weights is not None and finest.spans is not None
-        self._signs = wp.zeros(finest.padding.counts[:2], dtype=wp.uint64, device=self.device) if signed else None  # of rows of weights
         self._first_small = first_small(self.levels, cells)  # its index; none is small: len(levels)
         small = self.levels[self._first_small :]
-        self._descents: dict[tuple[int, bool, bool], Program] = {}
         self._small = SmallLevels(small, self.settings, self._inverse, self._matrix) if small else None
-        self.refresh()
 
     @property
     def finest(self) -> Level:
@@ -232,6 +244,8 @@ class Hierarchy:
         program = Program(self.device)
         for fine, coarse in zip(self.levels[: self._first_small], self.levels[1:], strict=False):
             s, c = fine.stencil, coarse.stencil
+            if s.ghosts is not None:
+                program.record(partial(share_changes, fine))
             sizes = [wp.vec3i(*s.padding.counts), wp.vec3i(*map(int, s.periodic)), c.shape, coarse.aggregates, c.grain]
             sizes += [self.settings.over_correction, self.settings.excess]
             kernel = kernels.coarsen_kernels(s.weights is not None, s.d.dtype, self.real)
@@ -243,9 +257,14 @@ class Hierarchy:
             flags = self.finest.changed.flatten()
             spans = Spans.of(flags.size, self.device)
             launch_spans(kernels.mark_kernel, spans, [flags, wp.uint8(0)], [], self.device, launch=program.launch)
+        self._factor_coarsest(program)
+        return program
+
+    def _factor_coarsest(self, program: Program) -> None:
+        """Record the preparation of solves on the coarsest levels."""
         if self._small is not None:
             self._small.rebuild(PINNED[self.real], program.launch)
-            return program
+            return
         last, s = self.levels[-1], self.levels[-1].stencil
         sizes = [wp.vec3i(*s.padding.counts), wp.vec3i(*map(int, s.periodic))]
         inputs = [s.shape, *last.grids, *sizes, wp.float64(PINNED[self.real]), last.changed, self._matrix]
@@ -254,7 +273,6 @@ class Hierarchy:
         columns = grain(m, self.device)
         inputs = [last.changed, self._matrix, columns, self._inverse]
         program.launch(kernels.invert_kernel, m // columns, inputs, device=self.device)
-        return program
 
     @cached_property
     def cycle(self) -> Program:
@@ -314,8 +332,7 @@ class Hierarchy:
             self._restrict(level, launch)
         if projected:
             self._restrict_bounds(level, launch)
-        visits = self.levels[level + 1].visits if level + 2 < len(self.levels) else 1
-        self._visit(level + 1, visits, program, projected=projected)
+        self._visit(level + 1, self._visits(level + 1), program, projected=projected)
         if not whole:
             return
         if fused:
@@ -324,9 +341,13 @@ class Hierarchy:
             self._correct(level, launch, projected=projected)
             self._pair(L, launch, reverse=True, projected=projected)
 
+    def _visits(self, level: int) -> int:
+        """Return how often a cycle of the next finer level visits a level: once where that solves."""
+        return self.levels[level].visits if level + 1 < len(self.levels) else 1
+
     def _fuses(self, L: Level) -> bool:
         """Whether a leg of the cycle is one launch: on the CPU, where one thread does it all, unless ghost cells must be filled between."""
-        return self.device.is_cpu and not any(L.stencil.periodic)
+        return self.device.is_cpu and not L.stencil.has_ghosts
 
     def _descending_leg(self, level: int, launch: Launch, *, projected: bool, from_zero: bool) -> None:
         """Sweeps, residual and restriction in one launch of one CPU thread."""
@@ -391,7 +412,8 @@ class Hierarchy:
     def _coarser(self, fine: Level, *, bounded: bool) -> Level:
         """Return the next level: aggregates of two cells along every axis, or along the strong ones only where axes differ much."""
         s, counts = fine.stencil, fine.stencil.padding.counts
-        factors = self._factors(counts)
+        whole = whole_counts(s)
+        factors = self._factors(whole)
         padding = Padding(tuple(-(-n // f) for n, f in zip(counts, reversed(factors), strict=True)))  # type: ignore[arg-type]
         for axis in range(3):  # a coarse face is as many finer ones as the other axes were aggregated by
             self._strength[axis] *= math.prod(factors) / factors[axis]
@@ -399,12 +421,13 @@ class Hierarchy:
         periodic = tuple(p and n > 1 for p, n in zip(s.periodic, reversed(padding.counts), strict=True))
         spans = None if s.spans is None else wp.zeros(padding.counts[:2], dtype=wp.vec2i, device=self.device)
         weights = (new[1], new[2], new[3])
-        stencil = Stencil(padding, new[0], weights, (0.0, 0.0, 0.0), 1.0, periodic, spans)  # type: ignore[arg-type]
+        ghosts = None if s.ghosts is None else s.ghosts.coarser(factors)
+        stencil = Stencil(padding, new[0], weights, (0.0, 0.0, 0.0), 1.0, periodic, spans, ghosts=ghosts)  # type: ignore[arg-type]
         level = Level(stencil, self.real, bounded=bounded, upper=fine.upper.size > 0)
         G = level.aggregates = Aggregates()
         G.fx, G.fy, G.fz, G.ny, G.nz = *factors, counts[1], counts[0]
         # visiting levels of half the cells twice would cost as much on each of them: only every second one is
-        level.shrunk = fine.shrunk * math.prod(counts) / math.prod(padding.counts)
+        level.shrunk = fine.shrunk * math.prod(whole) / math.prod(whole_counts(stencil))
         if level.shrunk >= 3:
             level.visits, level.shrunk = self.settings.gamma, 1.0
         return level
@@ -418,6 +441,41 @@ class Hierarchy:
         return tuple(1 if more and not take else 2 for more, take in zip(long, chosen, strict=True))  # type: ignore[return-value]
 
 
+def whole_counts(stencil: Stencil) -> tuple[int, int, int]:
+    """Return the cells (nz, ny, nx) of a stencil's grid, also of those that other processes have."""
+    return stencil.padding.counts if stencil.ghosts is None else stencil.ghosts.whole
+
+
+def make_hierarchy(stencil: Stencil, real: Any, **options: Any) -> Hierarchy:
+    """Return the hierarchy of a stencil, of all processes where it is shared; options as of `Hierarchy`."""
+    kind = Hierarchy if stencil.ghosts is None else stencil.ghosts.hierarchy
+    return kind(stencil, real, **options)
+
+
+def share_changes(level: Level) -> None:
+    """Fill the diagonal's ghost cells, and mark the rows beside those that are others now: their faces depend on them."""
+    s = level.stencil
+    assert s.ghosts is not None
+    grid, changed = s.d.reshape(s.padding.shape).numpy(), level.changed.numpy()
+    sides = [grid[(*[slice(1, -1)] * axis, end, ...)] for axis in range(3) for end in (0, -1)]
+    known = [side.copy() for side in sides]
+    s.ghosts.fill(s.d)
+    if s.device.is_cuda:
+        grid = s.d.reshape(s.padding.shape).numpy()
+        sides = [grid[(*[slice(1, -1)] * axis, end, ...)] for axis in range(3) for end in (0, -1)]
+    for number, (side, old) in enumerate(zip(sides, known, strict=True)):
+        axis, end = divmod(number, 2)
+        differs = (side != old)[(slice(1, -1),) * 2] if axis == 0 else (side != old)[:, 1:-1] if axis == 1 else side != old
+        if axis == 0:
+            changed[-end] |= differs.any(axis=1)
+        elif axis == 1:
+            changed[:, -end] |= differs.any(axis=1)
+        else:
+            changed |= differs
+    if s.device.is_cuda:
+        level.changed.assign(changed)
+
+
 def mean_weights(stencil: Stencil) -> list[float]:
     """Return the mean weight of the faces along x, y and z; of all faces where the operator knows it, whatever cells there are now."""
     if stencil.strength is not None:
@@ -429,4 +487,4 @@ def mean_weights(stencil: Stencil) -> list[float]:
     return [s / n for s, n in zip(sums, faces, strict=True)]
 
 
-__all__ = ["UNBOUNDED", "CycleSettings", "Hierarchy", "Level"]
+__all__ = ["UNBOUNDED", "CycleSettings", "Hierarchy", "Level", "make_hierarchy"]

@@ -13,6 +13,7 @@ from warp_lcp.operators.stencil_kernels import StencilShape
 
 if TYPE_CHECKING:
     from warp_lcp.operators.grid_poisson import GridPoisson
+    from warp_lcp.vectors import Across
 
 
 Scratch = tuple[wp.array[Any], wp.array[Any]]
@@ -27,17 +28,26 @@ class FloatingComponents:
     Args:
         label: component of each stored cell, -1 where there is none.
         device: where fields live.
+        across: who has other parts of the components; None: nobody.
     """
 
-    def __init__(self, label: np.ndarray, device: wp.Device) -> None:
-        self.device, self.label = device, label
-        self.count = int(label.max()) + 1
-        self.sizes = np.bincount(label[label >= 0], minlength=self.count).astype(np.float64)
+    def __init__(self, label: np.ndarray, device: wp.Device, across: Across | None = None) -> None:
+        self.device, self.label, self._across = device, label, across
+        self.count = int(self._largest(label.max())) + 1
+        self.sizes = self._total(np.bincount(label[label >= 0], minlength=self.count).astype(np.float64))
         self._label = wp.array(label, dtype=wp.int32, device=device)
         self._sizes = wp.array(self.sizes, dtype=wp.float64, device=device)
         self._sums = wp.zeros(self.count, dtype=wp.float64, device=device)
         self._held = wp.zeros(self.count, dtype=wp.int32, device=device)
         self._net: np.ndarray = np.zeros(self.count)
+
+    def _total(self, sums: np.ndarray) -> np.ndarray:
+        """Return sums over all parts of the components."""
+        return sums if self._across is None else self._across.sum(sums)
+
+    def _largest(self, values: Any) -> Any:
+        """Return the largest in any part of the components."""
+        return values if self._across is None else self._across.max(values)
 
     def without(self, gone: np.ndarray) -> FloatingComponents | None:
         """Return the components but for those that something holds after all, None if none is left.
@@ -50,7 +60,7 @@ class FloatingComponents:
         if gone.all():
             return None
         number = np.where(gone, -1, np.cumsum(~gone) - 1).astype(np.int32)
-        return FloatingComponents(np.where(self.label >= 0, number[self.label], -1).astype(np.int32), self.device)
+        return FloatingComponents(np.where(self.label >= 0, number[self.label], -1).astype(np.int32), self.device, self._across)
 
     def unattainable(self, b: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any]) -> float:
         """Return a norm that the natural residual cannot go below; 0 if b is compatible everywhere.
@@ -62,11 +72,10 @@ class FloatingComponents:
         """
         inside = self.label >= 0
         label = self.label[inside]
-        rest = np.bincount(label, b.numpy()[inside], self.count).astype(np.float64)
+        values = b.numpy()[inside], np.abs(b.numpy()[inside]), *(np.isfinite(bound.numpy()[inside]) for bound in (lower, upper))
+        sums = self._total(np.stack([np.bincount(label, v, self.count) for v in values]))
+        rest, scale, below, above = sums[0], sums[1], sums[2] > 0, sums[3] > 0
         self._net = rest.copy()
-        scale = np.bincount(label, np.abs(b.numpy()[inside]), self.count)
-        below = np.bincount(label, np.isfinite(lower.numpy()[inside]), self.count) > 0
-        above = np.bincount(label, np.isfinite(upper.numpy()[inside]), self.count) > 0
         rest[(below & (rest > 0)) | (above & (rest < 0))] = 0
         rest[np.abs(rest) <= 4 * np.finfo(np.float64).eps * scale * np.sqrt(self.sizes)] = 0  # the rounding of a sum
         return float(np.sqrt(np.sum(rest**2 / self.sizes)))
@@ -77,6 +86,9 @@ class FloatingComponents:
         self._held.zero_()
         n = r.size
         wp.launch(kernels.component_sums_kernel, n, [self._label, free, r, self._sums, self._held], device=self.device)
+        if self._across is not None:
+            self._sums.assign(self._across.sum(self._sums.numpy()))
+            self._held.assign(self._across.max(self._held.numpy()))
         wp.launch(kernels.remove_means_kernel, n, [self._label, self._sums, self._held, self._sizes, r], device=self.device)
 
     def settle(self, x: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any]) -> None:
@@ -87,9 +99,9 @@ class FloatingComponents:
         """
         below, above = (wp.full(self.count, np.inf, dtype=wp.float64, device=self.device) for _ in range(2))
         wp.launch(kernels.smallest_gap_kernel, x.size, [self._label, x, lower, upper, below, above], device=self.device)
-        gap_below, gap_above = below.numpy(), above.numpy()
+        gap_below, gap_above = -self._largest(-below.numpy()), -self._largest(-above.numpy())
         inside = self.label >= 0
-        mean = np.bincount(self.label[inside], x.numpy()[inside], self.count) / self.sizes
+        mean = self._total(np.bincount(self.label[inside], x.numpy()[inside], self.count)) / self.sizes
         # what is left of b pushes x down where it is positive, up where it is negative: the bound on that side is the one to touch
         up = np.isfinite(gap_above) & ((self._net < 0) | ~np.isfinite(gap_below))
         constant = np.where(up, gap_above, np.where(np.isfinite(gap_below), -gap_below, -mean))
@@ -116,6 +128,17 @@ class ComponentFinder:
 
     def find(self, scratch: Scratch | None = None) -> FloatingComponents | None:
         """Return the floating components, or None if there are none; `scratch` as in GridPoisson.floating_components."""
+        A = self._A
+        parent, grounded = self._grow(scratch, A.cells_around)
+        return self._label(parent.numpy(), grounded.numpy()) if self._count.numpy()[0] else None
+
+    def _grow(self, scratch: Scratch | None, joined: wp.array[Any]) -> Scratch:
+        """Return each cell's parent in the tree of its component, and which roots something holds; their number is `_count`.
+
+        Args:
+            scratch: memory, or None.
+            joined: stored cell types, of which FLUID neighbors are one component.
+        """
         A, s = self._A, self._A.stencil
         if scratch is None:
             if self._own is None:
@@ -130,15 +153,19 @@ class ComponentFinder:
         sizes = wp.vec3i(*A.layout.padding.counts)
         for kernel, inputs in (
             (self._kernels.singletons, [parent, grounded, s.grain]),
-            (self._kernels.unite, [cells, *faces, parent, sizes, s.grain]),
+            (self._kernels.unite, [joined.flatten(), *faces, parent, sizes, s.grain]),
             (self._kernels.ground, [cells, *faces, A.shift.flatten(), parent, grounded, s.grain]),
             (self._kernels.count_floating, [cells, parent, grounded, s.grain, self._count]),
         ):
             wp.launch(kernel, s.threads, [self._shape, *inputs], device=A.device)
-        return self._label(parent.numpy(), grounded.numpy()) if self._count.numpy()[0] else None
+        return parent, grounded
 
     def _label(self, parent: np.ndarray, grounded: np.ndarray) -> FloatingComponents:
         """Number the components that nothing holds; rare, so on the host."""
+        return FloatingComponents(self._numbers(parent, grounded), self._A.device)
+
+    def _numbers(self, parent: np.ndarray, grounded: np.ndarray) -> np.ndarray:
+        """Return the number of each stored cell's component, from 0, of those that nothing holds; -1 elsewhere."""
         A = self._A
         interior = np.zeros(A.layout.stored_shape, dtype=bool)
         interior[1:-1, 1:-1, 1:-1] = A.cells.numpy()[1:-1, 1:-1, 1:-1] == FLUID
@@ -147,7 +174,7 @@ class ComponentFinder:
         floating = inside & (grounded[roots] == 0)
         label = np.full(roots.size, -1, dtype=np.int32)
         label[floating] = np.unique(roots[floating], return_inverse=True)[1]
-        return FloatingComponents(label, A.device)
+        return label
 
 
 def _roots(parent: np.ndarray) -> np.ndarray:

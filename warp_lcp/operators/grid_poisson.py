@@ -13,9 +13,9 @@ from warp_lcp.native import Spans
 from warp_lcp.operators import grid_poisson_kernels as kernels
 from warp_lcp.operators.components import ComponentFinder, FloatingComponents, Scratch
 from warp_lcp.operators.grid_poisson_kernels import AIR, FLUID, SOLID
-from warp_lcp.operators.stencil import Stencil, wrap
+from warp_lcp.operators.stencil import Ghosts, Stencil
 from warp_lcp.operators.stencil_kernels import StencilShape, find_spans_kernel
-from warp_lcp.vectors import launch_spans
+from warp_lcp.vectors import Across, launch_spans
 
 __all__ = ["AIR", "FLUID", "SOLID", "GridPoisson"]
 
@@ -64,6 +64,8 @@ class GridPoisson:
     """
 
     symmetric = True
+    _ghosts: Ghosts | None = None  # of a box of cells among others
+    _across: Across | None = None
 
     def __init__(
         self,
@@ -82,7 +84,7 @@ class GridPoisson:
         host = _checked_cells(cells)
         self.device = wp.get_device(device if device is not None else cells.device if isinstance(cells, wp.array) else None)
         self.dtype, self.shape = dtype, host.shape
-        self.layout = PaddedLayout(host.shape, self.device)
+        self.layout = PaddedLayout(host.shape, self.device, self._across)
         counts = self.layout.padding.counts
         flags = (*(bool(p) for p in periodic), False, False, False)[:3]
         self.periodic = (flags[0] and counts[2] > 1, flags[1] and counts[1] > 1, flags[2] and counts[0] > 1)
@@ -92,7 +94,7 @@ class GridPoisson:
         self.faces = [self._stored_face(f, axis) for axis, f in enumerate(faces)]
         self.shift = self._stored_shift(shift)
         self.cells = wp.full(self.layout.stored_shape, SOLID, dtype=wp.int8, device=self.device)
-        self.cells_around = wp.zeros_like(self.cells) if any(self.periodic) else self.cells
+        self.cells_around = wp.zeros_like(self.cells) if any(self.periodic) or self._ghosts is not None else self.cells
         self._spans = wp.zeros((counts[0], counts[1]), dtype=wp.vec2i, device=self.device)
         self.version = 0
         self.stencil = self._empty_stencil()
@@ -165,8 +167,11 @@ class GridPoisson:
             scratch: stored fields, of 4-byte elements and of bytes, that may be overwritten on the rows' spans; saves as much memory.
         """
         if self._finder is None:
-            self._finder = ComponentFinder(self)
+            self._finder = self._component_finder()
         return self._finder.find(scratch)
+
+    def _component_finder(self) -> ComponentFinder:
+        return ComponentFinder(self)
 
     def diagonal(self) -> wp.array[Any]:
         """Return the diagonal of A, a field of the operator's shape and type; 0 off the FLUID cells."""
@@ -250,7 +255,7 @@ class GridPoisson:
 
     def _empty_stencil(self) -> Stencil:
         layout = self.layout
-        means = [_mean_coefficient(f, c) for f, c in zip(self.faces, self.uniform, strict=True)]
+        means = [self._mean_coefficient(f, c) for f, c in zip(self.faces, self.uniform, strict=True)]
         strength = (means[0], means[1], means[2])
         weights = None
         if self._has_arrays:
@@ -259,8 +264,19 @@ class GridPoisson:
         if self._counts_faces:
             used = [c for c, n in zip(self.uniform, reversed(layout.padding.counts), strict=True) if n > 1]
             unit = max(used, default=1.0) or 1.0
-            return Stencil(layout.padding, layout.zeros(wp.uint8), None, self.uniform, unit, self.periodic, self._spans, strength)
-        return Stencil(layout.padding, layout.zeros(self.dtype), weights, self.uniform, 1.0, self.periodic, self._spans, strength)
+            d, ends = layout.zeros(wp.uint8), (self.periodic, self._spans, strength, self._ghosts)
+            return Stencil(layout.padding, d, None, self.uniform, unit, *ends)
+        d, ends = layout.zeros(self.dtype), (self.periodic, self._spans, strength, self._ghosts)
+        return Stencil(layout.padding, d, weights, self.uniform, 1.0, *ends)
+
+    def _mean_coefficient(self, face: wp.array[Any], uniform: float) -> float:
+        """Return the mean of the coefficients that are not 0."""
+        if face.size == 0:
+            return uniform
+        values, across = face.numpy(), self.layout.across
+        sums = np.array([values.sum(dtype=np.float64), np.count_nonzero(values)])
+        total, count = sums if across is None else across.sum(sums)
+        return float(total / max(count, 1))
 
     def _refill(self, cells: wp.array[Any]) -> None:
         """Take padded cell types and compute diagonal and weights."""
@@ -272,7 +288,7 @@ class GridPoisson:
         self.version += 1
         if self.cells_around is not self.cells:
             wp.copy(self.cells_around, self.cells)
-            wrap(self.cells_around, self.periodic, counts)
+            s.wrap(self.cells_around)
         if self._counts_faces:
             axes = wp.vec3i(*(int(c > 0) for c in self.uniform))
             inputs = [self._whole_rows, self.cells_around.flatten(), axes, s.d, s.grain]
@@ -288,12 +304,6 @@ class GridPoisson:
             beyond = 1 if self.device.is_cuda else 0
             inputs = [self._rows_and_ghosts, *before, *s.weights, s.grain + (1 - beyond)]
             wp.launch(made.weights, (planes + 1, rows + 1, s.threads[2] + beyond), inputs, device=self.device)
-
-
-def _mean_coefficient(face: wp.array[Any], uniform: float) -> float:
-    """Return the mean of the coefficients that are not 0."""
-    values = face.numpy()
-    return float(values.sum(dtype=np.float64) / max(np.count_nonzero(values), 1)) if face.size else uniform
 
 
 def _checked_cells(cells: Any) -> np.ndarray:

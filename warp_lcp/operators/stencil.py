@@ -3,14 +3,35 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, Protocol
 
 import warp as wp
 
 from warp_lcp.layout import Padding
 from warp_lcp.native import grain
 from warp_lcp.operators.stencil_kernels import StencilShape, product_kernels, wrap_kernel
-from warp_lcp.program import Launch
+from warp_lcp.program import Launch, perform
+
+
+class Ghosts(Protocol):
+    """Fills the ghost cells that stand for cells stored elsewhere, by another process.
+
+    Attributes:
+        whole: cells (nz, ny, nx) of the grid that this process has a box of.
+        hierarchy: the class of multigrid hierarchies on such grids.
+    """
+
+    @property
+    def whole(self) -> tuple[int, int, int]: ...  # noqa: D102
+    @property
+    def hierarchy(self) -> Any: ...  # noqa: D102
+
+    def fill(self, field: wp.array[Any]) -> None:
+        """Fill those of a stored field."""
+
+    def coarser(self, factors: tuple[int, int, int]) -> Ghosts | None:
+        """Return what fills those of aggregates of so many cells along x, y, z; None if aggregates would be cut."""
 
 
 @dataclass
@@ -27,6 +48,7 @@ class Stencil:
         spans: first and one past the last cell of each row that may hold unknowns, shape (nz, ny), wp.vec2i; fields must be 0 outside.
             None: whole rows.
         strength: mean coefficient of all faces along x, y, z; None: that of the weights as they are.
+        ghosts: fills ghost cells where another process has the neighbors, before each product; None: nobody has.
     """
 
     padding: Padding
@@ -37,6 +59,7 @@ class Stencil:
     periodic: tuple[bool, bool, bool] = (False, False, False)
     spans: wp.array[Any] | None = None
     strength: tuple[float, float, float] | None = None
+    ghosts: Ghosts | None = None
 
     def __post_init__(self) -> None:
         """Lay out the kernel's view of the sizes."""
@@ -59,12 +82,19 @@ class Stencil:
     def with_diagonal(self, d: wp.array[Any]) -> Stencil:
         """Return the stencil with another diagonal (a mask makes it 0) and the same weights."""
         unit = self.unit if d.dtype is self.d.dtype else 1.0
-        return Stencil(self.padding, d, self.weights, self.coefficients, unit, self.periodic, self.spans, self.strength)
+        return Stencil(self.padding, d, self.weights, self.coefficients, unit, self.periodic, self.spans, self.strength, self.ghosts)
+
+    @property
+    def has_ghosts(self) -> bool:
+        """Whether ghost cells must be filled before each product."""
+        return any(self.periodic) or self.ghosts is not None
 
     def wrap(self, x: wp.array[Any], *, launch: Launch = wp.launch) -> None:
-        """Fill x's ghost cells along periodic axes."""
+        """Fill x's ghost cells along periodic axes, and those that stand for cells of others."""
         if any(self.periodic):
             wrap(x.reshape(self.padding.shape), self.periodic, self.padding.counts, launch=launch)
+        if self.ghosts is not None:
+            perform(partial(self.ghosts.fill, x), launch)
 
     def product(self, x: wp.array[Any], out: wp.array[Any], plus: wp.array[Any] | None = None, *, launch: Launch = wp.launch) -> None:
         """Out = A x, or A x + plus. All of one float type; rows that are no unknowns give 0 (or plus)."""

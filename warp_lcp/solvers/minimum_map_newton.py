@@ -19,7 +19,7 @@ from warp_lcp.result import SolveStatus
 from warp_lcp.solve import FLOOR_MARGIN, IterateInPlace, Precision, RoundedIterate, Step
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_kernels import all_free_kernel, kernels
-from warp_lcp.solvers.principal_system import DenseSystem, GridSystem, principal_system
+from warp_lcp.solvers.principal_system import DenseSystem, GridSystem, PrincipalSystem, principal_system
 from warp_lcp.solvers.proximal_point import ProximalPoint
 from warp_lcp.vectors import Reduction, launch_spans
 
@@ -58,6 +58,7 @@ class MinimumMapNewton:
 
     supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
     needs: ClassVar[str] = "positive definite or P-matrix"
+    distributed: ClassVar[bool] = True
 
     precision: str = "mixed"
     monotone_cycles: int = 2
@@ -111,7 +112,7 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         self.bounded = problem.bounded
         self.x, self.trial = layout.zeros(wp.float64), layout.zeros(wp.float64)
         self.residual = NaturalResidual(problem)
-        self.system = principal_system(problem, self.precision.correction, bounded=self.bounded, settings=settings.cycle)
+        self.system = self._principal_system()
         self.free = layout.zeros(wp.uint8)
         self._scalars = wp.zeros(4, dtype=wp.float64, device=problem.device)
         self._reduction = Reduction(layout.size, problem.device, self._scalars, columns=4)
@@ -122,6 +123,10 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         cycled = self.bounded and isinstance(problem.A, SparseOperator) and problem.A.unknowns >= LARGE
         self.aggregates = AggregateCycles(problem.A) if cycled else None  # type: ignore[arg-type]
         self.start(warm=True, tolerance=0.0)
+
+    def _principal_system(self) -> PrincipalSystem:
+        """Return what solves on free sets."""
+        return principal_system(self.problem, self.precision.correction, bounded=self.bounded, settings=self.settings.cycle)
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the active set; the operator may have changed."""

@@ -44,7 +44,8 @@ class MinimumMapResidual(AssessedResidual):
     @property
     def away(self) -> bool:
         """Read it."""
-        return bool(self._away.numpy().any())
+        found, across = bool(self._away.numpy().any()), self.problem.layout.across
+        return found if across is None else across.any(found)
 
     def hold(self, x: wp.array[Any]) -> None:
         """Move held unknowns onto their bounds, and the right-hand side with them."""
@@ -52,6 +53,8 @@ class MinimumMapResidual(AssessedResidual):
         inputs = [s.shape, s.grain, R, x, finest.b, *p.bounds.operands, self._away]
         wp.launch(self._hold, s.threads, inputs, device=p.device)
         s.wrap(x)
+        if s.ghosts is not None:
+            self._away.fill_(1)  # which rows beside a cut have moved, others know
         fields = [x, p.b, finest.stencil.d, finest.b, self.scalars, self._away]
         inputs = [*s.operands, R, wp.vec3i(*map(int, s.periodic)), *fields]
         wp.launch(self._right_side, s.threads, inputs, device=p.device)

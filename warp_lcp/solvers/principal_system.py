@@ -14,7 +14,7 @@ import warp as wp
 
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.krylov.gmres import GMRES
-from warp_lcp.multigrid.hierarchy import CycleSettings, Hierarchy
+from warp_lcp.multigrid.hierarchy import CycleSettings, make_hierarchy
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.operators.low_rank import LowRankOperator
@@ -64,18 +64,20 @@ class GridSystem:
     def __init__(self, A: GridPoisson, real: Any, *, bounded: bool, settings: CycleSettings | None = None, shifted: bool = False) -> None:
         self._A = A
         self._version = A.version
-        self.hierarchy = Hierarchy(A.stencil, real, bounded=bounded, settings=settings, shifted=shifted)
+        self.hierarchy = make_hierarchy(A.stencil, real, bounded=bounded, settings=settings, shifted=shifted)
         self.r, self.z = self.hierarchy.finest.b, self.hierarchy.finest.x
         self._weight = wp.zeros_like(self.r) if shifted else None
         self._norm = WeightedNorm(self.r, self._weight)
         self._no_shift = wp.empty(0, dtype=wp.float64, device=A.device)
-        self._krylov: Any
         self.fused = self.hierarchy.open_cycle is not None  # one CPU thread, no ghost cells to fill
-        if self.fused:
-            self._krylov = GridConjugateGradient(A.stencil, self.hierarchy, weighted=shifted)
-        else:
-            self._krylov = ConjugateGradient(self.hierarchy.finest.stencil.product, self, weight=self._weight)
+        self._krylov = self._krylov_method()
         self.e = self._krylov.x
+
+    def _krylov_method(self) -> Any:
+        """Return what iterates: it has `solve`, and the solution in `x`."""
+        if self.fused:
+            return GridConjugateGradient(self._A.stencil, self.hierarchy, weighted=self._weight is not None)
+        return ConjugateGradient(self.hierarchy.finest.stencil.product, self, weight=self._weight)
 
     def refresh(self) -> None:
         """Take the rows and the weights again if the operator has changed."""

@@ -38,6 +38,7 @@ class ProjectedMultigrid:
 
     supports: ClassVar[frozenset[str]] = frozenset({"grid"})
     needs: ClassVar[str] = ""
+    distributed: ClassVar[bool] = True
 
     precision: str = "mixed"
     monotone_cycles: int = 1  # without one the set creeps; two or three were never faster on splashes, basins and obstacles, 2-D and 3-D

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.multigrid.hierarchy import Hierarchy
+from warp_lcp.multigrid.hierarchy import Hierarchy, make_hierarchy
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
 from warp_lcp.program import Launch, Program
@@ -46,7 +46,7 @@ class AssessedResidual(NaturalResidual):
         R.planes, R.all_planes, R.rows, R.chunks, R.threads = slab, planes, rows, chunks, math.prod(self.threads)
         R.changed = self._finest.changed.flatten()
         self.scalars = wp.zeros(kernels.SLOTS, dtype=wp.float64, device=A.device)
-        self.sums = Reduction(problem.layout.size, A.device, self.scalars, columns=4, threads=R.threads)
+        self.sums = Reduction(problem.layout.size, A.device, self.scalars, columns=4, threads=R.threads, across=problem.layout.across)
         self.storage = (*s.storage, self._finest.stencil.d.dtype, hierarchy.real)
         self.row_kernels = kernels.row_kernels(*self.storage, rounded=rounded)
         self.classify, self.stale, self.active, self._norm_of_b = False, True, 0, 0.0
@@ -89,7 +89,7 @@ class AssessedResidual(NaturalResidual):
     def advance(self, x: wp.array[Any], direction: wp.array[Any], *, launch: Launch = wp.launch) -> None:
         """Launch the step and the evaluation where it ends: one launch on the CPU, unless ghost cells must be filled between."""
         p, s = self.problem, self._A.stencil
-        if p.device.is_cuda or any(s.periodic):
+        if p.device.is_cuda or s.has_ghosts:
             self.update(x, direction, launch=launch)
             self.assess(x, launch=launch)
             return
@@ -132,7 +132,7 @@ class MultigridWorkspace(RoundedIterate):
         self.x, self._p = problem.layout.zeros(wp.float64), problem.layout.zeros(real)
         # a projected cycle forgets the search direction, so its lower bounds may lie in that memory: finite numbers, and 0 off the unknowns
         upper = problem.layout.zeros(real) if problem.bounds.may_bind[1] else wp.empty(0, dtype=real, device=A.device)
-        self.hierarchy = Hierarchy(A.stencil, real, bounded=self.bounded, settings=settings.cycle, bounds=(self._p, upper))
+        self.hierarchy = make_hierarchy(A.stencil, real, bounded=self.bounded, settings=settings.cycle, bounds=(self._p, upper))
         self.residual = AssessedResidual(problem, A, self.hierarchy, rounded=self.precision is Precision.SINGLE)
         self._flat = kernels.flat_kernels(real)
         self._spans = self.residual._reduction.spans

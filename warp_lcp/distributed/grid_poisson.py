@@ -1,0 +1,124 @@
+"""The grid operator of a box of cells among those of other ranks."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
+
+from warp_lcp.distributed.decomposition import Decomposition
+from warp_lcp.distributed.halo import Halo
+from warp_lcp.operators.components import ComponentFinder, FloatingComponents, Scratch
+from warp_lcp.operators.grid_poisson import FLUID, GridPoisson
+
+GROUND = 0  # what holds a component, among the nodes of the components' graph
+
+
+class DistributedGridPoisson(GridPoisson):
+    """A `GridPoisson` whose grid is shared by the ranks: each has a box of its cells, and stores the cells of others that touch it.
+
+    All that `GridPoisson` takes and gives is of this rank's box: cells (nz, ny, nx), coefficients of its faces, the upper ones too (those at
+    a cut are known to both ranks), fields. An `LCP` with it is one problem of all ranks, and `wl.solve` of it collective: every rank calls
+    it, and gets its box of x with the status, the residual and the history of the whole. On one rank it is what a `GridPoisson` is.
+
+    Args:
+        decomposition: the boxes.
+        cells: integers AIR, FLUID, SOLID of this rank's box, shape (nz, ny, nx), or (ny, nx) if the whole grid has one cell along z.
+        coefficients: `face_x`, `face_y`, `face_z`, `shift`, `device`, `dtype` as of `GridPoisson`.
+
+    Attributes:
+        decomposition: the boxes.
+
+    Raises:
+        ValueError: an argument has a wrong shape, type or sign, or is not of the same kind on all ranks; a box is one cell thin at a cut.
+
+    Example:
+        >>> import numpy as np, warp_lcp as wl  # doctest: +SKIP
+        >>> from warp_lcp.distributed import Decomposition, DistributedGridPoisson, Ranks
+        >>> boxes = Decomposition((256, 256, 256), Ranks.world())
+        >>> A = DistributedGridPoisson(boxes, np.full(boxes.box.counts[::-1], wl.FLUID))
+    """
+
+    def __init__(self, decomposition: Decomposition, cells: Any, **coefficients: Any) -> None:
+        self.decomposition = decomposition
+        shape, expected = tuple(np.shape(cells)), tuple(reversed(decomposition.box.counts))
+        if any(coefficients.pop("periodic", ())):
+            raise ValueError("periodic: axes that wrap around are not shared by ranks yet; take one rank")
+        if shape != expected and not (shape == expected[1:] and decomposition.counts[2] == 1):
+            raise ValueError(f"cells has shape {shape}: expected {expected}, the cells of rank {decomposition.ranks.rank}")
+        if decomposition.ranks.size > 1:
+            for axis in decomposition.cut_axes:
+                if min(decomposition.parts[axis]) < 2:
+                    raise ValueError(f"a rank has one cell along {'xyz'[axis]}: boxes of shared operators have at least two")
+            self._ghosts, self._across = Halo(decomposition, 1), decomposition.ranks
+        kinds = [(name, np.ndim(value) > 0 or value) for name, value in sorted(coefficients.items()) if name not in ("device", "dtype")]
+        decomposition.ranks.agree("what the coefficients are", kinds)
+        super().__init__(cells, **coefficients)
+
+    @property
+    def unknowns(self) -> int:
+        """Number of FLUID cells of all ranks."""
+        return int(self.decomposition.ranks.sum(super().unknowns))
+
+    def _component_finder(self) -> ComponentFinder:
+        return ComponentFinder(self) if self._ghosts is None else DistributedComponentFinder(self)
+
+
+class DistributedComponentFinder(ComponentFinder):
+    """Finds floating components that may reach over several ranks.
+
+    Each rank finds the components of its own box; those that nothing holds there are nodes of a graph, whose edges are open faces at cuts.
+
+    Args:
+        A: the operator.
+    """
+
+    _A: DistributedGridPoisson
+
+    def find(self, scratch: Scratch | None = None) -> FloatingComponents | None:
+        """Return the floating components with the parts of all ranks, or None if there are none."""
+        A, ranks = self._A, self._A.decomposition.ranks
+        parent, grounded = self._grow(scratch, A.cells)
+        if not ranks.any(bool(self._count.numpy()[0])):
+            return None
+        number = self._numbers(parent.numpy(), grounded.numpy())
+        counts = ranks.gather(int(number.max(initial=-1)) + 1)
+        first, nodes = 1 + int(counts[: ranks.rank].sum()), 1 + int(counts.sum())
+        fluid = (A.cells.numpy() == FLUID).ravel()
+        node = np.where(number >= 0, number + first, np.where(fluid, GROUND, -1)).astype(np.int32)
+        edges = np.concatenate([_edges(A, node), np.empty((0, 2), dtype=np.int32)])
+        everyone = np.concatenate(ranks.comm.allgather(edges))
+        graph = scipy.sparse.coo_matrix((np.ones(len(everyone)), tuple(everyone.T)), shape=(nodes, nodes))
+        component = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+        floating = component != component[GROUND]
+        if not floating.any():
+            return None
+        names = np.full(nodes, -1, dtype=np.int32)
+        names[floating] = np.unique(component[floating], return_inverse=True)[1]
+        label = np.where(number >= 0, names[np.maximum(node, 0)], -1).astype(np.int32)
+        return FloatingComponents(label, A.device, ranks)
+
+
+def _edges(A: DistributedGridPoisson, node: np.ndarray) -> np.ndarray:
+    """Return the pairs of nodes of this rank and its neighbors between which a face at a cut is open, shape (n, 2)."""
+    assert A._ghosts is not None
+    shape, found = A.layout.stored_shape, []
+    grid = node.reshape(shape).copy()
+    for axis in A.decomposition.cut_axes:  # ghost cells at the domain's sides are not written
+        for end in (0, -1):
+            grid[(*[slice(None)] * (2 - axis), end, ...)] = -1
+    A._ghosts.fill(grid)
+    for axis in A.decomposition.cut_axes:
+        lower = [slice(1, -1)] * 3
+        lower[2 - axis] = slice(0, 1)
+        upper = list(lower)
+        upper[2 - axis] = slice(1, 2)
+        a, b = grid[tuple(lower)].ravel(), grid[tuple(upper)].ravel()
+        face = A.faces[axis].numpy()[tuple(upper)].ravel() if A.faces[axis].size else np.full(a.size, A.uniform[axis])
+        open_faces = (a >= 0) & (b >= 0) & (face > 0)
+        found.append(np.stack([a[open_faces], b[open_faces]], axis=1))
+    return np.unique(np.concatenate(found), axis=0) if found else np.empty((0, 2), dtype=np.int32)
+
+

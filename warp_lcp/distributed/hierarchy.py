@@ -1,0 +1,105 @@
+"""Multigrid across ranks: fine levels are shared, each rank with its box; a small one is gathered, and every rank does what is below it."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import Any
+
+import warp as wp
+
+from warp_lcp.distributed.halo import Gathering, Halo
+from warp_lcp.layout import Padding
+from warp_lcp.multigrid.hierarchy import Hierarchy
+from warp_lcp.operators.stencil import Stencil
+from warp_lcp.program import Launch, Program, perform
+
+GATHERED = 32_768  # cells from which on a level is gathered: exchanges between ranks would take as long as its cells
+
+
+class DistributedHierarchy(Hierarchy):
+    """What `Hierarchy` is, of a stencil whose grid is shared by the ranks: the same levels, the same cycles.
+
+    The last of `levels` is gathered on every rank, where a hierarchy of one process goes on. Its cells are so few that to share them
+    would cost more than all ranks doing the same.
+    """
+
+    def _add_levels(self, *, bounded: bool) -> None:
+        while True:
+            last = self.levels[-1]
+            halo = last.stencil.ghosts
+            assert isinstance(halo, Halo)
+            strength = list(self._strength)
+            if math.prod(halo.whole) <= GATHERED or halo.coarser(self._factors(halo.whole)) is None:
+                break
+            self.levels.append(self._coarser(last, bounded=bounded))
+        self._strength = strength
+        self._gathering = Gathering(halo.decomposition)
+        stencil = _whole_stencil(last.stencil, halo.whole, (strength[0], strength[1], strength[2]))
+        bounds = None
+        if bounded and last.upper.size == 0:
+            bounds = wp.zeros(stencil.padding.size, dtype=self.real, device=self.device), last.upper
+        shifted = last.stencil.d.dtype is not wp.uint8
+        self._whole = Hierarchy(
+            stencil, self.real, bounded=bounded, settings=self.settings, bounds=bounds, shifted=shifted, shrunk=last.shrunk
+        )  # fmt: skip
+
+    def _prepare_coarsest(self) -> None:
+        self._first_small, self._small = len(self.levels), None
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that the levels hold, those of the gathered ones too; shared weights of the finest one not counted."""
+        return super().nbytes + self._whole.nbytes
+
+    def refresh(self) -> None:
+        """Take the operator's rows and weights again after they changed in place."""
+        super().refresh()
+        self.finest.changed.fill_(1)  # what other ranks have changed is not known here
+
+    def _factor_coarsest(self, program: Program) -> None:
+        program.record(self._gather_stencil)
+
+    def _gather_stencil(self) -> None:
+        """Bring the gathered level up to date, and the levels below it."""
+        ours, theirs = self.levels[-1].stencil, self._whole.finest.stencil
+        self._gathering.collect(ours.d, theirs.d)
+        for w, whole in zip(ours.weights or (), theirs.weights or (), strict=True):
+            self._gathering.collect(w, whole)
+        self._whole.rebuild()
+
+    def _visits(self, level: int) -> int:
+        return self.levels[level].visits if level + 1 < len(self.levels) or len(self._whole.levels) > 1 else 1
+
+    def _visit(self, level: int, visits: int, program: Program, *, projected: bool) -> None:
+        if level + 1 < len(self.levels):
+            super()._visit(level, visits, program, projected=projected)
+            return
+        perform(partial(self._cycle_whole, visits, projected=projected), program.launch)
+
+    def _solve_coarsest(self, launch: Launch, *, projected: bool, from_zero: bool) -> None:
+        assert from_zero, "the only level is visited once"
+        perform(partial(self._cycle_whole, 1, projected=projected), launch)
+
+    def _cycle_whole(self, visits: int, *, projected: bool) -> None:
+        """Go on from the gathered level: cycles on it and those below, one after another, the first from x = 0."""
+        ours, whole = self.levels[-1], self._whole.finest
+        self._gathering.collect(ours.b, whole.b)
+        if projected:
+            self._gathering.collect(ours.lower, whole.lower)
+            if ours.upper.size:
+                self._gathering.collect(ours.upper, whole.upper)
+        for visit in range(visits):
+            self._whole._descent(0, projected=projected, from_zero=visit == 0).run()
+        self._gathering.take(whole.x, ours.x)
+
+
+def _whole_stencil(part: Stencil, counts: tuple[int, int, int], strength: tuple[float, float, float]) -> Stencil:
+    """Return a stencil like a rank's of the whole grid, still empty."""
+    padding = Padding(counts)
+
+    def like(field: wp.array[Any]) -> wp.array[Any]:
+        return wp.zeros(padding.size, dtype=field.dtype, device=field.device)
+
+    weights = None if part.weights is None else tuple(map(like, part.weights))
+    return Stencil(padding, like(part.d), weights, part.coefficients, part.unit, strength=strength)  # type: ignore[arg-type]

@@ -1,0 +1,212 @@
+"""Work that ranks end alike: what fails on one fails on all, with a message that names it, and none waits for ever."""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any
+
+from warp_lcp.distributed.ranks import Ranks
+
+PATIENCE = 10.0  # seconds that a rank waits for the others after a failure: they may be inside MPI, from where nothing brings them back
+PAUSE = 0.005  # seconds between two looks
+SHOWN = 3  # failures in one message
+
+
+class RankFailed(RuntimeError):
+    """Another rank has failed in a way that no message was planned for. The message names the rank and the error."""
+
+
+@dataclass(frozen=True)
+class Failure:
+    """What went wrong on a rank.
+
+    Args:
+        kind: of the exception.
+        text: of its message.
+        errno: of the system's error, if it is one.
+        planned: it ends the run with its message alone.
+        told: an inner block has told all ranks already.
+    """
+
+    kind: type[BaseException]
+    text: str
+    errno: int | None
+    planned: bool
+    told: bool
+
+
+class Meeting:
+    """Blocks that all ranks enter, and leave in the same way.
+
+    At the end of a block the ranks meet and tell each other how it went. If it failed on some, all raise: the error's own kind, as far as it
+    is among `planned`, with a message that names the rank; else `RankFailed`. A rank that failed while the others are in the midst of a
+    collective operation, which it will not take part in, waits PATIENCE seconds for them and then ends all processes.
+
+    Args:
+        ranks: who meet.
+        planned: kinds of errors whose message is enough.
+        last_words: takes the message before the processes are ended.
+
+    >>> alone = Meeting.of_one()
+    >>> with alone.together():
+    ...     raise OSError("the disk is full")
+    Traceback (most recent call last):
+    OSError: the disk is full
+    """
+
+    def __init__(
+        self, ranks: Ranks, planned: tuple[type[Exception], ...] = (OSError,), last_words: Callable[[str], object] = lambda text: None
+    ) -> None:
+        """Take a communicator of its own, so that meetings are never mistaken for other messages."""
+        self.ranks = ranks
+        self.last_words = last_words
+        self._planned = planned
+        self._comm: Any = ranks.comm.Dup() if ranks.size > 1 else ranks.comm
+        self._depth = 0
+        self._told: BaseException | None = None  # what a block has raised on all ranks
+
+    @classmethod
+    def of_one(cls) -> Meeting:
+        """Return the meeting of a process that has no others, which needs no MPI."""
+        return cls(Ranks(_Alone()))
+
+    def together(self) -> AbstractContextManager[None]:
+        """Return the context of what all ranks do."""
+        return _Block(self, named=True)
+
+    def led(self) -> AbstractContextManager[None]:
+        """Return the context of what the first rank does for all; its message speaks for itself."""
+        return _Block(self, named=False)
+
+    def exchange(self, value: Any) -> list[Any]:
+        """Return what each rank has given."""
+        return list(self._comm.allgather(value))
+
+    def share(self, value: Any) -> Any:
+        """Return what the first rank has given."""
+        return self._comm.bcast(value)
+
+    def enter(self) -> None:
+        """Begin a block."""
+        self._depth += 1
+
+    def leave(self, error: BaseException | None, *, named: bool) -> None:
+        """End a block.
+
+        Args:
+            error: what ends it on this rank.
+            named: say which rank has failed.
+
+        Raises:
+            BaseException: what failed on other ranks, or on this one with a message that tells the rank.
+        """
+        failure = self._failure(error)
+        found = self._meet(error, failure)
+        self._depth -= 1
+        failed = [(rank, other) for rank, other in enumerate(found) if other is not None]
+        if not failed:
+            return
+        self._told = error
+        fresh = [(rank, other) for rank, other in failed if not other.told]
+        if failure is not None and (failure.told or not fresh):
+            return  # the error goes on as it is
+        if error is not None and failure is not None and not failure.planned:
+            error.add_note(f"on rank {self.ranks.rank} of {self.ranks.size}")
+            return
+        same = len(failed) == self.ranks.size and all(other == failed[0][1] for _, other in failed)
+        if same or (failure is not None and not named):
+            return
+        self._told = _joined(fresh or failed, named)
+        raise self._told from error
+
+    def _failure(self, error: BaseException | None) -> Failure | None:
+        if error is None:
+            return None
+        planned = isinstance(error, self._planned)
+        kind = type(error) if planned else RankFailed
+        text = str(error) if planned else f"{type(error).__name__}: {error}"
+        return Failure(kind, text, getattr(error, "errno", None), planned, error is self._told)
+
+    def _meet(self, error: BaseException | None, failure: Failure | None) -> list[Failure | None]:
+        """Return how the block ended on every rank."""
+        if self.ranks.size == 1:
+            return [failure]
+        while True:
+            request = self._comm.Ibarrier()
+            if error is None:
+                request.Wait()
+            elif not _done(request):
+                self._end_all(error)
+            found: list[tuple[int, Failure | None]] = self._comm.allgather((self._depth, failure))
+            if max(depth for depth, _ in found) <= self._depth or failure is None:
+                return [other for _, other in found]
+            # a rank that failed between two blocks meets those that were still inside one: they come again
+
+    def _end_all(self, error: BaseException) -> None:
+        text = str(error) if isinstance(error, self._planned) else "".join(traceback.format_exception(error)).rstrip()
+        self.last_words(f"rank {self.ranks.rank}: {text}")
+        self._comm.Abort(1)
+
+
+class _Block:
+    """A block of a meeting."""
+
+    def __init__(self, meeting: Meeting, *, named: bool) -> None:
+        self._meeting, self._named = meeting, named
+
+    def __enter__(self) -> None:
+        self._meeting.enter()
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._meeting.leave(error, named=self._named)
+
+
+class _Alone:
+    """A communicator of one rank."""
+
+    rank, size = 0, 1
+
+    def allgather(self, value: Any) -> list[Any]:
+        """Return what was given."""
+        return [value]
+
+    def bcast(self, value: Any) -> Any:
+        """Return what was given."""
+        return value
+
+
+def _done(request: Any) -> bool:
+    """Wait for the other ranks, but not for ever."""
+    end = time.monotonic() + PATIENCE
+    while not request.Test():
+        if time.monotonic() > end:
+            return False
+        time.sleep(PAUSE)
+    return True
+
+
+def _joined(failed: list[tuple[int, Failure]], named: bool) -> BaseException:
+    """Return one error for what failed on some ranks."""
+    first = failed[0][1]
+    texts = list(_lines(failed)) if named else [first.text]
+    error = first.kind.__new__(first.kind)  # without __init__, whose arguments are not the same for all kinds
+    error.args = ("; ".join(texts),)
+    if isinstance(error, OSError):
+        error.errno = first.errno
+    return error
+
+
+def _lines(failed: list[tuple[int, Failure]]) -> Iterator[str]:
+    """Yield a line for each different message."""
+    ranks: dict[str, list[int]] = {}
+    for rank, failure in failed:
+        ranks.setdefault(failure.text, []).append(rank)
+    for text, those in list(ranks.items())[:SHOWN]:
+        yield f"rank {those[0]}: {text}" if len(those) == 1 else f"ranks {', '.join(map(str, those))}: {text}"
+    if len(ranks) > SHOWN:
+        yield f"and {len(ranks) - SHOWN} other messages"

@@ -1,0 +1,174 @@
+"""Newton's method on the minimum map with PETSc's KSP for its linear solves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import warp as wp
+
+from warp_lcp.distributed.petsc_matrix import PetscGrid
+from warp_lcp.distributed.ranks import petsc
+from warp_lcp.multigrid.hierarchy import CycleSettings
+from warp_lcp.operators.grid_poisson import GridPoisson
+from warp_lcp.problem import LCP
+from warp_lcp.solve import Step
+from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
+from warp_lcp.solvers.principal_system import GridSystem, PrincipalSystem
+
+
+@dataclass(frozen=True, kw_only=True)
+class PetscActiveSet:
+    """The primal-dual active set as the outer loop, PETSc's KSP for what is linear (Hintermueller, Ito, Kunisch 2003; [Book] 2.4.1).
+
+    Unknowns with x - y / A_ii outside their bounds are held there; PETSc solves on the others, matrix-free, by conjugate gradients
+    preconditioned with one multigrid cycle, and the step is safeguarded as MinimumMapNewton's is. For grids, on one process or on ranks
+    that share one. MinimumMapNewton and ProjectedMultigrid are faster; this one is for those who want PETSc's methods, monitors and
+    options, which it reads from the environment's PETSC_OPTIONS or from what a program gave petsc4py.init, once, in `init`:
+
+    =============================  ================================================================================================
+    -ksp_type cg                   fcg, pipecg, minres, gmres, ...; what needs A symmetric may be taken, A is; pipecg saves waits for sums
+    -pc_type python                our cycle; jacobi, none; -pc_type ksp -ksp_ksp_type ... is a solve within the solve
+    -ksp_norm_type unpreconditioned  preconditioned and natural norms make `eta` mean something else
+    -ksp_rtol, -ksp_atol, -ksp_max_it  replace what `eta`, the tolerance of the whole solve and `max_linear_iterations` ask for
+    -ksp_monitor, -ksp_converged_reason, -ksp_view, -log_view  tell what happens, on standard output
+    =============================  ================================================================================================
+
+    With `prefix="wall_"` they read `-wall_ksp_type` and so on; PETSc writes what nobody read when `-options_left` is given.
+
+    Args:
+        precision: "mixed": iterate float64, cycles float32; "double"; or "single": the iterate rounded to float32 as well. PETSc's vectors
+            are float64.
+        monotone_cycles: projected multigrid cycles of a cold start, not by PETSc.
+        eta: each linear solve reduces its residual by this factor, by its square once the active set has settled, or to what the whole
+            solve still needs.
+        max_linear_iterations: the most iterations of KSP in one step.
+        backtracks: halvings of a step before it is given up.
+        memory: residuals that a step may fall back to.
+        prefix: of PETSc's options.
+        cycle: how multigrid cycles go.
+
+    Raises:
+        ValueError: an argument is outside its range.
+    """
+
+    supports: ClassVar[frozenset[str]] = frozenset({"grid"})
+    needs: ClassVar[str] = "positive definite"
+
+    precision: str = "mixed"
+    monotone_cycles: int = 2
+    eta: float = 0.1
+    max_linear_iterations: int = 200
+    backtracks: int = 6
+    memory: int = 4
+    prefix: str = ""
+    cycle: CycleSettings = field(default_factory=CycleSettings)
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        self.as_newton()
+
+    def as_newton(self) -> MinimumMapNewton:
+        """Return the method with these settings whose linear solves are our own."""
+        return MinimumMapNewton(
+            precision=self.precision,
+            monotone_cycles=self.monotone_cycles,
+            eta=self.eta,
+            max_linear_iterations=self.max_linear_iterations,
+            backtracks=self.backtracks,
+            memory=self.memory,
+            cycle=self.cycle,
+        )
+
+    def init(self, problem: LCP) -> KSPWorkspace:
+        """Return a workspace.
+
+        Raises:
+            ImportError: PETSc cannot be imported; the message says how to install it.
+            ValueError: A is no grid operator.
+        """
+        if not isinstance(problem.A, GridPoisson):
+            raise ValueError(f"PetscActiveSet takes a GridPoisson, not a {type(problem.A).__name__}: take MinimumMapNewton")
+        return KSPWorkspace(problem, self)
+
+    def step(self, problem: LCP, work: KSPWorkspace, x: wp.array[Any]) -> Step:
+        """Take a monotone cycle while the start is cold, else a safeguarded Newton step."""
+        if work.cycles_left > 0:
+            work.cycles_left -= 1
+            return work.monotone_cycle(x)
+        return work.newton_step(x)
+
+
+class KSPWorkspace(NewtonWorkspace):
+    """Memory of the method for one problem.
+
+    Attributes:
+        ksp: PETSc's solver, as its options have made it.
+    """
+
+    def __init__(self, problem: LCP, settings: PetscActiveSet) -> None:
+        self._prefix = settings.prefix
+        super().__init__(problem, settings.as_newton())
+
+    @property
+    def ksp(self) -> Any:
+        """Return it."""
+        assert isinstance(self.system, KSPSystem)
+        return self.system.iteration.ksp
+
+    def _principal_system(self) -> PrincipalSystem:
+        A = self.problem.A
+        assert isinstance(A, GridPoisson)
+        return KSPSystem(A, self.precision.correction, bounded=self.bounded, settings=self.settings.cycle, prefix=self._prefix)
+
+
+class KSPSystem(GridSystem):
+    """The system on a grid's free set, solved by PETSc's KSP."""
+
+    def __init__(self, A: GridPoisson, real: Any, *, bounded: bool, settings: CycleSettings | None = None, prefix: str = "") -> None:
+        self._prefix = prefix
+        super().__init__(A, real, bounded=bounded, settings=settings)
+
+    def _krylov_method(self) -> KSPIteration:
+        self.iteration = KSPIteration(PetscGrid(self._A, self.hierarchy), self._prefix)
+        return self.iteration
+
+    def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
+        """Mask the finest diagonal and coarsen; PETSc is told that the matrix is another one."""
+        super().restrict(free, shift)
+        self.iteration.grid.matrix.stateIncrease()
+
+
+class KSPIteration:
+    """Iterates as PETSc's options say, on the finest level's right-hand side.
+
+    Args:
+        grid: the matrix and the cycle.
+        prefix: of the options.
+
+    Attributes:
+        x: stored field, the solution.
+        ksp: what iterates.
+    """
+
+    def __init__(self, grid: PetscGrid, prefix: str) -> None:
+        self.grid, self.ksp = grid, grid.solver(prefix)
+        self.x = wp.zeros_like(grid.hierarchy.finest.b)
+        self._right_side, self._solution = grid.vector(), grid.vector()
+        given = petsc().Options(prefix)
+        self._rtol = self.ksp.getTolerances()[0] if given.hasName("ksp_rtol") else 0.0
+        self._atol, self._most = (given.hasName(f"ksp_{name}") for name in ("atol", "max_it"))
+
+    def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
+        """Iterate from x = 0 until the residual's norm is at most the tolerance, or as long as PETSc's options say.
+
+        Returns:
+            Iterations and the norm reached, as KSP has them.
+        """
+        asked = {} if self._atol else {"atol": tolerance}
+        self.ksp.setTolerances(rtol=self._rtol, **asked, **({} if self._most else {"max_it": max_iterations}))
+        copies = self.grid.copies
+        copies.leave(self.grid.hierarchy.finest.b, None, self._right_side)
+        self.ksp.solve(self._right_side, self._solution)
+        copies.enter(self._solution, self.x)
+        return self.ksp.getIterationNumber(), self.ksp.getResidualNorm()

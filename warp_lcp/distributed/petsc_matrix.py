@@ -1,0 +1,219 @@
+"""The grid operator as PETSc's Mat and a multigrid cycle as PETSc's PC: for KSP, SNES and TAO, matrix-free.
+
+Vectors are those of a DMDA with one degree of freedom a cell: each rank's cells one after another, x fastest, without ghost cells. Warp
+reads and writes them where PETSc keeps them; fields have a ring of ghost cells, so each product and each cycle costs two strided copies.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.distributed.ranks import petsc
+from warp_lcp.distributed.vector_copies_kernels import copy_kernels
+from warp_lcp.layout import zeros
+from warp_lcp.multigrid.hierarchy import CycleSettings, Hierarchy
+from warp_lcp.operators.grid_poisson import GridPoisson
+from warp_lcp.operators.stencil import Stencil
+
+if TYPE_CHECKING:
+    from petsc4py import PETSc
+
+
+class VectorCopies:
+    """Copies between PETSc's vectors and the stored fields of a stencil's grid.
+
+    Args:
+        stencil: of the rank's cells; its diagonal says which of them are unknowns. Read at every copy.
+        comm: PETSc's communicator of the vectors, each rank having its own cells.
+
+    Attributes:
+        sizes: local and global length of the vectors, as PETSc takes them.
+    """
+
+    def __init__(self, stencil: Stencil, comm: Any) -> None:
+        self.stencil, self.comm, self.device = stencil, comm, stencil.device
+        self._n = math.prod(stencil.padding.counts)
+        self.sizes = self._n, None  # PETSc adds the ranks' up
+        s = stencil.shape
+        self._box = [wp.vec3i(*stencil.padding.counts), s.s1, s.s2, stencil.grain]
+        self._nothing = wp.empty(0, dtype=wp.float64, device=self.device)
+        staged = self.device.is_cuda  # PETSc's vectors are the host's
+        self._staging = [wp.zeros(self._n, dtype=wp.float64, device=self.device) for _ in range(2)] if staged else []
+
+    def vector(self) -> PETSc.Vec:
+        """Return a vector of zeros."""
+        PETSc = petsc()
+        v = PETSc.Vec().create(self.comm)
+        v.setSizes(self.sizes)
+        v.setType(PETSc.Vec.Type.STANDARD)
+        return v
+
+    def enter(self, v: PETSc.Vec, field: wp.array[Any], scale: float = 1.0) -> None:
+        """Set the field to scale v on the unknowns and to 0 on the other cells; its ghost cells stay as they are."""
+        s = self.stencil
+        kernel = copy_kernels(s.d.dtype, field.dtype).enter
+        values = v.getArray(readonly=True)  # PETSc counts accesses: it ends with the array
+        inputs = [self._seen(values, 0), s.d, wp.float64(scale), *self._box, field]
+        wp.launch(kernel, s.threads, inputs, device=self.device)
+
+    def leave(self, field: wp.array[Any], others: PETSc.Vec | None, v: PETSc.Vec, scale: float = 1.0) -> None:
+        """Set v to scale times the field on the unknowns and to `others` (0 if None) on the other cells."""
+        s = self.stencil
+        kernel = copy_kernels(s.d.dtype, field.dtype).leave
+        given = None if others is None else others.getArray(readonly=True)
+        values = v.getArray()
+        seen, target = self._nothing if given is None else self._seen(given, 0), self._seen(values, 1)
+        wp.launch(kernel, s.threads, [field, s.d, seen, wp.float64(scale), *self._box, target], device=self.device)
+        if self._staging:
+            values[:] = target.numpy()
+
+    def _seen(self, values: np.ndarray, buffer: int) -> wp.array[Any]:
+        """Return a vector's memory as the device sees it: itself on the CPU, a copy on a GPU."""
+        if not self._staging:
+            return wp.array(ptr=values.ctypes.data, dtype=wp.float64, shape=self._n, device=self.device)
+        self._staging[buffer].assign(values)
+        return self._staging[buffer]
+
+
+class StencilMatrix:
+    """The product with a stencil, as the context of a Mat of PETSc's type `python`.
+
+    B = A on the cells with a diagonal that is not 0, for x = 0 on the others; the identity on the others. A stencil whose diagonal a free
+    set I has masked thus gives B = D_I A D_I + D_(not I), symmetric if A is, and on ranks the same matrix as on one.
+
+    Args:
+        stencil: as it is at each product.
+        copies: of its grid.
+    """
+
+    def __init__(self, stencil: Stencil, copies: VectorCopies) -> None:
+        self._stencil, self._copies = stencil, copies
+        self._x, self._y = (zeros(stencil.padding.size, wp.float64, stencil.device) for _ in range(2))
+
+    def as_mat(self) -> PETSc.Mat:
+        """Return the Mat."""
+        matrix = petsc().Mat().createPython((self._copies.sizes,) * 2, self, comm=self._copies.comm)
+        matrix.setOption(petsc().Mat.Option.SYMMETRIC, True)
+        matrix.setUp()
+        return matrix
+
+    def mult(self, matrix: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Y = B x."""
+        self._copies.enter(x, self._x)
+        self._stencil.product(self._x, self._y)
+        self._copies.leave(self._y, x, y)
+
+    multTranspose = mult  # noqa: N815  # PETSc's name; B is symmetric
+
+    def getDiagonal(self, matrix: PETSc.Mat, d: PETSc.Vec) -> None:  # noqa: N802  # PETSc's name
+        """D = diag(B)."""
+        padding = self._stencil.padding
+        own = self._stencil.d.numpy().reshape(padding.shape)[1:-1, 1:-1, 1:-1].astype(np.float64) * self._stencil.unit
+        d.setArray(np.where(own == 0, 1.0, own).ravel())
+
+
+class CyclePreconditioner:
+    """One linear multigrid cycle, as the context of a PC of PETSc's type `python`: symmetric positive definite.
+
+    Args:
+        hierarchy: rebuilt for the free set by the caller.
+        copies: of its finest grid.
+    """
+
+    def __init__(self, hierarchy: Hierarchy, copies: VectorCopies) -> None:
+        self._hierarchy, self._copies = hierarchy, copies
+
+    def apply(self, preconditioner: PETSc.PC, r: PETSc.Vec, z: PETSc.Vec) -> None:
+        """Z = one cycle on r; the identity on cells that are held."""
+        finest = self._hierarchy.finest
+        size = r.norm()  # corrections may be float32: r is brought to length 1. PETSc remembers the norms that its KSP has asked for
+        if size == 0 or not math.isfinite(size):
+            r.copy(z)
+            return
+        self._copies.enter(r, finest.b, 1 / size)
+        self._hierarchy.cycle.run()
+        self._copies.leave(finest.x, r, z, size)
+
+    applyTranspose = apply  # noqa: N815  # PETSc's name
+
+
+class PetscGrid:
+    """A grid operator and its multigrid as PETSc's objects, on all unknowns or on a free set.
+
+    With them PETSc's own solvers work on the operator, matrix-free; everything here is collective where ranks share the operator.
+
+    Args:
+        A: the operator, one process's or one that ranks share. Grids whose FLUID cells touch neither AIR nor a shift are singular: tell
+            PETSc the constants as the matrices' null space.
+        hierarchy: of A, its finest diagonal filled by the caller; None: one of its own, for all unknowns until `hold` is called.
+        real: type in which its cycles work.
+        cycle: how they go.
+
+    Attributes:
+        operator: A as a Mat, the identity on cells that are no FLUID.
+        matrix: A on the free set as a Mat, the identity on other cells; in the hierarchy's storage, so with coefficients of type `real`.
+        cycle: context of a PC on the free set.
+        copies: between vectors and stored fields.
+    """
+
+    def __init__(
+        self, A: GridPoisson, hierarchy: Hierarchy | None = None, *, real: Any = wp.float32, cycle: CycleSettings | None = None
+    ) -> None:
+        self._A, comm = A, communicator(A)
+        self.hierarchy = hierarchy or Hierarchy(A.stencil, real, bounded=False, settings=cycle)
+        finest = self.hierarchy.finest.stencil
+        self.copies = VectorCopies(finest, comm)
+        self.matrix = StencilMatrix(finest, self.copies).as_mat()
+        self.cycle = CyclePreconditioner(self.hierarchy, self.copies)
+        if hierarchy is None:
+            self.hold(A.layout.load(np.ones(A.shape), wp.uint8))
+
+    @cached_property
+    def operator(self) -> PETSc.Mat:
+        """Make it when it is first asked for."""
+        return StencilMatrix(self._A.stencil, VectorCopies(self._A.stencil, self.copies.comm)).as_mat()
+
+    def vector(self, field: Any = None) -> PETSc.Vec:
+        """Return a vector with a field of A's shape, of zeros if None."""
+        v = self.copies.vector()
+        if field is not None:
+            v.setArray(np.ascontiguousarray(field, dtype=np.float64).ravel())
+        return v
+
+    def field(self, v: PETSc.Vec) -> np.ndarray:
+        """Return a vector's values as a field of A's shape, a copy."""
+        return v.getArray(readonly=True).reshape(self._A.shape).copy()
+
+    def hold(self, free: wp.array[Any]) -> None:
+        """Take another free set, a stored uint8 field: the others are held."""
+        self.hierarchy.hold(self._A.stencil.d, free)
+        self.hierarchy.rebuild_changed()
+        self.matrix.stateIncrease()
+
+    def solver(self, prefix: str = "") -> PETSc.KSP:
+        """Return conjugate gradients on `matrix`, preconditioned by a cycle; PETSc's options with this prefix change them.
+
+        Args:
+            prefix: of the options, say "wall_" for `-wall_ksp_type`.
+        """
+        PETSc = petsc()
+        ksp = PETSc.KSP().create(self.copies.comm)
+        ksp.setOptionsPrefix(prefix)
+        ksp.setOperators(self.matrix)
+        ksp.setType(PETSc.KSP.Type.CG)
+        ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
+        ksp.getPC().setType(PETSc.PC.Type.PYTHON)
+        ksp.getPC().setPythonContext(self.cycle)
+        ksp.setFromOptions()
+        return ksp
+
+
+def communicator(A: GridPoisson) -> Any:
+    """Return PETSc's or mpi4py's communicator of the ranks that share an operator."""
+    decomposition = getattr(A, "decomposition", None)
+    return petsc().COMM_SELF if decomposition is None else decomposition.ranks.comm
