@@ -103,19 +103,22 @@ def residual(scene: Splash, bounds: str, x: np.ndarray) -> float:
         bounds: of x.
         x: shape (n, n, n), float64; what it holds outside of FLUID cells does not matter.
     """
-    fluid, air = scene.cells == wl.FLUID, scene.cells == wl.AIR
-    p, y = np.where(fluid, x, 0.0), scene.b.copy()
+    return float(np.linalg.norm(natural(scene.cells, scene.b, scene.lower(bounds), x)))
+
+
+def natural(cells: np.ndarray, b: np.ndarray, lower: float | np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return min(x - l, A x + b) on FLUID cells and 0 elsewhere, with coefficients of 1; all arrays are of the shape of `cells`, float64."""
+    fluid, air = cells == wl.FLUID, cells == wl.AIR
+    p, y = np.where(fluid, x, 0.0), b.copy()
     for axis in range(3):
-        low, high = ([slice(None)] * 3 for _ in range(2))
-        low[axis], high[axis] = slice(None, -1), slice(1, None)
-        a, b = tuple(low), tuple(high)
-        open_ = (fluid[a] & (fluid[b] | air[b])) | (fluid[b] & air[a])  # SOLID cells, and the box around all, let nothing through
-        flux = np.where(open_, p[a] - p[b], 0.0)
-        y[a] += flux
-        y[b] -= flux
-    lower = np.broadcast_to(scene.lower(bounds), y.shape)
-    natural = np.minimum(p - lower, y)[fluid]
-    return float(np.linalg.norm(natural))
+        below, above = ([slice(None)] * 3 for _ in range(2))
+        below[axis], above[axis] = slice(None, -1), slice(1, None)
+        i, j = tuple(below), tuple(above)
+        open_ = (fluid[i] & (fluid[j] | air[j])) | (fluid[j] & air[i])  # SOLID cells, and the box around all, let nothing through
+        flux = np.where(open_, p[i] - p[j], 0.0)
+        y[i] += flux
+        y[j] -= flux
+    return np.where(fluid, np.minimum(p - lower, y), 0.0)
 
 
 def _of(floors: list[Floor], bounds: str, precision: str) -> list[Floor]:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from warp_lcp.gallery.fluid import BOUNDS, SOLID_CENTER, SOLID_RADIUS, Splash, basin, splash
+from warp_lcp.gallery.fluid import BOUNDS, SOLID_CENTER, SOLID_RADIUS, Splash, SplashPart, basin, splash, splash_part
 
-__all__ = ["BOUNDS", "Splash", "anisotropic", "basin", "cut_cells", "splash", "warm_changes"]
+__all__ = ["BOUNDS", "Splash", "SplashPart", "anisotropic", "basin", "cut_cells", "splash", "splash_part", "warm_changes"]
 
 
 def cut_cells(scene: Splash) -> Splash:

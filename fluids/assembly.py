@@ -23,7 +23,8 @@ def make_surface(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, ba
         return NoSurface(grid, boundary)
     count = scene.particles.per_axis**grid.dimension
     if scene.pressure.surface == "ghost-fluid":
-        return GhostFluidSurface(grid, boundary, particles_a_cell=count, smoothing=scene.pressure.smoothing, band=band)
+        fill = band.fill if band is not None else None
+        return GhostFluidSurface(grid, boundary, particles_a_cell=count, smoothing=scene.pressure.smoothing, fill=fill)
     return WholeCellSurface(grid, boundary, particles_a_cell=count)
 
 

@@ -141,7 +141,7 @@ class LiquidSimulation(ParticleSimulation):
         }
         return [
             self.points(),
-            Cells("grid", cells[:, ::-1] - 1, self.grid.spacing, self.grid.dimension, fields, self.grid.counts),
+            Cells("grid", cells[:, ::-1] - 1 + self.grid.origin, self.grid.spacing, self.grid.dimension, fields, self.grid.whole or self.grid.counts),
             *self.surfaces(),
             *self.volumes(),
             *self.body_surfaces(),

@@ -11,11 +11,10 @@ import warp as wp
 import warp_lcp as wl
 from fluids import surface_kernels as kernels
 from warp_lcp.grid.extrapolate import extrapolate
-from warp_lcp.grid.level_set import LevelSet
+from warp_lcp.grid.level_set import Fill, LevelSet
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary
-from warp_lcp.material.narrow_band import NarrowBand
 
 SLIVER = 0.35  # a cell whose open share is smaller may hold no particle though liquid fills it: the level set decides
 SAMPLES = 8  # points along the edge of a cut cell, of a volume that is found once
@@ -55,9 +54,9 @@ class WholeCellSurface:
 
     phi = None
 
-    def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int) -> None:
-        """Make a level set if cells are cut."""
-        self.grid, self.boundary = grid, boundary
+    def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int, fill: Fill | None = None) -> None:
+        """Make a level set if cells are cut; `fill` adds to its density what no particle stands for."""
+        self.grid, self.boundary, self._fill = grid, boundary, fill
         self._level_set = LevelSet(grid, particles_a_cell=particles_a_cell) if boundary.open else None
 
     def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
@@ -65,7 +64,7 @@ class WholeCellSurface:
         wp.copy(kind, self.boundary.base)
         wp.launch(kernels.mark_particles_kernel, particles.count, [particles.key, kind.flatten()], device=self.grid.device)
         if self._level_set is not None:
-            self._level_set.update(particles, window, self.boundary.capacity, self.boundary.base)
+            self._level_set.update(particles, window, self.boundary.capacity, self.boundary.base, fill=self._fill)
             window.launch(kernels.mark_inside_kernel, [self._level_set.phi, self.boundary.capacity, SLIVER, kind])
 
     def complete(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
@@ -111,14 +110,14 @@ class GhostFluidSurface:
         boundary: solids and walls.
         particles_a_cell: of liquid at rest.
         smoothing: binomial passes over the density: quieter, and less accurate in thin sheets.
-        band: where the particles are, if not everywhere.
+        fill: adds to the density what no particle stands for.
     """
 
     def __init__(
-        self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int, smoothing: int = 0, band: NarrowBand | None = None
+        self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int, smoothing: int = 0, fill: Fill | None = None
     ) -> None:
         """Allocate the level set."""
-        self.grid, self.boundary, self.band = grid, boundary, band
+        self.grid, self.boundary, self._fill = grid, boundary, fill
         self.level_set = LevelSet(grid, particles_a_cell=particles_a_cell, smoothing=smoothing)
         self.phi: wp.array | None = self.level_set.phi
         self._window = grid.everywhere
@@ -126,8 +125,7 @@ class GhostFluidSurface:
     def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
         """Write the cells' kinds: FLUID below the surface."""
         self._window = window
-        fill = self.band.fill if self.band is not None else None
-        self.level_set.update(particles, window, self.boundary.capacity, self.boundary.base, fill=fill)
+        self.level_set.update(particles, window, self.boundary.capacity, self.boundary.base, fill=self._fill)
         wp.copy(kind, self.boundary.base)
         window.launch(kernels.mark_inside_kernel, [self.level_set.phi, self.boundary.capacity, 2.0, kind])
 

@@ -71,7 +71,7 @@ class Reduction:
         inputs = [source, n, self.block, 1, self.scalars, slot]
         launch(add_up_kernel, columns * self.block, inputs, device=device, block_dim=self.block)
         if self._across is not None:
-            perform(partial(_add_across, self._across, self.scalars[slot : slot + columns]), launch)
+            perform(partial(_add_across, self._across, self.scalars, slice(slot, slot + columns)), launch)
 
     def dot(self, a: wp.array[Any], b: wp.array[Any], slot: int, *, launch: Launch = wp.launch) -> None:
         """Write a.b to scalars[slot]."""
@@ -79,9 +79,13 @@ class Reduction:
         self.add_up(slot, launch=launch)
 
 
-def _add_across(across: Across, sums: wp.array[wp.float64]) -> None:
+def _add_across(across: Across, scalars: wp.array[wp.float64], slots: slice) -> None:
     """Add what the others have summed."""
-    sums.assign(across.sum(sums.numpy()))
+    if scalars.device.is_cpu:
+        sums = scalars.numpy()[slots]
+        sums[...] = across.sum(sums)
+    else:
+        scalars[slots].assign(across.sum(scalars[slots].numpy()))
 
 
 def launch_spans(

@@ -21,8 +21,8 @@ PAUSE = 0.01  # [s] between two looks
 class Guard:
     """A context in which an exception that not all ranks raise ends them all, by MPI's Abort.
 
-    If all ranks raise the same, which wrong input makes them do, rank 0 goes on with the exception and the others end silently with the
-    exit code. Otherwise each rank that failed says so with its number. Ctrl-C counts as a failure. A rank that is killed is mpiexec's to see.
+    If all ranks raise the same, which wrong input makes them do, rank 0 goes on with the exception and the others end silently with its
+    exit code. Otherwise each rank that failed says so with its number. Ctrl-C counts as a failure. mpiexec sees when a rank is killed.
 
     Args:
         ranks: all of them; entering is collective.

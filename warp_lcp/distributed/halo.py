@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.distributed.decomposition import Box, Decomposition
-from warp_lcp.distributed.ranks import petsc
+from warp_lcp.distributed.ranks import Ranks, petsc
 
 
 class Halo:
@@ -37,7 +38,9 @@ class Halo:
                 )
         nx, ny, nz = (n + 2 * width for n in decomposition.box.counts)
         self.shape = nz, ny, nx
-        self._forest = _forest(decomposition, width) if decomposition.ranks.size > 1 else None
+        boxes = decomposition.boxes
+        stored = [box.grown(width) for box in boxes]
+        self._forest = star_forest(decomposition.ranks, boxes, stored) if decomposition.ranks.size > 1 else None
         self._staging: dict[Any, np.ndarray] = {}
 
     @property
@@ -45,6 +48,12 @@ class Halo:
         """Cells (nz, ny, nx) of the whole grid."""
         nx, ny, nz = self.decomposition.counts
         return nz, ny, nx
+
+    @property
+    def cuts(self) -> list[tuple[int, int]]:
+        """Sides with another rank beyond: axis x, y, z as 0, 1, 2, and 0 for the lower, 1 for the upper side."""
+        d = self.decomposition
+        return [(axis, side) for axis in d.cut_axes for side in range(2) if d.neighbor(axis, side) is not None]
 
     @property
     def hierarchy(self) -> Any:
@@ -79,15 +88,12 @@ class Halo:
     def _slabs(self, *, ghost: bool) -> list[tuple[slice, ...]]:
         """Return the slabs of a stored field beside this rank's cuts: ghost cells, or the cells that other ranks' ghost cells repeat."""
         found, w = [], self.width
-        for axis in self.decomposition.cut_axes:
-            for side in range(2):
-                if self.decomposition.neighbor(axis, side) is None:
-                    continue
-                n = self.shape[2 - axis]
-                first = (0 if ghost else w) if side == 0 else (n - w if ghost else n - 2 * w)
-                slab = [slice(None)] * 3
-                slab[2 - axis] = slice(first, first + w)
-                found.append(tuple(slab))
+        for axis, side in self.cuts:
+            n = self.shape[2 - axis]
+            first = (0 if ghost else w) if side == 0 else (n - w if ghost else n - 2 * w)
+            slab = [slice(None)] * 3
+            slab[2 - axis] = slice(first, first + w)
+            found.append(tuple(slab))
         return found
 
 
@@ -139,16 +145,22 @@ def exchange(forest: Any, roots: np.ndarray, leaves: np.ndarray | None = None) -
     forest.bcastEnd(unit, roots, target, MPI.REPLACE)
 
 
-def _forest(decomposition: Decomposition, width: int) -> Any:
-    """Return the star forest whose leaves are this rank's ghost cells and whose roots are the cells that they repeat."""
-    around, mine = decomposition.box.grown(width), decomposition.ranks.rank
+def star_forest(ranks: Ranks, owned: Sequence[Box], stored: Sequence[Box]) -> Any:
+    """Return the star forest whose leaves are this rank's ghost cells and whose roots are the cells that they repeat; collective.
+
+    Args:
+        ranks: who have the boxes.
+        owned: the cells that each rank is the one to know; they do not overlap.
+        stored: the cells that each rank stores.
+    """
+    around, mine = stored[ranks.rank], ranks.rank
     leaves, remotes = [np.empty(0, dtype=np.int64)], [np.empty((0, 2), dtype=np.int32)]
-    for rank, box in enumerate(decomposition.boxes):
+    for rank, (box, remote) in enumerate(zip(owned, stored, strict=True)):
         shared = around.common(box)
         if rank != mine and shared.cells:
             leaves.append(_elements(shared, around))
-            remotes.append(_remote(rank, _elements(shared, box.grown(width))))
-    forest = petsc().SF().create(comm=decomposition.ranks.comm)
+            remotes.append(_remote(rank, _elements(shared, remote)))
+    forest = petsc().SF().create(comm=ranks.comm)
     forest.setGraph(around.cells, np.concatenate(leaves).astype(np.int32), np.concatenate(remotes))
     return forest
 

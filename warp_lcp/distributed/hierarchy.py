@@ -10,7 +10,8 @@ import warp as wp
 
 from warp_lcp.distributed.halo import Gathering, Halo
 from warp_lcp.layout import Padding
-from warp_lcp.multigrid.hierarchy import Hierarchy
+from warp_lcp.multigrid.hierarchy import Hierarchy, Level
+from warp_lcp.multigrid.shared_cycle_kernels import shared_cycle_kernels
 from warp_lcp.operators.stencil import Stencil
 from warp_lcp.program import Launch, Program, perform
 
@@ -67,6 +68,34 @@ class DistributedHierarchy(Hierarchy):
         for w, whole in zip(ours.weights or (), theirs.weights or (), strict=True):
             self._gathering.collect(w, whole)
         self._whole.rebuild()
+
+    def _go_down(self, level: int, launch: Launch, *, projected: bool, from_zero: bool) -> None:
+        L = self.levels[level]
+        if projected or not from_zero or not self._streams(L):
+            super()._go_down(level, launch, projected=projected, from_zero=from_zero)
+            return
+        L.stencil.wrap(L.b, launch=launch)
+        planes, rows, _ = L.stencil.padding.counts
+        inputs = [*L.operands, planes, rows, L.x, L.b, L.t, L.lower, L.upper, *self.settings.weights]
+        launch(shared_cycle_kernels(*L.form).descend, 1, inputs, device=self.device)
+        self._restrict(level, launch)
+
+    def _go_up(self, level: int, launch: Launch, *, projected: bool) -> None:
+        L, C = self.levels[level], self.levels[level + 1]
+        if projected or not self._streams(L):
+            super()._go_up(level, launch, projected=projected)
+            return
+        C.stencil.wrap(C.x, launch=launch)  # those of L.x are filled since its restriction
+        planes, rows, _ = C.stencil.padding.counts
+        first, second = reversed(self.settings.weights)
+        fields = [L.x, L.b, L.t, L.lower, L.upper, C.x, first, self.settings.over_correction]
+        inputs = [*L.operands, C.stencil.shape, C.aggregates, planes, rows, *fields]
+        launch(shared_cycle_kernels(*L.form).ascend, 1, inputs, device=self.device)
+        L.sweep(L.x, L.t, second, projected=False, launch=launch)
+
+    def _streams(self, L: Level) -> bool:
+        """Whether legs of the cycle go through memory once for several sweeps: by one CPU thread, in three planes at a time."""
+        return self.device.is_cpu and L.stencil.padding.counts[0] >= 3
 
     def _visits(self, level: int) -> int:
         return self.levels[level].visits if level + 1 < len(self.levels) or len(self._whole.levels) > 1 else 1

@@ -43,8 +43,8 @@ class Failure:
 class Meeting:
     """Blocks that all ranks enter, and leave in the same way.
 
-    At the end of a block the ranks meet and tell each other how it went. If it failed on some, all raise: the error's own kind, as far as it
-    is among `planned`, with a message that names the rank; else `RankFailed`. A rank that failed while the others are in the midst of a
+    At the end of a block the ranks meet and tell each other how it went. If it failed on some, all raise: the error's own kind if that is
+    among `planned`, with a message that names the rank; else `RankFailed`. A rank that failed while the others are in the midst of a
     collective operation, which it will not take part in, waits PATIENCE seconds for them and then ends all processes.
 
     Args:
@@ -149,7 +149,7 @@ class Meeting:
 
     def _end_all(self, error: BaseException) -> None:
         text = str(error) if isinstance(error, self._planned) else "".join(traceback.format_exception(error)).rstrip()
-        self.last_words(f"rank {self.ranks.rank}: {text}")
+        self.last_words(f"rank {self.ranks.rank} of {self.ranks.size}: {text}\nall ranks end")
         self._comm.Abort(1)
 
 

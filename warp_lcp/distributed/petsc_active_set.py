@@ -54,6 +54,7 @@ class PetscActiveSet:
 
     supports: ClassVar[frozenset[str]] = frozenset({"grid"})
     needs: ClassVar[str] = "positive definite"
+    distributed: ClassVar[bool] = True
 
     precision: str = "mixed"
     monotone_cycles: int = 2

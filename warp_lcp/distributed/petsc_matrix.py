@@ -16,7 +16,7 @@ import warp as wp
 from warp_lcp.distributed.ranks import petsc
 from warp_lcp.distributed.vector_copies_kernels import copy_kernels
 from warp_lcp.layout import zeros
-from warp_lcp.multigrid.hierarchy import CycleSettings, Hierarchy
+from warp_lcp.multigrid.hierarchy import CycleSettings, Hierarchy, make_hierarchy
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.operators.stencil import Stencil
 
@@ -165,7 +165,7 @@ class PetscGrid:
         self, A: GridPoisson, hierarchy: Hierarchy | None = None, *, real: Any = wp.float32, cycle: CycleSettings | None = None
     ) -> None:
         self._A, comm = A, communicator(A)
-        self.hierarchy = hierarchy or Hierarchy(A.stencil, real, bounded=False, settings=cycle)
+        self.hierarchy = hierarchy or make_hierarchy(A.stencil, real, bounded=False, settings=cycle)
         finest = self.hierarchy.finest.stencil
         self.copies = VectorCopies(finest, comm)
         self.matrix = StencilMatrix(finest, self.copies).as_mat()

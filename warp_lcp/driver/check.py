@@ -28,17 +28,18 @@ def check_scene(path_or_name: str, overrides: Sequence[str] = ()) -> tuple[Scene
     return scene, [("scene", scene.scene.name), ("simulator", scene.scene.simulator), *scene.plan()]
 
 
-def check_memory(scene: Scene, device: str) -> None:
+def check_memory(scene: Scene, device: str, *, share: float = 1.0) -> None:
     """Refuse a scene that takes more memory than a device has free.
 
     Args:
         scene: what would run.
         device: a Warp device's name; on a GPU, the making of the particles, on the host, does not count.
+        share: of the run that is on this device.
 
     Raises:
         SceneError: naming both amounts.
     """
-    needed = scene.memory_estimate() if device == "cpu" else sum(scene.memory_parts().values())
+    needed = int(share * (scene.memory_estimate() if device == "cpu" else sum(scene.memory_parts().values())))
     free = free_memory(device) if needed else None
     if free is not None and needed > free:
         largest = ", ".join(sorted(scene.memory_parts(), key=scene.memory_parts().__getitem__, reverse=True)[:2])

@@ -8,6 +8,7 @@ import re
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ CHECKPOINT_FILE = re.compile(r"step_(?P<step>\d{6,})\.npz")
 REFUSED_FILE = re.compile(r"refused_\d{6,}\.npz")  # set aside when a run continued from an earlier one
 STATE = "state/"
 META = "meta"
+PIECES = "pieces"  # the only array of a checkpoint whose state is in the files of ranks: a checksum of each
 
 
 class CheckpointError(ValueError):
@@ -41,6 +43,11 @@ class Checkpoint:
     time: float
     state: Mapping[str, np.ndarray]
     keys: Mapping[str, Any] = field(default_factory=dict)
+
+    @cached_property
+    def checksum(self) -> str:
+        """A digest of the state."""
+        return _checksum(self.state)
 
 
 class CheckpointFolder:
@@ -84,7 +91,7 @@ class CheckpointFolder:
             "step": checkpoint.step,
             "time": checkpoint.time,
             "keys": self.keys,
-            "checksum": _checksum(checkpoint.state),
+            "checksum": checkpoint.checksum,
         }
         arrays: dict[str, Any] = {META: np.array(json.dumps(meta))}
         arrays |= {STATE + name: array for name, array in checkpoint.state.items()}
@@ -131,12 +138,12 @@ class CheckpointFolder:
         foreign = [name for name in arrays if not name.startswith(STATE)]
         if foreign:
             raise CheckpointError(f"{path}: holds arrays that no run writes: {', '.join(foreign)}")
-        state = {name.removeprefix(STATE): array for name, array in arrays.items()}
-        if found[2] != _checksum(state):
+        checkpoint = Checkpoint(step, time, {name.removeprefix(STATE): array for name, array in arrays.items()}, keys)
+        if found[2] != checkpoint.checksum:
             raise CheckpointError(f"{path}: damaged (its checksum does not fit)")
         if written != step:
             raise CheckpointError(f"{path}: holds step {written}, renamed")
-        return Checkpoint(step, time, state, keys)
+        return checkpoint
 
     def newest(self) -> tuple[Checkpoint | None, list[str]]:
         """Return the newest valid checkpoint, if there is one, and what is wrong with each newer file."""

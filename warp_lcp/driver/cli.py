@@ -18,7 +18,9 @@ from rich.console import Console
 from warp_lcp.driver.benchmark import benchmarks
 from warp_lcp.driver.calibrate import step_seconds
 from warp_lcp.driver.check import check_memory, check_scene
+from warp_lcp.driver.crew import crew_of
 from warp_lcp.driver.devices import DeviceError, choose_device, cuda_driver, devices
+from warp_lcp.driver.engine import Engine, EngineError, EngineOption
 from warp_lcp.driver.film import check_rate
 from warp_lcp.driver.particle_scene import ParticleScene
 from warp_lcp.driver.presets import PresetName
@@ -26,7 +28,6 @@ from warp_lcp.driver.profile import Profile
 from warp_lcp.driver.progress import Bar, Lines
 from warp_lcp.driver.recording import Color, RenderError, Show
 from warp_lcp.driver.render import Looks, film_run, parse_size, render_run
-from warp_lcp.driver.run import run_scene
 from warp_lcp.driver.run_folder import OutputError, RunRecord
 from warp_lcp.driver.scene_file import built_in_scenes, installed_simulators, load_scene
 from warp_lcp.driver.simulator import SimulationFailed, StepFailed
@@ -93,23 +94,27 @@ def run(
     record_problems: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Write each step's pressure problem into DIR.", show_default=False)
     ] = None,
+    engine: EngineOption = Engine.SINGLE,
     overrides: SetOption = None,
 ) -> None:
     """Simulate a scene into a folder that ParaView opens."""
-    with _wrong_input():
+    given = {"--out": out, "--device": device, "--frames": frames, "--resume": resume, "--force": force, "--force-memory": force_memory}
+    with _wrong_input(), crew_of(engine) as crew:
         if resume and force:
             raise OutputError("--resume continues a run and --force deletes it: choose one")
-        loaded = load_scene(scene, overrides or ())
-        chosen = choose_device(device)
+        loaded = crew.load(scene, overrides or (), given)
+        chosen = crew.choose_device(device)
         folder = out or Path("out") / loaded.scene.name
-        console = Console(stderr=True)
+        console = crew.console
         console.print(f"{loaded.scene.name} on {chosen}, into {folder}", markup=False, highlight=False, soft_wrap=True)
         with _interruptible(console) as stop, Bar(console) if console.is_terminal else Lines(console) as observer:
-            watch = Profile(chosen) if profile else None
-            record = run_scene(
+            watch = Profile(chosen) if profile and crew.speaks else None
+            record = crew.run(
                 loaded, folder, device=chosen, observer=observer, last_frame=frames, resume=resume, force=force, force_memory=force_memory,
                 stop=stop, profile=watch, record_problems=record_problems,
             )  # fmt: skip
+    if not crew.speaks:
+        raise typer.Exit(0 if record.status == "finished" else FAILED)
     if watch:
         typer.echo("\n".join(watch.table(record.steps - (record.resumed_from_step or 0), record.seconds)))
     _report(record, folder)
@@ -363,7 +368,7 @@ def _print_pairs(pairs: list[tuple[str, str]]) -> None:
 def _wrong_input() -> Iterator[None]:
     try:
         yield
-    except (SceneError, OutputError, DeviceError, RenderError, ProblemError) as error:
+    except (SceneError, OutputError, DeviceError, RenderError, ProblemError, EngineError) as error:
         _end(str(error), WRONG_INPUT)
 
 
@@ -400,6 +405,8 @@ def _report(record: RunRecord, folder: Path) -> None:
     if newest is None:
         _end(f"{message}; there is no checkpoint yet", FAILED)
     again = f"warp-lcp run {folder / 'scene.toml'} --out {folder} --device {record.device} --resume"
+    if record.engine != Engine.SINGLE:
+        again = f"mpiexec -n {record.ranks} {again} --engine {record.engine}"
     _end(f"{message}\nlast checkpoint: {newest}\ncontinue with: {again}", FAILED)
 
 

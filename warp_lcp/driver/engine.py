@@ -8,6 +8,10 @@ from typing import Annotated
 import typer
 
 
+class EngineError(ValueError):
+    """An engine cannot be used here. The message says why and what to do."""
+
+
 class Engine(StrEnum):
     """What carries a computation."""
 

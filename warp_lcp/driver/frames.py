@@ -13,12 +13,13 @@ from warp_lcp.driver.atomic import write_text
 from warp_lcp.driver.nvdb import nvdb_bytes, write_nvdb
 from warp_lcp.driver.ply import ply_bytes, write_ply
 from warp_lcp.driver.profile import NoStopwatch, Stopwatch
+from warp_lcp.driver.rank_folder import in_ranks
 from warp_lcp.driver.simulator import Cells, Part, Surface, Volume
 from warp_lcp.driver.vti import vti_bytes, write_vti
 from warp_lcp.driver.vtu import vtu_bytes, write_vtu
 
-FRAME_FILE = re.compile(r"(?P<name>[a-z][a-z_]*)_(?P<index>\d{6,})\.(?P<format>vtu|vti|ply|nvdb)")
-COLLECTED = ("vtu", "vti")  # what ParaView opens as a series
+FRAME_FILE = re.compile(r"(?P<name>[a-z][a-z_]*)_(?P<index>\d{6,})\.(?P<format>p?vtu|p?vti|ply|nvdb)")
+COLLECTED = ("vtu", "vti", "pvtu", "pvti")  # what ParaView opens as a series
 WAITING = 2  # frames in memory, the one being written included
 
 GridFormat = Literal["vtu", "vti"]
@@ -57,17 +58,24 @@ class FrameFolder:
         self.frames.mkdir(exist_ok=True)
         files = []
         for part in frame:
-            file = self._write(self.frames / f"{part.name}_{index:06d}", part)
+            file = self.write_part(self.frames / f"{part.name}_{index:06d}", part)
             files.append(file)
             if self.surface_ply and isinstance(part, Surface):
                 files.append(file.with_suffix(".ply"))
                 write_ply(files[-1], part)
-            if isinstance(part, Volume):
-                continue
-            times = self._times.setdefault(part.name, [])
-            times.append((time, f"frames/{file.name}"))
-            write_text(self.folder / f"{part.name}.pvd", collection(times))
+            if not isinstance(part, Volume):
+                self.collect(part.name, time, file)
         return files
+
+    def collect(self, name: str, time: float, file: Path) -> None:
+        """Add the file of a frame's part to the part's collection.
+
+        Raises:
+            OSError: the collection cannot be written.
+        """
+        times = self._times.setdefault(name, [])
+        times.append((time, f"frames/{file.name}"))
+        write_text(self.folder / f"{name}.pvd", collection(times))
 
     def resume(self, times: list[float]) -> None:
         """Continue after the frames of `times`: later files are deleted, the collections are those of the frames that are there.
@@ -79,20 +87,24 @@ class FrameFolder:
             OSError: a file cannot be deleted or written.
         """
         self._times.clear()
-        for file in sorted(self.frames.iterdir() if self.frames.is_dir() else []):
+        for file in sorted(in_ranks(self.frames)):
             match = FRAME_FILE.fullmatch(file.name)
             if match is None:
                 continue
             index = int(match["index"])
             if index >= len(times):
                 file.unlink()
-            elif match["format"] in COLLECTED:
+            elif match["format"] in COLLECTED and file.parent == self.frames:
                 self._times.setdefault(match["name"], []).append((times[index], f"frames/{file.name}"))
         for name, entries in self._times.items():
             write_text(self.folder / f"{name}.pvd", collection(entries))
 
-    def _write(self, path: Path, part: Part) -> Path:
-        """Write a part to a path that gets the suffix of its format."""
+    def write_part(self, path: Path, part: Part) -> Path:
+        """Write a part to a path that gets the suffix of its format; return the file.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
         if isinstance(part, Volume):
             file = path.with_suffix(".nvdb")
             write_nvdb(file, part)
@@ -114,12 +126,17 @@ class FrameWriter:
 
     def __init__(self, folder: FrameFolder, watch: Stopwatch | None = None) -> None:
         """Begin without frames."""
-        self.newest: int | None = None  # the number of the newest frame that this writer brought to disk
+        self.written: int | None = None  # the number of the newest frame that the thread brought to disk
         self._folder = folder
         self._watch = watch or NoStopwatch()
         self._pending: deque[Future[None]] = deque()
         self._failed = False
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="frames")
+
+    @property
+    def newest(self) -> int | None:
+        """The number of the newest frame that is there as a whole."""
+        return self.written
 
     def put(self, index: int, time: float, frame: list[Part]) -> None:
         """Hand over a frame, whose arrays nobody changes any more; wait if there are too many already.
@@ -171,7 +188,7 @@ class FrameWriter:
         with self._watch.beside("frames, written"):
             files = self._folder.write(index, time, frame)
         self._watch.wrote("frames, written", *files)
-        self._failed, self.newest = False, index
+        self._failed, self.written = False, index
 
 
 def frame_bytes(frame: list[Part], grid_format: GridFormat = "vtu", *, surface_ply: bool = False) -> int:

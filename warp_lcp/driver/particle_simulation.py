@@ -422,8 +422,7 @@ class ParticleSimulation(ABC):
         with self.watch.stage("diagnostics", self.particles.position, self.particles.velocity):
             totals = self.particles.totals()
         axes = slice(self.grid.dimension)
-        size = np.array(self.grid.counts) * self.grid.spacing
-        end = size - 0.5 * MARGIN * self.grid.spacing  # a tent at the very end would reach beyond what is stored
+        end = self.grid.extent - 0.5 * MARGIN * self.grid.spacing  # a tent at the very end would reach beyond what is stored
         if totals.finite and (totals.low[axes] >= 0.0).all() and (totals.high[axes] <= end[axes]).all():
             return totals if self.band is None else self.band.with_interior(totals)
         position, velocity = self.particles.position.numpy(), self.particles.velocity.numpy()
@@ -489,7 +488,7 @@ class ParticleSimulation(ABC):
     def _cell_of(self, particle: int) -> tuple[int, ...]:
         """Return the cell that a particle was last sorted into, counted from 0."""
         k, j, i = np.unravel_index(int(self.particles.key.numpy()[particle]), self.grid.shape)
-        return int(i) - 1, int(j) - 1, int(k) - 1
+        return tuple(int(c) - 1 + before for c, before in zip((i, j, k), self.grid.origin, strict=True))
 
     def _signature(self) -> np.ndarray:
         """Return numbers that tell this scene's arrays from another's."""

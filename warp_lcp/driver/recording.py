@@ -13,6 +13,7 @@ import meshio
 import numpy as np
 
 from warp_lcp.driver.frames import FRAME_FILE
+from warp_lcp.driver.pieces import one_grid, one_mesh, piece_files
 from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.scene_file import check_shapes, load_scene
 from warp_lcp.driver.simulator import Cells, Surface
@@ -20,6 +21,7 @@ from warp_lcp.driver.vti import read_vti
 
 SCALE_FRAMES = 16  # evenly spaced frames that fix the color scale of a run
 SCALE_VALUES = 50_000  # about how many values of each
+SUFFIXES = (".vti", ".pvti", ".pvtu", ".vtu")  # of a frame's files; at most one of them is there
 ROUND_NUMBERS = np.array([1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0])
 PALETTES = {  # of speeds, by `Scene.palette`
     "water": np.array([[14, 62, 138], [22, 106, 190], [58, 160, 224], [130, 208, 240], [206, 240, 250]]),
@@ -213,8 +215,8 @@ class Recording:
         return float(self.scene.spacing * (len(cells) / len(points)) ** (1.0 / self.scene.dimension))
 
     def _numbers(self, name: str) -> list[int]:
-        matches = [FRAME_FILE.fullmatch(file.name) for file in (self.folder / "frames").glob(f"{name}_*.vt[ui]")]
-        return sorted(int(match["index"]) for match in matches if match and match["name"] == name)
+        matches = [FRAME_FILE.fullmatch(file.name) for file in (self.folder / "frames").glob(f"{name}_*.*vt[ui]")]
+        return sorted({int(match["index"]) for match in matches if match and match["name"] == name})
 
     def _shown_numbers(self) -> list[int]:
         """Return the numbers of the frames that have all that is shown."""
@@ -245,7 +247,7 @@ class Recording:
     def _cells(self, number: int) -> Cells | None:
         """Return the cells of a frame with their fields."""
         file = self._file("grid", number)
-        if file.suffix == ".vti":
+        if file.suffix in (".vti", ".pvti"):
             return _read_image(file)
         mesh = _read(file)
         if mesh is None:
@@ -257,8 +259,8 @@ class Recording:
 
     def _file(self, name: str, number: int) -> Path:
         path = self.folder / "frames" / f"{name}_{number:06d}"
-        image = path.with_suffix(".vti")
-        return image if image.is_file() else path.with_suffix(".vtu")
+        files = [path.with_suffix(suffix) for suffix in SUFFIXES]
+        return next((file for file in files if file.is_file()), files[-1])
 
     def _field(self, fields: dict[str, Any], name: str) -> np.ndarray:
         if name not in fields:
@@ -285,6 +287,8 @@ def spread(numbers: Sequence[int], count: int) -> list[int]:
 def _read(file: Path) -> meshio.Mesh | None:
     """Return a frame's mesh; None if it is empty, which meshio cannot read."""
     try:
+        if file.suffix == ".pvtu":
+            return one_mesh([mesh for piece in piece_files(file) if (mesh := _read(piece)) is not None])
         with open(file, "rb") as stream:
             if b'NumberOfPoints="0"' in stream.read(1000):
                 return None
@@ -298,7 +302,7 @@ def _read(file: Path) -> meshio.Mesh | None:
 def _read_image(file: Path) -> Cells:
     """Return the cells of a frame that is an image."""
     try:
-        return read_vti(file)
+        return one_grid(list(map(read_vti, piece_files(file)))) if file.suffix == ".pvti" else read_vti(file)
     except OSError as error:
         raise RenderError(f"{file}: cannot be read: {error.strerror}") from error
     except ValueError as error:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from warp_lcp.driver.check import check_memory
 from warp_lcp.driver.checkpoint import Checkpoint
-from warp_lcp.driver.frames import FrameWriter, frame_bytes
+from warp_lcp.driver.frames import frame_bytes
 from warp_lcp.driver.log import Log, Value
 from warp_lcp.driver.problem_folder import ProblemFolder
 from warp_lcp.driver.profile import NoStopwatch, Profile, Stopwatch
@@ -77,9 +77,63 @@ def run_scene(
     """
     if not force_memory:
         check_memory(scene, device)
-    folder = RunFolder(out, scene)
+
+    def create(continued: Continuation | None) -> tuple[Simulation, list[str]]:
+        simulation, notes = _create(scene, device, continued)
+        if record_problems is not None:
+            _record_problems(simulation, scene, record_problems, more=resume)
+        return simulation, notes
+
+    record = RunRecord(scene.scene.name, scene.scene.simulator, device)
+    return run_in_folder(
+        RunFolder(out, scene),
+        record,
+        create,
+        observer=observer,
+        last_frame=last_frame,
+        resume=resume,
+        force=force,
+        stop=stop,
+        profile=profile,
+    )
+
+
+def run_in_folder(
+    folder: RunFolder,
+    record: RunRecord,
+    create: Callable[[Continuation | None], tuple[Simulation, list[str]]],
+    *,
+    observer: Observer,
+    last_frame: int | None,
+    resume: bool,
+    force: bool,
+    stop: Callable[[], bool],
+    profile: Profile | None,
+    somewhere: Callable[[bool], bool] = bool,
+) -> RunRecord:
+    """Simulate into a folder.
+
+    Args:
+        folder: of the run.
+        record: with what is known of it.
+        create: returns the simulation where the run begins, or where it goes on, and what there is to say of it.
+        observer: learns of every step.
+        last_frame: end after this frame.
+        resume: continue the run in the folder.
+        force: delete the run in the folder.
+        stop: asked after every step.
+        profile: measures the run's stages.
+        somewhere: see `Run`.
+
+    Returns:
+        How the run ended.
+
+    Raises:
+        OutputError: the folder cannot take the run.
+        SceneError: the scene cannot be simulated.
+    """
     with folder.held(resume=resume) as remarks:
-        record = RunRecord(scene.scene.name, scene.scene.simulator, device, warnings=list(remarks), mesh_files=folder.mesh_files)
+        record.warnings, record.mesh_files = list(remarks), folder.mesh_files
         continued: Continuation | None = None
         if resume:
             continued = folder.resume()
@@ -88,14 +142,12 @@ def run_scene(
             record.resumed_from_step = continued.checkpoint.step if continued.checkpoint else 0
         else:
             folder.check_new(force=force)
-        simulation, notes = _create(scene, device, continued)
-        if record_problems is not None:
-            _record_problems(simulation, scene, record_problems, more=resume)
+        simulation, notes = create(continued)
         record.warnings += notes
         for note in record.warnings:
             observer.note(note)
         checkpoint = continued.checkpoint if continued else None
-        run = _Run(scene, simulation, folder, record, observer, profile)
+        run = Run(folder.scene, simulation, folder, record, observer, profile, somewhere)
         with profile.kernels_apart() if profile else nullcontext():
             return run.execute(last_frame, stop, resumed=checkpoint is not None)
 
@@ -144,12 +196,30 @@ def plan_dt(stable: float, remaining: float, time: Time) -> float:
     return remaining / 2 if remaining < 2 * dt else dt
 
 
-class _Run:
-    """A simulation on its way through its frames."""
+class Run:
+    """A simulation on its way through its frames.
+
+    Args:
+        scene: what is simulated.
+        simulation: where it begins or goes on.
+        folder: takes the output.
+        record: says how the run ends.
+        observer: learns of every step.
+        profile: measures the stages.
+        somewhere: tells whether something that only this process knows holds for the run; where several run it, on some of them.
+    """
 
     def __init__(
-        self, scene: Scene, simulation: Simulation, folder: RunFolder, record: RunRecord, observer: Observer, profile: Profile | None
+        self,
+        scene: Scene,
+        simulation: Simulation,
+        folder: RunFolder,
+        record: RunRecord,
+        observer: Observer,
+        profile: Profile | None,
+        somewhere: Callable[[bool], bool] = bool,
     ) -> None:
+        """Take over a simulation; nothing is written yet."""
         self.time = scene.time
         self.output = scene.output
         self.simulation = simulation
@@ -160,7 +230,8 @@ class _Run:
         self.watch: Stopwatch = profile or NoStopwatch()
         if isinstance(simulation, Profiled):
             simulation.watch = self.watch
-        self.writer = FrameWriter(folder.frames, self.watch)
+        self.writer = folder.frame_writer(self.watch)
+        self._somewhere = somewhere
         self._has_bodies = any(solid.is_body for solid in scene.solid)  # whose surfaces are part of every frame
         self._begun = clock.perf_counter()
         self._first_step = 0
@@ -207,7 +278,7 @@ class _Run:
     def _start(self, last: int, frame: list[Part]) -> Log:
         """Write what there is before the first step."""
         self.folder.start(self.record)
-        log = Log(self.folder.log, self._columns())
+        log = self.folder.open_log(self._columns())
         self._write_frame(0, last, frame)
         self._write_checkpoint(log)  # so that a run can be continued from its first moment on
         return log
@@ -220,7 +291,7 @@ class _Run:
         self.folder.go_on(self.record, self._first_step)
         self.folder.frames.resume([self.time.frame_time(index) for index in range(self.record.frames + 1)])
         try:
-            return Log(self.folder.log, self._columns(), after_step=self.simulation.step_count)
+            return self.folder.open_log(self._columns(), after_step=self.simulation.step_count)
         except ValueError as error:
             raise OutputError(str(error)) from error
 
@@ -240,7 +311,7 @@ class _Run:
                 frame += 1
             if self._checkpoint_is_due():
                 self._write_checkpoint(log)
-            if stop() and frame <= last:
+            if self._somewhere(stop()) and frame <= last:
                 return True
         return False
 
@@ -306,7 +377,7 @@ class _Run:
         every, minutes = self.output.checkpoint_every, self.output.checkpoint_minutes
         if every and self.simulation.step_count % every == 0:
             return True
-        return minutes is not None and clock.monotonic() - self._checkpoint_time >= 60.0 * minutes
+        return minutes is not None and self._somewhere(clock.monotonic() - self._checkpoint_time >= 60.0 * minutes)
 
     def _write_checkpoint(self, log: Log | None = None) -> None:
         """Write a checkpoint unless there is one of this step; what a run that continues from it expects is on the disk before."""

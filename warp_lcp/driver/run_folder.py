@@ -14,10 +14,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 from warp_lcp.driver.atomic import SUFFIX, write_text
-from warp_lcp.driver.checkpoint import CHECKPOINT_FILE, REFUSED_FILE, Checkpoint, CheckpointFolder
+from warp_lcp.driver.checkpoint import CHECKPOINT_FILE, PIECES, REFUSED_FILE, Checkpoint, CheckpointFolder
 from warp_lcp.driver.continuation import MAY_CHANGE, RESOLUTION, Change, differences, fingerprint, mesh_digests
 from warp_lcp.driver.folder_lock import LOCK, FolderBusyError, locked
-from warp_lcp.driver.frames import FRAME_FILE, FrameFolder
+from warp_lcp.driver.frames import FRAME_FILE, FrameFolder, FrameWriter
+from warp_lcp.driver.log import Log
+from warp_lcp.driver.profile import Stopwatch
+from warp_lcp.driver.rank_folder import in_ranks
 from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.scene_file import dump_scene, keys, load_scene, table_keys
 from warp_lcp.driver.table import SceneError
@@ -47,6 +50,8 @@ class RunRecord:
         scene: the scene's name.
         simulator: what simulates it.
         device: where.
+        engine: what carried it, see `warp_lcp.driver.engine`.
+        ranks: processes that shared it.
         status: how it ended, or that it has not.
         reason: why it ended.
         steps: taken since the scene's start.
@@ -64,6 +69,8 @@ class RunRecord:
     scene: str
     simulator: str
     device: str
+    engine: str = "single"
+    ranks: int = 1
     status: Status = "running"
     reason: str = ""
     steps: int = 0
@@ -181,6 +188,7 @@ class RunFolder:
         if checkpoint is None:
             reasons = refused or ["none was written"]
             raise OutputError("\n  ".join([f"{self.path}: no checkpoint to resume from; --force starts again", *reasons]))
+        self.check_engine(checkpoint)
         end = self.scene.time.frame_time(self.scene.time.frame_count)
         if checkpoint.time > end * (1.0 + ROUNDING):
             raise OutputError(
@@ -199,6 +207,18 @@ class RunFolder:
         changed = differences(before, now, Change.SAME_STEPS, Change.OTHER_STEPS, Change.RESAMPLED)
         return Continuation(checkpoint, remarks, changed, None if old == now[RESOLUTION] else old)
 
+    def check_engine(self, checkpoint: Checkpoint) -> None:
+        """Refuse a checkpoint that this engine cannot continue from.
+
+        Raises:
+            OutputError: it is one in pieces.
+        """
+        if PIECES in checkpoint.state:
+            raise OutputError(
+                f"{self.checkpoints.path(checkpoint.step)}: written by {len(checkpoint.state[PIECES])} ranks; "
+                "continue with --engine petsc, on any number of ranks"
+            )
+
     def go_on(self, record: RunRecord, step: int) -> None:
         """Begin to write behind a step, once everything is known to fit: what a killed process left half-written goes.
 
@@ -211,6 +231,14 @@ class RunFolder:
             file.unlink()
         self.checkpoints.set_aside(step)
 
+    def open_log(self, columns: tuple[str, ...], *, after_step: int | None = None) -> Log:
+        """Begin the log or continue it, see `Log`."""
+        return Log(self.log, columns, after_step=after_step)
+
+    def frame_writer(self, watch: Stopwatch) -> FrameWriter:
+        """Return what writes the frames while the simulation goes on."""
+        return FrameWriter(self.frames, watch)
+
     def write_record(self, record: RunRecord) -> None:
         """Write run.json.
 
@@ -218,6 +246,16 @@ class RunFolder:
             OSError: the disk is full.
         """
         write_text(self.path / RECORD, json.dumps(asdict(record), indent=2) + "\n")
+
+    def mark_failed(self, reason: str) -> None:
+        """Write into run.json that the run has failed, if it says that it is running; for a process that does not have its record.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        record = self._record()
+        if record.get("status") == "running":
+            write_text(self.path / RECORD, json.dumps({**record, "status": "failed", "reason": reason}, indent=2) + "\n")
 
     def check_space(self, needed: int) -> None:
         """Refuse a run whose output does not fit.
@@ -311,7 +349,7 @@ def _walk(folder: Path) -> Iterator[tuple[Path, re.Pattern[str]]]:
     """Yield what is in a run's folder with the pattern of the names that a run writes there."""
     for path in folder.iterdir():
         if path.name in OWN_FOLDERS and path.is_dir() and not path.is_symlink():
-            for file in path.iterdir():
+            for file in in_ranks(path):
                 yield file, OWN_FOLDERS[path.name]
         elif path.name != LOCK:
             yield path, OWN_FILES

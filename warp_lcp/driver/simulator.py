@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 
 if TYPE_CHECKING:
+    from warp_lcp.distributed.ranks import Ranks
     from warp_lcp.driver.profile import Stopwatch
     from warp_lcp.driver.scene import Scene
 
@@ -39,7 +40,8 @@ class Cells:
     """A frame of equal axis-aligned cells. `index` (n, 3): integer x, y, z of each cell, whose low corner lies at index * spacing [m].
 
     `dimension` 2 makes quadrilaterals in the plane z = 0, 3 makes voxels. `fields` have shape (n,) or (n, 3). `counts`: cells of the whole
-    grid along x, y and z, which an image of it has in every frame.
+    grid along x, y and z, which an image of it has in every frame. `box`: the first cell, and the one behind the last, of the part of the
+    grid that these cells come from, if others have the rest; then an image is one of that part.
     """
 
     name: str
@@ -48,6 +50,7 @@ class Cells:
     dimension: int
     fields: dict[str, np.ndarray] = field(default_factory=dict)
     counts: tuple[int, int, int] | None = None
+    box: tuple[tuple[int, int, int], tuple[int, int, int]] | None = None
 
 
 @dataclass(frozen=True)
@@ -165,6 +168,36 @@ class Simulator(Protocol):
 
         Raises:
             ValueError: the scene cannot be simulated; the message names the key and what is allowed.
+        """
+
+
+class DistributedSimulation(Simulation, Protocol):
+    """A rank's part of a simulation that several MPI ranks share.
+
+    `stable_dt`, `step` and `restore_pieces` are collective. Times, rows of the log and columns are those of the whole simulation, the same
+    on all ranks, which also raise the same kind of error. `frame` returns what this rank has, in coordinates of the whole domain.
+    """
+
+    def piece_state(self) -> dict[str, np.ndarray]:
+        """Return this rank's part of the state; `box`, int (2, 3), is its part's first cell and the one behind the last."""
+
+    def restore_pieces(self, pieces: Sequence[Mapping[str, np.ndarray]]) -> None:
+        """Continue from the pieces of all ranks of a run, which need not have been as many. An array is read when it is asked for.
+
+        Raises:
+            ValueError: the pieces do not belong to this scene.
+        """
+
+
+@runtime_checkable
+class DistributedSimulator(Protocol):
+    """What a Simulator may also be: one whose simulations several MPI ranks share."""
+
+    def create_distributed(self, scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> DistributedSimulation:
+        """Build this rank's part of a simulation of `scene`; collective.
+
+        Raises:
+            ValueError: the scene cannot be simulated, or not on ranks; the message names the key and what is allowed.
         """
 
 

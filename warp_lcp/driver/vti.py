@@ -31,23 +31,31 @@ def write_vti(path: Path, cells: Cells) -> None:
         ValueError: a field has another length than the cells, or a cell lies outside the grid.
     """
     fields = {name: writable(name, values, len(cells.index)) for name, values in cells.fields.items()}
-    low, counts = _box(cells)
+    low, counts = image_box(cells)
     columns = cells.index.T
     if len(cells.index) and any(c.min() < a or c.max() >= a + n for c, a, n in zip(columns, low, counts, strict=True)):
         raise ValueError(f"the grid of {' x '.join(map(str, counts))} cells does not hold all cells of {cells.name!r}")
     x, y, z = (column - first for column, first in zip(columns, low, strict=True))
     flat = (z * counts[1] + y) * counts[0] + x
-    end = low + counts
-    if cells.dimension == 2:
-        end[2] = low[2]  # an image of pixels has no extent along z
+    end = image_end(low, counts, cells.dimension)
     with replacing(path) as temporary, open(temporary, "wb") as file:
         file.writelines(_vti(low, end, cells.spacing, fields, flat, int(counts.prod())))
+
+
+def image_end(low: np.ndarray, counts: np.ndarray, dimension: int) -> np.ndarray:
+    """Return the last corner of an image [cells] that begins at the corner `low`; one of pixels has no extent along z."""
+    return low + np.where(np.arange(3) < dimension, counts, 0)
+
+
+def extent_of(low: np.ndarray, end: np.ndarray) -> str:
+    """Return an image's first and last corner as VTK writes them."""
+    return " ".join(f"{a} {b}" for a, b in zip(low, end, strict=True))
 
 
 def vti_bytes(cells: Cells) -> int:
     """Return how many bytes the file of cells takes, or a little more."""
     each = sum(values.itemsize * values[:1].size if len(values) else 8 for values in cells.fields.values())
-    return XML_BYTES + int(_box(cells)[1].prod()) * (each + 1)
+    return XML_BYTES + int(image_box(cells)[1].prod()) * (each + 1)
 
 
 def read_vti(path: Path) -> Cells:
@@ -89,8 +97,11 @@ def _array(array: ElementTree.Element, data: bytes) -> np.ndarray:
     return values.reshape(-1, components) if components > 1 else values
 
 
-def _box(cells: Cells) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first cell of the image and the numbers of cells along x, y and z."""
+def image_box(cells: Cells) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first cell of the image of cells, and its numbers of cells along x, y and z."""
+    if cells.box is not None:
+        low, high = np.array(cells.box)
+        return low, high - low
     if cells.counts is not None:
         return np.zeros(3, dtype=int), np.array(cells.counts)
     if len(cells.index) == 0:
@@ -113,7 +124,7 @@ def _vti(
         size: cells of the image.
     """
     hidden = np.zeros(1, dtype=np.uint8)
-    extent = " ".join(f"{a} {b}" for a, b in zip(low, end, strict=True))
+    extent = extent_of(low, end)
     yield opening("ImageData")
     yield f'<ImageData WholeExtent="{extent}" Origin="0 0 0" Spacing="{spacing} {spacing} {spacing}">\n'.encode()
     yield f'<Piece Extent="{extent}">\n<CellData>\n'.encode()

@@ -64,6 +64,21 @@ class Splash:
         return Problem(f"splash {self.n}^3, {bounds}", A, self.b, lower, np.full(self.b.shape, np.inf), None, frozenset(facts))
 
 
+@dataclass(frozen=True)
+class SplashPart:
+    """Some of the cells of a splash.
+
+    Args:
+        cells: their types with those of the cells around, SOLID beyond the box of the liquid: two more along each axis than `b`.
+        b: net outflow of each FLUID cell, float64.
+        wall: which FLUID cells touch a solid, of the shape of `b`.
+    """
+
+    cells: np.ndarray
+    b: np.ndarray
+    wall: np.ndarray
+
+
 def splash(n: int, *, phase: float = 0.0) -> Splash:
     """Return liquid with a column, a pool, a film on a wall and a blob on the ceiling, around a solid sphere, in a closed box.
 
@@ -76,27 +91,42 @@ def splash(n: int, *, phase: float = 0.0) -> Splash:
     """
     if n < 1:
         raise ValueError(f"n = {n}: must be >= 1 cells a side")
-    c, f = (np.arange(n) + 0.5) / n, np.arange(n + 1) / n
-    x, y, z = np.meshgrid(c, c, c, indexing="ij", sparse=True)
+    whole = splash_part(n, (slice(0, n),) * 3, phase=phase)
+    return Splash(n, np.ascontiguousarray(whole.cells[1:-1, 1:-1, 1:-1]), whole.b, whole.wall)
+
+
+def splash_part(n: int, part: tuple[slice, ...], *, phase: float = 0.0) -> SplashPart:
+    """Return some of the cells of `splash(n)`, made without the others.
+
+    Args:
+        n: cells along a side of the whole.
+        part: their indices along each axis, as those of arrays of all cells.
+        phase: as in `splash`.
+    """
+    numbers = [np.arange(s.start - 1, s.stop + 1) for s in part]
+    x, y, z = np.meshgrid(*((i + 0.5) / n for i in numbers), indexing="ij", sparse=True)
     solid = sum((a - m) ** 2 for a, m in zip((x, y, z), SOLID_CENTER, strict=True)) < SOLID_RADIUS**2
     liquid = ((x < 0.45) & (z < 0.7)) | (z < 0.25) | ((x > 0.93) & (z < 0.8))
     liquid = liquid | ((x - 0.7) ** 2 + (y - 0.6) ** 2 + (z - 0.95) ** 2 < 0.25**2)
-    cells = np.where(solid, SOLID, np.where(liquid, FLUID, AIR)).astype(np.int8)
-    around = np.pad(cells, 1, constant_values=SOLID)
+    around = np.where(solid, SOLID, np.where(liquid, FLUID, AIR)).astype(np.int8)
+    for axis, i in enumerate(numbers):
+        around[tuple((i < 0) | (i >= n) if a == axis else slice(None) for a in range(3))] = SOLID
+    cells = around[1:-1, 1:-1, 1:-1]
     b, wall = np.zeros(cells.shape), np.zeros(cells.shape, dtype=bool)
     for axis, (offset, start) in enumerate([(0.5, 0.1), (0.0, 0.37), (-0.3, 0.71)]):
         s = start + phase
-        x, y, z = np.meshgrid(*(f if a == axis else c for a in range(3)), indexing="ij", sparse=True)
+        places = (i[1:] / n if a == axis else (i[1:-1] + 0.5) / n for a, i in enumerate(numbers))
+        x, y, z = np.meshgrid(*places, indexing="ij", sparse=True)
         u = np.sin(2 * np.pi * (1.5 * x + s)) * np.cos(2 * np.pi * (1.3 * y + 2 * s)) * np.sin(2 * np.pi * (1.7 * z - s))
         u = u + 0.4 * np.sin(9 * np.pi * x + s) * np.sin(7 * np.pi * y) * np.cos(8 * np.pi * z) + offset
         inner = tuple(slice(None) if a == axis else slice(1, -1) for a in range(3))
-        is_solid = around[inner] == SOLID
-        low, high = is_solid.take(range(n + 1), axis), is_solid.take(range(1, n + 2), axis)
+        is_solid, m = around[inner] == SOLID, cells.shape[axis]
+        low, high = is_solid.take(range(m + 1), axis), is_solid.take(range(1, m + 2), axis)
         u[low | high] = 0
         b += np.diff(u, axis=axis)
-        wall |= low.take(range(n), axis) | high.take(range(1, n + 1), axis)
+        wall |= low.take(range(m), axis) | high.take(range(1, m + 1), axis)
     fluid = cells == FLUID
-    return Splash(n, cells, np.where(fluid, b, 0.0), wall & fluid)
+    return SplashPart(around, np.where(fluid, b, 0.0), wall & fluid)
 
 
 def basin(n: int) -> Splash:

@@ -49,5 +49,5 @@ def advect(
     """
     u, v, w = [*fields, None][:3]
     inverse = 1.0 / grid.spacing
-    inputs = [grid.planes, grid.spacing, inverse, dt * inverse, position, u, v, w, room, stopped]
+    inputs = [grid.planes, grid.spacing, inverse, grid.first, dt * inverse, position, u, v, w, room, stopped]
     launch(advect_kernel(endless), len(position), inputs, grid.device)

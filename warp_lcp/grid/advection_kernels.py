@@ -13,9 +13,9 @@ MAX_CLEARANCE = 6  # cells; a particle that moves further in a step takes the ca
 
 # Move a particle from cell to cell along the straight line to its aim: a closed face stops it, it slides on along the face.
 WALK = """
-    auto cell_of = [](T x, int count) { x = x > 1 ? x : (T)1; const T e = count; return (int)(x < e ? x : e); };
+    auto cell_of = [](T x, T least, int count) { x = x > least ? x : least; const T e = count; return (int)(x < e ? x : e); };
     auto walk = [&](int m) {
-        int cell[3] = {cell_of(from[0][m], nx), cell_of(from[1][m], ny), planes == 2 ? cell_of(from[2][m], nz) : 1};
+        int cell[3] = {cell_of(from[0][m], lx, nx), cell_of(from[1][m], ly, ny), planes == 2 ? cell_of(from[2][m], lz, nz) : 1};
         T x[3], rest[3]; int stopped = 0;
         for (int d = 0; d < 3; ++d) { x[d] = from[d][m]; rest[d] = to[d][m] - x[d]; }
         // along each axis the walk goes one way only, so it crosses no more faces than this
@@ -33,21 +33,21 @@ WALK = """
             const int side = rest[axis] > 0 ? 1 : -1;
             for (int d = 0; d <= planes; ++d) { x[d] += t*rest[d]; rest[d] *= 1 - t; }
             x[axis] = (T)cell[axis] + (side > 0 ? (T)1 : (T)0);
-            if (room[cell[2]*s1 + cell[1]*s2 + cell[0] + side*stride[axis]] == 0) {
+            if (room[cell[2]*s1 + cell[1]*s2 + cell[0] - back + side*stride[axis]] == 0) {
                 x[axis] -= (T)side*margin; rest[axis] = 0; ++stopped;
             } else {
                 cell[axis] += side;
                 if ((ENDLESS >> axis & 1) && (cell[axis] < 1 || cell[axis] > counts[axis])) {  // in again at the other side
                     cell[axis] -= side*counts[axis]; x[axis] -= (T)(side*counts[axis]);
                 }
-                if (cell[axis] < 1 || cell[axis] > counts[axis]) {  // out through an open side: there is nothing to meet
+                if (cell[axis] < first_cell[axis] || cell[axis] > counts[axis]) {  // out through an open side: there is nothing to meet
                     for (int d = 0; d <= planes; ++d) to[d][m] = x[d] + rest[d];
                     hit[m] = stopped > 0;
                     return;
                 }
             }
         }
-        const signed char* here = room + (cell[2]*s1 + cell[1]*s2 + cell[0]);
+        const signed char* here = room + (cell[2]*s1 + cell[1]*s2 + cell[0] - back);
         for (int d = 0; d <= planes; ++d) {  // whoever moves along a closed face keeps off it too
             x[d] += rest[d];
             const T low = (T)cell[d] + margin, high = (T)cell[d] + 1 - margin;
@@ -62,14 +62,15 @@ WALK = """
 # Aim at from + a A + b B + c C. Nothing stops a particle that stays in its cell off the faces, or whose solids are further than it goes.
 MOVE = """
     auto move = [&](T a, const Block& A, T b, const Block& B, T c, const Block& C, int n) {
+        const T rx = lx - 1, ry = ly - 1, rz = lz - 1;  // the ring
         SIMD for (int m = 0; m < n; ++m) {
             const T x = from[0][m], y = from[1][m], z = planes == 2 ? from[2][m] : (T)1.5;
             const T X = x + (a*A[0][m] + b*B[0][m] + c*C[0][m]), Y = y + (a*A[1][m] + b*B[1][m] + c*C[1][m]);
             const T Z = planes == 2 ? z + (a*A[2][m] + b*B[2][m] + c*C[2][m]) : (T)1.5;
             to[0][m] = X; to[1][m] = Y; to[2][m] = Z; hit[m] = 0;
-            T p = x > 1 ? x : (T)1, q = y > 1 ? y : (T)1, r = z > 1 ? z : (T)1;
+            T p = x > lx ? x : lx, q = y > ly ? y : ly, r = z > lz ? z : lz;
             const int i = (int)(p < (T)nx ? p : (T)nx), j = (int)(q < (T)ny ? q : (T)ny), k = (int)(r < (T)nz ? r : (T)nz);
-            p = X > 0 ? X : (T)0; q = Y > 0 ? Y : (T)0; r = Z > 0 ? Z : (T)0;  // beyond the ring nothing is known, nor needed
+            p = X > rx ? X : rx; q = Y > ry ? Y : ry; r = Z > rz ? Z : rz;  // beyond the ring nothing is known, nor needed
             const int I = (int)(p < (T)(nx + 1) ? p : (T)(nx + 1)), J = (int)(q < (T)(ny + 1) ? q : (T)(ny + 1));
             const int K = (int)(r < (T)(nz + 1) ? r : (T)(nz + 1));
             int di = I - i, dj = J - j, dk = K - k;
@@ -78,7 +79,7 @@ MOVE = """
             const T fx = X - (T)i, fy = Y - (T)j, fz = Z - (T)k;
             const int stays = (int)(fx >= margin) & (int)(fx <= 1 - margin) & (int)(fy >= margin) & (int)(fy <= 1 - margin)
                 & (int)(fz >= margin) & (int)(fz <= 1 - margin);
-            begin[m] = (int)(k*s1 + j*s2) + i; end[m] = (int)(K*s1 + J*s2) + I; cells[m] = stays ? -1 : most;
+            begin[m] = (int)(k*s1 + j*s2 + i - back); end[m] = (int)(K*s1 + J*s2 + I - back); cells[m] = stays ? -1 : most;
         }
         int careful = 0;
         for (int m = 0; m < n; ++m) {  // no branches: half of the particles change cells, and nobody guesses which
@@ -104,19 +105,19 @@ def advect_kernel(endless: int):
 
     @wp.func_native(runge_kutta(ROOM + WALK + MOVE, endless))
     def advect_some(
-        planes: int, dx: float, inverse_dx: float, h: float, x_: wp.array(dtype=wp.vec3), u_: wp.array3d(dtype=wp.float32),
+        planes: int, dx: float, inverse_dx: float, origin: wp.vec3i, h: float, x_: wp.array(dtype=wp.vec3), u_: wp.array3d(dtype=wp.float32),
         v_: wp.array3d(dtype=wp.float32), w_: wp.array3d(dtype=wp.float32), room_: wp.array3d(dtype=wp.int8), first: int, last: int,
     ) -> int: ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module="warp_lcp.grid.advection" + (f"_{endless}" if endless else ""))
     def advect_particles(
-        count: int, grain: int, planes: int, dx: float, inverse_dx: float, h: float, position: wp.array(dtype=wp.vec3),
-        u: wp.array3d(dtype=wp.float32), v: wp.array3d(dtype=wp.float32), w: wp.array3d(dtype=wp.float32), room: wp.array3d(dtype=wp.int8),
-        stopped: wp.array(dtype=wp.int32),
+        count: int, grain: int, planes: int, dx: float, inverse_dx: float, origin: wp.vec3i, h: float,
+        position: wp.array(dtype=wp.vec3), u: wp.array3d(dtype=wp.float32), v: wp.array3d(dtype=wp.float32),
+        w: wp.array3d(dtype=wp.float32), room: wp.array3d(dtype=wp.int8), stopped: wp.array(dtype=wp.int32),
     ):  # fmt: skip
         """One Runge-Kutta step of some particles; h is the time step in units of 1 / (velocity in cells)."""
         first = wp.tid() * grain
-        hits = advect_some(planes, dx, inverse_dx, h, position, u, v, w, room, first, wp.min(first + grain, count))
+        hits = advect_some(planes, dx, inverse_dx, origin, h, position, u, v, w, room, first, wp.min(first + grain, count))
         if hits > 0:
             wp.atomic_add(stopped, 0, hits)
 

@@ -33,6 +33,7 @@ class CutCells:
         solids: in the order of their numbers, 1 + s; the domain is number 0.
         wall_separating: whether liquid may leave the domain's wall.
         capacity: whether to keep the capacity.
+        remarks: make notes of faces and refuse a grid without open cells; False: the grid is a part of a larger one.
         open_sides: of `warp_lcp.grid.sides.side_bits`: there the faces are open as far as no solid closes them, and the ring is air.
 
     Attributes:
@@ -58,8 +59,9 @@ class CutCells:
     """
 
     def __init__(
-        self, grid: StaggeredGrid, solids: Sequence[PlacedSolid], *, wall_separating: bool, capacity: bool = True, open_sides: int = 0
-    ) -> None:
+        self, grid: StaggeredGrid, solids: Sequence[PlacedSolid], *, wall_separating: bool, capacity: bool = True, open_sides: int = 0,
+        remarks: bool = True,
+    ) -> None:  # fmt: skip
         self.grid, self.solids, self.open_sides = grid, tuple(solids), open_sides
         self.moves = any(solid.motion is not None for solid in solids)
         self.names = ("domain", *(solid.name for solid in solids))
@@ -95,7 +97,7 @@ class CutCells:
         self._refresh()
         dropped, partial = self._counts.numpy().tolist()
         self.whole_cells = partial == 0 and not self.moves
-        self.notes = (*notes, *self._result_notes(dropped))
+        self.notes = (*notes, *(self._result_notes(dropped) if remarks else ()))
         if not self.moves:  # needed by `place` only
             del self._sampler, self._nodes, self._marks
 
@@ -236,7 +238,7 @@ class CutCells:
         for solid in self.solids:
             geometry = solid.geometry
             if solid.motion is None:
-                notes += placement_notes(geometry, solid.name, grid.counts, grid.spacing, grid.dimension)
+                notes += placement_notes(geometry, solid.name, grid.whole or grid.counts, grid.spacing, grid.dimension)
             else:  # it may come in later
                 notes += repair_notes(geometry, solid.name)
             notes += thin_notes(geometry, solid.name, grid.spacing, grid.device)

@@ -49,7 +49,7 @@ def advect_with_distance(
     """
     u, v, w = [*fields, None][:3]
     inverse = 1.0 / grid.spacing
-    inputs = [grid.planes, grid.spacing, inverse, dt * inverse, position, u, v, w, distance, open_sides, stopped]
+    inputs = [grid.planes, grid.spacing, inverse, grid.first, dt * inverse, position, u, v, w, distance, open_sides, stopped]
     launch(advect_kernel(endless), len(position), inputs, grid.device)
 
 

@@ -23,14 +23,15 @@ PUSH = 3.0  # cells that a wall may push a particle in a step
 # The distance to walls and its gradient at grid coordinates in the domain, in cells: that of the solids, linear between nodes, or of the
 # domain. The smaller of both taken at the nodes would close what is open between a solid and the domain's wall next to it.
 DISTANCE = """
-    const float* distance = distance_.data;
+    const float* distance = distance_.data - back;
     const T aim = (T)AIM;
     const int counts[3] = {nx, ny, nz};
     auto into_domain = [&](T* x) {
         for (int d = 0; d <= planes; ++d) {
             const T end = counts[d] + 1;
             if (ENDLESS >> d & 1) { x[d] = x[d] < 1 ? x[d] + (T)counts[d] : x[d]; x[d] = x[d] < end ? x[d] : x[d] - (T)counts[d]; }
-            x[d] = x[d] > 1 ? x[d] : (T)1; x[d] = x[d] < end ? x[d] : end;
+            const T least = first_cell[d];
+            x[d] = x[d] > least ? x[d] : least; x[d] = x[d] < end ? x[d] : end;
         }
     };
     auto closed = [=](int side) { return !(open_sides >> side & 1); };
@@ -50,7 +51,7 @@ DISTANCE = """
         }
         T least = low + fy*(high - low);
         for (int d = 0; d <= planes; ++d) {
-            const T below = closed(2*d) ? x[d] - (T)1 : (T)1e9, above = closed(2*d + 1) ? (T)(counts[d] + 1) - x[d] : (T)1e9;
+            const T below = closed(2*d) ? x[d] - (T)first_cell[d] : (T)1e9, above = closed(2*d + 1) ? (T)(counts[d] + 1) - x[d] : (T)1e9;
             const T side = below < above ? below : above;
             if (side < least) { least = side; g[0] = 0; g[1] = 0; g[2] = 0; g[d] = below < above ? (T)1 : (T)-1; }
         }
@@ -58,11 +59,11 @@ DISTANCE = """
     };
     auto measure_all = [&](const Block& at, T* result, int n) {
         const T ex = nx + 1, ey = ny + 1, ez = nz + 1, far = 1e9;
-        const T x0 = closed(0) ? (T)1 : -far, x1 = closed(1) ? ex : far, y0 = closed(2) ? (T)1 : -far, y1 = closed(3) ? ey : far;
-        const T z0 = closed(4) ? (T)1 : -far, z1 = closed(5) ? ez : far;
+        const T x0 = closed(0) ? lx : -far, x1 = closed(1) ? ex : far, y0 = closed(2) ? ly : -far, y1 = closed(3) ? ey : far;
+        const T z0 = closed(4) ? lz : -far, z1 = closed(5) ? ez : far;
         SIMD for (int m = 0; m < n; ++m) {
             T x = at[0][m], y = at[1][m], z = planes == 2 ? at[2][m] : (T)1;
-            x = x > 1 ? x : (T)1; y = y > 1 ? y : (T)1; z = z > 1 ? z : (T)1;
+            x = x > lx ? x : lx; y = y > ly ? y : ly; z = z > lz ? z : lz;
             x = x < ex ? x : ex; y = y < ey ? y : ey; z = z < ez ? z : ez;
             int i = (int)x, j = (int)y, k = (int)z;
             i = i < nx ? i : nx; j = j < ny ? j : ny; k = k < nz ? k : nz;
@@ -264,7 +265,9 @@ PUSH_OUT = """
     const T margin = (T)MARGIN;
     T* position = (T*)x_.data;
     const int nx = distance_.shape[2] - 2, ny = distance_.shape[1] - 2, nz = distance_.shape[0] - 2;
-    const long long s2 = nx + 2, s1 = s2*(ny + 2), up = planes == 2 ? s1 : 0;
+    const long long s2 = nx + 2, s1 = s2*(ny + 2), up = planes == 2 ? s1 : 0, back = 0;
+    const int first_cell[3] = {1, 1, 1};
+    const T lx = 1, ly = 1, lz = 1;
     Block at; T room[M]; int inside[M], list[M];
     GRID_COORDINATE DISTANCE PROJECT
     int moved = 0, left = 0;
@@ -319,20 +322,20 @@ def advect_kernel(endless: int):
 
     @wp.func_native(runge_kutta(_named("DISTANCE PROJECT" + MARCH + MOVE), endless))
     def advect_some(
-        planes: int, dx: float, inverse_dx: float, h: float, x_: wp.array(dtype=wp.vec3), u_: wp.array3d(dtype=wp.float32),
-        v_: wp.array3d(dtype=wp.float32), w_: wp.array3d(dtype=wp.float32), distance_: wp.array3d(dtype=wp.float32), open_sides: int,
-        first: int, last: int,
+        planes: int, dx: float, inverse_dx: float, origin: wp.vec3i, h: float, x_: wp.array(dtype=wp.vec3),
+        u_: wp.array3d(dtype=wp.float32), v_: wp.array3d(dtype=wp.float32), w_: wp.array3d(dtype=wp.float32),
+        distance_: wp.array3d(dtype=wp.float32), open_sides: int, first: int, last: int,
     ) -> int: ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module="warp_lcp.grid.distance_advection" + (f"_{endless}" if endless else ""))
     def advect_particles(
-        count: int, grain: int, planes: int, dx: float, inverse_dx: float, h: float, position: wp.array(dtype=wp.vec3),
-        u: wp.array3d(dtype=wp.float32), v: wp.array3d(dtype=wp.float32), w: wp.array3d(dtype=wp.float32),
+        count: int, grain: int, planes: int, dx: float, inverse_dx: float, origin: wp.vec3i, h: float,
+        position: wp.array(dtype=wp.vec3), u: wp.array3d(dtype=wp.float32), v: wp.array3d(dtype=wp.float32), w: wp.array3d(dtype=wp.float32),
         distance: wp.array3d(dtype=wp.float32), open_sides: int, stopped: wp.array(dtype=wp.int32),
     ):  # fmt: skip
         """One Runge-Kutta step of some particles; h is the time step in units of 1 / (velocity in cells)."""
         first = wp.tid() * grain
-        hits = advect_some(planes, dx, inverse_dx, h, position, u, v, w, distance, open_sides, first, wp.min(first + grain, count))
+        hits = advect_some(planes, dx, inverse_dx, origin, h, position, u, v, w, distance, open_sides, first, wp.min(first + grain, count))
         if hits > 0:
             wp.atomic_add(stopped, 0, hits)
 

@@ -134,7 +134,7 @@ def particle_density(grid: StaggeredGrid, particles: Particles, window: Window, 
         particles_a_cell: particles in a full cell at rest.
         density: float32 (written, 0 away from particles).
     """
-    numbers = [grid.planes, 1.0 / grid.spacing, 1.0 / particles_a_cell]
+    numbers = [grid.planes, 1.0 / grid.spacing, grid.first, 1.0 / particles_a_cell]
     density.zero_()
     if particles.offsets is not None:
         window.launch(kernels.gather_kernel, [*numbers, particles.offsets, particles.position, density])

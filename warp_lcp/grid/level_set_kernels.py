@@ -46,8 +46,8 @@ SCATTER = """
     GRID_COORDINATE WEIGHTS
     for (long long p = first; p < last; ++p) {
         T wx[3], wy[3], wz[3] = {0, 1, 0};
-        const int i = weigh(grid_coordinate(position[3*p]), nx, wx), j = weigh(grid_coordinate(position[3*p + 1]), ny, wy);
-        const int k = planes == 2 ? weigh(grid_coordinate(position[3*p + 2]), nz, wz) : 1;
+        const int i = weigh(grid_coordinate(position[3*p], origin[0]), nx, wx), j = weigh(grid_coordinate(position[3*p + 1], origin[1]), ny, wy);
+        const int k = planes == 2 ? weigh(grid_coordinate(position[3*p + 2], origin[2]), nz, wz) : 1;
         #ifndef __CUDA_ARCH__
         typedef T Four __attribute__((vector_size(4*sizeof(T))));
         const Four along = {wx[0], wx[1], wx[2], 0};
@@ -75,8 +75,8 @@ GATHER = """
     const int nx = density_.shape[2], ny = density_.shape[1], nz = density_.shape[0];
     const long long s2 = nx, s1 = s2*ny;
     GRID_COORDINATE
-    auto weight = [&](T x, int cell) {
-        T d = grid_coordinate(x) - ((T)cell + (T)0.5);
+    auto weight = [&](int axis, T x, int cell) {
+        T d = grid_coordinate(x, origin[axis]) - ((T)cell + (T)0.5);
         d = d < 0 ? -d : d;
         const T outer = d < (T)1.5 ? (T)1.5 - d : (T)0;
         return d < (T)0.5 ? (T)0.75 - d*d : (T)0.5*outer*outer;
@@ -88,8 +88,8 @@ GATHER = """
         const long long row = c*s1 + b*s2;
         const int last = first_of[row + x1 + 1];
         for (long long p = first_of[row + x0]; p < last; ++p) {
-            const T z = planes == 2 ? weight(position[3*p + 2], k) : (T)1;
-            total += weight(position[3*p], i)*weight(position[3*p + 1], j)*z;
+            const T z = planes == 2 ? weight(2, position[3*p + 2], k) : (T)1;
+            total += weight(0, position[3*p], i)*weight(1, position[3*p + 1], j)*z;
         }
     }
     density_.data[k*s1 + j*s2 + i] = each*total;
@@ -232,13 +232,14 @@ def _filled(source: str) -> str:
 
 @wp.func_native(particle_loop(_filled(SCATTER)))
 def scatter_some(
-    planes: int, inverse_dx: float, each: float, x_: wp.array(dtype=wp.vec3), density_: wp.array3d(dtype=wp.float32), first: int, last: int
-): ...
+    planes: int, inverse_dx: float, origin: wp.vec3i, each: float, x_: wp.array(dtype=wp.vec3), density_: wp.array3d(dtype=wp.float32),
+    first: int, last: int,
+): ...  # fmt: skip
 
 
 @wp.func_native(particle_loop(GATHER))
 def gather_cell(
-    planes: int, inverse_dx: float, each: float, offsets: wp.array(dtype=wp.int32), x_: wp.array(dtype=wp.vec3),
+    planes: int, inverse_dx: float, origin: wp.vec3i, each: float, offsets: wp.array(dtype=wp.int32), x_: wp.array(dtype=wp.vec3),
     density_: wp.array3d(dtype=wp.float32), k: int, j: int, i: int,
 ): ...  # fmt: skip
 
@@ -266,24 +267,24 @@ def volume_row(
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.density")
 def scatter_kernel(
-    count: int, grain: int, planes: int, inverse_dx: float, each: float, position: wp.array(dtype=wp.vec3),
+    count: int, grain: int, planes: int, inverse_dx: float, origin: wp.vec3i, each: float, position: wp.array(dtype=wp.vec3),
     density: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
     """Add the share of some particles to the cells around them."""
     first = wp.tid() * grain
-    scatter_some(planes, inverse_dx, each, position, density, first, wp.min(first + grain, count))
+    scatter_some(planes, inverse_dx, origin, each, position, density, first, wp.min(first + grain, count))
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.density")
 def gather_kernel(
-    cells: CellRange, planes: int, inverse_dx: float, each: float, offsets: wp.array(dtype=wp.int32), position: wp.array(dtype=wp.vec3),
-    density: wp.array3d(dtype=wp.float32),
+    cells: CellRange, planes: int, inverse_dx: float, origin: wp.vec3i, each: float, offsets: wp.array(dtype=wp.int32),
+    position: wp.array(dtype=wp.vec3), density: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
     """Let each cell add up the particles around it."""
     plane, row, chunk = wp.tid()
     first = cells.i + chunk * cells.grain
     for i in range(first, wp.min(first + cells.grain, cells.end)):
-        gather_cell(planes, inverse_dx, each, offsets, position, density, cells.k + plane, cells.j + row, i)
+        gather_cell(planes, inverse_dx, origin, each, offsets, position, density, cells.k + plane, cells.j + row, i)
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.level_set")

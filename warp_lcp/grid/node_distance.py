@@ -60,7 +60,7 @@ def nodes_near(grid: StaggeredGrid, geometry: Geometry) -> tuple[np.ndarray, np.
     low, high = np.zeros(3, dtype=np.int64), end.copy()
     bounds = geometry.bounds()
     if bounds is not None:
-        touched = np.clip(bounds / grid.spacing + 1.0 + np.array([[-FAR], [FAR]]), -1.0, end)
+        touched = np.clip(bounds / grid.spacing + 1.0 - np.array(grid.origin) + np.array([[-FAR], [FAR]]), -1.0, end)
         low, high = np.ceil(np.maximum(touched[0], 0.0)).astype(np.int64), np.minimum(np.floor(touched[1]).astype(np.int64) + 1, end)
     if grid.dimension == 2:
         low[2], high[2] = 1, 2
@@ -77,7 +77,7 @@ class NodeSampler:
     def __init__(self, grid: StaggeredGrid) -> None:
         """Allocate what a part needs."""
         self.grid = grid
-        self.snap = max(SNAP * max(grid.counts), 1e-6)
+        self.snap = max(SNAP * max(grid.whole or grid.counts), 1e-6)
         size = max(min(CHUNK, grid.size), max(grid.shape) * COARSE**2)  # a row of groups fits
         self._points = wp.empty(size, dtype=wp.vec3, device=grid.device)
         self._distances = wp.empty(size, dtype=wp.float32, device=grid.device)
@@ -161,7 +161,7 @@ class NodeSampler:
         block = NodeBlock()
         block.low, block.high = wp.vec3i(*(int(v) for v in low)), wp.vec3i(*(int(v) for v in high))
         block.counts = wp.vec3i(*(int(v) for v in -(-(high - low) // stride)))
-        block.stride, block.flat, block.spacing = stride, self.grid.dimension == 2, self.grid.spacing
+        block.stride, block.flat, block.spacing, block.origin = stride, self.grid.dimension == 2, self.grid.spacing, self.grid.first
         return block
 
     def _parts(self, low: np.ndarray, high: np.ndarray, stride: int) -> Iterator[NodeBlock]:

@@ -25,6 +25,7 @@ class NodeBlock:
     low: wp.vec3i
     high: wp.vec3i  # one past the last
     counts: wp.vec3i  # of items
+    origin: wp.vec3i  # cells of a larger grid before the first
     stride: int
     flat: bool  # 2-D: z does not count
     spacing: float  # [m]
@@ -45,10 +46,11 @@ def first_node(block: NodeBlock, item: int):
 @typing.no_type_check
 def node_position(block: NodeBlock, node: wp.vec3i, offset: float):
     """Return the place [m] of a node, moved by `offset` cells along each axis; 2-D has z = 0."""
-    z = (float(node[2] - 1) + offset) * block.spacing
+    z = (float(block.origin[2] + node[2] - 1) + offset) * block.spacing
     if block.flat:
         z = 0.0
-    return wp.vec3((float(node[0] - 1) + offset) * block.spacing, (float(node[1] - 1) + offset) * block.spacing, z)
+    x = (float(block.origin[0] + node[0] - 1) + offset) * block.spacing
+    return wp.vec3(x, (float(block.origin[1] + node[1] - 1) + offset) * block.spacing, z)
 
 
 @wp.func

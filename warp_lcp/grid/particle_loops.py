@@ -13,23 +13,25 @@ from warp_lcp.native import simd
 
 CPU_GRAIN = 1024  # particles that a CPU thread takes: the launch then costs nothing, the arrays stay in the L2 cache
 
-# Coordinates are rounded after each operation, unlike the rest, so that every kernel finds a particle in the same cell.
+# Coordinates are rounded after each operation, unlike the rest, so that every kernel finds a particle in the same cell. Taking off the
+# cells before a part of a grid is exact, as they are a whole number below the coordinate.
 GRID_COORDINATE = """
-    auto grid_coordinate = [=](T x) -> T {
+    auto grid_coordinate = [=](T x, int before = 0) -> T {
     #ifdef __CUDA_ARCH__
-        if (sizeof(T) == 4) return (T)__fadd_rn(__fmul_rn((float)x, (float)inverse_dx), 1.0f);
-        return (T)__dadd_rn(__dmul_rn((double)x, (double)inverse_dx), 1.0);
+        if (sizeof(T) == 4) return (T)__fsub_rn(__fadd_rn(__fmul_rn((float)x, (float)inverse_dx), 1.0f), (float)before);
+        return (T)__dsub_rn(__dadd_rn(__dmul_rn((double)x, (double)inverse_dx), 1.0), (double)before);
     #else
         #pragma clang fp contract(off) reassociate(off)
         const T scaled = x*inverse_dx;
-        return scaled + (T)1;
+        const T coordinate = scaled + (T)1;
+        return coordinate - (T)before;
     #endif
     };
 """
 
 
 def particle_loop(source: str) -> str:
-    """Return the body of a native function over particles first <= p < last, with `grid_coordinate` if it is wanted."""
+    """Return the body of a native function over particles first <= p < last, with `grid_coordinate(x, cells before)` if wanted."""
     return simd(source.replace("GRID_COORDINATE", GRID_COORDINATE))
 
 

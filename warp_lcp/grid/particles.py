@@ -219,7 +219,8 @@ class Particles:
     def number(self) -> None:
         """Find the cell of each particle."""
         grid = self.grid
-        launch(kernels.number_kernel, self.count, [1.0 / grid.spacing, *grid.counts, self.position, self.key], grid.device)
+        inputs = [1.0 / grid.spacing, grid.planes, *grid.counts, grid.first, self.position, self.key]
+        launch(kernels.number_kernel, self.count, inputs, grid.device)
 
     def sort(self) -> None:
         """Bring the particles into the order of their cells; equal cells keep their order, so that a run is repeatable."""
@@ -260,9 +261,10 @@ class Particles:
         )
 
     def cells_of(self, positions: np.ndarray) -> np.ndarray:
-        """Return the interior cell (x, y, z), counted from 0, of positions [m], shape (n, 3)."""
-        cells = np.floor(np.nan_to_num(np.asarray(positions, dtype=np.float64)) / self.grid.spacing)
-        return np.clip(cells, 0, np.array(self.grid.counts) - 1).astype(int)
+        """Return the interior cell (x, y, z), counted from 0, of positions [m], shape (n, 3); in a part of a grid it may lie outside."""
+        grid = self.grid
+        cells = np.floor(np.nan_to_num(np.asarray(positions, dtype=np.float64)) / grid.spacing)
+        return np.clip(cells, 0, np.array(grid.whole or grid.counts) - 1).astype(int) - np.array(grid.origin)
 
     def arrays(self) -> dict[str, wp.array]:
         """Return the particles' arrays by name."""
@@ -312,7 +314,8 @@ def seed(
     Args:
         grid: the grid.
         regions: functions that tell for points [m], shape (n, 3), which lie in the region, shape (n,).
-        open_cells: which cells may hold particles, shape (nz, ny, nx).
+        open_cells: which cells may hold particles, shape (nz, ny, nx). A part of a grid is given what all of it would be given there, at
+            the cost of a plane of all of it at a time.
         per_axis: points along an edge of a cell, >= 1.
         jitter: width of the random displacement as a fraction of the points' spacing, 0 <= jitter <= 1.
         random_seed: of the displacements; they do not depend on the regions.
@@ -329,13 +332,19 @@ def seed(
         raise ValueError(f"jitter = {jitter}: must be between 0 and 1")
     rng = np.random.default_rng(random_seed)
     axes, margin = slice(grid.dimension), MARGIN * grid.spacing
-    size = np.array(grid.counts) * grid.spacing
+    whole = StaggeredGrid(grid.whole or grid.counts, grid.spacing, grid.dimension, grid.device)
+    size, last = whole.extent, np.array(whole.counts) - 1
     positions, owners = [], []
-    for plane in range(grid.counts[2]):
-        points = lattice(grid, per_axis, jitter, rng, plane).astype(np.float32)
+    for plane in range(grid.origin[2] + grid.counts[2]):
+        points = lattice(whole, per_axis, jitter, rng, plane).astype(np.float32)
+        if plane < grid.origin[2]:
+            continue
         np.clip(points[:, axes], margin, size[axes] - margin, out=points[:, axes])
-        cells = np.minimum((points.astype(np.float64) / grid.spacing).astype(int), np.array(grid.counts) - 1)
-        free = open_cells[plane, cells[:, 1], cells[:, 0]]
+        cells = np.minimum((points.astype(np.float64) / grid.spacing).astype(int), last) - np.array(grid.origin)
+        if grid.whole is not None:
+            ours = ((cells >= 0) & (cells < np.array(grid.counts)))[:, :2].all(axis=1)
+            points, cells = points[ours], cells[ours]
+        free = open_cells[plane - grid.origin[2], cells[:, 1], cells[:, 0]]
         points = points[free]
         owner = np.full(len(points), -1)
         for number, region in enumerate(regions):

@@ -14,8 +14,8 @@ NUMBER = """
     auto cell_of = [](T x, int count) { x = x > 1 ? x : (T)1; const T e = count; return (int)(x < e ? x : e); };
     SIMD for (int p = first; p < last; ++p) {
         const long long q = 3*(long long)p;
-        const int i = cell_of(grid_coordinate(position[q]), nx), j = cell_of(grid_coordinate(position[q + 1]), ny);
-        const int k = nz > 1 ? cell_of(grid_coordinate(position[q + 2]), nz) : 1;
+        const int i = cell_of(grid_coordinate(position[q], origin[0]), nx), j = cell_of(grid_coordinate(position[q + 1], origin[1]), ny);
+        const int k = planes == 2 ? cell_of(grid_coordinate(position[q + 2], origin[2]), nz) : 1;
         key[p] = (k*(ny + 2) + j)*(nx + 2) + i;
     }
 """
@@ -64,8 +64,9 @@ TOTAL = """
 
 @wp.func_native(particle_loop(NUMBER))
 def number_some(
-    inverse_dx: float, nx: int, ny: int, nz: int, x_: wp.array(dtype=wp.vec3), key_: wp.array(dtype=wp.int32), first: int, last: int
-): ...
+    inverse_dx: float, planes: int, nx: int, ny: int, nz: int, origin: wp.vec3i, x_: wp.array(dtype=wp.vec3),
+    key_: wp.array(dtype=wp.int32), first: int, last: int,
+): ...  # fmt: skip
 
 
 @wp.func_native(particle_loop(TOTAL))
@@ -76,11 +77,12 @@ def total_some(
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")
 def number_kernel(
-    count: int, grain: int, inverse_dx: float, nx: int, ny: int, nz: int, position: wp.array(dtype=wp.vec3), key: wp.array(dtype=wp.int32)
-):
-    """Number the stored cell that each particle lies in; in 2-D nz = 1 and its plane is k = 1 whatever z is."""
+    count: int, grain: int, inverse_dx: float, planes: int, nx: int, ny: int, nz: int, origin: wp.vec3i, position: wp.array(dtype=wp.vec3),
+    key: wp.array(dtype=wp.int32),
+):  # fmt: skip
+    """Number the stored cell that each particle lies in; in 2-D its plane is k = 1 whatever z is."""
     first = wp.tid() * grain
-    number_some(inverse_dx, nx, ny, nz, position, key, first, wp.min(first + grain, count))
+    number_some(inverse_dx, planes, nx, ny, nz, origin, position, key, first, wp.min(first + grain, count))
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.particles")

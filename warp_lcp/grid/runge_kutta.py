@@ -9,19 +9,22 @@ from warp_lcp.native import BLOCK
 
 MARGIN = 1e-3  # how far from a wall particles stay, in cells: well above the rounding of float32 positions in 10^3 cells
 
+# Cells have the numbers of the larger grid where this is a part of one, from `first_cell` to `nx`, `ny`, `nz`; a stored field begins
+# `back` elements before the first one of the larger grid's. So coordinates are rounded alike in all parts.
+
 # Interpolate the velocity at grid coordinates; points outside the domain and NaN are brought inside, along axes without an end from the
 # other side.
 SAMPLE = """
     auto sample = [&](const Block& at, Block& result, int n) {
         const T ex = nx + 1, ey = ny + 1, ez = nz + 1;
         for (int axis = 0; axis <= planes; ++axis) {
-            const T* g = axis == 0 ? u_.data : (axis == 1 ? v_.data : w_.data);
+            const T* g = (axis == 0 ? u_.data : (axis == 1 ? v_.data : w_.data)) - back;
             const T hx = axis == 0 ? (T)0 : (T)0.5, hy = axis == 1 ? (T)0 : (T)0.5, hz = axis == 2 ? (T)0 : (T)0.5;
             SIMD for (int m = 0; m < n; ++m) {
                 T x = at[0][m], y = at[1][m], z = at[2][m];
                 if (ENDLESS & 1) { x = x < 1 ? x + (T)nx : x; x = x < ex ? x : x - (T)nx; }
                 if (ENDLESS & 4) { z = z < 1 ? z + (T)nz : z; z = z < ez ? z : z - (T)nz; }
-                x = x > 1 ? x : (T)1; y = y > 1 ? y : (T)1; z = z > 1 ? z : (T)1;
+                x = x > lx ? x : lx; y = y > ly ? y : ly; z = z > lz ? z : lz;
                 x = (x < ex ? x : ex) - hx; y = (y < ey ? y : ey) - hy; z = planes == 2 ? (z < ez ? z : ez) - hz : (T)1;
                 int i = (int)x, j = (int)y, k = (int)z;
                 i = i < nx ? i : nx; j = j < ny ? j : ny; k = k < nz ? k : nz;  // the next node is stored, too
@@ -40,8 +43,10 @@ LOOP = """
     typedef float T; typedef T Block[3][M];
     const T margin = (T)MARGIN;
     T* position = (T*)x_.data;
-    const int nx = u_.shape[2] - 2, ny = u_.shape[1] - 2, nz = u_.shape[0] - 2;
-    const long long s2 = nx + 2, s1 = s2*(ny + 2), up = planes == 2 ? s1 : 0;
+    const int nx = u_.shape[2] - 2 + origin[0], ny = u_.shape[1] - 2 + origin[1], nz = u_.shape[0] - 2 + origin[2];
+    const long long s2 = u_.shape[2], s1 = s2*u_.shape[1], up = planes == 2 ? s1 : 0, back = origin[2]*s1 + origin[1]*s2 + origin[0];
+    const int first_cell[3] = {1 + origin[0], 1 + origin[1], 1 + origin[2]};
+    const T lx = first_cell[0], ly = first_cell[1], lz = first_cell[2];
     Block from, to, k1, k2, k3;
     int hit[M], list[M];
     auto abs_of = [](T x) { return x < 0 ? -x : x; };
@@ -71,7 +76,7 @@ def runge_kutta(walls: str, endless: int = 0) -> str:
     """Return the body of a native function that moves particles first <= p < last and returns how many were stopped.
 
     Args:
-        walls: source of `prepare` and `move`. It finds planes, nx, ny, nz, the strides s1, s2 and up of a field, the Blocks `from` and
+        walls: source of `prepare` and `move`. It finds planes, first_cell, lx, ly, lz, nx, ny, nz, back, the strides s1, s2 and up of a field, the Blocks `from` and
             `to` of grid coordinates, `hit`, `margin` and the array `list` to note particles in.
         endless: has bit n set if axis n has no end; `walls` finds it as ENDLESS.
     """

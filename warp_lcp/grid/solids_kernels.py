@@ -153,12 +153,22 @@ def mesh_thickness(mesh: wp.uint64, reach: float, out: wp.array(dtype=wp.float32
 
 @wp.kernel(enable_backward=False, module=MODULE)
 @typing.no_type_check
-def cell_centers(low_x: int, low_y: int, low_z: int, count_x: int, count_y: int, spacing: float, flat: bool, out: wp.array(dtype=wp.vec3)):
-    """Fill a block of cell centers [m], x fastest; cell 1 of the padded grid begins at the origin, and `flat` puts them at z = 0."""
+def cell_centers(
+    low_x: int,
+    low_y: int,
+    low_z: int,
+    count_x: int,
+    count_y: int,
+    origin: wp.vec3i,
+    spacing: float,
+    flat: bool,
+    out: wp.array(dtype=wp.vec3),
+):
+    """Fill a block of cell centers [m], x fastest; cell 1 of the padded grid begins `origin` cells from 0, and `flat` puts them at z = 0."""
     c = wp.tid()
-    i = low_x + c % count_x
-    j = low_y + (c // count_x) % count_y
-    k = low_z + c // (count_x * count_y)
+    i = origin[0] + low_x + c % count_x
+    j = origin[1] + low_y + (c // count_x) % count_y
+    k = origin[2] + low_z + c // (count_x * count_y)
     z = (float(k) - 0.5) * spacing
     if flat:
         z = 0.0

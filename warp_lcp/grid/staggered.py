@@ -3,7 +3,8 @@
 A grid of nx x ny x nz cells is stored with one ring of ghost cells, shape (nz + 2, ny + 2, nx + 2), x fastest; a 2-D grid is nz = 1 and
 only its plane k = 1 is used. Face fields have the shape of the cells: element (k, j, i) of component 0 (x), 1 (y) or 2 (z) lies on the
 lower x, y or z face of cell (k, j, i). Grid coordinates are X = x / dx + 1 with x [m] the distance from the low corner of the domain, so
-that a point lies in cell floor(X). In 2-D, z is ignored.
+that a point lies in cell floor(X). In 2-D, z is ignored. A grid may be a part of a larger one: points and grid coordinates are then those of
+the larger grid, so that a point has the same in all parts, and stored cell floor(X) - origin.
 """
 
 import typing
@@ -98,6 +99,8 @@ class StaggeredGrid:
         spacing: edge of a cell dx [m].
         dimension: 2 or 3.
         device: a Warp device or its name.
+        origin: cells (x, y, z) of a larger grid before the first one of this.
+        whole: cells of the larger grid that this is a part of; None: it is no part.
 
     Raises:
         ValueError: a count is not positive, nz is not 1 in 2-D, or the spacing is not positive.
@@ -107,6 +110,8 @@ class StaggeredGrid:
     spacing: float
     dimension: int
     device: typing.Any = "cpu"
+    origin: tuple[int, int, int] = (0, 0, 0)
+    whole: tuple[int, int, int] | None = None
 
     def __post_init__(self) -> None:
         """Check the arguments and resolve the device."""
@@ -128,6 +133,16 @@ class StaggeredGrid:
     def size(self) -> int:
         """Elements of a field."""
         return int(np.prod(self.shape))
+
+    @property
+    def extent(self) -> np.ndarray:
+        """Sides of the domain [m], the larger grid's if this is a part of one, shape (3,)."""
+        return np.array(self.whole or self.counts) * self.spacing
+
+    @property
+    def first(self) -> wp.vec3i:
+        """`origin` as kernels take it."""
+        return wp.vec3i(*self.origin)
 
     @property
     def planes(self) -> int:
@@ -170,13 +185,13 @@ class StaggeredGrid:
         return self.window((1, 1, 1), self.counts)
 
     def window(self, low: typing.Sequence[int], high: typing.Sequence[int], grow: int = 0) -> Window:
-        """Return the box of cells from low to high (x, y, z, both included), grown by some cells and clipped to what is stored."""
+        """Return the box of cells from low to high (x, y, z, both included), grown by some cells and clipped to what is stored; a layer is left."""
         first, last = [], []
         for axis in (2, 1, 0):
             if axis == 2 and self.dimension == 2:
                 first.append(1)
                 last.append(2)
                 continue
-            first.append(max(int(low[axis]) - grow, 0))
-            last.append(min(int(high[axis]) + grow + 1, self.counts[axis] + 2))
+            first.append(min(max(int(low[axis]) - grow, 0), self.counts[axis] + 1))
+            last.append(max(min(int(high[axis]) + grow + 1, self.counts[axis] + 2), first[-1] + 1))
         return Window((first[0], first[1], first[2]), (last[0], last[1], last[2]), self.device)

@@ -118,7 +118,7 @@ class SurfaceMesh:
         raw, first, second = self._fields
         raw.zero_()
         numbers = [lattice.planes, 1.0 / lattice.spacing, self._each]
-        launch(scatter_kernel, len(position), [*numbers, position, raw], lattice.device)
+        launch(scatter_kernel, len(position), [*numbers[:2], lattice.first, self._each, position, raw], lattice.device)
         self._mirror(raw, fold=True)
         if interior is not None:
             inputs = [lattice.planes, self._parts, interior.least, interior.depth, interior.base, raw]

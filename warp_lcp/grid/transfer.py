@@ -48,7 +48,7 @@ def particles_to_faces(
         field.zero_()
         weight.zero_()
         gradient = affine[axis] if affine else None
-        numbers = [axis, grid.planes, grid.spacing, 1.0 / grid.spacing]
+        numbers = [axis, grid.planes, grid.spacing, 1.0 / grid.spacing, grid.first]
         if offsets is not None:
             window.launch(kernel.gather_weights, [*numbers, offsets, position, velocity, gradient, field, weight])
             continue
@@ -81,5 +81,5 @@ def faces_to_particles(
     for axis, field in enumerate(fields):
         gradient = affine[axis] if affine else None
         old = saved[axis] if saved and flip > 0.0 else None
-        inputs = [axis, grid.planes, 1.0 / grid.spacing, flip, position, field, old, velocity, gradient]
+        inputs = [axis, grid.planes, 1.0 / grid.spacing, grid.first, flip, position, field, old, velocity, gradient]
         launch(kernel.interpolate, len(position), inputs, grid.device)

@@ -1,7 +1,8 @@
 # mypy: ignore-errors
 """Kernels of the transfers. `scatter` and `gather_weights` are two forms of one sum, `interpolate` is its adjoint.
 
-Node (k, j, i) of component `axis` lies at the grid coordinates (i, j + 1/2, k + 1/2) with the axis' own 1/2 left out. In 2-D the nodes
+Node (k, j, i) of component `axis` lies at the grid coordinates (i, j + 1/2, k + 1/2) with the axis' own 1/2 left out, plus the origin of a
+part of a grid. In 2-D the nodes
 of one plane are used: the coordinate along z is that of the plane, and the plane above is the same one.
 """
 
@@ -25,8 +26,8 @@ NODES = """
     const T hx = axis == 0 ? (T)0 : (T)0.5, hy = axis == 1 ? (T)0 : (T)0.5, hz = axis == 2 ? (T)0 : (T)0.5;
     const T lx = axis == 0 ? (T)EDGE : (T)0, ly = axis == 1 ? (T)EDGE : (T)0, lz = axis == 2 ? (T)EDGE : (T)0;
     auto nodes = [&](long long p, int& i, int& j, int& k, T& fx, T& fy, T& fz) {
-        const T x = grid_coordinate(position[3*p]) - hx, y = grid_coordinate(position[3*p + 1]) - hy;
-        const T z = planes == 2 ? grid_coordinate(position[3*p + 2]) - hz : (T)1;
+        const T x = grid_coordinate(position[3*p], origin[0]) - hx, y = grid_coordinate(position[3*p + 1], origin[1]) - hy;
+        const T z = planes == 2 ? grid_coordinate(position[3*p + 2], origin[2]) - hz : (T)1;
         i = (int)x; j = (int)y; k = (int)z;
         fx = x - (T)i; fy = y - (T)j; fz = z - (T)k;
         fx = fx < lx ? lx : fx; fy = fy < ly ? ly : fy; fz = fz < lz ? lz : fz;
@@ -153,49 +154,49 @@ def kernels(real: Any) -> SimpleNamespace:
 
     @wp.func_native(native(SCATTER))
     def scatter_some(
-        axis: int, planes: int, dx: real, inverse_dx: real, s1: wp.int64, s2: wp.int64,
+        axis: int, planes: int, dx: real, inverse_dx: real, origin: wp.vec3i, s1: wp.int64, s2: wp.int64,
         x_: vectors, v_: vectors, c_: vectors, m_: values, w_: values, first: int, last: int,
     ): ...  # fmt: skip
 
     @wp.func_native(native(BLOCK + INTERPOLATE))
     def interpolate_some(
-        axis: int, planes: int, inverse_dx: real, flip: real, s1: wp.int64, s2: wp.int64,
+        axis: int, planes: int, inverse_dx: real, origin: wp.vec3i, flip: real, s1: wp.int64, s2: wp.int64,
         x_: vectors, field_: values, saved_: values, v_: vectors, c_: vectors, first: int, last: int,
     ): ...  # fmt: skip
 
     @wp.func_native(native(GATHER_WEIGHTS))
     def gather_face(
-        axis: int, planes: int, dx: real, inverse_dx: real, nx: int, ny: int, nz: int, s1: wp.int64, s2: wp.int64,
+        axis: int, planes: int, dx: real, inverse_dx: real, origin: wp.vec3i, nx: int, ny: int, nz: int, s1: wp.int64, s2: wp.int64,
         offsets: wp.array(dtype=wp.int32), x_: vectors, v_: vectors, c_: vectors, field_: values, w_: values, k: int, j: int, i: int,
     ): ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module=name)
     def scatter(
-        count: int, grain: int, axis: int, planes: int, dx: real, inverse_dx: real,
+        count: int, grain: int, axis: int, planes: int, dx: real, inverse_dx: real, origin: wp.vec3i,
         position: vectors, velocity: vectors, gradient: vectors, momentum: values, weight: values,
     ):  # fmt: skip
         first = wp.tid() * grain
         ny, nx = momentum.shape[1], momentum.shape[2]
         scatter_some(
-            axis, planes, dx, inverse_dx, wp.int64(ny) * wp.int64(nx), wp.int64(nx),
+            axis, planes, dx, inverse_dx, origin, wp.int64(ny) * wp.int64(nx), wp.int64(nx),
             position, velocity, gradient, momentum, weight, first, wp.min(first + grain, count),
         )  # fmt: skip
 
     @wp.kernel(enable_backward=False, module=name)
     def interpolate(
-        count: int, grain: int, axis: int, planes: int, inverse_dx: real, flip: real,
+        count: int, grain: int, axis: int, planes: int, inverse_dx: real, origin: wp.vec3i, flip: real,
         position: vectors, field: values, saved: values, velocity: vectors, gradient: vectors,
     ):  # fmt: skip
         first = wp.tid() * grain
         ny, nx = field.shape[1], field.shape[2]
         interpolate_some(
-            axis, planes, inverse_dx, flip, wp.int64(ny) * wp.int64(nx), wp.int64(nx),
+            axis, planes, inverse_dx, origin, flip, wp.int64(ny) * wp.int64(nx), wp.int64(nx),
             position, field, saved, velocity, gradient, first, wp.min(first + grain, count),
         )  # fmt: skip
 
     @wp.kernel(enable_backward=False, module=name)
     def gather_weights(
-        cells: CellRange, axis: int, planes: int, dx: real, inverse_dx: real, offsets: wp.array(dtype=wp.int32),
+        cells: CellRange, axis: int, planes: int, dx: real, inverse_dx: real, origin: wp.vec3i, offsets: wp.array(dtype=wp.int32),
         position: vectors, velocity: vectors, gradient: vectors, field: values, weight: values,
     ):  # fmt: skip
         plane, row, chunk = wp.tid()
@@ -203,7 +204,7 @@ def kernels(real: Any) -> SimpleNamespace:
         nz, ny, nx = field.shape[0], field.shape[1], field.shape[2]
         for i in range(first, wp.min(first + cells.grain, cells.end)):
             gather_face(
-                axis, planes, dx, inverse_dx, nx, ny, nz, wp.int64(ny) * wp.int64(nx), wp.int64(nx), offsets,
+                axis, planes, dx, inverse_dx, origin, nx, ny, nz, wp.int64(ny) * wp.int64(nx), wp.int64(nx), offsets,
                 position, velocity, gradient, field, weight, cells.k + plane, cells.j + row, i,
             )  # fmt: skip
 

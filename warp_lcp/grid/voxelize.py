@@ -65,6 +65,7 @@ def voxelize(
     wall_separating: bool,
     device: wp.Device | str,
     open_sides: int = 0,
+    origin: tuple[int, int, int] = (0, 0, 0),
     remarks: bool = True,
 ) -> VoxelSolids:
     """Give every cell whose center lies inside a solid to the first such solid.
@@ -77,6 +78,7 @@ def voxelize(
         wall_separating: whether liquid may leave the domain's wall.
         device: where the arrays live.
         open_sides: of `warp_lcp.grid.sides.side_bits`: beyond them cells are open.
+        origin: cells (x, y, z) of a larger grid before the first one, if this is a part of one.
         remarks: make notes and refuse what makes no sense at the start of a run; False: solids are where they have moved to.
 
     Raises:
@@ -96,7 +98,7 @@ def voxelize(
         if remarks:
             notes += placement_notes(solid.geometry, solid.name, counts, spacing, dimension)
             notes += thin_notes(solid.geometry, solid.name, spacing, device)
-        _claim(index, covered, solid.geometry, number, spacing, dimension)
+        _claim(index, covered, solid.geometry, number, spacing, dimension, origin)
     claimed = covered.numpy()[1:]
     notes += [
         f"{solid.name} is too small for the grid: no center of a cell of {spacing:.4g} m lies inside it"
@@ -150,11 +152,19 @@ def inside(geometries: Sequence[Geometry], points: np.ndarray, *, device: wp.Dev
 
 
 def _claim(
-    index: wp.array3d(dtype=wp.int32), covered: wp.array(dtype=wp.int32), geometry: Geometry, number: int, spacing: float, dimension: int
+    index: wp.array3d(dtype=wp.int32),
+    covered: wp.array(dtype=wp.int32),
+    geometry: Geometry,
+    number: int,
+    spacing: float,
+    dimension: int,
+    origin: tuple[int, int, int],
 ) -> None:
     """Give the open cells inside a geometry to solid `number`, a few layers of its bounds at a time."""
-    low, high = _cell_range(index.shape, geometry.bounds(), spacing, dimension)
+    low, high = _cell_range(index.shape, geometry.bounds(), spacing, dimension, origin)
     across = high[:2] - low[:2]
+    if not (low < high).all():
+        return
     layers = max(1, CHUNK // int(across.prod()))
     for bottom in range(int(low[2]), int(high[2]), layers):
         top = min(bottom + layers, int(high[2]))
@@ -162,17 +172,19 @@ def _claim(
         block = [int(low[0]), int(low[1]), bottom, int(across[0]), int(across[1])]
         points = wp.empty(size, dtype=wp.vec3, device=index.device)
         distance = wp.empty(size, dtype=wp.float32, device=index.device)
-        wp.launch(cell_centers, dim=size, inputs=[*block, spacing, dimension == 2], outputs=[points], device=index.device)
+        wp.launch(cell_centers, dim=size, inputs=[*block, wp.vec3i(*origin), spacing, dimension == 2], outputs=[points], device=index.device)
         geometry.signed_distance(points, distance)
         wp.launch(claim_cells, dim=size, inputs=[*block, distance, number, index, covered], device=index.device)
 
 
-def _cell_range(shape: tuple[int, ...], bounds: np.ndarray | None, spacing: float, dimension: int) -> tuple[np.ndarray, np.ndarray]:
+def _cell_range(
+    shape: tuple[int, ...], bounds: np.ndarray | None, spacing: float, dimension: int, origin: tuple[int, int, int]
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the first and one past the last interior cell (x, y, z) that bounds [m] can touch, with a cell to spare."""
     end = np.array(shape[::-1]) - 1
     low, high = np.ones(3, dtype=np.int64), end.copy()
     if bounds is not None:
-        touched = np.clip(bounds / spacing + 1.0, 0.0, end)
+        touched = np.clip(bounds / spacing + 1.0 - np.array(origin), 0.0, end)
         axes = slice(dimension)
         low[axes] = np.clip(np.floor(touched[0]) - 1, 1, end)[axes].astype(np.int64)
         high[axes] = np.clip(np.floor(touched[1]) + 2, 1, end)[axes].astype(np.int64)

@@ -17,7 +17,7 @@ from warp_lcp.grid.sides import continue_beyond
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.voxelize import VoxelSolids
 from warp_lcp.material import boundary_kernels as kernels
-from warp_lcp.material.wall import extend_velocity
+from warp_lcp.material.wall import Join, extend_velocity
 
 Faces = list[wp.array]  # one field a component
 
@@ -52,8 +52,14 @@ class Boundary(Protocol):
     def begin_step(self, time: float, dt: float) -> None:
         """Find how fast the solids move from `time` on [s]."""
 
-    def extend(self, window: Window, velocity: Faces, weights: Faces, known: Faces, kind: wp.array, contact: wp.array, layers: int) -> None:
-        """Continue the projected velocity into air and walls, see `warp_lcp.material.wall`."""
+    def extend(
+        self, window: Window, velocity: Faces, weights: Faces, known: Faces, kind: wp.array, contact: wp.array, layers: int,
+        join: Join | None = None,
+    ) -> None:  # fmt: skip
+        """Continue the projected velocity into air and walls, see `warp_lcp.material.wall`; `join` as there."""
+
+    def placed(self) -> list[wp.array]:
+        """Return the fields of solids that stand still: beyond its cuts a part of a grid takes them from the other parts."""
 
     def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> tuple[int, int, int]:
         """Move particles, then the solids to `time`. Return how many met a wall, were pushed by a solid, and are stuck inside one."""
@@ -121,10 +127,17 @@ class WholeCells:
     def begin_step(self, time: float, dt: float) -> None:
         """Do nothing: velocities are constant."""
 
-    def extend(self, window: Window, velocity: Faces, weights: Faces, known: Faces, kind: wp.array, contact: wp.array, layers: int) -> None:
+    def extend(
+        self, window: Window, velocity: Faces, weights: Faces, known: Faces, kind: wp.array, contact: wp.array, layers: int,
+        join: Join | None = None,
+    ) -> None:  # fmt: skip
         """Continue the projected velocity into air and walls."""
         s = self.solids
-        extend_velocity(window, velocity, weights, known, kind, contact, s.index, s.separating, self.velocity, layers)
+        extend_velocity(window, velocity, weights, known, kind, contact, s.index, s.separating, self.velocity, layers, join=join)
+
+    def placed(self) -> list[wp.array]:
+        """Return the fields of solids that stand still."""
+        return [self.base, self.touch, self.capacity, self._room]
 
     def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> tuple[int, int, int]:
         """Move particles, never into a SOLID cell."""

@@ -13,6 +13,7 @@ from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material import boundary_kernels as kernels
 from warp_lcp.material.boundary import Faces
 from warp_lcp.material.cut_wall import extend_velocity_cut
+from warp_lcp.material.wall import Join
 
 CLOSE = 1.0  # cells from a solid within which the sides of an axis without an end must be alike
 ALIKE = 1e-2  # cells
@@ -59,9 +60,16 @@ class CutBoundary:
         if self.moves:
             self.cut.set_velocity(time, dt)
 
-    def extend(self, window: Window, velocity: Faces, weights: Faces, known: Faces, kind: wp.array, contact: wp.array, layers: int) -> None:
+    def extend(
+        self, window: Window, velocity: Faces, weights: Faces, known: Faces, kind: wp.array, contact: wp.array, layers: int,
+        join: Join | None = None,
+    ) -> None:  # fmt: skip
         """Continue the projected velocity into air and walls."""
-        extend_velocity_cut(window, velocity, weights, known, kind, contact, self.cut, self._scratch, layers)
+        extend_velocity_cut(window, velocity, weights, known, kind, contact, self.cut, self._scratch, layers, join=join)
+
+    def placed(self) -> list[wp.array]:
+        """Return the fields of solids that stand still."""
+        return [self.base, self.touch, self.cut.distance, *self.open, *self.cut.wall, *([] if self.capacity is None else [self.capacity])]
 
     def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> tuple[int, int, int]:
         """Move particles, then the solids to `time`. Return how many met a wall, were pushed by a solid, and are stuck inside one."""
@@ -96,10 +104,10 @@ class CutBoundary:
         coordinates = self.grid.to_grid(points)
         if self.grid.dimension == 2:
             coordinates[:, 2] = 1.0
-        last = np.array(self.grid.shape[::-1]) - 2
-        cell = np.clip(np.floor(coordinates).astype(np.int64), 0, last)
+        last, origin = np.array(self.grid.shape[::-1]) - 2, np.array(self.grid.origin)
+        cell = np.clip(np.floor(coordinates).astype(np.int64) - origin, 0, last)
         i, j, k = cell.T
-        x, y, z = (coordinates - cell).T
+        x, y, z = (coordinates - origin - cell).T
         d = self.cut.distance.numpy().astype(np.float64)
         planes = [
             (1 - y) * ((1 - x) * d[c, j, i] + x * d[c, j, i + 1]) + y * ((1 - x) * d[c, j + 1, i] + x * d[c, j + 1, i + 1])
@@ -107,7 +115,7 @@ class CutBoundary:
         ]
         between = planes[0] if self.grid.dimension == 2 else (1 - z) * planes[0] + z * planes[1]
         axes = slice(self.grid.dimension)
-        side = np.minimum(coordinates - 1.0, np.array(self.grid.counts) + 1.0 - coordinates)[:, axes].min(axis=1)
+        side = np.minimum(coordinates - 1.0, np.array(self.grid.whole or self.grid.counts) + 1.0 - coordinates)[:, axes].min(axis=1)
         return np.asarray(np.minimum(between, side) >= MARGIN)
 
     def _join_sides(self) -> None:

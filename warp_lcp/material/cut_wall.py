@@ -22,6 +22,7 @@ from warp_lcp.grid.extrapolate import extrapolate
 from warp_lcp.grid.staggered import CellRange, Window
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.contact import HELD, RELEASED, TOUCHES_NOTHING
+from warp_lcp.material.wall import Join
 from warp_lcp.native import BLOCK, simd
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 
@@ -246,6 +247,8 @@ def extend_velocity_cut(
     cut: CutCells,
     scratch: Sequence[wp.array],
     layers: int,
+    *,
+    join: Join | None = None,
 ) -> None:
     """Continue the projected velocity into air and walls.
 
@@ -259,12 +262,13 @@ def extend_velocity_cut(
         cut: the walls: distances at nodes, open fractions, whose wall closes a face, and its velocity.
         scratch: a float32 field for each component (written).
         layers: how far into air and walls, in faces.
+        join: called with the marks and the velocity of a component after each layer, see `warp_lcp.grid.extrapolate`.
     """
     planes = len(velocity) - 1
     for field, weight, marks, fraction in zip(velocity, weights, known, cut.open, strict=True):
-        extrapolate(window, marks, field, 1)
+        extrapolate(window, marks, field, 1, join=join)
         window.launch(keep_spray_kernel, [marks, weight, fraction])
-        extrapolate(window, marks, field, layers)
+        extrapolate(window, marks, field, layers, join=join)
     pads = [None] * (3 - len(velocity))
     moving = [None] * 3 if cut.velocity is None else [*cut.velocity, *pads]
     fields = [*velocity, *pads, *known, *pads, kind, contact]

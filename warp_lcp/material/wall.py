@@ -18,6 +18,8 @@ from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.contact import RELEASED
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 
+Join = Callable[[wp.array, wp.array], None]  # takes the marks and the velocity of a component
+
 _FLUID = wp.constant(wp.int8(FLUID))
 _SOLID = wp.constant(wp.int8(SOLID))
 
@@ -99,7 +101,7 @@ def extend_velocity(
     solid_velocity: Sequence[wp.array],
     layers: int,
     *,
-    join: Callable[[wp.array, wp.array], None] | None = None,
+    join: Join | None = None,
 ) -> None:
     """Continue the projected velocity into air and walls.
 

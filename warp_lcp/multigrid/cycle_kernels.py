@@ -364,5 +364,8 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         ascend=ascend_kernel,
         relax=relax_kernel,
         rows=SimpleNamespace(sweep=sweep_row, first_sweep=first_sweep_row, restrict=restrict_row, bounds=bounds_row, correct=correct_row),
+        parts=SimpleNamespace(
+            first_sweep_to=first_sweep_to, sweep_between=sweep_between, clear_around=clear_around, correct_row=correct_row
+        ),
         planes=SimpleNamespace(correct=correct_plane, into_ring=sweep_plane_into_ring, out_of_ring=sweep_plane_out_of_ring),
     )

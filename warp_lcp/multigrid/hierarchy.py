@@ -323,19 +323,27 @@ class Hierarchy:
 
     def _descend(self, level: int, program: Program, *, projected: bool, from_zero: bool, whole: bool = True) -> None:
         """Record a cycle on a level and those below it, with the last leg or without."""
-        L, launch = self.levels[level], program.launch
-        fused = self._fuses(L)
-        if fused:
+        launch = program.launch
+        self._go_down(level, launch, projected=projected, from_zero=from_zero)
+        if projected:
+            self._restrict_bounds(level, launch)
+        self._visit(level + 1, self._visits(level + 1), program, projected=projected)
+        if whole:
+            self._go_up(level, launch, projected=projected)
+
+    def _go_down(self, level: int, launch: Launch, *, projected: bool, from_zero: bool) -> None:
+        """Sweep a level, and restrict its residual to the next one."""
+        L = self.levels[level]
+        if self._fuses(L):
             self._descending_leg(level, launch, projected=projected, from_zero=from_zero)
         else:
             self._pair(L, launch, from_zero=from_zero, projected=projected)
             self._restrict(level, launch)
-        if projected:
-            self._restrict_bounds(level, launch)
-        self._visit(level + 1, self._visits(level + 1), program, projected=projected)
-        if not whole:
-            return
-        if fused:
+
+    def _go_up(self, level: int, launch: Launch, *, projected: bool) -> None:
+        """Correct a level from the next one, and sweep it."""
+        L = self.levels[level]
+        if self._fuses(L):
             launch(L.kernels.ascend, 1, self._ascent(level, projected=projected), device=self.device)
         else:
             self._correct(level, launch, projected=projected)
@@ -454,24 +462,25 @@ def make_hierarchy(stencil: Stencil, real: Any, **options: Any) -> Hierarchy:
 
 def share_changes(level: Level) -> None:
     """Fill the diagonal's ghost cells, and mark the rows beside those that are others now: their faces depend on them."""
-    s = level.stencil
+    s, inner = level.stencil, slice(1, -1)
     assert s.ghosts is not None
-    grid, changed = s.d.reshape(s.padding.shape).numpy(), level.changed.numpy()
-    sides = [grid[(*[slice(1, -1)] * axis, end, ...)] for axis in range(3) for end in (0, -1)]
-    known = [side.copy() for side in sides]
+    sides = []
+    for axis, end in s.ghosts.cuts:
+        place: list[Any] = [inner] * 3
+        place[2 - axis] = -end
+        sides.append((tuple(place), axis, -end))
+    shape = s.padding.shape
+    known = [s.d.numpy().reshape(shape)[place].copy() for place, _, _ in sides]
     s.ghosts.fill(s.d)
-    if s.device.is_cuda:
-        grid = s.d.reshape(s.padding.shape).numpy()
-        sides = [grid[(*[slice(1, -1)] * axis, end, ...)] for axis in range(3) for end in (0, -1)]
-    for number, (side, old) in enumerate(zip(sides, known, strict=True)):
-        axis, end = divmod(number, 2)
-        differs = (side != old)[(slice(1, -1),) * 2] if axis == 0 else (side != old)[:, 1:-1] if axis == 1 else side != old
+    d, changed = s.d.numpy().reshape(shape), level.changed.numpy()
+    for (place, axis, end), old in zip(sides, known, strict=True):
+        differs = d[place] != old
         if axis == 0:
-            changed[-end] |= differs.any(axis=1)
-        elif axis == 1:
-            changed[:, -end] |= differs.any(axis=1)
-        else:
             changed |= differs
+        elif axis == 1:
+            changed[:, end] |= differs.any(axis=1)
+        else:
+            changed[end] |= differs.any(axis=1)
     if s.device.is_cuda:
         level.changed.assign(changed)
 

@@ -115,7 +115,7 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         self.system = self._principal_system()
         self.free = layout.zeros(wp.uint8)
         self._scalars = wp.zeros(4, dtype=wp.float64, device=problem.device)
-        self._reduction = Reduction(layout.size, problem.device, self._scalars, columns=4)
+        self._reduction = Reduction(layout.size, problem.device, self._scalars, columns=4, across=layout.across)
         self._nothing = wp.empty(0, dtype=wp.float64, device=problem.device)
         self._kernels = kernels(self.residual.diagonal.dtype, self.system.r.dtype)
         self._rounded = layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None

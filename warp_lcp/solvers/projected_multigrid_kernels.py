@@ -213,7 +213,30 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
                         slab * R.rows + j, R.threads, k > slab * R.planes, R.changed, k * R.rows + j, out,
                     )  # fmt: skip
 
-    return SimpleNamespace(assess=assess, measure=measure, update=update, advance=advance, measure_row=measure_row, update_row=update_row)
+    @wp.kernel(enable_backward=False, module=name)
+    def update_ghosts(
+        A: StencilShape, axis: int, plane: int, x: f64, z: field, p: field, lower: f64, lower_value: wp.float64, upper: f64,
+        upper_value: wp.float64, code: u8, scalars: f64,
+    ):  # fmt: skip
+        """Do what `update` does in the ghost cells of a side: stored plane `plane` along an axis."""
+        a, b = wp.tid()
+        beta = real(scalars[BETA])
+        o = wp.int64(plane)
+        n = int(1)
+        if axis == 0:
+            o += wp.int64(a + 1) * A.s1 + wp.int64(b + 1) * A.s2
+        elif axis == 1:
+            o = o * A.s2 + wp.int64(a + 1) * A.s1 + wp.int64(1)
+            n = A.nx
+        else:
+            o = o * A.s1 + wp.int64(a + 1) * A.s2 + wp.int64(1)
+            n = A.nx
+        update_row(x, z, p, lower, lower_value, upper, upper_value, code, beta, scalars[STEP], o, n)
+
+    return SimpleNamespace(
+        assess=assess, measure=measure, update=update, update_ghosts=update_ghosts, advance=advance, measure_row=measure_row,
+        update_row=update_row,
+    )  # fmt: skip
 
 
 @functools.cache

@@ -57,6 +57,10 @@ class AssessedResidual(NaturalResidual):
             self._version, self.stale = self._A.version, True
             self._hierarchy.refresh()
         super().start(x, keep=keep)
+        ghosts, (lower, _, upper, _, code) = self._A.stencil.ghosts, self.problem.bounds.operands
+        for bound in (lower, upper, code) if ghosts is not None else ():
+            if bound.size:
+                ghosts.fill(bound)  # x's ghost cells will move as the cells do that they stand for
         self.classify = keep
         if not keep:
             self._norm_of_b = super().norm_of_b()
@@ -87,12 +91,21 @@ class AssessedResidual(NaturalResidual):
         launch(self.row_kernels.update, s.threads, inputs, device=p.device)
 
     def advance(self, x: wp.array[Any], direction: wp.array[Any], *, launch: Launch = wp.launch) -> None:
-        """Launch the step and the evaluation where it ends: one launch on the CPU, unless ghost cells must be filled between."""
+        """Launch the step and the evaluation where it ends: one launch on the CPU, unless periodic ghost cells must be filled between.
+
+        Ghost cells that stand for cells of others take the step by themselves; x's and the correction's are filled.
+        """
         p, s = self.problem, self._A.stencil
-        if p.device.is_cuda or s.has_ghosts:
+        if p.device.is_cuda or any(s.periodic):
             self.update(x, direction, launch=launch)
             self.assess(x, launch=launch)
             return
+        nz, ny, nx = s.padding.counts
+        for axis, side in s.ghosts.cuts if s.ghosts is not None else ():
+            lines = [(nz, ny), (nz, 1), (ny, 1)][axis]
+            plane = side * ((nx, ny, nz)[axis] + 1)
+            inputs = [s.shape, axis, plane, x, self._finest.x, direction, *p.bounds.operands, self.scalars]
+            launch(self.row_kernels.update_ghosts, lines, inputs, device=p.device)
         inputs = [*s.operands[:-1], self.row_sums, x, self._finest.x, direction, *self._assessed()]
         launch(self.row_kernels.advance, 1, inputs, device=p.device)
         self.sums.add_up(int(kernels.NORM), columns=3, launch=launch)
@@ -226,6 +239,7 @@ class MultigridWorkspace(RoundedIterate):
         before = [self.x, *p.bounds.operands, p.unknown, finest.lower, finest.upper, self.residual.scalars]
         launch_spans(self._flat.gaps, self._spans, before, [], p.device)
         self.hierarchy.monotone_cycle.run()
+        finest.stencil.wrap(finest.x)
         wp.launch(kernels.plan_whole_step_kernel, 1, [self.residual.scalars], device=p.device)
         self._cycles_left -= 1
         self._classify_next()

@@ -1,0 +1,173 @@
+"""A program for ranks: solve a small problem by PETSc's own methods on an assembled matrix and by ours; tell how they differ.
+
+Usage: petsc_oracles.py NAME with a name of `oracle_problems.small`. Rank 0 prints one JSON object: what each method tells, for all bounds.
+"""
+
+import json
+import sys
+
+import numpy as np
+import petsc4py
+import warp as wp
+
+wp.config.log_level = wp.LOG_ERROR
+petsc4py.init([])
+from oracle_problems import BOUNDS, small
+from petsc4py import PETSc
+
+import warp_lcp as wl
+from warp_lcp.distributed.decomposition import Decomposition
+from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
+from warp_lcp.distributed.petsc_active_set import PetscActiveSet
+from warp_lcp.distributed.ranks import Ranks
+
+RANKS = Ranks.world()
+OURS = {"petsc": PetscActiveSet(), "newton": wl.MinimumMapNewton(), "multigrid": wl.ProjectedMultigrid()}
+TIGHT = wl.StoppingCriteria(rtol=1e-10)
+
+
+def shared_matrix(A):
+    """Return a SciPy matrix as PETSc's, its rows shared in their order."""
+    matrix = PETSc.Mat().createAIJ(A.shape, nnz=7)
+    first, last = matrix.getOwnershipRange()
+    mine = A[first:last]
+    matrix.setValuesCSR(mine.indptr.astype(np.int32), mine.indices.astype(np.int32), mine.data)
+    matrix.assemble()
+    return matrix
+
+
+def shared_vector(matrix, values):
+    """Return values as a vector that fits the matrix; infinite ones as PETSc's."""
+    v = matrix.createVecLeft()
+    first, last = v.getOwnershipRange()
+    v.setArray(np.clip(values[first:last], PETSc.NINFINITY, PETSc.INFINITY))
+    return v
+
+
+def gathered(v):
+    """Return a vector's values on every rank."""
+    return np.concatenate(RANKS.comm.allgather(v.getArray()))
+
+
+def direct(ksp):
+    """Every rank factors the whole matrix: what is left of a matrix on a free set may have no row on some rank."""
+    ksp.setType("preonly")
+    ksp.getPC().setType("redundant")
+
+
+def iterative(ksp):
+    """Conjugate gradients with Jacobi."""
+    ksp.setType("cg")
+    ksp.getPC().setType("jacobi")
+    ksp.setTolerances(rtol=1e-10, max_it=2000)
+
+
+def snes(problem, A, kind, prepare):
+    """Solve by PETSc's SNES for variational inequalities, F(x) = A x + b."""
+    matrix = shared_matrix(A)
+    fluid = problem.fluid
+    b, lower, upper = (shared_vector(matrix, field[fluid]) for field in (problem.b, problem.lower, problem.upper))
+    options = PETSc.Options()
+    options["snes_vi_zero_tolerance"] = 1e-13  # an absolute one, 1e-8 unless set: bounds would count as touched that are not
+    solver = PETSc.SNES().create()
+    solver.setType(kind)
+    solver.setFunction(lambda snes, x, f: matrix.multAdd(x, b, f), b.duplicate())
+    solver.setJacobian(lambda snes, x, J, P: matrix.copy(P), matrix.duplicate(copy=True))  # vinewtonssls scales the rows in place
+    solver.setVariableBounds(lower, upper)
+    solver.setTolerances(rtol=1e-11, atol=1e-11 * b.norm(), stol=0.0, max_it=100)
+    prepare(solver.getKSP())
+    solver.setFromOptions()
+    x = b.duplicate()
+    solver.solve(None, x)
+    return gathered(x), solver.getConvergedReason(), solver.getIterationNumber()
+
+
+def tao(problem, A, kind):
+    """Solve by PETSc's TAO, as the quadratic program of which the LCP is the condition of optimality."""
+    matrix = shared_matrix(A)
+    fluid = problem.fluid
+    b, lower, upper = (shared_vector(matrix, field[fluid]) for field in (problem.b, problem.lower, problem.upper))
+
+    def energy(tao, x, gradient):
+        matrix.mult(x, gradient)
+        value = 0.5 * x.dot(gradient) + x.dot(b)
+        gradient.axpy(1.0, b)
+        return value
+
+    solver = PETSc.TAO().create()
+    solver.setType(kind)
+    solver.setObjectiveGradient(energy, b.duplicate())
+    solver.setHessian(lambda tao, x, H, P: None, matrix)
+    solver.setVariableBounds((lower, upper))
+    solver.setTolerances(gatol=1e-9 * b.norm(), grtol=0.0, gttol=0.0)
+    solver.setMaximumIterations(300)
+    x = b.duplicate()
+    solver.setSolution(x)
+    solver.getKSP().setTolerances(rtol=1e-8, max_it=2000)
+    solver.solve(x)
+    return gathered(x), solver.getConvergedReason(), solver.getIterationNumber()
+
+
+THEIRS = {
+    "vinewtonrsls, direct": lambda p, A: snes(p, A, "vinewtonrsls", direct),
+    "vinewtonrsls, cg": lambda p, A: snes(p, A, "vinewtonrsls", iterative),
+    "vinewtonssls, direct": lambda p, A: snes(p, A, "vinewtonssls", direct),
+    "tron": lambda p, A: tao(p, A, "tron"),
+    "gpcg": lambda p, A: tao(p, A, "gpcg"),
+}
+
+
+def solve_ours(problem, solver):
+    """Solve by one of our methods on the ranks; return x on all unknowns, in their order, and the result."""
+    counts = (*reversed(problem.cells.shape), 1)[:3]
+    boxes = Decomposition(counts, RANKS)
+    whole = tuple(reversed(counts))
+
+    def mine(field, extra=(0, 0, 0)):
+        z, y, x = (slice(s.start, s.stop + e) for s, e in zip(boxes.box.slices, extra, strict=True))
+        grid = field.reshape([n + e for n, e in zip(whole, extra, strict=True)])[z, y, x]
+        return np.ascontiguousarray(grid[0] if problem.cells.ndim == 2 else grid)
+
+    given = dict(problem.coefficients)
+    for axis, name in enumerate(("face_z", "face_y", "face_x")):
+        if np.ndim(given.get(name, 1.0)):
+            given[name] = mine(given[name], tuple(int(a == axis) for a in range(3)))
+    if "shift" in given:
+        given["shift"] = mine(given["shift"])
+    A = DistributedGridPoisson(boxes, mine(problem.cells), device="cpu", dtype=wp.float64, **given)
+    result = wl.solve(wl.LCP(A, mine(problem.b), mine(problem.lower), mine(problem.upper)), solver, stopping=TIGHT)
+    x = np.zeros(whole)
+    for box, part in RANKS.comm.allgather((boxes.box.slices, result.x.numpy())):
+        x[box] = part.reshape(x[box].shape)
+    return x.reshape(problem.cells.shape)[problem.fluid], result
+
+
+def compare(problem):
+    """Solve by all methods; return what each tells, and how its x and its active set differ from those of our first one."""
+    A, told, reference = problem.matrix(), {}, None
+    for name, solver in OURS.items():
+        x, result = solve_ours(problem, solver)
+        places = problem.places(A, x)
+        reference = reference or (x, places)
+        told[name] = {
+            "converged": bool(result), "iterations": result.iterations, "linear_iterations": result.linear_iterations,
+            "residual": result.residual, "residual_by_scipy": float(np.linalg.norm(problem.natural_residual(A, x))),
+            **differences(x, places, *reference),
+        }  # fmt: skip
+    for name, solve in THEIRS.items():
+        x, reason, iterations = solve(problem, A)
+        told[name] = {"converged": reason > 0, "iterations": iterations, **differences(x, problem.places(A, x), *reference)}
+    return told
+
+
+def differences(x, places, other_x, other_places):
+    """Return how a solution differs from another one, the largest error relative to the largest x."""
+    held = [int((places < 0).sum()), int((places > 0).sum())]
+    error = float(np.abs(x - other_x).max() / np.abs(other_x).max())
+    return {"error": error, "held": held, "held_otherwise": int((places != other_places).sum())}
+
+
+if __name__ == "__main__":
+    found = {bounds: compare(small(sys.argv[1], bounds)) for bounds in BOUNDS}
+    if RANKS.first:
+        print(json.dumps(found))

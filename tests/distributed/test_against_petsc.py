@@ -1,0 +1,29 @@
+"""Solutions on ranks are those that PETSc's own methods find on a matrix assembled from the definition."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+PROGRAM = Path(__file__).with_name("petsc_oracles.py")
+OURS = ("petsc", "newton", "multigrid")
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+@pytest.mark.parametrize("name", ["cube", "brick", "plane"])
+def test_petscs_own_methods_find_the_same_solution_and_active_set(mpi, name, ranks):
+    lines = mpi(ranks, PROGRAM, name).stdout.splitlines()
+    found = json.loads(next(line for line in lines if line.startswith("{")))
+    for bounds, methods in found.items():
+        assert set(methods) > set(OURS), methods
+        assert len(methods) == len(OURS) + 5
+        below, above = methods["petsc"]["held"]
+        assert below > 30
+        assert (above > 30) == (bounds == "boxed")
+        for method, told in methods.items():
+            assert told["converged"], (bounds, method, told)
+            assert told["error"] < 1e-8, (bounds, method, told)
+            assert told["held_otherwise"] == 0, (bounds, method, told)
+        for method in OURS:  # the residual that a result tells is that of its x
+            told = methods[method]
+            assert told["residual_by_scipy"] == pytest.approx(told["residual"], rel=1e-3), (bounds, method, told)

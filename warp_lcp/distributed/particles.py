@@ -1,0 +1,222 @@
+"""Particles that belong to the rank whose box they are in: they move on to others, and cells at a cut know those beside them.
+
+In a step a rank has its own particles and copies of those within a cell of its box, `with_ghosts`; then its own alone. All are in one order
+that does not depend on the ranks, so that sums over particles have the same bits on any number of them: that of the last sort by cell,
+which a number stands for, the particle's `place`. Messages go from rank to rank: their lengths change from step to step, so that a star forest
+would have to be made anew each time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.distributed.subdomain import Subdomain
+from warp_lcp.grid import particles_kernels as kernels
+from warp_lcp.grid.particles import SORT_EVERY, Particles, ParticleTotals
+
+MOST_A_CELL = 1 << 20  # particles; places of one cell are numbers below those of the next
+REACH = 1  # cells from a box within which particles touch its faces and cells
+COUNT, DATA = 7101, 7102  # tags of messages
+
+
+class Post(Protocol):
+    """Carries messages between neighbors."""
+
+    def swap(self, outgoing: Mapping[int, np.ndarray]) -> list[np.ndarray]:
+        """Return what the neighbors have sent, in the order of their ranks.
+
+        Args:
+            outgoing: an array of one type for every neighbor, of any length.
+        """
+
+
+class MpiPost:
+    """Messages of MPI.
+
+    Args:
+        comm: of mpi4py.
+    """
+
+    def __init__(self, comm: Any) -> None:
+        self._comm = comm
+
+    def swap(self, outgoing: Mapping[int, np.ndarray]) -> list[np.ndarray]:
+        """Send lengths, then what is not empty."""
+        from mpi4py import MPI
+
+        neighbors, comm = sorted(outgoing), self._comm
+        sizes = np.array([[len(outgoing[rank]) for rank in neighbors], [0] * len(neighbors)], dtype=np.int64)
+        requests = [comm.Irecv(sizes[1, n : n + 1], rank, COUNT) for n, rank in enumerate(neighbors)]
+        requests += [comm.Isend(sizes[0, n : n + 1], rank, COUNT) for n, rank in enumerate(neighbors)]
+        MPI.Request.Waitall(requests)
+        kind = outgoing[neighbors[0]].dtype if neighbors else np.dtype(np.int64)
+        incoming = [np.empty(int(size), dtype=kind) for size in sizes[1]]
+        requests = [comm.Irecv([a.view(np.uint8), MPI.BYTE], rank, DATA) for a, rank in zip(incoming, neighbors, strict=True) if a.size]
+        requests += [comm.Isend([outgoing[rank].view(np.uint8), MPI.BYTE], rank, DATA) for rank in neighbors if outgoing[rank].size]
+        MPI.Request.Waitall(requests)
+        return incoming
+
+
+class SharedParticles(Particles):
+    """The particles of a rank.
+
+    `totals` and `arrange` are collective.
+
+    Args:
+        part: where this rank works.
+        position: [m], shape (n, 3), in this rank's box or within its ghost layers.
+        velocity: [m/s], shape (n, 3).
+        affine: also carry the gradient of each velocity component [1/s].
+        place: int64, shape (n,), in what order particles of one cell are; None: as they come.
+        indexed: of `Particles`.
+        post: carries messages; MPI's if None.
+
+    Attributes:
+        place: int64, shape (count,): where each particle is in the order of all ranks' particles.
+
+    Raises:
+        ValueError: the shapes do not match.
+    """
+
+    def __init__(
+        self, part: Subdomain, position: np.ndarray, velocity: np.ndarray, *, affine: bool, place: np.ndarray | None = None,
+        indexed: bool | None = None, post: Post | None = None,
+    ) -> None:  # fmt: skip
+        self.part = part
+        self.place = np.arange(len(position), dtype=np.int64) if place is None else np.asarray(place, dtype=np.int64)
+        self._own: np.ndarray | None = None  # which particles are this rank's; None: all
+        around = part.box.grown(REACH)
+        boxes = part.decomposition.boxes
+        self._neighbors = [r for r, box in enumerate(boxes) if r != part.ranks.rank and around.common(box).cells]
+        self._post = post or MpiPost(part.ranks.comm)
+        super().__init__(part.grid, position, velocity, affine=affine, indexed=indexed)
+        self._record = np.dtype([("place", np.int64), ("values", np.float32, (len(self._names), 3))])
+
+    def arrange(self, step: int) -> None:
+        """Hand particles that have left the box to their ranks, take in those that came, with ghosts, and bring all into order."""
+        self.drop_ghosts()
+        self.number()
+        due = self.offsets is not None or step % SORT_EVERY == 0
+        if not self._neighbors:
+            if due:
+                self.sort()
+            return
+        cells = self._cells()
+        keep = np.flatnonzero(_within(cells, self.part.box.grown(REACH)))
+        places = self._receive(self._post.swap(self._outgoing(cells)))
+        kept = np.concatenate([keep, np.arange(len(self.place), self.count)])
+        places = np.concatenate([self.place[keep], places])
+        order = np.argsort(places, kind="stable")
+        self._take(kept[order], places[order])
+        self.number()
+        if due:
+            self.sort()
+        self._own = _within(self._cells(), self.part.box)
+
+    def sort(self) -> None:
+        """Bring the particles into the order of their cells, those of a cell into that of their places, and give them new places."""
+        self.number()
+        key = self.key.numpy()[: self.count]
+        order = np.lexsort((self.place, key))
+        self._take(order, self.place[order])
+        self.number()
+        nx, ny, _ = self.part.decomposition.counts
+        i, j, k = self._cells().T.astype(np.int64)
+        cell = (k * ny + j) * nx + i
+        starts = np.flatnonzero(np.diff(cell, prepend=-1))
+        self.place = cell * MOST_A_CELL + np.arange(self.count) - np.repeat(starts, np.diff(starts, append=self.count))
+        if self.offsets is not None and self.count:
+            wp.launch(kernels.offset_kernel, self.grid.size + 1, [self.key, self.count, self.offsets], device=self.grid.device)
+        elif self.offsets is not None:
+            self.offsets.zero_()
+
+    def drop_ghosts(self) -> None:
+        """Keep this rank's own particles alone."""
+        if self._own is not None:
+            mine = np.flatnonzero(self._own)
+            self._own = None
+            self._take(mine, self.place[mine])
+
+    def totals(self) -> ParticleTotals:
+        """Return sums over all ranks' particles; there are no ghosts now."""
+        assert self._own is None, "ghosts would be counted twice"
+        mine, ranks = super().totals(), self.part.ranks
+        if ranks.size == 1:
+            return mine
+        n = mine.count
+        with np.errstate(invalid="ignore"):
+            sums = ranks.sum(np.array([n, n * mine.mean_square_speed, *(n * mine.center), mine.bad_positions, mine.bad_velocities]))
+        most = ranks.max(np.array([mine.max_speed, *(-mine.low if n else [-np.inf] * 3), *(mine.high if n else [-np.inf] * 3)]))
+        count = int(sums[0])
+        if count == 0:
+            return mine
+        return ParticleTotals(
+            count=count, mean_square_speed=float(sums[1]) / count, center=sums[2:5] / count, low=-most[1:4], high=most[4:7],
+            max_speed=float(most[0]), bad_positions=int(sums[5]), bad_velocities=int(sums[6]),
+        )  # fmt: skip
+
+    def assign_with_places(self, arrays: Mapping[str, np.ndarray], place: np.ndarray) -> None:
+        """Take other particles, in the order of their places.
+
+        Args:
+            arrays: float32 of shape (n, 3) for every name of `arrays`.
+            place: int64, shape (n,).
+        """
+        self._own = None
+        order = np.argsort(place, kind="stable")
+        self.assign({name: np.ascontiguousarray(values[order]) for name, values in arrays.items()})
+        self.place = np.asarray(place, dtype=np.int64)[order]
+
+    def _cells(self) -> np.ndarray:
+        """Return the cell (x, y, z) of the whole domain that each particle was last numbered in, shape (count, 3)."""
+        nx, ny, _ = (n + 2 for n in self.grid.counts)
+        rows, i = np.divmod(self.key.numpy()[: self.count], nx)
+        k, j = np.divmod(rows, ny)
+        return np.stack([i, j, k], axis=1) + (np.array(self.grid.origin, dtype=np.int32) - 1)
+
+    def _outgoing(self, cells: np.ndarray) -> dict[int, np.ndarray]:
+        """Return what each neighbor must know of: particles in its box and within a cell of it."""
+        hosts = [array.numpy() for array in self.arrays().values()]
+        near = np.flatnonzero(~_within(cells, self.part.box.grown(-REACH)))
+        beside, found = cells[near], {}
+        for rank in self._neighbors:
+            which = near[_within(beside, self.part.decomposition.boxes[rank].grown(REACH))]
+            records = np.empty(len(which), dtype=self._record)
+            records["place"] = self.place[which]
+            for column, host in enumerate(hosts):
+                records["values"][:, column] = host[which]
+            found[rank] = records
+        return found
+
+    def _receive(self, incoming: list[np.ndarray]) -> np.ndarray:
+        """Put what has come behind the particles, and return its places."""
+        records = np.concatenate(incoming)
+        first = self.make_room(len(records))
+        for column, view in enumerate(self.arrays().values()):
+            if len(records):
+                view[first:].assign(np.ascontiguousarray(records["values"][:, column]))
+        return np.asarray(records["place"])
+
+    def _take(self, order: np.ndarray, places: np.ndarray) -> None:
+        """Keep the particles of these numbers, in this order."""
+        device, count = self.grid.device, len(order)
+        if count:
+            numbers = wp.array(order.astype(np.int32), dtype=wp.int32, device=device)
+            for name, column in self._columns.items():
+                wp.launch(kernels.reorder_kernel, count, [numbers, column.view, self._spare.view], device=device)
+                self._columns[name], self._spare = self._spare, column
+        self._resize(count)
+        self.place = places
+
+
+def _within(cells: np.ndarray, box: Any) -> np.ndarray:
+    """Tell which cells (x, y, z), shape (n, 3), are in a box, along those axes that are not wholly in it."""
+    result = np.ones(len(cells), dtype=bool)
+    for axis in range(3):
+        if len(cells):
+            result &= (cells[:, axis] >= box.low[axis]) & (cells[:, axis] < box.high[axis])
+    return result

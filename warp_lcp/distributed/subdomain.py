@@ -1,0 +1,132 @@
+"""The part of a staggered grid that a rank works on: its own box of cells, and layers of other ranks' cells around it."""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.distributed.decomposition import Box, Decomposition
+from warp_lcp.distributed.halo import exchange, star_forest
+from warp_lcp.grid.staggered import StaggeredGrid, Window
+
+LAYERS = 5  # of ghost cells: to carry the velocity on at cut cells looks at the liquid up to 4.3 cells away
+
+
+def ghost_layers(cfl: float, smoothing: int) -> int:
+    """Return how many layers of ghost cells a box needs.
+
+    Of cells and faces the outermost ghost layer is right just after it was filled; what a face or cell takes from its neighbors is wrong a
+    layer further in, and so on. Fields are filled where that would reach the box itself. No filling comes between the stages of particles'
+    way in a step, at most the CFL number long as the particles' speeds tell, in which faces around each place are looked at: three layers
+    more leave room for liquid that the step makes faster. Nor between the binomial passes over a level set, one layer each, the slope
+    beside walls, a layer, and the two layers of cells in solids.
+
+    Args:
+        cfl: the Courant number of the run.
+        smoothing: binomial passes over the level set.
+    """
+    return max(LAYERS, math.ceil(cfl) + 3, smoothing + 3)
+
+
+class Subdomain:
+    """A rank's part of a grid: the cells of its box, and of those around it what lies in the domain within some layers.
+
+    The outermost layer is the ring that every staggered grid has around its cells. At the domain's sides the ring is that of the whole grid,
+    at cuts it is the last of the ghost layers: there the sides of the part must be open, see `cuts`.
+
+    Args:
+        decomposition: the boxes of all ranks.
+        spacing: edge of a cell [m].
+        dimension: 2 or 3.
+        device: a Warp device or its name.
+        layers: ghost cells at cuts, the ring included.
+
+    Attributes:
+        grid: the part as a grid, whose coordinates and positions are those of the whole domain.
+        cuts: has bit n set if side n of the part, see `warp_lcp.grid.sides`, is a cut.
+        owned: the cells of the box.
+
+    Raises:
+        ValueError: a box has fewer cells along a cut axis than layers; on all ranks.
+    """
+
+    def __init__(self, decomposition: Decomposition, *, spacing: float, dimension: int, device: Any, layers: int) -> None:
+        self.decomposition, self.layers, self.dimension = decomposition, layers, dimension
+        self.ranks, self.box = decomposition.ranks, decomposition.box
+        for axis in decomposition.cut_axes:
+            least, cells = min(decomposition.parts[axis]), decomposition.counts[axis]
+            if least < layers:
+                raise ValueError(
+                    f"{decomposition.processes[axis]} ranks along {'xyz'[axis]} have boxes of {least} cells, but what a step looks at "
+                    f"around a box takes {layers}: at most {max(cells // layers, 1)} ranks fit along that axis, or refine the grid"
+                )
+        cells = self._cells(self.box)
+        self.grid = StaggeredGrid(cells.counts, spacing, dimension, device, origin=cells.low, whole=decomposition.counts)
+        inner = self.box.moved(cells.low, -1)
+        self.owned = self.grid.window([low + 1 for low in inner.low], inner.high)
+        self.cuts = 0
+        for axis in range(dimension):
+            for side in range(2):
+                self.cuts |= (decomposition.neighbor(axis, side) is not None) << (2 * axis + side)
+
+    def _cells(self, box: Box) -> Box:
+        """Return the cells of the part around a box, without its ring."""
+        return box.grown(self.layers - 1).common(Box((0, 0, 0), self.decomposition.counts))
+
+    @cached_property
+    def _forest(self) -> Any:
+        """The star forest that fills ghost cells and the rings beside them; None: there is one rank."""
+        if self.ranks.size == 1:
+            return None
+        counts, boxes = self.decomposition.counts, self.decomposition.boxes
+        owned = [self._with_sides(box) for box in boxes]
+        stored = [self._cells(box).grown(1) for box in boxes]
+        assert stored[self.ranks.rank].counts == self.grid.shape[::-1], counts
+        return star_forest(self.ranks, owned, stored)
+
+    def _with_sides(self, box: Box) -> Box:
+        """Return a box with the ring beyond the domain's sides that it touches: it is the one to know that, too."""
+        low, high = list(box.low), list(box.high)
+        for axis in range(self.dimension):  # in 2-D one plane is used
+            low[axis] -= low[axis] == 0
+            high[axis] += high[axis] == self.decomposition.counts[axis]
+        return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+
+    def fill(self, *fields: wp.array) -> None:
+        """Fill the ghost cells of fields of the part; collective."""
+        if self._forest is None:
+            return
+        for field in fields:
+            host = field.numpy()
+            exchange(self._forest, host)
+            if field.device.is_cuda:
+                field.assign(host)
+
+    def box_of(self, field: wp.array, ring: int = 0) -> Any:
+        """Return the view of a field, host or device, on the cells of the box and on so many cells around it."""
+        low, high = self.owned.low, self.owned.high
+        edge = (ring if self.dimension == 3 else 0, ring, ring)
+        return field[tuple(slice(l - e, h + e) for l, h, e in zip(low, high, edge, strict=True))]
+
+    def stored_box_of(self, field: wp.array) -> Any:
+        """Return the view of a field on the cells of the box and one cell around it, in the stored shape of such a box."""
+        low, high = self.owned.low, self.owned.high
+        return field[low[0] - 1 : high[0] + 1, low[1] - 1 : high[1] + 1, low[2] - 1 : high[2] + 1]
+
+    def clipped(self, window: Window) -> Window | None:
+        """Return the part of a window in the box, None if there is none."""
+        low = [max(a, b) for a, b in zip(window.low, self.owned.low, strict=True)]
+        high = [min(a, b) for a, b in zip(window.high, self.owned.high, strict=True)]
+        if any(a >= b for a, b in zip(low, high, strict=True)):
+            return None
+        return Window((low[0], low[1], low[2]), (high[0], high[1], high[2]), window.device)
+
+    def owners(self, cells: np.ndarray) -> np.ndarray:
+        """Return the rank that has each cell (x, y, z) of the whole domain, shape (n, 3)."""
+        place = [np.searchsorted(np.cumsum(part)[:-1], cells[:, axis], side="right") for axis, part in enumerate(self.decomposition.parts)]
+        px, py, _ = self.decomposition.processes
+        return np.asarray(place[0] + px * (place[1] + py * place[2]))

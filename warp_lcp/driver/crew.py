@@ -1,0 +1,96 @@
+"""Who carries out a command: this process alone, or the ranks that started with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from warp_lcp.driver.devices import choose_device
+from warp_lcp.driver.engine import Engine
+from warp_lcp.driver.profile import Profile
+from warp_lcp.driver.progress import Observer
+from warp_lcp.driver.run import run_scene
+from warp_lcp.driver.run_folder import RunRecord
+from warp_lcp.driver.scene import Scene
+from warp_lcp.driver.scene_file import load_scene
+
+
+class Crew:
+    """This process alone.
+
+    Attributes:
+        console: takes messages.
+        speaks: this process tells the user what happens.
+    """
+
+    def __init__(self, console: Console | None = None, *, speaks: bool = True) -> None:
+        """Speak to the error stream."""
+        self.console = console or Console(stderr=True)
+        self.speaks = speaks
+
+    def load(self, scene: str, overrides: Sequence[str], options: Mapping[str, Any]) -> Scene:
+        """Return a scene.
+
+        Args:
+            scene: as of `load_scene`.
+            overrides: as of `load_scene`.
+            options: of the command, by their names.
+
+        Raises:
+            SceneError: listing everything that is wrong.
+        """
+        return load_scene(scene, overrides)
+
+    def choose_device(self, name: str | None) -> str:
+        """Return the device of this process.
+
+        Raises:
+            DeviceError: there is no such device.
+        """
+        return choose_device(name)
+
+    def run(
+        self,
+        scene: Scene,
+        out: Path,
+        *,
+        device: str,
+        observer: Observer,
+        last_frame: int | None,
+        resume: bool,
+        force: bool,
+        force_memory: bool,
+        stop: Callable[[], bool],
+        profile: Profile | None,
+        record_problems: Path | None,
+    ) -> RunRecord:
+        """Simulate a scene, as `run_scene` does.
+
+        Raises:
+            OutputError: the folder cannot take the run.
+            SceneError: the scene cannot be simulated.
+        """
+        return run_scene(
+            scene, out, device=device, observer=observer, last_frame=last_frame, resume=resume, force=force, force_memory=force_memory,
+            stop=stop, profile=profile, record_problems=record_problems,
+        )  # fmt: skip
+
+
+@contextmanager
+def crew_of(engine: Engine) -> Iterator[Crew]:
+    """Give who carries out a command.
+
+    Raises:
+        EngineError: the engine cannot be used here.
+    """
+    if engine is Engine.SINGLE:
+        yield Crew()
+        return
+    from warp_lcp.driver.parallel_crew import ranks_together  # needs MPI and PETSc
+
+    with ranks_together() as crew:
+        yield crew
