@@ -107,7 +107,7 @@ def residual(scene: Splash, bounds: str, x: np.ndarray) -> float:
 
 
 def natural(cells: np.ndarray, b: np.ndarray, lower: float | np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return min(x - l, A x + b) on FLUID cells and 0 elsewhere, with coefficients of 1; all arrays are of the shape of `cells`, float64."""
+    """Return min(x - l, A x + b) on FLUID cells and 0 elsewhere, with coefficients of 1; b, x and l are of the shape of `cells`."""
     fluid, air = cells == wl.FLUID, cells == wl.AIR
     p, y = np.where(fluid, x, 0.0), b.copy()
     for axis in range(3):

@@ -20,7 +20,7 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from benchmarks.cases import TOLERANCES
+from benchmarks.cases import MIDST, TOLERANCES
 from benchmarks.floor import natural
 from benchmarks.memory import array_bytes, forget_peak, resident_bytes
 from benchmarks.problems import BOUNDS, SplashPart, splash, splash_part
@@ -33,10 +33,12 @@ from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
 from warp_lcp.distributed.guard import WRONG_INPUT, Guard
 from warp_lcp.distributed.halo import Halo
 from warp_lcp.distributed.ranks import Ranks
-from warp_lcp.driver.devices import free_memory
+from warp_lcp.driver.devices import devices, free_memory
 
 PAUSE = 0.002  # [s] between two looks of a rank that waits: it leaves its core to the one that computes
 MEGA = 1 << 20
+WALLS = BOUNDS.index("walls")  # whose memory is counted: the others need as much or less
+MEMORY = ("bytes_per_cell", "resident", "resident_more")
 
 
 @dataclass
@@ -111,16 +113,20 @@ class Shared:
         return math.sqrt(self.ranks.sum(squares[0]) / self.ranks.sum(squares[1]))
 
     def memory(self, before: int) -> None:
-        """Count what this rank's process and its arrays hold in a solve; the most of any rank, and the sum a cell.
+        """Count what the ranks hold in a solve: bytes of arrays a cell, the most that a process has, and that less `before`.
 
         Args:
-            before: bytes that the process held before the scene was made.
+            before: bytes that this process held when it had loaded its kernels and no scene.
         """
         forget_peak()
-        arrays = array_bytes()
+        arrays, most = array_bytes(), list[int]()
         problem, solver, work = self.build()
-        most = list[int]()
-        wl.solve(problem, solver, stopping=wl.StoppingCriteria(rtol=TOLERANCES[-1]), workspace=work, callback=lambda r: most.append(0))
+
+        def look(record: wl.Record) -> None:
+            if record.iteration == MIDST:
+                most.append(array_bytes())
+
+        wl.solve(problem, solver, stopping=wl.StoppingCriteria(rtol=TOLERANCES[-1]), workspace=work, callback=look)
         most.append(array_bytes())
         peak, cells = resident_bytes(peak=True), self.n**3
         self.counts["bytes_per_cell"] = self.ranks.sum(max(most) - arrays) / cells
@@ -154,24 +160,23 @@ def measure(ranks: Ranks, sizes: Sequence[int], *, device: str, repeat: int, say
     """
     ranks.agree("sizes", tuple(sizes))
     ranks.agree("repeat", repeat)
+    devices()  # starts Warp without its native messages
     here = device_of_rank(ranks, device)
-    before = resident_bytes()
-    records, cases = list[Record](), list[tuple[Shared, Growing | None]]()
+    for case in _cases(min(sizes), ranks, here):
+        case.sample(keep=False)  # loads kernels
+    forget_peak()
+    before, records, cases = resident_bytes(), list[Record](), list[tuple[Shared, Growing | None]]()
     for n in sizes:
-        decomposition = Decomposition((n, n, n), ranks)
-        if ranks.any(not _fits(decomposition.box.cells, here)):
-            say(f"{n}^3 does not fit into memory")
+        if ranks.any(not _fits(Decomposition((n, n, n), ranks).box.cells, here)):
+            say(f"rank {ranks.rank}: {n}^3 does not fit into memory")
             records.append(Record(f"{n}^3, ranks: {ranks.size}", {}, {"left out": "does not fit into memory"}))
             continue
-        part = splash_part(n, decomposition.box.slices)
-        shared = [Shared(decomposition, part, bounds, here) for bounds in BOUNDS]
+        shared = _cases(n, ranks, here)
+        shared[WALLS].memory(before)
         for case in shared:
-            case.sample(keep=False)  # loads kernels
-        shared[1].memory(before)
-        for case in shared:
-            case.counts |= {name: shared[1].counts[name] for name in ("bytes_per_cell", "resident", "resident_more")}
-        alone = ranks.first and _fits(n**3, here)
-        scene = splash(n) if alone else None
+            case.sample(keep=False)
+            case.counts |= {name: shared[WALLS].counts[name] for name in MEMORY}
+        scene = splash(n) if ranks.first and _fits(n**3, here) else None
         cases += [(case, None if scene is None else Growing(scene, case.bounds, here)) for case in shared]
     if not cases:
         raise MemoryError(f"none of the sizes {', '.join(map(str, sizes))} fits")
@@ -185,6 +190,13 @@ def measure(ranks: Ranks, sizes: Sequence[int], *, device: str, repeat: int, say
                 plain.sample(keep=turn > 0)
             _wait(ranks)
     return [*records, *(case.record(plain) for case, plain in cases)]
+
+
+def _cases(n: int, ranks: Ranks, device: str) -> list[Shared]:
+    """Return the problems of n^3 cells."""
+    decomposition = Decomposition((n, n, n), ranks)
+    part = splash_part(n, decomposition.box.slices)
+    return [Shared(decomposition, part, bounds, device) for bounds in BOUNDS]
 
 
 def _fits(cells: int, device: str) -> bool:

@@ -10,9 +10,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from benchmarks.compare import comparison
+from warp_lcp.distributed import launch
+from warp_lcp.distributed.guard import WRONG_INPUT
 from warp_lcp.gallery import recorded
 from warp_lcp.solvers import METHODS
 
+DISTRIBUTED = "distributed"  # group of --engine petsc
 REPLAY = "replay"  # module and files of recorded problems
 # before NumPy is imported: PyAMG's set-up takes 20 times as long when two BLAS threads fight over two cores
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
@@ -94,6 +97,10 @@ class Suite:
         arguments += [part for method in methods for part in ("--method", method)]
         arguments += ["--problems", str(problems)] if problems is not None else []
         process = subprocess.run([sys.executable, "-m", "benchmarks", *arguments], env={**os.environ, **ONE_THREAD}, check=False)
+        if name == DISTRIBUTED and launch.rank_here():  # the first of several ranks speaks for all
+            raise SystemExit(process.returncode)
+        if process.returncode == WRONG_INPUT:
+            raise ValueError(f"the suite {name} refused its input")
         if process.returncode != 0:
             raise RuntimeError(f"the suite {name} ended with exit code {process.returncode}")
         return sorted(p for p in out.glob(f"{name}*") if p.suffix in (".json", ".md", ".csv", ".png", ".svg", ".html"))
@@ -133,7 +140,10 @@ SOLVERS = Suite(
 SCALING = Suite(
     "scaling",
     "linear and LCP solves from 32^3 up to what memory holds: seconds to three tolerances, bytes a cell, exponents",
-    groups={"floor": "the smallest residual that each precision reaches, up to 256^3"},
+    groups={
+        "floor": "the smallest residual that each precision reaches, up to 256^3",
+        DISTRIBUTED: "the same solves on 1, 2 and 4 ranks of PETSc: strong and weak scaling, memory of a rank",
+    },
 )
 PEERS = Suite("peers", "the same problems by PyAMG, AMGCL, SciPy, PETSc, OSQP, PIQP, Clarabel, Warp's CG, as far as they are there")
 RUN = Suite(

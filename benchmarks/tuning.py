@@ -16,19 +16,37 @@ from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.scene_file import load_scene
 from warp_lcp.driver.simulator import SimulationFailed, StepFailed
 from warp_lcp.driver.trial import trial
-from warp_lcp.driver.tune import CORRECTED_EVERY, FRAMES, Tuning, near_enough, tune
+from warp_lcp.driver.tune import CORRECTED_EVERY, FRAMES, Tuning, tune
 
 TITLE = "Tuned settings against the best of all"
-SCENES = {
-    "retracting-wall": 60,
-    "ceiling-drop": 32,
-    "inclined-layer": 32,
-    "mesh-obstacle": 20,
-    "sand-on-mesh": 16,
-}  # cells along the longest side
 ACCURACY: PresetName = "standard"
 MOST = 1.2  # times the best
 NEAR = 1.5  # times the shortest: what is timed again
+COLUMNS = ["scene", "tuned", "seconds", "distance", "trials", "best of all", "seconds", "distance", "settings", "accuracy", "ratio"]
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """A scene that the presets were not made on.
+
+    Args:
+        resolution: cells along the longest side: so coarse in 3-D that all settings run within minutes.
+        why: what it has that the scenes of the presets, a dam break and a collapsing column, do not.
+    """
+
+    resolution: int
+    why: str
+
+
+# A fixed list, easy ones and hard ones of both materials, in 2-D and 3-D: all are reported, whatever comes out. To leave one out, or to
+# take a kinder one instead, would be to choose the result.
+SCENES = {
+    "retracting-wall": HeldOut(60, "a solid that moves, and liquid that lets go of it"),
+    "ceiling-drop": HeldOut(32, "liquid that leaves a ceiling all at once and falls freely"),
+    "inclined-layer": HeldOut(32, "sand that flows steadily over friction, without end"),
+    "mesh-obstacle": HeldOut(20, "a splash in 3-D over a thin mesh, which runs drift apart in"),
+    "sand-on-mesh": HeldOut(16, "an impact of sand in 3-D on a curved solid, a few cells across"),
+}
 
 
 @dataclass
@@ -49,35 +67,60 @@ def measure(options: Options, out: Path) -> Results:
     """Tune each scene, then run all settings of the sweep, and time those near the best again, in turns with what tuning chose."""
     records, rows, failures = [machine(options.device, elements=1 << 22, repeat=options.repeat)], [], []
     for name in [options.scene] if options.scene else SCENES:
-        overrides = [f"domain.resolution={max(options.sizes, default=SCENES.get(name, 0))}"] if options.sizes or name in SCENES else []
-        scene = load_scene(name, overrides)
+        own = SCENES.get(name)
+        resolution = max(options.sizes, default=own.resolution if own else 0)
+        scene = load_scene(name, [f"domain.resolution={resolution}"] if resolution else [])
         options.say(f"{name}: tuning")
-        tuning = tune(scene, accuracy=ACCURACY, device=options.device)
-        own = Timed(tuning.chosen.settings, tuning.chosen.seconds, tuning.chosen.distance, tuning.met)
-        swept = _sweep(scene, tuning, options)
-        best = _best(scene, own, [s for s in swept if s.met], options)
-        ratio = own.seconds / best.seconds
-        figures = {
-            "tuned": Figure(own.seconds, "s"),
-            "best": Figure(best.seconds, "s"),
-            "ratio": Figure(ratio),
-            "distance": Figure(own.distance),
-            "best_distance": Figure(best.distance),
-            "bound": Figure(tuning.preset.distance),
-            "trials": Figure(len(tuning.tried) + 1),
-            "swept": Figure(len(swept)),
-        }
-        records.append(Record(name, figures, {"tuned_settings": own.words(), "best_settings": best.words(), "met": tuning.met}))
-        verdict = f"{ratio:.2f}" if tuning.met else "nothing near enough"
-        found = [own.words(), f"{own.seconds:.3f}", f"{own.distance:.4f}", f"{len(tuning.tried)}"]
-        rows.append([name, *found, best.words(), f"{best.seconds:.3f}", f"{best.distance:.4f}", f"{len(swept)}", verdict])
-        if tuning.met and ratio > MOST:
+        try:
+            tuning = tune(scene, accuracy=ACCURACY, device=options.device)
+        except (StepFailed, SimulationFailed) as error:
+            failures.append(f"{name}: {error}")
+            rows.append([name, *["missing"] * (len(COLUMNS) - 1)])
+            continue
+        record, row = _compare(name, scene, tuning, options)
+        records.append(record)
+        rows.append(row)
+        ratio = record.figures["ratio"].value
+        if ratio > MOST:
             failures.append(f"{name}: tuning takes {ratio:.2f} times the best")
-        if not tuning.met and any(s.met for s in swept):
-            failures.append(f"{name}: tuning found nothing near enough, though there is")
-    columns = ["scene", "tuned", "seconds", "distance", "trials", "best of all", "seconds", "distance", "settings", "ratio"]
-    remark = f"Accuracy {ACCURACY}; the ratio must be at most {MOST:g}. Seconds: the least of all timings, in turns."
-    return Results(records, [Table(TITLE, columns, rows, remark)], failures=failures)
+    remark = (
+        f"Accuracy {ACCURACY}: {_asked()}. kept: within its bounds. noise: no step is, but within what runs as good as the reference "
+        "differ by, in distance and volume. nearest: none is, even so; how many times the bounds it is off. The best of all is the fastest "
+        f"that is as near; the ratio must be at most {MOST:g}. Seconds: the least of all timings, in turns."
+    )
+    return Results(records, [Table(TITLE, COLUMNS, rows, remark)], failures=failures)
+
+
+def _asked() -> str:
+    parts = {name: prices.presets[ACCURACY] for name, prices in price_table().items()}
+    return ", ".join(f"{name} a distance of {p.distance:g} and {p.volume:g} of volume or packing" for name, p in parts.items())
+
+
+def _compare(name: str, scene: Scene, tuning: Tuning, options: Options) -> tuple[Record, list[str]]:
+    """Return what tuning chose against the best of the sweep, as a record and as a row."""
+    own = Timed(tuning.chosen.settings, tuning.chosen.seconds, tuning.chosen.distance, tuning.met)
+    swept = _sweep(scene, tuning, options)
+    best = _best(scene, own, [s for s in swept if s.met], options)
+    noise, ratio = tuning.noise, own.seconds / best.seconds
+    figures = {
+        "tuned": Figure(own.seconds, "s"),
+        "best": Figure(best.seconds, "s"),
+        "ratio": Figure(ratio),
+        "distance": Figure(own.distance),
+        "best_distance": Figure(best.distance),
+        "bound": Figure(tuning.preset.distance),
+        "noise": Figure(noise.distance if noise else 0.0),
+        "noise_volume": Figure(noise.volume if noise else 0.0),
+        "limit": Figure(tuning.limit),
+        "trials": Figure(len(tuning.tried) + 1),
+        "swept": Figure(len(swept)),
+    }
+    kept = "kept" if noise is None else f"noise {noise.distance:.3f}, {noise.volume:.3f}" if tuning.met else f"nearest, {tuning.limit:.2g}"
+    facts = {"tuned_settings": own.words(), "best_settings": best.words(), "met": tuning.met, "accuracy": kept}
+    facts |= {"why": SCENES[name].why} if name in SCENES else {}
+    found = [own.words(), f"{own.seconds:.3f}", f"{own.distance:.4f}", f"{len(tuning.tried)}"]
+    row = [name, *found, best.words(), f"{best.seconds:.3f}", f"{best.distance:.4f}", f"{len(swept)}", kept, f"{ratio:.2f}"]
+    return Record(name, figures, facts), row
 
 
 def _all_settings(scene: Scene, prices: Prices, tuned: dict[str, Any]) -> Iterator[dict[str, Any]]:
@@ -97,7 +140,7 @@ def _sweep(scene: Scene, tuning: Tuning, options: Options) -> list[Timed]:
         except (StepFailed, SimulationFailed) as error:
             options.say(f"{settings}: {error}")
             continue
-        found.append(Timed(settings, ran.seconds, ran.distance(tuning.reference), near_enough(ran, tuning.reference, tuning.preset)))
+        found.append(Timed(settings, ran.seconds, ran.distance(tuning.reference), tuning.near_enough(ran)))
     options.say(f"{scene.scene.name}: {len(found)} settings")
     return found
 

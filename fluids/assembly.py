@@ -19,7 +19,7 @@ from warp_lcp.rigid.bodies import RigidBodies
 
 def make_surface(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, band: NarrowBand | None) -> FreeSurface:
     """Return the free surface that a scene asks for, around particles that are everywhere or in a band."""
-    if _stays_full(scene, boundary):
+    if stays_full(scene, boundary):
         return NoSurface(grid, boundary)
     count = scene.particles.per_axis**grid.dimension
     if scene.pressure.surface == "ghost-fluid":
@@ -58,6 +58,6 @@ def make_pressure(
     )  # fmt: skip
 
 
-def _stays_full(scene: LiquidScene, boundary: Boundary) -> bool:
+def stays_full(scene: LiquidScene, boundary: Boundary) -> bool:
     """Return whether every cell is liquid for ever: walls that a caller moves might make room."""
     return scene.stays_full and not boundary.velocity

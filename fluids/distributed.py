@@ -1,4 +1,11 @@
-"""Liquid on the ranks of MPI: the domain is cut into boxes, one a rank, and particles belong to the rank whose box they are in."""
+"""Liquid on the ranks of MPI: the domain is cut into boxes, one a rank, and particles belong to the rank whose box they are in.
+
+A step is that of one process on the part of the grid around a rank's box. What another rank knows comes in where the chain of dependence
+needs it: particles a cell from the cut before they are brought to the faces; velocities and weights of the faces; density, surface and kinds
+of cells; the pressure, whose LCP is one of all ranks; projected velocities; and again while they are continued into air and walls. All of
+it is computed by the same kernels from the same numbers in the same order as by one process, so that runs on any number of ranks differ by
+the rounding in the solver's sums alone.
+"""
 
 from __future__ import annotations
 
@@ -6,22 +13,146 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import warp as wp
 
+import warp_lcp as wl
+from fluids.distributed_pressure import DistributedPressure
+from fluids.distributed_state import Piece, PieceReader
+from fluids.distributed_surface import make_shared_surface
+from fluids.pressure import PressureProjection
 from fluids.scene import LiquidScene
 from fluids.simulator import LiquidSimulation
+from fluids.surface import FreeSurface
+from warp_lcp.distributed.decomposition import Decomposition
+from warp_lcp.distributed.particles import SharedParticles
 from warp_lcp.distributed.ranks import Ranks
+from warp_lcp.distributed.solids import boundary_of_part
+from warp_lcp.distributed.subdomain import Subdomain, ghost_layers
+from warp_lcp.driver.particle_assembly import placed_solids, seed_materials, start_velocities
+from warp_lcp.driver.particle_simulation import Row
 from warp_lcp.driver.scene import Scene
+from warp_lcp.driver.simulator import SimulationFailed, StepFailed
+from warp_lcp.grid.particles import ParticleTotals
+from warp_lcp.grid.staggered import Window
+from warp_lcp.material.boundary import Boundary
 
-Piece = Mapping[str, np.ndarray]  # what one rank has of a simulation's state
+LEAST_RIGHT = 2  # layers of ghost cells that stay right while the velocity is continued: faces at cut cells look so far
+NOT_ON_RANKS = "is not there on several processes (--engine petsc) yet: leave it out, or run on one process"
 
 
 class DistributedLiquid(LiquidSimulation):
     """A rank's part of a liquid in progress; implements `warp_lcp.driver.simulator.Simulation`.
 
-    `stable_dt`, `step`, `restore_pieces` are collective and give every rank the same numbers, or raise the same kind of error on all:
-    rows of the log are of the whole liquid. `frame` shows this rank's particles and cells, with positions and cells' numbers of the whole
-    domain; `frame`, `piece_state`, `columns` and `notes` ask nobody.
+    Making it, `stable_dt`, `step`, `mark` and `restore_pieces` are collective and give every rank the same numbers, or raise the same error on
+    all: rows of the log are of the whole liquid. `frame` shows this rank's particles and cells, with positions and cells' numbers of the
+    whole domain; `frame`, `piece_state`, `columns` and `notes` ask nobody.
+
+    Args:
+        scene: what to simulate.
+        part: where this rank works.
+        boundary: the solids that meet it.
+        particles: this rank's.
+        notes: facts for the start of a run.
     """
+
+    particles: SharedParticles
+    projection: DistributedPressure
+
+    def __init__(
+        self, scene: LiquidScene, part: Subdomain, boundary: Boundary, particles: SharedParticles, *, notes: Sequence[str] = ()
+    ) -> None:
+        """Allocate the fields and find the liquid's cells."""
+        self.part = part
+        self._dt = 0.0
+        self._everyone = int(part.ranks.sum(particles.count))
+        super().__init__(scene, part.grid, boundary, particles, notes=notes)
+
+    def _surface(self) -> FreeSurface:
+        return make_shared_surface(self.scene, self.part, self.boundary)
+
+    def _pressure(self) -> PressureProjection:
+        settings = self.scene.solver
+        solver = wl.METHODS[settings.method](precision=settings.precision)
+        return DistributedPressure(
+            self.part, self.boundary, solver, tolerance=settings.tolerance, max_iterations=settings.max_iterations, phi=self.surface.phi,
+            lets_go=self.scene.lets_go,
+        )  # fmt: skip
+
+    def mark(self) -> None:
+        """Find the liquid's cells, and show them."""
+        self.particles.arrange(0)
+        super().mark()
+        self.particles.drop_ghosts()
+
+    def begin_step(self, dt: float) -> ParticleTotals:
+        """Check time step and particles, bring the particles into order with ghosts, and return sums over all; see the base class."""
+        self._dt = dt
+        self.particles.drop_ghosts()  # of a step that failed
+        return super().begin_step(dt)
+
+    def bring_to_faces(self, window: Window, dt: float) -> None:
+        """Bring the particles' velocities to the faces, and let gravity act on them for dt [s]."""
+        super().bring_to_faces(window, dt)
+        with self.watch.stage("exchange between ranks", *self.velocity, *self.weights):
+            self.part.fill(*self.velocity, *self.weights, *(self._saved or ()))
+
+    def extend(self, window: Window, known: Sequence[wp.array], kind: wp.array, contact: wp.array) -> None:
+        """Continue the velocity into air and walls, see the base class; it is then right in all ghost layers.
+
+        Raises:
+            StepFailed: it is so fast that particles would leave the ghost layers.
+        """
+        refill = Refill(self.part)
+        with self.watch.stage("extrapolation", *self.velocity, *self.weights, *known, kind, contact, *self.boundary.open):
+            self.boundary.extend(window, self.velocity, self.weights, list(known), kind, contact, self.layers, join=refill)
+            self.part.fill(*self.velocity)
+        fastest = float(self.part.ranks.max(max(float(np.abs(self.part.box_of(field.numpy(), 1)).max()) for field in self.velocity)))
+        cells, most = fastest * self._dt / self.grid.spacing, self.part.layers - 1.5  # a place has nodes within 1.5 cells
+        if cells > most:  # not if NaN: the particles will tell where
+            raise StepFailed(
+                f"step {self.step_count}: the velocity would take liquid {cells:.1f} cells far, of {most} that ranks know beyond their cuts"
+            )
+
+    def bring_to_particles(self) -> None:
+        """Give this rank's own particles the velocity of the faces."""
+        self.particles.drop_ghosts()
+        super().bring_to_particles()
+
+    def carry(self, dt: float) -> tuple[int, int, int]:
+        """Move particles by dt [s]. Return how many of all met a wall, and twice 0: no solid moves."""
+        met, pushed, stuck = self.part.ranks.sum(np.array(super().carry(dt)))
+        return int(met), int(pushed), int(stuck)
+
+    def checked_totals(self, when: str) -> ParticleTotals:
+        """Return sums over all ranks' particles.
+
+        Raises:
+            SimulationFailed: a value is not finite, a particle lies outside the domain, or not all are there; on all ranks.
+        """
+        totals = super().checked_totals(when)
+        if totals.count != self._everyone:
+            raise SimulationFailed(f"{when} step {self.step_count}: {totals.count} particles are there, of {self._everyone}")
+        return totals
+
+    def _trouble(self, totals: ParticleTotals, end: np.ndarray) -> str:
+        """Return what the first rank says on whose part something is wrong."""
+        told = self.part.ranks.comm.allgather(super()._trouble(totals, end))
+        return next((text for text in told if text), "")
+
+    def _totals_row(self, totals: ParticleTotals, dt: float) -> Row:
+        return super()._totals_row(totals, dt) | {"particles": totals.count}
+
+    def notes(self) -> list[str]:
+        """Return warnings and facts worth a line at the start of a run."""
+        boxes, dimension = self.part.decomposition.boxes, self.grid.dimension
+        cells, largest = (
+            " x ".join(map(str, counts[:dimension])) for counts in (self.part.decomposition.counts, max(boxes, key=lambda b: b.cells).counts)
+        )
+        return [
+            f"{self._everyone} particles, {cells} cells of {self.grid.spacing:.4g} m",
+            f"{len(boxes)} ranks, boxes of up to {largest} cells and {self.part.layers} layers of ghost cells",
+            *self._notes,
+        ]
 
     def piece_state(self) -> dict[str, np.ndarray]:
         """Return this rank's part of the state, without pickles, in the whole domain's coordinates.
@@ -31,19 +162,64 @@ class DistributedLiquid(LiquidSimulation):
         `velocity`, `affine_0` ... float32 (n, 3) and `place` int64 (n,), their order; cells: `pressure` float64, `cells` int8, `contact`
         uint8, of the box, shape (nz, ny, nx).
         """
-        raise NotImplementedError
+        box, own = self.part.box, self.own_state()
+        fields = {name: np.ascontiguousarray(self.part.box_of(own[name])) for name in ("pressure", "cells", "contact")}
+        clock = {"time": np.array(self.time), "step_count": np.array(self.step_count), "signature": self._signature()}
+        where = {"box": np.array([box.low, box.high]), "counts": np.array(self.part.decomposition.counts)}
+        particles = {name: array.numpy().copy() for name, array in self.particles.arrays().items()}
+        numbers = {name: own[name] for name in ("pressure_dt", "time_error")}
+        return where | clock | numbers | particles | {"place": self.particles.place.copy()} | fields
 
     def restore_pieces(self, pieces: Sequence[Piece]) -> None:
         """Continue from the pieces of all ranks of a run on any number of ranks; each rank takes what lies in its box. Collective.
 
         Args:
-            pieces: of `piece_state`, of all ranks, in any order. Of a piece that has nothing in this rank's box grown by a cell the arrays
+            pieces: of `piece_state`, of all ranks, in any order. Of a piece that has nothing in this rank's box grown by some cells the arrays
                 of particles and cells are not read.
 
         Raises:
             ValueError: the pieces do not belong to this scene, or do not cover the domain; on all ranks.
         """
-        raise NotImplementedError
+        reader = PieceReader(self.part, list(self.particles.arrays()), self._signature())
+        taken = reader.read(pieces, self.boundary.base)
+        everyone = int(self.part.ranks.sum(len(taken.place)))
+        if everyone != self._everyone:
+            raise ValueError(f"the pieces have {everyone} particles: this scene has {self._everyone}")
+        self.particles.assign_with_places(taken.particles, taken.place)
+        self._faces_know = False
+        own = self.own_state()
+        for name, values in taken.cells.items():
+            self.part.box_of(own[name])[...] = values
+        self.restore_own(own | {"pressure_dt": taken.numbers["pressure_dt"], "time_error": taken.numbers["time_error"]})
+        self.time, self.step_count = float(taken.numbers["time"]), int(taken.numbers["step_count"])
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return this rank's part of the state, see `piece_state`."""
+        return self.piece_state()
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue from the state of a run on one rank."""
+        self.restore_pieces([state])
+
+
+class Refill:
+    """Called after every layer that velocities are continued by: fills the ghost layers before what is wrong in them comes near the box.
+
+    Args:
+        part: where this rank works; its ghost layers have been filled.
+    """
+
+    def __init__(self, part: Subdomain) -> None:
+        self._part = part
+        self._right: dict[int, int] = {}  # layers that are right, by the field's address
+
+    def __call__(self, marks: wp.array, field: wp.array) -> None:
+        """Note a layer of a component; collective."""
+        right = self._right.get(field.ptr, self._part.layers) - 1
+        if right <= LEAST_RIGHT:
+            self._part.fill(marks, field)
+            right = self._part.layers
+        self._right[field.ptr] = right
 
 
 def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> DistributedLiquid:
@@ -60,4 +236,49 @@ def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> Distribu
     """
     if not isinstance(scene, LiquidScene):
         raise ValueError("scene.simulator: fluids needs a scene of liquid")
-    raise NotImplementedError
+    ranks.agree("the scene", scene.model_dump(mode="json"))
+    refused = refusals(scene)
+    if refused:
+        raise ValueError("; ".join(f"{key} {NOT_ON_RANKS}" for key in refused))
+    layers = ghost_layers(scene.time.cfl, scene.pressure.smoothing)
+    part = Subdomain(
+        Decomposition(scene.cell_counts, ranks), spacing=scene.spacing, dimension=scene.dimension, device=device, layers=layers
+    )
+    cut_cells, separating = scene.domain.solids == "cut-cell", scene.domain.wall == "separating"
+    boundary, warnings = boundary_of_part(part, placed_solids(scene, folder), cut_cells=cut_cells, wall_separating=separating)
+    elsewhere = np.ones(part.grid.counts[::-1], dtype=bool)
+    elsewhere[tuple(slice(low - 1, high - 1) for low, high in zip(part.owned.low, part.owned.high, strict=True))] = False
+    position, owner, notes = seed_materials(scene, part.grid, boundary, folder, elsewhere)
+    _check_seeded(scene, ranks.sum(np.bincount(owner, minlength=len(scene.materials()[1]))))
+    velocity = start_velocities(scene).astype(np.float32)[owner]
+    particles = SharedParticles(part, position, velocity, affine=scene.particles.transfer == "apic")
+    return DistributedLiquid(scene, part, boundary, particles, notes=[*warnings, *notes])
+
+
+def refusals(scene: LiquidScene) -> list[str]:
+    """Return the keys of a scene that ask for what runs on ranks have not."""
+    output, particles = scene.output, scene.particles
+    asked = {
+        **{f"solid[{n}].motion" if solid.motion else f"solid[{n}].mass": solid.moves for n, solid in enumerate(scene.solid)},
+        "source": scene.source,
+        "drain": scene.drain,
+        "domain.open": scene.domain.open,
+        "particles.narrow_band": particles.narrow_band,
+        "particles.reseed": particles.reseed,
+        "density_correction": scene.density_correction,
+        'pressure.model = "unilateral"': scene.pressure.model == "unilateral",
+        "output.surface": output.surface,
+        "output.volume": output.volume,
+    }
+    return [key for key, wanted in asked.items() if wanted]
+
+
+def _check_seeded(scene: LiquidScene, counts: np.ndarray) -> None:
+    """Refuse liquid without a particle on any rank."""
+    key, materials = scene.materials()
+    for number, (material, count) in enumerate(zip(materials, counts, strict=True)):
+        if count == 0:
+            raise ValueError(
+                f"{key}[{number}] ({material.shape}) holds no particle: it is too small for cells of {scene.spacing:.4g} m, or lies in "
+                f"solids, outside the domain or in an earlier {key}"
+            )

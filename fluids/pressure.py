@@ -96,6 +96,7 @@ class PressureProjection:
         self._lower = wp.full(grid.shape, -np.inf, dtype=wp.float64, device=grid.device) if lets_go else None
         self._shift = grid.field() if phi is not None or boundary.open_sides else None
         self._sums = wp.zeros((*grid.shape[:2], 2), dtype=wp.float64, device=grid.device)
+        self._solved, self._rhs, self._guess = grid.domain, self._b, self._start  # what is solved for
         self._problem: wl.LCP | None = None  # built when there is liquid: an empty problem is refused
         self._dt = self._ratio = 0.0  # of the last step [s]; of this step's length to that
 
@@ -118,7 +119,7 @@ class PressureProjection:
         ratio = self._ratio = dt / self._dt if self._dt > 0.0 else 0.0
         fields = [self.pressure, ratio, self._b, self._lower, self._start, self._shift]
         inputs = [*three(velocity), self.kind, self.boundary.touch, *self._faces(), *fields]
-        self.grid.domain.launch(self._kernels.prepare, inputs)
+        self._solved.launch(self._kernels.prepare, inputs)
         self._update(self.kind)
         return unknowns
 
@@ -163,9 +164,9 @@ class PressureProjection:
         """
         criteria = self.criteria(speed, unknowns)
         assert self._problem is not None, "prepare comes first"
-        result = wl.solve(self._problem, self.solver, stopping=criteria, x0=self._start, workspace=self._work)
+        result = wl.solve(self._problem, self.solver, stopping=criteria, x0=self._guess, workspace=self._work)
         if self.automatic is not None and result:
-            self.automatic.measure(self._problem.A, result, criteria, [self._start, self._b], unknowns)
+            self.automatic.measure(self._problem.A, result, criteria, [self._guess, self._rhs], unknowns)
         return result, criteria
 
     def push_bodies(self, result: wl.SolveResult) -> None:
@@ -216,7 +217,7 @@ class PressureProjection:
             criteria: of `solve`.
             unknowns: of `prepare`.
         """
-        convert(result.x.flatten(), self.pressure.flatten())
+        self._take(result.x)
         wp.copy(self.shown, self.kind)
         self._dt = dt
         for axis, field in enumerate(velocity):
@@ -227,9 +228,9 @@ class PressureProjection:
         threshold = RELEASE_FACTOR * criteria.tolerance(reference) / max(unknowns, 1) ** 0.5
         fields = [self.pressure, threshold, self.contact, self._sums]
         inputs = [*three(velocity), self.kind, self.boundary.touch, *self._faces(), *fields]
-        self.grid.domain.launch_rows(self._kernels.contact, inputs)
-        sums = self._row_sums()
-        return Projection(result, unknowns, int(sums[..., 0].sum()), float(sums[..., 1].max()))
+        self._solved.launch_rows(self._kernels.contact, inputs)
+        released, worst = self._found()
+        return Projection(result, unknowns, int(released), worst)
 
     def unknowns(self) -> int:
         """Return the number of FLUID cells."""
@@ -270,13 +271,18 @@ class PressureProjection:
 
     def _count(self, kind: wp.array) -> int:
         """Return the number of cells that are FLUID in a field."""
-        self.grid.domain.launch_rows(kernels.count_kernel, [kind, self._sums])
-        return int(self._row_sums()[..., 0].sum())
+        self._solved.launch_rows(kernels.count_kernel, [kind, self._sums])
+        return int(self._found()[0])
 
-    def _row_sums(self) -> np.ndarray:
-        """Return the sums of the rows in use."""
-        low, high = self.grid.domain.low, self.grid.domain.high
-        return self._sums.numpy()[low[0] : high[0], low[1] : high[1]]
+    def _take(self, x: wp.array) -> None:
+        """Take the solution of the problem as the pressure."""
+        convert(x.flatten(), self.pressure.flatten())
+
+    def _found(self) -> tuple[float, float]:
+        """Return the sum of what kernels have found in rows, and the largest of what else they have."""
+        low, high = self._solved.low, self._solved.high
+        rows = self._sums.numpy()[low[0] : high[0], low[1] : high[1]]
+        return float(rows[..., 0].sum()), float(rows[..., 1].max())
 
 
 def three(fields: Sequence[wp.array]) -> list[wp.array | None]:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 
 import warp_lcp as wl
 from fluids.assembly import make_pressure, make_surface
-from fluids.pressure import Projection
+from fluids.pressure import PressureProjection, Projection
 from fluids.scene import LiquidScene
+from fluids.surface import FreeSurface
 from warp_lcp.driver.particle_assembly import (
     make_bodies,
     make_boundary,
@@ -32,6 +33,10 @@ from warp_lcp.material.narrow_band import NarrowBand
 from warp_lcp.material.outlets import Outlets
 from warp_lcp.material.sources import Sources
 from warp_lcp.rigid.bodies import RigidBodies
+
+if TYPE_CHECKING:
+    from fluids.distributed import DistributedLiquid
+    from warp_lcp.distributed.ranks import Ranks
 
 
 class LiquidSimulation(ParticleSimulation):
@@ -72,10 +77,16 @@ class LiquidSimulation(ParticleSimulation):
         """Allocate the fields and find the liquid's cells."""
         super().__init__(scene, grid, boundary, particles, sources=sources, outlets=outlets, bodies=bodies, band=band, notes=notes)
         self.record: Callable[[Mapping[str, np.ndarray]], object] | None = None
-        self.surface = make_surface(scene, grid, boundary, band)
-        self.projection = make_pressure(scene, grid, boundary, self.surface, self.weights, bodies)
+        self.surface = self._surface()
+        self.projection = self._pressure()
         self.reach = max(self.layers, 2 * scene.pressure.smoothing)
         self.mark()
+
+    def _surface(self) -> FreeSurface:
+        return make_surface(self.scene, self.grid, self.boundary, self.band)
+
+    def _pressure(self) -> PressureProjection:
+        return make_pressure(self.scene, self.grid, self.boundary, self.surface, self.weights, self.bodies)
 
     def mark(self) -> None:
         """Find the liquid's cells, and show them."""
@@ -245,3 +256,9 @@ class FluidsSimulator:
         sources, outlets = make_sources(scene, grid, boundary, folder), make_outlets(scene, grid, folder)
         notes = [*warnings, *notes]
         return LiquidSimulation(scene, grid, boundary, particles, sources=sources, outlets=outlets, bodies=bodies, band=band, notes=notes)
+
+    def create_distributed(self, scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> DistributedLiquid:
+        """Build a rank's part of a simulation of `scene`, see `fluids.distributed.create`."""
+        from fluids.distributed import create  # noqa: PLC0415  what it needs is an extra
+
+        return create(scene, ranks, device=device, folder=folder)

@@ -82,12 +82,15 @@ class NoSurface:
 
     phi = None
 
-    def __init__(self, grid: StaggeredGrid, boundary: Boundary) -> None:
-        """Find the cells and their volume."""
+    def __init__(self, grid: StaggeredGrid, boundary: Boundary, counted: Window | None = None) -> None:
+        """Find the cells, and the volume of those in a window, of all if None."""
         kind = boundary.base.numpy().copy()
         kind[kind == wl.AIR] = wl.FLUID
         self._kind = wp.array(kind, dtype=wp.int8, device=grid.device)
-        self._volume = float(_open_shares(grid, boundary)[grid.interior(kind) == wl.FLUID].sum()) * grid.cell_volume
+        box = counted or grid.domain
+        cells = tuple(slice(low - 1, high - 1) for low, high in zip(box.low, box.high, strict=True))
+        filled = (grid.interior(kind) == wl.FLUID)[cells]
+        self._volume = float(_open_shares(grid, boundary)[cells][filled].sum()) * grid.cell_volume
 
     def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
         """Write the cells' kinds."""

@@ -9,7 +9,7 @@ import warp as wp
 
 import warp_lcp as wl
 from fluids.tolerance_kernels import change_kernel
-from warp_lcp.vectors import Reduction, convert, launch_spans
+from warp_lcp.vectors import Across, Reduction, convert, launch_spans
 
 FRACTION = 0.1  # of the time step's error that the solve may leave
 FIRST = 1e-4  # relative residual of the first steps, before which there is no change to measure: a liquid that is at rest shall stay so
@@ -37,19 +37,20 @@ class TimeErrorTolerance:
     Args:
         size: elements of a stored field.
         device: where they live.
+        across: who has other parts of the fields; None: nobody.
 
     Attributes:
         used: relative residual that the last solve was held to.
         time_error: of the last step, root mean square over the cells [m/s]; None: no step came before it.
     """
 
-    def __init__(self, size: int, device: wp.Device) -> None:
+    def __init__(self, size: int, device: wp.Device, across: Across | None = None) -> None:
         self.used = FIRST
         self.time_error: float | None = None
         self._warm = False
         self._reference = 0.0  # residual of the last step at x = 0, root mean square [m/s]
         self._sum = wp.zeros(1, dtype=wp.float64, device=device)
-        self._reduction = Reduction(size, device, self._sum)
+        self._reduction = Reduction(size, device, self._sum, across=across)
 
     def criteria(self, ratio: float, unknowns: int, *, atol: float, max_iterations: int) -> wl.StoppingCriteria:
         """Return when a solve is done.

@@ -144,8 +144,8 @@ class UnilateralPressure(PressureProjection):
         self.grid.domain.launch_rows(
             kernels.contact_kernel, [self._setting, self.kind, self.boundary.touch, *self._sides(velocity), *fields]
         )
-        sums = self._row_sums()
-        return Projection(result, unknowns, int(sums[..., 0].sum()), float(sums[..., 1].max()))
+        released, worst = self._found()
+        return Projection(result, unknowns, int(released), worst)
 
     def fluid_cells(self) -> np.ndarray:
         """Return where there was liquid or pressure in the last projection, as (k, j, i) in the stored shape, shape (n, 3)."""

@@ -19,6 +19,7 @@ from granular.checkerboard import damping_kernel
 from granular.interleaved_kernels import interleaved_kernels
 from granular.report_kernels import report_kernels
 from granular.stress_kernels import stress_kernels
+from warp_lcp.distributed.vector_copies_kernels import copy_kernels
 from warp_lcp.grid import advection_kernels, distance_advection_kernels, transfer_kernels
 from warp_lcp.grid.periodic import ring_kernels
 from warp_lcp.grid.semi_lagrangian import CENTERS
@@ -173,6 +174,8 @@ def test_all_kernels_compile_for_sm_80_and_sm_90(tmp_path):
         carry_kernels(axis)
     for dtype in (wp.int8, wp.uint8, wp.int32, wp.float32, wp.float64):
         ring_kernels(dtype)
+    for d_type, real in itertools.product((wp.uint8, wp.float32, wp.float64), (wp.float32, wp.float64)):
+        copy_kernels(d_type, real)
     use_sparse_kernels()
     use_sweeping_kernels()
     use_gradient_projection_kernels()

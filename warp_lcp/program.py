@@ -125,8 +125,8 @@ class Program:
     def _replace(self) -> None:
         """Make a graph of every stretch of launches between tasks."""
         commands: list[Any] = []
-        for is_task, stretch in groupby(self._commands, lambda command: isinstance(command, Task)):
-            stretch = list(stretch)
+        for is_task, group in groupby(self._commands, lambda command: isinstance(command, Task)):
+            stretch = list(group)
             commands += stretch if is_task or len(stretch) == 1 else [Task(partial(wp.capture_launch, self._captured(stretch)))]
         self._commands, self._replaced = commands, True
 

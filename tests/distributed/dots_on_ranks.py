@@ -64,7 +64,11 @@ class Dots:
         self.time += dt
         self.step_count += 1
         fastest = float(self.ranks.max(np.abs(self.velocity).max(initial=0.0)))
-        return {"max_speed": fastest, "height": self.ranks.sum(self.position[:, 1].sum()) / COUNT, "dots": self.ranks.sum(len(self.identity))}
+        return {
+            "max_speed": fastest,
+            "height": self.ranks.sum(self.position[:, 1].sum()) / COUNT,
+            "dots": self.ranks.sum(len(self.identity)),
+        }
 
     def columns(self) -> tuple[str, ...]:
         return ("max_speed", "height", "dots")

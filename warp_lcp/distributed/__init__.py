@@ -1,1 +1,8 @@
 """Grids that are shared by the ranks of MPI: PETSc cuts and exchanges them, the solvers are those of one process."""
+
+from warp_lcp.distributed.decomposition import Box, Decomposition
+from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
+from warp_lcp.distributed.halo import Halo
+from warp_lcp.distributed.ranks import Ranks
+
+__all__ = ["Box", "Decomposition", "DistributedGridPoisson", "Halo", "Ranks"]

@@ -56,7 +56,7 @@ class Box:
         return Box(low, high)  # type: ignore[arg-type]
 
     def _mapped(self, low: Any, high: Any) -> Box:
-        return Box(tuple(map(low, self.low)), tuple(map(high, self.high)))  # type: ignore[arg-type]
+        return Box(tuple(map(low, self.low)), tuple(map(high, self.high)))
 
 
 class Decomposition:
@@ -113,7 +113,7 @@ class Decomposition:
     def coarser(self, factors: Triple) -> Decomposition | None:
         """Return the boxes of aggregates of so many cells along x, y, z; None if an aggregate would be cut, or a rank left without."""
         new = []
-        for n, part, factor in zip(self.counts, self.parts, factors, strict=True):
+        for part, factor in zip(self.parts, factors, strict=True):
             if len(part) > 1 and (any(m % factor for m in part[:-1]) or -(-part[-1] // factor) < 1 or min(part) < factor):
                 return None
             new.append([-(-m // factor) for m in part])

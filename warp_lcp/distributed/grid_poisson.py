@@ -19,9 +19,9 @@ GROUND = 0  # what holds a component, among the nodes of the components' graph
 class DistributedGridPoisson(GridPoisson):
     """A `GridPoisson` whose grid is shared by the ranks: each has a box of its cells, and stores the cells of others that touch it.
 
-    All that `GridPoisson` takes and gives is of this rank's box: cells (nz, ny, nx), coefficients of its faces, the upper ones too (those at
-    a cut are known to both ranks), fields. An `LCP` with it is one problem of all ranks, and `wl.solve` of it collective: every rank calls
-    it, and gets its box of x with the status, the residual and the history of the whole. On one rank it is what a `GridPoisson` is.
+    All that `GridPoisson` takes and gives is of this rank's box: cells (nz, ny, nx), coefficients of its faces, the upper ones too (those
+    at a cut are known to both ranks), fields. An `LCP` with it is one problem of all ranks, and `wl.solve` of it collective: every rank
+    calls it, and gets its box of x with the status, the residual and the history of the whole. On one rank it is what a `GridPoisson` is.
 
     Args:
         decomposition: the boxes.
@@ -120,5 +120,3 @@ def _edges(A: DistributedGridPoisson, node: np.ndarray) -> np.ndarray:
         open_faces = (a >= 0) & (b >= 0) & (face > 0)
         found.append(np.stack([a[open_faces], b[open_faces]], axis=1))
     return np.unique(np.concatenate(found), axis=0) if found else np.empty((0, 2), dtype=np.int32)
-
-

@@ -58,7 +58,7 @@ class Halo:
     @property
     def hierarchy(self) -> Any:
         """The class of multigrid hierarchies on such grids."""
-        from warp_lcp.distributed.hierarchy import DistributedHierarchy  # noqa: PLC0415
+        from warp_lcp.distributed.hierarchy import DistributedHierarchy
 
         return DistributedHierarchy
 
@@ -137,7 +137,7 @@ class Gathering:
 
 def exchange(forest: Any, roots: np.ndarray, leaves: np.ndarray | None = None) -> None:
     """Copy roots to leaves over a star forest; leaves may lie in the same array."""
-    from mpi4py import MPI  # noqa: PLC0415
+    from mpi4py import MPI
 
     units = {1: MPI.SIGNED_CHAR, 2: MPI.SHORT, 4: MPI.INT, 8: MPI.DOUBLE}
     unit, target = units[roots.dtype.itemsize], roots if leaves is None else leaves

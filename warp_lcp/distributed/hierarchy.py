@@ -131,4 +131,4 @@ def _whole_stencil(part: Stencil, counts: tuple[int, int, int], strength: tuple[
         return wp.zeros(padding.size, dtype=field.dtype, device=field.device)
 
     weights = None if part.weights is None else tuple(map(like, part.weights))
-    return Stencil(padding, like(part.d), weights, part.coefficients, part.unit, strength=strength)  # type: ignore[arg-type]
+    return Stencil(padding, like(part.d), weights, part.coefficients, part.unit, strength=strength)

@@ -22,12 +22,12 @@ OPEN_MPI = {
     "PRTE_MCA_hwloc_default_binding_policy": "none",
 }
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # each rank has a core, not a machine
-OF_A_RANK = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMIX_RANK", "PMI_RANK")  # what mpiexec tells the processes that it starts
+RANK = ("OMPI_COMM_WORLD_RANK", "PMIX_RANK", "PMI_RANK")  # what mpiexec tells the processes that it starts
 
 
-def on_ranks() -> bool:
-    """Return whether mpiexec started this process."""
-    return any(name in os.environ for name in OF_A_RANK)
+def rank_here() -> int | None:
+    """Return the number of this process among those that mpiexec has started, None if it started none; without starting MPI."""
+    return next((int(os.environ[name]) for name in RANK if name in os.environ), None)
 
 
 def find_petsc() -> None:

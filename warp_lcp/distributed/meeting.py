@@ -52,6 +52,9 @@ class Meeting:
         planned: kinds of errors whose message is enough.
         last_words: takes the message before the processes are ended.
 
+    Attributes:
+        failed: the ranks on which the last block failed.
+
     >>> alone = Meeting.of_one()
     >>> with alone.together():
     ...     raise OSError("the disk is full")
@@ -67,6 +70,7 @@ class Meeting:
         self.last_words = last_words
         self._planned = planned
         self._comm: Any = ranks.comm.Dup() if ranks.size > 1 else ranks.comm
+        self.failed: list[int] = []
         self._depth = 0
         self._told: BaseException | None = None  # what a block has raised on all ranks
 
@@ -109,6 +113,7 @@ class Meeting:
         found = self._meet(error, failure)
         self._depth -= 1
         failed = [(rank, other) for rank, other in enumerate(found) if other is not None]
+        self.failed = [rank for rank, _ in failed]
         if not failed:
             return
         self._told = error

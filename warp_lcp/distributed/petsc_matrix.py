@@ -7,6 +7,7 @@ reads and writes them where PETSc keeps them; fields have a ring of ghost cells,
 from __future__ import annotations
 
 import math
+import weakref
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -165,10 +166,13 @@ class PetscGrid:
         self, A: GridPoisson, hierarchy: Hierarchy | None = None, *, real: Any = wp.float32, cycle: CycleSettings | None = None
     ) -> None:
         self._A, comm = A, communicator(A)
+        petsc().garbage_cleanup(comm)  # what ranks share ends when all have let go of it, and PETSc has time to look
+        self._kept: list[Any] = []
+        weakref.finalize(self, _let_go, self._kept).atexit = False
         self.hierarchy = hierarchy or make_hierarchy(A.stencil, real, bounded=False, settings=cycle)
         finest = self.hierarchy.finest.stencil
         self.copies = VectorCopies(finest, comm)
-        self.matrix = StencilMatrix(finest, self.copies).as_mat()
+        self.matrix = self._keep(StencilMatrix(finest, self.copies).as_mat())
         self.cycle = CyclePreconditioner(self.hierarchy, self.copies)
         if hierarchy is None:
             self.hold(A.layout.load(np.ones(A.shape), wp.uint8))
@@ -176,7 +180,7 @@ class PetscGrid:
     @cached_property
     def operator(self) -> PETSc.Mat:
         """Make it when it is first asked for."""
-        return StencilMatrix(self._A.stencil, VectorCopies(self._A.stencil, self.copies.comm)).as_mat()
+        return self._keep(StencilMatrix(self._A.stencil, VectorCopies(self._A.stencil, self.copies.comm)).as_mat())
 
     def vector(self, field: Any = None) -> PETSc.Vec:
         """Return a vector with a field of A's shape, of zeros if None."""
@@ -210,7 +214,23 @@ class PetscGrid:
         ksp.getPC().setType(PETSc.PC.Type.PYTHON)
         ksp.getPC().setPythonContext(self.cycle)
         ksp.setFromOptions()
+        self._keep(ksp.getPC())
         return ksp
+
+    def _keep(self, thing: Any) -> Any:
+        """Return an object whose methods are Python's, with one reference more as long as this grid lives.
+
+        When a program ends, PETSc ends what is left of its objects, and Python has ended already: it must not come to these.
+        """
+        thing.incRef()
+        self._kept.append(thing)
+        return thing
+
+
+def _let_go(kept: list[Any]) -> None:
+    """Let PETSc end objects when nobody refers to them."""
+    for thing in kept:
+        thing.decRef()
 
 
 def communicator(A: GridPoisson) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import pickle
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -38,7 +39,7 @@ class Ranks:
         Raises:
             ImportError: petsc4py or mpi4py cannot be imported; the message says how to install them.
         """
-        return cls(petsc().COMM_WORLD.tompi4py())
+        return cls(_world().tompi4py())
 
     @property
     def rank(self) -> int:
@@ -110,8 +111,18 @@ def petsc() -> Any:
     """
     find_petsc()
     try:
-        import mpi4py  # noqa: F401, PLC0415
-        from petsc4py import PETSc  # noqa: PLC0415
+        import mpi4py  # noqa: F401
+        from petsc4py import PETSc
     except ImportError as error:
         raise ImportError(f"{HOW_TO_INSTALL} ({error})") from error
     return PETSc
+
+
+@cache
+def _world() -> Any:
+    """Return PETSc's own communicator of all ranks, for the life of this process.
+
+    PETSc would make it with the first object on a communicator, which all ranks must do together, and free it with the last one. Python
+    ends objects on each rank at another time: with none left on one rank, that rank would wait for the others to make it again.
+    """
+    return petsc().COMM_WORLD.duplicate()

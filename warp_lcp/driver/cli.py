@@ -351,12 +351,8 @@ def _print_tuning(tuning: Tuning, accuracy: str, device: str) -> None:
     for row in rows:
         typer.echo("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
     typer.echo(f"{tuning.frames} frames on {device}; distance: share of the mass elsewhere than in a run of {tuning.reference.steps} steps")
-    best = tuning.chosen
-    if not tuning.met:
-        typer.echo(f"nothing that was tried is as near as {accuracy} asks; the nearest:")
-    volume, most = best.trial.volume_error(tuning.reference), tuning.preset
-    bounds = f"distance {best.distance:.4f} (at most {most.distance:g}), volume or packing {volume:.3f} (at most {most.volume:g})"
-    typer.echo(f"{accuracy}: {best.words()}: {best.seconds:.3g} s, {bounds}")
+    for line in tuning.verdict(accuracy):
+        typer.echo(line)
 
 
 def _print_pairs(pairs: list[tuple[str, str]]) -> None:

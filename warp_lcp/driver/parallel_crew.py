@@ -74,7 +74,7 @@ class RankCrew(Crew):
             try:
                 return device_of_rank(self.meeting.ranks, name)
             except ValueError as error:
-                raise DeviceError(str(error)) from error
+                raise DeviceError(str(error).removesuffix(f" (rank {self.meeting.ranks.rank})")) from error  # the meeting names it
 
     def run(
         self,
@@ -126,7 +126,9 @@ class RankCrew(Crew):
         sys.stderr.flush()
         if self._folder is not None:
             with suppress(OSError):
-                self._folder.mark_failed(text.splitlines()[-2] if "Traceback" in text else text.splitlines()[0])
+                lines = text.splitlines()
+                who = f"rank {self.meeting.ranks.rank}"
+                self._folder.mark_failed(f"{who}: {lines[-2]}" if "Traceback" in lines[0] else lines[0])
 
 
 @contextmanager

@@ -78,22 +78,15 @@ class AgreedSimulation:
             StepFailed: the solve missed its criteria on all ranks.
             SimulationFailed: the run cannot go on.
         """
-        row: dict[str, Value] = {}
-        missed = ""
         try:
             with self._meeting.together():
-                try:
-                    row = self._simulation.step(dt)
-                except StepFailed as error:
-                    missed = str(error)
+                row = self._simulation.step(dt)
         except RankFailed as error:
             raise SimulationFailed(str(error)) from error
-        found = self._meeting.exchange(missed)
-        if all(found):
-            raise StepFailed(found[0])
-        if any(found):  # the others have gone on: there is no state to try again from
-            rank, text = next((rank, text) for rank, text in enumerate(found) if text)
-            raise SimulationFailed(f"rank {rank}: {text} (but not on all ranks)")
+        except StepFailed as error:
+            if len(self._meeting.failed) < self._meeting.ranks.size:  # the others have gone on: there is no state to try again from
+                raise SimulationFailed(f"{error} (but not on all ranks)") from error
+            raise
         self.time, self.step_count = self._simulation.time, self._simulation.step_count
         return row
 
@@ -172,7 +165,7 @@ def run_on_ranks(
     def create(continued: Continuation | None) -> tuple[Simulation, list[str]]:
         with meeting.together():
             simulation = _create(simulator, scene, meeting, device, folder, continued)
-        return AgreedSimulation(simulation, meeting), [f"on {meeting.ranks.size} ranks", *simulation.notes()]
+        return AgreedSimulation(simulation, meeting), [f"on {_count(meeting.ranks.size)}", *simulation.notes()]
 
     ranks = meeting.ranks
     record = RunRecord(scene.scene.name, scene.scene.simulator, device, engine=Engine.PETSC.value, ranks=ranks.size)
@@ -221,6 +214,10 @@ def _create(
     except ValueError as error:
         raise SceneError(scene.scene.name, [Problem("", str(error))]) from error
     return simulation
+
+
+def _count(ranks: int) -> str:
+    return f"{ranks} rank{'s' if ranks > 1 else ''}"
 
 
 def _share(meeting: Meeting, device: str) -> float:

@@ -153,7 +153,7 @@ def seed_materials(
     names = [f"{key}[{number}] ({material.shape})" for number, material in enumerate(materials)]
     notes: list[str] = []
     for name, geometry in zip(names, geometries, strict=True):
-        notes += placement_notes(geometry, name, grid.counts, grid.spacing, grid.dimension)
+        notes += placement_notes(geometry, name, grid.whole or grid.counts, grid.spacing, grid.dimension)
     settings = scene.particles
     open_cells = grid.interior(boundary.base.numpy()) != wl.SOLID
     if without is not None:
@@ -180,9 +180,13 @@ def make_particles(
         ValueError: a material has no particle.
     """
     position, owner, notes = seed_materials(scene, grid, boundary, folder, without)
-    start = [_vector(material.velocity or [0.0, 0.0]) for material in scene.materials()[1]] or [_vector([0.0, 0.0])]
-    velocity = np.array(start, dtype=np.float32)[owner]
+    velocity = start_velocities(scene).astype(np.float32)[owner]
     return Particles(grid, position, velocity, affine=scene.particles.transfer == "apic"), notes
+
+
+def start_velocities(scene: ParticleScene) -> np.ndarray:
+    """Return the velocity of each material at the start [m/s], shape (materials, 3); one of rest if there is none."""
+    return np.array([_vector(material.velocity or [0.0, 0.0]) for material in scene.materials()[1]] or [_vector([0.0, 0.0])])
 
 
 def make_sources(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, folder: Path) -> Sources | None:
@@ -235,8 +239,7 @@ def make_narrow_band(
         grid, boundary, width=settings.width, per_axis=particles.per_axis, jitter=particles.jitter, random_seed=particles.seed,
         keep=_exchange_cells(scene, grid, folder),
     )  # fmt: skip
-    start = [_vector(material.velocity or [0.0, 0.0]) for material in scene.materials()[1]] or [_vector([0.0, 0.0])]
-    return band, band.start(owner, np.array(start))
+    return band, band.start(owner, start_velocities(scene))
 
 
 def _exchange_cells(scene: ParticleScene, grid: StaggeredGrid, folder: Path) -> np.ndarray | None:

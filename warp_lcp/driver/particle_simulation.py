@@ -425,6 +425,10 @@ class ParticleSimulation(ABC):
         end = self.grid.extent - 0.5 * MARGIN * self.grid.spacing  # a tent at the very end would reach beyond what is stored
         if totals.finite and (totals.low[axes] >= 0.0).all() and (totals.high[axes] <= end[axes]).all():
             return totals if self.band is None else self.band.with_interior(totals)
+        raise SimulationFailed(f"{when} step {self.step_count}: {self._trouble(totals, end)}")
+
+    def _trouble(self, totals: ParticleTotals, end: np.ndarray) -> str:
+        """Say which particles are not finite, or outside the domain, which ends at `end` [m]; "" if there are none."""
         position, velocity = self.particles.position.numpy(), self.particles.velocity.numpy()
         if totals.bad_velocities:
             field, bad = "velocity", ~((velocity.astype(np.float64) ** 2).sum(axis=1) <= np.finfo(np.float32).max)
@@ -432,11 +436,8 @@ class ParticleSimulation(ABC):
             field, bad = "position", ~np.isfinite(position).all(axis=1)
         else:
             field, bad = "position", ((position < 0.0) | (position > end))[:, axes].any(axis=1)
-        first = int(np.flatnonzero(bad)[0])
-        where = self._cell_of(first)
-        wrong = "outside the domain" if totals.finite else "not finite"
-        count = int(bad.sum())
-        raise SimulationFailed(f"{when} step {self.step_count}: {field} is {wrong} in cell (x, y, z) = {where} ({count} particles)")
+        found, wrong = np.flatnonzero(bad), "outside the domain" if totals.finite else "not finite"
+        return f"{field} is {wrong} in cell (x, y, z) = {self._cell_of(int(found[0]))} ({len(found)} particles)" if len(found) else ""
 
     def _rearrange(self, totals: ParticleTotals) -> Row:
         """Even out the particles and move them apart, if the scene asks for it and it is time; return what the log says of it."""
@@ -494,4 +495,5 @@ class ParticleSimulation(ABC):
         """Return numbers that tell this scene's arrays from another's."""
         settings = self.scene.particles
         transfer = ("apic", "flip", "pic").index(settings.transfer)
-        return np.array([*self.grid.counts, self.grid.dimension, self.grid.spacing, settings.per_axis, transfer], dtype=np.float64)
+        counts = self.grid.whole or self.grid.counts
+        return np.array([*counts, self.grid.dimension, self.grid.spacing, settings.per_axis, transfer], dtype=np.float64)

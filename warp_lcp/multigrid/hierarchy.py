@@ -16,6 +16,7 @@ from warp_lcp.multigrid import coarsen_kernels as kernels
 from warp_lcp.multigrid.coarsen_kernels import UNBOUNDED
 from warp_lcp.multigrid.cycle_kernels import Aggregates, cycle_kernels
 from warp_lcp.multigrid.renew_kernels import renew_kernels
+from warp_lcp.multigrid.shared_levels import share_changes, whole_counts
 from warp_lcp.multigrid.small_levels import SmallLevels, first_small
 from warp_lcp.native import Spans, grain
 from warp_lcp.operators.stencil import Stencil
@@ -449,40 +450,10 @@ class Hierarchy:
         return tuple(1 if more and not take else 2 for more, take in zip(long, chosen, strict=True))  # type: ignore[return-value]
 
 
-def whole_counts(stencil: Stencil) -> tuple[int, int, int]:
-    """Return the cells (nz, ny, nx) of a stencil's grid, also of those that other processes have."""
-    return stencil.padding.counts if stencil.ghosts is None else stencil.ghosts.whole
-
-
 def make_hierarchy(stencil: Stencil, real: Any, **options: Any) -> Hierarchy:
     """Return the hierarchy of a stencil, of all processes where it is shared; options as of `Hierarchy`."""
     kind = Hierarchy if stencil.ghosts is None else stencil.ghosts.hierarchy
     return kind(stencil, real, **options)
-
-
-def share_changes(level: Level) -> None:
-    """Fill the diagonal's ghost cells, and mark the rows beside those that are others now: their faces depend on them."""
-    s, inner = level.stencil, slice(1, -1)
-    assert s.ghosts is not None
-    sides = []
-    for axis, end in s.ghosts.cuts:
-        place: list[Any] = [inner] * 3
-        place[2 - axis] = -end
-        sides.append((tuple(place), axis, -end))
-    shape = s.padding.shape
-    known = [s.d.numpy().reshape(shape)[place].copy() for place, _, _ in sides]
-    s.ghosts.fill(s.d)
-    d, changed = s.d.numpy().reshape(shape), level.changed.numpy()
-    for (place, axis, end), old in zip(sides, known, strict=True):
-        differs = d[place] != old
-        if axis == 0:
-            changed |= differs
-        elif axis == 1:
-            changed[:, end] |= differs.any(axis=1)
-        else:
-            changed[end] |= differs.any(axis=1)
-    if s.device.is_cuda:
-        level.changed.assign(changed)
 
 
 def mean_weights(stencil: Stencil) -> list[float]:

@@ -58,8 +58,8 @@ class AssessedResidual(NaturalResidual):
             self._hierarchy.refresh()
         super().start(x, keep=keep)
         ghosts, (lower, _, upper, _, code) = self._A.stencil.ghosts, self.problem.bounds.operands
-        for bound in (lower, upper, code) if ghosts is not None else ():
-            if bound.size:
+        for bound in (lower, upper, code):
+            if ghosts is not None and bound.size:
                 ghosts.fill(bound)  # x's ghost cells will move as the cells do that they stand for
         self.classify = keep
         if not keep:

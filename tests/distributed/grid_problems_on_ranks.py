@@ -1,0 +1,154 @@
+"""Solves grid problems on the ranks and, on each, by itself; run by `test_grids_on_ranks`."""
+
+import sys
+
+import numpy as np
+import warp as wp
+
+import warp_lcp as wl
+from warp_lcp.distributed.decomposition import Decomposition
+from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
+from warp_lcp.distributed.ranks import Ranks
+
+ranks = Ranks.world()
+rng = np.random.default_rng(7301)
+
+
+def scene(shape, *, solids=0.08, air=True):
+    """Random solids in liquid, with air on top of its surface."""
+    cells = np.where(rng.random(shape) < solids, wl.SOLID, wl.FLUID)
+    if air:
+        height = shape[-2] * (0.55 + 0.2 * np.sin(np.arange(shape[-1]) / 3.0))
+        cells[..., np.arange(shape[-2])[:, None] > height[None, :]] = wl.AIR
+    return cells
+
+
+def coefficients(shape):
+    """Faces over two decades, some closed, and a shift."""
+    found = {}
+    for name, axis in zip(("face_x", "face_y", "face_z"), range(len(shape)), strict=False):
+        size = list(shape)
+        size[-1 - axis] += 1
+        faces = 10.0 ** rng.uniform(-1, 1, size)
+        found[name] = np.where(rng.random(size) < 0.1, 0.0, faces)
+    return found | {"shift": np.where(rng.random(shape) < 0.05, rng.random(shape), 0.0)}
+
+
+def part(values, box, shape, axis=None):
+    """This rank's part of a field, or of the faces along an axis, which include those at its upper sides."""
+    if np.ndim(values) == 0:
+        return values
+    slices = [slice(l, h + (a == axis)) for a, (l, h) in enumerate(zip(box.low, box.high, strict=True))][: len(shape)]
+    return np.ascontiguousarray(values[tuple(reversed(slices))])
+
+
+def compare(name, cells, b, lower, upper=np.inf, *, method, decomposition=None, rtol=1e-9, same=1e-7, **faces):
+    """Solve on all ranks and on one; statuses are the same, counts to one, x but for rounding."""
+    shape = cells.shape
+    counts = (*reversed(shape), 1)[:3]
+    boxes = decomposition or Decomposition(counts, ranks)
+    axes = {"face_x": 0, "face_y": 1, "face_z": 2}
+    mine = {key: part(value, boxes.box, shape, axes.get(key)) for key, value in faces.items()}
+    A = DistributedGridPoisson(boxes, part(cells, boxes.box, shape), device="cpu", **mine)
+    problem = wl.LCP(A, part(b, boxes.box, shape), part(lower, boxes.box, shape), part(upper, boxes.box, shape))
+    stopping = wl.StoppingCriteria(rtol=rtol)
+    found = wl.solve(problem, method, stopping=stopping)
+    alone = wl.LCP(wl.GridPoisson(cells, device="cpu", **faces), b, lower, upper)
+    expected = wl.solve(alone, method, stopping=stopping)
+    assert found.status is expected.status, (name, found.status, expected.status)
+    assert abs(found.iterations - expected.iterations) <= 1, (name, found.iterations, expected.iterations)
+    # floats of the residual that both start from agree; the norm is of all ranks
+    assert np.isclose(found.history[0].residual, expected.history[0].residual, rtol=1e-12), name
+    own, whole = found.x.numpy(), expected.x.numpy()
+    error = ranks.max(float(np.abs(own - part(whole, boxes.box, shape)).max(initial=0.0)))
+    scale = max(float(np.abs(whole).max()), 1e-300)
+    assert not expected or error <= same * scale, (name, error / scale)
+    return found, A
+
+
+PM, NEWTON = wl.ProjectedMultigrid(), wl.MinimumMapNewton()
+wp.config.log_level = wp.LOG_ERROR
+
+for shape in ((34, 21, 40), (17, 13, 11), (48, 37), (65, 64)):
+    cells = scene(shape)
+    b = rng.standard_normal(shape)
+    for method in (PM, NEWTON):
+        compare(f"everywhere {shape}", cells, b, 0.0, method=method)
+        compare(f"boxed {shape}", cells, b, -0.2, 0.3, method=method)
+        compare(f"linear {shape}", cells, b, -np.inf, method=method)
+        walls = np.where(rng.random(shape) < 0.3, 0.0, -np.inf)
+        compare(f"walls {shape}", cells, b, walls, method=method, **coefficients(shape))
+        compare(f"number a face {shape}", cells, b, 0.0, method=method, face_x=1.0, face_y=3.0)
+
+if ranks.size > 1:  # cuts at odd cells: the finest level is gathered; cuts along x and y
+    shape, cells = (20, 20, 20), scene((20, 20, 20))
+    b = rng.standard_normal(shape)
+    for processes in ((ranks.size, 1, 1), (1, ranks.size, 1)):
+        boxes = Decomposition(
+            (20, 20, 20),
+            ranks,
+            processes=processes,
+            cuts=[[20] if p == 1 else [7, *[5] * (p - 2), 20 - 7 - 5 * (p - 2)] for p in processes],
+        )
+        compare(f"odd cuts {processes}", cells, b, 0.0, method=PM, decomposition=boxes)
+    cells = scene((40, 40, 40))
+    b = rng.standard_normal((40, 40, 40))
+    for processes in ((ranks.size, 1, 1), (1, ranks.size, 1)):
+        compare(f"cuts {processes}", cells, b, 0.0, method=PM, decomposition=Decomposition((40, 40, 40), ranks, processes=processes))
+
+# closed pools: one that reaches over all ranks, and small ones; b sums to 0 on each or not
+cells = np.full((24, 10, 12), wl.FLUID)
+cells[:, 6, :] = wl.SOLID
+cells[:, 7:, 6] = wl.SOLID
+cells[3, 9, 9] = wl.AIR
+b = rng.standard_normal(cells.shape)
+for region in ((slice(None), slice(0, 6), slice(None)), (slice(None), slice(7, None), slice(0, 6))):
+    b[region] -= b[region].mean()
+for method in (PM, NEWTON):
+    found, A = compare("closed pools", cells, b, -np.inf, method=method, same=1e-8)
+    assert A.floating_components().count == 2
+    compare("closed pools, bounded", cells, b + 0.1, 0.0, method=method, same=1e-8)
+found, A = compare("no solution", cells, b + 1.0, -np.inf, method=PM)
+assert found.status is wl.SolveStatus.INFEASIBLE
+
+# the same memory while cells and b change in place
+shape = (32, 18, 18)
+boxes = Decomposition((18, 18, 32), ranks)
+full = [scene(shape) for _ in range(4)]
+nz, ny, nx = reversed(boxes.box.counts)
+stored = wp.zeros((nz + 2, ny + 2, nx + 2), dtype=wp.float64, device="cpu")
+A = DistributedGridPoisson(boxes, part(full[0], boxes.box, shape), device="cpu")
+problem = wl.LCP(A, stored, 0.0)
+work = PM.init(problem)
+for cells in full:
+    b = rng.standard_normal(shape)
+    padded = np.zeros(stored.shape, dtype=np.int8)
+    padded[1:-1, 1:-1, 1:-1] = part(cells, boxes.box, shape)
+    A.update(wp.array(padded, dtype=wp.int8, device="cpu"))
+    stored.numpy()[1:-1, 1:-1, 1:-1] = part(b, boxes.box, shape)
+    for _ in range(2):  # the second time warm
+        found = wl.solve(problem, PM, workspace=work, stopping=wl.StoppingCriteria(rtol=1e-9), x0=None if _ == 0 else found.x)
+    expected = wl.solve(wl.LCP(wl.GridPoisson(cells, device="cpu"), b, 0.0), PM, stopping=wl.StoppingCriteria(rtol=1e-9))
+    assert found and expected
+    inner = found.x.numpy()[1:-1, 1:-1, 1:-1]
+    assert np.abs(inner - part(expected.x.numpy(), boxes.box, shape)).max() <= 1e-7 * np.abs(expected.x.numpy()).max()
+
+# what is wrong is refused on all ranks
+for arguments, word in (({"periodic": (True, False, False)}, "periodic"), ({"face_x": np.ones((3, 3, 3))}, "face_x")):
+    try:
+        DistributedGridPoisson(boxes, part(full[0], boxes.box, shape), device="cpu", **arguments)
+        raise AssertionError(word)
+    except ValueError as error:
+        assert word in str(error), error
+if ranks.size > 1:
+    try:
+        wl.solve(problem, wl.ProjectedSOR())
+        raise AssertionError("ProjectedSOR")
+    except ValueError as error:
+        assert "several ranks" in str(error)
+    try:
+        ranks.agree("the number", ranks.rank)
+        raise AssertionError("agree")
+    except ValueError as error:
+        assert "the number on rank 1" in str(error)
+sys.stdout.write(f"rank {ranks.rank} of {ranks.size} is done\n")
