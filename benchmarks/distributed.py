@@ -11,6 +11,8 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import warp as wp
+
 from benchmarks import on_ranks
 from benchmarks.cases import TOLERANCES
 from benchmarks.machine import COPIED, machine
@@ -20,8 +22,6 @@ from benchmarks.scaling import FIGURES
 from benchmarks.targets import Target
 from benchmarks.timing import Figure, Options
 from warp_lcp.distributed import launch
-from warp_lcp.distributed.guard import WRONG_INPUT, Guard
-from warp_lcp.distributed.ranks import Ranks
 
 TITLE = "Solves on several ranks"
 SIZES = (64, 128, 129)
@@ -35,14 +35,14 @@ Found = Mapping[tuple[int, str, int], Record]  # by cells a side, bounds, ranks
 
 def measure(options: Options, out: Path) -> Results:
     """Measure on the ranks there are, or on each number of ranks in a run of its own."""
-    where = machine(options.device, elements=min(COPIED, 64 * max(options.sizes or SIZES) ** 3), repeat=options.repeat)
     if launch.rank_here() is not None:
-        records = _here(options)
-        return Results([where, *records], [_table(_found(records))], [], _failures(records))
+        sizes = options.sizes or SIZES
+        records = on_ranks.together(sizes, device=options.device, repeat=options.repeat, say=options.say)
+        return Results([_machine(options), *records], [_table(_found(records))], [], _failures(records))
     why = launch.missing()
     if why:
         options.say(why)
-        raise SystemExit(WRONG_INPUT)
+        raise SystemExit(on_ranks.WRONG_INPUT)
     strong = sorted(options.sizes or SIZES)
     records = []
     for count in RANKS:
@@ -50,7 +50,7 @@ def measure(options: Options, out: Path) -> Results:
         records += _started(count, sorted({*strong, *weak}), options)
     found = _found(records)
     tables = [_targets(found, strong), _strong(found, strong), _weak(found, strong), _table(found)]
-    return Results([where, *records], tables, _charts(found, strong), _failures(records))
+    return Results([_machine(options), *records], tables, _charts(found, strong), _failures(records))
 
 
 def weak_size(n: int, ranks: int) -> int:
@@ -71,20 +71,9 @@ def efficiency(one: float, n: int, shared: float, m: int, ranks: int) -> float:
     return one / n**3 / (shared * ranks / m**3)
 
 
-def _here(options: Options) -> list[Record]:
-    """Measure on the ranks that mpiexec has started; only the first one returns."""
-    ranks = Ranks.world()
-    try:
-        with Guard(ranks, options.say):
-            records = on_ranks.measure(
-                ranks, options.sizes or SIZES, device=options.device, repeat=options.repeat, say=options.say
-            )  # fmt: skip
-    except ValueError as error:
-        options.say(str(error))
-        raise SystemExit(WRONG_INPUT) from error
-    if not ranks.first:
-        raise SystemExit(0)
-    return records
+def _machine(options: Options) -> Record:
+    host = "cpu" if options.device == "cpu" else wp.get_preferred_device().alias
+    return machine(host, elements=min(COPIED, 64 * max(options.sizes or SIZES) ** 3), repeat=options.repeat)
 
 
 def _started(count: int, sizes: Sequence[int], options: Options) -> list[Record]:
@@ -228,6 +217,14 @@ def _charts(found: Found, sizes: Sequence[int]) -> list[Chart]:
         kept[f"{n}^3 a rank"] = [r for r, *_ in there], [efficiency(one.figures[TOLD].value, n, t, m, r) for r, m, t in there if one]
     cores = f"walls, to 1e-6, {os.cpu_count()} cores"
     return [
-        Lines("strong", f"One grid on more ranks: {cores}", "ranks", "times as fast as 1 rank", gains, logarithmic_x=False, logarithmic_y=False),
+        Lines(
+            "strong",
+            f"One grid on more ranks: {cores}",
+            "ranks",
+            "times as fast as 1 rank",
+            gains,
+            logarithmic_x=False,
+            logarithmic_y=False,
+        ),
         Lines("weak", f"Grids that grow with the ranks: {cores}", "ranks", "speed of a rank over that of 1", kept, False, False),
     ]

@@ -17,6 +17,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tomli_w
 import warp as wp
 
@@ -26,12 +27,15 @@ from benchmarks.record import Record, Results, Table
 from benchmarks.timing import Figure, Options
 from warp_lcp.driver.models import TABLE
 from warp_lcp.driver.profile import Profile
+from warp_lcp.driver.run import plan_dt
+from warp_lcp.driver.scene import Scene, Time
 from warp_lcp.driver.simulator import simulators
 from warp_lcp.driver.table import validate
 
 TITLE = "What models cost"
 RESOLUTION = {2: 128, 3: 48}  # cells along the longest side of the reference scenes
-WARM = 3  # steps that are not timed
+FRAMES = 15  # that are timed, half a second: columns collapse, and reach the other wall
+WATCHED = 3  # steps that the shares of the stages are taken from
 STAGES = ("sort", "particles-to-grid", "grid-to-particles", "advection", "diagnostics")  # whose time is the particles'
 QUIET = {"diagnostics": False}
 REFERENCE = "{}"  # the tables of the reference scene, as text
@@ -62,7 +66,7 @@ def offers(simulator: str, dimension: int) -> dict[str, Offer]:
     both = {
         "cut cells": Offer({"solid": [ball]}, {"solid": [ball], "domain": {"solids": "voxel"}}),
         "moving solids": Offer({"solid": [swaying]}, {"solid": [ball]}),
-        "rigid bodies": Offer({"solid": [ball | {"density": 700.0}]}, {"solid": [ball]}),
+        "rigid bodies": Offer({"solid": [ball | {"density": 700.0}]}, {"solid": [swaying]}),  # which move too
         "density correction": Offer({"density_correction": {}}),
         "reseeding": Offer({"particles": {"reseed": {"every": 1}}}, unit="particle"),
         "diagnostics": Offer({"output": {}}),
@@ -83,7 +87,7 @@ def offers(simulator: str, dimension: int) -> dict[str, Offer]:
     return liquid | both
 
 
-def create(simulator: str, dimension: int, tables: Tables, size: int, device: str) -> Any:
+def reference(simulator: str, dimension: int, tables: Tables, size: int) -> Scene:
     """Return the reference scene, a column in a box twice as long as high, with some tables changed."""
     scene: Tables = {
         "scene": {"simulator": simulator, "name": "reference"},
@@ -98,13 +102,21 @@ def create(simulator: str, dimension: int, tables: Tables, size: int, device: st
         {"shape": "box", "min": [0.0] * dimension, "max": [0.55, 0.4, 0.5][:dimension]},
     ]
     merged = scene | {name: scene["domain"] | value if name == "domain" else value for name, value in tables.items()}
-    plug_in = simulators()[simulator]
-    return plug_in.create(validate(plug_in.scene_model, merged, "reference"), device=device, folder=Path.cwd())
+    return validate(simulators()[simulator].scene_model, merged, "reference")
 
 
-def step_seconds(simulation: Any) -> float:
-    """Return the seconds of one short step: all scenes stay alike."""
-    return step_seconds_of(simulation, min(simulation.stable_dt(), 2e-3))[0]
+def create(scene: Scene, device: str) -> Any:
+    """Return the simulation of a scene."""
+    return simulators()[scene.scene.simulator].create(scene, device=device, folder=Path.cwd())
+
+
+def run_seconds(simulation: Any, time: Time) -> np.ndarray:
+    """Return the seconds of each step of a run's beginning, as long as a run takes them: how many iterations a solve needs follows that."""
+    spent = []
+    for frame in range(1, FRAMES + 1):
+        while time.frame_time(frame) - simulation.time > 1e-9:
+            spent.append(step_seconds_of(simulation, plan_dt(simulation.stable_dt(), time.frame_time(frame) - simulation.time, time))[0])
+    return np.array(spent)
 
 
 def step_seconds_of(simulation: Any, dt: float) -> tuple[float, dict[str, Any]]:
@@ -120,34 +132,42 @@ def step_seconds_of(simulation: Any, dt: float) -> tuple[float, dict[str, Any]]:
 
 @dataclass
 class Sample:
-    """A scene that is measured: its bytes and the least seconds of a step."""
+    """A scene that is measured: the scene, its bytes and the least seconds of each of its steps, which are the same in each run."""
 
-    simulation: Any
+    scene: Scene
     bytes: int
-    seconds: float = math.inf
+    steps: np.ndarray
+
+    @property
+    def seconds(self) -> float:
+        """Return the mean of a step."""
+        return float(self.steps.mean())
+
+    def again(self, steps: np.ndarray) -> None:
+        """Take the shorter times of another run; where its steps are others, which only GPUs' rounding makes them, of those of both."""
+        count = min(len(self.steps), len(steps))
+        self.steps = np.minimum(self.steps[:count], steps[:count])
 
 
 def measure_all(simulator: str, dimension: int, size: int, options: Options) -> dict[str, Sample]:
-    """Return the scenes of all offers by their tables' text, the reference among them; steps are taken in turns."""
-    wanted: list[Tables] = [{}]
+    """Return the scenes of all offers by their tables' text, the reference among them; runs are taken in turns."""
+    wanted: dict[str, Tables] = {REFERENCE: {}}
     for offer in offers(simulator, dimension).values():
-        wanted += [offer.on, offer.off]
-    create(simulator, dimension, {}, size, options.device).step(1e-3)  # what is loaded once is no scene's
+        wanted |= {str(tables): tables for tables in (offer.on, offer.off)}
     samples: dict[str, Sample] = {}
-    for tables in wanted:
-        if str(tables) in samples:
-            continue
+    for text, tables in wanted.items():
+        scene = reference(simulator, dimension, tables, size)
+        create(scene, options.device).step(1e-3)  # what is loaded once is no scene's
         gc.collect()
         before = array_bytes()
-        simulation = create(simulator, dimension, tables, size, options.device)
-        for _ in range(WARM):
-            step_seconds(simulation)
+        simulation = create(scene, options.device)
+        steps = run_seconds(simulation, scene.time)
         simulation.surfaces()
         gc.collect()
-        samples[str(tables)] = Sample(simulation, array_bytes() - before)
-    for _ in range(4 * options.repeat):
+        samples[text] = Sample(scene, array_bytes() - before, steps)
+    for _ in range(options.repeat - 1):
         for sample in samples.values():
-            sample.seconds = min(sample.seconds, step_seconds(sample.simulation))
+            sample.again(run_seconds(create(sample.scene, options.device), sample.scene.time))
     return samples
 
 
@@ -158,12 +178,13 @@ def split(seconds: float, half: float, dimension: int) -> tuple[float, float]:
     return fixed, max(seconds - fixed, 0.0)
 
 
-def particle_share(sample: Sample) -> float:
+def particle_share(simulation: Any) -> float:
     """Return which part of a step's time goes with the particles, the rest with the cells."""
-    profile = Profile(str(sample.simulation.grid.device))
-    sample.simulation.watch = profile
-    for _ in range(WARM):
-        step_seconds(sample.simulation)
+    simulation.step(1e-3)
+    profile = Profile(str(simulation.grid.device))
+    simulation.watch = profile
+    for _ in range(WATCHED):
+        simulation.step(simulation.stable_dt())
     spent = {name: stage.seconds for name, stage in profile.stages.items()}
     return sum(spent.get(name, 0.0) for name in STAGES) / sum(spent.values())
 
@@ -174,8 +195,9 @@ def records_of(simulator: str, dimension: int, options: Options) -> list[Record]
     size = max(options.sizes, default=RESOLUTION[dimension])
     samples, halves = (measure_all(simulator, dimension, n, options) for n in (size, size // 2))
     base = samples[REFERENCE]
-    cells, particles = math.prod(base.simulation.grid.counts), base.simulation.particles.count
-    share = particle_share(base)
+    simulation = create(base.scene, options.device)
+    cells, particles = math.prod(simulation.grid.counts), simulation.particles.count
+    share = particle_share(simulation)
     fixed, growing = split(base.seconds, halves[REFERENCE].seconds, dimension)
     figures = {
         "step": Figure(base.seconds, "s"),

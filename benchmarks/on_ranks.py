@@ -30,12 +30,14 @@ from benchmarks.timing import Figure, ratios
 from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.devices import device_of_rank
 from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
-from warp_lcp.distributed.guard import WRONG_INPUT, Guard
 from warp_lcp.distributed.halo import Halo
+from warp_lcp.distributed.meeting import Meeting, RankFailed
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.driver.devices import devices, free_memory
 
 PAUSE = 0.002  # [s] between two looks of a rank that waits: it leaves its core to the one that computes
+PLANNED = (ValueError, MemoryError, OSError)  # whose messages say enough
+FAILED, WRONG_INPUT = 1, 2  # exit codes
 MEGA = 1 << 20
 WALLS = BOUNDS.index("walls")  # whose memory is counted: the others need as much or less
 MEMORY = ("bytes_per_cell", "resident", "resident_more")
@@ -213,6 +215,25 @@ def _wait(ranks: Ranks) -> None:
         time.sleep(PAUSE)
 
 
+def together(sizes: Sequence[int], *, device: str, repeat: int, say: Callable[[str], object]) -> list[Record]:
+    """Measure on the ranks that mpiexec has started; every rank calls it, and only the first one returns.
+
+    Raises:
+        SystemExit: on the other ranks, and on all with an exit code that is not 0 where one has failed.
+    """
+    ranks = Ranks.world()
+    try:
+        with Meeting(ranks, PLANNED, say).together():
+            records = measure(ranks, sizes, device=device, repeat=repeat, say=say)
+    except (RankFailed, *PLANNED) as error:
+        if ranks.first:
+            say(str(error))
+        raise SystemExit(WRONG_INPUT if isinstance(error, ValueError) else FAILED) from error
+    if not ranks.first:
+        raise SystemExit(0)
+    return records
+
+
 def main() -> None:
     """Measure and write the records; every rank calls it."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.on_ranks")
@@ -222,16 +243,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
     wp.config.log_level = wp.LOG_ERROR
-    ranks = Ranks.world()
-    say = lambda text: sys.stderr.write(f"{text}\n")  # noqa: E731
-    try:
-        with Guard(ranks, say):
-            records = measure(ranks, given.size, device=given.device, repeat=given.repeat, say=say)
-            if ranks.first:
-                write_json(given.out, records)
-    except ValueError as error:
-        say(str(error))
-        sys.exit(WRONG_INPUT)
+    records = together(given.size, device=given.device, repeat=given.repeat, say=lambda text: sys.stderr.write(f"{text}\n"))
+    write_json(given.out, records)
 
 
 if __name__ == "__main__":

@@ -11,11 +11,11 @@ from pathlib import Path
 
 from benchmarks.compare import comparison
 from warp_lcp.distributed import launch
-from warp_lcp.distributed.guard import WRONG_INPUT
 from warp_lcp.gallery import recorded
 from warp_lcp.solvers import METHODS
 
 DISTRIBUTED = "distributed"  # group of --engine petsc
+WRONG_INPUT = 2  # exit code of a suite that says what is wrong with its input
 REPLAY = "replay"  # module and files of recorded problems
 # before NumPy is imported: PyAMG's set-up takes 20 times as long when two BLAS threads fight over two cores
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}

@@ -7,28 +7,23 @@ import json
 import sys
 
 import numpy as np
-import petsc4py
+import scipy.sparse
 import warp as wp
-
-wp.config.log_level = wp.LOG_ERROR
-petsc4py.init([])
 from oracle_problems import BOUNDS, small
-from petsc4py import PETSc
 
 import warp_lcp as wl
 from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
 from warp_lcp.distributed.petsc_active_set import PetscActiveSet
-from warp_lcp.distributed.ranks import Ranks
+from warp_lcp.distributed.ranks import Ranks, petsc
 
-RANKS = Ranks.world()
 OURS = {"petsc": PetscActiveSet(), "newton": wl.MinimumMapNewton(), "multigrid": wl.ProjectedMultigrid()}
 TIGHT = wl.StoppingCriteria(rtol=1e-10)
 
 
 def shared_matrix(A):
     """Return a SciPy matrix as PETSc's, its rows shared in their order."""
-    matrix = PETSc.Mat().createAIJ(A.shape, nnz=7)
+    matrix = petsc().Mat().createAIJ(A.shape, nnz=7)
     first, last = matrix.getOwnershipRange()
     mine = A[first:last]
     matrix.setValuesCSR(mine.indptr.astype(np.int32), mine.indices.astype(np.int32), mine.data)
@@ -40,13 +35,13 @@ def shared_vector(matrix, values):
     """Return values as a vector that fits the matrix; infinite ones as PETSc's."""
     v = matrix.createVecLeft()
     first, last = v.getOwnershipRange()
-    v.setArray(np.clip(values[first:last], PETSc.NINFINITY, PETSc.INFINITY))
+    v.setArray(np.clip(values[first:last], petsc().NINFINITY, petsc().INFINITY))
     return v
 
 
 def gathered(v):
     """Return a vector's values on every rank."""
-    return np.concatenate(RANKS.comm.allgather(v.getArray()))
+    return np.concatenate(Ranks.world().comm.allgather(v.getArray()))
 
 
 def direct(ksp):
@@ -67,9 +62,9 @@ def snes(problem, A, kind, prepare):
     matrix = shared_matrix(A)
     fluid = problem.fluid
     b, lower, upper = (shared_vector(matrix, field[fluid]) for field in (problem.b, problem.lower, problem.upper))
-    options = PETSc.Options()
+    options = petsc().Options()
     options["snes_vi_zero_tolerance"] = 1e-13  # an absolute one, 1e-8 unless set: bounds would count as touched that are not
-    solver = PETSc.SNES().create()
+    solver = petsc().SNES().create()
     solver.setType(kind)
     solver.setFunction(lambda snes, x, f: matrix.multAdd(x, b, f), b.duplicate())
     solver.setJacobian(lambda snes, x, J, P: matrix.copy(P), matrix.duplicate(copy=True))  # vinewtonssls scales the rows in place
@@ -94,7 +89,7 @@ def tao(problem, A, kind):
         gradient.axpy(1.0, b)
         return value
 
-    solver = PETSc.TAO().create()
+    solver = petsc().TAO().create()
     solver.setType(kind)
     solver.setObjectiveGradient(energy, b.duplicate())
     solver.setHessian(lambda tao, x, H, P: None, matrix)
@@ -117,15 +112,14 @@ THEIRS = {
 }
 
 
-def solve_ours(problem, solver):
-    """Solve by one of our methods on the ranks; return x on all unknowns, in their order, and the result."""
+def shared_problem(problem, ranks, dtype=wp.float64):
+    """Return the boxes of the ranks and the problem that they share."""
     counts = (*reversed(problem.cells.shape), 1)[:3]
-    boxes = Decomposition(counts, RANKS)
-    whole = tuple(reversed(counts))
+    boxes = Decomposition(counts, ranks)
 
     def mine(field, extra=(0, 0, 0)):
         z, y, x = (slice(s.start, s.stop + e) for s, e in zip(boxes.box.slices, extra, strict=True))
-        grid = field.reshape([n + e for n, e in zip(whole, extra, strict=True)])[z, y, x]
+        grid = field.reshape([n + e for n, e in zip(reversed(counts), extra, strict=True)])[z, y, x]
         return np.ascontiguousarray(grid[0] if problem.cells.ndim == 2 else grid)
 
     given = dict(problem.coefficients)
@@ -134,19 +128,45 @@ def solve_ours(problem, solver):
             given[name] = mine(given[name], tuple(int(a == axis) for a in range(3)))
     if "shift" in given:
         given["shift"] = mine(given["shift"])
-    A = DistributedGridPoisson(boxes, mine(problem.cells), device="cpu", dtype=wp.float64, **given)
-    result = wl.solve(wl.LCP(A, mine(problem.b), mine(problem.lower), mine(problem.upper)), solver, stopping=TIGHT)
-    x = np.zeros(whole)
-    for box, part in RANKS.comm.allgather((boxes.box.slices, result.x.numpy())):
-        x[box] = part.reshape(x[box].shape)
-    return x.reshape(problem.cells.shape)[problem.fluid], result
+    A = DistributedGridPoisson(boxes, mine(problem.cells), device="cpu", dtype=dtype, **given)
+    return boxes, wl.LCP(A, mine(problem.b), mine(problem.lower), mine(problem.upper))
+
+
+def whole_field(mine, boxes, shape):
+    """Return a field of the whole grid on every rank from the ranks' boxes of it."""
+    whole = np.zeros(tuple(reversed(boxes.counts)))
+    for box, part in boxes.ranks.comm.allgather((boxes.box.slices, mine)):
+        whole[box] = part.reshape(whole[box].shape)
+    return whole.reshape(shape)
+
+
+def solve_ours(problem, solver, ranks):
+    """Solve by one of our methods on the ranks; return x on all unknowns, in their order, and the result."""
+    boxes, lcp = shared_problem(problem, ranks)
+    result = wl.solve(lcp, solver, stopping=TIGHT)
+    return whole_field(result.x.numpy(), boxes, problem.cells.shape)[problem.fluid], result
+
+
+def level_matrix(stencil):
+    """Return a level's stencil of one rank as an assembled matrix on all cells, the identity on those that are no unknowns."""
+    counts, grid = stencil.padding.counts, np.arange(np.prod(stencil.padding.counts)).reshape(stencil.padding.counts)
+    inside = (slice(1, -1),) * 3
+    d = stencil.d.numpy().reshape(stencil.padding.shape)[inside].astype(float) * stencil.unit
+    matrix = scipy.sparse.diags_array(np.where(d == 0, 1.0, d).ravel()).tolil()
+    for axis, w in zip((2, 1, 0), stencil.weights, strict=True):
+        weight = w.numpy().reshape(stencil.padding.shape)[inside]
+        above, below = ((slice(None),) * axis + (cut,) for cut in (slice(1, None), slice(None, counts[axis] - 1)))
+        joined = (d[above] != 0) & (d[below] != 0)
+        i, j = grid[above][joined], grid[below][joined]
+        matrix[i, j] = matrix[j, i] = -weight[above][joined]
+    return shared_matrix(matrix.tocsr())
 
 
 def compare(problem):
     """Solve by all methods; return what each tells, and how its x and its active set differ from those of our first one."""
     A, told, reference = problem.matrix(), {}, None
     for name, solver in OURS.items():
-        x, result = solve_ours(problem, solver)
+        x, result = solve_ours(problem, solver, Ranks.world())
         places = problem.places(A, x)
         reference = reference or (x, places)
         told[name] = {
@@ -168,6 +188,7 @@ def differences(x, places, other_x, other_places):
 
 
 if __name__ == "__main__":
+    wp.config.log_level = wp.LOG_ERROR
     found = {bounds: compare(small(sys.argv[1], bounds)) for bounds in BOUNDS}
-    if RANKS.first:
+    if Ranks.world().first:
         print(json.dumps(found))

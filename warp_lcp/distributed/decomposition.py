@@ -121,6 +121,13 @@ class Decomposition:
         return Decomposition((nx, ny, nz), self.ranks, processes=self.processes, cuts=new)
 
     @cached_property
+    def halo(self) -> Any:
+        """What fills one layer of ghost cells, made once for all operators on these boxes."""
+        from warp_lcp.distributed.halo import Halo
+
+        return Halo(self, 1)
+
+    @cached_property
     def dmda(self) -> Any:
         """The same as a DMDA of PETSc: one number a cell, 7-point stencils."""
         PETSc = petsc()

@@ -9,7 +9,6 @@ import scipy.sparse
 import scipy.sparse.csgraph
 
 from warp_lcp.distributed.decomposition import Decomposition
-from warp_lcp.distributed.halo import Halo
 from warp_lcp.operators.components import ComponentFinder, FloatingComponents, Scratch
 from warp_lcp.operators.grid_poisson import FLUID, GridPoisson
 
@@ -52,7 +51,7 @@ class DistributedGridPoisson(GridPoisson):
             for axis in decomposition.cut_axes:
                 if min(decomposition.parts[axis]) < 2:
                     raise ValueError(f"a rank has one cell along {'xyz'[axis]}: boxes of shared operators have at least two")
-            self._ghosts, self._across = Halo(decomposition, 1), decomposition.ranks
+            self._ghosts, self._across = decomposition.halo, decomposition.ranks
         kinds = [(name, np.ndim(value) > 0 or value) for name, value in sorted(coefficients.items()) if name not in ("device", "dtype")]
         decomposition.ranks.agree("what the coefficients are", kinds)
         super().__init__(cells, **coefficients)

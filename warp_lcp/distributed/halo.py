@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,7 @@ class Halo:
         stored = [box.grown(width) for box in boxes]
         self._forest = star_forest(decomposition.ranks, boxes, stored) if decomposition.ranks.size > 1 else None
         self._staging: dict[Any, np.ndarray] = {}
+        self._coarser: dict[tuple[int, int, int], Halo | None] = {}
 
     @property
     def whole(self) -> tuple[int, int, int]:
@@ -64,8 +66,15 @@ class Halo:
 
     def coarser(self, factors: tuple[int, int, int]) -> Halo | None:
         """Return the halo of aggregates of so many cells along x, y, z; None if aggregates would be cut."""
-        decomposition = self.decomposition.coarser(factors)
-        return None if decomposition is None else Halo(decomposition, self.width)
+        if factors not in self._coarser:  # solves on the same boxes share what it takes to exchange
+            decomposition = self.decomposition.coarser(factors)
+            self._coarser[factors] = None if decomposition is None else Halo(decomposition, self.width)
+        return self._coarser[factors]
+
+    @cached_property
+    def gathering(self) -> Gathering:
+        """What collects the ranks' fields on every rank."""
+        return Gathering(self.decomposition)
 
     def fill(self, field: wp.array[Any] | np.ndarray) -> None:
         """Fill the ghost cells of a contiguous field of `shape`, or of that many elements; collective."""
@@ -114,8 +123,7 @@ class Gathering:
         roots = decomposition.box.grown(1).cells
         self._forest = petsc().SF().create(comm=decomposition.ranks.comm)
         self._forest.setGraph(roots, np.concatenate(leaves).astype(np.int32), np.concatenate(remotes))
-        low = decomposition.box.moved((1, 1, 1))
-        self._inner, self._mine = (slice(1, -1),) * 3, low.slices
+        self._mine = decomposition.box.grown(1).moved((1, 1, 1)).slices
         nx, ny, nz = decomposition.box.counts
         self._shape, self._whole = (nz + 2, ny + 2, nx + 2), tuple(n + 2 for n in reversed(decomposition.counts))
 
@@ -127,8 +135,8 @@ class Gathering:
             whole.assign(target)
 
     def take(self, whole: wp.array[Any], mine: wp.array[Any]) -> None:
-        """Write this rank's part of the whole grid's field to its own."""
-        target, source = mine.reshape(self._shape)[self._inner], whole.reshape(self._whole)[self._mine]
+        """Write this rank's part of the whole grid's field to its own, ghost cells too."""
+        target, source = mine.reshape(self._shape), whole.reshape(self._whole)[self._mine]
         if mine.device.is_cuda:
             wp.copy(target, source)
         else:  # NumPy copies rows ten times as fast

@@ -8,7 +8,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.distributed.halo import Gathering, Halo
+from warp_lcp.distributed.halo import Halo
 from warp_lcp.layout import Padding
 from warp_lcp.multigrid.hierarchy import Hierarchy, Level
 from warp_lcp.multigrid.shared_cycle_kernels import shared_cycle_kernels
@@ -35,7 +35,7 @@ class DistributedHierarchy(Hierarchy):
                 break
             self.levels.append(self._coarser(last, bounded=bounded))
         self._strength = strength
-        self._gathering = Gathering(halo.decomposition)
+        self._gathering = halo.gathering
         stencil = _whole_stencil(last.stencil, halo.whole, (strength[0], strength[1], strength[2]))
         bounds = None
         if bounded and last.upper.size == 0:
@@ -85,7 +85,8 @@ class DistributedHierarchy(Hierarchy):
         if projected or not self._streams(L):
             super()._go_up(level, launch, projected=projected)
             return
-        C.stencil.wrap(C.x, launch=launch)  # those of L.x are filled since its restriction
+        if level + 2 < len(self.levels):  # those of L.x are filled since its restriction, those of a gathered level since it was solved
+            C.stencil.wrap(C.x, launch=launch)
         planes, rows, _ = C.stencil.padding.counts
         first, second = reversed(self.settings.weights)
         fields = [L.x, L.b, L.t, L.lower, L.upper, C.x, first, self.settings.over_correction]

@@ -14,12 +14,16 @@ from typing import Any, Protocol
 import numpy as np
 import warp as wp
 
+from warp_lcp.distributed.decomposition import Box
+from warp_lcp.distributed.particles_kernels import INNER, OUTSIDE, where_kernel
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.grid import particles_kernels as kernels
+from warp_lcp.grid.particle_loops import launch
 from warp_lcp.grid.particles import SORT_EVERY, Particles, ParticleTotals
 
 MOST_A_CELL = 1 << 20  # particles; places of one cell are numbers below those of the next
 REACH = 1  # cells from a box within which particles touch its faces and cells
+ENDLESS = 1e30  # a coordinate beyond all
 COUNT, DATA = 7101, 7102  # tags of messages
 
 
@@ -105,30 +109,33 @@ class SharedParticles(Particles):
             if due:
                 self.sort()
             return
-        cells = self._cells()
-        keep = np.flatnonzero(_within(cells, self.part.box.grown(REACH)))
-        places = self._receive(self._post.swap(self._outgoing(cells)))
+        border = np.flatnonzero(self._where() != INNER)
+        cells = self._cells(border)
+        keep = np.ones(self.count, dtype=bool)
+        keep[border[~_within(cells, self.part.box.grown(REACH))]] = False
+        keep = np.flatnonzero(keep)
+        places = self._receive(self._post.swap(self._outgoing(border, cells)))
         kept = np.concatenate([keep, np.arange(len(self.place), self.count)])
         places = np.concatenate([self.place[keep], places])
         order = np.argsort(places, kind="stable")
         self._take(kept[order], places[order])
-        self.number()
         if due:
             self.sort()
-        self._own = _within(self._cells(), self.part.box)
+        else:
+            self.number()
+        self._own = self._where() != OUTSIDE
 
     def sort(self) -> None:
-        """Bring the particles into the order of their cells, those of a cell into that of their places, and give them new places."""
+        """Bring the particles, which are in the order of their places, into that of their cells, and give them new places."""
         self.number()
-        key = self.key.numpy()[: self.count]
-        order = np.lexsort((self.place, key))
-        self._take(order, self.place[order])
+        order = np.argsort(self.key.numpy()[: self.count], kind="stable")
+        self._take(order, self.place)
         self.number()
         nx, ny, _ = self.part.decomposition.counts
-        i, j, k = self._cells().T.astype(np.int64)
-        cell = (k * ny + j) * nx + i
-        starts = np.flatnonzero(np.diff(cell, prepend=-1))
-        self.place = cell * MOST_A_CELL + np.arange(self.count) - np.repeat(starts, np.diff(starts, append=self.count))
+        starts = np.flatnonzero(np.diff(self.key.numpy()[: self.count], prepend=-1))
+        i, j, k = self._cells(starts).T.astype(np.int64)
+        first = ((k * ny + j) * nx + i) * MOST_A_CELL
+        self.place = np.arange(self.count) + np.repeat(first - starts, np.diff(starts, append=self.count))
         if self.offsets is not None and self.count:
             wp.launch(kernels.offset_kernel, self.grid.size + 1, [self.key, self.count, self.offsets], device=self.grid.device)
         elif self.offsets is not None:
@@ -171,20 +178,29 @@ class SharedParticles(Particles):
         self.assign({name: np.ascontiguousarray(values[order]) for name, values in arrays.items()})
         self.place = np.asarray(place, dtype=np.int64)[order]
 
-    def _cells(self) -> np.ndarray:
-        """Return the cell (x, y, z) of the whole domain that each particle was last numbered in, shape (count, 3)."""
+    def _where(self) -> np.ndarray:
+        """Return INNER, BORDER or OUTSIDE of each particle, uint8, shape (count,)."""
+        part, grid = self.part, self.grid
+        bits = [[part.cuts >> 2 * axis + side & 1 for axis in range(3)] for side in range(2)]
+        low = [box + 1 if cut else -ENDLESS for box, cut in zip(part.box.low, bits[0], strict=True)]
+        high = [box + 1 if cut else ENDLESS for box, cut in zip(part.box.high, bits[1], strict=True)]
+        found = wp.empty(self.count, dtype=wp.uint8, device=grid.device)
+        inputs = [1.0 / grid.spacing, wp.vec3(*low), wp.vec3(*high), float(REACH), self.position, found]
+        launch(where_kernel, self.count, inputs, grid.device)
+        return np.asarray(found.numpy())
+
+    def _cells(self, which: np.ndarray) -> np.ndarray:
+        """Return the cell (x, y, z) of the whole domain that some particles were last numbered in, shape (n, 3)."""
         nx, ny, _ = (n + 2 for n in self.grid.counts)
-        rows, i = np.divmod(self.key.numpy()[: self.count], nx)
+        rows, i = np.divmod(self.key.numpy()[: self.count][which], nx)
         k, j = np.divmod(rows, ny)
         return np.stack([i, j, k], axis=1) + (np.array(self.grid.origin, dtype=np.int32) - 1)
 
-    def _outgoing(self, cells: np.ndarray) -> dict[int, np.ndarray]:
-        """Return what each neighbor must know of: particles in its box and within a cell of it."""
-        hosts = [array.numpy() for array in self.arrays().values()]
-        near = np.flatnonzero(~_within(cells, self.part.box.grown(-REACH)))
-        beside, found = cells[near], {}
+    def _outgoing(self, border: np.ndarray, cells: np.ndarray) -> dict[int, np.ndarray]:
+        """Return what each neighbor must know of: particles in its box and within a cell of it, out of some in these cells."""
+        hosts, found = [array.numpy() for array in self.arrays().values()], {}
         for rank in self._neighbors:
-            which = near[_within(beside, self.part.decomposition.boxes[rank].grown(REACH))]
+            which = border[_within(cells, self.part.decomposition.boxes[rank].grown(REACH))]
             records = np.empty(len(which), dtype=self._record)
             records["place"] = self.place[which]
             for column, host in enumerate(hosts):
@@ -213,10 +229,6 @@ class SharedParticles(Particles):
         self.place = places
 
 
-def _within(cells: np.ndarray, box: Any) -> np.ndarray:
-    """Tell which cells (x, y, z), shape (n, 3), are in a box, along those axes that are not wholly in it."""
-    result = np.ones(len(cells), dtype=bool)
-    for axis in range(3):
-        if len(cells):
-            result &= (cells[:, axis] >= box.low[axis]) & (cells[:, axis] < box.high[axis])
-    return result
+def _within(cells: np.ndarray, box: Box) -> np.ndarray:
+    """Tell which cells (x, y, z), shape (n, 3), are in a box."""
+    return np.asarray(((cells >= np.array(box.low)) & (cells < np.array(box.high))).all(axis=1))

@@ -31,7 +31,8 @@ from warp_lcp.driver.render import Looks, film_run, parse_size, render_run
 from warp_lcp.driver.run_folder import OutputError, RunRecord
 from warp_lcp.driver.scene_file import built_in_scenes, installed_simulators, load_scene
 from warp_lcp.driver.simulator import SimulationFailed, StepFailed
-from warp_lcp.driver.solve_file import ProblemError, solve_files, write_vector
+from warp_lcp.driver.solve_file import Outcome, ProblemError, solve_files
+from warp_lcp.driver.solve_recorded import SUFFIX, check_recorded, file_digest, solve_recorded
 from warp_lcp.driver.table import SceneError, nearest
 from warp_lcp.driver.tune import FRAMES, Tuning, tune, write_tuned
 from warp_lcp.driver.versions import shadowing_distributions, versions
@@ -39,6 +40,7 @@ from warp_lcp.driver.viewer import view_run
 
 FAILED = 1
 WRONG_INPUT = 2
+RANKED_SUITE, RANKED_GROUP = "scaling", "distributed"  # what `bench --engine petsc` measures
 
 app = typer.Typer(
     name="warp-lcp",
@@ -107,7 +109,7 @@ def run(
         folder = out or Path("out") / loaded.scene.name
         console = crew.console
         console.print(f"{loaded.scene.name} on {chosen}, into {folder}", markup=False, highlight=False, soft_wrap=True)
-        with _interruptible(console) as stop, Bar(console) if console.is_terminal else Lines(console) as observer:
+        with _interruptible(console, crew.signals) as stop, Bar(console) if console.is_terminal else Lines(console) as observer:
             watch = Profile(chosen) if profile and crew.speaks else None
             record = crew.run(
                 loaded, folder, device=chosen, observer=observer, last_frame=frames, resume=resume, force=force, force_memory=force_memory,
@@ -251,27 +253,48 @@ def schema(simulator: Annotated[str, typer.Option(help="Whose scenes.")] = "flui
 
 @app.command()
 def solve(
-    matrix: Annotated[Path, typer.Argument(metavar="A.mtx", help="A of y = A x + b, a Matrix Market file, sparse or dense.")],
-    right_side: Annotated[Path, typer.Argument(metavar="b.mtx", help="b, a vector.")],
-    lower: Annotated[str, typer.Option(metavar="NUMBER|FILE", help="Lower bounds of x; -inf for none.")] = "0",
-    upper: Annotated[str, typer.Option(metavar="NUMBER|FILE", help="Upper bounds of x.")] = "inf",
+    problem: Annotated[
+        Path,
+        typer.Argument(metavar="PROBLEM", help="A.mtx, A of y = A x + b, a Matrix Market file; or a recorded problem_STEP.npz of a grid."),
+    ],
+    right_side: Annotated[Path | None, typer.Argument(metavar="[b.mtx]", help="b, a vector.", show_default=False)] = None,
+    lower: Annotated[
+        str | None, typer.Option(metavar="NUMBER|FILE", help="Lower bounds of x; -inf for none; 0 unless given.", show_default=False)
+    ] = None,
+    upper: Annotated[
+        str | None, typer.Option(metavar="NUMBER|FILE", help="Upper bounds of x; inf unless given.", show_default=False)
+    ] = None,
     method: Annotated[str | None, typer.Option(metavar="NAME", help="The fastest for A unless given.", show_default=False)] = None,
     tolerance: Annotated[float, typer.Option(metavar="T", help="Of the residual, relative to the one at clip(0, lower, upper).")] = 1e-6,
     max_iterations: Annotated[int, typer.Option(min=0, metavar="N", help="The most steps.")] = 1000,
-    out: Annotated[Path | None, typer.Option(metavar="x.mtx", help="Where x goes.", show_default=False)] = None,
-    device: Annotated[str, typer.Option(help="cpu or cuda:N.")] = "cpu",
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Where x goes: x.mtx, or x.npy of a grid.", show_default=False)] = None,
+    device: Annotated[str, typer.Option(help="cpu, cuda:N, or with --engine petsc cuda.")] = "cpu",
+    engine: EngineOption = Engine.SINGLE,
 ) -> None:
-    """Solve the complementarity problem of a matrix and a vector: y = A x + b, lower <= x <= upper."""
-    with _wrong_input():
-        chosen = choose_device(device)
-        options = {"lower": lower, "upper": upper, "method": method, "tolerance": tolerance, "max_iterations": max_iterations}
+    """Solve a complementarity problem, y = A x + b, lower <= x <= upper: of a matrix and a vector, or one that a run has recorded."""
+    options: dict[str, Any] = {"method": method, "tolerance": tolerance, "max_iterations": max_iterations}
+    with _wrong_input(), crew_of(engine) as crew:
+        crew.agree({"the problem": file_digest(problem), "--out": out, "--device": device, **options})
+        chosen = crew.choose_device(device)
         if out is not None and not out.parent.is_dir():
             raise ProblemError(f"--out {out}: there is no folder {out.parent}")
         if out is not None and out.is_dir():
             raise ProblemError(f"--out {out}: is a folder; name a file")
-        outcome = solve_files(matrix, right_side, device=chosen, **options)  # type: ignore[arg-type]
+        outcome: Outcome
+        if problem.suffix == SUFFIX:
+            check_recorded(problem, right_side=right_side, lower=lower, upper=upper, out=out)
+            outcome = solve_recorded(problem, device=chosen, ranks=crew.ranks, **options)
+        elif engine is Engine.PETSC:
+            raise ProblemError(f"{problem}: --engine petsc solves problems of grids, which `warp-lcp run --record-problems` writes")
+        elif right_side is None:
+            raise ProblemError(f"{problem}: is a matrix: name b too, warp-lcp solve A.mtx b.mtx")
+        else:
+            bounds = {"lower": lower or "0", "upper": upper or "inf"}
+            outcome = solve_files(problem, right_side, device=chosen, **bounds, **options)
         if out is not None:
-            write_vector(out, outcome.result.x.numpy())
+            outcome.write(out)
+    if not crew.speaks:
+        raise typer.Exit(0 if outcome.result else FAILED)
     console = Console(soft_wrap=True, highlight=False)
     console.print(outcome.heading(), markup=False)
     console.print(outcome.table())
@@ -304,6 +327,9 @@ def bench(
             "--group", "--suite", metavar="GROUP", help="Other cases of SUITE: solvers has book, the book's appendix C.", show_default=False
         ),
     ] = "",
+    engine: Annotated[
+        Engine, typer.Option(help="petsc: scaling on 1, 2 and 4 ranks, or on those of `mpiexec -n N warp-lcp ...`.")
+    ] = Engine.SINGLE,
     compare: Annotated[
         tuple[Path, Path] | None,
         typer.Option(metavar="A.json B.json", help="Compare two results instead of measuring.", show_default=False),
@@ -314,9 +340,13 @@ def bench(
     if suite not in installed:
         _end(f"{suite}: no such suite; {nearest(suite, installed)}", WRONG_INPUT)
     with _wrong_input():
-        chosen = choose_device(device)
+        chosen = device if engine is Engine.PETSC else choose_device(device)  # ranks choose for themselves
         if scene:
             load_scene(scene)
+    if engine is Engine.PETSC:
+        if group or suite != RANKED_SUITE:
+            _end(f"--engine petsc: the suite {group or suite} measures one process; use {RANKED_SUITE}", WRONG_INPUT)
+        group = RANKED_GROUP
     try:
         if compare is not None:
             typer.echo(installed[suite].compare(*compare))
@@ -328,7 +358,8 @@ def bench(
         _end(str(error), WRONG_INPUT)
     except RuntimeError as error:
         _end(str(error), FAILED)
-    typer.echo("\n".join(map(str, files)))
+    for file in files:
+        typer.echo(file)
 
 
 @app.command()
@@ -369,8 +400,8 @@ def _wrong_input() -> Iterator[None]:
 
 
 @contextmanager
-def _interruptible(console: Console) -> Iterator[Callable[[], bool]]:
-    """Give a function that says whether Ctrl-C was pressed or SIGTERM came; a second Ctrl-C does not wait for the step's end."""
+def _interruptible(console: Console, signals: tuple[signal.Signals, ...]) -> Iterator[Callable[[], bool]]:
+    """Give a function that says whether Ctrl-C was pressed or another signal came; a second Ctrl-C does not wait for the step's end."""
     pressed = False
 
     def press(given: int, frame: FrameType | None) -> None:
@@ -382,7 +413,7 @@ def _interruptible(console: Console) -> Iterator[Callable[[], bool]]:
             again = "; press Ctrl-C again to end now"
         console.print(f"stopping after this step{again}", highlight=False)
 
-    previous = {number: signal.signal(number, press) for number in (signal.SIGINT, signal.SIGTERM)}
+    previous = {number: signal.signal(number, press) for number in signals}
     try:
         yield lambda: pressed
     finally:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
@@ -18,6 +19,9 @@ from warp_lcp.driver.run_folder import RunRecord
 from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.scene_file import load_scene
 
+if TYPE_CHECKING:
+    from warp_lcp.distributed.ranks import Ranks
+
 
 class Crew:
     """This process alone.
@@ -25,7 +29,10 @@ class Crew:
     Attributes:
         console: takes messages.
         speaks: this process tells the user what happens.
+        signals: that end a run after its step.
     """
+
+    signals: tuple[signal.Signals, ...] = (signal.SIGINT, signal.SIGTERM)
 
     def __init__(self, console: Console | None = None, *, speaks: bool = True) -> None:
         """Speak to the error stream."""
@@ -44,6 +51,18 @@ class Crew:
             SceneError: listing everything that is wrong.
         """
         return load_scene(scene, overrides)
+
+    def agree(self, given: Mapping[str, Any]) -> None:
+        """Check that all were given the same values, by their names.
+
+        Raises:
+            OutputError: they were not; the message names what differs.
+        """
+
+    @property
+    def ranks(self) -> Ranks | None:
+        """Who share the work; None if this process has it alone."""
+        return None
 
     def choose_device(self, name: str | None) -> str:
         """Return the device of this process.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import pickle
+import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -28,12 +29,14 @@ from warp_lcp.driver.run_folder import OutputError, RunFolder, RunRecord
 from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.scene_file import keys
 from warp_lcp.driver.simulator import SimulationFailed, StepFailed
+from warp_lcp.driver.solve_file import ProblemError
 from warp_lcp.driver.table import SceneError, written
 
-WRONG_INPUT = (SceneError, OutputError, DeviceError, EngineError)
+WRONG_INPUT = (SceneError, OutputError, DeviceError, EngineError, ProblemError)
 PLANNED = (OSError, *WRONG_INPUT, StepFailed, SimulationFailed)
 SIZES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE")  # how many processes mpiexec has started, as it tells them
 NUMBERS = ("OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK")  # which of them this one is
+SIGNALS = tuple(number for number in signal.Signals if number.name == "SIGUSR1")  # mpiexec and batch systems pass it on to all ranks
 SHOWN = 4  # differences in one message
 
 
@@ -43,6 +46,8 @@ class RankCrew(Crew):
     Args:
         ranks: all of them.
     """
+
+    signals = (*Crew.signals, *SIGNALS)
 
     def __init__(self, ranks: Ranks) -> None:
         """Let the first rank speak."""
@@ -60,7 +65,7 @@ class RankCrew(Crew):
         with self.meeting.together():
             loaded = super().load(scene, overrides, options)
             given = {**options, **keys(loaded), **{f"the content of {key}": value for key, value in mesh_digests(loaded).items()}}
-        self._agree(given)
+        self.agree(given)
         return loaded
 
     def choose_device(self, name: str | None) -> str:
@@ -105,8 +110,17 @@ class RankCrew(Crew):
             force_memory=force_memory, stop=stop, profile=profile,
         )  # fmt: skip
 
-    def _agree(self, given: Mapping[str, Any]) -> None:
-        """Check that all ranks were given the same."""
+    @property
+    def ranks(self) -> Ranks:
+        """Who share the work."""
+        return self.meeting.ranks
+
+    def agree(self, given: Mapping[str, Any]) -> None:
+        """Check that all ranks were given the same values, by their names.
+
+        Raises:
+            OutputError: they were not; the message names what differs.
+        """
         digests = self.meeting.exchange(hashlib.blake2b(pickle.dumps(sorted(given.items(), key=lambda item: item[0]))).digest())
         if digests.count(digests[0]) == len(digests):
             return

@@ -98,7 +98,7 @@ class ParticleScene(Scene):
 
     def models(self) -> list[Model]:
         """Return the models that the scene turns on, and those that it asks for but cannot need. Subclasses add their own."""
-        moving = [number for number, solid in enumerate(self.solid) if solid.motion is not None]
+        moving = [number for number, solid in enumerate(self.solid) if solid.moves]
         bodies = [number for number, solid in enumerate(self.solid) if solid.is_body]
         settings, output = self.particles, self.output
         used = {

@@ -286,9 +286,9 @@ def spread(numbers: Sequence[int], count: int) -> list[int]:
 
 def _read(file: Path) -> meshio.Mesh | None:
     """Return a frame's mesh; None if it is empty, which meshio cannot read."""
+    if file.suffix == ".pvtu":
+        return one_mesh([mesh for piece in _pieces(file) if (mesh := _read(piece)) is not None])
     try:
-        if file.suffix == ".pvtu":
-            return one_mesh([mesh for piece in piece_files(file) if (mesh := _read(piece)) is not None])
         with open(file, "rb") as stream:
             if b'NumberOfPoints="0"' in stream.read(1000):
                 return None
@@ -299,10 +299,22 @@ def _read(file: Path) -> meshio.Mesh | None:
         raise RenderError(f"{file}: is not a readable frame") from error
 
 
+def _pieces(file: Path) -> list[Path]:
+    """Return the files of the pieces of a frame."""
+    try:
+        return piece_files(file)
+    except OSError as error:
+        raise RenderError(f"{file}: cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise RenderError(f"{file}: is not a readable frame") from error
+
+
 def _read_image(file: Path) -> Cells:
     """Return the cells of a frame that is an image."""
+    if file.suffix == ".pvti":
+        return one_grid(list(map(_read_image, _pieces(file))))
     try:
-        return one_grid(list(map(read_vti, piece_files(file)))) if file.suffix == ".pvti" else read_vti(file)
+        return read_vti(file)
     except OSError as error:
         raise RenderError(f"{file}: cannot be read: {error.strerror}") from error
     except ValueError as error:

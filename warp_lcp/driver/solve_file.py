@@ -73,6 +73,14 @@ class Outcome:
         size = f"residual {r.residual:.3e}, relative {r.relative_residual:.3e}"
         return f"{r.status.name}: {r.status.value}; {r.iterations} iterations, {size}"
 
+    def write(self, path: Path) -> None:
+        """Write x as a Matrix Market array, n x 1.
+
+        Raises:
+            ProblemError: the file cannot be written.
+        """
+        write_vector(path, self.result.x.numpy())
+
 
 def solve_files(
     matrix: Path,

@@ -1,0 +1,215 @@
+"""A program for ranks: the grid operator and its cycle as PETSc's objects do what their definitions say.
+
+Usage: petsc_objects.py CHECK with the name of a function here. Fails by an assertion.
+"""
+
+import sys
+
+import numpy as np
+import warp as wp
+from oracle_problems import small
+from petsc_oracles import level_matrix, shared_problem, solve_ours, whole_field
+
+import warp_lcp as wl
+from warp_lcp.distributed.petsc_matrix import PetscGrid
+from warp_lcp.distributed.ranks import Ranks, petsc
+from warp_lcp.multigrid.hierarchy import CycleSettings
+
+
+def dense(problem, free):
+    """The matrix on all cells, from the definition: A on the free ones, the identity on the others."""
+    cells = np.flatnonzero(problem.fluid)
+    matrix = np.zeros((problem.cells.size,) * 2)
+    matrix[np.ix_(cells, cells)] = problem.matrix().toarray()
+    held = ~free.ravel()
+    matrix[held] = matrix[:, held] = 0.0
+    matrix[held, held] = 1.0
+    return matrix
+
+
+def random_vector(grid, boxes, shape, seed):
+    """A random field of the whole grid, and its vector."""
+    field = np.random.default_rng(seed).standard_normal(shape)
+    return field, grid.vector(field.reshape(boxes.counts[::-1])[boxes.box.slices])
+
+
+def products():
+    """Products and diagonals on all unknowns and on a free set, with unit coefficients and others, in 3-D and 2-D."""
+    for name, dtype, accuracy in (("brick", wp.float64, 1e-14), ("brick", wp.float32, 1e-6), ("plane", wp.float64, 1e-14)):
+        problem = small(name, "walls")
+        boxes, lcp = shared_problem(problem, Ranks.world(), dtype=dtype)
+        grid, shape = PetscGrid(lcp.A, real=dtype), problem.cells.shape
+        free = problem.fluid & (np.random.default_rng(517).random(shape) < 0.8)
+        held = grid.vector()
+        grid.hold(lcp.A.layout.load(free.reshape(boxes.counts[::-1])[boxes.box.slices].reshape(lcp.A.shape), wp.uint8))
+        for matrix, expected in ((grid.operator, dense(problem, problem.fluid)), (grid.matrix, dense(problem, free))):
+            x, v = random_vector(grid, boxes, shape, 29)
+            y = expected @ x.ravel()
+            for product in (matrix.mult, matrix.multTranspose):
+                product(v, held)
+                found = whole_field(grid.field(held), boxes, shape).ravel()
+                assert np.abs(found - y).max() < accuracy * np.abs(y).max()
+            matrix.getDiagonal(held)
+            diagonal = whole_field(grid.field(held), boxes, shape).ravel()
+            assert np.abs(diagonal - np.diag(expected)).max() < accuracy * np.abs(y).max()
+        w = boxes.dmda.createGlobalVec()  # the numbering is the DMDA's
+        grid.operator.mult(w, w.duplicate())
+        assert w.getOwnershipRange() == held.getOwnershipRange()
+
+
+def preconditioner():
+    """The cycle is symmetric and positive definite, linear over 40 orders of magnitude, and the identity on held cells."""
+    problem = small("brick", "walls")
+    boxes, lcp = shared_problem(problem, Ranks.world())
+    grid, shape = PetscGrid(lcp.A), problem.cells.shape
+    ksp = grid.solver()
+    ksp.setUp()
+    (a, u), (b, v) = (random_vector(grid, boxes, shape, seed) for seed in (31, 37))
+    mu, mv, small_mu = grid.vector(), grid.vector(), grid.vector()
+    ksp.getPC().apply(u, mu)
+    ksp.getPC().apply(v, mv)
+    assert abs(mu.dot(v) - u.dot(mv)) < 1e-6 * abs(mu.dot(u))
+    assert mu.dot(u) > 0
+    assert mv.dot(v) > 0
+    other = ~problem.fluid
+    assert np.array_equal(whole_field(grid.field(mu), boxes, shape)[other], a[other])
+    u.scale(1e-40)
+    ksp.getPC().apply(u, small_mu)
+    small_mu.scale(1e40)
+    small_mu.axpy(-1.0, mu)
+    assert small_mu.norm() < 1e-6 * mu.norm()
+    u.set(0.0)
+    ksp.getPC().apply(u, mu)
+    assert mu.norm() == 0
+
+
+def linear_solves():
+    """KSP reaches a direct solution, from PETSc's options too; a free set that changes is another matrix."""
+    problem = small("cube", "walls")
+    boxes, lcp = shared_problem(problem, Ranks.world())
+    grid, shape = PetscGrid(lcp.A, real=wp.float64), problem.cells.shape
+    options = petsc().Options()
+    options["jacobi_pc_type"], options["jacobi_ksp_type"], options["jacobi_ksp_max_it"] = "jacobi", "minres", 500
+    kinds = [grid.solver(), grid.solver("jacobi_")]
+    assert [ksp.getType() for ksp in kinds] == ["cg", "minres"]
+    for share in (1.1, 0.7):
+        free = problem.fluid & (np.random.default_rng(61).random(shape) < share)
+        grid.hold(lcp.A.layout.load(free[boxes.box.slices], wp.uint8))
+        x, b = random_vector(grid, boxes, shape, 41)
+        expected = np.linalg.solve(dense(problem, free), x.ravel()).reshape(shape)
+        for ksp, most in zip(kinds, (12, 500), strict=True):
+            ksp.setTolerances(rtol=1e-10)
+            found = grid.vector()
+            ksp.solve(b, found)
+            assert ksp.getConvergedReason() > 0
+            assert ksp.getIterationNumber() <= most
+            assert np.abs(whole_field(grid.field(found), boxes, shape) - expected).max() < 1e-7 * np.abs(expected).max()
+
+
+def shells_in_tao():
+    """TAO's methods take the operator itself, without a matrix, on subspaces of it."""
+    problem = small("cube", "walls")
+    boxes, lcp = shared_problem(problem, Ranks.world())
+    expected, _ = solve_ours(problem, wl.ProjectedMultigrid(), Ranks.world())
+    grid, fluid = PetscGrid(lcp.A), problem.fluid
+    options = petsc().Options()
+    options["tao_subset_type"] = "matrixfree"
+    options["pc_type"] = "none"
+    least, most = petsc().NINFINITY, petsc().INFINITY
+    fields = problem.b, np.where(fluid, np.maximum(problem.lower, least), 0.0), np.where(fluid, most, 0.0)
+    b, lower, upper = (grid.vector(field[boxes.box.slices]) for field in fields)
+
+    def energy(tao, x, gradient):
+        grid.operator.mult(x, gradient)
+        value = 0.5 * x.dot(gradient) + x.dot(b)
+        gradient.axpy(1.0, b)
+        return value
+
+    for kind in ("tron", "gpcg"):
+        tao, x = petsc().TAO().create(boxes.ranks.comm), b.duplicate()
+        tao.setType(kind)
+        tao.setObjectiveGradient(energy, b.duplicate())
+        tao.setHessian(lambda tao, x, H, P: None, grid.operator)
+        tao.setVariableBounds((lower, upper))
+        tao.setTolerances(gatol=1e-9 * b.norm(), grtol=0.0, gttol=0.0)
+        tao.setSolution(x)
+        tao.getKSP().setTolerances(rtol=1e-8, max_it=2000)
+        tao.setFromOptions()
+        tao.solve(x)
+        assert tao.getConvergedReason() > 0
+        found = whole_field(grid.field(x), boxes, problem.cells.shape)[fluid]
+        assert np.abs(found - expected).max() < 1e-8 * np.abs(expected).max()
+
+
+class Sums:
+    """Sums over aggregates of the next finer level's cells, and its transpose times a factor, by NumPy."""
+
+    def __init__(self, fine, coarse, factor):
+        self.shapes = [level.stencil.padding.counts for level in (fine, coarse)]
+        self.unknown = [inner(level.stencil, level.stencil.d) != 0 for level in (fine, coarse)]
+        G = coarse.aggregates
+        self.factor, self.by = factor, (G.fz, G.fy, G.fx)
+
+    def mult(self, matrix, x, y):
+        field = np.where(self.unknown[0], x.getArray(readonly=True).reshape(self.shapes[0]), 0.0)
+        for axis in range(3):
+            field = np.add.reduceat(field, np.arange(0, field.shape[axis], self.by[axis]), axis=axis)
+        y.setArray(np.where(self.unknown[1], field, 0.0).ravel())
+
+    def multTranspose(self, matrix, x, y):
+        field = np.where(self.unknown[1], x.getArray(readonly=True).reshape(self.shapes[1]), 0.0)
+        for axis in range(3):
+            field = np.repeat(field, self.by[axis], axis=axis).take(np.arange(self.shapes[0][axis]), axis=axis)
+        y.setArray(np.where(self.unknown[0], self.factor * field, 0.0).ravel())
+
+
+def inner(stencil, field):
+    """A stored field without its ghost cells."""
+    return field.numpy().reshape(stencil.padding.shape)[1:-1, 1:-1, 1:-1]
+
+
+def cycles_of_pcmg():
+    """A cycle is that of PETSc's PCMG with Chebyshev smoothing on matrices assembled from the levels, W and V; one rank."""
+    problem, PETSc, options = small("brick", "walls"), petsc(), petsc().Options()
+    for gamma in (2, 1):
+        _, lcp = shared_problem(problem, Ranks.world())
+        grid = PetscGrid(lcp.A, real=wp.float64, cycle=CycleSettings(gamma=gamma))
+        levels, ours = grid.hierarchy.levels, grid.solver()
+        ours.setUp()
+        pc = PETSc.PC().create(PETSc.COMM_SELF)
+        pc.setType("mg")
+        pc.setMGLevels(len(levels))
+        pc.setMGCycleType(PETSc.PC.MGCycleType.W if gamma == 2 else PETSc.PC.MGCycleType.V)
+        matrices = [level_matrix(level.stencil) for level in levels]
+        pc.setOperators(matrices[0])
+        for k, level in enumerate(reversed(range(len(levels)))):
+            smoother = pc.getMGSmoother(k)
+            smoother.setOperators(matrices[level])
+            if k == 0:
+                smoother.setType("preonly")
+                smoother.getPC().setType("lu")
+                continue
+            smoother.setType("chebyshev")
+            options[f"mg_levels_{k}_ksp_chebyshev_eigenvalues"] = "0.5,2.0"
+            smoother.setTolerances(max_it=2)
+            smoother.setNormType(PETSc.KSP.NormType.NONE)
+            smoother.getPC().setType("jacobi")
+            smoother.setFromOptions()
+            sizes = [m.getSize()[0] for m in (matrices[level], matrices[level + 1])]
+            sums = Sums(levels[level], levels[level + 1], grid.hierarchy.settings.over_correction)
+            restriction = PETSc.Mat().createPython((sizes[1], sizes[0]), sums, comm=PETSc.COMM_SELF)
+            restriction.setUp()
+            pc.setMGRestriction(k, restriction)
+            pc.setMGInterpolation(k, PETSc.Mat().createTranspose(restriction))
+        pc.setUp()
+        r = grid.vector(np.where(problem.fluid, np.random.default_rng(43).standard_normal(problem.cells.shape), 0.0))
+        z, expected = grid.vector(), grid.vector()
+        ours.getPC().apply(r, z)
+        pc.apply(r, expected)
+        z.axpy(-1.0, expected)
+        assert z.norm() < 1e-12 * expected.norm()
+
+
+if __name__ == "__main__":
+    wp.config.log_level = wp.LOG_ERROR
+    globals()[sys.argv[1]](*sys.argv[2:])

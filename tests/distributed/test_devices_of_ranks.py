@@ -1,0 +1,39 @@
+"""Ranks of one machine take its devices in turns."""
+
+import pytest
+
+from warp_lcp.distributed.devices import dealt
+
+
+@pytest.mark.parametrize(
+    ("name", "number", "found", "expected"),
+    [
+        (None, 1, [], "cpu"),
+        (None, 1, ["cuda:0"], "cuda:0"),
+        ("cpu", 0, ["cuda:0"], "cpu"),
+        ("cuda", 3, ["cuda:0", "cuda:1"], "cuda:1"),
+        ("cuda:1", 0, ["cuda:0", "cuda:1"], "cuda:1"),
+    ],
+)
+def test_devices_are_dealt_in_turns(name, number, found, expected):
+    assert dealt(name, number, found) == expected
+
+
+@pytest.mark.parametrize(("name", "choices"), [("cuda", "cpu"), ("cuda:0", "cpu"), ("tpu", "cpu")])
+def test_a_missing_device_is_named(name, choices):
+    with pytest.raises(ValueError, match=f"--device {name}: there is no such device on this machine; choose from {choices}"):
+        dealt(name, 0, [])
+
+
+def test_ranks_of_one_machine_count_through_its_devices(mpi):
+    text = """
+    import warp as wp
+    from warp_lcp.distributed import devices
+    from warp_lcp.distributed.ranks import Ranks
+    wp.config.log_level = wp.LOG_ERROR
+    devices.dealt = lambda name, number, found: f"{name} {number}"  # without a GPU at hand
+    ranks = Ranks.world()
+    print(f"{ranks.rank}: {devices.device_of_rank(ranks, 'cuda')}\\n", end="")
+    """
+    lines = mpi(3, text).stdout.split("\n")
+    assert sorted(line for line in lines if ": cuda" in line) == ["0: cuda 0", "1: cuda 1", "2: cuda 2"]

@@ -1,0 +1,113 @@
+"""Blocks that ranks end alike: what fails on one fails on all, with its name."""
+
+import pytest
+
+from warp_lcp.distributed.meeting import Meeting
+
+BLOCKS = """
+    import sys
+    from warp_lcp.distributed import meeting as meetings
+    from warp_lcp.distributed.ranks import Ranks
+
+    ranks = Ranks.world()
+    meetings.PATIENCE = 1.0
+    meeting = meetings.Meeting(ranks, (OSError, ValueError), lambda text: sys.stderr.write(text + "\\n"))
+
+    def one():
+        with meeting.together():
+            if ranks.rank == 1:
+                raise OSError(28, "No space left")
+
+    def in_another():
+        with meeting.together(), meeting.together():
+            if ranks.rank == 1:
+                raise ValueError("inside")
+
+    def between():
+        with meeting.together():
+            if ranks.rank == 1:
+                raise ValueError("not inside")
+            with meeting.together():
+                pass
+
+    def bug():
+        with meeting.together():
+            if ranks.rank == 1:
+                {}["key"]
+
+    def all_alike():
+        with meeting.together():
+            raise ValueError("wrong")
+
+    def all_but_one():
+        with meeting.together():
+            if ranks.rank:
+                raise ValueError("wrong")
+
+    def led():
+        with meeting.led():
+            if ranks.first:
+                raise ValueError("from the first")
+
+    def none():
+        with meeting.together():
+            assert meeting.exchange(ranks.rank) == [0, 1, 2]
+            assert meeting.share(ranks.rank) == 0
+
+    for block in (one, in_another, between, bug, all_alike, all_but_one, led, none):
+        try:
+            block()
+            text = "fine"
+        except BaseException as error:
+            text = f"{type(error).__name__} {error} {getattr(error, 'errno', '')} {getattr(error, '__notes__', '')} {meeting.failed}"
+        print(f"{ranks.rank} {block.__name__}: {text.strip()}\\n", end="")
+"""
+ALONE = """
+    import sys
+    from warp_lcp.distributed import meeting as meetings
+    from warp_lcp.distributed.ranks import Ranks
+
+    ranks = Ranks.world()
+    meetings.PATIENCE = 1.0
+    with meetings.Meeting(ranks, (ValueError,), lambda text: sys.stderr.write(text + "\\n")).together():
+        if ranks.rank == 1:
+            raise ValueError("left alone")
+        ranks.sum(1)  # without rank 1
+    print("done")
+"""
+EXPECTED = {
+    "one": "OSError rank 1: [Errno 28] No space left 28  [1]",
+    "in_another": "ValueError rank 1: inside   [0, 1, 2]",
+    "between": "ValueError rank 1: not inside   [0, 1, 2]",
+    "all_alike": "ValueError wrong   [0, 1, 2]",
+    "all_but_one": "ValueError ranks 1, 2: wrong   [1, 2]",
+    "led": "ValueError from the first   [0]",
+    "none": "fine",
+}
+
+
+def test_blocks_end_alike(mpi):
+    found = mpi(3, BLOCKS).stdout.splitlines()
+    for name, expected in EXPECTED.items():
+        assert {line for line in found if f" {name}:" in line} == {f"{rank} {name}: {expected}" for rank in range(3)}
+    bug = {line for line in found if " bug:" in line}
+    others = {f"{rank} bug: RankFailed rank 1: KeyError: 'key'   [1]" for rank in (0, 2)}
+    assert bug == others | {"1 bug: KeyError 'key'  ['on rank 1 of 3'] [1]"}
+
+
+def test_a_rank_that_nobody_meets_ends_all(mpi):
+    done = mpi(3, ALONE, exit_code=1)
+    assert "rank 1 of 3: left alone\nall ranks end" in done.stderr
+    assert "done" not in done.stdout
+
+
+def test_one_process_needs_no_others():
+    alone = Meeting.of_one()
+    with pytest.raises(KeyError), alone.together():
+        {}["key"]
+    with pytest.raises(OSError, match="full") as found, alone.led():
+        raise OSError("full")
+    assert str(found.value) == "full"
+    with alone.together():
+        assert alone.exchange(7) == [7]
+    assert alone.failed == []

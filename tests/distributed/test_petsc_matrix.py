@@ -1,0 +1,22 @@
+"""The operator and its multigrid as PETSc's objects."""
+
+from pathlib import Path
+
+import pytest
+
+PROGRAM = Path(__file__).with_name("petsc_objects.py")
+
+
+@pytest.mark.parametrize("ranks", [1, 2, 4])
+def test_products_and_diagonals_are_those_of_the_definition(mpi, ranks):
+    mpi(ranks, PROGRAM, "products")
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+@pytest.mark.parametrize("check", ["preconditioner", "linear_solves", "shells_in_tao"])
+def test_petscs_solvers_work_with_them(mpi, ranks, check):
+    mpi(ranks, PROGRAM, check)
+
+
+def test_a_cycle_is_that_of_pcmg(mpi):
+    mpi(1, PROGRAM, "cycles_of_pcmg")

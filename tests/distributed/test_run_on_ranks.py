@@ -1,0 +1,214 @@
+"""`warp-lcp run --engine petsc` on ranks: one folder, one log, one end, whatever happens to whom."""
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import meshio
+import numpy as np
+import pytest
+from dots_on_ranks import COUNT, SCENE, DotsSimulator
+from typer.testing import CliRunner
+
+from warp_lcp.driver import cli, simulator
+from warp_lcp.driver.pieces import one_mesh, piece_files
+
+PROGRAM = Path(__file__).with_name("dots_on_ranks.py")
+
+
+@pytest.fixture
+def run(mpi, tmp_path):
+    """Run the scene of dots on ranks into a folder of `tmp_path`; 0 ranks: in one process, without MPI."""
+    scene = tmp_path / "dots.toml"
+    scene.write_text(SCENE)
+
+    def go(ranks, *options, out="out", trouble="", refuse="", exit_code=0):
+        arguments = ["run", scene, "--out", tmp_path / out, "--device", "cpu", *options]
+        environment = {name: text for name, text in (("DOTS_TROUBLE", trouble), ("DOTS_REFUSE", refuse)) if text}
+        if ranks == 0:
+            return mpi(1, PROGRAM, *arguments)
+        return mpi(ranks, PROGRAM, *arguments, "--engine", "petsc", exit_code=exit_code, environment=environment)
+
+    return go
+
+
+def log(folder: Path) -> list[dict[str, float]]:
+    with open(folder / "log.csv", newline="") as file:
+        return [{name: float(value) for name, value in row.items() if name != "seconds"} for row in csv.DictReader(file)]
+
+
+def record(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "run.json").read_text())
+
+
+def particles(folder: Path, index: int) -> dict[str, np.ndarray]:
+    """Return the dots of a frame by their numbers, whether it is in pieces or not."""
+    whole = folder / "frames" / f"particles_{index:06d}.pvtu"
+    files = piece_files(whole) if whole.is_file() else [whole.with_suffix(".vtu")]
+    mesh = one_mesh([meshio.vtu.read(str(file)) for file in files])
+    assert mesh is not None
+    order = np.argsort(mesh.point_data["identity"])
+    return {"points": mesh.points[order], "velocity": mesh.point_data["velocity"][order], "identity": mesh.point_data["identity"][order]}
+
+
+def assert_same_run(a: Path, b: Path) -> None:
+    """Compare logs, and every frame's dots."""
+    rows = log(a), log(b)
+    assert len(rows[0]) == len(rows[1]) > 100
+    for one, other in zip(*rows, strict=True):
+        assert one == pytest.approx(other, rel=1e-12)
+    for index in range(11):
+        one, other = particles(a, index), particles(b, index)
+        np.testing.assert_array_equal(one["identity"], np.arange(COUNT))
+        for name in one:
+            np.testing.assert_array_equal(one[name], other[name])
+
+
+def test_ranks_write_the_run_of_one_process(run, tmp_path):
+    run(0, out="one")
+    done = run(3, "--profile", out="three")
+    assert done.stderr.count("frame 10/10") == done.stderr.count("on 3 ranks") == done.stdout.count("finished: frame 10 of 10") == 1
+    assert done.stdout.count("rest ") == 1  # the profile
+    assert_same_run(tmp_path / "one", tmp_path / "three")
+    found = record(tmp_path / "three")
+    assert (found["status"], found["engine"], found["ranks"], found["frames"]) == ("finished", "petsc", 3, 10)
+    assert (tmp_path / "three" / "particles.pvd").read_text().count(".pvtu") == 11
+    assert (tmp_path / "three" / "grid.pvd").read_text().count(".pvtu") == 11
+    left = [path for path in (tmp_path / "three").rglob("*") if path.name.endswith(".part") or path.name == "run.lock"]
+    assert not left
+
+
+def test_a_rank_is_killed_and_other_ranks_go_on(run, tmp_path):
+    """Without a message from the program, whose rank cannot say anything; what was written goes on on another number of ranks."""
+    run(0, out="one")
+    killed = run(3, trouble="70 1 killed", exit_code=None)
+    assert killed.returncode != 0
+    assert "finished" not in killed.stdout
+    assert record(tmp_path / "out")["status"] == "running"
+    resumed = run(2, "--resume")
+    assert "did not end cleanly; taken over" in resumed.stderr
+    found = record(tmp_path / "out")
+    assert (found["status"], found["resumed_from_step"], found["ranks"]) == ("finished", 68, 2)
+    assert_same_run(tmp_path / "one", tmp_path / "out")
+
+
+def test_damaged_pieces_are_found(run, tmp_path):
+    """The checkpoint before is taken; and a file without its pieces is none."""
+    run(2, "--frames", "3")
+    run(0, out="one")
+    checkpoints = tmp_path / "out" / "checkpoints"
+    newest, second = sorted(int(path.stem[5:]) for path in checkpoints.glob("step_*.npz"))[:0:-1]
+    file = checkpoints / "rank_0001" / f"step_{newest:06d}.npz"
+    file.write_bytes(file.read_bytes()[:-200])
+    resumed = run(3, "--resume")
+    assert f"rank_0001/step_{newest:06d}.npz: cut short, damaged or not a checkpoint" in resumed.stderr
+    assert record(tmp_path / "out")["resumed_from_step"] == second
+    assert_same_run(tmp_path / "one", tmp_path / "out")
+    pieces = {path.stem for path in checkpoints.glob("rank_*/step_*.npz")}
+    assert pieces == {path.stem for path in checkpoints.glob("step_*.npz")}
+    for file in checkpoints.glob("rank_0002/step_*.npz"):
+        file.unlink()
+    refused = run(2, "--resume", exit_code=2)
+    assert refused.stderr.count("no checkpoint to resume from; --force starts again") == 1
+    assert "rank_0002" in refused.stderr
+
+
+@pytest.mark.parametrize(
+    ("trouble", "status", "expected"),
+    [
+        ("40 -1 failed", "failed", "failed: step 40: velocity is not finite"),
+        ("40 -1 missed", "failed", "retries 6: the solve missed its criteria"),
+        ("40 1 disk", "failed", "failed: the disk is full: rank 1: [Errno 28] No space left on device; what was written before is intact"),
+        ("40 1 interrupted", "stopped", "stopped: interrupted"),
+    ],
+)
+def test_troubles_end_the_run_with_a_message(run, tmp_path, trouble, status, expected):
+    done = run(2, trouble=trouble, exit_code=1)
+    assert done.stderr.count(expected) == 1
+    assert "Traceback" not in done.stderr
+    assert done.stderr.count("--resume --engine petsc") == 1
+    assert record(tmp_path / "out")["status"] == status
+    assert (tmp_path / "out" / "particles.pvd").read_text().count(".pvtu") == record(tmp_path / "out")["frames"] + 1 == 4
+
+
+@pytest.mark.parametrize(
+    ("trouble", "expected"),
+    [
+        ("40 1 failed", "rank 1 of 2: step 40: velocity is not finite"),
+        ("40 0 missed", "rank 0 of 2: the solve missed its criteria"),
+        ("40 1 bug", "KeyError: 'no such key'"),
+    ],
+)
+def test_a_rank_that_fails_alone_ends_the_others(run, tmp_path, trouble, expected):
+    """They wait for it inside MPI: it says what happened, writes that into run.json and ends them."""
+    done = run(2, trouble=trouble, exit_code=1)
+    assert f"{expected}\nall ranks end" in done.stderr
+    found = record(tmp_path / "out")
+    assert found["status"] == "failed"
+    assert found["reason"].startswith(f"rank {trouble.split()[1]}")
+    assert found["reason"].endswith(expected)
+
+
+def test_wrong_input_is_said_once(run, tmp_path):
+    run(2, "--frames", "1")
+    for options, refuse, expected in [
+        ([], "", "holds a run already"),
+        (["--resume", "--force"], "", "choose one"),
+        (["--set", "time.cfl=0"], "", "time.cfl = 0: must be greater than 0"),
+        (["--set", "output.surface_ply=true", "--force"], "", "output.surface_ply = true: "),
+        (["--force", "--record-problems", "problems"], "", "--record-problems: not with --engine petsc"),
+        (["--force"], "liquid[0]: does not fit", "dots: liquid[0]: does not fit"),
+        (["--force"], "liquid[{rank}]: does not fit", "rank 0: dots: liquid[0]: does not fit; rank 1: dots: liquid[1]: does not fit"),
+    ]:
+        done = run(2, *options, refuse=refuse, exit_code=2)
+        assert done.stderr.count(expected) == 1
+        assert "Traceback" not in done.stderr
+    assert record(tmp_path / "out")["status"] == "finished"  # as it was
+
+
+def test_different_input_is_named(mpi, tmp_path):
+    (tmp_path / "dots.toml").write_text(SCENE)
+    text = f"""
+    import sys
+    sys.path.insert(0, {str(PROGRAM.parent)!r})
+    import dots_on_ranks
+    from mpi4py import MPI
+    rank = MPI.COMM_WORLD.rank
+    sys.argv[1:] = ["run", "dots.toml", "--engine", "petsc", "--device", "cpu", "--frames", str(rank), "--set", f"time.cfl={{1 + rank // 2}}"]
+    dots_on_ranks.main()
+    """
+    done = mpi(3, text, exit_code=2)
+    expected = "different scenes or options\n  --frames: 0 on rank 0, 1 on rank 1\n  time.cfl: 1.0 on rank 0, 2.0 on rank 2\n"
+    assert done.stderr.count(expected) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_engines_do_not_continue_each_other(run, tmp_path, monkeypatch):
+    run(2, "--frames", "1")
+    run(0, "--frames", "1", out="one")
+    refused = run(2, "--resume", out="one", exit_code=2)
+    assert "written by --engine single, which has to continue it" in refused.stderr
+    monkeypatch.setattr(simulator, "simulators", lambda: {"dots": DotsSimulator()})
+    monkeypatch.setattr("warp_lcp.driver.scene_file.simulators", lambda: {"dots": DotsSimulator()})
+    result = CliRunner().invoke(
+        cli.app, ["run", str(tmp_path / "dots.toml"), "--out", str(tmp_path / "out"), "--device", "cpu", "--resume"]
+    )
+    assert result.exit_code == 2
+    assert "written by 2 ranks; continue with --engine petsc, on any number of ranks" in result.stderr
+
+
+def test_without_mpi_the_message_says_how_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "mpi4py", None)
+    monkeypatch.setattr("warp_lcp.driver.scene_file.simulators", lambda: {"dots": DotsSimulator()})
+    (tmp_path / "dots.toml").write_text(SCENE)
+    call = ["run", str(tmp_path / "dots.toml"), "--out", str(tmp_path / "out"), "--device", "cpu", "--engine", "petsc"]
+    result = CliRunner().invoke(cli.app, call)
+    assert result.exit_code == 2
+    assert "pip install 'warp-lcp[distributed]'" in result.stderr
+    assert "PETSC_DIR" in result.stderr
+    for name in ("OMPI_COMM_WORLD_RANK", "PMI_RANK"):  # only one of several says it
+        monkeypatch.setenv(name, "1")
+        result = CliRunner().invoke(cli.app, call)
+        assert (result.exit_code, result.stderr) == (2, "")
+        monkeypatch.delenv(name)
