@@ -1,10 +1,10 @@
 """Liquid on the ranks of MPI: the domain is cut into boxes, one a rank, and particles belong to the rank whose box they are in.
 
 A step is that of one process on the part of the grid around a rank's box. What another rank knows comes in where the chain of dependence
-needs it: particles a cell from the cut before they are brought to the faces; velocities and weights of the faces; density, surface and kinds
-of cells; the pressure, whose LCP is one of all ranks; projected velocities; and again while they are continued into air and walls. All of
-it is computed by the same kernels from the same numbers in the same order as by one process, so that runs on any number of ranks differ by
-the rounding in the solver's sums alone.
+needs it: particles a cell from the cut before they are brought to the faces; velocities and weights of the faces; density, surface and
+kinds of cells; the pressure, whose LCP is one of all ranks; projected velocities, and again while they are continued into air and walls.
+All of it is computed by the same kernels from the same numbers in the same order as by one process, so that runs on any number of ranks
+differ by the rounding in the solver and in sums over all particles alone.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ NOT_ON_RANKS = "is not there on several processes (--engine petsc) yet: leave it
 class DistributedLiquid(LiquidSimulation):
     """A rank's part of a liquid in progress; implements `warp_lcp.driver.simulator.Simulation`.
 
-    Making it, `stable_dt`, `step`, `mark` and `restore_pieces` are collective and give every rank the same numbers, or raise the same error on
-    all: rows of the log are of the whole liquid. `frame` shows this rank's particles and cells, with positions and cells' numbers of the
+    Making it, `stable_dt`, `step`, `mark` and `restore_pieces` are collective and give every rank the same numbers, or raise the same error
+    on all: rows of the log are of the whole liquid. `frame` shows this rank's particles and cells, with positions and cells' numbers of the
     whole domain; `frame`, `piece_state`, `columns` and `notes` ask nobody.
 
     Args:
@@ -144,10 +144,9 @@ class DistributedLiquid(LiquidSimulation):
 
     def notes(self) -> list[str]:
         """Return warnings and facts worth a line at the start of a run."""
-        boxes, dimension = self.part.decomposition.boxes, self.grid.dimension
-        cells, largest = (
-            " x ".join(map(str, counts[:dimension])) for counts in (self.part.decomposition.counts, max(boxes, key=lambda b: b.cells).counts)
-        )
+        boxes, whole = self.part.decomposition.boxes, self.part.decomposition.counts
+        most = max(boxes, key=lambda box: box.cells).counts
+        cells, largest = (" x ".join(map(str, counts[: self.grid.dimension])) for counts in (whole, most))
         return [
             f"{self._everyone} particles, {cells} cells of {self.grid.spacing:.4g} m",
             f"{len(boxes)} ranks, boxes of up to {largest} cells and {self.part.layers} layers of ghost cells",
@@ -174,8 +173,8 @@ class DistributedLiquid(LiquidSimulation):
         """Continue from the pieces of all ranks of a run on any number of ranks; each rank takes what lies in its box. Collective.
 
         Args:
-            pieces: of `piece_state`, of all ranks, in any order. Of a piece that has nothing in this rank's box grown by some cells the arrays
-                of particles and cells are not read.
+            pieces: of `piece_state`, of all ranks, in any order. Of a piece that has nothing in this rank's box grown by some cells the
+                arrays of particles and cells are not read.
 
         Raises:
             ValueError: the pieces do not belong to this scene, or do not cover the domain; on all ranks.

@@ -22,9 +22,9 @@ from warp_lcp.vectors import convert
 class DistributedPressure(PressureProjection):
     """Solve for the pressure of all ranks' liquid, and project the velocity on this rank's part.
 
-    Its fields are of the part, with ghost cells; what is solved has the cells of the box. Right-hand side, bounds and coefficients of the box
-    are those of a whole grid, bit for bit, if velocity, kinds of cells and surface are right a cell beyond the box. `prepare`, `solve`,
-    `project`, `unknowns` are collective; numbers that they return are all ranks'.
+    Its fields are of the part, with ghost cells; what is solved has the cells of the box. Right-hand side, bounds and coefficients of the
+    box are those of a whole grid, bit for bit, if velocity, kinds of cells and surface are right a cell beyond the box. `prepare`, `solve`,
+    `project`, `unknowns` and `not_finite` are collective; what they return is of all ranks.
 
     Args:
         part: where this rank works.
@@ -48,24 +48,15 @@ class DistributedPressure(PressureProjection):
         lets_go: bool = True,
     ) -> None:
         """Allocate the fields."""
-        super().__init__(
-            part.grid, boundary, solver, tolerance=tolerance, max_iterations=max_iterations, phi=phi, lets_go=lets_go
-        )
+        super().__init__(part.grid, boundary, solver, tolerance=tolerance, max_iterations=max_iterations, phi=phi, lets_go=lets_go)
         self.part, self._solved = part, part.owned
         if phi is None:
-            self._shift = None  # the sides of the part at cuts are open, the domain's are not
-        pairs = [(self.kind, None), (self._b, None), (self._start, None), (self._lower, None), (self._shift, None)]
-        self._boxed = [self._box_like(field) for field, _ in pairs]
-        kind, self._rhs, self._guess, lower, shift = self._boxed
-        assert kind is not None
-        self._box_lower, self._box_shift, self._box_x = lower, shift, wp.zeros_like(self._rhs)
-        self._box_faces = [self._copied(field) for field in boundary.open]
+            self._shift = None  # the part's sides at cuts are open, the domain's are not
+        self._box_kind, self._rhs, self._guess = (self._box_like(field) for field in (self.kind, self._b, self._start))
+        self._box_lower, self._box_shift = (None if field is None else self._box_like(field) for field in (self._lower, self._shift))
+        self._box_x = wp.zeros_like(self._rhs)
         if tolerance == "auto":
             self.automatic = TimeErrorTolerance(self._rhs.size, part.grid.device, part.ranks)
-
-    def prepare(self, velocity: Sequence[wp.array], dt: float) -> int:
-        """Set up the problem of the marked cells and return the number of unknowns of all ranks."""
-        return super().prepare(velocity, dt)
 
     def project(
         self, velocity: Sequence[wp.array], dt: float, window: Window, result: wl.SolveResult, criteria: wl.StoppingCriteria, unknowns: int
@@ -80,27 +71,29 @@ class DistributedPressure(PressureProjection):
         return np.argwhere(self.part.box_of(self.shown.numpy()) == FLUID) + np.array(self.part.owned.low)
 
     def not_finite(self) -> np.ndarray:
-        """Return the cells (x, y, z) of the box, counted from 0 in the whole domain, whose right-hand side is not finite, shape (n, 3)."""
-        bad = ~np.isfinite(self.part.box_of(self._b.numpy()))
-        return np.argwhere(bad)[:, ::-1] + np.array(self.part.box.low)
+        """Return the cells (x, y, z), counted from 0 in the whole domain, whose right-hand side is not finite, shape (n, 3)."""
+        mine = np.argwhere(~np.isfinite(self.part.box_of(self._b.numpy())))[:, ::-1] + np.array(self.part.box.low)
+        return np.concatenate(self.part.ranks.comm.allgather(mine))
 
     def _make_problem(self) -> None:
         self._copy_to_box()
-        kind = self._boxed[0]
-        faces = {f"face_{axis}": field for axis, field in zip("xyz", self._box_faces, strict=False)}
-        cells = kind.numpy()[1:-1, 1:-1, 1:-1]
-        decomposition, device = self.part.decomposition, self.grid.device
-        self._operator = DistributedGridPoisson(decomposition, cells, shift=self._box_shift, device=device, **faces)
+        faces = {}
+        for axis, field in zip("xyz", self.boundary.open, strict=False):
+            faces[f"face_{axis}"] = self._box_like(field)
+            wp.copy(faces[f"face_{axis}"], self.part.stored_box_of(field))
+        cells, decomposition = self._box_kind.numpy()[1:-1, 1:-1, 1:-1], self.part.decomposition
+        self._operator = DistributedGridPoisson(decomposition, cells, shift=self._box_shift, device=self.grid.device, **faces)
         self._problem = wl.LCP(self._operator, self._rhs, -np.inf if self._box_lower is None else self._box_lower, np.inf)
         self._work = self.solver.init(self._problem)
 
     def _update(self, cells: wp.array) -> None:
         self._copy_to_box()
-        self._operator.update(self._boxed[0])
+        self._operator.update(self._box_kind)
 
     def _copy_to_box(self) -> None:
-        for field, box in zip((self.kind, self._b, self._start, self._lower, self._shift), self._boxed, strict=True):
-            if field is not None:
+        boxes = (self._box_kind, self._rhs, self._guess, self._box_lower, self._box_shift)
+        for field, box in zip((self.kind, self._b, self._start, self._lower, self._shift), boxes, strict=True):
+            if box is not None:
                 wp.copy(box, self.part.stored_box_of(field))
 
     def _take(self, x: wp.array) -> None:
@@ -114,16 +107,6 @@ class DistributedPressure(PressureProjection):
         every = self.part.ranks.gather(np.array(super()._found()))
         return float(every[:, 0].sum()), float(every[:, 1].max())
 
-    def _box_like(self, field: wp.array | None) -> wp.array | None:
+    def _box_like(self, field: wp.array) -> wp.array:
         """Return a field of zeros of the box with a ring."""
-        if field is None:
-            return None
-        shape = self.part.stored_box_of(field).shape
-        return wp.zeros(shape, dtype=field.dtype, device=self.grid.device)
-
-    def _copied(self, field: wp.array) -> wp.array:
-        """Return a field's values on the box and the ring around it."""
-        box = self._box_like(field)
-        assert box is not None
-        wp.copy(box, self.part.stored_box_of(field))
-        return box
+        return wp.zeros(self.part.stored_box_of(field).shape, dtype=field.dtype, device=self.grid.device)

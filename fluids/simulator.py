@@ -142,7 +142,7 @@ class LiquidSimulation(ParticleSimulation):
 
         And the liquid's surface and volume, if the scene wants them.
         """
-        cells = self.projection.fluid_cells()
+        cells, grid = self.projection.fluid_cells(), self.grid
         at = tuple(cells.T)
         contact = self.projection.contact.numpy()[at]
         fields = {
@@ -152,7 +152,7 @@ class LiquidSimulation(ParticleSimulation):
         }
         return [
             self.points(),
-            Cells("grid", cells[:, ::-1] - 1 + self.grid.origin, self.grid.spacing, self.grid.dimension, fields, self.grid.whole or self.grid.counts),
+            Cells("grid", cells[:, ::-1] - 1 + grid.origin, grid.spacing, grid.dimension, fields, grid.whole or grid.counts),
             *self.surfaces(),
             *self.volumes(),
             *self.body_surfaces(),
@@ -259,6 +259,6 @@ class FluidsSimulator:
 
     def create_distributed(self, scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> DistributedLiquid:
         """Build a rank's part of a simulation of `scene`, see `fluids.distributed.create`."""
-        from fluids.distributed import create  # noqa: PLC0415  what it needs is an extra
+        from fluids.distributed import create  # what it needs is an extra
 
         return create(scene, ranks, device=device, folder=folder)

@@ -119,7 +119,7 @@ class SandSolids:
         grid.everywhere.launch(base_kernel, [self.index, self.base])
         cells = self.index.numpy()
         if self._cells is None or not np.array_equal(cells, self._cells):  # else what is recorded for these walls stays valid
-            self._cells, self.walls = cells.copy(), Walls(grid, cells, self._friction)
+            self._cells, self.walls = cells.copy(), Walls(grid, cells, self._friction, rubbing_only=not self.moves)
 
     def _thin_notes(self) -> tuple[str, ...]:
         """Return a warning for each solid that stands still and that no stress feels."""

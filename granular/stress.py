@@ -44,6 +44,8 @@ class Walls:
         grid: the grid.
         index: int, -1 in open cells, the wall's number elsewhere, shape of the grid's fields.
         friction: Coulomb's coefficient of each wall, >= 0; inf sticks.
+        rubbing_only: leave out the faces of walls without friction. Their stresses are 0 from the start as long as no wall moves; what
+            moves may come where other cells of sand had theirs, which its faces then take away.
 
     Attributes:
         count: faces.
@@ -54,11 +56,14 @@ class Walls:
         active: int32: how many faces sand touches, and which.
     """
 
-    def __init__(self, grid: StaggeredGrid, index: np.ndarray, friction: Sequence[float]) -> None:
+    def __init__(self, grid: StaggeredGrid, index: np.ndarray, friction: Sequence[float], *, rubbing_only: bool = False) -> None:
         """Find the faces."""
         device = grid.device
         self.friction = wp.array(np.minimum(friction, 1e6), dtype=wp.float32, device=device)
         cells, sides, walls = wall_faces(index, grid.dimension)
+        if rubbing_only:
+            rubs = np.asarray(friction)[walls] > 0.0
+            cells, sides, walls = cells[rubs], sides[rubs], walls[rubs]
         self.count = len(cells)
         self.cells = wp.array(cells, dtype=wp.int32, device=device)
         self.sides = wp.array(sides, dtype=wp.uint8, device=device)

@@ -1,6 +1,7 @@
 """The command line with a simulator of falling dots that several ranks share, NumPy only, and willing to fail on request.
 
-DOTS_TROUBLE="step rank kind" in the environment: what goes wrong, see `trouble`.
+Several commands may follow each other, with `then` between them; their exit codes go to the error stream, the last one's is the program's.
+A command may begin with DOTS_TROUBLE="step rank kind", what goes wrong, see `trouble`, and DOTS_REFUSE, why there is no simulation.
 """
 
 from __future__ import annotations
@@ -8,11 +9,13 @@ from __future__ import annotations
 import errno
 import os
 import signal
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 
+from warp_lcp.distributed import meeting
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.driver import cli, parallel_frames
 from warp_lcp.driver import simulator as plug_ins
@@ -122,7 +125,7 @@ class DotsSimulator:
 
 def trouble(dots: Dots) -> None:
     """Let a step go wrong on one rank, or on all ("-1")."""
-    step, rank, kind = os.environ.get("DOTS_TROUBLE", "0 0 nothing").split()
+    step, rank, kind = (os.environ.get("DOTS_TROUBLE") or "0 0 nothing").split()
     if dots.step_count + 1 != int(step) or int(rank) not in (-1, dots.ranks.rank):
         return
     if kind == "failed":
@@ -143,11 +146,24 @@ def trouble(dots: Dots) -> None:
         parallel_frames.ParallelFrames.write_part = full
 
 
-def main() -> None:
-    """Run the command line with this simulator alone."""
-    plug_ins.entry_points = lambda group: [SimpleNamespace(name="dots", load=DotsSimulator)]
-    cli.main()
+def main(words: list[str]) -> None:
+    """Run commands of the command line with this simulator alone."""
+    plug_ins.entry_points = lambda group: [SimpleNamespace(name="dots", load=lambda: DotsSimulator())]
+    meeting.PATIENCE = 1.0
+    while words:
+        end = words.index("then") if "then" in words else len(words)
+        command, words = words[:end], words[end + 1 :]
+        for name in ("DOTS_TROUBLE", "DOTS_REFUSE"):
+            os.environ[name] = ""
+        while "=" in command[0]:
+            name, os.environ[name] = command.pop(0).split("=")
+        try:
+            cli.app(command)
+        except SystemExit as end_of_command:
+            sys.stderr.write(f"exit code {end_of_command.code}\n")
+            if not words:
+                raise
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

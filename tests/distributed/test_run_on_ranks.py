@@ -2,7 +2,10 @@
 
 import csv
 import json
+import shlex
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import meshio
@@ -18,17 +21,24 @@ PROGRAM = Path(__file__).with_name("dots_on_ranks.py")
 
 
 @pytest.fixture
-def run(mpi, tmp_path):
-    """Run the scene of dots on ranks into a folder of `tmp_path`; 0 ranks: in one process, without MPI."""
+def run(mpi, tmp_path, monkeypatch):
+    """Run commands on the scene of dots, each a text, one after the other on the same ranks, or without MPI on 0 ranks.
+
+    A command's text is completed by the scene and `--device cpu`, its exit code by that of the last.
+    """
     scene = tmp_path / "dots.toml"
     scene.write_text(SCENE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(simulator, "entry_points", lambda group: [SimpleNamespace(name="dots", load=lambda: DotsSimulator())])
 
-    def go(ranks, *options, out="out", trouble="", refuse="", exit_code=0):
-        arguments = ["run", scene, "--out", tmp_path / out, "--device", "cpu", *options]
-        environment = {name: text for name, text in (("DOTS_TROUBLE", trouble), ("DOTS_REFUSE", refuse)) if text}
+    def go(ranks, *commands, exit_code=0):
+        words = [[*shlex.split(command), "--device", "cpu"] for command in commands]
         if ranks == 0:
-            return mpi(1, PROGRAM, *arguments)
-        return mpi(ranks, PROGRAM, *arguments, "--engine", "petsc", exit_code=exit_code, environment=environment)
+            result = [CliRunner().invoke(cli.app, command) for command in words][-1]
+            assert result.exit_code == exit_code, result.output
+            return result
+        joined = [word for command in words for word in (*command, "--engine", "petsc", "then")]
+        return mpi(ranks, PROGRAM, *joined[:-1], exit_code=exit_code)
 
     return go
 
@@ -66,8 +76,8 @@ def assert_same_run(a: Path, b: Path) -> None:
 
 
 def test_ranks_write_the_run_of_one_process(run, tmp_path):
-    run(0, out="one")
-    done = run(3, "--profile", out="three")
+    run(0, "run dots.toml --out one")
+    done = run(3, "run dots.toml --out three --profile")
     assert done.stderr.count("frame 10/10") == done.stderr.count("on 3 ranks") == done.stdout.count("finished: frame 10 of 10") == 1
     assert done.stdout.count("rest ") == 1  # the profile
     assert_same_run(tmp_path / "one", tmp_path / "three")
@@ -81,12 +91,12 @@ def test_ranks_write_the_run_of_one_process(run, tmp_path):
 
 def test_a_rank_is_killed_and_other_ranks_go_on(run, tmp_path):
     """Without a message from the program, whose rank cannot say anything; what was written goes on on another number of ranks."""
-    run(0, out="one")
-    killed = run(3, trouble="70 1 killed", exit_code=None)
+    run(0, "run dots.toml --out one")
+    killed = run(3, "DOTS_TROUBLE='70 1 killed' run dots.toml --out out", exit_code=None)
     assert killed.returncode != 0
     assert "finished" not in killed.stdout
     assert record(tmp_path / "out")["status"] == "running"
-    resumed = run(2, "--resume")
+    resumed = run(2, "run dots.toml --out out --resume")
     assert "did not end cleanly; taken over" in resumed.stderr
     found = record(tmp_path / "out")
     assert (found["status"], found["resumed_from_step"], found["ranks"]) == ("finished", 68, 2)
@@ -95,13 +105,13 @@ def test_a_rank_is_killed_and_other_ranks_go_on(run, tmp_path):
 
 def test_damaged_pieces_are_found(run, tmp_path):
     """The checkpoint before is taken; and a file without its pieces is none."""
-    run(2, "--frames", "3")
-    run(0, out="one")
+    run(0, "run dots.toml --out one")
+    run(2, "run dots.toml --out out --frames 3")
     checkpoints = tmp_path / "out" / "checkpoints"
-    newest, second = sorted(int(path.stem[5:]) for path in checkpoints.glob("step_*.npz"))[:0:-1]
+    newest, second, _ = sorted((int(path.stem[5:]) for path in checkpoints.glob("step_*.npz")), reverse=True)
     file = checkpoints / "rank_0001" / f"step_{newest:06d}.npz"
     file.write_bytes(file.read_bytes()[:-200])
-    resumed = run(3, "--resume")
+    resumed = run(3, "run dots.toml --out out --resume")
     assert f"rank_0001/step_{newest:06d}.npz: cut short, damaged or not a checkpoint" in resumed.stderr
     assert record(tmp_path / "out")["resumed_from_step"] == second
     assert_same_run(tmp_path / "one", tmp_path / "out")
@@ -109,40 +119,38 @@ def test_damaged_pieces_are_found(run, tmp_path):
     assert pieces == {path.stem for path in checkpoints.glob("step_*.npz")}
     for file in checkpoints.glob("rank_0002/step_*.npz"):
         file.unlink()
-    refused = run(2, "--resume", exit_code=2)
+    refused = run(2, "run dots.toml --out out --resume", exit_code=2)
     assert refused.stderr.count("no checkpoint to resume from; --force starts again") == 1
     assert "rank_0002" in refused.stderr
 
 
-@pytest.mark.parametrize(
-    ("trouble", "status", "expected"),
-    [
-        ("40 -1 failed", "failed", "failed: step 40: velocity is not finite"),
-        ("40 -1 missed", "failed", "retries 6: the solve missed its criteria"),
-        ("40 1 disk", "failed", "failed: the disk is full: rank 1: [Errno 28] No space left on device; what was written before is intact"),
-        ("40 1 interrupted", "stopped", "stopped: interrupted"),
-    ],
-)
-def test_troubles_end_the_run_with_a_message(run, tmp_path, trouble, status, expected):
-    done = run(2, trouble=trouble, exit_code=1)
-    assert done.stderr.count(expected) == 1
+TROUBLES = {  # with how the run ends, and what it says
+    "40 -1 failed": ("failed", "failed: step 40: velocity is not finite"),
+    "40 -1 missed": ("failed", "retries 6: the solve missed its criteria"),
+    "40 1 interrupted": ("stopped", "stopped: interrupted"),
+    "40 1 disk": ("failed", "failed: the disk is full: rank 1: [Errno 28] No space left on device; what was written before is intact"),
+}
+
+
+def test_troubles_end_the_run_with_a_message(run, tmp_path):
+    commands = [f"DOTS_TROUBLE='{trouble}' run dots.toml --out {number}" for number, trouble in enumerate(TROUBLES)]
+    done = run(2, *commands, exit_code=1)
+    assert done.stderr.count("exit code 1") == 2 * len(TROUBLES)
+    assert done.stderr.count("--resume --engine petsc") == len(TROUBLES)
     assert "Traceback" not in done.stderr
-    assert done.stderr.count("--resume --engine petsc") == 1
-    assert record(tmp_path / "out")["status"] == status
-    assert (tmp_path / "out" / "particles.pvd").read_text().count(".pvtu") == record(tmp_path / "out")["frames"] + 1 == 4
+    for number, (status, expected) in enumerate(TROUBLES.values()):
+        assert done.stderr.count(expected) == 1
+        found = record(tmp_path / str(number))
+        assert found["status"] == status
+        assert (tmp_path / str(number) / "particles.pvd").read_text().count(".pvtu") == found["frames"] + 1 == 4
 
 
 @pytest.mark.parametrize(
-    ("trouble", "expected"),
-    [
-        ("40 1 failed", "rank 1 of 2: step 40: velocity is not finite"),
-        ("40 0 missed", "rank 0 of 2: the solve missed its criteria"),
-        ("40 1 bug", "KeyError: 'no such key'"),
-    ],
+    ("trouble", "expected"), [("40 0 missed", "rank 0 of 2: the solve missed its criteria"), ("40 1 bug", "KeyError: 'no such key'")]
 )
 def test_a_rank_that_fails_alone_ends_the_others(run, tmp_path, trouble, expected):
     """They wait for it inside MPI: it says what happened, writes that into run.json and ends them."""
-    done = run(2, trouble=trouble, exit_code=1)
+    done = run(2, f"DOTS_TROUBLE='{trouble}' run dots.toml --out out", exit_code=1)
     assert f"{expected}\nall ranks end" in done.stderr
     found = record(tmp_path / "out")
     assert found["status"] == "failed"
@@ -150,21 +158,29 @@ def test_a_rank_that_fails_alone_ends_the_others(run, tmp_path, trouble, expecte
     assert found["reason"].endswith(expected)
 
 
+WRONG = {  # commands, with what is said of each
+    "run dots.toml --out out": "holds a run already",
+    "run dots.toml --out out --resume --force": "choose one",
+    "run dots.toml --out out --set time.cfl=0": "time.cfl = 0: must be greater than 0",
+    "run dots.toml --out out --force --set output.surface_ply=true": "output.surface_ply = true: ",
+    "run dots.toml --out out --force --record-problems problems": "--record-problems: not with --engine petsc",
+    "DOTS_REFUSE=liquid[0] run dots.toml --out out --force": "dots: liquid[0]",
+    "DOTS_REFUSE=liquid[1{rank}] run dots.toml --out out --force": "rank 0: dots: liquid[10]; rank 1: dots: liquid[11]",
+    "run one/scene.toml --out one --resume": "written by --engine single, which has to continue it",
+}
+
+
 def test_wrong_input_is_said_once(run, tmp_path):
-    run(2, "--frames", "1")
-    for options, refuse, expected in [
-        ([], "", "holds a run already"),
-        (["--resume", "--force"], "", "choose one"),
-        (["--set", "time.cfl=0"], "", "time.cfl = 0: must be greater than 0"),
-        (["--set", "output.surface_ply=true", "--force"], "", "output.surface_ply = true: "),
-        (["--force", "--record-problems", "problems"], "", "--record-problems: not with --engine petsc"),
-        (["--force"], "liquid[0]: does not fit", "dots: liquid[0]: does not fit"),
-        (["--force"], "liquid[{rank}]: does not fit", "rank 0: dots: liquid[0]: does not fit; rank 1: dots: liquid[1]: does not fit"),
-    ]:
-        done = run(2, *options, refuse=refuse, exit_code=2)
+    run(0, "run dots.toml --out one --frames 1")
+    done = run(2, "run dots.toml --out out --frames 1", *WRONG, exit_code=2)
+    assert done.stderr.count("exit code 0") == 2
+    assert done.stderr.count("exit code 2") == 2 * len(WRONG)
+    for expected in WRONG.values():
         assert done.stderr.count(expected) == 1
-        assert "Traceback" not in done.stderr
+    assert "Traceback" not in done.stderr
     assert record(tmp_path / "out")["status"] == "finished"  # as it was
+    alone = run(0, "run dots.toml --out out --resume", exit_code=2)
+    assert "written by 2 ranks; continue with --engine petsc, on any number of ranks" in alone.stderr
 
 
 def test_different_input_is_named(mpi, tmp_path):
@@ -175,8 +191,8 @@ def test_different_input_is_named(mpi, tmp_path):
     import dots_on_ranks
     from mpi4py import MPI
     rank = MPI.COMM_WORLD.rank
-    sys.argv[1:] = ["run", "dots.toml", "--engine", "petsc", "--device", "cpu", "--frames", str(rank), "--set", f"time.cfl={{1 + rank // 2}}"]
-    dots_on_ranks.main()
+    own = ["--frames", str(rank), "--set", f"time.cfl={{1 + rank // 2}}"]
+    dots_on_ranks.main(["run", "dots.toml", "--engine", "petsc", "--device", "cpu", *own])
     """
     done = mpi(3, text, exit_code=2)
     expected = "different scenes or options\n  --frames: 0 on rank 0, 1 on rank 1\n  time.cfl: 1.0 on rank 0, 2.0 on rank 2\n"
@@ -184,31 +200,10 @@ def test_different_input_is_named(mpi, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_engines_do_not_continue_each_other(run, tmp_path, monkeypatch):
-    run(2, "--frames", "1")
-    run(0, "--frames", "1", out="one")
-    refused = run(2, "--resume", out="one", exit_code=2)
-    assert "written by --engine single, which has to continue it" in refused.stderr
-    monkeypatch.setattr(simulator, "simulators", lambda: {"dots": DotsSimulator()})
-    monkeypatch.setattr("warp_lcp.driver.scene_file.simulators", lambda: {"dots": DotsSimulator()})
-    result = CliRunner().invoke(
-        cli.app, ["run", str(tmp_path / "dots.toml"), "--out", str(tmp_path / "out"), "--device", "cpu", "--resume"]
-    )
-    assert result.exit_code == 2
-    assert "written by 2 ranks; continue with --engine petsc, on any number of ranks" in result.stderr
-
-
-def test_without_mpi_the_message_says_how_to_install(tmp_path, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "mpi4py", None)
-    monkeypatch.setattr("warp_lcp.driver.scene_file.simulators", lambda: {"dots": DotsSimulator()})
-    (tmp_path / "dots.toml").write_text(SCENE)
-    call = ["run", str(tmp_path / "dots.toml"), "--out", str(tmp_path / "out"), "--device", "cpu", "--engine", "petsc"]
-    result = CliRunner().invoke(cli.app, call)
-    assert result.exit_code == 2
-    assert "pip install 'warp-lcp[distributed]'" in result.stderr
-    assert "PETSC_DIR" in result.stderr
-    for name in ("OMPI_COMM_WORLD_RANK", "PMI_RANK"):  # only one of several says it
-        monkeypatch.setenv(name, "1")
-        result = CliRunner().invoke(cli.app, call)
-        assert (result.exit_code, result.stderr) == (2, "")
-        monkeypatch.delenv(name)
+@pytest.mark.parametrize("variable", ["", "OMPI_COMM_WORLD_RANK", "PMI_RANK"])
+def test_without_mpi_one_message_says_how_to_install(run, monkeypatch, variable):
+    monkeypatch.setitem(sys.modules, "mpi4py", None)
+    if variable:  # mpiexec has started several, of which this is not the first
+        monkeypatch.setenv(variable, "1")
+    said = run(0, "run dots.toml --engine petsc", exit_code=2).stderr
+    assert ("pip install 'warp-lcp[distributed]'" in said and "PETSC_DIR" in said) if not variable else said == ""

@@ -173,12 +173,28 @@ CASES = {
         {"solid": [BALL | {"density": 500.0}]}, {"solid": [SWAYING]}, modules=("granular.bodies",), files=("granular/bodies.py",),
         columns=("body0_x", "contacts"), sand=True,
     ),
+    "friction of walls": Case({"friction": 0.4}, {"friction": 0.0}, sand=True),
+    "friction of walls by sweeps": Case(
+        {"friction": 0.4, "solver": {"method": "interleaved-sweeps", "max_iterations": 20}},
+        {"friction": 0.0, "solver": {"method": "interleaved-sweeps", "max_iterations": 20}}, sand=True,
+    ),
+    "box of friction": Case({"friction": {"model": "box"}}, modules=("granular.stress_2d_float32_step_box",), sand=True),
+    "sweeps": Case(
+        {"solver": {"method": "interleaved-sweeps", "max_iterations": 20}}, modules=("granular.interleaved_2d",), sand=True
+    ),
+    "gauge": Case({"gauge": {"height": 0.2}}, columns=("flow_rate",), sand=True),
+    "cohesion": Case({"material": {"cohesion": 200.0, "tensile_strength": 50.0}}, sand=True),
     "diagnostics of sand": Case({"output": {}}, columns=("yielded", "dissipation", "predicted_excess"), sand=True),
     "density correction of sand": Case(
         {"density_correction": {}}, modules=("warp_lcp.material.density_correction",), files=("warp_lcp/material/density_correction.py",),
         columns=("density_status", "density_iterations", "max_density"), sand=True,
     ),
 }  # fmt: skip
+
+
+PLACED_ELSEWHERE = (  # take another's place, only look, or are numbers of kernels that are there anyway
+    "cut cells", "diagnostics", "diagnostics of sand", "unilateral pressure", "box of friction", "sweeps", "gauge", "cohesion",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -194,7 +210,7 @@ def test_a_model_that_is_off_leaves_no_trace(name: str, monkeypatch: pytest.Monk
         assert file not in off.bytes
     assert set(case.columns) <= set(on.columns)
     assert not set(case.columns) & set(off.columns)
-    if name not in ("cut cells", "diagnostics", "diagnostics of sand", "unilateral pressure"):  # which take another's place, or only look
+    if name not in PLACED_ELSEWHERE:
         assert on.total > off.total
 
 
@@ -202,6 +218,29 @@ def test_without_a_separating_wall_bounds_take_no_memory(monkeypatch: pytest.Mon
     off, on = (traces_of(monkeypatch, {"wall": wall}, sand=False) for wall in ("free-slip", "separating"))
     cells = 3 * 10 * 18  # stored
     assert on.total - off.total >= 8 * cells, "a lower bound"
+
+
+@pytest.mark.parametrize("slips", [True, False])
+def test_walls_without_friction_are_not_launched(slips: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The kernel of Coulomb friction on walls runs and reads faces only where a wall rubs; a solid that does counts its own alone."""
+    simulation = small_sands.create(small_sands.scene(**(SAND | {"friction": 0.0 if slips else 0.3})))
+    ran: list[str] = []
+    launch = wp.launch
+    monkeypatch.setattr(wp, "launch", lambda kernel, *given, **more: (ran.append(kernel.key), launch(kernel, *given, **more))[1])
+    walls, faces = simulation.stress.walls, 2 * (16 + 8)  # those of the box
+    assert walls.count == (0 if slips else faces)
+    simulation.step(1e-3)
+    assert simulation.stress.residual()[0] >= 0.0
+    assert any("step" in key for key in ran)
+    assert any("wall" in key for key in ran) == (not slips)
+    solid = {"solid": [small_sands.box([0.5, 0.0], [0.75, 0.125], friction=0.3)], "friction": 0.0}
+    rough = small_sands.create(small_sands.scene(**(SAND | solid))).stress.walls
+    assert set(rough.walls.numpy()) == {1}, "faces of the solid"
+
+
+def test_cohesion_takes_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    off, on = (traces_of(monkeypatch, {"material": {"cohesion": c, "tensile_strength": c}}, sand=True) for c in (0.0, 100.0))
+    assert (on.total, on.modules, on.columns) == (off.total, off.modules, off.columns)
 
 
 def test_a_plane_has_no_third_axis(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,9 +8,12 @@ import scipy.io
 import scipy.sparse
 from typer.testing import CliRunner, Result
 
+import warp_lcp as wl
+from benchmarks.problems import cut_cells, splash
 from oracle import boxed, lemke
 from warp_lcp.driver import cli
 from warp_lcp.driver.solve_file import MOST_ROWS
+from warp_lcp.gallery import recorded
 
 
 def call(*arguments: object) -> Result:
@@ -155,6 +158,56 @@ def test_all_forms_of_a_file_mean_the_same(text, right_side, tmp_path):
     result = call(tmp_path / "A.mtx", tmp_path / "b.mtx", "--out", tmp_path / "x.mtx", "--tolerance", 1e-12)
     assert result.exit_code == 0, result.stderr
     np.testing.assert_allclose(scipy.io.mmread(tmp_path / "x.mtx").ravel(), [1.0, 3.0], atol=1e-10)
+
+
+@pytest.fixture
+def recorded_problem(tmp_path):
+    """A splash as a run records it."""
+    scene = cut_cells(splash(10))
+    fields = {"cells": scene.cells, "b": scene.b, "lower": scene.lower("walls"), "upper": np.inf, "x0": np.zeros(scene.b.shape)}
+    np.savez_compressed(tmp_path / "problem_000007.npz", format=1, **fields, **scene.faces, **dict.fromkeys(recorded.NUMBERS, 1.0))
+    return scene
+
+
+def test_a_recorded_problem(recorded_problem, tmp_path):
+    file, out = tmp_path / "problem_000007.npz", tmp_path / "x.npy"
+    result = call(file, "--out", out, "--tolerance", 1e-10)
+    assert result.exit_code == 0, result.stderr
+    fluid = recorded_problem.cells == wl.FLUID
+    assert f"{fluid.sum()} unknowns, 10 x 10 x 10 cells, by projected-multigrid on cpu" in result.stdout
+    x, lower = np.load(out), np.where(recorded_problem.wall, 0.0, -np.inf)
+    y = recorded_problem.matrix() @ x[fluid] + recorded_problem.b[fluid]
+    assert np.abs(np.minimum(x[fluid] - lower[fluid], y)).max() < 1e-6  # coefficients are stored in float32
+    assert 0 < (x[fluid][np.isfinite(lower[fluid])] == 0.0).sum() < np.isfinite(lower).sum()  # some walls are let go of
+    assert (x[~fluid] == 0.0).all()
+    by_psor = call(file, "--method", "psor", "--out", out, "--max-iterations", 5)
+    assert by_psor.exit_code == 1
+    assert "5 iterations" in by_psor.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["b.mtx"], "b.mtx: problem_000007.npz has a right-hand side of its own"),
+        (["--lower", "0"], "--lower 0: problem_000007.npz has bounds of its own"),
+        (["--out", "x.mtx"], "--out x.mtx: x of a grid becomes a NumPy array: name a .npy file"),
+        (["--method", "psorr"], "--method psorr: no such method; did you mean 'psor'?"),
+        (["--tolerance", "2"], "--tolerance 2.0: rtol = 2.0"),
+    ],
+)
+def test_wrong_options_of_a_recorded_problem(recorded_problem, tmp_path, monkeypatch, arguments, expected):
+    monkeypatch.chdir(tmp_path)
+    result = call("problem_000007.npz", *arguments)
+    assert result.exit_code == 2
+    assert expected in result.stderr
+
+
+def test_a_damaged_recorded_problem(recorded_problem, tmp_path):
+    file = tmp_path / "problem_000007.npz"
+    file.write_bytes(file.read_bytes()[:-900])
+    result = call(file)
+    assert result.exit_code == 2
+    assert f"{file}: no recorded problem: " in result.stderr
 
 
 def test_a_pattern_is_a_matrix_of_ones(tmp_path):

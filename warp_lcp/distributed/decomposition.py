@@ -161,15 +161,16 @@ def parts(n: int, p: int) -> list[int]:
 
 def _processes(counts: Triple, size: int) -> Triple:
     """Return the ranks along x, y, z with the least cells at cuts; of equal ones those that cut z, whose planes lie in one piece."""
-    found = []
-    for px in (d for d in range(1, size + 1) if size % d == 0):
-        for py in (d for d in range(1, size // px + 1) if size // px % d == 0):
-            p = px, py, size // (px * py)
-            if all(a <= n for a, n in zip(p, counts, strict=True)):
-                nx, ny, nz = counts
-                found.append(((px - 1) * ny * nz + (py - 1) * nx * nz + (p[2] - 1) * nx * ny, px, py, p))
+    nx, ny, nz = counts
+    found = [((px - 1) * ny * nz + (py - 1) * nx * nz + (pz - 1) * nx * ny, px, py, (px, py, pz)) for px, py, pz in _cuttings(counts, size)]
     if not found:
-        raise ValueError(
-            f"{size} ranks cannot share {' x '.join(map(str, counts))} cells: start fewer, or a number with factors up to {max(counts)}"
-        )
+        most = next(fewer for fewer in range(size - 1, 0, -1) if _cuttings(counts, fewer))
+        raise ValueError(f"{size} ranks cannot share {' x '.join(map(str, counts))} cells, each with a box: start {most} or fewer")
     return min(found)[3]
+
+
+def _cuttings(counts: Triple, size: int) -> list[Triple]:
+    """Return the numbers of ranks along x, y, z, whose product is `size`, that leave each rank a cell."""
+    pairs = [(px, py) for px in range(1, size + 1) if size % px == 0 for py in range(1, size // px + 1) if size // px % py == 0]
+    triples = [(px, py, size // (px * py)) for px, py in pairs]
+    return [p for p in triples if all(a <= n for a, n in zip(p, counts, strict=True))]

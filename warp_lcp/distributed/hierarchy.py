@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from functools import partial
+from dataclasses import replace
+from functools import cached_property, partial
 from typing import Any
 
 import warp as wp
@@ -41,8 +42,9 @@ class DistributedHierarchy(Hierarchy):
         if bounded and last.upper.size == 0:
             bounds = wp.zeros(stencil.padding.size, dtype=self.real, device=self.device), last.upper
         shifted = last.stencil.d.dtype is not wp.uint8
+        settings = replace(self.settings, one_launch_cpu=GATHERED)  # a solve has too few cycles for their graph to pay
         self._whole = Hierarchy(
-            stencil, self.real, bounded=bounded, settings=self.settings, bounds=bounds, shifted=shifted, shrunk=last.shrunk
+            stencil, self.real, bounded=bounded, settings=settings, bounds=bounds, shifted=shifted, shrunk=last.shrunk
         )  # fmt: skip
 
     def _prepare_coarsest(self) -> None:
@@ -80,19 +82,33 @@ class DistributedHierarchy(Hierarchy):
         launch(shared_cycle_kernels(*L.form).descend, 1, inputs, device=self.device)
         self._restrict(level, launch)
 
+    @cached_property
+    def unswept_cycle(self) -> Program | None:
+        """The linear cycle without its last sweep, from the finest `t` to `x`, for a caller who fuses that with what follows."""
+        if len(self.levels) == 1 or not self._streams(self.finest):
+            return None
+        program = Program(self.device)
+        self._descend(0, program, projected=False, from_zero=True, whole=False)
+        self._climb(0, program.launch)
+        return program
+
     def _go_up(self, level: int, launch: Launch, *, projected: bool) -> None:
-        L, C = self.levels[level], self.levels[level + 1]
+        L = self.levels[level]
         if projected or not self._streams(L):
             super()._go_up(level, launch, projected=projected)
             return
+        self._climb(level, launch)
+        L.sweep(L.x, L.t, self.settings.weights[0], projected=False, launch=launch)
+
+    def _climb(self, level: int, launch: Launch) -> None:
+        """Correct a level from the next one, and sweep it once, from x to t."""
+        L, C = self.levels[level], self.levels[level + 1]
         if level + 2 < len(self.levels):  # those of L.x are filled since its restriction, those of a gathered level since it was solved
             C.stencil.wrap(C.x, launch=launch)
         planes, rows, _ = C.stencil.padding.counts
-        first, second = reversed(self.settings.weights)
-        fields = [L.x, L.b, L.t, L.lower, L.upper, C.x, first, self.settings.over_correction]
+        fields = [L.x, L.b, L.t, L.lower, L.upper, C.x, self.settings.weights[1], self.settings.over_correction]
         inputs = [*L.operands, C.stencil.shape, C.aggregates, planes, rows, *fields]
         launch(shared_cycle_kernels(*L.form).ascend, 1, inputs, device=self.device)
-        L.sweep(L.x, L.t, second, projected=False, launch=launch)
 
     def _streams(self, L: Level) -> bool:
         """Whether legs of the cycle go through memory once for several sweeps: by one CPU thread, in three planes at a time."""
@@ -119,8 +135,7 @@ class DistributedHierarchy(Hierarchy):
             self._gathering.collect(ours.lower, whole.lower)
             if ours.upper.size:
                 self._gathering.collect(ours.upper, whole.upper)
-        for visit in range(visits):
-            self._whole._descent(0, projected=projected, from_zero=visit == 0).run()
+        self._whole.visits(visits, projected=projected).run()
         self._gathering.take(whole.x, ours.x)
 
 

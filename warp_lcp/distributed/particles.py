@@ -1,9 +1,9 @@
 """Particles that belong to the rank whose box they are in: they move on to others, and cells at a cut know those beside them.
 
-In a step a rank has its own particles and copies of those within a cell of its box, `with_ghosts`; then its own alone. All are in one order
-that does not depend on the ranks, so that sums over particles have the same bits on any number of them: that of the last sort by cell,
-which a number stands for, the particle's `place`. Messages go from rank to rank: their lengths change from step to step, so that a star forest
-would have to be made anew each time.
+In a step a rank has its own particles and copies of those within a cell of its box, ghosts; then its own alone. All are in one order that
+does not depend on the ranks, so that sums over the particles around a face have the same bits on any number of ranks: that of the last sort
+by cell, which a number stands for, the particle's `place`. Messages go from rank to rank: their lengths change from step to step, so that a
+star forest would have to be made anew each time.
 """
 
 from __future__ import annotations

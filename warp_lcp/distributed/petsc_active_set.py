@@ -16,6 +16,8 @@ from warp_lcp.solve import Step
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
 from warp_lcp.solvers.principal_system import GridSystem, PrincipalSystem
 
+LEAST = 0.5  # by which a linear solve reduces its residual at least
+
 
 @dataclass(frozen=True, kw_only=True)
 class PetscActiveSet:
@@ -24,17 +26,16 @@ class PetscActiveSet:
     Unknowns with x - y / A_ii outside their bounds are held there; PETSc solves on the others, matrix-free, by conjugate gradients
     preconditioned with one multigrid cycle, and the step is safeguarded as MinimumMapNewton's is. For grids, on one process or on ranks
     that share one. MinimumMapNewton and ProjectedMultigrid are faster; this one is for those who want PETSc's methods, monitors and
-    options, which it reads from the environment's PETSC_OPTIONS or from what a program gave petsc4py.init, once, in `init`:
+    options. `init` reads them from PETSC_OPTIONS in the environment, or from what a program gave `petsc4py.init`:
 
-    =============================  ================================================================================================
-    -ksp_type cg                   fcg, pipecg, minres, gmres, ...; what needs A symmetric may be taken, A is; pipecg saves waits for sums
-    -pc_type python                our cycle; jacobi, none; -pc_type ksp -ksp_ksp_type ... is a solve within the solve
-    -ksp_norm_type unpreconditioned  preconditioned and natural norms make `eta` mean something else
-    -ksp_rtol, -ksp_atol, -ksp_max_it  replace what `eta`, the tolerance of the whole solve and `max_linear_iterations` ask for
-    -ksp_monitor, -ksp_converged_reason, -ksp_view, -log_view  tell what happens, on standard output
-    =============================  ================================================================================================
+    - `-ksp_type`: cg unless given; fcg, pipecg and groppcg (fewer waits for sums over the ranks), minres, gmres, fgmres, bcgs, richardson,
+      preonly (the cycle alone) and most others. A is symmetric.
+    - `-pc_type`: python, our cycle, unless given; jacobi, bjacobi, none. PETSc refuses what needs a matrix's entries (sor, ilu, gamg).
+    - `-ksp_norm_type`: unpreconditioned where the method has that norm, else its own; `eta` counts in it.
+    - `-ksp_rtol`, `-ksp_atol`, `-ksp_max_it`: instead of what `eta`, the whole solve's tolerance and `max_linear_iterations` ask for.
+    - `-ksp_monitor`, `-ksp_converged_reason`, `-ksp_view`, `-log_view`, `-options_left`: PETSc tells what it does, on standard output.
 
-    With `prefix="wall_"` they read `-wall_ksp_type` and so on; PETSc writes what nobody read when `-options_left` is given.
+    With `prefix="wall_"` those of KSP and PC read `-wall_ksp_type` and so on.
 
     Args:
         precision: "mixed": iterate float64, cycles float32; "double"; or "single": the iterate rounded to float32 as well. PETSc's vectors
@@ -157,19 +158,19 @@ class KSPIteration:
         self.x = wp.zeros_like(grid.hierarchy.finest.b)
         self._right_side, self._solution = grid.vector(), grid.vector()
         given = petsc().Options(prefix)
-        self._rtol = self.ksp.getTolerances()[0] if given.hasName("ksp_rtol") else 0.0
-        self._atol, self._most = (given.hasName(f"ksp_{name}") for name in ("atol", "max_it"))
+        self._given = frozenset(name for name in ("rtol", "atol", "max_it") if given.hasName(f"ksp_{name}"))
 
     def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
-        """Iterate from x = 0 until the residual's norm is at most the tolerance, or as long as PETSc's options say.
+        """Iterate from x = 0 until the residual has fallen as `tolerance` asks, in the norm that KSP takes, or as PETSc's options say.
 
         Returns:
             Iterations and the norm reached, as KSP has them.
         """
-        asked = {} if self._atol else {"atol": tolerance}
-        self.ksp.setTolerances(rtol=self._rtol, **asked, **({} if self._most else {"max_it": max_iterations}))
         copies = self.grid.copies
         copies.leave(self.grid.hierarchy.finest.b, None, self._right_side)
+        size = self._right_side.norm()
+        asked = {"rtol": min(tolerance / size, LEAST), "atol": 0.0, "max_it": max_iterations} if size > 0 else {}
+        self.ksp.setTolerances(**{name: value for name, value in asked.items() if name not in self._given})
         self.ksp.solve(self._right_side, self._solution)
         copies.enter(self._solution, self.x)
         return self.ksp.getIterationNumber(), self.ksp.getResidualNorm()

@@ -24,6 +24,9 @@ from warp_lcp.operators.stencil import Stencil
 if TYPE_CHECKING:
     from petsc4py import PETSc
 
+TRUE_RESIDUAL = frozenset({"cg", "cgne", "fcg", "pipefcg", "groppcg", "pipecg", "bcgs", "tfqmr", "fgmres", "richardson"})
+"""Methods of KSP that measure b - A x if asked to; others know other norms only."""
+
 
 class VectorCopies:
     """Copies between PETSc's vectors and the stored fields of a stencil's grid.
@@ -146,11 +149,13 @@ class CyclePreconditioner:
 class PetscGrid:
     """A grid operator and its multigrid as PETSc's objects, on all unknowns or on a free set.
 
-    With them PETSc's own solvers work on the operator, matrix-free; everything here is collective where ranks share the operator.
+    With them PETSc's own methods work on the operator, matrix-free: KSP, and TAO's bounded ones with `-tao_subset_type matrixfree` and
+    `-pc_type none`. Everything here is collective where ranks share the operator. Keep the grid while PETSc uses its objects.
+
+    Grids whose FLUID cells touch neither AIR nor a shift are singular: tell PETSc the constants as the matrices' null space.
 
     Args:
-        A: the operator, one process's or one that ranks share. Grids whose FLUID cells touch neither AIR nor a shift are singular: tell
-            PETSc the constants as the matrices' null space.
+        A: the operator, one process's or one that ranks share.
         hierarchy: of A, its finest diagonal filled by the caller; None: one of its own, for all unknowns until `hold` is called.
         real: type in which its cycles work.
         cycle: how they go.
@@ -160,6 +165,13 @@ class PetscGrid:
         matrix: A on the free set as a Mat, the identity on other cells; in the hierarchy's storage, so with coefficients of type `real`.
         cycle: context of a PC on the free set.
         copies: between vectors and stored fields.
+
+    Example:
+        >>> from warp_lcp.distributed.petsc_matrix import PetscGrid  # doctest: +SKIP
+        >>> grid = PetscGrid(A)  # doctest: +SKIP
+        >>> b, x, ksp = grid.vector(values), grid.vector(), grid.solver()  # doctest: +SKIP
+        >>> ksp.solve(b, x)  # doctest: +SKIP
+        >>> print(ksp.getIterationNumber(), grid.field(x).shape)  # doctest: +SKIP
     """
 
     def __init__(
@@ -210,10 +222,11 @@ class PetscGrid:
         ksp.setOptionsPrefix(prefix)
         ksp.setOperators(self.matrix)
         ksp.setType(PETSc.KSP.Type.CG)
-        ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
         ksp.getPC().setType(PETSc.PC.Type.PYTHON)
         ksp.getPC().setPythonContext(self.cycle)
         ksp.setFromOptions()
+        if ksp.getType() in TRUE_RESIDUAL and not PETSc.Options(prefix).hasName("ksp_norm_type"):
+            ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
         self._keep(ksp.getPC())
         return ksp
 

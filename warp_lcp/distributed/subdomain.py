@@ -35,8 +35,8 @@ def ghost_layers(cfl: float, smoothing: int) -> int:
 class Subdomain:
     """A rank's part of a grid: the cells of its box, and of those around it what lies in the domain within some layers.
 
-    The outermost layer is the ring that every staggered grid has around its cells. At the domain's sides the ring is that of the whole grid,
-    at cuts it is the last of the ghost layers: there the sides of the part must be open, see `cuts`.
+    The outermost layer is the ring that every staggered grid has around its cells. At the domain's sides the ring is that of the whole
+    grid, at cuts it is the last of the ghost layers: there the sides of the part must be open, see `cuts`.
 
     Args:
         decomposition: the boxes of all ranks.
@@ -58,11 +58,11 @@ class Subdomain:
         self.decomposition, self.layers, self.dimension = decomposition, layers, dimension
         self.ranks, self.box = decomposition.ranks, decomposition.box
         for axis in decomposition.cut_axes:
-            least, cells = min(decomposition.parts[axis]), decomposition.counts[axis]
+            least, most = min(decomposition.parts[axis]), max(decomposition.counts[axis] // layers, 1)
             if least < layers:
                 raise ValueError(
                     f"{decomposition.processes[axis]} ranks along {'xyz'[axis]} have boxes of {least} cells, but what a step looks at "
-                    f"around a box takes {layers}: at most {max(cells // layers, 1)} ranks fit along that axis, or refine the grid"
+                    f"around a box takes {layers}: at most {most} ranks fit along that axis, or refine the grid"
                 )
         cells = self._cells(self.box)
         self.grid = StaggeredGrid(cells.counts, spacing, dimension, device, origin=cells.low, whole=decomposition.counts)
@@ -82,11 +82,9 @@ class Subdomain:
         """The star forest that fills ghost cells and the rings beside them; None: there is one rank."""
         if self.ranks.size == 1:
             return None
-        counts, boxes = self.decomposition.counts, self.decomposition.boxes
+        boxes = self.decomposition.boxes
         owned = [self._with_sides(box) for box in boxes]
-        stored = [self._cells(box).grown(1) for box in boxes]
-        assert stored[self.ranks.rank].counts == self.grid.shape[::-1], counts
-        return star_forest(self.ranks, owned, stored)
+        return star_forest(self.ranks, owned, [self._cells(box).grown(1) for box in boxes])
 
     def _with_sides(self, box: Box) -> Box:
         """Return a box with the ring beyond the domain's sides that it touches: it is the one to know that, too."""

@@ -289,8 +289,7 @@ def solve(
         elif right_side is None:
             raise ProblemError(f"{problem}: is a matrix: name b too, warp-lcp solve A.mtx b.mtx")
         else:
-            bounds = {"lower": lower or "0", "upper": upper or "inf"}
-            outcome = solve_files(problem, right_side, device=chosen, **bounds, **options)
+            outcome = solve_files(problem, right_side, device=chosen, lower=lower or "0", upper=upper or "inf", **options)
         if out is not None:
             outcome.write(out)
     if not crew.speaks:

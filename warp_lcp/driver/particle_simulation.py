@@ -435,7 +435,7 @@ class ParticleSimulation(ABC):
         elif totals.bad_positions:
             field, bad = "position", ~np.isfinite(position).all(axis=1)
         else:
-            field, bad = "position", ((position < 0.0) | (position > end))[:, axes].any(axis=1)
+            field, bad = "position", ((position < 0.0) | (position > end))[:, : self.grid.dimension].any(axis=1)
         found, wrong = np.flatnonzero(bad), "outside the domain" if totals.finite else "not finite"
         return f"{field} is {wrong} in cell (x, y, z) = {self._cell_of(int(found[0]))} ({len(found)} particles)" if len(found) else ""
 

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 SUFFIX = ".npz"  # of recorded problems
 FIELD = ".npy"  # of their solutions
-MATRICES_ONLY = "--{option}: {path} has bounds of its own"
 
 
 @dataclass(frozen=True)
@@ -101,7 +100,7 @@ def solve_recorded(
         shape = cell_counts(path)
         decomposition = None if ranks is None else _decomposition(shape, ranks)
         problem = _problem(path, shape, decomposition, device)
-        work = solver.init(problem)
+        work: Any = solver.init(problem)
         result: SolveResult = solve(problem, solver, stopping=stopping, workspace=work)
     except ValueError as error:
         raise ProblemError(str(error)) from error
@@ -118,7 +117,7 @@ def check_recorded(path: Path, *, right_side: Path | None, lower: str | None, up
         raise ProblemError(f"{right_side}: {path} has a right-hand side of its own")
     for option, value in (("lower", lower), ("upper", upper)):
         if value is not None:
-            raise ProblemError(MATRICES_ONLY.format(option=option, path=path))
+            raise ProblemError(f"--{option} {value}: {path} has bounds of its own")
     if out is not None and out.suffix != FIELD:
         raise ProblemError(f"--out {out}: x of a grid becomes a NumPy array: name a {FIELD} file")
 

@@ -75,9 +75,11 @@ def _read(stream: IO[bytes], part: tuple[slice, ...]) -> np.ndarray:
         raise ValueError("it holds objects")
     if shape and len(shape) != len(part):
         raise ValueError(f"an array has {len(shape)} axes, cells {len(part)}")
-    if not shape or fastest_first:
+    if not shape:
+        return np.frombuffer(_exactly(stream, kind.itemsize), dtype=kind).reshape(())
+    if fastest_first:
         whole = np.frombuffer(_exactly(stream, prod(shape) * kind.itemsize), dtype=kind)
-        return np.ascontiguousarray(whole.reshape(shape, order="F" if fastest_first else "C")[part if shape else ()])
+        return np.ascontiguousarray(whole.reshape(shape, order="F")[part])
     plane = prod(shape[1:]) * kind.itemsize
     for _ in range(part[0].start):
         _exactly(stream, plane)

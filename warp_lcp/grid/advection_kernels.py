@@ -105,8 +105,9 @@ def advect_kernel(endless: int):
 
     @wp.func_native(runge_kutta(ROOM + WALK + MOVE, endless))
     def advect_some(
-        planes: int, dx: float, inverse_dx: float, origin: wp.vec3i, h: float, x_: wp.array(dtype=wp.vec3), u_: wp.array3d(dtype=wp.float32),
-        v_: wp.array3d(dtype=wp.float32), w_: wp.array3d(dtype=wp.float32), room_: wp.array3d(dtype=wp.int8), first: int, last: int,
+        planes: int, dx: float, inverse_dx: float, origin: wp.vec3i, h: float, x_: wp.array(dtype=wp.vec3),
+        u_: wp.array3d(dtype=wp.float32), v_: wp.array3d(dtype=wp.float32), w_: wp.array3d(dtype=wp.float32),
+        room_: wp.array3d(dtype=wp.int8), first: int, last: int,
     ) -> int: ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module="warp_lcp.grid.advection" + (f"_{endless}" if endless else ""))

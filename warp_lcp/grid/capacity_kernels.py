@@ -124,7 +124,9 @@ def cut_kernel(cells: CellRange, color: wp.vec3i, planes: int, near: _F32, state
             cut_cell(near, capacity, planes, k, j, i)
 
 
-def integrate_kernel(window: Window, planes: int, near: wp.array, state: wp.array, capacity: wp.array) -> None:
+def integrate_kernel(
+    window: Window, planes: int, near: wp.array, state: wp.array, capacity: wp.array, origin: tuple[int, int, int] = (0, 0, 0)
+) -> None:
     """Integrate each cell's kernel over what is open.
 
     Args:
@@ -133,11 +135,13 @@ def integrate_kernel(window: Window, planes: int, near: wp.array, state: wp.arra
         near: float32, signed distance of the solids at the nodes [cells].
         state: int8, CLOSED, OPEN or CUT.
         capacity: float32 (written, the ring included).
+        origin: of a part of a grid, in which sums then keep the order that they have in all of it.
     """
     everywhere = Window((1, 0, 0) if planes == 1 else (0, 0, 0), (2 if planes == 1 else state.shape[0], *state.shape[1:]), window.device)
     everywhere.launch(open_kernel, [planes, state, capacity])
     chunks = -(-(window.high[2] - window.low[2]) // window.cells.grain)
-    for z, y, x in itertools.product(range(COLORS if planes == 2 else 1), range(COLORS), range(COLORS)):
+    for color in itertools.product(range(COLORS if planes == 2 else 1), range(COLORS), range(COLORS)):
+        z, y, x = ((c - before) % COLORS for c, before in zip(color, reversed(origin), strict=True))
         # rows and planes of this color; chunks of a row are counted in cells of this color too, the last may be empty
         rows = [-(-max(high - low - color, 0) // COLORS) for low, high, color in zip(window.low, window.high, (z, y, x), strict=True)]
         if min(rows) > 0:

@@ -220,7 +220,7 @@ class CutCells:
                 self._open_side(number >> 1, SIDES[number])
         grid.domain.launch(kernels.states_kernel, [planes, nodes.near, *faces, self.base, self._state])
         if self.capacity is not None:
-            integrate_kernel(grid.domain, planes, nodes.near, self._state, self.capacity)
+            integrate_kernel(grid.domain, planes, nodes.near, self._state, self.capacity, grid.origin)
             continue_beyond(grid, self.open_sides, self.capacity)
 
     def _open_side(self, axis: int, name: str) -> None:

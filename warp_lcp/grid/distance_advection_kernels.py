@@ -330,8 +330,8 @@ def advect_kernel(endless: int):
     @wp.kernel(enable_backward=False, module="warp_lcp.grid.distance_advection" + (f"_{endless}" if endless else ""))
     def advect_particles(
         count: int, grain: int, planes: int, dx: float, inverse_dx: float, origin: wp.vec3i, h: float,
-        position: wp.array(dtype=wp.vec3), u: wp.array3d(dtype=wp.float32), v: wp.array3d(dtype=wp.float32), w: wp.array3d(dtype=wp.float32),
-        distance: wp.array3d(dtype=wp.float32), open_sides: int, stopped: wp.array(dtype=wp.int32),
+        position: wp.array(dtype=wp.vec3), u: wp.array3d(dtype=wp.float32), v: wp.array3d(dtype=wp.float32),
+        w: wp.array3d(dtype=wp.float32), distance: wp.array3d(dtype=wp.float32), open_sides: int, stopped: wp.array(dtype=wp.int32),
     ):  # fmt: skip
         """One Runge-Kutta step of some particles; h is the time step in units of 1 / (velocity in cells)."""
         first = wp.tid() * grain

@@ -46,7 +46,8 @@ SCATTER = """
     GRID_COORDINATE WEIGHTS
     for (long long p = first; p < last; ++p) {
         T wx[3], wy[3], wz[3] = {0, 1, 0};
-        const int i = weigh(grid_coordinate(position[3*p], origin[0]), nx, wx), j = weigh(grid_coordinate(position[3*p + 1], origin[1]), ny, wy);
+        const int i = weigh(grid_coordinate(position[3*p], origin[0]), nx, wx);
+        const int j = weigh(grid_coordinate(position[3*p + 1], origin[1]), ny, wy);
         const int k = planes == 2 ? weigh(grid_coordinate(position[3*p + 2], origin[2]), nz, wz) : 1;
         #ifndef __CUDA_ARCH__
         typedef T Four __attribute__((vector_size(4*sizeof(T))));

@@ -76,8 +76,8 @@ def runge_kutta(walls: str, endless: int = 0) -> str:
     """Return the body of a native function that moves particles first <= p < last and returns how many were stopped.
 
     Args:
-        walls: source of `prepare` and `move`. It finds planes, first_cell, lx, ly, lz, nx, ny, nz, back, the strides s1, s2 and up of a field, the Blocks `from` and
-            `to` of grid coordinates, `hit`, `margin` and the array `list` to note particles in.
+        walls: source of `prepare` and `move`. It finds planes, first_cell and lx, ly, lz, nx, ny, nz, back, the strides s1, s2 and up of a
+            field, the Blocks `from` and `to` of grid coordinates, `hit`, `margin` and the array `list` to note particles in.
         endless: has bit n set if axis n has no end; `walls` finds it as ENDLESS.
     """
     source = LOOP.replace("SAMPLE", SAMPLE).replace("WALLS", walls).replace("MARGIN", repr(MARGIN))

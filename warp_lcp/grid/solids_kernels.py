@@ -164,7 +164,7 @@ def cell_centers(
     flat: bool,
     out: wp.array(dtype=wp.vec3),
 ):
-    """Fill a block of cell centers [m], x fastest; cell 1 of the padded grid begins `origin` cells from 0, and `flat` puts them at z = 0."""
+    """Fill a block of cell centers [m], x fastest; cell 1 of the padded grid begins `origin` cells from 0, `flat` puts them at z = 0."""
     c = wp.tid()
     i = origin[0] + low_x + c % count_x
     j = origin[1] + low_y + (c // count_x) % count_y

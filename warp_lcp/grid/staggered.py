@@ -3,8 +3,8 @@
 A grid of nx x ny x nz cells is stored with one ring of ghost cells, shape (nz + 2, ny + 2, nx + 2), x fastest; a 2-D grid is nz = 1 and
 only its plane k = 1 is used. Face fields have the shape of the cells: element (k, j, i) of component 0 (x), 1 (y) or 2 (z) lies on the
 lower x, y or z face of cell (k, j, i). Grid coordinates are X = x / dx + 1 with x [m] the distance from the low corner of the domain, so
-that a point lies in cell floor(X). In 2-D, z is ignored. A grid may be a part of a larger one: points and grid coordinates are then those of
-the larger grid, so that a point has the same in all parts, and stored cell floor(X) - origin.
+that a point lies in cell floor(X). In 2-D, z is ignored. A grid may be a part of a larger one: points and grid coordinates are then those
+of the larger grid, so that a point has the same in all parts, and lies in stored cell floor(X) - origin.
 """
 
 import typing
@@ -185,7 +185,10 @@ class StaggeredGrid:
         return self.window((1, 1, 1), self.counts)
 
     def window(self, low: typing.Sequence[int], high: typing.Sequence[int], grow: int = 0) -> Window:
-        """Return the box of cells from low to high (x, y, z, both included), grown by some cells and clipped to what is stored; a layer is left."""
+        """Return the box of cells from low to high (x, y, z, both included), grown by some cells and clipped to what is stored.
+
+        Of a box beyond what is stored a layer of what is nearest is left.
+        """
         first, last = [], []
         for axis in (2, 1, 0):
             if axis == 2 and self.dimension == 2:

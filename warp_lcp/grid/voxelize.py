@@ -172,7 +172,9 @@ def _claim(
         block = [int(low[0]), int(low[1]), bottom, int(across[0]), int(across[1])]
         points = wp.empty(size, dtype=wp.vec3, device=index.device)
         distance = wp.empty(size, dtype=wp.float32, device=index.device)
-        wp.launch(cell_centers, dim=size, inputs=[*block, wp.vec3i(*origin), spacing, dimension == 2], outputs=[points], device=index.device)
+        wp.launch(
+            cell_centers, dim=size, inputs=[*block, wp.vec3i(*origin), spacing, dimension == 2], outputs=[points], device=index.device
+        )
         geometry.signed_distance(points, distance)
         wp.launch(claim_cells, dim=size, inputs=[*block, distance, number, index, covered], device=index.device)
 

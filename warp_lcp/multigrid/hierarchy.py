@@ -243,7 +243,8 @@ class Hierarchy:
     @cached_property
     def _coarsening(self) -> Program:
         program = Program(self.device)
-        for fine, coarse in zip(self.levels[: self._first_small], self.levels[1:], strict=False):
+        alone = len(self.levels) if self.device.is_cpu else self._first_small  # rows that have not changed are left out then
+        for fine, coarse in zip(self.levels[:alone], self.levels[1:], strict=False):
             s, c = fine.stencil, coarse.stencil
             if s.ghosts is not None:
                 program.record(partial(share_changes, fine))
@@ -263,7 +264,7 @@ class Hierarchy:
 
     def _factor_coarsest(self, program: Program) -> None:
         """Record the preparation of solves on the coarsest levels."""
-        if self._small is not None:
+        if self._small is not None and self.device.is_cuda:
             self._small.rebuild(PINNED[self.real], program.launch)
             return
         last, s = self.levels[-1], self.levels[-1].stencil
@@ -297,9 +298,19 @@ class Hierarchy:
         self._descend(0, program, projected=False, from_zero=True, whole=False)
         return program
 
+    unswept_cycle: Program | None = None  # the linear cycle without its last sweep, where ghost cells must be filled before that
+
     def last_leg(self) -> list[Any]:
         """Return what the last leg of a linear cycle takes, as `ascend` in `cycle_kernels` does."""
         return self._ascent(0, projected=False)
+
+    def visits(self, count: int, *, projected: bool) -> Program:
+        """Return cycles one after another, the first from x = 0, as a finer level takes them that this hierarchy serves."""
+        key = -count, projected, True
+        if key not in self._descents:
+            self._descents[key] = Program(self.device)
+            self._visit(0, count, self._descents[key], projected=projected)
+        return self._descents[key]
 
     def _descent(self, level: int, *, projected: bool, from_zero: bool) -> Program:
         """Return a cycle on a level and those below it. A W-cycle repeats it many times: it is recorded once."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import warp as wp
+
 from warp_lcp.operators.stencil import Stencil
 
 if TYPE_CHECKING:
@@ -38,3 +40,11 @@ def share_changes(level: Level) -> None:
             changed[end] |= differs.any(axis=1)
     if s.device.is_cuda:
         level.changed.assign(changed)
+
+
+def clear_ghosts(stencil: Stencil, field: wp.array[Any]) -> None:
+    """Set the ghost cells of a stored field that stand for cells of others to 0; on the CPU."""
+    assert stencil.ghosts is not None
+    grid = field.numpy().reshape(stencil.padding.shape)
+    for axis, end in stencil.ghosts.cuts:
+        grid[(*[slice(None)] * (2 - axis), -end)] = 0

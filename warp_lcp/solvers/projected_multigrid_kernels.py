@@ -275,6 +275,88 @@ def climb_kernel(variable: bool, d_type: Any, w_type: Any, free_type: Any, real:
 
 
 @functools.cache
+def sweep_and_measure_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: Any) -> SimpleNamespace:
+    """Return what replaces the last sweep and `measure` where z has ghost cells that others fill, by one CPU thread.
+
+    `sweep` does both as if z were 0 there; when they are filled, `add_side` adds what the faces at a side add to the products.
+    """
+    field, free_array = wp.array(dtype=real), wp.array(dtype=free_type)
+    sweep_between = cycle_kernels(variable, free_type, real).parts.sweep_between
+    measure_row = row_kernels(variable, d_type, w_type, free_type, real).measure_row
+    form = "variable" if variable else "uniform"
+    name = f"warp_lcp.sweep_and_measure.{form}_{free_type.__name__}_{real.__name__}"
+
+    @wp.kernel(enable_backward=False, module=name)
+    def sweep(
+        A: StencilShape, d: free_array, wx: field, wy: field, wz: field, x: field, b: field, t: field, lower: field, upper: field,
+        omega: real, R: RowSums, p: field, out: f64,
+    ):  # fmt: skip
+        """Sweep t into x, and measure a plane behind; t's ghost cells are filled, x's are 0."""
+        for s in range(R.all_planes + 1):
+            if s < R.all_planes:
+                for j in range(R.rows):
+                    o = row_start(A, s, j, 0, A.nx)
+                    n = row_count(A, s, j, 0, A.nx)
+                    sweep_between(A, d, wx, wy, wz, x, o, t, o, -A.s1, A.s1, b, lower, upper, o, n, omega, False)
+            k = s - 1
+            if k >= 0:
+                slab = k // R.planes
+                for j in range(R.rows):
+                    n = row_count(A, k, j, 0, A.nx)
+                    o = row_start(A, k, j, 0, A.nx)
+                    measure_row(A, d, wx, wy, wz, x, p, b, o, n, slab * R.rows + j, R.threads, k > slab * R.planes, out)
+
+    @wp.kernel(enable_backward=False, module=name)
+    def add_side(
+        A: StencilShape, d: free_array, wx: field, wy: field, wz: field, axis: int, end: int, last: int, R: RowSums, x: field, p: field,
+        out: f64,
+    ):  # fmt: skip
+        """Take the products with the ghost cells beyond side `end` of an axis off the sums of the rows beside it; a row a thread."""
+        a, b = wp.tid()
+        k = a
+        j = b
+        i = int(0)
+        n = A.nx
+        step = A.s1
+        coefficient = real(A.cz)
+        if axis == 0:
+            i = end * last
+            n = 1
+            step = wp.int64(1)
+            coefficient = real(A.cx)
+        elif axis == 1:
+            j = end * last
+            step = A.s2
+            coefficient = real(A.cy)
+        else:
+            k = end * last
+        o = wp.int64(k + 1) * A.s1 + wp.int64(j + 1) * A.s2 + wp.int64(1 + i)
+        out_of = step * wp.int64(2 * end - 1)
+        zaz = real(0.0)
+        zap = real(0.0)
+        for m in range(n):
+            q = o + wp.int64(m)
+            if d[q] != free_type(0):
+                w = coefficient
+                if wx:
+                    face = q + step * wp.int64(end)
+                    if axis == 0:
+                        w = wx[face]
+                    elif axis == 1:
+                        w = wy[face]
+                    else:
+                        w = wz[face]
+                beyond = w * x[q + out_of]
+                zaz += x[q] * beyond
+                zap += p[q] * beyond
+        t = (k // R.planes) * R.rows + j
+        out[t] = out[t] - wp.float64(zaz)
+        out[R.threads + t] = out[R.threads + t] - wp.float64(zap)
+
+    return SimpleNamespace(sweep=sweep, add_side=add_side)
+
+
+@functools.cache
 def flat_kernels(real: Any) -> SimpleNamespace:
     """Return the kernels on flat fields: `gaps` to the bounds, `undo` of an update."""
     name = f"warp_lcp.projected_multigrid.{real.__name__}"

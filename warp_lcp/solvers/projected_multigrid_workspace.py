@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.multigrid.hierarchy import Hierarchy, make_hierarchy
+from warp_lcp.multigrid.shared_levels import clear_ghosts
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
-from warp_lcp.program import Launch, Program
+from warp_lcp.program import Launch, Program, perform
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.solve import Precision, RoundedIterate, Step
 from warp_lcp.solvers import projected_multigrid_kernels as kernels
@@ -288,6 +290,10 @@ class MultigridWorkspace(RoundedIterate):
     def _correct(self, program: Program) -> None:
         """Record a cycle, the measuring of its correction and the plan of the step; on the CPU the cycle's last leg measures."""
         residual, hierarchy, device = self.residual, self.hierarchy, self.A.device
+        if hierarchy.unswept_cycle is not None:
+            program.extend(hierarchy.unswept_cycle)
+            self._sweep_and_measure(program.launch)
+            return
         if hierarchy.open_cycle is None:
             program.extend(hierarchy.cycle)
             self._measure(launch=program.launch)
@@ -297,6 +303,24 @@ class MultigridWorkspace(RoundedIterate):
         program.launch(kernels.climb_kernel(*residual.storage), 1, inputs, device=device)
         residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=program.launch)
         program.launch(kernels.plan_step_kernel, 1, [residual.scalars], device=device)
+
+    def _sweep_and_measure(self, launch: Launch) -> None:
+        """Make a shared cycle's last sweep, measure its correction, and plan the step."""
+        residual, finest, device = self.residual, self.hierarchy.finest, self.A.device
+        s, made = finest.stencil, kernels.sweep_and_measure_kernels(*residual.storage)
+        assert s.ghosts is not None
+        s.wrap(finest.t, launch=launch)
+        perform(partial(clear_ghosts, s, finest.x), launch)
+        fields = [finest.x, finest.b, finest.t, finest.lower, finest.upper, self.hierarchy.settings.weights[0]]
+        launch(made.sweep, 1, [*finest.operands, *fields, residual.row_sums, self._p, residual.sums.partials], device=device)
+        s.wrap(finest.x, launch=launch)
+        nz, ny, nx = s.padding.counts
+        for axis, end in s.ghosts.cuts:
+            lines, last = [(nz, ny), (nz, 1), (1, ny)][axis], (nx, ny, nz)[axis] - 1
+            inputs = [*finest.operands, axis, end, last, residual.row_sums, finest.x, self._p, residual.sums.partials]
+            launch(made.add_side, lines, inputs, device=device)
+        residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=launch)
+        launch(kernels.plan_step_kernel, 1, [residual.scalars], device=device)
 
     def _measure(self, *, launch: Launch = wp.launch) -> None:
         """Measure the cycle's correction and plan the step."""
