@@ -148,7 +148,7 @@ def trouble(dots: Dots) -> None:
 
 def main(words: list[str]) -> None:
     """Run commands of the command line with this simulator alone."""
-    plug_ins.entry_points = lambda group: [SimpleNamespace(name="dots", load=lambda: DotsSimulator())]
+    plug_ins.entry_points = lambda group: [SimpleNamespace(name="dots", load=DotsSimulator)]
     meeting.PATIENCE = 1.0
     while words:
         end = words.index("then") if "then" in words else len(words)

@@ -29,7 +29,7 @@ def run(mpi, tmp_path, monkeypatch):
     scene = tmp_path / "dots.toml"
     scene.write_text(SCENE)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(simulator, "entry_points", lambda group: [SimpleNamespace(name="dots", load=lambda: DotsSimulator())])
+    monkeypatch.setattr(simulator, "entry_points", lambda group: [SimpleNamespace(name="dots", load=DotsSimulator)])
 
     def go(ranks, *commands, exit_code=0):
         words = [[*shlex.split(command), "--device", "cpu"] for command in commands]
@@ -78,7 +78,7 @@ def assert_same_run(a: Path, b: Path) -> None:
 def test_ranks_write_the_run_of_one_process(run, tmp_path):
     run(0, "run dots.toml --out one")
     done = run(3, "run dots.toml --out three --profile")
-    assert done.stderr.count("frame 10/10") == done.stderr.count("on 3 ranks") == done.stdout.count("finished: frame 10 of 10") == 1
+    assert done.stderr.count("frame 10/10") == done.stderr.count("on 3 ranks (cpu)") == done.stdout.count("finished: frame 10 of 10") == 1
     assert done.stdout.count("rest ") == 1  # the profile
     assert_same_run(tmp_path / "one", tmp_path / "three")
     found = record(tmp_path / "three")

@@ -24,6 +24,8 @@ class Table:
         return found
 
     def _meet(self) -> None:
+        if self.barrier.parties == 1:
+            return
         self.turn.release()
         try:
             self.barrier.wait(timeout=WAIT)

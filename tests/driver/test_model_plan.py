@@ -24,6 +24,9 @@ def test_prices_add_up() -> None:
     models = [Model("walls", "asked for"), Model("band", "asked for"), Model("unknown", "asked for"), Model("walls", "", built=False)]
     assert predicted_seconds(models, LISTED, CELLS, PARTICLES) == pytest.approx(5e-3 + 2e-3 - 4e-4)
     assert predicted_seconds(models, {}, CELLS, PARTICLES) == 0.0, "nothing is known"
+    bodies = Model("walls", "three of them", count=3)
+    assert predicted_seconds([bodies], LISTED, CELLS, PARTICLES) == pytest.approx(5e-3 + 3 * 2e-3)
+    assert model_lines([bodies], LISTED, CELLS, PARTICLES, memory=200_000)[0][1].endswith("75 % of memory, 6 ms a step (55 %)")
 
 
 def test_a_line_tells_why_and_what_it_takes() -> None:
@@ -58,6 +61,9 @@ def test_every_built_in_scene_says_which_models_it_has(name: str) -> None:
     assert isinstance(scene, ParticleScene)
     said = [line.partition(":")[0] for word, line in lines if word == "model"]
     assert said == [model.name for model in scene.models() if model.built]
+    assert ("rigid bodies" in said) == any(solid.is_body for solid in scene.solid)
+    assert "moving solids" in said or "rigid bodies" not in said, "a body moves, too"
+    assert all(model.count == sum(solid.is_body for solid in scene.solid) for model in scene.models() if model.name == "rigid bodies")
     assert ("cut cells" in said) == (bool(scene.solid) and scene.domain.solids == "cut-cell")
     assert sum(word == "step" for word, _ in lines) == 1
 

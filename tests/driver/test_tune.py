@@ -166,31 +166,42 @@ def test_where_nothing_is_near_enough_the_nearest_is_chosen(monkeypatch: pytest.
 
 
 def test_what_shorter_steps_bring_tells_what_would_help(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert "shorter ones than those tried would help" in tuned(monkeypatch, Model(0.5)).verdict("standard")[-1]
-    stays = Model(0.0)
-    monkeypatch.setattr(Model, "__call__", _stays)
-    words = tuned(monkeypatch, stays).verdict("standard")[-1]
-    assert "a higher domain.resolution would help, shorter steps hardly" in words
+    falls = tuned(monkeypatch, Steps(0.0, 0.2)).verdict("standard")[-1]
+    assert falls == "the distance falls with the steps: shorter ones than those tried would help"
+    stays = tuned(monkeypatch, Steps(0.2, 0.01)).verdict("standard")[-1]
+    assert "a higher domain.resolution would help, shorter steps hardly" in stays
+    assert stays.startswith("4 times as many steps left 93 % of the distance")
 
 
-def _stays(self: Model, scene: Scene, **options: Any) -> Trial:
-    """Return a run whose distance hardly depends on its steps, of which there are 10 / cfl."""
-    cfl = scene.time.cfl
-    if cfl <= price_table()["fluids"].reference["time.cfl"]:
-        return made(0.0, 100.0)
-    ran = made(0.2 + 0.01 * cfl, 1.0 / cfl)
-    return replace(ran, steps=round(10.0 / cfl))
+class Steps(Model):
+    """Runs of 10 / cfl steps whose distance has a part that no step lessens.
+
+    Args:
+        stays: that part.
+        falls: what is beside it of a cfl of 1.
+    """
+
+    def __init__(self, stays: float, falls: float) -> None:
+        super().__init__(falls)
+        self.stays = stays
+
+    def __call__(self, scene: Scene, **options: Any) -> Trial:
+        cfl = scene.time.cfl
+        if cfl <= price_table()["fluids"].reference["time.cfl"]:
+            return made(0.0, 100.0)
+        return replace(made(self.stays + self.distance * cfl, 1.0 / cfl), steps=round(10.0 / cfl))
 
 
-@pytest.mark.parametrize("distance", [0.004, 0.012, 0.02])
+@pytest.mark.parametrize("distance", [0.019, 0.024, 0.035])
 def test_nothing_can_be_nearer_than_references_are_to_each_other(distance: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The longest step whose own distance keeps the bound is found beneath a noise of four times the bound."""
+    """The longest step whose own distance keeps the bound is found beneath a noise of four times the bound, as its square adds up."""
     model = Blurred(distance, noise=0.12)
     found = tuned(monkeypatch, model)
     bound = price_table()["fluids"].presets["standard"].distance
     assert found.scene.time.cfl == max(cfl for cfl, _ in price_table()["fluids"].steps if distance * cfl <= bound)
     assert found.met
     assert found.noise is not None
+    assert found.bounds.distance == pytest.approx(np.hypot(0.12, bound))
     assert found.noise.distance == pytest.approx(0.12)
     assert model.references == 3
     assert found.chosen.distance > bound

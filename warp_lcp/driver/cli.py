@@ -108,7 +108,7 @@ def run(
         chosen = crew.choose_device(device)
         folder = out or Path("out") / loaded.scene.name
         console = crew.console
-        console.print(f"{loaded.scene.name} on {chosen}, into {folder}", markup=False, highlight=False, soft_wrap=True)
+        console.print(f"{loaded.scene.name} on {crew.place(chosen)}, into {folder}", markup=False, highlight=False, soft_wrap=True)
         with _interruptible(console, crew.signals) as stop, Bar(console) if console.is_terminal else Lines(console) as observer:
             watch = Profile(chosen) if profile and crew.speaks else None
             record = crew.run(

@@ -72,6 +72,14 @@ class Crew:
         """
         return choose_device(name)
 
+    def place(self, device: str) -> str:
+        """Return where the crew works, in words.
+
+        Args:
+            device: of this process.
+        """
+        return device
+
     def run(
         self,
         scene: Scene,

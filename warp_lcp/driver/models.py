@@ -19,11 +19,13 @@ class Model:
         name: as in the list of prices.
         why: the key or what else of the scene asks for it.
         built: False: it was asked for, but the scene cannot need it; `why` then says so.
+        count: how many the scene has, each of which takes what the list says, such as rigid bodies.
     """
 
     name: str
     why: str
     built: bool = True
+    count: int = 1
 
 
 @dataclass(frozen=True)
@@ -62,8 +64,8 @@ def prices(simulator: str, dimension: int) -> Mapping[str, Price]:
 
 def predicted_seconds(models: Iterable[Model], listed: Mapping[str, Price], cells: int, particles: int) -> float:
     """Return how long a step takes by the list of prices [s]; 0: not known."""
-    names = ["base", *(model.name for model in models if model.built)]
-    return sum(listed[name].seconds(cells, particles) for name in names if name in listed) if "base" in listed else 0.0
+    counts = {"base": 1, **{model.name: model.count for model in models if model.built}}
+    return sum(n * listed[name].seconds(cells, particles) for name, n in counts.items() if name in listed) if "base" in listed else 0.0
 
 
 def model_lines(
@@ -86,8 +88,8 @@ def model_lines(
         text = f"{model.name}: {model.why}"
         if model.built and model.name in listed:
             price = listed[model.name]
-            share = 100.0 * price.bytes(cells, particles) / memory if memory else 0.0
-            seconds = max(price.seconds(cells, particles), 0.0)
+            share = 100.0 * model.count * price.bytes(cells, particles) / memory if memory else 0.0
+            seconds = max(model.count * price.seconds(cells, particles), 0.0)
             part = 100.0 * seconds / predicted if predicted > 0.0 else 0.0
             text += f"; {share:.0f} % of memory, {1e3 * scale * seconds:.2g} ms a step ({part:.0f} %)"
         lines.append(("model" if model.built else "not built", text))

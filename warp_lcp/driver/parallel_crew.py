@@ -81,6 +81,11 @@ class RankCrew(Crew):
             except ValueError as error:
                 raise DeviceError(str(error).removesuffix(f" (rank {self.meeting.ranks.rank})")) from error  # the meeting names it
 
+    def place(self, device: str) -> str:
+        """Return where the ranks work, in words."""
+        size = self.meeting.ranks.size
+        return f"{size} rank{'s' if size > 1 else ''} ({device})"
+
     def run(
         self,
         scene: Scene,

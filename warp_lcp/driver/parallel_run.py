@@ -165,7 +165,7 @@ def run_on_ranks(
     def create(continued: Continuation | None) -> tuple[Simulation, list[str]]:
         with meeting.together():
             simulation = _create(simulator, scene, meeting, device, folder, continued)
-        return AgreedSimulation(simulation, meeting), [f"on {_count(meeting.ranks.size)}", *simulation.notes()]
+        return AgreedSimulation(simulation, meeting), simulation.notes()
 
     ranks = meeting.ranks
     record = RunRecord(scene.scene.name, scene.scene.simulator, device, engine=Engine.PETSC.value, ranks=ranks.size)
@@ -214,10 +214,6 @@ def _create(
     except ValueError as error:
         raise SceneError(scene.scene.name, [Problem("", str(error))]) from error
     return simulation
-
-
-def _count(ranks: int) -> str:
-    return f"{ranks} rank{'s' if ranks > 1 else ''}"
 
 
 def _share(meeting: Meeting, device: str) -> float:

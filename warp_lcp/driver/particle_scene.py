@@ -115,7 +115,7 @@ class ParticleScene(Scene):
             "volume": "output.volume" if output.volume else "",
             "diagnostics": "output.diagnostics" if output.diagnostics else "",
         }
-        return [Model(name, why) for name, why in used.items() if why]
+        return [Model(name, why, count=len(bodies) if name == "rigid bodies" else 1) for name, why in used.items() if why]
 
     @property
     def endless(self) -> tuple[int, ...]:

@@ -298,7 +298,10 @@ class Hierarchy:
         self._descend(0, program, projected=False, from_zero=True, whole=False)
         return program
 
-    unswept_cycle: Program | None = None  # the linear cycle without its last sweep, where ghost cells must be filled before that
+    @cached_property
+    def unswept_cycle(self) -> Program | None:
+        """The linear cycle without its last sweep, where ghost cells must be filled before that and a caller goes on; None elsewhere."""
+        return None
 
     def last_leg(self) -> list[Any]:
         """Return what the last leg of a linear cycle takes, as `ascend` in `cycle_kernels` does."""

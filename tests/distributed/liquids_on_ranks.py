@@ -1,0 +1,127 @@
+"""Liquids on ranks, which `test_liquid_on_ranks` starts: `liquids_on_ranks.py WHAT FOLDER`; rows of the log go into the folder."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fluids.distributed import DistributedLiquid, create
+from fluids.scene import LiquidScene
+from small_liquids import box, scene
+from warp_lcp.distributed.ranks import Ranks
+from warp_lcp.driver.simulator import SimulationFailed, StepFailed
+
+DT = 0.01  # the longest step [s]
+STEPS = 10
+BALL = {"shape": "sphere", "radius": 0.12, "center": [0.5, 0.2, 0.25]}
+FLAT = {"size": [1.0, 0.5], "resolution": 32, "liquid": [box([0.0, 0.0], [0.5, 0.45])]}
+DEEP = {"size": [1.0, 0.5, 0.5], "resolution": 32, "liquid": [box([0.0, 0.0, 0.0], [0.5, 0.45, 0.5])]}
+DROP = box([0.6, 0.3, 0.1], [0.8, 0.45, 0.3], velocity=[-1.0, 0.5, 0.7])
+SCENES = {
+    "flat": FLAT,
+    "flip": DEEP | {"particles": {"transfer": "flip"}, "pressure": {"surface": "voxel"}, "wall": "free-slip"},
+    "pic": FLAT | {"particles": {"transfer": "pic"}, "pressure": {"smoothing": 2}},
+    "cut": DEEP | {"solid": [BALL], "liquid": [*DEEP["liquid"], DROP]},
+    "slivers": DEEP | {"solid": [BALL], "pressure": {"surface": "voxel"}},
+    "voxel": DEEP | {"solid": [BALL], "solids": "voxel", "solver": {"tolerance": "auto"}},
+    "full": FLAT | {"liquid": [box([0.0, 0.0], [1.0, 0.5])], "wall": "free-slip", "physics": {"gravity": [0.0, 0.0]}},
+}
+
+
+def model(name: str) -> LiquidScene:
+    """Return a scene."""
+    return scene(**SCENES[name])
+
+
+def advance(simulation, steps=STEPS):
+    """Step, and return the rows of the log."""
+    rows = []
+    for _ in range(steps):
+        dt = min(simulation.stable_dt(), DT)
+        rows.append({"dt": dt, **simulation.step(dt)})
+    return rows
+
+
+def start(ranks: Ranks, name: str, **tables) -> DistributedLiquid:
+    """Return a simulation on ranks."""
+    return create(scene(**(SCENES[name] | tables)), ranks, device="cpu", folder=Path())
+
+
+def run(ranks: Ranks, folder: Path) -> None:
+    """Run all scenes."""
+    for name in SCENES:
+        simulation = start(ranks, name)
+        rows = advance(simulation)
+        ranks.agree("the log", rows)
+        everyone = ranks.comm.allgather(list(simulation.frame()))
+        assert sum(len(points.points) for points, _ in everyone) == rows[-1]["particles"]
+        cells = np.concatenate([cells.index for _, cells in everyone])
+        assert len(np.unique(cells, axis=0)) == len(cells)
+        box_ = simulation.part.box
+        assert ((everyone[ranks.rank][1].index >= box_.low) & (everyone[ranks.rank][1].index < box_.high)).all()
+        pressure = np.concatenate([cells.fields["pressure"] for _, cells in everyone])
+        if ranks.first:
+            order = np.lexsort(cells.T)
+            np.savez(folder / f"{name}_{ranks.size}.npz", cells=cells[order], pressure=pressure[order])
+            (folder / f"{name}_{ranks.size}.json").write_text(json.dumps(rows))
+
+
+def keep(ranks: Ranks, folder: Path) -> None:
+    """Run in two halves, and keep the pieces of the state between."""
+    simulation = start(ranks, "cut")
+    first = advance(simulation, 5)
+    np.savez(folder / f"piece_{ranks.rank}.npz", **simulation.piece_state())
+    rows = first + advance(simulation, 5)
+    if ranks.first:
+        (folder / "whole.json").write_text(json.dumps(rows))
+
+
+def go_on(ranks: Ranks, folder: Path) -> None:
+    """Go on from pieces."""
+    pieces = [dict(np.load(file)) for file in sorted(folder.glob("piece_*.npz"))]
+    simulation = start(ranks, "cut")
+    simulation.restore_pieces(pieces)
+    rows = advance(simulation, 5)
+    if ranks.first:
+        (folder / f"rest_{ranks.size}.json").write_text(json.dumps(rows))
+    with pytest.raises(ValueError, match="do not cover the domain"):
+        simulation.restore_pieces(pieces[1:])
+    with pytest.raises(ValueError, match="differ from this scene's"):
+        start(ranks, "flip").restore_pieces(pieces)
+
+
+def fail(ranks: Ranks, folder: Path) -> None:
+    """Fail on all ranks alike, with the state as it was, and go on after it."""
+    simulation = start(ranks, "cut", solver={"tolerance": 1e-9, "max_iterations": 1})
+    before = simulation.piece_state()
+    with pytest.raises(StepFailed, match="MAX_ITERATIONS"):
+        simulation.step(DT)
+    after = simulation.piece_state()
+    assert simulation.step_count == 0
+    assert (np.sort(before["place"]) == np.sort(after["place"])).all()
+    simulation = start(ranks, "cut")
+    with pytest.raises(StepFailed, match="cells far"):
+        simulation.step(0.3)
+    reference = advance(start(ranks, "cut"), 2)
+    for row, expected in zip(advance(simulation, 2), reference, strict=True):
+        assert row["kinetic_energy"] == pytest.approx(expected["kinetic_energy"], rel=1e-3)  # the solve starts from another guess
+    if ranks.rank == ranks.size - 1 and simulation.particles.count:
+        velocity = simulation.particles.velocity.numpy()
+        velocity[3] = np.nan
+        simulation.particles.velocity.assign(velocity)
+    with pytest.raises(SimulationFailed, match=r"velocity is not finite in cell .* \(1 particles\)") as failed:
+        simulation.step(DT)
+    ranks.agree("the message", str(failed.value))
+
+
+def differ(ranks: Ranks, folder: Path) -> None:
+    """Refuse scenes that are not the same."""
+    with pytest.raises(ValueError, match="the scene on rank 1 is not what it is on rank 0"):
+        start(ranks, "flat", time={"duration": 1.0 + ranks.rank})
+
+
+if __name__ == "__main__":
+    world = Ranks.world()
+    {"run": run, "keep": keep, "go-on": go_on, "fail": fail, "differ": differ}[sys.argv[1]](world, Path(sys.argv[2]))

@@ -1,0 +1,168 @@
+"""Liquids that ranks share have the log, the frames and the failures of one process."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from liquids_on_ranks import DEEP, FLAT, SCENES, advance, model
+from turns import Seat
+
+from fluids import distributed
+from small_liquids import box, create, scene
+from warp_lcp.distributed.ranks import Ranks
+
+PROGRAM = Path(__file__).with_name("liquids_on_ranks.py")
+TESTS = Path(__file__).parents[1]
+# What is left of the residual is as large as the rounding of the solve: it is compared with what it is a small part of.
+NOISE = {"solve_residual": lambda row: 1.0, "max_divergence": lambda row: 32.0 * max(row["max_speed"], 0.1)}
+
+
+def same(rows, expected, rel):
+    """Assert that two logs are the same: numbers of all kinds but for what rounding changes."""
+    assert len(rows) == len(expected)
+    for row, other in zip(rows, expected, strict=True):
+        assert row.keys() == other.keys()
+        for name, value in other.items():
+            if name in NOISE:
+                assert abs(row[name] - value) <= rel * NOISE[name](other), name
+            elif isinstance(value, float):
+                assert row[name] == pytest.approx(value, rel=rel, abs=1e-12), name
+            else:
+                assert row[name] == value, name
+
+
+def alone(model_, **options):
+    """Return a simulation on one rank, for which no MPI is needed."""
+    return distributed.create(model_, Ranks(Seat(0, 1)), device="cpu", folder=Path(), **options)
+
+
+@pytest.mark.parametrize("name", ["flat", "cut", "voxel"])
+def test_one_rank_is_one_process_bit_for_bit(name):
+    single, shared = create(model(name)), alone(model(name))
+    assert advance(shared, 6) == advance(single, 6)
+    state, piece = single.state(), shared.piece_state()
+    for array in ("position", "velocity", "affine_0"):
+        np.testing.assert_array_equal(piece[array], state[array])
+    for array in ("pressure", "cells", "contact"):
+        inner = state[array][1:-1, 1:-1, 1:-1]
+        np.testing.assert_array_equal(piece[array], inner)
+    assert shared.notes()[0] == single.notes()[0]
+    for part, expected in zip(shared.frame(), single.frame(), strict=True):
+        np.testing.assert_array_equal(getattr(part, "index", None), getattr(expected, "index", None))
+        for field, values in expected.fields.items():
+            np.testing.assert_array_equal(part.fields[field], values)
+
+
+@pytest.fixture(scope="module")
+def logs():
+    """The logs of one process, and the pressures in its last frames."""
+    found = {}
+    for name in SCENES:
+        simulation = create(model(name))
+        rows = advance(simulation)
+        cells = simulation.frame()[1]
+        order = np.lexsort(cells.index.T)
+        found[name] = rows, cells.index[order], cells.fields["pressure"][order]
+    return found
+
+
+@pytest.mark.parametrize("ranks", [2, 4])
+def test_ranks_have_the_log_and_the_pressure_of_one_process(mpi, tmp_path, logs, ranks):
+    mpi(ranks, PROGRAM, "run", tmp_path, environment={"PYTHONPATH": f"{TESTS}:{TESTS.parent}"}, seconds=300.0)
+    for name, (rows, cells, pressure) in logs.items():
+        same(json.loads((tmp_path / f"{name}_{ranks}.json").read_text()), rows, 1e-6)
+        assert rows[-1]["particles"] == rows[0]["particles"]
+        saved = np.load(tmp_path / f"{name}_{ranks}.npz")
+        np.testing.assert_array_equal(saved["cells"], cells)
+        np.testing.assert_allclose(saved["pressure"], pressure, atol=1e-5 * np.abs(pressure).max())
+
+
+def test_a_run_goes_on_on_any_number_of_ranks(mpi, tmp_path):
+    environment = {"PYTHONPATH": f"{TESTS}:{TESTS.parent}"}
+    mpi(2, PROGRAM, "keep", tmp_path, environment=environment)
+    whole = json.loads((tmp_path / "whole.json").read_text())[5:]
+    for ranks in (1, 2, 4):
+        mpi(ranks, PROGRAM, "go-on", tmp_path, environment=environment)
+        same(json.loads((tmp_path / f"rest_{ranks}.json").read_text()), whole, 0.0 if ranks == 2 else 1e-6)
+
+
+def test_failures_are_those_of_all_ranks(mpi, tmp_path):
+    environment = {"PYTHONPATH": f"{TESTS}:{TESTS.parent}"}
+    mpi(2, PROGRAM, "fail", tmp_path, environment=environment)
+    mpi(2, PROGRAM, "differ", tmp_path, environment=environment)
+
+
+def test_pieces_of_any_boxes_can_be_read():
+    simulation = alone(model("flat"))
+    advance(simulation, 3)
+    whole = simulation.piece_state()
+    pieces = []
+    for low, high in ((0, 13), (13, 32)):
+        mine = (whole["position"][:, 0] < 0.55) if low == 0 else (whole["position"][:, 0] >= 0.55)  # some have not moved on yet
+        part = {name: values[mine] for name, values in whole.items() if name[:6] in ("positi", "veloci", "affine", "place")}
+        fields = {name: whole[name][:, :, low:high] for name in ("pressure", "cells", "contact")}
+        pieces.append(whole | part | fields | {"box": np.array([[low, 0, 0], [high, 16, 1]])})
+    again = alone(model("flat"))
+    again.restore_pieces(pieces[::-1])
+    for name, values in again.piece_state().items():
+        np.testing.assert_array_equal(values, whole[name])
+    assert advance(again, 3) == advance(simulation, 3)
+
+
+def damaged(name, change):
+    """Return a piece of which something is changed."""
+    simulation = alone(model(name))
+    advance(simulation, 1)
+    piece = dict(simulation.piece_state())
+    change(piece)
+    return simulation, piece
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda p: p.pop("place"), "lacks place"),
+        (lambda p: p.update(signature=p["signature"] + 1), "differ from this scene's"),
+        (lambda p: p.update(box=np.array([[0, 0, 0], [31, 16, 1]])), "do not cover the domain"),
+        (lambda p: p["velocity"].__setitem__((3, 0), np.nan), "not finite"),
+        (lambda p: p["cells"].__setitem__((0, 3, 4), 2), "solids are not this scene's"),
+        (lambda p: p.update({n: p[n][1:] for n in ("position", "velocity", "affine_0", "affine_1", "place")}), "927 particles.*928"),
+    ],
+)
+def test_pieces_of_something_else_are_refused(change, message):
+    simulation, piece = damaged("flat", change)
+    with pytest.raises(ValueError, match=message):
+        simulation.restore_pieces([piece])
+
+
+@pytest.mark.parametrize(
+    ("tables", "key"),
+    [
+        (FLAT | {"density_correction": {}}, "density_correction"),
+        (FLAT | {"particles": {"reseed": {}}}, "particles.reseed"),
+        (FLAT | {"particles": {"narrow_band": {}}}, "particles.narrow_band"),
+        (FLAT | {"pressure": {"model": "unilateral"}}, 'pressure.model = "unilateral"'),
+        (FLAT | {"output": {"surface": True}}, "output.surface"),
+        (DEEP | {"output": {"volume": True}}, "output.volume"),
+        (FLAT | {"drain": [box([0.9, 0.0], [1.0, 0.1])]}, "drain"),
+        (FLAT | {"source": [box([0.9, 0.3], [1.0, 0.4], velocity=[-1.0, 0.0])]}, "source"),
+        (FLAT | {"solid": [box([0.7, 0.1], [0.8, 0.2], mass=10.0)]}, r"solid\[0\].mass"),
+        (FLAT | {"solid": [box([0.7, 0.1], [0.8, 0.2], motion={"kind": "translation", "velocity": [0.1, 0.0]})]}, r"solid\[0\].motion"),
+    ],
+)
+def test_what_ranks_have_not_is_refused_by_name(tables, key):
+    with pytest.raises(ValueError, match=f"{key} is not there on several processes"):
+        alone(scene(**tables))
+
+
+def test_open_sides_are_refused_by_name():
+    tables = json.loads(model("flat").model_dump_json())
+    tables["domain"]["open"] = ["right"]
+    with pytest.raises(ValueError, match=r"domain\.open is not there"):
+        alone(type(model("flat")).model_validate(tables))
+
+
+def test_liquid_without_a_particle_is_refused():
+    with pytest.raises(ValueError, match=r"liquid\[1\] \(box\) holds no particle"):
+        alone(scene(**(FLAT | {"liquid": [*FLAT["liquid"], box([0.1, 0.1], [0.2, 0.2])]})))

@@ -1,0 +1,45 @@
+"""A rank that is killed or interrupted ends all; ranks that were given different things say so."""
+
+import pytest
+
+FAIL = """
+    import os, signal, sys, time
+    from warp_lcp.distributed import meeting as meetings
+    from warp_lcp.distributed.ranks import Ranks
+
+    def say(text):
+        sys.stderr.write(text + "\\n")
+
+    meetings.PATIENCE = 2.0
+    ranks = Ranks.world()
+    what = sys.argv[1]
+    try:
+        with meetings.Meeting(ranks, (ValueError,), say).together():
+            if what == "interrupt" and ranks.rank == 1:
+                os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(30)
+            if what == "killed" and ranks.rank == 1:
+                os.kill(os.getpid(), signal.SIGKILL)
+            if what == "differ":
+                ranks.agree("the scene", f"text {ranks.rank == 1}")
+            ranks.sum(1)  # with the others they wait here for a rank that does not come
+    except ValueError as error:
+        if ranks.first:
+            say(str(error))
+        sys.exit(2)
+    print("done")
+"""
+
+
+@pytest.mark.parametrize("what", ["interrupt", "killed"])
+def test_one_ends_all(mpi, what):
+    done = mpi(2, FAIL, what, exit_code=None, seconds=60.0)
+    assert done.returncode != 0
+    assert "done" not in done.stdout
+    assert ("rank 1 of 2: " in done.stderr and "KeyboardInterrupt" in done.stderr) == (what == "interrupt")
+
+
+def test_different_things_are_refused_once(mpi):
+    done = mpi(3, FAIL, "differ", exit_code=2)
+    assert done.stderr.count("the scene on rank 1 is not what it is on rank 0: start all ranks with the same command and files") == 1
+    assert "done" not in done.stdout
