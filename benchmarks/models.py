@@ -25,7 +25,7 @@ from benchmarks.machine import machine
 from benchmarks.memory import array_bytes
 from benchmarks.record import Record, Results, Table
 from benchmarks.timing import Figure, Options
-from warp_lcp.driver.models import TABLE
+from warp_lcp.driver.models import TABLE, prices
 from warp_lcp.driver.profile import Profile
 from warp_lcp.driver.run import plan_dt
 from warp_lcp.driver.scene import Scene, Time
@@ -281,8 +281,9 @@ PAGE = """# What models cost
 
 A scene has what it asks for and nothing else: a model that is off loads no kernel, allocates no byte and logs no column (a test for each of
 them proves it). `warp-lcp check SCENE` says which models a scene turns on and why, and what they take of its memory and of a step, by the
-prices below; `--calibrate` takes a few steps and scales them to the machine at hand. What a scene asks for but cannot need is not built,
-and the plan says so:
+prices below; `--calibrate` takes a few steps and scales them to the machine at hand. The prices are those of half a second of a run, with
+steps as long as a run's, and of two resolutions: a part of each is the same at any size, a part grows with the cells or the particles. What
+a scene asks for but cannot need is not built, and the plan says so:
 
 - where no wall separates, or no side has a wall, the pressure is the solution of equations: no bounds are stored or tested;
 - a closed box full of liquid has no free surface, and no level set is made for one;
@@ -314,12 +315,13 @@ its own is in units of a cell's weight.
 
 def write_page(page: Path, results: Results, automatic: Table) -> None:
     """Write the page of the documentation."""
-    tables = "\n\n".join(f"## {table.title}\n\n{_markdown(table)}" for table in results.tables)
+    tables = "\n\n".join(f"## {table.title}\n\n{markdown(table)}" for table in results.tables)
     machine = str(results.records[0].facts["hardware"]["cpu"])
-    page.write_text(PAGE.format(machine=machine, tables=tables, automatic=_markdown(automatic)), "utf-8")
+    page.write_text(PAGE.format(machine=machine, tables=tables, automatic=markdown(automatic)), "utf-8")
 
 
-def _markdown(table: Table) -> str:
+def markdown(table: Table) -> str:
+    """Return a table as the page has it."""
     return "\n".join([table.remark, "", _row(table.columns), _row(["---"] * len(table.columns)), *map(_row, table.rows)])
 
 
@@ -340,6 +342,8 @@ def main() -> None:
     compared = importlib.import_module("benchmarks.automatic_tolerance").measure(options, Path())
     head = "# What models add to a step and to memory, by simulator and dimension; written by `python -m benchmarks.models`.\n\n"
     Path(str(files("warp_lcp.driver") / TABLE)).write_text(head + tomli_w.dumps(price_list(results.records)), "utf-8")
+    prices.cache_clear()
+    results.tables.extend(importlib.import_module("benchmarks.predictions").measure(options, Path()).tables)
     write_page(given.page, results, compared.tables[0])
 
 

@@ -17,12 +17,13 @@ import warp as wp
 
 import warp_lcp as wl
 from fluids.distributed_pressure import DistributedPressure
-from fluids.distributed_state import Piece, PieceReader
+from fluids.distributed_state import Piece, PieceReader, piece_of
 from fluids.distributed_surface import make_shared_surface
 from fluids.pressure import PressureProjection
 from fluids.scene import LiquidScene
 from fluids.simulator import LiquidSimulation
 from fluids.surface import FreeSurface
+from warp_lcp.distributed.balance import balanced_processes, pool
 from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.particles import SharedParticles
 from warp_lcp.distributed.ranks import Ranks
@@ -87,8 +88,15 @@ class DistributedLiquid(LiquidSimulation):
     def begin_step(self, dt: float) -> ParticleTotals:
         """Check time step and particles, bring the particles into order with ghosts, and return sums over all; see the base class."""
         self._dt = dt
-        self.particles.drop_ghosts()  # of a step that failed
         return super().begin_step(dt)
+
+    def step(self, dt: float) -> Row:
+        """Advance by dt [s]; see the base class. What it raises is raised on all ranks."""
+        try:
+            return super().step(dt)
+        except (StepFailed, SimulationFailed):
+            self.particles.drop_ghosts()
+            raise
 
     def bring_to_faces(self, window: Window, dt: float) -> None:
         """Bring the particles' velocities to the faces, and let gravity act on them for dt [s]."""
@@ -197,8 +205,8 @@ class DistributedLiquid(LiquidSimulation):
         return self.piece_state()
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from the state of a run on one rank."""
-        self.restore_pieces([state])
+        """Continue from the state of a simulation in one process; collective."""
+        self.restore_pieces([state if "box" in state else piece_of(state)])
 
 
 class Refill:
@@ -239,10 +247,7 @@ def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> Distribu
     refused = refusals(scene)
     if refused:
         raise ValueError("; ".join(f"{key} {NOT_ON_RANKS}" for key in refused))
-    layers = ghost_layers(scene.time.cfl, scene.pressure.smoothing)
-    part = Subdomain(
-        Decomposition(scene.cell_counts, ranks), spacing=scene.spacing, dimension=scene.dimension, device=device, layers=layers
-    )
+    part = _part(scene, ranks, device)
     cut_cells, separating = scene.domain.solids == "cut-cell", scene.domain.wall == "separating"
     boundary, warnings = boundary_of_part(part, placed_solids(scene, folder), cut_cells=cut_cells, wall_separating=separating)
     elsewhere = np.ones(part.grid.counts[::-1], dtype=bool)
@@ -252,6 +257,24 @@ def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> Distribu
     velocity = start_velocities(scene).astype(np.float32)[owner]
     particles = SharedParticles(part, position, velocity, affine=scene.particles.transfer == "apic")
     return DistributedLiquid(scene, part, boundary, particles, notes=[*warnings, *notes])
+
+
+def _part(scene: LiquidScene, ranks: Ranks, device: str) -> Subdomain:
+    """Return where this rank works: all have about as much liquid, at the start and when it has come to rest."""
+    counts, layers = scene.cell_counts, ghost_layers(scene.time.cfl, scene.pressure.smoothing)
+    size = np.array([*scene.domain.size, scene.spacing][:3])
+    start = []
+    for shape in scene.materials()[1]:
+        bounds = shape.bounds(scene.dimension)
+        low, high = (np.zeros(3), size) if bounds is None else (np.clip(corner, 0.0, size) for corner in bounds)
+        if scene.dimension == 2:
+            low[2], high[2] = 0.0, scene.spacing
+        start.append((low / scene.spacing, high / scene.spacing))
+    volume = sum(float(np.prod(high - low)) for low, high in start)
+    rest = pool(counts, scene.dimension, volume, np.array(scene.physics.gravity))
+    processes = balanced_processes(counts, ranks.size, layers=layers, states=[start, [rest]])
+    decomposition = Decomposition(counts, ranks, processes=processes)
+    return Subdomain(decomposition, spacing=scene.spacing, dimension=scene.dimension, device=device, layers=layers)
 
 
 def refusals(scene: LiquidScene) -> list[str]:

@@ -35,6 +35,53 @@ class Taken:
     numbers: dict[str, np.ndarray]
 
 
+def piece_of(state: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the state of a simulation in one process as the piece of a rank that has everything.
+
+    Raises:
+        ValueError: it is not the state of a liquid.
+    """
+    missing = sorted({"signature", "position", *CELLS} - state.keys())
+    if missing:
+        raise ValueError(f"the state lacks {', '.join(missing)}: it does not belong to this scene")
+    counts = np.asarray(state["signature"][:3], dtype=np.int64)
+    cells = {name: np.ascontiguousarray(state[name][1:-1, 1:-1, 1:-1]) for name in CELLS}
+    place = np.arange(len(state["position"]), dtype=np.int64)
+    return {**state, **cells, "counts": counts, "box": np.array([np.zeros(3, dtype=np.int64), counts]), "place": place}
+
+
+def state_of(pieces: Sequence[Piece], like: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the pieces of all ranks as the state of a simulation in one process.
+
+    Args:
+        pieces: of all ranks.
+        like: a state of the same scene in one process, which gives names, types and what lies around the domain.
+
+    Raises:
+        ValueError: the pieces do not cover the domain, or lack something.
+    """
+    missing = sorted({name for piece in pieces for name in (*like, "place", "box") if name not in piece})
+    if missing or not pieces:
+        raise ValueError(f"the pieces lack {', '.join(missing) or 'everything'}: they do not belong to this scene")
+    order = np.argsort(np.concatenate([piece["place"] for piece in pieces]), kind="stable")
+    whole, covered = {}, 0
+    for name, values in like.items():
+        if name in CELLS:
+            whole[name] = np.array(values)
+        elif values.ndim == 2:
+            whole[name] = np.concatenate([piece[name] for piece in pieces])[order]
+        else:
+            whole[name] = np.asarray(pieces[0][name])
+    for piece in pieces:
+        low, high = piece["box"] + 1  # a ring of cells lies around the domain
+        covered += int(np.prod(high - low))
+        for name in CELLS:
+            whole[name][tuple(slice(a, b) for a, b in zip(low[::-1], high[::-1], strict=True))] = piece[name]
+    if covered != np.prod(pieces[0]["counts"]):
+        raise ValueError("the pieces do not cover the domain: some are missing, or twice there")
+    return whole
+
+
 class PieceReader:
     """Takes from pieces what lies in a rank's box.
 

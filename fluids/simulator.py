@@ -166,6 +166,16 @@ class LiquidSimulation(ParticleSimulation):
         """Continue from the arrays of `own_state`."""
         self.projection.restore(dict(state))
 
+    def restore_pieces(self, pieces: Sequence[Mapping[str, np.ndarray]]) -> None:
+        """Continue from the pieces of all ranks of a run on several, see `fluids.distributed`.
+
+        Raises:
+            ValueError: the pieces do not belong to this scene.
+        """
+        from fluids.distributed_state import state_of  # what only such runs need
+
+        self.restore(state_of(pieces, self.state()))
+
     def _project(self, window: Window, dt: float, speed: float) -> Projection:
         """Solve for the pressure and project the velocity."""
         projection, watch = self.projection, self.watch

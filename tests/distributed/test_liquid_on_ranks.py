@@ -145,6 +145,7 @@ def test_pieces_of_something_else_are_refused(change, message):
         (FLAT | {"pressure": {"model": "unilateral"}}, 'pressure.model = "unilateral"'),
         (FLAT | {"output": {"surface": True}}, "output.surface"),
         (DEEP | {"output": {"volume": True}}, "output.volume"),
+        (FLAT | {"domain": {"size": [1.0, 0.5], "resolution": 32, "open": ["right"]}}, "domain.open"),
         (FLAT | {"drain": [box([0.9, 0.0], [1.0, 0.1])]}, "drain"),
         (FLAT | {"source": [box([0.9, 0.3], [1.0, 0.4], velocity=[-1.0, 0.0])]}, "source"),
         (FLAT | {"solid": [box([0.7, 0.1], [0.8, 0.2], mass=10.0)]}, r"solid\[0\].mass"),
@@ -154,13 +155,6 @@ def test_pieces_of_something_else_are_refused(change, message):
 def test_what_ranks_have_not_is_refused_by_name(tables, key):
     with pytest.raises(ValueError, match=f"{key} is not there on several processes"):
         alone(scene(**tables))
-
-
-def test_open_sides_are_refused_by_name():
-    tables = json.loads(model("flat").model_dump_json())
-    tables["domain"]["open"] = ["right"]
-    with pytest.raises(ValueError, match=r"domain\.open is not there"):
-        alone(type(model("flat")).model_validate(tables))
 
 
 def test_liquid_without_a_particle_is_refused():

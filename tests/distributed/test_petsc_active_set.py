@@ -32,6 +32,40 @@ WITH_OPTIONS = """
     assert np.abs(plain.x.numpy() - other.x.numpy()).max() < 1e-7 * np.abs(plain.x.numpy()).max()
 """
 
+IN_PLACE = """
+    import numpy as np
+    import warp as wp
+    import warp_lcp as wl
+    from warp_lcp.distributed.petsc_active_set import PetscActiveSet
+
+    def cells(height):
+        found = np.full((12, 20, 14), wl.AIR, dtype=np.int8)
+        found[:, :height, : height + 2] = wl.FLUID
+        found[3:5, 2:4, 5:9] = wl.SOLID
+        return found
+
+    def padded(seed):
+        field = np.zeros((14, 22, 16))
+        field[1:-1, 1:-1, 1:-1] = np.random.default_rng(seed).standard_normal((12, 20, 14))
+        return field
+
+    stopping, method = wl.StoppingCriteria(rtol=1e-9), PetscActiveSet(precision="double")
+    A, b = wl.GridPoisson(cells(9), device="cpu"), wp.array(padded(19), dtype=wp.float64, device="cpu")
+    problem = wl.LCP(A, b)
+    work = method.init(problem)
+    assert wl.solve(problem, method, workspace=work, stopping=stopping)
+    for height, seed in ((5, 23), (12, 27)):
+        A.update(wp.array(cells(height), dtype=wp.int8, device="cpu"))
+        b.assign(padded(seed))
+        again = wl.solve(problem, method, workspace=work, stopping=stopping)
+        other = wl.LCP(wl.GridPoisson(cells(height), device="cpu"), padded(seed)[1:-1, 1:-1, 1:-1])
+        fresh = wl.solve(other, method, stopping=stopping)
+        assert again and fresh, (again.status, fresh.status)
+        assert again.linear_iterations == fresh.linear_iterations
+        x = fresh.x.numpy()
+        assert np.abs(again.x.numpy()[1:-1, 1:-1, 1:-1] - x).max() <= 1e-12 * np.abs(x).max()
+"""
+
 
 @pytest.fixture(scope="module")
 def told():
@@ -73,6 +107,10 @@ def test_statuses_and_limits(mpi, told):
     assert max(np.diff([step[1] for step in found["cube, few"]["history"]])) == 1
     for name in ("cube", "brick", "plane"):
         assert found[name]["linear_iterations"] <= 16, name  # as many as one linear solve to that accuracy
+
+
+def test_problems_that_change_in_place_keep_their_workspace(mpi):
+    mpi(1, IN_PLACE)
 
 
 def test_options_of_petsc_count(mpi):

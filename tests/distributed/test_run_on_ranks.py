@@ -166,12 +166,10 @@ WRONG = {  # commands, with what is said of each
     "run dots.toml --out out --force --record-problems problems": "--record-problems: not with --engine petsc",
     "DOTS_REFUSE=liquid[0] run dots.toml --out out --force": "dots: liquid[0]",
     "DOTS_REFUSE=liquid[1{rank}] run dots.toml --out out --force": "rank 0: dots: liquid[10]; rank 1: dots: liquid[11]",
-    "run one/scene.toml --out one --resume": "written by --engine single, which has to continue it",
 }
 
 
 def test_wrong_input_is_said_once(run, tmp_path):
-    run(0, "run dots.toml --out one --frames 1")
     done = run(2, "run dots.toml --out out --frames 1", *WRONG, exit_code=2)
     assert done.stderr.count("exit code 0") == 2
     assert done.stderr.count("exit code 2") == 2 * len(WRONG)
@@ -179,8 +177,19 @@ def test_wrong_input_is_said_once(run, tmp_path):
         assert done.stderr.count(expected) == 1
     assert "Traceback" not in done.stderr
     assert record(tmp_path / "out")["status"] == "finished"  # as it was
-    alone = run(0, "run dots.toml --out out --resume", exit_code=2)
-    assert "written by 2 ranks; continue with --engine petsc, on any number of ranks" in alone.stderr
+
+
+def test_engines_continue_each_other(run, tmp_path):
+    """One process goes on where two ranks ended, and two ranks where that ended."""
+    run(0, "run dots.toml --out one")
+    run(2, "run dots.toml --out out --frames 3")
+    run(0, "run dots.toml --out out --frames 7 --resume")
+    assert (record(tmp_path / "out")["engine"], record(tmp_path / "out")["frames"]) == ("single", 7)
+    run(2, "run dots.toml --out out --resume")
+    assert_same_run(tmp_path / "one", tmp_path / "out")
+    for name in ("particles", "grid"):
+        collection = (tmp_path / "out" / f"{name}.pvd").read_text()
+        assert (collection.count(".pvtu"), collection.count(".vtu")) == (7, 4)
 
 
 def test_different_input_is_named(mpi, tmp_path):

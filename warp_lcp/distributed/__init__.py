@@ -3,6 +3,8 @@
 from warp_lcp.distributed.decomposition import Box, Decomposition
 from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
 from warp_lcp.distributed.halo import Halo
+from warp_lcp.distributed.petsc_active_set import PetscActiveSet
+from warp_lcp.distributed.petsc_matrix import PetscGrid
 from warp_lcp.distributed.ranks import Ranks
 
-__all__ = ["Box", "Decomposition", "DistributedGridPoisson", "Halo", "Ranks"]
+__all__ = ["Box", "Decomposition", "DistributedGridPoisson", "Halo", "PetscActiveSet", "PetscGrid", "Ranks"]

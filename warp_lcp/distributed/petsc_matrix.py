@@ -114,6 +114,12 @@ class StencilMatrix:
 
     multTranspose = mult  # noqa: N815  # PETSc's name; B is symmetric
 
+    def createSubMatrix(  # noqa: N802  # PETSc's name
+        self, matrix: PETSc.Mat, rows: PETSc.IS, columns: PETSc.IS, out: PETSc.Mat | None = None
+    ) -> PETSc.Mat:
+        """Return B on some rows and columns, as products with zeros elsewhere: methods for bounds solve on free cells."""
+        return petsc().Mat().createSubMatrixVirtual(matrix, rows, columns)
+
     def getDiagonal(self, matrix: PETSc.Mat, d: PETSc.Vec) -> None:  # noqa: N802  # PETSc's name
         """D = diag(B)."""
         padding = self._stencil.padding
@@ -149,8 +155,9 @@ class CyclePreconditioner:
 class PetscGrid:
     """A grid operator and its multigrid as PETSc's objects, on all unknowns or on a free set.
 
-    With them PETSc's own methods work on the operator, matrix-free: KSP, and TAO's bounded ones with `-tao_subset_type matrixfree` and
-    `-pc_type none`. Everything here is collective where ranks share the operator. Keep the grid while PETSc uses its objects.
+    With them PETSc's own methods work on the operator, matrix-free: KSP with the cycle; SNES's vinewtonrsls and TAO's tron and gpcg, which
+    take free sets out of the operator themselves, with `-pc_type none` or jacobi. Everything here is collective where ranks share the
+    operator. Keep the grid while PETSc uses its objects.
 
     Grids whose FLUID cells touch neither AIR nor a shift are singular: tell PETSc the constants as the matrices' null space.
 
@@ -167,7 +174,7 @@ class PetscGrid:
         copies: between vectors and stored fields.
 
     Example:
-        >>> from warp_lcp.distributed.petsc_matrix import PetscGrid  # doctest: +SKIP
+        >>> from warp_lcp.distributed import PetscGrid  # doctest: +SKIP
         >>> grid = PetscGrid(A)  # doctest: +SKIP
         >>> b, x, ksp = grid.vector(values), grid.vector(), grid.solver()  # doctest: +SKIP
         >>> ksp.solve(b, x)  # doctest: +SKIP

@@ -6,7 +6,7 @@ import hashlib
 import json
 import re
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -15,13 +15,14 @@ from typing import Any
 import numpy as np
 
 from warp_lcp.driver.atomic import replacing
+from warp_lcp.driver.rank_folder import in_ranks, rank_folder
 
 FORMAT = 2
 CHECKPOINT_FILE = re.compile(r"step_(?P<step>\d{6,})\.npz")
 REFUSED_FILE = re.compile(r"refused_\d{6,}\.npz")  # set aside when a run continued from an earlier one
 STATE = "state/"
 META = "meta"
-PIECES = "pieces"  # the only array of a checkpoint whose state is in the files of ranks: a checksum of each
+PIECES = "pieces_of_ranks"  # the only array of a checkpoint whose state is in the files of ranks: a checksum of each
 
 
 class CheckpointError(ValueError):
@@ -50,8 +51,39 @@ class Checkpoint:
         return _checksum(self.state)
 
 
+class StoredPiece(Mapping[str, np.ndarray]):
+    """A rank's piece of a state in its file; an array is read when it is asked for.
+
+    Args:
+        path: of the file, which has been verified.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Read the arrays' names."""
+        self.path = path
+        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
+            self._names = [name.removeprefix(STATE) for name in file.files if name.startswith(STATE)]
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Read an array."""
+        if name not in self._names:
+            raise KeyError(name)
+        with open(self.path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
+            return np.asarray(file[STATE + name])
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over the arrays' names."""
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        """Return the number of arrays."""
+        return len(self._names)
+
+
 class CheckpointFolder:
     """The checkpoints of one run, `step_<number>.npz`.
+
+    Those of a run on several ranks have their states in pieces, `rank_0003/step_<number>.npz`; `step_<number>.npz` has their checksums.
 
     Args:
         folder: made when the first checkpoint is written.
@@ -100,13 +132,17 @@ class CheckpointFolder:
         return self.path(checkpoint.step)
 
     def prune(self, kept: int) -> None:
-        """Delete all but the newest `kept`.
+        """Delete all but the newest `kept`, and pieces that belong to none.
 
         Raises:
             OSError: a file cannot be deleted.
         """
         for step in self.steps()[kept:]:
             self.path(step).unlink()
+        steps = self.steps()
+        for step, piece in self._all_pieces():
+            if step not in steps:
+                piece.unlink()
 
     def set_aside(self, after: int) -> list[Path]:
         """Rename what is newer than a step, so that it is neither continued from nor counted; return the new names.
@@ -114,6 +150,9 @@ class CheckpointFolder:
         Raises:
             OSError: a file cannot be renamed.
         """
+        for step, piece in self._all_pieces():
+            if step > after:
+                piece.replace(piece.with_name(f"refused_{step:06d}.npz"))
         return [self.path(step).replace(self.folder / f"refused_{step:06d}.npz") for step in self.steps() if step > after]
 
     def read(self, step: int) -> Checkpoint:
@@ -145,12 +184,51 @@ class CheckpointFolder:
             raise CheckpointError(f"{path}: holds step {written}, renamed")
         return checkpoint
 
+    def verify(self, checkpoint: Checkpoint) -> None:
+        """Read and verify the pieces of a checkpoint, if it is in pieces.
+
+        Raises:
+            CheckpointError: one of them cannot be used.
+        """
+        for rank in range(len(checkpoint.state.get(PIECES, ()))):
+            if problem := self.problem(checkpoint, rank):
+                raise CheckpointError(problem)
+
+    def problem(self, checkpoint: Checkpoint, rank: int) -> str:
+        """Return why a rank's piece of a checkpoint cannot be used, "" if it can."""
+        folder = self.of_rank(rank)
+        try:
+            if folder.read(checkpoint.step).checksum == checkpoint.state[PIECES][rank]:
+                return ""
+        except CheckpointError as error:
+            return str(error)
+        return f"{folder.path(checkpoint.step)}: belongs to another checkpoint"
+
+    def pieces(self, checkpoint: Checkpoint) -> list[StoredPiece]:
+        """Return the pieces of a checkpoint, which have been verified.
+
+        Raises:
+            OSError: a file cannot be read.
+        """
+        return [StoredPiece(self.of_rank(rank).path(checkpoint.step)) for rank in range(len(checkpoint.state[PIECES]))]
+
+    def of_rank(self, rank: int) -> CheckpointFolder:
+        """Return the folder of a rank's pieces."""
+        return CheckpointFolder(self.folder / rank_folder(rank), self.fingerprint)
+
+    def _all_pieces(self) -> list[tuple[int, Path]]:
+        """Return the pieces of all ranks with their steps."""
+        matches = [(CHECKPOINT_FILE.fullmatch(file.name), file) for file in in_ranks(self.folder) if file.parent != self.folder]
+        return [(int(match["step"]), file) for match, file in matches if match]
+
     def newest(self) -> tuple[Checkpoint | None, list[str]]:
         """Return the newest valid checkpoint, if there is one, and what is wrong with each newer file."""
         refused: list[str] = []
         for step in self.steps():
             try:
-                return self.read(step), refused
+                found = self.read(step)
+                self.verify(found)
+                return found, refused
             except CheckpointError as error:
                 refused.append(str(error))
         return None, refused

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from warp_lcp.distributed.meeting import Meeting
-from warp_lcp.driver.checkpoint import PIECES, Checkpoint
+from warp_lcp.driver.checkpoint import PIECES
 from warp_lcp.driver.frames import FrameWriter
 from warp_lcp.driver.log import Log, Value
 from warp_lcp.driver.parallel_checkpoint import ParallelCheckpoints
@@ -128,28 +131,30 @@ class ParallelRunFolder(RunFolder):
                 super().start(record)
 
     def resume(self) -> Continuation:
-        """Return where to continue: the newest checkpoint of which all pieces are valid.
+        """Return where to continue: the newest checkpoint of which all pieces are valid; one of a single process is on all ranks.
 
         Raises:
             OutputError: there is no run, its scene is another one, or no checkpoint is valid.
         """
         while True:
             found: Continuation | None = None
+            whole: Mapping[str, np.ndarray] = {}
             with self.meeting.led():
                 if self._first:
                     found = super().resume()
+                    if found.checkpoint is not None and PIECES not in found.checkpoint.state:  # too much for a message
+                        whole, found = found.checkpoint.state, replace(found, checkpoint=replace(found.checkpoint, state={}))
             continued: Continuation = self.meeting.share(found)
-            if continued.checkpoint is None or self.checkpoints.complete(continued.checkpoint):
+            checkpoint = continued.checkpoint
+            if checkpoint is None:
                 return continued
-
-    def check_engine(self, checkpoint: Checkpoint) -> None:
-        """Refuse a checkpoint that is not one in pieces.
-
-        Raises:
-            OutputError: it was written by one process.
-        """
-        if PIECES not in checkpoint.state:
-            raise OutputError(f"{self.checkpoints.path(checkpoint.step)}: written by --engine single, which has to continue it")
+            if checkpoint.state:
+                if self.checkpoints.complete(checkpoint):
+                    return continued
+                continue
+            with self.meeting.together():
+                state = whole if self._first else self.checkpoints.read(checkpoint.step).state
+            return replace(continued, checkpoint=replace(checkpoint, state=state))
 
     def go_on(self, record: RunRecord, step: int) -> None:
         """Begin to write behind a step, as `RunFolder.go_on` does."""

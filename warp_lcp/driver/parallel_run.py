@@ -12,6 +12,7 @@ import numpy as np
 
 from warp_lcp.distributed.meeting import Meeting, RankFailed
 from warp_lcp.driver.check import check_memory
+from warp_lcp.driver.checkpoint import PIECES
 from warp_lcp.driver.engine import Engine
 from warp_lcp.driver.log import Value
 from warp_lcp.driver.parallel_folder import ParallelRunFolder
@@ -210,7 +211,10 @@ def _create(
         if continued and continued.checkpoint:
             if continued.resampled_from is not None:
                 raise ValueError(f"domain.resolution: must stay {continued.resampled_from}: --engine petsc cannot change grids")
-            simulation.restore_pieces(folder.checkpoints.pieces(continued.checkpoint))
+            if PIECES in continued.checkpoint.state:
+                simulation.restore_pieces(folder.checkpoints.pieces(continued.checkpoint))
+            else:
+                simulation.restore(continued.checkpoint.state)
     except ValueError as error:
         raise SceneError(scene.scene.name, [Problem("", str(error))]) from error
     return simulation

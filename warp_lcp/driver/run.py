@@ -10,7 +10,7 @@ from contextlib import closing, nullcontext
 from pathlib import Path
 
 from warp_lcp.driver.check import check_memory
-from warp_lcp.driver.checkpoint import Checkpoint
+from warp_lcp.driver.checkpoint import PIECES, Checkpoint
 from warp_lcp.driver.frames import frame_bytes
 from warp_lcp.driver.log import Log, Value
 from warp_lcp.driver.problem_folder import ProblemFolder
@@ -20,6 +20,7 @@ from warp_lcp.driver.run_folder import Continuation, OutputError, RunFolder, Run
 from warp_lcp.driver.scene import Scene, Time
 from warp_lcp.driver.simulator import (
     Cells,
+    Joined,
     Part,
     Points,
     Profiled,
@@ -78,15 +79,17 @@ def run_scene(
     if not force_memory:
         check_memory(scene, device)
 
+    folder = RunFolder(out, scene)
+
     def create(continued: Continuation | None) -> tuple[Simulation, list[str]]:
-        simulation, notes = _create(scene, device, continued)
+        simulation, notes = _create(folder, device, continued)
         if record_problems is not None:
             _record_problems(simulation, scene, record_problems, more=resume)
         return simulation, notes
 
     record = RunRecord(scene.scene.name, scene.scene.simulator, device)
     return run_in_folder(
-        RunFolder(out, scene),
+        folder,
         record,
         create,
         observer=observer,
@@ -152,14 +155,17 @@ def run_in_folder(
             return run.execute(last_frame, stop, resumed=checkpoint is not None)
 
 
-def _create(scene: Scene, device: str, continued: Continuation | None) -> tuple[Simulation, list[str]]:
+def _create(folder: RunFolder, device: str, continued: Continuation | None) -> tuple[Simulation, list[str]]:
     """Return the simulation where the run begins or goes on, and what it has to say."""
+    scene = folder.scene
     try:
         simulation = simulators()[scene.scene.simulator].create(scene, device=device, folder=Path.cwd())
         notes: list[str] = []
         if continued and continued.checkpoint:
             state = continued.checkpoint.state
-            if continued.resampled_from is None:
+            if PIECES in state:
+                _join(simulation, folder, continued)
+            elif continued.resampled_from is None:
                 simulation.restore(state)
             elif isinstance(simulation, Resampled):
                 notes = simulation.resample(state)
@@ -168,6 +174,16 @@ def _create(scene: Scene, device: str, continued: Continuation | None) -> tuple[
     except ValueError as error:
         raise SceneError(scene.scene.name, [Problem("", str(error))]) from error
     return simulation, simulation.notes() + notes
+
+
+def _join(simulation: Simulation, folder: RunFolder, continued: Continuation) -> None:
+    """Continue from the pieces of ranks."""
+    assert continued.checkpoint is not None
+    if not isinstance(simulation, Joined):
+        raise ValueError("the checkpoint is one of several ranks: continue with --engine petsc, on any number of ranks")
+    if continued.resampled_from is not None:
+        raise ValueError(f"domain.resolution: must stay {continued.resampled_from}: the checkpoint is one of several ranks")
+    simulation.restore_pieces(folder.checkpoints.pieces(continued.checkpoint))
 
 
 def _record_problems(simulation: Simulation, scene: Scene, folder: Path, *, more: bool) -> None:

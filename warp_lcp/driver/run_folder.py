@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from warp_lcp.driver.atomic import SUFFIX, write_text
-from warp_lcp.driver.checkpoint import CHECKPOINT_FILE, PIECES, REFUSED_FILE, Checkpoint, CheckpointFolder
+from warp_lcp.driver.checkpoint import CHECKPOINT_FILE, REFUSED_FILE, Checkpoint, CheckpointFolder
 from warp_lcp.driver.continuation import MAY_CHANGE, RESOLUTION, Change, differences, fingerprint, mesh_digests
 from warp_lcp.driver.folder_lock import LOCK, FolderBusyError, locked
 from warp_lcp.driver.frames import FRAME_FILE, FrameFolder, FrameWriter
@@ -188,7 +188,6 @@ class RunFolder:
         if checkpoint is None:
             reasons = refused or ["none was written"]
             raise OutputError("\n  ".join([f"{self.path}: no checkpoint to resume from; --force starts again", *reasons]))
-        self.check_engine(checkpoint)
         end = self.scene.time.frame_time(self.scene.time.frame_count)
         if checkpoint.time > end * (1.0 + ROUNDING):
             raise OutputError(
@@ -206,18 +205,6 @@ class RunFolder:
         old = int(before.get(RESOLUTION, now[RESOLUTION]))
         changed = differences(before, now, Change.SAME_STEPS, Change.OTHER_STEPS, Change.RESAMPLED)
         return Continuation(checkpoint, remarks, changed, None if old == now[RESOLUTION] else old)
-
-    def check_engine(self, checkpoint: Checkpoint) -> None:
-        """Refuse a checkpoint that this engine cannot continue from.
-
-        Raises:
-            OutputError: it is one in pieces.
-        """
-        if PIECES in checkpoint.state:
-            raise OutputError(
-                f"{self.checkpoints.path(checkpoint.step)}: written by {len(checkpoint.state[PIECES])} ranks; "
-                "continue with --engine petsc, on any number of ranks"
-            )
 
     def go_on(self, record: RunRecord, step: int) -> None:
         """Begin to write behind a step, once everything is known to fit: what a killed process left half-written goes.

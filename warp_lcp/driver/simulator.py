@@ -171,15 +171,9 @@ class Simulator(Protocol):
         """
 
 
-class DistributedSimulation(Simulation, Protocol):
-    """A rank's part of a simulation that several MPI ranks share.
-
-    `stable_dt`, `step` and `restore_pieces` are collective. Times, rows of the log and columns are those of the whole simulation, the same
-    on all ranks, which also raise the same kind of error. `frame` returns what this rank has, in coordinates of the whole domain.
-    """
-
-    def piece_state(self) -> dict[str, np.ndarray]:
-        """Return this rank's part of the state; `box`, int (2, 3), is its part's first cell and the one behind the last."""
+@runtime_checkable
+class Joined(Protocol):
+    """What a Simulation may also be: one that can go on where several MPI ranks ended."""
 
     def restore_pieces(self, pieces: Sequence[Mapping[str, np.ndarray]]) -> None:
         """Continue from the pieces of all ranks of a run, which need not have been as many. An array is read when it is asked for.
@@ -187,6 +181,18 @@ class DistributedSimulation(Simulation, Protocol):
         Raises:
             ValueError: the pieces do not belong to this scene.
         """
+
+
+class DistributedSimulation(Simulation, Joined, Protocol):
+    """A rank's part of a simulation that several MPI ranks share.
+
+    `stable_dt`, `step`, `restore` (the state of one process) and `restore_pieces` are collective. Times, rows of the log and columns are
+    those of the whole simulation, the same on all ranks, which also raise the same kind of error. `frame` returns what this rank has, in
+    coordinates of the whole domain.
+    """
+
+    def piece_state(self) -> dict[str, np.ndarray]:
+        """Return this rank's part of the state; `box`, int (2, 3), is its part's first cell and the one behind the last."""
 
 
 @runtime_checkable

@@ -16,7 +16,8 @@ CENTERS = 3  # the `axis` of a field at cell centers
 CARRY = """
     typedef float T; typedef T Block[3][M];
     const int nx = u_.shape[2] - 2, ny = u_.shape[1] - 2, nz = u_.shape[0] - 2;
-    const long long s2 = nx + 2, s1 = s2*(ny + 2), up = planes == 2 ? s1 : 0, row = k*s1 + j*s2;
+    const long long s2 = nx + 2, s1 = s2*(ny + 2), up = planes == 2 ? s1 : 0, back = 0, row = k*s1 + j*s2;
+    const T lx = 1, ly = 1, lz = 1;
     const long long below = AXIS == 0 ? 1 : AXIS == 1 ? s2 : AXIS == 2 ? s1 : 0;
     const T hx = AXIS == 0 ? (T)0 : (T)0.5, hy = AXIS == 1 ? (T)0 : (T)0.5, hz = AXIS == 2 ? (T)0 : (T)0.5;
     const T ex = nx + 1, ey = ny + 1, ez = nz + 1;
