@@ -107,39 +107,54 @@ def linear_solves():
             assert np.abs(whole_field(grid.field(found), boxes, shape) - expected).max() < 1e-7 * np.abs(expected).max()
 
 
-def shells_in_tao():
-    """TAO's methods take the operator itself, without a matrix, on subspaces of it."""
+def bounded_methods():
+    """Methods of SNES and TAO for bounds take free sets out of the operator themselves, without a matrix."""
     problem = small("cube", "walls")
     boxes, lcp = shared_problem(problem, Ranks.world())
     expected, _ = solve_ours(problem, wl.ProjectedMultigrid(), Ranks.world())
     grid, fluid = PetscGrid(lcp.A), problem.fluid
+    operator, comm = grid.operator, boxes.ranks.comm
     options = petsc().Options()
-    options["tao_subset_type"] = "matrixfree"
-    options["pc_type"] = "none"
+    options["pc_type"], options["snes_vi_zero_tolerance"] = "jacobi", 1e-13
     least, most = petsc().NINFINITY, petsc().INFINITY
     fields = problem.b, np.where(fluid, np.maximum(problem.lower, least), 0.0), np.where(fluid, most, 0.0)
     b, lower, upper = (grid.vector(field[boxes.box.slices]) for field in fields)
 
     def energy(tao, x, gradient):
-        grid.operator.mult(x, gradient)
+        operator.mult(x, gradient)
         value = 0.5 * x.dot(gradient) + x.dot(b)
         gradient.axpy(1.0, b)
         return value
 
-    for kind in ("tron", "gpcg"):
-        tao, x = petsc().TAO().create(boxes.ranks.comm), b.duplicate()
+    def by_tao(kind, x):
+        tao = petsc().TAO().create(comm)
         tao.setType(kind)
         tao.setObjectiveGradient(energy, b.duplicate())
-        tao.setHessian(lambda tao, x, H, P: None, grid.operator)
+        tao.setHessian(lambda tao, x, H, P: None, operator)
         tao.setVariableBounds((lower, upper))
         tao.setTolerances(gatol=1e-9 * b.norm(), grtol=0.0, gttol=0.0)
         tao.setSolution(x)
-        tao.getKSP().setTolerances(rtol=1e-8, max_it=2000)
-        tao.setFromOptions()
-        tao.solve(x)
-        assert tao.getConvergedReason() > 0
+        return tao
+
+    def by_snes(kind, x):
+        snes = petsc().SNES().create(comm)
+        snes.setType(kind)
+        snes.setFunction(lambda snes, x, f: operator.multAdd(x, b, f), b.duplicate())
+        snes.setJacobian(lambda snes, x, J, P: None, operator)
+        snes.setVariableBounds(lower, upper)
+        snes.setTolerances(rtol=1e-11, atol=1e-11 * b.norm(), stol=0.0, max_it=100)
+        snes.getKSP().setType("cg")
+        return snes
+
+    for kind, make in (("tron", by_tao), ("gpcg", by_tao), ("vinewtonrsls", by_snes)):
+        x = b.duplicate()
+        method = make(kind, x)
+        method.getKSP().setTolerances(rtol=1e-8, max_it=2000)
+        method.setFromOptions()
+        method.solve(*([x] if make is by_tao else [None, x]))
+        assert method.getConvergedReason() > 0, kind
         found = whole_field(grid.field(x), boxes, problem.cells.shape)[fluid]
-        assert np.abs(found - expected).max() < 1e-8 * np.abs(expected).max()
+        assert np.abs(found - expected).max() < 1e-8 * np.abs(expected).max(), kind
 
 
 class Sums:

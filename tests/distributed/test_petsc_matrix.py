@@ -13,7 +13,7 @@ def test_products_and_diagonals_are_those_of_the_definition(mpi, ranks):
 
 
 @pytest.mark.parametrize("ranks", [1, 2])
-@pytest.mark.parametrize("check", ["preconditioner", "linear_solves", "shells_in_tao"])
+@pytest.mark.parametrize("check", ["preconditioner", "linear_solves", "bounded_methods"])
 def test_petscs_solvers_work_with_them(mpi, ranks, check):
     mpi(ranks, PROGRAM, check)
 

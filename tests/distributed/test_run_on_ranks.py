@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 
 from warp_lcp.driver import cli, simulator
 from warp_lcp.driver.pieces import one_mesh, piece_files
+from warp_lcp.driver.recording import Recording
 
 PROGRAM = Path(__file__).with_name("dots_on_ranks.py")
 
@@ -216,3 +217,32 @@ def test_without_mpi_one_message_says_how_to_install(run, monkeypatch, variable)
         monkeypatch.setenv(variable, "1")
     said = run(0, "run dots.toml --engine petsc", exit_code=2).stderr
     assert ("pip install 'warp-lcp[distributed]'" in said and "PETSC_DIR" in said) if not variable else said == ""
+
+
+LIQUID = "--set domain.resolution=24 --set time.duration=0.3 --set output.checkpoint_every=4 --set output.grid_format=vti"
+
+
+def test_liquid_goes_on_on_other_numbers_of_ranks(mpi, tmp_path):
+    """From two ranks to three, and on in one process: one log, and frames with the particles and cells of a run in one process."""
+    go = ["-c", "from warp_lcp.driver.cli import main; main()", *shlex.split(f"run dam-break-2d --device cpu {LIQUID}")]
+    mpi(1, *go, "--out", "one")
+    mpi(2, *go, "--out", "out", "--engine", "petsc", "--frames", 3)
+    mpi(3, *go, "--out", "out", "--engine", "petsc", "--frames", 6, "--resume")
+    mpi(1, *go, "--out", "out", "--resume")
+    one, out = tmp_path / "one", tmp_path / "out"
+    with open(one / "log.csv", newline="") as a, open(out / "log.csv", newline="") as b:
+        rows = list(zip(csv.DictReader(a), csv.DictReader(b), strict=True))
+    assert len(rows) > 10
+    for expected, found in rows:
+        for name in ("time", "dt", "particles", "mass", "kinetic_energy", "potential_energy", "max_speed", "volume", "active"):
+            assert float(found[name]) == pytest.approx(float(expected[name]), rel=1e-6)
+    whole, parts = Recording(one, cells=True), Recording(out, cells=True)
+    assert whole.numbers == parts.numbers
+    for number in whole.numbers:
+        a, b = whole.frame(number), parts.frame(number)
+        assert a.cells is not None and b.cells is not None
+        assert {*map(tuple, a.cells.index.tolist())} == {*map(tuple, b.cells.index.tolist())}
+        near = np.linalg.norm(a.points[:, None] - b.points, axis=2).min(axis=1)
+        assert len(a.points) == len(b.points)
+        assert near.max() < 1e-5
+        np.testing.assert_allclose(np.sort(a.values), np.sort(b.values), atol=0.05)

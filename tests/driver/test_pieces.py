@@ -11,7 +11,7 @@ from warp_lcp.driver.frames import FrameFolder
 from warp_lcp.driver.parallel_frames import ParallelFrames
 from warp_lcp.driver.pieces import describe, one_grid, piece_files, write_whole
 from warp_lcp.driver.recording import Color, Recording, RenderError
-from warp_lcp.driver.run_folder import OutputError, RunFolder
+from warp_lcp.driver.run_folder import OutputError, RunFolder, RunRecord
 from warp_lcp.driver.scene_file import dump_scene, load_scene
 from warp_lcp.driver.simulator import Cells, Part, Points, Surface
 
@@ -160,6 +160,9 @@ def test_pieces_are_files_of_the_run(dots, tmp_path):
     (out / "frames" / "rank_0001" / "notes.txt").write_text("mine")
     with pytest.raises(OutputError, match=r"holds files that are no run's \(frames.rank_0001.notes.txt, "):
         folder.check_new(force=True)
+    (out / "frames" / "rank_0001" / "notes.txt").unlink()
+    folder.start(RunRecord("dots", "dots", "cpu"))
+    assert list((out / "frames").iterdir()) == []
 
 
 def places():

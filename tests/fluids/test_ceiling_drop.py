@@ -65,8 +65,8 @@ def test_a_wall_that_keeps_its_velocity_fails_the_last_particle_only(monkeypatch
     """The negative control of the release: the mean looks right, the last particle lags."""
     extend = boundary.extend_velocity
 
-    def hold(window: Any, velocity: Any, weights: Any, known: Any, kind: wp.array, contact: wp.array, *rest: Any) -> None:
-        extend(window, velocity, weights, known, kind, wp.zeros_like(contact), *rest)
+    def hold(window: Any, velocity: Any, weights: Any, known: Any, kind: wp.array, contact: wp.array, *rest: Any, **more: Any) -> None:
+        extend(window, velocity, weights, known, kind, wp.zeros_like(contact), *rest, **more)
 
     monkeypatch.setattr(boundary, "extend_velocity", hold)
     fallen, expected, _ = drop(block(2), 0.25)

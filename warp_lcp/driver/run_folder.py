@@ -20,7 +20,7 @@ from warp_lcp.driver.folder_lock import LOCK, FolderBusyError, locked
 from warp_lcp.driver.frames import FRAME_FILE, FrameFolder, FrameWriter
 from warp_lcp.driver.log import Log
 from warp_lcp.driver.profile import Stopwatch
-from warp_lcp.driver.rank_folder import in_ranks
+from warp_lcp.driver.rank_folder import in_ranks, remove_empty_ranks
 from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.scene_file import dump_scene, keys, load_scene, table_keys
 from warp_lcp.driver.table import SceneError
@@ -171,6 +171,8 @@ class RunFolder:
         for file in own:
             if file.name != RECORD:  # replaced below: at every moment the folder is a run's
                 file.unlink()
+        for name in OWN_FOLDERS:
+            remove_empty_ranks(self.path / name)
         self.write_record(record)
         write_text(self.path / SCENE, dump_scene(self.scene))
 
