@@ -38,6 +38,7 @@ from warp_lcp.grid.staggered import Window
 from warp_lcp.material.boundary import Boundary
 
 LEAST_RIGHT = 2  # layers of ghost cells that stay right while the velocity is continued: faces at cut cells look so far
+METHODS = ("projected-multigrid", "minimum-map-newton")  # that solve problems of several ranks
 NOT_ON_RANKS = "is not there on several processes (--engine petsc) yet: leave it out, or run on one process"
 
 
@@ -244,9 +245,11 @@ def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> Distribu
     if not isinstance(scene, LiquidScene):
         raise ValueError("scene.simulator: fluids needs a scene of liquid")
     ranks.agree("the scene", scene.model_dump(mode="json"))
-    refused = refusals(scene)
+    refused = [f"{key} {NOT_ON_RANKS}" for key in refusals(scene)]
+    if scene.solver.method not in METHODS:
+        refused.append(f"solver.method = {scene.solver.method} works on one process only (without --engine petsc): {' or '.join(METHODS)}")
     if refused:
-        raise ValueError("; ".join(f"{key} {NOT_ON_RANKS}" for key in refused))
+        raise ValueError("; ".join(refused))
     part = _part(scene, ranks, device)
     cut_cells, separating = scene.domain.solids == "cut-cell", scene.domain.wall == "separating"
     boundary, warnings = boundary_of_part(part, placed_solids(scene, folder), cut_cells=cut_cells, wall_separating=separating)

@@ -54,7 +54,6 @@ class DistributedPressure(PressureProjection):
             self._shift = None  # the part's sides at cuts are open, the domain's are not
         self._box_kind, self._rhs, self._guess = (self._box_like(field) for field in (self.kind, self._b, self._start))
         self._box_lower, self._box_shift = (None if field is None else self._box_like(field) for field in (self._lower, self._shift))
-        self._box_x = wp.zeros_like(self._rhs)
         if tolerance == "auto":
             self.automatic = TimeErrorTolerance(self._rhs.size, part.grid.device, part.ranks)
 
@@ -79,8 +78,9 @@ class DistributedPressure(PressureProjection):
         self._copy_to_box()
         faces = {}
         for axis, field in zip("xyz", self.boundary.open, strict=False):
-            faces[f"face_{axis}"] = self._box_like(field)
-            wp.copy(faces[f"face_{axis}"], self.part.stored_box_of(field))
+            face = faces[f"face_{axis}"] = self._box_like(field)
+            if face is not field:
+                wp.copy(face, self.part.stored_box_of(field))
         cells, decomposition = self._box_kind.numpy()[1:-1, 1:-1, 1:-1], self.part.decomposition
         self._operator = DistributedGridPoisson(decomposition, cells, shift=self._box_shift, device=self.grid.device, **faces)
         self._problem = wl.LCP(self._operator, self._rhs, -np.inf if self._box_lower is None else self._box_lower, np.inf)
@@ -93,13 +93,15 @@ class DistributedPressure(PressureProjection):
     def _copy_to_box(self) -> None:
         boxes = (self._box_kind, self._rhs, self._guess, self._box_lower, self._box_shift)
         for field, box in zip((self.kind, self._b, self._start, self._lower, self._shift), boxes, strict=True):
-            if box is not None:
+            if box is not field:
                 wp.copy(box, self.part.stored_box_of(field))
 
     def _take(self, x: wp.array) -> None:
         """Take the solution of the problem as the pressure, that of the ghost layers from other ranks."""
-        convert(x.flatten(), self._box_x.flatten())
-        wp.copy(self.part.box_of(self.pressure), self._box_x[1:-1, 1:-1, 1:-1])
+        if x.dtype is not wp.float64:  # of a method in single precision; the guess has been used
+            convert(x.flatten(), self._guess.flatten())
+            x = self._guess
+        wp.copy(self.part.box_of(self.pressure), x.reshape(self._rhs.shape)[1:-1, 1:-1, 1:-1])
         self.part.fill(self.pressure)
 
     def _found(self) -> tuple[float, float]:
@@ -108,5 +110,6 @@ class DistributedPressure(PressureProjection):
         return float(every[:, 0].sum()), float(every[:, 1].max())
 
     def _box_like(self, field: wp.array) -> wp.array:
-        """Return a field of zeros of the box with a ring."""
-        return wp.zeros(self.part.stored_box_of(field).shape, dtype=field.dtype, device=self.grid.device)
+        """Return a field of zeros of the box with a ring; on one rank the field itself, which is of the box."""
+        shape = self.part.stored_box_of(field).shape
+        return field if shape == field.shape else wp.zeros(shape, dtype=field.dtype, device=self.grid.device)

@@ -9,7 +9,7 @@ import pytest
 
 import warp_lcp as wl
 from code_blocks import anchors, links, prose
-from warp_lcp import gallery
+from warp_lcp import distributed, gallery
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -74,6 +74,7 @@ def test_the_reference_has_every_public_name():
     short = {name.rpartition(".")[2] for name in NAMED}
     constants = {"AIR", "FLUID", "SOLID", "METHODS", "Precision", "Step"}
     assert set(wl.__all__) - constants <= short
+    assert set(distributed.__all__) <= short
     assert {f"warp_lcp.gallery.{path.stem}" for path in Path(gallery.__file__).parent.glob("[a-z]*.py")} <= set(NAMED)
 
 

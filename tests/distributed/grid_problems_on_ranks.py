@@ -12,7 +12,6 @@ from warp_lcp.distributed.halo import Halo
 from warp_lcp.distributed.hierarchy import DistributedHierarchy
 from warp_lcp.distributed.ranks import Ranks
 
-ranks = Ranks.world()
 rng = np.random.default_rng(7301)
 
 
@@ -44,7 +43,7 @@ def part(values, box, shape, axis=None):
     return np.ascontiguousarray(values[tuple(reversed(slices))])
 
 
-def compare(name, cells, b, lower, upper=np.inf, *, method, decomposition=None, rtol=1e-9, same=1e-7, **faces):
+def compare(ranks, name, cells, b, lower, upper=np.inf, *, method, decomposition=None, rtol=1e-9, same=1e-7, **faces):
     """Solve on all ranks and on one; statuses are the same, counts to one, x but for rounding."""
     shape = cells.shape
     counts = (*reversed(shape), 1)[:3]
@@ -69,98 +68,124 @@ def compare(name, cells, b, lower, upper=np.inf, *, method, decomposition=None, 
 
 
 PM, NEWTON = wl.ProjectedMultigrid(), wl.MinimumMapNewton()
-wp.config.log_level = wp.LOG_ERROR
 
-for shape in ((34, 21, 40), (17, 13, 11), (48, 37), (65, 64)):
-    cells = scene(shape)
-    b = rng.standard_normal(shape)
+
+def shapes(ranks):
+    """Shapes, methods, bounds and coefficients."""
+    for shape in ((34, 21, 40), (17, 13, 11), (48, 37), (65, 64)):
+        cells = scene(shape)
+        b = rng.standard_normal(shape)
+        for method in (PM, NEWTON):
+            compare(ranks, f"everywhere {shape}", cells, b, 0.0, method=method)
+            compare(ranks, f"boxed {shape}", cells, b, -0.2, 0.3, method=method)
+            compare(ranks, f"linear {shape}", cells, b, -np.inf, method=method)
+            walls = np.where(rng.random(shape) < 0.3, 0.0, -np.inf)
+            compare(ranks, f"walls {shape}", cells, b, walls, method=method, **coefficients(shape))
+            compare(ranks, f"number a face {shape}", cells, b, 0.0, method=method, face_x=1.0, face_y=3.0)
+
+
+def other_cuts(ranks):
+    """Cuts along x and y, and at odd cells: then the finest level is gathered."""
+    if ranks.size > 1:
+        shape, cells = (20, 20, 20), scene((20, 20, 20))
+        b = rng.standard_normal(shape)
+        for processes in ((ranks.size, 1, 1), (1, ranks.size, 1)):
+            boxes = Decomposition(
+                (20, 20, 20),
+                ranks,
+                processes=processes,
+                cuts=[[20] if p == 1 else [7, *[5] * (p - 2), 20 - 7 - 5 * (p - 2)] for p in processes],
+            )
+            compare(ranks, f"odd cuts {processes}", cells, b, 0.0, method=PM, decomposition=boxes)
+        cells = scene((40, 40, 40))
+        b = rng.standard_normal((40, 40, 40))
+        for processes in ((ranks.size, 1, 1), (1, ranks.size, 1)):
+            compare(
+                ranks, f"cuts {processes}", cells, b, 0.0, method=PM, decomposition=Decomposition((40, 40, 40), ranks, processes=processes)
+            )
+
+
+def closed_pools(ranks):
+    """Closed pools: one that reaches over all ranks, and small ones; b sums to 0 on each or not."""
+    cells = np.full((24, 10, 12), wl.FLUID)
+    cells[:, 6, :] = wl.SOLID
+    cells[:, 7:, 6] = wl.SOLID
+    cells[3, 9, 9] = wl.AIR
+    b = rng.standard_normal(cells.shape)
+    for region in ((slice(None), slice(0, 6), slice(None)), (slice(None), slice(7, None), slice(0, 6))):
+        b[region] -= b[region].mean()
     for method in (PM, NEWTON):
-        compare(f"everywhere {shape}", cells, b, 0.0, method=method)
-        compare(f"boxed {shape}", cells, b, -0.2, 0.3, method=method)
-        compare(f"linear {shape}", cells, b, -np.inf, method=method)
-        walls = np.where(rng.random(shape) < 0.3, 0.0, -np.inf)
-        compare(f"walls {shape}", cells, b, walls, method=method, **coefficients(shape))
-        compare(f"number a face {shape}", cells, b, 0.0, method=method, face_x=1.0, face_y=3.0)
+        found, A = compare(ranks, "closed pools", cells, b, -np.inf, method=method, same=1e-8)
+        assert A.floating_components().count == 2
+        compare(ranks, "closed pools, bounded", cells, b + 0.1, 0.0, method=method, same=1e-8)
+    found, A = compare(ranks, "no solution", cells, b + 1.0, -np.inf, method=PM)
+    assert found.status is wl.SolveStatus.INFEASIBLE
 
-if ranks.size > 1:  # cuts at odd cells: the finest level is gathered; cuts along x and y
-    shape, cells = (20, 20, 20), scene((20, 20, 20))
-    b = rng.standard_normal(shape)
-    for processes in ((ranks.size, 1, 1), (1, ranks.size, 1)):
-        boxes = Decomposition(
-            (20, 20, 20),
-            ranks,
-            processes=processes,
-            cuts=[[20] if p == 1 else [7, *[5] * (p - 2), 20 - 7 - 5 * (p - 2)] for p in processes],
-        )
-        compare(f"odd cuts {processes}", cells, b, 0.0, method=PM, decomposition=boxes)
-    cells = scene((40, 40, 40))
-    b = rng.standard_normal((40, 40, 40))
-    for processes in ((ranks.size, 1, 1), (1, ranks.size, 1)):
-        compare(f"cuts {processes}", cells, b, 0.0, method=PM, decomposition=Decomposition((40, 40, 40), ranks, processes=processes))
 
-# closed pools: one that reaches over all ranks, and small ones; b sums to 0 on each or not
-cells = np.full((24, 10, 12), wl.FLUID)
-cells[:, 6, :] = wl.SOLID
-cells[:, 7:, 6] = wl.SOLID
-cells[3, 9, 9] = wl.AIR
-b = rng.standard_normal(cells.shape)
-for region in ((slice(None), slice(0, 6), slice(None)), (slice(None), slice(7, None), slice(0, 6))):
-    b[region] -= b[region].mean()
-for method in (PM, NEWTON):
-    found, A = compare("closed pools", cells, b, -np.inf, method=method, same=1e-8)
-    assert A.floating_components().count == 2
-    compare("closed pools, bounded", cells, b + 0.1, 0.0, method=method, same=1e-8)
-found, A = compare("no solution", cells, b + 1.0, -np.inf, method=PM)
-assert found.status is wl.SolveStatus.INFEASIBLE
+def memory_in_place(ranks):
+    """The same memory while cells and b change in place."""
+    shape = (32, 18, 18)
+    boxes = Decomposition((18, 18, 32), ranks)
+    full = [scene(shape) for _ in range(4)]
+    nz, ny, nx = reversed(boxes.box.counts)
+    stored = wp.zeros((nz + 2, ny + 2, nx + 2), dtype=wp.float64, device="cpu")
+    A = DistributedGridPoisson(boxes, part(full[0], boxes.box, shape), device="cpu")
+    problem = wl.LCP(A, stored, 0.0)
+    work = PM.init(problem)
+    for cells in full:
+        b = rng.standard_normal(shape)
+        padded = np.zeros(stored.shape, dtype=np.int8)
+        padded[1:-1, 1:-1, 1:-1] = part(cells, boxes.box, shape)
+        A.update(wp.array(padded, dtype=wp.int8, device="cpu"))
+        stored.numpy()[1:-1, 1:-1, 1:-1] = part(b, boxes.box, shape)
+        for _ in range(2):  # the second time warm
+            found = wl.solve(problem, PM, workspace=work, stopping=wl.StoppingCriteria(rtol=1e-9), x0=None if _ == 0 else found.x)
+        expected = wl.solve(wl.LCP(wl.GridPoisson(cells, device="cpu"), b, 0.0), PM, stopping=wl.StoppingCriteria(rtol=1e-9))
+        assert found and expected
+        inner = found.x.numpy()[1:-1, 1:-1, 1:-1]
+        assert np.abs(inner - part(expected.x.numpy(), boxes.box, shape)).max() <= 1e-7 * np.abs(expected.x.numpy()).max()
 
-# the same memory while cells and b change in place
-shape = (32, 18, 18)
-boxes = Decomposition((18, 18, 32), ranks)
-full = [scene(shape) for _ in range(4)]
-nz, ny, nx = reversed(boxes.box.counts)
-stored = wp.zeros((nz + 2, ny + 2, nx + 2), dtype=wp.float64, device="cpu")
-A = DistributedGridPoisson(boxes, part(full[0], boxes.box, shape), device="cpu")
-problem = wl.LCP(A, stored, 0.0)
-work = PM.init(problem)
-for cells in full:
-    b = rng.standard_normal(shape)
-    padded = np.zeros(stored.shape, dtype=np.int8)
-    padded[1:-1, 1:-1, 1:-1] = part(cells, boxes.box, shape)
-    A.update(wp.array(padded, dtype=wp.int8, device="cpu"))
-    stored.numpy()[1:-1, 1:-1, 1:-1] = part(b, boxes.box, shape)
-    for _ in range(2):  # the second time warm
-        found = wl.solve(problem, PM, workspace=work, stopping=wl.StoppingCriteria(rtol=1e-9), x0=None if _ == 0 else found.x)
-    expected = wl.solve(wl.LCP(wl.GridPoisson(cells, device="cpu"), b, 0.0), PM, stopping=wl.StoppingCriteria(rtol=1e-9))
-    assert found and expected
-    inner = found.x.numpy()[1:-1, 1:-1, 1:-1]
-    assert np.abs(inner - part(expected.x.numpy(), boxes.box, shape)).max() <= 1e-7 * np.abs(expected.x.numpy()).max()
 
-# what devices do: ghost cells go through the host's memory, and no leg of a cycle is one pass
-fill, streams = Halo.fill, DistributedHierarchy._streams
-Halo.fill = lambda self, field: self._fill_through_host(field.reshape(self.shape)) if isinstance(field, wp.array) else fill(self, field)
-DistributedHierarchy._streams = lambda self, level: False
-cells = scene((34, 21, 40))
-b = rng.standard_normal(cells.shape)
-for method in (PM, NEWTON):
-    compare("as on a device", cells, b, 0.0, method=method, **coefficients(cells.shape))
-Halo.fill, DistributedHierarchy._streams = fill, streams
+def as_on_devices(ranks):
+    """Ghost cells that go through the host's memory, and no leg of a cycle in one pass."""
+    fill, streams = Halo.fill, DistributedHierarchy._streams
+    Halo.fill = lambda self, field: self._fill_through_host(field.reshape(self.shape)) if isinstance(field, wp.array) else fill(self, field)
+    DistributedHierarchy._streams = lambda self, level: False
+    cells = scene((34, 21, 40))
+    b = rng.standard_normal(cells.shape)
+    for method in (PM, NEWTON):
+        compare(ranks, "as on a device", cells, b, 0.0, method=method, **coefficients(cells.shape))
+    Halo.fill, DistributedHierarchy._streams = fill, streams
 
-# what is wrong is refused on all ranks
-for arguments, word in (({"periodic": (True, False, False)}, "periodic"), ({"face_x": np.ones((3, 3, 3))}, "face_x")):
-    try:
-        DistributedGridPoisson(boxes, part(full[0], boxes.box, shape), device="cpu", **arguments)
-        raise AssertionError(word)
-    except ValueError as error:
-        assert word in str(error), error
-if ranks.size > 1:
-    try:
-        wl.solve(problem, wl.ProjectedSOR())
-        raise AssertionError("ProjectedSOR")
-    except ValueError as error:
-        assert "several ranks" in str(error)
-    try:
-        ranks.agree("the number", ranks.rank)
-        raise AssertionError("agree")
-    except ValueError as error:
-        assert "the number on rank 1" in str(error)
-sys.stdout.write(f"rank {ranks.rank} of {ranks.size} is done\n")
+
+def wrong_input(ranks):
+    """What is wrong is refused on all ranks."""
+    shape = (32, 18, 18)
+    boxes = Decomposition((18, 18, 32), ranks)
+    cells, b = (part(field, boxes.box, shape) for field in (scene(shape), rng.standard_normal(shape)))
+    problem = wl.LCP(DistributedGridPoisson(boxes, cells, device="cpu"), b)
+    for arguments, word in (({"periodic": (True, False, False)}, "periodic"), ({"face_x": np.ones((3, 3, 3))}, "face_x")):
+        try:
+            DistributedGridPoisson(boxes, cells, device="cpu", **arguments)
+            raise AssertionError(word)
+        except ValueError as error:
+            assert word in str(error), error
+    if ranks.size > 1:
+        try:
+            wl.solve(problem, wl.ProjectedSOR())
+            raise AssertionError("ProjectedSOR")
+        except ValueError as error:
+            assert "several ranks" in str(error)
+        try:
+            ranks.agree("the number", ranks.rank)
+            raise AssertionError("agree")
+        except ValueError as error:
+            assert "the number on rank 1" in str(error)
+
+
+if __name__ == "__main__":
+    wp.config.log_level = wp.LOG_ERROR
+    everyone = Ranks.world()
+    for check in (shapes, other_cuts, closed_pools, memory_in_place, as_on_devices, wrong_input):
+        check(everyone)
+    sys.stdout.write(f"rank {everyone.rank} of {everyone.size} is done\n")

@@ -11,10 +11,12 @@ from fluids.distributed import DistributedLiquid, create
 from fluids.scene import LiquidScene
 from small_liquids import box, scene
 from warp_lcp.distributed.ranks import Ranks
+from warp_lcp.driver.scene_file import load_scene
 from warp_lcp.driver.simulator import SimulationFailed, StepFailed
 
 DT = 0.01  # the longest step [s]
 STEPS = 10
+DAM_STEPS = 20
 BALL = {"shape": "sphere", "radius": 0.12, "center": [0.5, 0.2, 0.25]}
 FLAT = {"size": [1.0, 0.5], "resolution": 32, "liquid": [box([0.0, 0.0], [0.5, 0.45])]}
 DEEP = {"size": [1.0, 0.5, 0.5], "resolution": 32, "liquid": [box([0.0, 0.0, 0.0], [0.5, 0.45, 0.5])]}
@@ -116,6 +118,14 @@ def fail(ranks: Ranks, folder: Path) -> None:
     ranks.agree("the message", str(failed.value))
 
 
+def dam(ranks: Ranks, folder: Path) -> None:
+    """Run the scene that comes with the package."""
+    simulation = create(load_scene("dam-break"), ranks, device="cpu", folder=Path())
+    rows = advance(simulation, DAM_STEPS)
+    if ranks.first:
+        (folder / "dam.json").write_text(json.dumps(rows))
+
+
 def differ(ranks: Ranks, folder: Path) -> None:
     """Refuse scenes that are not the same."""
     with pytest.raises(ValueError, match="the scene on rank 1 is not what it is on rank 0"):
@@ -124,4 +134,4 @@ def differ(ranks: Ranks, folder: Path) -> None:
 
 if __name__ == "__main__":
     world = Ranks.world()
-    {"run": run, "keep": keep, "go-on": go_on, "fail": fail, "differ": differ}[sys.argv[1]](world, Path(sys.argv[2]))
+    {"run": run, "keep": keep, "go-on": go_on, "fail": fail, "differ": differ, "dam": dam}[sys.argv[1]](world, Path(sys.argv[2]))

@@ -56,6 +56,7 @@ def test_what_does_not_fit_is_refused_unless_forced(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(check, "free_memory", lambda device: needed)
     check_memory(scene, "cpu")
     monkeypatch.setattr(check, "free_memory", lambda device: needed - 1)
+    check_memory(scene, "cpu", share=0.9)  # of ranks, some on another machine
     with pytest.raises(SceneError, match="most of it for pressure, grid"):
         check_memory(scene, "cpu")
     out = tmp_path / "out"

@@ -8,6 +8,7 @@ import pytest
 from warp_lcp.distributed.meeting import Meeting
 from warp_lcp.driver import recording
 from warp_lcp.driver.frames import FrameFolder
+from warp_lcp.driver.parallel_folder import ParallelRunFolder
 from warp_lcp.driver.parallel_frames import ParallelFrames
 from warp_lcp.driver.pieces import describe, one_grid, piece_files, write_whole
 from warp_lcp.driver.recording import Color, Recording, RenderError
@@ -163,6 +164,14 @@ def test_pieces_are_files_of_the_run(dots, tmp_path):
     (out / "frames" / "rank_0001" / "notes.txt").unlink()
     folder.start(RunRecord("dots", "dots", "cpu"))
     assert list((out / "frames").iterdir()) == []
+
+
+def test_a_folder_that_ranks_do_not_share_is_refused(dots, scene_file, tmp_path):
+    meeting = Meeting.of_one()
+    meeting.ranks.comm.rank = 1  # the first one writes elsewhere
+    folder = ParallelRunFolder(tmp_path / "out", load_scene(scene_file), meeting)
+    with pytest.raises(OutputError, match="is not the folder that rank 0 writes; choose one that all machines share"):
+        folder.start(RunRecord("dots", "dots", "cpu"))
 
 
 def places():

@@ -34,10 +34,11 @@ class DistributedGridPoisson(GridPoisson):
         ValueError: an argument has a wrong shape, type or sign, or is not of the same kind on all ranks; a box is one cell thin at a cut.
 
     Example:
-        >>> import numpy as np, warp_lcp as wl  # doctest: +SKIP
+        >>> import numpy as np, warp_lcp as wl
         >>> from warp_lcp.distributed import Decomposition, DistributedGridPoisson, Ranks
-        >>> boxes = Decomposition((256, 256, 256), Ranks.world())
-        >>> A = DistributedGridPoisson(boxes, np.full(boxes.box.counts[::-1], wl.FLUID))
+        >>> def operator(n):
+        ...     boxes = Decomposition((n, n, n), Ranks.world())
+        ...     return DistributedGridPoisson(boxes, np.full(boxes.box.counts[::-1], wl.FLUID))
     """
 
     def __init__(self, decomposition: Decomposition, cells: Any, **coefficients: Any) -> None:

@@ -145,12 +145,17 @@ class Gathering:
 
 def exchange(forest: Any, roots: np.ndarray, leaves: np.ndarray | None = None) -> None:
     """Copy roots to leaves over a star forest; leaves may lie in the same array."""
+    exchange_all(forest, [(roots, roots if leaves is None else leaves)])
+
+
+def exchange_all(forest: Any, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> None:
+    """Copy roots to leaves over a star forest, many of them at once: their messages are under way together."""
     from mpi4py import MPI
 
     units = {1: MPI.SIGNED_CHAR, 2: MPI.SHORT, 4: MPI.INT, 8: MPI.DOUBLE}
-    unit, target = units[roots.dtype.itemsize], roots if leaves is None else leaves
-    forest.bcastBegin(unit, roots, target, MPI.REPLACE)
-    forest.bcastEnd(unit, roots, target, MPI.REPLACE)
+    for step in (forest.bcastBegin, forest.bcastEnd):
+        for roots, leaves in pairs:
+            step(units[roots.dtype.itemsize], roots, leaves, MPI.REPLACE)
 
 
 def star_forest(ranks: Ranks, owned: Sequence[Box], stored: Sequence[Box]) -> Any:

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.distributed.decomposition import Box, Decomposition
-from warp_lcp.distributed.halo import exchange, star_forest
+from warp_lcp.distributed.halo import exchange_all, star_forest
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 
 LAYERS = 5  # of ghost cells: to carry the velocity on at cut cells looks at the liquid up to 4.3 cells away
@@ -98,9 +98,9 @@ class Subdomain:
         """Fill the ghost cells of fields of the part; collective."""
         if self._forest is None:
             return
-        for field in fields:
-            host = field.numpy()
-            exchange(self._forest, host)
+        hosts = [field.numpy() for field in fields]
+        exchange_all(self._forest, [(host, host) for host in hosts])
+        for field, host in zip(fields, hosts, strict=True):
             if field.device.is_cuda:
                 field.assign(host)
 

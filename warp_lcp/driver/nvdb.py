@@ -121,7 +121,7 @@ def _grid(volume: Volume) -> tuple[list[np.ndarray], bytes]:
     parts = [grid, tree, root, upper, lower, leaves]
     begins = np.cumsum([part.nbytes for part in parts]) - grid.nbytes  # of the next part, from the tree's beginning
     tree["offsets"], tree["nodes"] = begins[[4, 3, 2, 1]], [len(leaves), len(lower), 1]
-    tree["voxels"] = np.bitwise_count(leaves["active"]).sum(dtype=np.int64)
+    tree["voxels"] = np.unpackbits(leaves["active"]).sum(dtype=np.int64)
     root["entries"], root["background"], root["child"] = 1, background, root.nbytes
     root["low"], root["high"] = upper["low"], upper["high"] = lower["low"], lower["high"] = _box(leaves)
     _describe(grid, root, volume, sum(part.nbytes for part in parts))

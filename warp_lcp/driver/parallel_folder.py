@@ -16,7 +16,7 @@ from warp_lcp.driver.log import Log, Value
 from warp_lcp.driver.parallel_checkpoint import ParallelCheckpoints
 from warp_lcp.driver.parallel_frames import ParallelFrames, ParallelFrameWriter
 from warp_lcp.driver.profile import Stopwatch
-from warp_lcp.driver.run_folder import CHECKPOINTS, Continuation, OutputError, RunFolder, RunRecord
+from warp_lcp.driver.run_folder import CHECKPOINTS, RECORD, Continuation, OutputError, RunFolder, RunRecord
 from warp_lcp.driver.scene import Scene
 
 
@@ -129,6 +129,7 @@ class ParallelRunFolder(RunFolder):
         with self.meeting.led():
             if self._first:
                 super().start(record)
+        self._check_shared()
 
     def resume(self) -> Continuation:
         """Return where to continue: the newest checkpoint of which all pieces are valid; one of a single process is on all ranks.
@@ -161,6 +162,17 @@ class ParallelRunFolder(RunFolder):
         with self.meeting.led():
             if self._first:
                 super().go_on(record, step)
+        self._check_shared()
+
+    def _check_shared(self) -> None:
+        """Refuse a folder that the first rank has begun to write and that others do not see.
+
+        Raises:
+            OutputError: the machine of a rank has another folder of that name, or none.
+        """
+        with self.meeting.together():
+            if not (self.path / RECORD).is_file():
+                raise OutputError(f"{self.path}: is not the folder that rank 0 writes; choose one that all machines share")
 
     def open_log(self, columns: tuple[str, ...], *, after_step: int | None = None) -> Log:
         """Begin the log or continue it."""

@@ -121,7 +121,7 @@ class ContactSolve:
         x, _ = problem.solve(ROUGH)
         pushes = touching.on_bodies(x, len(self.bodies))
         roots = self._roots()
-        return np.asarray((roots @ (roots.mT @ pushes[:, :, None]))[:, :, 0])
+        return np.asarray((roots @ (roots.swapaxes(1, 2) @ pushes[:, :, None]))[:, :, 0])
 
     def hold(self, touching: Touching, impulses: np.ndarray) -> None:
         """Let contacts that bear against walls and other solids take what impulses would move into them, for each body by itself.
@@ -198,7 +198,7 @@ class ContactSolve:
         """Return velocities and angular velocities [m/s, rad/s], shape (n, 6)."""
         R = np.array([body.rotation for body in self.bodies])
         linear, angular = (np.array([getattr(body, name) for body in self.bodies]) for name in ("momentum", "angular_momentum"))
-        spin = R @ (self._inverse_inertias @ (R.mT @ angular[:, :, None]))
+        spin = R @ (self._inverse_inertias @ (R.swapaxes(1, 2) @ angular[:, :, None]))
         return np.concatenate([linear / self._masses[:, None], spin[:, :, 0]], axis=1)
 
     def _velocities(self) -> np.ndarray:
