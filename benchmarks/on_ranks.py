@@ -118,7 +118,7 @@ class Shared:
         """Count what the ranks hold in a solve: bytes of arrays a cell, the most that a process has, and that less `before`.
 
         Args:
-            before: bytes that this process held when it had loaded its kernels and no scene.
+            before: bytes that this process held when it had loaded its kernels, and not this scene.
         """
         forget_peak()
         arrays, most = array_bytes(), list[int]()
@@ -166,13 +166,14 @@ def measure(ranks: Ranks, sizes: Sequence[int], *, device: str, repeat: int, say
     here = device_of_rank(ranks, device)
     for case in _cases(min(sizes), ranks, here):
         case.sample(keep=False)  # loads kernels
-    forget_peak()
-    before, records, cases = resident_bytes(), list[Record](), list[tuple[Shared, Growing | None]]()
+    records, cases = list[Record](), list[tuple[Shared, Growing | None]]()
     for n in sizes:
         if ranks.any(not _fits(Decomposition((n, n, n), ranks).box.cells, here)):
             say(f"rank {ranks.rank}: {n}^3 does not fit into memory")
             records.append(Record(f"{n}^3, ranks: {ranks.size}", {}, {"left out": "does not fit into memory"}))
             continue
+        forget_peak()
+        before = resident_bytes()  # with the arrays of smaller grids
         shared = _cases(n, ranks, here)
         shared[WALLS].memory(before)
         for case in shared:

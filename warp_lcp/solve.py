@@ -162,7 +162,7 @@ def solve(
     if problem.bounds.affine is not None and not getattr(solver, "affine_bounds", False):
         raise ValueError(f"{type(solver).__name__} takes no bounds that are affine in x: take ProjectedSOR or another sweeping method")
     if problem.layout.across is not None and not getattr(solver, "distributed", False):
-        raise ValueError(f"{type(solver).__name__} does not work on several ranks: take ProjectedMultigrid, MinimumMapNewton or one with PETSc")
+        raise ValueError(f"{type(solver).__name__} does not work on several ranks: take ProjectedMultigrid or MinimumMapNewton")
     work = solver.init(problem) if workspace is None else _checked(workspace, problem, solver)
     return _Loop(problem, solver, stopping or StoppingCriteria(), work, callback).run(x0)
 
