@@ -7,7 +7,7 @@ import pytest
 
 from warp_lcp.distributed import launch
 
-SECONDS = 120.0  # a run that takes longer hangs
+SECONDS = 240.0  # a run that takes longer hangs; the first one compiles kernels
 
 launch.find_petsc()
 

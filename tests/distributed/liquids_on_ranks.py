@@ -25,7 +25,7 @@ SCENES = {
     "flat": FLAT,
     "flip": DEEP | {"particles": {"transfer": "flip"}, "pressure": {"surface": "voxel"}, "wall": "free-slip"},
     "pic": FLAT | {"particles": {"transfer": "pic"}, "pressure": {"smoothing": 2}},
-    "cut": DEEP | {"solid": [BALL], "liquid": [*DEEP["liquid"], DROP]},
+    "cut": DEEP | {"solid": [BALL], "liquid": [*DEEP["liquid"], DROP], "solver": {"precision": "double"}},
     "slivers": DEEP | {"solid": [BALL], "pressure": {"surface": "voxel"}},
     "voxel": DEEP | {"solid": [BALL], "solids": "voxel", "solver": {"tolerance": "auto"}},
     "full": FLAT | {"liquid": [box([0.0, 0.0], [1.0, 0.5])], "wall": "free-slip", "physics": {"gravity": [0.0, 0.0]}},

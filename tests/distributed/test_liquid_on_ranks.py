@@ -10,13 +10,19 @@ from turns import Seat
 
 from fluids import distributed
 from small_liquids import box, create, scene
+from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.ranks import Ranks
+from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.driver.scene_file import load_scene
 
 PROGRAM = Path(__file__).with_name("liquids_on_ranks.py")
 TESTS = Path(__file__).parents[1]
 # What is left of the residual is as large as the rounding of the solve: it is compared with what it is a small part of.
 NOISE = {"solve_residual": lambda row: 1.0, "max_divergence": lambda row: 32.0 * max(row["max_speed"], 0.1)}
+
+
+# With a solver in double precision the order of its sums differs alone; now and then that is the last bit of a velocity.
+CLOSE = {"cut": 1e-8}
 
 
 def same(rows, expected, rel):
@@ -26,7 +32,8 @@ def same(rows, expected, rel):
         assert row.keys() == other.keys()
         for name, value in other.items():
             if name in NOISE:
-                assert abs(row[name] - value) <= rel * NOISE[name](other), name
+                last_bit = 1e-7 if rel else 0.0  # of a velocity, in float32
+                assert abs(row[name] - value) <= max(rel, last_bit) * NOISE[name](other), name
             elif isinstance(value, float):
                 assert row[name] == pytest.approx(value, rel=rel, abs=1e-12), name
             else:
@@ -72,7 +79,7 @@ def logs():
 def test_ranks_have_the_log_and_the_pressure_of_one_process(mpi, tmp_path, logs, ranks):
     mpi(ranks, PROGRAM, "run", tmp_path, environment={"PYTHONPATH": f"{TESTS}:{TESTS.parent}"}, seconds=300.0)
     for name, (rows, cells, pressure) in logs.items():
-        same(json.loads((tmp_path / f"{name}_{ranks}.json").read_text()), rows, 1e-6)
+        same(json.loads((tmp_path / f"{name}_{ranks}.json").read_text()), rows, CLOSE.get(name, 1e-6))
         assert rows[-1]["particles"] == rows[0]["particles"]
         saved = np.load(tmp_path / f"{name}_{ranks}.npz")
         np.testing.assert_array_equal(saved["cells"], cells)
@@ -93,7 +100,7 @@ def test_a_run_goes_on_on_any_number_of_ranks(mpi, tmp_path):
     whole = json.loads((tmp_path / "whole.json").read_text())[5:]
     for ranks in (1, 2, 4):
         mpi(ranks, PROGRAM, "go-on", tmp_path, environment=environment)
-        same(json.loads((tmp_path / f"rest_{ranks}.json").read_text()), whole, 0.0 if ranks == 2 else 1e-6)
+        same(json.loads((tmp_path / f"rest_{ranks}.json").read_text()), whole, 0.0 if ranks == 2 else CLOSE["cut"])
 
 
 def test_failures_are_those_of_all_ranks(mpi, tmp_path):
@@ -117,6 +124,23 @@ def test_pieces_of_any_boxes_can_be_read():
     for name, values in again.piece_state().items():
         np.testing.assert_array_equal(values, whole[name])
     assert advance(again, 3) == advance(simulation, 3)
+
+
+def test_velocities_that_ranks_cannot_follow_are_seen_near_cuts_and_along_them():
+    part = Subdomain(Decomposition((40, 8, 1), Ranks(Seat(0, 2))), spacing=0.1, dimension=2, device="cpu", layers=5)
+    for axis, place, cells, expected in (
+        (0, 21, 3.9, 0.0),  # as far as the layers go but for one
+        (0, 21, -4.2, 4.2),
+        (0, 25, 4.2, 4.2),  # in a ghost layer
+        (0, 8, 4.2, 0.0),  # deep in the box
+        (0, 8, 40.0, 40.0),
+        (1, 21, 40.0, 0.0),  # along the cut
+        (0, 21, np.nan, 0.0),
+    ):
+        velocity = part.grid.faces()
+        host = velocity[axis].numpy()
+        host[1, 4, place] = cells * 0.1 / 0.02
+        assert distributed.too_far(part, velocity, 0.02) == pytest.approx(expected, rel=1e-5)
 
 
 def damaged(name, change):

@@ -13,17 +13,17 @@ from warp_lcp.distributed.decomposition import Box, Decomposition
 from warp_lcp.distributed.halo import exchange_all, star_forest
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 
-LAYERS = 5  # of ghost cells: to carry the velocity on at cut cells looks at the liquid up to 4.3 cells away
+LAYERS = 5  # of ghost cells: at a face that a wall closes the liquid up to 4.8 cells away tells whether it is held
 
 
 def ghost_layers(cfl: float, smoothing: int) -> int:
     """Return how many layers of ghost cells a box needs.
 
-    Of cells and faces the outermost ghost layer is right just after it was filled; what a face or cell takes from its neighbors is wrong a
-    layer further in, and so on. Fields are filled where that would reach the box itself. No filling comes between the stages of particles'
-    way in a step, at most the CFL number long as the particles' speeds tell, in which faces around each place are looked at: three layers
-    more leave room for liquid that the step makes faster. Nor between the binomial passes over a level set, one layer each, the slope
-    beside walls, a layer, and the two layers of cells in solids.
+    Ghost layers are right when they have been filled; what a face or cell takes from its neighbors is then wrong in the outermost layer, what
+    those take in the next, and so on. Fields are filled again before that would reach the box. Nothing is filled while particles move: a
+    stage of their way looks at faces within 1.5 cells of a place, and three layers more than the Courant number leave room for liquid that
+    the step makes faster. Nor between the binomial passes over a level set, a layer each, the slope beside walls, another, and the two layers
+    of cells in solids.
 
     Args:
         cfl: the Courant number of the run.
