@@ -86,13 +86,9 @@ class DistributedLiquid(LiquidSimulation):
         super().mark()
         self.particles.drop_ghosts()
 
-    def begin_step(self, dt: float) -> ParticleTotals:
-        """Check time step and particles, bring the particles into order with ghosts, and return sums over all; see the base class."""
-        self._dt = dt
-        return super().begin_step(dt)
-
     def step(self, dt: float) -> Row:
         """Advance by dt [s]; see the base class. What it raises is raised on all ranks."""
+        self._dt = dt
         try:
             return super().step(dt)
         except (StepFailed, SimulationFailed):

@@ -19,11 +19,11 @@ LAYERS = 5  # of ghost cells: at a face that a wall closes the liquid up to 4.8 
 def ghost_layers(cfl: float, smoothing: int) -> int:
     """Return how many layers of ghost cells a box needs.
 
-    Ghost layers are right when they have been filled; what a face or cell takes from its neighbors is then wrong in the outermost layer, what
-    those take in the next, and so on. Fields are filled again before that would reach the box. Nothing is filled while particles move: a
-    stage of their way looks at faces within 1.5 cells of a place, and three layers more than the Courant number leave room for liquid that
-    the step makes faster. Nor between the binomial passes over a level set, a layer each, the slope beside walls, another, and the two layers
-    of cells in solids.
+    Ghost layers are right when they have been filled; what a face or cell takes from its neighbors is then wrong in the outermost layer,
+    what those take in the next, and so on. Fields are filled again before that would reach the box. Nothing is filled while particles move:
+    a stage of their way looks at faces within 1.5 cells of a place, and three layers more than the Courant number leave room for liquid
+    that the step makes faster. Nor between the binomial passes over a level set, a layer each, the slope beside walls, another, and the two
+    layers of cells in solids.
 
     Args:
         cfl: the Courant number of the run.
