@@ -54,7 +54,7 @@ def make_pressure(
         )  # fmt: skip
     return PressureProjection(
         grid, boundary, solver, tolerance=settings.tolerance, max_iterations=settings.max_iterations, phi=surface.phi, coupling=coupling,
-        lets_go=scene.lets_go,
+        lets_go=scene.lets_go, weights=weights,
     )  # fmt: skip
 
 

@@ -77,7 +77,7 @@ class DistributedLiquid(LiquidSimulation):
         solver = wl.METHODS[settings.method](precision=settings.precision)
         return DistributedPressure(
             self.part, self.boundary, solver, tolerance=settings.tolerance, max_iterations=settings.max_iterations, phi=self.surface.phi,
-            lets_go=self.scene.lets_go,
+            lets_go=self.scene.lets_go, weights=self.weights,
         )  # fmt: skip
 
     def mark(self) -> None:

@@ -34,6 +34,7 @@ class DistributedPressure(PressureProjection):
         max_iterations: of the method a solve may take.
         phi: as of `PressureProjection`.
         lets_go: whether a wall separates.
+        weights: as of `PressureProjection`.
     """
 
     def __init__(
@@ -46,9 +47,12 @@ class DistributedPressure(PressureProjection):
         max_iterations: int = 100,
         phi: wp.array | None = None,
         lets_go: bool = True,
+        weights: Sequence[wp.array] | None = None,
     ) -> None:
         """Allocate the fields."""
-        super().__init__(part.grid, boundary, solver, tolerance=tolerance, max_iterations=max_iterations, phi=phi, lets_go=lets_go)
+        super().__init__(
+            part.grid, boundary, solver, tolerance=tolerance, max_iterations=max_iterations, phi=phi, lets_go=lets_go, weights=weights
+        )
         self.part, self._solved = part, part.owned
         if phi is None:
             self._shift = None  # the part's sides at cuts are open, the domain's are not
@@ -89,6 +93,11 @@ class DistributedPressure(PressureProjection):
     def _update(self, cells: wp.array) -> None:
         self._copy_to_box()
         self._operator.update(self._box_kind)
+
+    def _support(self, velocity: Sequence[wp.array], window: Window) -> None:
+        """Let the pressure act on what rests on the surface, beside projected faces of other ranks too."""
+        self.part.fill(*velocity, *self.known)
+        super()._support(velocity, window)
 
     def _copy_to_box(self) -> None:
         boxes = (self._box_kind, self._rhs, self._guess, self._box_lower, self._box_shift)

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from warp_lcp.grid.staggered import CellRange
+from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.contact import HELD, LETS_GO, RELEASED, TOUCHES
 from warp_lcp.native import BLOCK, simd
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
@@ -91,6 +92,34 @@ SUBTRACT = """
     }
 """
 
+# Open faces between AIR cells that particles gave weight, beside projected ones. All that a face reads of others is of projected ones, which
+# nobody writes here, so that the order does not matter.
+SUPPORT = """
+    const int nx = kind_.shape[2], ny = kind_.shape[1], nz = kind_.shape[0];
+    const long long s = axis == 0 ? 1 : (axis == 1 ? s2 : s1), steps[6] = {-1, 1, -s2, s2, -s1, s1};
+    const double* x = x_.data + row; float* field = field_.data + row; signed char* known = (signed char*)known_.data + row;
+    const float* weight = weight_.data + row;
+    const bool inside_y = j > 0 && j < (axis == 1 ? ny : ny - 1), inside_z = planes != 2 || (k > 0 && k < (axis == 2 ? nz : nz - 1));
+    const int low = first > 1 ? first : 1, end = axis == 0 ? nx : nx - 1, high = last < end ? last : end;
+    for (int i = low; i < high && inside_y && inside_z; ++i) {
+        if (known[i] != 0 || !(weight[i] > TINY_WEIGHTf)) continue;
+        if (kind[i] == SOLID || kind[i - s] == SOLID || !(fraction(axis, i, s) > 0.0f)) continue;
+        const bool there[6] = {true, i + 1 < nx, true, j + 1 < ny, planes == 2, planes == 2 && k + 1 < nz};
+        float change = 0.0f, velocity = 0.0f; int found = 0;
+        for (int n = 0; n < 6; ++n) {
+            const long long e = there[n] ? i + steps[n] : i;
+            if (known[e] != 1) continue;
+            const float inverse = kind[e] == AIR ? inverse_theta(e - s, e) : (kind[e - s] == AIR ? inverse_theta(e, e - s) : 1.0f);
+            change -= (float)(x[e] - x[e - s])*inverse; velocity += field[e]; ++found;
+        }
+        if (found == 0) continue;
+        change /= (float)found;
+        const float gap = velocity/(float)found - field[i], size = change < 0.0f ? -change : change, most = gap < 0.0f ? -gap : gap;
+        field[i] += change*gap > 0.0f ? (size < most ? change : gap) : 0.0f;
+        known[i] = 2;
+    }
+"""
+
 CONTACT = """
     const float* u = u_.data + row; const float* v = v_.data + row; const float* w = planes == 2 ? w_.data + row : u;
     const unsigned char* touch = touch_.data + row; const double* x = x_.data + row; unsigned char* contact = contact_.data + row;
@@ -126,12 +155,13 @@ def _source(body: str, *, cut: bool = False, moving: bool = False, ghost: bool =
     """Return a native function's body with its constants."""
     values = _CONSTANTS | {"CUT": int(cut), "MOVING": int(moving), "GHOST": int(ghost), "BOUNDED": int(bounded)}
     names = "".join(f"constexpr int {name} = {value}; " for name, value in values.items())
+    body = body.replace("TINY_WEIGHT", repr(TINY_WEIGHT))
     return simd(BLOCK + names + f"constexpr double THETA_MIN = {THETA_MIN};" + body)
 
 
 @functools.cache
 def pressure_kernels(cut: bool, moving: bool, ghost: bool, bounded: bool = True) -> SimpleNamespace:
-    """Return `prepare`, `subtract_gradient` and `contact`.
+    """Return `prepare`, `subtract_gradient`, `support` and `contact`.
 
     Args:
         cut: whether faces have open fractions.
@@ -153,6 +183,12 @@ def pressure_kernels(cut: bool, moving: bool, ghost: bool, bounded: bool = True)
     def subtract_row(
         axis: int, x_: _F64, kind_: _I8, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32, solid_y: _F32, solid_z: _F32, phi_: _F32,
         planes: int, field_: _F32, known_: _I8, k: int, j: int, first: int, last: int,
+    ): ...  # fmt: skip
+
+    @wp.func_native(_source(ROW + FACE + SUPPORT, **flags))
+    def support_row(
+        axis: int, x_: _F64, kind_: _I8, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32, solid_y: _F32, solid_z: _F32, phi_: _F32,
+        planes: int, weight_: _F32, field_: _F32, known_: _I8, k: int, j: int, first: int, last: int,
     ): ...  # fmt: skip
 
     @wp.func_native(_source(ROW + FACE + CONTACT, **flags))
@@ -189,6 +225,19 @@ def pressure_kernels(cut: bool, moving: bool, ghost: bool, bounded: bool = True)
         )  # fmt: skip
 
     @wp.kernel(enable_backward=False, module=module)
+    def support(
+        cells: CellRange, axis: int, x: _F64, kind: _I8, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32, solid_y: _F32,
+        solid_z: _F32, phi: _F32, planes: int, weight: _F32, field: _F32, known: _I8,
+    ):  # fmt: skip
+        """Give faces with weight beside projected ones the pressure's change there, as far as it brings them closer; they become 2."""
+        plane, row, chunk = wp.tid()
+        first = cells.i + chunk * cells.grain
+        support_row(
+            axis, x, kind, open_x, open_y, open_z, solid_x, solid_y, solid_z, phi, planes, weight, field, known,
+            cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end),
+        )  # fmt: skip
+
+    @wp.kernel(enable_backward=False, module=module)
     def contact(
         cells: CellRange, u: _F32, v: _F32, w: _F32, kind: _I8, touch: _U8, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32,
         solid_y: _F32, solid_z: _F32, phi: _F32, planes: int, x: _F64, threshold: wp.float64, contact_: _U8, sums: _F64,
@@ -200,7 +249,7 @@ def pressure_kernels(cut: bool, moving: bool, ghost: bool, bounded: bool = True)
             cells.k + plane, cells.j + row, cells.i, cells.end,
         )  # fmt: skip
 
-    return SimpleNamespace(prepare=prepare, subtract_gradient=subtract_gradient, contact=contact)
+    return SimpleNamespace(prepare=prepare, subtract_gradient=subtract_gradient, support=support, contact=contact)
 
 
 @wp.func_native(_source(COUNT))

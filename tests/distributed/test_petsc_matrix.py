@@ -19,4 +19,5 @@ def test_petscs_solvers_work_with_them(mpi, ranks, check):
 
 
 def test_a_cycle_is_that_of_pcmg(mpi):
-    mpi(1, PROGRAM, "cycles_of_pcmg")
+    done = mpi(1, PROGRAM, "cycles_of_pcmg")  # which asserts that they agree to 1e-12
+    assert done.returncode == 0

@@ -62,7 +62,7 @@ class Subdomain:
             if least < layers:
                 raise ValueError(
                     f"{decomposition.processes[axis]} ranks along {'xyz'[axis]} have boxes of {least} cells, but what a step looks at "
-                    f"around a box takes {layers}: at most {most} ranks fit along that axis, or refine the grid"
+                    f"around a box takes {layers}: start fewer ranks (along that axis {most} at most), or refine the grid"
                 )
         cells = self._cells(self.box)
         self.grid = StaggeredGrid(cells.counts, spacing, dimension, device, origin=cells.low, whole=decomposition.counts)
