@@ -173,6 +173,11 @@ def wrong_input(ranks):
         except ValueError as error:
             assert word in str(error), error
     if ranks.size > 1:
+        try:  # on one rank alone
+            DistributedGridPoisson(boxes, cells if ranks.rank else cells[:, :-1], device="cpu")
+            raise AssertionError("cells")
+        except ValueError as error:
+            assert "rank 0: cells has shape" in str(error), error
         try:
             wl.solve(problem, wl.ProjectedSOR())
             raise AssertionError("ProjectedSOR")

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import itertools
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+from warp_lcp.distributed.meeting import Meeting
 from warp_lcp.distributed.ranks import Ranks, petsc
 
 UNEVEN = 1.125  # the largest part may exceed an even share by this factor, so that cuts lie at multiples of large powers of two
@@ -126,6 +128,11 @@ class Decomposition:
         from warp_lcp.distributed.halo import Halo
 
         return Halo(self, 1)
+
+    @cached_property
+    def meeting(self) -> Meeting:
+        """Blocks of code that the ranks leave alike: what fails on one fails on all."""
+        return Meeting(self.ranks, planned=(ValueError, OSError), last_words=sys.stderr.write)
 
     @cached_property
     def dmda(self) -> Any:

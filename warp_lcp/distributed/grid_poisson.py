@@ -43,19 +43,26 @@ class DistributedGridPoisson(GridPoisson):
 
     def __init__(self, decomposition: Decomposition, cells: Any, **coefficients: Any) -> None:
         self.decomposition = decomposition
-        shape, expected = tuple(np.shape(cells)), tuple(reversed(decomposition.box.counts))
-        if any(coefficients.pop("periodic", ())):
-            raise ValueError("periodic: axes that wrap around are not shared by ranks yet; take one rank")
-        if shape != expected and not (shape == expected[1:] and decomposition.counts[2] == 1):
-            raise ValueError(f"cells has shape {shape}: expected {expected}, the cells of rank {decomposition.ranks.rank}")
-        if decomposition.ranks.size > 1:
-            for axis in decomposition.cut_axes:
-                if min(decomposition.parts[axis]) < 2:
-                    raise ValueError(f"a rank has one cell along {'xyz'[axis]}: boxes of shared operators have at least two")
-            self._ghosts, self._across = decomposition.halo, decomposition.ranks
+        with decomposition.meeting.together():
+            self._check(cells, coefficients)
         kinds = [(name, np.ndim(value) > 0 or value) for name, value in sorted(coefficients.items()) if name not in ("device", "dtype")]
         decomposition.ranks.agree("what the coefficients are", kinds)
-        super().__init__(cells, **coefficients)
+        if decomposition.ranks.size > 1:
+            self._ghosts, self._across = decomposition.halo, decomposition.ranks
+        with decomposition.meeting.together():
+            super().__init__(cells, **coefficients)
+
+    def _check(self, cells: Any, coefficients: dict[str, Any]) -> None:
+        """Refuse what is wrong on this rank; takes `periodic` out of the coefficients."""
+        boxes = self.decomposition
+        shape, expected = tuple(np.shape(cells)), tuple(reversed(boxes.box.counts))
+        if any(coefficients.pop("periodic", ())):
+            raise ValueError("periodic: axes that wrap around are not shared by ranks yet; take one rank")
+        if shape != expected and not (shape == expected[1:] and boxes.counts[2] == 1):
+            raise ValueError(f"cells has shape {shape}: expected {expected}, the cells of rank {boxes.ranks.rank}")
+        for axis in boxes.cut_axes:
+            if min(boxes.parts[axis]) < 2:
+                raise ValueError(f"a rank has one cell along {'xyz'[axis]}: boxes of shared operators have at least two")
 
     @property
     def unknowns(self) -> int:
