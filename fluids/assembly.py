@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import warp as wp
 
 import warp_lcp as wl
@@ -54,7 +55,7 @@ def make_pressure(
         )  # fmt: skip
     return PressureProjection(
         grid, boundary, solver, tolerance=settings.tolerance, max_iterations=settings.max_iterations, phi=surface.phi, coupling=coupling,
-        lets_go=scene.lets_go, weights=weights,
+        lets_go=scene.lets_go, weights=weights if scene.short_steps else None, gravity=float(np.linalg.norm(scene.physics.gravity)),
     )  # fmt: skip
 
 

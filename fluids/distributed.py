@@ -77,7 +77,8 @@ class DistributedLiquid(LiquidSimulation):
         solver = wl.METHODS[settings.method](precision=settings.precision)
         return DistributedPressure(
             self.part, self.boundary, solver, tolerance=settings.tolerance, max_iterations=settings.max_iterations, phi=self.surface.phi,
-            lets_go=self.scene.lets_go, weights=self.weights,
+            lets_go=self.scene.lets_go, weights=self.weights if self.scene.short_steps else None,
+            gravity=float(np.linalg.norm(self.gravity)),
         )  # fmt: skip
 
     def mark(self) -> None:
@@ -275,13 +276,18 @@ def create(scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> Distribu
     part = _part(scene, ranks, device)
     cut_cells, separating = scene.domain.solids == "cut-cell", scene.domain.wall == "separating"
     boundary, warnings = boundary_of_part(part, placed_solids(scene, folder), cut_cells=cut_cells, wall_separating=separating)
+    particles, notes = _particles(scene, part, boundary, folder)
+    return DistributedLiquid(scene, part, boundary, particles, notes=[*warnings, *notes])
+
+
+def _particles(scene: LiquidScene, part: Subdomain, boundary: Boundary, folder: Path) -> tuple[SharedParticles, list[str]]:
+    """Return this rank's particles at the start, and warnings; the host's arrays are gone before the fields are made."""
     elsewhere = np.ones(part.grid.counts[::-1], dtype=bool)
     elsewhere[tuple(slice(low - 1, high - 1) for low, high in zip(part.owned.low, part.owned.high, strict=True))] = False
     position, owner, notes = seed_materials(scene, part.grid, boundary, folder, elsewhere)
-    _check_seeded(scene, ranks.sum(np.bincount(owner, minlength=len(scene.materials()[1]))))
+    _check_seeded(scene, part.ranks.sum(np.bincount(owner, minlength=len(scene.materials()[1]))))
     velocity = start_velocities(scene).astype(np.float32)[owner]
-    particles = SharedParticles(part, position, velocity, affine=scene.particles.transfer == "apic")
-    return DistributedLiquid(scene, part, boundary, particles, notes=[*warnings, *notes])
+    return SharedParticles(part, position, velocity, affine=scene.particles.transfer == "apic"), notes
 
 
 def _part(scene: LiquidScene, ranks: Ranks, device: str) -> Subdomain:

@@ -35,6 +35,7 @@ class DistributedPressure(PressureProjection):
         phi: as of `PressureProjection`.
         lets_go: whether a wall separates.
         weights: as of `PressureProjection`.
+        gravity: as of `PressureProjection`.
     """
 
     def __init__(
@@ -48,10 +49,19 @@ class DistributedPressure(PressureProjection):
         phi: wp.array | None = None,
         lets_go: bool = True,
         weights: Sequence[wp.array] | None = None,
+        gravity: float = 0.0,
     ) -> None:
         """Allocate the fields."""
         super().__init__(
-            part.grid, boundary, solver, tolerance=tolerance, max_iterations=max_iterations, phi=phi, lets_go=lets_go, weights=weights
+            part.grid,
+            boundary,
+            solver,
+            tolerance=tolerance,
+            max_iterations=max_iterations,
+            phi=phi,
+            lets_go=lets_go,
+            weights=weights,
+            gravity=gravity,
         )
         self.part, self._solved = part, part.owned
         if phi is None:
@@ -83,8 +93,7 @@ class DistributedPressure(PressureProjection):
         faces = {}
         for axis, field in zip("xyz", self.boundary.open, strict=False):
             face = faces[f"face_{axis}"] = self._box_like(field)
-            if face is not field:
-                wp.copy(face, self.part.stored_box_of(field))
+            self._copy(field, face)
         cells, decomposition = self._box_kind.numpy()[1:-1, 1:-1, 1:-1], self.part.decomposition
         self._operator = DistributedGridPoisson(decomposition, cells, shift=self._box_shift, device=self.grid.device, **faces)
         self._problem = wl.LCP(self._operator, self._rhs, -np.inf if self._box_lower is None else self._box_lower, np.inf)
@@ -102,8 +111,8 @@ class DistributedPressure(PressureProjection):
     def _copy_to_box(self) -> None:
         boxes = (self._box_kind, self._rhs, self._guess, self._box_lower, self._box_shift)
         for field, box in zip((self.kind, self._b, self._start, self._lower, self._shift), boxes, strict=True):
-            if box is not field:
-                wp.copy(box, self.part.stored_box_of(field))
+            if box is not None:
+                self._copy(field, box)
 
     def _take(self, x: wp.array) -> None:
         """Take the solution of the problem as the pressure, that of the ghost layers from other ranks."""
@@ -119,6 +128,12 @@ class DistributedPressure(PressureProjection):
         return float(every[:, 0].sum()), float(every[:, 1].max())
 
     def _box_like(self, field: wp.array) -> wp.array:
-        """Return a field of zeros of the box with a ring; on one rank the field itself, which is of the box."""
-        shape = self.part.stored_box_of(field).shape
-        return field if shape == field.shape else wp.zeros(shape, dtype=field.dtype, device=self.grid.device)
+        """Return a field of the box with a ring: memory of the field itself where boxes are layers of planes, else one of zeros."""
+        view = self.part.stored_box_of(field)
+        return view if view.is_contiguous else wp.zeros(view.shape, dtype=field.dtype, device=self.grid.device)
+
+    def _copy(self, field: wp.array, box: wp.array) -> None:
+        """Give a field of the box what one of the part holds, if it does not share its memory."""
+        view = self.part.stored_box_of(field)
+        if view.ptr != box.ptr:
+            wp.copy(box, view)

@@ -53,10 +53,11 @@ class PressureProjection:
     solids that cut cells the matrix keeps unit weights, and the surface adds a_f (1 / theta_f - 1) to the diagonal. Beyond an open side of
     the domain lies AIR that the operator does not have: its faces add a_f / theta_f.
 
-    Material in AIR cells has no pressure. Beside the surface it rests on liquid nevertheless: a face there that particles gave weight takes
-    the mean change of the projected faces around it, but no more than brings it to their mean velocity. To take that velocity itself, in
-    every step however short, would drag spray along with whatever passes it: at CFL 1/8 that raised the energy of liquid poured over a
-    mesh without bound.
+    Material in AIR cells has no pressure; where the velocity is continued into air, it takes that of liquid beside it. With `weights`, for
+    short steps, it rests on the surface instead: a face there that particles gave weight takes the mean change of the projected faces
+    around it, but no more than gravity gave it, nor than brings it to their mean velocity. To take that velocity itself, in every step
+    however short, would drag spray along with whatever passes it: at CFL 1/8 that raised the energy of liquid poured over a mesh without
+    bound, and so did changes beyond gravity's at CFL 1/16.
 
     Args:
         grid: the grid.
@@ -67,7 +68,8 @@ class PressureProjection:
         phi: float32 distance to the free surface at cell centers [cells], < 0 exactly in FLUID cells; None: it lies on the cells' faces.
         coupling: with bodies that the pressure moves, whose term A then has too; None: there are none.
         lets_go: whether a wall separates; else y = 0 on all cells, and no bounds are stored.
-        weights: of the particles on each component's faces; None: AIR cells hold nothing.
+        weights: of the particles on each component's faces; None: nothing rests on the surface.
+        gravity: its size [m/s^2], the most that the surface supports.
 
     Attributes:
         kind: int8 of AIR, FLUID, SOLID, which the caller marks.
@@ -90,10 +92,11 @@ class PressureProjection:
         coupling: BodyCoupling | None = None,
         lets_go: bool = True,
         weights: Sequence[wp.array] | None = None,
+        gravity: float = 0.0,
     ) -> None:
         """Allocate the fields."""
         self.grid, self.boundary, self.solver, self._phi, self.coupling = grid, boundary, solver, phi, coupling
-        self._weights = list(weights or ())
+        self._weights, self._gravity = list(weights or ()), gravity
         self.tolerance, self.max_iterations = tolerance, max_iterations
         self.automatic = TimeErrorTolerance(grid.size, grid.device) if tolerance == "auto" else None
         self._kernels = kernels.pressure_kernels(bool(boundary.open), bool(boundary.velocity), phi is not None, lets_go)
@@ -281,7 +284,9 @@ class PressureProjection:
     def _support(self, velocity: Sequence[wp.array], window: Window) -> None:
         """Let the pressure act on what rests on the surface; its faces become known after the projected ones."""
         for axis, (field, weight, known) in enumerate(zip(velocity, self._weights, self.known, strict=False)):
-            window.launch(self._kernels.support, [axis, self.pressure, self.kind, *self._faces(), weight, field, known])
+            window.launch(
+                self._kernels.support, [axis, self.pressure, self.kind, *self._faces(), weight, self._gravity * self._dt, field, known]
+            )
 
     def _count(self, kind: wp.array) -> int:
         """Return the number of cells that are FLUID in a field."""

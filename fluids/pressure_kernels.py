@@ -92,8 +92,8 @@ SUBTRACT = """
     }
 """
 
-# Open faces between AIR cells that particles gave weight, beside projected ones. All that a face reads of others is of projected ones, which
-# nobody writes here, so that the order does not matter.
+# Open faces between AIR cells that particles gave weight, beside projected ones. All that a face reads of others is of projected ones,
+# which nobody writes here, so that the order does not matter.
 SUPPORT = """
     const int nx = kind_.shape[2], ny = kind_.shape[1], nz = kind_.shape[0];
     const long long s = axis == 0 ? 1 : (axis == 1 ? s2 : s1), steps[6] = {-1, 1, -s2, s2, -s1, s1};
@@ -115,7 +115,8 @@ SUPPORT = """
         if (found == 0) continue;
         change /= (float)found;
         const float gap = velocity/(float)found - field[i], size = change < 0.0f ? -change : change, most = gap < 0.0f ? -gap : gap;
-        field[i] += change*gap > 0.0f ? (size < most ? change : gap) : 0.0f;
+        const float nearer = change*gap > 0.0f ? (size < most ? change : gap) : 0.0f, low = nearer > -limit ? nearer : -limit;
+        field[i] += low < limit ? low : limit;
         known[i] = 2;
     }
 """
@@ -188,7 +189,7 @@ def pressure_kernels(cut: bool, moving: bool, ghost: bool, bounded: bool = True)
     @wp.func_native(_source(ROW + FACE + SUPPORT, **flags))
     def support_row(
         axis: int, x_: _F64, kind_: _I8, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32, solid_y: _F32, solid_z: _F32, phi_: _F32,
-        planes: int, weight_: _F32, field_: _F32, known_: _I8, k: int, j: int, first: int, last: int,
+        planes: int, weight_: _F32, limit: float, field_: _F32, known_: _I8, k: int, j: int, first: int, last: int,
     ): ...  # fmt: skip
 
     @wp.func_native(_source(ROW + FACE + CONTACT, **flags))
@@ -227,13 +228,13 @@ def pressure_kernels(cut: bool, moving: bool, ghost: bool, bounded: bool = True)
     @wp.kernel(enable_backward=False, module=module)
     def support(
         cells: CellRange, axis: int, x: _F64, kind: _I8, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32, solid_y: _F32,
-        solid_z: _F32, phi: _F32, planes: int, weight: _F32, field: _F32, known: _I8,
+        solid_z: _F32, phi: _F32, planes: int, weight: _F32, limit: float, field: _F32, known: _I8,
     ):  # fmt: skip
-        """Give faces with weight beside projected ones the pressure's change there, as far as it brings them closer; they become 2."""
+        """Give faces with weight beside projected ones their change, up to `limit` [m/s] and not beyond them; they become 2."""
         plane, row, chunk = wp.tid()
         first = cells.i + chunk * cells.grain
         support_row(
-            axis, x, kind, open_x, open_y, open_z, solid_x, solid_y, solid_z, phi, planes, weight, field, known,
+            axis, x, kind, open_x, open_y, open_z, solid_x, solid_y, solid_z, phi, planes, weight, limit, field, known,
             cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end),
         )  # fmt: skip
 

@@ -23,6 +23,7 @@ from warp_lcp.grid.particles import SORT_EVERY, Particles, ParticleTotals
 
 MOST_A_CELL = 1 << 20  # particles; places of one cell are numbers below those of the next
 REACH = 1  # cells from a box within which particles touch its faces and cells
+ROOM = 1.25  # of the storage over the particles at the start: ghosts come before the first step
 ENDLESS = 1e30  # a coordinate beyond all
 COUNT, DATA = 7101, 7102  # tags of messages
 
@@ -96,6 +97,8 @@ class SharedParticles(Particles):
         around = part.box.grown(REACH)
         boxes = part.decomposition.boxes
         self._neighbors = [r for r, box in enumerate(boxes) if r != part.ranks.rank and around.common(box).cells]
+        if self._neighbors:
+            self.room = ROOM
         self._post = post or MpiPost(part.ranks.comm)
         super().__init__(part.grid, position, velocity, affine=affine, indexed=indexed)
         self._record = np.dtype([("place", np.int64), ("values", np.float32, (len(self._names), 3))])
@@ -113,11 +116,10 @@ class SharedParticles(Particles):
         cells = self._cells(border)
         keep = np.ones(self.count, dtype=bool)
         keep[border[~_within(cells, self.part.box.grown(REACH))]] = False
-        keep = np.flatnonzero(keep)
         places = self._receive(self._post.swap(self._outgoing(border, cells)))
-        kept = np.concatenate([keep, np.arange(len(self.place), self.count)])
         places = np.concatenate([self.place[keep], places])
-        order = np.argsort(places, kind="stable")
+        kept = np.concatenate([np.flatnonzero(keep).astype(np.int32), np.arange(len(self.place), self.count, dtype=np.int32)])
+        order = np.argsort(places, kind="stable").astype(np.int32)
         self._take(kept[order], places[order])
         if due:
             self.sort()
@@ -128,14 +130,16 @@ class SharedParticles(Particles):
     def sort(self) -> None:
         """Bring the particles, which are in the order of their places, into that of their cells, and give them new places."""
         self.number()
-        order = np.argsort(self.key.numpy()[: self.count], kind="stable")
-        self._take(order, self.place)
+        self._take(np.argsort(self.key.numpy()[: self.count], kind="stable"), self.place)
         self.number()
         nx, ny, _ = self.part.decomposition.counts
-        starts = np.flatnonzero(np.diff(self.key.numpy()[: self.count], prepend=-1))
+        key, begins = self.key.numpy()[: self.count], np.ones(self.count, dtype=bool)
+        begins[1:] = key[1:] != key[:-1]
+        starts = np.flatnonzero(begins)
         i, j, k = self._cells(starts).T.astype(np.int64)
         first = ((k * ny + j) * nx + i) * MOST_A_CELL
-        self.place = np.arange(self.count) + np.repeat(first - starts, np.diff(starts, append=self.count))
+        self.place = np.repeat(first - starts, np.diff(starts, append=self.count))
+        self.place += np.arange(self.count)
         if self.offsets is not None and self.count:
             wp.launch(kernels.offset_kernel, self.grid.size + 1, [self.key, self.count, self.offsets], device=self.grid.device)
         elif self.offsets is not None:
@@ -221,7 +225,7 @@ class SharedParticles(Particles):
         """Keep the particles of these numbers, in this order."""
         device, count = self.grid.device, len(order)
         if count:
-            numbers = wp.array(order.astype(np.int32), dtype=wp.int32, device=device)
+            numbers = wp.array(order.astype(np.int32, copy=False), dtype=wp.int32, device=device, copy=device.is_cuda)
             for name, column in self._columns.items():
                 wp.launch(kernels.reorder_kernel, count, [numbers, column.view, self._spare.view], device=device)
                 self._columns[name], self._spare = self._spare, column

@@ -10,6 +10,7 @@ from warp_lcp.grid import particles_kernels as kernels
 from warp_lcp.grid.particle_loops import launch
 from warp_lcp.grid.runge_kutta import MARGIN
 from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.layout import zeros
 
 CHUNK = 256  # the fewest particles that one thread adds up
 THREADS = 1024  # the most threads of a sum, each a partial result that the host reads
@@ -57,7 +58,10 @@ class Column:
 
     def __init__(self, capacity: int, count: int, device: wp.Device) -> None:
         """Allocate zeros."""
-        self.store = wp.zeros(capacity, dtype=wp.vec3, device=device)
+        if device.is_cpu:  # NumPy's zeros take no memory before a particle has been there
+            self.store = wp.array(np.zeros((capacity, 3), dtype=np.float32), dtype=wp.vec3, device=device, copy=False)
+        else:
+            self.store = wp.zeros(capacity, dtype=wp.vec3, device=device)
         self.view = self.store[:count]
 
 
@@ -81,6 +85,7 @@ class Particles:
         ValueError: the shapes do not match.
     """
 
+    room = 1.0  # of the storage over the particles that it is made for
     _order: wp.array  # scratch memory, as large as `key`
     _spare: Column  # where the next reordered column goes
 
@@ -193,15 +198,15 @@ class Particles:
     def _grow(self, before: int) -> None:
         """Make room for `count` particles and more, and keep those there were `before`."""
         device = self.grid.device
-        self._capacity = max(self.count, int(GROWTH * self._capacity), 1)
+        self._capacity = max(int(self.room * self.count), int(GROWTH * self._capacity), 1)
         for name in self._names:
             column = Column(self._capacity, self.count, device)
             if before:
                 wp.copy(column.store, self._columns[name].store, count=before)
             self._columns[name] = column
         self._spare = Column(self._capacity, self.count, device)
-        self.key = wp.zeros(2 * self._capacity, dtype=wp.int32, device=device)
-        self._order = wp.zeros(2 * self._capacity, dtype=wp.int32, device=device)
+        self.key = zeros(2 * self._capacity, wp.int32, device)
+        self._order = zeros(2 * self._capacity, wp.int32, device)
 
     def arrange(self, step: int) -> None:
         """Number the particles by cell, and sort them in every SORT_EVERY-th step, or in each where the order is needed.
