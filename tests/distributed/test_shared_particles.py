@@ -170,7 +170,9 @@ def test_boxes_thinner_than_the_ghost_layers_are_refused():
     def work(seat: Seat) -> None:
         part_of(seat, (16, 3, 1))
 
-    with pytest.raises(ValueError, match=r"4 ranks along x have boxes of 4 cells.*takes 5: at most 3 ranks fit"):
+    with pytest.raises(
+        ValueError, match=r"4 ranks along x have boxes of 4 cells.*takes 5: start fewer ranks \(along that axis 3 at most\)"
+    ):
         on_ranks(4, work)
 
 
