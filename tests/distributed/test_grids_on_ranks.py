@@ -18,9 +18,10 @@ def test_problems_of_one_process_and_of_ranks(mpi, ranks):
 
 @pytest.mark.parametrize("ranks", [2, 4])
 def test_halos_of_every_type(mpi, ranks):
-    mpi(
-        ranks,
-        """
+    assert (
+        mpi(
+            ranks,
+            """
         import numpy as np
         from warp_lcp.distributed.decomposition import Decomposition
         from warp_lcp.distributed.halo import Halo
@@ -46,6 +47,8 @@ def test_halos_of_every_type(mpi, ranks):
         except ValueError as error:
             assert "2 cells along z, but 3 ghost cells" in str(error)
         """,
+        ).returncode
+        == 0
     )
 
 

@@ -89,24 +89,24 @@ def test_ranks_have_the_log_and_the_pressure_of_one_process(mpi, tmp_path, logs,
 @pytest.mark.slow
 def test_a_dam_break_has_the_log_of_one_process(mpi, tmp_path):
     """The last bit of a thousandth of all velocities, changed once in one process, makes up to 1.7e-6 of a column in these steps."""
-    mpi(2, PROGRAM, "dam", tmp_path, environment={"PYTHONPATH": f"{TESTS}:{TESTS.parent}"}, seconds=300.0)
+    assert mpi(2, PROGRAM, "dam", tmp_path, environment={"PYTHONPATH": f"{TESTS}:{TESTS.parent}"}, seconds=300.0).returncode == 0
     rows = advance(create(load_scene("dam-break")), DAM_STEPS)
     same(json.loads((tmp_path / "dam.json").read_text()), rows, 3e-6)
 
 
 def test_a_run_goes_on_on_any_number_of_ranks(mpi, tmp_path):
     environment = {"PYTHONPATH": f"{TESTS}:{TESTS.parent}"}
-    mpi(2, PROGRAM, "keep", tmp_path, environment=environment)
+    assert mpi(2, PROGRAM, "keep", tmp_path, environment=environment).returncode == 0
     whole = json.loads((tmp_path / "whole.json").read_text())[5:]
     for ranks in (1, 2, 4):
-        mpi(ranks, PROGRAM, "go-on", tmp_path, environment=environment)
+        assert mpi(ranks, PROGRAM, "go-on", tmp_path, environment=environment).returncode == 0
         same(json.loads((tmp_path / f"rest_{ranks}.json").read_text()), whole, 0.0 if ranks == 2 else CLOSE["cut"])
 
 
 def test_failures_are_those_of_all_ranks(mpi, tmp_path):
     environment = {"PYTHONPATH": f"{TESTS}:{TESTS.parent}"}
-    mpi(2, PROGRAM, "fail", tmp_path, environment=environment)
-    mpi(2, PROGRAM, "differ", tmp_path, environment=environment)
+    assert mpi(2, PROGRAM, "fail", tmp_path, environment=environment).returncode == 0
+    assert mpi(2, PROGRAM, "differ", tmp_path, environment=environment).returncode == 0
 
 
 def test_pieces_of_any_boxes_can_be_read():

@@ -110,11 +110,13 @@ def test_statuses_and_limits(mpi, told):
 
 
 def test_problems_that_change_in_place_keep_their_workspace(mpi):
-    mpi(1, IN_PLACE)
+    assert mpi(1, IN_PLACE).returncode == 0
 
 
 def test_options_of_petsc_count(mpi):
-    mpi(1, WITH_OPTIONS, environment={"PETSC_OPTIONS": "-ksp_type fcg -pc_type jacobi -ksp_max_it 70 -ksp_rtol 1e-12"})
+    assert (
+        mpi(1, WITH_OPTIONS, environment={"PETSC_OPTIONS": "-ksp_type fcg -pc_type jacobi -ksp_max_it 70 -ksp_rtol 1e-12"}).returncode == 0
+    )
 
 
 def test_monitors_speak(mpi):
