@@ -58,8 +58,11 @@ def compare(ranks, name, cells, b, lower, upper=np.inf, *, method, decomposition
     expected = wl.solve(alone, method, stopping=stopping)
     assert found.status is expected.status, (name, found.status, expected.status)
     assert abs(found.iterations - expected.iterations) <= 1, (name, found.iterations, expected.iterations)
-    # floats of the residual that both start from agree; the norm is of all ranks
-    assert np.isclose(found.history[0].residual, expected.history[0].residual, rtol=1e-12), name
+    # both start from the same residual, and take the same steps on their way: lengths and directions are from sums over all ranks
+    ours, theirs = (np.array([r.residual for r in result.history]) for result in (found, expected))
+    assert np.isclose(ours[0], theirs[0], rtol=1e-12), name
+    way = min(len(ours), len(theirs), 4)  # later, rounding may have moved cells between sets
+    assert np.allclose(ours[:way], theirs[:way], rtol=1e-3, atol=1e-300), (name, ours[:way], theirs[:way])
     own, whole = found.x.numpy(), expected.x.numpy()
     error = ranks.max(float(np.abs(own - part(whole, boxes.box, shape)).max(initial=0.0)))
     scale = max(float(np.abs(whole).max()), 1e-300)
