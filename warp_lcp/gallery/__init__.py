@@ -8,7 +8,7 @@ from warp_lcp.gallery.contact_stepper import ContactStepper
 from warp_lcp.gallery.families import FAMILIES
 from warp_lcp.gallery.fclib import FclibProblem, read_fclib
 from warp_lcp.gallery.fluid import Splash, basin, splash
-from warp_lcp.gallery.obstacle import ball_obstacle
+from warp_lcp.gallery.obstacle import ball_obstacle, dam, torsion
 from warp_lcp.gallery.planted import Plant, planted, poisson
 from warp_lcp.gallery.problem import FACTS, Problem
 from warp_lcp.gallery.psd import definite, period_three, semidefinite, skewed
@@ -33,6 +33,7 @@ __all__ = [
     "basin",
     "contact",
     "contact_scene",
+    "dam",
     "definite",
     "period_three",
     "planted",
@@ -42,4 +43,5 @@ __all__ = [
     "semidefinite",
     "skewed",
     "splash",
+    "torsion",
 ]

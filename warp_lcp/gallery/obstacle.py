@@ -1,4 +1,4 @@
-"""A membrane over a ball: the obstacle problem whose solution and free boundary are known."""
+"""Obstacle problems of the literature: a membrane over a ball, torsion of a bar that yields, seepage through a dam."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from warp_lcp.operators.grid_poisson import AIR, FLUID, GridPoisson
 
 RADIUS = 0.697965148223374  # a, where the membrane leaves the ball: a^2 (log 2 - log a) = 1 - a^2
 EDGE = 0.9  # beyond it the ball is continued by its tangent cone, so that psi is defined on the square
+FACTS = frozenset({"symmetric", "positive-definite", "p-matrix", "m-matrix", "positive-diagonal", "unique", "solvable"})
 SLOPE = RADIUS**2 / np.sqrt(1 - RADIUS**2)  # of the membrane against -log r
 
 
@@ -53,5 +54,61 @@ def ball_obstacle(n: int, *, device: Any = None, dtype: Any = wp.float32) -> Pro
     b, lower, u = (np.zeros((n, n)) for _ in range(3))
     b[inner] = -(border[2:, 1:-1] + border[:-2, 1:-1] + border[1:-1, 2:] + border[1:-1, :-2])
     lower[inner], u[inner] = ball_height(r)[inner], exact[inner]
-    facts = frozenset({"symmetric", "positive-definite", "p-matrix", "m-matrix", "positive-diagonal", "unique", "solvable"})
-    return Problem(f"ball obstacle {n}x{n}", GridPoisson(cells, device=device, dtype=dtype), b, lower, np.full((n, n), np.inf), u, facts)
+    return Problem(f"ball obstacle {n}x{n}", GridPoisson(cells, device=device, dtype=dtype), b, lower, np.full((n, n), np.inf), u, FACTS)
+
+
+def torsion(n: int, load: float = 5.0, *, device: Any = None, dtype: Any = wp.float32) -> Problem:
+    """Return the elastic-plastic torsion of a square bar: -Laplace u = load where |u| is less than the distance to the border.
+
+    The unit square has n nodes a side, the border not included; u is Prandtl's stress function, whose slope is 1 at most. Where |u| is the
+    distance, the bar has yielded: along the diagonals it never does.
+
+    Args:
+        n: inner nodes a side.
+        load: twice the shear modulus times the twist, in units of the yield stress.
+        device: Warp device of the operator.
+        dtype: its storage.
+
+    Raises:
+        ValueError: there is no inner node.
+    """
+    if n < 1:
+        raise ValueError(f"n = {n}: must be >= 1, the inner nodes a side")
+    cells = np.pad(np.full((n, n), FLUID, dtype=np.int8), 1, constant_values=AIR)
+    X, Y = np.meshgrid(*(np.linspace(0, 1, n + 2),) * 2)
+    distance = np.minimum(np.minimum(X, 1 - X), np.minimum(Y, 1 - Y))
+    b = np.where(cells == FLUID, -load / (n + 1) ** 2, 0.0)
+    A = GridPoisson(cells, device=device, dtype=dtype)
+    return Problem(f"torsion {n}x{n}", A, b, -distance, distance, None, FACTS | {"boxed"})
+
+
+def dam(nx: int, ny: int, *, device: Any = None, dtype: Any = wp.float32) -> Problem:
+    """Return the seepage of water through a dam, 16 wide and 24 high, from a full reservoir to water of depth 4 [Brandt & Cryer 1983].
+
+    By Baiocchi's transform, w(x, y) is the integral of the pressure's head from y up: w >= 0, -Laplace w + 1 >= 0, and w has its values
+    on the border. Where w > 0 the dam is wet. `b` holds hx hy and the border's values, which are AIR.
+
+    Args:
+        nx: nodes along x, the border included.
+        ny: nodes along y, the border included.
+        device: Warp device of the operator.
+        dtype: its storage.
+
+    Raises:
+        ValueError: there is no inner node.
+    """
+    if min(nx, ny) < 3:
+        raise ValueError(f"nx, ny = {nx}, {ny}: must be >= 3, the nodes with those on the border")
+    width, high, low = 16.0, 24.0, 4.0
+    x, y = np.linspace(0, width, nx), np.linspace(0, high, ny)
+    w = np.zeros((ny, nx))
+    w[0] = (high**2 * (width - x) + low**2 * x) / (2 * width)
+    w[:, 0], w[:, -1] = (high - y) ** 2 / 2, np.where(y < low, (low - y) ** 2 / 2, 0.0)
+    faces = y[1] / x[1], x[1] / y[1]
+    cells = np.full((ny, nx), AIR, dtype=np.int8)
+    inner = (slice(1, -1),) * 2
+    cells[inner], w[inner] = FLUID, 0.0
+    b = np.zeros((ny, nx))
+    b[inner] = x[1] * y[1] - faces[0] * (w[1:-1, 2:] + w[1:-1, :-2]) - faces[1] * (w[2:, 1:-1] + w[:-2, 1:-1])
+    A = GridPoisson(cells, face_x=faces[0], face_y=faces[1], device=device, dtype=dtype)
+    return Problem(f"dam {nx}x{ny}", A, b, np.zeros_like(b), np.full_like(b, np.inf), None, FACTS)

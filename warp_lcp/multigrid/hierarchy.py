@@ -290,6 +290,13 @@ class Hierarchy:
         return self._descent(0, projected=True, from_zero=True)
 
     @cached_property
+    def projected_sweep(self) -> Program:
+        """One projected Jacobi sweep of the finest level: what no bounded problem can make worse."""
+        program, L = Program(self.device), self.finest
+        L.sweep(L.x, L.t, min(self.settings.weights), projected=True, from_zero=True, launch=program.launch)
+        return program
+
+    @cached_property
     def open_cycle(self) -> Program | None:
         """The linear cycle without its last leg, for a caller who fuses that with what follows; None where it is no single launch."""
         if len(self.levels) == 1 or self._first_small == 0 or not self._fuses(self.finest):

@@ -104,8 +104,9 @@ class GridNewtonWorkspace(MultigridWorkspace):
             iterations += 1
             if residual.stale or not residual.norm > wanted or iterations >= s.max_linear_iterations:
                 break
-        if not residual.norm > (1 - DECREASE) * limit or not math.isfinite(residual.norm) or not self.bounded:
-            return Step("newton", iterations, active)
+        sinks = self._descent.sinks  # then the residual may rise
+        if sinks or not residual.norm > (1 - DECREASE) * limit or not math.isfinite(residual.norm) or not self.bounded:
+            return Step("newton", iterations, active, interim=sinks)
         return self._shorten(limit, iterations, active)
 
     def classify(self) -> None:
@@ -144,10 +145,9 @@ class GridNewtonWorkspace(MultigridWorkspace):
             self._set_length(length, 0.5 * length, whole)
             length *= 0.5
             if residual.evaluate(self.x) <= (1 - DECREASE * length) * limit:
-                return Step("newton", iterations, active)
-        self._cycles_left, self._relapse = self._relapse, 2 * self._relapse
-        residual.classify = False
-        residual.evaluate(self.x)
+                self._judge()
+                return Step("newton", iterations, active, interim=self._descent.sinks)
+        self._begin_cycles(self._descent.due(0))
         return Step("monotone cycle", iterations + self.monotone_step().linear_iterations, active)
 
     def _set_length(self, old: float, new: float, whole: float) -> None:

@@ -41,7 +41,7 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
             + stencil_head(variable, "double")
             + f"""typedef {C_TYPES[free_type]} F; typedef {C_TYPES[real]} S; F* free = free_.data + p;
         const T *x = x_.data + p, *over = x + s1, *b = b_.data + p; S* g = g_.data + p;
-        const auto* m = m_.data + p; T s = 0; int moved = 0, active = 0, away = 0; unsigned char hold[M];
+        const auto* m = m_.data + p; T s = 0; T energy = 0; int moved = 0, active = 0, away = 0; unsigned char hold[M];
         const bool free_all = !l_.data && !u_.data && !code_.data && l_value == -(T)INFINITY && u_value == (T)INFINITY;
         for (int begin = 0; begin < n; begin += M) {{
             const int end = n - begin < M ? n : begin + (int)M; T y[M];
@@ -64,7 +64,8 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
                     const bool held = classify & (m[k] == 1) & (low | high);
                     const bool there = x[k] == (low ? {near}l : {near}u);
                     const S at = ((e != 0) & !held) ? (S)(-v*inverse) : (S)0, mark = low ? -(S){MARK} : (S){MARK};
-                    s += r*r; hold[k - begin] = held ? (there ? 1 : 3) : 0; g[k] = (held & !there) ? mark : at; }} }});
+                    s += r*r; energy += m[k] == 1 ? x[k]*(v + b[k]) : (T)0;
+                    hold[k - begin] = held ? (there ? 1 : 3) : 0; g[k] = (held & !there) ? mark : at; }} }});
             SIMD for (int k = begin; k < end; ++k) {{  // bytes only, where the diagonal is one
                 const unsigned char h = hold[k - begin]; const F now = h ? (F)0 : (F)d[k];
                 const unsigned char one = free[k] != now, two = h & m[k];
@@ -72,8 +73,8 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
             moved += changed; active += count; away |= off & 2; }}
         if (moved) changed_.data[row] = 1;
         if (away) away_.data[row] = 1;
-        const double all[3] = {{s, (double)moved, (double)active}}; double* sums = out.data + t;
-        for (int c = 0; c < 3; ++c) sums[c*threads] = more ? all[c] + sums[c*threads] : all[c];"""
+        const double all[4] = {{s, (double)moved, (double)active, energy}}; double* sums = out.data + t;
+        for (int c = 0; c < 4; ++c) sums[c*threads] = more ? all[c] + sums[c*threads] : all[c];"""
         )
     )
     def assess_row(

@@ -17,12 +17,11 @@ from warp_lcp.solvers import projected_multigrid_kernels as kernels
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
 from warp_lcp.solvers.principal_system_low_rank import LowRankCorrection
 from warp_lcp.solvers.projected_multigrid_workspace import AssessedResidual, MultigridWorkspace
-from warp_lcp.vectors import launch_spans
 
 if TYPE_CHECKING:
     from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 
-RELAPSES = 4  # monotone cycles in a row that a relapse asks for, from which on steps are Newton's
+RELAPSES = 3  # runs of monotone cycles that were due, from which on steps are Newton's
 
 
 class CoupledResidual(AssessedResidual):
@@ -47,7 +46,15 @@ class CoupledResidual(AssessedResidual):
     def assess(self, x: wp.array[Any], *, launch: Launch = wp.launch) -> None:
         """Launch the evaluation."""
         self._low.add(x, self.problem.b, self._b, launch=launch)
+        self._at = x
         super().assess(x, launch=launch)
+
+    def read(self) -> float:
+        """Read what the evaluation found; x'(y + b + U W U' x) is more than twice the energy by x'U W U' x."""
+        norm = super().read()
+        along = self._low.columns.gather(self._at).numpy()
+        self.energy -= 0.5 * float(along @ self._low.weights.numpy().reshape(along.size, along.size) @ along)
+        return norm
 
     def advance(self, x: wp.array[Any], direction: wp.array[Any], *, launch: Launch = wp.launch) -> None:
         """Launch the step and the evaluation where it ends; U'x is needed between them."""
@@ -90,22 +97,11 @@ class CoupledWorkspace(MultigridWorkspace):
         Where the free set keeps going round in circles, a Newton step instead, which searches along its path: what a projection does to
         the force on a body that weighs next to nothing is a leap each time, and the energy lets projected cycles of the grid hardly move.
         """
-        if self._searches or self._relapse > RELAPSES:
-            return self._newton_step()
-        p, finest, last = self.problem, self.hierarchy.finest, self.residual.norm
-        self._rebuild()
-        self._leave()
-        before = [self.x, *p.bounds.operands, p.unknown, finest.lower, finest.upper, self.residual.scalars]
-        launch_spans(self._flat.gaps, self._spans, before, [], p.device)
-        self.hierarchy.monotone_cycle.run()
+        return self._newton_step() if self._searches or self._descent.runs >= RELAPSES else super().monotone_step()
+
+    def _plan_monotone_step(self) -> None:
         self._sum_products()
-        wp.launch(coupling.plan_bounded_step_kernel, 1, [self.residual.scalars], device=p.device)
-        self._cycles_left -= 1
-        self._classify_next()
-        self._advance()
-        self.residual.read()
-        self._count_rises(last)
-        return Step("monotone cycle", 1, None)
+        wp.launch(coupling.plan_bounded_step_kernel, 1, [self.residual.scalars], device=self.problem.device)
 
     def _newton_step(self) -> Step:
         """Take a step of Newton's method on the minimum map, whose memory is made when the first solve needs it."""

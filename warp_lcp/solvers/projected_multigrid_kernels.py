@@ -16,16 +16,17 @@ from warp_lcp.vector_kernels import CODED, flat, span_end, span_start
 NORM = wp.constant(0)  # squared norm of the natural residual
 MOVED = wp.constant(1)  # not 0 if the free set has changed
 ACTIVE = wp.constant(2)  # unknowns held at a bound
-ZAZ = wp.constant(3)
-ZAP = wp.constant(4)
-GZ = wp.constant(5)
-GP = wp.constant(6)
-PAP = wp.constant(7)  # of the search direction, carried from step to step
-SIZE = wp.constant(8)  # corrections are computed for a right-hand side divided by this
-BETA = wp.constant(9)
-STEP = wp.constant(10)  # x moved by this multiple of the direction
-CARRY = wp.constant(11)  # 0: forget the search direction
-SLOTS = 12
+ENERGY = wp.constant(3)  # x'(y + b), twice the energy
+ZAZ = wp.constant(4)
+ZAP = wp.constant(5)
+GZ = wp.constant(6)
+GP = wp.constant(7)
+PAP = wp.constant(8)  # of the search direction, carried from step to step
+SIZE = wp.constant(9)  # corrections are computed for a right-hand side divided by this
+BETA = wp.constant(10)
+STEP = wp.constant(11)  # x moved by this multiple of the direction
+CARRY = wp.constant(12)  # 0: forget the search direction
+SLOTS = 13
 
 f64, i8, u8 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int8), wp.array(dtype=wp.uint8)
 
@@ -68,7 +69,7 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
             + stencil_head(variable, "double")
             + f"""typedef {C_TYPES[free_type]} F; F* free = free_.data + p;
         const T *x = x_.data + p, *above = x + s1, *b = b_.data + p; auto* g = g_.data + p;
-        const auto* m = m_.data + p; T s = 0; int moved = 0, active = 0; unsigned char hold[M];
+        const auto* m = m_.data + p; T s = 0, energy = 0; int moved = 0, active = 0; unsigned char hold[M];
         const bool free_all = !l_.data && !u_.data && !code_.data && l_value == -(T)INFINITY && u_value == (T)INFINITY;
         for (int begin = 0; begin < n; begin += M) {{
             const int end = n - begin < M ? n : begin + (int)M; T y[M];
@@ -91,14 +92,15 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
                     const T below = f*(x[k] - l), above = f*(x[k] - u), least = below < v ? below : v, r0 = above > least ? above : least;
                     const bool held = classify & (((x[k] <= {near}l) & (v >= 0)) | ((x[k] >= {near}u) & (v <= 0)));
                     const T r = m[k] == 1 ? r0 : (T)0;
-                    s += r*r; hold[k - begin] = held; g[k] = ((e != 0) & !held) ? -v*inverse : (T)0; }} }});
+                    s += r*r; energy += m[k] == 1 ? x[k]*(v + b[k]) : (T)0;
+                    hold[k - begin] = held; g[k] = ((e != 0) & !held) ? -v*inverse : (T)0; }} }});
             SIMD for (int k = begin; k < end; ++k) {{  // bytes only, where the diagonal is one
                 const F now = hold[k - begin] ? (F)0 : (F)d[k]; const unsigned char one = free[k] != now, two = hold[k - begin] & m[k];
                 changed |= one; count += two; free[k] = now; }}
             moved += changed; active += count; }}
         if (moved) changed_.data[row] = 1;
-        const double all[3] = {{s, (double)moved, (double)active}}; double* sums = out.data + t;
-        for (int c = 0; c < 3; ++c) sums[c*threads] = more ? all[c] + sums[c*threads] : all[c];"""
+        const double all[4] = {{s, (double)moved, (double)active, energy}}; double* sums = out.data + t;
+        for (int c = 0; c < 4; ++c) sums[c*threads] = more ? all[c] + sums[c*threads] : all[c];"""
         )
     )
     def assess_row(

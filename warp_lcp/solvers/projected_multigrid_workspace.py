@@ -17,12 +17,12 @@ from warp_lcp.program import Launch, Program, perform
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.solve import Precision, RoundedIterate, Step
 from warp_lcp.solvers import projected_multigrid_kernels as kernels
+from warp_lcp.solvers.descent import Descent
 from warp_lcp.vectors import Reduction, launch_spans
 
 if TYPE_CHECKING:
     from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 
-LEAP = 10.0  # a residual that exceeds the least one by this factor says that the free set was a bad guess: CG's own rises are smaller
 # planes that a thread sums over: on CUDA, a place for the sums of every cell would cost more memory than the rest of the method
 PLANES_A_THREAD = {"cpu": 1, "cuda": 16}
 
@@ -34,6 +34,7 @@ class AssessedResidual(NaturalResidual):
         classify: whether unknowns at a bound leave the free set.
         stale: whether the free set has changed since the hierarchy was built.
         active: unknowns held.
+        energy: x'Ax/2 + b'x.
         storage: form and types that choose the kernels.
     """
 
@@ -51,7 +52,7 @@ class AssessedResidual(NaturalResidual):
         self.sums = Reduction(problem.layout.size, A.device, self.scalars, columns=4, threads=R.threads, across=problem.layout.across)
         self.storage = (*s.storage, self._finest.stencil.d.dtype, hierarchy.real)
         self.row_kernels = kernels.row_kernels(*self.storage, rounded=rounded)
-        self.classify, self.stale, self.active, self._norm_of_b = False, True, 0, 0.0
+        self.classify, self.stale, self.active, self.energy, self._norm_of_b = False, True, 0, 0.0, 0.0
 
     def start(self, x: wp.array[Any], *, keep: bool) -> None:
         """Set x to clip(x, l, u) or clip(0, l, u); a guess is classified, a cold start is not."""
@@ -84,7 +85,7 @@ class AssessedResidual(NaturalResidual):
         s.wrap(x, launch=launch)
         inputs = [*s.operands, self.row_sums, x, *self._assessed()]
         launch(self.row_kernels.assess, self.threads, inputs, device=p.device)
-        self.sums.add_up(int(kernels.NORM), columns=3, launch=launch)
+        self.sums.add_up(int(kernels.NORM), columns=4, launch=launch)
 
     def update(self, x: wp.array[Any], direction: wp.array[Any], *, launch: Launch = wp.launch) -> None:
         """Launch the step from x along the direction that the cycle's correction gives."""
@@ -110,7 +111,7 @@ class AssessedResidual(NaturalResidual):
             launch(self.row_kernels.update_ghosts, lines, inputs, device=p.device)
         inputs = [*s.operands[:-1], self.row_sums, x, self._finest.x, direction, *self._assessed()]
         launch(self.row_kernels.advance, 1, inputs, device=p.device)
-        self.sums.add_up(int(kernels.NORM), columns=3, launch=launch)
+        self.sums.add_up(int(kernels.NORM), columns=4, launch=launch)
 
     def _assessed(self) -> list[Any]:
         """Return what the evaluation takes besides the stencil and x."""
@@ -121,7 +122,8 @@ class AssessedResidual(NaturalResidual):
     def read(self) -> float:
         """Read what the evaluation found; a step that is not finite was not taken, and its residual is no number."""
         scalars = self.scalars.numpy()
-        square, moved, active = scalars[:3]
+        square, moved, active, twice = scalars[:4]
+        self.energy = 0.5 * float(twice)
         self.norm, self.current, self.active = float(np.sqrt(square)), True, int(active)
         if not math.isfinite(scalars[int(kernels.STEP)]):
             self.norm = math.nan
@@ -158,7 +160,7 @@ class MultigridWorkspace(RoundedIterate):
         self.floating: Any = None
         self._best: wp.array[Any] | None = None
         self._past, self._stored = 0, False  # steps since the best iterate; whether it is in memory of its own
-        self._cycles_left, self._rises, self._relapse, self._least = 0, 0, 1, math.inf
+        self._cycles_left, self._descent = 0, Descent()
 
     def _scratch(self) -> tuple[wp.array[Any], wp.array[Any]]:
         """Return what is free between cycles, as fields of four bytes and of one byte a cell."""
@@ -168,7 +170,6 @@ class MultigridWorkspace(RoundedIterate):
     def keep(self) -> None:
         """Remember x as the best iterate."""
         self._past, self._stored = 0, False
-        self._least = min(self._least, self.residual.norm)
 
     def restore(self) -> None:
         """Make x the best iterate again."""
@@ -201,7 +202,7 @@ class MultigridWorkspace(RoundedIterate):
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the search direction; the operator may have changed."""
         self._cycles_left = self.settings.monotone_cycles if self.bounded and not warm else 0
-        self._rises, self._relapse, self._least = 0, 1, self.residual.norm
+        self._descent.start(self.residual.energy, self.residual.norm)
         self._forget()
         self.hierarchy.finest.x[: self.x.size // 4 + 1].zero_()  # its bytes were scratch memory
         size = float(self.residual.scalars.numpy()[int(kernels.SIZE)])
@@ -221,38 +222,44 @@ class MultigridWorkspace(RoundedIterate):
 
     def wants_monotone_cycle(self) -> bool:
         """Return whether the next step is a projected cycle."""
-        leapt = self.residual.norm > LEAP * self._least
-        if self._cycles_left == 0 and self.bounded and (leapt or self._rises >= self.settings.patience):
-            if leapt:
-                self.restore()
-            self._rises = 0
-            self._forget()
-            # an active set can go round in a circle, projected cycles never do: each time it takes twice as many of them
-            self._cycles_left, self._relapse = self._relapse, 2 * self._relapse
-            self.residual.classify = False
-            self.residual.evaluate(self.x)
+        if self._cycles_left == 0 and self.bounded:
+            due = self._descent.due(self.settings.patience)  # an active set can go round in a circle
+            if due:
+                self._begin_cycles(due)
         return self._cycles_left > 0
 
+    def _begin_cycles(self, count: int) -> None:
+        """Let projected cycles come next: all unknowns are in their right-hand side."""
+        self._cycles_left = count
+        self._forget()
+        self.residual.classify = False
+        self.residual.evaluate(self.x)
+
     def monotone_step(self) -> Step:
-        """Projected cycle on all unknowns."""
-        p, finest, last = self.problem, self.hierarchy.finest, self.residual.norm
+        """Projected cycle on all unknowns; a projected sweep where cycles have been seen to raise the energy."""
+        p, finest, descent = self.problem, self.hierarchy.finest, self._descent
         self._rebuild()
         self._leave()
         before = [self.x, *p.bounds.operands, p.unknown, finest.lower, finest.upper, self.residual.scalars]
         launch_spans(self._flat.gaps, self._spans, before, [], p.device)
-        self.hierarchy.monotone_cycle.run()
-        finest.stencil.wrap(finest.x)
-        wp.launch(kernels.plan_whole_step_kernel, 1, [self.residual.scalars], device=p.device)
+        (self.hierarchy.projected_sweep if descent.safe else self.hierarchy.monotone_cycle).run()
+        self._plan_monotone_step()
         self._cycles_left -= 1
         self._classify_next()
         self._advance()
         self.residual.read()
-        self._count_rises(last)
-        return Step("monotone cycle", 1, None)
+        descent.weigh(self._judge())
+        return Step("monotone cycle", 1, None, interim=descent.sinks)
+
+    def _plan_monotone_step(self) -> None:
+        """Take the projected cycle's correction as it is."""
+        finest = self.hierarchy.finest
+        finest.stencil.wrap(finest.x)
+        wp.launch(kernels.plan_whole_step_kernel, 1, [self.residual.scalars], device=self.problem.device)
 
     def truncated_step(self) -> Step:
         """One linear cycle on the free unknowns, made conjugate to the last direction, projected."""
-        last, active = self.residual.norm, self.residual.active
+        active = self.residual.active
         self._rebuild()
         self._leave()
         self.residual.classify = True
@@ -265,8 +272,13 @@ class MultigridWorkspace(RoundedIterate):
         self.residual.read()
         if self.floating is not None:
             self._project()
-        self._count_rises(last)
-        return Step("truncated cycle", 1, active)
+        if self._descent.creeps(self._judge(), moved=self.bounded and self.residual.stale):
+            self._begin_cycles(1)
+        return Step("truncated cycle", 1, active, interim=self._descent.sinks)
+
+    def _judge(self) -> float:
+        """Let the energy judge the step that has been evaluated; return by how much it has lowered it."""
+        return self._descent.record(self.residual.energy, self.residual.norm)
 
     def _cycle(self) -> None:
         """Run a cycle on the right-hand side."""
@@ -352,9 +364,6 @@ class MultigridWorkspace(RoundedIterate):
     def _classify_next(self) -> None:
         """Unknowns at their bounds leave the free set unless a projected cycle comes next."""
         self.residual.classify = self._cycles_left == 0
-
-    def _count_rises(self, last: float) -> None:
-        self._rises = self._rises + 1 if self.residual.norm > last else 0
 
     def _forget(self) -> None:
         """Drop the search direction."""

@@ -1,0 +1,175 @@
+"""The energy as the judge of steps, and grids on which the residual misleads: strips, vents, torsion, a dam, an obstacle that moves."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warp_lcp as wl
+from oracle import assemble, lemke
+from warp_lcp.gallery import dam, torsion
+from warp_lcp.solvers.descent import Descent
+
+CELLS = {"strip": (1, 100), "wide-strip": (8, 2000), "vent": (60, 70), "vent-3d": (20, 22, 24)}
+
+
+def equality(p):
+    result = wl.solve(wl.LCP(p.A, p.b, -np.inf, np.inf))
+    assert result
+    return result.iterations
+
+
+@pytest.mark.parametrize("name", CELLS)
+def test_pressure_far_from_air_is_that_of_the_linear_system(name):
+    cells = np.ones(CELLS[name], dtype=np.int8)
+    cells[(..., -1) if "strip" in name else (0,) * cells.ndim] = 0
+    A, b = wl.GridPoisson(cells, device="cpu"), np.where(cells == 1, -1.0, 0.0)
+    result, linear = wl.solve(wl.LCP(A, b)), wl.solve(wl.LCP(A, b, -np.inf))
+    assert result, result.status  # no unknown is held, and the residual rises thirtyfold on the way
+    assert linear
+    assert result.iterations <= 2 * linear.iterations + 6
+    x = result.x.numpy()
+    np.testing.assert_allclose(x, linear.x.numpy(), atol=1e-3 * x.max())
+    if "strip" in name:  # the flux through a face is that of all cells before it
+        np.testing.assert_allclose(x[:, :-1] - x[:, 1:], np.arange(1, cells.shape[1]) * np.ones((len(cells), 1)), rtol=1e-3, atol=0.05)
+
+
+@pytest.mark.parametrize("method", ["projected-multigrid", "minimum-map-newton"])
+@pytest.mark.parametrize("problem", [torsion(250, device="cpu"), torsion(250, 20.0, device="cpu"), dam(257, 385, device="cpu")], ids=str)
+def test_boundaries_of_contact_do_not_creep(problem, method):
+    result = wl.solve(problem.lcp(), wl.METHODS[method]())
+    assert result, result.status
+    assert result.linear_iterations <= 2 * equality(problem)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [lambda: torsion(1000, device="cpu"), lambda: torsion(2000, device="cpu"),
+                                  lambda: dam(1025, 1537, device="cpu"), lambda: dam(4097, 6145, device="cpu")],
+                         ids=["torsion-1000", "torsion-2000", "dam-1025", "dam-4097"])  # fmt: skip
+def test_boundaries_of_contact_do_not_creep_on_large_grids(make):
+    result = wl.solve(make().lcp())
+    assert result, result.status
+    assert result.iterations <= 15
+
+
+@pytest.mark.parametrize("problem", [torsion(6, device="cpu"), torsion(6, 12.0, device="cpu"), dam(6, 8, device="cpu")], ids=str)
+def test_obstacles_against_lemke(problem):
+    dense = problem.dense()
+    result = wl.solve(problem.lcp(), stopping=wl.StoppingCriteria(rtol=1e-10))
+    assert result, result.status
+    x, fluid = result.x.numpy(), problem.sparse()
+    rows = np.flatnonzero(problem.A.cells.numpy()[1, 1:-1, 1:-1].ravel() == wl.FLUID)
+    n, gap = len(dense.b), dense.upper - dense.lower
+    q = dense.b + dense.A @ dense.lower
+    if np.isfinite(gap).all():  # w = A z + q + v, s = gap - z; z with w, v with s
+        z = lemke(np.block([[dense.A, np.eye(n)], [-np.eye(n), np.zeros((n, n))]]), np.concatenate([q, gap]))[:n]
+    else:
+        z = lemke(dense.A, q)
+    np.testing.assert_allclose(x.ravel()[rows], fluid.lower + z, atol=1e-8 * np.abs(x).max())
+
+
+def test_dam_is_that_of_its_definition():
+    """Where the dam is wet the second differences are 1, whatever the grid; above it is dry."""
+    p = dam(17, 25, device="cpu")
+    x = wl.solve(p.lcp(), stopping=wl.StoppingCriteria(rtol=1e-10)).x.numpy()
+    w = x.copy()
+    w[0], w[:, 0], y = np.linspace(576, 16, 17) / 2, (24 - np.arange(25)) ** 2 / 2, np.arange(25)
+    w[:, -1] = np.where(y < 4, (4 - y) ** 2 / 2, 0)  # hx = hy = 1
+    laplace = w[1:-1, 2:] + w[1:-1, :-2] + w[2:, 1:-1] + w[:-2, 1:-1] - 4 * w[1:-1, 1:-1]
+    wet = w[1:-1, 1:-1] > 0
+    np.testing.assert_allclose(laplace[wet], 1.0, atol=1e-6)
+    assert (laplace <= 1 + 1e-6).all()
+    assert 0 < wet.sum() < wet.size
+
+
+@pytest.mark.parametrize("faces", [{}, {"face_x": 2.0, "face_y": 0.5}, "arrays"], ids=["unit", "flat", "arrays"])
+@pytest.mark.parametrize("method", ["projected-multigrid", "minimum-map-newton"])
+def test_energy_is_that_of_the_definition(method, faces):
+    rng = np.random.default_rng(20260217)
+    cells = rng.choice([0, 1, 1, 1, 2], size=(7, 9)).astype(np.int8)
+    if faces == "arrays":
+        faces = {"face_x": rng.random((7, 10)), "face_y": rng.random((8, 9))}
+    A = wl.GridPoisson(cells, device="cpu", dtype=wp.float64, **faces)
+    b, x = rng.standard_normal(cells.shape), np.where(cells == 1, rng.random(cells.shape), 0.0)
+    problem = wl.LCP(A, b, 0.0, 0.9)
+    work = wl.METHODS[method]().init(problem)
+    dense = assemble(cells, (faces.get("face_x", 1.0), faces.get("face_y", 1.0), 1.0))
+    x = np.minimum(x, 0.9)
+    work.residual.start(work.x, keep=False)
+    work.x.assign(problem.layout.load(x, wp.float64).numpy())
+    work.residual.evaluate(work.x)
+    inside = np.where(cells == 1, b, 0.0).ravel()
+    assert work.residual.energy == pytest.approx(0.5 * x.ravel() @ dense @ x.ravel() + inside @ x.ravel(), rel=1e-12)
+
+
+def test_projected_sweeps_lower_the_energy_from_anywhere():
+    """What a solve falls back on if nothing else leads down converges: every sweep lowers the energy, for any iterate."""
+    rng = np.random.default_rng(5150)
+    cells = rng.choice([0, 1, 1, 1, 1, 2], size=(11, 8)).astype(np.int8)
+    problem = wl.LCP(wl.GridPoisson(cells, device="cpu"), rng.standard_normal(cells.shape), -0.5, 0.7)
+    work = wl.ProjectedMultigrid(precision="double").init(problem)
+    work.residual.start(work.x, keep=False)
+    work.x.assign(problem.layout.load(np.where(cells == 1, rng.uniform(-0.5, 0.7, cells.shape), 0.0), wp.float64).numpy())
+    work.residual.settle_isolated(work.x)
+    work.residual.evaluate(work.x)
+    work.start(warm=False, tolerance=0.0)
+    work._begin_cycles(300)
+    energies, norms = [work.residual.energy], [work.residual.norm]
+    for _ in range(300):
+        work._descent.safe = True
+        work.monotone_step()
+        energies.append(work.residual.energy)
+        norms.append(work.residual.norm)
+    assert (np.diff(energies) <= 1e-13 * np.abs(energies[:-1])).all()
+    assert norms[-1] < 1e-8 * norms[0]
+
+
+def test_runs_of_projected_steps_double():
+    descent, due = Descent(), []
+    descent.start(-1.0, 1.0)
+    for _ in range(12):
+        descent.record(-0.9, 2.0)
+        due.append(descent.due(3))
+    assert due == [0, 0, 1, 0, 0, 2, 0, 0, 4, 0, 0, 8]
+    assert not descent.sinks
+    descent.record(-1.1, 50.0)  # the residual rises, the energy has never been less
+    assert descent.sinks
+    assert descent.due(3) == 0
+
+
+def test_calls_against_creeping_wait_longer_where_they_are_in_vain():
+    descent, called = Descent(), []
+    descent.start(0.0, 1.0)
+    for k in range(16):
+        fell = descent.record(-0.1 * (k + 1), 1.0)
+        called.append(descent.creeps(fell, moved=True))
+        if called[-1]:
+            descent.weigh(0.1)  # no more than the step before: in vain
+    steps = np.flatnonzero(called)
+    assert (np.diff(np.diff(steps)) > 0).all()
+    assert len(steps) >= 3
+    assert not descent.creeps(0.1, moved=False)
+
+
+def test_a_cycle_that_raises_the_energy_makes_the_next_ones_safe():
+    descent = Descent()
+    descent.start(-1.0, 1.0)
+    descent.weigh(descent.record(-1.5, 1.0))
+    assert not descent.safe
+    descent.weigh(descent.record(-1.5 + 1e-14, 1.0))  # rounding
+    assert not descent.safe
+    descent.weigh(descent.record(-1.4, 1.0))
+    assert descent.safe
+
+
+def test_warm_starts_take_no_more_steps_than_cold_ones():
+    n = 129
+    X, Y = np.meshgrid(*(np.linspace(-2, 2, n),) * 2)
+    cells = np.pad(np.ones((n - 2, n - 2), dtype=np.int8), 1)
+    A, b, x = wl.GridPoisson(cells, device="cpu", dtype=wp.float64), np.where(cells == 1, (4 / (n - 1)) ** 2, 0.0), None
+    for k in range(12):
+        low = 0.5 - (X - 0.8 * np.cos(0.03 * k)) ** 2 - (Y - 0.8 * np.sin(0.03 * k)) ** 2
+        cold = wl.solve(wl.LCP(A, b, low))
+        warm = cold if x is None else wl.solve(wl.LCP(A, b, low), x0=x)
+        assert cold and warm
+        assert warm.iterations <= cold.iterations + 1
+        x = warm.x

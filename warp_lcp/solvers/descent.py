@@ -1,0 +1,79 @@
+"""What the energy says about the steps of a solve: whether they lead down, creep, or go round in a circle."""
+
+from __future__ import annotations
+
+import math
+
+NOISE = 1e-13  # of the energy: what rounding its sum may pretend
+CREEP = 0.5  # a step that moves the free set and lowers the energy by more than this share of what the last one did: the set creeps
+WORTH = 2.0  # a projected cycle against creeping is worth it if it lowers the energy by this many times what the step before did
+
+
+class Descent:
+    """Judges steps by the energy x'Ax/2 + b'x, which only falls on the way to a solution where A is symmetric and semi-definite.
+
+    The natural residual does not: it may rise thirtyfold in the best of steps, where the set of held unknowns grows. It counts only
+    where the energy says nothing, within rounding.
+
+    Convergence: a solve alternates between `patience` steps of any kind that set no new least energy and as many projected ones as are
+    `due`, twice as many each time. New least energies, a margin apart, are finitely many above the minimum; so either the solve ends or
+    ever longer runs of projected steps are taken, and once one of those has raised the energy (`safe` is set) they are plain
+    projected Jacobi sweeps with a factor below 2 / lambda_max(D^-1 A), which converge linearly from anywhere.
+
+    Attributes:
+        sinks: whether the last step set a new least energy.
+        safe: whether a projected cycle has raised the energy.
+        runs: runs of projected steps that were due.
+    """
+
+    def __init__(self) -> None:
+        self.start(0.0, 0.0)
+
+    def start(self, energy: float, norm: float) -> None:
+        """Forget the last solve; energy and residual norm are those of the start."""
+        self._energy, self._lowest, self._norm = energy, energy, norm
+        self.sinks, self.safe = False, False
+        self._vain, self.runs = 0, 0
+        self._fell, self._owed, self._pause, self._wait = math.inf, 0.0, 0, 1
+
+    def record(self, energy: float, norm: float) -> float:
+        """Take note of where a step ends; return by how much it has lowered the energy, 0 if that is within rounding."""
+        fell, rose = self._energy - energy, norm > self._norm
+        margin = NOISE * (abs(self._energy) + abs(energy))
+        above = energy - self._lowest
+        self._energy, self._norm, self.sinks = energy, norm, above < -margin
+        if self.sinks:
+            self._lowest, self._vain = energy, 0
+        else:
+            self._vain = self._vain + 1 if above > margin or rose else 0
+        return fell if abs(fell) > margin else 0.0
+
+    def due(self, patience: int) -> int:
+        """Return how many projected steps are to come now: 0 until `patience` steps set no new least energy, twice as many each time."""
+        if self._vain < patience:
+            return 0
+        self._vain, self._fell, self.runs = 0, math.inf, self.runs + 1
+        return 2 ** (self.runs - 1)
+
+    def creeps(self, fell: float, *, moved: bool) -> bool:
+        """Return whether a projected cycle should follow a step that has lowered the energy by `fell`, and moved the free set or not.
+
+        Truncated steps that lower the energy evenly while the set moves are those in which a contact's boundary comes back by a layer of
+        cells a step.
+        """
+        slow = moved and fell > 0 and fell > CREEP * self._fell
+        called = slow and self._pause == 0
+        self._fell, self._pause = math.inf if called else fell, max(self._pause - 1, 0)
+        if called:
+            self._owed = fell
+        return called
+
+    def weigh(self, fell: float) -> None:
+        """Judge a projected cycle that has lowered the energy by `fell`.
+
+        If it was called against creeping and in vain, steps were slow, but not because the set crept: the next call waits longer.
+        """
+        self.safe = self.safe or fell < 0
+        if self._owed > 0:
+            vain = fell < WORTH * self._owed
+            self._pause, self._wait, self._owed = (self._wait, 2 * self._wait, 0.0) if vain else (0, 1, 0.0)
