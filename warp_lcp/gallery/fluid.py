@@ -9,7 +9,8 @@ import numpy as np
 import scipy.sparse
 import warp as wp
 
-from warp_lcp.gallery.problem import Problem, grid_matrix
+from warp_lcp.gallery.problem import Problem
+from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID, GridPoisson
 from warp_lcp.problem import LCP
 

@@ -11,6 +11,7 @@ import warp as wp
 
 from warp_lcp.affine_bounds import AffineBounds
 from warp_lcp.operators.dense import DenseOperator
+from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.grid_poisson import FLUID, GridPoisson
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem import LCP
@@ -106,23 +107,3 @@ def _number_or_field(bound: Any) -> Any:
         return bound
     first = float(bound.flat[0])
     return first if (bound == first).all() else bound
-
-
-def grid_matrix(A: GridPoisson) -> scipy.sparse.csr_array:
-    """Assemble a grid operator on its FLUID cells, in their order, from its diagonal and lower-face weights; no axis may be periodic."""
-    s, padding = A.stencil, A.layout.padding
-    fluid = A.cells.numpy().ravel() == FLUID
-    index = np.cumsum(fluid) - 1
-    cells = np.flatnonzero(fluid)
-    rows, columns, entries = [index[cells]], [index[cells]], [s.d.numpy()[cells].astype(np.float64) * s.unit]
-    for axis, offset in enumerate((1, padding.row, padding.plane)):
-        joined = cells[fluid[cells - offset]]
-        weight = s.weights[axis].numpy()[joined].astype(np.float64) if s.weights is not None else np.full(len(joined), s.coefficients[axis])
-        i, j = index[joined], index[joined - offset]
-        rows += [i, j]
-        columns += [j, i]
-        entries += [-weight, -weight]
-    n = len(cells)
-    matrix = scipy.sparse.coo_array((np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))), shape=(n, n)).tocsr()
-    matrix.eliminate_zeros()
-    return matrix

@@ -123,17 +123,9 @@ class GridNewtonWorkspace(MultigridWorkspace):
             super()._leave()
 
     def _store(self) -> None:
-        """Keep the best iterate in memory of its own: x is about to change by more than can be taken back."""
-        if self._serves:
-            return
-        if not self._stored and self._past == 0:
-            if self._best is None:
-                self._best = wp.empty_like(self.x)
-            wp.copy(self._best, self.x)
-            self._stored = True
-        elif not self._stored and self._past == 1:
-            self._leave()
-            self._past = 1  # that counted a step
+        """Keep the best iterate in memory of its own."""
+        if not self._serves:
+            super()._store()
 
     def _shorten(self, limit: float, iterations: int, active: int) -> Step:
         """Take the longest of the halves of the last move that the safeguard allows; if there is none, projected cycles."""

@@ -26,7 +26,8 @@ class ProjectedMultigrid:
     the step onto the bounds. There are no inner tolerances: without bounds this is preconditioned conjugate gradients with a true
     residual, and the same code is the linear solver. Steps are judged by the energy x'Ax/2 + b'x (`descent.Descent`): where it falls evenly
     while the free set moves, a contact's boundary creeps by a layer of cells a step, and a monotone cycle follows; where `patience` steps
-    set no new least energy, monotone cycles follow, twice as many each time.
+    set no new least energy, monotone cycles follow, twice as many each time. Where cycles are slow (channels a cell wide, coefficients that
+    are random over decades), the solve goes on by `MinimumMapNewton` on the grid's matrix, unless ranks share it.
 
     Args:
         precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate rounded to float32 as well.
@@ -69,7 +70,9 @@ class ProjectedMultigrid:
         return MultigridWorkspace(problem, problem.A, self)
 
     def step(self, problem: LCP, work: MultigridWorkspace, x: wp.array[Any]) -> Step:
-        """Take a monotone cycle while the start is cold or steps do not lead down, else a truncated one."""
+        """Take a monotone cycle while the start is cold or steps do not lead down, else a truncated one; on the matrix if these crawl."""
+        if work.crawls():
+            return work.algebraic_step()
         if work.wants_monotone_cycle():
             return work.monotone_step()
         return work.truncated_step()

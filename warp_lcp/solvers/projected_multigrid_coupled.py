@@ -80,12 +80,16 @@ class CoupledWorkspace(MultigridWorkspace):
         self._along = wp.zeros(low.rank, dtype=wp.float64, device=problem.device)  # U'p
         self._fresh = True  # whether the correction is still that of the last solve
         self._newton: NewtonWorkspace | None = None
-        self._searches, self._tolerance = False, 0.0  # whether steps are Newton's
+        self._searches = False  # whether steps are Newton's
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the search direction; operator and bodies may have changed."""
         super().start(warm=warm, tolerance=tolerance)
-        self._fresh, self._searches, self._tolerance = True, False, tolerance
+        self._fresh, self._searches = True, False
+
+    def crawls(self) -> bool:
+        """Bodies have no part in the grid's matrix."""
+        return False
 
     def wants_monotone_cycle(self) -> bool:
         """Return whether the next step is none of truncated multigrid."""
@@ -117,10 +121,7 @@ class CoupledWorkspace(MultigridWorkspace):
             wp.copy(newton.x, self.x)
             newton.residual.evaluate(newton.x)
             newton.start(warm=True, tolerance=self._tolerance)
-        if self._past == 0 and not self._stored:
-            self._best = wp.empty_like(self.x) if self._best is None else self._best
-            wp.copy(self._best, self.x)
-            self._stored = True
+        self._store()
         self._past += 1
         newton.residual.current = False
         done = settings.step(p, newton, newton.x)

@@ -15,8 +15,9 @@ from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
 from warp_lcp.program import Launch, Program, perform
 from warp_lcp.residual import NaturalResidual
-from warp_lcp.solve import Precision, RoundedIterate, Step
+from warp_lcp.solve import FLOOR_MARGIN, Precision, RoundedIterate, Step
 from warp_lcp.solvers import projected_multigrid_kernels as kernels
+from warp_lcp.solvers.algebraic_steps import AlgebraicSteps, Pace
 from warp_lcp.solvers.descent import Descent
 from warp_lcp.vectors import Reduction, launch_spans
 
@@ -161,6 +162,8 @@ class MultigridWorkspace(RoundedIterate):
         self._best: wp.array[Any] | None = None
         self._past, self._stored = 0, False  # steps since the best iterate; whether it is in memory of its own
         self._cycles_left, self._descent = 0, Descent()
+        self._tolerance, self._pace = 0.0, Pace(0.0)
+        self._algebraic: AlgebraicSteps | None = None
 
     def _scratch(self) -> tuple[wp.array[Any], wp.array[Any]]:
         """Return what is free between cycles, as fields of four bytes and of one byte a cell."""
@@ -193,6 +196,17 @@ class MultigridWorkspace(RoundedIterate):
             self._stored = True
         self._past += 1
 
+    def _store(self) -> None:
+        """Keep the best iterate in memory of its own: x is about to change by more than can be taken back."""
+        if not self._stored and self._past == 0:
+            if self._best is None:
+                self._best = wp.empty_like(self.x)
+            wp.copy(self._best, self.x)
+            self._stored = True
+        elif not self._stored and self._past == 1:
+            self._leave()
+            self._past = 1  # that counted a step
+
     def _undo(self, out: wp.array[Any]) -> None:
         """Write where the last step began."""
         p = self.problem
@@ -203,6 +217,7 @@ class MultigridWorkspace(RoundedIterate):
         """Forget the search direction; the operator may have changed."""
         self._cycles_left = self.settings.monotone_cycles if self.bounded and not warm else 0
         self._descent.start(self.residual.energy, self.residual.norm)
+        self._tolerance, self._pace, self._algebraic = tolerance, Pace(tolerance), None
         self._forget()
         self.hierarchy.finest.x[: self.x.size // 4 + 1].zero_()  # its bytes were scratch memory
         size = float(self.residual.scalars.numpy()[int(kernels.SIZE)])
@@ -219,6 +234,28 @@ class MultigridWorkspace(RoundedIterate):
         elif self._cycles_left == 0 and not self.residual.classify and self.bounded:
             self.residual.classify = True
             self.residual.evaluate(self.x)
+
+    def crawls(self) -> bool:
+        """Return whether cycles have been too slow for the tolerance, above what rounding leaves, where a matrix can be had."""
+        if self._algebraic is not None:
+            return True
+        self._pace.record(self.residual.norm)
+        if not self._pace.crawls or self.floating is not None or self.problem.layout.across is not None:
+            return False
+        return self.residual.norm > FLOOR_MARGIN * self.residual.rounding_floor(self.x, self.precision.epsilon)
+
+    def algebraic_step(self) -> Step:
+        """Newton step on the grid's matrix, from the best iterate on."""
+        if self._algebraic is None:
+            self.restore()
+            self._algebraic = AlgebraicSteps(self.problem, self.A, self.x, self._tolerance)
+        self._store()
+        self._past += 1
+        done = self._algebraic.step(self.x)
+        self._round(self.x)
+        self.residual.classify = True
+        self.residual.evaluate(self.x)
+        return done
 
     def wants_monotone_cycle(self) -> bool:
         """Return whether the next step is a projected cycle."""
