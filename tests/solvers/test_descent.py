@@ -7,6 +7,7 @@ import warp as wp
 import warp_lcp as wl
 from oracle import assemble, lemke
 from warp_lcp.gallery import dam, torsion
+from warp_lcp.solve import EPS
 from warp_lcp.solvers.descent import Descent
 
 CELLS = {"strip": (1, 100), "wide-strip": (8, 2000), "vent": (60, 70), "vent-3d": (20, 22, 24)}
@@ -124,7 +125,7 @@ def test_projected_sweeps_lower_the_energy_from_anywhere():
 
 
 def test_runs_of_projected_steps_double():
-    descent, due = Descent(), []
+    descent, due = Descent(EPS), []
     descent.start(-1.0, 1.0)
     for _ in range(12):
         descent.record(-0.9, 2.0)
@@ -137,7 +138,7 @@ def test_runs_of_projected_steps_double():
 
 
 def test_calls_against_creeping_wait_longer_where_they_are_in_vain():
-    descent, called = Descent(), []
+    descent, called = Descent(EPS), []
     descent.start(0.0, 1.0)
     for k in range(16):
         fell = descent.record(-0.1 * (k + 1), 1.0)
@@ -151,7 +152,7 @@ def test_calls_against_creeping_wait_longer_where_they_are_in_vain():
 
 
 def test_a_cycle_that_raises_the_energy_makes_the_next_ones_safe():
-    descent = Descent()
+    descent = Descent(EPS)
     descent.start(-1.0, 1.0)
     descent.weigh(descent.record(-1.5, 1.0))
     assert not descent.safe

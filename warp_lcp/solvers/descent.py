@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import sys
 
-NOISE = 1e-13  # of the energy: what rounding its sum may pretend
+NOISE = 500.0  # rounding units of the iterate, in parts of the energy: what rounding may pretend
+LEAP = 1e3  # times the least residual: a step that ends there, and sets no new least energy, was wrong
 CREEP = 0.5  # a step that moves the free set and lowers the energy by more than this share of what the last one did: the set creeps
 WORTH = 2.0  # a projected cycle against creeping is worth it if it lowers the energy by this many times what the step before did
 
@@ -20,18 +22,22 @@ class Descent:
     ever longer runs of projected steps are taken, and once one of those has raised the energy (`safe` is set) they are plain
     projected Jacobi sweeps with a factor below 2 / lambda_max(D^-1 A), which converge linearly from anywhere.
 
+    Args:
+        epsilon: rounding unit of the iterate.
+
     Attributes:
         sinks: whether the last step set a new least energy.
         safe: whether a projected cycle has raised the energy.
         runs: runs of projected steps that were due.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, epsilon: float) -> None:
+        self._noise = NOISE * epsilon
         self.start(0.0, 0.0)
 
     def start(self, energy: float, norm: float) -> None:
         """Forget the last solve; energy and residual norm are those of the start."""
-        self._energy, self._lowest, self._norm = energy, energy, norm
+        self._energy, self._lowest, self._norm, self._least = energy, energy, norm, norm
         self.sinks, self.safe = False, False
         self._vain, self.runs = 0, 0
         self._fell, self._owed, self._pause, self._wait = math.inf, 0.0, 0, 1
@@ -39,17 +45,22 @@ class Descent:
     def record(self, energy: float, norm: float) -> float:
         """Take note of where a step ends; return by how much it has lowered the energy, 0 if that is within rounding."""
         fell, rose = self._energy - energy, norm > self._norm
-        margin = NOISE * (abs(self._energy) + abs(energy))
+        margin = self._noise * (abs(self._energy) + abs(energy))
         above = energy - self._lowest
-        self._energy, self._norm, self.sinks = energy, norm, above < -margin
+        self._energy, self._norm, self.sinks, self._least = energy, norm, above < -margin, min(norm, self._least)
         if self.sinks:
             self._lowest, self._vain = energy, 0
+        elif norm > LEAP * self._least:
+            self._vain = sys.maxsize
         else:
             self._vain = self._vain + 1 if above > margin or rose else 0
         return fell if abs(fell) > margin else 0.0
 
     def due(self, patience: int) -> int:
-        """Return how many projected steps are to come now: 0 until `patience` steps set no new least energy, twice as many each time."""
+        """Return how many projected steps are to come now: 0 until `patience` steps set no new least energy, twice as many each time.
+
+        The residual of one of them may have leapt instead.
+        """
         if self._vain < patience:
             return 0
         self._vain, self._fell, self.runs = 0, math.inf, self.runs + 1

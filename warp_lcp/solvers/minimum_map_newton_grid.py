@@ -104,7 +104,7 @@ class GridNewtonWorkspace(MultigridWorkspace):
             iterations += 1
             if residual.stale or not residual.norm > wanted or iterations >= s.max_linear_iterations:
                 break
-        sinks = self._descent.sinks  # then the residual may rise
+        sinks = self._descent.sinks and self._rounded is None  # then the residual may rise
         if sinks or not residual.norm > (1 - DECREASE) * limit or not math.isfinite(residual.norm) or not self.bounded:
             return Step("newton", iterations, active, interim=sinks)
         return self._shorten(limit, iterations, active)

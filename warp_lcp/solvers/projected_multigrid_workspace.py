@@ -161,7 +161,7 @@ class MultigridWorkspace(RoundedIterate):
         self.floating: Any = None
         self._best: wp.array[Any] | None = None
         self._past, self._stored = 0, False  # steps since the best iterate; whether it is in memory of its own
-        self._cycles_left, self._descent = 0, Descent()
+        self._cycles_left, self._descent = 0, Descent(self.precision.epsilon)
         self._tolerance, self._pace = 0.0, Pace(0.0)
         self._algebraic: AlgebraicSteps | None = None
 
@@ -240,7 +240,8 @@ class MultigridWorkspace(RoundedIterate):
         if self._algebraic is not None:
             return True
         self._pace.record(self.residual.norm)
-        if not self._pace.crawls or self.floating is not None or self.problem.layout.across is not None:
+        exact = self.floating is None and self._rounded is None
+        if not self._pace.crawls or not exact or self.problem.layout.across is not None:
             return False
         return self.residual.norm > FLOOR_MARGIN * self.residual.rounding_floor(self.x, self.precision.epsilon)
 
