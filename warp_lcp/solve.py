@@ -244,7 +244,8 @@ class _Loop:
                 return self._iterate()
         except TimeIsUp:  # within a step, of which nothing is left
             self._restore()
-            return self._finish(SolveStatus.TIME_LIMIT, self.history[-1].iteration)
+            ended = SolveStatus.CONVERGED if self.residual.norm <= self.tolerance else SolveStatus.TIME_LIMIT
+            return self._finish(ended, self.history[-1].iteration)
 
     def _iterate(self) -> SolveResult:
         iteration, status = 0, self._status(0, None)
