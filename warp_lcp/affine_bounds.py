@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.affine_bounds_kernels import evaluate_kernel
-from warp_lcp.layout import Layout
+from warp_lcp.layout import Layout, real_array
 
 SIDES = ("lower", "upper")
 
@@ -44,7 +44,7 @@ class AffineBounds:
             raise ValueError(f"index has values from {index.min()} to {index.max()}: expected -1 ... {index.size - 1}")
         object.__setattr__(self, "index", index)
         for name in ("constant", "coefficient"):
-            value = np.asarray(getattr(self, name), dtype=np.float64)
+            value = np.asarray(real_array(getattr(self, name), name), dtype=np.float64)
             if value.shape not in ((), index.shape):
                 raise ValueError(f"{name} has shape {value.shape}: expected a number or {index.shape}")
             object.__setattr__(self, name, np.array(np.broadcast_to(value, index.shape)))
@@ -150,7 +150,7 @@ def affine_fields(layout: Layout, lower: Any, upper: Any) -> AffineFields | None
 
 def _constant(layout: Layout, side: Any, name: str) -> AffineBounds:
     """Return constant bounds as affine ones."""
-    host = side.numpy() if isinstance(side, wp.array) else np.asarray(side, dtype=np.float64)
+    host = real_array(side, name)
     shape = layout.shape if host.ndim == 0 else host.shape
     if shape not in (layout.shape, layout.stored_shape):
         raise ValueError(f"{name} has shape {shape}: expected {layout.shape}")

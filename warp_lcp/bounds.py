@@ -44,13 +44,14 @@ class Bounds:
         if self.affine is not None:
             self.fields, self.values, self.varying, self.in_place = list(self.affine.values), [0.0, 0.0], (True, True), False
             return
-        sides = (lower, upper)
-        varies = [isinstance(v, wp.array) or np.ndim(v) > 0 for v in sides]
+        low, high = (v if isinstance(v, wp.array) else real_array(v, name) for v, name in zip((lower, upper), NAMES, strict=True))
+        sides = (low, high)
+        varies = [v.ndim > 0 for v in sides]
         self.varying = (varies[0], varies[1])
         self.in_place = any(varies[s] and layout.holds(sides[s], wp.float64) for s in (0, 1))
         for side in (0, 1):
             if not varies[side]:
-                self.values[side] = float(real_array(sides[side], NAMES[side]))
+                self.values[side] = float(sides[side])
         if any(varies) and not self.in_place and self._code_from_host(sides):
             return
         for side in (0, 1):
@@ -106,7 +107,7 @@ class Bounds:
         """Code fields that are not stored yet; returns False, with nothing done, if their finite values differ or one is a NaN."""
         code, values = np.zeros(self.layout.stored_shape, dtype=np.uint8), list(self.values)
         for side in (0, 1):
-            host = sides[side].numpy() if isinstance(sides[side], wp.array) else np.asarray(sides[side])
+            host = real_array(sides[side], NAMES[side])
             if not self.varying[side]:
                 code += np.uint8(BITS[side] * bool(np.isfinite(values[side])))
                 continue

@@ -24,7 +24,10 @@ class SolveStatus(Enum):
     LOCAL_MINIMUM = "the merit function has a stationary point that is no solution: start elsewhere or take another method"
     NON_DESCENT = "no step reduces the merit function: take another method, for example ProjectedSOR"
     DIVERGED = "the residual grew beyond `divergence` times the first one: the method's assumptions on A do not hold"
-    NON_FINITE = "a NaN or an infinity appeared: check b, the bounds and the coefficients"
+    NON_FINITE = (
+        "a NaN or an infinity appeared: check b, the bounds and the coefficients; where these are beyond 1e36 or below 1e-36, "
+        "scale A and b, or take precision='double'"
+    )
     INFEASIBLE = "the problem has no solution: b is incompatible with a singular component, or the method has proved it"
 
 

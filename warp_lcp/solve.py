@@ -217,6 +217,7 @@ class _Loop:
         self.reference = residual.evaluate(x)
         self.tolerance = self.stopping.tolerance(self.reference)
         if not math.isfinite(self.reference) or not math.isfinite(residual.norm_of_b()):
+            self._refuse_unrepresentable()
             self._record(0, Step("start", 0))
             self._keep(0)
             return self._finish(SolveStatus.NON_FINITE, 0)
@@ -261,6 +262,14 @@ class _Loop:
                 self._keep(iteration)
             status = self._status(iteration, step.failure, interim=step.interim)
         return self._finish(status, iteration)
+
+    def _refuse_unrepresentable(self) -> None:
+        """Refuse bounds that no x in the method's precision can meet."""
+        iterate, p = self.work.precision.iterate, self.problem
+        for name, side, sign in (("lower", p.lower, 1), ("upper", p.upper, -1)):
+            least = float((sign * side.numpy()).max())  # x must be as large, in this direction
+            if float(np.finfo(wp.dtype_to_numpy(iterate)).max) < least < math.inf:
+                raise ValueError(f"{name}: x must be {sign * least:.1e}, too large for precision='single': take 'mixed'")
 
     def _refuse_vanishing(self) -> None:
         """Refuse data so small that squares of residuals are 0: anything would look like a solution."""

@@ -34,10 +34,11 @@ from warp_lcp.driver.scene_file import built_in_scenes, installed_simulators, lo
 from warp_lcp.driver.simulator import SimulationFailed, StepFailed
 from warp_lcp.driver.solve_file import Outcome, ProblemError, solve_files
 from warp_lcp.driver.solve_recorded import SUFFIX, check_recorded, file_digest, solve_recorded
-from warp_lcp.driver.table import SceneError, nearest
+from warp_lcp.driver.table import SceneError
 from warp_lcp.driver.tune import FRAMES, Tuning, tune, write_tuned
 from warp_lcp.driver.versions import shadowing_distributions, versions
 from warp_lcp.driver.viewer import view_run
+from warp_lcp.nearest import nearest
 
 FAILED = 1
 WRONG_INPUT = 2

@@ -13,7 +13,7 @@ import scipy.sparse
 from rich.table import Table
 
 from warp_lcp.driver.atomic import replacing
-from warp_lcp.driver.table import nearest
+from warp_lcp.nearest import nearest
 from warp_lcp.operators import DenseOperator, SparseOperator
 from warp_lcp.problem import LCP
 from warp_lcp.result import SolveResult

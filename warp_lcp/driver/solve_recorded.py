@@ -12,8 +12,8 @@ import numpy as np
 
 from warp_lcp.driver.atomic import replacing
 from warp_lcp.driver.solve_file import Outcome, ProblemError, criteria
-from warp_lcp.driver.table import nearest
 from warp_lcp.gallery.recorded_part import cell_counts, load_part
+from warp_lcp.nearest import nearest
 from warp_lcp.operators import GridPoisson
 from warp_lcp.problem import LCP
 from warp_lcp.solvers import ProjectedMultigrid, solve

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.layout import Layout, layout_of
+from warp_lcp.layout import Layout, check_storable, layout_of, real_array
 from warp_lcp.operators.low_rank_columns import BlockColumns
 from warp_lcp.operators.low_rank_kernels import weigh_kernel
 from warp_lcp.program import Launch
@@ -38,11 +38,10 @@ class LowRankOperator:
     def __init__(self, columns: Any, weights: Any, *, device: Any = None, dtype: Any = wp.float64) -> None:
         if dtype not in (wp.float32, wp.float64):
             raise ValueError(f"dtype = {dtype}: must be wp.float32 or wp.float64")
-        U = np.asarray(columns, dtype=np.float64)
+        U = np.asarray(real_array(columns, "columns"), dtype=np.float64)
         if U.ndim < 2 or U.size == 0:
             raise ValueError(f"columns has shape {U.shape}: expected a field's shape and the number of columns, both positive")
-        if not np.isfinite(U).all():
-            raise ValueError("columns holds a value that is not finite")
+        check_storable(U, dtype, "columns")
         layout = Layout(U.shape[:-1], wp.get_device(device))
         U = U.reshape(layout.size, -1)
         stored = BlockColumns(layout.size, 1, U.shape[1], dtype, layout.device)
@@ -153,7 +152,7 @@ class LowRankOperator:
 
     def _checked_weights(self, weights: Any) -> np.ndarray:
         """Return W as a host matrix."""
-        W, k = np.asarray(weights, dtype=np.float64), self.rank
+        W, k = np.asarray(real_array(weights, "weights"), dtype=np.float64), self.rank
         W = np.diag(W) if W.ndim == 1 else W
         if W.shape != (k, k):
             raise ValueError(f"weights has shape {np.shape(weights)}: expected {(k,)} or {(k, k)} for {k} columns")

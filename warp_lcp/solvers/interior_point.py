@@ -209,7 +209,7 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
         return self._passes if self.floating is None and self.count else None
 
     def begin(self, x: wp.array[Any]) -> None:
-        """Move x inside its bounds, and choose multipliers: by the sizes of b and the residual far from the path, by the residual near it."""
+        """Move x inside its bounds, and choose multipliers: by b and the residual far from the path, by the residual near it."""
         p = self.problem
         self._inside(x, 0.0)
         self.count = int(self._multipliers(0.0)[1])
@@ -280,6 +280,8 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
 
     def _center(self, longest: float, products: float) -> float:
         """Return Mehrotra's tau: mu times the cube of what the predictor would leave of it."""
+        if not self.mu > 0:  # products that vanish: rounding, or coefficients beyond what corrections hold
+            return 0.0
         length = min(1.0, 1 / longest) if longest > 0 else 1.0
         after = (1 - length) * self.mu + length**2 * products / self.count
         return self.mu * min(1.0, max(0.0, after / self.mu)) ** 3
