@@ -94,6 +94,7 @@ class AffineFields:
         index: stored int32 fields of stored indices, -1 where the bound is the constant.
         coefficient: stored fields, float64.
         values: stored fields, the bounds at the x of the last `evaluate`; at clip(0, l, u) before that.
+        sides: both sides as AffineBounds.
     """
 
     def __init__(self, layout: Layout, lower: Any, upper: Any) -> None:
@@ -105,6 +106,7 @@ class AffineFields:
             if not layout.fits(side.index):
                 raise ValueError(f"{name}: index has shape {side.index.shape}: expected {layout.shape}")
         stored = _stored_indices(layout)
+        self.sides = (sides[0], sides[1])
         indices = [np.where(s.index >= 0, stored(s.index)[s.index], -1) for s in sides]
         self.constant = [layout.load(s.constant, wp.float64, name) for s, name in zip(sides, SIDES, strict=True)]
         self.coefficient = [layout.load(s.coefficient, wp.float64, name) for s, name in zip(sides, SIDES, strict=True)]

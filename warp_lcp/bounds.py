@@ -11,6 +11,7 @@ from warp_lcp.affine_bounds import affine_fields
 from warp_lcp.bounds_kernels import LOWER_IS_FINITE, UPPER_IS_FINITE, decode_kernel, encode_kernel, encode_rows_kernel
 from warp_lcp.layout import Array, Layout, real_array
 from warp_lcp.native import Spans
+from warp_lcp.pickling import OnHost
 
 NAMES, INFINITE = ("lower", "upper"), (-np.inf, np.inf)
 BITS = (int(LOWER_IS_FINITE), int(UPPER_IS_FINITE))
@@ -79,6 +80,17 @@ class Bounds:
         """Evaluate bounds that depend on x at x (stored, float64)."""
         if self.affine is not None:
             self.affine.evaluate(x)
+
+    def given_again(self) -> tuple[Any, Any]:
+        """Return both sides as they are now, for a pickle."""
+        if self.affine is not None:
+            return self.affine.sides
+        sides = []
+        for side in (0, 1):
+            held = self.fields[side].size and self.in_place
+            field = self.as_field(side) if self.varying[side] else None
+            sides.append(self.values[side] if field is None else OnHost(field) if held else field.numpy().copy())
+        return sides[0], sides[1]
 
     def refresh(self) -> None:
         """Code fields again that the caller may have changed, where all their finite values are 0."""

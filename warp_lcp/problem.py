@@ -11,6 +11,7 @@ import warp as wp
 from warp_lcp.bounds import INFINITE, Bounds
 from warp_lcp.layout import Array, layout_of, real_array
 from warp_lcp.native import Spans
+from warp_lcp.pickling import OnHost, Pickled
 from warp_lcp.problem_kernels import check_kernel
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ def as_operator(A: Any, device: Any = None) -> Operator:
     raise ValueError(f"A is a {type(A).__name__}: expected an operator, a numpy array or a scipy.sparse matrix")
 
 
-class LCP:
+class LCP(Pickled):
     """A linear complementarity problem ([Book] 1.2).
 
     y = A x + b, l <= x <= u, and for every i: y_i > 0 => x_i = l_i; y_i < 0 => x_i = u_i; y_i = 0 otherwise. `lower=0`, `upper=inf` is
@@ -82,6 +83,11 @@ class LCP:
         self.bounds = Bounds(self.layout, lower, upper)
         self.unknown = _unknown(A, self.layout)
         self._check()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the operator, b and the bounds as they are now; fields that are used in place come back as device arrays."""
+        b = OnHost(self.b.reshape(self.layout.stored_shape)) if self.in_place else self.b.numpy().copy()
+        return LCP, (self.A, b, *self.bounds.given_again())
 
     @property
     def device(self) -> wp.Device:

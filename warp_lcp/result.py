@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING, Any
 
+from warp_lcp.pickling import FieldsOnHost
+
 if TYPE_CHECKING:
     import warp as wp
 
@@ -30,6 +32,10 @@ class SolveStatus(Enum):
     )
     INFEASIBLE = "the problem has no solution: b is incompatible with a singular component, or the method has proved it"
 
+    def __reduce_ex__(self, protocol: Any) -> tuple[Any, ...]:
+        """Pickle the name: what the value says may change."""
+        return getattr, (SolveStatus, self.name)
+
 
 @dataclass(frozen=True)
 class Record:
@@ -53,7 +59,7 @@ class Record:
 
 
 @dataclass(frozen=True)
-class SolveResult:
+class SolveResult(FieldsOnHost):
     """The outcome of `wl.solve`; true only if the recomputed residual meets the criteria.
 
     Attributes:

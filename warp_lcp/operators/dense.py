@@ -10,12 +10,13 @@ import warp as wp
 
 from warp_lcp.layout import Layout, check_kept, check_storable, real_array
 from warp_lcp.operators.dense_kernels import product_kernel, relax_kernel
+from warp_lcp.pickling import Pickled, made_again
 from warp_lcp.problem import as_operator
 
 SYMMETRIC = 64 * float(np.finfo(np.float64).eps)  # of the largest entries of two rows: what J M^-1 J' in float64 leaves of symmetry
 
 
-class DenseOperator:
+class DenseOperator(Pickled):
     """A x with a dense square matrix A.
 
     Args:
@@ -46,6 +47,10 @@ class DenseOperator:
         check_kept(largest, dtype, "matrix, the largest entries of its rows")
         self.row_sizes = None if largest.all() else wp.array(largest, dtype=wp.float64, device=self.device)
         self.symmetric = bool((np.abs(host - host.T) <= SYMMETRIC * np.minimum.outer(largest, largest)).all())
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the matrix."""
+        return made_again(DenseOperator, self.matrix.numpy(), device=self.device, dtype=self.dtype)
 
     @property
     def unknowns(self) -> int:

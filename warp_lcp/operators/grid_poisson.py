@@ -15,6 +15,7 @@ from warp_lcp.operators.components import ComponentFinder, FloatingComponents, S
 from warp_lcp.operators.grid_poisson_kernels import AIR, FLUID, SOLID
 from warp_lcp.operators.stencil import Ghosts, Stencil
 from warp_lcp.operators.stencil_kernels import StencilShape, find_spans_kernel
+from warp_lcp.pickling import OnHost, Pickled, made_again
 from warp_lcp.vectors import Across, launch_spans
 
 __all__ = ["AIR", "FLUID", "SOLID", "GridPoisson"]
@@ -23,7 +24,7 @@ Face = Any  # a number or an array
 AXES = "xyz"
 
 
-class GridPoisson:
+class GridPoisson(Pickled):
     """Negative Laplacian on the FLUID cells of a grid ([Book] 1.3.1), with general face coefficients.
 
     (A x)_i = sum over i's open faces of c_f (x_i - x_neighbor) + shift_i x_i, with x = 0 in AIR and in SOLID. A face with SOLID on a side
@@ -197,6 +198,22 @@ class GridPoisson:
             wp.launch(kernels.mask_and_shift_kernel, d.size, inputs, device=self.device)
         twin.stencil = self.stencil.with_diagonal(new)
         return twin
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle cells and coefficients; these come back in the padded shape.
+
+        Raises:
+            TypeError: it is a part of a grid that ranks share, or a principal system.
+        """
+        if self.layout.across is not None:
+            raise TypeError(f"{type(self).__name__} is a part of a grid that ranks share: pickle its cells and coefficients on each rank")
+        if self._mask is not None:
+            raise TypeError("a masked operator is not pickled: pickle the one it was made from, and mask that again")
+        faces = {f"face_{axis}": OnHost(f) if f.size else c for axis, f, c in zip(AXES, self.faces, self.uniform, strict=True)}
+        shift = OnHost(self.shift) if self.shift.size else None
+        cells = self.cells.numpy()[1:-1, 1:-1, 1:-1].reshape(self.shape).copy()
+        options = {**faces, "shift": shift, "periodic": self.periodic, "dtype": self.dtype}
+        return made_again(GridPoisson, cells, device=self.device, **options)
 
     @property
     def unknowns(self) -> int:

@@ -10,10 +10,11 @@ import warp as wp
 from warp_lcp.layout import Layout, check_storable, layout_of, real_array
 from warp_lcp.operators.low_rank_columns import BlockColumns
 from warp_lcp.operators.low_rank_kernels import weigh_kernel
+from warp_lcp.pickling import Pickled, made_again
 from warp_lcp.program import Launch
 
 
-class LowRankOperator:
+class LowRankOperator(Pickled):
     """U W U' x, with a few columns U and a small matrix W; usually a term of a SumOperator, A + U W U'.
 
     Only the rows of U that are not 0 are stored, and a product costs no more than they do.
@@ -64,6 +65,17 @@ class LowRankOperator:
         made = cls.__new__(cls)
         made._make(layout, columns, weights)
         return made
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the rows of U that are not 0, by the field's elements that they belong to."""
+        rows, blocks, values = self.columns.entries()
+        stored = self.layout.zeros(wp.int32)
+        stored.assign(np.arange(self.layout.size))
+        user = np.full(self.layout.size, -1)
+        user[self.layout.unload(stored).numpy().ravel()] = np.arange(int(np.prod(self.shape)))
+        entries = (user[rows], blocks.copy(), values.copy())
+        sizes = (self.shape, self.columns.rank // self.columns.width, self.columns.width)
+        return made_again(_of_entries, sizes, entries, self.weights.numpy(), device=self.device, dtype=self.dtype)
 
     def update(self, weights: Any = None) -> None:
         """Take other weights, and what the columns have become in place.
@@ -173,6 +185,17 @@ class LowRankOperator:
         out.zero_()
         self.add(x.flatten(), out.flatten(), out.flatten(), transposed=W is self._transposed)
         return out
+
+
+def _of_entries(sizes: Any, entries: Any, weights: np.ndarray, *, device: Any, dtype: Any) -> LowRankOperator:
+    """Return an operator from what it was pickled as."""
+    shape, blocks, width = sizes
+    layout = Layout(shape, wp.get_device(device))
+    columns = BlockColumns(layout.size, blocks, width, dtype, layout.device)
+    columns.assign(*entries)
+    made = LowRankOperator.__new__(LowRankOperator)
+    made._make(layout, columns, weights)
+    return made
 
 
 def _is_symmetric(W: np.ndarray) -> bool:

@@ -12,6 +12,7 @@ import warp as wp
 from warp_lcp.layout import Layout, check_kept, check_storable, real_array
 from warp_lcp.native import Spans
 from warp_lcp.operators.sparse_kernels import color_kernel, gather_kernel, kernels
+from warp_lcp.pickling import Pickled, made_again
 from warp_lcp.problem import as_operator
 from warp_lcp.program import Launch
 from warp_lcp.vectors import launch_spans
@@ -19,7 +20,7 @@ from warp_lcp.vectors import launch_spans
 SYMMETRIC = 64 * float(np.finfo(np.float64).eps)  # of the largest entries of two rows: what assembly in float64 leaves of symmetry
 
 
-class SparseOperator:
+class SparseOperator(Pickled):
     """A x with a sparse square matrix A, from scipy.sparse.
 
     Duplicate entries are summed and columns sorted, as `matrix.tocsr().sum_duplicates()` does; explicit zeros are kept, so that
@@ -63,6 +64,10 @@ class SparseOperator:
         self._transpose_values: wp.array[Any] | None = None
         self.version = 0
         self._take(host)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the matrix."""
+        return made_again(SparseOperator, self.matrix(), device=self.device, dtype=self.dtype)
 
     @property
     def unknowns(self) -> int:
