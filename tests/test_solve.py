@@ -184,7 +184,19 @@ def test_empty_problem_is_refused():
         wl.LCP(wl.GridPoisson(np.zeros((3, 3), dtype=int), device="cpu"), np.ones((3, 3)))
 
 
-@pytest.mark.parametrize("bad", [{"rtol": 1.0}, {"rtol": -1}, {"atol": np.inf}, {"max_iterations": -1}, {"patience": 0}, {"divergence": 1}])
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"rtol": 1.0},
+        {"rtol": -1},
+        {"atol": np.inf},
+        {"max_iterations": -1},
+        {"patience": 0},
+        {"divergence": 1},
+        {"max_seconds": 0},
+        {"max_seconds": np.nan},
+    ],
+)
 def test_criteria_are_checked(bad):
     with pytest.raises(ValueError, match=next(iter(bad))):
         wl.StoppingCriteria(**bad)

@@ -6,6 +6,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
+from warp_lcp.problem import MEMBERS
 
 A, B = np.array([[2.0, -1.0], [-1.0, 2.0]]), np.array([0.5, -2.5])
 X = [0.5, 1.5]  # 2 * 0.5 - 1.5 + 0.5 = 0 and -0.5 + 2 * 1.5 - 2.5 = 0
@@ -132,3 +133,146 @@ def test_arrays_of_every_kind_are_taken(made, device):
         problem = wl.LCP(*made(device))
         assert problem.device == wp.get_device(device)
         np.testing.assert_allclose(wl.solve(problem, x0=[0, 1]).x.numpy(), X, atol=1e-5)
+
+
+class Frame:
+    """A stand-in for what pandas has: no array, but made into one by `__array__`; it has an `apply` of its own."""
+
+    def __init__(self, values):
+        self.values = values
+
+    def __array__(self, dtype=None, copy=None):
+        return np.array(self.values, dtype=dtype)
+
+    def apply(self, function):
+        raise AssertionError
+
+
+class Table:
+    """Another one, made into an array by `to_numpy` only."""
+
+    def __init__(self, values):
+        self.values = values
+
+    def to_numpy(self):
+        return np.array(self.values)
+
+
+@pytest.mark.parametrize("kind", [Frame, Table])
+def test_what_converts_to_an_array_is_taken_as_one(kind):
+    given = [kind(values) for values in (A, B, np.full(2, -1.0), np.full(2, 9.0))]
+    np.testing.assert_allclose(wl.solve(wl.LCP(*given), x0=kind(np.ones(2))).x.numpy(), X, atol=1e-5)
+    assert (
+        wl.GridPoisson(kind([[1, 0]]), face_x=kind([[1.0, 2.0, 3.0]]), shift=kind([[4.0, 0.0]]), device="cpu").diagonal().numpy()[0, 0] == 6
+    )
+    for wrong, message in (([["a", "b"]], "A is a .* of type"), ([1.0, 2.0], r"matrix has shape \(2,\)"), (A * 1j, "of type complex128")):
+        with pytest.raises(ValueError, match=message):
+            wl.LCP(kind(wrong), B)
+
+
+def masked(values, *where):
+    mask = np.zeros(np.shape(values), dtype=bool)
+    mask.ravel()[list(where)] = True
+    return np.ma.array(values, mask=mask)
+
+
+@pytest.mark.parametrize(
+    ("make", "name", "count"),
+    [
+        (lambda: wl.LCP(masked(A, 1, 2), B), "matrix", 2),
+        (lambda: wl.LCP(A, masked(B, 0)), "b", 1),
+        (lambda: wl.LCP(A, B, masked(B, 1)), "lower", 1),
+        (lambda: wl.LCP(A, B, -9.0, masked(np.ones(2), 0, 1)), "upper", 2),
+        (lambda: wl.solve(wl.LCP(A, B), x0=masked(B, 1)), "x0", 1),
+        (lambda: wl.GridPoisson(masked(np.ones((2, 2), dtype=int), 3)), "cells", 1),
+        (lambda: wl.GridPoisson(np.ones((1, 2), dtype=int), face_x=masked(np.ones((1, 3)), 1)), "face_x", 1),
+        (lambda: wl.GridPoisson(np.ones((1, 2), dtype=int), shift=masked(np.ones((1, 2)), 1)), "shift", 1),
+        (lambda: wl.LowRankOperator(masked(np.ones((3, 1)), 1), np.ones(1)), "columns", 1),
+        (lambda: wl.AffineBounds(masked(B, 1), np.full(2, -1), 0.0), "constant", 1),
+    ],
+)
+def test_masked_entries_are_no_values(make, name, count):
+    with pytest.raises(ValueError, match=rf"{name} is a masked array with {count} masked entries: .*{name}.filled"):
+        make()
+
+
+def test_masked_arrays_without_masked_entries_are_taken():
+    np.testing.assert_allclose(wl.solve(wl.LCP(masked(A), masked(B), masked(np.zeros(2)))).x.numpy(), X, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"face_x": 1e39}, r"face_x holds values up to 1.0e\+39, too large for float32: pass dtype=wp.float64"),
+        ({"face_y": np.full((2, 2), 1e39)}, r"face_y holds values up to 1.0e\+39"),
+        ({"shift": 1e100}, r"shift holds values up to 1.0e\+100"),
+        ({"face_x": np.full((1, 3), 1e38), "shift": 2e38}, r"face_x, face_y, face_z and shift add up to 4.0e\+38, too large for float32"),
+        ({"face_x": 1e-60}, "face_x: 1 are not 0, but float32 takes them for it: pass dtype=wp.float64"),
+        ({"shift": np.array([[1e-60, 1.0]])}, "shift: 1 are not 0"),
+    ],
+)
+def test_coefficients_beyond_their_type(options, message):
+    cells = np.array([[wl.FLUID, wl.AIR]])
+    with pytest.raises(ValueError, match=message):
+        wl.GridPoisson(cells, **options)
+    grid = wl.GridPoisson(cells, **options, dtype=wp.float64, device="cpu")
+    d = grid.diagonal().numpy()[0, 0]
+    result = wl.solve(wl.LCP(grid, np.array([[-d, 0.0]])), wl.MinimumMapNewton(precision="double"))
+    np.testing.assert_allclose(result.x.numpy(), [[1.0, 0.0]])
+
+
+def test_matrices_beyond_float32():
+    for make in (wl.DenseOperator, lambda M, **options: wl.SparseOperator(scipy.sparse.csr_array(M), **options)):
+        for scale, message in ((1e39, "matrix holds values up to"), (1e-60, "matrix, the largest entries of its rows: 2 are not 0")):
+            with pytest.raises(ValueError, match=message):
+                make(scale * A, dtype=wp.float32, device="cpu")
+            assert wl.solve(wl.LCP(make(scale * A, device="cpu"), scale * B), wl.Lemke())
+    with pytest.raises(ValueError, match=r"columns holds values up to 1.0e\+39"):
+        wl.LowRankOperator(np.full((2, 1), 1e39), np.ones(1), dtype=wp.float32)
+
+
+@pytest.mark.parametrize(
+    ("bounds", "message"), [((1e39, np.inf), r"lower: x must be 1.0e\+39"), ((-np.inf, -1e39), r"upper: x must be -1.0e\+39")]
+)
+def test_bounds_beyond_single_precision(bounds, message):
+    problem = wl.LCP(A, B, *bounds)
+    with pytest.raises(ValueError, match=message + ", too large for precision='single': take 'mixed'"):
+        wl.solve(problem, wl.ProjectedSOR(precision="single"))
+    assert wl.solve(problem, wl.ProjectedSOR(precision="mixed"))
+    assert wl.solve(wl.LCP(A, B, 0.0, 1e39), wl.ProjectedSOR(precision="single"))  # a bound beyond all x is none
+
+
+def test_operators_that_lack_members():
+    members = {name for name in vars(wl.Operator) if not name.startswith("_")} | set(wl.Operator.__annotations__)
+    assert set(MEMBERS) == members
+
+    class Half:
+        shape, dtype, symmetric = (2,), wp.float64, True
+
+        def apply(self, x, out=None):
+            raise AssertionError
+
+    with pytest.raises(ValueError, match=r"A is a Half without device, apply_transpose, diagonal, masked: an operator needs them"):
+        wl.LCP(Half(), B)
+
+
+def test_methods_by_name():
+    with pytest.raises(KeyError, match="no method is called 'lemk': did you mean 'lemke'"):
+        wl.METHODS["lemk"]
+    with pytest.raises(KeyError, match=r"no method is called 'foo': choose from .*, lemke, .*, psor"):
+        wl.METHODS["foo"]
+    assert wl.METHODS.get("foo") is None
+    assert "foo" not in wl.METHODS
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ({"rtol": 1e-8}, r"solve takes no rtol: it is a criterion, pass stopping=wl.StoppingCriteria\(rtol=...\)"),
+        ({"max_seconds": 1.0}, r"pass stopping=wl.StoppingCriteria\(max_seconds=...\)"),
+        ({"omega": 1.5}, "solve takes no omega: settings are the method's own"),
+    ],
+)
+def test_options_that_belong_elsewhere(option, message):
+    with pytest.raises(TypeError, match=message):
+        wl.solve(wl.LCP(A, B), **option)

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.affine_bounds_kernels import evaluate_kernel
-from warp_lcp.layout import Layout
+from warp_lcp.layout import Layout, real_array
 
 SIDES = ("lower", "upper")
 
@@ -44,7 +44,7 @@ class AffineBounds:
             raise ValueError(f"index has values from {index.min()} to {index.max()}: expected -1 ... {index.size - 1}")
         object.__setattr__(self, "index", index)
         for name in ("constant", "coefficient"):
-            value = np.asarray(getattr(self, name), dtype=np.float64)
+            value = np.asarray(real_array(getattr(self, name), name), dtype=np.float64)
             if value.shape not in ((), index.shape):
                 raise ValueError(f"{name} has shape {value.shape}: expected a number or {index.shape}")
             object.__setattr__(self, name, np.array(np.broadcast_to(value, index.shape)))
@@ -94,6 +94,7 @@ class AffineFields:
         index: stored int32 fields of stored indices, -1 where the bound is the constant.
         coefficient: stored fields, float64.
         values: stored fields, the bounds at the x of the last `evaluate`; at clip(0, l, u) before that.
+        sides: both sides as AffineBounds.
     """
 
     def __init__(self, layout: Layout, lower: Any, upper: Any) -> None:
@@ -105,6 +106,7 @@ class AffineFields:
             if not layout.fits(side.index):
                 raise ValueError(f"{name}: index has shape {side.index.shape}: expected {layout.shape}")
         stored = _stored_indices(layout)
+        self.sides = (sides[0], sides[1])
         indices = [np.where(s.index >= 0, stored(s.index)[s.index], -1) for s in sides]
         self.constant = [layout.load(s.constant, wp.float64, name) for s, name in zip(sides, SIDES, strict=True)]
         self.coefficient = [layout.load(s.coefficient, wp.float64, name) for s, name in zip(sides, SIDES, strict=True)]
@@ -150,7 +152,7 @@ def affine_fields(layout: Layout, lower: Any, upper: Any) -> AffineFields | None
 
 def _constant(layout: Layout, side: Any, name: str) -> AffineBounds:
     """Return constant bounds as affine ones."""
-    host = side.numpy() if isinstance(side, wp.array) else np.asarray(side, dtype=np.float64)
+    host = real_array(side, name)
     shape = layout.shape if host.ndim == 0 else host.shape
     if shape not in (layout.shape, layout.stored_shape):
         raise ValueError(f"{name} has shape {shape}: expected {layout.shape}")

@@ -11,6 +11,7 @@ from warp_lcp.affine_bounds import affine_fields
 from warp_lcp.bounds_kernels import LOWER_IS_FINITE, UPPER_IS_FINITE, decode_kernel, encode_kernel, encode_rows_kernel
 from warp_lcp.layout import Array, Layout, real_array
 from warp_lcp.native import Spans
+from warp_lcp.pickling import OnHost
 
 NAMES, INFINITE = ("lower", "upper"), (-np.inf, np.inf)
 BITS = (int(LOWER_IS_FINITE), int(UPPER_IS_FINITE))
@@ -44,13 +45,14 @@ class Bounds:
         if self.affine is not None:
             self.fields, self.values, self.varying, self.in_place = list(self.affine.values), [0.0, 0.0], (True, True), False
             return
-        sides = (lower, upper)
-        varies = [isinstance(v, wp.array) or np.ndim(v) > 0 for v in sides]
+        low, high = (v if isinstance(v, wp.array) else real_array(v, name) for v, name in zip((lower, upper), NAMES, strict=True))
+        sides = (low, high)
+        varies = [v.ndim > 0 for v in sides]
         self.varying = (varies[0], varies[1])
         self.in_place = any(varies[s] and layout.holds(sides[s], wp.float64) for s in (0, 1))
         for side in (0, 1):
             if not varies[side]:
-                self.values[side] = float(real_array(sides[side], NAMES[side]))
+                self.values[side] = float(sides[side])
         if any(varies) and not self.in_place and self._code_from_host(sides):
             return
         for side in (0, 1):
@@ -79,6 +81,17 @@ class Bounds:
         if self.affine is not None:
             self.affine.evaluate(x)
 
+    def given_again(self) -> tuple[Any, Any]:
+        """Return both sides as they are now, for a pickle."""
+        if self.affine is not None:
+            return self.affine.sides
+        sides = []
+        for side in (0, 1):
+            held = self.fields[side].size and self.in_place
+            field = self.as_field(side) if self.varying[side] else None
+            sides.append(self.values[side] if field is None else OnHost(field) if held else field.numpy().copy())
+        return sides[0], sides[1]
+
     def refresh(self) -> None:
         """Code fields again that the caller may have changed, where all their finite values are 0."""
         if not self.in_place:
@@ -106,7 +119,7 @@ class Bounds:
         """Code fields that are not stored yet; returns False, with nothing done, if their finite values differ or one is a NaN."""
         code, values = np.zeros(self.layout.stored_shape, dtype=np.uint8), list(self.values)
         for side in (0, 1):
-            host = sides[side].numpy() if isinstance(sides[side], wp.array) else np.asarray(sides[side])
+            host = real_array(sides[side], NAMES[side])
             if not self.varying[side]:
                 code += np.uint8(BITS[side] * bool(np.isfinite(values[side])))
                 continue

@@ -26,13 +26,18 @@ def zeros(n: int, dtype: Any, device: wp.Device) -> wp.array[Any]:
 
 
 def real_array(values: Any, name: str) -> np.ndarray:
-    """Return an array, or what makes one, as a numpy array of real numbers of any type.
+    """Return an array (numpy, Warp), or what makes one (a list, a data frame), as a numpy array of real numbers of any type.
 
     Raises:
-        ValueError: it holds something else; the message names it.
+        ValueError: it holds something else, or masked entries; the message names it.
     """
+    masked = int(np.count_nonzero(np.ma.getmaskarray(values))) if isinstance(values, np.ma.MaskedArray) else 0
+    if masked:
+        raise ValueError(f"{name} is a masked array with {masked} masked entries: say what they are, {name}.filled(...)")
     try:
-        host = np.asarray(values)
+        host = values.numpy() if isinstance(values, wp.array) else np.asarray(values)
+        if host.dtype.kind == "O" and hasattr(values, "to_numpy"):
+            host = np.asarray(values.to_numpy())
     except ValueError:
         raise ValueError(f"{name}: its rows differ in length") from None
     if host.dtype.kind not in "biuf":
@@ -48,8 +53,20 @@ def check_storable(values: np.ndarray, dtype: Any, name: str) -> None:
     """
     if not np.isfinite(values).all():
         raise ValueError(f"{name} holds a value that is not finite")
-    if np.abs(values).max(initial=0.0) > np.finfo(wp.dtype_to_numpy(dtype)).max:
-        raise ValueError(f"{name} holds a value that is too large for {dtype.__name__}")
+    largest = float(np.abs(values).max(initial=0.0))
+    if largest > float(np.finfo(wp.dtype_to_numpy(dtype)).max):
+        raise ValueError(f"{name} holds values up to {largest:.1e}, too large for {dtype.__name__}: pass dtype=wp.float64")
+
+
+def check_kept(values: np.ndarray, dtype: Any, name: str) -> None:
+    """Check that no value but 0 becomes 0 in a type.
+
+    Raises:
+        ValueError: one does.
+    """
+    lost = np.count_nonzero(values) - np.count_nonzero(values.astype(wp.dtype_to_numpy(dtype)))
+    if lost:
+        raise ValueError(f"{name}: {lost} are not 0, but {dtype.__name__} takes them for it: pass dtype=wp.float64")
 
 
 class Layout:
@@ -92,7 +109,7 @@ class Layout:
         """
         if self.holds(field, dtype):
             return field.flatten()
-        host = real_array(field.numpy() if isinstance(field, wp.array) else field, name)
+        host = real_array(field, name)
         if not self.fits(host):
             raise ValueError(f"{name} has shape {host.shape}: expected {self.shape}")
         stored = np.zeros(self.stored_shape, dtype=wp.dtype_to_numpy(dtype))

@@ -9,31 +9,42 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.bounds import INFINITE, Bounds
-from warp_lcp.layout import Array, layout_of
+from warp_lcp.layout import Array, layout_of, real_array
 from warp_lcp.native import Spans
+from warp_lcp.pickling import OnHost, Pickled
 from warp_lcp.problem_kernels import check_kernel
 
 if TYPE_CHECKING:
     from warp_lcp.operators.protocol import Operator
 
 
+MEMBERS = ("shape", "dtype", "device", "symmetric", "apply", "apply_transpose", "diagonal", "masked")  # of `wl.Operator`
+
+
 @singledispatch
 def as_operator(A: Any, device: Any = None) -> Operator:
     """Return A as an operator; operators register here which arrays they take (numpy arrays, scipy.sparse matrices).
+
+    What converts to an array, by `__array__` or `to_numpy` (a data frame), is taken as one.
 
     Args:
         A: an operator, or what one is made of.
         device: where an operator is made; the default device if None.
 
     Raises:
-        ValueError: A is neither.
+        ValueError: A is neither, or lacks members of `wl.Operator`; the message names them.
     """
-    if not hasattr(A, "apply"):
-        raise ValueError(f"A is a {type(A).__name__}: expected an operator, a numpy array or a scipy.sparse matrix")
-    return A
+    missing = [name for name in MEMBERS if not hasattr(A, name)]
+    if not missing:
+        return A
+    if hasattr(A, "__array__") or hasattr(A, "to_numpy"):
+        return as_operator(real_array(A, "A"), device)
+    if hasattr(A, "apply"):
+        raise ValueError(f"A is a {type(A).__name__} without {', '.join(missing)}: an operator needs them, see wl.Operator")
+    raise ValueError(f"A is a {type(A).__name__}: expected an operator, a numpy array or a scipy.sparse matrix")
 
 
-class LCP:
+class LCP(Pickled):
     """A linear complementarity problem ([Book] 1.2).
 
     y = A x + b, l <= x <= u, and for every i: y_i > 0 => x_i = l_i; y_i < 0 => x_i = u_i; y_i = 0 otherwise. `lower=0`, `upper=inf` is
@@ -72,6 +83,11 @@ class LCP:
         self.bounds = Bounds(self.layout, lower, upper)
         self.unknown = _unknown(A, self.layout)
         self._check()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the operator, b and the bounds as they are now; fields that are used in place come back as device arrays."""
+        b = OnHost(self.b.reshape(self.layout.stored_shape)) if self.in_place else self.b.numpy().copy()
+        return LCP, (self.A, b, *self.bounds.given_again())
 
     @property
     def device(self) -> wp.Device:

@@ -9,6 +9,8 @@ from typing import Any, Protocol
 
 import warp as wp
 
+from warp_lcp.deadline import check_time
+
 CPU_RUNS_BEFORE_CAPTURE = 24  # recording a CPU graph costs about as much as it saves in so many runs
 
 
@@ -103,13 +105,17 @@ class Program:
             condition: shape (1,), wp.int32.
         """
         if self._runs == 0 or self._has_tasks or not loops_on_device(self.device):  # the first run loads the kernels
-            wp.capture_while(condition, self.run)
+            wp.capture_while(condition, self._run_in_time)
             return
         if condition.ptr not in self._loops:
             with wp.ScopedCapture(device=self.device, force_module_load=False) as capture:
                 wp.capture_while(condition, self._launch)
             self._loops[condition.ptr] = capture.graph
         wp.capture_launch(self._loops[condition.ptr])
+
+    def _run_in_time(self) -> None:
+        check_time()
+        self.run()
 
     @property
     def _has_tasks(self) -> bool:

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING, Any
 
+from warp_lcp.pickling import FieldsOnHost
+
 if TYPE_CHECKING:
     import warp as wp
 
@@ -18,13 +20,21 @@ class SolveStatus(Enum):
         "the iteration limit came first: raise max_iterations, start warmer, or take a faster method; "
         "where coefficients differ by more than 1e5, precision='double'"
     )
+    TIME_LIMIT = "`max_seconds` came first: raise it, start from this x, or take a faster method, that of wl.solve(problem) or wl.recommend"
     STAGNATED = "no smaller residual in the last `patience` steps: take another method or precision='double'"
     FLOOR = "the precision's floor is reached before the tolerance: loosen rtol or use precision='double'"
     LOCAL_MINIMUM = "the merit function has a stationary point that is no solution: start elsewhere or take another method"
     NON_DESCENT = "no step reduces the merit function: take another method, for example ProjectedSOR"
     DIVERGED = "the residual grew beyond `divergence` times the first one: the method's assumptions on A do not hold"
-    NON_FINITE = "a NaN or an infinity appeared: check b, the bounds and the coefficients"
+    NON_FINITE = (
+        "a NaN or an infinity appeared: check b, the bounds and the coefficients; where these are beyond 1e36 or below 1e-36, "
+        "scale A and b, or take precision='double'"
+    )
     INFEASIBLE = "the problem has no solution: b is incompatible with a singular component, or the method has proved it"
+
+    def __reduce_ex__(self, protocol: Any) -> tuple[Any, ...]:
+        """Pickle the name: what the value says may change."""
+        return getattr, (SolveStatus, self.name)
 
 
 @dataclass(frozen=True)
@@ -49,7 +59,7 @@ class Record:
 
 
 @dataclass(frozen=True)
-class SolveResult:
+class SolveResult(FieldsOnHost):
     """The outcome of `wl.solve`; true only if the recomputed residual meets the criteria.
 
     Attributes:

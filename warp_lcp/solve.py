@@ -13,6 +13,7 @@ from typing import Any, Protocol, get_args, get_type_hints
 import numpy as np
 import warp as wp
 
+from warp_lcp.deadline import Deadline, TimeIsUp
 from warp_lcp.layout import Array
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
@@ -163,8 +164,10 @@ def solve(
         raise ValueError(f"{type(solver).__name__} takes no bounds that are affine in x: take ProjectedSOR or another sweeping method")
     if problem.layout.across is not None and not getattr(solver, "distributed", False):
         raise ValueError(f"{type(solver).__name__} does not work on several ranks: take ProjectedMultigrid or MinimumMapNewton")
+    stopping = stopping or StoppingCriteria()
+    deadline = Deadline(stopping.max_seconds, problem.layout.across)
     work = solver.init(problem) if workspace is None else _checked(workspace, problem, solver)
-    return _Loop(problem, solver, stopping or StoppingCriteria(), work, callback).run(x0)
+    return _Loop(problem, solver, stopping, deadline, work, callback).run(x0)
 
 
 def _checked(work: Any, problem: LCP, solver: Solver) -> Workspace:
@@ -195,9 +198,11 @@ class _Loop:
     """The state of one solve."""
 
     def __init__(
-        self, problem: LCP, solver: Solver, stopping: StoppingCriteria, work: Workspace, callback: Callable[[Record], None] | None
-    ) -> None:
+        self, problem: LCP, solver: Solver, stopping: StoppingCriteria, deadline: Deadline, work: Workspace,
+        callback: Callable[[Record], None] | None,
+    ) -> None:  # fmt: skip
         self.problem, self.solver, self.stopping, self.work, self.callback = problem, solver, stopping, work, callback
+        self.deadline = deadline
         self.residual, self.history = work.residual, list[Record]()
         self.begun = time.perf_counter()
         self.linear = 0
@@ -212,6 +217,7 @@ class _Loop:
         self.reference = residual.evaluate(x)
         self.tolerance = self.stopping.tolerance(self.reference)
         if not math.isfinite(self.reference) or not math.isfinite(residual.norm_of_b()):
+            self._refuse_unrepresentable()
             self._record(0, Step("start", 0))
             self._keep(0)
             return self._finish(SolveStatus.NON_FINITE, 0)
@@ -233,8 +239,14 @@ class _Loop:
         self._keep(0)
         if lost > self.tolerance:
             return self._finish(SolveStatus.INFEASIBLE, 0)
-        self.work.start(warm=guess is not None, tolerance=self.tolerance)
-        return self._iterate()
+        try:
+            with self.deadline:
+                self.work.start(warm=guess is not None, tolerance=self.tolerance)
+                return self._iterate()
+        except TimeIsUp:  # within a step, of which nothing is left
+            self._restore()
+            ended = SolveStatus.CONVERGED if self.residual.norm <= self.tolerance else SolveStatus.TIME_LIMIT
+            return self._finish(ended, self.history[-1].iteration)
 
     def _iterate(self) -> SolveResult:
         iteration, status = 0, self._status(0, None)
@@ -252,6 +264,14 @@ class _Loop:
                 self.progress = iteration
             status = self._status(iteration, step.failure, interim=step.interim)
         return self._finish(status, iteration)
+
+    def _refuse_unrepresentable(self) -> None:
+        """Refuse bounds that no x in the method's precision can meet."""
+        iterate, p = self.work.precision.iterate, self.problem
+        for name, side, sign in (("lower", p.lower, 1), ("upper", p.upper, -1)):
+            least = float((sign * side.numpy()).max())  # x must be as large, in this direction
+            if float(np.finfo(wp.dtype_to_numpy(iterate)).max) < least < math.inf:
+                raise ValueError(f"{name}: x must be {sign * least:.1e}, too large for precision='single': take 'mixed'")
 
     def _refuse_vanishing(self) -> None:
         """Refuse data so small that squares of residuals are 0: anything would look like a solution."""
@@ -296,7 +316,7 @@ class _Loop:
             return SolveStatus.MAX_ITERATIONS
         if not interim and iteration - max(self.best_iteration, self.progress) >= stopping.patience:
             return self._floor_or(SolveStatus.STAGNATED)
-        return None
+        return None if self.deadline.left() > 0 else SolveStatus.TIME_LIMIT
 
     def _floor_or(self, status: SolveStatus) -> SolveStatus:
         """Return FLOOR where the best iterate's residual is what rounding leaves, else the status: the solve ends with it."""
@@ -317,10 +337,14 @@ class _Loop:
         self.work.keep()
         self.best_iteration, self.best_norm = iteration, self.residual.norm
 
+    def _restore(self) -> None:
+        """Take the best iterate back."""
+        self.work.restore()
+        self.residual.evaluate(self.work.x)
+
     def _finish(self, status: SolveStatus, iterations: int) -> SolveResult:
         if self.best_iteration != iterations or not math.isfinite(self.residual.norm):
-            self.work.restore()
-            self.residual.evaluate(self.work.x)
+            self._restore()
         norm = self.residual.norm
         relative = norm / self.reference if self.reference > 0 else 0.0
         layout, x = self.problem.layout, self.work.x

@@ -16,6 +16,9 @@ class StoppingCriteria:
         max_iterations: the most steps of the method, >= 0; the limit is honored exactly.
         patience: steps without a new smallest residual after which the solve has stagnated, >= 1.
         divergence: the solve has diverged when the residual exceeds this multiple of the first one, > 1.
+        max_seconds: wall time after which the solve ends with TIME_LIMIT, > 0; inf: never. A method's set-up counts. What cannot be cut
+            short is finished first: a pivot, a sweep, an iteration of a linear solve, a factorization, PIQP's one call, and on CUDA a
+            linear solve, whose loop the host does not see. On ranks time is up for all as soon as it is for one.
 
     Raises:
         ValueError: an argument is outside its range.
@@ -34,6 +37,7 @@ class StoppingCriteria:
     max_iterations: int = 100
     patience: int = 30
     divergence: float = 1e8
+    max_seconds: float = math.inf
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -47,6 +51,8 @@ class StoppingCriteria:
                 raise ValueError(f"{name} = {value}: must be an integer >= {least}")
         if not self.divergence > 1:
             raise ValueError(f"divergence = {self.divergence}: must be > 1")
+        if not self.max_seconds > 0:
+            raise ValueError(f"max_seconds = {self.max_seconds}: must be > 0, or inf for no limit")
 
     def tolerance(self, reference: float) -> float:
         """Return the absolute tolerance for a reference residual norm."""

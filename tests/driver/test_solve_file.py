@@ -90,6 +90,13 @@ def test_a_solve_that_fails_exits_with_1(problem, tmp_path):
     assert np.isfinite(scipy.io.mmread(out)).all()  # the best there is
 
 
+def test_a_solve_ends_in_time(problem, tmp_path):
+    result = call(tmp_path / "A.mtx", tmp_path / "b.mtx", "--max-seconds", 1e-9)
+    assert result.exit_code == 1
+    assert result.stderr.startswith("TIME_LIMIT: `max_seconds` came first")
+    assert call(tmp_path / "A.mtx", tmp_path / "b.mtx", "--max-seconds", 600).exit_code == 0
+
+
 def test_a_long_history_is_shortened(problem, tmp_path):
     result = call(tmp_path / "A.mtx", tmp_path / "b.mtx", "--method", "psor", "--max-iterations", 70, "--tolerance", 1e-15)
     rows = [line.split()[0] for line in result.stdout.splitlines()[2:] if line.split()[0].isdigit() or line.split()[0] == "..."]
@@ -118,6 +125,8 @@ def test_a_long_history_is_shortened(problem, tmp_path):
         (["A.mtx", "b.mtx", "--method", "projected-multigrid"], "does not take sparse matrices; choose from"),
         (["A.mtx", "b.mtx", "--tolerance", "2"], "--tolerance 2.0: rtol = 2.0: must be in [0, 1)"),
         (["A.mtx", "b.mtx", "--max-iterations", "-1"], "--max-iterations"),
+        (["A.mtx", "b.mtx", "--max-seconds", "0"], "--max-seconds 0.0: must be > 0"),
+        (["A.mtx", "b.mtx", "--max-seconds", "nan"], "--max-seconds nan: must be > 0"),
         (["A.mtx", "b.mtx", "--out", "no/where/x.mtx"], "--out no/where/x.mtx: there is no folder no/where"),
         (["A.mtx"], "b.mtx"),
     ],

@@ -140,7 +140,7 @@ def test_what_cannot_be_taken_apart_is_refused():
         def apply(self, x, out=None):
             return x
 
-        apply_transpose = apply
+        apply_transpose = masked = apply
 
         def diagonal(self):
             return wp.full(3, 1.0, dtype=wp.float64, device="cpu")

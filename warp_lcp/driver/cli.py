@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -33,10 +34,11 @@ from warp_lcp.driver.scene_file import built_in_scenes, installed_simulators, lo
 from warp_lcp.driver.simulator import SimulationFailed, StepFailed
 from warp_lcp.driver.solve_file import Outcome, ProblemError, solve_files
 from warp_lcp.driver.solve_recorded import SUFFIX, check_recorded, file_digest, solve_recorded
-from warp_lcp.driver.table import SceneError, nearest
+from warp_lcp.driver.table import SceneError
 from warp_lcp.driver.tune import FRAMES, Tuning, tune, write_tuned
 from warp_lcp.driver.versions import shadowing_distributions, versions
 from warp_lcp.driver.viewer import view_run
+from warp_lcp.nearest import nearest
 
 FAILED = 1
 WRONG_INPUT = 2
@@ -267,12 +269,17 @@ def solve(
     method: Annotated[str | None, typer.Option(metavar="NAME", help="The fastest for A unless given.", show_default=False)] = None,
     tolerance: Annotated[float, typer.Option(metavar="T", help="Of the residual, relative to the one at clip(0, lower, upper).")] = 1e-6,
     max_iterations: Annotated[int, typer.Option(min=0, metavar="N", help="The most steps.")] = 1000,
+    max_seconds: Annotated[
+        float, typer.Option(metavar="S", help="The most wall time of the solve; no limit unless given.", show_default=False)
+    ] = math.inf,
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Where x goes: x.mtx, or x.npy of a grid.", show_default=False)] = None,
     device: Annotated[str, typer.Option(help="cpu, cuda:N, or with --engine petsc cuda.")] = "cpu",
     engine: EngineOption = Engine.SINGLE,
 ) -> None:
     """Solve a complementarity problem, y = A x + b, lower <= x <= upper: of a matrix and a vector, or one that a run has recorded."""
-    options: dict[str, Any] = {"method": method, "tolerance": tolerance, "max_iterations": max_iterations}
+    options: dict[str, Any] = {
+        "method": method, "tolerance": tolerance, "max_iterations": max_iterations, "max_seconds": max_seconds
+    }  # fmt: skip
     with _wrong_input(), crew_of(engine) as crew:
         crew.agree({"the problem": file_digest(problem), "--out": out, "--device": device, **options})
         chosen = crew.choose_device(device)

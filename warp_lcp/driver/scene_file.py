@@ -15,7 +15,8 @@ import tomli_w
 from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.shapes import BUILTIN
 from warp_lcp.driver.simulator import Simulator, simulators
-from warp_lcp.driver.table import Problem, SceneError, nearest, validate, written
+from warp_lcp.driver.table import Problem, SceneError, validate, written
+from warp_lcp.nearest import nearest
 
 DEEPEST = 16  # tables and arrays in each other; a scene needs six
 LARGEST = 1e18  # of a number: its square is a float32, and sums of cubes are float64

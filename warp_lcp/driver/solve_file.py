@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import scipy.sparse
 from rich.table import Table
 
 from warp_lcp.driver.atomic import replacing
-from warp_lcp.driver.table import nearest
+from warp_lcp.nearest import nearest
 from warp_lcp.operators import DenseOperator, SparseOperator
 from warp_lcp.problem import LCP
 from warp_lcp.result import SolveResult
@@ -91,6 +92,7 @@ def solve_files(
     method: str | None = None,
     tolerance: float = 1e-6,
     max_iterations: int = 1000,
+    max_seconds: float = math.inf,
     device: str = "cpu",
 ) -> Outcome:
     """Solve y = A x + b, lower <= x <= upper, from files.
@@ -103,6 +105,7 @@ def solve_files(
         method: a name in `METHODS`; the default method for A if None.
         tolerance: of the residual, relative to the one at clip(0, lower, upper).
         max_iterations: the most steps.
+        max_seconds: the most wall time of the solve.
         device: a Warp device.
 
     Raises:
@@ -112,19 +115,30 @@ def solve_files(
     n = A.shape[0]
     b = read_vector(right_side, n)
     sides = [_bound(value, n, f"--{name}") for name, value in (("lower", lower), ("upper", upper))]
-    try:
-        stopping = StoppingCriteria(rtol=tolerance, max_iterations=max_iterations)
-    except ValueError as error:
-        raise ProblemError(f"--tolerance {tolerance}: {error}") from error
+    stopping = criteria(tolerance, max_iterations, max_seconds)
     try:
         operator = SparseOperator(A, device=device) if scipy.sparse.issparse(A) else DenseOperator(A, device=device)
         problem = LCP(operator, b, *sides)
         solver = default_method(problem) if method is None else _method(method, operator)
-        work = solver.init(problem)
+        result = solve(problem, solver, stopping=stopping)
     except ValueError as error:
         raise ProblemError(str(error)) from error
     name = next((name for name, kind in METHODS.items() if type(solver) is kind), type(solver).__name__)
-    return Outcome(problem, solver, name, solve(problem, solver, stopping=stopping, workspace=work))
+    return Outcome(problem, solver, name, result)
+
+
+def criteria(tolerance: float, max_iterations: int, max_seconds: float) -> StoppingCriteria:
+    """Return the criteria that options ask for.
+
+    Raises:
+        ProblemError: an option is outside its range; the message names it.
+    """
+    if not max_seconds > 0:
+        raise ProblemError(f"--max-seconds {max_seconds}: must be > 0")
+    try:
+        return StoppingCriteria(rtol=tolerance, max_iterations=max_iterations, max_seconds=max_seconds)
+    except ValueError as error:
+        raise ProblemError(f"--tolerance {tolerance}: {error}") from error
 
 
 def read_matrix(path: Path) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,15 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from warp_lcp.driver.atomic import replacing
-from warp_lcp.driver.solve_file import Outcome, ProblemError
-from warp_lcp.driver.table import nearest
+from warp_lcp.driver.solve_file import Outcome, ProblemError, criteria
 from warp_lcp.gallery.recorded_part import cell_counts, load_part
+from warp_lcp.nearest import nearest
 from warp_lcp.operators import GridPoisson
 from warp_lcp.problem import LCP
-from warp_lcp.result import SolveResult
 from warp_lcp.solvers import ProjectedMultigrid, solve
 from warp_lcp.solvers.registry import METHODS
-from warp_lcp.stopping import StoppingCriteria
 
 if TYPE_CHECKING:
     from warp_lcp.distributed.decomposition import Decomposition
@@ -74,6 +73,7 @@ def solve_recorded(
     method: str | None = None,
     tolerance: float = 1e-6,
     max_iterations: int = 1000,
+    max_seconds: float = math.inf,
     device: str = "cpu",
     ranks: Ranks | None = None,
 ) -> GridOutcome:
@@ -84,24 +84,21 @@ def solve_recorded(
         method: a name in `METHODS`; the default method for grids if None.
         tolerance: of the residual, relative to the one at clip(0, lower, upper).
         max_iterations: the most steps.
+        max_seconds: the most wall time of the solve.
         device: a Warp device.
         ranks: who solve it together, each of them its own box of cells; collective. None: this process alone.
 
     Raises:
         ProblemError: the file or an option is wrong.
     """
-    try:
-        stopping = StoppingCriteria(rtol=tolerance, max_iterations=max_iterations)
-    except ValueError as error:
-        raise ProblemError(f"--tolerance {tolerance}: {error}") from error
+    stopping = criteria(tolerance, max_iterations, max_seconds)
     solver = ProjectedMultigrid() if method is None else _method(method, shared=ranks is not None and ranks.size > 1)
     name = next(name for name, kind in METHODS.items() if type(solver) is kind)
     try:
         shape = cell_counts(path)
         decomposition = None if ranks is None else _decomposition(shape, ranks)
         problem = _problem(path, shape, decomposition, device)
-        work: Any = solver.init(problem)
-        result: SolveResult = solve(problem, solver, stopping=stopping, workspace=work)
+        result = solve(problem, solver, stopping=stopping)
     except ValueError as error:
         raise ProblemError(str(error)) from error
     return GridOutcome(problem, solver, name, result, shape, problem.A.unknowns, decomposition)  # type: ignore[attr-defined]

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 from typing import Annotated, Any, ClassVar, TypeVar, get_args
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
+
+from warp_lcp.nearest import nearest
 
 ModelT = TypeVar("ModelT", bound="Table")
 
@@ -130,13 +131,6 @@ def validate(model: type[ModelT], data: Mapping[str, Any], source: str) -> Model
     except ValidationError as error:
         details = error.errors(include_url=False)
     raise SceneError(source, [_problem(model, line) for line in details])
-
-
-def nearest(word: str, known: Iterable[str]) -> str:
-    """Return `did you mean ...?` for a word that is near a known one, and the list of known ones otherwise."""
-    known = sorted(known)
-    match = get_close_matches(word, known, n=1, cutoff=0.6)
-    return f"did you mean {match[0]!r}?" if match else f"choose from {', '.join(known)}"
 
 
 @dataclass

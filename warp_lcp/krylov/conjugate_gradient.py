@@ -7,6 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 import warp as wp
 
+from warp_lcp.deadline import check_time
 from warp_lcp.krylov.conjugate_gradient_kernels import ITERATIONS, PQ, RR, RZ, SLOTS, begin_kernel, end_kernel, kernels
 from warp_lcp.program import Launch, Program
 from warp_lcp.vectors import Reduction, launch_spans
@@ -76,6 +77,7 @@ class ConjugateGradient:
 
     def _iterate(self) -> None:
         """Launch an iteration whose preconditioner is no program."""
+        check_time()
         self._preconditioner.apply()
         self._advance(wp.launch)
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.deadline import check_time
 from warp_lcp.field_set import FieldSet
 from warp_lcp.krylov.conjugate_gradient import LinearMap, Preconditioner
 from warp_lcp.krylov.gmres_kernels import kernels
@@ -77,6 +78,7 @@ class GMRES:
         g[:] = 0.0
         g[0] = norm
         for k in range(most):
+            check_time()
             self._basis.take(k, self._preconditioner.r)
             self._weigh(self._preconditioner.r, inverse=True)
             self._preconditioner.apply()

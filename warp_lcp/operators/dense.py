@@ -8,14 +8,15 @@ import numpy as np
 import scipy.sparse
 import warp as wp
 
-from warp_lcp.layout import Layout, check_storable, real_array
+from warp_lcp.layout import Layout, check_kept, check_storable, real_array
 from warp_lcp.operators.dense_kernels import product_kernel, relax_kernel
+from warp_lcp.pickling import Pickled, made_again
 from warp_lcp.problem import as_operator
 
 SYMMETRIC = 64 * float(np.finfo(np.float64).eps)  # of the largest entries of two rows: what J M^-1 J' in float64 leaves of symmetry
 
 
-class DenseOperator:
+class DenseOperator(Pickled):
     """A x with a dense square matrix A.
 
     Args:
@@ -35,7 +36,7 @@ class DenseOperator:
             raise ValueError(f"dtype = {dtype}: must be wp.float32 or wp.float64")
         if scipy.sparse.issparse(matrix):
             raise ValueError("matrix is a sparse one: SparseOperator takes it")
-        host = np.asarray(real_array(matrix.numpy() if isinstance(matrix, wp.array) else matrix, "matrix"), dtype=np.float64)
+        host = np.asarray(real_array(matrix, "matrix"), dtype=np.float64)
         if host.ndim != 2 or host.shape[0] != host.shape[1] or host.size == 0:
             raise ValueError(f"matrix has shape {host.shape}: expected (n, n) with n >= 1")
         check_storable(host, dtype, "matrix")
@@ -43,8 +44,13 @@ class DenseOperator:
         self.layout = Layout(self.shape, self.device)
         self.matrix = wp.array(host, dtype=dtype, device=self.device)
         largest = np.abs(host).max(axis=1)
+        check_kept(largest, dtype, "matrix, the largest entries of its rows")
         self.row_sizes = None if largest.all() else wp.array(largest, dtype=wp.float64, device=self.device)
         self.symmetric = bool((np.abs(host - host.T) <= SYMMETRIC * np.minimum.outer(largest, largest)).all())
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the matrix."""
+        return made_again(DenseOperator, self.matrix.numpy(), device=self.device, dtype=self.dtype)
 
     @property
     def unknowns(self) -> int:

@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.layout import PaddedLayout
+from warp_lcp.layout import PaddedLayout, check_kept, check_storable, real_array
 from warp_lcp.native import Spans
 from warp_lcp.operators import grid_poisson_kernels as kernels
 from warp_lcp.operators.components import ComponentFinder, FloatingComponents, Scratch
 from warp_lcp.operators.grid_poisson_kernels import AIR, FLUID, SOLID
 from warp_lcp.operators.stencil import Ghosts, Stencil
 from warp_lcp.operators.stencil_kernels import StencilShape, find_spans_kernel
+from warp_lcp.pickling import OnHost, Pickled, made_again
 from warp_lcp.vectors import Across, launch_spans
 
 __all__ = ["AIR", "FLUID", "SOLID", "GridPoisson"]
@@ -23,7 +24,7 @@ Face = Any  # a number or an array
 AXES = "xyz"
 
 
-class GridPoisson:
+class GridPoisson(Pickled):
     """Negative Laplacian on the FLUID cells of a grid ([Book] 1.3.1), with general face coefficients.
 
     (A x)_i = sum over i's open faces of c_f (x_i - x_neighbor) + shift_i x_i, with x = 0 in AIR and in SOLID. A face with SOLID on a side
@@ -88,11 +89,13 @@ class GridPoisson:
         counts = self.layout.padding.counts
         flags = (*(bool(p) for p in periodic), False, False, False)[:3]
         self.periodic = (flags[0] and counts[2] > 1, flags[1] and counts[1] > 1, flags[2] and counts[0] > 1)
-        faces = [face_x, face_y, face_z if host.ndim == 3 else 1.0]
-        numbers = [float(f) if np.ndim(f) == 0 and not isinstance(f, wp.array) else 0.0 for f in faces]
+        given = (face_x, face_y, face_z if host.ndim == 3 else 1.0)
+        faces = [f if isinstance(f, wp.array) else real_array(f, f"face_{axis}") for f, axis in zip(given, AXES, strict=True)]
+        numbers = [float(f) if f.ndim == 0 else 0.0 for f in faces]
         self.uniform = (numbers[0], numbers[1], numbers[2])
         self.faces = [self._stored_face(f, axis) for axis, f in enumerate(faces)]
         self.shift = self._stored_shift(shift)
+        self._check_sums()
         self.cells = wp.full(self.layout.stored_shape, SOLID, dtype=wp.int8, device=self.device)
         self.cells_around = wp.zeros_like(self.cells) if any(self.periodic) or self._ghosts is not None else self.cells
         self._spans = wp.zeros((counts[0], counts[1]), dtype=wp.vec2i, device=self.device)
@@ -196,6 +199,22 @@ class GridPoisson:
         twin.stencil = self.stencil.with_diagonal(new)
         return twin
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle cells and coefficients; these come back in the padded shape.
+
+        Raises:
+            TypeError: it is a part of a grid that ranks share, or a principal system.
+        """
+        if self.layout.across is not None:
+            raise TypeError(f"{type(self).__name__} is a part of a grid that ranks share: pickle its cells and coefficients on each rank")
+        if self._mask is not None:
+            raise TypeError("a masked operator is not pickled: pickle the one it was made from, and mask that again")
+        faces = {f"face_{axis}": OnHost(f) if f.size else c for axis, f, c in zip(AXES, self.faces, self.uniform, strict=True)}
+        shift = OnHost(self.shift) if self.shift.size else None
+        cells = self.cells.numpy()[1:-1, 1:-1, 1:-1].reshape(self.shape).copy()
+        options = {**faces, "shift": shift, "periodic": self.periodic, "dtype": self.dtype}
+        return made_again(GridPoisson, cells, device=self.device, **options)
+
     @property
     def unknowns(self) -> int:
         """Number of FLUID cells."""
@@ -204,17 +223,17 @@ class GridPoisson:
     def _stored_face(self, face: Face, axis: int) -> wp.array[Any]:
         """Return the coefficients of lower faces as a padded array, or an empty array for a number."""
         name = f"face_{AXES[axis]}"
-        if np.ndim(face) == 0 and not isinstance(face, wp.array):
-            _check_coefficients(np.asarray(face, dtype=np.float64), name)
+        if face.ndim == 0:
+            _check_coefficients(face, self.dtype, name)
             return wp.empty((0, 0, 0), dtype=self.dtype, device=self.device)
         if self._in_place(face, name):
             return face
-        host = face.numpy() if isinstance(face, wp.array) else np.asarray(face, dtype=np.float64)
+        host = real_array(face, name)
         expected = list(self.shape)
         expected[-1 - axis] += 1
         if host.shape != tuple(expected):
             raise ValueError(f"{name} has shape {host.shape}: expected {tuple(expected)} for cells of shape {self.shape}")
-        _check_coefficients(host, name)
+        _check_coefficients(host, self.dtype, name)
         if self.periodic[axis] and not np.array_equal(host.take(0, -1 - axis), host.take(-1, -1 - axis)):
             raise ValueError(f"{name}: the first and the last faces of a periodic axis are the same ones, but their coefficients differ")
         counts = [*self.layout.padding.counts]
@@ -228,7 +247,7 @@ class GridPoisson:
             return False
         if field.dtype is not self.dtype or field.device != self.device:
             raise ValueError(f"{name} in the padded shape must be of type {self.dtype.__name__} on {self.device}")
-        _check_coefficients(field.numpy(), name)
+        _check_coefficients(field.numpy(), self.dtype, name)
         return True
 
     def _stored_shift(self, shift: Any) -> wp.array[Any]:
@@ -236,12 +255,20 @@ class GridPoisson:
             return wp.empty((0, 0, 0), dtype=self.dtype, device=self.device)
         if self._in_place(shift, "shift"):
             return shift
-        host = shift.numpy() if isinstance(shift, wp.array) else np.asarray(shift, dtype=np.float64)
+        host = real_array(shift, "shift")
         host = np.full(self.shape, host) if host.ndim == 0 else host
         if host.shape != self.shape:
             raise ValueError(f"shift has shape {host.shape}: expected {self.shape}")
-        _check_coefficients(host, "shift")
+        _check_coefficients(host, self.dtype, "shift")
         return wp.array(np.pad(host.reshape(self.layout.padding.counts), 1), dtype=self.dtype, device=self.device)
+
+    def _check_sums(self) -> None:
+        """Refuse coefficients that the type holds, but perhaps not their sums, which are the diagonal."""
+        parts = zip([*self.faces, self.shift], [*self.uniform, 0.0], strict=True)
+        *faces, shift = (float(f.numpy().max()) if f.size else number for f, number in parts)
+        most, name = 2 * sum(faces) + shift, self.dtype.__name__
+        if most > float(np.finfo(wp.dtype_to_numpy(self.dtype)).max):
+            raise ValueError(f"face_x, face_y, face_z and shift add up to {most:.1e}, too large for {name}: pass dtype=wp.float64")
 
     @property
     def _counts_faces(self) -> bool:
@@ -308,7 +335,7 @@ class GridPoisson:
 
 def _checked_cells(cells: Any) -> np.ndarray:
     """Return cell types as a host array."""
-    host = cells.numpy() if isinstance(cells, wp.array) else np.asarray(cells)
+    host = real_array(cells, "cells")
     if host.ndim not in (2, 3) or host.size == 0:
         raise ValueError(f"cells has shape {host.shape}: expected (nz, ny, nx) or (ny, nx) with at least one cell")
     if not np.issubdtype(host.dtype, np.integer):
@@ -318,9 +345,9 @@ def _checked_cells(cells: Any) -> np.ndarray:
     return host
 
 
-def _check_coefficients(values: np.ndarray, name: str) -> None:
-    if not np.isfinite(values).all():
-        raise ValueError(f"{name} holds a value that is not finite")
+def _check_coefficients(values: np.ndarray, dtype: Any, name: str) -> None:
+    check_storable(values, dtype, name)
+    check_kept(values, dtype, name)
     if (values < 0).any():
         raise ValueError(f"{name} holds a negative value ({values.min()}): coefficients must be >= 0")
 

@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.layout import Layout, layout_of
+from warp_lcp.layout import Layout, check_storable, layout_of, real_array
 from warp_lcp.operators.low_rank_columns import BlockColumns
 from warp_lcp.operators.low_rank_kernels import weigh_kernel
+from warp_lcp.pickling import Pickled, made_again
 from warp_lcp.program import Launch
 
 
-class LowRankOperator:
+class LowRankOperator(Pickled):
     """U W U' x, with a few columns U and a small matrix W; usually a term of a SumOperator, A + U W U'.
 
     Only the rows of U that are not 0 are stored, and a product costs no more than they do.
@@ -38,11 +39,10 @@ class LowRankOperator:
     def __init__(self, columns: Any, weights: Any, *, device: Any = None, dtype: Any = wp.float64) -> None:
         if dtype not in (wp.float32, wp.float64):
             raise ValueError(f"dtype = {dtype}: must be wp.float32 or wp.float64")
-        U = np.asarray(columns, dtype=np.float64)
+        U = np.asarray(real_array(columns, "columns"), dtype=np.float64)
         if U.ndim < 2 or U.size == 0:
             raise ValueError(f"columns has shape {U.shape}: expected a field's shape and the number of columns, both positive")
-        if not np.isfinite(U).all():
-            raise ValueError("columns holds a value that is not finite")
+        check_storable(U, dtype, "columns")
         layout = Layout(U.shape[:-1], wp.get_device(device))
         U = U.reshape(layout.size, -1)
         stored = BlockColumns(layout.size, 1, U.shape[1], dtype, layout.device)
@@ -65,6 +65,17 @@ class LowRankOperator:
         made = cls.__new__(cls)
         made._make(layout, columns, weights)
         return made
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the rows of U that are not 0, by the field's elements that they belong to."""
+        rows, blocks, values = self.columns.entries()
+        stored = self.layout.zeros(wp.int32)
+        stored.assign(np.arange(self.layout.size))
+        user = np.full(self.layout.size, -1)
+        user[self.layout.unload(stored).numpy().ravel()] = np.arange(int(np.prod(self.shape)))
+        entries = (user[rows], blocks.copy(), values.copy())
+        sizes = (self.shape, self.columns.rank // self.columns.width, self.columns.width)
+        return made_again(_of_entries, sizes, entries, self.weights.numpy(), device=self.device, dtype=self.dtype)
 
     def update(self, weights: Any = None) -> None:
         """Take other weights, and what the columns have become in place.
@@ -153,7 +164,7 @@ class LowRankOperator:
 
     def _checked_weights(self, weights: Any) -> np.ndarray:
         """Return W as a host matrix."""
-        W, k = np.asarray(weights, dtype=np.float64), self.rank
+        W, k = np.asarray(real_array(weights, "weights"), dtype=np.float64), self.rank
         W = np.diag(W) if W.ndim == 1 else W
         if W.shape != (k, k):
             raise ValueError(f"weights has shape {np.shape(weights)}: expected {(k,)} or {(k, k)} for {k} columns")
@@ -174,6 +185,17 @@ class LowRankOperator:
         out.zero_()
         self.add(x.flatten(), out.flatten(), out.flatten(), transposed=W is self._transposed)
         return out
+
+
+def _of_entries(sizes: Any, entries: Any, weights: np.ndarray, *, device: Any, dtype: Any) -> LowRankOperator:
+    """Return an operator from what it was pickled as."""
+    shape, blocks, width = sizes
+    layout = Layout(shape, wp.get_device(device))
+    columns = BlockColumns(layout.size, blocks, width, dtype, layout.device)
+    columns.assign(*entries)
+    made = LowRankOperator.__new__(LowRankOperator)
+    made._make(layout, columns, weights)
+    return made
 
 
 def _is_symmetric(W: np.ndarray) -> bool:

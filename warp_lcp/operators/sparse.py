@@ -9,9 +9,10 @@ import numpy as np
 import scipy.sparse
 import warp as wp
 
-from warp_lcp.layout import Layout, check_storable
+from warp_lcp.layout import Layout, check_kept, check_storable, real_array
 from warp_lcp.native import Spans
 from warp_lcp.operators.sparse_kernels import color_kernel, gather_kernel, kernels
+from warp_lcp.pickling import Pickled, made_again
 from warp_lcp.problem import as_operator
 from warp_lcp.program import Launch
 from warp_lcp.vectors import launch_spans
@@ -19,7 +20,7 @@ from warp_lcp.vectors import launch_spans
 SYMMETRIC = 64 * float(np.finfo(np.float64).eps)  # of the largest entries of two rows: what assembly in float64 leaves of symmetry
 
 
-class SparseOperator:
+class SparseOperator(Pickled):
     """A x with a sparse square matrix A, from scipy.sparse.
 
     Duplicate entries are summed and columns sorted, as `matrix.tocsr().sum_duplicates()` does; explicit zeros are kept, so that
@@ -64,6 +65,10 @@ class SparseOperator:
         self.version = 0
         self._take(host)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the matrix."""
+        return made_again(SparseOperator, self.matrix(), device=self.device, dtype=self.dtype)
+
     @property
     def unknowns(self) -> int:
         """Number of rows."""
@@ -92,7 +97,7 @@ class SparseOperator:
             if not (np.array_equal(host.indptr, self._indptr) and np.array_equal(host.indices, self._indices)):
                 raise ValueError("values has another pattern than the operator: make a new SparseOperator")
         else:
-            array = values.numpy() if isinstance(values, wp.array) else np.asarray(values)
+            array = real_array(values, "values")
             if array.shape != (self.nnz,):
                 raise ValueError(f"values has shape {array.shape}: expected {(self.nnz,)}")
             host = self._matrix_of(array)
@@ -200,6 +205,7 @@ class SparseOperator:
         """Derive what follows from the entries."""
         self.symmetric = _is_symmetric(host)
         largest = abs(host).max(axis=1).toarray().ravel()
+        check_kept(largest, self.dtype, "matrix, the largest entries of its rows")
         self.row_sizes = None if largest.all() else wp.array(largest, dtype=wp.float64, device=self.device)
         self._diagonal.assign(host.diagonal().astype(wp.dtype_to_numpy(self.dtype)))
         if self._transpose_values is not None:

@@ -12,12 +12,13 @@ from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.operators.low_rank_kernels import add_kernel
 from warp_lcp.operators.protocol import Operator
+from warp_lcp.pickling import Pickled
 from warp_lcp.problem import as_operator
 
 FELT = 1e-5  # of the sum of a column's sizes over a component: open fractions are of float32
 
 
-class SumOperator:
+class SumOperator(Pickled):
     """(A + B) x = A x + B x.
 
     It has no `relax`: methods that sweep refuse it, those that take products (Newton types, gradient methods) do not. With a grid
@@ -58,6 +59,10 @@ class SumOperator:
         grid = next((A for A in (first, second) if hasattr(A, "cells")), None)
         if grid is not None:
             self.cells = grid.cells
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the terms."""
+        return SumOperator, (self.first, self.second)
 
     @property
     def symmetric(self) -> bool:

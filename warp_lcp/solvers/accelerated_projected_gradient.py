@@ -95,11 +95,11 @@ class GradientWorkspace(IterateInPlace):
         self._momentum = 0.0  # Nesterov's t; 0 before the first step, when there is no z
         version = getattr(self.problem.A, "version", None)
         if version != self._version:
-            self._version = version
             self._d.assign(positive_diagonal(self.problem))
             if self.settings.lipschitz is None:
                 greatest = scaled_spectrum(self.problem, self.settings.estimate_steps)[1]
                 self.lipschitz = MARGIN * greatest if greatest > 0 else 1.0  # any L will do for a zero matrix
+            self._version = version  # last: time may be up before
 
     def advance(self, x: wp.array[Any]) -> None:
         """Take the step; the residual's y is that of x."""

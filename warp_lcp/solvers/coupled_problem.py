@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
 import warp as wp
 
+from warp_lcp.deadline import Deadline, TimeIsUp, check_time
 from warp_lcp.problem import LCP
 from warp_lcp.result import SolveResult, SolveStatus
 from warp_lcp.solve import Solver, solve
@@ -93,6 +95,7 @@ class StaggeredRound:
         """Solve each block once, from first to last or back; `target` is the residual asked for of all. Returns linear iterations."""
         count, linear = len(self.blocks), 0
         for k in range(count) if forward else reversed(range(count)):
+            check_time()
             norm = self._residual(k)
             goal = max(self._eta * norm, SHARE * target / math.sqrt(count))
             if not math.isfinite(norm) or norm <= goal:
@@ -127,7 +130,8 @@ def solve_coupled(
     Args:
         blocks: the problems.
         solvers: a method for each.
-        stopping: criteria for the blocks' residuals together; relative to those at the state in which the loop starts.
+        stopping: criteria for the blocks' residuals together; relative to those at the state in which the loop starts. A round that
+            `max_seconds` cuts short leaves what its blocks have accepted.
         eta: each solve of a block reduces its residual by this factor, or to what the whole still needs.
         max_block_iterations: the most steps in one block's solve.
         staggered: memory of an earlier call with these blocks and solvers.
@@ -136,22 +140,24 @@ def solve_coupled(
         ValueError: numbers of blocks and solvers differ, or a method does not take its block.
     """
     begun, stopping = time.perf_counter(), stopping or StoppingCriteria()
+    deadline = Deadline(stopping.max_seconds)
     rounds = staggered or StaggeredRound(blocks, solvers, eta=eta, max_iterations=max_block_iterations)
     norms = rounds.residuals()
     history = [float(np.linalg.norm(norms))]
     tolerance, linear, best = stopping.tolerance(history[0]), 0, 0
-    status = _status(history, tolerance, best, stopping)
+    status = _status(history, tolerance, best, stopping, deadline)
     while status is None:
-        linear += rounds.run(tolerance)
+        with suppress(TimeIsUp), deadline:
+            linear += rounds.run(tolerance)
         norms = rounds.residuals()
         history.append(float(np.linalg.norm(norms)))
         best = len(history) - 1 if history[-1] < min(history[:-1]) else best
-        status = _status(history, tolerance, best, stopping)
+        status = _status(history, tolerance, best, stopping, deadline)
     relative = history[-1] / history[0] if history[0] > 0 else 0.0
     return CoupledResult(status, len(history) - 1, linear, history[-1], relative, norms, history, time.perf_counter() - begun)
 
 
-def _status(history: list[float], tolerance: float, best: int, stopping: StoppingCriteria) -> SolveStatus | None:
+def _status(history: list[float], tolerance: float, best: int, stopping: StoppingCriteria, deadline: Deadline) -> SolveStatus | None:
     """Return how the loop ends now, None if it goes on."""
     norm, rounds = history[-1], len(history) - 1
     if not math.isfinite(norm):
@@ -162,4 +168,6 @@ def _status(history: list[float], tolerance: float, best: int, stopping: Stoppin
         return SolveStatus.DIVERGED
     if rounds >= stopping.max_iterations:
         return SolveStatus.MAX_ITERATIONS
-    return SolveStatus.STAGNATED if rounds - best >= stopping.patience else None
+    if rounds - best >= stopping.patience:
+        return SolveStatus.STAGNATED
+    return None if deadline.left() > 0 else SolveStatus.TIME_LIMIT

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Never
 
 from warp_lcp.layout import Array
 from warp_lcp.operators.grid_poisson import GridPoisson
@@ -34,6 +35,7 @@ def solve(
     x0: Array | None = None,
     workspace: Workspace | None = None,
     callback: Callable[[Record], None] | None = None,
+    **misplaced: Never,
 ) -> SolveResult:
     """Solve a problem by a method.
 
@@ -44,6 +46,7 @@ def solve(
         x0: a guess, field of the problem's shape, projected onto the bounds; clip(0, l, u) if None.
         workspace: what `solver.init(problem)` returned, to use its memory again.
         callback: called with each Record as it is made.
+        misplaced: nothing; other options are refused.
 
     Returns:
         The best iterate, its status and recomputed residual, the history. The result's x is the caller's to keep, unless the problem
@@ -52,7 +55,12 @@ def solve(
     Raises:
         ValueError: an argument is of another kind, x0 has a wrong shape or is not finite, a workspace comes without its solver, or the
             method cannot take this A.
+        TypeError: an option of another name; the message says where it belongs.
     """
+    for name in misplaced:
+        if name in StoppingCriteria.__dataclass_fields__:
+            raise TypeError(f"solve takes no {name}: it is a criterion, pass stopping=wl.StoppingCriteria({name}=...)")
+        raise TypeError(f"solve takes no {name}: settings are the method's own, say wl.ProjectedSOR(omega=1.5)")
     if solver is None and workspace is not None:
         raise ValueError("workspace: name the solver that made it")
     solver = default_method(problem) if solver is None else solver

@@ -11,6 +11,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 import warp as wp
 
+from warp_lcp.deadline import check_time, seconds_left
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
@@ -108,6 +109,7 @@ def assemble(problem: LCP, rows: np.ndarray) -> np.ndarray:
     apply_plus = getattr(A, "apply_plus", None)  # takes stored fields, as grids have them
     host, matrix = np.zeros(layout.size), np.empty((len(rows), len(rows)))
     for column, row in enumerate(rows):
+        check_time()
         host[row] = 1.0
         unit.assign(host)
         if apply_plus is not None:
@@ -129,6 +131,7 @@ def equilibration(A: Any) -> np.ndarray:
     magnitude, S = abs(A), np.ones(A.shape[0])
     sparse = scipy.sparse.issparse(A)
     for _ in range(EQUILIBRATIONS):
+        check_time()
         scaled = magnitude.multiply(S[:, None]).multiply(S).tocsr() if sparse else S[:, None] * magnitude * S
         rows, columns = (scaled.max(axis=k).toarray().ravel() if sparse else scaled.max(axis=k) for k in (1, 0))
         S = S * power_of_two(1 / np.sqrt(np.where(np.maximum(rows, columns) > 0, np.maximum(rows, columns), 1.0)))
@@ -170,7 +173,8 @@ def inconsistent(data: DenseProblem) -> bool:
         rows[f"A_{name}"] = stack([sign * data.A[mask] for sign, mask in pieces])
         rows[f"b_{name}"] = np.concatenate([-sign * data.b[mask] for sign, mask in pieces])
     limits = np.stack([data.lower, data.upper], axis=1)
-    found = linprog(np.zeros(len(data.b)), **rows, bounds=limits, method="highs")
+    found = linprog(np.zeros(len(data.b)), **rows, bounds=limits, method="highs", options={"time_limit": seconds_left()})
+    check_time()
     return bool(found.status == 2)  # HiGHS: infeasible
 
 

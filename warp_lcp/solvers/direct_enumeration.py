@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.layout import Array, real_array
+from warp_lcp.pickling import FieldsOnHost
 from warp_lcp.problem import LCP
 from warp_lcp.result import SolveStatus
 from warp_lcp.solve import Step
@@ -83,7 +84,7 @@ class DirectEnumeration:
 
 
 @dataclass(frozen=True)
-class BatchResult:
+class BatchResult(FieldsOnHost):
     """The answers of `enumerate_batch`.
 
     Attributes:

@@ -6,6 +6,8 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from warp_lcp.deadline import check_time
+
 DECREASE = 1e-4  # share of the slope that a step must gain: Armijo's constant
 
 
@@ -40,6 +42,7 @@ class NonmonotoneSearch:
         """
         limit, length = max(self.merits), first
         while length >= self.least:
+            check_time()
             merit = trial(length)
             if math.isfinite(merit) and merit <= limit + DECREASE * length * slope:
                 return length, merit

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
+from warp_lcp.deadline import time_is_up
 from warp_lcp.problem import LCP
 from warp_lcp.result import SolveStatus
 from warp_lcp.solve import Step
@@ -92,7 +93,7 @@ class PivotingWorkspace(DenseWorkspace):
     def pivot(self, count: int) -> int:
         """Make at most `count` pivots; returns how many were made."""
         done = 0
-        while done < count and self.ended is None:
+        while done < count and self.ended is None and not time_is_up():
             if self.driven < 0 and not self._choose():
                 self._finish()
                 continue

@@ -49,7 +49,8 @@ class InteriorPoint:
         horizon: N of the book's rule, the number of steps in which it reaches the boundary.
         backoff: share of the longest step that is taken, in (0, 1).
         crossover: hand over to MinimumMapNewton when the residual is below this multiple of the first one; 0: never.
-        start: a cold start has w A_ii and s at least this multiple of the root mean square of b.
+        start: a cold start has w A_ii and s at least this multiple of the root mean square of b, or of the residual at clip(0, l, u) if
+            that is larger.
         monotone_cycles: projected multigrid cycles of a cold start on a grid, from which the path is joined where it is near.
         predictor_eta: the predictor's linear solve reduces its residual by this factor.
         eta: the same of the corrector, and of the book's step.
@@ -208,7 +209,7 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
         return self._passes if self.floating is None and self.count else None
 
     def begin(self, x: wp.array[Any]) -> None:
-        """Move x inside its bounds, and choose multipliers: by the size of b far from the path, by the residual near it."""
+        """Move x inside its bounds, and choose multipliers: by b and the residual far from the path, by the residual near it."""
         p = self.problem
         self._inside(x, 0.0)
         self.count = int(self._multipliers(0.0)[1])
@@ -217,7 +218,8 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
                 least = NEAR * self.residual.norm / math.sqrt(self.count)
             else:
                 unknowns = max(int(np.count_nonzero(p.unknown.numpy() == 1)), 1)
-                least = self.settings.start * self.residual.norm_of_b() / math.sqrt(unknowns)
+                size = max(self.residual.norm_of_b(), self.residual.norm)  # b may be 0 where bounds are not
+                least = self.settings.start * size / math.sqrt(unknowns)
             self._inside(x, least)
             self.residual.affine(x)
             self.mu = self._multipliers(least)[0] / self.count
@@ -278,6 +280,8 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
 
     def _center(self, longest: float, products: float) -> float:
         """Return Mehrotra's tau: mu times the cube of what the predictor would leave of it."""
+        if not self.mu > 0:  # products that vanish: rounding, or coefficients beyond what corrections hold
+            return 0.0
         length = min(1.0, 1 / longest) if longest > 0 else 1.0
         after = (1 - length) * self.mu + length**2 * products / self.count
         return self.mu * min(1.0, max(0.0, after / self.mu)) ** 3

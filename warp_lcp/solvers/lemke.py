@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
+from warp_lcp.deadline import time_is_up
 from warp_lcp.problem import LCP
 from warp_lcp.result import SolveStatus
 from warp_lcp.solve import Step
@@ -207,7 +208,7 @@ class LemkeWorkspace(DenseWorkspace):
         if self.basis is None:
             self._finish(np.zeros(len(self.form.q)))
             return 0
-        while done < count and self.ended is None:
+        while done < count and self.ended is None and not time_is_up():
             outcome = self.basis.pivot()
             done += outcome is not False
             if outcome is True:

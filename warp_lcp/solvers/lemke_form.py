@@ -59,8 +59,8 @@ class LemkeForm:
                 split[np.r_[equations, equations], np.arange(2 * len(equations))] = np.repeat([1.0, -1.0], len(equations))
                 columns = np.hstack([columns, split])
                 M, q = columns.T @ A @ columns, columns.T @ (A @ base + data.b)
-        else:
-            M, q = columns.T @ A @ columns, columns.T @ (A @ base + data.b)
+        else:  # a choice of rows and columns with signs, no product of matrices
+            M, q = sign[:, None] * A[np.ix_(sided, sided)] * sign, sign * (A @ base + data.b)[sided]
         both = np.flatnonzero((below & above)[sided])
         if len(both):
             m, k = len(q), len(both)

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
+from warp_lcp.deadline import check_time
 from warp_lcp.multigrid.aggregates import AggregateCycles
 from warp_lcp.multigrid.hierarchy import CycleSettings
 from warp_lcp.operators.grid_poisson import GridPoisson
@@ -208,6 +209,7 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         p, residual, s = self.problem, self.residual, self.settings
         limit, scale, best, best_scale = max(self.norms), 1.0, math.inf, 1.0
         for _ in range(s.backtracks + 1):
+            check_time()
             self._correct(x if scale == 1 else self.trial, self.system.e, scale * size, x, kept=self.trial if scale == 1 else None)
             if self.floating is not None:
                 self.floating.settle(x, p.lower, p.upper)
@@ -270,6 +272,7 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         gradient, normal = J.T @ r, J.T @ J
         size = float(np.trace(normal)) / len(r)
         for nu in REGULARIZATIONS:
+            check_time()
             dx = np.linalg.solve(normal + nu * size * np.eye(len(r)), -gradient)
             x.assign(np.clip(start + dx, lower, upper))
             if residual.evaluate(x) <= (1 - 1e-6) * norm:

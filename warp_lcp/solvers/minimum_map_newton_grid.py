@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
+from warp_lcp.deadline import time_is_up
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
@@ -102,7 +103,7 @@ class GridNewtonWorkspace(MultigridWorkspace):
         while True:
             self.truncated_step()
             iterations += 1
-            if residual.stale or not residual.norm > wanted or iterations >= s.max_linear_iterations:
+            if residual.stale or not residual.norm > wanted or iterations >= s.max_linear_iterations or time_is_up():
                 break
         sinks = self._descent.sinks and self._rounded is None  # then the residual may rise
         if sinks or not residual.norm > (1 - DECREASE) * limit or not math.isfinite(residual.norm) or not self.bounded:

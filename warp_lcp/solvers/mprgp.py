@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 import warp as wp
 
+from warp_lcp.deadline import check_time
 from warp_lcp.multigrid.hierarchy import CycleSettings, Level
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.grid_poisson import GridPoisson
@@ -321,6 +322,7 @@ class GradientWorkspace(RoundedIterate):
         energy = residual.energy
         origin = self._move(direction, length)
         for _ in range(0 if self.is_grid else 30):
+            check_time()
             residual.evaluate(self.x)
             if not residual.moved or residual.energy <= energy + ENERGY_ROUNDING * abs(energy):
                 break

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
+from warp_lcp.deadline import time_is_up
 from warp_lcp.multigrid.hierarchy import CycleSettings
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem import LCP
@@ -175,7 +176,7 @@ class ActiveSetWorkspace(NewtonWorkspace):
             self.places = np.where(free, FREE, np.where(at == own.upper, UPPER, LOWER))
         pivots, most = 0, pivots_of(None, len(data.b)) * 8
         values, violated, singular = _basic_solution(data, self.places)
-        while violated.size and pivots < most and not (singular and self.last_resort):
+        while violated.size and pivots < most and not (singular and self.last_resort) and not time_is_up():
             self.places[violated[0]] = _other_place(data, self.places, values, int(violated[0]))
             values, violated, singular = _basic_solution(data, self.places)
             pivots += 1

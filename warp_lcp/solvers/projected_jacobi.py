@@ -83,8 +83,8 @@ class JacobiWorkspace(SweepWorkspace):
         """Estimate the damping where the operator is new."""
         version = getattr(self.problem.A, "version", None)
         if self._given is None and version != self._version:
-            self._version = version
             self.omega = self._estimate()
+            self._version = version  # last: time may be up before
         self.contraction.start(self.x)
 
     def _estimate(self) -> float:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+from warp_lcp.nearest import nearest
 from warp_lcp.solvers.accelerated_projected_gradient import AcceleratedProjectedGradient
 from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel
 from warp_lcp.solvers.direct_enumeration import DirectEnumeration
@@ -29,26 +30,37 @@ from warp_lcp.solvers.quadratic_program import QuadraticProgram
 from warp_lcp.solvers.staggering import Staggering
 from warp_lcp.solvers.subspace_minimization import SubspaceMinimization
 
-METHODS: dict[str, type[Any]] = {
-    "accelerated-projected-gradient": AcceleratedProjectedGradient,
-    "blocked-gauss-seidel": BlockedGaussSeidel,
-    "direct-enumeration": DirectEnumeration,
-    "fischer-newton": FischerNewton,
-    "gradient-descent": GradientDescent,
-    "incremental-pivoting": IncrementalPivoting,
-    "interior-point": InteriorPoint,
-    "lemke": Lemke,
-    "minimum-map-newton": MinimumMapNewton,
-    "mprgp": MPRGP,
-    "nncg": NNCG,
-    "primal-dual-active-set": PrimalDualActiveSet,
-    "projected-jacobi": ProjectedJacobi,
-    "projected-multigrid": ProjectedMultigrid,
-    "psor": ProjectedSOR,
-    "quadratic-program": QuadraticProgram,
-    "staggering": Staggering,
-    "subspace-minimization": SubspaceMinimization,
-}
+
+class Methods(dict[str, type[Any]]):
+    """Methods by their names; an unknown one's KeyError says which there are."""
+
+    def __missing__(self, name: str) -> type[Any]:
+        """Refuse the name."""
+        raise KeyError(f"no method is called {name!r}: {nearest(str(name), self)}")
+
+
+METHODS = Methods(
+    {
+        "accelerated-projected-gradient": AcceleratedProjectedGradient,
+        "blocked-gauss-seidel": BlockedGaussSeidel,
+        "direct-enumeration": DirectEnumeration,
+        "fischer-newton": FischerNewton,
+        "gradient-descent": GradientDescent,
+        "incremental-pivoting": IncrementalPivoting,
+        "interior-point": InteriorPoint,
+        "lemke": Lemke,
+        "minimum-map-newton": MinimumMapNewton,
+        "mprgp": MPRGP,
+        "nncg": NNCG,
+        "primal-dual-active-set": PrimalDualActiveSet,
+        "projected-jacobi": ProjectedJacobi,
+        "projected-multigrid": ProjectedMultigrid,
+        "psor": ProjectedSOR,
+        "quadratic-program": QuadraticProgram,
+        "staggering": Staggering,
+        "subspace-minimization": SubspaceMinimization,
+    }
+)
 
 
 def grid_methods() -> tuple[str, ...]:

@@ -8,6 +8,7 @@ import numpy as np
 import scipy.linalg
 import warp as wp
 
+from warp_lcp.deadline import check_time
 from warp_lcp.problem import LCP
 
 SEED = 20151
@@ -73,6 +74,7 @@ def _lanczos(product: Any, v: np.ndarray, steps: int) -> tuple[float, float]:
     beta: list[float] = []
     old = np.zeros_like(v)
     for _ in range(steps):
+        check_time()
         w = product(v)
         if beta:
             w -= beta[-1] * old

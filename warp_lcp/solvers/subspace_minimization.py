@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
+from warp_lcp.deadline import check_time
 from warp_lcp.multigrid.hierarchy import CycleSettings
 from warp_lcp.problem import LCP
 from warp_lcp.solve import Precision, Step
@@ -87,6 +88,7 @@ class SubspaceMinimization:
     def step(self, problem: LCP, work: SubspaceWorkspace, x: wp.array[Any]) -> Step:
         """Sweep, then minimize on the free set until it stays."""
         for _ in range(self.sweeps):
+            check_time()
             work.sweep.run(x, forward=True)
         work.round_iterate()
         iterations, held = self.sweeps, 0
@@ -146,6 +148,7 @@ class SubspaceWorkspace(SweepWorkspace):
         iterations = self.system.solve(max(s.eta, 0.3 * self._target / size), s.max_linear_iterations)[0]
         wp.copy(self._before, x)
         for halving in range(max(s.backtracks, 0) + 1):
+            check_time()
             self._correct(x, size * 0.5**halving)
             if s.backtracks < 0 or residual.evaluate(x) < norm or self._energy(x) < energy - ROUNDING * abs(energy):
                 residual.current = s.backtracks >= 0
