@@ -1,6 +1,6 @@
 """Random problems of many kinds, by kind and seed: what no method was tuned on. `problem(kind, seed)` is the same for ever.
 
-Seeds 0 to 9,999 are for tests and for development, 10,000 to 19,999 are kept unseen for acceptance, a run of the suite draws from 20,000 on.
+Seeds 0 to 9,999 are for tests and for development, 10,000 to 19,999 are kept unseen for acceptance, a run draws from 20,000 on.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def problem(kind: str, seed: int, *, small: bool = False) -> Unseen:
     if isinstance(made, tuple):
         made, then = made
     if isinstance(made, GridProblem):
-        made = solvable(made)
+        made, then = solvable(made), None if then is None else solvable(then)
         if then is None and seed % WARM_EVERY == 0 and not small:
             then = changed(made, seed)
     return Unseen(kind, seed, made, then, ALLOWANCE.get(kind, 1.0), sure=kind not in HARD_MATRICES)

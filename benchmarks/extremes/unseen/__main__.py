@@ -1,4 +1,4 @@
-"""`python -m benchmarks.extremes.unseen KIND SEED [SEED]`: solve problems of a kind ("all": of every kind), seeds from the first to the last."""
+"""Solve problems by kind and seed: `python -m benchmarks.extremes.unseen KIND[,KIND] FIRST [LAST]`, KIND may be all."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ def main(arguments: Sequence[str]) -> None:
             verdicts.append(judge(make(name, seed), "mixed", "cpu"))
             attempt = verdicts[-1].attempt
             counts = ", ".join(f"{key} {attempt.facts[key]}" for key in ("iterations", "equality", "warm", "cold") if key in attempt.facts)
-            sys.stdout.write(
-                f"{name} {seed}: {attempt.status}, {attempt.facts.get('unknowns', '')} unknowns, {counts}, {attempt.seconds:.2f} s: {verdicts[-1].outcome}\n"
-            )
+            n = attempt.facts.get("unknowns", "few")
+            line = f"{name} {seed}: {attempt.status}, {n} unknowns, {counts}, {attempt.seconds:.2f} s: {verdicts[-1].outcome}"
+            sys.stdout.write(f"{line}\n")
             sys.stdout.flush()
     table, wrong = summary(verdicts, int(first))
     sys.stdout.write("\n".join([table.remark, " | ".join(table.columns), *(" | ".join(row) for row in table.rows), *wrong]) + "\n")

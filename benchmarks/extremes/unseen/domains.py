@@ -23,6 +23,12 @@ def some_bounds(draw: Draw, shape: tuple[int, ...]) -> dict[str, Any]:
     return {"upper": draw.decades(0.1, 100)}
 
 
+def aired(cells: np.ndarray) -> np.ndarray:
+    """Return the cells with liquid that no AIR reaches made SOLID."""
+    label, _ = scipy.ndimage.label(cells != SOLID)
+    return np.where(np.isin(label, np.unique(label[cells == AIR])), cells, SOLID)
+
+
 def strip(draw: Draw) -> GridProblem:
     """Return a long strip, 1 to 40 cells wide, with AIR at one end or both, perhaps with a lid."""
     length = draw.whole(50, 5000)
@@ -105,7 +111,7 @@ def spiral(draw: Draw) -> GridProblem:
         cells[-1, n // 2] = AIR
     else:
         cells[int(middle) : int(middle) + 2, int(middle) : int(middle) + 2] = AIR
-    cells[n // 2, 0] = FLUID
+    cells = aired(cells)
     return GridProblem(cells=cells, b=draw.load((n, n)), **some_bounds(draw, (n, n)))
 
 
@@ -134,7 +140,8 @@ def porous(draw: Draw) -> GridProblem:
     distance = scipy.ndimage.distance_transform_edt(~grains) if grains.any() else np.full(shape, np.inf)
     cells = np.where(distance < draw.decades(0.8, 3.5), SOLID, FLUID)
     cells[-1] = AIR
-    cells[0, 0] = FLUID
+    cells[-2] = FLUID
+    cells = aired(cells) if draw.chance(0.7) else cells
     return GridProblem(cells=cells, b=draw.load(shape), **some_bounds(draw, shape))
 
 

@@ -1,4 +1,4 @@
-"""What the default method makes of an unseen problem, cold and warm, against the same problem without bounds; and every method on small ones."""
+"""What the default method makes of unseen problems, cold, warm and against their equations; and every method of small ones."""
 
 from __future__ import annotations
 

@@ -26,7 +26,8 @@ def section(draw: Draw, n: int) -> np.ndarray:
     if kind == "ellipse":
         return np.asarray((X - 0.5) ** 2 + ((Y - 0.5) / draw.between(0.3, 1)) ** 2 < 0.25)
     if kind == "L":
-        return np.asarray((X > draw.between(0.3, 0.7)) | (Y > draw.between(0.3, 0.7)))
+        corner = draw.between(0.3, 0.7)
+        return np.asarray((corner < X) | (draw.between(0.3, 0.7) < Y))
     if kind == "triangle":
         return np.asarray(Y <= X)
     if kind == "hole":
