@@ -168,12 +168,14 @@ def liquid(draw: Draw) -> GridProblem:
     height = np.arange(shape[0]).reshape(-1, *(1,) * (dimensions - 1))
     cells = np.where(height < surface, FLUID, AIR)
     cells[0].flat[0], cells[-1] = FLUID, AIR
-    b = sum(np.diff(draw.smooth(tuple(n + (q == axis) for q, n in enumerate(shape)), 4), axis=axis) for axis in range(dimensions))
+    b = np.zeros(shape)
+    for axis in range(dimensions):
+        b += np.diff(draw.smooth(tuple(n + (q == axis) for q, n in enumerate(shape)), 4), axis=axis)
     b[0] -= draw.between(-1, 1)
     walls = np.ones(shape, dtype=bool)
     walls[(slice(1, -1),) * dimensions] = False
     lower = 0.0 if draw.chance(0.5) else np.where(walls, 0.0, -np.inf)
-    return GridProblem(cells=cells, b=np.asarray(b), lower=lower)
+    return GridProblem(cells=cells, b=b, lower=lower)
 
 
 def periodic(draw: Draw) -> GridProblem:

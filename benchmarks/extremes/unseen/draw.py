@@ -195,8 +195,9 @@ def solvable(problem: GridProblem) -> GridProblem:
 
 
 def equality(problem: GridProblem) -> GridProblem | None:
-    """Return the problem without bounds, None if it has no solution or many."""
-    free = replace(problem, lower=-np.inf, upper=np.inf)
+    """Return the problem without bounds, None if it has no solution; where b = 0 solves it at once, that of a constant b."""
+    b = problem.b if np.any(problem.b[problem.cells == FLUID]) else -np.ones(problem.cells.shape)
+    free = replace(problem, b=b, lower=-np.inf, upper=np.inf)
     pools = Pools.of(free.exact())
     return None if pools.lost.any() else free
 
@@ -206,5 +207,6 @@ def changed(problem: GridProblem, seed: int, share: float = 0.01) -> GridProblem
     draw = Draw("changed", seed)
     b = np.broadcast_to(problem.b, problem.cells.shape).astype(np.float64)
     field = draw.smooth(b.shape, 5) * (problem.cells == FLUID)
-    size, largest = np.linalg.norm(b[problem.cells == FLUID]), np.linalg.norm(field)
+    exact, largest = problem.exact(), np.linalg.norm(field)
+    size = np.linalg.norm(exact.b) or exact.residual(exact.start)
     return solvable(replace(problem, b=b + share * size / (largest if largest > 0 else 1.0) * field))

@@ -71,7 +71,7 @@ def stairs(draw: Draw) -> GridProblem:
             far = np.maximum(np.abs(X - draw.between(0, 1)), np.abs(Y - draw.between(0, 1))) / draw.between(0.05, 0.3)
             height = draw.between(-0.05, 0.3)
             low = np.maximum(low, np.where(far < 1, height if kind == "blocks" else height - far, -1.0))
-    return GridProblem(cells=framed(np.ones((n - 2, n - 2))), b=draw.between(0, 10) / n**2, lower=low)
+    return GridProblem(cells=framed(np.ones((n - 2, n - 2))), b=np.full(low.shape, draw.between(0, 10) / n**2), lower=low)
 
 
 def ball(draw: Draw) -> GridProblem:
@@ -81,7 +81,7 @@ def ball(draw: Draw) -> GridProblem:
     r2 = sum(g * g for g in np.meshgrid(*(np.linspace(-2, 2, n),) * dimensions, indexing="ij"))
     sphere = np.where(r2 < 1, np.sqrt(np.maximum(1 - r2, 0)), -1.0)
     low = sphere if draw.chance(0.5) else draw.between(0.1, 1) - r2 * draw.between(0.2, 2)
-    b = 0.0 if draw.chance(0.5) else draw.between(0, 8) / n**2
+    b = np.full(low.shape, 0.0 if draw.chance(0.5) else draw.between(0, 8) / n**2)
     return GridProblem(cells=framed(np.ones((n - 2,) * dimensions)), b=b, lower=low)
 
 
@@ -98,7 +98,7 @@ def moving(draw: Draw) -> tuple[GridProblem, GridProblem]:
             return {"lower": np.where(far < 0.3, 0.4, -1.0)}
         return {"lower": 0.5 - far, "upper": np.inf if kind == "paraboloid" else 0.6 + 0.1 * X}
 
-    b = draw.decades(0.1, 10) * (4 / n) ** 2
+    b = np.full((n, n), draw.decades(0.1, 10) * (4 / n) ** 2)
     made = GridProblem(cells=framed(np.ones((n - 2, n - 2))), b=b, **at(angle))
     return made, replace(made, **at(angle + speed / 0.8))
 
