@@ -174,7 +174,7 @@ class EveryMethodCase:
         return Attempt("done", None, time.perf_counter() - begun, faults=faults, facts=facts)
 
 
-def by_method(name: str, problem: GridProblem | MatrixProblem, device: str) -> tuple[str, list[str]]:
+def by_method(name: str, problem: GridProblem | MatrixProblem, device: str, solve: Solve = wl.solve) -> tuple[str, list[str]]:
     """Return how a method ends on a small problem that has a solution, and what is wrong with that."""
     method: Any = wl.METHODS[name]
     lcp = problem.lcp(device, wp.float64)
@@ -183,7 +183,7 @@ def by_method(name: str, problem: GridProblem | MatrixProblem, device: str) -> t
         return "not for it", []
     try:
         with interrupted_after(METHOD_SECONDS):
-            result = wl.solve(lcp, method(), stopping=wl.StoppingCriteria(**CRITERIA))
+            result = solve(lcp, method(), stopping=wl.StoppingCriteria(**CRITERIA))
     except ValueError as refusal:
         return "refused", [] if str(refusal) else ["refused without a message"]
     except OverBudgetError:

@@ -92,7 +92,7 @@ def triangles(draw: Draw) -> MatrixProblem:
     mesh = scipy.spatial.Delaunay(points)
     p = points[mesh.simplices]
     edges = np.roll(p, -1, axis=1) - np.roll(p, -2, axis=1)
-    area = np.abs(np.cross(edges[:, 0], edges[:, 1])) / 2
+    area = np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]) / 2
     good = area > 1e-12
     K = np.einsum("tik,tjk->tij", edges, edges)[good] / (4 * area[good, None, None])
     at = mesh.simplices[good]
