@@ -90,4 +90,4 @@ def problem(kind: str, seed: int, *, small: bool = False) -> Unseen:
         made, then = solvable(made), None if then is None else solvable(then)
         if then is None and seed % WARM_EVERY == 0 and not small:
             then = changed(made, seed)
-    return Unseen(kind, seed, made, then, ALLOWANCE.get(kind, 1.0), sure=kind not in HARD_MATRICES)
+    return Unseen(kind, seed, made, then, ALLOWANCE.get(kind, 1.0))

@@ -34,7 +34,6 @@ class Unseen:
         problem: what is to be solved.
         then: one that differs a little, to be solved from the solution of `problem`; None for none.
         allowance: factor of the iterations that it may take.
-        sure: whether the default method must solve it; an honest status will do if not.
     """
 
     kind: str
@@ -42,12 +41,6 @@ class Unseen:
     problem: GridProblem | MatrixProblem
     then: GridProblem | None = None
     allowance: float = 1.0
-    sure: bool = True
-
-    @property
-    def name(self) -> str:
-        """Kind, seed and shape in words."""
-        return f"{self.kind} {self.seed}"
 
 
 class Draw:

@@ -38,7 +38,7 @@ OFTEN_SHARE = 0.95  # on this share of the grids,
 ALWAYS = (3.0, 6)  # and never more than 3 e + 6
 WITHOUT_EQUATIONS = 100  # iterations where they have no solution: what a user gets by default
 WARM_MORE = 1  # iterations that a warm start may take beyond a cold one
-METHOD_SECONDS = 20.0  # of a method on a small problem
+METHOD_SECONDS = 120.0  # after which a method hangs on a small problem, compilers included
 GAVE_UP = Promise(Expected.EITHER, HONEST | {"LOCAL_MINIMUM", "DIVERGED"})
 BROKEN = (ArithmeticError, TypeError, LookupError, AttributeError, np.linalg.LinAlgError)  # what no method may end with
 GRIDS_A_KIND, MATRICES_A_KIND = 9, 6
@@ -67,13 +67,11 @@ class UnseenCase:
     Args:
         kind: of problem.
         seed: of it.
-        small: of a size that every method can take.
         solve: stands in for `wl.solve`, where something wrong is to be caught.
     """
 
     kind: str
     seed: int
-    small: bool = False
     solve: Solve = wl.solve
     family: str = FAMILY
     budget: float = 30.0
@@ -82,7 +80,7 @@ class UnseenCase:
     @property
     def name(self) -> str:
         """Kind and seed, by which it can be made again."""
-        return f"{self.kind} {self.seed}{' small' if self.small else ''}"
+        return f"{self.kind} {self.seed}"
 
     def promise(self, precision: str) -> Promise:
         """Return what it must come to."""
@@ -91,7 +89,7 @@ class UnseenCase:
     def attempt(self, precision: str, device: str) -> Attempt:
         """Solve, cold and warm, and the equations."""
         begun = time.perf_counter()
-        drawn = unseen.problem(self.kind, self.seed, small=self.small)
+        drawn = unseen.problem(self.kind, self.seed)
         facts = {"kind": self.kind, "seed": self.seed, "unknowns": unknowns(drawn.problem)}
         try:
             return self._solved(drawn, facts, device)
@@ -143,14 +141,12 @@ class EveryMethodCase:
     Args:
         kind: of problem.
         seed: of it.
-        methods: names of `wl.METHODS`.
     """
 
     kind: str
     seed: int
-    methods: Sequence[str] = tuple(wl.METHODS)
     family: str = METHODS_FAMILY
-    budget: float = 60.0
+    budget: float = 180.0
     precisions: tuple[str, ...] = ("mixed",)
 
     @property
@@ -167,7 +163,7 @@ class EveryMethodCase:
         problem = unseen.problem(self.kind, self.seed, small=True).problem
         begun, faults = time.perf_counter(), list[str]()
         ends: dict[str, str] = {}
-        for name in self.methods:
+        for name in wl.METHODS:
             ends[name], found = by_method(name, problem, device)
             faults += [f"{name}: {fault}" for fault in found]
         facts = {"kind": self.kind, "seed": self.seed, "ends": ends, "converged": sum(end == "CONVERGED" for end in ends.values())}
