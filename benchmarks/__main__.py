@@ -29,6 +29,7 @@ def main() -> None:
     parser.add_argument("--problems", type=Path)
     parser.add_argument("--method", action="append", default=[])
     parser.add_argument("--scene", default="")
+    parser.add_argument("--seed", type=int)
     given = parser.parse_args()
     wp.config.log_level = wp.LOG_ERROR
     launches.install()  # before anything imports warp_lcp
@@ -41,6 +42,7 @@ def main() -> None:
         given.problems,
         tuple(given.method),
         given.scene,
+        given.seed,
     )
     given.out.mkdir(parents=True, exist_ok=True)
     try:

@@ -31,6 +31,7 @@ class Suite:
         resizable: whether it can be asked for other sizes.
         replays: whether it can be asked for recorded problems.
         scenes: whether it can be asked for a scene.
+        seeded: whether it can be asked for seeds of random problems.
         groups: other cases of it by name, with what they are; their files are GROUP.json and so on.
     """
 
@@ -39,6 +40,7 @@ class Suite:
     resizable: bool = True
     replays: bool = False
     scenes: bool = False
+    seeded: bool = False
     groups: Mapping[str, str] = field(default_factory=dict)
 
     def run(
@@ -52,6 +54,7 @@ class Suite:
         methods: tuple[str, ...] = (),
         group: str = "",
         scene: str = "",
+        seed: int | None = None,
     ) -> list[Path]:
         """Measure and write the files.
 
@@ -64,12 +67,13 @@ class Suite:
             methods: names of those methods; the suite's choice without any.
             group: name of one of `groups`, to measure instead.
             scene: the only one to measure, its name or file.
+            seed: first one of its random problems, >= 0; new ones without.
 
         Returns:
             The files.
 
         Raises:
-            ValueError: a size or the number of samples is out of range, a method is unknown, or `problems` holds no problem.
+            ValueError: a size, a seed or the number of samples is out of range, a method is unknown, or `problems` holds no problem.
             RuntimeError: a measurement or a check failed; what it said is on the error stream. A failed check leaves the files.
         """
         if sizes and not self.resizable:
@@ -86,12 +90,17 @@ class Suite:
             raise ValueError("--group: cannot be combined with --problems and --method")
         if scene and not self.scenes:
             raise ValueError(f"{scene}: the suite {self.name} has scenes of its own; use tradeoff")
+        if seed is not None and not self.seeded:
+            raise ValueError(f"--seed {seed}: the suite {self.name} draws no problems; use extremes")
+        if seed is not None and seed < 0:
+            raise ValueError(f"--seed {seed}: must be >= 0")
         name = group or name
         if problems is not None or methods:
             self._check_replay(problems, methods, sizes)
             name = REPLAY
         arguments = [name, "--device", device, "--out", str(out), "--repeat", str(repeat)]
         arguments += ["--scene", scene] if scene else []
+        arguments += ["--seed", str(seed)] if seed is not None else []
         for size in sizes:
             arguments += ["--size", str(size)]
         arguments += [part for method in methods for part in ("--method", method)]
@@ -174,5 +183,8 @@ VALIDATION = Suite(
     False,
 )
 EXTREMES = Suite(
-    "extremes", "hostile problems and scenes: solved, refused or stopped as is fixed beforehand, checked by NumPy and SciPy", False
+    "extremes",
+    "hostile problems and scenes: solved, refused or stopped as is fixed beforehand, checked by NumPy and SciPy; random problems by seed",
+    False,
+    seeded=True,
 )

@@ -23,6 +23,7 @@ class Options:
         problems: folder of recorded problems, for the suite `replay`.
         methods: names of those it tries; empty for its own.
         scene: the one to measure, its name or file; empty for the suite's own.
+        seed: first one of random problems; None for one that was never drawn.
     """
 
     device: str
@@ -32,6 +33,7 @@ class Options:
     problems: Path | None = None
     methods: tuple[str, ...] = ()
     scene: str = ""
+    seed: int | None = None
 
 
 @dataclass(frozen=True)

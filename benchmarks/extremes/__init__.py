@@ -1,16 +1,19 @@
 """Hostile cases with an outcome that is fixed beforehand, judged by NumPy and SciPy in float64; `warp-lcp bench extremes` runs them all.
 
 A case is solved to its tolerance, refused before the start with a message that names the argument, or stopped with a status that says so.
-Solvers that are wrong on purpose are among the cases: the checks must catch each of them.
+Solvers that are wrong on purpose are among the cases: the checks must catch each of them. Random problems come last, new ones each time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import chain
 from pathlib import Path
+from random import SystemRandom
 
 from benchmarks.extremes import bounds, broken, coefficients, matrices, refused, shapes, simulations
 from benchmarks.extremes.case import PRECISIONS, Case, Expected, Verdict, judge
+from benchmarks.extremes.unseen import FRESH, judging
 from benchmarks.machine import machine
 from benchmarks.record import Record, Results, Table
 from benchmarks.timing import Figure, Options
@@ -23,36 +26,40 @@ FAMILIES = (
 )  # fmt: skip
 
 
-def cases() -> Iterator[Case]:
+def cases(seed: int) -> Iterator[Case]:
     """Yield all cases, family by family.
+
+    Args:
+        seed: first one of the random problems.
 
     Raises:
         ValueError: two cases share a name.
     """
     seen = set[tuple[str, str]]()
-    for family in FAMILIES:
-        for case in family():
-            if (case.family, case.name) in seen:
-                raise ValueError(f"two cases are called {case.family}: {case.name}")
-            seen.add((case.family, case.name))
-            yield case
+    for case in chain(*(family() for family in FAMILIES), judging.cases(seed)):
+        if (case.family, case.name) in seen:
+            raise ValueError(f"two cases are called {case.family}: {case.name}")
+        seen.add((case.family, case.name))
+        yield case
 
 
 def measure(options: Options, out: Path) -> Results:
     """Try every case in each of its precisions."""
     verdicts: list[Verdict] = []
     family = ""
-    for case in cases():
+    seed = SystemRandom().choice(FRESH) if options.seed is None else options.seed
+    for case in cases(seed):
         if case.family != family:
             family = case.family
-            options.say(f"{family} ...")
+            options.say(f"{family} ..." + (f" seeds from {seed} on" if family in judging.FAMILIES else ""))
         for precision in case.precisions:
             verdicts.append(judge(case, precision, options.device))
             if verdicts[-1].wrong:
                 options.say(f"{verdicts[-1].name}: {verdicts[-1].outcome}")
     records = [machine(options.device, elements=1 << 22, repeat=options.repeat), *(record(v) for v in verdicts)]
-    failures = [f"{v.name}: {v.outcome} (expected: {v.promise})" for v in verdicts if v.wrong]
-    return Results(records, [families(verdicts), table(verdicts)], failures=failures)
+    unseen, beyond = judging.summary(verdicts, seed)
+    failures = [f"{v.name}: {v.outcome} (expected: {v.promise})" for v in verdicts if v.wrong] + beyond
+    return Results(records, [families(verdicts), unseen, table(verdicts)], failures=failures)
 
 
 def record(verdict: Verdict) -> Record:
@@ -72,6 +79,7 @@ def record(verdict: Verdict) -> Record:
         "budget": verdict.case.budget,
         "message": attempt.message or None,
         "passed": not verdict.wrong,
+        **attempt.facts,
     }
     return Record(verdict.name, figures, facts)
 

@@ -46,10 +46,27 @@ def flipped_and_sure(problem: wl.LCP, solver: Any, **options: Any) -> wl.SolveRe
     return replace(result, x=wp.array(-result.x.numpy(), dtype=result.x.dtype, device=result.x.device))
 
 
+def equations(problem: wl.LCP, sign: float) -> wl.LCP:
+    """Return y = A x + sign b without bounds."""
+    b = wp.array(sign * problem.b.numpy(), dtype=wp.float64, device=problem.device)
+    return wl.LCP(problem.A, problem.layout.unload(b), -np.inf, np.inf)
+
+
 def wrong_sign_of_b(problem: wl.LCP, solver: Any, **options: Any) -> wl.SolveResult:
     """Return the solution of y = A x - b: right for what it solves."""
-    wrong = wl.LCP(problem.A, problem.layout.unload(wp.array(-problem.b.numpy(), dtype=wp.float64, device=problem.device)), -np.inf, np.inf)
-    return wl.solve(wrong, solver, **options)
+    return wl.solve(equations(problem, -1.0), solver, **options)
+
+
+def ignores_bounds(problem: wl.LCP, solver: Any, **options: Any) -> wl.SolveResult:
+    """Return the solution of the equations: right for what it solves."""
+    return wl.solve(equations(problem, 1.0), solver, **options)
+
+
+def stays_at_start(problem: wl.LCP, solver: Any, **options: Any) -> wl.SolveResult:
+    """Return the start without a step, and call it converged."""
+    criteria = options.pop("stopping")
+    result = wl.solve(problem, solver, stopping=replace(criteria, max_iterations=0), **options)
+    return replace(result, status=wl.SolveStatus.CONVERGED, residual=result.residual * 1e-9)
 
 
 def claims_too_much(problem: wl.LCP, solver: Any, **options: Any) -> wl.SolveResult:
@@ -63,6 +80,8 @@ SOLVERS = {
     "steps backwards": backwards,
     "x flipped": flipped_and_sure,
     "b flipped": wrong_sign_of_b,
+    "bounds ignored": ignores_bounds,
+    "start returned": stays_at_start,
     "claims too much": claims_too_much,
 }
 

@@ -81,6 +81,7 @@ class Attempt:
         message: of a refusal or a failed step.
         faults: what is wrong whatever was expected.
         met: whether the independent residual meets the tolerance.
+        facts: what else a record keeps.
     """
 
     status: str
@@ -89,6 +90,7 @@ class Attempt:
     message: str = ""
     faults: list[str] = field(default_factory=list)
     met: bool = False
+    facts: dict[str, Any] = field(default_factory=dict)
 
 
 class Case(Protocol):

@@ -40,7 +40,7 @@ def test_every_family(family):
 
 
 def test_there_are_enough_cases_of_every_kind():
-    cases = list(extremes.cases())  # refuses names that are there twice
+    cases = list(extremes.cases(4217))  # refuses names that are there twice
     kinds = Counter(c.promise(p).expected for c in cases for p in c.precisions)
     assert len(cases) >= 150
     assert set(kinds) == set(Expected)

@@ -27,6 +27,7 @@ class Benchmark(Protocol):
         methods: tuple[str, ...] = (),
         group: str = "",
         scene: str = "",
+        seed: int | None = None,
     ) -> list[Path]:
         """Measure, and return the files written to `out`: NAME.json, NAME.md and plots.
 
@@ -39,6 +40,7 @@ class Benchmark(Protocol):
             methods: their names.
             group: other cases of the suite, to measure instead; the files then have that name.
             scene: the only one to measure, of a suite that runs scenes; a name or a file.
+            seed: first one of the random problems, of a suite that draws them; new ones without.
 
         Raises:
             ValueError: an option is out of range.

@@ -336,6 +336,9 @@ def bench(
     engine: Annotated[
         Engine, typer.Option(help="petsc: scaling on 1, 2 and 4 ranks, or on those of `mpiexec -n N warp-lcp ...`.")
     ] = Engine.SINGLE,
+    seed: Annotated[
+        int | None, typer.Option(metavar="N", help="With extremes: the random problems of these seeds again.", show_default=False)
+    ] = None,
     compare: Annotated[
         tuple[Path, Path] | None,
         typer.Option(metavar="A.json B.json", help="Compare two results instead of measuring.", show_default=False),
@@ -358,7 +361,7 @@ def bench(
             typer.echo(installed[suite].compare(*compare))
             return
         asked: dict[str, Any] = {} if problems is None and not method else {"problems": problems, "methods": tuple(method or ())}
-        asked |= ({"group": group} if group else {}) | ({"scene": scene} if scene else {})
+        asked |= ({"group": group} if group else {}) | ({"scene": scene} if scene else {}) | ({} if seed is None else {"seed": seed})
         files = installed[suite].run(device=chosen, out=out, sizes=tuple(size or ()), repeat=repeat, **asked)
     except ValueError as error:
         _end(str(error), WRONG_INPUT)

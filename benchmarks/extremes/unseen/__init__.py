@@ -1,0 +1,93 @@
+"""Random problems of many kinds, by kind and seed: what no method was tuned on. `problem(kind, seed)` is the same for ever.
+
+Seeds 0 to 9,999 are for tests and for development, 10,000 to 19,999 are kept unseen for acceptance, a run draws from 20,000 on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from benchmarks.extremes.problem import GridProblem
+from benchmarks.extremes.unseen import domains, matrices, media, obstacles
+from benchmarks.extremes.unseen.draw import Draw, Unseen, changed, solvable
+
+RESERVED = range(10_000, 20_000)  # seeds for acceptance
+FRESH = range(20_000, 1 << 31)  # seeds that a run draws from
+GRIDS: Mapping[str, Callable[[Draw], Any]] = {
+    "strip": domains.strip,
+    "vent": domains.vent,
+    "voxels-2d": domains.voxels_2d,
+    "voxels-3d": domains.voxels_3d,
+    "rectangles": domains.rectangles,
+    "bend": domains.bend,
+    "spiral": domains.spiral,
+    "maze": domains.maze,
+    "porous": domains.porous,
+    "film": domains.film,
+    "liquid": domains.liquid,
+    "periodic": domains.periodic,
+    "chain": domains.chain,
+    "handful": domains.handful,
+    "torsion": obstacles.torsion,
+    "membrane": obstacles.membrane,
+    "stairs": obstacles.stairs,
+    "ball": obstacles.ball,
+    "moving": obstacles.moving,
+    "lid": obstacles.lid,
+    "rough": obstacles.rough,
+    "dam": obstacles.dam,
+    "bearing": obstacles.bearing,
+    "rows": obstacles.rows,
+    "degenerate": obstacles.degenerate,
+    "lognormal": media.lognormal,
+    "checkerboard": media.checkerboard,
+    "inclusions": media.inclusions,
+    "anisotropic": media.anisotropic,
+    "flat-cells": media.flat_cells,
+    "cut-cells": media.cut_cells,
+    "shifted": media.shifted,
+    "scaled": media.scaled,
+}
+SURE_MATRICES: Mapping[str, Callable[[Draw], Any]] = {
+    "torsion-matrix": matrices.torsion_matrix,
+    "grid-matrix": matrices.grid_matrix,
+    "plate": matrices.plate,
+    "elastic": matrices.elastic,
+    "triangles": matrices.triangles,
+    "option": matrices.option,
+    "convection": matrices.convection,
+}
+HARD_MATRICES: Mapping[str, Callable[[Draw], Any]] = {
+    "linear-program": matrices.linear_program,
+    "quadratic-program": matrices.quadratic_program,
+    "skew": matrices.skew,
+    "nearly-skew": matrices.nearly_skew,
+    "least-squares": matrices.least_squares,
+}
+KINDS = {**GRIDS, **SURE_MATRICES, **HARD_MATRICES}
+ALLOWANCE = {"lognormal": 1.5}
+WARM_EVERY = 3  # of how many seeds one is solved once more with b changed by 1 %
+
+
+def problem(kind: str, seed: int, *, small: bool = False) -> Unseen:
+    """Return the problem of a kind and a seed.
+
+    Args:
+        kind: of `KINDS`.
+        seed: >= 0.
+        small: of a size that every method can take; another problem than the large one.
+
+    Raises:
+        ValueError: there is no such kind.
+    """
+    if kind not in KINDS:
+        raise ValueError(f"kind = {kind}: must be one of {', '.join(KINDS)}")
+    made, then = KINDS[kind](Draw(kind, seed, small=small)), None
+    if isinstance(made, tuple):
+        made, then = made
+    if isinstance(made, GridProblem):
+        made, then = solvable(made), None if then is None else solvable(then)
+        if then is None and seed % WARM_EVERY == 0 and not small:
+            then = changed(made, seed)
+    return Unseen(kind, seed, made, then, ALLOWANCE.get(kind, 1.0))

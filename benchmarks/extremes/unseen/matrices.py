@@ -1,0 +1,194 @@
+"""Kinds of matrices: plates, elastic contact, irregular meshes, options, linear programs, skew matrices with small diagonals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+import scipy.spatial
+
+from benchmarks.extremes.problem import GridProblem, MatrixProblem
+from benchmarks.extremes.unseen import domains, media, obstacles
+from benchmarks.extremes.unseen.draw import Draw, solvable
+
+GRIDS = (obstacles.torsion, obstacles.stairs, obstacles.dam, domains.voxels_2d, domains.bend, media.anisotropic, media.shifted)
+SMALLEST_DIAGONALS = (0.0, 1e-12, 1e-4)  # none, and the range of those that are tiny
+
+
+def from_grid(make: Callable[[Draw], GridProblem], draw: Draw) -> MatrixProblem:
+    """Return a grid's problem as a sparse matrix."""
+    exact = solvable(make(draw)).exact()
+    return MatrixProblem(matrix=exact.matrix, b=exact.b, lower=exact.lower, upper=exact.upper)
+
+
+def torsion_matrix(draw: Draw) -> MatrixProblem:
+    """Return elastic-plastic torsion as a sparse matrix."""
+    return from_grid(obstacles.torsion, draw)
+
+
+def grid_matrix(draw: Draw) -> MatrixProblem:
+    """Return one of several grids as a sparse matrix."""
+    return from_grid(draw.of(*GRIDS), draw)
+
+
+def plate(draw: Draw) -> MatrixProblem:
+    """Return a plate over an obstacle: the biharmonic operator, clamped or simply supported."""
+    n = draw.whole(8, 90)
+    second = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n))
+    eye = scipy.sparse.eye_array(n)
+    laplace = scipy.sparse.kron(second, eye) + scipy.sparse.kron(eye, second)
+    matrix = laplace @ laplace
+    if draw.chance(0.5):  # clamped: the mirrored node beyond a border adds 2 to the diagonal beside it
+        edge = np.zeros(n)
+        edge[[0, -1]] = 2.0
+        matrix = matrix + scipy.sparse.diags_array(np.add.outer(edge, edge).ravel())
+    g = (np.arange(n) + 1) / (n + 1)
+    X, Y = np.meshgrid(g, g)
+    low = -draw.between(0.01, 0.1) - draw.between(0, 1) * ((X - draw.between(0.2, 0.8)) ** 2 + (Y - 0.5) ** 2)
+    b = draw.decades(10, 1e3) * (1.0 if draw.chance(0.6) else draw.smooth((n, n), 4)) * np.ones((n, n)) / (n + 1) ** 4
+    return MatrixProblem(matrix=matrix.tocsr(), b=b.ravel(), lower=low.ravel(), upper=draw.of(np.inf, 0.02))
+
+
+def stiffness(poisson: float) -> np.ndarray:
+    """Return the stiffness of a bilinear unit square in plane strain, E = 1; nodes (0,0), (1,0), (0,1), (1,1), x before y."""
+    D = np.array([[1 - poisson, poisson, 0], [poisson, 1 - poisson, 0], [0, 0, 0.5 - poisson]]) / ((1 + poisson) * (1 - 2 * poisson))
+    K = np.zeros((8, 8))
+    for s in (0.5 - 0.5 / np.sqrt(3), 0.5 + 0.5 / np.sqrt(3)):
+        for t in (0.5 - 0.5 / np.sqrt(3), 0.5 + 0.5 / np.sqrt(3)):
+            dx, dy = np.array([t - 1, 1 - t, -t, t]), np.array([s - 1, -s, 1 - s, s])
+            B = np.zeros((3, 8))
+            B[0, ::2], B[1, 1::2], B[2, ::2], B[2, 1::2] = dx, dy, dy, dx
+            K += B.T @ D @ B / 4
+    return K
+
+
+def elastic(draw: Draw) -> MatrixProblem:
+    """Return a block of elastic squares held at its top and pressed on a foundation: gaps bound the bottom's displacements."""
+    nx, ny = draw.whole(6, 80), draw.whole(4, 50)
+    node = np.arange((nx + 1) * (ny + 1)).reshape(ny + 1, nx + 1)
+    corners = np.stack([node[:-1, :-1], node[:-1, 1:], node[1:, :-1], node[1:, 1:]], axis=-1).reshape(-1, 4)
+    dofs = (2 * corners[:, :, None] + np.arange(2)).reshape(-1, 8)
+    K = stiffness(draw.between(0, 0.45))
+    rows, columns = np.repeat(dofs, 8, axis=1).ravel(), np.tile(dofs, 8).ravel()
+    stiff = np.repeat(np.exp(draw.between(0, 2) * draw.smooth((nx * ny,), 1)), 64) if draw.chance(0.3) else 1.0
+    A = scipy.sparse.coo_array((np.tile(K.ravel(), len(dofs)) * stiff, (rows, columns)), shape=(2 * node.size,) * 2).tocsr()
+    free = np.ones(2 * node.size, dtype=bool)
+    free[2 * node[-1]], free[2 * node[-1] + 1] = False, False
+    lower = np.full(2 * node.size, -np.inf)
+    x = np.linspace(-1, 1, nx + 1)
+    lower[2 * node[0] + 1] = draw.of(0.02 * x**2, 0.01 * np.abs(x), 0.01 * draw.smooth((nx + 1,), 3)) - draw.between(0, 0.01)
+    pressed = np.zeros(2 * node.size)
+    pressed[2 * node[-1] + 1] = -draw.decades(1e-3, 1e-1)
+    b = A @ pressed + draw.decades(1e-6, 1e-3) * np.tile([0.0, 1.0], node.size)
+    return MatrixProblem(matrix=A[free][:, free].tocsr(), b=b[free], lower=lower[free])
+
+
+def triangles(draw: Draw) -> MatrixProblem:
+    """Return a membrane over an obstacle on an irregular mesh of linear triangles."""
+    n = draw.whole(12, 12000)
+    points = np.vstack([draw.rng.random((n, 2)) ** draw.of(1.0, 2.0), [[0, 0], [0, 1], [1, 0], [1, 1]]])
+    mesh = scipy.spatial.Delaunay(points)
+    p = points[mesh.simplices]
+    edges = np.roll(p, -1, axis=1) - np.roll(p, -2, axis=1)
+    area = np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]) / 2
+    good = area > 1e-12
+    K = np.einsum("tik,tjk->tij", edges, edges)[good] / (4 * area[good, None, None])
+    at = mesh.simplices[good]
+    rows, columns = np.repeat(at, 3, axis=1).ravel(), np.tile(at, 3).ravel()
+    A = scipy.sparse.coo_array((K.ravel(), (rows, columns)), shape=(len(points),) * 2).tocsr()
+    lumped = np.bincount(at.ravel(), np.repeat(area[good] / 3, 3), len(points))
+    inside = np.setdiff1d(np.arange(len(points)), mesh.convex_hull)
+    far = ((points - draw.rng.random(2)) ** 2).sum(axis=1)
+    return MatrixProblem(
+        matrix=A[inside][:, inside].tocsr(),
+        b=(draw.between(-20, 20) * lumped)[inside],
+        lower=(-0.02 - draw.between(0.05, 1) * far)[inside],
+        upper=draw.of(np.inf, 0.05),
+    )
+
+
+def option(draw: Draw) -> MatrixProblem:
+    """Return an implicit step of an American put, tridiagonal and unsymmetric, early exercise as its lower bound."""
+    n, rate, sigma = draw.whole(20, 3000), draw.between(0.01, 0.1), draw.between(0.1, 0.6)
+    dt, strike, i = draw.decades(1e-4, 1.0), 100.0, np.arange(1, n)
+    s = 3 * strike * i / n
+    down, up = 0.5 * dt * (sigma**2 * i**2 - rate * i), 0.5 * dt * (sigma**2 * i**2 + rate * i)
+    wind = down < 0  # there differences against the wind keep it an M-matrix
+    down, up = np.where(wind, 0.5 * dt * sigma**2 * i**2, down), np.where(wind, up + 0.5 * dt * rate * i, up)
+    A = scipy.sparse.diags_array([-down[1:], 1 + down + up + rate * dt, -up[:-1]], offsets=[-1, 0, 1])
+    payoff = np.maximum(strike - s, 0.0)
+    b = -payoff.copy()
+    b[0] -= down[0] * strike
+    return MatrixProblem(matrix=A.tocsr(), b=b, lower=payoff)
+
+
+def convection(draw: Draw) -> MatrixProblem:
+    """Return an obstacle under diffusion and upwind convection."""
+    n = max(4, draw.side())
+    eye, ones = scipy.sparse.eye_array(n), np.ones(n)
+    parts = []
+    for wind in (draw.decades(1e-2, 1e2) / n, draw.decades(1e-2, 1e2) / n):
+        parts.append(scipy.sparse.diags_array([-(1 + wind) * ones[1:], (2 + wind) * ones, -ones[1:]], offsets=[-1, 0, 1]))
+    A = scipy.sparse.kron(parts[0], eye) + scipy.sparse.kron(eye, parts[1])
+    b = draw.load((n, n)) if draw.chance(0.5) else np.full((n, n), -draw.between(1, 50) / n**2)
+    return MatrixProblem(matrix=A.tocsr(), b=b.ravel(), upper=draw.of(np.inf, 0.1))
+
+
+def held(draw: Draw, matrix: Any) -> MatrixProblem:
+    """Return the problem of a matrix whose solution is chosen: entries of x > 0 where y = 0 and the other way round."""
+    n = matrix.shape[0]
+    free = draw.rng.random(n) < draw.between(0.2, 0.8)
+    x = np.where(free, draw.rng.uniform(0.1, 1.0, n), 0.0) * draw.decades(1e-2, 1e2)
+    y = np.where(free, 0.0, draw.rng.uniform(0.1, 1.0, n)) * draw.decades(1e-2, 1e2)
+    return MatrixProblem(matrix=matrix, b=y - matrix @ x)
+
+
+def as_kind(draw: Draw, matrix: np.ndarray) -> Any:
+    """Return the matrix dense or sparse."""
+    return matrix if draw.chance(0.5) else scipy.sparse.csr_array(matrix)
+
+
+def small_diagonal(draw: Draw) -> float:
+    """Return 0 or a tiny number."""
+    none, low, high = SMALLEST_DIAGONALS
+    return none if draw.chance(0.2) else draw.decades(low, high)
+
+
+def linear_program(draw: Draw) -> MatrixProblem:
+    """Return the optimality conditions of a linear program, with a tiny diagonal: min c'x, A x >= b, x >= 0."""
+    m, n = draw.whole(1, 100), draw.whole(1, 100)
+    A = draw.noise((m, n)) * (draw.rng.random((m, n)) < draw.between(0.2, 1))
+    A = A * 10.0 ** draw.rng.uniform(-draw.of(0, 0, 2), 0, (m, 1))
+    M = np.block([[np.zeros((n, n)), -A.T], [A, np.zeros((m, m))]]) + small_diagonal(draw) * np.eye(m + n)
+    return held(draw, as_kind(draw, M))
+
+
+def quadratic_program(draw: Draw) -> MatrixProblem:
+    """Return the optimality conditions of a convex quadratic program, its Hessian perhaps singular, its other diagonal tiny."""
+    m, n = draw.whole(1, 100), draw.whole(1, 100)
+    B, A = draw.noise((n, max(1, int(n * draw.between(0.3, 1.5))))), draw.noise((m, n))
+    M = np.block([[B @ B.T / n, -A.T], [A, small_diagonal(draw) * np.eye(m)]])
+    return held(draw, as_kind(draw, M))
+
+
+def skew(draw: Draw) -> MatrixProblem:
+    """Return a skew matrix with a small diagonal."""
+    n = draw.whole(2, 120)
+    C = draw.noise((n, n)) * (draw.rng.random((n, n)) < draw.between(0.2, 1))
+    return held(draw, as_kind(draw, (C - C.T) / np.sqrt(n) + small_diagonal(draw) * np.eye(n)))
+
+
+def nearly_skew(draw: Draw) -> MatrixProblem:
+    """Return a skew matrix and a positive definite one, 10^-4 to 1 of its size."""
+    n = draw.whole(2, 120)
+    B, C = draw.rng.standard_normal((2, n, n))
+    return held(draw, as_kind(draw, (C - C.T) / np.sqrt(n) + draw.decades(1e-4, 1) * (B @ B.T / n + 1e-3 * np.eye(n))))
+
+
+def least_squares(draw: Draw) -> MatrixProblem:
+    """Return nonnegative least squares: B'B of full or lower rank, columns of any length."""
+    n = draw.whole(2, 150)
+    B = draw.noise((max(1, int(n * draw.between(0.4, 3))), n)) * 10.0 ** draw.rng.uniform(-draw.of(0, 1, 3), 0, n)
+    return MatrixProblem(matrix=B.T @ B, b=-B.T @ (draw.noise((len(B),)) + draw.between(0, 2)))
