@@ -102,6 +102,15 @@ class Bounds:
             wp.launch(decode_kernel, self.layout.size, inputs, device=self.device)
         return field
 
+    def host(self, side: int) -> np.ndarray:
+        """Return `as_field` on the host, without a launch: the caller's memory where there is a field on the CPU."""
+        if self.fields[side].size:
+            return self.fields[side].numpy()  # type: ignore[no-any-return]
+        field = np.full(self.layout.size, self.values[side])
+        if self.code.size and not self.in_place:
+            field[self.code.numpy() & BITS[side] == 0] = INFINITE[side]
+        return field
+
     def _code_from_host(self, sides: tuple[Array, Array]) -> bool:
         """Code fields that are not stored yet; returns False, with nothing done, if their finite values differ or one is a NaN."""
         code, values = np.zeros(self.layout.stored_shape, dtype=np.uint8), list(self.values)

@@ -74,6 +74,14 @@ class SparseOperator:
         """Number of stored entries."""
         return int(self.values.size)
 
+    @cached_property
+    def bandwidth(self) -> int:
+        """How far from the diagonal the farthest entry is."""
+        first, last = self._indptr[:-1], self._indptr[1:] - 1
+        rows = np.flatnonzero(last >= first)  # columns ascend in each row
+        ends = np.stack([self._indices[first[rows]], self._indices[last[rows]]])
+        return int(np.abs(ends - rows).max(initial=0))
+
     def matrix(self) -> scipy.sparse.csr_array:
         """Return A as it is now, on the host, in float64."""
         return self._matrix_of(self.values.numpy())
