@@ -105,7 +105,7 @@ class Bounds:
     def host(self, side: int) -> np.ndarray:
         """Return `as_field` on the host, without a launch: the caller's memory where there is a field on the CPU."""
         if self.fields[side].size:
-            return self.fields[side].numpy()  # type: ignore[no-any-return]
+            return self.fields[side].numpy()
         field = np.full(self.layout.size, self.values[side])
         if self.code.size and not self.in_place:
             field[self.code.numpy() & BITS[side] == 0] = INFINITE[side]

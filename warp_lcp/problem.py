@@ -16,6 +16,8 @@ from warp_lcp.problem_kernels import check_kernel
 if TYPE_CHECKING:
     from warp_lcp.operators.protocol import Operator
 
+LAUNCHED = 4096  # elements from which a kernel checks fields on the CPU: below, NumPy takes less than the launch
+
 
 @singledispatch
 def as_operator(A: Any, device: Any = None) -> Operator:
@@ -99,11 +101,18 @@ class LCP:
 
     def _faults(self, field: wp.array[Any], bounds: Bounds) -> list[int]:
         """Count values of a stored field that are not finite, NaN in l and in u, crossed bounds, l = inf, u = -inf."""
+        if self.device.is_cpu and self.layout.size <= LAUNCHED:
+            inside = self.unknown.numpy() == 1
+            b, lower, upper = field.numpy()[inside], bounds.host(0)[inside], bounds.host(1)[inside]
+            faults = (~np.isfinite(b), np.isnan(lower), np.isnan(upper), lower > upper, lower == np.inf, upper == -np.inf)
+            return self._totals(np.array([np.count_nonzero(fault) for fault in faults]))
         spans = Spans.of(self.layout.size, self.device)
         counts = wp.zeros((6, spans.threads), dtype=wp.float64, device=self.device)
         inputs = [field, *bounds.operands, self.unknown, spans.n, spans.chunk, spans.stride, spans.threads, counts.flatten()]
         wp.launch(check_kernel, spans.threads, inputs, device=self.device)
-        found = counts.numpy().sum(axis=1)
+        return self._totals(counts.numpy().sum(axis=1))
+
+    def _totals(self, found: np.ndarray) -> list[int]:
         return [int(n) for n in (found if self.layout.across is None else self.layout.across.sum(found))]
 
     def _check(self) -> None:

@@ -15,12 +15,13 @@ from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
-from warp_lcp.solve import IterateInPlace, Precision, RoundedIterate, Step
+from warp_lcp.solve import Precision, RoundedIterate, Step
 
 if TYPE_CHECKING:
     from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
 
 MOST, WIDEST = 200, 3  # unknowns, or bandwidth whatever their number, up to which LAPACK on the host costs less than launches
+FEW = 30  # unknowns up to which dense factors cost no more than banded ones, whatever the bandwidth
 SINGULAR = 1e-13  # of the matrix's largest row sum: a pivot below it is rounding, the free block singular
 IDLE = 30  # steps without a smaller residual, the loop's patience, after which safeguarded steps take over
 PAUSE = 4  # steps without reaching out after a set has come again, doubled each time
@@ -43,7 +44,7 @@ class SmallMatrix:
 
     def product(self, x: np.ndarray) -> np.ndarray:
         """Return A x."""
-        return self._host @ x  # type: ignore[no-any-return]
+        return self._host @ x
 
     def solve(self, free: np.ndarray, r: np.ndarray) -> np.ndarray | None:
         """Return e with A_FF e_F = r_F and 0 elsewhere, None where A_FF looks singular."""
@@ -91,7 +92,7 @@ class BandedMatrix:
     def product(self, x: np.ndarray) -> np.ndarray:
         """Return A x."""
         n, k = len(x), self.width
-        return scipy.linalg.blas.dgbmv(n, n, k, k, 1.0, self._bands, x)  # type: ignore[no-any-return]
+        return scipy.linalg.blas.dgbmv(n, n, k, k, 1.0, self._bands, x)
 
     def solve(self, free: np.ndarray, r: np.ndarray) -> np.ndarray | None:
         """Return e with A_FF e_F = r_F and 0 elsewhere, None where A_FF looks singular; held rows and columns keep their diagonal."""
@@ -138,15 +139,17 @@ class HostResidual(NaturalResidual):
     def __init__(self, problem: LCP, matrix: SmallMatrix | BandedMatrix) -> None:
         self.problem, self.matrix = problem, matrix
         self.norm, self.current, self.unit = 0.0, False, 1.0
+        self._y = np.zeros(problem.layout.size)
 
     @cached_property
-    def diagonal(self) -> wp.array[Any]:  # type: ignore[override]
+    def diagonal(self) -> wp.array[Any]:
         """The operator's, for what goes on by kernels."""
         return self.problem.layout.load(self.problem.A.diagonal(), self.problem.A.dtype)
 
     @cached_property
-    def _y(self) -> np.ndarray:
-        return self.y.numpy()  # type: ignore[no-any-return]
+    def y(self) -> wp.array[Any]:
+        """What `evaluate` computes y in, likewise."""
+        return wp.array(self._y, dtype=wp.float64, device=self.problem.device, copy=False)
 
     def start(self, x: wp.array[Any], *, keep: bool) -> None:
         """Set x to clip(x, l, u), or to clip(0, l, u)."""
@@ -167,12 +170,16 @@ class HostResidual(NaturalResidual):
             self.norm, self.current = math.sqrt(r @ r), True
         return self.norm
 
+    def host_y(self) -> np.ndarray:
+        """Return y's memory."""
+        return self._y
+
     def norm_of_b(self) -> float:
         """Return ||b||."""
         return math.sqrt(self.b @ self.b)
 
 
-class DirectNewtonWorkspace(IterateInPlace, RoundedIterate):
+class DirectNewtonWorkspace(RoundedIterate):
     """Whole Newton steps solved by LAPACK on the host, then the safeguarded ones where these lead nowhere.
 
     On an M-matrix whole steps end at the solution, but the contact set may shrink by a layer a step. Where a narrow problem's set has
@@ -191,13 +198,21 @@ class DirectNewtonWorkspace(IterateInPlace, RoundedIterate):
         if not suits(A):
             raise ValueError(f"A: direct = True is for dense and sparse matrices of at most {MOST} unknowns or a bandwidth up to {WIDEST}")
         self.problem, self.settings, self.precision = problem, settings, Precision(settings.precision)
-        width = bandwidth(A)
+        width = bandwidth(A) if A.unknowns > FEW else WIDEST + 1
         self.matrix: SmallMatrix | BandedMatrix = BandedMatrix(A, width) if width <= WIDEST else SmallMatrix(A)
         self.x = problem.layout.zeros(wp.float64)
         on_host = problem.device.is_cpu and problem.bounds.affine is None
         self.residual: NaturalResidual = HostResidual(problem, self.matrix) if on_host else NaturalResidual(problem)
         self._rounded = problem.layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
         self.floating: Any = None
+
+    def keep(self) -> None:
+        """Remember x, on the host."""
+        self._kept = self.x.numpy().copy()
+
+    def restore(self) -> None:
+        """Take x back."""
+        self._write(self.x, self._kept)
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the sets."""
@@ -242,7 +257,7 @@ class DirectNewtonWorkspace(IterateInPlace, RoundedIterate):
         residual, start = self.residual, x.numpy()
         if self._held is not None:  # the start's residual says nothing of the steps to come
             self._least, self._idle = (residual.norm, 0) if residual.norm < self._least else (self._least, self._idle + 1)
-        below, above = self._classify(start, residual.y.numpy())
+        below, above = self._classify(start, residual.host_y() if isinstance(residual, HostResidual) else residual.y.numpy())
         if self._idle >= IDLE or self._comes_again(below, above):
             return None
         held = below | above
@@ -251,13 +266,19 @@ class DirectNewtonWorkspace(IterateInPlace, RoundedIterate):
         if e is None or not np.isfinite(e).all():
             return None
         moved += e
-        x.assign(moved)
+        self._write(x, moved)
         if residual.evaluate(x) <= self._target:  # x may miss its bounds by what the criteria allow
-            x.assign(np.clip(moved, self._lower, self._upper))
+            self._write(x, np.clip(moved, self._lower, self._upper))
             residual.current = False
         self._round(x)
         residual.current = residual.current and self._rounded is None
         return Step("active set", 1, int(np.count_nonzero(held)), interim=True)
+
+    def _write(self, x: wp.array[Any], values: np.ndarray) -> None:
+        if self.problem.device.is_cpu:
+            x.numpy()[...] = values
+        else:
+            x.assign(values)
 
     def _classify(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return which unknowns are held at l and which at u."""
@@ -293,4 +314,4 @@ def _spread(marked: np.ndarray, distance: int) -> np.ndarray:
         return marked
     n, at = len(marked), np.arange(len(marked))
     counts = np.r_[0, np.cumsum(marked)]
-    return counts[np.minimum(at + distance + 1, n)] > counts[np.maximum(at - distance, 0)]  # type: ignore[no-any-return]
+    return counts[np.minimum(at + distance + 1, n)] > counts[np.maximum(at - distance, 0)]
