@@ -13,6 +13,7 @@ from warp_lcp.layout import Array, Layout, real_array
 from warp_lcp.native import Spans
 
 NAMES, INFINITE = ("lower", "upper"), (-np.inf, np.inf)
+LAUNCHED = 4096  # elements from which a kernel looks at fields on the CPU: below, NumPy takes less than the launch
 BITS = (int(LOWER_IS_FINITE), int(UPPER_IS_FINITE))
 
 
@@ -122,6 +123,8 @@ class Bounds:
             if not self.layout.fits(host) or host.dtype.kind not in "fiu":
                 return False
             value = float(host.max() if side == 0 else host.min())
+            if host.size <= LAUNCHED and ((host != value) & (host != INFINITE[side])).any():  # NaN too
+                return False
             if value == -INFINITE[side] or np.isnan(value) or not self._code_rows(side, host, value, code):
                 return False
             values[side] = value

@@ -8,15 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.bounds import INFINITE, Bounds
+from warp_lcp.bounds import INFINITE, LAUNCHED, Bounds
 from warp_lcp.layout import Array, layout_of
 from warp_lcp.native import Spans
 from warp_lcp.problem_kernels import check_kernel
 
 if TYPE_CHECKING:
     from warp_lcp.operators.protocol import Operator
-
-LAUNCHED = 4096  # elements from which a kernel checks fields on the CPU: below, NumPy takes less than the launch
 
 
 @singledispatch

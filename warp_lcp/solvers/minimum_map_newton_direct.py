@@ -49,9 +49,11 @@ class SmallMatrix:
     def solve(self, free: np.ndarray, r: np.ndarray) -> np.ndarray | None:
         """Return e with A_FF e_F = r_F and 0 elsewhere, None where A_FF looks singular."""
         rows = free.nonzero()[0]
+        if not len(rows):
+            return np.zeros(len(r))
         block = self._host if len(rows) == len(r) else self._host[rows[:, None], rows]
         factors, pivots, info = scipy.linalg.lapack.dgetrf(block)
-        if info != 0 or _singular(factors.diagonal(), np.abs(block).sum(axis=1)):
+        if info != 0 or _singular(factors.diagonal(), np.abs(block).sum(axis=1).max()):
             return None
         e = np.zeros(len(r))
         e[rows] = scipy.linalg.lapack.dgetrs(factors, pivots, r[rows])[0]
@@ -68,7 +70,7 @@ class BandedMatrix:
 
     def __init__(self, A: DenseOperator | SparseOperator, width: int) -> None:
         self._A, self.width, self._version = A, width, -1
-        self._bands = np.zeros((2 * width + 1, A.unknowns), order="F")  # a_ij at (width + i - j, j), as LAPACK has it
+        self._bands = np.zeros((2 * width + 1, A.unknowns))  # a_ij at (width + i - j, j), as LAPACK has it
         if isinstance(A, SparseOperator):
             self._columns = A.indices.numpy()
             self._at = width + np.repeat(np.arange(A.unknowns), np.diff(A.indptr.numpy())) - self._columns
@@ -87,19 +89,21 @@ class BandedMatrix:
             for o in range(-k, k + 1):
                 self._bands[k - o, max(o, 0) : n + min(o, 0)] = host.diagonal(o)
         self.diagonal = self._bands[k].copy()
-        self._sizes = np.abs(self._bands).sum(axis=0)
+        self._by_columns = np.asfortranarray(self._bands)
+        sizes = np.abs(self._bands).sum(axis=0)
+        self._size, self._own = sizes.max(), np.where(sizes > 0, sizes, 1.0)
 
     def product(self, x: np.ndarray) -> np.ndarray:
         """Return A x."""
         n, k = len(x), self.width
-        return scipy.linalg.blas.dgbmv(n, n, k, k, 1.0, self._bands, x)
+        return scipy.linalg.blas.dgbmv(n, n, k, k, 1.0, self._by_columns, x)
 
     def solve(self, free: np.ndarray, r: np.ndarray) -> np.ndarray | None:
         """Return e with A_FF e_F = r_F and 0 elsewhere, None where A_FF looks singular; held rows and columns keep their diagonal."""
         k, n, masked = self.width, len(r), self._bands * free
         for o in range(-k, k + 1):
             masked[k - o, max(o, 0) : n + min(o, 0)] *= free[max(-o, 0) : n - max(o, 0)]
-        masked[k] += ~free * np.where(self._sizes > 0, self._sizes, 1.0)
+        masked[k] += ~free * self._own
         right = np.where(free, r, 0.0)
         if k == 0:
             pivots, info = masked[0], 0
@@ -109,11 +113,11 @@ class BandedMatrix:
         else:
             factors, _, e, info = scipy.linalg.lapack.dgbsv(k, k, np.vstack([np.zeros((k, n)), masked]), right)
             pivots = factors[2 * k]
-        return None if info != 0 or _singular(pivots, self._sizes) else e
+        return None if info != 0 or _singular(pivots, self._size) else e
 
 
-def _singular(pivots: np.ndarray, sizes: np.ndarray) -> bool:
-    return len(pivots) > 0 and bool(np.abs(pivots).min() <= SINGULAR * sizes.max())
+def _singular(pivots: np.ndarray, size: float) -> bool:
+    return bool(np.abs(pivots).min() <= SINGULAR * size)
 
 
 def suits(A: Any) -> bool:
