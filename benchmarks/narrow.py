@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -50,13 +51,12 @@ def _pairs(options: Options) -> dict[str, tuple[Callable[[], object], Callable[[
     put = option(2015, n=NODES, kind="put")
     for made in (True, False):
         name = f"put, {NODES} nodes, {STEPS} steps, {'made each step' if made else 'in place'}"
-        pairs[name] = (lambda: _march(put, None, options.device, True), lambda made=made: _march(put, wl.solve, options.device, made))
+        pairs[name] = (partial(_march, put, None, options.device, True), partial(_march, put, wl.solve, options.device, made))
     cases = {f"dense {n}": _sized(n) for n in options.sizes or (5, 20, 50, 100, 200)}
     cases |= {f"obstacle {n}": string(2017, n=n, between=False) for n in (50, 500)}
     cases |= {f"strings {n}": string(2019, n=n) for n in (50, 500)}
     for name, problem in cases.items():
-        bands = _bands(problem)
-        pairs[name] = (lambda p=problem, bands=bands: plain_active_set(p, bands), lambda p=problem: _made(p, options.device))
+        pairs[name] = (partial(plain_active_set, problem, _bands(problem)), partial(_made, problem, options.device))
     return pairs
 
 

@@ -34,7 +34,7 @@ class SmallProblem:
     @property
     def first(self) -> np.ndarray:
         """Where a method starts."""
-        return np.clip(0.0 if self.start is None else self.start, self.lower, self.upper)  # type: ignore[no-any-return]
+        return np.clip(0.0 if self.start is None else self.start, self.lower, self.upper)
 
 
 def option(seed: int, *, n: int | None = None, kind: str | None = None) -> SmallProblem:
