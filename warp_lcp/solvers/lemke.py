@@ -222,7 +222,8 @@ class BandedBasis(Basis):
             return
         self.variables[self.row], self.missing = 2 * self.m, self.row
         self.regular = self.factors.factor(self.variables >= self.m, self.row)
-        self.values = self.factors.solve(self.q)
+        if self.regular:
+            self.values = self.factors.solve(self.q)
 
 
 class LemkeWorkspace(DenseWorkspace):
