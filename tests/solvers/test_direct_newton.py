@@ -1,5 +1,7 @@
 """Small and narrow problems: whole Newton steps on the host, what they hand over, Lemke's banded basis."""
 
+import itertools
+
 import numpy as np
 import pytest
 import scipy.sparse
@@ -8,6 +10,7 @@ import warp as wp
 import warp_lcp as wl
 from benchmarks.small_problems import FAMILIES, SmallProblem, option, plain_active_set, stepped, string
 from oracle import boxed, lemke, natural_residual
+from warp_lcp.residual import NaturalResidual
 from warp_lcp.solvers.lemke import BandedBasis, Basis
 
 DIRECT = wl.MinimumMapNewton(direct=True)
@@ -162,6 +165,16 @@ def test_a_small_problem_on_the_cpu_launches_nothing(monkeypatch):
     assert launched == []
 
 
+def test_kernels_may_evaluate_the_residual_as_they_do_on_cuda():
+    for p in (FAMILIES["dense"](5533), option(5533, n=300)):
+        problem = lcp(p)
+        work = DIRECT.init(problem)
+        work.residual = NaturalResidual(problem)
+        result = wl.solve(problem, DIRECT, workspace=work, x0=p.start, stopping=TIGHT)
+        assert result
+        np.testing.assert_allclose(result.x.numpy(), wl.solve(problem, x0=p.start, stopping=TIGHT).x.numpy(), atol=1e-12)
+
+
 def test_single_precision_rounds_the_iterate():
     p = string(5537, n=100)
     result = wl.solve(lcp(p), wl.MinimumMapNewton(direct=True, precision="single"), stopping=wl.StoppingCriteria(rtol=1e-2))
@@ -204,7 +217,7 @@ def test_lemke_tells_how_far_it_is_on_a_large_narrow_problem():
     result = wl.solve(lcp(p), wl.Lemke(), callback=told.append)
     assert result
     assert len(told) > 2
-    assert all(b.linear_iterations - a.linear_iterations <= 250 for a, b in zip(told, told[1:], strict=False))
+    assert all(b.linear_iterations - a.linear_iterations <= 250 for a, b in itertools.pairwise(told))
     own, reference = residuals(p, result.x.numpy())
     assert own <= 1e-6 * reference
 
@@ -214,6 +227,9 @@ def test_lemke_widens_where_banded_factors_are_singular():
     n = 40
     A = scipy.sparse.diags_array([np.tile([1.0, 0.0], 20)[:-1], np.tile([-1.0, 0.0], 20)[:-1]], offsets=[-1, 1], shape=(n, n)).tocsr()
     b = np.tile([1.0, -1.0], 20)
-    result = wl.solve(wl.LCP(A, b), wl.Lemke())
+    problem = wl.LCP(A, b)
+    work = wl.Lemke().init(problem)
+    result = wl.solve(problem, wl.Lemke(), workspace=work)
     assert result, result.status
+    assert type(work.basis) is Basis
     np.testing.assert_allclose(result.x.numpy(), 1.0)
