@@ -123,8 +123,6 @@ class Bounds:
             if not self.layout.fits(host) or host.dtype.kind not in "fiu":
                 return False
             value = float(host.max() if side == 0 else host.min())
-            if host.size <= LAUNCHED and ((host != value) & (host != INFINITE[side])).any():  # NaN too
-                return False
             if value == -INFINITE[side] or np.isnan(value) or not self._code_rows(side, host, value, code):
                 return False
             values[side] = value
@@ -135,6 +133,10 @@ class Bounds:
     def _code_rows(self, side: int, host: np.ndarray, value: float, code: np.ndarray) -> bool:
         """Add a side's bits to a code on the host; returns False if there are other finite values."""
         target = self.layout.target(code, host)
+        if host.size <= LAUNCHED:
+            finite = host != INFINITE[side]
+            target += (BITS[side] * finite).astype(np.uint8).reshape(target.shape)
+            return not (finite & (host != value)).any()
         target = target if target.ndim == 3 else target.reshape(1, 1, -1)
         source = np.ascontiguousarray(host, dtype=np.float64).ravel()
         first = target.__array_interface__["data"][0] - code.__array_interface__["data"][0]

@@ -144,6 +144,7 @@ class HostResidual(NaturalResidual):
         self.problem, self.matrix = problem, matrix
         self.norm, self.current, self.unit = 0.0, False, 1.0
         self._y = np.zeros(problem.layout.size)
+        self._field: wp.array[Any] | None = None
 
     @cached_property
     def diagonal(self) -> wp.array[Any]:
@@ -161,18 +162,24 @@ class HostResidual(NaturalResidual):
         bounds, d = self.problem.bounds, np.abs(self.matrix.diagonal)
         self.lower, self.upper, self.b = bounds.host(0), bounds.host(1), self.problem.b.numpy()
         self.scale = d if d.all() else np.where(d == 0, 1.0, d)
-        values = x.numpy()
+        values = self.values(x)
         np.clip(values if keep else 0.0, self.lower, self.upper, out=values)
         self.current = False
 
     def evaluate(self, x: wp.array[Any]) -> float:
         """Compute y and return the norm of the natural residual at x."""
-        values, y, d = x.numpy(), self._y, self.scale
+        values, y, d = self.values(x), self._y, self.scale
         np.add(self.matrix.product(values), self.b, out=y)
         with np.errstate(invalid="ignore", over="ignore"):
             r = np.maximum(np.minimum(y, d * (values - self.lower)), d * (values - self.upper))
             self.norm, self.current = math.sqrt(r @ r), True
         return self.norm
+
+    def values(self, x: wp.array[Any]) -> np.ndarray:
+        """Return x's memory; a view takes a tenth of a small solve each time it is made."""
+        if x is not self._field:
+            self._field, self._values = x, x.numpy()
+        return self._values
 
     def host_y(self) -> np.ndarray:
         """Return y's memory."""
@@ -212,7 +219,7 @@ class DirectNewtonWorkspace(RoundedIterate):
 
     def keep(self) -> None:
         """Remember x, on the host."""
-        self._kept = self.x.numpy().copy()
+        self._kept = self._read(self.x).copy()
 
     def restore(self) -> None:
         """Take x back."""
@@ -221,7 +228,7 @@ class DirectNewtonWorkspace(RoundedIterate):
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the sets."""
         self._warm, self._target, self.rest = warm, tolerance, None
-        residual, bounds = self.residual, self.problem.bounds
+        residual, bounds, self._b = self.residual, self.problem.bounds, self.problem.b.numpy()
         if isinstance(residual, HostResidual):
             self._d, self._lower, self._upper = residual.scale, residual.lower, residual.upper
         else:
@@ -258,7 +265,7 @@ class DirectNewtonWorkspace(RoundedIterate):
 
     def _whole_step(self, x: wp.array[Any]) -> Step | None:
         """Classify, solve on the free set, take the whole step; None where that leads nowhere."""
-        residual, start = self.residual, x.numpy()
+        residual, start = self.residual, self._read(x)
         if self._held is not None:  # the start's residual says nothing of the steps to come
             self._least, self._idle = (residual.norm, 0) if residual.norm < self._least else (self._least, self._idle + 1)
         below, above = self._classify(start, residual.host_y() if isinstance(residual, HostResidual) else residual.y.numpy())
@@ -266,7 +273,7 @@ class DirectNewtonWorkspace(RoundedIterate):
             return None
         held = below | above
         moved = np.where(below, self._lower, np.where(above, self._upper, start))
-        e = self.matrix.solve(~held, -(self.matrix.product(moved) + self.problem.b.numpy()))
+        e = self.matrix.solve(~held, -(self.matrix.product(moved) + self._b))
         if e is None or not np.isfinite(e).all():
             return None
         moved += e
@@ -278,9 +285,13 @@ class DirectNewtonWorkspace(RoundedIterate):
         residual.current = residual.current and self._rounded is None
         return Step("active set", 1, int(np.count_nonzero(held)), interim=True)
 
+    def _read(self, x: wp.array[Any]) -> np.ndarray:
+        residual = self.residual
+        return residual.values(x) if isinstance(residual, HostResidual) else x.numpy()
+
     def _write(self, x: wp.array[Any], values: np.ndarray) -> None:
         if self.problem.device.is_cpu:
-            x.numpy()[...] = values
+            self._read(x)[...] = values
         else:
             x.assign(values)
 
