@@ -144,7 +144,7 @@ SOLVERS = Suite(
     "solvers",
     "linear and LCP solves: set-up, iterations, time to a tolerance, memory; against PyAMG and SciPy",
     replays=True,
-    groups={"book": "the experiments of [Book] appendix C"},
+    groups={"book": "the experiments of [Book] appendix C", "narrow": "small and narrow matrices against a plain active set in NumPy"},
 )
 SCALING = Suite(
     "scaling",

@@ -154,8 +154,17 @@ def test_wrong_budgets_are_named(wrong, message):
         wl.Budget(**wrong)
 
 
+@pytest.mark.parametrize("n", [120, 3000])
+def test_small_and_narrow_matrices_get_the_default(n):
+    """Directly on the host: NumPy's sweeps would do, the dense one's eigenvalues are positive."""
+    lcp = (gallery.definite(n, seed=76) if n == 120 else gallery.banded(n, seed=76)).lcp(device="cpu")
+    advice = wl.recommend(lcp, accuracy=1e-8)
+    assert advice.method == wl.default_method(lcp) == wl.MinimumMapNewton(direct=True)
+    assert wl.solve(lcp, advice.method, stopping=advice.stopping)
+
+
 def test_a_budget_of_steps_is_a_limit_and_changes_the_method():
-    lcp = gallery.banded(3000, seed=78).lcp(device="cpu")
+    lcp = gallery.banded(3000, bands=4, seed=78).lcp(device="cpu")
     free = wl.recommend(lcp, accuracy=1e-8)
     assert free.name == "psor"
     few = wl.recommend(lcp, accuracy=1e-8, budget=wl.Budget(iterations=8))

@@ -14,6 +14,7 @@ from warp_lcp.native import Spans
 from warp_lcp.pickling import OnHost
 
 NAMES, INFINITE = ("lower", "upper"), (-np.inf, np.inf)
+LAUNCHED = 4096  # elements from which a kernel looks at fields on the CPU: below, NumPy takes less than the launch
 BITS = (int(LOWER_IS_FINITE), int(UPPER_IS_FINITE))
 
 
@@ -115,6 +116,15 @@ class Bounds:
             wp.launch(decode_kernel, self.layout.size, inputs, device=self.device)
         return field
 
+    def host(self, side: int) -> np.ndarray:
+        """Return `as_field` on the host, without a launch: the caller's memory where there is a field on the CPU."""
+        if self.fields[side].size:
+            return self.fields[side].numpy()
+        field = np.full(self.layout.size, self.values[side])
+        if self.code.size and not self.in_place:
+            field[self.code.numpy() & BITS[side] == 0] = INFINITE[side]
+        return field
+
     def _code_from_host(self, sides: tuple[Array, Array]) -> bool:
         """Code fields that are not stored yet; returns False, with nothing done, if their finite values differ or one is a NaN."""
         code, values = np.zeros(self.layout.stored_shape, dtype=np.uint8), list(self.values)
@@ -136,6 +146,10 @@ class Bounds:
     def _code_rows(self, side: int, host: np.ndarray, value: float, code: np.ndarray) -> bool:
         """Add a side's bits to a code on the host; returns False if there are other finite values."""
         target = self.layout.target(code, host)
+        if host.size <= LAUNCHED:
+            finite = host != INFINITE[side]
+            target += (BITS[side] * finite).astype(np.uint8).reshape(target.shape)
+            return not (finite & (host != value)).any()
         target = target if target.ndim == 3 else target.reshape(1, 1, -1)
         source = np.ascontiguousarray(host, dtype=np.float64).ravel()
         first = target.__array_interface__["data"][0] - code.__array_interface__["data"][0]

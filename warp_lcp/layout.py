@@ -5,6 +5,7 @@ A user's field has the operator's shape; a *stored* field is a flat array of `si
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -85,7 +86,7 @@ class Layout:
     @property
     def size(self) -> int:
         """Elements of a stored field."""
-        return int(np.prod(self.stored_shape))
+        return math.prod(self.stored_shape)
 
     def zeros(self, dtype: Any) -> wp.array[Any]:
         """Return a stored field of zeros."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.bounds import INFINITE, Bounds
+from warp_lcp.bounds import INFINITE, LAUNCHED, Bounds
 from warp_lcp.layout import Array, layout_of, real_array
 from warp_lcp.native import Spans
 from warp_lcp.pickling import OnHost, Pickled
@@ -115,11 +115,18 @@ class LCP(Pickled):
 
     def _faults(self, field: wp.array[Any], bounds: Bounds) -> list[int]:
         """Count values of a stored field that are not finite, NaN in l and in u, crossed bounds, l = inf, u = -inf."""
+        if self.device.is_cpu and self.layout.size <= LAUNCHED:
+            inside = self.unknown.numpy() == 1
+            b, lower, upper = field.numpy()[inside], bounds.host(0)[inside], bounds.host(1)[inside]
+            faults = (~np.isfinite(b), np.isnan(lower), np.isnan(upper), lower > upper, lower == np.inf, upper == -np.inf)
+            return self._totals(np.array([np.count_nonzero(fault) for fault in faults]))
         spans = Spans.of(self.layout.size, self.device)
         counts = wp.zeros((6, spans.threads), dtype=wp.float64, device=self.device)
         inputs = [field, *bounds.operands, self.unknown, spans.n, spans.chunk, spans.stride, spans.threads, counts.flatten()]
         wp.launch(check_kernel, spans.threads, inputs, device=self.device)
-        found = counts.numpy().sum(axis=1)
+        return self._totals(counts.numpy().sum(axis=1))
+
+    def _totals(self, found: np.ndarray) -> list[int]:
         return [int(n) for n in (found if self.layout.across is None else self.layout.across.sum(found))]
 
     def _check(self) -> None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 from warp_lcp.problem import LCP
 from warp_lcp.solve import Solver, solve
+from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.registry import METHODS
 from warp_lcp.stopping import StoppingCriteria
 from warp_lcp.traits import TRIAL, Traits, traits_of
@@ -189,6 +190,14 @@ RULES: tuple[Rule, ...] = (
         lambda t: t.kind == "operator",
         (4, 6, 8),
         ("primal-dual-active-set", "mprgp", "fischer-newton"),
+    ),
+    Rule(
+        "minimum-map-newton",
+        "A definite matrix of at most 200 unknowns, or of a bandwidth up to 3,",
+        "is solved directly on the host, for less than launches cost",
+        lambda t: t.direct and (t.definiteness == "definite" or (t.m_matrix and t.definiteness == "unknown")),
+        (1, 3, 9),
+        ("primal-dual-active-set", "lemke", "interior-point"),
     ),
     Rule(
         "blocked-gauss-seidel",
@@ -372,7 +381,9 @@ def _from_rule(rule: Rule, t: Traits, rtol: float) -> Recommendation:
         expected = f"about {math.ceil(sweeps)} sweeps, by the rate of the first {TRIAL}"
     reasons = (f"{rule.when} {rule.why}.", _portrait(t))
     stopping = StoppingCriteria(rtol=rtol, max_iterations=limit, patience=max(30, limit // 10))
-    return Recommendation(rule.method, METHODS[rule.method](), stopping, reasons, expected, _able(rule.alternatives, t), t)
+    direct = rule.method == "minimum-map-newton" and t.direct
+    method = MinimumMapNewton(direct=True) if direct else METHODS[rule.method]()
+    return Recommendation(rule.method, method, stopping, reasons, expected, _able(rule.alternatives, t), t)
 
 
 def _able(names: tuple[str, ...], t: Traits) -> tuple[str, ...]:

@@ -17,6 +17,7 @@ from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem import LCP
 from warp_lcp.solve import Solver, solve
 from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel
+from warp_lcp.solvers.minimum_map_newton_direct import suits
 from warp_lcp.solvers.psor import ProjectedSOR
 from warp_lcp.stopping import StoppingCriteria
 
@@ -42,6 +43,7 @@ class Traits:
             do not converge or are not possible.
         block_sweeps: the same of `BlockedGaussSeidel`; 1 or 2 where unknowns are coupled in small blocks alone.
         quiet: share of the unknowns with b_i = 0: of contacts at rest, most.
+        direct: whether the matrix is so small or narrow that its systems are solved directly on the host.
     """
 
     kind: str
@@ -55,6 +57,7 @@ class Traits:
     sweeps: float
     block_sweeps: float
     quiet: float = 0.0
+    direct: bool = False
 
 
 def traits_of(problem: LCP, accuracy: float) -> Traits:
@@ -82,7 +85,8 @@ def traits_of(problem: LCP, accuracy: float) -> Traits:
     b = np.abs(problem.b.numpy().ravel()[problem.unknown.numpy().ravel() == 1])
     quiet = float((b <= 1e-9 * b.max()).mean())
     trials = [sweeps_to(problem, accuracy, method) for method in (ProjectedSOR(), BlockedGaussSeidel())]
-    return Traits(kind, unknowns, entries, A.symmetric, sign, m_matrix, definiteness, bounds_of(problem), trials[0], trials[1], quiet)
+    known = (kind, unknowns, entries, A.symmetric, sign, m_matrix, definiteness)
+    return Traits(*known, bounds_of(problem), trials[0], trials[1], quiet, suits(A))
 
 
 def bounds_of(problem: LCP) -> str:

@@ -79,6 +79,14 @@ class SparseOperator(Pickled):
         """Number of stored entries."""
         return int(self.values.size)
 
+    @cached_property
+    def bandwidth(self) -> int:
+        """How far from the diagonal the farthest entry is."""
+        first, last = self._indptr[:-1], self._indptr[1:] - 1
+        rows = np.flatnonzero(last >= first)  # columns ascend in each row
+        ends = np.stack([self._indices[first[rows]], self._indices[last[rows]]])
+        return int(np.abs(ends - rows).max(initial=0))
+
     def matrix(self) -> scipy.sparse.csr_array:
         """Return A as it is now, on the host, in float64."""
         return self._matrix_of(self.values.numpy())
@@ -203,8 +211,8 @@ class SparseOperator(Pickled):
 
     def _take(self, host: scipy.sparse.csr_array) -> None:
         """Derive what follows from the entries."""
-        self.symmetric = _is_symmetric(host)
-        largest = abs(host).max(axis=1).toarray().ravel()
+        largest = _largest(host)
+        self.symmetric = _is_symmetric(host, largest)
         check_kept(largest, self.dtype, "matrix, the largest entries of its rows")
         self.row_sizes = None if largest.all() else wp.array(largest, dtype=wp.float64, device=self.device)
         self._diagonal.assign(host.diagonal().astype(wp.dtype_to_numpy(self.dtype)))
@@ -256,14 +264,23 @@ def _ones(indptr: np.ndarray, indices: np.ndarray) -> scipy.sparse.csr_array:
     return scipy.sparse.csr_array((np.ones(len(indices), dtype=np.float32), indices, indptr), shape=(n, n))
 
 
-def _is_symmetric(host: scipy.sparse.csr_array) -> bool:
+def _largest(host: scipy.sparse.csr_array) -> np.ndarray:
+    """Return the largest magnitude of each row."""
+    largest, filled = np.zeros(host.shape[0]), np.diff(host.indptr) > 0
+    if host.nnz:
+        largest[filled] = np.maximum.reduceat(np.abs(host.data), host.indptr[:-1][filled])
+    return largest
+
+
+def _is_symmetric(host: scipy.sparse.csr_array, largest: np.ndarray) -> bool:
     """Return whether |a_ij - a_ji| is rounding of the smaller one of the largest entries of rows i and j, for all i, j."""
-    difference = (host - host.T).tocoo()
-    if difference.nnz == 0:
-        return True
-    n = host.shape[0]
-    largest = np.zeros(n)
-    np.maximum.at(largest, np.repeat(np.arange(n), np.diff(host.indptr)), np.abs(host.data))
+    turned = host.T.tocsr()
+    if np.array_equal(turned.indptr, host.indptr) and np.array_equal(turned.indices, host.indices):
+        if np.array_equal(turned.data, host.data):
+            return True
+        largest_here = np.repeat(largest, np.diff(host.indptr))
+        return bool((np.abs(turned.data - host.data) <= SYMMETRIC * np.minimum(largest_here, largest[host.indices])).all())
+    difference = (host - turned).tocoo()
     return bool((np.abs(difference.data) <= SYMMETRIC * np.minimum(largest[difference.row], largest[difference.col])).all())
 
 

@@ -12,6 +12,7 @@ from warp_lcp.result import Record, SolveResult
 from warp_lcp.solve import Solver, Workspace
 from warp_lcp.solve import solve as solve_by
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
+from warp_lcp.solvers.minimum_map_newton_direct import suits
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 from warp_lcp.solvers.psor import ProjectedSOR
 from warp_lcp.stopping import StoppingCriteria
@@ -20,11 +21,12 @@ from warp_lcp.stopping import StoppingCriteria
 def default_method(problem: LCP) -> Solver:
     """Return the fastest method measured for the problem's operator: ProjectedMultigrid on grids, MinimumMapNewton on others.
 
-    Where bounds are affine in x, a method that takes them: ProjectedSOR.
+    Its systems are solved directly on the host, on CUDA devices too, where a matrix has at most 200 unknowns or a bandwidth up to 3. Where
+    bounds are affine in x, a method that takes them: ProjectedSOR.
     """
     if problem.bounds.affine is not None:
         return ProjectedSOR()
-    return ProjectedMultigrid() if isinstance(problem.A, GridPoisson) else MinimumMapNewton()
+    return ProjectedMultigrid() if isinstance(problem.A, GridPoisson) else MinimumMapNewton(direct=suits(problem.A))
 
 
 def solve(

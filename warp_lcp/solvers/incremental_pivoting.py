@@ -17,6 +17,8 @@ from warp_lcp.solvers.principal_inverse import PrincipalInverse
 
 EPS = float(np.finfo(np.float64).eps)
 ZERO = 1e-11  # a rate below this part of the terms that it is a sum of is rounding: nothing changes there
+CLEAR = 1e-8  # of the largest sum that a row's terms can make: a y beyond it is no rounding, whatever x has gone through
+CORRECTED = 32  # rows driven after which y is computed afresh
 RESTARTS = 3  # times that the last check may send rows back that rounding has undone
 OPEN, FREE, LOW, HIGH = 0, 1, 2, 3  # not held yet; y = 0; x = l and y >= 0; x = u and y <= 0
 
@@ -82,7 +84,7 @@ class PivotingWorkspace(DenseWorkspace):
         self.kind = np.zeros(n, dtype=np.int8)
         self.inverse = PrincipalInverse(self.data.A)
         self.driven, self.sign, self.idle, self.restarts = -1, 0.0, 0, 0
-        self.magnitude = np.abs(self.data.A)
+        self.sizes, self._chosen = np.abs(self.data.A).max(axis=1), 0
         self.y = self.data.affine(self.values)
 
     @property
@@ -102,17 +104,23 @@ class PivotingWorkspace(DenseWorkspace):
         self.write_iterate(self.values)
         return done
 
-    def _violation(self) -> np.ndarray:
-        """Return |y| of the rows that do not hold, 0 of the others, whatever their kind."""
+    def _violation(self, *, surely: bool = False) -> np.ndarray:
+        """Return |y| of the rows that do not hold, 0 of the others, whatever their kind; `surely`: beyond doubt, at no product's cost."""
         x, y, data = self.values, self.y, self.data
         wrong = np.where(y < 0, x < data.upper, x > data.lower)
-        noise = 8 * EPS * (self.magnitude @ np.abs(x) + np.abs(data.b))
+        if surely:
+            noise = CLEAR * (self.sizes * np.abs(x).sum() + np.abs(data.b))
+        else:
+            noise = 8 * EPS * (np.abs(data.A) @ np.abs(x) + np.abs(data.b))
         return np.where(wrong & (np.abs(y) > noise), np.abs(y), 0.0)
 
     def _choose(self) -> bool:
         """Take the worst open row as the one to drive; False if all hold."""
-        self._correct()
-        violation = np.where(self.kind == OPEN, self._violation(), 0.0)
+        self._chosen += 1
+        violation = np.where(self.kind == OPEN, self._violation(surely=True), 0.0)
+        if self._chosen % CORRECTED == 0 or not violation.any():
+            self._correct()
+            violation = np.where(self.kind == OPEN, self._violation(), 0.0)
         j = int(violation.argmax())
         if violation[j] == 0:
             return False
@@ -133,11 +141,10 @@ class PivotingWorkspace(DenseWorkspace):
         """Move along the direction of the driven row to the first thing that blocks, and let that change sides."""
         j, F, data = self.driven, self.inverse.members, self.data
         dx = np.zeros(len(data.b))
-        dx[F] = -self.sign * self.inverse.solve(data.A[F, j])
-        dx[j] = self.sign
-        dy = data.A @ dx
+        z, dy = self.inverse.direction(j)
+        dx[F], dx[j], dy = self.sign * z, self.sign, self.sign * dy
         dy[F] = 0.0
-        noise = ZERO * (self.magnitude @ np.abs(dx))
+        noise = self._noise(dx, dy)
         rate = self.sign * dy[j]
         if rate < -1e3 * noise[j]:
             self.ended = SolveStatus.NON_DESCENT  # negative curvature: A, changed since init, is not positive semi-definite
@@ -156,6 +163,17 @@ class PivotingWorkspace(DenseWorkspace):
         self.y += length * dy
         self.y[F] = 0.0
         self._exchange(q, dx[q])
+
+    def _noise(self, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
+        """Return below which part of the terms that it is a sum of a rate is rounding; larger where the rate is beyond any doubt."""
+        size = np.abs(dx)
+        noise = ZERO * self.sizes * size.sum()  # no sum of its terms is larger
+        doubtful = ((self.kind == LOW) & (dy < 0)) | ((self.kind == HIGH) & (dy > 0))
+        doubtful &= np.abs(dy) <= noise
+        doubtful[self.driven] = True
+        rows = np.flatnonzero(doubtful)
+        noise[rows] = ZERO * (np.abs(self.data.A[rows]) @ size)
+        return noise
 
     def _steps(self, dx: np.ndarray, dy: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return how far each row lets the driven one go ([Book] eqs. 2.26-2.27)."""

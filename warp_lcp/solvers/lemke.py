@@ -6,13 +6,16 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
+import scipy.sparse
 import warp as wp
+from scipy.linalg.blas import dger
 
 from warp_lcp.deadline import time_is_up
 from warp_lcp.problem import LCP
 from warp_lcp.result import SolveStatus
 from warp_lcp.solve import Step
-from warp_lcp.solvers.dense_problem import DenseWorkspace, check_size, inconsistent, pivots_of, semidefinite
+from warp_lcp.solvers.dense_problem import DenseProblem, DenseWorkspace, check_size, inconsistent, pivots_of, semidefinite
+from warp_lcp.solvers.lemke_banded import BandedFactors, narrow_problem
 from warp_lcp.solvers.lemke_form import LemkeForm
 
 EPS = float(np.finfo(np.float64).eps)
@@ -85,13 +88,17 @@ class Basis:
     """
 
     def __init__(self, M: np.ndarray, q: np.ndarray, d: np.ndarray) -> None:
+        self._start(M, q, d)
+        m = self.m
+        self.matrix: np.ndarray = np.eye(m)
+        self.inverse: np.ndarray = np.asfortranarray(np.eye(m))
+        self.age = 0
+
+    def _start(self, M: Any, q: np.ndarray, d: np.ndarray) -> None:
+        """Take the data; w is basic."""
         m = len(q)
         self.M, self.q, self.d, self.m = M, q, d, m
-        self.variables = np.arange(m)
-        self.matrix: np.ndarray = np.eye(m)
-        self.inverse: np.ndarray = np.eye(m)
-        self._scratch = np.empty((m, m))
-        self.values, self.age = q.copy(), 0
+        self.variables, self.values = np.arange(m), q.copy()
         # the lexicographic minimum of (q_i, e_i) / d_i leaves: of equal ratios the last, whose row has the later 1
         ratios = q / d
         self.row = int(np.flatnonzero(ratios <= ratios.min() + TIE * abs(ratios.min()))[-1])
@@ -123,10 +130,13 @@ class Basis:
         """Compute the inverse afresh, O(m^3)."""
         self.age = 0
         try:
-            self.inverse = np.linalg.inv(self.matrix)
+            self.inverse = np.asfortranarray(np.linalg.inv(self.matrix))
         except np.linalg.LinAlgError:
-            self.inverse = np.linalg.pinv(self.matrix)
+            self.inverse = np.asfortranarray(np.linalg.pinv(self.matrix))
         self.values = self._solve(self.q)
+
+    def _rows_of_inverse(self, rows: np.ndarray) -> np.ndarray:
+        return self.inverse[rows]
 
     def _column(self) -> np.ndarray:
         """Return the entering variable's column."""
@@ -159,11 +169,13 @@ class Basis:
         rows = rows[ratios <= ratios.min() + TIE * max(ratios.min(), np.abs(self.q).max())]
         if (self.variables[rows] == 2 * self.m).any():
             return int(rows[self.variables[rows] == 2 * self.m][0])
+        inverse = self._rows_of_inverse(rows) if len(rows) > 1 else None
         for column in range(self.m):
-            if len(rows) == 1:
+            if inverse is None or len(rows) == 1:
                 break
-            ratios = self.inverse[rows, column] / direction[rows]
-            rows = rows[ratios <= ratios.min() + TIE * np.abs(ratios).max()]
+            ratios = inverse[:, column] / direction[rows]
+            least = ratios <= ratios.min() + TIE * np.abs(ratios).max()
+            rows, inverse = rows[least], inverse[least]
         return int(rows[direction[rows].argmax()])
 
     def _replace(self, direction: np.ndarray) -> None:
@@ -172,11 +184,47 @@ class Basis:
         self.matrix[:, row] = self._column()
         self.inverse[row] /= direction[row]
         others[row] = 0.0
-        np.multiply(others[:, None], self.inverse[row], out=self._scratch)
-        self.inverse -= self._scratch
+        dger(-1.0, others, self.inverse[row].copy(), a=self.inverse, overwrite_a=True)
         self.variables[row] = self.entering
         self.age += 1
         self.values = self._solve(self.q)
+
+
+class BandedBasis(Basis):
+    """The same basis of a sparse M of small bandwidth, its variables in the order of their pairs, factored at each pivot."""
+
+    def __init__(self, M: Any, q: np.ndarray, d: np.ndarray) -> None:
+        self._start(M, q, d)
+        self.factors = BandedFactors(M, d)
+        self.missing, self.regular = -1, True  # the pair both of whose variables are out, once z0 is in
+
+    def refresh(self) -> None:
+        """The factors are fresh."""
+
+    def _rows_of_inverse(self, rows: np.ndarray) -> np.ndarray:
+        return self.factors.rows(rows) if self.missing >= 0 else np.eye(self.m)[rows]
+
+    def _column(self) -> np.ndarray:
+        z = self.m <= self.entering < 2 * self.m
+        return self.factors.column(self.entering - self.m) if z else super()._column()
+
+    def _direction(self) -> np.ndarray:
+        return self._column() if self.missing < 0 else self.factors.solve(self._column())
+
+    def _replace(self, direction: np.ndarray) -> None:
+        """Let the entering variable stand at its own pair, z0 at the pair of the leaving one."""
+        ended = self.variables[self.row] == 2 * self.m
+        if self.missing >= 0:
+            self.variables[self.missing] = self.entering
+        if ended:
+            step = max(self.values[self.row], 0.0) / direction[self.row]
+            self.values -= step * direction
+            self.values[self.row] = step
+            return
+        self.variables[self.row], self.missing = 2 * self.m, self.row
+        self.regular = self.factors.factor(self.variables >= self.m, self.row)
+        if self.regular:
+            self.values = self.factors.solve(self.q)
 
 
 class LemkeWorkspace(DenseWorkspace):
@@ -189,11 +237,24 @@ class LemkeWorkspace(DenseWorkspace):
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Begin at z = 0 with the covering vector of ones."""
         super().start(warm=warm, tolerance=tolerance)
+        self.rays, self._random = 0, np.random.default_rng(5381)
+        self._take()
+
+    def read(self) -> DenseProblem:
+        """Copy the problem to the host; a narrow one stays sparse."""
+        return narrow_problem(self.problem) or super().read()
+
+    def _widen(self) -> None:
+        """Begin again with a dense inverse: the banded factors are singular, which the basis need not be."""
+        self.data = super().read()
+        self._take()
+
+    def _take(self) -> None:
+        """Scale the problem, and begin at z = 0 with the covering vector of ones."""
         scaled, self.units = self.data.scaled()
         self.form = LemkeForm.of(scaled)
-        self.rays, self._random = 0, np.random.default_rng(5381)
         m = len(self.form.q)
-        self._sizes = (float(np.abs(self.form.M).max(initial=0.0)) or 1.0, float(np.abs(self.form.q).max(initial=0.0)) or 1.0)
+        self._sizes = (float(abs(self.form.M).max() if m else 0.0) or 1.0, float(np.abs(self.form.q).max(initial=0.0)) or 1.0)
         self._cover(np.ones(m))
 
     @property
@@ -211,7 +272,9 @@ class LemkeWorkspace(DenseWorkspace):
         while done < count and self.ended is None and not time_is_up():
             outcome = self.basis.pivot()
             done += outcome is not False
-            if outcome is True:
+            if isinstance(self.basis, BandedBasis) and not self.basis.regular:
+                self._widen()
+            elif outcome is True:
                 self.basis.refresh()
                 self._finish(self._scaled())
             elif outcome is False:
@@ -227,14 +290,16 @@ class LemkeWorkspace(DenseWorkspace):
     def _cover(self, d: np.ndarray) -> None:
         """Start with a covering vector, M and q scaled to 1; no basis is needed where z = 0 is the solution."""
         M, q = self.form.M / self._sizes[0], self.form.q / self._sizes[1]
-        self.basis = Basis(M, q, d) if (q < 0).any() else None
+        made = BandedBasis if scipy.sparse.issparse(M) else Basis
+        self.basis: Basis | None = made(M, q, d) if (q < 0).any() else None
 
     def _finish(self, z: np.ndarray) -> None:
         """Write the solution, polished where x is between its bounds; one that is none is a ray in truth: a pivot was noise."""
         data = self.data
         x = np.clip(self.units * self.form.solution(z), data.lower, data.upper)
         size = 16 * EPS * self.units * np.abs(x / self.units).max()
-        x = data.polished(x, (x - data.lower > size) & (data.upper - x > size))
+        if not isinstance(self.basis, BandedBasis):  # whose factors are fresh
+            x = data.polished(x, (x - data.lower > size) & (data.upper - x > size))
         if self.basis is not None and not data.residual(x) <= NOISE * data.residual(np.clip(0.0, data.lower, data.upper)):
             self._ray()
             return
@@ -251,4 +316,5 @@ class LemkeWorkspace(DenseWorkspace):
 
     def _has_none(self) -> bool:
         """Return whether there is surely no solution: the ray proves it if A is positive semi-definite, a linear program else."""
-        return semidefinite(self.data.A) or inconsistent(self.data)
+        A = self.data.A
+        return semidefinite(A.toarray() if scipy.sparse.issparse(A) else A) or inconsistent(self.data)

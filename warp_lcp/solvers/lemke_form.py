@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import scipy.sparse
 
 from warp_lcp.solvers.dense_problem import DenseProblem
 
@@ -22,20 +24,22 @@ class LemkeForm:
       with M = [[A, -A], [-A, A]], positive semi-definite if A is.
 
     Attributes:
-        M: shape (m, m).
+        M: shape (m, m); sparse, like `map`, where the problem is.
         q: shape (m,).
         base: x at z = 0, shape (n,).
         map: x = base + map z, shape (n, m).
     """
 
-    M: np.ndarray
+    M: Any
     q: np.ndarray
     base: np.ndarray
-    map: np.ndarray
+    map: Any
 
     @classmethod
     def of(cls, data: DenseProblem) -> LemkeForm:
         """Reformulate a boxed problem."""
+        if scipy.sparse.issparse(data.A):
+            return cls._of_one_sided(data)
         A, lower, upper, n = data.A, data.lower, data.upper, len(data.b)
         fixed = lower == upper
         below, above = np.isfinite(lower) & ~fixed, np.isfinite(upper) & ~fixed
@@ -46,7 +50,9 @@ class LemkeForm:
         # columns: what z does to x; the rows of y are combined likewise
         columns = np.zeros((n, len(sided)))
         columns[sided, np.arange(len(sided))] = sign
-        if len(equations):
+        if len(sided) == n:
+            M, q = sign[:, None] * A * sign, sign * (A @ base + data.b)
+        elif len(equations):
             block = A[np.ix_(equations, equations)]
             if 1 / np.linalg.cond(block) > REGULAR:
                 base[equations] = 0.0
@@ -71,6 +77,18 @@ class LemkeForm:
             columns = np.hstack([columns, np.zeros((n, k))])
         return cls(M, q, base, columns)
 
+    @classmethod
+    def _of_one_sided(cls, data: DenseProblem) -> LemkeForm:
+        """Reformulate a sparse problem all of whose rows are one-sided."""
+        below = np.isfinite(data.lower)
+        S, base = scipy.sparse.diags_array(np.where(below, 1.0, -1.0)), np.where(below, data.lower, data.upper)
+        return cls((S @ data.A @ S).tocsr(), S @ data.affine(base), base, S)
+
     def solution(self, z: np.ndarray) -> np.ndarray:
         """Return x."""
         return self.base + self.map @ z
+
+
+def one_sided(data: DenseProblem) -> np.ndarray:
+    """Return which rows have one finite bound, shape (n,)."""
+    return np.isfinite(data.lower) != np.isfinite(data.upper)

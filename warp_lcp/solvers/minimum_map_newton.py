@@ -18,6 +18,7 @@ from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
 from warp_lcp.solve import FLOOR_MARGIN, IterateInPlace, Precision, RoundedIterate, Step
+from warp_lcp.solvers.minimum_map_newton_direct import DirectNewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_kernels import all_free_kernel, kernels
 from warp_lcp.solvers.principal_system import DenseSystem, GridSystem, PrincipalSystem, principal_system
@@ -52,6 +53,8 @@ class MinimumMapNewton:
         backtracks: halvings of a step before it is given up.
         memory: residuals that a step may fall back to.
         cycle: how multigrid cycles go.
+        direct: begin with whole steps that LAPACK solves on the host, for matrices of at most 200 unknowns or a bandwidth up to 3: what
+            `default_method` chooses there. The steps above take over where these lead nowhere.
 
     Raises:
         ValueError: an argument is outside its range.
@@ -68,6 +71,7 @@ class MinimumMapNewton:
     backtracks: int = 6
     memory: int = 4
     cycle: CycleSettings = field(default_factory=CycleSettings)
+    direct: bool = False
 
     def __post_init__(self) -> None:
         """Check the settings."""
@@ -78,16 +82,20 @@ class MinimumMapNewton:
             if getattr(self, name) < least:
                 raise ValueError(f"{name} = {getattr(self, name)}: must be >= {least}")
 
-    def init(self, problem: LCP) -> NewtonWorkspace | GridNewtonWorkspace:
+    def init(self, problem: LCP) -> NewtonWorkspace | GridNewtonWorkspace | DirectNewtonWorkspace:
         """Return a workspace.
 
         Raises:
-            ValueError: A is neither a grid operator, dense nor symmetric.
+            ValueError: A is neither a grid operator, dense nor symmetric; or `direct`, and A is neither small nor narrow.
         """
+        if self.direct:
+            return DirectNewtonWorkspace(problem, self)
         return GridNewtonWorkspace(problem, problem.A, self) if isinstance(problem.A, GridPoisson) else NewtonWorkspace(problem, self)
 
     def step(self, problem: LCP, work: Any, x: wp.array[Any]) -> Step:
         """Take a monotone cycle while the start is cold, else a safeguarded Newton step."""
+        if isinstance(work, DirectNewtonWorkspace):
+            return work.step(x)
         if isinstance(work, GridNewtonWorkspace):
             return work.monotone_step() if work.wants_monotone_cycle() else work.newton_step()
         if work.cycles_left > 0:

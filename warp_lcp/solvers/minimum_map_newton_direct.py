@@ -1,0 +1,332 @@
+"""Newton's method on the minimum map where the host solves directly: small and narrow problems, whole steps, no kernel launches."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.linalg
+import warp as wp
+
+from warp_lcp.operators.dense import DenseOperator
+from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.problem import LCP
+from warp_lcp.residual import NaturalResidual
+from warp_lcp.solve import Precision, RoundedIterate, Step
+
+if TYPE_CHECKING:
+    from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
+
+MOST, WIDEST = 200, 3  # unknowns, or bandwidth whatever their number, up to which LAPACK on the host costs less than launches
+FEW = 30  # unknowns up to which dense factors cost no more than banded ones, whatever the bandwidth
+SINGULAR = 1e-13  # of the matrix's largest row sum: a pivot below it is rounding, the free block singular
+IDLE = 30  # steps without a smaller residual, the loop's patience, after which safeguarded steps take over
+PAUSE = 4  # steps without reaching out after a set has come again, doubled each time
+
+
+class SmallMatrix:
+    """A dense copy of at most `MOST` unknowns on the host, float64; of a dense operator on the CPU the operator's own memory."""
+
+    width = 0  # how far unknowns are coupled; 0: no order of the unknowns is known to matter
+
+    def __init__(self, A: DenseOperator | SparseOperator) -> None:
+        self._A = A
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Take the entries as they are now."""
+        A = self._A
+        host = A.matrix().toarray() if isinstance(A, SparseOperator) else A.matrix.numpy().astype(np.float64, copy=False)
+        self._host, self.diagonal = host, host.diagonal()
+
+    def product(self, x: np.ndarray) -> np.ndarray:
+        """Return A x."""
+        return self._host @ x
+
+    def solve(self, free: np.ndarray, r: np.ndarray) -> np.ndarray | None:
+        """Return e with A_FF e_F = r_F and 0 elsewhere, None where A_FF looks singular."""
+        rows = free.nonzero()[0]
+        if not len(rows):
+            return np.zeros(len(r))
+        block = self._host if len(rows) == len(r) else self._host[rows[:, None], rows]
+        factors, pivots, info = scipy.linalg.lapack.dgetrf(block)
+        if info != 0 or _singular(factors.diagonal(), np.abs(block).sum(axis=1).max()):
+            return None
+        e = np.zeros(len(r))
+        e[rows] = scipy.linalg.lapack.dgetrs(factors, pivots, r[rows])[0]
+        return e
+
+
+class BandedMatrix:
+    """The diagonals of a matrix of bandwidth at most `WIDEST` on the host, float64.
+
+    Args:
+        A: dense or sparse.
+        width: diagonals on either side.
+    """
+
+    def __init__(self, A: DenseOperator | SparseOperator, width: int) -> None:
+        self._A, self.width, self._version = A, width, -1
+        self._bands = np.zeros((2 * width + 1, A.unknowns))  # a_ij at (width + i - j, j), as LAPACK has it
+        if isinstance(A, SparseOperator):
+            self._columns = A.indices.numpy()
+            self._at = width + np.repeat(np.arange(A.unknowns), np.diff(A.indptr.numpy())) - self._columns
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Take the entries as they are now."""
+        A, k, n = self._A, self.width, self._A.unknowns
+        if isinstance(A, SparseOperator):
+            if self._version == A.version:
+                return
+            self._version = A.version
+            self._bands[self._at, self._columns] = A.values.numpy()
+        else:
+            host = A.matrix.numpy()
+            for o in range(-k, k + 1):
+                self._bands[k - o, max(o, 0) : n + min(o, 0)] = host.diagonal(o)
+        self.diagonal = self._bands[k].copy()
+        self._by_columns = np.asfortranarray(self._bands)
+        sizes = np.abs(self._bands).sum(axis=0)
+        self._size, self._own = sizes.max(), np.where(sizes > 0, sizes, 1.0)
+
+    def product(self, x: np.ndarray) -> np.ndarray:
+        """Return A x."""
+        n, k = len(x), self.width
+        return scipy.linalg.blas.dgbmv(n, n, k, k, 1.0, self._by_columns, x)
+
+    def solve(self, free: np.ndarray, r: np.ndarray) -> np.ndarray | None:
+        """Return e with A_FF e_F = r_F and 0 elsewhere, None where A_FF looks singular; held rows and columns keep their diagonal."""
+        k, n, masked = self.width, len(r), self._bands * free
+        for o in range(-k, k + 1):
+            masked[k - o, max(o, 0) : n + min(o, 0)] *= free[max(-o, 0) : n - max(o, 0)]
+        masked[k] += ~free * self._own
+        right = np.where(free, r, 0.0)
+        if k == 0:
+            pivots, info = masked[0], 0
+            e = right / np.where(pivots == 0, 1.0, pivots)
+        elif k == 1:
+            _, pivots, _, e, info = scipy.linalg.lapack.dgtsv(masked[2, :-1], masked[1], masked[0, 1:], right)
+        else:
+            factors, _, e, info = scipy.linalg.lapack.dgbsv(k, k, np.vstack([np.zeros((k, n)), masked]), right)
+            pivots = factors[2 * k]
+        return None if info != 0 or _singular(pivots, self._size) else e
+
+
+def _singular(pivots: np.ndarray, size: float) -> bool:
+    return bool(np.abs(pivots).min() <= SINGULAR * size)
+
+
+def suits(A: Any) -> bool:
+    """Return whether an operator's systems are solved directly on the host: a matrix that is small or narrow."""
+    return isinstance(A, (DenseOperator, SparseOperator)) and A.layout.across is None and (A.unknowns <= MOST or bandwidth(A) <= WIDEST)
+
+
+def bandwidth(A: DenseOperator | SparseOperator) -> int:
+    """Return how far from the diagonal the farthest entry is."""
+    if isinstance(A, SparseOperator):
+        return A.bandwidth
+    return max(scipy.linalg.bandwidth(A.matrix.numpy()))
+
+
+class HostResidual(NaturalResidual):
+    """The natural residual of a problem on the CPU, by NumPy: a launch costs more than a small problem's product.
+
+    Args:
+        problem: on the CPU, its fields stored as they are.
+        matrix: its A.
+    """
+
+    def __init__(self, problem: LCP, matrix: SmallMatrix | BandedMatrix) -> None:
+        self.problem, self.matrix = problem, matrix
+        self.norm, self.current, self.unit = 0.0, False, 1.0
+        self._y = np.zeros(problem.layout.size)
+        self._field: wp.array[Any] | None = None
+
+    @cached_property
+    def diagonal(self) -> wp.array[Any]:
+        """The operator's, for what goes on by kernels."""
+        return self.problem.layout.load(self.problem.A.diagonal(), self.problem.A.dtype)
+
+    @cached_property
+    def y(self) -> wp.array[Any]:
+        """What `evaluate` computes y in, likewise."""
+        return wp.array(self._y, dtype=wp.float64, device=self.problem.device, copy=False)
+
+    def start(self, x: wp.array[Any], *, keep: bool) -> None:
+        """Set x to clip(x, l, u), or to clip(0, l, u)."""
+        self.matrix.refresh()
+        bounds, d = self.problem.bounds, np.abs(self.matrix.diagonal)
+        self.lower, self.upper, self.b = bounds.host(0), bounds.host(1), self.problem.b.numpy()
+        self.scale = d if d.all() else np.where(d == 0, 1.0, d)
+        values = self.values(x)
+        np.clip(values if keep else 0.0, self.lower, self.upper, out=values)
+        self.current = False
+
+    def evaluate(self, x: wp.array[Any]) -> float:
+        """Compute y and return the norm of the natural residual at x."""
+        values, y, d = self.values(x), self._y, self.scale
+        np.add(self.matrix.product(values), self.b, out=y)
+        with np.errstate(invalid="ignore", over="ignore"):
+            r = np.maximum(np.minimum(y, d * (values - self.lower)), d * (values - self.upper))
+            self.norm, self.current = math.sqrt(r @ r), True
+        return self.norm
+
+    def values(self, x: wp.array[Any]) -> np.ndarray:
+        """Return x's memory; a view takes a tenth of a small solve each time it is made."""
+        if x is not self._field:
+            self._field, self._values = x, x.numpy()
+        return self._values
+
+    def host_y(self) -> np.ndarray:
+        """Return y's memory."""
+        return self._y
+
+    def norm_of_b(self) -> float:
+        """Return ||b||."""
+        return math.sqrt(self.b @ self.b)
+
+
+class DirectNewtonWorkspace(RoundedIterate):
+    """Whole Newton steps solved by LAPACK on the host, then the safeguarded ones where these lead nowhere.
+
+    On an M-matrix whole steps end at the solution, but the contact set may shrink by a layer a step. Where a narrow problem's set has
+    shrunk and not grown for some steps in a row, releases reach out by 1, 3, 7, ... unknowns; what is let go too early comes back at
+    once. A set that comes again, a singular block, or `IDLE` steps without gain: MinimumMapNewton's own steps go on from the best
+    iterate.
+
+    Attributes:
+        rest: their memory, once they do.
+    """
+
+    rest: NewtonWorkspace | None = None
+
+    def __init__(self, problem: LCP, settings: MinimumMapNewton) -> None:
+        A: Any = problem.A
+        if not suits(A):
+            raise ValueError(f"A: direct = True is for dense and sparse matrices of at most {MOST} unknowns or a bandwidth up to {WIDEST}")
+        self.problem, self.settings, self.precision = problem, settings, Precision(settings.precision)
+        width = bandwidth(A) if A.unknowns > FEW else WIDEST + 1
+        self.matrix: SmallMatrix | BandedMatrix = BandedMatrix(A, width) if width <= WIDEST else SmallMatrix(A)
+        self.x = problem.layout.zeros(wp.float64)
+        on_host = problem.device.is_cpu and problem.bounds.affine is None
+        self.residual: NaturalResidual = HostResidual(problem, self.matrix) if on_host else NaturalResidual(problem)
+        self._rounded = problem.layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
+        self.floating: Any = None
+
+    def keep(self) -> None:
+        """Remember x, on the host."""
+        self._kept = self._read(self.x).copy()
+
+    def restore(self) -> None:
+        """Take x back."""
+        self._write(self.x, self._kept)
+
+    def start(self, *, warm: bool, tolerance: float) -> None:
+        """Forget the sets."""
+        self._warm, self._target, self.rest = warm, tolerance, None
+        residual, bounds, self._b = self.residual, self.problem.bounds, self.problem.b.numpy()
+        if isinstance(residual, HostResidual):
+            self._d, self._lower, self._upper = residual.scale, residual.lower, residual.upper
+        else:
+            self.matrix.refresh()
+            self._lower, self._upper = bounds.host(0), bounds.host(1)
+            self._d = np.where(self.matrix.diagonal == 0, 1.0, np.abs(self.matrix.diagonal))
+        self._seen: set[bytes] = set()
+        self._held: tuple[np.ndarray, np.ndarray] | None = None
+        self._reach, self._plain, self._pause = 0, 0, PAUSE
+        self._least, self._idle = math.inf, 0
+
+    def step(self, x: wp.array[Any]) -> Step:
+        """Take a whole step, or one of the safeguarded ones."""
+        if self.rest is None:
+            taken = self._whole_step(x)
+            if taken is not None:
+                return taken
+            self._hand_over(x)
+        step: Step = self.settings.step(self.problem, self.rest, x)
+        self._grace -= 1
+        return replace(step, interim=step.interim or self._grace >= 0)
+
+    def _hand_over(self, x: wp.array[Any]) -> None:
+        """Let safeguarded steps go on from the best iterate."""
+        from warp_lcp.solvers.minimum_map_newton import NewtonWorkspace
+
+        self.restore()
+        self._grace = IDLE
+        self.residual.evaluate(x)
+        self.residual.current = False
+        self.rest = NewtonWorkspace(self.problem, self.settings)
+        self.rest.x, self.rest.residual, self.rest.floating = self.x, self.residual, self.floating
+        self.rest.start(warm=self._warm, tolerance=self._target)
+
+    def _whole_step(self, x: wp.array[Any]) -> Step | None:
+        """Classify, solve on the free set, take the whole step; None where that leads nowhere."""
+        residual, start = self.residual, self._read(x)
+        if self._held is not None:  # the start's residual says nothing of the steps to come
+            self._least, self._idle = (residual.norm, 0) if residual.norm < self._least else (self._least, self._idle + 1)
+        below, above = self._classify(start, residual.host_y() if isinstance(residual, HostResidual) else residual.y.numpy())
+        if self._idle >= IDLE or self._comes_again(below, above):
+            return None
+        held = below | above
+        moved = np.where(below, self._lower, np.where(above, self._upper, start))
+        e = self.matrix.solve(~held, -(self.matrix.product(moved) + self._b))
+        if e is None or not np.isfinite(e).all():
+            return None
+        moved += e
+        self._write(x, moved)
+        if residual.evaluate(x) <= self._target:  # x may miss its bounds by what the criteria allow
+            self._write(x, np.clip(moved, self._lower, self._upper))
+            residual.current = False
+        self._round(x)
+        residual.current = residual.current and self._rounded is None
+        return Step("active set", 1, int(np.count_nonzero(held)), interim=True)
+
+    def _read(self, x: wp.array[Any]) -> np.ndarray:
+        residual = self.residual
+        return residual.values(x) if isinstance(residual, HostResidual) else x.numpy()
+
+    def _write(self, x: wp.array[Any], values: np.ndarray) -> None:
+        if self.problem.device.is_cpu:
+            self._read(x)[...] = values
+        else:
+            x.assign(values)
+
+    def _classify(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return which unknowns are held at l and which at u."""
+        target = x - y / self._d
+        below, above = target < self._lower, target > self._upper
+        last, self._held = self._held, (below, above)
+        if self.matrix.width and last is not None:
+            released = (last[0] & ~below) | (last[1] & ~above)
+            shrinks = released.any() and not ((below & ~last[0]) | (above & ~last[1])).any()
+            self._plain -= 1
+            if shrinks and self._plain < 0:
+                spread = _spread(released, self._reach * self.matrix.width)
+                below, above = below & ~spread, above & ~spread
+                self._held = below, above
+            self._reach = 2 * self._reach + 1 if shrinks and self._plain < 0 else 0
+        return below, above
+
+    def _comes_again(self, below: np.ndarray, above: np.ndarray) -> bool:
+        """Return whether a set has come again; the first times that stops reaching out for some steps instead."""
+        key = below.tobytes() + above.tobytes()
+        if key in self._seen:
+            if self._plain >= 0 or not self.matrix.width or self._pause > len(below):
+                return True
+            self._seen.clear()
+            self._reach, self._plain, self._pause = 0, self._pause, 2 * self._pause
+        self._seen.add(key)
+        return False
+
+
+def _spread(marked: np.ndarray, distance: int) -> np.ndarray:
+    """Return what is within a distance of a marked entry."""
+    if distance == 0:
+        return marked
+    n, at = len(marked), np.arange(len(marked))
+    counts = np.r_[0, np.cumsum(marked)]
+    return counts[np.minimum(at + distance + 1, n)] > counts[np.maximum(at - distance, 0)]
