@@ -61,7 +61,7 @@ class Step:
         linear_iterations: iterations on the finest grid.
         active: unknowns held at a bound, None where the method has no active set.
         failure: the status with which the method gives up, None to go on.
-        interim: the residual need not fall before the method's end (a pivot on the way): patience and divergence do not apply yet.
+        interim: the residual need not fall (a pivot on the way, or a step that lowers the energy): patience and divergence do not apply.
     """
 
     name: str
@@ -201,7 +201,7 @@ class _Loop:
         self.residual, self.history = work.residual, list[Record]()
         self.begun = time.perf_counter()
         self.linear = 0
-        self.best_iteration, self.best_norm = 0, math.inf
+        self.best_iteration, self.best_norm, self.progress = 0, math.inf, 0
 
     def run(self, x0: Array | None) -> SolveResult:
         x, residual = self.work.x, self.residual
@@ -248,6 +248,8 @@ class _Loop:
             self._record(iteration, step)
             if self.residual.norm < self.best_norm:
                 self._keep(iteration)
+            if step.interim:
+                self.progress = iteration
             status = self._status(iteration, step.failure, interim=step.interim)
         return self._finish(status, iteration)
 
@@ -292,7 +294,7 @@ class _Loop:
             return SolveStatus.DIVERGED
         if iteration >= stopping.max_iterations:
             return SolveStatus.MAX_ITERATIONS
-        if not interim and iteration - self.best_iteration >= stopping.patience:
+        if not interim and iteration - max(self.best_iteration, self.progress) >= stopping.patience:
             return self._floor_or(SolveStatus.STAGNATED)
         return None
 

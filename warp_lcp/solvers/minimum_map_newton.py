@@ -17,6 +17,7 @@ from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
 from warp_lcp.solve import FLOOR_MARGIN, IterateInPlace, Precision, RoundedIterate, Step
+from warp_lcp.solvers.coarse_problem import CoarseProblem
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_kernels import all_free_kernel, kernels
 from warp_lcp.solvers.principal_system import DenseSystem, GridSystem, PrincipalSystem, principal_system
@@ -122,6 +123,7 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         self.floating: Any = None
         cycled = self.bounded and isinstance(problem.A, SparseOperator) and problem.A.unknowns >= LARGE
         self.aggregates = AggregateCycles(problem.A) if cycled else None  # type: ignore[arg-type]
+        self.coarse = CoarseProblem(problem.A, settings) if cycled else None  # type: ignore[arg-type]
         self.start(warm=True, tolerance=0.0)
 
     def _principal_system(self) -> PrincipalSystem:
@@ -134,6 +136,8 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         self.cycles_left = self.settings.monotone_cycles if cold_grid else 0
         if self.aggregates is not None and not warm and self.settings.monotone_cycles > 0 and self.aggregates.refresh():
             self.cycles_left = 2 * self.settings.monotone_cycles
+        if self.coarse is not None:
+            self.coarse.start()
         self.free.zero_()
         self.stale = True
         self.norms: list[float] = []
@@ -176,6 +180,8 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         launch_spans(self._kernels.classify, reduction.spans, [*before, wp.float64(1 / size)], after, p.device)
         reduction.add_up(MOVED, columns=4)
         moved, active, shifted, square = self._scalars.numpy()
+        if self.coarse is not None and self.coarse.is_due(float(moved)):
+            return self._coarse_step(x, int(active))
         if moved or self.stale:
             self.system.restrict(self.free)
             self.stale = False
@@ -186,6 +192,18 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
             return Step("newton", 0, int(active))
         iterations = self._solve(float(np.sqrt(square)) / size, size, settled=not moved)
         return self._move(x, size, iterations, int(active))
+
+    def _coarse_step(self, x: wp.array[Any], active: int) -> Step:
+        """Correct x, with held unknowns at their bounds, by the coarse problem."""
+        assert self.coarse is not None
+        p, residual = self.problem, self.residual
+        residual.affine(x)
+        self.trial.assign(self.coarse.correction(p, x.numpy(), residual.y.numpy()))
+        correct = kernels(self.residual.diagonal.dtype, wp.float64).correct
+        self._flat(correct, [x, self.trial, *p.bounds.operands, x, self._nothing, wp.float64(1.0)])
+        self._round(x)
+        self.norms, self.stale, self._smallest, self._waited = [], True, math.inf, 0
+        return Step("coarse problem", 1, active, interim=True)
 
     def _right_side(self, size: float) -> float:
         """Set the system's right-hand side to -y / size on the free set; return the square of y's norm there."""
