@@ -18,8 +18,8 @@ STALL = 0.9  # the largest share of the unknowns that a split may keep
 def coarse_points(host: Any) -> tuple[Any, Any, np.ndarray] | None:
     """Return P, P'A P and the points, for a scipy.sparse matrix A that is nearly an M-matrix; None where it does not get smaller.
 
-    A coarse unknown is one of the fine ones: (P e)_i = e_j where point j is unknown i. So the bounds of unknowns are those of a coarse problem,
-    where those of aggregates would have to be averaged.
+    A coarse unknown is one of the fine ones: (P e)_i = e_j where point j is unknown i. So the bounds of the coarse problem are those of
+    unknowns, where those of aggregates would have to be averaged.
     """
     A, P, points = scipy.sparse.csr_matrix(host), None, np.arange(host.shape[0])
     while len(points) * LEAST > host.shape[0]:

@@ -26,9 +26,9 @@ STEPS = 3  # of creeping before the correction, which costs as much as ten Newto
 class CoarseProblem:
     """Solves for the correction P e of an x: P'A P e + P'(A x + b), with the bounds that x leaves to the coarse points.
 
-    Those are unknowns of the fine problem, so that an obstacle's corners stay where they are, and where unknowns sit at their bounds, so does
-    the correction: the contact's boundary moves as far as it must at once, where Newton's own step moves it by a layer of unknowns. The
-    coarse problem is solved by Newton's method too, which begins with a coarse problem of its own.
+    Those are unknowns of the fine problem, so that an obstacle's corners stay where they are, and unknowns at their bounds stay there until
+    the correction says otherwise: the contact's boundary moves as far as it must at once, where Newton's own step moves it by a layer of
+    unknowns. The coarse problem is solved by Newton's method too, which begins with a coarse problem of its own.
 
     Args:
         A: the matrix.

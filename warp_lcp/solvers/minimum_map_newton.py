@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
 
-from warp_lcp.multigrid.aggregates import AggregateCycles
+from warp_lcp.multigrid.aggregates import AggregateCycles, suits_multigrid
 from warp_lcp.multigrid.hierarchy import CycleSettings
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.operators.sparse import SparseOperator
@@ -18,6 +18,7 @@ from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
 from warp_lcp.solve import FLOOR_MARGIN, IterateInPlace, Precision, RoundedIterate, Step
 from warp_lcp.solvers.coarse_problem import CoarseProblem
+from warp_lcp.solvers.gradient_phase import GradientPhase
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_kernels import all_free_kernel, kernels
 from warp_lcp.solvers.principal_system import DenseSystem, GridSystem, PrincipalSystem, principal_system
@@ -26,6 +27,7 @@ from warp_lcp.vectors import Reduction, launch_spans
 
 MOVED, SQUARE = 0, 3  # slots of the device scalars: cells moved, active, shifted, and the free residual's square
 LARGE = 1000  # unknowns from which a cold start on a sparse matrix takes projected cycles
+WEAK = 30  # iterations of a linear solve that say that its preconditioner is weak
 STALLED = 10  # steps without a smaller residual after which free blocks are taken for singular
 REGULARIZATIONS = (1e-8, 1e-4, 1e-2, 0.1, 1.0, 10.0, 100.0)  # of J'J, times its mean diagonal
 
@@ -93,7 +95,8 @@ class MinimumMapNewton:
         if work.cycles_left > 0:
             work.cycles_left -= 1
             return work.monotone_cycle(x)
-        return work.newton_step(x)
+        step = work.gradient_step(x) if work.descends else None
+        return step or work.newton_step(x)
 
 
 class NewtonWorkspace(IterateInPlace, RoundedIterate):
@@ -102,10 +105,13 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
     Attributes:
         last_resort: whether a proximal-point iteration takes over where steps lead nowhere, if A's entries are at hand.
         resort: that iteration, once it has.
+        descends: whether linear solves are slow, and conjugate gradients that know the bounds have taken over.
     """
 
     last_resort = True
     resort: ProximalPoint | None = None
+    descends = False
+    gradients: GradientPhase | None = None
 
     def __init__(self, problem: LCP, settings: MinimumMapNewton) -> None:
         self.problem, self.settings, self.precision = problem, settings, Precision(settings.precision)
@@ -138,6 +144,7 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
             self.cycles_left = 2 * self.settings.monotone_cycles
         if self.coarse is not None:
             self.coarse.start()
+        self.descends, self._may_descend = False, self._minimizes()
         self.free.zero_()
         self.stale = True
         self.norms: list[float] = []
@@ -191,7 +198,28 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         if square == 0:
             return Step("newton", 0, int(active))
         iterations = self._solve(float(np.sqrt(square)) / size, size, settled=not moved)
+        if self._may_descend and iterations >= WEAK:
+            self.descends, self._may_descend = True, False
+            self.gradients = self.gradients or GradientPhase(p, self.system, self.settings.precision)  # type: ignore[arg-type]
+            self.gradients.start(x, self.floating, self.target)
+            step = self.gradient_step(x, spent=iterations)
+            if step is not None:
+                return step
         return self._move(x, size, iterations, int(active))
+
+    def _minimizes(self) -> bool:
+        """Return whether conjugate gradients within the bounds may take over: A has an energy, and is no matrix for coarse problems."""
+        if self.coarse is None or not self.problem.A.symmetric:
+            return False
+        host = self.problem.A.matrix()  # type: ignore[attr-defined]
+        return not suits_multigrid(host) and bool((host.diagonal() >= 0).all())
+
+    def gradient_step(self, x: wp.array[Any], spent: int = 0) -> Step | None:
+        """Take a batch of conjugate gradients; None, and Newton's steps again, where the energy has no minimum."""
+        assert self.gradients is not None
+        step, self.stale = self.gradients.step(x, self.settings.eta, self.settings.max_linear_iterations), True
+        self.descends = step is not None
+        return step and replace(step, linear_iterations=step.linear_iterations + spent)
 
     def _coarse_step(self, x: wp.array[Any], active: int) -> Step:
         """Correct x, with held unknowns at their bounds, by the coarse problem."""
@@ -219,7 +247,8 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         if self.floating is not None:
             self.floating.project(self.system.r, self.free)
         target = 0.3 * self.target / size
-        return self.system.solve(max((s.eta**2 if settled else s.eta) * norm, target), s.max_linear_iterations)[0]
+        most = min(s.max_linear_iterations, WEAK) if self._may_descend else s.max_linear_iterations
+        return self.system.solve(max((s.eta**2 if settled else s.eta) * norm, target), most)[0]
 
     def _move(self, x: wp.array[Any], size: float, iterations: int, active: int) -> Step:
         """Accept the longest of the halved, projected steps that the safeguard allows."""

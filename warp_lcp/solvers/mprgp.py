@@ -42,7 +42,8 @@ class MPRGP:
     linear solve, this one 1.5. Cold, the first steps on a grid are projected multigrid cycles.
 
     On grids the residual may rise `patience` times running, then a projected cycle follows; elsewhere a projected step that raises the
-    energy is halved, and while steps lower it the stopping criteria's own patience does not run out, however the residual goes. `linear_iterations` counts monotone cycles and products with A: one a step, two if it releases unknowns.
+    energy is halved, and while steps lower it the stopping criteria's own patience does not run out.
+    `linear_iterations` counts monotone cycles and products with A: one a step, two if it releases unknowns.
 
     Args:
         precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate rounded to float32 as well. Dense
@@ -193,12 +194,18 @@ class SplitResidual(NaturalResidual):
 
 
 class GradientWorkspace(RoundedIterate):
-    """Memory of the method for one problem."""
+    """Memory of the method for one problem.
 
-    def __init__(self, problem: LCP, settings: MPRGP) -> None:
+    Args:
+        problem: the problem.
+        settings: the method.
+        system: a sparse matrix's principal system to share; its own if None.
+    """
+
+    def __init__(self, problem: LCP, settings: MPRGP, system: SparseSystem | None = None) -> None:
         self.problem, self.settings, self.precision = problem, settings, Precision(settings.precision)
         self.bounded, self.is_grid = problem.bounded, isinstance(problem.A, GridPoisson)
-        self.system, self.preconditioner = _preconditioner(problem, self.precision.correction, settings.cycle)
+        self.system, self.preconditioner = _preconditioner(problem, self.precision.correction, settings.cycle, system)
         z, single = self.preconditioner.z, self.precision is Precision.SINGLE
         self._fields = [problem.layout.zeros(wp.float64) for _ in range(2 if self.is_grid else 3)]
         self.x, self._best = self._fields[0], self._fields[0]
@@ -398,10 +405,10 @@ def row_sums(threads: tuple[int, int, int], device: wp.Device) -> Any:
     return R
 
 
-def _preconditioner(problem: LCP, real: Any, cycle: CycleSettings) -> tuple[Any, Any]:
+def _preconditioner(problem: LCP, real: Any, cycle: CycleSettings, system: Any) -> tuple[Any, Any]:
     """Return the principal system and what preconditions it."""
-    if isinstance(problem.A, DenseOperator):  # its own system is solved directly: then this would be an active-set method
-        system: Any = DiagonalSystem(problem)
-    else:
+    if system is None and isinstance(problem.A, DenseOperator):  # its own system is solved directly: that would be an active-set method
+        system = DiagonalSystem(problem)
+    elif system is None:
         system = principal_system(problem, real, bounded=problem.bounded, settings=cycle)
     return system, system.preconditioner if isinstance(system, SparseSystem) else system
