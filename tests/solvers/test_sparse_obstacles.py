@@ -118,7 +118,7 @@ FAMILY = {
 
 @pytest.mark.parametrize("name", FAMILY)
 def test_steps_do_not_grow_with_the_mesh(name, device):
-    """The boundary of the plastic zone crept by a row a step: 63 steps at 250^2, STAGNATED at 1000^2."""
+    """The boundary of the plastic zone crept by a row a step: 26 steps at 120^2, STAGNATED at 250^2 and 1000^2."""
     assert solved(FAMILY[name], device=device).iterations <= 20
 
 
@@ -154,11 +154,13 @@ def test_coarse_unknowns_are_fine_ones():
     assert coarse_points(scipy.sparse.eye_array(50).tocsr()) is None
 
 
-@pytest.mark.parametrize(
-    ("data", "linear"), [(plate(60, clamped=True), 240), (plate(60, clamped=False), 240), (elastic_block(50), 200)], ids=["clamped", "supported", "elastic"]
-)
-def test_weak_preconditioners_cost_one_linear_solve(data, linear, device):
-    """Newton's steps took 1,200, 1,100 and 600 iterations, most of them in steps that its safeguard undid."""
+WEAK = {"clamped": (plate(60, clamped=True), 240), "supported": (plate(60, clamped=False), 240), "elastic": (elastic_block(50), 200)}
+
+
+@pytest.mark.parametrize("name", WEAK)
+def test_weak_preconditioners_cost_one_linear_solve(name, device):
+    """Newton's steps took 1,232, 1,406 and 658 iterations, most of them in steps that its safeguard undid."""
+    data, linear = WEAK[name]
     result = solved(data, device=device)
     assert result.linear_iterations <= linear
     assert result.iterations <= 10
