@@ -154,7 +154,7 @@ def test_coarse_unknowns_are_fine_ones():
     assert coarse_points(scipy.sparse.eye_array(50).tocsr()) is None
 
 
-WEAK = {"clamped": (plate(60, clamped=True), 240), "supported": (plate(60, clamped=False), 240), "elastic": (elastic_block(50), 200)}
+WEAK = {"clamped": (plate(60, clamped=True), 180), "supported": (plate(60, clamped=False), 190), "elastic": (elastic_block(50), 150)}
 
 
 @pytest.mark.parametrize("name", WEAK)
@@ -167,9 +167,9 @@ def test_weak_preconditioners_cost_one_linear_solve(name, device):
 
 
 def test_the_energy_is_the_progress_of_mprgp():
-    """The residual of a plate is above its start for a hundred steps, while the energy falls in each; patience ended them after 30."""
+    """The residual of a plate is above its start for dozens of steps, while the energy falls in each; patience ended them after 30."""
     result = solved(plate(60, clamped=True), wl.MPRGP(), max_iterations=1000)
-    assert result.iterations <= 250
+    assert result.iterations <= 130
     assert max(r.residual for r in result.history[31:60]) > result.history[0].residual
 
 
@@ -199,4 +199,4 @@ def test_torsion_of_a_fine_mesh(n):
 
 @pytest.mark.slow
 def test_a_fine_plate():
-    assert solved(plate(160, clamped=True)).linear_iterations <= 800
+    assert solved(plate(160, clamped=True)).linear_iterations <= 450

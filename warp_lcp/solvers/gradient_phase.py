@@ -41,7 +41,11 @@ class GradientPhase:
         work.start(warm=True, tolerance=tolerance)
 
     def step(self, x: wp.array[Any], factor: float, most: int) -> Step | None:
-        """Iterate until the residual is `factor` times what it was, at most so often; move x there. None: the energy has no minimum."""
+        """Iterate until the residual is `factor` times what it was, at most so often; move x there.
+
+        Returns:
+            None: the energy has no minimum, or neither it nor the residual falls any more.
+        """
         work, residual, linear, idle, sank = self._work, self._work.residual, 0, 0, False
         least, target = residual.norm, max(self._tolerance, factor * residual.norm)
         while linear < most and idle < PATIENCE and residual.norm > target:
@@ -52,4 +56,6 @@ class GradientPhase:
             idle = 0 if step.interim or residual.norm < least else idle + 1
             least, sank = min(least, residual.norm), sank or step.interim
         wp.copy(x, work.x)
+        if idle == PATIENCE:
+            return None
         return Step("conjugate gradients", linear, residual.active, interim=sank)

@@ -95,8 +95,7 @@ class MinimumMapNewton:
         if work.cycles_left > 0:
             work.cycles_left -= 1
             return work.monotone_cycle(x)
-        step = work.gradient_step(x) if work.descends else None
-        return step or work.newton_step(x)
+        return work.newton_step(x)
 
 
 class NewtonWorkspace(IterateInPlace, RoundedIterate):
@@ -177,6 +176,9 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
     def newton_step(self, x: wp.array[Any]) -> Step:
         """Classify, solve on the free set, move along the projected step."""
         p, residual = self.problem, self.residual
+        step = self._gradient_step(x) if self.descends else None
+        if step is not None:
+            return step
         if self.resort is not None or (self._stalls() and self._may_resort()):
             return self._resort(x)
         self.norms = [*self.norms, residual.norm][-self.settings.memory :]
@@ -202,9 +204,7 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
             self.descends, self._may_descend = True, False
             self.gradients = self.gradients or GradientPhase(p, self.system, self.settings.precision)  # type: ignore[arg-type]
             self.gradients.start(x, self.floating, self.target)
-            step = self.gradient_step(x, spent=iterations)
-            if step is not None:
-                return step
+            return self._gradient_step(x, spent=iterations) or self.newton_step(x)
         return self._move(x, size, iterations, int(active))
 
     def _minimizes(self) -> bool:
@@ -214,11 +214,13 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         host = self.problem.A.matrix()  # type: ignore[attr-defined]
         return not suits_multigrid(host) and bool((host.diagonal() >= 0).all())
 
-    def gradient_step(self, x: wp.array[Any], spent: int = 0) -> Step | None:
-        """Take a batch of conjugate gradients; None, and Newton's steps again, where the energy has no minimum."""
+    def _gradient_step(self, x: wp.array[Any], spent: int = 0) -> Step | None:
+        """Take a batch of conjugate gradients; None, and Newton's steps again, where they lead nowhere."""
         assert self.gradients is not None
         step, self.stale = self.gradients.step(x, self.settings.eta, self.settings.max_linear_iterations), True
-        self.descends = step is not None
+        if step is None:
+            self.descends, self.norms = False, []
+            self.residual.evaluate(x)
         return step and replace(step, linear_iterations=step.linear_iterations + spent)
 
     def _coarse_step(self, x: wp.array[Any], active: int) -> Step:
