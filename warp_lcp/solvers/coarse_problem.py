@@ -19,8 +19,10 @@ if TYPE_CHECKING:
     from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 
 TOLERANCE = StoppingCriteria(rtol=1e-2, max_iterations=30)  # of a correction that interpolation blurs by a layer or two anyway
-CREEP = 0.75  # a set of which more than this share of the last step's moves again creeps: one that settles moves ever less of it
-STEPS = 3  # of creeping before the correction, which costs as much as ten Newton steps
+# a set creeps while more than this share of what the last step moved moves again: at that rate a dozen steps or more are still to
+# come, and a first correction costs as much as those
+CREEP = 0.92
+STEPS = 3  # of creeping before the correction
 
 
 class CoarseProblem:
