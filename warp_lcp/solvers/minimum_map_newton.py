@@ -39,7 +39,7 @@ class MinimumMapNewton:
     Unknown i is held where x_i - y_i / A_ii is outside [l_i, u_i]. Cold, the first steps on a grid are projected multigrid cycles, which
     find the active set to within a few cells; a Newton step alone moves its boundary by about a layer a step. Each Newton correction is
     solved inexactly in the corrections' precision, and the step is shortened along its projection onto the bounds if the residual would
-    exceed the largest of the last `memory` ones. On a large sparse matrix, an active set that creeps all the same is moved by the problem on
+    exceed the largest of the last `memory` ones. On a large sparse matrix, an active set that creeps all the same is moved by a problem on
     coarse points if A is nearly a diagonally dominant M-matrix; other symmetric A whose linear solves are slow get conjugate gradients
     within the bounds (MPRGP). Converges on a grid in a few steps; on other matrices A should be a P-matrix. Where it
     is not, free blocks may be singular and steps lead nowhere: dense and sparse problems then go on by the proximal-point iteration,
