@@ -93,7 +93,10 @@ def test_newton_does_not_creep(wind, method, device):
         counts.append(result.iterations)
     assert counts[0] <= 10
     assert counts[1] <= 12
-    cold = wl.solve(problem, method(monotone_cycles=0), stopping=wl.StoppingCriteria(max_iterations=200))
+    plain = method(monotone_cycles=0)
+    work = plain.init(problem)
+    work.coarse = None
+    cold = wl.solve(problem, plain, stopping=wl.StoppingCriteria(max_iterations=200), workspace=work)
     assert cold, cold.status
     assert cold.iterations >= 20
     np.testing.assert_allclose(result.x.numpy(), cold.x.numpy(), atol=1e-4 * cold.x.numpy().max())

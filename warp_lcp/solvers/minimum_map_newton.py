@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.deadline import check_time
-from warp_lcp.multigrid.aggregates import AggregateCycles
+from warp_lcp.multigrid.aggregates import AggregateCycles, suits_multigrid
 from warp_lcp.multigrid.hierarchy import CycleSettings
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.operators.sparse import SparseOperator
@@ -18,6 +18,8 @@ from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
 from warp_lcp.solve import FLOOR_MARGIN, IterateInPlace, Precision, RoundedIterate, Step
+from warp_lcp.solvers.coarse_problem import CoarseProblem
+from warp_lcp.solvers.gradient_phase import GradientPhase
 from warp_lcp.solvers.minimum_map_newton_direct import DirectNewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_kernels import all_free_kernel, kernels
@@ -27,6 +29,7 @@ from warp_lcp.vectors import Reduction, launch_spans
 
 MOVED, SQUARE = 0, 3  # slots of the device scalars: cells moved, active, shifted, and the free residual's square
 LARGE = 1000  # unknowns from which a cold start on a sparse matrix takes projected cycles
+WEAK = 30  # iterations of a linear solve that say that its preconditioner is weak
 STALLED = 10  # steps without a smaller residual after which free blocks are taken for singular
 REGULARIZATIONS = (1e-8, 1e-4, 1e-2, 0.1, 1.0, 10.0, 100.0)  # of J'J, times its mean diagonal
 
@@ -38,7 +41,9 @@ class MinimumMapNewton:
     Unknown i is held where x_i - y_i / A_ii is outside [l_i, u_i]. Cold, the first steps on a grid are projected multigrid cycles, which
     find the active set to within a few cells; a Newton step alone moves its boundary by about a layer a step. Each Newton correction is
     solved inexactly in the corrections' precision, and the step is shortened along its projection onto the bounds if the residual would
-    exceed the largest of the last `memory` ones. Converges on a grid in a few steps; on other matrices A should be a P-matrix. Where it
+    exceed the largest of the last `memory` ones. On a large sparse matrix, an active set that creeps all the same is moved by a problem on
+    coarse points if A is nearly a diagonally dominant M-matrix; other symmetric A whose linear solves are slow get conjugate gradients
+    within the bounds (MPRGP). Converges on a grid in a few steps; on other matrices A should be a P-matrix. Where it
     is not, free blocks may be singular and steps lead nowhere: dense and sparse problems then go on by the proximal-point iteration,
     whose problems have A + eps D: a P-matrix if A is positive semi-definite, skew, or any other P0-matrix. Where that gains nothing
     either, the status says so: STAGNATED, NON_DESCENT, or INFEASIBLE if a linear program proves it.
@@ -110,10 +115,13 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
     Attributes:
         last_resort: whether a proximal-point iteration takes over where steps lead nowhere, if A's entries are at hand.
         resort: that iteration, once it has.
+        descends: whether linear solves are slow, and conjugate gradients that know the bounds have taken over.
     """
 
     last_resort = True
     resort: ProximalPoint | None = None
+    descends = False
+    gradients: GradientPhase | None = None
 
     def __init__(self, problem: LCP, settings: MinimumMapNewton) -> None:
         self.problem, self.settings, self.precision = problem, settings, Precision(settings.precision)
@@ -131,6 +139,7 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         self.floating: Any = None
         cycled = self.bounded and isinstance(problem.A, SparseOperator) and problem.A.unknowns >= LARGE
         self.aggregates = AggregateCycles(problem.A) if cycled else None  # type: ignore[arg-type]
+        self.coarse = CoarseProblem(problem.A, settings) if cycled else None  # type: ignore[arg-type]
         self.start(warm=True, tolerance=0.0)
 
     def _principal_system(self) -> PrincipalSystem:
@@ -143,6 +152,9 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         self.cycles_left = self.settings.monotone_cycles if cold_grid else 0
         if self.aggregates is not None and not warm and self.settings.monotone_cycles > 0 and self.aggregates.refresh():
             self.cycles_left = 2 * self.settings.monotone_cycles
+        if self.coarse is not None:
+            self.coarse.start()
+        self.descends, self._may_descend = False, self._minimizes()
         self.free.zero_()
         self.stale = True
         self.norms: list[float] = []
@@ -175,6 +187,9 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
     def newton_step(self, x: wp.array[Any]) -> Step:
         """Classify, solve on the free set, move along the projected step."""
         p, residual = self.problem, self.residual
+        step = self._gradient_step(x) if self.descends else None
+        if step is not None:
+            return step
         if self.resort is not None or (self._stalls() and self._may_resort()):
             return self._resort(x)
         self.norms = [*self.norms, residual.norm][-self.settings.memory :]
@@ -185,6 +200,8 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         launch_spans(self._kernels.classify, reduction.spans, [*before, wp.float64(1 / size)], after, p.device)
         reduction.add_up(MOVED, columns=4)
         moved, active, shifted, square = self._scalars.numpy()
+        if self.coarse is not None and self.coarse.is_due(float(moved)):
+            return self._coarse_step(x, int(active))
         if moved or self.stale:
             self.system.restrict(self.free)
             self.stale = False
@@ -194,7 +211,40 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         if square == 0:
             return Step("newton", 0, int(active))
         iterations = self._solve(float(np.sqrt(square)) / size, size, settled=not moved)
+        if self._may_descend and iterations >= WEAK:
+            self.descends, self._may_descend = True, False
+            self.gradients = self.gradients or GradientPhase(p, self.system, self.settings.precision)  # type: ignore[arg-type]
+            self.gradients.start(x, self.floating, self.target)
+            return self._gradient_step(x, spent=iterations) or self.newton_step(x)
         return self._move(x, size, iterations, int(active))
+
+    def _minimizes(self) -> bool:
+        """Return whether conjugate gradients within the bounds may take over: A has an energy, and is no matrix for coarse problems."""
+        if self.coarse is None or not self.problem.A.symmetric:
+            return False
+        host = self.problem.A.matrix()  # type: ignore[attr-defined]
+        return not suits_multigrid(host) and bool((host.diagonal() >= 0).all())
+
+    def _gradient_step(self, x: wp.array[Any], spent: int = 0) -> Step | None:
+        """Take a batch of conjugate gradients; None, and Newton's steps again, where they lead nowhere."""
+        assert self.gradients is not None
+        step, self.stale = self.gradients.step(x, self.settings.eta, self.settings.max_linear_iterations), True
+        if step is None:
+            self.descends, self.norms = False, []
+            self.residual.evaluate(x)
+        return step and replace(step, linear_iterations=step.linear_iterations + spent)
+
+    def _coarse_step(self, x: wp.array[Any], active: int) -> Step:
+        """Correct x, with held unknowns at their bounds, by the coarse problem."""
+        assert self.coarse is not None
+        p, residual = self.problem, self.residual
+        residual.affine(x)
+        self.trial.assign(self.coarse.correction(p, x.numpy(), residual.y.numpy()))
+        correct = kernels(self.residual.diagonal.dtype, wp.float64).correct
+        self._flat(correct, [x, self.trial, *p.bounds.operands, x, self._nothing, wp.float64(1.0)])
+        self._round(x)
+        self.norms, self.stale, self._smallest, self._waited = [], True, math.inf, 0
+        return Step("coarse problem", 1, active, interim=True)
 
     def _right_side(self, size: float) -> float:
         """Set the system's right-hand side to -y / size on the free set; return the square of y's norm there."""
@@ -210,7 +260,8 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         if self.floating is not None:
             self.floating.project(self.system.r, self.free)
         target = 0.3 * self.target / size
-        return self.system.solve(max((s.eta**2 if settled else s.eta) * norm, target), s.max_linear_iterations)[0]
+        most = min(s.max_linear_iterations, WEAK) if self._may_descend else s.max_linear_iterations
+        return self.system.solve(max((s.eta**2 if settled else s.eta) * norm, target), most)[0]
 
     def _move(self, x: wp.array[Any], size: float, iterations: int, active: int) -> Step:
         """Accept the longest of the halved, projected steps that the safeguard allows."""

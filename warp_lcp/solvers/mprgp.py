@@ -28,6 +28,7 @@ from warp_lcp.vectors import Reduction, launch_spans
 SINGLE_SLACK = 1.2e-7  # a bound that float32 rounds is met within this part of it
 LEAST_REST = 1e-3  # of a correction's energy that must not lie along the last direction; what is left else is cancellation
 ENERGY_ROUNDING = 1e-12  # rises of the energy within this part of it are rounding
+NOISE = 1e-14  # of the energy: falls of less, over as many steps as patience lasts, are what rounding its sum may pretend
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +43,8 @@ class MPRGP:
     linear solve, this one 1.5. Cold, the first steps on a grid are projected multigrid cycles.
 
     On grids the residual may rise `patience` times running, then a projected cycle follows; elsewhere a projected step that raises the
-    energy is halved. `linear_iterations` counts monotone cycles and products with A: one a step, two if it releases unknowns.
+    energy is halved, and while steps lower it the stopping criteria's own patience does not run out.
+    `linear_iterations` counts monotone cycles and products with A: one a step, two if it releases unknowns.
 
     Args:
         precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate rounded to float32 as well. Dense
@@ -96,7 +98,7 @@ class MPRGP:
         release = work.residual.chopped > self.gamma**2 * work.residual.reduced
         if (release and not work.proportion()) or not work.conjugate():
             return Step("unbounded", 1, held, SolveStatus.DIVERGED)
-        return Step("proportioning", 2, held) if release else Step("conjugate gradient", 1, held)
+        return Step("proportioning" if release else "conjugate gradient", 2 if release else 1, held, interim=work.sinks())
 
 
 class Preconditioner(Protocol):
@@ -193,12 +195,18 @@ class SplitResidual(NaturalResidual):
 
 
 class GradientWorkspace(RoundedIterate):
-    """Memory of the method for one problem."""
+    """Memory of the method for one problem.
 
-    def __init__(self, problem: LCP, settings: MPRGP) -> None:
+    Args:
+        problem: the problem.
+        settings: the method.
+        system: a sparse matrix's principal system to share; its own if None.
+    """
+
+    def __init__(self, problem: LCP, settings: MPRGP, system: SparseSystem | None = None) -> None:
         self.problem, self.settings, self.precision = problem, settings, Precision(settings.precision)
         self.bounded, self.is_grid = problem.bounded, isinstance(problem.A, GridPoisson)
-        self.system, self.preconditioner = _preconditioner(problem, self.precision.correction, settings.cycle)
+        self.system, self.preconditioner = _preconditioner(problem, self.precision.correction, settings.cycle, system)
         z, single = self.preconditioner.z, self.precision is Precision.SINGLE
         self._fields = [problem.layout.zeros(wp.float64) for _ in range(2 if self.is_grid else 3)]
         self.x, self._best = self._fields[0], self._fields[0]
@@ -212,9 +220,15 @@ class GradientWorkspace(RoundedIterate):
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the direction; the operator may have changed."""
         self._cycles_left = self.settings.monotone_cycles if self.is_grid and self.bounded and not warm else 0
-        self._rises, self._carry, self._last = 0, False, math.inf
+        self._rises, self._carry, self._last, self._lowest = 0, False, math.inf, self.residual.energy
         self.residual.moved = True
         self.system.refresh()
+
+    def sinks(self) -> bool:
+        """Return whether the energy has fallen beyond rounding since this was last so; on grids it is not known."""
+        sinks = not self.is_grid and self.residual.energy < self._lowest - NOISE * abs(self._lowest)
+        self._lowest = self.residual.energy if sinks else self._lowest
+        return sinks
 
     def wants_monotone_cycle(self) -> bool:
         """Return whether the next step is a projected cycle."""
@@ -393,10 +407,10 @@ def row_sums(threads: tuple[int, int, int], device: wp.Device) -> Any:
     return R
 
 
-def _preconditioner(problem: LCP, real: Any, cycle: CycleSettings) -> tuple[Any, Any]:
+def _preconditioner(problem: LCP, real: Any, cycle: CycleSettings, system: Any) -> tuple[Any, Any]:
     """Return the principal system and what preconditions it."""
-    if isinstance(problem.A, DenseOperator):  # its own system is solved directly: then this would be an active-set method
-        system: Any = DiagonalSystem(problem)
-    else:
+    if system is None and isinstance(problem.A, DenseOperator):  # its own system is solved directly: that would be an active-set method
+        system = DiagonalSystem(problem)
+    elif system is None:
         system = principal_system(problem, real, bounded=problem.bounded, settings=cycle)
     return system, system.preconditioner if isinstance(system, SparseSystem) else system

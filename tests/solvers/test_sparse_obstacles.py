@@ -1,0 +1,202 @@
+"""Obstacle problems as sparse matrices: steps do not grow with the mesh, and the energy is progress. Residuals are SciPy's."""
+
+import numpy as np
+import pytest
+import scipy.sparse
+import scipy.spatial
+import warp as wp
+
+import warp_lcp as wl
+from warp_lcp.multigrid.coarse_points import coarse_points
+
+
+def laplacian(n):
+    second, one = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n)), scipy.sparse.eye_array(n)
+    return (scipy.sparse.kron(one, second) + scipy.sparse.kron(second, one)).tocsr()
+
+
+def nodes(n):
+    line = np.arange(1, n + 1) / (n + 1)
+    x, y = np.meshgrid(line, line)
+    return x.ravel(), y.ravel()
+
+
+def border(x, y):
+    """Distance to the border of the unit square."""
+    return np.minimum(np.minimum(x, 1 - x), np.minimum(y, 1 - y))
+
+
+def torsion(n, load=5.0, wind=0.0):
+    """An elastic-plastic bar, or upwind convection through it: A, b, l, u."""
+    A = laplacian(n) + wind / (n + 1) * scipy.sparse.diags_array([-1.0, 1.0], offsets=[-1, 0], shape=(n * n, n * n))
+    d = border(*nodes(n))
+    return A.tocsr(), np.full(n * n, -load / (n + 1) ** 2), -d, d
+
+
+def torsion_on_triangles(n, load=8.0):
+    """Linear elements on a Delaunay mesh of n random points."""
+    points = np.random.default_rng(6203).random((n, 2))
+    line = np.linspace(0, 1, int(np.sqrt(n)))
+    edge = np.concatenate([np.stack(np.broadcast_arrays(*pair), axis=1) for pair in ((line, 0), (line, 1), (0, line), (1, line))])
+    points = np.unique(np.concatenate([points, edge]), axis=0)
+    triangles = scipy.spatial.Delaunay(points).simplices
+    p = points[triangles]
+    opposite = np.stack([p[:, 2] - p[:, 1], p[:, 0] - p[:, 2], p[:, 1] - p[:, 0]], axis=1)
+    area = 0.5 * np.abs(opposite[:, 0, 0] * opposite[:, 1, 1] - opposite[:, 0, 1] * opposite[:, 1, 0])
+    sound = area > 1e-12
+    triangles, opposite, area = triangles[sound], opposite[sound], area[sound]
+    entries = np.einsum("tik,tjk->tij", opposite, opposite) / (4 * area)[:, None, None]
+    rows, columns = np.repeat(triangles, 3, axis=1), np.tile(triangles, 3)
+    A = scipy.sparse.csr_array((entries.ravel(), (rows.ravel(), columns.ravel())), shape=(len(points),) * 2)
+    mass, d = np.bincount(triangles.ravel(), np.repeat(area / 3, 3), len(points)), border(*points.T)
+    inner = np.flatnonzero(d > 0)
+    return A[inner][:, inner].tocsr(), -load * mass[inner], -d[inner], d[inner]
+
+
+def between_corners(n):
+    """A membrane pressed up and down between a pyramid and its copy above."""
+    x, y = nodes(n)
+    low = 0.3 - 1.5 * np.maximum(np.abs(x - 0.45), np.abs(y - 0.6))
+    return laplacian(n), -20 * np.sin(4 * np.pi * x) * np.sin(2 * np.pi * y) / (n + 1) ** 2, low, low + 0.05
+
+
+def plate(n, *, clamped):
+    """A square plate pushed up against a plane."""
+    L, x = laplacian(n), np.arange(n * n)
+    A = L @ L
+    if clamped:
+        sides = (x < n).astype(float) + (x >= n * n - n) + (x % n == 0) + (x % n == n - 1)
+        A = A + scipy.sparse.diags_array(2 * sides)
+    return A.tocsr(), np.full(n * n, -1000 / (n + 1) ** 4), -np.inf, np.full(n * n, 0.45)
+
+
+def elastic_block(n):
+    """Plane strain, bilinear elements: a block held at its top is pulled down onto a parabola, which bounds some displacements."""
+    lame, shear, g = 0.6, 0.4, 1 / np.sqrt(3)
+    C = np.diag([2 * shear, 2 * shear, shear]) + lame * np.pad(np.ones((2, 2)), ((0, 1), (0, 1)))
+    K = np.zeros((8, 8))
+    for s, t in ((-g, -g), (g, -g), (-g, g), (g, g)):
+        slope = 0.5 * np.array([[t - 1, 1 - t, 1 + t, -1 - t], [s - 1, -1 - s, 1 + s, 1 - s]])
+        B = np.zeros((3, 8))
+        B[0, 0::2] = B[2, 1::2] = slope[0]
+        B[1, 1::2] = B[2, 0::2] = slope[1]
+        K += 0.25 * B.T @ C @ B
+    node = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
+    corners = np.stack([node[:-1, :-1], node[:-1, 1:], node[1:, 1:], node[1:, :-1]], axis=-1).reshape(-1, 4)
+    unknowns = np.stack([2 * corners, 2 * corners + 1], axis=-1).reshape(-1, 8)
+    rows, columns = np.repeat(unknowns, 8, axis=1), np.tile(unknowns, 8)
+    A = scipy.sparse.csr_array((np.tile(K.ravel(), n * n), (rows.ravel(), columns.ravel())), shape=(2 * node.size,) * 2)
+    b, low, kept = np.zeros(2 * node.size), np.full(2 * node.size, -np.inf), 2 * node[-1, 0]
+    b[1::2] = 0.4 / n**2
+    low[2 * node[0] + 1] = -0.01 - 0.1 * np.linspace(-0.5, 0.5, n + 1) ** 2
+    return A[:kept, :kept].tocsr(), b[:kept], low[:kept], np.inf
+
+
+def natural(A, b, lower, upper, x):
+    d, y = A.diagonal(), A @ x + b
+    return np.linalg.norm(d * (x - np.clip(x - y / d, lower, upper)))
+
+
+def solved(data, method=None, *, x0=None, device="cpu", **stopping):
+    """Solve, check the residual by SciPy, return the result."""
+    A, b, lower, upper = data
+    problem = wl.LCP(wl.SparseOperator(A, device=device), b, lower, upper)
+    result = wl.solve(problem, method, x0=x0, stopping=wl.StoppingCriteria(**stopping))
+    assert result, result.status
+    assert natural(*data, result.x.numpy()) <= 1.01e-6 * natural(*data, np.clip(np.zeros(len(b)), lower, upper))
+    return result
+
+
+FAMILY = {
+    "torsion": torsion(120),
+    "strong torsion": torsion(120, load=14.0),
+    "torsion with wind": torsion(250, wind=10.0),  # 35 steps without coarse problems
+    "torsion on triangles": torsion_on_triangles(9000),
+    "between corners": between_corners(120),
+}
+
+
+@pytest.mark.parametrize("name", FAMILY)
+def test_steps_do_not_grow_with_the_mesh(name, device):
+    """The boundary of the plastic zone crept by a row a step: 26 steps at 120^2, STAGNATED at 250^2 and 1000^2."""
+    assert solved(FAMILY[name], device=device).iterations <= 20
+
+
+def test_a_set_that_begins_everywhere_is_no_trap():
+    data = torsion(120)
+    for method in (wl.MinimumMapNewton(), wl.PrimalDualActiveSet()):
+        result = solved(data, method, x0=data[3])
+        assert result.iterations <= 15
+        assert "coarse problem" in {r.step for r in result.history}
+
+
+def test_a_workspace_serves_another_load_and_other_entries():
+    A, b, lower, upper = torsion(120)
+    operator, right = wl.SparseOperator(A, device="cpu"), wp.array(b, dtype=wp.float64, device="cpu")
+    problem, method = wl.LCP(operator, right, lower, upper), wl.MinimumMapNewton()
+    work = method.init(problem)
+    for factor, load in ((1.0, 1.0), (1.0, -1.0), (4.0, 4.0)):
+        operator.update(factor * A)
+        right.assign(load * b)
+        result = wl.solve(problem, method, workspace=work)
+        assert "coarse problem" in {r.step for r in result.history}
+        again = solved((factor * A, load * b, lower, upper))
+        assert result.iterations == again.iterations
+        np.testing.assert_array_equal(result.x.numpy(), again.x.numpy())
+
+
+def test_coarse_unknowns_are_fine_ones():
+    A = laplacian(40)
+    P, coarse, points = coarse_points(A)
+    assert 4 * len(points) <= 1600
+    np.testing.assert_array_equal(P[points].toarray(), np.eye(len(points)))
+    np.testing.assert_allclose(coarse.toarray(), (P.T @ A @ P).toarray(), atol=1e-14)
+    assert coarse_points(scipy.sparse.eye_array(50).tocsr()) is None
+
+
+WEAK = {"clamped": (plate(60, clamped=True), 180), "supported": (plate(60, clamped=False), 190), "elastic": (elastic_block(50), 150)}
+
+
+@pytest.mark.parametrize("name", WEAK)
+def test_weak_preconditioners_cost_one_linear_solve(name, device):
+    """Newton's steps took 1,232, 1,406 and 658 iterations, most of them in steps that its safeguard undid."""
+    data, linear = WEAK[name]
+    result = solved(data, device=device)
+    assert result.linear_iterations <= linear
+    assert result.iterations <= 10
+
+
+def test_the_energy_is_the_progress_of_mprgp():
+    """The residual of a plate is above its start for dozens of steps, while the energy falls in each; patience ended them after 30."""
+    result = solved(plate(60, clamped=True), wl.MPRGP(), max_iterations=1000)
+    assert result.iterations <= 130
+    assert max(r.residual for r in result.history[31:60]) > result.history[0].residual
+
+
+def test_patience_ends_mprgp_where_rounding_does():
+    A, b, lower, upper = plate(20, clamped=True)
+    stopping = wl.StoppingCriteria(rtol=0.0, max_iterations=2000)
+    result = wl.solve(wl.LCP(wl.SparseOperator(A, device="cpu"), b, lower, upper), wl.MPRGP(), stopping=stopping)
+    assert result.status in (wl.SolveStatus.FLOOR, wl.SolveStatus.STAGNATED)
+    assert result.iterations < 500
+
+
+def test_an_energy_without_a_minimum_goes_back_to_newton():
+    """Symmetric, positive on the diagonal, indefinite: conjugate gradients run away, and the answer must say what it is."""
+    n = 1200
+    A = (plate(35, clamped=True)[0][:n, :n] - 0.5 * scipy.sparse.eye_array(n)).tocsr()
+    b = np.random.default_rng(907).standard_normal(n)
+    result = wl.solve(wl.LCP(wl.SparseOperator(A, device="cpu"), b), wl.MinimumMapNewton())
+    x = result.x.numpy()
+    assert bool(result) == (natural(A, b, 0.0, np.inf, x) <= 1.01e-6 * natural(A, b, 0.0, np.inf, np.zeros(n)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [500, 1000])
+def test_torsion_of_a_fine_mesh(n):
+    assert solved(torsion(n)).iterations <= 20
+
+
+@pytest.mark.slow
+def test_a_fine_plate():
+    assert solved(plate(160, clamped=True)).linear_iterations <= 450
