@@ -14,6 +14,7 @@ from warp_lcp.native import Spans
 from warp_lcp.operators.sparse_kernels import color_kernel, gather_kernel, kernels
 from warp_lcp.problem import as_operator
 from warp_lcp.program import Launch
+from warp_lcp.scale import scale_of_matrix
 from warp_lcp.vectors import launch_spans
 
 SYMMETRIC = 64 * float(np.finfo(np.float64).eps)  # of the largest entries of two rows: what assembly in float64 leaves of symmetry
@@ -62,6 +63,7 @@ class SparseOperator:
         self._diagonal = wp.zeros(self.unknowns, dtype=dtype, device=self.device)
         self._transpose_values: wp.array[Any] | None = None
         self.version = 0
+        self._scale: np.ndarray | None = None
         self._take(host)
 
     @property
@@ -131,6 +133,12 @@ class SparseOperator:
     def diagonal(self) -> wp.array[Any]:
         """Return the diagonal of A, shape (n,): the operator's own memory, which `update` keeps current."""
         return self._diagonal
+
+    def scale(self) -> np.ndarray:
+        """Return the natural residual's d, shape (n,)."""
+        if self._scale is None:
+            self._scale = scale_of_matrix(self.matrix())
+        return self._scale
 
     def masked(self, free: Any, shift: Any = None) -> SparseOperator:
         """Return P A P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift)."""
@@ -204,6 +212,7 @@ class SparseOperator:
         self._diagonal.assign(host.diagonal().astype(wp.dtype_to_numpy(self.dtype)))
         if self._transpose_values is not None:
             self._gather(self._transpose[2])
+        self._scale = None
         self.version += 1
 
     def _gather(self, order: wp.array[Any]) -> None:

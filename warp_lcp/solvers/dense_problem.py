@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
+from warp_lcp.scale import scale_of_matrix
 from warp_lcp.solve import IterateInPlace, Precision, Step
 
 SEMIDEFINITE = 1e-10  # shift with which an equilibrated semi-definite matrix must have a Cholesky factor
@@ -67,10 +69,13 @@ class DenseProblem:
         A = scipy.sparse.csr_array(self.A.multiply(S[:, None]).multiply(S)) if scipy.sparse.issparse(self.A) else S[:, None] * self.A * S
         return DenseProblem(self.rows, A, b / beta, self.lower / units, self.upper / units), units
 
+    @cached_property
+    def _scale(self) -> np.ndarray:
+        return scale_of_matrix(self.A)
+
     def residual(self, x: np.ndarray) -> float:
         """Return the norm of the natural residual."""
-        d = np.abs(self.A.diagonal())
-        d = np.where(d == 0, 1.0, d)
+        d = self._scale
         return float(np.linalg.norm(d * (x - np.clip(x - self.affine(x) / d, self.lower, self.upper))))
 
     def polished(self, x: np.ndarray, free: np.ndarray) -> np.ndarray:

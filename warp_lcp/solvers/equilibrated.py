@@ -17,7 +17,7 @@ from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
 from warp_lcp.solve import IterateInPlace, Precision, RoundedIterate, Step
-from warp_lcp.solvers.dense_problem import equilibration, power_of_two, proved_infeasible
+from warp_lcp.solvers.dense_problem import power_of_two, proved_infeasible
 from warp_lcp.solvers.equilibrated_kernels import multiply_kernel
 
 ALIKE = 4.0  # rows whose units differ by no more stay as they are
@@ -30,7 +30,7 @@ EARLY = 10  # steps before which a residual says little: a path is joined far fr
 class EquilibratedWorkspace(IterateInPlace, RoundedIterate):
     """A method's workspace for S A S x' + S b, bounds l / S and u / S, and the problem's own iterate x = S x'.
 
-    S are powers of 2 near |a_ii|^(-1/2) (Jacobi's scaling), those of Ruiz's iteration where a diagonal entry is 0. A step whose x is not
+    S are powers of 2 near d_i^(-1/2) with the natural residual's d (of semi-definite matrices Jacobi's scaling). A step whose x is not
     finite is not taken: it ends the solve, with INFEASIBLE if a linear program proves that there is no solution, else with STAGNATED.
 
     Args:
@@ -75,7 +75,7 @@ class EquilibratedWorkspace(IterateInPlace, RoundedIterate):
                 operator.update(self._scaled())
             else:
                 operator.matrix.assign(self._scaled())
-                wp.copy(self.inner.residual.diagonal, operator.diagonal())
+                self.inner.residual.rescale()
         self._multiply(self.problem.b, inner.b)
         for k, side in enumerate(self._sides):
             if side is not None:
@@ -118,8 +118,7 @@ class EquilibratedWorkspace(IterateInPlace, RoundedIterate):
         """Set S, and return S A S on the host."""
         A: Any = self.problem.A
         matrix = A.matrix() if isinstance(A, SparseOperator) else A.matrix.numpy().astype(np.float64)
-        d = np.abs(matrix.diagonal())
-        S = power_of_two(1 / np.sqrt(d)) if d.all() else equilibration(matrix)
+        S = power_of_two(1 / np.sqrt(A.scale()))
         if S.max() <= ALIKE * S.min():
             S = np.ones(len(S))
         self._units.assign(S)

@@ -261,8 +261,7 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         """
         p, residual, start = self.problem, self.residual, x.numpy().copy()
         norm, y = residual.evaluate(x), residual.y.numpy()
-        d = np.abs(residual.diagonal.numpy().astype(np.float64)) * residual.unit
-        d = np.where(d == 0, 1.0, d)
+        d = residual.diagonal.numpy().astype(np.float64)
         lower, upper, A = p.lower.numpy(), p.upper.numpy(), p.A.matrix.numpy().astype(np.float64)  # type: ignore[attr-defined]
         r = d * (start - np.clip(start - y / d, lower, upper))
         held = (start - y / d < lower) | (start - y / d > upper)
