@@ -28,15 +28,22 @@ TRUSTED = 10.0  # times |A_ii|: an operator's rows and columns that are larger h
 
 def scale_of_matrix(A: Any) -> np.ndarray:
     """Return d > 0, shape (n,), of a numpy or scipy.sparse matrix; an empty row or column counts as 1."""
+    return sizes_of_matrix(A)[0]
+
+
+def sizes_of_matrix(A: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return d, 1 / r and 1 / c, shape (n,); where d_i = |A_ii|, r = c."""
     size = abs(A)
     d = np.asarray(size.diagonal(), dtype=np.float64)
     with np.errstate(over="ignore"):
         if _diagonal_leads(size, d):
-            return np.where(d > 0, d, 1.0)
+            d = np.where(d > 0, d, 1.0)
+            return d, np.sqrt(d), np.sqrt(d)
     q = _largest(size, 0)
     q = np.where(q > 0, q, 1.0)
-    t = _largest(_scaled(size, np.ones_like(q), 1 / q), 1)
-    return q * np.where(t > 0, t, 1.0)
+    t = _largest(scaled(size, np.ones_like(q), 1 / q), 1)
+    t = np.where(t > 0, t, 1.0)
+    return q * t, t, q
 
 
 def scale_by_products(
@@ -71,14 +78,14 @@ def _diagonal_leads(size: Any, d: np.ndarray) -> bool:
     if zero.size and (_largest(size[zero], 1).any() or _largest(size[:, zero], 0).any()):
         return False
     root = np.sqrt(np.where(d > 0, d, 1.0))
-    w = _scaled(size, 1 / root, 1 / root)
+    w = scaled(size, 1 / root, 1 / root)
     if w.max() <= 1 + SLACK:
         return True
     if (w.multiply(w.T) if scipy.sparse.issparse(w) else w * w.T).max() > 1 + 2 * SLACK:
         return False
     g = np.ones_like(d)
     for _ in range(PASSES):
-        most = _largest(_scaled(w, g, 1 / g), 1)
+        most = _largest(scaled(w, g, 1 / g), 1)
         if most.max() <= 1 + SLACK:
             return True
         g = g / np.maximum(most, 1.0)
@@ -87,7 +94,7 @@ def _diagonal_leads(size: Any, d: np.ndarray) -> bool:
     return False
 
 
-def _scaled(A: Any, left: np.ndarray, right: np.ndarray) -> Any:
+def scaled(A: Any, left: np.ndarray, right: np.ndarray) -> Any:
     """Return diag(left) A diag(right)."""
     if not scipy.sparse.issparse(A):
         return left[:, None] * A * right
