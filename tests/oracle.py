@@ -3,6 +3,7 @@
 import itertools
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 
 def assemble(cells, faces=(1.0, 1.0, 1.0), shift=None, periodic=(False, False, False)):
@@ -82,9 +83,27 @@ def boxed(A, b, lower, upper):
     return None
 
 
+def natural_scale(A):
+    """The natural residual's d: |A_ii| where no other transversal of A has a larger product than the diagonal (by assignment), else that of
+    columns scaled to 1 and then rows."""
+    size = np.abs(np.asarray(A, dtype=np.float64))
+    full = (size > 0).any(axis=0) | (size > 0).any(axis=1)
+    inner, d = size[np.ix_(full, full)], np.ones(len(size))
+    with np.errstate(divide="ignore"):
+        cost = -np.log(inner)
+    allowed = np.isfinite(cost)
+    if np.diag(allowed).all():
+        far = 4.0 * len(cost) * (np.abs(cost[allowed]).max(initial=0.0) + 1.0)  # as good as forbidden
+        best = np.where(allowed, cost, far)[linear_sum_assignment(np.where(allowed, cost, far))].sum()
+        if np.trace(cost) <= best + 1e-6 * max(1, len(cost)):
+            d[full] = np.diag(inner)
+            return d
+    q = np.array([column.max() or 1.0 for column in size.T])
+    return q * np.array([row.max() or 1.0 for row in size / q])
+
+
 def natural_residual(A, b, lower, upper, x):
     """Norm of the natural residual, from its definition."""
-    d = np.abs(np.diag(A))
-    d = np.where(d == 0, 1.0, d)
+    d = natural_scale(A)
     y = A @ x + b
     return np.linalg.norm(d * (x - np.clip(x - y / d, lower, upper)))

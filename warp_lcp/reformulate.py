@@ -16,6 +16,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 
 from warp_lcp.problem import LCP, as_operator
+from warp_lcp.scale import scale_of_matrix
 
 Vector = np.ndarray
 Map = Callable[[Vector], Vector]
@@ -269,14 +270,13 @@ def boxed_to_proximal(A: Any, b: Vector, lower: Vector, upper: Vector, *, r: flo
         b: shape (n,).
         lower: l, shape (n,).
         upper: u, shape (n,).
-        r: r > 0; 1 / |A_ii| (1 where that is 0) if None. With r < 2 / ||A||_2 and a symmetric positive definite A repeated application
-            converges.
+        r: r > 0; 1 / d_i of the natural residual (of semi-definite matrices 1 / A_ii) if None. With r < 2 / ||A||_2 and a symmetric
+            positive definite A repeated application converges.
 
     Raises:
         ValueError: r is not positive.
     """
-    d = np.abs(A.diagonal())
-    r = 1 / np.where(d == 0, 1.0, d) if r is None else np.broadcast_to(np.asarray(r, dtype=np.float64), b.shape)
+    r = 1 / scale_of_matrix(A) if r is None else np.broadcast_to(np.asarray(r, dtype=np.float64), b.shape)
     if not (r > 0).all():
         raise ValueError("r holds a value that is not positive")
     return ProximalFixedPoint(lambda x: A @ x + b, r, lower, upper)

@@ -1,11 +1,13 @@
 """The natural residual, the one number in which all methods are compared; always evaluated from x in float64.
 
-r_i = d_i (x_i - clip(x_i - y_i / d_i, l_i, u_i)) with d_i = |A_ii|, 1 where that is 0. r has the units of y and does not change when x is
-rescaled; it vanishes exactly at solutions.
+r_i = d_i (x_i - clip(x_i - y_i / d_i, l_i, u_i)) with d_i = 1 / (r_i c_i) where diag(r) A diag(c) is equilibrated: |A_ii| for positive
+semi-definite matrices and on grids (`warp_lcp.scale`; 1 where a row and a column are empty). r has the units of y and does not change when
+x is rescaled; it vanishes exactly at solutions.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -14,6 +16,7 @@ import warp as wp
 
 from warp_lcp.problem import LCP
 from warp_lcp.residual_kernels import add_kernel, kernels, masked_square_kernel, settle_isolated_kernel, start_kernel
+from warp_lcp.scale import scale_by_products
 from warp_lcp.vectors import Reduction, launch_spans
 
 
@@ -23,6 +26,7 @@ class NaturalResidual:
     Attributes:
         y: stored field, A x + b at the x of the last evaluation.
         norm: the residual's norm there, units of y.
+        diagonal: d / unit, stored field: on grids the stencil's own diagonal, with its sign, and 0 where no unknown or an empty row is.
         current: whether `y` and `norm` belong to the iterate as it is; a method that moves x sets it to False.
     """
 
@@ -31,11 +35,13 @@ class NaturalResidual:
         layout = problem.layout
         self.norm, self.current = 0.0, False
         stencil = getattr(problem.A, "stencil", None)
-        self.diagonal = stencil.d if stencil else layout.load(problem.A.diagonal(), problem.A.dtype)
+        self.diagonal = stencil.d if stencil else wp.zeros(layout.size, dtype=problem.A.dtype, device=layout.device)
         self.unit = float(stencil.unit) if stencil else 1.0
-        self._diagonal_of = None if stencil else getattr(problem.A, "version", None)  # of an operator whose diagonal is a copy
+        self._diagonal_of = None if stencil else getattr(problem.A, "version", None)  # of an operator whose scale is a copy
         self._sums = wp.zeros(2, dtype=wp.float64, device=layout.device)
         self._reduction = Reduction(layout.size, layout.device, self._sums, across=layout.across)
+        if not stencil:
+            self.rescale()
 
     @cached_property
     def y(self) -> wp.array[Any]:
@@ -69,11 +75,33 @@ class NaturalResidual:
         p = self.problem
         if self._diagonal_of is not None and self._diagonal_of != p.A.version:  # type: ignore[attr-defined]
             self._diagonal_of = p.A.version  # type: ignore[attr-defined]
-            wp.copy(self.diagonal, p.layout.load(p.A.diagonal(), p.A.dtype))
+            self.rescale()
         for _ in range(1 if p.bounds.affine is None else 2):  # bounds that depend on x: at x as it is, then at x within its bounds
             p.bounds.follow(x)
             launch_spans(start_kernel, self._reduction.spans, [x, *p.bounds.operands, p.unknown, keep], [], p.device)
         self.current = False
+
+    def rescale(self) -> None:
+        """Take d again from an operator that has changed; grids share theirs."""
+        own = getattr(self.problem.A, "scale", None)
+        d = self._estimated_scale() if own is None else own()
+        self.diagonal.assign(np.maximum(d, np.finfo(wp.dtype_to_numpy(self.diagonal.dtype)).tiny))
+
+    def _estimated_scale(self) -> np.ndarray:
+        """Return d of an operator that does not know it, a flat stored field."""
+        p, layout = self.problem, self.problem.layout
+        z, image, unknown = layout.zeros(wp.float64), layout.zeros(wp.float64), p.unknown.numpy() == 1
+
+        def images(apply: Callable[..., Any]) -> Callable[[np.ndarray], np.ndarray]:
+            def product(values: np.ndarray) -> np.ndarray:
+                z.assign(values * unknown)
+                apply(z.reshape(layout.stored_shape), image.reshape(layout.stored_shape))
+                return image.numpy() * unknown
+
+            return product
+
+        d = layout.load(p.A.diagonal(), wp.float64).numpy() * unknown
+        return scale_by_products(d, images(p.A.apply), images(p.A.apply if p.A.symmetric else p.A.apply_transpose))
 
     def settle_isolated(self, x: wp.array[Any]) -> None:
         """Set x where A's row is empty, so that y = b, to the bound that b's sign asks for; methods move coupled unknowns only."""

@@ -319,11 +319,14 @@ class _Loop:
         return None if self.deadline.left() > 0 else SolveStatus.TIME_LIMIT
 
     def _floor_or(self, status: SolveStatus) -> SolveStatus:
-        """Return FLOOR where the best iterate's residual is what rounding leaves, else the status: the solve ends with it."""
+        """Return FLOOR where the best iterate's residual is what rounding leaves, else the status: the solve ends with it.
+
+        A proof that there is no solution stays one: iterates that leave for infinity have any rounding.
+        """
         if self.best_iteration != self.history[-1].iteration:
             self.work.restore()
         floor = FLOOR_MARGIN * self.residual.rounding_floor(self.work.x, self.work.precision.epsilon)
-        return SolveStatus.FLOOR if self.best_norm <= floor else status
+        return SolveStatus.FLOOR if self.best_norm <= floor and status is not SolveStatus.INFEASIBLE else status
 
     def _record(self, iteration: int, step: Step) -> None:
         seconds = time.perf_counter() - self.begun

@@ -1,7 +1,8 @@
 """A x + b of hostile problems and its natural residual, assembled anew in float64: no code of the library takes part.
 
-r_i = d_i (x_i - clip(x_i - y_i / d_i, l_i, u_i)) with d_i = |A_ii|, 1 where that is 0. Norms are scaled by their largest entry, so that
-squares neither overflow nor vanish.
+r_i = d_i (x_i - clip(x_i - y_i / d_i, l_i, u_i)) with d_i = 1 / (r_i c_i), diag(r) A diag(c) equilibrated: |A_ii| where no transversal of A
+has a larger product than the diagonal, else that of columns scaled to 1, then rows; 1 for empty rows and columns. Norms are scaled by
+their largest entry, so that squares neither overflow nor vanish.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse
+from scipy.optimize import linear_sum_assignment
 
 AIR, FLUID, SOLID = 0, 1, 2
 AXES = "xyz"
@@ -43,9 +45,11 @@ class Exact:
         return np.clip(np.zeros(len(self.b)), self.lower, self.upper)
 
     def diagonal(self, *, bodies: bool = True) -> np.ndarray:
-        """Return |A_ii|, 1 where that is 0; without the term of bodies if so asked."""
+        """Return d; without the term of bodies, which is semi-definite, if so asked."""
+        if self.columns is None or self.weights is None:
+            return equilibrated_scale(self.matrix)
         d = np.asarray(self.matrix.diagonal(), dtype=np.float64)
-        if bodies and self.columns is not None and self.weights is not None:
+        if bodies:
             d = d + np.einsum("ij,jk,ik->i", self.columns, self.weights, self.columns)
         return np.where(d == 0.0, 1.0, np.abs(d))
 
@@ -63,6 +67,33 @@ class Exact:
         if self.columns is not None and self.weights is not None:
             size = size + np.abs(self.columns) @ (np.abs(self.weights) @ (np.abs(self.columns).T @ np.abs(x)))
         return norm(size)
+
+
+def equilibrated_scale(matrix: Any) -> np.ndarray:
+    """Return the d of a matrix's natural residual, by SciPy's matching where entries are larger than their rows' and columns' diagonals."""
+    A = scipy.sparse.csr_array(matrix, dtype=np.float64)
+    A.eliminate_zeros()
+    entries, d = A.tocoo(), np.abs(A.diagonal())
+    size, row, column = np.abs(entries.data), entries.row, entries.col
+    empty = (np.diff(A.indptr) == 0) & (np.bincount(column, minlength=len(d)) == 0)
+    if (d[~empty] > 0).all():
+        one = np.where(empty, 1.0, d)
+        cost = np.log(np.sqrt(one[row])) + np.log(np.sqrt(one[column])) - np.log(size)  # 0 on the diagonal
+        if (cost >= -1e-6).all() or _least_cost(cost, row, column, np.flatnonzero(empty), len(d)) >= -1e-6 * len(d):
+            return one
+    q, t = np.zeros(len(d)), np.zeros(len(d))
+    np.maximum.at(q, column, size)
+    q[q == 0] = 1.0
+    np.maximum.at(t, row, size / q[column])
+    t[t == 0] = 1.0
+    return q * t
+
+
+def _least_cost(cost: np.ndarray, row: np.ndarray, column: np.ndarray, alone: np.ndarray, n: int) -> float:
+    """Return the cost of the cheapest matching of rows and columns, `alone` with themselves at no cost; dense, O(n^3)."""
+    table = np.full((n, n), 4.0 * n * (float(np.abs(cost).max()) + 1.0))  # as good as forbidden
+    table[row, column], table[alone, alone] = cost, 0.0
+    return float(table[linear_sum_assignment(table)].sum())
 
 
 def norm(values: np.ndarray) -> float:

@@ -12,6 +12,7 @@ from warp_lcp.layout import Layout, check_kept, check_storable, real_array
 from warp_lcp.operators.dense_kernels import product_kernel, relax_kernel
 from warp_lcp.pickling import Pickled, made_again
 from warp_lcp.problem import as_operator
+from warp_lcp.scale import scale_of_matrix
 
 SYMMETRIC = 64 * float(np.finfo(np.float64).eps)  # of the largest entries of two rows: what J M^-1 J' in float64 leaves of symmetry
 
@@ -68,6 +69,10 @@ class DenseOperator(Pickled):
     def diagonal(self) -> wp.array[Any]:
         """Return the diagonal of A, shape (n,)."""
         return wp.array(np.diag(self.matrix.numpy()).copy(), dtype=self.dtype, device=self.device)
+
+    def scale(self) -> np.ndarray:
+        """Return the natural residual's d, shape (n,), of the entries as they are now."""
+        return scale_of_matrix(self.matrix.numpy().astype(np.float64))
 
     def masked(self, free: Any, shift: Any = None) -> DenseOperator:
         """Return P A P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift)."""

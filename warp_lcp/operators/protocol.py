@@ -19,6 +19,9 @@ class Operator(Protocol):
         dtype: type in which A's entries are stored, wp.float32 or wp.float64.
         device: the device of A's arrays.
         symmetric: whether A equals its transpose.
+
+    An operator may have a method `scale`, which returns the d > 0 of the natural residual as a flat NumPy array (`warp_lcp.scale` has
+    that of matrices); without one, d is estimated by 16 products.
     """
 
     shape: tuple[int, ...]

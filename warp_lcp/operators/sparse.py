@@ -15,6 +15,7 @@ from warp_lcp.operators.sparse_kernels import color_kernel, gather_kernel, kerne
 from warp_lcp.pickling import Pickled, made_again
 from warp_lcp.problem import as_operator
 from warp_lcp.program import Launch
+from warp_lcp.scale import scale_of_matrix
 from warp_lcp.vectors import launch_spans
 
 SYMMETRIC = 64 * float(np.finfo(np.float64).eps)  # of the largest entries of two rows: what assembly in float64 leaves of symmetry
@@ -63,6 +64,7 @@ class SparseOperator(Pickled):
         self._diagonal = wp.zeros(self.unknowns, dtype=dtype, device=self.device)
         self._transpose_values: wp.array[Any] | None = None
         self.version = 0
+        self._scale: np.ndarray | None = None
         self._take(host)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -145,6 +147,12 @@ class SparseOperator(Pickled):
         """Return the diagonal of A, shape (n,): the operator's own memory, which `update` keeps current."""
         return self._diagonal
 
+    def scale(self) -> np.ndarray:
+        """Return the natural residual's d, shape (n,)."""
+        if self._scale is None:
+            self._scale = scale_of_matrix(self.matrix())
+        return self._scale
+
     def masked(self, free: Any, shift: Any = None) -> SparseOperator:
         """Return P A P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift)."""
         p = scipy.sparse.diags_array((self.layout.load(free, wp.uint8, "free").numpy() != 0).astype(np.float64))
@@ -218,6 +226,7 @@ class SparseOperator(Pickled):
         self._diagonal.assign(host.diagonal().astype(wp.dtype_to_numpy(self.dtype)))
         if self._transpose_values is not None:
             self._gather(self._transpose[2])
+        self._scale = None
         self.version += 1
 
     def _gather(self, order: wp.array[Any]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -91,6 +92,11 @@ class SumOperator(Pickled):
         """Return the sum of the diagonals."""
         d = self.first.diagonal().numpy().astype(np.float64) + self.second.diagonal().numpy()
         return wp.array(d, dtype=self.dtype, device=self.device)
+
+    @property
+    def scale(self) -> Callable[[], np.ndarray] | None:
+        """What returns the natural residual's d: the diagonal of a grid and a symmetric term of low rank; None for other sums."""
+        return None if grid_and_low_rank(self) is None else lambda: self.layout.load(self.diagonal(), self.dtype).numpy()
 
     def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
         """Out = A x + B x + b; flat stored fields of one type."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
+from warp_lcp.scale import scale_of_matrix, scaled, sizes_of_matrix
 from warp_lcp.solve import IterateInPlace, Precision, Step
 
 SEMIDEFINITE = 1e-10  # shift with which an equilibrated semi-definite matrix must have a Cholesky factor
@@ -34,6 +36,7 @@ class DenseProblem:
         b: shape (n,), units of y.
         lower: l, shape (n,).
         upper: u, shape (n,).
+        symmetric: whether A is, and is to stay so in other units.
     """
 
     rows: np.ndarray
@@ -41,15 +44,16 @@ class DenseProblem:
     b: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
+    symmetric: bool = True
 
     @classmethod
     def read(cls, problem: LCP, *, keep_sparse: bool = False) -> DenseProblem:
         """Copy a problem's data as they are now to the host."""
         problem.bounds.refresh()
         rows = np.flatnonzero(problem.unknown.numpy() == 1)
-        fields = (field.numpy()[rows].astype(np.float64) for field in (problem.b, *(problem.bounds.as_field(k) for k in (0, 1))))
+        b, lower, upper = (f.numpy()[rows].astype(np.float64) for f in (problem.b, *(problem.bounds.as_field(k) for k in (0, 1))))
         sparse = sparse_matrix(problem) if keep_sparse else None
-        return cls(rows, assemble(problem, rows) if sparse is None else sparse, *fields)
+        return cls(rows, assemble(problem, rows) if sparse is None else sparse, b, lower, upper, problem.A.symmetric)
 
     def affine(self, x: np.ndarray) -> np.ndarray:
         """Return y = A x + b."""
@@ -58,20 +62,29 @@ class DenseProblem:
     def scaled(self) -> tuple[DenseProblem, np.ndarray]:
         """Return the problem in units in which A's rows and columns have entries near 1, and b too, and those units of x.
 
-        With x = beta S x', y = beta S^-1 y' it is S A S, S b / beta and l / (beta S), u / (beta S): of the same class and symmetry. The
-        units are powers of 2, so that nothing is rounded.
+        With x = beta C x', y = beta R^-1 y' it is R A C, R b / beta and l / (beta C), u / (beta C), of which methods that pivot choose the
+        same pivots but for ties; R = C where A is symmetric. The units are powers of 2, so that nothing is rounded.
         """
-        S = equilibration(self.A)
-        b, start = S * self.b, S * (self.A @ np.clip(0.0, self.lower, self.upper))
+        R, C = self._units()
+        b, start = R * self.b, R * (self.A @ np.clip(0.0, self.lower, self.upper))
         beta = power_of_two(max(np.abs(b).max(), np.abs(start).max()) or 1.0)
-        units = beta * S
-        A = scipy.sparse.csr_array(self.A.multiply(S[:, None]).multiply(S)) if scipy.sparse.issparse(self.A) else S[:, None] * self.A * S
-        return DenseProblem(self.rows, A, b / beta, self.lower / units, self.upper / units), units
+        units = beta * C
+        return DenseProblem(self.rows, scaled(self.A, R, C), b / beta, self.lower / units, self.upper / units, self.symmetric), units
+
+    def _units(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return R and C."""
+        if not self.symmetric:
+            return unit_rows_and_columns(self.A)
+        S = equilibration(self.A)
+        return S, S
+
+    @cached_property
+    def _scale(self) -> np.ndarray:
+        return scale_of_matrix(self.A)
 
     def residual(self, x: np.ndarray) -> float:
         """Return the norm of the natural residual."""
-        d = np.abs(self.A.diagonal())
-        d = np.where(d == 0, 1.0, d)
+        d = self._scale
         return float(np.linalg.norm(d * (x - np.clip(x - self.affine(x) / d, self.lower, self.upper))))
 
     def polished(self, x: np.ndarray, free: np.ndarray) -> np.ndarray:
@@ -124,6 +137,12 @@ def assemble(problem: LCP, rows: np.ndarray) -> np.ndarray:
 def power_of_two(value: Any) -> Any:
     """Return the nearest power of 2, on a logarithmic scale; 1 for 0."""
     return 2.0 ** np.round(np.log2(np.where(value > 0, value, 1.0)))
+
+
+def unit_rows_and_columns(A: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return R and C > 0, powers of 2, so that R A C has a largest entry near 1 in each row and in each column, or its diagonal near 1."""
+    _, rows, columns = sizes_of_matrix(A)
+    return power_of_two(1 / rows), power_of_two(1 / columns)
 
 
 def equilibration(A: Any) -> np.ndarray:

@@ -16,8 +16,9 @@ from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
+from warp_lcp.scale import scaled
 from warp_lcp.solve import IterateInPlace, Precision, RoundedIterate, Step
-from warp_lcp.solvers.dense_problem import equilibration, power_of_two, proved_infeasible
+from warp_lcp.solvers.dense_problem import power_of_two, proved_infeasible, unit_rows_and_columns
 from warp_lcp.solvers.equilibrated_kernels import multiply_kernel
 
 ALIKE = 4.0  # rows whose units differ by no more stay as they are
@@ -28,9 +29,10 @@ EARLY = 10  # steps before which a residual says little: a path is joined far fr
 
 
 class EquilibratedWorkspace(IterateInPlace, RoundedIterate):
-    """A method's workspace for S A S x' + S b, bounds l / S and u / S, and the problem's own iterate x = S x'.
+    """A method's workspace for R A C x' + R b, bounds l / C and u / C, and the problem's own iterate x = C x'.
 
-    S are powers of 2 near |a_ii|^(-1/2) (Jacobi's scaling), those of Ruiz's iteration where a diagonal entry is 0. A step whose x is not
+    R and C are powers of 2 with R_i C_i near 1 / d_i of the natural residual, equal where A is symmetric (of semi-definite matrices:
+    Jacobi's scaling). A step whose x is not
     finite is not taken: it ends the solve, with INFEASIBLE if a linear program proves that there is no solution, else with STAGNATED.
 
     Args:
@@ -45,7 +47,7 @@ class EquilibratedWorkspace(IterateInPlace, RoundedIterate):
     def __init__(self, problem: LCP, precision: Precision, make: Callable[[LCP], Any]) -> None:
         self.problem, self.precision = problem, precision
         layout, bounds = problem.layout, problem.bounds
-        self.x, self._units = layout.zeros(wp.float64), layout.zeros(wp.float64)
+        self.x, self._rows, self._units = (layout.zeros(wp.float64) for _ in range(3))
         self.residual = NaturalResidual(problem)
         self._rounded = layout.zeros(wp.float32) if precision is Precision.SINGLE else None
         self.floating: Any = None
@@ -75,8 +77,8 @@ class EquilibratedWorkspace(IterateInPlace, RoundedIterate):
                 operator.update(self._scaled())
             else:
                 operator.matrix.assign(self._scaled())
-                wp.copy(self.inner.residual.diagonal, operator.diagonal())
-        self._multiply(self.problem.b, inner.b)
+                self.inner.residual.rescale()
+        wp.launch(multiply_kernel, inner.b.size, [self.problem.b, self._rows, False, inner.b], device=self.problem.device)
         for k, side in enumerate(self._sides):
             if side is not None:
                 self._multiply(self.problem.bounds.as_field(k), side, inverse=True)
@@ -84,7 +86,7 @@ class EquilibratedWorkspace(IterateInPlace, RoundedIterate):
         self._multiply(self.x, self.inner.x, inverse=True)
         self.inner.floating = None
         self.inner.residual.evaluate(self.inner.x)
-        self.inner.start(warm=warm, tolerance=tolerance * float(self._units.numpy().min()))
+        self.inner.start(warm=warm, tolerance=tolerance * float(self._rows.numpy().min()))
         self._smallest, self._waited, self._steps, self._asked = math.inf, 0, 0, False
 
     def step(self, advance: Callable[[LCP, Any, wp.array[Any]], Step]) -> Step:
@@ -115,18 +117,15 @@ class EquilibratedWorkspace(IterateInPlace, RoundedIterate):
         return SolveStatus.INFEASIBLE if proved_infeasible(self.problem) else SolveStatus.STAGNATED
 
     def _scaled(self) -> Any:
-        """Set S, and return S A S on the host."""
+        """Set R and C, and return R A C on the host."""
         A: Any = self.problem.A
         matrix = A.matrix() if isinstance(A, SparseOperator) else A.matrix.numpy().astype(np.float64)
-        d = np.abs(matrix.diagonal())
-        S = power_of_two(1 / np.sqrt(d)) if d.all() else equilibration(matrix)
-        if S.max() <= ALIKE * S.min():
-            S = np.ones(len(S))
-        self._units.assign(S)
-        if not scipy.sparse.issparse(matrix):
-            return S[:, None] * matrix * S
-        matrix.data = np.repeat(S, np.diff(matrix.indptr)) * matrix.data * S[matrix.indices]
-        return matrix
+        R, C = (power_of_two(1 / np.sqrt(A.scale())),) * 2 if A.symmetric else unit_rows_and_columns(matrix)
+        if max(R.max() / R.min(), C.max() / C.min()) <= ALIKE:
+            R = C = np.ones(len(R))
+        self._rows.assign(R)
+        self._units.assign(C)
+        return scaled(matrix, R, C)
 
     def _multiply(self, field: wp.array[Any], out: wp.array[Any], *, inverse: bool = False) -> None:
         wp.launch(multiply_kernel, field.size, [field, self._units, inverse, out], device=self.problem.device)

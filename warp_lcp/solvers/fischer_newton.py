@@ -33,8 +33,9 @@ SHARE = 0.95  # lambda of the penalized map for dense problems: measured on fric
 class FischerNewton:
     """Solve f(x) = 0 for the Fischer-Burmeister map, plain or penalized, by a nonsmooth Newton method ([Book] 2.4.2-3, algorithm 12).
 
-    f_i = lambda psi(a_i, y_i) + (1 - lambda) a_i+ y_i+ / scale, psi(a, b) = a + b - sqrt(a^2 + b^2), a = d (x - l), d = |A_ii|; two-sided
-    rows take psi(a, -psi(-y, d (u - x))) ([Book] eq. 1.48), rows without bounds y. The step solves J dx = -f with J = diag(p d) +
+    f_i = lambda psi(a_i, y_i) + (1 - lambda) a_i+ y_i+ / scale, psi(a, b) = a + b - sqrt(a^2 + b^2), a = d (x - l) with d of the
+    natural residual; two-sided rows take psi(a, -psi(-y, d (u - x))) ([Book] eq. 1.48), rows without bounds y. The step solves
+    J dx = -f with J = diag(p d) +
     diag(q) A: divided by q it is the shifted system (A + D) dx = -f / q, D = d p / q, which multigrid preconditions on grids. The merit
     f.f / 2 may not exceed the largest of the last ones. Iterates need not obey the bounds; what is returned as solved does.
 

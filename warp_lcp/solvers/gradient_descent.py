@@ -25,10 +25,10 @@ LONGEST = 1e6  # length tried
 class GradientDescent:
     """Descend on the merit f.f / 2 of a reformulation ([Book] 2.4.4, eq. 2.199, algorithm 13).
 
-    x <- clip(x - t d^-2 J'f, l, u) with an element J = diag(p d) + diag(q) A of the generalized Jacobian and d = |A_ii|, which makes
-    the direction independent of x's units. t comes from a backtracking search along the projected path that starts at Barzilai and
-    Borwein's length; the merit may not exceed the largest of the last ones. Needs products with A' as well, and nothing else of A: it
-    is slow, with a rate that the square of A's condition decides.
+    x <- clip(x - t d^-2 J'f, l, u) with an element J = diag(p d) + diag(q) A of the generalized Jacobian and the natural residual's
+    d, which makes the direction independent of x's units. t comes from a backtracking search along the projected path that starts at
+    Barzilai and Borwein's length; the merit may not exceed the largest of the last ones. Needs products with A' as well, and nothing
+    else of A: it is slow, with a rate that the square of A's condition decides.
 
     The book's tests end it: the absolute one is the criteria of every method (CONVERGED); the relative one (eq. 2.202), a merit that
     changes by less than `relative` of itself, and the stagnation test (eq. 2.203), an x that changes by less than `stagnation` of its

@@ -20,6 +20,7 @@ from warp_lcp.result import SolveStatus
 from warp_lcp.solve import FLOOR_MARGIN, IterateInPlace, Precision, RoundedIterate, Step
 from warp_lcp.solvers.coarse_problem import CoarseProblem
 from warp_lcp.solvers.gradient_phase import GradientPhase
+from warp_lcp.solvers.interior_steps import InteriorSteps
 from warp_lcp.solvers.minimum_map_newton_direct import DirectNewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_kernels import all_free_kernel, kernels
@@ -38,15 +39,16 @@ REGULARIZATIONS = (1e-8, 1e-4, 1e-2, 0.1, 1.0, 10.0, 100.0)  # of J'J, times its
 class MinimumMapNewton:
     """Solve on the unknowns that the minimum map calls free, hold the others at their bounds ([Book] 2.4.1, Schur-reduced).
 
-    Unknown i is held where x_i - y_i / A_ii is outside [l_i, u_i]. Cold, the first steps on a grid are projected multigrid cycles, which
-    find the active set to within a few cells; a Newton step alone moves its boundary by about a layer a step. Each Newton correction is
-    solved inexactly in the corrections' precision, and the step is shortened along its projection onto the bounds if the residual would
-    exceed the largest of the last `memory` ones. On a large sparse matrix, an active set that creeps all the same is moved by a problem on
-    coarse points if A is nearly a diagonally dominant M-matrix; other symmetric A whose linear solves are slow get conjugate gradients
-    within the bounds (MPRGP). Converges on a grid in a few steps; on other matrices A should be a P-matrix. Where it
-    is not, free blocks may be singular and steps lead nowhere: dense and sparse problems then go on by the proximal-point iteration,
-    whose problems have A + eps D: a P-matrix if A is positive semi-definite, skew, or any other P0-matrix. Where that gains nothing
-    either, the status says so: STAGNATED, NON_DESCENT, or INFEASIBLE if a linear program proves it.
+    Unknown i is held where x_i - y_i / d_i, with the natural residual's d, is outside [l_i, u_i]. Cold, the first steps on a grid are
+    projected multigrid cycles, which find the active set to within a few cells; a Newton step alone moves its boundary by about a layer a
+    step. Each Newton correction is solved inexactly in the corrections' precision, and the step is shortened along its projection onto the
+    bounds if the residual would exceed the largest of the last `memory` ones. On a large sparse matrix, an active set that creeps all the
+    same is moved by a problem on coarse points if A is nearly a diagonally dominant M-matrix; other symmetric A whose linear solves are
+    slow get conjugate gradients within the bounds (MPRGP). Converges on a grid in a few steps; on other matrices A should be a P-matrix.
+    Where it is not, free blocks may be singular and steps lead nowhere: dense and sparse problems then go on by interior-point steps where
+    A is not symmetric, as in linear programs, and by the proximal-point iteration, whose problems have A + eps D: a P-matrix if A is
+    positive semi-definite, skew, or any other P0-matrix. Where that gains nothing either, the status says so: STAGNATED, NON_DESCENT, or
+    INFEASIBLE if a linear program proves it.
 
     Args:
         precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate rounded to float32 as well.
@@ -113,13 +115,13 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
     """Memory of the method for one problem.
 
     Attributes:
-        last_resort: whether a proximal-point iteration takes over where steps lead nowhere, if A's entries are at hand.
+        last_resort: whether another iteration takes over where steps lead nowhere, if A's entries are at hand.
         resort: that iteration, once it has.
         descends: whether linear solves are slow, and conjugate gradients that know the bounds have taken over.
     """
 
     last_resort = True
-    resort: ProximalPoint | None = None
+    resort: InteriorSteps | ProximalPoint | None = None
     descends = False
     gradients: GradientPhase | None = None
 
@@ -308,9 +310,10 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         return self.last_resort and self.residual.norm > floor and ProximalPoint.suits(self.problem)
 
     def _resort(self, x: wp.array[Any]) -> Step:
-        """Take a step of the proximal-point iteration."""
+        """Take a step of the last resort."""
         if self.resort is None:
-            self.resort = ProximalPoint(self.problem, self.residual, self.target)
+            made = ProximalPoint if self.problem.A.symmetric else InteriorSteps
+            self.resort = made(self.problem, self.residual, self.target)
         step = self.resort.step(x)
         self._round(x)
         return step
@@ -322,8 +325,7 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         """
         p, residual, start = self.problem, self.residual, x.numpy().copy()
         norm, y = residual.evaluate(x), residual.y.numpy()
-        d = np.abs(residual.diagonal.numpy().astype(np.float64)) * residual.unit
-        d = np.where(d == 0, 1.0, d)
+        d = residual.diagonal.numpy().astype(np.float64)
         lower, upper, A = p.lower.numpy(), p.upper.numpy(), p.A.matrix.numpy().astype(np.float64)  # type: ignore[attr-defined]
         r = d * (start - np.clip(start - y / d, lower, upper))
         held = (start - y / d < lower) | (start - y / d > upper)

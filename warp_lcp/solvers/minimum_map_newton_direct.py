@@ -39,8 +39,7 @@ class SmallMatrix:
     def refresh(self) -> None:
         """Take the entries as they are now."""
         A = self._A
-        host = A.matrix().toarray() if isinstance(A, SparseOperator) else A.matrix.numpy().astype(np.float64, copy=False)
-        self._host, self.diagonal = host, host.diagonal()
+        self._host = A.matrix().toarray() if isinstance(A, SparseOperator) else A.matrix.numpy().astype(np.float64, copy=False)
 
     def product(self, x: np.ndarray) -> np.ndarray:
         """Return A x."""
@@ -88,7 +87,6 @@ class BandedMatrix:
             host = A.matrix.numpy()
             for o in range(-k, k + 1):
                 self._bands[k - o, max(o, 0) : n + min(o, 0)] = host.diagonal(o)
-        self.diagonal = self._bands[k].copy()
         self._by_columns = np.asfortranarray(self._bands)
         sizes = np.abs(self._bands).sum(axis=0)
         self._size, self._own = sizes.max(), np.where(sizes > 0, sizes, 1.0)
@@ -148,8 +146,8 @@ class HostResidual(NaturalResidual):
 
     @cached_property
     def diagonal(self) -> wp.array[Any]:
-        """The operator's, for what goes on by kernels."""
-        return self.problem.layout.load(self.problem.A.diagonal(), self.problem.A.dtype)
+        """The scale, for what goes on by kernels."""
+        return wp.array(self.scale, dtype=self.problem.A.dtype, device=self.problem.device)
 
     @cached_property
     def y(self) -> wp.array[Any]:
@@ -159,9 +157,10 @@ class HostResidual(NaturalResidual):
     def start(self, x: wp.array[Any], *, keep: bool) -> None:
         """Set x to clip(x, l, u), or to clip(0, l, u)."""
         self.matrix.refresh()
-        bounds, d = self.problem.bounds, np.abs(self.matrix.diagonal)
+        bounds = self.problem.bounds
         self.lower, self.upper, self.b = bounds.host(0), bounds.host(1), self.problem.b.numpy()
-        self.scale = d if d.all() else np.where(d == 0, 1.0, d)
+        self.scale = self.problem.A.scale()  # type: ignore[attr-defined]
+        self.__dict__.pop("diagonal", None)
         values = self.values(x)
         np.clip(values if keep else 0.0, self.lower, self.upper, out=values)
         self.current = False
@@ -234,7 +233,7 @@ class DirectNewtonWorkspace(RoundedIterate):
         else:
             self.matrix.refresh()
             self._lower, self._upper = bounds.host(0), bounds.host(1)
-            self._d = np.where(self.matrix.diagonal == 0, 1.0, np.abs(self.matrix.diagonal))
+            self._d = residual.diagonal.numpy().astype(np.float64)
         self._seen: set[bytes] = set()
         self._held: tuple[np.ndarray, np.ndarray] | None = None
         self._reach, self._plain, self._pause = 0, 0, PAUSE

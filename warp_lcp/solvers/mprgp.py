@@ -23,6 +23,7 @@ from warp_lcp.solvers.minimum_map_newton_kernels import all_free_kernel
 from warp_lcp.solvers.principal_system import DiagonalSystem, principal_system
 from warp_lcp.solvers.principal_system_sparse import SparseSystem
 from warp_lcp.solvers.projected_multigrid_workspace import PLANES_A_THREAD
+from warp_lcp.solvers.sweep import Diagonal
 from warp_lcp.vectors import Reduction, launch_spans
 
 SINGLE_SLACK = 1.2e-7  # a bound that float32 rounds is met within this part of it
@@ -85,7 +86,7 @@ class MPRGP:
         if not problem.A.symmetric:
             raise ValueError("A is not symmetric: MPRGP minimizes an energy that only a symmetric A has; take MinimumMapNewton or Lemke")
         work = GradientWorkspace(problem, self)
-        negative = np.count_nonzero(work.residual.diagonal.numpy().astype(np.float64) * work.residual.unit < 0)
+        negative = np.count_nonzero(Diagonal(problem, work.residual).values() < 0)
         if negative:
             raise ValueError(f"A has {negative} negative diagonal entries: MPRGP needs a positive semi-definite A")
         return work

@@ -42,7 +42,7 @@ class Kink(Enum):
 class NonsmoothMap:
     """f, the merit f.f / 2 and its gradient, at the point where a residual was evaluated last.
 
-    With d = |A_ii| (1 where that is 0), a = d (x - l), c = d (u - x) and psi(a, b) = a + b - sqrt(a^2 + b^2), the Fischer map of a boxed
+    With the natural residual's d, a = d (x - l), c = d (u - x) and psi(a, b) = a + b - sqrt(a^2 + b^2), the Fischer map of a boxed
     row is psi(a, -psi(-y, c)) ([Book] eq. 1.48, signs turned so that f > 0 where y > 0), of one without upper bound psi(a, y), of an
     equation y; penalized: lambda times that plus (1 - lambda) (a+ y+ - c+ (-y)+) / scale with `scale` the root mean square of b. The
     factor d makes f's units those of y, so that a change of x's units changes nothing.

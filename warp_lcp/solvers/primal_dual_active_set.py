@@ -31,8 +31,9 @@ SLACK = 1e-12  # of the largest magnitudes of x and y: violations below it are r
 class PrimalDualActiveSet:
     """Guess the active set from x and y, solve for the rest, repeat until the guess stays (Hintermueller, Ito, Kunisch 2003).
 
-    Unknown i is held at l_i if x_i - y_i / A_ii < l_i, at u_i if it is above, else free: y_i = 0 there. This is MinimumMapNewton's step
-    without search or projection, and shares its implementation. Started anywhere it ends after finitely many steps if A is an M-matrix;
+    With the natural residual's d, unknown i is held at l_i if x_i - y_i / d_i < l_i, at u_i if it is above, else free: y_i = 0 there. This
+    is MinimumMapNewton's step without search or projection, and shares its implementation. Started anywhere it ends after finitely many
+    steps if A is an M-matrix;
     on other P-matrices it may cycle. A set that comes again without a smaller residual is a cycle: then dense problems go on by
     least-index principal pivoting (Murty; with bounds Judice and Pires), which is finite for every P-matrix but may be slow; others by
     MinimumMapNewton's safeguarded steps. Where a free block is singular, which no P-matrix has, dense and sparse problems go on by the

@@ -61,8 +61,8 @@ class ProjectedJacobi:
     def step(self, problem: LCP, work: JacobiWorkspace, x: wp.array[Any]) -> Step:
         """Pass once over the unknowns; y is that of the residual."""
         r = work.residual
-        inputs = [r.diagonal, r.unit, r.y, problem.lower, problem.upper, problem.unknown, work.omega, x]
-        wp.launch(jacobi_kernel(r.diagonal.dtype), x.size, inputs, device=problem.device)
+        inputs = [work.d, r.unit, r.y, problem.lower, problem.upper, problem.unknown, work.omega, x]
+        wp.launch(jacobi_kernel(work.d.dtype), x.size, inputs, device=problem.device)
         work.round_iterate()
         return Step("sweep", 1, failure=work.contraction.test(x))
 
@@ -72,7 +72,10 @@ class JacobiWorkspace(SweepWorkspace):
 
     Attributes:
         omega: the damping in use.
+        d: A's diagonal / unit, stored field, as it was when the solve began.
     """
+
+    d: wp.array[Any]
 
     def __init__(self, problem: LCP, settings: ProjectedJacobi) -> None:
         super().__init__(problem, Precision(settings.precision))
@@ -81,7 +84,7 @@ class JacobiWorkspace(SweepWorkspace):
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Estimate the damping where the operator is new."""
-        version = getattr(self.problem.A, "version", None)
+        self.d, version = self.diagonal.field(), getattr(self.problem.A, "version", None)
         if self._given is None and version != self._version:
             self.omega = self._estimate()
             self._version = version  # last: time may be up before

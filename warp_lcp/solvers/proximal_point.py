@@ -28,7 +28,7 @@ IDLE = 4  # centers without progress before the end
 class ProximalPoint:
     """Solve A x + b + eps D (x - c) = y with the same bounds, take x for the center c, lower eps, repeat (Martinet 1970, Rockafellar 1976).
 
-    D is A's diagonal in magnitude, the largest entry of a row and column where that is 0. A + eps D is a P-matrix wherever A is a
+    D is the natural residual's d. A + eps D is a P-matrix wherever A is a
     P0-matrix (positive semi-definite ones, skew ones), so that free blocks are regular and least-index pivoting is finite. Its solutions
     tend to one of the problem's own if A is monotone and there is one. The regularized problems are solved by PrimalDualActiveSet; where
     it fails, eps is raised, and does not fall again. Failure with eps = 1 ends the iteration with NON_DESCENT.
@@ -48,7 +48,7 @@ class ProximalPoint:
         self._problem, self._residual, self._tolerance = problem, residual, tolerance
         A = problem.A
         self._matrix: Any = A.matrix() if isinstance(A, SparseOperator) else A.matrix.numpy().astype(np.float64)  # type: ignore[attr-defined]
-        self._D = _scale(self._matrix)
+        self._D = A.scale()  # type: ignore[attr-defined]
         self._b, self._eps = problem.b.numpy(), FIRST
         if scipy.sparse.issparse(self._matrix) and A.unknowns <= SMALL:  # type: ignore[attr-defined]
             self._matrix = self._matrix.toarray()
@@ -125,12 +125,3 @@ class ProximalPoint:
         if not scipy.sparse.issparse(self._matrix):
             return self._matrix + np.diag(self._eps * self._D)
         return scipy.sparse.csr_array(self._matrix + scipy.sparse.diags_array(self._eps * self._D))
-
-
-def _scale(matrix: Any) -> np.ndarray:
-    """Return D > 0: |a_ii|, or the largest magnitude of row and column i, or the mean of the others where these are empty."""
-    size, sparse = abs(matrix), scipy.sparse.issparse(matrix)
-    diagonal = np.asarray(size.diagonal(), dtype=np.float64)
-    rows, columns = (size.max(axis=k).toarray().ravel() if sparse else size.max(axis=k) for k in (1, 0))
-    D = np.where(diagonal > 0, diagonal, np.maximum(rows, columns))
-    return np.where(D > 0, D, D[D > 0].mean() if (D > 0).any() else 1.0)

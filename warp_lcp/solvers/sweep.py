@@ -155,9 +155,12 @@ class Diagonal:
 
     def values(self) -> np.ndarray:
         """Return the diagonal, a stored field on the host, float64."""
-        r = self._residual
-        d = r.diagonal if getattr(self.problem.A, "stencil", None) else self.problem.A.diagonal()
-        return d.numpy().ravel().astype(np.float64) * r.unit
+        return self.field().numpy().astype(np.float64) * self._residual.unit
+
+    def field(self) -> wp.array[Any]:
+        """Return the diagonal / unit, a stored field; of grids and sparse matrices their own memory."""
+        p, r = self.problem, self._residual
+        return r.diagonal if getattr(p.A, "stencil", None) else p.layout.load(p.A.diagonal(), p.A.dtype)
 
     def positive(self) -> bool:
         """Return whether every unknown's entry is positive."""

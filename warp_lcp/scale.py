@@ -1,0 +1,109 @@
+"""The scale d of the natural residual: what y_i a unit of x_i is worth, from A alone.
+
+d_i = 1 / (r_i c_i), where diag(r) A diag(c) has 1 as the largest magnitude of each row and column (Ruiz 2001). Such r and c are not
+unique:
+
+- Where some r and c make every diagonal entry 1, and no entry larger, d_i = |A_ii|: no cycle of entries has a product above that of its
+  diagonal entries. That holds for symmetric positive semi-definite matrices with a positive diagonal, for M- and H-matrices, and for any of
+  them with rows and columns scaled: as A becomes diag(R) A diag(C), d_i becomes R_i C_i d_i.
+- Elsewhere Ruiz's iteration starts from the matrix whose columns are scaled, from where its limit has a closed form: c_j = 1 / q_j with
+  q_j = max_k |a_kj|, and 1 / r_i = max_j |a_ij| / q_j. It does not depend on the units of x. On those of rows it does, and must: the
+  residual's norm adds rows up in the units of y, and [[e, -1], [1, 0]] is [[1, -1], [1, 0]] in other units of rows and columns whatever
+  e > 0, so that a scale that followed both would be of size e in row 1 and hide y_1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+
+SLACK = 1e-6  # of entries above the diagonal's: what storage in float32 leaves of semi-definite matrices of low rank
+PASSES = 50  # over the entries in search of r and c that make the diagonal 1: chains of rows that differ are seldom longer
+PROBES = 8  # vectors of signs with which the sizes of rows and columns are estimated
+TRUSTED = 10.0  # times |A_ii|: an operator's rows and columns that are larger have another scale
+
+
+def scale_of_matrix(A: Any) -> np.ndarray:
+    """Return d > 0, shape (n,), of a numpy or scipy.sparse matrix; an empty row or column counts as 1."""
+    return sizes_of_matrix(A)[0]
+
+
+def sizes_of_matrix(A: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return d, 1 / r and 1 / c, shape (n,); where d_i = |A_ii|, r = c."""
+    size = abs(A)
+    d = np.asarray(size.diagonal(), dtype=np.float64)
+    with np.errstate(over="ignore"):
+        if _diagonal_leads(size, d):
+            d = np.where(d > 0, d, 1.0)
+            return d, np.sqrt(d), np.sqrt(d)
+    q = _largest(size, 0)
+    q = np.where(q > 0, q, 1.0)
+    t = _largest(scaled(size, np.ones_like(q), 1 / q), 1)
+    t = np.where(t > 0, t, 1.0)
+    return q * t, t, q
+
+
+def scale_by_products(
+    diagonal: np.ndarray, product: Callable[[np.ndarray], np.ndarray], transposed: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """Return d > 0 of an operator that knows its diagonal and products only.
+
+    |A_ii| where the rest of row and column i is not much larger; elsewhere q_i t_i as of a matrix, but with 2-norms, which are no smaller
+    than the largest entries. With vectors z of random signs, the same each time, they are the roots of the means of (A'z)_j^2 and of
+    (A diag(1 / q) z)_i^2 (Hutchinson's estimator).
+
+    Args:
+        diagonal: of A, shape (n,).
+        product: returns A z.
+        transposed: returns A' z.
+    """
+    signs = np.random.default_rng(20010611).choice((-1.0, 1.0), (PROBES, len(diagonal)))
+    q = np.sqrt(np.mean([transposed(z) ** 2 for z in signs], axis=0))
+    q = np.where(q > 0, q, 1.0)
+    t = np.sqrt(np.mean([product(z / q) ** 2 for z in signs], axis=0))
+    d, found = np.abs(diagonal), q * np.where(t > 0, t, 1.0)
+    return np.where((d > 0) & (found <= TRUSTED * d), d, found)
+
+
+def _diagonal_leads(size: Any, d: np.ndarray) -> bool:
+    """Return whether some r and c make the diagonal of |A| 1 and no entry larger; rows that are empty with their columns aside.
+
+    With r_i = g_i / sqrt(d_i) and c_i = 1 / (g_i sqrt(d_i)) these are difference constraints on log g, which Bellman and Ford's iteration
+    solves; g = 1 does for semi-definite matrices. A pair of entries across the diagonal that allows no g is seen at once.
+    """
+    zero = np.flatnonzero(d == 0)
+    if zero.size and (_largest(size[zero], 1).any() or _largest(size[:, zero], 0).any()):
+        return False
+    root = np.sqrt(np.where(d > 0, d, 1.0))
+    w = scaled(size, 1 / root, 1 / root)
+    if w.max() <= 1 + SLACK:
+        return True
+    if (w.multiply(w.T) if scipy.sparse.issparse(w) else w * w.T).max() > 1 + 2 * SLACK:
+        return False
+    g = np.ones_like(d)
+    for _ in range(PASSES):
+        most = _largest(scaled(w, g, 1 / g), 1)
+        if most.max() <= 1 + SLACK:
+            return True
+        g = g / np.maximum(most, 1.0)
+        if not (g > 0).all():
+            return False
+    return False
+
+
+def scaled(A: Any, left: np.ndarray, right: np.ndarray) -> Any:
+    """Return diag(left) A diag(right)."""
+    if not scipy.sparse.issparse(A):
+        return left[:, None] * A * right
+    data = np.repeat(left, np.diff(A.indptr))
+    data *= A.data
+    data *= right[A.indices]
+    return scipy.sparse.csr_array((data, A.indices, A.indptr), shape=A.shape)
+
+
+def _largest(A: Any, axis: int) -> np.ndarray:
+    """Return the largest entries of the columns (0) or rows (1) of a matrix without negative ones."""
+    return A.max(axis=axis).toarray().ravel() if scipy.sparse.issparse(A) else A.max(axis=axis)
