@@ -135,6 +135,8 @@ class Hierarchy:
             corrections have no upper bounds.
         shrunk: by how much the cells of the finest level are fewer than those of the last level above it that cycles visit more than once,
             where it is a level of a larger hierarchy.
+        strength: weights along x, y and z that decide which axes are coarsened first; None: the mean ones.
+        finest: another hierarchy's finest level of this stencil, where this one shares it.
     """
 
     def __init__(
@@ -147,23 +149,19 @@ class Hierarchy:
         bounds: Pair | None = None,
         shifted: bool = False,
         shrunk: float = 1.0,
+        strength: list[float] | None = None,
+        finest: Level | None = None,
     ) -> None:
         self.settings, self.real, self._source = settings or CycleSettings(), real, stencil
         self.device = stencil.device
-        d_type = wp.uint8 if stencil.d.dtype is wp.uint8 and not shifted else real
-        weights = stencil.weights
-        if weights is not None and weights[0].dtype is not real:
-            weights = tuple(wp.zeros(w.size, dtype=real, device=w.device) for w in weights)
-        d = wp.zeros(stencil.d.size, dtype=d_type, device=self.device)
-        unit = stencil.unit if d_type is wp.uint8 else 1.0
-        finest = Stencil(stencil.padding, d, weights, stencil.coefficients, unit, stencil.periodic, stencil.spans, ghosts=stencil.ghosts)
-        self._strength = mean_weights(stencil)
-        self.levels = [Level(finest, real, bounded=bounded, bounds=bounds)]
+        self._strength = strength or mean_weights(stencil)
+        self.levels = [finest or _finest_level(stencil, real, bounded=bounded, bounds=bounds, shifted=shifted)]
         self.finest.shrunk = shrunk
         self._add_levels(bounded=bounded)
         self._prepare_coarsest()
-        signed = finest.weights is not None and finest.spans is not None
-        self._signs = wp.zeros(finest.padding.counts[:2], dtype=wp.uint64, device=self.device) if signed else None  # of rows of weights
+        s = self.finest.stencil
+        signed = s.weights is not None and s.spans is not None
+        self._signs = wp.zeros(s.padding.counts[:2], dtype=wp.uint64, device=self.device) if signed else None  # of rows of weights
         self._descents: dict[tuple[int, bool, bool], Program] = {}
         self.refresh()
 
@@ -471,10 +469,16 @@ class Hierarchy:
         return tuple(1 if more and not take else 2 for more, take in zip(long, chosen, strict=True))  # type: ignore[return-value]
 
 
-def make_hierarchy(stencil: Stencil, real: Any, **options: Any) -> Hierarchy:
-    """Return the hierarchy of a stencil, of all processes where it is shared; options as of `Hierarchy`."""
-    kind = Hierarchy if stencil.ghosts is None else stencil.ghosts.hierarchy
-    return kind(stencil, real, **options)
+def _finest_level(stencil: Stencil, real: Any, *, bounded: bool, bounds: Pair | None, shifted: bool) -> Level:
+    """Return the level of an operator's stencil: its weights, and a diagonal of its own, 0 so far."""
+    d_type = wp.uint8 if stencil.d.dtype is wp.uint8 and not shifted else real
+    weights = stencil.weights
+    if weights is not None and weights[0].dtype is not real:
+        weights = tuple(wp.zeros(w.size, dtype=real, device=w.device) for w in weights)
+    d = wp.zeros(stencil.d.size, dtype=d_type, device=stencil.device)
+    unit = stencil.unit if d_type is wp.uint8 else 1.0
+    finest = Stencil(stencil.padding, d, weights, stencil.coefficients, unit, stencil.periodic, stencil.spans, ghosts=stencil.ghosts)
+    return Level(finest, real, bounded=bounded, bounds=bounds)
 
 
 def mean_weights(stencil: Stencil) -> list[float]:
@@ -488,4 +492,4 @@ def mean_weights(stencil: Stencil) -> list[float]:
     return [s / n for s, n in zip(sums, faces, strict=True)]
 
 
-__all__ = ["UNBOUNDED", "CycleSettings", "Hierarchy", "Level", "make_hierarchy"]
+__all__ = ["UNBOUNDED", "CycleSettings", "Hierarchy", "Level", "mean_weights"]

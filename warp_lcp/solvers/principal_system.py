@@ -14,7 +14,8 @@ import warp as wp
 
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.krylov.gmres import GMRES
-from warp_lcp.multigrid.hierarchy import CycleSettings, make_hierarchy
+from warp_lcp.multigrid.hierarchy import CycleSettings
+from warp_lcp.multigrid.turning import make_hierarchy
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.operators.low_rank import LowRankOperator

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.multigrid.hierarchy import Hierarchy, make_hierarchy
+from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.multigrid.shared_levels import clear_ghosts
+from warp_lcp.multigrid.turning import make_hierarchy
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
 from warp_lcp.program import Launch, Program, perform

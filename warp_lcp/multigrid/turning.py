@@ -1,0 +1,160 @@
+"""Multigrid where the strong direction turns from place to place: a hierarchy for each way in which cells are coupled, on one finest level."""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.multigrid.hierarchy import Hierarchy, mean_weights
+from warp_lcp.multigrid.turning_kernels import sample_kernel
+from warp_lcp.operators.stencil import Stencil
+from warp_lcp.program import Program
+
+Strength = list[float]  # mean weights along x, y and z, in units of the largest
+
+TURN = 10.0  # ratios of weights that differ by this factor between places, or from the mean weights', ask for a hierarchy of their own
+SHARE = 0.01  # of the sampled blocks that must do so
+LEAST = 1e-6  # of a block's largest weight: what smaller ones count as
+EDGES = {2: 8, 3: 4}  # cells of a block along each long axis: 64 faces an axis, whose mean noise does not turn
+SAMPLES = {2: 64, 3: 16}  # the most blocks that are sampled along each axis
+
+
+class TurningHierarchy(Hierarchy):
+    """`Hierarchy` and companions that coarsen other axes first; cycles visit them one after another, forth and back.
+
+    Point sweeps smooth along strong couplings only, so levels must coarsen there; where the strong axis differs from place to place no
+    order of coarsening suits all of them (multiple semi-coarsening: Mulder 1989). Each hierarchy deals with the places that it suits, and
+    each cycle starts from what the one before has left, so that they share the finest level and need no residuals between them.
+
+    Args:
+        strengths: of each companion.
+    """
+
+    def __init__(self, stencil: Stencil, real: Any, strengths: list[Strength], **options: Any) -> None:
+        super().__init__(stencil, real, **options)
+        self.companions = [Hierarchy(stencil, real, **options, strength=strength, finest=self.finest) for strength in strengths]
+        self._marks = wp.zeros_like(self.finest.changed)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that the levels hold, the finest one once; shared weights not counted."""
+        finest = {id(v): v.capacity for v in (self.finest.x, self.finest.b, self.finest.t, self.finest.lower, self.finest.upper)}
+        return super().nbytes + sum(c.nbytes - sum(finest.values()) for c in self.companions)
+
+    def refresh(self) -> None:
+        """Take the operator's rows and weights again."""
+        super().refresh()
+        for companion in getattr(self, "companions", ()):
+            companion.refresh()
+
+    def rebuild(self) -> None:
+        """Coarsen from the finest diagonal down."""
+        self.finest.changed.fill_(1)
+        self.rebuild_changed()
+
+    def rebuild_changed(self) -> None:
+        """Coarsen what the finest level's marked rows change; the last hierarchy clears the marks."""
+        wp.copy(self._marks, self.finest.changed)
+        for part in (self, *self.companions):
+            wp.copy(self.finest.changed, self._marks)
+            part._coarsening.run()
+
+    @cached_property
+    def cycle(self) -> Program:
+        """One cycle on each hierarchy, forth and back: symmetric."""
+        program = self._leading(projected=False)
+        program.extend(self.companions[0]._descent(0, projected=False, from_zero=False))
+        return program
+
+    @cached_property
+    def monotone_cycle(self) -> Program:
+        """One projected cycle on each hierarchy, forth and back."""
+        program = self._leading(projected=True)
+        program.extend(self.companions[0]._descent(0, projected=True, from_zero=False))
+        return program
+
+    @cached_property
+    def open_cycle(self) -> Program | None:
+        """The linear cycle without its last leg."""
+        if super().open_cycle is None:
+            return None
+        program = self._leading(projected=False)
+        self.companions[0]._descend(0, program, projected=False, from_zero=False, whole=False)
+        return program
+
+    def last_leg(self) -> list[Any]:
+        """Return what the last leg of a linear cycle takes."""
+        return self.companions[0].last_leg()
+
+    def _leading(self, *, projected: bool) -> Program:
+        """Return all but the last of a cycle's parts."""
+        program = Program(self.device)
+        for i, part in enumerate((*self.companions, self, *self.companions[:0:-1])):
+            program.extend(part._descent(0, projected=projected, from_zero=i == 0))
+        return program
+
+
+def make_hierarchy(stencil: Stencil, real: Any, **options: Any) -> Hierarchy:
+    """Return the hierarchy of a stencil, of all processes where it is shared; options as of `Hierarchy`."""
+    if stencil.ghosts is not None:
+        return stencil.ghosts.hierarchy(stencil, real, **options)  # type: ignore[no-any-return]
+    strengths = turns(stencil)
+    return TurningHierarchy(stencil, real, strengths, **options) if strengths else Hierarchy(stencil, real, **options)
+
+
+def turns(stencil: Stencil) -> list[Strength]:
+    """Return the ways in which cells are coupled that the mean weights do not tell; none where the strong axes are the same everywhere.
+
+    Blocks are sampled. The mean logarithm of 64 faces knows neither random coefficients, nor surfaces and cut cells, which are few in a
+    block, from equal ones; where a block's ratios of weights along the axes differ from the median block's by `TURN`, the direction turns.
+    """
+    if stencil.weights is None:
+        return []
+    logs = _sampled(stencil)
+    centered = logs - logs.mean(axis=1, keepdims=True)
+    if len(logs) == 0 or (_mismatch(centered, np.median(centered, axis=0)) > math.log(TURN)).mean() < SHARE:
+        return []
+    long = _long(stencil)
+    relative = logs - logs.max(axis=1, keepdims=True)
+    ways, way_of = np.unique(relative > -math.log(TURN), axis=0, return_inverse=True)
+    mean, found = np.log(np.maximum(np.array(mean_weights(stencil))[long], 1e-300)), []
+    for way in range(len(ways)):
+        members = relative[way_of == way]
+        if len(members) < SHARE * len(relative):
+            continue
+        typical = np.median(members, axis=0)
+        if _mismatch(typical[None], mean)[0] > math.log(TURN):
+            strength = np.full(3, LEAST)
+            strength[long] = np.exp(typical)
+            found.append(strength.tolist())
+    return found
+
+
+def _mismatch(logs: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return by how much the ratios of rows of weights differ from others, as a logarithm."""
+    return np.ptp(logs - other, axis=1)
+
+
+def _long(stencil: Stencil) -> list[int]:
+    """Return the axes of more than one cell, 0, 1, 2 = x, y, z."""
+    return [axis for axis, n in enumerate(reversed(stencil.padding.counts)) if n > 1]
+
+
+def _sampled(stencil: Stencil) -> np.ndarray:
+    """Return the mean logarithms of the weights along the long axes, a row a block that has open faces along all of them."""
+    counts, long, device = stencil.padding.counts, _long(stencil), stencil.device
+    dimension = max(len(long), 2)
+    edges = [min(n, EDGES[dimension]) for n in counts]
+    blocks = [n // edge for n, edge in zip(counts, edges, strict=True)]
+    samples = [min(n, SAMPLES[dimension]) for n in blocks]
+    assert stencil.weights is not None
+    grids = [w.reshape(stencil.padding.shape) for w in stencil.weights]
+    out = wp.empty(math.prod(samples), dtype=wp.vec3, device=device)
+    inputs = [*grids, wp.vec3i(*samples), wp.vec3i(*blocks), wp.vec3i(*edges), LEAST, out]
+    wp.launch(sample_kernel(grids[0].dtype), samples, inputs, device=device)
+    logs = out.numpy()[:, long].astype(np.float64)
+    return logs[np.isfinite(logs).all(axis=1)] if len(long) > 1 else logs[:0]
