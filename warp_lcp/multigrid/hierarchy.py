@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from warp_lcp.layout import Padding, zeros
@@ -154,7 +153,7 @@ class Hierarchy:
     ) -> None:
         self.settings, self.real, self._source = settings or CycleSettings(), real, stencil
         self.device = stencil.device
-        self._strength = strength or mean_weights(stencil)
+        self._strength = strength or stencil.mean_weights
         self.levels = [finest or _finest_level(stencil, real, bounded=bounded, bounds=bounds, shifted=shifted)]
         self.finest.shrunk = shrunk
         self._add_levels(bounded=bounded)
@@ -481,15 +480,4 @@ def _finest_level(stencil: Stencil, real: Any, *, bounded: bool, bounds: Pair | 
     return Level(finest, real, bounded=bounded, bounds=bounds)
 
 
-def mean_weights(stencil: Stencil) -> list[float]:
-    """Return the mean weight of the faces along x, y and z; of all faces where the operator knows it, whatever cells there are now."""
-    if stencil.strength is not None:
-        return list(stencil.strength)
-    if stencil.weights is None:
-        return list(stencil.coefficients)
-    sums = [float(w.numpy().sum(dtype=np.float64)) for w in stencil.weights]
-    faces = [max(int(np.count_nonzero(w.numpy())), 1) for w in stencil.weights]
-    return [s / n for s, n in zip(sums, faces, strict=True)]
-
-
-__all__ = ["UNBOUNDED", "CycleSettings", "Hierarchy", "Level", "mean_weights"]
+__all__ = ["UNBOUNDED", "CycleSettings", "Hierarchy", "Level"]

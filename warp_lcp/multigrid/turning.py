@@ -1,15 +1,16 @@
-"""Multigrid where the strong direction turns from place to place: a hierarchy for each way in which cells are coupled, on one finest level."""
+"""Multigrid where the strong direction turns from place to place: a hierarchy for each way in which cells are coupled."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from warp_lcp.multigrid.hierarchy import Hierarchy, mean_weights
+from warp_lcp.multigrid.hierarchy import CycleSettings, Hierarchy
 from warp_lcp.multigrid.turning_kernels import sample_kernel
 from warp_lcp.operators.stencil import Stencil
 from warp_lcp.program import Program
@@ -20,7 +21,7 @@ TURN = 10.0  # ratios of weights that differ by this factor between places, or f
 SHARE = 0.01  # of the sampled blocks that must do so
 LEAST = 1e-6  # of a block's largest weight: what smaller ones count as
 EDGES = {2: 8, 3: 4}  # cells of a block along each long axis: 64 faces an axis, whose mean noise does not turn
-SAMPLES = {2: 64, 3: 16}  # the most blocks that are sampled along each axis
+SAMPLES = {2: 32, 3: 10}  # the most blocks that are sampled along each axis
 
 
 class TurningHierarchy(Hierarchy):
@@ -35,7 +36,12 @@ class TurningHierarchy(Hierarchy):
     """
 
     def __init__(self, stencil: Stencil, real: Any, strengths: list[Strength], **options: Any) -> None:
-        super().__init__(stencil, real, **options)
+        settings = options.pop("settings", None) or CycleSettings()
+        fewer = math.prod(stencil.padding.counts) - 1  # a launch of all levels starts from x = 0: the finest one stays out of it
+        cpu, cuda = (min(n, fewer) for n in (settings.one_launch_cpu, settings.one_launch_cuda))
+        settings = replace(settings, one_launch_cpu=cpu, one_launch_cuda=cuda)
+        super().__init__(stencil, real, **options, settings=settings)
+        options["settings"] = replace(settings, gamma=1)  # W-cycles save a step in ten and cost two to four times as much
         self.companions = [Hierarchy(stencil, real, **options, strength=strength, finest=self.finest) for strength in strengths]
         self._marks = wp.zeros_like(self.finest.changed)
 
@@ -66,23 +72,19 @@ class TurningHierarchy(Hierarchy):
     @cached_property
     def cycle(self) -> Program:
         """One cycle on each hierarchy, forth and back: symmetric."""
-        program = self._leading(projected=False)
-        program.extend(self.companions[0]._descent(0, projected=False, from_zero=False))
-        return program
+        return self._one_by_one([*self.companions, self, *self.companions[::-1]], projected=False)
 
     @cached_property
     def monotone_cycle(self) -> Program:
-        """One projected cycle on each hierarchy, forth and back."""
-        program = self._leading(projected=True)
-        program.extend(self.companions[0]._descent(0, projected=True, from_zero=False))
-        return program
+        """One projected cycle on each hierarchy."""
+        return self._one_by_one([*self.companions, self], projected=True)
 
     @cached_property
     def open_cycle(self) -> Program | None:
         """The linear cycle without its last leg."""
         if super().open_cycle is None:
             return None
-        program = self._leading(projected=False)
+        program = self._one_by_one([*self.companions, self, *self.companions[:0:-1]], projected=False)
         self.companions[0]._descend(0, program, projected=False, from_zero=False, whole=False)
         return program
 
@@ -90,18 +92,18 @@ class TurningHierarchy(Hierarchy):
         """Return what the last leg of a linear cycle takes."""
         return self.companions[0].last_leg()
 
-    def _leading(self, *, projected: bool) -> Program:
-        """Return all but the last of a cycle's parts."""
+    def _one_by_one(self, parts: list[Hierarchy], *, projected: bool) -> Program:
+        """Return a cycle on each part, the first from x = 0."""
         program = Program(self.device)
-        for i, part in enumerate((*self.companions, self, *self.companions[:0:-1])):
-            program.extend(part._descent(0, projected=projected, from_zero=i == 0))
+        for place, part in enumerate(parts):
+            program.extend(part._descent(0, projected=projected, from_zero=place == 0))
         return program
 
 
 def make_hierarchy(stencil: Stencil, real: Any, **options: Any) -> Hierarchy:
     """Return the hierarchy of a stencil, of all processes where it is shared; options as of `Hierarchy`."""
     if stencil.ghosts is not None:
-        return stencil.ghosts.hierarchy(stencil, real, **options)  # type: ignore[no-any-return]
+        return stencil.ghosts.hierarchy(stencil, real, **options)
     strengths = turns(stencil)
     return TurningHierarchy(stencil, real, strengths, **options) if strengths else Hierarchy(stencil, real, **options)
 
@@ -121,7 +123,7 @@ def turns(stencil: Stencil) -> list[Strength]:
     long = _long(stencil)
     relative = logs - logs.max(axis=1, keepdims=True)
     ways, way_of = np.unique(relative > -math.log(TURN), axis=0, return_inverse=True)
-    mean, found = np.log(np.maximum(np.array(mean_weights(stencil))[long], 1e-300)), []
+    mean, found = np.log(np.maximum(np.array(stencil.mean_weights)[long], 1e-300)), []
     for way in range(len(ways)):
         members = relative[way_of == way]
         if len(members) < SHARE * len(relative):

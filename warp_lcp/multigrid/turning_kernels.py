@@ -19,18 +19,27 @@ def sample_kernel(real: Any) -> Any:
     field = wp.array3d(dtype=real)
 
     @wp.func
-    def coupling(w: field, k0: int, j0: int, i0: int, edges: wp.vec3i, least: float):
-        """Mean logarithm of a block's weights that are not 0, none taken for less than `least`; and the largest, NaN if there are none."""
-        largest, total, count = float(0.0), float(0.0), float(0.0)
+    def largest(w: field, k0: int, j0: int, i0: int, edges: wp.vec3i):
+        """The largest of a block's weights."""
+        most = float(0.0)
+        for k in range(k0, k0 + edges[0]):
+            for j in range(j0, j0 + edges[1]):
+                for i in range(i0, i0 + edges[2]):
+                    most = wp.max(most, float(w[k, j, i]))
+        return most
+
+    @wp.func
+    def mean_logarithm(w: field, k0: int, j0: int, i0: int, edges: wp.vec3i, bottom: float):
+        """Mean logarithm of a block's weights that are not 0, those below `bottom` taken for it; NaN if there are none."""
+        total, count = float(0.0), float(0.0)
         for k in range(k0, k0 + edges[0]):
             for j in range(j0, j0 + edges[1]):
                 for i in range(i0, i0 + edges[2]):
                     v = float(w[k, j, i])
                     if v > 0.0:
-                        largest = wp.max(largest, v)
-                        total += wp.log(wp.max(v, least))
+                        total += wp.log(wp.max(v, bottom))
                         count += 1.0
-        return wp.vec2(total / count, largest)
+        return total / count
 
     @wp.kernel(enable_backward=False, module=f"warp_lcp.turning.{real.__name__}")
     def sample(
@@ -41,9 +50,10 @@ def sample_kernel(real: Any) -> Any:
         k0 = first_cell(c, samples[0], blocks[0], edges[0])
         j0 = first_cell(b, samples[1], blocks[1], edges[1])
         i0 = first_cell(a, samples[2], blocks[2], edges[2])
-        x, y, z = coupling(wx, k0, j0, i0, edges, 0.0), coupling(wy, k0, j0, i0, edges, 0.0), coupling(wz, k0, j0, i0, edges, 0.0)
-        bottom = least * wp.max(wp.max(x[1], y[1]), z[1])
-        x, y, z = coupling(wx, k0, j0, i0, edges, bottom), coupling(wy, k0, j0, i0, edges, bottom), coupling(wz, k0, j0, i0, edges, bottom)
-        out[(c * samples[1] + b) * samples[2] + a] = wp.vec3(x[0], y[0], z[0])
+        most = wp.max(wp.max(largest(wx, k0, j0, i0, edges), largest(wy, k0, j0, i0, edges)), largest(wz, k0, j0, i0, edges))
+        x = mean_logarithm(wx, k0, j0, i0, edges, least * most)
+        y = mean_logarithm(wy, k0, j0, i0, edges, least * most)
+        z = mean_logarithm(wz, k0, j0, i0, edges, least * most)
+        out[(c * samples[1] + b) * samples[2] + a] = wp.vec3(x, y, z)
 
     return sample

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol
 
+import numpy as np
 import warp as wp
 
 from warp_lcp.layout import Padding
@@ -81,6 +82,17 @@ class Stencil:
     def storage(self) -> tuple[bool, Any, Any]:
         """Form and types that choose the kernels: variable weights?, type of d, type of the weights."""
         return self.weights is not None, self.d.dtype, self.weights[0].dtype if self.weights else wp.float32
+
+    @property
+    def mean_weights(self) -> list[float]:
+        """The mean weight of the faces along x, y and z; of all faces where the operator knows it, whatever cells there are now."""
+        if self.strength is not None:
+            return list(self.strength)
+        if self.weights is None:
+            return list(self.coefficients)
+        sums = [float(w.numpy().sum(dtype=np.float64)) for w in self.weights]
+        faces = [max(int(np.count_nonzero(w.numpy())), 1) for w in self.weights]
+        return [s / n for s, n in zip(sums, faces, strict=True)]
 
     def with_diagonal(self, d: wp.array[Any]) -> Stencil:
         """Return the stencil with another diagonal (a mask makes it 0) and the same weights."""
