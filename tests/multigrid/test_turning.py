@@ -211,9 +211,9 @@ def hold(A, hierarchy, free):
     hierarchy.rebuild_changed()
 
 
-def operator(device, periodic=False):
-    """Return two halves of 32^2 cells that are strong along other axes."""
-    cells, faces = np.ones((32, 32), dtype=int), faces_of((32, 32), halves(1e-3))
+def operator(device, periodic=False, shape=(32, 32)):
+    """Return two halves that are strong along other axes."""
+    cells, faces = np.ones(shape, dtype=int), faces_of(shape, halves(1e-3))
     cells[0] = wl.AIR
     return wl.GridPoisson(cells, **faces, device=device, dtype=wp.float64, periodic=(False, periodic, False))
 
@@ -234,7 +234,6 @@ def test_cycle_is_symmetric_and_positive(device, periodic):
     Br, Bs = applied(hierarchy, r), applied(hierarchy, s)
     assert np.dot(s, Br) == pytest.approx(np.dot(r, Bs), rel=1e-10)
     assert np.dot(r, Br) > 0
-    assert not Br[~inside].any()
 
 
 def test_levels_in_one_launch_leave_the_finest_one_out(device):
@@ -261,18 +260,19 @@ def test_changed_rows_are_coarsened_in_every_hierarchy(device):
 
 def test_new_cells_in_place(device):
     """A workspace that is used again after `update` gives what a new one gives."""
-    b, cells = load((32, 32)), np.ones((32, 32), dtype=np.int8)
-    cells[:7] = wl.AIR
-    A = operator(device)
+    b, more = load((32, 64)), np.ones((32, 64), dtype=np.int8)
+    more[0] = wl.AIR
+    some = np.where(np.indices(more.shape)[1] < 44, more, wl.AIR).astype(np.int8)  # the rows' spans are shorter
+    A = operator(device, shape=more.shape)
     problem, method = wl.LCP(A, b), wl.ProjectedMultigrid()
+    A.update(wp.array(some, device=device))
     work = method.init(problem)
-    assert wl.solve(problem, method, workspace=work)
-    A.update(wp.array(cells, device=device))
-    again = wl.solve(problem, method, workspace=work)
-    fresh = wl.solve(problem, method)
-    assert again
-    assert again.iterations == fresh.iterations <= 15
-    np.testing.assert_array_equal(again.x.numpy(), fresh.x.numpy())
+    for cells in (some, more, some):
+        A.update(wp.array(cells, device=device))
+        again, fresh = wl.solve(problem, method, workspace=work), wl.solve(problem, method)
+        assert again
+        assert again.iterations == fresh.iterations <= 15
+        np.testing.assert_array_equal(again.x.numpy(), fresh.x.numpy())
 
 
 def test_legs_apart_give_the_same_iterates(monkeypatch):
