@@ -28,7 +28,7 @@ class TurningHierarchy(Hierarchy):
     """`Hierarchy` and companions that coarsen other axes first; cycles visit them one after another, forth and back.
 
     Point sweeps smooth along strong couplings only, so levels must coarsen there; where the strong axis differs from place to place no
-    order of coarsening suits all of them (multiple semi-coarsening: Mulder 1989). Each hierarchy deals with the places that it suits, and
+    order of coarsening suits all of them. Each hierarchy deals with the places that it suits, and
     each cycle starts from what the one before has left, so that they share the finest level and need no residuals between them.
 
     Args:
