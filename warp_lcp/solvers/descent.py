@@ -8,6 +8,7 @@ import sys
 NOISE = 500.0  # rounding units of the iterate, in parts of the energy: what rounding may pretend
 LEAP = 1e3  # times the least residual: a step that ends there, and sets no new least energy, was wrong
 CREEP = 0.5  # a step that moves the free set and lowers the energy by more than this share of what the last one did: the set creeps
+STALL = 0.7  # a step that moves the free set and leaves more than this share of the residual was spoiled by its projection
 WORTH = 2.0  # a projected cycle against creeping is worth it if it lowers the energy by this many times what the step before did
 
 
@@ -39,21 +40,21 @@ class Descent:
         """Forget the last solve; energy and residual norm are those of the start."""
         self._energy, self._lowest, self._norm, self._least = energy, energy, norm, norm
         self.sinks, self.safe = False, False
-        self._vain, self.runs = 0, 0
+        self._vain, self.runs, self._left = 0, 0, 1.0
         self._fell, self._owed, self._pause, self._wait = math.inf, 0.0, 0, 1
 
     def record(self, energy: float, norm: float) -> float:
         """Take note of where a step ends; return by how much it has lowered the energy, 0 if that is within rounding."""
-        fell, rose = self._energy - energy, norm > self._norm
+        fell, left = self._energy - energy, norm / self._norm if self._norm > 0 else 0.0
         margin = self._noise * (abs(self._energy) + abs(energy))
         above = energy - self._lowest
-        self._energy, self._norm, self.sinks, self._least = energy, norm, above < -margin, min(norm, self._least)
+        self._left, self._energy, self._norm, self.sinks, self._least = left, energy, norm, above < -margin, min(norm, self._least)
         if self.sinks:
             self._lowest, self._vain = energy, 0
         elif norm > LEAP * self._least:
             self._vain = sys.maxsize
         else:
-            self._vain = self._vain + 1 if above > margin or rose else 0
+            self._vain = self._vain + 1 if above > margin or left > 1 else 0
         return fell if abs(fell) > margin else 0.0
 
     def due(self, patience: int) -> int:
@@ -70,13 +71,13 @@ class Descent:
         """Return whether a projected cycle should follow a step that has lowered the energy by `fell`, and moved the free set or not.
 
         Truncated steps that lower the energy evenly while the set moves are those in which a contact's boundary comes back by a layer of
-        cells a step.
+        cells a step. It begins with a step whose projection overshoots the contact: the energy rises, or the residual hardly falls.
         """
-        slow = moved and fell > 0 and fell > CREEP * self._fell
+        slow = moved and fell != 0 and (fell < 0 or fell > CREEP * self._fell or self._left > STALL)
         called = slow and self._pause == 0
         self._fell, self._pause = math.inf if called else fell, max(self._pause - 1, 0)
         if called:
-            self._owed = fell
+            self._owed = abs(fell)
         return called
 
     def weigh(self, fell: float) -> None:
