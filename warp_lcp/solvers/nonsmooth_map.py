@@ -140,7 +140,7 @@ class NonsmoothMap:
     def advance(self, base: wp.array[Any], e: wp.array[Any], scale: float, x: wp.array[Any], *, projected: bool) -> None:
         """Set x = base + scale e, projected onto the bounds or not; base and x may be one field."""
         p = self.problem
-        before = [base, e, p.lower, p.upper, x, wp.float64(scale), projected]
+        before = [base, e, p.lower, p.upper, p.unknown, x, wp.float64(scale), projected]
         launch_spans((self._kernels if e.dtype is not wp.float64 else self._double).advance, self._reduction.spans, before, [], p.device)
 
     def _half_sum(self, kernel: wp.Kernel, x: wp.array[Any], after: list[Any]) -> float:

@@ -152,13 +152,14 @@ def kernels(d_type: Any, real: Any, form: Form) -> SimpleNamespace:
 
     @wp.func_native(
         flat(
-            """const double *b = b_.data, *l = l_.data, *u = u_.data; const auto* e = e_.data; double* x = x_.data;
-        if (projected) { EACH { const double v = b[i] + scale*(double)e[i], w = v < l[i] ? l[i] : v; x[i] = w > u[i] ? u[i] : w; } }
+            """const double *b = b_.data, *l = l_.data, *u = u_.data; const auto* e = e_.data; const auto* m = m_.data; double* x = x_.data;
+        if (projected) { EACH { const double v = b[i] + scale*(double)e[i], w = v < l[i] ? l[i] : v, c = w > u[i] ? u[i] : w;
+            x[i] = m[i] == 1 ? c : 0.0; } }
         else { EACH { x[i] = b[i] + scale*(double)e[i]; } }"""
         )
     )
     def advance_span(
-        b_: f64, e_: field, l_: f64, u_: f64, x_: f64, scale: wp.float64, projected: bool, start: wp.int64, end: wp.int64,
+        b_: f64, e_: field, l_: f64, u_: f64, m_: i8, x_: f64, scale: wp.float64, projected: bool, start: wp.int64, end: wp.int64,
         stride: wp.int64,
     ): ...  # fmt: skip
 
@@ -200,10 +201,11 @@ def kernels(d_type: Any, real: Any, form: Form) -> SimpleNamespace:
 
     @wp.kernel(enable_backward=False, module=name)
     def advance(
-        base: f64, e: field, lower: f64, upper: f64, x: f64, scale: wp.float64, projected: bool, n: int, chunk: int, stride: wp.int64
-    ):
+        base: f64, e: field, lower: f64, upper: f64, unknown: i8, x: f64, scale: wp.float64, projected: bool, n: int, chunk: int,
+        stride: wp.int64,
+    ):  # fmt: skip
         k = wp.tid()
-        advance_span(base, e, lower, upper, x, scale, projected, span_start(k, chunk), span_end(k, chunk, n), stride)
+        advance_span(base, e, lower, upper, unknown, x, scale, projected, span_start(k, chunk), span_end(k, chunk, n), stride)
 
     return SimpleNamespace(merit=merit, values=values, condense=condense, weighted=weighted, gradient=gradient, advance=advance)
 
