@@ -83,7 +83,7 @@ def torsion(n: int, load: float = 5.0, *, device: Any = None, dtype: Any = wp.fl
 
 
 def dam(nx: int, ny: int, *, device: Any = None, dtype: Any = wp.float32) -> Problem:
-    """Return the seepage of water through a dam, 16 wide and 24 high, from a full reservoir to water of depth 4 [Brandt & Cryer 1983].
+    """Return the seepage of water through a dam, 16 wide and 24 high, from a full reservoir to water of depth 4.
 
     By Baiocchi's transform, w(x, y) is the integral of the pressure's head from y up: w >= 0, -Laplace w + 1 >= 0, and w has its values
     on the border. Where w > 0 the dam is wet. `b` holds hx hy and the border's values, which are AIR.

@@ -1,4 +1,4 @@
-"""Coarse points of a sparse matrix and the interpolation from them, by PyAMG (Ruge and Stueben 1987)."""
+"""Coarse points of a sparse matrix and the interpolation from them, by PyAMG's Ruge-Stueben splitting."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pyamg.classical.interpolate import classical_interpolation
 from pyamg.classical.split import RS
 from pyamg.strength import classical_strength_of_connection
 
-STRONG = 0.25  # entries from this share of a row's largest on are strong: Ruge and Stueben's own choice
+STRONG = 0.25  # entries from this share of a row's largest on are strong: PyAMG's own choice
 LEAST = 4  # fine unknowns a coarse one: two splits of a five-point stencil leave an eighth
 STALL = 0.9  # the largest share of the unknowns that a split may keep
 

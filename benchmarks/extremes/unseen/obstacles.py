@@ -127,7 +127,7 @@ def rough(draw: Draw) -> GridProblem:
 
 
 def dam(draw: Draw) -> GridProblem:
-    """Return seepage through a dam of any width and water levels, by Baiocchi's variable (Brandt & Cryer 1983)."""
+    """Return seepage through a dam of any width and water levels, by Baiocchi's variable."""
     nx = max(5, draw.side())
     ny = max(5, int(nx * draw.between(0.6, 2)))
     width, high = draw.between(8, 32), draw.between(16, 32)
