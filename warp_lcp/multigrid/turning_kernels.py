@@ -30,7 +30,7 @@ def sample_kernel(real: Any) -> Any:
 
     @wp.func
     def mean_logarithm(w: field, k0: int, j0: int, i0: int, edges: wp.vec3i, bottom: float):
-        """Mean logarithm of a block's weights that are not 0, those below `bottom` taken for it; NaN if there are none."""
+        """Mean logarithm of a block's weights that are not 0, those below `bottom` taken for it; NaN if most are 0: few tell nothing."""
         total, count = float(0.0), float(0.0)
         for k in range(k0, k0 + edges[0]):
             for j in range(j0, j0 + edges[1]):
@@ -39,6 +39,8 @@ def sample_kernel(real: Any) -> Any:
                     if v > 0.0:
                         total += wp.log(wp.max(v, bottom))
                         count += 1.0
+        if 2.0 * count < float(edges[0] * edges[1] * edges[2]):
+            total = wp.nan
         return total / count
 
     @wp.kernel(enable_backward=False, module=f"warp_lcp.turning.{real.__name__}")
