@@ -19,6 +19,7 @@ from warp_lcp.result import SolveStatus
 from warp_lcp.solve import Precision, RoundedIterate, Step
 from warp_lcp.solvers import mprgp_kernels as kernels
 from warp_lcp.solvers import projected_multigrid_kernels as engine
+from warp_lcp.solvers.descent import Descent
 from warp_lcp.solvers.minimum_map_newton_kernels import all_free_kernel
 from warp_lcp.solvers.principal_system import DiagonalSystem, principal_system
 from warp_lcp.solvers.principal_system_sparse import SparseSystem
@@ -43,8 +44,9 @@ class MPRGP:
     unknowns. Dostal's expansion by a half step and a fixed step is replaced by the projected step: it needed over 8 times the work of a
     linear solve, this one 1.5. Cold, the first steps on a grid are projected multigrid cycles.
 
-    On grids the residual may rise `patience` times running, then a projected cycle follows; elsewhere a projected step that raises the
-    energy is halved, and while steps lower it the stopping criteria's own patience does not run out.
+    On grids a projected cycle follows a step that its projection has spoiled, and `patience` steps without a new least energy, as in
+    `ProjectedMultigrid`; elsewhere a projected step that raises the energy is halved. While steps lower the energy the stopping criteria's
+    own patience does not run out.
     `linear_iterations` counts monotone cycles and products with A: one a step, two if it releases unknowns.
 
     Args:
@@ -52,7 +54,7 @@ class MPRGP:
             and user-made operators take float64 corrections.
         monotone_cycles: projected cycles of a cold start on a grid.
         gamma: Gamma > 0, how large the chopped gradient may be; larger: bounds are left later.
-        patience: rises of the residual before a monotone cycle is taken on a grid.
+        patience: steps without a new least energy before monotone cycles are taken on a grid.
         cycle: how multigrid cycles go.
 
     Raises:
@@ -132,7 +134,7 @@ class SplitResidual(NaturalResidual):
         reduced: product of the residual and y on the free ones.
         release: product of -y / size and the chopped step.
         active: number of held unknowns.
-        energy: 1/2 x'Ax + b'x; not on grids.
+        energy: 1/2 x'Ax + b'x.
     """
 
     def __init__(self, problem: LCP, r: wp.array[Any], chopped_step: wp.array[Any], *, slack: float) -> None:
@@ -216,29 +218,37 @@ class GradientWorkspace(RoundedIterate):
         self._chopped = z if self.is_grid else wp.zeros_like(z)  # a multigrid cycle leaves nothing of what was in z
         self.residual = SplitResidual(problem, self.preconditioner.r, self._chopped, slack=SINGLE_SLACK if single else 0.0)
         self.floating: Any = None
-        self._cycles_left, self._rises, self._carry, self._curvature = 0, 0, False, 0.0
+        self._cycles_left, self._cycled, self._carry, self._curvature = 0, False, False, 0.0
+        self._descent = Descent(self.precision.epsilon)
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the direction; the operator may have changed."""
         self._cycles_left = self.settings.monotone_cycles if self.is_grid and self.bounded and not warm else 0
-        self._rises, self._carry, self._last, self._lowest = 0, False, math.inf, self.residual.energy
+        self._cycled, self._carry, self._lowest = False, False, self.residual.energy
+        self._descent.start(self.residual.energy, self.residual.norm)
         self.residual.moved = True
         self.system.refresh()
 
     def sinks(self) -> bool:
-        """Return whether the energy has fallen beyond rounding since this was last so; on grids it is not known."""
-        sinks = not self.is_grid and self.residual.energy < self._lowest - NOISE * abs(self._lowest)
+        """Return whether the energy has fallen beyond rounding since this was last so; on grids, whether the step before has lowered it."""
+        if self.is_grid:
+            return self._descent.sinks
+        sinks = self.residual.energy < self._lowest - NOISE * abs(self._lowest)
         self._lowest = self.residual.energy if sinks else self._lowest
         return sinks
 
     def wants_monotone_cycle(self) -> bool:
-        """Return whether the next step is a projected cycle."""
-        norm = self.residual.norm
-        self._rises = self._rises + 1 if norm > self._last else 0
-        self._last = norm
-        if self._rises >= self.settings.patience and self.is_grid and self.bounded:
-            self._rises, self._cycles_left = 0, 1
-        return self._cycles_left > 0
+        """Judge the last step; return whether the next one is a projected cycle."""
+        if not (self.is_grid and self.bounded):
+            return False
+        fell = self._descent.record(self.residual.energy, self.residual.norm)
+        if self._cycled:
+            self._descent.weigh(fell)
+        elif self._cycles_left == 0 and self._descent.creeps(fell, moved=self.residual.moved):
+            self._cycles_left = 1
+        self._cycles_left = self._cycles_left or self._descent.due(self.settings.patience)
+        self._cycled = self._cycles_left > 0
+        return self._cycled
 
     def monotone_step(self, x: wp.array[Any]) -> Step:
         """Projected cycle on all unknowns."""

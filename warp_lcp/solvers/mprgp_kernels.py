@@ -231,7 +231,7 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, real: Any) -> Any:
             + AT_ROW
             + stencil_head(variable, "double")
             + f"""const T *x = x_.data + p, *over = x + s1, *b = b_.data + p; {R} *g = g_.data + p, *c_ = step_.data + p;
-        unsigned char* free = free_.data + p; const auto* m = m_.data + p; T s = 0, chopped = 0, reduced = 0, release = 0;
+        unsigned char* free = free_.data + p; const auto* m = m_.data + p; T s = 0, chopped = 0, reduced = 0, release = 0, energy = 0;
         int moved = 0, active = 0; unsigned char now[M];
         for (int begin = 0; begin < n; begin += M) {{
             const int end = n - begin < M ? n : begin + (int)M; T y[M];
@@ -247,13 +247,14 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, real: Any) -> Any:
                     const T r = in ? r0 : (T)0, h = held ? r : (T)0;
                     const {R} w = ({R})(-h*inverse)/({R})f;  // division is what would take longest in double precision
                     s += r*r; chopped += h*h; reduced += held ? (T)0 : r*v; release -= h*inverse*(T)w;
+                    energy += in ? (T)0.5*x[k]*(v + b[k]) : (T)0;
                     now[k - begin] = in & !held; g[k] = ({R})((in & !held) ? -v*inverse : (T)0); c_[k] = w; }} }});
             SIMD64 for (int k = begin; k < end; ++k) {{
                 const unsigned char one = now[k - begin] != free[k], two = (m[k] == 1) & !now[k - begin];
                 changed |= one; count += two; free[k] = now[k - begin]; }}
             moved += changed; active += count; }}
-        const double all[6] = {{s, chopped, reduced, release, (double)moved, (double)active}}; double* sums = out.data + t;
-        for (int c = 0; c < 6; ++c) sums[c*threads] = more ? all[c] + sums[c*threads] : all[c];"""
+        const double all[{COLUMNS}] = {{s, chopped, reduced, release, (double)moved, (double)active, energy}}; double* sums = out.data + t;
+        for (int c = 0; c < {COLUMNS}; ++c) sums[c*threads] = more ? all[c] + sums[c*threads] : all[c];"""
         )
     )
     def assess_row(
