@@ -34,7 +34,7 @@ def test_pressure_far_from_air_is_that_of_the_linear_system(name):
         np.testing.assert_allclose(x[:, :-1] - x[:, 1:], np.arange(1, cells.shape[1]) * np.ones((len(cells), 1)), rtol=1e-3, atol=0.05)
 
 
-@pytest.mark.parametrize("method", ["projected-multigrid", "minimum-map-newton"])
+@pytest.mark.parametrize("method", ["projected-multigrid", "minimum-map-newton", "mprgp"])
 @pytest.mark.parametrize("problem", [torsion(250, device="cpu"), torsion(250, 20.0, device="cpu"), dam(257, 385, device="cpu")], ids=str)
 def test_boundaries_of_contact_do_not_creep(problem, method):
     result = wl.solve(problem.lcp(), wl.METHODS[method]())

@@ -218,13 +218,13 @@ class GradientWorkspace(RoundedIterate):
         self._chopped = z if self.is_grid else wp.zeros_like(z)  # a multigrid cycle leaves nothing of what was in z
         self.residual = SplitResidual(problem, self.preconditioner.r, self._chopped, slack=SINGLE_SLACK if single else 0.0)
         self.floating: Any = None
-        self._cycles_left, self._cycled, self._carry, self._curvature = 0, False, False, 0.0
+        self._cycles_left, self._cycled, self._released, self._carry, self._curvature = 0, False, False, False, 0.0
         self._descent = Descent(self.precision.epsilon)
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the direction; the operator may have changed."""
         self._cycles_left = self.settings.monotone_cycles if self.is_grid and self.bounded and not warm else 0
-        self._cycled, self._carry, self._lowest = False, False, self.residual.energy
+        self._cycled, self._released, self._carry, self._lowest = False, False, False, self.residual.energy
         self._descent.start(self.residual.energy, self.residual.norm)
         self.residual.moved = True
         self.system.refresh()
@@ -244,10 +244,10 @@ class GradientWorkspace(RoundedIterate):
         fell = self._descent.record(self.residual.energy, self.residual.norm)
         if self._cycled:
             self._descent.weigh(fell)
-        elif self._cycles_left == 0 and self._descent.creeps(fell, moved=self.residual.moved):
+        elif self._cycles_left == 0 and self._descent.creeps(fell, moved=self.residual.moved or self._released):
             self._cycles_left = 1
         self._cycles_left = self._cycles_left or self._descent.due(self.settings.patience)
-        self._cycled = self._cycles_left > 0
+        self._cycled, self._released = self._cycles_left > 0, False
         return self._cycled
 
     def monotone_step(self, x: wp.array[Any]) -> Step:
@@ -268,7 +268,7 @@ class GradientWorkspace(RoundedIterate):
     def proportion(self) -> bool:
         """Step along the chopped gradient as far as the energy falls: it releases unknowns. False: it falls without end."""
         residual, direction = self.residual, self._chopped
-        self._carry = False
+        self._carry, self._released = False, True
         self._product(direction)
         residual.sums.dot(direction, self._q, kernels.CURVATURE)
         curvature = float(residual.scalars.numpy()[kernels.CURVATURE])
