@@ -68,7 +68,7 @@ class AlgebraicSteps:
         work = self._work = self._method.init(self._problem)
         work.x.assign(start)
         work.residual.evaluate(work.x)
-        work.start(warm=True, tolerance=tolerance)
+        work.start(warm=False, tolerance=tolerance)
 
     def step(self, x: wp.array[Any]) -> Step:
         """Take a step, and write the iterate to x."""

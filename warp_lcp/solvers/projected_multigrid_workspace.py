@@ -247,9 +247,8 @@ class MultigridWorkspace(RoundedIterate):
         return self.residual.norm > FLOOR_MARGIN * self.residual.rounding_floor(self.x, self.precision.epsilon)
 
     def algebraic_step(self) -> Step:
-        """Newton step on the grid's matrix, from the best iterate on."""
+        """Newton step on the grid's matrix, from the iterate on that has the least energy, nearly, whatever its residual."""
         if self._algebraic is None:
-            self.restore()
             self._algebraic = AlgebraicSteps(self.problem, self.A, self.x, self._tolerance)
         self._store()
         self._past += 1
