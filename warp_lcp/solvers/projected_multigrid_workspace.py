@@ -286,6 +286,8 @@ class MultigridWorkspace(RoundedIterate):
         self._classify_next()
         self._advance()
         self.residual.read()
+        if self.floating is not None and self._cycles_left == 0:
+            self._project()
         descent.weigh(self._judge())
         return Step("monotone cycle", 1, None, interim=descent.sinks)
 
