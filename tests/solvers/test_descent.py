@@ -7,6 +7,7 @@ import warp as wp
 import warp_lcp as wl
 from oracle import assemble, lemke
 from warp_lcp.gallery import dam, torsion
+from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.solve import EPS
 from warp_lcp.solvers.descent import Descent
 
@@ -177,7 +178,7 @@ def test_warm_starts_take_no_more_steps_than_cold_ones():
 
 
 @pytest.mark.parametrize("method", ["projected-multigrid", "minimum-map-newton", "mprgp"])
-@pytest.mark.parametrize(("shape", "periodic"), [((17, 16, 15), (True, True, False)), ((60, 44), (True, True)), ((52, 75), (True, False))])
+@pytest.mark.parametrize(("shape", "periodic"), [((17, 17, 17), (True, True, False)), ((60, 44), (True, True)), ((52, 75), (True, False))])
 def test_boxes_that_one_bound_holds(shape, periodic, method):
     """Off its bound the box is singular: what b pushes it with is left to the bound, and the rest solved as without it."""
     rng = np.random.default_rng([*shape, 7])
@@ -185,17 +186,12 @@ def test_boxes_that_one_bound_holds(shape, periodic, method):
     upper[tuple(n // 3 for n in shape)] = 4000.0
     b = rng.standard_normal(shape)
     b -= b.mean() + 0.3
-    result = wl.solve(
-        wl.LCP(wl.GridPoisson(cells, periodic=periodic, device="cpu", dtype=wp.float64), b, -np.inf, upper), wl.METHODS[method]()
-    )
+    A = wl.GridPoisson(cells, periodic=periodic, device="cpu", dtype=wp.float64)
+    result = wl.solve(wl.LCP(A, b, -np.inf, upper), wl.METHODS[method]())
     assert result, result.status
     assert result.linear_iterations <= 30
-    x, A = result.x.numpy().ravel(), None
-    if x.size <= 5000:
-        wraps = [*periodic, False, False][:3]
-        A = assemble(cells, periodic=wraps)
-        y = A @ x + b.ravel()
-        at = int(np.argmin(upper.ravel()))
-        assert x[at] == 4000.0
-        assert y[at] == pytest.approx(b.sum(), rel=1e-5)  # all that b has
-        assert np.abs(np.delete(y, at)).max() < 1e-3 * abs(b.sum())
+    x, at = result.x.numpy().ravel(), int(np.argmin(upper.ravel()))
+    y = grid_matrix(A) @ x + b.ravel()
+    assert x[at] == 4000.0
+    assert y[at] == pytest.approx(b.sum(), rel=1e-5)  # all that b has
+    assert np.abs(np.delete(y, at)).max() < 1e-3 * abs(b.sum())
