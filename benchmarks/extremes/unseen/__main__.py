@@ -28,6 +28,8 @@ def main(arguments: Sequence[str]) -> None:
             line = f"{name} {seed}: {attempt.status}, {n} unknowns, {counts}, {attempt.seconds:.2f} s: {verdicts[-1].outcome}"
             sys.stdout.write(f"{line}\n")
             sys.stdout.flush()
+    if small:
+        return
     table, wrong = summary(verdicts, int(first))
     sys.stdout.write("\n".join([table.remark, " | ".join(table.columns), *(" | ".join(row) for row in table.rows), *wrong]) + "\n")
 

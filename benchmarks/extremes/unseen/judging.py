@@ -221,7 +221,7 @@ def summary(verdicts: Sequence[Verdict], first: int) -> tuple[Table, list[str]]:
         "warm beyond cold, most",
         "slowest [s]",
     )
-    wrong = [f"{FAMILY}: only {within}"] if share < OFTEN_SHARE else []
+    wrong = [f"{FAMILY}: only {within}"] if counted and share < OFTEN_SHARE else []
     return Table("Unseen problems", columns, [row for row in rows if row], remark), wrong
 
 
