@@ -160,6 +160,9 @@ def test_a_cycle_that_raises_the_energy_makes_the_next_ones_safe():
     descent.weigh(descent.record(-1.5 + 1e-14, 1.0))  # rounding
     assert not descent.safe
     descent.weigh(descent.record(-1.4, 1.0))
+    assert not descent.safe  # none was due
+    assert descent.due(0) == 1
+    descent.weigh(descent.record(-1.3, 1.0))
     assert descent.safe
 
 

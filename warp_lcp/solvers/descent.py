@@ -28,7 +28,7 @@ class Descent:
 
     Attributes:
         sinks: whether the last step set a new least energy.
-        safe: whether a projected cycle has raised the energy.
+        safe: whether a projected cycle that was due has raised the energy.
         runs: runs of projected steps that were due.
     """
 
@@ -85,7 +85,7 @@ class Descent:
 
         If it was called against creeping and in vain, steps were slow, but not because the set crept: the next call waits longer.
         """
-        self.safe = self.safe or fell < 0
+        self.safe = self.safe or (fell < 0 and self.runs > 0)  # what a cold start's first cycles do is no matter
         if self._owed > 0:
             vain = fell < WORTH * self._owed
             self._pause, self._wait, self._owed = (self._wait, 2 * self._wait, 0.0) if vain else (0, 1, 0.0)

@@ -118,6 +118,10 @@ class GridNewtonWorkspace(MultigridWorkspace):
         residual.classify = True
         residual.evaluate(self.x)
 
+    def _creeps(self) -> bool:
+        """Where x is rounded to float32 the energy says little of a step, and Newton's own safeguard has the word."""
+        return super()._creeps() and self._rounded is None
+
     def _leave(self) -> None:
         """Store the best iterate before x leaves it behind."""
         if not self._serves:

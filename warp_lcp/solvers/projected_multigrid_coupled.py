@@ -88,12 +88,18 @@ class CoupledWorkspace(MultigridWorkspace):
         self._fresh, self._searches = True, False
 
     def crawls(self) -> bool:
-        """Bodies have no part in the grid's matrix."""
+        """Take note of the pace; bodies have no part in the grid's matrix, so it is Newton's steps that take over."""
+        self._pace.record(self.residual.norm)
         return False
+
+    @property
+    def _fails(self) -> bool:
+        """Whether truncated steps go round in circles or hardly move."""
+        return self._searches or self._descent.runs >= RELAPSES or self._pace.crawls
 
     def wants_monotone_cycle(self) -> bool:
         """Return whether the next step is none of truncated multigrid."""
-        return self._searches or super().wants_monotone_cycle()
+        return self._fails or super().wants_monotone_cycle()
 
     def monotone_step(self) -> Step:
         """Projected cycle of the grid on all unknowns, and as much of it as lowers the energy of grid and bodies most.
@@ -101,7 +107,7 @@ class CoupledWorkspace(MultigridWorkspace):
         Where the free set keeps going round in circles, a Newton step instead, which searches along its path: what a projection does to
         the force on a body that weighs next to nothing is a leap each time, and the energy lets projected cycles of the grid hardly move.
         """
-        return self._newton_step() if self._searches or self._descent.runs >= RELAPSES else super().monotone_step()
+        return self._newton_step() if self._fails else super().monotone_step()
 
     def _plan_monotone_step(self) -> None:
         self._sum_products()

@@ -312,9 +312,13 @@ class MultigridWorkspace(RoundedIterate):
         self.residual.read()
         if self.floating is not None:
             self._project()
-        if self._descent.creeps(self._judge(), moved=self.bounded and self.residual.stale):
+        if self._creeps():
             self._begin_cycles(1)
         return Step("truncated cycle", 1, active, interim=self._descent.sinks)
+
+    def _creeps(self) -> bool:
+        """Judge a truncated step; return whether a projected cycle should follow."""
+        return self._descent.creeps(self._judge(), moved=self.bounded and self.residual.stale)
 
     def _judge(self) -> float:
         """Let the energy judge the step that has been evaluated; return by how much it has lowered it."""
