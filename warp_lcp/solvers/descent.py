@@ -18,10 +18,10 @@ class Descent:
     The natural residual does not: it may rise thirtyfold in the best of steps, where the set of held unknowns grows. It counts only
     where the energy says nothing, within rounding.
 
-    Convergence: a solve alternates between `patience` steps of any kind that set no new least energy and as many projected ones as are
-    `due`, twice as many each time. New least energies, a margin apart, are finitely many above the minimum; so either the solve ends or
-    ever longer runs of projected steps are taken, and once one of those has raised the energy (`safe` is set) they are plain
-    projected Jacobi sweeps with a factor below 2 / lambda_max(D^-1 A), which converge linearly from anywhere.
+    Why solves end, in outline: between runs of projected steps that are `due`, twice as many each time, at most `patience` steps in a row
+    set no new least energy, and new ones, a margin apart, are finitely many above the minimum. Once a projected cycle of such a run has
+    raised the energy (`safe` is set), runs are plain projected Jacobi sweeps with a factor below 2 / lambda_max(D^-1 A), which converge
+    linearly from anywhere. What this does not cover are runs of cycles that neither raise the energy nor lower it beyond rounding.
 
     Args:
         epsilon: rounding unit of the iterate.
