@@ -96,9 +96,9 @@ class DistributedLiquid(LiquidSimulation):
             self.particles.drop_ghosts()
             raise
 
-    def bring_to_faces(self, window: Window, dt: float) -> None:
-        """Bring the particles' velocities to the faces, and let gravity act on them for dt [s]."""
-        super().bring_to_faces(window, dt)
+    def bring_to_faces(self, window: Window) -> None:
+        """Bring the particles' velocities to the faces, and let gravity act on them."""
+        super().bring_to_faces(window)
         with self.watch.stage("exchange between ranks", *self.velocity, *self.weights):
             self.part.fill(*self.velocity, *self.weights, *(self._saved or ()))
 
@@ -163,17 +163,17 @@ class DistributedLiquid(LiquidSimulation):
         """Return this rank's part of the state, without pickles, in the whole domain's coordinates.
 
         Names and shapes: `box` int64 (2, 3), the low and high (exclusive) cell x, y, z of this rank; `counts` int64 (3,), the whole grid's;
-        `time`, `step_count`, `pressure_dt`, `signature` as of `state`, `time_error` (2,), the same on all ranks; particles: `position`,
+        `time`, `step_count`, `last_dt`, `pressure_dt`, `signature` as of `state`, `time_error` (2,), the same on all ranks; particles: `position`,
         `velocity`, `affine_0` ... float32 (n, 3) and `place` int64 (n,), their order; cells: `pressure` float64, `cells` int8, `contact`
         uint8, of the box, shape (nz, ny, nx).
         """
         box, own = self.part.box, self.own_state()
         fields = {name: np.ascontiguousarray(self.part.box_of(own[name])) for name in ("pressure", "cells", "contact")}
-        clock = {"time": np.array(self.time), "step_count": np.array(self.step_count), "signature": self._signature()}
+        clock = {"time": np.array(self.time), "step_count": np.array(self.step_count), "last_dt": np.array(self.last_dt)}
         where = {"box": np.array([box.low, box.high]), "counts": np.array(self.part.decomposition.counts)}
         particles = {name: array.numpy().copy() for name, array in self.particles.arrays().items()}
         numbers = {name: own[name] for name in ("pressure_dt", "time_error")}
-        return where | clock | numbers | particles | {"place": self.particles.place.copy()} | fields
+        return where | clock | {"signature": self._signature()} | numbers | particles | {"place": self.particles.place.copy()} | fields
 
     def restore_pieces(self, pieces: Sequence[Piece]) -> None:
         """Continue from the pieces of all ranks of a run on any number of ranks; each rank takes what lies in its box. Collective.
@@ -197,6 +197,7 @@ class DistributedLiquid(LiquidSimulation):
             self.part.box_of(own[name])[...] = values
         self.restore_own(own | {"pressure_dt": taken.numbers["pressure_dt"], "time_error": taken.numbers["time_error"]})
         self.time, self.step_count = float(taken.numbers["time"]), int(taken.numbers["step_count"])
+        self.last_dt = float(taken.numbers["last_dt"])
 
     def state(self) -> dict[str, np.ndarray]:
         """Return this rank's part of the state, see `piece_state`."""

@@ -72,10 +72,10 @@ class DistributedPressure(PressureProjection):
             self.automatic = TimeErrorTolerance(self._rhs.size, part.grid.device, part.ranks)
 
     def project(
-        self, velocity: Sequence[wp.array], dt: float, window: Window, result: wl.SolveResult, criteria: wl.StoppingCriteria, unknowns: int
+        self, velocity: Sequence[wp.array], window: Window, result: wl.SolveResult, criteria: wl.StoppingCriteria, unknowns: int
     ) -> Projection:
         """Take a result, and the velocity, marks and contacts of the ghost layers from other ranks."""
-        found = super().project(velocity, dt, window, result, criteria, unknowns)
+        found = super().project(velocity, window, result, criteria, unknowns)
         self.part.fill(*velocity, *self.known, self.contact)
         return found
 

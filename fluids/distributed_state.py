@@ -15,7 +15,7 @@ from warp_lcp.distributed.subdomain import Subdomain
 Piece = Mapping[str, np.ndarray]  # what one rank has of a simulation's state
 
 CELLS = {"pressure": np.float64, "cells": np.int8, "contact": np.uint8}
-NUMBERS = ("time", "step_count", "pressure_dt", "time_error", "signature", "counts")
+NUMBERS = ("time", "step_count", "last_dt", "pressure_dt", "time_error", "signature", "counts")
 
 
 @dataclass(frozen=True)

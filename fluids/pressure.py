@@ -28,7 +28,7 @@ class Projection:
     """What a projection found.
 
     Attributes:
-        result: of the solve; `result.x` is dt p / (rho dx) [m/s]. None: no cell holds liquid, there was nothing to solve.
+        result: of the solve; `result.x` is kick_dt p / (rho dx) [m/s]. None: no cell holds liquid, there was nothing to solve.
         unknowns: FLUID cells.
         released: wall cells that let go.
         max_outflow: largest |y| of the other FLUID cells, recomputed from the projected velocities [m/s].
@@ -43,7 +43,7 @@ class Projection:
 class PressureProjection:
     """Solve for the pressure of the liquid's cells and project the velocity.
 
-    With x = dt p / (rho dx) [m/s] on every FLUID cell, s_f = +-1 outward, a_f the open fraction of a face, u_s the solid's velocity and
+    With x = kick_dt p / (rho dx) [m/s] on every FLUID cell, s_f = +-1 outward, a_f the open fraction of a face, u_s the solid's velocity and
     theta_f the distance to the free surface in cells where air is beyond the face, else 1 [Batty, Bertails & Bridson 2007],
 
         y_i = b_i + sum over faces of (a_f / theta_f) (x_i - x_neighbor),   b_i = sum of s_f [a_f u*_f + (1 - a_f) u_s,f],   x = 0 in AIR,
@@ -109,38 +109,43 @@ class PressureProjection:
         self._sums = wp.zeros((*grid.shape[:2], 2), dtype=wp.float64, device=grid.device)
         self._solved, self._rhs, self._guess = grid.domain, self._b, self._start  # what is solved for
         self._problem: wl.LCP | None = None  # built when there is liquid: an empty problem is refused
-        self._dt = self._ratio = 0.0  # of the last step [s]; of this step's length to that
+        self._last = self._kick = self._ratio = 0.0  # how long forces acted in the last projection and act in this one [s]; by that
 
     def show(self) -> None:
         """Show `kind` in frames though nothing has been projected yet."""
         wp.copy(self.shown, self.kind)
 
-    def prepare(self, velocity: Sequence[wp.array], dt: float) -> int:
+    def prepare(self, velocity: Sequence[wp.array], dt: float, kick_dt: float) -> int:
         """Set up the problem of the marked cells and return the number of unknowns. The first guess is the last pressure.
 
         Args:
             velocity: u* of each component [m/s].
             dt: time step [s].
+            kick_dt: how long forces have acted on u* [s].
         """
         unknowns = self.unknowns()
         if self._problem is None and unknowns > 0:
             self._make_problem()
+        self._begin(kick_dt)
         if self._problem is None:
             return 0
-        ratio = self._ratio = dt / self._dt if self._dt > 0.0 else 0.0
-        fields = [self.pressure, ratio, self._b, self._lower, self._start, self._shift]
+        fields = [self.pressure, self._ratio, self._b, self._lower, self._start, self._shift]
         inputs = [*three(velocity), self.kind, self.boundary.touch, *self._faces(), *fields]
         self._solved.launch(self._kernels.prepare, inputs)
         self._update(self.kind)
         return unknowns
 
-    def leave(self, dt: float) -> Projection:
+    def leave(self) -> Projection:
         """Take a step without liquid cells: all is spray."""
         for field in (self.pressure, self.contact, *self.known):
             field.zero_()
         self.show()
-        self._dt = dt
+        self._last = self._kick
         return Projection(None, 0, 0, 0.0)
+
+    def _begin(self, kick_dt: float) -> None:
+        """Note how long forces act: what pressures were as impulses in the last projection they are now by the ratio of these times."""
+        self._kick, self._ratio = kick_dt, kick_dt / self._last if self._last > 0.0 else 0.0
 
     def _make_problem(self) -> None:
         faces = {f"face_{axis}": field for axis, field in zip("xyz", self.boundary.open, strict=False)}
@@ -216,13 +221,12 @@ class PressureProjection:
         return [self.kind, self._b, *([] if self._lower is None else [self._lower]), self._start]
 
     def project(
-        self, velocity: Sequence[wp.array], dt: float, window: Window, result: wl.SolveResult, criteria: wl.StoppingCriteria, unknowns: int
+        self, velocity: Sequence[wp.array], window: Window, result: wl.SolveResult, criteria: wl.StoppingCriteria, unknowns: int
     ) -> Projection:
         """Take a result: subtract the gradient, mark valid faces, find the released cells.
 
         Args:
             velocity: u* of each component [m/s] (updated on open faces that touch FLUID, and on those with weight beside them).
-            dt: time step [s].
             window: cells that hold all FLUID cells, with one to spare on each side.
             result: of `solve`.
             criteria: of `solve`.
@@ -230,7 +234,7 @@ class PressureProjection:
         """
         self._take(result.x)
         wp.copy(self.shown, self.kind)
-        self._dt = dt
+        self._last = self._kick
         for axis, field in enumerate(velocity):
             self.known[axis].zero_()
             window.launch(self._kernels.subtract_gradient, [axis, self.pressure, self.kind, *self._faces(), field, self.known[axis]])
@@ -261,7 +265,7 @@ class PressureProjection:
         """Return what the next projection starts from, and what a frame shows of the last."""
         return {
             "pressure": self.pressure.numpy().copy(),
-            "pressure_dt": np.array(self._dt),
+            "pressure_dt": np.array(self._last),
             "cells": self.shown.numpy().copy(),
             "contact": self.contact.numpy().copy(),
             "time_error": np.array([-1.0, 0.0]) if self.automatic is None else self.automatic.state(),
@@ -272,20 +276,20 @@ class PressureProjection:
         self.pressure.assign(state["pressure"])
         self.shown.assign(state["cells"])
         self.contact.assign(state["contact"])
-        self._dt = float(state["pressure_dt"])
+        self._last = float(state["pressure_dt"])
         if self.automatic is not None:
             self.automatic.restore(state["time_error"])
 
     def pressures(self, density: float) -> np.ndarray:
-        """Return the pressure p = rho dx x / dt [Pa] in the stored shape; zeros before the first step."""
-        scale = density * self.grid.spacing / self._dt if self._dt > 0.0 else 0.0
+        """Return the pressure p = rho dx x / kick_dt [Pa] in the stored shape; zeros before the first step."""
+        scale = density * self.grid.spacing / self._last if self._last > 0.0 else 0.0
         return self.pressure.numpy() * scale
 
     def _support(self, velocity: Sequence[wp.array], window: Window) -> None:
         """Let the pressure act on what rests on the surface; its faces become known after the projected ones."""
         for axis, (field, weight, known) in enumerate(zip(velocity, self._weights, self.known, strict=False)):
             window.launch(
-                self._kernels.support, [axis, self.pressure, self.kind, *self._faces(), weight, self._gravity * self._dt, field, known]
+                self._kernels.support, [axis, self.pressure, self.kind, *self._faces(), weight, self._gravity * self._last, field, known]
             )
 
     def _count(self, kind: wp.array) -> int:

@@ -105,8 +105,8 @@ class LiquidSimulation(ParticleSimulation):
         """
         before = self.begin_step(dt)
         window = self.window(before)
-        self.bring_to_faces(window, dt)
-        projected = self._project(window, dt, self.top_speed(before, dt))
+        self.bring_to_faces(window)
+        projected = self._project(window, dt, self.top_speed(before))
         measured = self._measured(projected)  # before solids move
         self.extend(window, self.projection.known, self.projection.kind, self.projection.contact)
         if self.projection.coupling is not None:
@@ -186,9 +186,9 @@ class LiquidSimulation(ParticleSimulation):
             self.boundary.begin_step(self.time, dt)
             if self.sources is not None:
                 self.sources.supply(self.time, self.velocity, projection.kind)
-            unknowns = projection.prepare(self.velocity, dt)
+            unknowns = projection.prepare(self.velocity, dt, self.kick_dt)
         if unknowns == 0:
-            return self._held(projection.leave(dt))
+            return self._held(projection.leave())
         if self.record is not None:
             with watch.stage("recording", *projection.fields()):
                 clock = {"step": np.array(self.step_count), "time": np.array(self.time), "dt": np.array(float(dt))}
@@ -203,7 +203,7 @@ class LiquidSimulation(ParticleSimulation):
                 projection.push_bodies(result)
                 self.boundary.begin_step(self.time, dt)  # their velocities are others now
         with watch.stage("projection", *self.velocity, *projection.known, projection.pressure, projection.kind, projection.contact):
-            return self._held(projection.project(self.velocity, dt, window, result, criteria, unknowns))
+            return self._held(projection.project(self.velocity, window, result, criteria, unknowns))
 
     def _held(self, projected: Projection) -> Projection:
         """Give the sources' faces their velocity back, and show their cells as liquid."""

@@ -21,12 +21,12 @@ class TimeErrorTolerance:
     """Stop a solve when the velocity error that it leaves is FRACTION of the step's own error in time.
 
     A step takes the acceleration by the pressure as constant. To first order its error in the velocity is half of what this acceleration
-    changes by from one step to the next. The first guess of a solve is just the last step's pressure, x0 = x_last dt / dt_last: so
+    changes by from one step to the next. The first guess of a solve is just the last step's pressure, x0 = x_last kick_dt / kick_dt_last: so
 
         time error = 1/2 ||G (x - x0)||,   ||G e||^2 = e'A e,
 
     with G the gradient: in the energy norm of A an error in x is one in the velocity. It is measured once x is known, and used for the
-    next step, times (dt / dt_last)^2 where that is shorter.
+    next step, times (kick_dt / kick_dt_last)^2 where that is shorter.
 
     What a solve leaves is e with residual r = A e. Multigrid cycles leave errors that are as short as the cells, on which A is of order
     one: looked at in forty steps of dam-break-2d, splash-in-circle, mesh-obstacle and wave-maker, ||G e|| = 0.12 to 1.0 ||r|| after one to
@@ -56,7 +56,7 @@ class TimeErrorTolerance:
         """Return when a solve is done.
 
         Args:
-            ratio: dt / dt_last; 0 without a last step.
+            ratio: kick_dt / kick_dt_last; 0 without a last step.
             unknowns: of the problem.
             atol: absolute tolerance for rounding [m/s].
             max_iterations: of the method.

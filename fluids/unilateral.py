@@ -31,7 +31,7 @@ class UnilateralPressure(PressureProjection):
     rho_f the density on a face, s_f = +-1 outward. Mass is conserved and the pressure accelerates it:
 
         rho_i(t + dt) = rho_i - (dt / dx) sum of s_f [a_f rho_f u_f + (1 - a_f) rho_max u_s,f],
-        rho_f u_f = rho_f u*_f - (x_right - x_left),   x = dt p / (rho_0 dx) [m/s].
+        rho_f u_f = rho_f u*_f - (x_right - x_left),   x = kick_dt p / (rho_0 dx) [m/s].
 
     (A solid that comes in takes room: the second term.) With y_i = (dx / dt) [rho_max capacity_i - rho_i(t + dt)] this is
 
@@ -95,18 +95,19 @@ class UnilateralPressure(PressureProjection):
         setting.limit = wp.ones(grid.shape, dtype=wp.float32, device=grid.device)
         self._setting = setting
 
-    def prepare(self, velocity: Sequence[wp.array], dt: float) -> int:
+    def prepare(self, velocity: Sequence[wp.array], dt: float, kick_dt: float) -> int:
         """Set up the problem of all cells that are not SOLID and return their number. The first guess is the last pressure.
 
         Args:
             velocity: u* of each component [m/s].
             dt: time step [s].
+            kick_dt: how long forces have acted on u* [s].
         """
-        ratio = self._ratio = dt / self._dt if self._dt > 0.0 else 0.0
+        self._begin(kick_dt)
         self._setting.rate = wp.float64(self.grid.spacing / dt)
         least = SHIFT if self.boundary.open else 0.0
         self.grid.domain.launch(kernels.limit_kernel, [self._setting, *three(velocity), *three(self.boundary.open)])
-        fields = [self.pressure, ratio, least, self._b, self._start, self._shift]
+        fields = [self.pressure, self._ratio, least, self._b, self._start, self._shift]
         self.grid.domain.launch(kernels.prepare_kernel, [self._setting, self.kind, *self._sides(velocity), *fields])
         unknowns = self.unknowns()
         if unknowns and self._problem is None:
@@ -120,13 +121,12 @@ class UnilateralPressure(PressureProjection):
         return self._count(self._cells)
 
     def project(
-        self, velocity: Sequence[wp.array], dt: float, window: Window, result: wl.SolveResult, criteria: wl.StoppingCriteria, unknowns: int
+        self, velocity: Sequence[wp.array], window: Window, result: wl.SolveResult, criteria: wl.StoppingCriteria, unknowns: int
     ) -> Projection:
         """Take a result: let the pressure act, mark valid faces, find the walls that liquid presses on.
 
         Args:
             velocity: u* of each component [m/s] (updated).
-            dt: time step [s].
             window: cells that hold all liquid, with one to spare on each side.
             result: of `solve`.
             criteria: of `solve`.
@@ -134,7 +134,7 @@ class UnilateralPressure(PressureProjection):
         """
         convert(result.x.flatten(), self.pressure.flatten())
         wp.copy(self.shown, self.kind)
-        self._dt = dt
+        self._last = self._kick
         for axis, field in enumerate(velocity):
             self.known[axis].zero_()
             open_ = self.boundary.open[axis] if self.boundary.open else None

@@ -111,9 +111,9 @@ class SandSimulation(ParticleSimulation):
         window = super().window(totals)
         return window if self.sides is None else self.sides.widen(window)
 
-    def bring_to_faces(self, window: Window, dt: float) -> None:
-        """Bring the particles' velocities to the faces, and let gravity act on them for dt [s]."""
-        super().bring_to_faces(window, dt)
+    def bring_to_faces(self, window: Window) -> None:
+        """Bring the particles' velocities to the faces, and let gravity act on them."""
+        super().bring_to_faces(window)
         if self.sides is not None:
             self.sides.average(self.velocity, self.weights, self._saved or ())
 
@@ -135,7 +135,7 @@ class SandSimulation(ParticleSimulation):
         """
         before = self.begin_step(dt)
         window = self.window(before)
-        self.bring_to_faces(window, dt)
+        self.bring_to_faces(window)
         solved = self._solve(window, dt)
         measured = self._measured()
         self._extend(window)
@@ -211,7 +211,7 @@ class SandSimulation(ParticleSimulation):
 
     def pressures(self) -> np.ndarray:
         """Return the pressure p = rho dx x / dt [Pa] of the last solve, in the stored shape; zeros before the first."""
-        scale = self.scene.physics.density * self.grid.spacing / self.stress.dt if self.stress.dt > 0.0 else 0.0
+        scale = self.scene.physics.density * self.grid.spacing / self.stress.kick_dt if self.stress.kick_dt > 0.0 else 0.0
         return np.asarray(self.stress.now.numpy()[0] * scale)
 
     def own_state(self) -> dict[str, np.ndarray]:
@@ -219,7 +219,7 @@ class SandSimulation(ParticleSimulation):
         packing = self.packing
         return {
             "stress": self.stress.now.numpy().copy(),
-            "stress_dt": np.array(self.stress.dt),
+            "stress_dt": np.array(self.stress.kick_dt),
             "cells": packing.kind.numpy().copy(),
             "fraction": packing.fraction.numpy().copy(),
             "yield_ratio": self.outcome.ratio.numpy().copy(),
@@ -229,7 +229,7 @@ class SandSimulation(ParticleSimulation):
     def restore_own(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from the arrays of `own_state`."""
         self.stress.now.assign(state["stress"])
-        self.stress.dt = float(state["stress_dt"])
+        self.stress.kick_dt = float(state["stress_dt"])
         self.packing.kind.assign(state["cells"])
         self.packing.fraction.assign(state["fraction"])
         self.outcome.ratio.assign(state["yield_ratio"])
@@ -266,13 +266,13 @@ class SandSimulation(ParticleSimulation):
                 self.sources.hold(solids.velocity, [])
             packing.update(self.density, self.velocity, dt, solids.velocity)
             self._begin_bodies()
-        impulse = dt / (scene.physics.density * self.grid.spacing)  # of a stress of 1 Pa
+        impulse = self.kick_dt / (scene.physics.density * self.grid.spacing)  # of a stress of 1 Pa
         angle = math.radians(scene.friction_angle)
         bound = YieldSet(scene.slope, scene.cohesion * math.cos(angle) * impulse, scene.material.tensile_strength * impulse)
         g = float(np.linalg.norm(self.gravity))
-        scale = g * dt if g > 0.0 else STANDING * math.sqrt(self.grid.spacing)
+        scale = g * self.kick_dt if g > 0.0 else STANDING * math.sqrt(self.grid.spacing)
         with self.watch.stage("stress", stress.now, *packing.mass, *packing.inverse, *packing.start):
-            stress.begin(bound, self.gravity, dt, decay=self.method.decay)
+            stress.begin(bound, self.gravity, dt, self.kick_dt, decay=self.method.decay)
             solved = self.method.solve(
                 stress, scale=scale, tolerance=scene.solver.tolerance, max_iterations=scene.solver.max_iterations
             )  # fmt: skip

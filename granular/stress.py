@@ -123,7 +123,7 @@ class Velocity:
 class Stress:
     """Pressure and friction of sand under a packing.
 
-    With x = dt p / (rho dx) and s in the same units, u = u* + (1/m) (-grad x + div s) on faces of mass m, the stress is the solution of
+    With x = kick_dt p / (rho dx) and s in the same units, u = u* + (1/m) (-grad x + div s) on faces of mass m, the stress is the solution of
 
         0 <= x  complementary to  w = (1 - phi) dx / dt + div(m' u) >= 0,   s = the nearest point of the yield set of x to s + r E u,
 
@@ -139,7 +139,7 @@ class Stress:
 
     Attributes:
         now: the stresses, see `granular.yield_set`, float32.
-        dt: time step that they belong to [s]; 0 before the first.
+        kick_dt: how long forces acted in the step that they belong to [s]; 0 before the first.
         checked: the velocity that they leave, in float64, since the last `residual`.
         last_residual: that of pressure and friction [m/s].
     """
@@ -162,7 +162,7 @@ class Stress:
         self._check: Program | None = None  # of the residual
         self._cells = 1
         self.last_residual = 0.0, 0.0
-        self.dt = 0.0
+        self.kick_dt = 0.0
         self.face(walls)
 
     def face(self, walls: Walls) -> None:
@@ -173,24 +173,26 @@ class Stress:
         threads = -(-walls.count // self._grain)
         self._wall_sums = Reduction(max(threads, 1), device, self._sums, columns=COLUMNS, threads=threads) if threads else None
 
-    def begin(self, bound: YieldSet, gravity: np.ndarray, dt: float, *, decay: float = 1.0) -> None:
+    def begin(self, bound: YieldSet, gravity: np.ndarray, dt: float, kick_dt: float, *, decay: float = 1.0) -> None:
         """Start from the last stresses, as far as they have a place in the packing now.
 
         Args:
             bound: what sand can bear.
             gravity: [m/s^2], three entries.
             dt: time step [s].
+            kick_dt: how long forces act in it [s]. Stresses are impulses: those of the last step are scaled, as it is the pressure that goes on.
             decay: factor of the last stresses; less than 1 damps patterns that exert no force.
         """
         self._host = np.array(
-            [bound.k, bound.cohesion, bound.tension, *(gravity * dt), 1.0, 1.0, 0.0, dt / self.packing.grid.spacing], dtype=np.float32
+            [bound.k, bound.cohesion, bound.tension, *(gravity * kick_dt), 1.0, 1.0, 0.0, dt / self.packing.grid.spacing], dtype=np.float32
         )
         self.numbers.assign(self._host)
         p = self.packing
         flags = p.flags.numpy()
         self._cells = max(int(np.count_nonzero(p.grid.interior(flags))), 1)
         self.walls.activate(flags)
-        inputs = [p.flags, p.stiff, *three(p.share), decay, self.now, self._before, self._point]
+        ratio = decay * (kick_dt / self.kick_dt if self.kick_dt > 0.0 else 1.0)
+        inputs = [p.flags, p.stiff, *three(p.share), ratio, self.now, self._before, self._point]
         p.grid.domain.launch(self.velocity.kernels.admit, inputs)
         if self.bodies is not None:
             self.bodies.forget([self.now, self._before, self._point])
@@ -198,7 +200,7 @@ class Stress:
             p.sides.wrap(self._point)
         inputs = [p.flags, *three(p.share), self._point, self.now]
         p.grid.domain.launch(damping_kernel(p.grid.dimension), inputs)
-        self.dt = dt
+        self.kick_dt = kick_dt
 
     def restart(self, *, pressure_step: float, shear_step: float, lookahead: float, momentum: float) -> None:
         """Start a sequence of steps with momentum.

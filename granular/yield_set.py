@@ -1,6 +1,6 @@
 """What sand can bear, as native code: the shape of a field of stresses, the yield set of a cell, friction on a wall.
 
-All stresses are impulses over rho dx [m/s]: x = dt p / (rho dx) and the like, so that spacing and time step appear nowhere. A field of
+All stresses are impulses over rho dx [m/s]: x = kick_dt p / (rho dx) and the like, so that spacing and time step appear nowhere. A field of
 stresses has layers of the grid's shape: x, the normal parts of the deviator (2-D: a = s_xx = -s_yy; 3-D: s_xx, s_yy, s_zz), and for each
 shear four *copies*, which belong to the cell: copy q of the shear of axes (alpha, beta) lies on the cell's edge at the low (0) or high
 (1) side along alpha, q & 1, and along beta, q >> 1. Shears are ordered xy, xz, yz. An edge, stored at the cell whose low side it is, has

@@ -139,13 +139,13 @@ def exchange(dimension: int, ratio: float, device: str, *, together: bool = True
         coupling._share = 0.0
     begun = simulation.begin_step(0.01)
     window: Window = simulation.window(begun)
-    simulation.bring_to_faces(window, 0.01)
+    simulation.bring_to_faces(window)
     simulation.surface.mark(simulation.particles, window, simulation.projection.kind)
     simulation.surface.complete(window, simulation.velocity, simulation.weights, simulation.projection.known)
     before = [field.numpy().astype(np.float64) for field in simulation.velocity]
     start = bodies.bodies[0].momentum.copy()
     energy = bodies.bodies[0].kinetic_energy
-    simulation._project(window, 0.01, simulation.top_speed(begun, 0.01))
+    simulation._project(window, 0.01, simulation.top_speed(begun))
     wet = np.zeros(simulation.grid.shape, dtype=bool)
     wet[tuple(simulation.projection.fluid_cells().T)] = True
     scale, gained, energies = DENSITY * simulation.grid.cell_volume, bodies.bodies[0].momentum - start, np.zeros(2)

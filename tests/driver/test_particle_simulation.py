@@ -61,7 +61,7 @@ class Dust(ParticleSimulation):
     def step(self, dt: float) -> Row:
         totals = self.begin_step(dt)
         window = self.window(totals)
-        self.bring_to_faces(window, dt)
+        self.bring_to_faces(window)
         self.mark()
         for marks, weight in zip(self.known, self.weights, strict=True):
             marks.assign((weight.numpy() > TINY_WEIGHT).astype(np.int8))

@@ -52,7 +52,7 @@ def test_the_columns_are_what_velocities_add_to_the_right_hand_side(dimension, m
             six = np.array([v[0], v[1], 0.0, 0.0, 0.0, v[2]]) if dimension == 2 else v
             body.momentum, body.angular_momentum = body.properties.mass * six[:3], body.inertia @ six[3:]
         simulation.boundary.begin_step(simulation.time, 1e-4)
-        projection.prepare(still, 1e-4)
+        projection.prepare(still, 1e-4, 1e-4)
         return projection._b.numpy().ravel().copy()
 
     width = 3 if dimension == 2 else 6
@@ -70,16 +70,16 @@ def projected(simulation, dt):
     """Project once; return velocities before and after, and the bodies' velocities (6 each) before and after."""
     before, taken = simulation.begin_step(dt), {}
     window = simulation.window(before)
-    simulation.bring_to_faces(window, dt)
+    simulation.bring_to_faces(window)
     prepare = simulation.projection.prepare
 
-    def watched(velocity, step):
+    def watched(velocity, *steps):
         taken["u"] = [field.numpy().astype(np.float64) for field in velocity]
         taken["V"] = np.array([np.r_[body.velocity, body.angular_velocity] for body in simulation.bodies.bodies])
-        return prepare(velocity, step)
+        return prepare(velocity, *steps)
 
     simulation.projection.prepare = watched
-    simulation._project(window, dt, simulation.top_speed(before, dt))
+    simulation._project(window, dt, simulation.top_speed(before))
     after = [field.numpy().astype(np.float64) for field in simulation.velocity]
     return taken["u"], after, taken["V"], np.array([np.r_[body.velocity, body.angular_velocity] for body in simulation.bodies.bodies])
 

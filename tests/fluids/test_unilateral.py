@@ -32,11 +32,12 @@ def test_the_solution_satisfies_the_law_written_face_by_face() -> None:
     dt, dx = 0.01, 1 / 16
     simulation.particles.sort()
     window = simulation.grid.everywhere
-    simulation.bring_to_faces(window, dt)
+    simulation.kick_dt = dt
+    simulation.bring_to_faces(window)
     projection = simulation.projection
     simulation.surface.mark(simulation.particles, window, projection.kind)
     u, v = (field.numpy()[1].astype(np.float64) for field in simulation.velocity)
-    unknowns = projection.prepare(simulation.velocity, dt)
+    unknowns = projection.prepare(simulation.velocity, dt, dt)
     assert unknowns == 256
     result, _ = projection.solve(3.0, unknowns)
     assert result

@@ -42,8 +42,8 @@ def borne(degrees: float, plane: tuple[int, int], dimension: int, *, box: bool) 
     start = np.zeros(stress.now.shape, dtype=np.float32)
     start[0] = PRESSURE
     stress.now.assign(start)
-    stress.dt = 1.0
-    stress.begin(YieldSet(SLOPE), np.zeros(3), 1.0)
+    stress.kick_dt = 1.0
+    stress.begin(YieldSet(SLOPE), np.zeros(3), 1.0, 1.0)
     stress.restart(pressure_step=1e-6, shear_step=0.2, lookahead=0.0, momentum=0.0)  # the pressure stays
     stress.advance(1)  # so fast a flow takes the stress to the point of the yield set where friction takes most
     k = CELLS // 2 if dimension == 3 else 1

@@ -86,9 +86,9 @@ def test_sand_bears_a_block_and_the_floor_bears_both() -> None:
         for _ in range(20):
             simulation.step(simulation.scene.time.dt_max)
             pressure, deviator = simulation.stress.now.numpy()[:2, 1, 1, 1:-1]  # on the floor lies p - s_yy = p + a
-            floor.append((pressure + deviator).sum() * DENSITY * simulation.grid.spacing**2 / simulation.stress.dt)
+            floor.append((pressure + deviator).sum() * DENSITY * simulation.grid.spacing**2 / simulation.stress.kick_dt)
             if simulation.carried is not None:
-                given.append(simulation.carried.impulses()[0] / simulation.stress.dt)
+                given.append(simulation.carried.impulses()[0] / simulation.stress.kick_dt)
         loads.append(float(np.mean(floor)))
         forces += [np.mean(given, axis=0)] if given else []
         simulations.append(simulation)

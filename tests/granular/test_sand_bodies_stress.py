@@ -93,7 +93,7 @@ def make(
     case = Case(Stress(packing, walls, bodies=bodies), packing, bodies, np.array(centers), np.array(masses))
     if bodies is not None:
         case.begin(start, inverse)
-    case.stress.begin(YieldSet(0.5), GRAVITY, DT)
+    case.stress.begin(YieldSet(0.5), GRAVITY, DT, DT)
     return case
 
 
@@ -282,7 +282,7 @@ def test_without_friction_it_is_the_linear_complementarity_problem_with_the_bodi
     b += rows @ inverse_body @ momentum
     lcp = wl.LCP(wl.DenseOperator(matrix, device="cpu", dtype=wp.float64), b)
     x = wl.solve(lcp, wl.Lemke(), stopping=wl.StoppingCriteria(rtol=1e-10)).x.numpy()
-    case.stress.begin(YieldSet(0.0), GRAVITY, DT)
+    case.stress.begin(YieldSet(0.0), GRAVITY, DT, DT)
     assert case.solve(1e-6).residual <= 1e-6
     np.testing.assert_allclose(case.stress.now.numpy()[0][tuple(np.array(cells).T)], x, atol=2e-4 * SCALE)
     np.testing.assert_allclose(bodies.velocity.numpy()[0], inverse_body @ (momentum + rows.T @ x), atol=2e-4 * SCALE)

@@ -59,7 +59,7 @@ def test_the_checkerboard_that_is_damped_moves_nothing(dimension: int) -> None:
     checkers = (-1.0) ** (i + j + (k if dimension == 3 else 0))
     start = np.zeros(stress.now.shape, dtype=np.float32)
     start[0] = (index < 0) * (5.0 + 0.5 * checkers)
-    stress.begin(YieldSet(0.5), np.zeros(3), 0.01)
+    stress.begin(YieldSet(0.5), np.zeros(3), 0.01, 0.01)
     stress.now.assign(start)
     stress.residual()
     before = [field.numpy().copy() for field in stress.checked.u]

@@ -17,7 +17,7 @@ def vertical_load(simulation: SandSimulation) -> np.ndarray:
     now = simulation.stress.now.numpy().astype(float)
     deviator = -now[1] if simulation.grid.dimension == 2 else now[2]
     planes = slice(1, 2) if simulation.grid.dimension == 2 else slice(1, -1)
-    return np.asarray((now[0] - deviator)[planes, 1:-1, 1:-1] * DENSITY * simulation.grid.spacing / simulation.stress.dt)
+    return np.asarray((now[0] - deviator)[planes, 1:-1, 1:-1] * DENSITY * simulation.grid.spacing / simulation.stress.kick_dt)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

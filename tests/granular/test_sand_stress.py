@@ -65,9 +65,9 @@ def make(dimension: int, seed: int, *, cohesion: float = 0.0, tension: float = 0
     start[0] = np.maximum(random.normal(0.4, 0.5, size=grid.shape), 0.0)
     start[:, index == 0] = 0.0  # nothing is ever written into the domain's ring
     stress.now.assign(start.astype(np.float32))
-    stress.dt = DT
+    stress.kick_dt = DT
     bound = YieldSet(0.5, cohesion, tension)
-    stress.begin(bound, GRAVITY, DT)
+    stress.begin(bound, GRAVITY, DT, DT)
     return Case(stress, packing, bound, index)
 
 
@@ -335,5 +335,5 @@ def test_a_stress_free_fall_has_no_residual(dimension: int) -> None:
     u = [wp.full(grid.shape, -0.3, dtype=wp.float32, device=grid.device) for _ in range(dimension)]
     packing.update(wp.full(grid.shape, 0.2, dtype=wp.float32, device=grid.device), u, DT)
     stress = Stress(packing, Walls(grid, np.full(grid.shape, -1, dtype=np.int32), [0.0]))
-    stress.begin(YieldSet(0.5), GRAVITY, DT)
+    stress.begin(YieldSet(0.5), GRAVITY, DT, DT)
     assert stress.residual() == (0.0, 0.0)

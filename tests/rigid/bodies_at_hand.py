@@ -26,7 +26,7 @@ def run(bodies, duration, dt=0.01, gravity=GRAVITY):
     """Advance without a material; return the kinetic energies after each step."""
     energies = []
     for _ in range(round(duration / dt)):
-        bodies.begin_step(bodies.time, dt, gravity)
+        bodies.begin_step(bodies.time, dt, gravity, dt)
         bodies.end_step(dt)
         energies.append(bodies.kinetic_energy())
     return np.array(energies)

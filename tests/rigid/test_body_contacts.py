@@ -292,7 +292,7 @@ def test_obstacles_need_no_name_to_be_found():
 def begun(dimension=2, **settings):
     """Return a box at rest on the floor, and its weight's impulse, in a step that has begun."""
     bodies = bodies_of([box([0.4, 0.0], [0.6, 0.1], dimension)], dimension, **settings)
-    bodies.begin_step(0.0, 0.01, GRAVITY)
+    bodies.begin_step(0.0, 0.01, GRAVITY, 0.01)
     return bodies, bodies.bodies[0], bodies.bodies[0].properties.mass * G * 0.01
 
 
@@ -327,7 +327,7 @@ def test_a_material_lifts_a_body_off_the_floor_if_it_bears_its_weight(share, spe
 def test_in_the_air_impulses_act_in_full():
     bodies = bodies_of([box([0.4, 0.5], [0.6, 0.6], 2)], 2)
     body = bodies.bodies[0]
-    bodies.begin_step(0.0, 0.01, GRAVITY)
+    bodies.begin_step(0.0, 0.01, GRAVITY, 0.01)
     impulse, before, inverse = np.array([1.0, 2.0, 0.3]), body.velocities(2), body.inverse_mass(2)
     body.apply_impulse(impulse)
     after = body.velocities(2)
@@ -352,7 +352,7 @@ def test_a_smooth_body_slides_away_under_a_rough_one():
     """As far as both surfaces rub: the coefficient is the geometric mean."""
     made = [box([0.3, 0.0], [0.6, 0.1], 2), box([0.35, 0.1], [0.55, 0.25], 2)]
     bodies = bodies_of(made, 2, settings=[{"friction": 0.0}, {"friction": 1.0}])
-    bodies.begin_step(0.0, 0.01, GRAVITY)
+    bodies.begin_step(0.0, 0.01, GRAVITY, 0.01)
     bodies.bodies[0].apply_impulse(np.array([1.0, 0.0, 0.0]))
     bodies.end_step(0.01)
     assert bodies.bodies[0].velocity[0] == pytest.approx(1.0 / 15.0)

@@ -74,7 +74,7 @@ def test_a_stack_on_the_floor_is_held_to_its_top(dimension):
     beside = Sphere(center=[0.8, 0.5, 0.5][:dimension], radius=0.1)
     bodies = bodies_of([*stack(dimension), beside], dimension)
     run(bodies, 0.05)
-    bodies.begin_step(bodies.time, 0.01, GRAVITY)
+    bodies.begin_step(bodies.time, 0.01, GRAVITY, 0.01)
     for body in bodies.bodies[:3]:
         assert np.abs(body.inverse_mass(dimension)).max() < 1e-9 * np.abs(body.free_inverse_mass(dimension)).max()
     assert bodies.bodies[3].hold is None
@@ -83,7 +83,7 @@ def test_a_stack_on_the_floor_is_held_to_its_top(dimension):
 def test_a_body_on_a_smooth_one_is_held_upward_only():
     made = stack(2, 2)
     bodies = bodies_of(made, 2, settings=[{"friction": 0.0}, {"friction": 0.5}])
-    bodies.begin_step(0.0, 0.01, GRAVITY)
+    bodies.begin_step(0.0, 0.01, GRAVITY, 0.01)
     upper = bodies.bodies[1]
     before = upper.velocities(2)
     upper.apply_impulse(np.array([1.0, 1.0, 0.0]))

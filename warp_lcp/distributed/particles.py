@@ -160,14 +160,15 @@ class SharedParticles(Particles):
             return mine
         n = mine.count
         with np.errstate(invalid="ignore"):
-            sums = ranks.sum(np.array([n, n * mine.mean_square_speed, *(n * mine.center), mine.bad_positions, mine.bad_velocities]))
+            means = n * mine.mean_square_speed, *(n * mine.center), *(n * mine.velocity)
+            sums = ranks.sum(np.array([n, mine.bad_positions, mine.bad_velocities, *means]))
         most = ranks.max(np.array([mine.max_speed, *(-mine.low if n else [-np.inf] * 3), *(mine.high if n else [-np.inf] * 3)]))
         count = int(sums[0])
         if count == 0:
             return mine
         return ParticleTotals(
-            count=count, mean_square_speed=float(sums[1]) / count, center=sums[2:5] / count, low=-most[1:4], high=most[4:7],
-            max_speed=float(most[0]), bad_positions=int(sums[5]), bad_velocities=int(sums[6]),
+            count=count, mean_square_speed=float(sums[3]) / count, velocity=sums[7:10] / count, center=sums[4:7] / count, low=-most[1:4],
+            high=most[4:7], max_speed=float(most[0]), bad_positions=int(sums[1]), bad_velocities=int(sums[2]),
         )  # fmt: skip
 
     def assign_with_places(self, arrays: Mapping[str, np.ndarray], place: np.ndarray) -> None:

@@ -50,6 +50,10 @@ CORRECTION_COLUMNS = ("density_status", "density_iterations", "max_density")
 class ParticleSimulation(ABC):
     """Particles, the fields that they share, and the parts of a step around a solve, for a subclass to call in its own `step`.
 
+    Particles have the velocities of the middle of the last step, the grid in a step those of its middle: forces act for `kick_dt`, half of
+    the last step and half of this one, and then particles move for all of it (the leapfrog of Verlet). One solve a step so makes a scheme
+    that is its own inverse in time, whatever the steps' lengths: what flies goes along its parabola.
+
     A step calls `begin_step`, `window` and `bring_to_faces`; changes `velocity` as its material's laws ask; then calls `extend`,
     `bring_to_particles` and `move`, and returns `logged` of what the log gets. Nothing before `move` changes the state but for the
     particles' order, so that a solve may fail.
@@ -81,6 +85,8 @@ class ParticleSimulation(ABC):
         reach: how far from particles a step touches cells; more than `layers` where a subclass needs it.
         time: [s].
         step_count: steps done.
+        last_dt: length of the last step [s], 0 before the first.
+        kick_dt: how long forces act in the step that has begun [s].
         watch: what the stages of a step are measured with.
     """
 
@@ -101,6 +107,8 @@ class ParticleSimulation(ABC):
         self.scene, self.grid, self.boundary, self.particles = scene, grid, boundary, particles
         self.sources, self.outlets, self.bodies, self.band = sources, outlets, bodies, band
         self.time, self.step_count = 0.0, 0
+        self.last_dt = self.kick_dt = 0.0
+        self._velocity_before = np.zeros(3)  # mean of the particles at the start of the step [m/s]
         self.watch: Stopwatch = NoStopwatch()
         self._faces_know = False  # the velocity of the particles, around them
         self._notes = list(notes)
@@ -158,11 +166,12 @@ class ParticleSimulation(ABC):
         if not (math.isfinite(dt) and dt > 0.0):
             raise ValueError(f"dt = {dt}: must be a positive time [s]")
         totals = self.checked_totals("at the start of")
+        self.kick_dt, self._velocity_before = 0.5 * (self.last_dt + dt), totals.velocity
         with self.watch.stage("sort", *self.particles.arrays().values()):
             self.particles.arrange(self.step_count)
         if self.bodies is not None:
             with self.watch.stage("bodies"):
-                self.bodies.begin_step(self.time, dt, self.gravity)
+                self.bodies.begin_step(self.time, dt, self.gravity, self.kick_dt)
         return totals
 
     def restore_bodies(self) -> None:
@@ -175,12 +184,12 @@ class ParticleSimulation(ABC):
         low, high = (self.particles.cells_of(corner[None])[0] + 1 for corner in (totals.low, totals.high))
         return self.grid.window(low, high, grow=self.reach + 2)
 
-    def top_speed(self, totals: ParticleTotals, dt: float) -> float:
+    def top_speed(self, totals: ParticleTotals) -> float:
         """Return the scale of the velocities that `bring_to_faces` leaves [m/s]."""
-        return totals.max_speed + dt * float(np.linalg.norm(self.gravity))
+        return totals.max_speed + self.kick_dt * float(np.linalg.norm(self.gravity))
 
-    def bring_to_faces(self, window: Window, dt: float) -> None:
-        """Bring the particles' velocities to the faces, and let gravity act on them for dt [s]."""
+    def bring_to_faces(self, window: Window) -> None:
+        """Bring the particles' velocities to the faces, and let gravity act on them for `kick_dt`."""
         particles = self.particles
         with self.watch.stage("particles-to-grid", *particles.arrays().values(), *self.velocity, *self.weights):
             particles_to_faces(
@@ -191,7 +200,7 @@ class ParticleSimulation(ABC):
                 self.band.blend(window, self.velocity, self.weights)
             for field, saved in zip(self.velocity, self._saved or (), strict=False):
                 wp.copy(saved, field)
-            accelerate(window, self.velocity, self.weights, self.gravity * dt)
+            accelerate(window, self.velocity, self.weights, self.gravity * self.kick_dt)
 
     def extend(self, window: Window, known: Sequence[wp.array], kind: wp.array, contact: wp.array) -> None:
         """Continue the velocity from the faces that a solve has made valid into air and walls, see `warp_lcp.material.wall`.
@@ -247,6 +256,7 @@ class ParticleSimulation(ABC):
             after = self.checked_totals("after the density correction of")
         self.time += dt
         self.step_count += 1
+        self.last_dt = dt
         return self._totals_row(after, dt) | {"stopped": stopped, "pushed": pushed, "stuck": stuck} | rearranged | exchanged
 
     def carry(self, dt: float) -> tuple[int, int, int]:
@@ -278,6 +288,7 @@ class ParticleSimulation(ABC):
         """Return the names of the log's columns.
 
         SI units; in 2-D mass and energies are per meter of depth. Energies are the particles' own; potential_energy is 0 at the origin.
+        Velocities, in frames too, are those of the step's middle, which move things through it; kinetic_energy is that of its end.
         With a narrow band mass, energies and center count the interior, particles does not; interior_density is that of the interior, in
         units of that at rest, if the mass is to be what it was.
         solve_residual is relative to the right-hand side's, which in free fall is rounding noise that is not iterated on: it may then be
@@ -331,11 +342,11 @@ class ParticleSimulation(ABC):
     def state(self) -> dict[str, np.ndarray]:
         """Return what `restore` needs to continue bit for bit on the CPU."""
         particles = {name: array.numpy().copy() for name, array in self.particles.arrays().items()}
-        clock = {"time": np.array(self.time), "step_count": np.array(self.step_count), "signature": self._signature()}
+        clock = {"time": np.array(self.time), "step_count": np.array(self.step_count), "last_dt": np.array(self.last_dt)}
         correction = {"density_correction": self.correction.x.numpy().copy()} if self.correction is not None else {}
         bodies = self.bodies.state() if self.bodies is not None else {}
         band = self.band.state() if self.band is not None else {}
-        return clock | particles | self.own_state() | band | correction | bodies
+        return clock | {"signature": self._signature()} | particles | self.own_state() | band | correction | bodies
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from `state`.
@@ -343,7 +354,7 @@ class ParticleSimulation(ABC):
         Raises:
             ValueError: the arrays do not belong to this scene.
         """
-        expected = self.state()
+        expected, state = self.state(), {"last_dt": np.array(0.0), **state}  # older states have velocities of their own time
         missing = sorted(expected.keys() - state.keys())
         if missing:
             raise ValueError(f"the state lacks {', '.join(missing)}: it does not belong to this scene")
@@ -369,7 +380,7 @@ class ParticleSimulation(ABC):
             self.correction.x.assign(state["density_correction"])
         if self.band is not None:
             self.band.restore(state)
-        self.time, self.step_count = float(state["time"]), int(state["step_count"])
+        self.time, self.step_count, self.last_dt = float(state["time"]), int(state["step_count"]), float(state["last_dt"])
         if self.bodies is not None:
             self.bodies.restore(state)
         self.boundary.place(self.time)
@@ -384,7 +395,7 @@ class ParticleSimulation(ABC):
         size = before[:3] * before[4], now[:3] * now[4]
         if not np.array_equal(before[[3, 5, 6]], now[[3, 5, 6]]) or not np.allclose(*(side[: self.grid.dimension] for side in size)):
             raise ValueError("the state's domain, number of particles a cell or transfer differ from this scene's")
-        self.time, self.step_count = float(state["time"]), int(state["step_count"])
+        self.time, self.step_count, self.last_dt = float(state["time"]), int(state["step_count"]), float(state["last_dt"])
         if self.bodies is not None:
             if "bodies" not in state:
                 raise ValueError("the state has no bodies: it does not belong to this scene")
@@ -473,13 +484,23 @@ class ParticleSimulation(ABC):
         return {
             "particles": self.particles.count,
             "mass": mass,
-            "kinetic_energy": 0.5 * mass * totals.mean_square_speed,
+            "kinetic_energy": mass * self._kinetic_energy(totals, dt),
             "potential_energy": -mass * float(self.gravity @ totals.center),
             "center_of_mass_y": float(totals.center[1]),
             "max_speed": totals.max_speed,
             "cfl": totals.max_speed * dt / self.grid.spacing,
             "interior_density": self.band.mean_density if self.band is not None else None,
         }
+
+    def _kinetic_energy(self, totals: ParticleTotals, dt: float) -> float:
+        """Return the energy of motion at the end of a step over mass [m^2/s^2]; the particles' velocities are those of its middle.
+
+        For half a step more gravity works on what moves, V, and by what it has changed V in this one: nothing where solids bear it.
+        """
+        g = self.gravity
+        gained = float(g @ (totals.velocity - self._velocity_before)) / self.kick_dt
+        work = 0.5 * dt * float(g @ totals.velocity) + 0.125 * dt**2 * min(max(gained, 0.0), float(g @ g))
+        return max(0.5 * totals.mean_square_speed + work, 0.0)
 
     def _admits(self, points: np.ndarray) -> np.ndarray:
         """Tell which points [m], shape (n, 3), a particle may be at."""

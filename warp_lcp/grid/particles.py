@@ -25,6 +25,7 @@ class ParticleTotals:
     Attributes:
         count: particles.
         mean_square_speed: [m^2/s^2].
+        velocity: mean velocity [m/s], shape (3,).
         center: mean position [m], shape (3,).
         low: smallest coordinates [m], shape (3,).
         high: largest coordinates [m], shape (3,).
@@ -35,6 +36,7 @@ class ParticleTotals:
 
     count: int
     mean_square_speed: float
+    velocity: np.ndarray
     center: np.ndarray
     low: np.ndarray
     high: np.ndarray
@@ -246,7 +248,7 @@ class Particles:
     def totals(self) -> ParticleTotals:
         """Return sums over the particles as they are now; the same bits on every run. Without particles all are 0."""
         if self.count == 0:
-            return ParticleTotals(0, 0.0, np.zeros(3), np.zeros(3), np.zeros(3), 0.0, 0, 0)
+            return ParticleTotals(0, 0.0, *np.zeros((4, 3)), 0.0, 0, 0)
         chunk = max(CHUNK, -(-self.count // THREADS))
         rows = -(-self.count // chunk)
         inputs = [self.count, chunk, self.position, self.velocity, self._partials]
@@ -257,6 +259,7 @@ class Particles:
         return ParticleTotals(
             count=self.count,
             mean_square_speed=float(total[0]) / self.count,
+            velocity=total[13:16] / self.count,
             center=total[1:4] / self.count,
             low=part[:, 4:7].min(axis=0),
             high=part[:, 7:10].max(axis=0),

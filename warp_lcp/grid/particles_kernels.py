@@ -5,7 +5,7 @@ import warp as wp
 
 from warp_lcp.grid.particle_loops import particle_loop
 
-COLUMNS = 13  # of a partial result, see `total_some`
+COLUMNS = 16  # of a partial result, see `total_some`
 
 NUMBER = """
     typedef float T;
@@ -27,11 +27,11 @@ TOTAL = """
     enum { LANES = 16 };
     #endif
     typedef float T;
-    const T* position = (const T*)x_.data; const T* velocity = (const T*)v_.data; double* out = out_.data + 13*row;
-    double squares[LANES], sum[3][LANES]; T low[3][LANES], high[3][LANES], fastest[LANES]; int bad_x[LANES], bad_v[LANES];
+    const T* position = (const T*)x_.data; const T* velocity = (const T*)v_.data; double* out = out_.data + 16*row;
+    double squares[LANES], sum[3][LANES], way[3][LANES]; T low[3][LANES], high[3][LANES], fastest[LANES]; int bad_x[LANES], bad_v[LANES];
     for (int m = 0; m < LANES; ++m) {
         squares[m] = 0; fastest[m] = 0; bad_x[m] = 0; bad_v[m] = 0;
-        for (int d = 0; d < 3; ++d) { sum[d][m] = 0; low[d][m] = high[d][m] = position[3*(long long)first + d]; }
+        for (int d = 0; d < 3; ++d) { sum[d][m] = way[d][m] = 0; low[d][m] = high[d][m] = position[3*(long long)first + d]; }
     }
     for (int start = first; start < last; start += LANES) {
         const int n = last - start < LANES ? last - start : (int)LANES;
@@ -40,6 +40,7 @@ TOTAL = """
             const T x = X[3*m], y = X[3*m + 1], z = X[3*m + 2], u = V[3*m], v = V[3*m + 1], w = V[3*m + 2];
             const T speed = u*u + v*v + w*w, most = (T)3.4028234e38;
             squares[m] += (double)speed; sum[0][m] += (double)x; sum[1][m] += (double)y; sum[2][m] += (double)z;
+            way[0][m] += (double)u; way[1][m] += (double)v; way[2][m] += (double)w;
             low[0][m] = x < low[0][m] ? x : low[0][m]; high[0][m] = x > high[0][m] ? x : high[0][m];
             low[1][m] = y < low[1][m] ? y : low[1][m]; high[1][m] = y > high[1][m] ? y : high[1][m];
             low[2][m] = z < low[2][m] ? z : low[2][m]; high[2][m] = z > high[2][m] ? z : high[2][m];
@@ -53,12 +54,12 @@ TOTAL = """
         squares[0] += squares[m]; bad_x[0] += bad_x[m]; bad_v[0] += bad_v[m];
         fastest[0] = fastest[m] > fastest[0] ? fastest[m] : fastest[0];
         for (int d = 0; d < 3; ++d) {
-            sum[d][0] += sum[d][m];
+            sum[d][0] += sum[d][m]; way[d][0] += way[d][m];
             low[d][0] = low[d][m] < low[d][0] ? low[d][m] : low[d][0]; high[d][0] = high[d][m] > high[d][0] ? high[d][m] : high[d][0];
         }
     }
     out[0] = squares[0]; out[10] = fastest[0]; out[11] = bad_x[0]; out[12] = bad_v[0];
-    for (int d = 0; d < 3; ++d) { out[1 + d] = sum[d][0]; out[4 + d] = low[d][0]; out[7 + d] = high[d][0]; }
+    for (int d = 0; d < 3; ++d) { out[1 + d] = sum[d][0]; out[4 + d] = low[d][0]; out[7 + d] = high[d][0]; out[13 + d] = way[d][0]; }
 """
 
 
@@ -130,6 +131,6 @@ def close_ranks_kernel(
 def total_kernel(
     count: int, chunk: int, position: wp.array(dtype=wp.vec3), velocity: wp.array(dtype=wp.vec3), out: wp.array2d(dtype=wp.float64)
 ):
-    """Add up a chunk of particles: [0] |v|^2, [1-3] x, [4-6] lowest x, [7-9] highest x, [10] largest |v|^2, [11-12] bad x and v."""
+    """Add up a chunk of particles: [0] |v|^2, [1-3] x, [4-6] lowest x, [7-9] highest x, [10] largest |v|^2, [11-12] bad x and v, [13-15] v."""
     t = wp.tid()
     total_some(position, velocity, out, t, t * chunk, wp.min((t + 1) * chunk, count))

@@ -55,6 +55,7 @@ class Interior:
     Attributes:
         cells: how many there are.
         mean_square_speed: [m^2/s^2].
+        velocity: mean velocity [m/s], shape (3,).
         center: mean position [m], shape (3,).
         low: smallest coordinates of cell centers [m], shape (3,).
         high: largest coordinates of cell centers [m], shape (3,).
@@ -63,6 +64,7 @@ class Interior:
 
     cells: int
     mean_square_speed: float
+    velocity: np.ndarray
     center: np.ndarray
     low: np.ndarray
     high: np.ndarray
@@ -253,6 +255,7 @@ class NarrowBand:
             totals,
             count=count,
             mean_square_speed=(1.0 - share) * totals.mean_square_speed + share * inside.mean_square_speed,
+            velocity=(1.0 - share) * totals.velocity + share * inside.velocity,
             center=(1.0 - share) * totals.center + share * inside.center,
             low=np.minimum(totals.low, inside.low) if totals.count else inside.low,
             high=np.maximum(totals.high, inside.high) if totals.count else inside.high,
@@ -323,12 +326,12 @@ class NarrowBand:
         rows = self._sums.numpy()[low[0] : high[0], low[1] : high[1]].reshape(-1, kernels.COLUMNS)
         cells, dx = int(rows[:, 0].sum()), self.grid.spacing
         if cells == 0:
-            return Interior(0, 0.0, np.zeros(3), np.zeros(3), np.zeros(3), 0.0)
+            return Interior(0, 0.0, *np.zeros((4, 3)), 0.0)
         center, lowest, highest = rows[:, 2:5].sum(axis=0) / cells, rows[:, 6:9].min(axis=0), rows[:, 9:12].max(axis=0)
         places = (np.stack([center, lowest, highest]) - 0.5) * dx
         places[:, self.grid.dimension :] = 0.0
         squares, fastest = float(rows[:, 1].sum()) / cells, float(rows[:, 5].max())
-        return Interior(cells, squares, places[0], places[1], places[2], math.sqrt(fastest))
+        return Interior(cells, squares, rows[:, 12:15].sum(axis=0) / cells, places[0], places[1], places[2], math.sqrt(fastest))
 
 
 def without_band(state: Mapping[str, np.ndarray], spacing: float, random_seed: int) -> Mapping[str, np.ndarray]:

@@ -11,7 +11,7 @@ from warp_lcp.operators.grid_poisson import FLUID, SOLID
 NEAR = 1.0  # cells from a solid inside the domain within which particles stay
 CLEAR = 0.01  # cells by which a solid must be nearer than the domain's walls to be one of its own
 INSET = 1e-3  # of a cell: particles are put no nearer to its faces
-COLUMNS = 12  # of a row's sums, see `sum_kernel`
+COLUMNS = 15  # of a row's sums, see `sum_kernel`
 
 _FLUID = wp.constant(wp.int8(FLUID))
 _SOLID = wp.constant(wp.int8(SOLID))
@@ -233,7 +233,7 @@ def sum_kernel(
 ):  # fmt: skip
     """Add up a row's cells deeper than the band.
 
-    [0] cells, [1] |u|^2, [2-4] indices (i, j, k), [5] largest |u|^2, [6-8] lowest, [9-11] highest indices.
+    [0] cells, [1] |u|^2, [2-4] indices (i, j, k), [5] largest |u|^2, [6-8] lowest, [9-11] highest indices, [12-14] u.
     """
     plane, row = wp.tid()
     k = cells.k + plane
@@ -242,6 +242,7 @@ def sum_kernel(
     squares = wp.float64(0.0)
     along = int(0)
     fastest = float(0.0)
+    way = wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(0.0))
     low = int(1 << 30)
     high = int(-1)
     for i in range(cells.i, cells.end):
@@ -250,11 +251,14 @@ def sum_kernel(
             along += i
             low = wp.min(low, i)
             high = wp.max(high, i)
+            mean = wp.vec3(u[k, j, i] + u[k, j, i + 1], v[k, j, i] + v[k, j + 1, i], 0.0)
             square = 0.5 * (u[k, j, i] * u[k, j, i] + u[k, j, i + 1] * u[k, j, i + 1])
             square += 0.5 * (v[k, j, i] * v[k, j, i] + v[k, j + 1, i] * v[k, j + 1, i])
             if planes == 2:
+                mean[2] = w[k, j, i] + w[k + 1, j, i]
                 square += 0.5 * (w[k, j, i] * w[k, j, i] + w[k + 1, j, i] * w[k + 1, j, i])
             squares += wp.float64(square)
+            way += wp.vec3d(0.5 * mean)
             fastest = wp.max(fastest, square)
     sums[k, j, 0] = wp.float64(count)
     sums[k, j, 1] = squares
@@ -268,3 +272,5 @@ def sum_kernel(
     sums[k, j, 9] = wp.float64(high)
     sums[k, j, 10] = wp.float64(wp.where(count > 0, j, -1))
     sums[k, j, 11] = wp.float64(wp.where(count > 0, k, -1))
+    for d in range(3):
+        sums[k, j, 12 + d] = way[d]

@@ -84,7 +84,7 @@ class RigidBodies:
         """Time of the state [s]."""
         return self.bodies[0].time
 
-    def begin_step(self, time: float, dt: float, gravity: np.ndarray) -> None:
+    def begin_step(self, time: float, dt: float, gravity: np.ndarray, kick_dt: float) -> None:
         """Let gravity act, and contacts; hold bodies that rest against walls and solids that the scene moves or that stand.
 
         Held directions answer to no impulse of the material (see `RigidBody.inverse_mass`): it meets a body on the floor as it meets the
@@ -94,6 +94,7 @@ class RigidBodies:
             time: of the state [s].
             dt: time step [s], > 0.
             gravity: [m/s^2], shape (3,).
+            kick_dt: how long gravity acts [s].
         """
         self.restore_step()
         gravity = np.asarray(gravity, dtype=np.float64)
@@ -103,7 +104,7 @@ class RigidBodies:
         touching = self._solve.find(time, dt, gravity)
         for body in self.bodies:
             body.release()
-            body.accelerate(gravity, dt)
+            body.accelerate(gravity, kick_dt)
         free = self._momenta()
         impulses = self._solve.push_apart(touching)
         self._solve.hold(touching, impulses)
