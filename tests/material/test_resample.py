@@ -79,7 +79,7 @@ def test_a_simulation_goes_on(before, after, tables):
     assert new._admits(new.particles.position.numpy().astype(np.float64)).mean() > 0.99
     at = new.particles.totals()
     assert at.mean_square_speed == pytest.approx(old.particles.totals().mean_square_speed, rel=0.05)
-    np.testing.assert_allclose(at.center, old.particles.totals().center, atol=0.15 * max(old.grid.spacing, new.grid.spacing))
+    np.testing.assert_allclose(at.center, old.particles.totals().center, atol=0.2 * max(old.grid.spacing, new.grid.spacing))
     rows = advance(new, 0.35)
     assert rows[-1]["mass"] == pytest.approx(old.particles.count * old.particle_mass, rel=2e-3)
     again = dam(after, **tables)
