@@ -163,8 +163,8 @@ class DistributedLiquid(LiquidSimulation):
         """Return this rank's part of the state, without pickles, in the whole domain's coordinates.
 
         Names and shapes: `box` int64 (2, 3), the low and high (exclusive) cell x, y, z of this rank; `counts` int64 (3,), the whole grid's;
-        `time`, `step_count`, `last_dt`, `pressure_dt`, `signature` as of `state`, `time_error` (2,), the same on all ranks; particles: `position`,
-        `velocity`, `affine_0` ... float32 (n, 3) and `place` int64 (n,), their order; cells: `pressure` float64, `cells` int8, `contact`
+        `time`, `step_count`, `last_dt`, `pressure_dt`, `signature` as of `state`, `time_error` (2,), the same on all ranks; particles:
+        `position`, `velocity`, `affine_0` ... float32 (n, 3) and `place` int64 (n,), their order; cells: `pressure` float64, `cells` int8, `contact`
         uint8, of the box, shape (nz, ny, nx).
         """
         box, own = self.part.box, self.own_state()

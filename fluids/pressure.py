@@ -43,7 +43,7 @@ class Projection:
 class PressureProjection:
     """Solve for the pressure of the liquid's cells and project the velocity.
 
-    With x = kick_dt p / (rho dx) [m/s] on every FLUID cell, s_f = +-1 outward, a_f the open fraction of a face, u_s the solid's velocity and
+    With x = kick_dt p / (rho dx) [m/s] on FLUID cells, s_f = +-1 outward, a_f the open fraction of a face, u_s the solid's velocity and
     theta_f the distance to the free surface in cells where air is beyond the face, else 1 [Batty, Bertails & Bridson 2007],
 
         y_i = b_i + sum over faces of (a_f / theta_f) (x_i - x_neighbor),   b_i = sum of s_f [a_f u*_f + (1 - a_f) u_s,f],   x = 0 in AIR,

@@ -21,7 +21,7 @@ class TimeErrorTolerance:
     """Stop a solve when the velocity error that it leaves is FRACTION of the step's own error in time.
 
     A step takes the acceleration by the pressure as constant. To first order its error in the velocity is half of what this acceleration
-    changes by from one step to the next. The first guess of a solve is just the last step's pressure, x0 = x_last kick_dt / kick_dt_last: so
+    changes by from one step to the next. The first guess of a solve is just the last step's pressure, x0 = x_last kick_dt / kick_dt_last:
 
         time error = 1/2 ||G (x - x0)||,   ||G e||^2 = e'A e,
 

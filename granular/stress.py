@@ -123,7 +123,7 @@ class Velocity:
 class Stress:
     """Pressure and friction of sand under a packing.
 
-    With x = kick_dt p / (rho dx) and s in the same units, u = u* + (1/m) (-grad x + div s) on faces of mass m, the stress is the solution of
+    With x = kick_dt p / (rho dx) and s alike, u = u* + (1/m) (-grad x + div s) on faces of mass m, the stress is the solution of
 
         0 <= x  complementary to  w = (1 - phi) dx / dt + div(m' u) >= 0,   s = the nearest point of the yield set of x to s + r E u,
 
@@ -180,7 +180,7 @@ class Stress:
             bound: what sand can bear.
             gravity: [m/s^2], three entries.
             dt: time step [s].
-            kick_dt: how long forces act in it [s]. Stresses are impulses: those of the last step are scaled, as it is the pressure that goes on.
+            kick_dt: how long forces act in it [s]; stresses are impulses, and it is the last step's pressure that goes on.
             decay: factor of the last stresses; less than 1 damps patterns that exert no force.
         """
         self._host = np.array(
