@@ -21,7 +21,7 @@ SPARE = 1.5  # room for entries, times those there are when there is none left
 class BodyCoupling:
     """Move bodies and liquid by one pressure [Batty, Bertails & Bridson 2007].
 
-    A body's velocity is V* + M^-1 I after the pressure's impulse I = rho dx^d U'x (x: see `PressureProjection`), and the outflow of a cell gains
+    A body's velocity is V* + M^-1 I after the pressure's impulse I = rho dx^d U'x of its x [m/s], and the outflow of a cell gains
     U V: U_iq is the sum over the faces of cell i of s_f (1 - a_f) times the velocity of unit motion q at the face's center, s_f = +-1
     outward. So with b from V* the outflow is
 

@@ -164,8 +164,8 @@ class DistributedLiquid(LiquidSimulation):
 
         Names and shapes: `box` int64 (2, 3), the low and high (exclusive) cell x, y, z of this rank; `counts` int64 (3,), the whole grid's;
         `time`, `step_count`, `last_dt`, `pressure_dt`, `signature` as of `state`, `time_error` (2,), the same on all ranks; particles:
-        `position`, `velocity`, `affine_0` ... float32 (n, 3) and `place` int64 (n,), their order; cells: `pressure` float64, `cells` int8, `contact`
-        uint8, of the box, shape (nz, ny, nx).
+        `position`, `velocity`, `affine_0` ... float32 (n, 3) and `place` int64 (n,), their order; of the box, shape (nz, ny, nx):
+        `pressure` float64, `cells` int8, `contact` uint8.
         """
         box, own = self.part.box, self.own_state()
         fields = {name: np.ascontiguousarray(self.part.box_of(own[name])) for name in ("pressure", "cells", "contact")}

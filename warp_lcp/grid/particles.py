@@ -248,7 +248,7 @@ class Particles:
     def totals(self) -> ParticleTotals:
         """Return sums over the particles as they are now; the same bits on every run. Without particles all are 0."""
         if self.count == 0:
-            return ParticleTotals(0, 0.0, *np.zeros((4, 3)), 0.0, 0, 0)
+            return ParticleTotals(0, 0.0, np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), 0.0, 0, 0)
         chunk = max(CHUNK, -(-self.count // THREADS))
         rows = -(-self.count // chunk)
         inputs = [self.count, chunk, self.position, self.velocity, self._partials]

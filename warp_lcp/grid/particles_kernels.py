@@ -131,6 +131,6 @@ def close_ranks_kernel(
 def total_kernel(
     count: int, chunk: int, position: wp.array(dtype=wp.vec3), velocity: wp.array(dtype=wp.vec3), out: wp.array2d(dtype=wp.float64)
 ):
-    """Add up a chunk of particles: [0] |v|^2, [1-3] x, [4-6] lowest, [7-9] highest x, [10] largest |v|^2, [11-12] bad x and v, [13-15] v."""
+    """Add up particles: [0] |v|^2, [1-3] x, [4-6] lowest, [7-9] highest x, [10] largest |v|^2, [11-12] bad x and v, [13-15] v."""
     t = wp.tid()
     total_some(position, velocity, out, t, t * chunk, wp.min((t + 1) * chunk, count))

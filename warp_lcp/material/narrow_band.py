@@ -326,7 +326,7 @@ class NarrowBand:
         rows = self._sums.numpy()[low[0] : high[0], low[1] : high[1]].reshape(-1, kernels.COLUMNS)
         cells, dx = int(rows[:, 0].sum()), self.grid.spacing
         if cells == 0:
-            return Interior(0, 0.0, *np.zeros((4, 3)), 0.0)
+            return Interior(0, 0.0, np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), 0.0)
         center, lowest, highest = rows[:, 2:5].sum(axis=0) / cells, rows[:, 6:9].min(axis=0), rows[:, 9:12].max(axis=0)
         places = (np.stack([center, lowest, highest]) - 0.5) * dx
         places[:, self.grid.dimension :] = 0.0
