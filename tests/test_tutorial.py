@@ -75,7 +75,7 @@ def test_the_scene_with_a_body_has_one(tmp_path):
     """At the text's own resolution, until the crate meets the water."""
     scene = tmp_path / "crate.toml"
     scene.write_text(SCENES[3])
-    invoke("run", str(scene), "--out", str(tmp_path / "out"), "--frames", "4")
+    invoke("run", str(scene), "--out", str(tmp_path / "out"), "--frames", "3")
     with (tmp_path / "out" / "log.csv").open() as log:
         rows = list(csv.DictReader(log))
     assert float(rows[-1]["body0_y"]) < 0.35 - 0.04
