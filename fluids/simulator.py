@@ -185,7 +185,7 @@ class LiquidSimulation(ParticleSimulation):
         with watch.stage("pressure set-up", *self.velocity, *projection.fields()):
             self.boundary.begin_step(self.time, dt)
             if self.sources is not None:
-                self.sources.supply(self.time, self.velocity, projection.kind)
+                self.sources.supply(self.time + 0.5 * dt, self.velocity, projection.kind)
             unknowns = projection.prepare(self.velocity, dt, self.kick_dt)
         if unknowns == 0:
             return self._held(projection.leave())

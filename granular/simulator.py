@@ -262,7 +262,7 @@ class SandSimulation(ParticleSimulation):
             wp.copy(self._base, solids.base)
             solids.begin_step(self.time, dt)
             if self.sources is not None:
-                self.sources.supply(self.time, self.velocity, self._base)
+                self.sources.supply(self.time + 0.5 * dt, self.velocity, self._base)
                 self.sources.hold(solids.velocity, [])
             packing.update(self.density, self.velocity, dt, solids.velocity)
             self._begin_bodies()

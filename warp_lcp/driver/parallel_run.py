@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import socket
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -27,6 +28,7 @@ from warp_lcp.driver.simulator import (
     DistributedSimulator,
     Part,
     Profiled,
+    Scheduled,
     Simulation,
     SimulationFailed,
     StepFailed,
@@ -71,6 +73,10 @@ class AgreedSimulation:
         with self._meeting.together():
             mine = self._simulation.stable_dt()
         return float(self._meeting.share(mine))
+
+    def next_event(self, after: float) -> float:
+        """Return when the next thing starts or stops that steps should end at [s]; what all ranks know."""
+        return self._simulation.next_event(after) if isinstance(self._simulation, Scheduled) else math.inf
 
     def step(self, dt: float) -> dict[str, Value]:
         """Advance by dt [s] and return a row of the log.

@@ -21,9 +21,9 @@ from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.gravity import accelerate
 from warp_lcp.material.narrow_band import NarrowBand, without_band
-from warp_lcp.material.outlets import Outlets
+from warp_lcp.material.outlets import Drain, Outlets
 from warp_lcp.material.resample import resampled, resampling_notes
-from warp_lcp.material.sources import Sources
+from warp_lcp.material.sources import Source, Sources
 from warp_lcp.rigid.bodies import RigidBodies
 
 Row = dict[str, float | int | str | None]  # of the log
@@ -42,8 +42,6 @@ COLUMNS = (
     "linear_iterations",
     "solve_residual",
 )
-
-
 CORRECTION_COLUMNS = ("density_status", "density_iterations", "max_density")
 
 
@@ -141,17 +139,19 @@ class ParticleSimulation(ABC):
         """Continue from the arrays of `own_state`, whose shapes, types and values have been checked."""
 
     def stable_dt(self) -> float:
-        """Return CFL dx / (v_max + sqrt(CFL g dx)) [s]; v_max is of the material and of solids in the time to come.
-
-        Gravity's own speed counts, so that a material at rest does not take off. A step ends when a source or drain starts or stops.
-        """
+        """Return CFL dx / (v_max + sqrt(CFL g dx)) [s]; v_max is of the material, and of solids and sources in the time to come."""
         cfl, dx = self.scene.time.cfl, self.grid.spacing
         with self.watch.stage("diagnostics", self.particles.position, self.particles.velocity):
             totals = self.particles.totals() if self.band is None else self.band.with_interior(self.particles.totals())
-        solids = self.boundary.top_speed(self.time, self.scene.time.dt_max)
-        speed = max(totals.max_speed, solids) + math.sqrt(cfl * float(np.linalg.norm(self.gravity)) * dx)
-        event = min((part.next_event(self.time) for part in (self.sources, self.outlets) if part is not None), default=math.inf)
-        return min(cfl * dx / speed if speed > 0.0 else math.inf, event - self.time)
+        driven = [part.top_speed(self.time, self.scene.time.dt_max) for part in (self.boundary, self.sources) if part is not None]
+        # gravity's own speed counts, so that a material at rest does not take off
+        speed = max(totals.max_speed, *driven) + math.sqrt(cfl * float(np.linalg.norm(self.gravity)) * dx)
+        return cfl * dx / speed if speed > 0.0 else math.inf
+
+    def next_event(self, after: float) -> float:
+        """Return when a source or drain first starts or stops later than `after` [s]; infinite if none does."""
+        timed: list[Source | Drain] = [*(self.sources.sources if self.sources else ()), *(self.outlets.drains if self.outlets else ())]
+        return min((time for part in timed for time in (part.start, part.stop) if time > after), default=math.inf)
 
     def begin_step(self, dt: float) -> ParticleTotals:
         """Check time step and particles, bring the particles into order, and return sums over them.
@@ -247,7 +247,7 @@ class ParticleSimulation(ABC):
         if self.band is not None:
             with self.watch.stage("narrow band", self.band.depth, *self.velocity):
                 self.band.carry(self.velocity, dt)
-        exchanged = self._exchange(dt)
+        exchanged = self._exchange(dt) if self.outlets is not None or self.sources is not None else {}
         after = self.checked_totals("after")
         rearranged = self._rearrange(after)
         if rearranged:
@@ -470,11 +470,9 @@ class ParticleSimulation(ABC):
     def _exchange(self, dt: float) -> dict[str, int]:
         """Remove the particles that have left in the step and add those that have come in; return what the log says of it."""
         drained = departed = emitted = 0
-        if self.outlets is None and self.sources is None:
-            return {}
         with self.watch.stage("sources and outlets", self.particles.position):
             if self.outlets is not None:
-                drained, departed = self.outlets.apply(self.particles, self.time + dt)
+                drained, departed = self.outlets.apply(self.particles, self.time, self.time + dt)
             if self.sources is not None:
                 emitted = self.sources.emit(self.particles, self.time, self.time + dt)
         return {"emitted": emitted, "drained": drained, "departed": departed}

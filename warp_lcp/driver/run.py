@@ -26,6 +26,7 @@ from warp_lcp.driver.simulator import (
     Profiled,
     Recorded,
     Resampled,
+    Scheduled,
     Simulation,
     SimulationFailed,
     StepFailed,
@@ -36,6 +37,7 @@ from warp_lcp.driver.simulator import (
 from warp_lcp.driver.table import Problem, SceneError
 
 RETRIES = 6  # halvings of dt: a step 64 times shorter that still fails has another cause than its length
+SHARE = 0.25  # of a step: what starts or stops closer to a step's end than that makes no step of its own
 SAME_TIME = 1e-9  # of a frame's interval: what rounding leaves between a step's end and the frame it was cut for
 SPACE_MARGIN = 1.1
 
@@ -195,21 +197,50 @@ def _record_problems(simulation: Simulation, scene: Scene, folder: Path, *, more
     simulation.record = ProblemFolder(folder, more=more).write
 
 
-def plan_dt(stable: float, remaining: float, time: Time) -> float:
+def plan_dt(stable: float, remaining: float, time: Time, next_event: Callable[[float], float] = lambda wait: math.inf) -> float:
     """Return the next step [s]: within the scene's bounds, ending on the frame's time, never leaving a sliver before it.
 
-    It depends on nothing but the state, so a run that was interrupted takes the same steps. The last two steps before a frame are
-    equal; they may be shorter than dt_min.
+    It depends on nothing but the state, so a run that was interrupted takes the same steps. The last two steps before a frame or an event
+    are equal; they may be shorter than dt_min. Steps run across events that are closer than SHARE dt to now or to the frame.
 
     Args:
         stable: what the CFL number allows [s].
         remaining: the time to the next frame [s].
         time: the scene's bounds.
+        next_event: returns when the first event is that is not sooner than so long from now [s].
     """
     dt = min(max(stable, time.dt_min), time.dt_max)
-    if remaining <= dt:
-        return remaining
-    return remaining / 2 if remaining < 2 * dt else dt
+    event = next_event(SHARE * dt)
+    ahead = event if event <= remaining - SHARE * dt else remaining
+    if ahead <= dt:
+        return ahead
+    return ahead / 2 if ahead < 2 * dt else dt
+
+
+def take_step(simulation: Simulation, stable: float, end: float, time: Time) -> tuple[float, int, dict[str, Value]]:
+    """Take a step, or a shorter one where it fails; return its length [s], how often it was halved and what the log gets.
+
+    Args:
+        simulation: that takes it.
+        stable: what the CFL number allows [s].
+        end: the next frame's time [s].
+        time: the scene's bounds.
+
+    Raises:
+        StepFailed: the shortest step failed too.
+        SimulationFailed: the run cannot go on.
+    """
+    now, retries = simulation.time, 0
+    events = simulation.next_event if isinstance(simulation, Scheduled) else lambda after: math.inf
+    dt = plan_dt(stable, end - now, time, lambda wait: events(now + wait) - now)
+    while True:
+        try:
+            return dt, retries, simulation.step(dt)
+        except StepFailed as error:
+            if retries == RETRIES or dt / 2 < time.dt_min:
+                number = simulation.step_count + 1
+                raise StepFailed(f"step {number} at t = {now:.6g} s, dt = {dt:.3g} s, retries {retries}: {error}") from error
+            retries, dt = retries + 1, dt / 2
 
 
 class Run:
@@ -318,7 +349,7 @@ class Run:
         """Step until the last frame is written; return whether the user stopped the run before."""
         frame = self._frames_done() + 1
         while frame <= last:
-            row = self._step(self.time.frame_time(frame) - self.simulation.time)
+            row = self._step(self.time.frame_time(frame))
             log.append(row)
             self.observer.step(row)
             self.writer.check()
@@ -331,8 +362,8 @@ class Run:
                 return True
         return False
 
-    def _step(self, remaining: float) -> dict[str, Value]:
-        """Take a step, or a shorter one where it fails."""
+    def _step(self, end: float) -> dict[str, Value]:
+        """Take a step towards a time [s] and return its row of the log."""
         begun = clock.perf_counter()
         stable = self.simulation.stable_dt()
         number = self.simulation.step_count + 1
@@ -341,19 +372,7 @@ class Run:
         if stable < self.time.dt_min and not self._below_dt_min:
             self._below_dt_min = True  # once is enough: the log's column cfl has the rest
             self._warn(f"step {number}: the CFL number asks for dt = {stable:.3g} s, below time.dt_min; steps are longer than it allows")
-        dt = plan_dt(stable, remaining, self.time)
-        retries = 0
-        while True:
-            try:
-                values = self.simulation.step(dt)
-                break
-            except StepFailed as error:
-                if retries == RETRIES or dt / 2 < self.time.dt_min:
-                    raise StepFailed(
-                        f"step {number} at t = {self.simulation.time:.6g} s, dt = {dt:.3g} s, retries {retries}: {error}"
-                    ) from error
-                retries += 1
-                dt /= 2
+        dt, retries, values = take_step(self.simulation, stable, end, self.time)
         seconds = clock.perf_counter() - begun
         return {
             "step": self.simulation.step_count,

@@ -91,7 +91,10 @@ class Simulation(Protocol):
     step_count: int
 
     def stable_dt(self) -> float:
-        """Return the largest time step [s] that the scene's CFL number allows now, not yet clipped to dt_min, dt_max or a frame's time."""
+        """Return the largest time step [s] that the scene's CFL number allows now, not yet clipped to dt_min, dt_max or a frame's time.
+
+        It is a function of the state alone.
+        """
 
     def step(self, dt: float) -> dict[str, float | int | str | None]:
         """Advance by dt [s] and return a row of the log.
@@ -119,6 +122,18 @@ class Simulation(Protocol):
 
     def notes(self) -> list[str]:
         """Return warnings and facts worth a line at the start of a run (say, a mesh outside the domain)."""
+
+
+@runtime_checkable
+class Scheduled(Protocol):
+    """What a Simulation may also be: one in which something starts or stops at times known before.
+
+    Steps end there where that takes no step that is much shorter than its neighbors. The others run across: the simulation must be right
+    then too.
+    """
+
+    def next_event(self, after: float) -> float:
+        """Return the first such time [s] later than `after` [s]; infinite if there is none."""
 
 
 @runtime_checkable

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-from warp_lcp.driver.run import RETRIES, SAME_TIME, plan_dt
+from warp_lcp.driver.run import SAME_TIME, take_step
 from warp_lcp.driver.scene import Scene
-from warp_lcp.driver.simulator import Points, Simulation, StepFailed, simulators
+from warp_lcp.driver.simulator import Points, Simulation, simulators
 from warp_lcp.driver.table import Problem, SceneError
 
 FRONT = 99.0  # percentile of the particles that the front is of
@@ -149,7 +149,7 @@ class _Trial:
         for frame in range(1, frames + 1):
             end = self.scene.time.frame_time(frame)
             while end - self.simulation.time > SAME_TIME / self.scene.time.frames_per_second:
-                self._step(end - self.simulation.time)
+                self._step(end)
                 if not looks:
                     looks.append(self._look())  # the first step tells energy and mass
             if any(abs(end - time) < SAME_TIME for time in times):
@@ -162,19 +162,11 @@ class _Trial:
             packing=self._most("max_fraction"), penetration=self._penetration(),
         )  # fmt: skip
 
-    def _step(self, remaining: float) -> None:
-        """Take a step, or a shorter one where it fails, as a run does."""
+    def _step(self, end: float) -> None:
+        """Take a step towards a time [s], as a run does."""
         clock_of = clock.perf_counter if wp.get_device(self.device).is_cuda else clock.process_time
         begun = clock_of()
-        dt = plan_dt(self.simulation.stable_dt(), remaining, self.scene.time)
-        for attempt in range(RETRIES + 1):
-            try:
-                self.rows.append(dict(self.simulation.step(dt)))
-                break
-            except StepFailed:
-                if attempt == RETRIES or dt / 2 < self.scene.time.dt_min:
-                    raise
-                dt /= 2
+        self.rows.append(take_step(self.simulation, self.simulation.stable_dt(), end, self.scene.time)[2])
         wp.synchronize_device(self.device)
         self.seconds += clock_of() - begun
 

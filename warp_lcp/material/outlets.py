@@ -39,13 +39,15 @@ class Drain:
     start: float = 0.0
     stop: float = np.inf
 
-    def runs(self, time: float) -> bool:
-        """Tell whether it is open at `time` [s]."""
-        return self.start <= time + NOW < self.stop
+    def opens(self, before: float, now: float) -> bool:
+        """Tell whether it is open at a time after `before` and up to `now` [s]."""
+        return self.start <= now + NOW and before + NOW < self.stop
 
 
 class Outlets:
     """Remove the particles that are in a drain or have crossed an open side.
+
+    A drain acts at the end of each step in part of which it is open, however small that part is.
 
     Args:
         grid: the grid.
@@ -58,22 +60,19 @@ class Outlets:
         self.grid, self.drains, self.open_sides = grid, tuple(drains), open_sides
         self._distance = wp.zeros(0, dtype=wp.float32, device=grid.device)
 
-    def next_event(self, time: float) -> float:
-        """Return when a drain next opens or closes after `time` [s]; infinite if none does."""
-        return min((t for drain in self.drains for t in (drain.start, drain.stop) if t > time + NOW), default=np.inf)
-
-    def apply(self, particles: Particles, time: float) -> tuple[int, int]:
+    def apply(self, particles: Particles, before: float, now: float) -> tuple[int, int]:
         """Remove particles; the others keep their order.
 
         Args:
             particles: the material (updated).
-            time: [s].
+            before: at the start of the step [s].
+            now: at its end [s].
 
         Returns:
             How many drains have swallowed, and how many have left through open sides.
         """
         departed, drained = self.remove_departed(particles), 0
-        drains = [drain for drain in self.drains if drain.runs(time)]
+        drains = [drain for drain in self.drains if drain.opens(before, now)]
         if drains and particles.count:
             marks = particles.marks
             marks.zero_()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -15,6 +17,7 @@ from warp_lcp.material.boundary import Boundary, Faces
 from warp_lcp.operators.grid_poisson import SOLID
 
 NOW = 1e-9  # s: a time that a step has been cut to may be off by its rounding
+GRAZED = 1e-9  # of a way: less than that in a cell is rounding
 FILLED = 0.5  # of a full cell's particles: a source that starts fills cells that hold fewer
 JAMMED = 2.0  # cells that hold more than this share get no more
 
@@ -49,6 +52,9 @@ class Sources:
     them is area times velocity, whatever is in the way. Material behind a source is not drawn in. Particles lie on a jittered lattice that
     moves with the source; those that the lattice brings into the cells in a step are new. It is a function of time alone, so that an
     interrupted run goes on as if it had not been. A source that starts fills its cells, as far as they are not full already.
+
+    A step need not end where a source starts or stops. What comes in is what the lattice brings in from start to stop, to the particle,
+    however the time is cut into steps; the flow has the source's velocity in the steps in whose middle it runs.
 
     Args:
         grid: the grid.
@@ -86,15 +92,15 @@ class Sources:
         self._window: Window = grid.window((cells.min(axis=0) + 1)[::-1], (cells.max(axis=0) + 1)[::-1], grow=1)
         self._moving_walls = boundary.velocity if not boundary.open else []
 
-    def next_event(self, time: float) -> float:
-        """Return when a source next starts or stops after `time` [s]; infinite if none does."""
-        return min((t for s in self.sources for t in (s.start, s.stop) if t > time + NOW), default=np.inf)
+    def top_speed(self, time: float, span: float) -> float:
+        """Return how fast the sources are at most [m/s] that run at a time from `time` to `time` + `span` [s]."""
+        return max((float(np.linalg.norm(s.velocity)) for s in self.sources if s.start <= time + span and s.stop > time), default=0.0)
 
     def supply(self, time: float, velocity: Faces, kind: wp.array) -> None:
         """Give the faces of running sources their velocity and close their cells to the pressure, before it is solved for.
 
         Args:
-            time: at the start of the step [s].
+            time: in the middle of the step [s].
             velocity: u* of each component [m/s] (updated).
             kind: int8 of AIR, FLUID, SOLID (updated).
         """
@@ -122,9 +128,9 @@ class Sources:
             before: at the start of the step [s]; None: there has been no step.
             now: at its end [s].
         """
-        ran = [before is not None and source.runs(before) for source in self.sources]
-        runs = [source.runs(now) for source in self.sources]
-        if not any(ran + runs):
+        since = now if before is None else before
+        running = [number for number, source in enumerate(self.sources) if source.start <= now + NOW and source.stop > since + NOW]
+        if not running:
             return 0
         self._counts.zero_()
         numbers = [1.0 / self.grid.spacing, *self.grid.counts]
@@ -136,37 +142,40 @@ class Sources:
         )
         held = self._counts.numpy() / self.per_axis**self.grid.dimension
         emitted = 0
-        for number, source in enumerate(self.sources):
-            if ran[number] or runs[number]:
-                points = self._points(number, before if ran[number] else None, now, held)
-                particles.append(points, np.broadcast_to(source.velocity.astype(np.float32), points.shape))
-                emitted += len(points)
+        for number in running:
+            source = self.sources[number]
+            starts = before is None or source.start > before + NOW
+            points = self._points(number, min(max(since, source.start), now) if starts else since, now, held, starts=starts)
+            particles.append(points, np.broadcast_to(source.velocity.astype(np.float32), points.shape))
+            emitted += len(points)
         return emitted
 
-    def _points(self, number: int, before: float | None, now: float, held: np.ndarray) -> np.ndarray:
-        """Return the points [m] that a source's lattice has brought in since `before`, or all of them in cells that are not full."""
-        lattice, jitter = self._lattice(number, now)
-        points = self._at(number, lattice, jitter, now)
-        slot = self._slot(points, number)
-        new = slot > 0
-        if before is None:
-            new &= held[np.maximum(slot, 1) - 1] < FILLED
-        else:
-            new &= (held[np.maximum(slot, 1) - 1] < JAMMED) & (self._slot(self._at(number, lattice, jitter, before), number) == 0)
-        points = points[new].astype(np.float32)
+    def _points(self, number: int, since: float, now: float, held: np.ndarray, *, starts: bool) -> np.ndarray:
+        """Return where the points are [m] that a source's lattice has brought in since a time [s].
+
+        If the source starts then, those that fill cells are among them. Some have left the cells again, if those are few.
+        """
+        until = min(now, self.sources[number].stop)
+        lattice, jitter = self._lattice(number, since, until)
+        first, last = (self._at(number, lattice, jitter, time) for time in (since, until))
+        before, slot = self._slot(first, number), self._slot(last, number)
+        passed = (before == 0) & (slot == 0)
+        slot[passed] = self._first_slot(first[passed], number, self.sources[number].velocity * (until - since))
+        new = (before == 0) & (slot > 0) & (held[np.maximum(slot, 1) - 1] < JAMMED)
+        if starts:
+            new |= (before > 0) & (held[np.maximum(before, 1) - 1] < FILLED)
+        points = self._at(number, lattice[new], jitter[new], now).astype(np.float32)
         dx, axes = self.grid.spacing, slice(self.grid.dimension)
         size = np.array(self.grid.counts)[axes] * dx
         np.clip(points[:, axes], 1.1 * MARGIN * dx, size - 1.1 * MARGIN * dx, out=points[:, axes])
         return points[self.boundary.admits(points)] if len(points) else points
 
-    def _lattice(self, number: int, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the numbers of the lattice points that may lie in a source's cells, shape (n, 3), and their displacements."""
+    def _lattice(self, number: int, since: float, until: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the numbers of the points that may lie in a source's cells between two times, shape (n, 3), and their displacements."""
         distance, dimension = self.grid.spacing / self.per_axis, self.grid.dimension
-        low, high = self._boxes[number]
-        way = self._way(number, time)
-        ranges = [
-            np.arange(np.floor((a - w) / distance) - 1, np.ceil((b - w) / distance) + 1) for a, b, w in zip(low, high, way, strict=True)
-        ]
+        ways = self._way(number, since), self._way(number, until)
+        lows, highs = (self._boxes[number][0] - np.maximum(*ways)) / distance, (self._boxes[number][1] - np.minimum(*ways)) / distance
+        ranges = [np.arange(np.floor(low) - 1, np.ceil(high) + 1) for low, high in zip(lows, highs, strict=True)]
         if dimension == 2:
             ranges[2] = np.zeros(1)
         Z, Y, X = np.meshgrid(ranges[2], ranges[1], ranges[0], indexing="ij")
@@ -192,6 +201,22 @@ class Sources:
         np.clip(cells, 0, np.array(self.grid.shape[::-1]) - 1, out=cells)
         slot = self._slots[cells[:, 2], cells[:, 1], cells[:, 0]]
         return np.where((slot > 0) & (self._owner[np.maximum(slot, 1) - 1] == number), slot, 0)
+
+    def _first_slot(self, points: np.ndarray, number: int, way: np.ndarray) -> np.ndarray:
+        """Return the slot of the first of the source's cells on the straight ways of points [m] by `way` [m], 0 if there is none."""
+        axes = np.flatnonzero(way)
+        slot = np.zeros(len(points), dtype=np.int32)
+        if not (len(axes) and len(points)):
+            return slot
+        begin, step = points[:, axes] / self.grid.spacing, way[axes] / self.grid.spacing
+        planes = np.sign(step)[:, None] * np.arange(1, math.ceil(np.abs(step).max()) + 1)
+        planes = planes + np.where(step > 0.0, np.floor(begin), np.ceil(begin))[..., None]
+        crossings = ((planes - begin[..., None]) / step[:, None]).reshape(len(points), -1)
+        crossings = np.pad(np.sort(np.clip(crossings, 0.0, 1.0), axis=1), ((0, 0), (1, 1)), constant_values=(0.0, 1.0))
+        for enters, leaves in itertools.pairwise(crossings.T):  # shares of the way between which it is in one cell
+            met = self._slot(points + 0.5 * (enters + leaves)[:, None] * way, number)
+            slot = np.where((slot == 0) & (leaves - enters > GRAZED), met, slot)
+        return slot
 
     def _box(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the low and the high corner [m] of cells (k, j, i)."""
