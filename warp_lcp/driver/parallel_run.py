@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import socket
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -74,9 +73,9 @@ class AgreedSimulation:
             mine = self._simulation.stable_dt()
         return float(self._meeting.share(mine))
 
-    def next_event(self, after: float) -> float:
-        """Return when the next thing starts or stops that steps should end at [s]; what all ranks know."""
-        return self._simulation.next_event(after) if isinstance(self._simulation, Scheduled) else math.inf
+    def events(self, until: float) -> list[float]:
+        """Return when something starts or stops, up to `until` [s]; all ranks know it."""
+        return self._simulation.events(until) if isinstance(self._simulation, Scheduled) else []
 
     def step(self, dt: float) -> dict[str, Value]:
         """Advance by dt [s] and return a row of the log.

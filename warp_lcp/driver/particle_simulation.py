@@ -148,10 +148,11 @@ class ParticleSimulation(ABC):
         speed = max(totals.max_speed, *driven) + math.sqrt(cfl * float(np.linalg.norm(self.gravity)) * dx)
         return cfl * dx / speed if speed > 0.0 else math.inf
 
-    def next_event(self, after: float) -> float:
-        """Return when a source or drain first starts or stops later than `after` [s]; infinite if none does."""
+    def events(self, until: float) -> list[float]:
+        """Return the times [s] later than now, up to `until`, at which a source or drain starts or stops or a solid's velocity jumps."""
         timed: list[Source | Drain] = [*(self.sources.sources if self.sources else ()), *(self.outlets.drains if self.outlets else ())]
-        return min((time for part in timed for time in (part.start, part.stop) if time > after), default=math.inf)
+        times = [*self.boundary.kinks, *(time for part in timed for time in (part.start, part.stop))]
+        return [time for time in times if self.time < time <= until]
 
     def begin_step(self, dt: float) -> ParticleTotals:
         """Check time step and particles, bring the particles into order, and return sums over them.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import math
 import time as clock
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing, nullcontext
 from pathlib import Path
 
@@ -197,21 +197,22 @@ def _record_problems(simulation: Simulation, scene: Scene, folder: Path, *, more
     simulation.record = ProblemFolder(folder, more=more).write
 
 
-def plan_dt(stable: float, remaining: float, time: Time, next_event: Callable[[float], float] = lambda wait: math.inf) -> float:
+def plan_dt(stable: float, remaining: float, time: Time, events: Sequence[float] = ()) -> float:
     """Return the next step [s]: within the scene's bounds, ending on the frame's time, never leaving a sliver before it.
 
     It depends on nothing but the state, so a run that was interrupted takes the same steps. The last two steps before a frame or an event
-    are equal; they may be shorter than dt_min. Steps run across events that are closer than SHARE dt to now or to the frame.
+    are equal; they may be shorter than dt_min. Steps run across events that are closer than SHARE dt to now or to the frame, and of several
+    within dt across all but the last.
 
     Args:
         stable: what the CFL number allows [s].
         remaining: the time to the next frame [s].
         time: the scene's bounds.
-        next_event: returns when the first event is that is not sooner than so long from now [s].
+        events: the times from now [s] to those at which steps should end.
     """
     dt = min(max(stable, time.dt_min), time.dt_max)
-    event = next_event(SHARE * dt)
-    ahead = event if event <= remaining - SHARE * dt else remaining
+    later = [event for event in events if SHARE * dt <= event <= remaining - SHARE * dt]
+    ahead = max((event for event in later if event <= dt), default=min(later, default=remaining))
     if ahead <= dt:
         return ahead
     return ahead / 2 if ahead < 2 * dt else dt
@@ -231,8 +232,8 @@ def take_step(simulation: Simulation, stable: float, end: float, time: Time) -> 
         SimulationFailed: the run cannot go on.
     """
     now, retries = simulation.time, 0
-    events = simulation.next_event if isinstance(simulation, Scheduled) else lambda after: math.inf
-    dt = plan_dt(stable, end - now, time, lambda wait: events(now + wait) - now)
+    events = simulation.events(end) if isinstance(simulation, Scheduled) else []
+    dt = plan_dt(stable, end - now, time, [event - now for event in events])
     while True:
         try:
             return dt, retries, simulation.step(dt)

@@ -132,8 +132,8 @@ class Scheduled(Protocol):
     then too.
     """
 
-    def next_event(self, after: float) -> float:
-        """Return the first such time [s] later than `after` [s]; infinite if there is none."""
+    def events(self, until: float) -> list[float]:
+        """Return these times [s] as far as they are later than now and not later than `until` [s], in any order."""
 
 
 @runtime_checkable

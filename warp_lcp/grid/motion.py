@@ -282,6 +282,13 @@ def top_speed(motion: Motion, bounds: np.ndarray | None, size: np.ndarray, time:
     return fastest
 
 
+def kinks(motion: Motion) -> tuple[float, ...]:
+    """Return the times [s] at which a motion's velocity jumps, as far as it is one of this module."""
+    if isinstance(motion, Keyframes):
+        return () if motion.smooth else tuple(float(time) for time in motion.times)
+    return (motion.start, motion.stop) if isinstance(motion, Translation | Rotation) else ()
+
+
 class _Curve:
     """Values over time, constant before the first and after the last.
 

@@ -34,6 +34,7 @@ class Boundary(Protocol):
         velocity: float32 velocity of the solids on each component's faces [m/s]; empty: they stand still.
         capacity: float32 share of a cell's quadratic kernel that is open.
         distance: float32 distance to the solids at the cells' low corners [cells]; None: whole cells, no distance.
+        kinks: times [s] at which the velocity of a solid jumps.
     """
 
     moves: bool  # whether a solid moves
@@ -45,6 +46,7 @@ class Boundary(Protocol):
     velocity: Faces
     capacity: wp.array | None
     distance: wp.array | None
+    kinks: tuple[float, ...]
 
     def top_speed(self, time: float, span: float) -> float:
         """Return how fast the solids move at most [m/s] from `time` to `time` + `span` [s]."""
@@ -90,6 +92,7 @@ class WholeCells:
     """
 
     distance: wp.array | None = None
+    kinks: tuple[float, ...] = ()
     moves = False
 
     def __init__(

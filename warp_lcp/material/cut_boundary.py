@@ -7,7 +7,7 @@ import warp as wp
 
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.distance_advection import MARGIN, advect_with_distance, push_out
-from warp_lcp.grid.motion import top_speed
+from warp_lcp.grid.motion import kinks, top_speed
 from warp_lcp.grid.periodic import PeriodicSides, with_periodic
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material import boundary_kernels as kernels
@@ -46,6 +46,7 @@ class CutBoundary:
         self._reachable = grid.field() if cut.moves else cut.distance  # distance where particles may go within a step
         self._counts = wp.zeros(3, dtype=wp.int32, device=grid.device)
         self._moving = [(solid.motion, solid.geometry.bounds()) for solid in cut.solids if solid.motion is not None]
+        self.kinks = tuple(time for motion, _ in self._moving for time in kinks(motion))
         self._find_walls()
         self._join_sides()
 
