@@ -153,18 +153,16 @@ class Sources:
     def _points(self, number: int, since: float, now: float, held: np.ndarray, *, starts: bool) -> np.ndarray:
         """Return where the points are [m] that a source's lattice has brought in since a time [s].
 
-        If the source starts then, those that fill cells are among them. Some have left the cells again, if those are few.
+        If the source starts then, those that fill cells are among them. Some have left the cells again.
         """
         until = min(now, self.sources[number].stop)
         lattice, jitter = self._lattice(number, since, until)
-        first, last = (self._at(number, lattice, jitter, time) for time in (since, until))
-        before, slot = self._slot(first, number), self._slot(last, number)
-        passed = (before == 0) & (slot == 0)
-        slot[passed] = self._first_slot(first[passed], number, self.sources[number].velocity * (until - since))
-        new = (before == 0) & (slot > 0) & (held[np.maximum(slot, 1) - 1] < JAMMED)
+        filled, slot, entries = self._entries(number, *(self._at(number, lattice, jitter, time) for time in (since, until)))
+        new = np.where(held[np.maximum(slot, 1) - 1] < JAMMED, entries, 0)
         if starts:
-            new |= (before > 0) & (held[np.maximum(before, 1) - 1] < FILLED)
-        points = self._at(number, lattice[new], jitter[new], now).astype(np.float32)
+            new += (filled > 0) & (held[np.maximum(filled, 1) - 1] < FILLED)
+        lattice, jitter = np.repeat(lattice, new, axis=0), np.repeat(jitter, new, axis=0)
+        points = self._at(number, lattice, jitter, now).astype(np.float32)
         dx, axes = self.grid.spacing, slice(self.grid.dimension)
         size = np.array(self.grid.counts)[axes] * dx
         np.clip(points[:, axes], 1.1 * MARGIN * dx, size - 1.1 * MARGIN * dx, out=points[:, axes])
@@ -202,21 +200,26 @@ class Sources:
         slot = self._slots[cells[:, 2], cells[:, 1], cells[:, 0]]
         return np.where((slot > 0) & (self._owner[np.maximum(slot, 1) - 1] == number), slot, 0)
 
-    def _first_slot(self, points: np.ndarray, number: int, way: np.ndarray) -> np.ndarray:
-        """Return the slot of the first of the source's cells on the straight ways of points [m] by `way` [m], 0 if there is none."""
-        axes = np.flatnonzero(way)
-        slot = np.zeros(len(points), dtype=np.int32)
-        if not (len(axes) and len(points)):
-            return slot
-        begin, step = points[:, axes] / self.grid.spacing, way[axes] / self.grid.spacing
-        planes = np.sign(step)[:, None] * np.arange(1, math.ceil(np.abs(step).max()) + 1)
-        planes = planes + np.where(step > 0.0, np.floor(begin), np.ceil(begin))[..., None]
-        crossings = ((planes - begin[..., None]) / step[:, None]).reshape(len(points), -1)
-        crossings = np.pad(np.sort(np.clip(crossings, 0.0, 1.0), axis=1), ((0, 0), (1, 1)), constant_values=(0.0, 1.0))
-        for enters, leaves in itertools.pairwise(crossings.T):  # shares of the way between which it is in one cell
-            met = self._slot(points + 0.5 * (enters + leaves)[:, None] * way, number)
-            slot = np.where((slot == 0) & (leaves - enters > GRAZED), met, slot)
-        return slot
+    def _entries(self, number: int, first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Follow points [m], which all go the same straight way, through a source's cells.
+
+        Returns:
+            The slots that they are in at first, those that they have come into last, and how often they have come in.
+        """
+        filled = here = self._slot(first, number)
+        slot, entries = np.zeros_like(here), np.zeros(len(here), dtype=np.int64)
+        begin, way = first / self.grid.spacing, (last[0] - first[0]) / self.grid.spacing
+        crossings = [np.zeros(len(first)), np.ones(len(first))]  # shares of the way between which it stays in one cell
+        for axis in np.flatnonzero(way):
+            plane = (np.floor if way[axis] > 0.0 else np.ceil)(begin[:, axis]) - begin[:, axis]
+            crossings += [(plane + n * np.sign(way[axis])) / way[axis] for n in range(1, math.ceil(abs(way[axis])) + 1)]
+        ordered = np.sort(np.clip(crossings, 0.0, 1.0), axis=0)
+        middles = ((first + (0.5 * (a + b))[:, None] * (last - first), b - a > GRAZED) for a, b in itertools.pairwise(ordered))
+        for points, counts in itertools.chain(middles, [(last, True)]):
+            there = np.where(counts, self._slot(points, number), here)
+            comes = (here == 0) & (there > 0)
+            slot, entries, here = np.where(comes, there, slot), entries + comes, there
+        return filled, slot, entries
 
     def _box(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the low and the high corner [m] of cells (k, j, i)."""
