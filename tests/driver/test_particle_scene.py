@@ -129,7 +129,7 @@ def test_it_is_made_of_the_shared_parts() -> None:
     assert sources is not None
     assert outlets is not None
     assert sources.emit(particles, None, 0.0) == 4 * 4 * 4
-    assert outlets.apply(particles, 0.0)[0] == 16 * 16 * 4  # the drain lies where the first box does
+    assert outlets.apply(particles, 0.0, 0.0)[0] == 16 * 16 * 4  # the drain lies where the first box does
 
 
 def test_a_material_without_room_is_named() -> None:

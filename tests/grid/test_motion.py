@@ -9,7 +9,7 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from warp_lcp.grid.motion import Keyframes, Motion, Pose, Rotation, Sinusoid, Translation, top_speed
+from warp_lcp.grid.motion import Keyframes, Motion, Pose, Rotation, Sinusoid, Translation, kinks, top_speed
 from warp_lcp.grid.solids import Box, Capsule, Placement, Plane, Sphere, TriangleMesh
 from warp_lcp.grid.triangle_mesh import builtin_mesh
 
@@ -179,6 +179,25 @@ def test_smooth_turns_go_on_where_their_axis_stays():
     np.testing.assert_allclose(velocity(motion, 1.0), rigid(POINTS, [0, 0, 0], [0, 0, 120.0], [0, 0, 0]), atol=2e-4)
     still = Keyframes(times=[0.0, 1.0, 2.0], rotate=[[0, 0, 10], [0, 0, 10], [0, 0, 40]], center=[0, 0, 0], smooth=True)
     np.testing.assert_allclose(still.pose(0.5).rotation, turn([0, 0, 1], 10), atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [
+        Translation(velocity=[0.5, 0.0], start=0.5, stop=1.25),
+        Translation(velocity=[0.5, 0.0]),
+        Rotation(rate=40.0, center=[0.3, 0.1], start=0.25, stop=2.0),
+        Keyframes(times=[0.25, 1.0, 1.75], translate=[[0.0, 0.0], [0.4, 0.0], [0.1, 0.3]]),
+        Keyframes(times=[0.5, 1.0, 1.75], rotate=[0.0, 40.0, -30.0], smooth=True),
+        Sinusoid(period=1.0, amplitude=[0.2, 0.0]),
+    ],
+)
+def test_kinks_are_where_the_velocity_jumps(motion):
+    def jumps(time):
+        change = velocity(motion, time + 2 * STEP) - velocity(motion, time - 2 * STEP)
+        return np.abs(change).max() > 0.01
+
+    assert [time for time in np.arange(0.0, 3.0, 0.125) if jumps(time)] == [time for time in kinks(motion) if time < 3.0]
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
