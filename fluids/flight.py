@@ -1,0 +1,150 @@
+"""Bodies of liquid in flight: what touches no wall keeps its momentum and its angular momentum, and goes along its parabola."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from fluids import flight_kernels as kernels
+from warp_lcp.grid.particles import Particles
+from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.material.boundary import Boundary
+
+NARROW = 1.0  # [cells^2] the least second moment about an axis, a particle, of a body whose turning the grid resolves
+Sums = np.ndarray  # of `kernels.add_up`, float64, shape (bodies, COLUMNS)
+
+
+class Flights:
+    """Find the bodies of liquid that no wall touches in a step, and keep their momenta.
+
+    The pressure's impulses on a body in flight add up to nothing, but not what particles take of them: they are not spread as evenly as
+    the volume that the pressure is solved for, and those outside the surface take the velocity of liquid beside them. And a particle that
+    goes along with a flow that turns by an angle a keeps a velocity that does not: a rigid rotation loses a^2 / 2 of its angular momentum
+    in each step. So when particles have moved their body takes a rigid motion, by which nothing in it is strained, that gives it back what
+    it had before the transfer, and gravity's. Its particles move through a velocity that goes along with it: in one that stays where it is
+    the middle of a spinning drop would move aside by a / 2 of its way.
+
+    Bodies are made of cells with faces between them that particles gave weight, and have a FLUID cell at least: elsewhere no pressure acts.
+
+    Args:
+        grid: the grid.
+        boundary: solids and walls.
+        coheres: whether a pressure below that of the air keeps a body that turns together; else its particles go straight on.
+    """
+
+    def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, coheres: bool = True) -> None:
+        """Allocate the fields."""
+        self.grid, self.boundary = grid, boundary
+        self._parent, self._number = (wp.zeros(grid.size, dtype=wp.int32, device=grid.device) for _ in range(2))
+        self._held, self._wet = (wp.zeros(grid.size, dtype=wp.uint8, device=grid.device) for _ in range(2))
+        self._count = wp.zeros(1, dtype=wp.int32, device=grid.device)
+        self._flight = kernels.Flight()
+        self._flight.straight = not coheres
+        self._flight.planes, self._flight.inverse_dx = grid.planes, 1.0 / grid.spacing
+        self._before: Sums = np.zeros((0, kernels.COLUMNS))
+
+    def begin(self, particles: Particles, window: Window, weights: Sequence[wp.array], kind: wp.array, dt: float, change: np.ndarray) -> int:
+        """Find the bodies before particles take their new velocities, and return how many there are.
+
+        Args:
+            particles: the liquid; `key` holds its cells.
+            window: cells that it can touch.
+            weights: of the particles on each component's faces.
+            kind: int8 of AIR, FLUID, SOLID, of the step's pressure.
+            dt: time step [s].
+            change: of the velocity by gravity in this step [m/s], shape (3,).
+        """
+        trees, device = [self._parent, self._held, self._wet], self.grid.device
+        wp.launch(kernels.alone_kernel, self.grid.size, trees, device=device)
+        window.launch(kernels.unite_kernel, [*weights, None][:3] + [self._parent])
+        window.launch(kernels.hold_kernel, [kind, self.boundary.touch, *trees])
+        self._count.zero_()
+        wp.launch(kernels.number_kernel, self.grid.size, [*trees, self._number, self._count], device=device)
+        count = int(self._count.numpy()[0])
+        if count == 0:
+            self._before = np.zeros((0, kernels.COLUMNS))
+            return 0
+        self._flight.rate = dt / self.grid.spacing
+        self._flight.body = wp.empty(particles.count, dtype=wp.int32, device=device)
+        self._take(particles, count)
+        self._start = wp.clone(particles.position)
+        self._launch(kernels.board_kernel, [particles.position, particles.key, self._parent, self._number])
+        self._before, self._change = self._sums(), change * self._flight.rate
+        return count
+
+    def end(self, particles: Particles, velocity: Sequence[wp.array]) -> None:
+        """Move the bodies' particles anew, after all have moved, and give them what they lack.
+
+        Args:
+            particles: those of `begin`, in their order, with new velocities (updated: position, velocity, gradients).
+            velocity: of each component on the faces [m/s].
+        """
+        count = len(self._before)
+        if count == 0:
+            return
+        before, dx, dt = self._before, self.grid.spacing, self._flight.rate * self.grid.spacing
+        number = np.maximum(before[:, :1], 1.0)
+        center, drift = before[:, 1:4] / number, before[:, 4:7] / number + self._change
+        spin = np.zeros_like(drift) if self._flight.straight else self._turning(before, _about_center(before))
+        self._take(particles, count)
+        end = wp.empty(particles.count, dtype=wp.vec3, device=self.grid.device)
+        fields = [*[*velocity, None][:3], *(self._vectors(a) for a in (drift * dx / dt, spin / dt, center * dx)), self.boundary.touch]
+        self._launch(kernels.fly_kernel, [*fields, self._start, end])
+        after = self._sums()
+        shift, push = center + drift - after[:, 1:4] / number, drift - after[:, 4:7] / number
+        rigid = self._turning(after, _about_center(before))
+        turn = rigid - self._turning(after, _about_center(after))
+        least, most = (rigid * _about_center(before)).sum(axis=1), _about_mean(before)
+        now = _about_mean(after) + (turn * (_about_center(before) + _about_center(after))).sum(axis=1)
+        share = np.sqrt(np.clip((most - least) / np.maximum(now - least, 1e-30), 0.0, 1.0))[:, None]
+        push, turn = share * push + (1.0 - share) * drift, share * turn + (1.0 - share) * rigid
+        share[after[:, kernels.LEAVES] > 0.0] = -1.0  # it meets a wall in this step
+        vectors = [self._vectors(a) for a in (shift * dx, push * dx / dt, turn / dt, (center + drift) * dx)]
+        shares = wp.array(share[:, 0].astype(np.float32), dtype=float, device=self.grid.device)
+        self._launch(kernels.land_kernel, [*vectors, shares, end, particles.position])
+
+    def _turning(self, sums: Sums, momentum: np.ndarray) -> np.ndarray:
+        """Return the rigid rotations that have angular momenta about the bodies' centers, in cells and steps, shape (bodies, 3)."""
+        number = np.maximum(sums[:, :1], 1.0)
+        center = sums[:, 1:4] / number
+        xx, yy, zz, xy, xz, yz = sums[:, 10:16].T
+        moments = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
+        moments -= number[:, :, None] * center[:, :, None] * center[:, None, :]
+        values, axes = np.linalg.eigh(np.trace(moments, axis1=1, axis2=2)[:, None, None] * np.eye(3) - moments)
+        along = np.einsum("bij,bi->bj", axes, momentum)
+        rates = np.where(values > NARROW * number, along / np.maximum(values, NARROW * number), 0.0)
+        return np.einsum("bij,bj->bi", axes, rates)
+
+    def _take(self, particles: Particles, count: int) -> None:
+        """Point the kernels at the particles, and at sums of nothing."""
+        flight = self._flight
+        flight.velocity = particles.velocity
+        flight.gradient_u, flight.gradient_v, flight.gradient_w = ([*particles.affine, None, None, None][:3])
+        flight.sums = wp.zeros((count, kernels.COLUMNS), dtype=wp.int64, device=self.grid.device)
+        # no sum of products of positions and velocities, which are of fewer cells than the domain has along its longest side, overflows
+        flight.quanta = 2.0 ** math.floor(60.0 - math.log2(particles.count * max(self.grid.counts) ** 2))
+
+    def _sums(self) -> Sums:
+        """Return the sums of the last launch."""
+        sums = self._flight.sums.numpy().astype(np.float64)
+        sums[:, 1 : kernels.LEAVES] /= float(self._flight.quanta)
+        return sums
+
+    def _vectors(self, values: np.ndarray) -> wp.array:
+        return wp.array(values.astype(np.float32), dtype=wp.vec3, device=self.grid.device)
+
+    def _launch(self, kernel: wp.Kernel, inputs: Sequence[object]) -> None:
+        wp.launch(kernel, len(self._flight.body), [self._flight, *inputs], device=self.grid.device)
+
+
+def _about_center(sums: Sums) -> np.ndarray:
+    """Return the angular momenta of bodies about their centers, shape (bodies, 3)."""
+    return sums[:, 7:10] - np.cross(sums[:, 1:4], sums[:, 4:7]) / np.maximum(sums[:, :1], 1.0)
+
+
+def _about_mean(sums: Sums) -> np.ndarray:
+    """Return the sums of the squares of velocities relative to the bodies' own, shape (bodies,)."""
+    return sums[:, 16] - (sums[:, 4:7] ** 2).sum(axis=1) / np.maximum(sums[:, 0], 1.0)

@@ -1,0 +1,271 @@
+# mypy: ignore-errors
+"""Kernels that find bodies of liquid in flight, add up their momenta and move them.
+
+Sums are of int64, in fixed point: whole numbers add up to the same in any order, so that a GPU gives the same bits on every run.
+"""
+
+import warp as wp
+
+from warp_lcp.grid.staggered import CellRange
+from warp_lcp.grid.transfer import TINY_WEIGHT
+from warp_lcp.material.contact import TOUCHES
+from warp_lcp.operators.grid_poisson import FLUID, SOLID
+
+COLUMNS = 18  # of a body's sums, see `add_up`
+LEAVES = 17  # of them, the particles that come near a wall or an open side
+
+_TOUCHES = wp.constant(wp.uint8(TOUCHES))
+_FLUID = wp.constant(wp.int8(FLUID))
+_SOLID = wp.constant(wp.int8(SOLID))
+_ONE = wp.constant(wp.vec3(1.0, 1.0, 1.0))
+
+options = {"enable_backward": False, "module": "fluids.flight"}
+Integers, Bytes = wp.array(dtype=wp.int32), wp.array(dtype=wp.uint8)
+Kinds = wp.array3d(dtype=wp.int8)
+Vectors, Field = wp.array(dtype=wp.vec3), wp.array3d(dtype=wp.float32)
+
+
+@wp.struct
+class Flight:
+    """What particles carry and which bodies they belong to, for kernels."""
+
+    planes: int
+    straight: int  # whether particles go straight on
+    inverse_dx: float  # [1/m]
+    rate: float  # cells a step in one m/s
+    quanta: wp.float64  # of the sums, in one cell or cell a step or product of two of them
+    velocity: Vectors  # [m/s]
+    gradient_u: Vectors  # [1/s], empty but for APIC
+    gradient_v: Vectors
+    gradient_w: Vectors
+    body: Integers  # of each particle, -1 without one
+    sums: wp.array2d(dtype=wp.int64)
+
+
+@wp.func
+def root_of(parent: Integers, cell: int):
+    """Follow parents to the root of a cell's tree."""
+    c = cell
+    while parent[c] != c:
+        c = parent[c]
+    return c
+
+
+@wp.func
+def unite(parent: Integers, one: int, other: int):
+    """Join the trees of two cells; parents have the smaller numbers. A lost race is seen in what the minimum returns, and tried again."""
+    a = root_of(parent, one)
+    b = root_of(parent, other)
+    while a != b:
+        low = wp.min(a, b)
+        high = wp.max(a, b)
+        old = wp.atomic_min(parent, high, low)
+        a = low
+        b = low
+        if old != high:
+            b = root_of(parent, old)
+
+
+@wp.func
+def weighs(weight: Field, k: int, j: int, i: int):
+    """Tell whether particles gave weight to a face."""
+    if weight:
+        return weight[k, j, i] > TINY_WEIGHT
+    return False
+
+
+@wp.kernel(**options)
+def alone_kernel(parent: Integers, held: Bytes, wet: Bytes):
+    """Every cell is a tree of its own."""
+    c = wp.tid()
+    parent[c] = c
+    held[c] = wp.uint8(0)
+    wet[c] = wp.uint8(0)
+
+
+@wp.kernel(**options)
+def unite_kernel(cells: CellRange, u: Field, v: Field, w: Field, parent: Integers):
+    """Cells with a face between them that particles gave weight belong together; a face with weight is none of the array's edge."""
+    plane, row, chunk = wp.tid()
+    k = cells.k + plane
+    j = cells.j + row
+    s2 = u.shape[2]
+    s1 = s2 * u.shape[1]
+    first = cells.i + chunk * cells.grain
+    for i in range(first, wp.min(first + cells.grain, cells.end)):
+        c = k * s1 + j * s2 + i
+        if weighs(u, k, j, i):
+            unite(parent, c, c - 1)
+        if weighs(v, k, j, i):
+            unite(parent, c, c - s2)
+        if weighs(w, k, j, i):
+            unite(parent, c, c - s1)
+
+
+@wp.kernel(**options)
+def hold_kernel(cells: CellRange, kind: Kinds, touch: wp.array3d(dtype=wp.uint8), parent: Integers, held: Bytes, wet: Bytes):
+    """Trees that reach a wall are held, those with a FLUID cell feel the pressure."""
+    plane, row, chunk = wp.tid()
+    k = cells.k + plane
+    j = cells.j + row
+    first = cells.i + chunk * cells.grain
+    for i in range(first, wp.min(first + cells.grain, cells.end)):
+        root = root_of(parent, (k * kind.shape[1] + j) * kind.shape[2] + i)
+        if kind[k, j, i] == _FLUID:
+            wet[root] = wp.uint8(1)
+        if kind[k, j, i] == _SOLID or (touch[k, j, i] & _TOUCHES) != wp.uint8(0):
+            held[root] = wp.uint8(1)
+
+
+@wp.kernel(**options)
+def number_kernel(parent: Integers, held: Bytes, wet: Bytes, number: Integers, count: Integers):
+    """Number the trees that nothing holds; other cells get -1."""
+    c = wp.tid()
+    n = int(-1)
+    if parent[c] == c and held[c] == wp.uint8(0) and wet[c] != wp.uint8(0):
+        n = wp.atomic_add(count, 0, 1)
+    number[c] = n
+
+
+@wp.func
+def put(sums: wp.array2d(dtype=wp.int64), body: int, column: int, quanta: wp.float64, value: float):
+    """Add a value to a sum."""
+    wp.atomic_add(sums, body, column, wp.int64(wp.rint(wp.float64(value) * quanta)))
+
+
+@wp.func
+def add_up(flight: Flight, p: int, x: wp.vec3):
+    """Add a particle at x [cells] to its body's sums, in cells and steps.
+
+    [0] particles; [1:4] x; [4:7] v; [7:10] x cross v; [10:16] xx, yy, zz, xy, xz, yz; [16] v v.
+    """
+    b = flight.body[p]
+    q = flight.quanta
+    v = flight.velocity[p] * flight.rate
+    turn = wp.cross(x, v)
+    wp.atomic_add(flight.sums, b, 0, wp.int64(1))
+    for d in range(3):
+        put(flight.sums, b, 1 + d, q, x[d])
+        put(flight.sums, b, 4 + d, q, v[d])
+        put(flight.sums, b, 7 + d, q, turn[d])
+        put(flight.sums, b, 10 + d, q, x[d] * x[d])
+    put(flight.sums, b, 13, q, x[0] * x[1])
+    put(flight.sums, b, 14, q, x[0] * x[2])
+    put(flight.sums, b, 15, q, x[1] * x[2])
+    put(flight.sums, b, 16, q, wp.dot(v, v))
+
+
+@wp.kernel(**options)
+def board_kernel(flight: Flight, position: Vectors, key: Integers, parent: Integers, number: Integers):
+    """Find each particle's body and add it up."""
+    p = wp.tid()
+    b = number[root_of(parent, key[p])]
+    flight.body[p] = b
+    if b >= 0:
+        add_up(flight, p, position[p] * flight.inverse_dx)
+
+
+@wp.func
+def component(field: Field, planes: int, x: float, y: float, z: float):
+    """Return a component at node coordinates, which are brought within the array."""
+    cx = wp.clamp(x, 0.0, float(field.shape[2]) - 1.001)
+    cy = wp.clamp(y, 0.0, float(field.shape[1]) - 1.001)
+    i = int(cx)
+    j = int(cy)
+    k = int(1)
+    fx = cx - float(i)
+    fy = cy - float(j)
+    value = wp.lerp(wp.lerp(field[1, j, i], field[1, j, i + 1], fx), wp.lerp(field[1, j + 1, i], field[1, j + 1, i + 1], fx), fy)
+    if planes == 2:
+        cz = wp.clamp(z, 0.0, float(field.shape[0]) - 1.001)
+        k = int(cz)
+        low = wp.lerp(wp.lerp(field[k, j, i], field[k, j, i + 1], fx), wp.lerp(field[k, j + 1, i], field[k, j + 1, i + 1], fx), fy)
+        k += 1
+        high = wp.lerp(wp.lerp(field[k, j, i], field[k, j, i + 1], fx), wp.lerp(field[k, j + 1, i], field[k, j + 1, i + 1], fx), fy)
+        value = wp.lerp(low, high, cz - float(k - 1))
+    return value
+
+
+@wp.func
+def velocity_at(u: Field, v: Field, w: Field, planes: int, x: wp.vec3):
+    """Return the velocity of the faces at x [cells]."""
+    a = x[0] + 1.0
+    b = x[1] + 1.0
+    c = x[2] + 1.0
+    at = wp.vec3(component(u, planes, a, b - 0.5, c - 0.5), component(v, planes, a - 0.5, b, c - 0.5), 0.0)
+    if planes == 2:
+        at[2] = component(w, planes, a - 0.5, b - 0.5, c)
+    return at
+
+
+@wp.func
+def turned(angle: wp.vec3, a: wp.vec3):
+    """Return a vector turned about an axis by its length [radians]."""
+    size = wp.length(angle)
+    if size == 0.0:
+        return a
+    n = angle / size
+    return wp.cos(size) * a + wp.sin(size) * wp.cross(n, a) + (1.0 - wp.cos(size)) * wp.dot(n, a) * n
+
+
+@wp.kernel(**options)
+def fly_kernel(
+    flight: Flight, u: Field, v: Field, w: Field, drift: Vectors, spin: Vectors, center: Vectors, touch: wp.array3d(dtype=wp.uint8),
+    start: Vectors, end: Vectors,
+):  # fmt: skip
+    """Carry particles through the velocity that moves along with their body, a third-order Runge-Kutta step, and add them up.
+
+    What they have of the body's spin turns with it.
+    """
+    p = wp.tid()
+    b = flight.body[p]
+    if b >= 0:
+        h = flight.rate
+        x = start[p] * flight.inverse_dx
+        mean = drift[b]
+        k1 = velocity_at(u, v, w, flight.planes, x)
+        k2 = velocity_at(u, v, w, flight.planes, x + 0.5 * h * (k1 - mean))
+        k3 = velocity_at(u, v, w, flight.planes, x + 0.75 * h * (k2 - mean))
+        way = h / 9.0 * (2.0 * k1 + 3.0 * k2 + 4.0 * k3)
+        if flight.straight:
+            way = h * k1
+        x += way
+        end[p] = start[p] + way / flight.inverse_dx
+        arm = start[p] - center[b]
+        rigid = wp.cross(spin[b], arm)
+        flight.velocity[p] = flight.velocity[p] + turned(spin[b] * (h / flight.inverse_dx), rigid) - rigid
+        add_up(flight, p, x)
+        i = int(wp.floor(x[0])) + 1
+        j = int(wp.floor(x[1])) + 1
+        k = int(1)
+        if flight.planes == 2:
+            k = int(wp.floor(x[2])) + 1
+        inside = i > 0 and j > 0 and k > 0 and i + 1 < u.shape[2] and j + 1 < u.shape[1] and k + 1 < u.shape[0]
+        near = int(1)
+        if inside:
+            if (touch[k, j, i] & _TOUCHES) == wp.uint8(0):
+                near = 0
+        if near == 1:
+            wp.atomic_add(flight.sums, b, LEAVES, wp.int64(1))
+
+
+@wp.kernel(**options)
+def land_kernel(
+    flight: Flight, shift: Vectors, push: Vectors, turn: Vectors, center: Vectors, share: wp.array(dtype=float), end: Vectors,
+    position: Vectors,
+):  # fmt: skip
+    """Give particles their places, a share of their velocity and a rigid motion; bodies without a share stay as they are."""
+    p = wp.tid()
+    b = flight.body[p]
+    if b >= 0:
+        s = share[b]
+        if s >= 0.0:
+            x = end[p] + shift[b]
+            w = turn[b]
+            position[p] = x
+            flight.velocity[p] = s * flight.velocity[p] + push[b] + wp.cross(w, x - center[b])
+            if flight.gradient_u:
+                flight.gradient_u[p] = s * flight.gradient_u[p] + wp.vec3(0.0, -w[2], w[1])
+                flight.gradient_v[p] = s * flight.gradient_v[p] + wp.vec3(w[2], 0.0, -w[0])
+                if flight.planes == 2:
+                    flight.gradient_w[p] = s * flight.gradient_w[p] + wp.vec3(-w[1], w[0], 0.0)
