@@ -85,26 +85,26 @@ class Flights:
         count = len(self._before)
         if count == 0:
             return
-        before, dx, dt = self._before, self.grid.spacing, self._flight.rate * self.grid.spacing
+        before, dx, dt, had = self._before, self.grid.spacing, self._flight.rate * self.grid.spacing, _about_center(self._before)
         number = np.maximum(before[:, :1], 1.0)
         center, drift = before[:, 1:4] / number, before[:, 4:7] / number + self._change
-        spin = np.zeros_like(drift) if self._flight.straight else self._turning(before, _about_center(before))
+        spin = np.zeros_like(drift) if self._flight.straight else self._turning(before, had)
         self._take(particles, count)
         end = wp.empty(particles.count, dtype=wp.vec3, device=self.grid.device)
-        fields = [*[*velocity, None][:3], *(self._vectors(a) for a in (drift * dx / dt, spin / dt, center * dx)), self.boundary.touch]
-        self._launch(kernels.fly_kernel, [*fields, self._start, end])
+        fields, wall = [*velocity, None][:3], self.boundary
+        motion = self._motion(drift * dx / dt, spin / dt, center * dx)
+        self._launch(kernels.fly_kernel, [*fields, motion, wall.base, wall.touch, self._start, end])
         after = self._sums()
-        shift, push = center + drift - after[:, 1:4] / number, drift - after[:, 4:7] / number
-        rigid = self._turning(after, _about_center(before))
-        turn = rigid - self._turning(after, _about_center(after))
-        least, most = (rigid * _about_center(before)).sum(axis=1), _about_mean(before)
-        now = _about_mean(after) + (turn * (_about_center(before) + _about_center(after))).sum(axis=1)
+        has, missing = _about_center(after), drift - after[:, 4:7] / number
+        rigid, turn = self._turning(after, had), self._turning(after, had - has)
+        least, most = (rigid * had).sum(axis=1), _about_mean(before)
+        now = _about_mean(after) + (turn * (had + has)).sum(axis=1)
         share = np.sqrt(np.clip((most - least) / np.maximum(now - least, 1e-30), 0.0, 1.0))[:, None]
-        push, turn = share * push + (1.0 - share) * drift, share * turn + (1.0 - share) * rigid
+        push, turn = share * missing + (1.0 - share) * drift, share * turn + (1.0 - share) * rigid
         share[after[:, kernels.LEAVES] > 0.0] = -1.0  # it meets a wall in this step
-        vectors = [self._vectors(a) for a in (shift * dx, push * dx / dt, turn / dt, (center + drift) * dx)]
-        shares = wp.array(share[:, 0].astype(np.float32), dtype=float, device=self.grid.device)
-        self._launch(kernels.land_kernel, [*vectors, shares, end, particles.position])
+        shift, center = center + drift - after[:, 1:4] / number, center + drift
+        motion = self._motion(shift * dx, push * dx / dt, turn / dt, center * dx, np.repeat(share, 3, axis=1))
+        self._launch(kernels.land_kernel, [motion, end, particles.position])
 
     def _turning(self, sums: Sums, momentum: np.ndarray) -> np.ndarray:
         """Return the rigid rotations that have angular momenta about the bodies' centers, in cells and steps, shape (bodies, 3)."""
@@ -133,8 +133,9 @@ class Flights:
         sums[:, 1 : kernels.LEAVES] /= float(self._flight.quanta)
         return sums
 
-    def _vectors(self, values: np.ndarray) -> wp.array:
-        return wp.array(values.astype(np.float32), dtype=wp.vec3, device=self.grid.device)
+    def _motion(self, *vectors: np.ndarray) -> wp.array:
+        """Return what kernels need of each body, wp.vec3, shape (bodies, vectors)."""
+        return wp.array(np.stack(vectors, axis=1).astype(np.float32), dtype=wp.vec3, device=self.grid.device)
 
     def _launch(self, kernel: wp.Kernel, inputs: Sequence[object]) -> None:
         wp.launch(kernel, len(self._flight.body), [self._flight, *inputs], device=self.grid.device)

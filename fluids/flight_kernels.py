@@ -9,19 +9,19 @@ import warp as wp
 from warp_lcp.grid.staggered import CellRange
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.contact import TOUCHES
+from warp_lcp.native import simd
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 
 COLUMNS = 18  # of a body's sums, see `add_up`
 LEAVES = 17  # of them, the particles that come near a wall or an open side
 
 _TOUCHES = wp.constant(wp.uint8(TOUCHES))
-_FLUID = wp.constant(wp.int8(FLUID))
 _SOLID = wp.constant(wp.int8(SOLID))
-_ONE = wp.constant(wp.vec3(1.0, 1.0, 1.0))
 
 options = {"enable_backward": False, "module": "fluids.flight"}
 Integers, Bytes = wp.array(dtype=wp.int32), wp.array(dtype=wp.uint8)
 Kinds = wp.array3d(dtype=wp.int8)
+Motions = wp.array2d(dtype=wp.vec3)
 Vectors, Field = wp.array(dtype=wp.vec3), wp.array3d(dtype=wp.float32)
 
 
@@ -42,6 +42,68 @@ class Flight:
     sums: wp.array2d(dtype=wp.int64)
 
 
+# Parents have the smaller numbers, so that trees are the same whatever the order of the threads. A lost race is seen in what the atomic
+# minimum returns, and tried again. Rows in native form take a third of the time: they know most roots from the cell before.
+TREES = """
+    int* P = parent.data; const long long q = ((long long)k*s1 + (long long)j*s2);
+    auto find = [&](int i) { while (P[i] != i) i = P[i]; return i; };
+    auto unite = [&](int i, int j) {
+        int a = find(i), b = find(j);
+        while (a != b) {
+            if (a < b) { const int t = a; a = b; b = t; }
+            const int old = wp::atomic_min(P + a, b);
+            if (old == a) return;
+            a = find(old); b = find(b);
+        }
+    };
+"""
+UNITE = """
+    const float* u = u_.data + q; const float* v = v_.data + q; const float* w = w_.data ? w_.data + q : nullptr;
+    auto weighs = [](float weight) { return weight > TINY_WEIGHTf; };
+    for (int i = first; i < last; ++i) {  // a face with weight is none of the array's edge: the cell below it is there
+        const int c = (int)(q + i), x = weighs(u[i]);
+        if (x) {
+    #ifndef __CUDA_ARCH__
+            if (P[c] == c) P[c] = P[c - 1]; else
+    #endif
+            unite(c, c - 1);
+        }
+        // where the cells to the left of both are joined to them, and to each other, there is no need
+        if (weighs(v[i]) && !(x && weighs(v[i - 1]) && weighs(u[i - s2]))) unite(c, c - s2);
+        if (w && weighs(w[i]) && !(x && weighs(w[i - 1]) && weighs(u[i - s1]))) unite(c, c - s1);
+    }
+"""
+HOLD = """
+    const signed char* kind = (const signed char*)kind_.data + q; const unsigned char* touch = touch_.data + q;
+    int parent_of = -1, root = -1;
+    for (int i = first; i < last; ++i) {
+        const int fluid = kind[i] == FLUID, wall = (kind[i] == SOLID) | (touch[i] & TOUCHES);
+        if (!(fluid | wall)) continue;
+        const int c = (int)(q + i);
+        if (P[c] != parent_of) { parent_of = P[c]; root = find(c); }
+        if (fluid) wet.data[root] = 1;
+        if (wall) held.data[root] = 1;
+    }
+"""
+
+
+def _native(source: str) -> str:
+    names = {"FLUID": FLUID, "SOLID": SOLID, "TOUCHES": TOUCHES}
+    constants = "".join(f"constexpr int {name} = {value}; " for name, value in names.items())
+    return simd(constants + TREES + source.replace("TINY_WEIGHT", repr(TINY_WEIGHT)))
+
+
+@wp.func_native(_native(UNITE))
+def unite_row(u_: Field, v_: Field, w_: Field, parent: Integers, s1: int, s2: int, k: int, j: int, first: int, last: int): ...
+
+
+@wp.func_native(_native(HOLD))
+def hold_row(
+    kind_: Kinds, touch_: wp.array3d(dtype=wp.uint8), parent: Integers, held: Bytes, wet: Bytes, s1: int, s2: int, k: int, j: int,
+    first: int, last: int,
+): ...  # fmt: skip
+
+
 @wp.func
 def root_of(parent: Integers, cell: int):
     """Follow parents to the root of a cell's tree."""
@@ -49,29 +111,6 @@ def root_of(parent: Integers, cell: int):
     while parent[c] != c:
         c = parent[c]
     return c
-
-
-@wp.func
-def unite(parent: Integers, one: int, other: int):
-    """Join the trees of two cells; parents have the smaller numbers. A lost race is seen in what the minimum returns, and tried again."""
-    a = root_of(parent, one)
-    b = root_of(parent, other)
-    while a != b:
-        low = wp.min(a, b)
-        high = wp.max(a, b)
-        old = wp.atomic_min(parent, high, low)
-        a = low
-        b = low
-        if old != high:
-            b = root_of(parent, old)
-
-
-@wp.func
-def weighs(weight: Field, k: int, j: int, i: int):
-    """Tell whether particles gave weight to a face."""
-    if weight:
-        return weight[k, j, i] > TINY_WEIGHT
-    return False
 
 
 @wp.kernel(**options)
@@ -85,36 +124,22 @@ def alone_kernel(parent: Integers, held: Bytes, wet: Bytes):
 
 @wp.kernel(**options)
 def unite_kernel(cells: CellRange, u: Field, v: Field, w: Field, parent: Integers):
-    """Cells with a face between them that particles gave weight belong together; a face with weight is none of the array's edge."""
+    """Cells with a face between them that particles gave weight belong together."""
     plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
+    first = cells.i + chunk * cells.grain
     s2 = u.shape[2]
     s1 = s2 * u.shape[1]
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        c = k * s1 + j * s2 + i
-        if weighs(u, k, j, i):
-            unite(parent, c, c - 1)
-        if weighs(v, k, j, i):
-            unite(parent, c, c - s2)
-        if weighs(w, k, j, i):
-            unite(parent, c, c - s1)
+    unite_row(u, v, w, parent, s1, s2, cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end))
 
 
 @wp.kernel(**options)
 def hold_kernel(cells: CellRange, kind: Kinds, touch: wp.array3d(dtype=wp.uint8), parent: Integers, held: Bytes, wet: Bytes):
     """Trees that reach a wall are held, those with a FLUID cell feel the pressure."""
     plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
     first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        root = root_of(parent, (k * kind.shape[1] + j) * kind.shape[2] + i)
-        if kind[k, j, i] == _FLUID:
-            wet[root] = wp.uint8(1)
-        if kind[k, j, i] == _SOLID or (touch[k, j, i] & _TOUCHES) != wp.uint8(0):
-            held[root] = wp.uint8(1)
+    s2 = kind.shape[2]
+    s1 = s2 * kind.shape[1]
+    hold_row(kind, touch, parent, held, wet, s1, s2, cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end))
 
 
 @wp.kernel(**options)
@@ -210,19 +235,20 @@ def turned(angle: wp.vec3, a: wp.vec3):
 
 @wp.kernel(**options)
 def fly_kernel(
-    flight: Flight, u: Field, v: Field, w: Field, drift: Vectors, spin: Vectors, center: Vectors, touch: wp.array3d(dtype=wp.uint8),
-    start: Vectors, end: Vectors,
+    flight: Flight, u: Field, v: Field, w: Field, motion: Motions, base: Kinds, touch: wp.array3d(dtype=wp.uint8), start: Vectors,
+    end: Vectors,
 ):  # fmt: skip
     """Carry particles through the velocity that moves along with their body, a third-order Runge-Kutta step, and add them up.
 
-    What they have of the body's spin turns with it.
+    What they have of the body's spin turns with it. A motion is the body's [0] velocity, [1] spin, [2] center.
     """
     p = wp.tid()
     b = flight.body[p]
     if b >= 0:
         h = flight.rate
         x = start[p] * flight.inverse_dx
-        mean = drift[b]
+        mean = motion[b, 0]
+        spin = motion[b, 1]
         k1 = velocity_at(u, v, w, flight.planes, x)
         k2 = velocity_at(u, v, w, flight.planes, x + 0.5 * h * (k1 - mean))
         k3 = velocity_at(u, v, w, flight.planes, x + 0.75 * h * (k2 - mean))
@@ -231,9 +257,8 @@ def fly_kernel(
             way = h * k1
         x += way
         end[p] = start[p] + way / flight.inverse_dx
-        arm = start[p] - center[b]
-        rigid = wp.cross(spin[b], arm)
-        flight.velocity[p] = flight.velocity[p] + turned(spin[b] * (h / flight.inverse_dx), rigid) - rigid
+        rigid = wp.cross(spin, start[p] - motion[b, 2])
+        flight.velocity[p] = flight.velocity[p] + turned(spin * (h / flight.inverse_dx), rigid) - rigid
         add_up(flight, p, x)
         i = int(wp.floor(x[0])) + 1
         j = int(wp.floor(x[1])) + 1
@@ -243,27 +268,27 @@ def fly_kernel(
         inside = i > 0 and j > 0 and k > 0 and i + 1 < u.shape[2] and j + 1 < u.shape[1] and k + 1 < u.shape[0]
         near = int(1)
         if inside:
-            if (touch[k, j, i] & _TOUCHES) == wp.uint8(0):
+            if base[k, j, i] != _SOLID and (touch[k, j, i] & _TOUCHES) == wp.uint8(0):
                 near = 0
         if near == 1:
             wp.atomic_add(flight.sums, b, LEAVES, wp.int64(1))
 
 
 @wp.kernel(**options)
-def land_kernel(
-    flight: Flight, shift: Vectors, push: Vectors, turn: Vectors, center: Vectors, share: wp.array(dtype=float), end: Vectors,
-    position: Vectors,
-):  # fmt: skip
-    """Give particles their places, a share of their velocity and a rigid motion; bodies without a share stay as they are."""
+def land_kernel(flight: Flight, motion: Motions, end: Vectors, position: Vectors):
+    """Give particles their places, a share of their velocity and a rigid motion; bodies without a share stay as they are.
+
+    A motion is [0] the shift, [1] the velocity, [2] the spin, [3] the center, [4] the share, three times.
+    """
     p = wp.tid()
     b = flight.body[p]
     if b >= 0:
-        s = share[b]
+        s = motion[b, 4][0]
         if s >= 0.0:
-            x = end[p] + shift[b]
-            w = turn[b]
+            x = end[p] + motion[b, 0]
+            w = motion[b, 2]
             position[p] = x
-            flight.velocity[p] = s * flight.velocity[p] + push[b] + wp.cross(w, x - center[b])
+            flight.velocity[p] = s * flight.velocity[p] + motion[b, 1] + wp.cross(w, x - motion[b, 3])
             if flight.gradient_u:
                 flight.gradient_u[p] = s * flight.gradient_u[p] + wp.vec3(0.0, -w[2], w[1])
                 flight.gradient_v[p] = s * flight.gradient_v[p] + wp.vec3(w[2], 0.0, -w[0])
