@@ -27,7 +27,7 @@ class Flights:
     it had before the transfer, and gravity's. Its particles move through a velocity that goes along with it: in one that stays where it is
     the middle of a spinning drop would move aside by a / 2 of its way.
 
-    Bodies are made of cells with faces between them that particles gave weight, and have a FLUID cell at least: elsewhere no pressure acts.
+    Bodies are made of cells with faces between them that particles gave weight; a lone particle is one.
 
     Args:
         grid: the grid.
@@ -39,8 +39,8 @@ class Flights:
         """Allocate the fields."""
         self.grid, self.boundary = grid, boundary
         self._parent, self._number = (wp.zeros(grid.size, dtype=wp.int32, device=grid.device) for _ in range(2))
-        self._held, self._wet = (wp.zeros(grid.size, dtype=wp.uint8, device=grid.device) for _ in range(2))
-        self._count = wp.zeros(1, dtype=wp.int32, device=grid.device)
+        self._held, self._several = (wp.zeros(grid.size, dtype=wp.uint8, device=grid.device) for _ in range(2))
+        self._count = wp.zeros(2, dtype=wp.int32, device=grid.device)
         self._flight = kernels.Flight()
         self._flight.straight = not coheres
         self._flight.planes, self._flight.inverse_dx = grid.planes, 1.0 / grid.spacing
@@ -57,23 +57,26 @@ class Flights:
             dt: time step [s].
             change: of the velocity by gravity in this step [m/s], shape (3,).
         """
-        trees, device = [self._parent, self._held, self._wet], self.grid.device
+        trees, device = [self._parent, self._held, self._several], self.grid.device
         wp.launch(kernels.alone_kernel, self.grid.size, trees, device=device)
         window.launch(kernels.unite_kernel, [*weights, None][:3] + [self._parent])
         window.launch(kernels.hold_kernel, [kind, self.boundary.touch, *trees])
         self._count.zero_()
         wp.launch(kernels.number_kernel, self.grid.size, [*trees, self._number, self._count], device=device)
-        count = int(self._count.numpy()[0])
-        if count == 0:
-            self._before = np.zeros((0, kernels.COLUMNS))
+        bodies = int(self._count.numpy()[0])
+        self._before = np.zeros((bodies, kernels.COLUMNS))
+        if bodies == 0:
             return 0
-        self._flight.rate = dt / self.grid.spacing
-        self._flight.body = wp.empty(particles.count, dtype=wp.int32, device=device)
-        self._take(particles, count)
-        self._start = wp.clone(particles.position)
-        self._launch(kernels.board_kernel, [particles.position, particles.key, self._parent, self._number])
+        who, body = (wp.empty(particles.count, dtype=wp.int32, device=device) for _ in range(2))
+        listed = [particles.key, self._parent, self._number, who, body, self._count]
+        wp.launch(kernels.board_kernel, particles.count, listed, device=device)
+        flying = int(self._count.numpy()[1])
+        self._flight.who, self._flight.body, self._flight.rate = who[:flying], body[:flying], dt / self.grid.spacing
+        self._take(particles)
+        self._start = wp.empty(flying, dtype=wp.vec3, device=device)
+        self._launch(kernels.lift_kernel, [particles.position, self._start])
         self._before, self._change = self._sums(), change * self._flight.rate
-        return count
+        return bodies
 
     def end(self, particles: Particles, velocity: Sequence[wp.array]) -> None:
         """Move the bodies' particles anew, after all have moved, and give them what they lack.
@@ -82,21 +85,20 @@ class Flights:
             particles: those of `begin`, in their order, with new velocities (updated: position, velocity, gradients).
             velocity: of each component on the faces [m/s].
         """
-        count = len(self._before)
-        if count == 0:
+        if len(self._before) == 0:
             return
         before, dx, dt, had = self._before, self.grid.spacing, self._flight.rate * self.grid.spacing, _about_center(self._before)
         number = np.maximum(before[:, :1], 1.0)
         center, drift = before[:, 1:4] / number, before[:, 4:7] / number + self._change
-        spin = np.zeros_like(drift) if self._flight.straight else self._turning(before, had)
-        self._take(particles, count)
-        end = wp.empty(particles.count, dtype=wp.vec3, device=self.grid.device)
+        spin = np.zeros_like(drift) if self._flight.straight else _turning(before, had)[0]
+        self._take(particles)
+        end = wp.empty_like(self._start)
         fields, wall = [*velocity, None][:3], self.boundary
         motion = self._motion(drift * dx / dt, spin / dt, center * dx)
         self._launch(kernels.fly_kernel, [*fields, motion, wall.base, wall.touch, self._start, end])
         after = self._sums()
         has, missing = _about_center(after), drift - after[:, 4:7] / number
-        rigid, turn = self._turning(after, had), self._turning(after, had - has)
+        rigid, turn = _turning(after, had, had - has)
         least, most = (rigid * had).sum(axis=1), _about_mean(before)
         now = _about_mean(after) + (turn * (had + has)).sum(axis=1)
         share = np.sqrt(np.clip((most - least) / np.maximum(now - least, 1e-30), 0.0, 1.0))[:, None]
@@ -106,24 +108,12 @@ class Flights:
         motion = self._motion(shift * dx, push * dx / dt, turn / dt, center * dx, np.repeat(share, 3, axis=1))
         self._launch(kernels.land_kernel, [motion, end, particles.position])
 
-    def _turning(self, sums: Sums, momentum: np.ndarray) -> np.ndarray:
-        """Return the rigid rotations that have angular momenta about the bodies' centers, in cells and steps, shape (bodies, 3)."""
-        number = np.maximum(sums[:, :1], 1.0)
-        center = sums[:, 1:4] / number
-        xx, yy, zz, xy, xz, yz = sums[:, 10:16].T
-        moments = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
-        moments -= number[:, :, None] * center[:, :, None] * center[:, None, :]
-        values, axes = np.linalg.eigh(np.trace(moments, axis1=1, axis2=2)[:, None, None] * np.eye(3) - moments)
-        along = np.einsum("bij,bi->bj", axes, momentum)
-        rates = np.where(values > NARROW * number, along / np.maximum(values, NARROW * number), 0.0)
-        return np.einsum("bij,bj->bi", axes, rates)
-
-    def _take(self, particles: Particles, count: int) -> None:
+    def _take(self, particles: Particles) -> None:
         """Point the kernels at the particles, and at sums of nothing."""
         flight = self._flight
         flight.velocity = particles.velocity
         flight.gradient_u, flight.gradient_v, flight.gradient_w = ([*particles.affine, None, None, None][:3])
-        flight.sums = wp.zeros((count, kernels.COLUMNS), dtype=wp.int64, device=self.grid.device)
+        flight.sums = wp.zeros(self._before.shape, dtype=wp.int64, device=self.grid.device)
         # no sum of products of positions and velocities, which are of fewer cells than the domain has along its longest side, overflows
         flight.quanta = 2.0 ** math.floor(60.0 - math.log2(particles.count * max(self.grid.counts) ** 2))
 
@@ -149,3 +139,13 @@ def _about_center(sums: Sums) -> np.ndarray:
 def _about_mean(sums: Sums) -> np.ndarray:
     """Return the sums of the squares of velocities relative to the bodies' own, shape (bodies,)."""
     return sums[:, 16] - (sums[:, 4:7] ** 2).sum(axis=1) / np.maximum(sums[:, 0], 1.0)
+
+
+def _turning(sums: Sums, *momenta: np.ndarray) -> list[np.ndarray]:
+    """Return the rigid rotations that have angular momenta about the bodies' centers, in cells and steps, shape (bodies, 3) each."""
+    least, center = NARROW * np.maximum(sums[:, :1], 1.0), sums[:, 1:4] / np.maximum(sums[:, :1], 1.0)
+    xx, yy, zz, xy, xz, yz = sums[:, 10:16].T
+    moments = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3) - sums[:, 1:4, None] * center[:, None, :]
+    values, axes = np.linalg.eigh(np.trace(moments, axis1=1, axis2=2)[:, None, None] * np.eye(3) - moments)
+    inverse = (axes * np.where(values > least, 1.0 / np.maximum(values, least), 0.0)[:, None, :]) @ axes.swapaxes(1, 2)
+    return [(inverse @ momentum[:, :, None])[:, :, 0] for momentum in momenta]

@@ -10,7 +10,7 @@ from warp_lcp.grid.staggered import CellRange
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.contact import TOUCHES
 from warp_lcp.native import simd
-from warp_lcp.operators.grid_poisson import FLUID, SOLID
+from warp_lcp.operators.grid_poisson import SOLID
 
 COLUMNS = 18  # of a body's sums, see `add_up`
 LEAVES = 17  # of them, the particles that come near a wall or an open side
@@ -38,7 +38,8 @@ class Flight:
     gradient_u: Vectors  # [1/s], empty but for APIC
     gradient_v: Vectors
     gradient_w: Vectors
-    body: Integers  # of each particle, -1 without one
+    who: Integers  # the particles of all bodies
+    body: Integers  # of each of them
     sums: wp.array2d(dtype=wp.int64)
 
 
@@ -77,18 +78,17 @@ HOLD = """
     const signed char* kind = (const signed char*)kind_.data + q; const unsigned char* touch = touch_.data + q;
     int parent_of = -1, root = -1;
     for (int i = first; i < last; ++i) {
-        const int fluid = kind[i] == FLUID, wall = (kind[i] == SOLID) | (touch[i] & TOUCHES);
-        if (!(fluid | wall)) continue;
-        const int c = (int)(q + i);
+        const int c = (int)(q + i), joined = P[c] != c, wall = (kind[i] == SOLID) | (touch[i] & TOUCHES);
+        if (!(joined | wall)) continue;
         if (P[c] != parent_of) { parent_of = P[c]; root = find(c); }
-        if (fluid) wet.data[root] = 1;
         if (wall) held.data[root] = 1;
+        if (joined) several.data[root] = 1;
     }
 """
 
 
 def _native(source: str) -> str:
-    names = {"FLUID": FLUID, "SOLID": SOLID, "TOUCHES": TOUCHES}
+    names = {"SOLID": SOLID, "TOUCHES": TOUCHES}
     constants = "".join(f"constexpr int {name} = {value}; " for name, value in names.items())
     return simd(constants + TREES + source.replace("TINY_WEIGHT", repr(TINY_WEIGHT)))
 
@@ -99,7 +99,7 @@ def unite_row(u_: Field, v_: Field, w_: Field, parent: Integers, s1: int, s2: in
 
 @wp.func_native(_native(HOLD))
 def hold_row(
-    kind_: Kinds, touch_: wp.array3d(dtype=wp.uint8), parent: Integers, held: Bytes, wet: Bytes, s1: int, s2: int, k: int, j: int,
+    kind_: Kinds, touch_: wp.array3d(dtype=wp.uint8), parent: Integers, held: Bytes, several: Bytes, s1: int, s2: int, k: int, j: int,
     first: int, last: int,
 ): ...  # fmt: skip
 
@@ -114,12 +114,12 @@ def root_of(parent: Integers, cell: int):
 
 
 @wp.kernel(**options)
-def alone_kernel(parent: Integers, held: Bytes, wet: Bytes):
+def alone_kernel(parent: Integers, held: Bytes, several: Bytes):
     """Every cell is a tree of its own."""
     c = wp.tid()
     parent[c] = c
     held[c] = wp.uint8(0)
-    wet[c] = wp.uint8(0)
+    several[c] = wp.uint8(0)
 
 
 @wp.kernel(**options)
@@ -133,21 +133,21 @@ def unite_kernel(cells: CellRange, u: Field, v: Field, w: Field, parent: Integer
 
 
 @wp.kernel(**options)
-def hold_kernel(cells: CellRange, kind: Kinds, touch: wp.array3d(dtype=wp.uint8), parent: Integers, held: Bytes, wet: Bytes):
-    """Trees that reach a wall are held, those with a FLUID cell feel the pressure."""
+def hold_kernel(cells: CellRange, kind: Kinds, touch: wp.array3d(dtype=wp.uint8), parent: Integers, held: Bytes, several: Bytes):
+    """Tell which trees reach a wall, and which have several cells: those without weight stay alone."""
     plane, row, chunk = wp.tid()
     first = cells.i + chunk * cells.grain
     s2 = kind.shape[2]
     s1 = s2 * kind.shape[1]
-    hold_row(kind, touch, parent, held, wet, s1, s2, cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end))
+    hold_row(kind, touch, parent, held, several, s1, s2, cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end))
 
 
 @wp.kernel(**options)
-def number_kernel(parent: Integers, held: Bytes, wet: Bytes, number: Integers, count: Integers):
+def number_kernel(parent: Integers, held: Bytes, several: Bytes, number: Integers, count: Integers):
     """Number the trees that nothing holds; other cells get -1."""
     c = wp.tid()
     n = int(-1)
-    if parent[c] == c and held[c] == wp.uint8(0) and wet[c] != wp.uint8(0):
+    if parent[c] == c and held[c] == wp.uint8(0) and several[c] != wp.uint8(0):
         n = wp.atomic_add(count, 0, 1)
     number[c] = n
 
@@ -159,14 +159,14 @@ def put(sums: wp.array2d(dtype=wp.int64), body: int, column: int, quanta: wp.flo
 
 
 @wp.func
-def add_up(flight: Flight, p: int, x: wp.vec3):
-    """Add a particle at x [cells] to its body's sums, in cells and steps.
+def add_up(flight: Flight, n: int, x: wp.vec3):
+    """Add the n-th particle at x [cells] to its body's sums, in cells and steps.
 
     [0] particles; [1:4] x; [4:7] v; [7:10] x cross v; [10:16] xx, yy, zz, xy, xz, yz; [16] v v.
     """
-    b = flight.body[p]
+    b = flight.body[n]
     q = flight.quanta
-    v = flight.velocity[p] * flight.rate
+    v = flight.velocity[flight.who[n]] * flight.rate
     turn = wp.cross(x, v)
     wp.atomic_add(flight.sums, b, 0, wp.int64(1))
     for d in range(3):
@@ -181,13 +181,23 @@ def add_up(flight: Flight, p: int, x: wp.vec3):
 
 
 @wp.kernel(**options)
-def board_kernel(flight: Flight, position: Vectors, key: Integers, parent: Integers, number: Integers):
-    """Find each particle's body and add it up."""
+def board_kernel(key: Integers, parent: Integers, number: Integers, who: Integers, body: Integers, count: Integers):
+    """List the particles of bodies; count[1] becomes their number. All others take no more than this look."""
     p = wp.tid()
     b = number[root_of(parent, key[p])]
-    flight.body[p] = b
     if b >= 0:
-        add_up(flight, p, position[p] * flight.inverse_dx)
+        n = wp.atomic_add(count, 1, 1)
+        who[n] = p
+        body[n] = b
+
+
+@wp.kernel(**options)
+def lift_kernel(flight: Flight, position: Vectors, start: Vectors):
+    """Note where particles are, and add them up."""
+    n = wp.tid()
+    x = position[flight.who[n]]
+    start[n] = x
+    add_up(flight, n, x * flight.inverse_dx)
 
 
 @wp.func
@@ -242,36 +252,36 @@ def fly_kernel(
 
     What they have of the body's spin turns with it. A motion is the body's [0] velocity, [1] spin, [2] center.
     """
-    p = wp.tid()
-    b = flight.body[p]
-    if b >= 0:
-        h = flight.rate
-        x = start[p] * flight.inverse_dx
-        mean = motion[b, 0]
-        spin = motion[b, 1]
-        k1 = velocity_at(u, v, w, flight.planes, x)
-        k2 = velocity_at(u, v, w, flight.planes, x + 0.5 * h * (k1 - mean))
-        k3 = velocity_at(u, v, w, flight.planes, x + 0.75 * h * (k2 - mean))
-        way = h / 9.0 * (2.0 * k1 + 3.0 * k2 + 4.0 * k3)
-        if flight.straight:
-            way = h * k1
-        x += way
-        end[p] = start[p] + way / flight.inverse_dx
-        rigid = wp.cross(spin, start[p] - motion[b, 2])
-        flight.velocity[p] = flight.velocity[p] + turned(spin * (h / flight.inverse_dx), rigid) - rigid
-        add_up(flight, p, x)
-        i = int(wp.floor(x[0])) + 1
-        j = int(wp.floor(x[1])) + 1
-        k = int(1)
-        if flight.planes == 2:
-            k = int(wp.floor(x[2])) + 1
-        inside = i > 0 and j > 0 and k > 0 and i + 1 < u.shape[2] and j + 1 < u.shape[1] and k + 1 < u.shape[0]
-        near = int(1)
-        if inside:
-            if base[k, j, i] != _SOLID and (touch[k, j, i] & _TOUCHES) == wp.uint8(0):
-                near = 0
-        if near == 1:
-            wp.atomic_add(flight.sums, b, LEAVES, wp.int64(1))
+    n = wp.tid()
+    p = flight.who[n]
+    b = flight.body[n]
+    h = flight.rate
+    x = start[n] * flight.inverse_dx
+    mean = motion[b, 0]
+    spin = motion[b, 1]
+    k1 = velocity_at(u, v, w, flight.planes, x)
+    k2 = velocity_at(u, v, w, flight.planes, x + 0.5 * h * (k1 - mean))
+    k3 = velocity_at(u, v, w, flight.planes, x + 0.75 * h * (k2 - mean))
+    way = h / 9.0 * (2.0 * k1 + 3.0 * k2 + 4.0 * k3)
+    if flight.straight:
+        way = h * k1
+    x += way
+    end[n] = start[n] + way / flight.inverse_dx
+    rigid = wp.cross(spin, start[n] - motion[b, 2])
+    flight.velocity[p] = flight.velocity[p] + turned(spin * (h / flight.inverse_dx), rigid) - rigid
+    add_up(flight, n, x)
+    i = int(wp.floor(x[0])) + 1
+    j = int(wp.floor(x[1])) + 1
+    k = int(1)
+    if flight.planes == 2:
+        k = int(wp.floor(x[2])) + 1
+    inside = i > 0 and j > 0 and k > 0 and i + 1 < u.shape[2] and j + 1 < u.shape[1] and k + 1 < u.shape[0]
+    near = int(1)
+    if inside:
+        if base[k, j, i] != _SOLID and (touch[k, j, i] & _TOUCHES) == wp.uint8(0):
+            near = 0
+    if near == 1:
+        wp.atomic_add(flight.sums, b, LEAVES, wp.int64(1))
 
 
 @wp.kernel(**options)
@@ -280,17 +290,17 @@ def land_kernel(flight: Flight, motion: Motions, end: Vectors, position: Vectors
 
     A motion is [0] the shift, [1] the velocity, [2] the spin, [3] the center, [4] the share, three times.
     """
-    p = wp.tid()
-    b = flight.body[p]
-    if b >= 0:
-        s = motion[b, 4][0]
-        if s >= 0.0:
-            x = end[p] + motion[b, 0]
-            w = motion[b, 2]
-            position[p] = x
-            flight.velocity[p] = s * flight.velocity[p] + motion[b, 1] + wp.cross(w, x - motion[b, 3])
-            if flight.gradient_u:
-                flight.gradient_u[p] = s * flight.gradient_u[p] + wp.vec3(0.0, -w[2], w[1])
-                flight.gradient_v[p] = s * flight.gradient_v[p] + wp.vec3(w[2], 0.0, -w[0])
-                if flight.planes == 2:
-                    flight.gradient_w[p] = s * flight.gradient_w[p] + wp.vec3(-w[1], w[0], 0.0)
+    n = wp.tid()
+    p = flight.who[n]
+    b = flight.body[n]
+    s = motion[b, 4][0]
+    if s >= 0.0:
+        x = end[n] + motion[b, 0]
+        w = motion[b, 2]
+        position[p] = x
+        flight.velocity[p] = s * flight.velocity[p] + motion[b, 1] + wp.cross(w, x - motion[b, 3])
+        if flight.gradient_u:
+            flight.gradient_u[p] = s * flight.gradient_u[p] + wp.vec3(0.0, -w[2], w[1])
+            flight.gradient_v[p] = s * flight.gradient_v[p] + wp.vec3(w[2], 0.0, -w[0])
+            if flight.planes == 2:
+                flight.gradient_w[p] = s * flight.gradient_w[p] + wp.vec3(-w[1], w[0], 0.0)
