@@ -81,6 +81,9 @@ class DistributedLiquid(LiquidSimulation):
             gravity=float(np.linalg.norm(self.gravity)),
         )  # fmt: skip
 
+    def _flights(self) -> None:
+        """Bodies reach across the cuts between ranks, where none of them knows the whole of one."""
+
     def mark(self) -> None:
         """Find the liquid's cells, and show them."""
         self.particles.arrange(0)

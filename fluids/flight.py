@@ -22,10 +22,15 @@ class Flights:
 
     The pressure's impulses on a body in flight add up to nothing, but not what particles take of them: they are not spread as evenly as
     the volume that the pressure is solved for, and those outside the surface take the velocity of liquid beside them. And a particle that
-    goes along with a flow that turns by an angle a keeps a velocity that does not: a rigid rotation loses a^2 / 2 of its angular momentum
-    in each step. So when particles have moved their body takes a rigid motion, by which nothing in it is strained, that gives it back what
-    it had before the transfer, and gravity's. Its particles move through a velocity that goes along with it: in one that stays where it is
-    the middle of a spinning drop would move aside by a / 2 of its way.
+    goes along with a flow that turns by an angle a in a step keeps a velocity that does not: a rigid rotation loses a^2 / 2 of its angular
+    momentum. So a body's particles are moved anew once it is known where the step brings them:
+
+    - through a velocity that goes along with the body: in one that stays where it is the middle of a spinning drop moves aside by a / 2
+      of its way;
+    - what they have of the body's rigid rotation turns with it, which is what the pressure that keeps it together does;
+    - a rigid motion, by which nothing is strained, gives the body back the momentum and the angular momentum, of the particles' x and v,
+      that it had before the transfer to the grid, and gravity's;
+    - where it then moved faster within itself than before, what is not rigid slows down until it does not.
 
     Bodies are made of cells with faces between them that particles gave weight; a lone particle is one.
 
@@ -46,7 +51,9 @@ class Flights:
         self._flight.planes, self._flight.inverse_dx = grid.planes, 1.0 / grid.spacing
         self._before: Sums = np.zeros((0, kernels.COLUMNS))
 
-    def begin(self, particles: Particles, window: Window, weights: Sequence[wp.array], kind: wp.array, dt: float, change: np.ndarray) -> int:
+    def begin(
+        self, particles: Particles, window: Window, weights: Sequence[wp.array], kind: wp.array, dt: float, change: np.ndarray
+    ) -> int:
         """Find the bodies before particles take their new velocities, and return how many there are.
 
         Args:
@@ -59,7 +66,7 @@ class Flights:
         """
         trees, device = [self._parent, self._held, self._several], self.grid.device
         wp.launch(kernels.alone_kernel, self.grid.size, trees, device=device)
-        window.launch(kernels.unite_kernel, [*weights, None][:3] + [self._parent])
+        window.launch(kernels.unite_kernel, [*[*weights, None][:3], self._parent])
         window.launch(kernels.hold_kernel, [kind, self.boundary.touch, *trees])
         self._count.zero_()
         wp.launch(kernels.number_kernel, self.grid.size, [*trees, self._number, self._count], device=device)
@@ -112,7 +119,7 @@ class Flights:
         """Point the kernels at the particles, and at sums of nothing."""
         flight = self._flight
         flight.velocity = particles.velocity
-        flight.gradient_u, flight.gradient_v, flight.gradient_w = ([*particles.affine, None, None, None][:3])
+        flight.gradient_u, flight.gradient_v, flight.gradient_w = [*particles.affine, None, None, None][:3]
         flight.sums = wp.zeros(self._before.shape, dtype=wp.int64, device=self.grid.device)
         # no sum of products of positions and velocities, which are of fewer cells than the domain has along its longest side, overflows
         flight.quanta = 2.0 ** math.floor(60.0 - math.log2(particles.count * max(self.grid.counts) ** 2))

@@ -309,7 +309,7 @@ def test_a_step_marks_its_stages() -> None:
     assert watched.step(0.01) == plain.step(0.01)
     assert watched.watch.found == [
         "diagnostics", "sort", "particles-to-grid", "surface", "pressure set-up", "pressure solve", "projection", "diagnostics",
-        "extrapolation", "grid-to-particles", "advection", "diagnostics",
+        "extrapolation", "bodies in flight", "grid-to-particles", "advection", "bodies in flight", "diagnostics",
     ]  # fmt: skip
 
 
