@@ -14,6 +14,7 @@ from benchmarks.timing import Options
 from benchmarks.validation import (
     ceiling,
     dam_break,
+    flight,
     floating,
     inclined,
     rest,
@@ -32,6 +33,7 @@ from benchmarks.validation.html_page import Section, page
 TITLE = "Liquids, sand and rigid bodies against known answers"
 CHECKS = {
     "transfers": transfers,
+    "flight": flight,
     "ceiling": ceiling,
     "slope": slope,
     "dam break": dam_break,
