@@ -125,8 +125,8 @@ class LiquidScene(ParticleScene):
         bounded = self.lets_go or self.pressure.model == "unilateral"
         motions = sum(solid.is_body for solid in self.solid) * (3 if self.dimension == 2 else 6)
         return {
-            "pressure": cells * (PRESSURE_BYTES - BOUND_BYTES * (not bounded) + UNILATERAL_BYTES * (self.pressure.model == "unilateral")),
-            "flights": cells * FLIGHT_BYTES * (self.particles.narrow_band is None),
+            "pressure": cells * (PRESSURE_BYTES - BOUND_BYTES * (not bounded) + UNILATERAL_BYTES * (self.pressure.model == "unilateral"))
+            + cells * FLIGHT_BYTES * (self.particles.narrow_band is None),
             "bodies": cells * (BODY_BYTES * bool(motions) + POTENTIAL_BYTES * motions),
             "surface": cells
             * (not self.stays_full)
