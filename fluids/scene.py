@@ -126,7 +126,7 @@ class LiquidScene(ParticleScene):
         motions = sum(solid.is_body for solid in self.solid) * (3 if self.dimension == 2 else 6)
         return {
             "pressure": cells * (PRESSURE_BYTES - BOUND_BYTES * (not bounded) + UNILATERAL_BYTES * (self.pressure.model == "unilateral"))
-            + cells * FLIGHT_BYTES * (self.particles.narrow_band is None),
+            + cells * FLIGHT_BYTES * (self.particles.narrow_band is None and not self.stays_full),
             "bodies": cells * (BODY_BYTES * bool(motions) + POTENTIAL_BYTES * motions),
             "surface": cells
             * (not self.stays_full)

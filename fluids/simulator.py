@@ -91,8 +91,9 @@ class LiquidSimulation(ParticleSimulation):
         return make_pressure(self.scene, self.grid, self.boundary, self.surface, self.weights, self.bodies)
 
     def _flights(self) -> Flights | None:
-        coheres = self.scene.pressure.model == "incompressible"
-        return Flights(self.grid, self.boundary, coheres=coheres) if self.band is None else None
+        if self.band is not None or self.scene.stays_full:  # what flies may have no particles inside; nothing can fly
+            return None
+        return Flights(self.grid, self.boundary, coheres=self.scene.pressure.model == "incompressible")
 
     def mark(self) -> None:
         """Find the liquid's cells, and show them."""
