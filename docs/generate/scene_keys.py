@@ -23,10 +23,10 @@ for sand).
 A key with a default may be left out. A key that no table has is refused, and the message names the nearest one. `--set table.key=value` on
 the command line overrides a key.
 
-Steps end exactly at frames. They end, too, where a source or drain starts or stops or a solid's velocity jumps, unless that is closer than a
-quarter of a step to the step's start or to a frame, or another such time follows within the step: the step then runs across it. What a source
-lets in is exact all the same, the flow has its velocity in the steps in whose middle it runs, and a drain acts at the end of each step in
-part of which it is open.
+Steps end exactly at frames. They end, too, where a source or drain starts or stops or a solid's velocity jumps, unless that is closer than
+a quarter of a step to the step's start or to a frame, or another such time follows within the step: the step then runs across it. What a
+source lets in is exact all the same, the flow has its velocity in the steps in whose middle it runs, and a drain acts at the end of each
+step in part of which it is open.
 """
 
 
