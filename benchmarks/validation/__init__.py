@@ -14,6 +14,7 @@ from benchmarks.timing import Options
 from benchmarks.validation import (
     ceiling,
     dam_break,
+    flight,
     floating,
     inclined,
     rest,
@@ -23,6 +24,7 @@ from benchmarks.validation import (
     sand_rest,
     slope,
     sloshing,
+    time_steps,
     transfers,
     volume,
 )
@@ -32,6 +34,8 @@ from benchmarks.validation.html_page import Section, page
 TITLE = "Liquids, sand and rigid bodies against known answers"
 CHECKS = {
     "transfers": transfers,
+    "flight": flight,
+    "time steps": time_steps,
     "ceiling": ceiling,
     "slope": slope,
     "dam break": dam_break,

@@ -64,7 +64,7 @@ def best_shift(time: np.ndarray, values: np.ndarray, at: np.ndarray, expected: n
 
 
 def best_pace(time: np.ndarray, values: np.ndarray, at: np.ndarray, expected: np.ndarray, limit: float) -> float:
-    """Return how many times as fast as expected a curve runs: the factor on its time, from .5 to 2, that makes `best_shift`'s error smallest."""
+    """Return how many times as fast as expected a curve runs: the factor on its time, .5 to 2, with which `best_shift` errs least."""
     paces = np.geomspace(0.5, 2.0, PACES)
     return float(paces[np.argmin([best_shift(np.asarray(time) * pace, values, at, expected, limit)[1] for pace in paces])])
 
