@@ -55,8 +55,9 @@ class Ledger:
                 self._watch(name, part, *exchange)
         if simulation.boundary.sides is not None:
             self._watch("carry", simulation.boundary.sides, *exchange)
-        if simulation.correction is not None:
-            self._watch("apply", simulation.correction, *self._exchange("_displaced"))
+        apart = getattr(simulation, "rearrangement", None) or getattr(simulation, "correction", None)
+        if apart is not None:
+            self._watch("apply", apart, *self._exchange("_displaced"))
         projection = getattr(simulation, "projection", None)
         if projection is not None and simulation.boundary.velocity:
             self._watch("project", projection, None, self._note_walls)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time as clock
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -94,15 +95,26 @@ def study(name: str, device: str, *, overrides: tuple[str, ...] = (), duration: 
     begun, rises = clock.perf_counter(), list[Rise]()
     try:
         simulation: Any = simulators()[scene.scene.simulator].create(scene, device=device, folder=Path.cwd())
-        ledger, dt_max = Ledger(simulation), scene.time.dt_max
-        for share in MOMENTS:
-            until = share * (duration or time)
-            while simulation.time < until or simulation.step_count == 0:
-                ledger.step(min(simulation.stable_dt(), dt_max))
-            rises += _from_here(ledger, dt_max)
+        rises = along(Ledger(simulation), [share * (duration or time) for share in MOMENTS], scene.time.dt_max)
     except (StepFailed, SimulationFailed) as error:
         return Study(name, rises, clock.perf_counter() - begun, str(error))
     return Study(name, rises, clock.perf_counter() - begun)
+
+
+def along(ledger: Ledger, moments: Sequence[float], dt_max: float) -> list[Rise]:
+    """Step from moment to moment and try all lengths at each.
+
+    Args:
+        ledger: of a simulation.
+        moments: times [s]; one that is past is the end of the next step.
+        dt_max: the longest step [s].
+    """
+    simulation, rises = ledger.simulation, list[Rise]()
+    for moment in moments:
+        while simulation.time < moment or simulation.step_count == 0:
+            ledger.step(min(simulation.stable_dt(), dt_max))
+        rises += _from_here(ledger, dt_max)
+    return rises
 
 
 def _from_here(ledger: Ledger, dt_max: float) -> list[Rise]:
