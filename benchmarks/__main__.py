@@ -14,7 +14,7 @@ from benchmarks.timing import Options
 
 SUITES = (
     "kernels", "solvers", "scaling", "floor", "peers", "run", "sand", "implicit_mpm", "contacts", "models", "automatic_tolerance",
-    "validation", "narrow_band", "narrow", "replay", "book", "guard", "tradeoff", "tuning", "extremes", "distributed",
+    "validation", "narrow_band", "narrow", "replay", "book", "guard", "tradeoff", "tuning", "extremes", "distributed", "short_steps",
 )  # fmt: skip
 
 

@@ -181,6 +181,7 @@ VALIDATION = Suite(
     "validation",
     "liquids, sand and bodies against known answers, with negative controls: rest, sloshing, ceiling, dam break, floating, piles and more",
     False,
+    groups={"short_steps": "the energy that steps of any length make in the middle of every built-in scene"},
 )
 EXTREMES = Suite(
     "extremes",

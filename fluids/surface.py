@@ -10,7 +10,7 @@ import warp as wp
 
 import warp_lcp as wl
 from fluids import surface_kernels as kernels
-from warp_lcp.grid.extrapolate import extrapolate
+from warp_lcp.grid.extrapolate import complete
 from warp_lcp.grid.level_set import Fill, LevelSet
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
@@ -18,7 +18,6 @@ from warp_lcp.material.boundary import Boundary
 
 SLIVER = 0.35  # a cell whose open share is smaller may hold no particle though liquid fills it: the level set decides
 SAMPLES = 8  # points along the edge of a cut cell, of a volume that is found once
-REACH = 2  # layers that u* is continued into cells of the level set whose faces no particle gave weight
 
 
 class FreeSurface(Protocol):
@@ -70,7 +69,7 @@ class WholeCellSurface:
     def complete(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
         """Give u* to slivers."""
         if self._level_set is not None:
-            _complete(window, velocity, weights, known)
+            complete(window, velocity, weights, known)
 
     def volume(self, cells: int) -> float:
         """Return the volume of the FLUID cells."""
@@ -98,7 +97,7 @@ class NoSurface:
 
     def complete(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
         """Give u* to faces between particles."""
-        _complete(window, velocity, weights, known)
+        complete(window, velocity, weights, known)
 
     def volume(self, cells: int) -> float:
         """Return the volume that solids leave."""
@@ -134,18 +133,11 @@ class GhostFluidSurface:
 
     def complete(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
         """Give u* to FLUID faces between particles."""
-        _complete(window, velocity, weights, known)
+        complete(window, velocity, weights, known)
 
     def volume(self, cells: int) -> float:
         """Return the volume inside the surface."""
         return self.level_set.volume(self.boundary.distance, self._window)
-
-
-def _complete(window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
-    for field, weight, marks in zip(velocity, weights, known, strict=True):
-        marks.zero_()
-        window.launch(kernels.weighted_kernel, [weight, marks])
-        extrapolate(window, marks, field, REACH)
 
 
 def _open_shares(grid: StaggeredGrid, boundary: Boundary) -> np.ndarray:

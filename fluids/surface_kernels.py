@@ -5,7 +5,6 @@ import typing
 import warp as wp
 
 from warp_lcp.grid.staggered import CellRange
-from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.operators.grid_poisson import AIR, FLUID
 
 _AIR = wp.constant(wp.int8(AIR))
@@ -41,15 +40,3 @@ def mark_inside_kernel(
         if kind[k, j, i] == _AIR and k > 0 and j > 0 and k + 1 < kind.shape[0] and j + 1 < kind.shape[1]:
             if phi[k, j, i] < 0.0 and capacity[k, j, i] <= most:
                 kind[k, j, i] = _FLUID
-
-
-@wp.kernel(**options)
-@typing.no_type_check
-def weighted_kernel(cells: CellRange, weight: wp.array3d(dtype=wp.float32), known: wp.array3d(dtype=wp.int8)):
-    """Mark the faces that particles gave weight."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        known[k, j, i] = wp.where(weight[k, j, i] > TINY_WEIGHT, wp.int8(1), wp.int8(0))

@@ -21,6 +21,7 @@ from warp_lcp.driver.particle_assembly import make_bodies, make_boundary, make_o
 from warp_lcp.driver.particle_simulation import ParticleSimulation, Row
 from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.simulator import Cells, Part, SimulationFailed
+from warp_lcp.grid.extrapolate import complete
 from warp_lcp.grid.level_set import particle_density
 from warp_lcp.grid.particles import Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
@@ -116,6 +117,7 @@ class SandSimulation(ParticleSimulation):
         super().bring_to_faces(window)
         if self.sides is not None:
             self.sides.average(self.velocity, self.weights, self._saved or ())
+        complete(window, self.velocity, self.weights, self.outcome.known, self._join)  # faces have mass farther out than weight
 
     def carry(self, dt: float) -> tuple[int, int, int]:
         """Move particles and solids by dt [s]. Return how many met a wall, were pushed by a solid, and are stuck inside one."""

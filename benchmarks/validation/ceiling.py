@@ -81,15 +81,13 @@ def drop(
     simulation = create(
         numerics, size=SIZE, resolution=resolution, liquid=[box([0.0, LOW], SIZE)], solid=CEILINGS[ceiling], wall=wall, device=device
     )  # fmt: skip
-    start, speed, way, lowest, highest = np.sort(positions(simulation)[:, 1]), 0.0, 0.0, 0.0, 0.0
+    start, lowest, highest = np.sort(positions(simulation)[:, 1]), 0.0, 0.0
     if not release:
         _hold(simulation)
-    for row in steps(simulation, DURATION):
-        speed += GRAVITY * row["dt"]
-        way += speed * row["dt"]  # symplectic Euler
+    for _ in steps(simulation, DURATION):
         pressure = pressures(simulation)
         lowest, highest = min(lowest, pressure.min()), max(highest, pressure.max())
-    dx = simulation.grid.spacing
+    dx, way = simulation.grid.spacing, 0.5 * GRAVITY * DURATION**2
     return Fall((start - np.sort(positions(simulation)[:, 1])) / dx, way / dx, float(lowest), float(highest))
 
 

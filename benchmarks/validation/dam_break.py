@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.record import Chart, Lines
 from benchmarks.validation.enclosed import filled_fraction
 from benchmarks.validation.finding import Findings, Trial, attempt
-from benchmarks.validation.signals import best_shift, front, relative_rms, slope, stays, surface_height
+from benchmarks.validation.signals import best_pace, best_shift, front, relative_rms, stays, surface_height
 from benchmarks.validation.tank import GRAVITY, PER_AXIS, SUB_CELL, Numerics, box, create, fill, positions, steps
 from fluids import LiquidSimulation
 
@@ -22,7 +22,7 @@ LENGTH, HEIGHT = 6.0, 2.5  # of the tank, in units of a: the front meets no wall
 END = 3.7  # T
 MAX_SHIFT = 0.3  # of T: the experiment's time origin is uncertain
 FIRST, LAST = 0.84, 3.33  # T of the data compared
-STRAIGHT = 1.6  # T from which on the front moves evenly
+WRONG_GRAVITY = (0.5, 0.8, 1.25, 2.0)  # of the real one, in the controls
 TAU_LAST = 2.45
 
 # [MartinMoyce1952], front and height of the column of square section, n^2 = 2
@@ -66,7 +66,7 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
 
 
 def trial(cells: int, device: str, numerics: Numerics = SUB_CELL) -> Trial:
-    """Compare a collapse with the data; the control has half the gravity that its time is measured in."""
+    """Compare a collapse with the data; the controls have another gravity than their time is measured in."""
 
     def run(found: Findings) -> None:
         limit = LIMITS[cells]
@@ -77,18 +77,29 @@ def trial(cells: int, device: str, numerics: Numerics = SUB_CELL) -> Trial:
         found.add("RMS error of Z", 100.0 * relative_rms(c.T, c.Z, at, expected), high=20.0, unit="%")
         found.add("RMS error of Z after the best shift", 100.0 * rms, high=limit, unit="%")
         found.add("the best shift of T", shift, low=-MAX_SHIFT, high=MAX_SHIFT)
-        found.add("dZ/dT", slope(c.T, c.Z, STRAIGHT + shift, LAST + shift), low=1.19, high=1.74)
+        found.add("gravity that the front shows", shown_gravity(c), low=0.9, high=1.1, unit="g")
         early = TAU <= TAU_LAST
         found.add("largest |dH|", float(np.abs(np.interp(TAU[early], c.tau, c.H) - H[early]).max()), high=0.05)
         found.curves["front"], found.curves["height"] = (c.T.tolist(), c.Z.tolist()), (c.tau.tolist(), c.H.tolist())
         found.curves[f"front, shifted by {-shift:.2f}"] = ((c.T - shift).tolist(), c.Z.tolist())
-        slow = collapse(cells, device, numerics, gravity=0.5 * GRAVITY)
-        found.must_break(
-            "half the gravity: RMS error of Z after the best shift", 100.0 * best_shift(slow.T, slow.Z, at, expected, MAX_SHIFT)[1],
-            high=limit, unit="%",
-        )  # fmt: skip
+        for factor in WRONG_GRAVITY:
+            wrong = collapse(cells, device, numerics, gravity=factor * GRAVITY)
+            found.must_break(f"{factor:g} g: gravity that the front shows", shown_gravity(wrong), low=0.9, high=1.1, unit="g")
+            if factor == min(WRONG_GRAVITY):  # nearer ones a shift can hide
+                rms = 100.0 * best_shift(wrong.T, wrong.Z, at, expected, MAX_SHIFT)[1]
+                found.must_break(f"{factor:g} g: RMS error of Z after the best shift", rms, high=limit, unit="%")
 
     return attempt("dam break", f"{cells} cells of a, {numerics.name}", run)
+
+
+def shown_gravity(c: Collapse) -> float:
+    """Return the gravity with which the experiment's front would go as fast as a collapse's, over the real one.
+
+    Times go with 1 / sqrt(g), and where the experiment's begins is open. The speed of the even part alone would not tell: it goes with
+    sqrt(g) too, and data and simulation leave it a range as wide as that from .8 g to 1.25 g.
+    """
+    compared = (T >= FIRST) & (T <= LAST)
+    return best_pace(c.T, c.Z, T[compared], Z[compared], MAX_SHIFT) ** 2
 
 
 def collapse(cells: int, device: str, numerics: Numerics, *, gravity: float = GRAVITY) -> Collapse:

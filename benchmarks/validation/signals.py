@@ -8,6 +8,7 @@ import numpy as np
 
 HALF_FULL = 0.5
 SHIFT_STEP = 0.01
+PACES = 141  # a percent apart
 
 
 def crossings(time: np.ndarray, signal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -62,13 +63,10 @@ def best_shift(time: np.ndarray, values: np.ndarray, at: np.ndarray, expected: n
     return float(shifts[best]), errors[best]
 
 
-def slope(x: np.ndarray, y: np.ndarray, low: float, high: float) -> float:
-    """Return the slope of the line through the points with low <= x <= high, by least squares."""
-    x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
-    chosen = (x >= low) & (x <= high)
-    if chosen.sum() < 2:
-        raise ValueError(f"less than two points lie between {low} and {high}")
-    return float(np.polyfit(x[chosen], y[chosen], 1)[0])
+def best_pace(time: np.ndarray, values: np.ndarray, at: np.ndarray, expected: np.ndarray, limit: float) -> float:
+    """Return how many times as fast as expected a curve runs: the factor on its time, .5 to 2, with which `best_shift` errs least."""
+    paces = np.geomspace(0.5, 2.0, PACES)
+    return float(paces[np.argmin([best_shift(np.asarray(time) * pace, values, at, expected, limit)[1] for pace in paces])])
 
 
 def front(fill: np.ndarray) -> int:

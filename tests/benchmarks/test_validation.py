@@ -95,9 +95,8 @@ def test_the_shift_that_fits_best() -> None:
     assert error < 1e-4
     assert signals.best_shift(t, values, at, 1.0 + (at - 0.5) ** 2, 0.3)[0] == pytest.approx(-0.3)
     assert signals.relative_rms(t, 1.1 * values, at, 1.0 + at**2) == pytest.approx(0.1, rel=1e-3)
-    assert signals.slope(t, 3.0 * t + 1.0, 1.0, 2.0) == pytest.approx(3.0)
-    with pytest.raises(ValueError, match="less than two points"):
-        signals.slope(t, t, 5.0, 6.0)
+    for pace in (0.71, 1.0, 1.4):
+        assert signals.best_pace(t / pace, 1.0 + (t - 0.1) ** 2, at, 1.0 + at**2, 0.3) == pytest.approx(pace, rel=0.01)
 
 
 def test_the_front_is_the_far_edge_of_the_last_floor_cell_half_full() -> None:

@@ -186,6 +186,15 @@ def test_bodies_of_all_weights_in_one_tank():
     assert speeds[3] > speeds[4] > -9.81 * 0.06 - 0.01
 
 
+@pytest.mark.parametrize("body", [box([-0.1] * 3, [0.1] * 3), disc([0.0] * 3, 0.1)])
+def test_bodies_of_equal_moments_may_be_turned(body):
+    turned = body | {"density": 300.0, "rotate": [12.0, 34.0, 56.0], "translate": [0.4, 0.6, 0.4], "angular_velocity": [3.0, -2.0, 1.0]}
+    model = scene(size=[0.8] * 3, resolution=8, liquid=[box([0.0, 0.0, 0.0], [0.8, 0.65, 0.8])], solid=[turned])
+    simulation = create(model)
+    rows = advance(simulation, 0.03)
+    assert {row["solve_status"] for row in rows} == {"CONVERGED"}
+
+
 def test_a_failed_step_leaves_the_bodies_as_they_were():
     simulation = crowded(2)
     simulation.step(0.001)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import scipy.sparse
 import warp as wp
+from scipy.spatial.transform import Rotation
 
 import warp_lcp as wl
 from oracle import assemble, lemke
@@ -75,6 +76,32 @@ def test_a_body_coupled_to_a_grid(cells, device):
         assert result, result.status
         expected = lemke(dense[np.ix_(fluid, fluid)], b.ravel()[fluid])
         np.testing.assert_allclose(result.x.numpy().ravel()[fluid], expected, atol=1e-7)
+
+
+@pytest.mark.parametrize("dtype", [wp.float32, wp.float64])
+def test_weights_that_are_symmetric_but_for_rounding(cells, dtype, device):
+    """A turned body's: R I^-1 R' of equal moments is diagonal, and what rounding leaves beside the diagonal has no symmetry."""
+    rng, grid = np.random.default_rng(19), wl.GridPoisson(cells, device=device, dtype=dtype)
+    U = rng.standard_normal((*cells.shape, 3)) * (cells == wl.FLUID)[..., None]
+    fluid, b = cells.ravel() == wl.FLUID, rng.standard_normal(cells.shape)
+    uneven = 0
+    for moments in ([1.0, 1.0, 1.0], [0.2, 0.2, 0.2], [1.0, 1.0, 3.0], [0.7, 1.9, 4.0], [1e-9, 2e-9, 2e-9]):
+        for rotation in Rotation.random(40, rng=rng).as_matrix():
+            W = rotation @ np.diag(moments) @ rotation.T
+            uneven += not np.array_equal(W, W.T)
+            low = wl.LowRankOperator(U, W, device=device, dtype=dtype)
+            assert low.symmetric
+            W[0, 1] += 1e-12 * W[0, 0]
+            assert not wl.LowRankOperator(U, W, device=device, dtype=dtype).symmetric
+            low.update(W)
+            assert not low.symmetric
+    assert uneven > 100
+    W = rotation @ np.eye(3) @ rotation.T
+    A, u = wl.SumOperator(grid, wl.LowRankOperator(U, W, device=device, dtype=dtype)), U.reshape(-1, 3)
+    result = wl.solve(wl.LCP(A, b), wl.MinimumMapNewton(precision="double" if dtype is wp.float64 else "mixed"), stopping=TIGHT)
+    assert result, result.status
+    expected = lemke((assemble(cells) + u @ u.T)[np.ix_(fluid, fluid)], b.ravel()[fluid])
+    np.testing.assert_allclose(result.x.numpy().ravel()[fluid], expected, atol=1e-7 if dtype is wp.float64 else 1e-5)
 
 
 def test_an_unsymmetric_sum_in_a_solver(device):

@@ -14,7 +14,20 @@ from warp_lcp.pickling import Pickled, made_again
 from warp_lcp.problem import as_operator
 from warp_lcp.scale import scale_of_matrix
 
-SYMMETRIC = 64 * float(np.finfo(np.float64).eps)  # of the largest entries of two rows: what J M^-1 J' in float64 leaves of symmetry
+SYMMETRIC = 64 * float(
+    np.finfo(np.float64).eps
+)  # of the largest entries of two rows: what J M^-1 J' and assembly in float64 leave of symmetry
+
+
+def is_rounding(difference: np.ndarray, one: np.ndarray, other: np.ndarray) -> bool:
+    """Return whether each a_ij - a_ji is rounding of the smaller one of the largest entries of rows i and j.
+
+    Args:
+        difference: a_ij - a_ji.
+        one: the largest magnitude of row i, of a shape that goes with the difference.
+        other: that of row j.
+    """
+    return bool((np.abs(difference) <= SYMMETRIC * np.minimum(one, other)).all())
 
 
 class DenseOperator(Pickled):
@@ -47,7 +60,7 @@ class DenseOperator(Pickled):
         largest = np.abs(host).max(axis=1)
         check_kept(largest, dtype, "matrix, the largest entries of its rows")
         self.row_sizes = None if largest.all() else wp.array(largest, dtype=wp.float64, device=self.device)
-        self.symmetric = bool((np.abs(host - host.T) <= SYMMETRIC * np.minimum.outer(largest, largest)).all())
+        self.symmetric = is_rounding(host - host.T, largest[:, None], largest)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the matrix."""

@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.layout import Layout, check_storable, layout_of, real_array
+from warp_lcp.operators.dense import is_rounding
 from warp_lcp.operators.low_rank_columns import BlockColumns
 from warp_lcp.operators.low_rank_kernels import weigh_kernel
 from warp_lcp.pickling import Pickled, made_again
@@ -26,7 +27,7 @@ class LowRankOperator(Pickled):
         dtype: storage of the columns, wp.float64 or wp.float32.
 
     Attributes:
-        symmetric: whether W equals its transpose.
+        symmetric: whether W equals its transpose but for rounding of its rows' largest entries.
         rank: number of columns.
         columns: the rows of U that are not 0, `warp_lcp.operators.low_rank_columns.BlockColumns`.
         weights: W, float64, shape (k, k); `update` changes it.
@@ -199,4 +200,5 @@ def _of_entries(sizes: Any, entries: Any, weights: np.ndarray, *, device: Any, d
 
 
 def _is_symmetric(W: np.ndarray) -> bool:
-    return bool(np.allclose(W, W.T, rtol=1e-14, atol=0.0))
+    largest = np.abs(W).max(axis=1)
+    return is_rounding(W - W.T, largest[:, None], largest)

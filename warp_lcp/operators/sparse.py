@@ -11,14 +11,13 @@ import warp as wp
 
 from warp_lcp.layout import Layout, check_kept, check_storable, real_array
 from warp_lcp.native import Spans
+from warp_lcp.operators.dense import is_rounding
 from warp_lcp.operators.sparse_kernels import color_kernel, gather_kernel, kernels
 from warp_lcp.pickling import Pickled, made_again
 from warp_lcp.problem import as_operator
 from warp_lcp.program import Launch
 from warp_lcp.scale import scale_of_matrix
 from warp_lcp.vectors import launch_spans
-
-SYMMETRIC = 64 * float(np.finfo(np.float64).eps)  # of the largest entries of two rows: what assembly in float64 leaves of symmetry
 
 
 class SparseOperator(Pickled):
@@ -288,9 +287,9 @@ def _is_symmetric(host: scipy.sparse.csr_array, largest: np.ndarray) -> bool:
         if np.array_equal(turned.data, host.data):
             return True
         largest_here = np.repeat(largest, np.diff(host.indptr))
-        return bool((np.abs(turned.data - host.data) <= SYMMETRIC * np.minimum(largest_here, largest[host.indices])).all())
+        return is_rounding(turned.data - host.data, largest_here, largest[host.indices])
     difference = (host - turned).tocoo()
-    return bool((np.abs(difference.data) <= SYMMETRIC * np.minimum(largest[difference.row], largest[difference.col])).all())
+    return is_rounding(difference.data, largest[difference.row], largest[difference.col])
 
 
 @as_operator.register(scipy.sparse.sparray)

@@ -87,7 +87,8 @@ class RigidBody:
         """Return block diag(1/m, I^-1), shape (k, k): k = 3 in 2-D (vx, vy, wz), 6 in 3-D (vx, vy, vz, wx, wy, wz)."""
         result, R = np.zeros((6, 6)), self.rotation
         result[AXES, AXES] = 1.0 / self.properties.mass
-        result[3:, 3:] = R @ self.properties.inverse_inertia @ R.T
+        turned = R @ self.properties.inverse_inertia @ R.T
+        result[3:, 3:] = 0.5 * (turned + turned.T)
         return result if dimension == 3 else result[PLANAR][:, PLANAR]
 
     def inverse_mass(self, dimension: int) -> np.ndarray:

@@ -1,0 +1,210 @@
+"""The energy of a simulation, and what sources, outlets, moving walls and ends of endless axes put in or take out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from warp_lcp.operators.grid_poisson import SOLID
+
+
+@dataclass(frozen=True)
+class Step:
+    """Energies [J; J/m in 2-D] of a step.
+
+    Attributes:
+        before: kinetic and potential energy at its start, bodies included.
+        after: at its end.
+        given: what came in from outside: with particles that sources add and outlets remove, by walls that the scene moves, and where an
+            endless axis takes particles back to its beginning.
+        displaced: what the density correction's displacements lifted; part of `after`.
+    """
+
+    before: float
+    after: float
+    given: float
+    displaced: float
+
+    @property
+    def gained(self) -> float:
+        """Energy out of nothing; negative: what was dissipated."""
+        return self.after - self.before - self.given
+
+
+class Ledger:
+    """Steps a simulation and keeps account of its energy, in float64 from its particles and bodies.
+
+    A particle's velocity is that of the middle of its step. Its energy of motion at the end has what gravity does in half a step more: a
+    power that is that of the mean velocity V, and that changes as V has in the step, as far as that is free fall. Walls that move do the
+    work of the pressure's impulses at their faces; what they do to spray that they hit is not in `given`.
+
+    Args:
+        simulation: of particles; a ledger stays with it, as it watches its parts.
+    """
+
+    def __init__(self, simulation: Any) -> None:
+        self.simulation = simulation
+        self._dt, self._given, self._displaced, self._carried = simulation.last_dt, 0.0, 0.0, np.zeros(3)
+        self._watch("carry", simulation, self._note_momentum, None)
+        exchange = self._exchange("_given")
+        for part, names in ((simulation.sources, ("emit",)), (simulation.outlets, ("apply", "remove_departed"))):
+            for name in names if part is not None else ():
+                self._watch(name, part, *exchange)
+        if simulation.boundary.sides is not None:
+            self._watch("carry", simulation.boundary.sides, *exchange)
+        apart = getattr(simulation, "rearrangement", None) or getattr(simulation, "correction", None)
+        if apart is not None:
+            self._watch("apply", apart, *self._exchange("_displaced"))
+        projection = getattr(simulation, "projection", None)
+        if projection is not None and simulation.boundary.velocity:
+            self._watch("project", projection, None, self._note_walls)
+        self.now = self.energy()
+
+    def energy(self) -> float:
+        """Return kinetic and potential energy of particles and bodies as they are [J; J/m]; the gain of free fall is not known yet."""
+        return self._material() + self._bodies()
+
+    def height(self) -> float:
+        """Return the energy that the material and the bodies have by their height over the domain's lowest corner [J; J/m], >= 0."""
+        s = self.simulation
+        gravity, size = self._gravity(), np.zeros(3)
+        size[: s.grid.dimension] = s.scene.domain.size
+        lowest = float(np.minimum(-gravity * size, 0.0).sum())
+        mass, moment = self._moments()
+        own = -float(gravity @ moment) - mass * lowest
+        bodies = s.bodies.bodies if s.bodies is not None else []
+        return own + sum(-b.properties.mass * (float(gravity @ b.position) + lowest) for b in bodies)
+
+    def total(self) -> float:
+        """Return the energy of motion and that of height over the domain's lowest corner [J; J/m]."""
+        bodies = self.simulation.bodies
+        motion = self.now - self._potential() - (bodies.potential_energy(self.simulation.gravity) if bodies is not None else 0.0)
+        return max(motion, 0.0) + self.height()
+
+    def set_back(self, state: dict[str, np.ndarray], energy: float) -> None:
+        """Put the simulation back to a state.
+
+        Args:
+            state: of the simulation.
+            energy: that `now` was then.
+        """
+        self.simulation.restore(state)
+        self._dt, self.now = self.simulation.last_dt, energy
+
+    def step(self, dt: float) -> Step:
+        """Step by dt [s] and return the account."""
+        s = self.simulation
+        before, momentum, self._dt = self.now, self._momentum(), dt
+        moving = self._body_velocities()
+        self._given = self._displaced = 0.0
+        self._carried = momentum
+        s.step(dt)
+        gained = self._free_fall(s.particle_mass * s.particles.count, self._carried - momentum)
+        bodies = s.bodies.bodies if s.bodies is not None else []
+        for body, old in zip(bodies, moving, strict=True):
+            gained += self._free_fall(body.properties.mass, body.properties.mass * (body.velocity - old))
+        self.now = self.energy() + gained
+        return Step(before, self.now, self._given, self._displaced)
+
+    def _free_fall(self, mass: float, change: np.ndarray) -> float:
+        """Return what half a step more of falling as fast as the momentum has changed adds to the energy of motion."""
+        g = self.simulation.gravity
+        rate = float(g @ change) / self.simulation.kick_dt
+        return 0.125 * self._dt**2 * min(max(rate, 0.0), mass * float(g @ g))
+
+    def _material(self) -> float:
+        s = self.simulation
+        velocity = s.particles.velocity.numpy().astype(np.float64)
+        motion = 0.5 * s.particle_mass * float(np.square(velocity).sum())
+        return motion + 0.5 * self._dt * float(s.gravity @ self._momentum()) + self._potential()
+
+    def _bodies(self) -> float:
+        s = self.simulation
+        if s.bodies is None:
+            return 0.0
+        power = sum(body.properties.mass * float(s.gravity @ body.velocity) for body in s.bodies.bodies)
+        return s.bodies.kinetic_energy() + 0.5 * self._dt * power + s.bodies.potential_energy(s.gravity)
+
+    def _potential(self) -> float:
+        return -float(self.simulation.gravity @ self._moments()[1])
+
+    def _gravity(self) -> np.ndarray:
+        """Return gravity [m/s^2] without its part along axes without an end, where there is no lowest place."""
+        s = self.simulation
+        axes = [axis in s.scene.endless for axis in range(3)]
+        return np.where(axes, 0.0, s.gravity)
+
+    def _moments(self) -> tuple[float, np.ndarray]:
+        s = self.simulation
+        position = s.particles.position.numpy().astype(np.float64)
+        return s.particle_mass * len(position), s.particle_mass * position.sum(axis=0)
+
+    def _momentum(self) -> np.ndarray:
+        s = self.simulation
+        return np.asarray(s.particle_mass * s.particles.velocity.numpy().astype(np.float64).sum(axis=0))
+
+    def _body_velocities(self) -> list[np.ndarray]:
+        bodies = self.simulation.bodies
+        return [] if bodies is None else [body.velocity.copy() for body in bodies.bodies]
+
+    def _note_momentum(self) -> None:
+        self._carried = self._momentum()
+
+    def _note_walls(self) -> None:
+        """Note the work of the pressure's impulses, rho dx^d x a cell, on walls and sources, whose flow they push back."""
+        s: Any = self.simulation
+        flow = s.scene.physics.density * s.grid.cell_volume * s.projection.pressure.numpy()
+        self._given -= float((flow * wall_outflow(s)).sum())
+
+    def _exchange(self, account: str) -> tuple[Callable[[], None], Callable[[], None]]:
+        depth = 0  # outlets call their own parts
+
+        def before() -> None:
+            nonlocal depth
+            if depth == 0:
+                setattr(self, account, getattr(self, account) - self._material())
+            depth += 1
+
+        def after() -> None:
+            nonlocal depth
+            depth -= 1
+            if depth == 0:
+                setattr(self, account, getattr(self, account) + self._material())
+
+        return before, after
+
+    def _watch(self, name: str, part: Any, before: Callable[[], None] | None, after: Callable[[], None] | None) -> None:
+        """Call something before and after a method of a part."""
+        method = getattr(part, name)
+
+        def watched(*given: Any, **named: Any) -> Any:
+            if before is not None:
+                before()
+            result = method(*given, **named)
+            if after is not None:
+                after()
+            return result
+
+        setattr(part, name, watched)
+
+
+def wall_outflow(simulation: Any) -> np.ndarray:
+    """Return what walls that the scene moves, and sources, take up of each cell's outflow [m/s], in the stored shape; bodies do not count.
+
+    On a face of the open fraction a_f it is s_f (1 - a_f) u_s,f, s_f = +-1 outward; a source's cells are SOLID and their faces closed.
+    """
+    boundary, kind = simulation.boundary, simulation.projection.kind.numpy()
+    bodies = simulation.bodies.numbers if simulation.bodies is not None else []
+    result = np.zeros(simulation.grid.shape)
+    for axis, field in enumerate(boundary.velocity):
+        along = 2 - axis
+        if boundary.open:
+            wall = np.where(np.isin(boundary.cut.wall[axis].numpy(), bodies), 0.0, field.numpy())
+            passes = (1.0 - boundary.open[axis].numpy()) * wall
+        else:
+            passes = np.where((kind == SOLID) | (np.roll(kind, 1, along) == SOLID), field.numpy(), 0.0).astype(np.float64)
+        result += np.roll(passes, -1, along) - passes
+    return result

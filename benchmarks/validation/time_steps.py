@@ -1,0 +1,119 @@
+"""The energy of a collapse converges as its steps get shorter, and no step makes any, the first one from rest included."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from benchmarks.energy import Ledger
+from benchmarks.record import Chart, Lines
+from benchmarks.validation import sand_pit, tank
+from benchmarks.validation.finding import Findings, Trial, attempt
+from benchmarks.validation.tank import SUB_CELL, VOXEL, box
+from warp_lcp.operators.grid_poisson import FLUID
+
+RESOLUTIONS = (24, 48)  # cells along the domain
+SIZE, COLUMN = [0.8, 0.4], box([0.0, 0.0], [0.2, 0.3])  # [m]
+LONGEST = {"liquid, whole cells": 0.02, "liquid, sub-cell": 0.02, "liquid, unilateral": 0.02, "sand": 0.01}  # [s]: steps of the first run
+HALVINGS = 4
+MOMENTS = np.array([0.04, 0.08, 0.12, 0.16, 0.2])  # [s] at which runs are compared: the front meets no wall
+MOST = 1e-3  # of the total, that a step may add
+CHANGE = 5e-3  # of the total, that the last halving may change
+Watched = Callable[[Any], None]
+
+
+def check(device: str) -> tuple[list[Trial], list[Chart]]:
+    """Run the check at its resolutions."""
+    trials = [trial(n, device, what) for n in RESOLUTIONS for what in LONGEST]
+    curves = {f"{t.resolution}: {label}": curve for t in trials for label, curve in t.curves.items()}
+    title = "Energy of a collapse by the length of steps"
+    return trials, [Lines("time-steps", title, "t [s]", "energy / start", curves, logarithmic_x=False, logarithmic_y=False)]
+
+
+def trial(cells: int, device: str, what: str) -> Trial:
+    """Halve the steps of a collapse; the controls push crowds apart within the step, and let gravity act for whole steps."""
+
+    def run(found: Findings) -> None:
+        lengths = LONGEST[what] * 0.5 ** np.arange(HALVINGS + 1)
+        runs = [collapse(what, cells, dt, device) for dt in lengths]
+        changes = [float(np.abs(a - b).max()) for (a, _), (b, _) in pairwise(runs)]
+        found.add("most that a step adds", max(gained for _, gained in runs), high=MOST, unit="of the total")
+        found.add("highest energy over that at the start", max(float(E.max()) for E, _ in runs), high=1.0 + MOST)
+        found.add("change by the last halving", changes[-1], high=CHANGE, unit="of the total")
+        found.add("change by the last halving over that by the first", changes[-1] / changes[0], high=1.0)
+        for dt, (energy, _) in zip(lengths, runs, strict=True):
+            found.curves[f"{what}, {1e3 * dt:g} ms"] = (MOMENTS.tolist(), energy.tolist())
+        if what in PUSHED_APART:
+            _, gained = collapse(what, cells, lengths[-1], device, change=PUSHED_APART[what])
+            found.must_break("old relaxation: most that a step adds", gained, high=MOST, unit="of the total")
+
+    return attempt("time steps", f"{what}, {cells} cells", run)
+
+
+def collapse(
+    what: str, cells: int, dt: float, device: str = "cpu", *, change: Watched | None = None, moments: np.ndarray = MOMENTS
+) -> tuple[np.ndarray, float]:
+    """Let a column collapse from rest.
+
+    Args:
+        what: a key of `LONGEST`.
+        cells: along the domain.
+        dt: length of the steps [s].
+        device: where it runs.
+        change: makes the simulation a control.
+        moments: at which the energy is wanted [s].
+
+    Returns:
+        The energy at the moments over that at the start, and the most that a step added to it, over it.
+    """
+    simulation: Any
+    if what == "sand":
+        simulation = sand_pit.create(SIZE, cells, [COLUMN], walls=0.5, device=device)
+    else:
+        numerics = SUB_CELL if what == "liquid, sub-cell" else VOXEL
+        tables: dict[str, Any] = {"pressure": {"model": "unilateral"}} if what == "liquid, unilateral" else {}
+        simulation = tank.create(numerics, size=SIZE, resolution=cells, liquid=[COLUMN], device=device, **tables)
+    if change is not None:
+        change(simulation)
+    ledger = Ledger(simulation)
+    total, most, energy = ledger.total(), -np.inf, []
+    for moment in moments:
+        while simulation.time < moment - tank.SHORTEST:
+            most = max(most, ledger.step(min(dt, moment - simulation.time)).gained / total)
+        energy.append(ledger.total() / total)
+    return np.array(energy), float(most)
+
+
+def _push_sand_apart(simulation: Any) -> None:
+    """Let a fifth of what is too dense be pushed out within a step, however short, as a velocity."""
+    packing = simulation.packing
+    update = packing.update
+
+    def pushed(density: Any, velocity: Any, dt: float, *more: Any) -> None:
+        update(density, velocity, dt, *more)
+        phi = density.numpy() / np.maximum(simulation.boundary.capacity.numpy(), 0.1)
+        excess = np.where(packing.flags.numpy() != 0, np.maximum(phi - 1.0, 0.0), 0.0)
+        packing.drive.assign((packing.drive.numpy() - 0.2 * excess * simulation.grid.spacing / dt).astype(np.float32))
+
+    packing.update = pushed
+
+
+def _push_liquid_apart(simulation: Any) -> None:
+    """Let all that is too dense be pushed out within a step, however short, as a velocity."""
+    projection = simulation.projection
+    prepare = projection.prepare
+
+    def pushed(velocity: Any, dt: float, kick_dt: float) -> int:
+        unknowns: int = prepare(velocity, dt, kick_dt)
+        excess = np.maximum(simulation.surface.level_set.density.numpy() - simulation.boundary.capacity.numpy(), 0.0)
+        inside = projection._cells.numpy() == FLUID
+        projection._b.assign(projection._b.numpy() - np.where(inside, excess, 0.0) * simulation.grid.spacing / dt)
+        return unknowns
+
+    projection.prepare = pushed
+
+
+PUSHED_APART: dict[str, Watched] = {"sand": _push_sand_apart, "liquid, unilateral": _push_liquid_apart}

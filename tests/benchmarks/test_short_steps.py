@@ -1,0 +1,82 @@
+"""The account of a step's energy against what is known by hand, and steps of any length in the middle of small scenes."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks import short_steps
+from benchmarks.energy import Ledger
+from benchmarks.validation import flight, sand_pit, tank, time_steps
+from benchmarks.validation.tank import DENSITY, SUB_CELL, VOXEL, box
+
+LENGTHS = (0.02, 1e-6, 0.013, 1e-4, 1e-4, 0.02)  # [s]
+STILL = {"gravity": [0.0, 0.0]}
+
+
+def test_free_fall_makes_no_energy_whatever_the_steps() -> None:
+    ledger = Ledger(tank.create(VOXEL, size=[1.0, 1.0], resolution=16, liquid=[box([0.3, 0.6], [0.6, 0.9], velocity=[0.5, 1.0])]))
+    start = ledger.total()
+    for dt in LENGTHS:
+        assert abs(ledger.step(dt).gained) < 1e-6 * start
+    speed = np.hypot(0.5, 1.0 - 9.81 * ledger.simulation.time)
+    mass = ledger.simulation.particle_mass * ledger.simulation.particles.count
+    assert ledger.total() == pytest.approx(start, rel=1e-6)
+    assert ledger.total() - ledger.height() == pytest.approx(0.5 * mass * speed**2, rel=1e-5)
+
+
+def test_what_a_source_brings_is_not_made() -> None:
+    """The first step emits what the velocity brings in: its energy is that of particles at that velocity, nothing else happens."""
+    source = box([0.0, 0.25], [0.125, 0.5], velocity=[2.0, 0.0])
+    simulation = tank.create(VOXEL, size=[1.0, 1.0], resolution=16, liquid=[], source=[source], physics=STILL)
+    ledger = Ledger(simulation)
+    before = simulation.particles.count
+    done = ledger.step(0.0625)  # the way of two cells
+    emitted = simulation.particles.count - before
+    assert emitted > 0
+    assert done.given == pytest.approx(0.5 * simulation.particle_mass * emitted * 2.0**2, rel=1e-6)
+    assert abs(done.gained) < 1e-6 * done.after
+
+
+def test_the_work_of_a_wall_that_sets_a_plug_in_motion_is_its_momentum_times_its_velocity() -> None:
+    """From rest to u at once takes m u^2: half of it becomes motion, half is lost in the blow."""
+    motion = {"kind": "translation", "velocity": [0.8, 0.0]}
+    piston = box([-2.0, -1.0], [0.25, 2.0], motion=motion, wall="free-slip")
+    simulation = tank.create(
+        SUB_CELL, size=[1.0, 0.25], resolution=32, liquid=[box([0.25, 0.0], [0.5, 0.25])], solid=[piston], physics=STILL, wall="free-slip",
+        solver={"tolerance": 1e-8},
+    )  # fmt: skip
+    done = Ledger(simulation).step(1e-4)
+    assert done.given == pytest.approx(DENSITY * 0.25 * 0.25 * 0.8**2, rel=0.1)
+    assert done.gained == pytest.approx(-0.5 * done.given, rel=0.1)
+
+
+TAP = {"shape": "box", "min": [0.0, 0.5], "max": [0.125, 0.625], "velocity": [1.5, 0.0]}
+
+
+@pytest.mark.parametrize("what", ["liquid and a tap", "unilateral", "sand"])
+def test_a_step_of_any_length_makes_no_energy(what: str) -> None:
+    """But for what the density correction lifts, which is a matter of positions and the same whatever the step."""
+    simulation: Any
+    if what == "sand":
+        simulation = sand_pit.create([0.8, 0.4], 24, [box([0.0, 0.0], [0.2, 0.3])], walls=0.5)
+    else:
+        tables: dict[str, Any] = {"source": [TAP]} if what == "liquid and a tap" else {"pressure": {"model": "unilateral"}}
+        simulation = tank.create(VOXEL, size=[1.0, 0.75], resolution=16, liquid=[box([0.0, 0.0], [0.375, 0.5])], **tables)
+    found = short_steps.along(Ledger(simulation), (0.02, 0.2), simulation.scene.time.dt_max)
+    assert len(found) > 20
+    assert min(rise.length for rise in found) == 1e-6
+    assert max(rise.gained - rise.displaced for rise in found) < short_steps.MOST
+
+
+@pytest.mark.parametrize("what", ["liquid, unilateral", "sand"])
+def test_the_old_relaxation_is_told(what: str) -> None:
+    """Crowds that are pushed apart within a step get the faster the shorter it is."""
+    _, gained = time_steps.collapse(what, 24, 1e-3, change=time_steps.PUSHED_APART[what], moments=np.array([0.01]))
+    assert gained > time_steps.MOST
+
+
+@pytest.mark.parametrize("what", ["liquid, whole cells", "body over liquid"])
+def test_what_is_thrown_flies_along_its_parabola(what: str) -> None:
+    assert flight.off_its_parabola(what, 16, 8.0) < flight.MOST
+    assert flight.off_its_parabola(what, 16, 8.0, whole_kicks=True) > 0.1
