@@ -19,15 +19,14 @@ class Packing:
     """Where sand is in a step, and what of it the stresses move.
 
     phi is the share of a cell that grains fill, in units of the densest packing. Sand may be denser than 1 by what the particles'
-    sampling makes of it: of phi - 1 > 0 the share `relax` is pushed out in a step. A face has the mean of its cells as mass; those with
-    less than 0.02 are empty, those with less than 0.1 count as 0.1. A cell with phi > 0.3 beside air counts as full in the pressure's
+    sampling makes of it, which the stresses leave as it is; from FULL on a cell is full. A face has the mean of its cells as mass; those
+    with less than 0.02 are empty, those with less than 0.1 count as 0.1. A cell with phi > 0.3 beside air counts as full in the pressure's
     problem, so that a surface of partly filled cells carries a pressure, and thus friction; its mass is its own.
 
     Args:
         grid: the grid.
         base: int8, SOLID or AIR.
         capacity: float32, share of a cell's kernel that is open.
-        relax: of what is too dense, the share that a step pushes out.
         sides: of axes without an end, if there are any.
 
     Attributes:
@@ -35,7 +34,7 @@ class Packing:
         fraction: phi, float32.
         kind: int8 FLUID where a cell holds sand (phi > 0.02), AIR, SOLID.
         flags: uint8 bits of a cell, see `granular.yield_set`.
-        drive: (1 - phi) dx / dt [m/s] of the pressure's problem, float32.
+        drive: max(FULL - phi, 0) dx / dt [m/s] of the pressure's problem, float32.
         mass, inverse: of each component's faces, in units of a full face's, float32; inverse is 0 where nothing can be moved.
         start: velocity of each component that the stresses act on [m/s], float32.
         share: weight of a cell's copy on the edges of each shear, float32, see `granular.yield_set`.
@@ -44,11 +43,9 @@ class Packing:
         nodes: the window of lower faces and edges of all cells and the domain's upper side.
     """
 
-    def __init__(
-        self, grid: StaggeredGrid, base: wp.array, capacity: wp.array, *, relax: float = 0.2, sides: PeriodicSides | None = None
-    ) -> None:
+    def __init__(self, grid: StaggeredGrid, base: wp.array, capacity: wp.array, *, sides: PeriodicSides | None = None) -> None:
         """Allocate the fields."""
-        self.grid, self.base, self._capacity, self.relax, self.sides = grid, base, capacity, relax, sides
+        self.grid, self.base, self._capacity, self.sides = grid, base, capacity, sides
         self.fraction, self.kind, self.flags, self.drive = grid.field(), grid.field(wp.int8), grid.field(wp.uint8), grid.field()
         wp.copy(self.kind, base)
         self.mass, self.inverse, self.start = grid.faces(), grid.faces(), grid.faces()
@@ -73,7 +70,7 @@ class Packing:
         """
         grid, dimension = self.grid, self.grid.dimension
         domain, nodes = grid.domain, self.nodes
-        domain.launch(kernels.fraction_kernel, [self.base, self._capacity, self.relax, density, self.fraction])
+        domain.launch(kernels.fraction_kernel, [self.base, self._capacity, density, self.fraction])
         if self.sides is not None:
             self.sides.wrap(self.fraction)
         rate = grid.spacing / dt

@@ -16,6 +16,7 @@ LEAST_FRACTION = 0.02  # of a cell or face, below which it is empty
 LEAST_MASS = 0.1  # of a face, in units of a full one: lighter ones would make the problem stiff
 DENSE = 0.5  # the fraction from which a cell carries shear
 SURFACE = 0.3  # the fraction from which a cell beside air counts as full: a partly filled one has no pressure, and so no friction
+FULL = 0.95  # the fraction from which a cell counts as full: less than 1 by the sampling's noise, whose gaps would close as falls
 FIRM_FRACTION = 0.9  # from which cohesion holds a cell together
 LANES = 16  # cells of a vector
 ROUNDING = 1e-6  # by which a fraction may differ from 1 and count as 1
@@ -28,8 +29,8 @@ options: dict[str, typing.Any] = {"enable_backward": False, "module": "granular.
 
 @wp.kernel(**options)
 @typing.no_type_check
-def fraction_kernel(cells: CellRange, base: _I8, capacity: _F32, relax: float, splatted: _F32, fraction: _F32):
-    """Fraction of a cell from the particles' density; of what exceeds 1 only the share `relax` counts."""
+def fraction_kernel(cells: CellRange, base: _I8, capacity: _F32, splatted: _F32, fraction: _F32):
+    """Fraction of a cell from the particles' density. More than 1 is mass, but never a velocity, see `cell_kernel`."""
     plane, row, chunk = wp.tid()
     k = cells.k + plane
     j = cells.j + row
@@ -38,11 +39,8 @@ def fraction_kernel(cells: CellRange, base: _I8, capacity: _F32, relax: float, s
         phi = float(0.0)
         if base[k, j, i] != _SOLID:
             phi = splatted[k, j, i] / wp.max(capacity[k, j, i], 0.1)
-            excess = phi - 1.0
-            if wp.abs(excess) <= ROUNDING:
+            if wp.abs(phi - 1.0) <= ROUNDING:
                 phi = 1.0
-            elif excess > 0.0:
-                phi = 1.0 + relax * excess
         fraction[k, j, i] = phi
 
 
@@ -51,7 +49,11 @@ def fraction_kernel(cells: CellRange, base: _I8, capacity: _F32, relax: float, s
 def cell_kernel(
     cells: CellRange, base: _I8, fraction: _F32, planes: int, rate: float, kind: _I8, flags: _U8, drive: _F32,
 ):  # fmt: skip
-    """Which cells hold sand, and what of them is still free: drive = (1 - saturation) dx / dt [m/s]."""
+    """Which cells hold sand, and what of them is still free: drive = max(FULL - saturation, 0) dx / dt [m/s].
+
+    Never negative: what is too dense is a matter of positions, which the density correction moves apart. Pushed out by the stresses it
+    would be a velocity, which friction works against (a silo's walls would pull its sand down), and the larger the shorter the step.
+    """
     plane, row, chunk = wp.tid()
     k = cells.k + plane
     j = cells.j + row
@@ -80,7 +82,7 @@ def cell_kernel(
                 if air:
                     full = wp.max(phi, 1.0)
         flags[k, j, i] = wp.uint8(mark)
-        drive[k, j, i] = (1.0 - full) * rate
+        drive[k, j, i] = wp.max(FULL - full, 0.0) * rate
         if solid:
             kind[k, j, i] = _SOLID
         elif mark != 0:

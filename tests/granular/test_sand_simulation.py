@@ -49,7 +49,8 @@ def test_a_block_falls_freely(dimension: int) -> None:
     advance(simulation, 0.2)
     fallen = GRAVITY * (simulation.time - 0.5 * simulation.last_dt)
     velocity = simulation.particles.velocity.numpy()
-    assert velocity[:, 1].mean() == pytest.approx(-fallen, rel=0.002)
+    # a foremost cell that counts as full may have faces before it that no particle has given a velocity yet: 0.7 % in two dimensions
+    assert velocity[:, 1].mean() == pytest.approx(-fallen, rel=0.01)
     assert np.abs(velocity[:, 1] + fallen).max() < 0.1 * fallen
     assert np.abs(velocity[:, 0]).max() < 0.1 * fallen
 
@@ -95,7 +96,9 @@ def test_each_layer_bears_what_lies_on_it(dimension: int) -> None:
     exact = DENSITY * GRAVITY * (0.375 - (np.arange(len(load)) + 0.5) * dx)  # rho g (h - y), if nothing had settled
     np.testing.assert_allclose(load[deep], exact[deep], rtol=0.1)
     mean = simulation.pressures()[planes, 1:-1, 1:-1].mean(axis=(0, 2))
-    np.testing.assert_allclose(mean[deep], exact[deep], rtol=0.25)
+    least = (1.0 + (dimension - 1) / 3.0) / dimension  # Rankine's active state of 30 degrees: a third of the load acts sideways
+    assert (mean[deep] > 0.95 * least * load[deep]).all()
+    assert (mean[deep] < 1.05 * load[deep]).all()  # nor more than the load: sand that pushes itself apart would be passive
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
