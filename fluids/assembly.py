@@ -48,14 +48,15 @@ def make_pressure(
     if bodies is not None:
         assert isinstance(boundary, CutBoundary), "a scene with bodies has cut cells"
         coupling = BodyCoupling(grid, boundary, bodies, scene.physics.density)
+    gravity = float(np.linalg.norm(scene.physics.gravity))
     if isinstance(surface, GhostFluidSurface) and scene.pressure.model == "unilateral":
         return UnilateralPressure(
             grid, boundary, solver, level_set=surface.level_set, weights=weights, tolerance=settings.tolerance,
-            max_iterations=settings.max_iterations, coupling=coupling,
+            max_iterations=settings.max_iterations, coupling=coupling, gravity=gravity,
         )  # fmt: skip
     return PressureProjection(
         grid, boundary, solver, tolerance=settings.tolerance, max_iterations=settings.max_iterations, phi=surface.phi, coupling=coupling,
-        lets_go=scene.lets_go, weights=weights if scene.short_steps else None, gravity=float(np.linalg.norm(scene.physics.gravity)),
+        lets_go=scene.lets_go, weights=weights if scene.short_steps else None, gravity=gravity,
     )  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -19,35 +20,37 @@ from warp_lcp.material.density_correction import SHIFT
 from warp_lcp.operators.grid_poisson import FLUID
 from warp_lcp.vectors import convert
 
-MAX_DENSITY = 1.0  # of a cell, in units of the density at rest: a liquid as it is seeded neither falls into itself nor bursts
-
 
 class UnilateralPressure(PressureProjection):
-    """Solve 0 <= p complementary to rho_max - rho >= 0 in every cell that is not SOLID.
+    """Solve 0 <= p complementary to what is left of a cell >= 0, in every cell that is not SOLID.
 
     The idea is that of Narain et al. (2010) and Gerszewski and Bargteil (2013), as [Book] 1.3 reports it; the discrete law is derived here.
 
     rho_i is the density of the particles in units of that at rest, capacity_i what fits beside walls, a_f the open fraction of a face,
-    rho_f the density on a face, s_f = +-1 outward. Mass is conserved and the pressure accelerates it:
+    s_f = +-1 outward. A cell is filled to f_i = min(rho_i / (FULL capacity_i), 1), f_f is that of a face. The pressure accelerates it:
 
-        rho_i(t + dt) = rho_i - (dt / dx) sum of s_f [a_f rho_f u_f + (1 - a_f) rho_max u_s,f],
-        rho_f u_f = rho_f u*_f - (x_right - x_left),   x = kick_dt p / (rho_0 dx) [m/s].
+        f_f u_f = f_f u*_f - (x_right - x_left),   x = kick_dt p / (rho_0 dx) [m/s].
 
-    (A solid that comes in takes room: the second term.) With y_i = (dx / dt) [rho_max capacity_i - rho_i(t + dt)] this is
+    With what passes a face, q_f = a_f f_f u*_f + (1 - a_f) u_s,f (a solid that comes in takes room: the second term),
 
-        y_i = (dx / dt) (rho_max capacity_i - rho_i) + sum of s_f [a_f rho_f u*_f + (1 - a_f) rho_max u_s,f]
-              + sum of a_f (x_i - x_neighbor),   0 <= x complementary to y >= 0,
+        y_i = room_i + settling_i + sum of s_f q_f + sum of a_f (x_i - x_neighbor),   0 <= x complementary to y >= 0,
+        room_i = max(dx / dt, what flows in) max(capacity_i - rho_i / FULL, 0),
+        settling_i = c (capacity_i - rho_i), within +-(1 - FULL) c,
 
-    whose matrix is symmetric and has no density in it, since it is the momentum rho_f u_f and not the velocity that the pressure's
-    gradient changes. Where a cell has room for what flows in, x = 0: nothing holds liquid together, and walls let go as air does. An
-    over-full cell has y < 0 for x = 0: its x is positive and pushes its excess outward within the step. (To take out a part only seems
-    gentler and is not: with a fifth a step a pool starts to boil within seconds, with all of it it is at rest.)
+    whose matrix is symmetric and has no density in it, since it is the momentum f_f u_f and not the velocity that the pressure's
+    gradient changes. Where a cell has room for what flows in, x = 0: nothing holds liquid together, and walls let go as air does.
 
-    In rho_f u*_f the density is the filled share of the cell that the flow comes from, and no cell gives more than it holds, whatever the
-    Courant number: with the mean of both cells, or without that limit, the front of a block in free flight seems to over-fill the cells
-    ahead and is blown off. What the gradient accelerates is the mean of both.
+    A full cell has no room, whatever it holds and however long the step is, so that its pressure acts in the shortest one. That it comes
+    to the density at rest takes a time of its own: c = sqrt(g dx), the speed of waves on a layer of cells, or dx / dt if that is less. At
+    dx / dt, as room is taken, a short step would throw out what is too much at any speed, and lose the pressure where a little is missing.
+    Too much and too little count alike: where the one acts slowly and the other at once, the uppermost cells fall into the room that was
+    made by pushing, and a pool boils.
 
-    Cells that are open to less than a quarter hold too few particles to tell a density: they take what fits, but give off no excess.
+    In q the share f_f is that of the cell that the flow comes from, and room grows with what flows in, which in a step of many cells is
+    more than fits: a cell that is filled and empties at once has room for all of it. With f_f the mean of both cells, or without that, the
+    front of a block in free flight seems to over-fill the cells ahead and is blown off. What the gradient accelerates is the mean of both.
+
+    Cells that are open to less than a quarter hold too few particles to tell a density: they take what fits, and do not settle.
 
     The density is that of a kernel three cells wide, so that the two layers of cells beneath a surface are not full and carry no pressure
     until they have been compressed a little.
@@ -60,8 +63,8 @@ class UnilateralPressure(PressureProjection):
         weights: of the particles on each component's faces: faces without keep nothing.
         tolerance: relative residual at which a solve is done.
         max_iterations: of the method a solve may take.
-        max_density: rho_max, > 0.
-        coupling: with bodies that the pressure moves, with rho_max as its share; None: there are none.
+        coupling: with bodies that the pressure moves; None: there are none.
+        gravity: its size [m/s^2]; without it nothing settles.
 
     Attributes: as of `PressureProjection`; `kind` says where the level set lies in the liquid.
     """
@@ -76,23 +79,20 @@ class UnilateralPressure(PressureProjection):
         weights: Sequence[wp.array],
         tolerance: float | Literal["auto"],
         max_iterations: int = 100,
-        max_density: float = MAX_DENSITY,
         coupling: BodyCoupling | None = None,
+        gravity: float = 0.0,
     ) -> None:
         """Allocate the fields."""
-        super().__init__(grid, boundary, solver, tolerance=tolerance, max_iterations=max_iterations, coupling=coupling)
-        if max_density <= 0.0:
-            raise ValueError(f"max_density = {max_density}: must be positive")
+        super().__init__(grid, boundary, solver, tolerance=tolerance, max_iterations=max_iterations, coupling=coupling, gravity=gravity)
         self._weights = list(weights)
         self._cells = grid.field(wp.int8)
         wp.copy(self._cells, boundary.base)  # the ring stays as it is
         if boundary.open and self._shift is None:  # pockets between solids that are too full
             self._shift = grid.field()
         setting = kernels.Setting()
-        setting.planes, setting.most = grid.planes, max_density
+        setting.planes = grid.planes
         setting.density, setting.capacity = level_set.density, boundary.capacity
         setting.cells, setting.base = self._cells, boundary.base
-        setting.limit = wp.ones(grid.shape, dtype=wp.float32, device=grid.device)
         self._setting = setting
 
     def prepare(self, velocity: Sequence[wp.array], dt: float, kick_dt: float) -> int:
@@ -105,8 +105,8 @@ class UnilateralPressure(PressureProjection):
         """
         self._begin(kick_dt)
         self._setting.rate = wp.float64(self.grid.spacing / dt)
+        self._setting.settling = min(math.sqrt(self._gravity * self.grid.spacing), self.grid.spacing / dt)
         least = SHIFT if self.boundary.open else 0.0
-        self.grid.domain.launch(kernels.limit_kernel, [self._setting, *three(velocity), *three(self.boundary.open)])
         fields = [self.pressure, self._ratio, least, self._b, self._start, self._shift]
         self.grid.domain.launch(kernels.prepare_kernel, [self._setting, self.kind, *self._sides(velocity), *fields])
         unknowns = self.unknowns()

@@ -9,9 +9,8 @@ from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.contact import HELD, LETS_GO, RELEASED, TOUCHES
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 
-# Of a cell's kernel: where less is open, as in `warp_lcp.grid.level_set`, a particle more or less is not to tell. Such a cell takes what
-# fits, but is not pushed for what it holds too much: kicks of up to 29 m/s threw a pool around a ball about. With 0.5 the pool sank by 4 %.
-LEAST_SHARE = 0.25
+FULL = 0.8  # density, of that at rest, from which a cell counts as full: less than 1 by more than what the sampling makes of it
+LEAST_SHARE = 0.25  # of a cell's kernel: where less is open, as in `warp_lcp.grid.level_set`, a particle more or less is not to tell
 LEAST_DENSITY = 0.1  # of a face: less mass would be thrown about by the pressure of a full cell beside it
 
 _AIR = wp.constant(wp.int8(AIR))
@@ -28,10 +27,9 @@ class Setting:
 
     planes: int
     rate: wp.float64  # dx / dt [m/s]
-    most: float  # largest density, of the density at rest
+    settling: float  # speed at which a full cell comes to the density at rest [m/s], of what it is off by
     density: wp.array3d(dtype=wp.float32)
     capacity: wp.array3d(dtype=wp.float32)
-    limit: wp.array3d(dtype=wp.float32)  # share of its outflow that a cell can give in a step
     cells: wp.array3d(dtype=wp.int8)  # FLUID: an unknown
     base: wp.array3d(dtype=wp.int8)
 
@@ -51,14 +49,14 @@ def open_part(s: Setting, open: _F32, k: int, j: int, i: int, c: int, b: int, a:
 @wp.func
 @typing.no_type_check
 def filled(s: Setting, k: int, j: int, i: int):
-    """Return which share of a cell is filled."""
-    return s.density[k, j, i] / wp.max(s.capacity[k, j, i], LEAST_SHARE)
+    """Return which share of a cell is filled: never more than all of it, whatever it holds."""
+    return wp.min(s.density[k, j, i] / (FULL * wp.max(s.capacity[k, j, i], LEAST_SHARE)), 1.0)
 
 
 @wp.func
 @typing.no_type_check
 def face_density(s: Setting, k: int, j: int, i: int, c: int, b: int, a: int):
-    """Return the density on the face between two cells, of the density at rest."""
+    """Return the density on the face between two cells, of a full cell's."""
     total = float(0.0)
     count = float(0.0)
     if s.base[k, j, i] != _SOLID:
@@ -73,15 +71,15 @@ def face_density(s: Setting, k: int, j: int, i: int, c: int, b: int, a: int):
 @wp.func
 @typing.no_type_check
 def passing(s: Setting, u: _F32, open: _F32, solid: _F32, k: int, j: int, i: int, c: int, b: int, a: int):
-    """Return what passes the lower face of cell (k, j, i) [m/s], in units of the density at rest; solids take the place of full liquid."""
+    """Return what passes the lower face of cell (k, j, i) [m/s], in units of what full cells let pass; solids take their place."""
     part = open_part(s, open, k, j, i, c, b, a)
     flow = part * u[k, j, i]
     if flow > 0.0:
-        flow = flow * filled(s, c, b, a) * s.limit[c, b, a]
+        flow = flow * filled(s, c, b, a)
     elif flow < 0.0:
-        flow = flow * filled(s, k, j, i) * s.limit[k, j, i]
+        flow = flow * filled(s, k, j, i)
     if solid:
-        flow += (1.0 - part) * s.most * solid[k, j, i]
+        flow += (1.0 - part) * solid[k, j, i]
     return wp.float64(flow)
 
 
@@ -91,40 +89,24 @@ def slack(
     s: Setting, u: _F32, v: _F32, w: _F32, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32, solid_y: _F32, solid_z: _F32,
     k: int, j: int, i: int,
 ):  # fmt: skip
-    """Return y of a cell: what it may still take, and what flows out of it [m/s]."""
-    room = s.most * s.capacity[k, j, i] - s.density[k, j, i]
-    if s.capacity[k, j, i] < LEAST_SHARE:
-        room = wp.max(room, 0.0)
-    y = s.rate * wp.float64(room)
-    y += passing(s, u, open_x, solid_x, k, j, i + 1, k, j, i) - passing(s, u, open_x, solid_x, k, j, i, k, j, i - 1)
-    y += passing(s, v, open_y, solid_y, k, j + 1, i, k, j, i) - passing(s, v, open_y, solid_y, k, j, i, k, j - 1, i)
+    """Return y of a cell: what it may still take, what it is off the density at rest, and what flows out of it [m/s]."""
+    left = passing(s, u, open_x, solid_x, k, j, i, k, j, i - 1)
+    right = passing(s, u, open_x, solid_x, k, j, i + 1, k, j, i)
+    low = passing(s, v, open_y, solid_y, k, j, i, k, j - 1, i)
+    high = passing(s, v, open_y, solid_y, k, j + 1, i, k, j, i)
+    zero = wp.float64(0.0)
+    inward = wp.max(left, zero) - wp.min(right, zero) + wp.max(low, zero) - wp.min(high, zero)
+    y = right - left + high - low
     if s.planes == 2:
-        y += passing(s, w, open_z, solid_z, k + 1, j, i, k, j, i) - passing(s, w, open_z, solid_z, k, j, i, k - 1, j, i)
+        back = passing(s, w, open_z, solid_z, k, j, i, k - 1, j, i)
+        front = passing(s, w, open_z, solid_z, k + 1, j, i, k, j, i)
+        inward += wp.max(back, zero) - wp.min(front, zero)
+        y += front - back
+    capacity = s.capacity[k, j, i]
+    y += wp.max(s.rate, inward) * wp.float64(wp.max(capacity - s.density[k, j, i] / FULL, 0.0))
+    if capacity >= LEAST_SHARE:
+        y += wp.float64(s.settling * wp.clamp(capacity - s.density[k, j, i], FULL - 1.0, 1.0 - FULL))
     return y
-
-
-@wp.func
-@typing.no_type_check
-def leaving(s: Setting, u: _F32, open: _F32, outward: float, k: int, j: int, i: int, c: int, b: int, a: int):
-    """Return the speed at which a face takes liquid out of the cell that it is the upper (`outward` 1) or lower (-1) face of [m/s]."""
-    return wp.max(outward * open_part(s, open, k, j, i, c, b, a) * u[k, j, i], 0.0)
-
-
-@wp.kernel(**options)
-@typing.no_type_check
-def limit_kernel(cells: CellRange, s: Setting, u: _F32, v: _F32, w: _F32, open_x: _F32, open_y: _F32, open_z: _F32):
-    """Find the share of its outflow that each cell can give: all of it while that is no more than what it holds."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        out = leaving(s, u, open_x, 1.0, k, j, i + 1, k, j, i) + leaving(s, u, open_x, -1.0, k, j, i, k, j, i - 1)
-        out += leaving(s, v, open_y, 1.0, k, j + 1, i, k, j, i) + leaving(s, v, open_y, -1.0, k, j, i, k, j - 1, i)
-        if s.planes == 2:
-            out += leaving(s, w, open_z, 1.0, k + 1, j, i, k, j, i) + leaving(s, w, open_z, -1.0, k, j, i, k - 1, j, i)
-        rate = wp.float32(s.rate)
-        s.limit[k, j, i] = rate / wp.max(out, rate)
 
 
 @wp.kernel(**options)
@@ -187,9 +169,7 @@ def push_kernel(cells: CellRange, s: Setting, axis: int, x: _F64, open: _F32, we
                 # a source's cells are no unknowns, and their faces' velocities are given
                 if s.cells[k, j, i] != _SOLID and s.cells[c, b, a] != _SOLID:
                     change = x[k, j, i] - x[c, b, a]
-                    u = field[k, j, i]
-                    limit = wp.where(u > 0.0, s.limit[c, b, a], s.limit[k, j, i])
-                    field[k, j, i] = u - wp.float32(change) / (limit * face_density(s, k, j, i, c, b, a))
+                    field[k, j, i] -= wp.float32(change) / face_density(s, k, j, i, c, b, a)
         elif not open:
             if s.base[k, j, i] == _SOLID and s.base[c, b, a] == _SOLID:
                 mark = -1

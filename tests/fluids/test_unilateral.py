@@ -49,36 +49,45 @@ def test_the_solution_satisfies_the_law_written_face_by_face() -> None:
     rho = wy.T @ wx / 4
     share = np.array([5 / 6] + [1.0] * 14 + [5 / 6])
     capacity = np.outer(share, share)
-    full = rho / np.maximum(capacity, 0.25)
+    full = np.minimum(rho / (0.8 * np.maximum(capacity, 0.25)), 1.0)
     u, v = u[1:-1, 1:18].copy(), v[1:18, 1:-1].copy()
     u[:, [0, -1]] = 0.0
     v[[0, -1]] = 0.0
-    out = np.maximum(u[:, 1:], 0) + np.maximum(-u[:, :-1], 0) + np.maximum(v[1:], 0) + np.maximum(-v[:-1], 0)
-    gives = full * np.minimum(1.0, 1.0 / np.maximum(out * dt / dx, 1e-30))
     flow_x, flow_y = np.zeros_like(u), np.zeros_like(v)
-    flow_x[:, 1:-1] = np.where(u[:, 1:-1] > 0, gives[:, :-1], gives[:, 1:]) * u[:, 1:-1] - (p[:, 1:] - p[:, :-1])
-    flow_y[1:-1] = np.where(v[1:-1] > 0, gives[:-1], gives[1:]) * v[1:-1] - (p[1:] - p[:-1])
-    after = rho - dt / dx * (flow_x[:, 1:] - flow_x[:, :-1] + flow_y[1:] - flow_y[:-1])
-    room = capacity - after
+    flow_x[:, 1:-1] = np.where(u[:, 1:-1] > 0, full[:, :-1], full[:, 1:]) * u[:, 1:-1]
+    flow_y[1:-1] = np.where(v[1:-1] > 0, full[:-1], full[1:]) * v[1:-1]
+    inward = np.maximum(flow_x[:, :-1], 0) - np.minimum(flow_x[:, 1:], 0) + np.maximum(flow_y[:-1], 0) - np.minimum(flow_y[1:], 0)
+    flow_x[:, 1:-1] -= p[:, 1:] - p[:, :-1]
+    flow_y[1:-1] -= p[1:] - p[:-1]
+    out = flow_x[:, 1:] - flow_x[:, :-1] + flow_y[1:] - flow_y[:-1]
+    room = np.maximum(dx / dt, inward) * np.maximum(capacity - rho / 0.8, 0.0)
+    settling = np.sqrt(GRAVITY * dx) * np.clip(capacity - rho, -0.2, 0.2)
+    y = room + settling + out
     assert (p >= 0).all()
     assert 20 < (p > 0).sum() < 200
-    assert room.min() > -1e-4
-    assert np.abs(room[p > 0]).max() < 1e-4
-    assert after.sum() == pytest.approx(rho.sum())
+    assert y.min() > -1e-3
+    assert np.abs(y[p > 0]).max() < 1e-3
+    assert np.abs(out.sum()) < 1e-9
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_an_over_full_cell_pushes_outward_and_keeps_momentum(dimension: int) -> None:
+def test_what_is_too_dense_flies_as_it_is_and_settles_slowly(dimension: int) -> None:
+    """Without gravity crowding is no velocity; with it a cell twice as full expands by at most a fifth of sqrt(g dx), whatever dt is."""
     low, high = [0.375] * dimension, [0.625] * dimension
-    simulation = liquid([1.0] * dimension, [box(low, high)], 8, physics={"gravity": [0.0] * dimension})
-    simulation.particles.append(np.tile(simulation.particles.position.numpy(), (2, 1)), np.zeros((2 * simulation.particles.count, 3)))
-    center = simulation.particles.position.numpy().mean(axis=0)
-    simulation.step(0.01)
-    assert simulation.projection.pressure.numpy().max() > 0.0
-    outward = simulation.particles.position.numpy() - center
-    velocity = simulation.particles.velocity.numpy()
-    assert ((outward * velocity).sum(axis=1) > 0.0).mean() > 0.99
-    np.testing.assert_allclose(velocity.mean(axis=0), 0.0, atol=0.02 * np.abs(velocity).max())
+    for g, dt in ((0.0, 0.01), (GRAVITY, 1e-5)):
+        simulation = liquid([1.0] * dimension, [box(low, high)], 8, physics={"gravity": [0.0, -g, 0.0][:dimension]})
+        simulation.particles.append(np.tile(simulation.particles.position.numpy(), (2, 1)), np.zeros((2 * simulation.particles.count, 3)))
+        simulation.particles.sort()
+        center = simulation.particles.position.numpy().mean(axis=0)
+        simulation.step(dt)
+        outward, velocity = simulation.particles.position.numpy() - center, simulation.particles.velocity.numpy()
+        fastest = np.abs(velocity).max()
+        if g == 0.0:
+            assert fastest == 0.0
+        else:
+            assert 0.1 < fastest / (0.2 * np.sqrt(g / 8)) < 2.0  # two cells, one on each side
+            assert ((outward * velocity).sum(axis=1) > 0.0).mean() > 0.99
+            np.testing.assert_allclose(velocity.mean(axis=0), 0.0, atol=0.02 * fastest)
 
 
 def test_cells_with_room_have_no_pressure_and_spray_is_ballistic() -> None:
@@ -106,7 +115,7 @@ def test_a_falling_block_is_ballistic(dimension: int, cfl: float) -> None:
     velocity = simulation.particles.velocity.numpy().astype(np.float64)
     expected = [0.5, -(0.2 - 0.5 * simulation.last_dt) * GRAVITY, 0.0]
     np.testing.assert_allclose(velocity.mean(axis=0), expected, atol=2e-3)
-    assert np.abs(velocity - expected).max() < 0.05  # 2 % of the speed: the jitter's densest cells
+    assert np.abs(velocity - expected).max() < 0.06  # 3 % of the speed: the jitter's densest cells settle
     assert np.abs(velocity - expected).std() < 0.01
 
 
@@ -117,13 +126,13 @@ def test_a_pool_holds_itself(dimension: int, cut: bool) -> None:
     tables = {"solid": [ball]} if cut else {}
     simulation = liquid([0.5, 1.0, 0.25][:dimension], [box([0.0] * dimension, [0.5, 0.5, 0.25][:dimension])], **tables)
     height = simulation.particles.totals().center[1]
-    rows = advance(simulation, 1.0)
+    rows = advance(simulation, 1.0, 0.01)
     assert rows[-1]["volume"] == pytest.approx(rows[0]["volume"], rel=0.02)
     assert rows[-1]["center_of_mass_y"] == pytest.approx(height, rel=0.01)
     assert rows[-1]["kinetic_energy"] < 1e-3 * rows[-1]["potential_energy"]
     p = simulation.grid.interior(simulation.projection.pressures(1000.0))[..., 0].mean(axis=0)
     depth = 0.5 - (np.arange(32) + 0.5) / 32
-    np.testing.assert_allclose(p[:14] / (1000.0 * GRAVITY), depth[:14], atol=0.01)
+    np.testing.assert_allclose(p[:14] / (1000.0 * GRAVITY), depth[:14], atol=0.45 / 32)  # the surface is known to half a cell
     assert not p[17:].any()
 
 
@@ -151,7 +160,7 @@ def test_a_collision_conserves_volume_and_momentum() -> None:
         {"shape": "sphere", "center": [0.3, 0.5], "radius": 0.12, "velocity": [2.0, 0.0]},
         {"shape": "sphere", "center": [0.7, 0.5], "radius": 0.12, "velocity": [-2.0, 0.0]},
     ]
-    simulation = liquid([1.0, 1.0], drops, 48, physics={"gravity": [0.0, 0.0]}, cfl=1.0)
+    simulation = liquid([1.0, 1.0], drops, 48, physics={"gravity": [0.0, 0.0]}, cfl=1.0, density_correction={})
     rows = advance(simulation, 0.12)
     velocity = simulation.particles.velocity.numpy()
     assert np.abs(velocity[:, 0]).mean() < 1.2  # they have met
