@@ -95,6 +95,11 @@ class LiquidScene(ParticleScene):
         return [*found, *super().models()]
 
     @property
+    def keeps_volume(self) -> bool:
+        """Return whether the liquid neither grows nor shrinks inside; the unilateral model lets it come apart anywhere."""
+        return self.pressure.model == "incompressible"
+
+    @property
     def stays_full(self) -> bool:
         """Return whether liquid fills the domain but for solids that stand still, so that there never is a surface."""
         openings = self.domain.open or self.source or self.drain or any(solid.moves for solid in self.solid)

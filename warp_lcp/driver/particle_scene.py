@@ -12,10 +12,12 @@ from pydantic import Field
 
 from warp_lcp.driver.models import Model, model_lines, prices
 from warp_lcp.driver.particle_volume import VOLUME_BYTES
+from warp_lcp.driver.presets import preset_values
 from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.shapes import BODY_FRICTION, STICKS, Drain, MaterialProperties, Source
 from warp_lcp.driver.table import Complaint, Table
 from warp_lcp.grid.surface_mesh import MESH_LATTICE_BYTES, MESH_POINT_BYTES, MESH_SOLID_BYTES
+from warp_lcp.material.density_correction import CROWDED
 
 # Measured at 96^3 as the growth of a process on the CPU, first step included.
 GRID_BYTES = 36  # fields of the grid, a cell
@@ -64,9 +66,9 @@ class ParticleSettings(Table):
 
 
 class DensityCorrectionSettings(Table):
-    """[density_correction]: moves particles apart where they have come too close; off unless the table is there."""
+    """[density_correction]: moves particles apart where they have come too close; without the table as soon as a thousandth is too much."""
 
-    every: int = Field(default=1, ge=1, description="steps from one correction to the next")
+    every: int = Field(default=1, ge=0, description="steps from one correction to the next; 0 switches it off")
     tolerance: float = Field(default=1e-2, gt=0, lt=1, description="the relative residual to reach")
     max_density: float | None = Field(
         default=None, gt=0, le=2, description="of a cell, in units of the density at rest; 1 + 0.1 / particles.per_axis unless given"
@@ -106,7 +108,7 @@ class ParticleScene(Scene):
             "moving solids": _solids(moving, "moves") if moving else "",
             "rigid bodies": _solids(bodies, "has a mass") if bodies else "",
             "FLIP": 'particles.transfer = "flip"' if settings.transfer == "flip" else "",
-            "density correction": "[density_correction]" if self.density_correction is not None else "",
+            "density correction": "[density_correction]" if self.density_correction is not None and self.correction is not None else "",
             "reseeding": "[particles.reseed]" if settings.reseed is not None else "",
             "narrow band": "[particles.narrow_band]" if settings.narrow_band is not None else "",
             "sources": "[[source]]" if self.source else "",
@@ -116,6 +118,26 @@ class ParticleScene(Scene):
             "diagnostics": "output.diagnostics" if output.diagnostics else "",
         }
         return [Model(name, why, count=len(bodies) if name == "rigid bodies" else 1) for name, why in used.items() if why]
+
+    @property
+    def correction(self) -> DensityCorrectionSettings | None:
+        """Return how particles are moved apart, with or without the table, which a preset's values stand in for; None: they never are."""
+        given = self.density_correction
+        if given is None:
+            if self.endless or self.stays_full:
+                return None
+            given = DensityCorrectionSettings(**preset_values(self, "density_correction"))
+        return given if given.every else None
+
+    @property
+    def keeps_volume(self) -> bool:
+        """Return whether the density correction closes voids inside the material too."""
+        return False
+
+    @property
+    def stays_full(self) -> bool:
+        """Return whether the material fills the domain for ever."""
+        return False
 
     @property
     def endless(self) -> tuple[int, ...]:
@@ -209,13 +231,16 @@ class ParticleScene(Scene):
 
     def _rearrangement(self) -> list[tuple[str, str]]:
         """Return what moves particles apart from the flow."""
-        lines, correction, reseed = [], self.density_correction, self.particles.reseed
+        lines, correction, reseed = [], self.correction, self.particles.reseed
         band = self.particles.narrow_band
         if band is not None:
             lines.append(("narrow band", f"particles within {band.width:g} cells of the surface, the grid carries the rest"))
         if correction is not None:
             most = correction.largest(self.particles.per_axis)
-            lines.append(("density", f"at most {most:.4g} of that at rest, corrected {_steps(correction.every)}"))
+            when = _steps(correction.every) + (
+                "" if self.density_correction else f" in which more than {CROWDED:.1%} of the material is beyond"
+            )
+            lines.append(("density", f"at most {most:.4g} of that at rest, corrected {when}"))
         if reseed is not None:
             least, many = self.particles.reseed_range(self.dimension)
             lines.append(("reseeding", f"{least} to {many} particles a cell, {_steps(reseed.every)}"))
@@ -230,7 +255,7 @@ class ParticleScene(Scene):
             "grid": cells * (GRID_BYTES + 4 * self.dimension * (settings.transfer == "flip")),
             **self.own_memory_parts(),
             "solids": cells * (CUT_BYTES * cut + MOVING_BYTES * moving),
-            "density correction": cells * (CORRECTION_BYTES + CUT_CORRECTION_BYTES * cut) * (self.density_correction is not None),
+            "density correction": cells * (CORRECTION_BYTES + CUT_CORRECTION_BYTES * cut) * (self.correction is not None),
             "reseeding": cells * RESEED_BYTES * (settings.reseed is not None),
             "narrow band": cells * BAND_BYTES * (settings.narrow_band is not None),
             "sources": cells * SOURCE_BYTES * bool(self.source),
