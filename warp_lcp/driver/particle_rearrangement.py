@@ -14,7 +14,7 @@ from warp_lcp.grid.level_set import Fill
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary
-from warp_lcp.material.density_correction import CROWDED, DensityCorrection
+from warp_lcp.material.density_correction import DensityCorrection
 
 CORRECTION_COLUMNS = ("density_status", "density_iterations", "max_density")
 STATE = "density_correction"
@@ -23,8 +23,8 @@ STATE = "density_correction"
 class Rearrangement:
     """Even out a material's particles and move them apart, when it is time.
 
-    Without the table [density_correction] a correction acts in the steps that begin with more than `CROWDED` of the material beyond what
-    cells may hold. That is told from the particles' density at the start of the step, which liquid's surface and sand's packing have found
+    Without the table [density_correction] a correction acts in the steps that begin with more of the material beyond what cells may
+    hold than `ParticleScene.most_crowded`. That is told from the particles' density at the start of the step, which liquid's surface and sand's packing have found
     for themselves: whether it acts depends on where particles are, and on nothing that a checkpoint would have to keep. Its fields are made
     when it acts first.
 
@@ -104,7 +104,7 @@ class Rearrangement:
 
     def _parts(self, step: int) -> bool:
         if self.crowding is not None:
-            return self._crowded is not None and self._crowded[0] > CROWDED
+            return self._crowded is not None and self._crowded[0] > self._scene.most_crowded
         return self.correction is not None and step % self.correction.every == 0
 
     def columns(self) -> tuple[str, ...]:

@@ -17,7 +17,6 @@ from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.shapes import BODY_FRICTION, STICKS, Drain, MaterialProperties, Source
 from warp_lcp.driver.table import Complaint, Table
 from warp_lcp.grid.surface_mesh import MESH_LATTICE_BYTES, MESH_POINT_BYTES, MESH_SOLID_BYTES
-from warp_lcp.material.density_correction import CROWDED
 
 # Measured at 96^3 as the growth of a process on the CPU, first step included.
 GRID_BYTES = 36  # fields of the grid, a cell
@@ -25,6 +24,7 @@ CUT_BYTES = 45
 MOVING_BYTES = 30
 SOURCE_BYTES = 8
 CORRECTION_BYTES, CUT_CORRECTION_BYTES = 54, 22  # the density correction's fields and method, and more where cells are cut
+EVEN_BYTES = 9  # and more where it closes voids
 RESEED_BYTES = 13
 BAND_BYTES = 24
 SPREAD = 2.0  # how much a narrow band may grow as its surface does: 1.3 times in a double dam break, 1.7 in a dam break in 3-D
@@ -66,7 +66,7 @@ class ParticleSettings(Table):
 
 
 class DensityCorrectionSettings(Table):
-    """[density_correction]: moves particles apart where they have come too close; without the table as soon as a thousandth is too much."""
+    """[density_correction]: moves particles apart where they have come too close; without the table where a thousandth of the material crowds."""
 
     every: int = Field(default=1, ge=0, description="steps from one correction to the next; 0 switches it off")
     tolerance: float = Field(default=1e-2, gt=0, lt=1, description="the relative residual to reach")
@@ -87,6 +87,7 @@ class ParticleScene(Scene):
 
     solve_bytes: ClassVar[int] = 0  # a cell, of the fields of the solve that are there before the particles are made
     correction_gain: ClassVar[float] = 1.0  # of the density correction
+    crowded: ClassVar[float] = 2e-3  # of the material, over particles.per_axis: a pool at rest has 1e-3 / 3e-5 at 1 / 2, splashed 1e-2
     carried_by_grid: ClassVar[bool] = False  # whether the grid can carry the material without particles
 
     particles: ParticleSettings = Field(default_factory=ParticleSettings)
@@ -128,6 +129,11 @@ class ParticleScene(Scene):
                 return None
             given = DensityCorrectionSettings(**preset_values(self, "density_correction"))
         return given if given.every else None
+
+    @property
+    def most_crowded(self) -> float:
+        """Return which share of the material may be beyond what cells hold before it is moved apart where the scene does not say when."""
+        return self.crowded / self.particles.per_axis
 
     @property
     def keeps_volume(self) -> bool:
@@ -236,10 +242,9 @@ class ParticleScene(Scene):
         if band is not None:
             lines.append(("narrow band", f"particles within {band.width:g} cells of the surface, the grid carries the rest"))
         if correction is not None:
-            most = correction.largest(self.particles.per_axis)
-            when = _steps(correction.every) + (
-                "" if self.density_correction else f" in which more than {CROWDED:.1%} of the material is beyond"
-            )
+            most, when = correction.largest(self.particles.per_axis), _steps(correction.every)
+            if self.density_correction is None:
+                when += f" that starts with more than {100.0 * self.most_crowded:.2g} % beyond it"
             lines.append(("density", f"at most {most:.4g} of that at rest, corrected {when}"))
         if reseed is not None:
             least, many = self.particles.reseed_range(self.dimension)
@@ -251,11 +256,12 @@ class ParticleScene(Scene):
         cells, settings, cut = self.counted_cells, self.particles, self.cuts_cells
         moving = any(solid.moves for solid in self.solid)
         vectors = 3 + (self.dimension if settings.transfer == "apic" else 0)
+        correction = CORRECTION_BYTES + CUT_CORRECTION_BYTES * cut + EVEN_BYTES * self.keeps_volume
         parts = {
             "grid": cells * (GRID_BYTES + 4 * self.dimension * (settings.transfer == "flip")),
             **self.own_memory_parts(),
             "solids": cells * (CUT_BYTES * cut + MOVING_BYTES * moving),
-            "density correction": cells * (CORRECTION_BYTES + CUT_CORRECTION_BYTES * cut) * (self.correction is not None),
+            "density correction": cells * correction * (self.correction is not None),
             "reseeding": cells * RESEED_BYTES * (settings.reseed is not None),
             "narrow band": cells * BAND_BYTES * (settings.narrow_band is not None),
             "sources": cells * SOURCE_BYTES * bool(self.source),

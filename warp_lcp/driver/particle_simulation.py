@@ -367,6 +367,7 @@ class ParticleSimulation(ABC):
         Raises:
             ValueError: the arrays do not belong to this scene.
         """
+        self.rearrangement.expect(state)
         expected, state = self.state(), {"last_dt": np.array(0.0), **state}  # older states have velocities of their own time
         missing = sorted(expected.keys() - state.keys())
         if missing:

@@ -18,7 +18,6 @@ from warp_lcp.operators.grid_poisson import SOLID
 from warp_lcp.vectors import convert
 
 LONGEST = 0.5  # cells that a correction moves a particle at most
-CROWDED = 1e-3  # of the material beyond what cells may hold: a pool at rest has at most 1e-4, one that has splashed 1e-2
 EXCESS = 1e-3  # of a cell, root mean square over the over-full cells, that is not worth a solve
 SHIFT = 1e-5  # of the diagonal: gives closed pockets a solution, and leaves 0.5 % of what is too much 45 cells deep
 
