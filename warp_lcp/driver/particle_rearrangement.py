@@ -23,10 +23,10 @@ STATE = "density_correction"
 class Rearrangement:
     """Even out a material's particles and move them apart, when it is time.
 
-    Without the table [density_correction] a correction acts in the steps that begin with more of the material beyond what cells may
-    hold than `ParticleScene.most_crowded`. That is told from the particles' density at the start of the step, which liquid's surface and sand's packing have found
-    for themselves: whether it acts depends on where particles are, and on nothing that a checkpoint would have to keep. Its fields are made
-    when it acts first.
+    Without the table [density_correction] a correction acts in the steps that begin with a share of the material beyond what cells may
+    hold that is larger than `ParticleScene.most_crowded`. It is told from the particles' density at the start of the step, which liquid's
+    surface and sand's packing have found for themselves: whether a step acts depends on where particles are, and on nothing that a
+    checkpoint would have to keep. The correction's fields are made when it acts first.
 
     Args:
         scene: what asks for it.
@@ -44,7 +44,9 @@ class Rearrangement:
         self._scene, self._grid, self._boundary = scene, grid, boundary
         self.reseeding, self.crowding = make_reseeding(scene, grid, boundary), make_crowding(scene, grid, boundary)
         self.correction: DensityCorrection | None = None
-        if scene.density_correction is not None and scene.correction is not None:
+        settings = scene.correction
+        self._every, self._most = settings.every if settings is not None else 0, scene.most_crowded
+        if scene.density_correction is not None and settings is not None:
             self.correction = self._made()
         self._crowded: tuple[float, float] | None = None  # share and largest density at the start of the step
 
@@ -57,8 +59,7 @@ class Rearrangement:
             particles: the material.
         """
         self._crowded = None
-        settings = self._scene.correction
-        if self.crowding is not None and settings is not None and step % settings.every == 0:
+        if self.crowding is not None and step % self._every == 0:
             self._crowded = self.crowding.measure(density, particles, self._grid.everywhere)
 
     @property
@@ -104,7 +105,7 @@ class Rearrangement:
 
     def _parts(self, step: int) -> bool:
         if self.crowding is not None:
-            return self._crowded is not None and self._crowded[0] > self._scene.most_crowded
+            return self._crowded is not None and self._crowded[0] > self._most
         return self.correction is not None and step % self.correction.every == 0
 
     def columns(self) -> tuple[str, ...]:

@@ -66,7 +66,7 @@ class ParticleSettings(Table):
 
 
 class DensityCorrectionSettings(Table):
-    """[density_correction]: moves particles apart where they have come too close; without the table where a thousandth of the material crowds."""
+    """[density_correction]: moves particles apart that have come too close; without the table as soon as a thousandth crowds."""
 
     every: int = Field(default=1, ge=0, description="steps from one correction to the next; 0 switches it off")
     tolerance: float = Field(default=1e-2, gt=0, lt=1, description="the relative residual to reach")
