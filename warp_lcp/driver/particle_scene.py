@@ -244,7 +244,7 @@ class ParticleScene(Scene):
         if correction is not None:
             most, when = correction.largest(self.particles.per_axis), _steps(correction.every)
             if self.density_correction is None:
-                when += f" that starts with more than {100.0 * self.most_crowded:.2g} % beyond it"
+                when += f" if more than {100.0 * self.most_crowded:.2g} % is beyond it"
             lines.append(("density", f"at most {most:.4g} of that at rest, corrected {when}"))
         if reseed is not None:
             least, many = self.particles.reseed_range(self.dimension)
