@@ -96,8 +96,8 @@ class LiquidScene(ParticleScene):
 
     @property
     def keeps_volume(self) -> bool:
-        """Return whether the liquid neither grows nor shrinks inside; the unilateral model lets it come apart anywhere."""
-        return self.pressure.model == "incompressible"
+        """Return whether voids inside are closed: the unilateral model lets liquid come apart, a band knows its interior to a tenth."""
+        return self.pressure.model == "incompressible" and self.particles.narrow_band is None
 
     @property
     def stays_full(self) -> bool:
