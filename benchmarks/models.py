@@ -96,6 +96,7 @@ def reference(simulator: str, dimension: int, tables: Tables, size: int) -> Scen
         "time": {"duration": 10.0},
         "domain": {"size": [1.0, 0.5, 0.5][:dimension], "resolution": size},
         "output": QUIET,
+        "density_correction": {"every": 0},
     }
     if simulator == "fluids":
         scene["domain"]["wall"] = "free-slip"

@@ -95,6 +95,11 @@ class LiquidScene(ParticleScene):
         return [*found, *super().models()]
 
     @property
+    def keeps_volume(self) -> bool:
+        """Return whether voids inside are closed: the unilateral model lets liquid come apart, a band knows its interior to a tenth."""
+        return self.pressure.model == "incompressible" and self.particles.narrow_band is None
+
+    @property
     def stays_full(self) -> bool:
         """Return whether liquid fills the domain but for solids that stand still, so that there never is a surface."""
         openings = self.domain.open or self.source or self.drain or any(solid.moves for solid in self.solid)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
+import warp as wp
 
 import warp_lcp as wl
 from fluids.assembly import make_pressure, make_surface
@@ -144,6 +145,14 @@ class LiquidSimulation(ParticleSimulation):
         with self.watch.stage("diagnostics", self.projection.kind):
             volume = self.surface.volume(projected.unknowns)
         return {"max_divergence": projected.max_outflow / self.grid.spacing, "volume": volume}
+
+    def known_density(self) -> wp.array | None:
+        """Return the density that the surface lies in, if it is made of one."""
+        return self.surface.density
+
+    def known_contact(self) -> wp.array | None:
+        """Return where walls held the liquid and where they let go."""
+        return self.projection.contact
 
     def own_columns(self) -> tuple[str, ...]:
         """Return the names of the pressure's columns and the volume's.

@@ -25,9 +25,11 @@ class FreeSurface(Protocol):
 
     Attributes:
         phi: float32 distance to the surface at cell centers [cells], < 0 in liquid; None: the surface lies on the cells' faces.
+        density: of the particles when it was last marked, in units of that at rest, float32; None: nothing needed it.
     """
 
     phi: wp.array | None
+    density: wp.array | None
 
     def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
         """Write the cells' kinds.
@@ -57,6 +59,7 @@ class WholeCellSurface:
         """Make a level set if cells are cut; `fill` adds to its density what no particle stands for."""
         self.grid, self.boundary, self._fill = grid, boundary, fill
         self._level_set = LevelSet(grid, particles_a_cell=particles_a_cell) if boundary.open else None
+        self.density = self._level_set.density if self._level_set is not None else None
 
     def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
         """Write the cells' kinds."""
@@ -79,7 +82,7 @@ class WholeCellSurface:
 class NoSurface:
     """Every open cell is liquid, and stays so: a closed box full of it has no surface, whatever was asked for."""
 
-    phi = None
+    phi = density = None
 
     def __init__(self, grid: StaggeredGrid, boundary: Boundary, counted: Window | None = None) -> None:
         """Find the cells, and the volume of those in a window, of all if None."""
@@ -122,6 +125,7 @@ class GhostFluidSurface:
         self.grid, self.boundary, self._fill = grid, boundary, fill
         self.level_set = LevelSet(grid, particles_a_cell=particles_a_cell, smoothing=smoothing)
         self.phi: wp.array | None = self.level_set.phi
+        self.density: wp.array | None = self.level_set.density
         self._window = grid.everywhere
 
     def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:

@@ -169,6 +169,7 @@ class SandScene(ParticleScene):
     elsewhere: ClassVar = {"liquid": "fluids", "pressure": "fluids"}
     palette: ClassVar = "sand"
     solve_bytes: ClassVar[int] = STRESS_BYTES[3]
+    crowded: ClassVar[float] = 4e-4  # sand at rest has 1e-5, and what crowds is not pushed apart by its pressure
     correction_gain: ClassVar[float] = 4.0  # leaves at most 1.1 of the densest nearly everywhere; 1 leaves 1.27
 
     time: SandTime

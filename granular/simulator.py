@@ -173,6 +173,10 @@ class SandSimulation(ParticleSimulation):
         scale = self.scene.physics.density * self.grid.cell_volume
         return {"yielded": report.yielded, "dissipation": report.dissipation * scale, "predicted_excess": report.predicted}
 
+    def known_density(self) -> wp.array | None:
+        """Return the density that the packing is made of."""
+        return self.density
+
     def own_columns(self) -> tuple[str, ...]:
         """Return the names of the columns of the stresses and of the sand's shape.
 

@@ -42,7 +42,7 @@ def trial(cells: int, device: str = "cpu", duration: float = DURATION) -> Trial:
         found.add("densest cell of any step, corrected", max(densest), high=DENSEST)
         found.add("95th percentile over steps: densest cell, corrected", float(np.percentile(densest, 95.0)), high=DENSEST)
         found.curves["with density correction"] = ([row["time"] for row in rows], densest)
-        loose = list(steps(column(ASPECT, cells, length=LENGTH, device=device, density_correction=None), duration))
+        loose = list(steps(column(ASPECT, cells, length=LENGTH, device=device, density_correction={"every": 0}), duration))
         densest = [row["max_fraction"] for row in loose]
         found.must_break("no correction: densest cell of any step", max(densest), high=DENSEST)
         found.curves["without"] = ([row["time"] for row in loose], densest)

@@ -58,7 +58,10 @@ def test_the_plan_counts_particles() -> None:
 
 
 def test_the_plan_says_what_moves_particles_apart() -> None:
-    assert not {"density", "reseeding"} & dict(small().plan()).keys()
+    assert not {"density", "reseeding"} & dict(small(density_correction={"every": 0}).plan()).keys()
+    assert dict(small().plan())["density"] == "at most 1.05 of that at rest, corrected every step if more than 0.1 % is beyond it"
+    rare = dict(small(particles={"per_axis": 4}, solver={"preset": "preview"}).plan())["density"]
+    assert rare == "at most 1.025 of that at rest, corrected every 2 steps if more than 0.05 % is beyond it"
     plan = dict(small(density_correction={"every": 2}, particles={"per_axis": 3, "reseed": {"every": 1}}).plan())
     assert plan["density"] == "at most 1.033 of that at rest, corrected every 2 steps"
     assert plan["reseeding"] == "4 to 18 particles a cell, every step"
@@ -70,9 +73,11 @@ def test_the_estimate_of_memory_counts_what_the_options_add() -> None:
     voxel = {"solids": "voxel", "pressure": {"surface": "voxel"}}
     options = [voxel, {"solids": "voxel"}, {"solids": "voxel", "pressure": {"smoothing": 1}}, {}, {"solid": [moving]}]
     options += [{"solid": [moving], "density_correction": {}, "particles": more} for more in ({}, {"reseed": {}})]
+    off = {"density_correction": {"every": 0}}
     size = {"size": [1.0, 0.5], "resolution": 1000, "liquid": [box([0.0, 0.0], [0.1, 0.1])]}
-    sizes = [scene(**size, **({"solid": [ball]} | tables)).memory_estimate() for tables in options]
+    sizes = [scene(**size, **({"solid": [ball]} | off | tables)).memory_estimate() for tables in options]
     assert sizes == sorted(set(sizes))
+    assert scene(**size, solid=[moving]).memory_estimate() == sizes[-2]  # it may act by itself
     assert 100 * 2**20 < sizes[0] < 400 * 2**20  # measured: about 160 MB
 
 

@@ -117,7 +117,7 @@ def test_runs_are_repeatable() -> None:
 
 
 def test_only_a_scene_that_asks_for_it_has_one() -> None:
-    assert dam().reseeding is None
+    assert dam().rearrangement.reseeding is None
     assert "reseeded" not in dam().columns()
     simulation = dam(particles={"reseed": {"every": 4}})
     rows = advance(simulation, 0.3)

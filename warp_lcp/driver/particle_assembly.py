@@ -22,7 +22,7 @@ from warp_lcp.grid.surface_mesh import Obstacles, SurfaceMesh
 from warp_lcp.grid.voxelize import PlacedSolid, inside, placement_notes, voxelize
 from warp_lcp.material.boundary import Boundary, WholeCells
 from warp_lcp.material.cut_boundary import CutBoundary
-from warp_lcp.material.density_correction import DensityCorrection
+from warp_lcp.material.density_correction import Crowding, DensityCorrection
 from warp_lcp.material.narrow_band import NarrowBand
 from warp_lcp.material.outlets import Drain, Outlets
 from warp_lcp.material.reseeding import Reseeding
@@ -270,18 +270,30 @@ def make_reseeding(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary
     return Reseeding(grid, boundary, least=least, most=most, particles_a_cell=at_rest, every=settings.every)
 
 
-def make_density_correction(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> DensityCorrection | None:
-    """Return the density correction if a scene asks for one."""
-    settings = scene.density_correction
+def make_density_correction(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> DensityCorrection:
+    """Return what moves the particles of a scene apart.
+
+    Raises:
+        ValueError: the scene has none.
+    """
+    settings = scene.correction
     if settings is None:
-        return None
-    count = scene.particles.per_axis
-    most = settings.largest(count)
+        raise ValueError("density_correction.every = 0: must be at least 1")
     solver = wl.ProjectedMultigrid(precision=scene.solver.precision)
     return DensityCorrection(
-        grid, boundary, solver, particles_a_cell=count**grid.dimension, max_density=most, every=settings.every,
-        gain=scene.correction_gain, tolerance=settings.tolerance,
+        grid, boundary, solver, particles_a_cell=scene.particles.per_axis**grid.dimension,
+        max_density=settings.largest(scene.particles.per_axis), every=settings.every, gain=scene.correction_gain, even=scene.keeps_volume,
+        tolerance=settings.tolerance,
     )  # fmt: skip
+
+
+def make_crowding(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> Crowding | None:
+    """Return what tells when the particles of a scene are to be moved apart; None: the scene says so itself, or they never are."""
+    settings = scene.correction
+    if scene.density_correction is not None or settings is None or grid.whole is not None:
+        return None
+    count = scene.particles.per_axis
+    return Crowding(grid, boundary, particles_a_cell=count**grid.dimension, max_density=settings.largest(count))
 
 
 def _body(solid: SolidProperties, geometry: Geometry, name: str, friction: float, dimension: int) -> RigidBody:

@@ -12,6 +12,7 @@ from pydantic import Field
 
 from warp_lcp.driver.models import Model, model_lines, prices
 from warp_lcp.driver.particle_volume import VOLUME_BYTES
+from warp_lcp.driver.presets import preset_values
 from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.shapes import BODY_FRICTION, STICKS, Drain, MaterialProperties, Source
 from warp_lcp.driver.table import Complaint, Table
@@ -23,6 +24,7 @@ CUT_BYTES = 45
 MOVING_BYTES = 30
 SOURCE_BYTES = 8
 CORRECTION_BYTES, CUT_CORRECTION_BYTES = 54, 22  # the density correction's fields and method, and more where cells are cut
+EVEN_BYTES = 9  # and more where it closes voids
 RESEED_BYTES = 13
 BAND_BYTES = 24
 SPREAD = 2.0  # how much a narrow band may grow as its surface does: 1.3 times in a double dam break, 1.7 in a dam break in 3-D
@@ -64,9 +66,9 @@ class ParticleSettings(Table):
 
 
 class DensityCorrectionSettings(Table):
-    """[density_correction]: moves particles apart where they have come too close; off unless the table is there."""
+    """[density_correction]: moves particles apart that have come too close; without the table as soon as a thousandth crowds."""
 
-    every: int = Field(default=1, ge=1, description="steps from one correction to the next")
+    every: int = Field(default=1, ge=0, description="steps from one correction to the next; 0 switches it off")
     tolerance: float = Field(default=1e-2, gt=0, lt=1, description="the relative residual to reach")
     max_density: float | None = Field(
         default=None, gt=0, le=2, description="of a cell, in units of the density at rest; 1 + 0.1 / particles.per_axis unless given"
@@ -85,6 +87,7 @@ class ParticleScene(Scene):
 
     solve_bytes: ClassVar[int] = 0  # a cell, of the fields of the solve that are there before the particles are made
     correction_gain: ClassVar[float] = 1.0  # of the density correction
+    crowded: ClassVar[float] = 2e-3  # of the material, over particles.per_axis: a pool at rest has 1e-3 / 3e-5 at 1 / 2, splashed 1e-2
     carried_by_grid: ClassVar[bool] = False  # whether the grid can carry the material without particles
 
     particles: ParticleSettings = Field(default_factory=ParticleSettings)
@@ -106,7 +109,7 @@ class ParticleScene(Scene):
             "moving solids": _solids(moving, "moves") if moving else "",
             "rigid bodies": _solids(bodies, "has a mass") if bodies else "",
             "FLIP": 'particles.transfer = "flip"' if settings.transfer == "flip" else "",
-            "density correction": "[density_correction]" if self.density_correction is not None else "",
+            "density correction": "[density_correction]" if self.density_correction is not None and self.correction is not None else "",
             "reseeding": "[particles.reseed]" if settings.reseed is not None else "",
             "narrow band": "[particles.narrow_band]" if settings.narrow_band is not None else "",
             "sources": "[[source]]" if self.source else "",
@@ -116,6 +119,31 @@ class ParticleScene(Scene):
             "diagnostics": "output.diagnostics" if output.diagnostics else "",
         }
         return [Model(name, why, count=len(bodies) if name == "rigid bodies" else 1) for name, why in used.items() if why]
+
+    @property
+    def correction(self) -> DensityCorrectionSettings | None:
+        """Return how particles are moved apart, with or without the table, which a preset's values stand in for; None: they never are."""
+        given = self.density_correction
+        if given is None:
+            if self.endless or self.stays_full:
+                return None
+            given = DensityCorrectionSettings(**preset_values(self, "density_correction"))
+        return given if given.every else None
+
+    @property
+    def most_crowded(self) -> float:
+        """Return which share of the material may be beyond what cells hold before it is moved apart where the scene does not say when."""
+        return self.crowded / self.particles.per_axis
+
+    @property
+    def keeps_volume(self) -> bool:
+        """Return whether the density correction closes voids inside the material too."""
+        return False
+
+    @property
+    def stays_full(self) -> bool:
+        """Return whether the material fills the domain for ever."""
+        return False
 
     @property
     def endless(self) -> tuple[int, ...]:
@@ -209,13 +237,15 @@ class ParticleScene(Scene):
 
     def _rearrangement(self) -> list[tuple[str, str]]:
         """Return what moves particles apart from the flow."""
-        lines, correction, reseed = [], self.density_correction, self.particles.reseed
+        lines, correction, reseed = [], self.correction, self.particles.reseed
         band = self.particles.narrow_band
         if band is not None:
             lines.append(("narrow band", f"particles within {band.width:g} cells of the surface, the grid carries the rest"))
         if correction is not None:
-            most = correction.largest(self.particles.per_axis)
-            lines.append(("density", f"at most {most:.4g} of that at rest, corrected {_steps(correction.every)}"))
+            most, when = correction.largest(self.particles.per_axis), _steps(correction.every)
+            if self.density_correction is None:
+                when += f" if more than {100.0 * self.most_crowded:.2g} % is beyond it"
+            lines.append(("density", f"at most {most:.4g} of that at rest, corrected {when}"))
         if reseed is not None:
             least, many = self.particles.reseed_range(self.dimension)
             lines.append(("reseeding", f"{least} to {many} particles a cell, {_steps(reseed.every)}"))
@@ -226,11 +256,12 @@ class ParticleScene(Scene):
         cells, settings, cut = self.counted_cells, self.particles, self.cuts_cells
         moving = any(solid.moves for solid in self.solid)
         vectors = 3 + (self.dimension if settings.transfer == "apic" else 0)
+        correction = CORRECTION_BYTES + CUT_CORRECTION_BYTES * cut + EVEN_BYTES * self.keeps_volume
         parts = {
             "grid": cells * (GRID_BYTES + 4 * self.dimension * (settings.transfer == "flip")),
             **self.own_memory_parts(),
             "solids": cells * (CUT_BYTES * cut + MOVING_BYTES * moving),
-            "density correction": cells * (CORRECTION_BYTES + CUT_CORRECTION_BYTES * cut) * (self.density_correction is not None),
+            "density correction": cells * correction * (self.correction is not None),
             "reseeding": cells * RESEED_BYTES * (settings.reseed is not None),
             "narrow band": cells * BAND_BYTES * (settings.narrow_band is not None),
             "sources": cells * SOURCE_BYTES * bool(self.source),

@@ -10,7 +10,8 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.driver.particle_assembly import make_density_correction, make_particle_volume, make_reseeding, make_surface_mesh
+from warp_lcp.driver.particle_assembly import make_particle_volume, make_surface_mesh
+from warp_lcp.driver.particle_rearrangement import Rearrangement
 from warp_lcp.driver.particle_scene import ParticleScene
 from warp_lcp.driver.profile import NoStopwatch, Stopwatch
 from warp_lcp.driver.simulator import Points, SimulationFailed, Surface, Volume
@@ -42,7 +43,6 @@ COLUMNS = (
     "linear_iterations",
     "solve_residual",
 )
-CORRECTION_COLUMNS = ("density_status", "density_iterations", "max_density")
 
 
 class ParticleSimulation(ABC):
@@ -114,7 +114,8 @@ class ParticleSimulation(ABC):
         self.particle_mass = scene.physics.density * grid.cell_volume / scene.particles.per_axis**grid.dimension
         self.velocity, self.weights = grid.faces(), grid.faces()
         self._saved = grid.faces() if scene.particles.transfer == "flip" else None
-        self.reseeding, self.correction = make_reseeding(scene, grid, boundary), make_density_correction(scene, grid, boundary)
+        self.rearrangement = Rearrangement(scene, grid, boundary)
+        self._notes += self.rearrangement.notes()
         self.surface_mesh = make_surface_mesh(scene, grid, boundary)
         self.particle_volume = make_particle_volume(scene, grid, boundary)
         self.layers = self.reach = math.ceil(scene.time.cfl) + 2
@@ -125,6 +126,14 @@ class ParticleSimulation(ABC):
     @abstractmethod
     def mark(self) -> None:
         """Find the material's cells from the sorted particles, as frames show them before the first step."""
+
+    def known_density(self) -> wp.array | None:
+        """Return the particles' density in units of that at rest, if a step has found it before anything moves."""
+        return None
+
+    def known_contact(self) -> wp.array | None:
+        """Return uint8 of TOUCHES_NOTHING, HELD, RELEASED where walls held the material in the step or let go of it, if a step finds it."""
+        return None
 
     @abstractmethod
     def own_columns(self) -> tuple[str, ...]:
@@ -243,6 +252,8 @@ class ParticleSimulation(ABC):
         Raises:
             SimulationFailed: something is not finite, or a particle has left the domain.
         """
+        with self.watch.stage("crowding"):
+            self.rearrangement.look(self.step_count, self.known_density(), self.particles)
         with self.watch.stage("advection", self.particles.position, *self.velocity):
             stopped, pushed, stuck = self.carry(dt)
         if self.band is not None:
@@ -250,8 +261,11 @@ class ParticleSimulation(ABC):
                 self.band.carry(self.velocity, dt)
         exchanged = self._exchange(dt) if self.outlets is not None or self.sources is not None else {}
         after = self.checked_totals("after")
-        rearranged = self._rearrange(after)
-        if rearranged:
+        rearranged: Row = {"max_density": self.rearrangement.max_density}
+        if self.rearrangement.due(self.step_count):
+            fill = self.band.fill_interior if self.band is not None else None
+            window, contact = self.window(after), self.known_contact()
+            rearranged |= self.rearrangement.apply(self.particles, window, self.step_count, self.watch, fill, contact)
             if self.outlets is not None:  # the density correction may push particles out through open sides
                 exchanged["departed"] += self.outlets.remove_departed(self.particles)
             after = self.checked_totals("after the density correction of")
@@ -294,7 +308,8 @@ class ParticleSimulation(ABC):
         units of that at rest, if the mass is to be what it was.
         solve_residual is relative to the right-hand side's, which in free fall is rounding noise that is not iterated on: it may then be
         up to 1. stopped: particles that met a wall; pushed: those that a moving solid swept along; stuck: those inside solids that found
-        no way out, between solids that close, say. max_density: before the density correction of the step, of material at rest 1;
+        no way out, between solids that close, say. max_density: before the density correction of the step, of material at rest 1, or at the
+        start of a step that none was due in; density_status and density_iterations: of that correction, empty where none was due;
         reseeded: particles that went to a neighboring cell; emitted, drained, departed: those that sources have added in the step, that
         drains have swallowed, and that have left through open sides. Rigid bodies, numbered from 0 in the order of the scene's solids,
         have body0_x, body0_y, body0_z [m], the center of mass; body0_vx, body0_vy, body0_vz [m/s]; 2-D: body0_angle [degrees], how far it
@@ -304,9 +319,7 @@ class ParticleSimulation(ABC):
         columns = (*COLUMNS, *self.own_columns(), "stopped")
         columns = (*columns, "pushed", "stuck") if self.boundary.moves else columns
         columns = (*columns, "interior_density") if self.band is not None else columns
-        if self.reseeding is not None:
-            columns = (*columns, "reseeded")
-        columns = (*columns, *CORRECTION_COLUMNS) if self.correction is not None else columns
+        columns = (*columns, *self.rearrangement.columns())
         exchanged = {"emitted": self.scene.source, "drained": self.scene.drain, "departed": self.scene.domain.open}
         columns = (*columns, *(name for name, used in exchanged.items() if used))
         return (*columns, *self.bodies.columns()) if self.bodies is not None else columns
@@ -344,10 +357,9 @@ class ParticleSimulation(ABC):
         """Return what `restore` needs to continue bit for bit on the CPU."""
         particles = {name: array.numpy().copy() for name, array in self.particles.arrays().items()}
         clock = {"time": np.array(self.time), "step_count": np.array(self.step_count), "last_dt": np.array(self.last_dt)}
-        correction = {"density_correction": self.correction.x.numpy().copy()} if self.correction is not None else {}
         bodies = self.bodies.state() if self.bodies is not None else {}
         band = self.band.state() if self.band is not None else {}
-        return clock | {"signature": self._signature()} | particles | self.own_state() | band | correction | bodies
+        return clock | {"signature": self._signature()} | particles | self.own_state() | band | self.rearrangement.state() | bodies
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from `state`.
@@ -355,6 +367,7 @@ class ParticleSimulation(ABC):
         Raises:
             ValueError: the arrays do not belong to this scene.
         """
+        self.rearrangement.expect(state)
         expected, state = self.state(), {"last_dt": np.array(0.0), **state}  # older states have velocities of their own time
         missing = sorted(expected.keys() - state.keys())
         if missing:
@@ -377,8 +390,7 @@ class ParticleSimulation(ABC):
         self.particles.assign(state)
         self._faces_know = False
         self.restore_own({name: np.asarray(state[name]) for name in self.own_state()})
-        if self.correction is not None:
-            self.correction.x.assign(state["density_correction"])
+        self.rearrangement.restore(state)
         if self.band is not None:
             self.band.restore(state)
         self.time, self.step_count, self.last_dt = float(state["time"]), int(state["step_count"]), float(state["last_dt"])
@@ -450,23 +462,6 @@ class ParticleSimulation(ABC):
             field, bad = "position", ((position < 0.0) | (position > end))[:, : self.grid.dimension].any(axis=1)
         found, wrong = np.flatnonzero(bad), "outside the domain" if totals.finite else "not finite"
         return f"{field} is {wrong} in cell (x, y, z) = {self._cell_of(int(found[0]))} ({len(found)} particles)" if len(found) else ""
-
-    def _rearrange(self, totals: ParticleTotals) -> Row:
-        """Even out the particles and move them apart, if the scene asks for it and it is time; return what the log says of it."""
-        particles = self.particles
-        row: Row = {}
-        if self.reseeding is not None and self.step_count % self.reseeding.every == 0:
-            with self.watch.stage("reseeding", *particles.arrays().values()):
-                row["reseeded"] = self.reseeding.apply(particles, self.window(totals), self.step_count)
-        correction = self.correction
-        if correction is not None and self.step_count % correction.every == 0:
-            with self.watch.stage("density correction", particles.position, correction.density, correction.x, *correction.displacement):
-                fill = self.band.fill_interior if self.band is not None else None
-                done = correction.apply(particles, self.window(totals), fill=fill)
-            row["density_status"] = done.result.status.name if done.result is not None else "NOTHING_TO_DO"
-            row["density_iterations"] = done.result.iterations if done.result is not None else 0
-            row["max_density"] = done.max_density
-        return row
 
     def _exchange(self, dt: float) -> dict[str, int]:
         """Remove the particles that have left in the step and add those that have come in; return what the log says of it."""

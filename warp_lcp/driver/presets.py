@@ -83,6 +83,12 @@ def fill_in(model: type[Scene], data: Mapping[str, Any]) -> Mapping[str, Any]:
     return filled
 
 
+def preset_values(scene: Scene, table: str) -> dict[str, Any]:
+    """Return what a scene's preset says of a table; nothing where there is no preset."""
+    prices, name = price_table().get(scene.scene.simulator), scene.solver.preset
+    return _nested(prices.presets[name].settings).get(table, {}) if prices is not None and name is not None else {}
+
+
 def preset_line(scene: Scene) -> str | None:
     """Return what a scene has from its preset and what is its own, for the plan; None: it has no preset."""
     name = scene.solver.preset

@@ -1,4 +1,4 @@
-"""Particles that have come too close to each other are moved apart: an LCP for the displacement ([Book] 1.3.3)."""
+"""Particles that have come too close to each other, measured, and moved apart: an LCP for the displacement ([Book] 1.3.3)."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material import density_correction_kernels as kernels
 from warp_lcp.material.boundary import Boundary
+from warp_lcp.operators.grid_poisson import SOLID
 from warp_lcp.vectors import convert
 
 LONGEST = 0.5  # cells that a correction moves a particle at most
@@ -21,13 +22,53 @@ EXCESS = 1e-3  # of a cell, root mean square over the over-full cells, that is n
 SHIFT = 1e-5  # of the diagonal: gives closed pockets a solution, and leaves 0.5 % of what is too much 45 cells deep
 
 
+class Crowding:
+    """Measure how much of a material is in over-full cells, from a density that is known.
+
+    Args:
+        grid: the grid.
+        boundary: solids and walls.
+        particles_a_cell: of material at rest.
+        max_density: of a cell, in units of the density at rest.
+    """
+
+    def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int, max_density: float) -> None:
+        """Allocate the sums."""
+        self.grid, self.boundary, self.particles_a_cell, self.max_density = grid, boundary, particles_a_cell, max_density
+        self._sums = wp.zeros((*grid.shape[:2], kernels.COLUMNS), dtype=wp.float64, device=grid.device)
+        self._density: wp.array | None = None
+
+    def measure(self, density: wp.array | None, particles: Particles, window: Window) -> tuple[float, float]:
+        """Return which share of the material is beyond what cells may hold, and the largest density, that at rest being 1.
+
+        Args:
+            density: of the particles, in units of that at rest, float32; None: it is found here.
+            particles: the material; where the density is found here they must not have moved since they were sorted.
+            window: cells that hold all particles, with two to spare on each side.
+        """
+        if density is None:
+            density = self._density = self.grid.field() if self._density is None else self._density
+            particle_density(self.grid, particles, window, self.particles_a_cell, density)
+        b = self.boundary
+        self.grid.domain.launch_rows(kernels.crowd_kernel, [b.base, density, b.capacity, self.max_density, self._sums])
+        sums = _inner(self.grid, self._sums)
+        held = float(sums[..., 2].sum())
+        return (float(sums[..., 0].sum()) / held if held > 0.0 else 0.0), float(sums[..., 1].max())
+
+
+def _inner(grid: StaggeredGrid, sums: wp.array) -> np.ndarray:
+    """Return the sums of the domain's rows."""
+    low, high = grid.domain.low, grid.domain.high
+    return np.asarray(sums.numpy()[low[0] : high[0], low[1] : high[1]])
+
+
 @dataclass(frozen=True)
 class Correction:
     """What a correction found.
 
     Attributes:
-        result: of the solve; None: no cell was over-full, nothing has moved.
-        over_full: cells above the largest density.
+        result: of the solve; None: every cell held what it should, nothing has moved.
+        over_full: cells above the largest density, and cells deep inside below the least.
         max_density: before the correction, in units of the density at rest: 1 and the most by which a cell exceeds what fits beside walls.
     """
 
@@ -51,6 +92,11 @@ class DensityCorrection:
     others: nothing pulls, the surface needs no condition. Particles go d = -(x_right - x_left) / max(rho_face, 1/2), at most half a cell,
     along walls where they meet one. Their velocities stay as they are, so momentum is conserved.
 
+    With `even` a cell is an equation where it and all cells around it are more than half full: inside a liquid that keeps its volume.
+    y_i = 0 then moves what is beyond rho_max, or below 2 - rho_max, to or from the surface, and leaves the density of other cells as it is;
+    x may have either sign. Without it nothing closes the voids that a flow draws, every cell is truncated at rho_max from above
+    alone, and the liquid grows: a thin pool by 5 %. Where a wall lets go there is a surface too, and nothing is drawn to it.
+
     The operator, the method and its hierarchy are the pressure's. Where solids cut cells, pockets between them may be closed and count
     particles beyond a thin wall; SHIFT keeps their problem solvable.
 
@@ -62,6 +108,7 @@ class DensityCorrection:
         max_density: rho_max, > 0. A material at rest whose particles lie at random would grow with 1.
         gain: factor of what a cell holds too much, >= 1: a kernel spreads what a single cell gives away, so that its density falls by less
             than the problem says.
+        even: whether cells inside the material are to hold neither too much nor too little.
         every: steps from one correction to the next.
         tolerance: relative residual at which a solve is done.
         max_iterations: of the method; the best iterate is taken then.
@@ -81,6 +128,7 @@ class DensityCorrection:
         particles_a_cell: int,
         max_density: float,
         gain: float = 1.0,
+        even: bool = False,
         every: int = 1,
         tolerance: float = 1e-2,
         max_iterations: int = 20,
@@ -95,23 +143,28 @@ class DensityCorrection:
         wp.copy(self._kind, boundary.base)
         self._displace = kernels.displacement_kernel(bool(boundary.open)).displace
         self._sums = wp.zeros((*grid.shape[:2], kernels.COLUMNS), dtype=wp.float64, device=grid.device)
-        self._shift = wp.full(grid.shape, SHIFT, dtype=wp.float32, device=grid.device) if boundary.open else None
+        self._inside = self._lower = None
+        if even:  # the ring stays as it is
+            self._inside = wp.array(boundary.base.numpy() == SOLID, dtype=wp.uint8, device=grid.device)
+            self._lower = grid.field(wp.float64)
+        self._shift = wp.full(grid.shape, SHIFT, dtype=wp.float32, device=grid.device) if boundary.open or even else None
         self._problem: wl.LCP | None = None  # built when there is material: an empty problem is refused
 
-    def apply(self, particles: Particles, window: Window, *, fill: Fill | None = None) -> Correction:
+    def apply(self, particles: Particles, window: Window, *, fill: Fill | None = None, contact: wp.array | None = None) -> Correction:
         """Correct the particles' positions.
 
         Args:
             particles: the material (moved). If they are indexed they are sorted first.
             window: cells that hold all particles, with two to spare on each side.
             fill: adds to the density in a window what no particle stands for.
+            contact: uint8, RELEASED where walls let go, see `warp_lcp.material.contact`; None: they do not.
         """
         if particles.offsets is not None:
             particles.sort()  # they have moved: gathering needs the order, and gives the same bits on every run
         particle_density(self.grid, particles, window, self.particles_a_cell, self.density)
         if fill is not None:
             fill(window, self.density)
-        over_full, most = self._prepare()
+        over_full, most = self._prepare(contact)
         if over_full == 0:
             self.x.zero_()
             return Correction(None, 0, most)
@@ -128,22 +181,24 @@ class DensityCorrection:
         self.boundary.displace(self.displacement, particles.position)
         return Correction(result, over_full, most)
 
-    def _prepare(self) -> tuple[int, float]:
+    def _prepare(self, contact: wp.array | None) -> tuple[int, float]:
         """Set up the problem; return how many cells are over-full, and the largest density."""
-        b = self.boundary
-        self.grid.domain.launch_rows(
-            kernels.prepare_kernel, [b.base, self.density, b.capacity, self.max_density, self.gain, self._kind, self._b, self.x, self._sums]
-        )
-        low, high = self.grid.domain.low, self.grid.domain.high
-        sums = self._sums.numpy()[low[0] : high[0], low[1] : high[1]]
-        return int(sums[..., 0].sum()), float(sums[..., 1].max())
+        b, most = self.boundary, self.max_density
+        problem = [self._kind, self._b, self.x]
+        fields = [b.base, self.density, b.capacity, most, self.gain, *problem, contact, self._inside, self._sums]
+        self.grid.domain.launch_rows(kernels.prepare_kernel, fields)
+        if self._inside is not None:
+            fields = [self.density, b.capacity, min(most, 2.0 - most), self._inside, *problem, self._lower, self._sums]
+            self.grid.domain.launch_rows(kernels.even_kernel, [self.grid.planes - 1, *fields])
+        sums = _inner(self.grid, self._sums)
+        return int(sums[..., [0, 2]].sum()), float(sums[..., 1].max())
 
     def _solve(self, over_full: int) -> wl.SolveResult:
         if self._problem is None:
             faces = {f"face_{axis}": field for axis, field in zip("xyz", self.boundary.open, strict=False)}
             cells = self.grid.interior(self._kind.numpy())
             self._operator = wl.GridPoisson(cells, shift=self._shift, device=self.grid.device, **faces)
-            self._problem = wl.LCP(self._operator, self._b, 0.0, np.inf)
+            self._problem = wl.LCP(self._operator, self._b, 0.0 if self._lower is None else self._lower, np.inf)
             self._work = self.solver.init(self._problem)
         self._operator.update(self._kind)
         criteria = wl.StoppingCriteria(rtol=self.tolerance, atol=EXCESS * over_full**0.5, max_iterations=self.max_iterations)
