@@ -100,6 +100,11 @@ class LiquidScene(ParticleScene):
         return self.pressure.model == "incompressible" and self.particles.narrow_band is None
 
     @property
+    def settles(self) -> bool:
+        """Return whether full cells settle to the density at rest, which the unilateral model has gravity do, see `fluids.unilateral`."""
+        return self.pressure.model == "unilateral" and any(self.physics.gravity)
+
+    @property
     def stays_full(self) -> bool:
         """Return whether liquid fills the domain but for solids that stand still, so that there never is a surface."""
         openings = self.domain.open or self.source or self.drain or any(solid.moves for solid in self.solid)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -18,15 +19,17 @@ from warp_lcp.material.density_correction import DensityCorrection
 
 CORRECTION_COLUMNS = ("density_status", "density_iterations", "max_density")
 STATE = "density_correction"
+PACE = 2.0  # of sqrt(dx / g), in which a correction that acts by itself takes out what crowds
 
 
 class Rearrangement:
     """Even out a material's particles and move them apart, when it is time.
 
     Without the table [density_correction] a correction acts in the steps that begin with a share of the material beyond what cells may
-    hold that is larger than `ParticleScene.most_crowded`. It is told from the particles' density at the start of the step, which liquid's
-    surface and sand's packing have found for themselves: whether a step acts depends on where particles are, and on nothing that a
-    checkpoint would have to keep. The correction's fields are made when it acts first.
+    hold that is larger than `ParticleScene.most_crowded`, and in `PACE` sqrt(dx / g) takes out what crowds: what it lifts in a step is as
+    little as the step is short. Crowding is told from the particles' density at the start of the step, which liquid's surface and sand's
+    packing have found for themselves: whether a step acts depends on where particles are, and on nothing that a checkpoint would have to
+    keep. The correction's fields are made when it acts first.
 
     Args:
         scene: what asks for it.
@@ -48,6 +51,8 @@ class Rearrangement:
         self._every, self._most = settings.every if settings is not None else 0, scene.most_crowded
         if scene.density_correction is not None and settings is not None:
             self.correction = self._made()
+        g = math.hypot(*scene.physics.gravity)
+        self._pace = PACE * math.sqrt(grid.spacing / g) if g > 0.0 else 0.0  # [s]
         self._crowded: tuple[float, float] | None = None  # share and largest density at the start of the step
 
     def look(self, step: int, density: wp.array | None, particles: Particles) -> None:
@@ -72,7 +77,7 @@ class Rearrangement:
         return self._evens(step) or self._parts(step)
 
     def apply(
-        self, particles: Particles, window: Window, step: int, watch: Stopwatch, fill: Fill | None, contact: wp.array | None
+        self, particles: Particles, window: Window, step: int, dt: float, watch: Stopwatch, fill: Fill | None, contact: wp.array | None
     ) -> dict[str, float | int | str]:
         """Even out the particles and move them apart, if it is time.
 
@@ -80,6 +85,7 @@ class Rearrangement:
             particles: the material (moved).
             window: cells that hold all particles, with two to spare on each side.
             step: its number.
+            dt: its length [s].
             watch: what the stages are measured with.
             fill: adds to the density in a window what no particle stands for.
             contact: uint8, RELEASED where walls have let go in the step; None: it is not known.
@@ -94,7 +100,7 @@ class Rearrangement:
         if self._parts(step):
             correction = self.correction = self.correction or self._made()
             with watch.stage("density correction", particles.position, correction.density, correction.x, *correction.displacement):
-                done = correction.apply(particles, window, fill=fill, contact=contact)
+                done = correction.apply(particles, window, fill=fill, contact=contact, share=self._share(dt))
             row["density_status"] = done.result.status.name if done.result is not None else "NOTHING_TO_DO"
             row["density_iterations"] = done.result.iterations if done.result is not None else 0
             row["max_density"] = done.max_density
@@ -107,6 +113,10 @@ class Rearrangement:
         if self.crowding is not None:
             return self._crowded is not None and self._crowded[0] > self._most
         return self.correction is not None and step % self.correction.every == 0
+
+    def _share(self, dt: float) -> float:
+        """Return how much of what crowds a step moves apart: all where the scene says when, else at a rate that knows of no steps."""
+        return min(1.0, dt / self._pace) if self.crowding is not None and self._pace > 0.0 else 1.0
 
     def columns(self) -> tuple[str, ...]:
         """Return the names of the log's columns that `apply` fills."""

@@ -125,7 +125,7 @@ class ParticleScene(Scene):
         """Return how particles are moved apart, with or without the table, which a preset's values stand in for; None: they never are."""
         given = self.density_correction
         if given is None:
-            if self.endless or self.stays_full:
+            if self.endless or self.stays_full or self.settles:
                 return None
             given = DensityCorrectionSettings(**preset_values(self, "density_correction"))
         return given if given.every else None
@@ -138,6 +138,11 @@ class ParticleScene(Scene):
     @property
     def keeps_volume(self) -> bool:
         """Return whether the density correction closes voids inside the material too."""
+        return False
+
+    @property
+    def settles(self) -> bool:
+        """Return whether the material's own law keeps its density."""
         return False
 
     @property

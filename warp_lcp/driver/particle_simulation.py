@@ -265,7 +265,7 @@ class ParticleSimulation(ABC):
         if self.rearrangement.due(self.step_count):
             fill = self.band.fill_interior if self.band is not None else None
             window, contact = self.window(after), self.known_contact()
-            rearranged |= self.rearrangement.apply(self.particles, window, self.step_count, self.watch, fill, contact)
+            rearranged |= self.rearrangement.apply(self.particles, window, self.step_count, dt, self.watch, fill, contact)
             if self.outlets is not None:  # the density correction may push particles out through open sides
                 exchanged["departed"] += self.outlets.remove_departed(self.particles)
             after = self.checked_totals("after the density correction of")

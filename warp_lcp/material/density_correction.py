@@ -150,7 +150,9 @@ class DensityCorrection:
         self._shift = wp.full(grid.shape, SHIFT, dtype=wp.float32, device=grid.device) if boundary.open or even else None
         self._problem: wl.LCP | None = None  # built when there is material: an empty problem is refused
 
-    def apply(self, particles: Particles, window: Window, *, fill: Fill | None = None, contact: wp.array | None = None) -> Correction:
+    def apply(
+        self, particles: Particles, window: Window, *, fill: Fill | None = None, contact: wp.array | None = None, share: float = 1.0
+    ) -> Correction:
         """Correct the particles' positions.
 
         Args:
@@ -158,6 +160,7 @@ class DensityCorrection:
             window: cells that hold all particles, with two to spare on each side.
             fill: adds to the density in a window what no particle stands for.
             contact: uint8, RELEASED where walls let go, see `warp_lcp.material.contact`; None: they do not.
+            share: of the displacement that particles go.
         """
         if particles.offsets is not None:
             particles.sort()  # they have moved: gathering needs the order, and gives the same bits on every run
@@ -177,7 +180,7 @@ class DensityCorrection:
         for axis, field in enumerate(self.displacement):
             open_ = self.boundary.open[axis] if self.boundary.open else None
             fields = [self.x, self._kind, open_, self.density, self.boundary.capacity]
-            self.grid.domain.launch(self._displace, [axis, *fields, longest, self.grid.spacing, field])
+            self.grid.domain.launch(self._displace, [axis, *fields, longest, share * self.grid.spacing, field])
         self.boundary.displace(self.displacement, particles.position)
         return Correction(result, over_full, most)
 
