@@ -133,4 +133,4 @@ def test_other_values_are_refused(value: Any, expected: str) -> None:
 
 def test_a_fixed_tolerance_has_no_columns_of_the_other() -> None:
     assert {"tolerance", "time_error"}.isdisjoint(dam().columns())
-    assert SIMULATOR.create(dam(solver=AUTO).scene, device="cpu", folder=Path()).columns()[-3:-1] == ("tolerance", "time_error")
+    assert {"tolerance", "time_error"} <= set(SIMULATOR.create(dam(solver=AUTO).scene, device="cpu", folder=Path()).columns())

@@ -309,7 +309,8 @@ def test_a_step_marks_its_stages() -> None:
     assert watched.step(0.01) == plain.step(0.01)
     assert watched.watch.found == [
         "diagnostics", "sort", "particles-to-grid", "surface", "pressure set-up", "pressure solve", "projection", "diagnostics",
-        "extrapolation", "bodies in flight", "grid-to-particles", "advection", "bodies in flight", "diagnostics",
+        "extrapolation", "bodies in flight", "grid-to-particles", "crowding", "advection", "bodies in flight",
+        "diagnostics",
     ]  # fmt: skip
 
 

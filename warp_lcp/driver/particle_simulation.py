@@ -252,7 +252,7 @@ class ParticleSimulation(ABC):
         Raises:
             SimulationFailed: something is not finite, or a particle has left the domain.
         """
-        with self.watch.stage("crowding"):
+        with self.watch.stage("crowding", self.particles.position):
             self.rearrangement.look(self.step_count, self.known_density(), self.particles)
         with self.watch.stage("advection", self.particles.position, *self.velocity):
             stopped, pushed, stuck = self.carry(dt)
