@@ -51,9 +51,9 @@ def test_a_collapse_keeps_its_invariants() -> None:
 
 
 def test_a_pile_at_rest_hardly_moves_inside() -> None:
-    (whole, deep), *_ = sand_rest.rest(10, "cpu", 1)
-    assert deep < sand_rest.DEEP
-    assert whole < 3.0 * sand_rest.ALL  # few cells have a large share of them in the surface
+    (_, deep), (whole, later) = sand_rest.rest(10, "cpu", 2)
+    assert max(deep, later) < sand_rest.DEEP
+    assert whole < sand_rest.ALL  # few cells have a large share of them in the surface, where at first a grain still slides
 
 
 def test_drift_is_the_way_of_each_particle_whatever_their_order(monkeypatch: pytest.MonkeyPatch) -> None:
