@@ -16,6 +16,7 @@ from warp_lcp.material.wall import extend_velocity
 
 FLAT = StaggeredGrid((24, 22, 1), 0.1, 2)
 SPACE = StaggeredGrid((12, 13, 11), 0.1, 3)
+Faces = Sequence[np.ndarray]  # one field a component
 JUNK = 1e3  # on faces that are neither projected nor carry weight
 
 
@@ -94,16 +95,19 @@ class Slope:
                 total += self.signed(points(self.grid, offset)) > 0
         return (total / n ** len(others)).astype(np.float32)
 
-    def extend(self, velocity: tuple[float, ...], layers: int = 4) -> list[np.ndarray]:
+    def extend(
+        self, velocity: tuple[float, ...], layers: int = 4, *, closed: tuple[float, ...] = (JUNK,) * 3, weights: Faces = ()
+    ) -> list[np.ndarray]:
         grid = self.grid
+        given = [wp.array(w, dtype=wp.float32, device="cpu") for w in weights] or grid.faces()
         fields, known = [], []
         for axis, fraction in enumerate(self.open):
-            fields.append(wp.array(np.where(fraction > 0, velocity[axis], JUNK).astype(np.float32), device="cpu"))
+            fields.append(wp.array(np.where(fraction > 0, velocity[axis], closed[axis]).astype(np.float32), device="cpu"))
             known.append(wp.array((fraction > 0).astype(np.int8), device="cpu"))
             if grid.dimension == 2:
                 known[-1].numpy()[[0, 2]] = 0
         extend_velocity_cut(
-            grid.everywhere, fields, grid.faces(), known, wp.array(self.kind, device="cpu"), wp.array(self.contact, device="cpu"),
+            grid.everywhere, fields, given, known, wp.array(self.kind, device="cpu"), wp.array(self.contact, device="cpu"),
             self.cut(), grid.faces(), layers,
         )  # fmt: skip
         return [field.numpy() for field in fields]
@@ -238,7 +242,7 @@ def test_a_box_is_treated_as_one_of_whole_cells(counts: tuple[int, int, int], ra
         cut.open.append(wp.array(open_face.astype(np.float32), device="cpu"))
         cut.wall.append(wp.array(np.where(open_face, -1, 0).astype(np.int16), device="cpu"))
         projected = open_face & ((kind == FLUID) | (below == FLUID))
-        weights.append((rng.random(grid.shape) < 0.3).astype(np.float32) * open_face)
+        weights.append((rng.random(grid.shape) < 0.3).astype(np.float32) * ((kind != SOLID) | (below != SOLID)))
         marks.append(np.where((kind == SOLID) & (below == SOLID), -1, projected).astype(np.int8))
         start.append((rng.normal(size=grid.shape) * (projected | (weights[-1] > 0))).astype(np.float32))
     layers = 4
@@ -277,6 +281,25 @@ def test_spray_keeps_its_own_velocity_on_open_faces_only() -> None:
     assert v[floor + 2, 9] == -2.0  # two layers from it
     assert known[floor + 4, 9] == 1
     assert known[floor - 1, 15] == 0
+
+
+@pytest.mark.parametrize(("grid", "normal"), SLOPES)
+@pytest.mark.parametrize("contact", [HELD, RELEASED])
+def test_what_rests_at_a_cut_wall_is_not_thrown_after_what_leaves_it(
+    grid: StaggeredGrid, normal: tuple[float, float, float], contact: int
+) -> None:
+    """Liquid leaves the plane at 3 m/s; what has weight on closed faces leaves it at 0.06 m/s, and none of them lies in another cell."""
+    slope = Slope(grid, normal, contact=contact)
+    away = slope.normal[: grid.dimension]
+    weights = [np.where(fraction == 0, 1.0, 0.0) for fraction in slope.open]
+    fields = slope.extend(tuple(3.0 * away), closed=tuple(0.06 * away), weights=weights)
+    for axis, field in enumerate(fields):
+        beside = slope.judged(axis) & ((slope.contact == contact) | (np.roll(slope.contact, 1, 2 - axis) == contact))
+        if abs(away[axis]) < 0.1:
+            continue
+        assert beside.sum() > 5
+        kept = np.abs(field[beside] - 0.06 * away[axis]) < 1e-6
+        assert kept.all() if contact == RELEASED else not kept.any()
 
 
 def test_deep_faces_are_left_alone() -> None:

@@ -94,6 +94,31 @@ def test_a_released_cell_is_pushed_by_a_wall_that_overtakes_it() -> None:
     assert v[CEILING, 1:-1] == pytest.approx(-0.25)
 
 
+@pytest.mark.parametrize(
+    ("separating", "state", "weight", "own", "expected"),
+    [
+        (1, RELEASED, 4.6, 0.06, 0.06),  # not the speed of what leaves
+        (1, RELEASED, 4.6, -0.06, 0.0),  # but not into the wall
+        (1, RELEASED, 0.0, 0.0, 3.0),  # nothing of its own
+        (1, HELD, 4.6, 0.06, 0.0),
+        (0, RELEASED, 4.6, 0.06, 0.0),
+    ],
+)
+def test_what_rests_at_a_wall_is_not_thrown_after_what_leaves_it(
+    separating: int, state: int, weight: float, own: float, expected: float
+) -> None:
+    air = Air(cells((0, 0)), (3.0, 0.0))
+    air.separating.fill_(separating)
+    air.contact.fill_(state)
+    air.velocity[0].numpy()[1, 1, 1] = own
+    air.weights[0].numpy()[1, 1, 1] = weight
+    u, _ = air.extend()
+    assert u[1, 2] == 3.0
+    assert u[1, 1] == pytest.approx(expected)
+    assert u[1, 3] == 3.0  # the first layer is the projected face's
+    assert u[0, 1] == pytest.approx(u[1, 1])  # inside the corner it follows
+
+
 def test_spray_beyond_one_layer_keeps_its_own_velocity() -> None:
     """A drop above a pool at rest: extrapolating the pool over it would make it hang."""
     air = Air(cells(*((x, 0) for x in range(5))), (0.0, 0.0))

@@ -22,7 +22,7 @@ from warp_lcp.grid.extrapolate import extrapolate
 from warp_lcp.grid.staggered import CellRange, Window
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.contact import HELD, RELEASED, TOUCHES_NOTHING
-from warp_lcp.material.wall import Join
+from warp_lcp.material.wall import Join, keep_released_kernel
 from warp_lcp.native import BLOCK, simd
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 
@@ -265,7 +265,8 @@ def extend_velocity_cut(
         join: called with the marks and the velocity of a component after each layer, see `warp_lcp.grid.extrapolate`.
     """
     planes = len(velocity) - 1
-    for field, weight, marks, fraction in zip(velocity, weights, known, cut.open, strict=True):
+    for axis, (field, weight, marks, fraction) in enumerate(zip(velocity, weights, known, cut.open, strict=True)):
+        window.launch(keep_released_kernel, [axis, kind, contact, weight, marks])
         extrapolate(window, marks, field, 1, join=join)
         window.launch(keep_spray_kernel, [marks, weight, fraction])
         extrapolate(window, marks, field, layers, join=join)

@@ -1,8 +1,10 @@
 """Velocity around the material after the projection: into the air, and at walls that hold it or let it go.
 
-The order matters. 1. One layer is extrapolated from the projected faces. 2. Faces between AIR cells that particles gave weight keep their
-own velocity: extrapolating over spray would make a droplet hang above a pool. 3. Further layers are extrapolated from both. Closed faces
-have taken part and now carry the material's velocity, not the wall's. 4. Held cells give their closed faces the wall's normal velocity
+The order matters. 0. Closed faces of RELEASED cells that particles gave weight have been projected too, with no pressure on either side:
+they keep their own velocity. A layer over them would throw all that rests at a wall after the one particle that leaves it. 1. One layer is
+extrapolated from the projected faces. 2. Faces between AIR cells that particles gave weight keep their own velocity: extrapolating over
+spray would make a droplet hang above a pool. 3. Further layers are extrapolated from all of them. Closed faces have taken part and now
+carry the material's velocity, not the wall's. 4. Held cells give their closed faces the wall's normal velocity
 (not merely less of the inward one: a moving wall drags its material along); released and AIR cells lose only the part into the wall, so
 that the last particles can leave. 5. Faces inside solids follow the faces beside them, so that tangential flow is not slowed by a wall.
 """
@@ -22,6 +24,31 @@ Join = Callable[[wp.array, wp.array], None]  # takes the marks and the velocity 
 
 _FLUID = wp.constant(wp.int8(FLUID))
 _SOLID = wp.constant(wp.int8(SOLID))
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.material.wall")
+@typing.no_type_check
+def keep_released_kernel(
+    cells: CellRange,
+    axis: int,
+    kind: wp.array3d(dtype=wp.int8),
+    contact: wp.array3d(dtype=wp.uint8),
+    weight: wp.array3d(dtype=wp.float32),
+    known: wp.array3d(dtype=wp.int8),
+):
+    """Faces of RELEASED cells that are still unknown, closed ones, become known after the first layer if they carry weight."""
+    plane, row, chunk = wp.tid()
+    k = cells.k + plane
+    j = cells.j + row
+    first = cells.i + chunk * cells.grain
+    for i in range(first, wp.min(first + cells.grain, cells.end)):
+        if known[k, j, i] == wp.int8(0) and weight[k, j, i] > TINY_WEIGHT:  # and so no face of the array's edge, see below
+            c = k - wp.where(axis == 2, 1, 0)
+            b = j - wp.where(axis == 1, 1, 0)
+            a = i - wp.where(axis == 0, 1, 0)
+            here = kind[k, j, i] == _FLUID and int(contact[k, j, i]) == RELEASED
+            if here or (kind[c, b, a] == _FLUID and int(contact[c, b, a]) == RELEASED):
+                known[k, j, i] = wp.int8(2)
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.material.wall")
@@ -119,6 +146,7 @@ def extend_velocity(
         join: called with the marks and the velocity of a component after each layer, see `warp_lcp.grid.extrapolate`.
     """
     for axis, (field, weight, marks) in enumerate(zip(velocity, weights, known, strict=True)):
+        window.launch(keep_released_kernel, [axis, kind, contact, weight, marks])
         extrapolate(window, marks, field, 1, join=join)
         window.launch(keep_spray_kernel, [axis, kind, weight, marks])
         if join is not None:
