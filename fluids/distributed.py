@@ -31,6 +31,7 @@ from warp_lcp.distributed.solids import boundary_of_part
 from warp_lcp.distributed.subdomain import Subdomain, ghost_layers
 from warp_lcp.driver.particle_assembly import placed_solids, seed_materials, start_velocities
 from warp_lcp.driver.particle_simulation import Row
+from warp_lcp.driver.particle_state import signature
 from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.simulator import SimulationFailed, StepFailed
 from warp_lcp.grid.particles import ParticleTotals
@@ -122,10 +123,10 @@ class DistributedLiquid(LiquidSimulation):
                 "around its box"
             )
 
-    def bring_to_particles(self) -> None:
+    def bring_to_particles(self, window: Window, kind: wp.array, dt: float) -> None:
         """Give this rank's own particles the velocity of the faces."""
         self.particles.drop_ghosts()
-        super().bring_to_particles()
+        super().bring_to_particles(window, kind, dt)
 
     def carry(self, dt: float) -> tuple[int, int, int]:
         """Move particles by dt [s]. Return how many of all met a wall, and twice 0: no solid moves."""
@@ -175,8 +176,8 @@ class DistributedLiquid(LiquidSimulation):
         clock = {"time": np.array(self.time), "step_count": np.array(self.step_count), "last_dt": np.array(self.last_dt)}
         where = {"box": np.array([box.low, box.high]), "counts": np.array(self.part.decomposition.counts)}
         particles = {name: array.numpy().copy() for name, array in self.particles.arrays().items()}
-        numbers = {name: own[name] for name in ("pressure_dt", "time_error")}
-        return where | clock | {"signature": self._signature()} | numbers | particles | {"place": self.particles.place.copy()} | fields
+        numbers = {name: own[name] for name in ("pressure_dt", "time_error")} | {"signature": signature(self.scene, self.part.grid)}
+        return where | clock | numbers | particles | {"place": self.particles.place.copy()} | fields
 
     def restore_pieces(self, pieces: Sequence[Piece]) -> None:
         """Continue from the pieces of all ranks of a run on any number of ranks; each rank takes what lies in its box. Collective.
@@ -188,7 +189,7 @@ class DistributedLiquid(LiquidSimulation):
         Raises:
             ValueError: the pieces do not belong to this scene, or do not cover the domain; on all ranks.
         """
-        reader = PieceReader(self.part, list(self.particles.arrays()), self._signature())
+        reader = PieceReader(self.part, list(self.particles.arrays()), signature(self.scene, self.part.grid))
         taken = reader.read(pieces, self.boundary.base)
         everyone = int(self.part.ranks.sum(len(taken.place)))
         if everyone != self._everyone:

@@ -18,7 +18,6 @@ BOUND_BYTES = 9  # of them, those of walls that separate
 LEVEL_SET_BYTES = 19  # more for a surface between cells, or slivers
 SMOOTHING_BYTES = 12
 UNILATERAL_BYTES = 5
-FLIGHT_BYTES = 10  # what says which cells belong to bodies in flight
 SHORT_STEPS = 0.5  # Courant numbers below it: liquid over a mesh gained energy without bound at 1/4 on 40 cells, at 1/8 on 20
 BODY_BYTES, POTENTIAL_BYTES = 8, 4  # of a right-hand side that bodies change, and a motion of a body, if it is light
 COUPLED_METHODS = ("projected-multigrid", "minimum-map-newton", "primal-dual-active-set")  # for A + U W U', see `fluids.coupling`
@@ -125,6 +124,11 @@ class LiquidScene(ParticleScene):
         return walls or any((solid.wall or self.domain.wall) == "separating" for solid in self.solid)
 
     @property
+    def coheres(self) -> bool:
+        """Return whether a pressure below that of the air keeps together what turns in flight."""
+        return self.pressure.model == "incompressible"
+
+    @property
     def short_steps(self) -> bool:
         """Return whether steps are so short that spray must not take the velocity of liquid beside it in each of them."""
         return self.time.cfl < SHORT_STEPS and self.pressure.model == "incompressible"
@@ -135,8 +139,7 @@ class LiquidScene(ParticleScene):
         bounded = self.lets_go or self.pressure.model == "unilateral"
         motions = sum(solid.is_body for solid in self.solid) * (3 if self.dimension == 2 else 6)
         return {
-            "pressure": cells * (PRESSURE_BYTES - BOUND_BYTES * (not bounded) + UNILATERAL_BYTES * (self.pressure.model == "unilateral"))
-            + cells * FLIGHT_BYTES * (self.particles.narrow_band is None and not self.stays_full),
+            "pressure": cells * (PRESSURE_BYTES - BOUND_BYTES * (not bounded) + UNILATERAL_BYTES * (self.pressure.model == "unilateral")),
             "bodies": cells * (BODY_BYTES * bool(motions) + POTENTIAL_BYTES * motions),
             "surface": cells
             * (not self.stays_full)

@@ -11,7 +11,6 @@ import warp as wp
 
 import warp_lcp as wl
 from fluids.assembly import make_pressure, make_surface
-from fluids.flight import Flights
 from fluids.pressure import PressureProjection, Projection
 from fluids.scene import LiquidScene
 from fluids.surface import FreeSurface
@@ -82,7 +81,6 @@ class LiquidSimulation(ParticleSimulation):
         self.surface = self._surface()
         self.projection = self._pressure()
         self.reach = max(self.layers, 2 * scene.pressure.smoothing)
-        self.flights = self._flights()
         self.mark()
 
     def _surface(self) -> FreeSurface:
@@ -90,11 +88,6 @@ class LiquidSimulation(ParticleSimulation):
 
     def _pressure(self) -> PressureProjection:
         return make_pressure(self.scene, self.grid, self.boundary, self.surface, self.weights, self.bodies)
-
-    def _flights(self) -> Flights | None:
-        if self.band is not None or self.scene.stays_full:  # what flies may have no particles inside; nothing can fly
-            return None
-        return Flights(self.grid, self.boundary, coheres=self.scene.pressure.model == "incompressible")
 
     def mark(self) -> None:
         """Find the liquid's cells, and show them."""
@@ -120,23 +113,12 @@ class LiquidSimulation(ParticleSimulation):
         if self.projection.coupling is not None:
             self.projection.coupling.hold(self.velocity, self.projection.known)
         self.exchange(window, self.projection.kind, self.surface.phi, self.projection.contact)
-        if self.flights is not None:
-            with self.watch.stage("bodies in flight", self.particles.position):
-                self.flights.begin(self.particles, window, self.weights, self.projection.kind, dt, self.gravity * self.kick_dt)
-        self.bring_to_particles()
+        self.bring_to_particles(window, self.projection.kind, dt)
         row = self.move(dt) | self.solve_row(projected.result)
         automatic = self.projection.automatic
         if automatic is not None and projected.result is not None:
             row |= {"tolerance": automatic.used, "time_error": automatic.time_error}
         return self.logged(row | {"active": projected.released} | measured)
-
-    def carry(self, dt: float) -> tuple[int, int, int]:
-        """Move particles and solids by dt [s], see `ParticleSimulation.carry`; bodies in flight keep their momenta."""
-        moved = super().carry(dt)
-        if self.flights is not None:
-            with self.watch.stage("bodies in flight", self.particles.position):
-                self.flights.end(self.particles, self.velocity)
-        return moved
 
     def _measured(self, projected: Projection) -> Row:
         """Return what the log alone wants to know of the liquid at the start of the step."""

@@ -141,7 +141,7 @@ class SandSimulation(ParticleSimulation):
         solved = self._solve(window, dt)
         measured = self._measured()
         self._extend(window)
-        self.bring_to_particles()
+        self.bring_to_particles(window, self.packing.kind, dt)
         below, most = self._mass_below(), self._most()
         row = self.move(dt)
         self._place_solids()

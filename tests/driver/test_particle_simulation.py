@@ -66,7 +66,7 @@ class Dust(ParticleSimulation):
         for marks, weight in zip(self.known, self.weights, strict=True):
             marks.assign((weight.numpy() > TINY_WEIGHT).astype(np.int8))
         self.extend(window, self.known, self.kind, self.contact)
-        self.bring_to_particles()
+        self.bring_to_particles(window, self.kind, dt)
         return self.logged(self.move(dt) | self.solve_row(None) | {"grains": 7, "unasked": 1})
 
 

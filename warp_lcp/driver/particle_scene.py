@@ -27,6 +27,7 @@ CORRECTION_BYTES, CUT_CORRECTION_BYTES = 54, 22  # the density correction's fiel
 EVEN_BYTES = 9  # and more where it closes voids
 RESEED_BYTES = 13
 BAND_BYTES = 24
+FLIGHT_BYTES = 10  # what says which cells belong to bodies in flight
 SPREAD = 2.0  # how much a narrow band may grow as its surface does: 1.3 times in a double dam break, 1.7 in a dam break in 3-D
 PLANES = 2.5  # that a 2-D cell counts for: its fields have three, the solver's one
 VECTOR_BYTES, KEY_BYTES = 12, 16  # a particle's vectors, one of them spare, and its sort keys
@@ -151,6 +152,16 @@ class ParticleScene(Scene):
         return False
 
     @property
+    def coheres(self) -> bool:
+        """Return whether what turns in flight keeps together."""
+        return False
+
+    @property
+    def flies(self) -> bool:
+        """Return whether bodies in flight can be told: not where they lack particles inside, nor where they go on at another side."""
+        return self.particles.narrow_band is None and not self.stays_full and not self.endless
+
+    @property
     def endless(self) -> tuple[int, ...]:
         """Return the axes without an end: what leaves at one side comes in at the other."""
         return ()
@@ -265,6 +276,7 @@ class ParticleScene(Scene):
         parts = {
             "grid": cells * (GRID_BYTES + 4 * self.dimension * (settings.transfer == "flip")),
             **self.own_memory_parts(),
+            "bodies in flight": cells * FLIGHT_BYTES * self.flies,
             "solids": cells * (CUT_BYTES * cut + MOVING_BYTES * moving),
             "density correction": cells * correction * (self.correction is not None),
             "reseeding": cells * RESEED_BYTES * (settings.reseed is not None),

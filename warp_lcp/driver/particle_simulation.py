@@ -13,6 +13,7 @@ import warp_lcp as wl
 from warp_lcp.driver.particle_assembly import make_particle_volume, make_surface_mesh
 from warp_lcp.driver.particle_rearrangement import Rearrangement
 from warp_lcp.driver.particle_scene import ParticleScene
+from warp_lcp.driver.particle_state import check_state, other_spacing, particle_trouble, signature
 from warp_lcp.driver.profile import NoStopwatch, Stopwatch
 from warp_lcp.driver.simulator import Points, SimulationFailed, Surface, Volume
 from warp_lcp.grid.particles import MARGIN, Particles, ParticleTotals
@@ -20,6 +21,7 @@ from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.surface_mesh import Interior, faces_from_particles, sample
 from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
 from warp_lcp.material.boundary import Boundary
+from warp_lcp.material.flight import Flights
 from warp_lcp.material.gravity import accelerate
 from warp_lcp.material.narrow_band import NarrowBand, without_band
 from warp_lcp.material.outlets import Drain, Outlets
@@ -77,6 +79,7 @@ class ParticleSimulation(ABC):
         particles: the material.
         velocity: of the last step on the faces, one field a component [m/s].
         weights: of the particles on each component's faces, in the last step.
+        flights: gives bodies in flight their momenta back; None: the material has none, or none that can be told.
         gravity: [m/s^2], shape (3,).
         particle_mass: [kg]; 2-D: [kg/m].
         layers: how far the velocity is continued into air and walls, in faces.
@@ -114,6 +117,7 @@ class ParticleSimulation(ABC):
         self.particle_mass = scene.physics.density * grid.cell_volume / scene.particles.per_axis**grid.dimension
         self.velocity, self.weights = grid.faces(), grid.faces()
         self._saved = grid.faces() if scene.particles.transfer == "flip" else None
+        self.flights = self._flights()
         self.rearrangement = Rearrangement(scene, grid, boundary)
         self._notes += self.rearrangement.notes()
         self.surface_mesh = make_surface_mesh(scene, grid, boundary)
@@ -122,6 +126,9 @@ class ParticleSimulation(ABC):
         if sources is not None:
             sources.emit(particles, None, self.time)
         particles.sort()
+
+    def _flights(self) -> Flights | None:
+        return Flights(self.grid, self.boundary, coheres=self.scene.coheres) if self.scene.flies else None
 
     @abstractmethod
     def mark(self) -> None:
@@ -233,9 +240,18 @@ class ParticleSimulation(ABC):
             with self.watch.stage("narrow band", *self.particles.arrays().values(), self.band.depth):
                 self.band.exchange(self.particles, window, kind, phi, contact, self.step_count, self._saved or ())
 
-    def bring_to_particles(self) -> None:
-        """Give the particles the velocity of the faces."""
+    def bring_to_particles(self, window: Window, kind: wp.array, dt: float) -> None:
+        """Find the bodies in flight, and give the particles the velocity of the faces.
+
+        Args:
+            window: of the step.
+            kind: int8 of AIR, FLUID, SOLID, of the step's solve.
+            dt: time step [s].
+        """
         particles = self.particles
+        if self.flights is not None:
+            with self.watch.stage("bodies in flight", particles.position):
+                self.flights.begin(particles, window, self.weights, kind, dt, self.gravity * self.kick_dt)
         self._faces_know = True
         with self.watch.stage("grid-to-particles", *particles.arrays().values(), *self.velocity):
             flip = self.scene.particles.flip_ratio if self._saved else 0.0
@@ -275,12 +291,20 @@ class ParticleSimulation(ABC):
         return self._totals_row(after, dt) | {"stopped": stopped, "pushed": pushed, "stuck": stuck} | rearranged | exchanged
 
     def carry(self, dt: float) -> tuple[int, int, int]:
-        """Move particles and solids by dt [s]. Return how many met a wall, were pushed by a solid, and are stuck inside one."""
+        """Move particles and solids by dt [s]; bodies in flight keep their momenta.
+
+        Returns:
+            How many met a wall, were pushed by a solid, and are stuck inside one.
+        """
         if self.bodies is not None:
             self.bodies.end_step(dt)
             if trouble := self.bodies.trouble(self.scene.domain.size, self.scene.endless):
                 raise SimulationFailed(f"step {self.step_count}: {trouble}")
-        return self.boundary.advect(self.velocity, dt, self.time + dt, self.particles.position)
+        met = self.boundary.advect(self.velocity, dt, self.time + dt, self.particles.position)
+        if self.flights is not None:
+            with self.watch.stage("bodies in flight", self.particles.position):
+                self.flights.end(self.particles, self.velocity)
+        return met
 
     def solve_row(self, result: wl.SolveResult | None) -> Row:
         """Return what the log says of a step's solve; nothing if there was none."""
@@ -357,9 +381,10 @@ class ParticleSimulation(ABC):
         """Return what `restore` needs to continue bit for bit on the CPU."""
         particles = {name: array.numpy().copy() for name, array in self.particles.arrays().items()}
         clock = {"time": np.array(self.time), "step_count": np.array(self.step_count), "last_dt": np.array(self.last_dt)}
+        scene = {"signature": signature(self.scene, self.grid)}
         bodies = self.bodies.state() if self.bodies is not None else {}
         band = self.band.state() if self.band is not None else {}
-        return clock | {"signature": self._signature()} | particles | self.own_state() | band | self.rearrangement.state() | bodies
+        return clock | scene | particles | self.own_state() | band | self.rearrangement.state() | bodies
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from `state`.
@@ -369,24 +394,8 @@ class ParticleSimulation(ABC):
         """
         self.rearrangement.expect(state)
         expected, state = self.state(), {"last_dt": np.array(0.0), **state}  # older states have velocities of their own time
-        missing = sorted(expected.keys() - state.keys())
-        if missing:
-            raise ValueError(f"the state lacks {', '.join(missing)}: it does not belong to this scene")
-        if not np.array_equal(state["signature"], expected["signature"]):
-            raise ValueError("the state's grid, spacing, number of particles a cell or transfer differ from this scene's")
-        if self.band is None and "interior" in state:
-            raise ValueError("the state's particles are a narrow band: this scene has no particles.narrow_band")
-        for name, value in expected.items():
-            given = np.asarray(state[name])
-            if name in self.particles.arrays() and (self.sources or self.outlets or self.band):
-                value = np.empty((len(state["position"]), 3), dtype=value.dtype)  # their number changes
-            if given.shape != value.shape or given.dtype != value.dtype:
-                found, wanted = f"{given.dtype}{given.shape}", f"{value.dtype}{value.shape}"
-                raise ValueError(f"the state's {name} is {found}: this scene has {wanted}")
-            if given.dtype.kind == "f" and not np.isfinite(given).all():
-                raise ValueError(f"the state's {name} holds values that are not finite")
-        if not self.boundary.moves and not np.array_equal(state["cells"] == wl.SOLID, expected["cells"] == wl.SOLID):
-            raise ValueError("the state's solids are not this scene's")
+        varies = bool(self.sources or self.outlets or self.band)
+        check_state(state, expected, changing=[*self.particles.arrays()] if varies else [], solids_move=self.boundary.moves)
         self.particles.assign(state)
         self._faces_know = False
         self.restore_own({name: np.asarray(state[name]) for name in self.own_state()})
@@ -404,10 +413,7 @@ class ParticleSimulation(ABC):
         Raises:
             ValueError: the state differs in more than the grid, or no particle is left.
         """
-        before, now = np.asarray(state.get("signature", np.zeros(7))), self._signature()
-        size = before[:3] * before[4], now[:3] * now[4]
-        if not np.array_equal(before[[3, 5, 6]], now[[3, 5, 6]]) or not np.allclose(*(side[: self.grid.dimension] for side in size)):
-            raise ValueError("the state's domain, number of particles a cell or transfer differ from this scene's")
+        spacing = other_spacing(state, self.scene, self.grid)
         self.time, self.step_count, self.last_dt = float(state["time"]), int(state["step_count"]), float(state["last_dt"])
         if self.bodies is not None:
             if "bodies" not in state:
@@ -415,9 +421,9 @@ class ParticleSimulation(ABC):
             self.bodies.restore(state)
         self.boundary.place(self.time)
         settings, wanted = self.scene.particles, self.particles.arrays().keys()
-        state = without_band(state, float(before[4]), settings.seed)
+        state = without_band(state, spacing, settings.seed)
         arrays, moved = resampled(
-            {name: np.asarray(state[name]) for name in wanted}, self.grid, self._admits, spacing=float(before[4]),
+            {name: np.asarray(state[name]) for name in wanted}, self.grid, self._admits, spacing=spacing,
             per_axis=settings.per_axis, random_seed=settings.seed + self.step_count,
         )  # fmt: skip
         self.particles.assign(arrays)
@@ -426,7 +432,7 @@ class ParticleSimulation(ABC):
             self.band.forget()
         self.particles.sort()
         self.mark()
-        return resampling_notes(len(state["position"]), self.particles.count, moved, float(before[4]), self.grid)
+        return resampling_notes(len(state["position"]), self.particles.count, moved, spacing, self.grid)
 
     def notes(self) -> list[str]:
         """Return warnings and facts worth a line at the start of a run."""
@@ -453,15 +459,7 @@ class ParticleSimulation(ABC):
 
     def _trouble(self, totals: ParticleTotals, end: np.ndarray) -> str:
         """Say which particles are not finite, or outside the domain, which ends at `end` [m]; "" if there are none."""
-        position, velocity = self.particles.position.numpy(), self.particles.velocity.numpy()
-        if totals.bad_velocities:
-            field, bad = "velocity", ~((velocity.astype(np.float64) ** 2).sum(axis=1) <= np.finfo(np.float32).max)
-        elif totals.bad_positions:
-            field, bad = "position", ~np.isfinite(position).all(axis=1)
-        else:
-            field, bad = "position", ((position < 0.0) | (position > end))[:, : self.grid.dimension].any(axis=1)
-        found, wrong = np.flatnonzero(bad), "outside the domain" if totals.finite else "not finite"
-        return f"{field} is {wrong} in cell (x, y, z) = {self._cell_of(int(found[0]))} ({len(found)} particles)" if len(found) else ""
+        return particle_trouble(self.particles, self.grid, totals, end)
 
     def _exchange(self, dt: float) -> dict[str, int]:
         """Remove the particles that have left in the step and add those that have come in; return what the log says of it."""
@@ -500,15 +498,3 @@ class ParticleSimulation(ABC):
         """Tell which points [m], shape (n, 3), a particle may be at."""
         i, j, k = self.particles.cells_of(points).T + 1
         return (self.boundary.base.numpy()[k, j, i] != wl.SOLID) & self.boundary.admits(points)
-
-    def _cell_of(self, particle: int) -> tuple[int, ...]:
-        """Return the cell that a particle was last sorted into, counted from 0."""
-        k, j, i = np.unravel_index(int(self.particles.key.numpy()[particle]), self.grid.shape)
-        return tuple(int(c) - 1 + before for c, before in zip((i, j, k), self.grid.origin, strict=True))
-
-    def _signature(self) -> np.ndarray:
-        """Return numbers that tell this scene's arrays from another's."""
-        settings = self.scene.particles
-        transfer = ("apic", "flip", "pic").index(settings.transfer)
-        counts = self.grid.whole or self.grid.counts
-        return np.array([*counts, self.grid.dimension, self.grid.spacing, settings.per_axis, transfer], dtype=np.float64)

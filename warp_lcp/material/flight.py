@@ -1,4 +1,4 @@
-"""Bodies of liquid in flight: what touches no wall keeps its momentum and its angular momentum, and goes along its parabola."""
+"""Bodies of material in flight: what touches no wall keeps its momentum and its angular momentum, and goes along its parabola."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from fluids import flight_kernels as kernels
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.material import flight_kernels as kernels
 from warp_lcp.material.boundary import Boundary
 
 NARROW = 1.0  # [cells^2] the least second moment about an axis, a particle, of a body whose turning the grid resolves
@@ -18,7 +18,7 @@ Sums = np.ndarray  # of `kernels.add_up`, float64, shape (bodies, COLUMNS)
 
 
 class Flights:
-    """Find the bodies of liquid that no wall touches in a step, and keep their momenta.
+    """Find the bodies of material that no wall touches in a step, and keep their momenta.
 
     The pressure's impulses on a body in flight add up to nothing, but not what particles take of them: they are not spread as evenly as
     the volume that the pressure is solved for, and those outside the surface take the velocity of liquid beside them. And a particle that
@@ -57,10 +57,10 @@ class Flights:
         """Find the bodies before particles take their new velocities, and return how many there are.
 
         Args:
-            particles: the liquid; `key` holds its cells.
+            particles: the material; `key` holds its cells.
             window: cells that it can touch.
             weights: of the particles on each component's faces.
-            kind: int8 of AIR, FLUID, SOLID, of the step's pressure.
+            kind: int8 of AIR, FLUID, SOLID, of the step's solve.
             dt: time step [s].
             change: of the velocity by gravity in this step [m/s], shape (3,).
         """

@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Kernels that find bodies of liquid in flight, add up their momenta and move them.
+"""Kernels that find bodies of material in flight, add up their momenta and move them.
 
 Sums are of int64, in fixed point: whole numbers add up to the same in any order, so that a GPU gives the same bits on every run.
 """
@@ -18,7 +18,7 @@ LEAVES = 17  # of them, the particles that come near a wall or an open side
 _TOUCHES = wp.constant(wp.uint8(TOUCHES))
 _SOLID = wp.constant(wp.int8(SOLID))
 
-options = {"enable_backward": False, "module": "fluids.flight"}
+options = {"enable_backward": False, "module": "warp_lcp.material.flight"}
 Integers, Bytes = wp.array(dtype=wp.int32), wp.array(dtype=wp.uint8)
 Kinds = wp.array3d(dtype=wp.int8)
 Motions = wp.array2d(dtype=wp.vec3)
