@@ -126,6 +126,18 @@ def test_a_drop_flies_over_a_pool_that_rests() -> None:
     assert center(pool, drop)[1] < 0.6
 
 
+def test_a_small_drop_does_not_fly_through_a_plate() -> None:
+    """A plate of a cell, a step of six: the drop's cells are far from it before the step and after."""
+    width = 1.0 / 32.0
+    for offset in range(4):
+        low = 0.1 + offset * width
+        liquid = [box([low, 0.5], [low + 2.0 * width, 0.5 + 2.0 * width], velocity=[6.0, 2.0])]
+        plate = box([0.6, 0.0], [0.6 + 1.2 * width, 1.0])
+        drop = create(scene(size=[1.0, 1.0], resolution=32, liquid=liquid, solid=[plate], cfl=8.0))
+        advance(drop, 0.12, dt_max=1.0)
+        assert drop.particles.position.numpy()[:, 0].max() < 0.6 + 1.2 * width
+
+
 def test_a_drop_that_meets_a_wall_in_the_step_is_left_to_it() -> None:
     """The step that ends at a wall, as near as its cells are, gives no body a velocity through it."""
     drop = create(scene(size=[1.0, 1.0], resolution=32, liquid=[ball([0.5, 0.4], 0.15)], cfl=8.0))

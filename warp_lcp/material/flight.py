@@ -109,8 +109,6 @@ class Flights:
         least, most = (rigid * had).sum(axis=1), _about_mean(before)
         now = _about_mean(after) + (turn * (had + has)).sum(axis=1)
         share = np.sqrt(np.clip((most - least) / np.maximum(now - least, 1e-30), 0.0, 1.0))[:, None]
-        if self._flight.straight:  # what is packed too densely is pushed apart
-            share[:] = 1.0
         push, turn = share * missing + (1.0 - share) * drift, share * turn + (1.0 - share) * rigid
         share[after[:, kernels.LEAVES] > 0.0] = -1.0  # it meets a wall in this step
         shift, center = center + drift - after[:, 1:4] / number, center + drift

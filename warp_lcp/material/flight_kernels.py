@@ -14,6 +14,7 @@ from warp_lcp.operators.grid_poisson import SOLID
 
 COLUMNS = 18  # of a body's sums, see `add_up`
 LEAVES = 17  # of them, the particles that come near a wall or an open side
+MOST_STRIDES = 1024  # of a way, a cell each, as far as particles go in a step
 
 _TOUCHES = wp.constant(wp.uint8(TOUCHES))
 _SOLID = wp.constant(wp.int8(SOLID))
@@ -243,6 +244,20 @@ def turned(angle: wp.vec3, a: wp.vec3):
     return wp.cos(size) * a + wp.sin(size) * wp.cross(n, a) + (1.0 - wp.cos(size)) * wp.dot(n, a) * n
 
 
+@wp.func
+def is_near(base: Kinds, touch: wp.array3d(dtype=wp.uint8), planes: int, x: wp.vec3):
+    """Tell whether x [cells] is in a cell that a wall touches, or near the domain's end."""
+    i = int(wp.floor(x[0])) + 1
+    j = int(wp.floor(x[1])) + 1
+    k = int(1)
+    if planes == 2:
+        k = int(wp.floor(x[2])) + 1
+    near = bool(True)
+    if i > 0 and j > 0 and k > 0 and i + 1 < base.shape[2] and j + 1 < base.shape[1] and k + 1 < base.shape[0]:
+        near = base[k, j, i] == _SOLID or (touch[k, j, i] & _TOUCHES) != wp.uint8(0)
+    return near
+
+
 @wp.kernel(**options)
 def fly_kernel(
     flight: Flight, u: Field, v: Field, w: Field, motion: Motions, base: Kinds, touch: wp.array3d(dtype=wp.uint8), start: Vectors,
@@ -270,16 +285,12 @@ def fly_kernel(
     rigid = wp.cross(spin, start[n] - motion[b, 2])
     flight.velocity[p] = flight.velocity[p] + turned(spin * (h / flight.inverse_dx), rigid) - rigid
     add_up(flight, n, x)
-    i = int(wp.floor(x[0])) + 1
-    j = int(wp.floor(x[1])) + 1
-    k = int(1)
-    if flight.planes == 2:
-        k = int(wp.floor(x[2])) + 1
-    inside = i > 0 and j > 0 and k > 0 and i + 1 < u.shape[2] and j + 1 < u.shape[1] and k + 1 < u.shape[0]
-    near = int(1)
-    if inside:
-        if base[k, j, i] != _SOLID and (touch[k, j, i] & _TOUCHES) == wp.uint8(0):
-            near = 0
+    longest = wp.max(wp.max(wp.abs(way[0]), wp.abs(way[1])), wp.abs(way[2]))
+    strides = wp.clamp(int(wp.ceil(longest)), 1, MOST_STRIDES)
+    near = int(0)
+    for stride in range(strides):
+        if is_near(base, touch, flight.planes, x - (float(stride) / float(strides)) * way):
+            near = 1
     if near == 1:
         wp.atomic_add(flight.sums, b, LEAVES, wp.int64(1))
 
