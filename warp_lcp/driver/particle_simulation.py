@@ -107,8 +107,7 @@ class ParticleSimulation(ABC):
         """Allocate the fields, fill the sources that run at the start and sort the particles."""
         self.scene, self.grid, self.boundary, self.particles = scene, grid, boundary, particles
         self.sources, self.outlets, self.bodies, self.band = sources, outlets, bodies, band
-        self.time, self.step_count = 0.0, 0
-        self.last_dt = self.kick_dt = 0.0
+        self.time, self.step_count, self.last_dt, self.kick_dt = 0.0, 0, 0.0, 0.0
         self._velocity_before = np.zeros(3)  # mean of the particles at the start of the step [m/s]
         self.watch: Stopwatch = NoStopwatch()
         self._faces_know = False  # the velocity of the particles, around them
