@@ -48,7 +48,7 @@ class Ledger:
     def __init__(self, simulation: Any) -> None:
         self.simulation = simulation
         self._dt, self._given, self._displaced, self._carried = simulation.last_dt, 0.0, 0.0, np.zeros(3)
-        self._watch("carry", simulation, self._note_momentum, None)
+        self._watch("carry", simulation, None, self._note_momentum)
         exchange = self._exchange("_given")
         for part, names in ((simulation.sources, ("emit",)), (simulation.outlets, ("apply", "remove_departed"))):
             for name in names if part is not None else ():

@@ -76,7 +76,7 @@ def test_the_old_relaxation_is_told(what: str) -> None:
     assert gained > time_steps.MOST
 
 
-@pytest.mark.parametrize("what", ["liquid, whole cells", "body over liquid"])
+@pytest.mark.parametrize("what", ["liquid, whole cells", "sand", "body over liquid"])
 def test_what_is_thrown_flies_along_its_parabola(what: str) -> None:
     assert flight.off_its_parabola(what, 16, 8.0) < flight.MOST
     assert flight.off_its_parabola(what, 16, 8.0, whole_kicks=True) > 0.1
