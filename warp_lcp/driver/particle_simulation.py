@@ -127,7 +127,8 @@ class ParticleSimulation(ABC):
         particles.sort()
 
     def _flights(self) -> Flights | None:
-        return Flights(self.grid, self.boundary, coheres=self.scene.coheres) if self.scene.flies else None
+        s = self.scene
+        return Flights(self.grid, self.boundary, coheres=s.coheres, settles=s.settles) if s.flies else None
 
     @abstractmethod
     def mark(self) -> None:

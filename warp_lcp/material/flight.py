@@ -38,11 +38,12 @@ class Flights:
         grid: the grid.
         boundary: solids and walls.
         coheres: whether a pressure below that of the air keeps a body that turns together; else its particles go straight on.
+        settles: whether what is packed too densely is pushed apart in flight, and so may move faster within itself.
     """
 
-    def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, coheres: bool = True) -> None:
+    def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, coheres: bool = True, settles: bool = False) -> None:
         """Allocate the fields."""
-        self.grid, self.boundary = grid, boundary
+        self.grid, self.boundary, self._settles = grid, boundary, settles
         self._parent, self._number = (wp.zeros(grid.size, dtype=wp.int32, device=grid.device) for _ in range(2))
         self._held, self._several = (wp.zeros(grid.size, dtype=wp.uint8, device=grid.device) for _ in range(2))
         self._count = wp.zeros(2, dtype=wp.int32, device=grid.device)
@@ -109,6 +110,8 @@ class Flights:
         least, most = (rigid * had).sum(axis=1), _about_mean(before)
         now = _about_mean(after) + (turn * (had + has)).sum(axis=1)
         share = np.sqrt(np.clip((most - least) / np.maximum(now - least, 1e-30), 0.0, 1.0))[:, None]
+        if self._settles:
+            share[:] = 1.0
         push, turn = share * missing + (1.0 - share) * drift, share * turn + (1.0 - share) * rigid
         share[after[:, kernels.LEAVES] > 0.0] = -1.0  # it meets a wall in this step
         shift, center = center + drift - after[:, 1:4] / number, center + drift
