@@ -129,11 +129,6 @@ class LiquidScene(ParticleScene):
         return self.pressure.model == "incompressible"
 
     @property
-    def settles(self) -> bool:
-        """Return whether what is packed too densely is pushed apart."""
-        return self.pressure.model == "unilateral"
-
-    @property
     def short_steps(self) -> bool:
         """Return whether steps are so short that spray must not take the velocity of liquid beside it in each of them."""
         return self.time.cfl < SHORT_STEPS and self.pressure.model == "incompressible"

@@ -157,11 +157,6 @@ class ParticleScene(Scene):
         return False
 
     @property
-    def settles(self) -> bool:
-        """Return whether what is packed too densely is pushed apart by the material's own law."""
-        return False
-
-    @property
     def flies(self) -> bool:
         """Return whether bodies in flight can be told: not where they lack particles inside, nor where they go on at another side."""
         return self.particles.narrow_band is None and not self.stays_full and not self.endless
