@@ -323,7 +323,7 @@ def refusals(scene: LiquidScene) -> list[str]:
         "domain.open": scene.domain.open,
         "particles.narrow_band": particles.narrow_band,
         "particles.reseed": particles.reseed,
-        "density_correction": scene.density_correction,
+        "density_correction": scene.density_correction is not None and scene.correction is not None,
         'pressure.model = "unilateral"': scene.pressure.model == "unilateral",
         "output.surface": output.surface,
         "output.volume": output.volume,

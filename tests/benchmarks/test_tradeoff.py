@@ -91,7 +91,7 @@ def test_the_files_of_a_small_suite(scene: str, few: None, tmp_path: Path) -> No
         assert r["figures"]["residual"]["value"] <= (1.1 * r["tolerance"] if scene.startswith("dam") else 0.1)
         curves.setdefault((r["method"], r["precision"]), []).append(r["figures"]["error"]["value"])
     for errors in curves.values():
-        assert errors[-1] < 0.1 * errors[0]
+        assert errors[-1] < (0.1 if scene.startswith("dam") else 0.5) * errors[0]  # sand is known to 2e-4 at once
     pages = {path.suffix for path in tmp_path.glob(f"tradeoff-{scene}*")}
     assert pages == {".png", ".svg", ".csv"}
     with (tmp_path / f"tradeoff-{scene}.csv").open(newline="") as file:

@@ -119,9 +119,9 @@ class Rearrangement:
         return min(1.0, dt / self._pace) if self.crowding is not None and self._pace > 0.0 else 1.0
 
     def columns(self) -> tuple[str, ...]:
-        """Return the names of the log's columns that `apply` fills."""
+        """Return the names of the log's columns that `apply` fills, on ranks too, where none does: a log goes on on any number of them."""
         evens = ("reseeded",) if self.reseeding is not None else ()
-        return (*evens, *CORRECTION_COLUMNS) if self.crowding is not None or self.correction is not None else evens
+        return (*evens, *CORRECTION_COLUMNS) if self._scene.correction is not None else evens
 
     def notes(self) -> list[str]:
         """Return why nothing keeps the particles apart where the scene leaves that to the program."""
