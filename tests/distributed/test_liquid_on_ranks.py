@@ -42,7 +42,7 @@ def same(rows, expected, rel):
 
 
 def single(model_) -> LiquidSimulation:
-    """Return a simulation in one process that does what ranks do: nothing moves crowds apart, or gives bodies in flight their momenta back."""
+    """Return a simulation in one process that does what ranks do: nothing parts crowds, or gives bodies in flight their momenta back."""
     simulation = create(model_)
     simulation.flights = simulation.rearrangement.crowding = None
     return simulation
