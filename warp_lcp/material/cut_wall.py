@@ -266,7 +266,7 @@ def extend_velocity_cut(
     """
     planes = len(velocity) - 1
     for axis, (field, weight, marks, fraction) in enumerate(zip(velocity, weights, known, cut.open, strict=True)):
-        window.launch(keep_released_kernel, [axis, kind, contact, weight, marks])
+        window.launch(keep_released_kernel, [axis, kind, contact, weight, field, marks])
         extrapolate(window, marks, field, 1, join=join)
         window.launch(keep_spray_kernel, [marks, weight, fraction])
         extrapolate(window, marks, field, layers, join=join)

@@ -1,12 +1,13 @@
 """Velocity around the material after the projection: into the air, and at walls that hold it or let it go.
 
-The order matters. 0. Closed faces of RELEASED cells that particles gave weight have been projected too, with no pressure on either side:
-they keep their own velocity. A layer over them would throw all that rests at a wall after the one particle that leaves it. 1. One layer is
-extrapolated from the projected faces. 2. Faces between AIR cells that particles gave weight keep their own velocity: extrapolating over
-spray would make a droplet hang above a pool. 3. Further layers are extrapolated from all of them. Closed faces have taken part and now
-carry the material's velocity, not the wall's. 4. Held cells give their closed faces the wall's normal velocity
-(not merely less of the inward one: a moving wall drags its material along); released and AIR cells lose only the part into the wall, so
-that the last particles can leave. 5. Faces inside solids follow the faces beside them, so that tangential flow is not slowed by a wall.
+The order matters. 0. Closed faces of RELEASED cells that particles gave weight keep their own velocity, but no more than the mean of the
+projected faces around them: a layer over them would throw all that rests at a wall after the one particle that leaves it, and their own
+alone would let a cell's worth of a full box fall. 1. One layer is extrapolated from the projected faces. 2. Faces between AIR cells that
+particles gave weight keep their own velocity: extrapolating over spray would make a droplet hang above a pool. 3. Further layers are
+extrapolated from all of them. Closed faces have taken part and now carry the material's velocity, not the wall's. 4. Held cells give their
+closed faces the wall's normal velocity (not merely less of the inward one: a moving wall drags its material along); released and AIR cells
+lose only the part into the wall, so that the last particles can leave. 5. Faces inside solids follow the faces beside them, so that
+tangential flow is not slowed by a wall.
 """
 
 import typing
@@ -34,9 +35,13 @@ def keep_released_kernel(
     kind: wp.array3d(dtype=wp.int8),
     contact: wp.array3d(dtype=wp.uint8),
     weight: wp.array3d(dtype=wp.float32),
+    field: wp.array3d(dtype=wp.float32),
     known: wp.array3d(dtype=wp.int8),
 ):
-    """Faces of RELEASED cells that are still unknown, closed ones, become known after the first layer if they carry weight."""
+    """Faces of RELEASED cells that are still unknown, closed ones, become known after the first layer if they carry weight.
+
+    They move as their own particles do, but no faster than the known faces around them in the mean, nor against those.
+    """
     plane, row, chunk = wp.tid()
     k = cells.k + plane
     j = cells.j + row
@@ -48,6 +53,21 @@ def keep_released_kernel(
             a = i - wp.where(axis == 0, 1, 0)
             here = kind[k, j, i] == _FLUID and int(contact[k, j, i]) == RELEASED
             if here or (kind[c, b, a] == _FLUID and int(contact[c, b, a]) == RELEASED):
+                total = float(0.0)
+                count = float(0.0)
+                for n in range(6):
+                    side = 1 - 2 * (n & 1)
+                    z = k + wp.where(n // 2 == 2, side, 0)
+                    y = j + wp.where(n // 2 == 1, side, 0)
+                    x = i + wp.where(n // 2 == 0, side, 0)
+                    if z >= 0 and z < known.shape[0] and y < known.shape[1] and x < known.shape[2]:
+                        if known[z, y, x] == wp.int8(1):
+                            total += field[z, y, x]
+                            count += 1.0
+                if count > 0.0:
+                    own = field[k, j, i]
+                    around = total / count
+                    field[k, j, i] = wp.where(own * around > 0.0, wp.sign(own) * wp.min(wp.abs(own), wp.abs(around)), 0.0)
                 known[k, j, i] = wp.int8(2)
 
 
@@ -146,7 +166,7 @@ def extend_velocity(
         join: called with the marks and the velocity of a component after each layer, see `warp_lcp.grid.extrapolate`.
     """
     for axis, (field, weight, marks) in enumerate(zip(velocity, weights, known, strict=True)):
-        window.launch(keep_released_kernel, [axis, kind, contact, weight, marks])
+        window.launch(keep_released_kernel, [axis, kind, contact, weight, field, marks])
         extrapolate(window, marks, field, 1, join=join)
         window.launch(keep_spray_kernel, [axis, kind, weight, marks])
         if join is not None:
