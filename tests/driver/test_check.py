@@ -38,11 +38,11 @@ def test_the_parts_add_up_to_what_a_simulation_takes(name: str, every: int) -> N
 def test_the_plan_has_a_line_for_each_part() -> None:
     _, lines = check_scene("mesh-obstacle")
     parts = {word.strip() for word, _ in lines if word.startswith("  ")}
-    assert parts == {"grid", "pressure", "surface", "solids", "particles", "density correction"}
+    assert parts == {"grid", "pressure", "surface", "solids", "particles", "density correction", "bodies in flight"}
     without, _ = check_scene("mesh-obstacle", ["density_correction.every=0"])
     assert parts - set(without.memory_parts()) == {"density correction"}
     with_more, _ = check_scene("dam-break-2d", ["density_correction.every=2", "particles.reseed.every=2"])
-    assert set(with_more.memory_parts()) == {"grid", "pressure", "surface", "particles", "density correction", "reseeding"}
+    assert set(with_more.memory_parts()) == {"grid", "pressure", "surface", "particles", "density correction", "reseeding", "bodies in flight"}
 
 
 def test_sources_count_later() -> None:

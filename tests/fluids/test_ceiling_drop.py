@@ -77,11 +77,3 @@ def test_a_solid_ceiling_decides_for_itself(wall: str, falls: bool) -> None:
     fallen, expected, _ = drop(create(scene(size=[0.4, 0.8], resolution=32, liquid=liquid, solid=solid, wall="free-slip")), 0.15)
     assert expected > 3
     assert np.abs(fallen - expected if falls else fallen).max() < (0.01 if falls else 0.5)
-
-
-def test_a_full_box_stays_where_it_is_however_gravity_points() -> None:
-    """Its highest corner has no pressure and lets go; what its faces had of gravity is not to be theirs alone."""
-    gravity = [GRAVITY * np.sin(np.radians(20.0)), -GRAVITY * np.cos(np.radians(20.0))]
-    simulation = create(scene(size=[0.4, 0.4], resolution=10, liquid=[box([0.0, 0.0], [0.4, 0.4])], physics={"gravity": gravity}))
-    _, _, rows = drop(simulation, 0.3)
-    assert max(row["max_speed"] for row in rows) < 1e-3 * np.sqrt(GRAVITY * simulation.grid.spacing)
