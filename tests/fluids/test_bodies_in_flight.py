@@ -1,11 +1,14 @@
 """What touches no wall keeps its momentum and its angular momentum, and its center of mass goes along a parabola."""
 
 from collections.abc import Callable
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 
+import small_liquids
+import small_sands
 from fluids import LiquidSimulation
 from small_liquids import GRAVITY, advance, box, create, scene
 
@@ -126,15 +129,16 @@ def test_a_drop_flies_over_a_pool_that_rests() -> None:
     assert center(pool, drop)[1] < 0.6
 
 
-def test_a_small_drop_does_not_fly_through_a_plate() -> None:
+@pytest.mark.parametrize(("key", "materials"), [("liquid", small_liquids), ("sand", small_sands)])
+def test_a_small_drop_does_not_fly_through_a_plate(key: str, materials: ModuleType) -> None:
     """A plate of a cell, a step of six: the drop's cells are far from it before the step and after."""
     width = 1.0 / 32.0
     for offset in range(4):
         low = 0.1 + offset * width
-        liquid = [box([low, 0.5], [low + 2.0 * width, 0.5 + 2.0 * width], velocity=[6.0, 2.0])]
+        small = {key: [box([low, 0.5], [low + 2.0 * width, 0.5 + 2.0 * width], velocity=[6.0, 2.0])]}
         plate = box([0.6, 0.0], [0.6 + 1.2 * width, 1.0])
-        drop = create(scene(size=[1.0, 1.0], resolution=32, liquid=liquid, solid=[plate], cfl=8.0))
-        advance(drop, 0.12, dt_max=1.0)
+        drop = materials.create(materials.scene(size=[1.0, 1.0], resolution=32, **small, solid=[plate], cfl=8.0))
+        materials.advance(drop, 0.12, dt_max=1.0)
         assert drop.particles.position.numpy()[:, 0].max() < 0.6 + 1.2 * width
 
 

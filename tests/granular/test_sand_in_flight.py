@@ -79,17 +79,5 @@ def test_only_the_sand_in_the_air_is_told_where_to_go() -> None:
     assert np.abs(velocity[~low] - velocity[~low].mean(axis=0)).max() < 1e-3  # the root of what rounding makes of energies
 
 
-def test_a_small_drop_of_sand_does_not_fly_through_a_plate() -> None:
-    """A plate of a cell, a step of six: the drop's cells are far from it before the step and after."""
-    width = 1.0 / 32.0
-    for offset in range(4):
-        low = 0.1 + offset * width
-        sand = [box([low, 0.5], [low + 2.0 * width, 0.5 + 2.0 * width], velocity=[6.0, 2.0])]
-        plate = box([0.6, 0.0], [0.6 + 1.2 * width, 1.0])
-        simulation = create(scene(size=[1.0, 1.0], resolution=32, sand=sand, solid=[plate], cfl=8.0))
-        advance(simulation, 0.12, dt_max=1.0)
-        assert simulation.particles.position.numpy()[:, 0].max() < 0.6 + 1.2 * width
-
-
 def test_sand_on_an_endless_axis_has_no_bodies_that_end() -> None:
     assert create(scene(size=[1.0, 1.0], resolution=16, sand=[box([0.0, 0.5], [1.0, 0.8])], periodic=[True, False])).flights is None

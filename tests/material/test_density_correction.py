@@ -251,6 +251,22 @@ def test_it_acts_by_itself_where_particles_crowd_and_nowhere_else() -> None:
     assert "density_correction" in crowded.state()
 
 
+def test_what_it_lifts_by_itself_is_in_proportion_to_the_step() -> None:
+    """A tenth of the step, a tenth of the way; at most all of it. With a table the scene says when, and a step takes out everything."""
+
+    def lift(dt: float, **tables: Any) -> float:
+        squeezed = pool(**tables)
+        position = squeezed.particles.position.numpy() * np.array([1.0, 0.9, 1.0], dtype=np.float32)
+        squeezed.particles.position.assign(position)
+        squeezed.particles.sort()
+        assert squeezed.step(dt)["density_status"] == "CONVERGED"
+        return float(squeezed.particles.totals().center[1] - position[:, 1].mean())
+
+    asked = lift(1e-3, density_correction={})
+    assert lift(1e-3) == pytest.approx(10.0 * lift(1e-4), rel=0.05)
+    assert 0.0 < lift(1e-3) < 0.1 * asked
+
+
 @pytest.mark.parametrize("table", [{}, {"density_correction": {"every": 0}}])
 def test_a_collapsed_column_has_the_volume_that_it_had(table: dict[str, Any]) -> None:
     """By an oracle of its own, from particles alone; without the correction it falls into itself by a tenth."""
