@@ -1,7 +1,8 @@
 """Granular materials: what a scene may call by name, and where the numbers come from.
 
-The angles are between loose and dense packing as soil mechanics measures them: uniform sand of round grains 27.5 to 34 degrees, sandy
-gravel 35 to 50 [Terzaghi & Peck 1967, table 17.1]; so are the densities, dry uniform sand 1430 to 1750 kg/m^3 [table 6.3]. Sugar: angle
+The angles are between loose and dense packing as soil mechanics measures them, near the loose one, which is that of a heap: uniform sand
+of round grains 27.5 to 34 degrees, sandy gravel 35 to 50 [Terzaghi & Peck 1967, table 17.1]; the densities are between both too, dry
+uniform sand 1430 to 1750 kg/m^3 [table 6.3]. Sugar: angle
 of repose and bulk density of dry granulated sugar [Beakawi Al-Hashemi & Al-Amoudi 2018, a review]. Friction against walls is that of
 smooth solid walls, about two thirds of the angle's tangent. Every number may be set in a scene instead.
 """
@@ -10,6 +11,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
+
+AngleOf = Literal["repose", "plane-strain", "triaxial-compression"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,7 +21,7 @@ class Material:
     """A granular material.
 
     Attributes:
-        friction_angle: internal, in plane strain [degrees].
+        friction_angle: of a heap of it [degrees].
         density: of the material at its densest [kg/m^3], air included.
         max_fraction: of space that grains fill at their densest.
         wall_friction: Coulomb's coefficient against solids.
@@ -36,8 +40,20 @@ MATERIALS = {
 }
 
 
+def repose_slope(angle: float) -> float:
+    """Return k of the yield set |s|_F / sqrt(2) <= k p whose heaps and running layers lie at an angle [degrees], k = tan(angle).
+
+    What slides along a slope shears alone, under equal normal stresses: its shear stress over its pressure is the slope's tangent. Sand
+    that rests and has pushed against itself along the slope holds up to asin(k), 35.3 degrees where k = tan(30 degrees).
+
+    >>> round(repose_slope(26.565), 3)
+    0.5
+    """
+    return math.tan(math.radians(angle))
+
+
 def plane_strain_slope(angle: float) -> float:
-    """Return k of the yield set |s|_F / sqrt(2) <= k p that has a friction angle [degrees] in plane strain, k = sin(angle).
+    """Return k of the yield set that has a friction angle [degrees] in plane strain (Mohr and Coulomb's), k = sin(angle).
 
     In 3-D the same cone is flatter where a sample is compressed along one axis: 30 degrees become 22.2, see `compression_slope`.
 
@@ -57,3 +73,10 @@ def compression_slope(angle: float) -> float:
     """
     sine = math.sin(math.radians(angle))
     return 2.0 * math.sqrt(3.0) * sine / (3.0 - sine)
+
+
+def slope(angle: float, test: AngleOf, dimension: int) -> float:
+    """Return k of an angle [degrees] by the test that it is of; in 2-D there is no other compression than plane strain's."""
+    if test == "repose":
+        return repose_slope(angle)
+    return compression_slope(angle) if test == "triaxial-compression" and dimension == 3 else plane_strain_slope(angle)

@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from granular.materials import MATERIALS, Material, compression_slope, plane_strain_slope
+from granular.materials import MATERIALS, AngleOf, Material, slope
 from warp_lcp.driver.particle_scene import ParticleScene
 from warp_lcp.driver.presets import PresetName
 from warp_lcp.driver.scene import PRESET_KEY, Complaint, Domain, Table, Time
@@ -31,8 +31,8 @@ from warp_lcp.driver.shapes import (
 )
 
 STRESS_BYTES = {2: 160, 3: 330}  # a cell: the coupled solve's fields
-STEEPEST = math.sqrt(0.75)  # slope of a cone in 3-D, from which it holds stresses with tension: that of 36.87 degrees in compression
-STEEPEST_ANGLE = 36.8  # degrees
+STEEPEST = {2: 1.0, 3: math.sqrt(0.75)}  # slope of a cone from which on it holds stresses with tension
+STEEPEST_ANGLE = {"repose": {2: 45.0, 3: 40.8}, "triaxial-compression": {3: 36.8}}  # degrees
 
 Angle = Annotated[float, Field(gt=0, lt=60)]
 
@@ -58,14 +58,18 @@ class MaterialTable(Table):
     """[material]: what kind of grains."""
 
     name: Literal["dry-sand", "gravel", "sugar"] = Field(default="dry-sand", description="gives what the table does not")
-    friction_angle: Angle | None = Field(default=None, description="degrees, in plane strain")
+    friction_angle: Angle | None = Field(default=None, description="degrees: what a heap lies at; see angle_of")
     density: float | None = Field(default=None, gt=0, description="at the densest, air included [kg/m^3]")
     max_fraction: float | None = Field(default=None, gt=0, lt=1, description="of space that grains fill at the densest")
     wall_friction: WallFriction | None = Field(default=None, description=f"against solids: {FRICTIONS}")
-    cohesion: float = Field(default=0.0, ge=0, description="the shear stress it bears without pressure, over cos(friction angle) [Pa]")
+    cohesion: float = Field(
+        default=0.0, ge=0, description="the shear stress it bears without pressure [Pa]; over cos(friction_angle) unless that is of repose"
+    )
     tensile_strength: float = Field(default=0.0, ge=0, description="the tension it bears where it is densely packed [Pa]")
-    angle_of: Literal["plane-strain", "triaxial-compression"] = Field(
-        default="plane-strain", description="the test that friction_angle is of; the other makes conical piles as steep as it says"
+    angle_of: AngleOf = Field(
+        default="repose",
+        description="what friction_angle is of: repose, the slope of heaps and of layers that run (k = tan); or a test of soil mechanics,"
+        " plane-strain (k = sin: heaps of 30 degrees lie at 26.6) or triaxial-compression",
     )
 
 
@@ -223,8 +227,12 @@ class SandScene(ParticleScene):
     @property
     def slope(self) -> float:
         """Return k of the yield set |s|_F / sqrt(2) <= k p."""
-        compressed = self.material.angle_of == "triaxial-compression" and self.dimension == 3
-        return compression_slope(self.friction_angle) if compressed else plane_strain_slope(self.friction_angle)
+        return slope(self.friction_angle, self.material.angle_of, self.dimension)
+
+    @property
+    def intercept(self) -> float:
+        """Return what |s|_F / sqrt(2) may be without pressure [Pa]."""
+        return self.cohesion * (1.0 if self.material.angle_of == "repose" else math.cos(math.radians(self.friction_angle)))
 
     @property
     def max_fraction(self) -> float:
@@ -259,10 +267,9 @@ class SandScene(ParticleScene):
         if material.tensile_strength > most:
             message = f"must be at most {most:.4g}, the cohesion over the tangent of the friction angle"
             return [Complaint(("material", "tensile_strength"), material.tensile_strength, message)]
-        if self.slope > STEEPEST:
-            message = (
-                f'must be at most {STEEPEST_ANGLE:g} where material.angle_of = "triaxial-compression": a steeper cone would bear tension'
-            )
+        if self.slope > STEEPEST[self.dimension]:
+            test, most = material.angle_of, STEEPEST_ANGLE[material.angle_of][self.dimension]
+            message = f'must be at most {most:g} where material.angle_of = "{test}": a steeper cone would bear tension'
             return [Complaint(("material", "friction_angle"), self.friction_angle, message)]
         if material.density is not None and material.density != self.physics.density:
             message = f"differs from physics.density = {self.physics.density:g}; give one of them"

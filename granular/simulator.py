@@ -273,8 +273,7 @@ class SandSimulation(ParticleSimulation):
             packing.update(self.density, self.velocity, dt, solids.velocity)
             self._begin_bodies()
         impulse = self.kick_dt / (scene.physics.density * self.grid.spacing)  # of a stress of 1 Pa
-        angle = math.radians(scene.friction_angle)
-        bound = YieldSet(scene.slope, scene.cohesion * math.cos(angle) * impulse, scene.material.tensile_strength * impulse)
+        bound = YieldSet(scene.slope, scene.intercept * impulse, scene.material.tensile_strength * impulse)
         g = float(np.linalg.norm(self.gravity))
         scale = g * self.kick_dt if g > 0.0 else STANDING * math.sqrt(self.grid.spacing)
         with self.watch.stage("stress", stress.now, *packing.mass, *packing.inverse, *packing.start):

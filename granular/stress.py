@@ -27,7 +27,7 @@ class YieldSet:
     """The stresses that sand can bear, as impulses over rho dx [m/s]: |s|_F / sqrt(2) <= k x + cohesion, x >= -tension.
 
     Attributes:
-        k: sine of the friction angle.
+        k: tangent of the angle of repose.
         cohesion: of cells that carry shear.
         tension: of cells that are nearly full.
     """

@@ -1,8 +1,8 @@
 """Sand on a slope without an end: it rests, or runs with the acceleration that friction leaves of gravity's.
 
-On a rough floor the friction is the sand's own, k = sin(friction angle) of the normal load; stiff sand slides on a smooth one with the
-wall's. Above the angle whose tangent that is, sand that runs goes on running; sand that has settled holds up to the friction angle itself,
-because it has pushed against itself along the slope. So the checks of running sand start it moving. The rough floor holds the lowest row.
+On a rough floor the friction is the sand's own, k = tan(friction angle) of the normal load; stiff sand slides on a smooth one with the
+wall's. Above the friction angle sand that runs goes on running; sand that has settled holds up to the angle whose sine is k, because it
+has pushed against itself along the slope. So the checks of running sand start it moving. The rough floor holds the lowest row.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ DT = 2e-3  # [s], at 16 cells
 RUNS, SETTLES, RESTS = 0.2, 0.12, 0.4  # [s]: how long sand runs, settles, and is watched as it rests
 START = 0.5  # [m/s] of sand that runs
 ROUGH, SMOOTH = "stick", 0.5
-FRICTION_ANGLE, STIFF = 30.0, 50.0  # degrees
 COEFFICIENT = 0.5  # of both
+FRICTION_ANGLE, STIFF = math.degrees(math.atan(COEFFICIENT)), 37.5  # degrees
 ANGLES, SLIDES = (27.5, 29.0, 31.0, 35.0), (26.8, 30.0, 35.0)
 REST, SLAB_REST, BOX_FLOWS = 26.0, 26.3, 26.0  # degrees
 

@@ -11,7 +11,7 @@ from granular.simulator import SandSimulation
 
 RESOLUTIONS = (20, 40)  # cells of a column's width
 ASPECT, LENGTH, DURATION = 2.0, 7.0, 1.2  # of the column; of the domain [widths]; [s]
-EXCESS = 1e-2  # by which a step may overfill a cell, by its own stresses
+EXCESS = 5e-3  # by which a step may overfill a cell, by its own stresses
 FEW = 10  # iterations of a control's solves
 DENSEST = 1.1  # of a cell once particles have been moved apart
 

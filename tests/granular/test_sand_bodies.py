@@ -112,7 +112,7 @@ def test_a_block_on_a_slope_of_firm_sand_slides_as_coulomb_says(friction: float)
     block = box([0.1, 0.15], [0.4, 0.25], DENSITY, friction=friction)
     simulation = start(
         [block], size=[0.9, 0.35], depth=0.15, resolution=54, physics={"gravity": gravity, "density": DENSITY},
-        material={"friction_angle": 50.0},
+        material={"friction_angle": 37.5},
     )  # fmt: skip
     run(simulation, 0.06)  # it falls a part of a cell first
     assert simulation.bodies is not None

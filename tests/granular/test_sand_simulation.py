@@ -153,7 +153,7 @@ def test_tilted_gravity_moves_a_slab_as_coulomb_says(degrees: float) -> None:
     gravity = [GRAVITY * math.sin(angle), -GRAVITY * math.cos(angle)]
     model = scene(
         size=[2.0, 0.25], resolution=128, sand=[box([0.25, 0.0], [1.0, 0.09375])], friction=mu, physics={"gravity": gravity},
-        material={"friction_angle": 50.0},
+        material={"friction_angle": 37.5},
     )  # fmt: skip
     simulation = create(model)
     advance(simulation, 0.15)
