@@ -272,7 +272,8 @@ def step_source(text: str, dimension: int, real, *, box: bool, rate: bool = Fals
 @functools.cache
 def stress_kernels(dimension: int, real, residual: bool, box: bool, rate: bool = False) -> SimpleNamespace:
     """Return the kernels for 2 or 3 dimensions, velocities of `real`; steps, or what the natural residual would move."""
-    name = f"granular.stress_{dimension}d_{real.__name__}_{'residual' if residual else 'step'}{'_box' if box else ''}{'_rate' if rate else ''}"
+    kind = f"{'residual' if residual else 'step'}{'_box' if box else ''}{'_rate' if rate else ''}"
+    name = f"granular.stress_{dimension}d_{real.__name__}_{kind}"
     field = wp.array3d(dtype=real)
 
     def source(text: str) -> str:

@@ -169,8 +169,8 @@ def nearest(
         return out
 
     def excess(mu: float) -> float:
-        new = shrunk(mu)
-        return float(free @ new**2 + sum(np.abs(new[group]).max(initial=0.0) ** 2 for group in groups) - (grown(mu) if grown else radius) ** 2)
+        new, bound = shrunk(mu), grown(mu) if grown else radius
+        return float(free @ new**2 + sum(np.abs(new[group]).max(initial=0.0) ** 2 for group in groups) - bound**2)
 
     if excess(0.0) <= 0.0:
         return point
@@ -181,7 +181,7 @@ def nearest(
 
 
 def growth(radius: float, gain: float, half: float, soft: float) -> Growth:
-    """Return the radius r = radius + gain e / (e + half) by the multiplier: mu times r is what a step `soft` takes of the rate of shear e."""
+    """Return r = radius + gain e / (e + half) by the multiplier mu: a step `soft` that takes mu r leaves the rate e = mu r / soft."""
 
     def grown(mu: float) -> float:
         if mu == 0.0 or gain == 0.0:
@@ -326,8 +326,15 @@ def test_stress_and_strain_are_adjoint(dimension: int, seed: int) -> None:
 
 @pytest.mark.parametrize(
     ("dimension", "seed", "options"),
-    [(2, 41, {}), (2, 42, {"cohesion": 0.1, "tension": 0.05}), (2, 44, {"box": True}), (3, 43, {}), (3, 45, {"box": True}),
-     (2, 46, {"gain": 0.3, "halfway": 0.5}), (3, 47, {"gain": 0.3, "halfway": 2.0, "cohesion": 0.1})],
+    [
+        (2, 41, {}),
+        (2, 42, {"cohesion": 0.1, "tension": 0.05}),
+        (2, 44, {"box": True}),
+        (3, 43, {}),
+        (3, 45, {"box": True}),
+        (2, 46, {"gain": 0.3, "halfway": 0.5}),
+        (3, 47, {"gain": 0.3, "halfway": 2.0, "cohesion": 0.1}),
+    ],
 )
 def test_the_residual_is_how_far_the_projection_moves_the_stress(dimension: int, seed: int, options: dict[str, float]) -> None:
     """Projections by SciPy: another yield set, another metric, or a cell whose copies are others would change the sum."""
