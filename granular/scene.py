@@ -80,7 +80,7 @@ class Friction(Table):
     `material.friction_angle`, mu_s, to that of `dynamic_angle`, mu_2, as mu_s + (mu_2 - mu_s) / (1 + I_0 / I), where I is the rate of shear
     times `grain_size` over the square root of pressure over the density of a grain, `material.density` over `material.max_fraction`. So a
     layer on a slope between the two angles runs at a steady speed, and columns of sand fall a little less far. Glass beads of 0.53 mm have
-    20.9 and 32.76 degrees. It takes no memory.
+    20.9 and 32.76 degrees. It takes no memory; an iteration of the solve takes up to 1.4 times as long.
     """
 
     model: Literal["cone", "box"] = Field(

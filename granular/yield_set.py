@@ -69,7 +69,7 @@ YIELD = """
     auto magnitude = [](T a) INLINE { return a < (T)0 ? -a : a; };
     // how much n shrinks, and the largest |b| of each shear
     auto yield = [&](T normal2, const T (&largest)[SHEARS][4], T static_, T gain, T half, T soft, T (&cap)[SHEARS]) INLINE {
-        T r = static_;
+        T r = static_, e = 0;
         if (BOX) {
             for (int d = 0; d < SHEARS; ++d) cap[d] = r;
             return smaller(r/larger(sqrt(normal2), (T)LEAST_RADIUS), (T)1);
@@ -101,15 +101,15 @@ YIELD = """
             if (RATE && iteration < NEWTON) {
                 const T along = slope/larger(total, (T)LEAST_RADIUS), rest = (T)1 - along*mu, by_rate = along*soft, q = size - rest*static_;
                 const T p = by_rate*half + rest*gain - q, root = sqrt(p*p + (T)4*larger(by_rate*q*half, (T)0));
-                const T e = p > (T)0 ? (T)2*q*half/(p + root) : (root - p)/larger((T)2*by_rate, (T)LEAST_RADIUS);
-                const T rate = q > (T)0 ? e : (T)0;
-                r = static_ + gained(rate, gain, half);
-                mu = soft*rate/r;
+                const T above = p > (T)0 ? (T)2*q*half : root - p, below = p > (T)0 ? p + root : larger((T)2*by_rate, (T)LEAST_RADIUS);
+                e = q > (T)0 ? above/below : (T)0;
+                mu = e > (T)0 ? soft*e*(e + half)/(static_*(e + half) + gain*e) : (T)0;
             } else if (iteration < NEWTON) {
                 const T step = (size*inverse_r - (T)1)*total/larger(slope, (T)LEAST_RADIUS);
                 mu = larger(mu + step, (T)0);
             }
         }
+        if (RATE) r += gained(e, gain, half);
         const T onto = smaller(r/larger(size, (T)LEAST_RADIUS), (T)1);
         UNROLL for (int d = 0; d < SHEARS; ++d) cap[d] *= onto;
         return onto*shrink;
