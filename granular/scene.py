@@ -33,6 +33,7 @@ from warp_lcp.driver.shapes import (
 STRESS_BYTES = {2: 160, 3: 330}  # a cell: the coupled solve's fields
 STEEPEST = {2: 1.0, 3: math.sqrt(0.75)}  # slope of a cone from which on it holds stresses with tension
 STEEPEST_ANGLE = {"repose": {2: 45.0, 3: 40.8}, "triaxial-compression": {3: 36.8}}  # degrees
+GLASS = 0.279  # inertial number at which half of the growth of glass beads' friction is there [Jop, Forterre & Pouliquen 2006]
 
 Angle = Annotated[float, Field(gt=0, lt=60)]
 
@@ -91,8 +92,8 @@ class Friction(Table):
         default=None, description="degrees: friction grows with the rate of shear, mu(I), from material.friction_angle to this"
     )
     grain_size: float | None = Field(default=None, gt=0, description="diameter of the grains, with dynamic_angle [m]")
-    inertial_number: float = Field(
-        default=0.279, gt=0, description="at which half of that growth is there, of glass beads unless given; with dynamic_angle"
+    inertial_number: float | None = Field(
+        default=None, gt=0, description=f"at which half of the growth is there, with dynamic_angle; {GLASS:g}, of glass beads, unless given"
     )
 
 
@@ -263,7 +264,7 @@ class SandScene(ParticleScene):
         dynamic, grain = self.friction.dynamic_angle, self.friction.grain_size
         if dynamic is None or grain is None:
             return {}
-        halfway = self.friction.inertial_number * spacing / grain * math.sqrt(self.max_fraction * spacing / kick_dt)
+        halfway = (self.friction.inertial_number or GLASS) * spacing / grain * math.sqrt(self.max_fraction * spacing / kick_dt)
         return {"gain": self._slope_of(dynamic) - self.slope, "halfway": halfway}
 
     @property
@@ -315,8 +316,9 @@ class SandScene(ParticleScene):
         """Return what is wrong with friction that grows with the rate of shear."""
         table, dynamic = self.friction, self.friction.dynamic_angle
         if dynamic is None:
-            keys = sorted(table.model_fields_set & {"grain_size", "inertial_number"})
-            return [Complaint(("friction", key), getattr(table, key), "goes with friction.dynamic_angle, which is missing") for key in keys]
+            given = {"grain_size": table.grain_size, "inertial_number": table.inertial_number}
+            message = "goes with friction.dynamic_angle, which is missing"
+            return [Complaint(("friction", key), value, message) for key, value in given.items() if value is not None]
         found = []
         if dynamic <= self.friction_angle:
             message = f"must be above the friction angle, {self.friction_angle:g} degrees: friction grows with the rate of shear"
