@@ -332,8 +332,8 @@ def test_stress_and_strain_are_adjoint(dimension: int, seed: int) -> None:
         (2, 44, {"box": True}),
         (3, 43, {}),
         (3, 45, {"box": True}),
-        (2, 46, {"gain": 0.3, "halfway": 0.5}),
-        (3, 47, {"gain": 0.3, "halfway": 2.0, "cohesion": 0.1}),
+        (2, 46, {"gain": 0.8, "halfway": 4.0}),
+        (3, 47, {"gain": 0.8, "halfway": 4.0, "cohesion": 0.1}),
     ],
 )
 def test_the_residual_is_how_far_the_projection_moves_the_stress(dimension: int, seed: int, options: dict[str, float]) -> None:
