@@ -190,7 +190,7 @@ class SandBodies:
 
     def move(self, velocity: Velocity, launch: Launch) -> None:
         """Give the bodies' faces their velocity."""
-        kernel = body_kernels(self.grid.dimension, velocity.real, velocity.box).move
+        kernel = body_kernels(self.grid.dimension, velocity.real, velocity.box, velocity.rate).move
         if len(self._face[0]):
             launch(kernel, len(self._face[0]), [*self._face, self.velocity, *_flat(velocity.u)], device=self.grid.device)
 
@@ -219,7 +219,7 @@ class SandBodies:
             launch: records.
         """
         p, device, walls = packing, self.grid.device, self._walls
-        kernels = body_kernels(self.grid.dimension, velocity.real, velocity.box)
+        kernels = body_kernels(self.grid.dimension, velocity.real, velocity.box, velocity.rate)
         share, edge, inverse, u = three(p.share), three(velocity.edge), three(p.inverse), three(velocity.u)
         cells = [self._trial, p.spans, p.flags, *stress, p.drive, p.stiff, *share, *edge, *three(p.mass), *inverse, *u]
         faces = [walls.cells, walls.sides, walls.walls, walls.friction, self._active, p.fraction]

@@ -182,9 +182,9 @@ def lightness_kernel(
 
 
 @functools.cache
-def body_kernels(dimension: int, real, box: bool) -> SimpleNamespace:
+def body_kernels(dimension: int, real, box: bool, rate: bool = False) -> SimpleNamespace:
     """Return the kernels for 2 or 3 dimensions and velocities of `real`."""
-    name = f"granular.bodies_{dimension}d_{real.__name__}{'_box' if box else ''}"
+    name = f"granular.bodies_{dimension}d_{real.__name__}{'_box' if box else ''}{'_rate' if rate else ''}"
     field, flat = wp.array3d(dtype=real), wp.array(dtype=real)
 
     @wp.kernel(enable_backward=False, module=name)
@@ -216,7 +216,7 @@ def body_kernels(dimension: int, real, box: bool) -> SimpleNamespace:
         else:
             b_z[i] = (u_y[i] - u_y[i - strides[2]]) + (u_z[i] - u_z[i - strides[1]])
 
-    @wp.func_native(step_source(CELLS, dimension, real, box=box, trial=True))
+    @wp.func_native(step_source(CELLS, dimension, real, box=box, rate=rate, trial=True))
     def trial_row(
         spans_: _SPANS, flags_: _U8, now_: _STRESS, before_: _STRESS, point_: _STRESS, drive_: _F32, stiff_: _F32,
         share_x: _F32, share_y: _F32, share_z: _F32, b_x: field, b_y: field, b_z: field, mass_x: _F32, mass_y: _F32, mass_z: _F32,
@@ -241,7 +241,7 @@ def body_kernels(dimension: int, real, box: bool) -> SimpleNamespace:
             inverse_x, inverse_y, inverse_z, u_x, u_y, u_z, momentum, numbers, partials, 1, 0, k, j, i, i + 1,
         )  # fmt: skip
 
-    @wp.func_native(step_source(WALLS, dimension, real, box=box, trial=True))
+    @wp.func_native(step_source(WALLS, dimension, real, box=box, rate=rate, trial=True))
     def trial_entries(
         cells: _INTS, sides: _BYTES, walls: _INTS, friction: _SINGLE, active: _INTS, fraction_: _F32,
         now_: _STRESS, before_: _STRESS, point_: _STRESS,

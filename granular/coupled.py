@@ -151,7 +151,8 @@ class InterleavedSweeps:
         return CoupledOutcome(status, done, pressure / scale, friction / scale, history)
 
     def _round(self, stress: Stress) -> None:
-        p, kernels, u = stress.packing, interleaved_kernels(stress.packing.grid.dimension, stress.box), three(stress.velocity.u)
+        p, u = stress.packing, three(stress.velocity.u)
+        kernels = interleaved_kernels(p.grid.dimension, stress.box, stress.rate)
         share, mass, inverse, numbers = three(p.share), three(p.mass), three(p.inverse), stress.numbers
         pressure = [p.flags, stress.now, p.drive, share[0], *mass, *inverse, *u, numbers, self.pressure_relaxation]
         friction = [p.flags, stress.now, p.stiff, *share, *inverse, *u, numbers, self.friction_relaxation]

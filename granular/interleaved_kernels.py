@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from granular.yield_set import FLUX, SHAPE, WALL_FACE, YIELD, native
+from granular.yield_set import FLUX, RATE_BOUND, SHAPE, WALL_FACE, YIELD, native
 
 APART = 3  # cells along an axis, so that two threads change no velocity in common
 
@@ -64,6 +64,7 @@ EDGES = """
 
 CELL = (
     SHAPE
+    + RATE_BOUND
     + YIELD
     + EDGES
     + """
@@ -93,7 +94,7 @@ CELL = (
         for (int q = 0; q < 4; ++q) m[q] = part[d][q] > (T)0 ? magnitude(b[d][q]) : (T)0;
         sums(m[0], m[1], m[2], m[3], largest[d]);
     }
-    const T shrink = yield(normal2, largest, r, cap), keep = radius > (T)LEAST_RADIUS ? shrink : (T)0;
+    const T shrink = yield(normal2, largest, r, gain_at(x), half_at(x), soft, cap), keep = radius > (T)LEAST_RADIUS ? shrink : (T)0;
     for (int m = 0; m < NORMALS; ++m) {
         const float fresh = (float)(n[m]*keep); const T by = (T)fresh - (T)now[(1 + m)*layer];
         now[(1 + m)*layer] = fresh;
@@ -139,12 +140,12 @@ _STRESS = wp.array4d(dtype=wp.float32)
 
 
 @functools.cache
-def interleaved_kernels(dimension: int, box: bool) -> SimpleNamespace:
+def interleaved_kernels(dimension: int, box: bool, rate: bool = False) -> SimpleNamespace:
     """Return the kernels of sweeps in 2 or 3 dimensions."""
-    name = f"granular.interleaved_{dimension}d{'_box' if box else ''}"
+    name = f"granular.interleaved_{dimension}d{'_box' if box else ''}{'_rate' if rate else ''}"
 
     def source(text: str) -> str:
-        return native(text, dimension, wp.float32, box=box)
+        return native(text, dimension, wp.float32, box=box, rate=rate)
 
     @wp.func_native(source(PRESSURE))
     def pressure_cell(

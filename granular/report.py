@@ -47,7 +47,7 @@ class Outcome:
         self.ratio, self.contact, self.known = grid.field(), grid.field(wp.uint8), grid.faces(wp.int8)
         self._rows = int(np.prod(grid.shape[:2]))
         self._sums = wp.zeros(REPORT_COLUMNS * self._rows, dtype=wp.float64, device=grid.device)
-        self._kernels = report_kernels(grid.dimension)
+        self._kernels = report_kernels(grid.dimension, stress.rate)
 
     def take(self, velocity: Sequence[wp.array]) -> None:
         """Give the faces that stresses act on the velocity that they leave [m/s], and find `known` and `contact`."""

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from granular.yield_set import FLUX, SHAPE, native
+from granular.yield_set import FLUX, RATE_BOUND, SHAPE, native
 from warp_lcp.grid.extrapolate import BLOCKED
 from warp_lcp.grid.staggered import CellRange
 from warp_lcp.operators.grid_poisson import SOLID
@@ -19,6 +19,7 @@ REPORT_COLUMNS = (
 REPORT = (
     SHAPE
     + FLUX
+    + RATE_BOUND
     + """
     const unsigned char* flags = flags_.data + row; const float* now = now_.data + row; const float* drive = drive_.data + row;
     const float* share[3] = {share_x.data + row, share_y.data + (DIM == 3 ? row : 0), share_z.data + (DIM == 3 ? row : 0)};
@@ -29,26 +30,30 @@ REPORT = (
     double cells = 0, yielded = 0, taken = 0, most = 0;
     for (int i = first; i < last; ++i) {
         if (!flags[i]) { ratio[i] = 0; continue; }  // no sand, no stress
-        float size = 0; double e[3], mean = 0, w = drive[i];
+        float size = 0; double e[3], mean = 0, w = drive[i], fast2 = 0;
         const double full = fullness(w*numbers.data[STEP_OF_CELL]);
         for (int axis = 0; axis < DIM; ++axis) {
             const long long o = i + s[axis];
             e[axis] = u[axis][o] - u[axis][i]; mean += e[axis]/DIM;
             w += passes(mass[axis][o], full)*u[axis][o] - passes(mass[axis][i], full)*u[axis][i];
         }
-        if (DIM == 2) { const float a = now[layer + i]; size = a*a; taken += a*(e[0] - e[1]); }
-        else for (int c = 0; c < NORMALS; ++c) { const float n = now[(1 + c)*layer + i]; size += 0.5f*n*n; taken += n*(e[c] - mean); }
+        if (DIM == 2) { const float a = now[layer + i]; size = a*a; taken += a*(e[0] - e[1]); fast2 = (e[0] - e[1])*(e[0] - e[1]); }
+        else for (int c = 0; c < NORMALS; ++c) {
+            const float n = now[(1 + c)*layer + i];
+            size += 0.5f*n*n; taken += n*(e[c] - mean); fast2 += 2*(e[c] - mean)*(e[c] - mean);
+        }
         for (int d = 0; d < SHEARS; ++d) {
-            float largest = 0;
+            float largest = 0; double fast = 0;
             for (int q = 0; q < 4; ++q) {
                 const long long o = i + (q & 1)*s[ALPHA[d]] + (q >> 1)*s[BETA[d]];
                 const float b = now[(FIRST + 4*d + q)*layer + i], part = share[d][o];
-                if (part > 0.0f) { const float m = b < 0.0f ? -b : b; largest = m > largest ? m : largest; }
+                if (part > 0.0f) { const float m = b < 0.0f ? -b : b; largest = m > largest ? m : largest; fast += part*fabs(rate[d][o]); }
                 taken += (part > 0.0f ? part : -part)*b*rate[d][o];
             }
-            size += largest*largest;
+            size += largest*largest; fast2 += fast*fast;
         }
-        const float bound = numbers.data[FRICTION]*now[i] + (flags[i] & SHEARS_HERE ? numbers.data[COHESION] : 0.0f);
+        const float bound = numbers.data[FRICTION]*now[i] + (flags[i] & SHEARS_HERE ? numbers.data[COHESION] : 0.0f)
+            + (RATE ? (float)gained(sqrt(fast2), gain_at(now[i]), half_at(now[i])) : 0.0f);
         const bool carries = (flags[i] & SHEARS_HERE) && bound > 1e-12f;
         ratio[i] = carries ? sqrt(size)/bound : 0.0f;
         cells += carries; yielded += carries && ratio[i] > (float)RATIO_YIELDS;
@@ -64,18 +69,19 @@ _STRESS = wp.array4d(dtype=wp.float32)
 
 
 @functools.cache
-def report_kernels(dimension: int) -> SimpleNamespace:
+def report_kernels(dimension: int, rate: bool = False) -> SimpleNamespace:
     """Return the kernels for 2 or 3 dimensions."""
     words = {"REPORT_COLUMNS": REPORT_COLUMNS, "RATIO_YIELDS": RATIO_YIELDS}
+    name = f"granular.report_{dimension}d{'_rate' if rate else ''}"
 
-    @wp.func_native(native(REPORT, dimension, wp.float64, box=False, **words))
+    @wp.func_native(native(REPORT, dimension, wp.float64, rate=rate, **words))
     def report_row(
         flags_: _U8, now_: _STRESS, drive_: _F32, share_x: _F32, share_y: _F32, share_z: _F32, b_x: _F64, b_y: _F64, b_z: _F64,
         u_x: _F64, u_y: _F64, u_z: _F64, mass_x: _F32, mass_y: _F32, mass_z: _F32, numbers: wp.array(dtype=wp.float32),
         ratio_: _F32, sums_: wp.array(dtype=wp.float64), k: int, j: int, first: int, last: int,
     ): ...  # fmt: skip
 
-    @wp.kernel(enable_backward=False, module=f"granular.report_{dimension}d")
+    @wp.kernel(enable_backward=False, module=name)
     def report(
         cells: CellRange, flags: _U8, now: _STRESS, drive: _F32, share_x: _F32, share_y: _F32, share_z: _F32,
         b_x: _F64, b_y: _F64, b_z: _F64, u_x: _F64, u_y: _F64, u_z: _F64, mass_x: _F32, mass_y: _F32, mass_z: _F32,
@@ -87,7 +93,7 @@ def report_kernels(dimension: int) -> SimpleNamespace:
             ratio, sums, cells.k + plane, cells.j + row, cells.i, cells.end,
         )  # fmt: skip
 
-    @wp.kernel(enable_backward=False, module=f"granular.report_{dimension}d")
+    @wp.kernel(enable_backward=False, module=name)
     def take(
         cells: CellRange, axis: int, base: wp.array3d(dtype=wp.int8), inverse: _F32, found: _F64, velocity: _F32,
         known: wp.array3d(dtype=wp.int8),
@@ -108,7 +114,7 @@ def report_kernels(dimension: int) -> SimpleNamespace:
                 mark = wp.int8(BLOCKED)
             known[k, j, i] = mark
 
-    @wp.kernel(enable_backward=False, module=f"granular.report_{dimension}d")
+    @wp.kernel(enable_backward=False, module=name)
     def contact(cells: CellRange, held: wp.uint8, released: wp.uint8, flags: _U8, now: _STRESS, out: _U8):
         plane, row, chunk = wp.tid()
         k = cells.k + plane

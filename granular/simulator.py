@@ -94,7 +94,8 @@ class SandSimulation(ParticleSimulation):
         self._base, self.density = grid.field(wp.int8), grid.field()
         self.packing = Packing(grid, self._base, boundary.capacity, sides=self.sides)
         self.carried = None if bodies is None else SandBodies(grid, bodies.numbers)
-        self.stress = Stress(self.packing, solids.walls, box=scene.friction.model == "box", bodies=self.carried)
+        box, rate = scene.friction.model == "box", scene.friction.dynamic_angle is not None
+        self.stress = Stress(self.packing, solids.walls, box=box, rate=rate, bodies=self.carried)
         self.outcome = Outcome(self.stress)
         self._at_rest = scene.particles.per_axis**grid.dimension
         self._start = self._front()[0]
@@ -273,7 +274,8 @@ class SandSimulation(ParticleSimulation):
             packing.update(self.density, self.velocity, dt, solids.velocity)
             self._begin_bodies()
         impulse = self.kick_dt / (scene.physics.density * self.grid.spacing)  # of a stress of 1 Pa
-        bound = YieldSet(scene.slope, scene.intercept * impulse, scene.material.tensile_strength * impulse)
+        growth = scene.growth(self.grid.spacing, self.kick_dt)
+        bound = YieldSet(scene.slope, scene.intercept * impulse, scene.material.tensile_strength * impulse, **growth)
         g = float(np.linalg.norm(self.gravity))
         scale = g * self.kick_dt if g > 0.0 else STANDING * math.sqrt(self.grid.spacing)
         with self.watch.stage("stress", stress.now, *packing.mass, *packing.inverse, *packing.start):

@@ -26,15 +26,22 @@ SHARE = 0.7**0.5  # by which a step of the friction, over its length, exceeds th
 class YieldSet:
     """The stresses that sand can bear, as impulses over rho dx [m/s]: |s|_F / sqrt(2) <= k x + cohesion, x >= -tension.
 
+    With `gain` friction grows with the rate of shear: k becomes k + gain e / (e + halfway sqrt(x)), e = |rate of shear| dx [m/s], which is
+    mu(I) [Jop, Forterre & Pouliquen 2006].
+
     Attributes:
         k: tangent of the angle of repose.
         cohesion: of cells that carry shear.
         tension: of cells that are nearly full.
+        gain: what k gains at most; counts where the stresses are made for it.
+        halfway: e / sqrt(x) [sqrt(m/s)] at which half of that is gained.
     """
 
     k: float
     cohesion: float = 0.0
     tension: float = 0.0
+    gain: float = 0.0
+    halfway: float = 0.0
 
 
 class Walls:
@@ -87,13 +94,13 @@ class Velocity:
         edge: of each shear: first the shear stress of the edges, then twice their rate of shear times dx [m/s].
     """
 
-    def __init__(self, packing: Packing, real: type, *, box: bool) -> None:
+    def __init__(self, packing: Packing, real: type, *, box: bool, rate: bool) -> None:
         """Allocate the fields."""
         grid = packing.grid
-        self.packing, self.real, self.box = packing, real, box
+        self.packing, self.real, self.box, self.rate = packing, real, box, rate
         self.u = grid.faces(real)
         self.edge = [grid.field(real) for _ in SHEARS[grid.dimension]]
-        self.kernels = stress_kernels(grid.dimension, real, residual=real is wp.float64, box=box)
+        self.kernels = stress_kernels(grid.dimension, real, residual=real is wp.float64, box=box, rate=rate)
 
     def find(self, stress: wp.array, *, launch: Launch = wp.launch, bodies: SandBodies | None = None, respond: bool = False) -> None:
         """Find velocity and rates of strain under a field of stresses.
@@ -136,6 +143,7 @@ class Stress:
         packing: where sand is.
         walls: its faces with solids.
         box: bound each part of the friction by itself, as Narain et al. do; else the cone.
+        rate: friction grows with the rate of shear, as the yield set says.
         bodies: those that the stresses move, if there are any.
 
     Attributes:
@@ -145,13 +153,13 @@ class Stress:
         last_residual: that of pressure and friction [m/s].
     """
 
-    def __init__(self, packing: Packing, walls: Walls, *, box: bool = False, bodies: SandBodies | None = None) -> None:
+    def __init__(self, packing: Packing, walls: Walls, *, box: bool = False, rate: bool = False, bodies: SandBodies | None = None) -> None:
         """Allocate the fields."""
-        grid, self.packing, self.walls, self.box, self.bodies = packing.grid, packing, walls, box, bodies
+        grid, self.packing, self.walls, self.box, self.rate, self.bodies = packing.grid, packing, walls, box, rate, bodies
         normals, shears = (3, 3) if grid.dimension == 3 else (1, 1)
         shape = (1 + normals + 4 * shears, *grid.shape)
         self.now, self._before, self._point = (wp.zeros(shape, dtype=wp.float32, device=grid.device) for _ in range(3))
-        self.velocity, self.checked = Velocity(packing, wp.float32, box=box), Velocity(packing, wp.float64, box=box)
+        self.velocity, self.checked = (Velocity(packing, real, box=box, rate=rate) for real in (wp.float32, wp.float64))
         self.numbers = wp.zeros(NUMBERS, dtype=wp.float32, device=grid.device)
         self._momentum = wp.zeros(STATE, dtype=wp.float64, device=grid.device)
         self._sums = wp.zeros(2 * COLUMNS, dtype=wp.float64, device=grid.device)
@@ -185,8 +193,9 @@ class Stress:
             decay: factor of the last stresses; less than 1 damps patterns that exert no force.
         """
         self._host = np.array(
-            [bound.k, bound.cohesion, bound.tension, *(gravity * kick_dt), 1.0, 1.0, 0.0, dt / self.packing.grid.spacing], dtype=np.float32
-        )
+            [bound.k, bound.cohesion, bound.tension, *(gravity * kick_dt), 1.0, 1.0, 0.0, dt / self.packing.grid.spacing, bound.gain,
+             bound.halfway], dtype=np.float32,
+        )  # fmt: skip
         self.numbers.assign(self._host)
         p = self.packing
         flags = p.flags.numpy()

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from granular.yield_set import COLUMNS, FLUX, SHAPE, WALL_FACE, YIELD, native
+from granular.yield_set import COLUMNS, FLUX, RATE_BOUND, SHAPE, WALL_FACE, YIELD, native
 from warp_lcp.grid.staggered import CellRange
 
 # The momentum's state: steps done; the most of it for pressure and friction; that of this step; that of the next; estimates of the natural
@@ -107,6 +107,7 @@ CELLS = (
     + SPAN
     + SHAPE
     + FLUX
+    + RATE_BOUND
     + YIELD
     + """
     const unsigned char* flags = flags_.data + row;
@@ -163,7 +164,7 @@ CELLS = (
             }
             sums(m[0], m[1], m[2], m[3], largest[d]);
         }
-        const T shrink = yield(normal2, largest, r, cap), keep = sheared ? shrink : (T)0;
+        const T shrink = yield(normal2, largest, r, gain_at(x), half_at(x), soft, cap), keep = sheared ? shrink : (T)0;
         T es = 0, ee = 0, ss = 0;
         auto put = [&](int c, T value, T from, T weight, T ahead, int held) INLINE {  // held: the copies on walls are the walls'
             const long long at = c*layer + i;
@@ -262,20 +263,21 @@ _F32, _F64, _U8 = (wp.array3d(dtype=t) for t in (wp.float32, wp.float64, wp.uint
 _STRESS, _SPANS = wp.array4d(dtype=wp.float32), wp.array3d(dtype=wp.int32)
 
 
-def step_source(text: str, dimension: int, real, *, box: bool, residual: bool = False, trial: bool = False) -> str:
+def step_source(text: str, dimension: int, real, *, box: bool, rate: bool = False, residual: bool = False, trial: bool = False) -> str:
     """Return native code for 2 or 3 dimensions: of a step, of what the natural residual would move, or of a trial step."""
     words = {"NOW_X": NOW_X, "NOW_S": NOW_S, "NEXT_X": NEXT_X, "NEXT_S": NEXT_S, "RESIDUAL": int(residual), "TRIAL": int(trial)}
-    return native(text, dimension, real, box=box, **words)
+    return native(text, dimension, real, box=box, rate=rate, **words)
 
 
 @functools.cache
-def stress_kernels(dimension: int, real, residual: bool, box: bool) -> SimpleNamespace:
+def stress_kernels(dimension: int, real, residual: bool, box: bool, rate: bool = False) -> SimpleNamespace:
     """Return the kernels for 2 or 3 dimensions, velocities of `real`; steps, or what the natural residual would move."""
-    name = f"granular.stress_{dimension}d_{real.__name__}_{'residual' if residual else 'step'}{'_box' if box else ''}"
+    kind = f"{'residual' if residual else 'step'}{'_box' if box else ''}{'_rate' if rate else ''}"
+    name = f"granular.stress_{dimension}d_{real.__name__}_{kind}"
     field = wp.array3d(dtype=real)
 
     def source(text: str) -> str:
-        return step_source(text, dimension, real, box=box, residual=residual)
+        return step_source(text, dimension, real, box=box, rate=rate, residual=residual)
 
     @wp.func_native(source(EDGE_STRESS))
     def edge_stress_row(

@@ -17,8 +17,9 @@ NEWTON = 4  # iterations for the multiplier of a yielding cell: 3 are exact to 2
 COLUMNS = 8  # of a row's sums, see `granular.stress_kernels`
 
 # what kernels read: the yield set, dt g [m/s] (three entries), the steps of a method relative to the diagonal, how far beyond the
-# stresses, in units of the momentum's displacement, it takes its gradient, and dt / dx [s/m]
-FRICTION, COHESION, TENSION, WEIGHT, PRESSURE_STEP, SHEAR_STEP, LOOKAHEAD, STEP_OF_CELL, NUMBERS = 0, 1, 2, 3, 6, 7, 8, 9, 10
+# stresses, in units of the momentum's displacement, it takes its gradient, dt / dx [s/m], and what friction gains with the rate, see RATE
+FRICTION, COHESION, TENSION, WEIGHT, PRESSURE_STEP, SHEAR_STEP, LOOKAHEAD, STEP_OF_CELL = 0, 1, 2, 3, 6, 7, 8, 9
+GAIN, HALFWAY, NUMBERS = 10, 11, 12
 
 HOLDS = 1  # bits of a cell: it holds sand, and so a pressure,
 SHEARS_HERE = 2  # enough of it to carry shear,
@@ -30,6 +31,7 @@ CONSTANTS = {
     "NEWTON": NEWTON, "COLUMNS": COLUMNS, "LEAST_RADIUS": LEAST_RADIUS, "FRICTION": FRICTION, "COHESION": COHESION,
     "TENSION": TENSION, "WEIGHT": WEIGHT, "PRESSURE_STEP": PRESSURE_STEP, "SHEAR_STEP": SHEAR_STEP, "LOOKAHEAD": LOOKAHEAD,
     "HOLDS": HOLDS, "SHEARS_HERE": SHEARS_HERE, "FIRM": FIRM, "STEP_OF_CELL": STEP_OF_CELL, "NEARLY": NEARLY,
+    "GAIN": GAIN, "HALFWAY": HALFWAY,
 }  # fmt: skip
 
 SHAPE = """
@@ -46,21 +48,33 @@ FLUX = """
     auto fullness = [](T free) INLINE { const T c = (T)1 - free*(T)(1.0/NEARLY); return c < (T)0 ? (T)0 : c > (T)1 ? (T)1 : c; };
 """
 
+# Friction that grows with the rate of shear [Jop, Forterre & Pouliquen 2006]: the radius is r + gain e/(e + half), with e the cell's rate
+# of shear times dx [m/s] and half the one at which half of the gain is there, both functions of the pressure.
+RATE_BOUND = """
+    auto gain_at = [&](T x) INLINE { return RATE && x > (T)0 ? (T)numbers.data[GAIN]*x : (T)0; };
+    auto half_at = [&](T x) INLINE { return RATE && x > (T)0 ? (T)numbers.data[HALFWAY]*sqrt(x) : (T)0; };
+    auto gained = [](T e, T gain, T half) INLINE { return e > (T)0 ? gain*e/(e + half) : (T)0; };
+"""
+
 # Nearest point of { |n|^2 / 2 + sum over shears of max_q b_q^2 <= r^2 } in the metric |n|^2 / 2 + sum of b_q^2 / 4. With a multiplier mu
 # n shrinks by 1 + mu and the largest |b_q| of a shear are cut to m = max_n S_n / (n + 4 mu), S_n the sum of the n largest of the four;
 # mu is the root of 1/r - 1/sqrt(|n|^2/2 + sum m^2), nearly linear in mu. The box of Narain et al.
 # bounds each part by itself instead: |n|^2 / 2 <= r^2, |b_q| <= r.
+# RATE: a step of `soft` leaves the rate of shear e = mu r / soft, by which r itself grows: the step is backward Euler's, and what it comes
+# to rest at does not depend on its length. Newton's line for 1/size then meets 1/r(e) where r(e) (size - slope mu) + slope soft e = size^2:
+# a quadratic for e.
 YIELD = """
     auto larger = [](T a, T b) INLINE { return a > b ? a : b; };
     auto smaller = [](T a, T b) INLINE { return a < b ? a : b; };
     auto magnitude = [](T a) INLINE { return a < (T)0 ? -a : a; };
     // how much n shrinks, and the largest |b| of each shear
-    auto yield = [&](T normal2, const T (&largest)[SHEARS][4], T r, T (&cap)[SHEARS]) INLINE {
+    auto yield = [&](T normal2, const T (&largest)[SHEARS][4], T static_, T gain, T half, T soft, T (&cap)[SHEARS]) INLINE {
+        T r = static_, e = 0;
         if (BOX) {
             for (int d = 0; d < SHEARS; ++d) cap[d] = r;
             return smaller(r/larger(sqrt(normal2), (T)LEAST_RADIUS), (T)1);
         }
-        const T inverse_r = (T)1/r, all = sqrt(normal2);
+        const T inverse_r = (T)1/(RATE ? r + gain : r), all = sqrt(normal2);
         T mu = all*inverse_r - (T)1, size = 0;  // a lower bound: each part by itself must fit
         UNROLL for (int d = 0; d < SHEARS; ++d) UNROLL for (int n = 0; n < 4; ++n)
             mu = larger(mu, (T)0.25*(largest[d][n]*inverse_r - (T)(n + 1)));
@@ -84,11 +98,18 @@ YIELD = """
                 slope += m*m*(T)4*rate;
             }
             size = sqrt(total);
-            if (iteration < NEWTON) {
+            if (RATE && iteration < NEWTON) {
+                const T along = slope/larger(total, (T)LEAST_RADIUS), rest = (T)1 - along*mu, by_rate = along*soft, q = size - rest*static_;
+                const T p = by_rate*half + rest*gain - q, root = sqrt(p*p + (T)4*larger(by_rate*q*half, (T)0));
+                const T above = p > (T)0 ? (T)2*q*half : root - p, below = p > (T)0 ? p + root : larger((T)2*by_rate, (T)LEAST_RADIUS);
+                e = q > (T)0 ? above/below : (T)0;
+                mu = e > (T)0 ? soft*e*(e + half)/(static_*(e + half) + gain*e) : (T)0;
+            } else if (iteration < NEWTON) {
                 const T step = (size*inverse_r - (T)1)*total/larger(slope, (T)LEAST_RADIUS);
                 mu = larger(mu + step, (T)0);
             }
         }
+        if (RATE) r += gained(e, gain, half);
         const T onto = smaller(r/larger(size, (T)LEAST_RADIUS), (T)1);
         UNROLL for (int d = 0; d < SHEARS; ++d) cap[d] *= onto;
         return onto*shrink;
@@ -171,7 +192,7 @@ INLINE = """
 """
 
 
-def native(source: str, dimension: int, real: Any, *, box: bool, **numbers: int) -> str:
+def native(source: str, dimension: int, real: Any, *, box: bool = False, rate: bool = False, **numbers: int) -> str:
     """Return the body of a native function for 2 or 3 dimensions and velocities of `real`; words in `numbers` become their values.
 
     `UNROLL for` becomes a loop that is unrolled: a vectorized loop may have no other inside.
@@ -181,9 +202,10 @@ def native(source: str, dimension: int, real: Any, *, box: bool, **numbers: int)
         dimension: 2 or 3.
         real: wp.float32 or wp.float64.
         box: Narain's box instead of the cone.
+        rate: friction grows with the rate of shear.
         numbers: more words and their values.
     """
     source = INLINE + f"typedef {C_TYPES[real]} T;\n" + source
-    for word, value in (CONSTANTS | {"DIM": dimension, "BOX": int(box)} | numbers).items():
+    for word, value in (CONSTANTS | {"DIM": dimension, "BOX": int(box), "RATE": int(rate)} | numbers).items():
         source = re.sub(rf"\b{word}\b", str(value), source)
     return simd(source.replace("UNROLL ", "\n#ifndef __CUDA_ARCH__\n#pragma clang loop unroll(full)\n#endif\n"))

@@ -149,13 +149,14 @@ def use_sand_kernels():
     """Instantiate the kernels of sand in 2-D and 3-D, with both yield sets."""
     for dimension in (2, 3):
         damping_kernel(dimension)
-        report_kernels(dimension)
-        for box in (False, True):
-            interleaved_kernels(dimension, box)
-            stress_kernels(dimension, wp.float32, residual=False, box=box)
-            stress_kernels(dimension, wp.float64, residual=True, box=box)
+        for rate in (False, True):
+            report_kernels(dimension, rate)
+        for box, rate in ((False, False), (True, False), (False, True)):
+            interleaved_kernels(dimension, box, rate)
+            stress_kernels(dimension, wp.float32, residual=False, box=box, rate=rate)
+            stress_kernels(dimension, wp.float64, residual=True, box=box, rate=rate)
             for real in (wp.float32, wp.float64):
-                body_kernels(dimension, real, box)
+                body_kernels(dimension, real, box, rate)
 
 
 def test_all_kernels_compile_for_sm_80_and_sm_90(tmp_path):

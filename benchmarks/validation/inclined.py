@@ -3,6 +3,11 @@
 On a rough floor the friction is the sand's own, k = tan(friction angle) of the normal load; stiff sand slides on a smooth one with the
 wall's. Above the friction angle sand that runs goes on running; sand that has settled holds up to the angle whose sine is k, because it
 has pushed against itself along the slope. So the checks of running sand start it moving. The rough floor holds the lowest row.
+
+Where friction grows with the rate of shear, mu(I) [Jop, Forterre & Pouliquen 2006], a layer runs at a steady speed. Pressure and shear
+stress grow with the depth alike, so that I is the same everywhere, mu(I) = tan(slope). |Rate of shear| = I sqrt(p / rho_s) / d with
+p = rho g (H - y) cos(slope), rho = max_fraction rho_s, then integrates to Bagnold's profile,
+u = 2/3 I / d sqrt(max_fraction g cos(slope)) (H^1.5 - (H - y)^1.5).
 """
 
 from __future__ import annotations
@@ -15,6 +20,7 @@ import numpy as np
 
 from benchmarks.record import Chart, Lines
 from benchmarks.validation.finding import Findings, Trial, attempt
+from granular.materials import MATERIALS
 from granular.scene import SandScene
 from granular.simulator import GranularSimulator, SandSimulation
 
@@ -25,20 +31,32 @@ DT = 2e-3  # [s], at 16 cells
 RUNS, SETTLES, RESTS = 0.2, 0.12, 0.4  # [s]: how long sand runs, settles, and is watched as it rests
 START = 0.5  # [m/s] of sand that runs
 ROUGH, SMOOTH = "stick", 0.5
+BAGNOLD = "Bagnold's layer"
 COEFFICIENT = 0.5  # of both
 FRICTION_ANGLE, STIFF = math.degrees(math.atan(COEFFICIENT)), 37.5  # degrees
 ANGLES, SLIDES = (27.5, 29.0, 31.0, 35.0), (26.8, 30.0, 35.0)
 REST, SLAB_REST, BOX_FLOWS = 26.0, 26.3, 26.0  # degrees
+STATIC, DYNAMIC, INERTIAL = 20.9, 32.76, 0.279  # degrees, degrees and I0: glass beads [Jop, Forterre & Pouliquen 2006]
+GRAIN = 0.3  # [m]: Bagnold's profile knows no other length than the depth, and with so large a grain it is steady in a second
+STEADY, BELOW, STOPPED = (24.0, 28.0), 19.0, 0.6  # degrees; degrees at which it rests after this time [s],
+CREEPS = 0.1  # from this speed [m/s]
+SETS_IN, OFF = 0.9, 0.8  # [s] until it is steady; what of the profile it starts with
 
 
 def check(device: str) -> tuple[list[Trial], list[Chart]]:
     """Run the check at its resolutions."""
-    trials = [trial(n, device) for trial in (layer, slab) for n in RESOLUTIONS]
+    trials = [trial(n, device) for trial in (layer, slab, bagnold) for n in RESOLUTIONS]
     curves = {f"{t.resolution}: {label}": curve for t in trials if t.check == "inclined layer" for label, curve in t.curves.items()}
     exact = [(math.degrees(a), accelerates(math.degrees(a)) / GRAVITY) for a in np.linspace(math.atan(COEFFICIENT), math.radians(36.0), 20)]
     curves["sin - cos / 2"] = ([x for x, _ in exact], [y for _, y in exact])
     title = "Acceleration of a layer that runs"
-    return trials, [Lines("inclined-layer", title, "slope [degrees]", "a / g", curves, logarithmic_x=False, logarithmic_y=False)]
+    profiles = {f"{t.resolution}: {label}": c for t in trials if t.check == BAGNOLD for label, c in t.curves.items()}
+    y = np.linspace(0.0, DEPTH, 40)
+    profiles |= {f"Bagnold, {a:g} degrees": ((y / DEPTH).tolist(), bagnold_profile(y, a).tolist()) for a in STEADY}
+    return trials, [
+        Lines("inclined-layer", title, "slope [degrees]", "a / g", curves, logarithmic_x=False, logarithmic_y=False),
+        Lines("bagnold-layer", f"{BAGNOLD}: speed", "y / depth", "u [m/s]", profiles, logarithmic_x=False, logarithmic_y=False),
+    ]
 
 
 def layer(cells: int, device: str = "cpu", angles: tuple[float, ...] = ANGLES) -> Trial:
@@ -75,6 +93,49 @@ def slab(cells: int, device: str = "cpu", angles: tuple[float, ...] = SLIDES) ->
         found.must_break("smooth floor: mean acceleration", slips, high=0.01, unit="g")
 
     return attempt("sliding slab", f"{cells} cells of depth", run)
+
+
+def bagnold(cells: int, device: str = "cpu", angles: tuple[float, ...] = STEADY) -> Trial:
+    """Let sand whose friction grows with the rate of shear run to its steady speed; the control is friction that does not grow."""
+    beads: dict[str, Any] = {"material": {"friction_angle": STATIC}}
+    growing = beads | {"friction": {"dynamic_angle": DYNAMIC, "grain_size": GRAIN, "inertial_number": INERTIAL}}
+
+    def run(found: Findings) -> None:
+        for angle in angles:
+            y, u = steady(cells, angle, device, **growing)
+            expected, most = bagnold_profile(y, angle), float(bagnold_profile(np.array([DEPTH]), angle)[0])
+            found.add(f"{angle:g} degrees: mean speed over Bagnold's", u.mean() / expected.mean(), low=0.95, high=1.05)
+            off = np.abs(u - expected).max() / most
+            found.add(f"{angle:g} degrees: farthest from Bagnold's profile, over its surface's speed", off, high=0.05)
+            found.curves[f"{angle:g} degrees"] = ((y / DEPTH).tolist(), u.tolist())
+        _, mean = _watch(_create(cells, BELOW, device, CREEPS, **growing), cells, STOPPED)
+        found.add(f"{BELOW:g} degrees: speed in the end over that at the start", abs(mean[-1]) / CREEPS, high=0.01)
+        y, u = steady(cells, angles[0], device, **beads)
+        ratio = u.mean() / bagnold_profile(y, angles[0]).mean()
+        found.must_break(f"friction that does not grow, {angles[0]:g} degrees: mean speed over Bagnold's", ratio, low=0.95, high=1.05)
+
+    return attempt(BAGNOLD, f"{cells} cells of depth", run)
+
+
+def bagnold_profile(y: np.ndarray, angle: float) -> np.ndarray:
+    """Return the steady speed [m/s] at heights [m] of a layer on a slope [degrees]."""
+    static, slope, dynamic = (math.tan(math.radians(a)) for a in (STATIC, angle, DYNAMIC))
+    inertial = INERTIAL * (slope - static) / (dynamic - slope)
+    fall = math.sqrt(MATERIALS["dry-sand"].max_fraction * GRAVITY * math.cos(math.radians(angle)))
+    return np.asarray(2.0 / 3.0 * inertial / GRAIN * fall * (DEPTH**1.5 - np.maximum(DEPTH - y, 0.0) ** 1.5))
+
+
+def steady(cells: int, angle: float, device: str = "cpu", **tables: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the heights [m] of rows of sand that has run for a while on a slope [degrees], and their mean speeds [m/s]."""
+    simulation = _create(cells, angle, device, 0.0, **tables)
+    velocity = simulation.particles.velocity.numpy()
+    velocity[:, 0] = OFF * bagnold_profile(simulation.particles.position.numpy()[:, 1], angle)
+    simulation.particles.velocity.assign(velocity)
+    _watch(simulation, cells, SETS_IN)
+    y, u = simulation.particles.position.numpy()[:, 1], simulation.particles.velocity.numpy()[:, 0]
+    row = np.minimum((y * cells / DEPTH).astype(int), cells - 1)
+    count = np.bincount(row, minlength=cells)
+    return np.bincount(row, y, cells) / count, np.bincount(row, u, cells) / count
 
 
 def accelerates(angle: float) -> float:

@@ -1,4 +1,4 @@
-"""Collapsing columns of sand against the runouts that experiments found: Lube et al. 2005 and Lajeunesse et al. 2005."""
+"""Collapsing columns of sand against the runouts and heights that experiments found: Lube et al. 2005 and Lajeunesse et al. 2005."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from benchmarks.validation.sand_pit import (
     Row,
     column,
     create,
+    height,
     profile,
     runout,
     share_solved,
@@ -28,8 +29,16 @@ from benchmarks.validation.sand_pit import (
 CASES = {20: (0.5, 1.0, 2.0, 4.0, 8.0), 40: (0.5, 1.0, 2.0, 4.0)}  # aspects at each number of cells of a column's width
 CONTROLLED = 2.0  # the aspect of the negative controls
 WIDENED = 0.2  # of the experiments' range
+HEIGHT = 0.1  # of the experiments' heights
+STEEPEST = 45.0  # degrees of a control: no cone is steeper
+GROWTH = 20, (1.0, 2.0, 4.0)  # cells and aspects of columns whose friction grows with the rate of shear,
+GAIN = math.tan(math.radians(32.76)) - math.tan(math.radians(20.9))  # by as much as that of glass beads
+DYNAMIC = math.degrees(math.atan(WALL_FRICTION + GAIN))
+GRAIN = 5.3e-4  # [m], and of their size [Jop, Forterre & Pouliquen 2006]
+TALL = 4.0  # the aspect from which that must bring the runout into the experiments' range
 STOPS, STAYS = 3.5, 0.5  # [sqrt(height / g)]: when a pile has stopped; [s] that it is watched then
 HIGH, MOST = 80, 1500  # cells of height from which columns need more iterations a step than a scene allows by itself; how many
+STEEP = 40.0  # degrees of the control in 3-D, where no cone is steeper than 40.8
 CUBE = 48  # cells of the domain in 3-D
 CUBE_DOMAIN, CUBE_WIDTH = 0.96, 0.28  # [m]: of the domain, and of the cube that collapses there
 
@@ -40,6 +49,7 @@ class Collapse:
 
     Attributes:
         runout: of the front, in widths.
+        height: of the pile, in widths.
         moved: how far the front went in the end of the run, in widths.
         energy: kinetic, at the end, over the largest.
         solved: share of the steps whose stresses are within the tolerance [%].
@@ -47,6 +57,7 @@ class Collapse:
     """
 
     runout: float
+    height: float
     moved: float
     energy: float
     solved: float
@@ -63,6 +74,11 @@ def lajeunesse(aspect: float) -> float:
     return min(1.8 * aspect, 2.3 * aspect ** (2.0 / 3.0))
 
 
+def lube_height(aspect: float) -> float:
+    """Return the height of the pile, in widths, that [Lube2005] found: a, a^(2/5) from 1.15 on."""
+    return aspect if aspect < 1.15 else float(aspect**0.4)
+
+
 def envelope(aspect: float) -> tuple[float, float]:
     """Return the least and the largest runout that the experiments allow."""
     found = lube(aspect), lajeunesse(aspect)
@@ -71,14 +87,14 @@ def envelope(aspect: float) -> tuple[float, float]:
 
 def check(device: str) -> tuple[list[Trial], list[Chart]]:
     """Run the check at its resolutions."""
-    trials = [trial(cells, device) for cells in CASES] + [cube(device)]
+    trials = [*(trial(cells, device) for cells in CASES), growing(device), cube(device)]
     a = np.geomspace(0.4, 10.0, 60)
     laws = {"Lube et al. 2005": lube, "Lajeunesse et al. 2005": lajeunesse}
     curves: dict[str, Any] = {name: (a.tolist(), [law(x) for x in a]) for name, law in laws.items()}
     for label, side in (("20 % below both", 0), ("20 % above both", 1)):
         curves[label] = (a.tolist(), [envelope(x)[side] for x in a])
     shapes: dict[str, Any] = {}
-    for t in trials[: len(CASES)]:
+    for t in trials[:-1]:
         curves[t.resolution] = t.curves.get("runout", ([], []))
         shapes |= {f"{t.resolution}: {label}": c for label, c in t.curves.items() if label.startswith("a = ")}
     return trials, [
@@ -91,7 +107,7 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
 
 
 def trial(cells: int, device: str = "cpu", aspects: tuple[float, ...] = (), *, controls: bool = True) -> Trial:
-    """Compare runouts with the experiments; the controls have half and twice their friction.
+    """Compare runouts and heights with the experiments; the controls have half of their friction, and the most that a cone may have.
 
     Args:
         cells: of a column's width.
@@ -107,6 +123,7 @@ def trial(cells: int, device: str = "cpu", aspects: tuple[float, ...] = (), *, c
             c = collapse(aspect, cells, device)
             ways.append(c.runout)
             found.add(f"a = {aspect:g}: runout", c.runout, low=low, high=high, unit="widths")
+            found.add(f"a = {aspect:g}: height over Lube's", c.height / lube_height(aspect), low=1.0 - HEIGHT, high=1.0 + HEIGHT)
             found.add(f"a = {aspect:g}: way of the front in the last {STAYS:g} s", abs(c.moved), high=0.02, unit="widths")
             found.add(f"a = {aspect:g}: kinetic energy in the end over the largest", c.energy, high=1e-3)
             found.add(f"a = {aspect:g}: steps with stresses to 1e-3", c.solved, low=95.0, unit="%")
@@ -114,10 +131,11 @@ def trial(cells: int, device: str = "cpu", aspects: tuple[float, ...] = (), *, c
         found.curves["runout"] = (list(chosen), ways)
         low, high = envelope(CONTROLLED)
         slope = math.tan(math.radians(FRICTION_ANGLE))
-        for label, factor in (("half", 0.5), ("twice", 2.0)) if controls else ():
-            angle = math.degrees(math.atan(factor * slope))
-            c = collapse(CONTROLLED, cells, device, length=12.0, angle=angle, floor=factor * slope)
-            found.must_break(f"{label} the friction, a = {CONTROLLED:g}: runout", c.runout, low=low, high=high, unit="widths")
+        for angle in (math.degrees(math.atan(0.5 * slope)), STEEPEST) if controls else ():
+            c = collapse(CONTROLLED, cells, device, length=12.0, angle=angle, floor=math.tan(math.radians(angle)))
+            found.must_break(f"{angle:.0f} degrees, a = {CONTROLLED:g}: runout", c.runout, low=low, high=high, unit="widths")
+            ratio = c.height / lube_height(CONTROLLED)
+            found.must_break(f"{angle:.0f} degrees, a = {CONTROLLED:g}: height over Lube's", ratio, low=1.0 - HEIGHT, high=1.0 + HEIGHT)
 
     return attempt("sand collapse", f"{cells} cells of width", run)
 
@@ -139,22 +157,37 @@ def collapse(aspect: float, cells: int, device: str = "cpu", *, length: float = 
     before = runout(simulation)
     rows += steps(simulation, stops + STAYS)
     energies = [row["kinetic_energy"] for row in rows]
-    height = (profile(simulation)[1:-1] - FLOOR) / cells
-    pile = height > 0.0
-    x = (np.arange(len(height)) + 0.5) / cells
-    way = runout(simulation)
-    return Collapse(way, way - before, energies[-1] / max(energies), share_solved(rows), (x[pile].tolist(), height[pile].tolist()))
+    outline = (profile(simulation)[1:-1] - FLOOR) / cells
+    pile = outline > 0.0
+    x = (np.arange(len(outline)) + 0.5) / cells
+    way, surface = runout(simulation), (x[pile].tolist(), outline[pile].tolist())
+    return Collapse(way, height(simulation), way - before, energies[-1] / max(energies), share_solved(rows), surface)
+
+
+def growing(device: str = "cpu", cells: int = GROWTH[0], aspects: tuple[float, ...] = GROWTH[1]) -> Trial:
+    """Compare columns whose friction grows with the rate of shear by as much as that of glass beads."""
+
+    def run(found: Findings) -> None:
+        ways = {}
+        for aspect in aspects:
+            c = collapse(aspect, cells, device, friction={"dynamic_angle": DYNAMIC, "grain_size": GRAIN})
+            low, high = envelope(aspect) if aspect < TALL else (lube(aspect), lajeunesse(aspect))
+            ways[aspect] = c.runout
+            found.add(f"a = {aspect:g}: runout", c.runout, low=low, high=high, unit="widths")
+            found.add(f"a = {aspect:g}: height over Lube's", c.height / lube_height(aspect), low=1.0 - HEIGHT, high=1.0 + HEIGHT)
+        found.curves["runout"] = (list(ways), list(ways.values()))
+
+    return attempt("sand collapse", f"mu(I), {cells} cells of width", run)
 
 
 def cube(device: str = "cpu", cells: int = CUBE) -> Trial:
     """Let a square column collapse in 3-D: it must stop, as a round pile that reaches as far as those of round columns do.
 
-    The controls are the cube itself, and twice the friction, as of plane strain: in compression no cone is that steep. Sand with half of
-    the friction would meet the walls.
+    The controls are the cube itself, and sand of nearly the steepest cone. Sand with half of the friction would meet the walls.
     """
 
     def run(found: Findings) -> None:
-        material = {"friction_angle": FRICTION_ANGLE, "angle_of": "triaxial-compression"}
+        material = {"friction_angle": FRICTION_ANGLE}
         start, x, rows = _falling_cube(material, WALL_FRICTION, cells, device)
         energies = [row["kinetic_energy"] for row in rows]
         found.add("kinetic energy in the end over the largest", energies[-1] / max(energies), high=1e-3)
@@ -166,9 +199,8 @@ def cube(device: str = "cpu", cells: int = CUBE) -> Trial:
         low, high = (1.0 - WIDENED) * 1.6 * math.sqrt(aspect), (1.0 + WIDENED) * 2.0 * math.sqrt(aspect)  # [Lube2004], [Lajeunesse2004]
         found.add(f"a = {aspect:.2f}: runout", _reach(x) / radius - 1.0, low=low, high=high, unit="radii")
         found.add("least dissipation of a step", min(row["dissipation"] for row in rows), low=0.0, unit="J")
-        steep = {"friction_angle": math.degrees(math.atan(2.0 * WALL_FRICTION))}
-        _, x, _ = _falling_cube(steep, 2.0 * WALL_FRICTION, cells, device)
-        found.must_break(f"twice the friction, a = {aspect:.2f}: runout", _reach(x) / radius - 1.0, low=low, high=high, unit="radii")
+        _, x, _ = _falling_cube({"friction_angle": STEEP}, math.tan(math.radians(STEEP)), cells, device)
+        found.must_break(f"{STEEP:g} degrees, a = {aspect:.2f}: runout", _reach(x) / radius - 1.0, low=low, high=high, unit="radii")
 
     return attempt("sand collapse", f"3-D, {cells} cells", run)
 

@@ -101,6 +101,12 @@ def profile(simulation: SandSimulation) -> np.ndarray:
     return np.asarray((full * rows).max(axis=0))
 
 
+def height(simulation: SandSimulation) -> float:
+    """Return how high the sand in three columns of cells is, were it packed densely, where it is most [widths]."""
+    sand = simulation.packing.fraction.numpy()[1, 1 + FLOOR : -1, 1:-1].sum(axis=0) * simulation.grid.spacing / WIDTH
+    return float(np.convolve(sand, np.full(3, 1.0 / 3.0), "valid").max())
+
+
 def depth(simulation: SandSimulation) -> np.ndarray:
     """Return how many cells each particle lies below the surface, shape (n,); negative above it."""
     cells = np.floor(positions(simulation) / simulation.grid.spacing).astype(int) + 1

@@ -180,6 +180,9 @@ CASES = {
         {"friction": 0.0, "solver": {"method": "interleaved-sweeps", "max_iterations": 20}}, sand=True,
     ),
     "box of friction": Case({"friction": {"model": "box"}}, modules=("granular.stress_2d_float32_step_box",), sand=True),
+    "friction that grows with the rate": Case(
+        {"friction": {"dynamic_angle": 40.0, "grain_size": 0.01}}, modules=("granular.stress_2d_float32_step_rate",), sand=True
+    ),
     "sweeps": Case(
         {"solver": {"method": "interleaved-sweeps", "max_iterations": 20}}, modules=("granular.interleaved_2d",), sand=True
     ),
@@ -196,6 +199,7 @@ CASES = {
 
 PLACED_ELSEWHERE = (  # take another's place, only look, or are numbers of kernels that are there anyway
     "cut cells", "diagnostics", "diagnostics of sand", "unilateral pressure", "box of friction", "sweeps", "gauge", "cohesion",
+    "friction that grows with the rate",
 )  # fmt: skip
 
 

@@ -1,6 +1,7 @@
 """Velocity, rates of strain, projection and residual of sand's stresses against NumPy and SciPy, cell by cell from the equations."""
 
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ DT, GRAVITY = 0.01, np.array([0.0, -9.81, 0.0])
 AXES = {2: ((0, 1),), 3: ((0, 1), (0, 2), (1, 2))}  # of the shears xy, xz, yz
 OPENING = np.array([0, 1, 3])  # bits of a copy's place: q & 1 along the first axis, q >> 1 along the second
 FRICTIONS = [0.3, 0.7]  # of the domain and of the solid
+Growth = Callable[[float], float]  # of a yield set's radius, by the multiplier of the projection onto it
 
 
 def step_along(axis: int) -> np.ndarray:
@@ -45,7 +47,9 @@ class Case:
         return [f.numpy().astype(float) for f in getattr(self.packing, name)]
 
 
-def make(dimension: int, seed: int, *, cohesion: float = 0.0, tension: float = 0.0, box: bool = False) -> Case:
+def make(
+    dimension: int, seed: int, *, cohesion: float = 0.0, tension: float = 0.0, box: bool = False, gain: float = 0.0, halfway: float = 0.0
+) -> Case:
     """Return a case: cells that are empty, loose and dense, partly in touch with walls and a solid of two cells."""
     random = np.random.default_rng(seed)
     grid = StaggeredGrid((6, 5, 4 if dimension == 3 else 1), 0.1, dimension)
@@ -60,13 +64,13 @@ def make(dimension: int, seed: int, *, cohesion: float = 0.0, tension: float = 0
     density = np.where(random.random(grid.shape) < 0.75, random.uniform(0.55, 1.1, grid.shape), random.uniform(0.0, 0.3, grid.shape))
     u = [wp.array(random.normal(size=grid.shape).astype(np.float32), dtype=wp.float32, device=grid.device) for _ in range(dimension)]
     packing.update(wp.array(density.astype(np.float32), dtype=wp.float32, device=grid.device), u, DT)
-    stress = Stress(packing, Walls(grid, index, FRICTIONS), box=box)
+    stress = Stress(packing, Walls(grid, index, FRICTIONS), box=box, rate=gain > 0.0)
     start = random.normal(scale=0.4, size=stress.now.shape)
     start[0] = np.maximum(random.normal(0.4, 0.5, size=grid.shape), 0.0)
     start[:, index == 0] = 0.0  # nothing is ever written into the domain's ring
     stress.now.assign(start.astype(np.float32))
     stress.kick_dt = DT
-    bound = YieldSet(0.5, cohesion, tension)
+    bound = YieldSet(0.5, cohesion, tension, gain, halfway)
     stress.begin(bound, GRAVITY, DT, DT)
     return Case(stress, packing, bound, index)
 
@@ -132,7 +136,9 @@ def shear_rate(u: list[np.ndarray], shear: int, edge: tuple[int, ...]) -> float:
     return float(u[alpha][edge] - u[alpha][at(edge, -step_along(beta))] + u[beta][edge] - u[beta][at(edge, -step_along(alpha))])
 
 
-def nearest(point: np.ndarray, groups: list[np.ndarray], free: np.ndarray, metric: np.ndarray, radius: float) -> np.ndarray:
+def nearest(
+    point: np.ndarray, groups: list[np.ndarray], free: np.ndarray, metric: np.ndarray, radius: float, grown: Growth | None = None
+) -> np.ndarray:
     """Return the point of { sum of free n^2 + sum over groups of max |z|^2 <= radius^2 } nearest in a metric.
 
     With a multiplier mu of the set's bound, each group is cut to the size m that minimizes sum metric (|z| - m)_+^2 + mu m^2, and what
@@ -144,6 +150,7 @@ def nearest(point: np.ndarray, groups: list[np.ndarray], free: np.ndarray, metri
         free: weights of the squares of the entries that count by themselves; 0 for those in groups.
         metric: weights of the squared distance; on the entries that count by themselves equal to `free`.
         radius: of the set.
+        grown: the radius by the multiplier instead.
     """
     if radius < 1e-12:
         return np.zeros_like(point)
@@ -162,8 +169,8 @@ def nearest(point: np.ndarray, groups: list[np.ndarray], free: np.ndarray, metri
         return out
 
     def excess(mu: float) -> float:
-        new = shrunk(mu)
-        return float(free @ new**2 + sum(np.abs(new[group]).max(initial=0.0) ** 2 for group in groups) - radius**2)
+        new, bound = shrunk(mu), grown(mu) if grown else radius
+        return float(free @ new**2 + sum(np.abs(new[group]).max(initial=0.0) ** 2 for group in groups) - bound**2)
 
     if excess(0.0) <= 0.0:
         return point
@@ -171,6 +178,17 @@ def nearest(point: np.ndarray, groups: list[np.ndarray], free: np.ndarray, metri
     while excess(high) > 0.0:
         high *= 4.0
     return shrunk(float(scipy.optimize.brentq(excess, 0.0, high, xtol=1e-14)))
+
+
+def growth(radius: float, gain: float, half: float, soft: float) -> Growth:
+    """Return r = radius + gain e / (e + half) by the multiplier mu: a step `soft` that takes mu r leaves the rate e = mu r / soft."""
+
+    def grown(mu: float) -> float:
+        if mu == 0.0 or gain == 0.0:
+            return radius
+        return float(scipy.optimize.brentq(lambda r: r - radius - gain / (1.0 + half * soft / (mu * r)), radius, radius + gain, xtol=1e-14))
+
+    return grown
 
 
 def cell_move(case: Case, u: list[np.ndarray], cell: tuple[int, ...], *, box: bool = False) -> tuple[float, float]:
@@ -216,7 +234,8 @@ def cell_move(case: Case, u: list[np.ndarray], cell: tuple[int, ...], *, box: bo
         size = np.sqrt(free @ point**2)
         new[:count] = point[:count] * min(1.0, radius / size) if size > 0.0 else 0.0
     else:
-        new = nearest(point, groups, free, metric, radius)
+        grown = growth(radius, case.bound.gain * max(x, 0.0), case.bound.halfway * np.sqrt(max(x, 0.0)), soft) if case.bound.gain else None
+        new = nearest(point, groups, free, metric, radius, grown)
     return (x - now[(0, *cell)]) ** 2, float(metric @ (new - np.array(old)) ** 2)
 
 
@@ -307,7 +326,15 @@ def test_stress_and_strain_are_adjoint(dimension: int, seed: int) -> None:
 
 @pytest.mark.parametrize(
     ("dimension", "seed", "options"),
-    [(2, 41, {}), (2, 42, {"cohesion": 0.1, "tension": 0.05}), (2, 44, {"box": True}), (3, 43, {}), (3, 45, {"box": True})],
+    [
+        (2, 41, {}),
+        (2, 42, {"cohesion": 0.1, "tension": 0.05}),
+        (2, 44, {"box": True}),
+        (3, 43, {}),
+        (3, 45, {"box": True}),
+        (2, 42, {"gain": 0.8, "halfway": 1.0}),
+        (3, 47, {"gain": 0.8, "halfway": 4.0, "cohesion": 0.1}),
+    ],
 )
 def test_the_residual_is_how_far_the_projection_moves_the_stress(dimension: int, seed: int, options: dict[str, float]) -> None:
     """Projections by SciPy: another yield set, another metric, or a cell whose copies are others would change the sum."""

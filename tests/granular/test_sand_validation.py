@@ -14,6 +14,12 @@ def test_the_envelope_is_that_of_the_experiments() -> None:
         assert sand_collapse.envelope(aspect) == pytest.approx((0.8 * low, 1.2 * high), abs=0.02)
 
 
+def test_the_height_is_that_of_the_experiments() -> None:
+    """Low columns keep theirs; were the power that of round ones, 1/6, a = 4 would be off by a quarter."""
+    for aspect, height in ((0.5, 0.5), (1.1, 1.1), (2.0, 1.32), (4.0, 1.741), (8.0, 2.297)):
+        assert sand_collapse.lube_height(aspect) == pytest.approx(height, abs=1e-3)
+
+
 def test_a_column_runs_as_far_as_in_experiments_and_stops() -> None:
     trial = sand_collapse.trial(12, aspects=(1.0,), controls=False)
     assert trial.failures() == []
