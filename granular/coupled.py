@@ -92,6 +92,8 @@ class AcceleratedProjection:
     check_every: int = 2
     patience: int = 300
     least: int = 80
+    wait: int = 50
+    calm: tuple[float, ...] = (0.87, 0.8)
 
     def solve(self, stress: Stress, *, scale: float, tolerance: float, max_iterations: int) -> CoupledOutcome:
         """Solve from the stresses as they are."""
@@ -101,7 +103,7 @@ class AcceleratedProjection:
             pressure_step=self.pressure_step, shear_step=self.shear_step * (1.0 if flat else 0.5), lookahead=self.lookahead,
             momentum=self.momentum,
         )  # fmt: skip
-        aim, best, best_at = tolerance * scale, math.inf, 0
+        aim, best, best_at, moved, limits = tolerance * scale, math.inf, 0, 0, list(self.calm)
         least = min(self.least, max_iterations) if history[0][1] > NOTHING * tolerance else 0
         status = None if least > 0 and math.isfinite(history[0][1]) else _status(history, tolerance, max_iterations, done)
         while status is None:
@@ -111,8 +113,11 @@ class AcceleratedProjection:
                 done += self.check_every * PERIOD
                 if not estimate < BETTER * best:
                     stagnates = not math.isfinite(estimate) or (done - best_at >= self.patience and estimate < NEAR_BEST * best)
+                    if limits and done - moved >= self.wait:
+                        stress.calm(limits.pop(0))
+                        moved = done
                 else:
-                    best, best_at = estimate, done
+                    best, best_at, moved = estimate, done, done
             history.append((done, math.hypot(*stress.residual()) / scale))
             status = _status(history, tolerance, max_iterations, done) or (wl.SolveStatus.STAGNATED if stagnates else None)
             aim *= 0.8  # should the estimate have been too good
