@@ -19,7 +19,7 @@ from warp_lcp.program import Launch, Program
 from warp_lcp.vectors import Reduction
 
 WALL_GRAIN = 256  # wall faces a CPU thread takes
-MOST_MOMENTUM = 0.985
+MOST_MOMENTUM = 0.985  # unless a method wants less
 SHARE = 0.7**0.5  # by which a step of the friction, over its length, exceeds the natural residual: measured
 
 
