@@ -66,8 +66,9 @@ class AcceleratedProjection:
     Each step moves all stresses against their gradient, scaled by the problem's diagonal, and projects: x onto x >= 0, the friction onto
     the yield set of the new x. Pressure and friction have momenta of their own, which grow where steps go on in one direction and fall
     where they flutter: the friction's bound depends on the pressure but not the other way round, so that the problem has no energy to
-    descend and too much momentum makes it oscillate where sand is nearly rigid. No theorem promises convergence: the residual that is
-    reported is that of the stresses, recomputed in float64.
+    descend and too much momentum makes it oscillate where sand is nearly rigid. Where the residual no longer falls, the momentum is
+    limited further. No theorem promises convergence, and in deep sand that yields there is a floor, see docs/methods.md: the residual
+    that is reported is that of the stresses, recomputed in float64.
 
     With diagonals D_x and D_s of a full packing, steps are stable while c_x a_x + c_s a_s < 2 (1 + beta) / (1 + 2 lookahead beta), where
     a are the steps and c = 2, 2 in 2-D, 2, 4 in 3-D (the largest eigenvalue on a periodic grid); the defaults take four fifths of that.
@@ -80,6 +81,9 @@ class AcceleratedProjection:
         decay: of the stresses that a time step starts from.
         check_every: periods of steps between two looks at the estimate of the residual.
         patience: steps without a better estimate after which the next that is nearly as good as the best is taken.
+        wait: steps without a better estimate after which the momentum is limited, unless the estimate is within the tolerance.
+        calm: limits of the momentum, one after the other: beyond .87 deep sand that yields flutters, which doubles its residual; waves
+            of pressure as long as the sand is deep want .95 and more, so that solves start without a limit.
         least: steps that a solve takes, whatever its residual, unless that is next to nothing. Smooth errors hardly show in the residual
             and add up from one time step to the next: without these steps, packed sand at rest creeps two to four times as far.
     """
@@ -91,6 +95,8 @@ class AcceleratedProjection:
     decay: float = 1.0
     check_every: int = 2
     patience: int = 300
+    wait: int = 100
+    calm: tuple[float, ...] = (0.87, 0.8)
     least: int = 80
 
     def solve(self, stress: Stress, *, scale: float, tolerance: float, max_iterations: int) -> CoupledOutcome:
@@ -101,7 +107,7 @@ class AcceleratedProjection:
             pressure_step=self.pressure_step, shear_step=self.shear_step * (1.0 if flat else 0.5), lookahead=self.lookahead,
             momentum=self.momentum,
         )  # fmt: skip
-        aim, best, best_at = tolerance * scale, math.inf, 0
+        aim, best, best_at, moved, limits = tolerance * scale, math.inf, 0, 0, list(self.calm)
         least = min(self.least, max_iterations) if history[0][1] > NOTHING * tolerance else 0
         status = None if least > 0 and math.isfinite(history[0][1]) else _status(history, tolerance, max_iterations, done)
         while status is None:
@@ -111,8 +117,11 @@ class AcceleratedProjection:
                 done += self.check_every * PERIOD
                 if not estimate < BETTER * best:
                     stagnates = not math.isfinite(estimate) or (done - best_at >= self.patience and estimate < NEAR_BEST * best)
+                    if limits and done - moved >= self.wait and estimate > aim:
+                        stress.calm(limits.pop(0))
+                        moved = done
                 else:
-                    best, best_at = estimate, done
+                    best, best_at, moved = estimate, done, done
             history.append((done, math.hypot(*stress.residual()) / scale))
             status = _status(history, tolerance, max_iterations, done) or (wl.SolveStatus.STAGNATED if stagnates else None)
             aim *= 0.8  # should the estimate have been too good

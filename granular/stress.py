@@ -12,13 +12,14 @@ import warp as wp
 from granular.bodies import SandBodies
 from granular.checkerboard import damping_kernel
 from granular.packing import SHEARS, Packing, three, wall_faces
-from granular.stress_kernels import BETA_X, NEXT_X, PERIOD, RESIDUAL_X, STATE, momentum_kernel, stress_kernels
+from granular.stress_kernels import BETA_X, NEXT_X, PERIOD, RESIDUAL_X, REST, STATE, momentum_kernel, stress_kernels
 from granular.yield_set import COLUMNS, LOOKAHEAD, NUMBERS, PRESSURE_STEP, SHEAR_STEP
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.program import Launch, Program
 from warp_lcp.vectors import Reduction
 
 WALL_GRAIN = 256  # wall faces a CPU thread takes
+MOST_MOMENTUM = 0.985  # unless a method wants less
 SHARE = 0.7**0.5  # by which a step of the friction, over its length, exceeds the natural residual: measured
 
 
@@ -226,11 +227,19 @@ class Stress:
         state = np.zeros(STATE)
         state[[BETA_X, BETA_X + 1]] = momentum
         state[[NEXT_X, NEXT_X + 1]] = 0.25
+        state[REST] = 1.0 - MOST_MOMENTUM
         self._momentum.assign(state)
         wp.copy(self._point, self.now)
         wp.copy(self._before, self.now)
         if self.bodies is not None:
             self.bodies.prepare(self.packing, self.numbers, pressure_step=pressure_step, shear_step=shear_step)
+
+    def calm(self, momentum: float) -> None:
+        """Let momenta from now on be at most `momentum`."""
+        state = self._momentum.numpy().copy()
+        state[BETA_X : NEXT_X + 2] = np.minimum(state[BETA_X : NEXT_X + 2], momentum)
+        state[REST] = 1.0 - momentum
+        self._momentum.assign(state)
 
     def advance(self, periods: int) -> float:
         """Take some periods of steps with momentum, see `PERIOD`; return an estimate of the natural residual [m/s]."""

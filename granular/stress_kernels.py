@@ -13,8 +13,8 @@ from granular.yield_set import COLUMNS, FLUX, RATE_BOUND, SHAPE, WALL_FACE, YIEL
 from warp_lcp.grid.staggered import CellRange
 
 # The momentum's state: steps done; the most of it for pressure and friction; that of this step; that of the next; estimates of the natural
-# residuals over the last PERIOD steps; sums over these.
-COUNT, BETA_X, NOW_X, NOW_S, NEXT_X, NEXT_S, RESIDUAL_X, SUMS, STATE = 0, 1, 3, 4, 5, 6, 7, 9, 17
+# residuals over the last PERIOD steps; sums over these; 1 less the most that the momentum may grow to.
+COUNT, BETA_X, NOW_X, NOW_S, NEXT_X, NEXT_S, RESIDUAL_X, SUMS, REST, STATE = 0, 1, 3, 4, 5, 6, 7, 9, 17, 18
 PERIOD = 5
 HIGH, LOW = 0.85, 0.5  # cosines above and below which the momentum grows and falls
 
@@ -426,7 +426,7 @@ def momentum_kernel(sums: wp.array(dtype=wp.float64), state: wp.array(dtype=wp.f
                     rest = rest * wp.float64(0.8)
                 if cosine < wp.float64(LOW):
                     rest = rest * wp.float64(1.8)
-            state[BETA_X + block] = wp.float64(1.0) - wp.clamp(rest, wp.float64(0.015), wp.float64(0.4))
+            state[BETA_X + block] = wp.float64(1.0) - wp.clamp(rest, state[REST], wp.float64(0.4))
         state[RESIDUAL_X] = state[SUMS + 6] / wp.float64(PERIOD)
         state[RESIDUAL_X + 1] = state[SUMS + 7] / wp.float64(PERIOD)
         for c in range(COLUMNS):

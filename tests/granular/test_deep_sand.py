@@ -1,0 +1,46 @@
+"""Pressure and friction together in deep sand: what a solve takes, and what is left where sand yields."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from granular.coupled import AcceleratedProjection
+from granular.simulator import SandSimulation
+from small_sands import GRAVITY, box, create, scene
+
+
+def silo(cells: int, depth: int, slot: int, **tables: Any) -> SandSimulation:
+    """Return a silo of some cells' width and depth, with a slot in its floor."""
+    dx, left = 0.0125, (cells - slot) // 2
+    low, floor, high = 4 * dx, 6 * dx, (6 + depth) * dx
+    solid = [
+        box([-1.0, low], [left * dx, floor], friction="stick"),
+        box([(left + slot) * dx, low], [1.0, floor], friction="stick"),
+    ]
+    sand, drain = [box([0.0, floor], [cells * dx, high])], [box([-1.0, -1.0], [1.0, 2 * dx])]
+    size = [cells * dx, (depth + 10) * dx]
+    return create(scene(size=size, resolution=depth + 10, sand=sand, friction=0.5, solid=solid, drain=drain, **tables))
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.5])
+@pytest.mark.parametrize("cells", [32, 64, 96])
+def test_a_cold_start_takes_iterations_as_the_sand_is_deep(cells: int, friction: float) -> None:
+    """Waves as long as the depth keep their momentum: a solve that limits it before they are gone takes twice as long."""
+    dx = 0.02
+    sand = [box([0.0, 0.0], [8 * dx, cells * dx])]
+    simulation = create(scene(size=[8 * dx, (cells + 4) * dx], resolution=cells + 4, sand=sand, friction=friction))
+    row = simulation.step(0.5 * float(np.sqrt(dx / GRAVITY)))
+    assert row["solve_status"] == "CONVERGED"
+    assert row["solve_iterations"] <= (3.0 if friction else 4.0) * cells + 40
+
+
+def test_a_limit_of_the_momentum_leaves_less_of_the_residual_where_deep_sand_yields() -> None:
+    """Sand of 40 degrees that runs out of a silo: pressure and the friction's bound drive each other on."""
+    medians = []
+    for limits in ((), AcceleratedProjection().calm):
+        simulation = silo(16, 48, 6, material={"friction_angle": 40.0}, density_correction={})
+        simulation.method = AcceleratedProjection(calm=limits)
+        rows = [simulation.step(min(simulation.stable_dt(), 0.01)) for _ in range(30)]
+        medians.append(float(np.median([row["coupled_residual"] for row in rows[10:]])))
+    assert medians[1] < 0.75 * medians[0]
