@@ -11,7 +11,8 @@ from granular.yield_set import COLUMNS, SHAPE, native
 # Coulomb friction of the wall in a cell, within mu times its load, against the sand's slip along it: the mean of its faces' velocities by
 # what is open of them, without the part along the wall's normal n. A layer holds the traction times the wall's area over what is open of
 # the cell's two faces along an axis: so much a face takes of it for its own open part. The load is the pressure, which is all that keeps
-# sand from going into the wall, and the weight of what no face of the cell stands for; without pressure all its weight.
+# sand from going into the wall, and the weight of what no face of the cell stands for: of all that a cell holds with no sand upon it. On
+# a wall rougher than sand it is the sand beside it that fails: a band of shear thinner than a cell, which no grid oblique to it has.
 TRACTION = (
     SHAPE.replace(", row = k*s[2] + j*s[1]", "")
     + """
@@ -27,13 +28,16 @@ TRACTION = (
         const float* n = walls.data + 8*m;  // normal (3), area, what faces leave out along each axis (3), volume
         const T size = n[3], x = now_.data[cell];
         T v[DIM], sum[DIM], across = 0, stiffest = 0, load = x;
+        int main = 0;
+        for (int a = 1; a < DIM; ++a) main = n[a]*n[a] > n[main]*n[main] ? a : main;
+        const int alone = !(flags_.data[cell - (n[main] > 0.0f ? s[main] : -s[main])] & HOLDS);
         for (int a = 0; a < DIM; ++a) {
             const long long o = cell + s[a];
             const T low = cut_.data[a*layer + cell], high = cut_.data[a*layer + o];
             sum[a] = low + high;
             v[a] = sum[a] > (T)0 ? (low*u[a][cell] + high*u[a][o])/sum[a] : (T)0;
             across += n[a]*v[a];
-            load += n[a]*weight[a]*fraction_.data[cell]*(x > (T)0 ? n[4 + a] : n[7])/size;
+            load += n[a]*weight[a]*fraction_.data[cell]*(alone ? n[7] : n[4 + a])/size;
             if (sum[a] > (T)0) {
                 const T stiff = (T)2*size*(low*low*inverse[a][cell] + high*high*inverse[a][o])/(sum[a]*sum[a]);
                 stiffest = stiff > stiffest ? stiff : stiffest;
@@ -48,7 +52,8 @@ TRACTION = (
             tau[a] = from[a] - omega/stiffest*(v[a] - across*n[a]);
             total += tau[a]*tau[a];
         }
-        const T bound = (T)friction.data[numbers_of.data[m]]*(load > (T)0 ? load : (T)0);
+        const T normal = load > (T)0 ? load : (T)0, wall = (T)friction.data[numbers_of.data[m]]*normal;
+        const T sand = (T)numbers.data[FRICTION]*normal + (T)numbers.data[COHESION], bound = wall < sand ? wall : sand;
         const T keep = total > bound*bound ? bound/sqrt(total) : (T)1;
         for (int a = 0; a < DIM; ++a) {
             if (!(sum[a] > (T)0)) continue;
