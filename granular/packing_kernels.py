@@ -17,6 +17,7 @@ LEAST_MASS = 0.1  # of a face, in units of a full one: lighter ones would make t
 DENSE = 0.5  # the fraction from which a cell carries shear
 SURFACE = 0.3  # the fraction from which a cell beside air counts as full: a partly filled one has no pressure, and so no friction
 FULL = 0.95  # the fraction from which a cell counts as full: less than 1 by the sampling's noise, whose gaps would close as falls
+WALL_NOISE = 0.25  # by which it is less where a wall takes nearly all of a cell: half the distance of two particles
 FIRM_FRACTION = 0.9  # from which cohesion holds a cell together
 LANES = 16  # cells of a vector
 ROUNDING = 1e-6  # by which a fraction may differ from 1 and count as 1
@@ -85,7 +86,8 @@ def cell_kernel(
                     full = wp.max(phi, 1.0)
         free = wp.max(FULL - full, 0.0) * rate
         if volume:
-            free = free * volume[k, j, i]
+            open = volume[k, j, i]
+            free = wp.max(FULL - WALL_NOISE * (1.0 - open) - full, 0.0) * rate * open
             if mark != 0:
                 least = float(1.0)
                 for c in range(-planes + 1, planes):
