@@ -71,9 +71,7 @@ class CutWalls:
         self._find_walls(cut, inner & ~solid, faces, high, volume)
         self._friction = wp.array(np.minimum(friction, 1e6), dtype=wp.float32, device=device)
 
-    def _find_walls(
-        self, cut: CutCells, open_: np.ndarray, faces: list[np.ndarray], high: list[np.ndarray], volume: np.ndarray
-    ) -> None:
+    def _find_walls(self, cut: CutCells, open_: np.ndarray, faces: list[np.ndarray], high: list[np.ndarray], volume: np.ndarray) -> None:
         """Find the cells with a wall, and what their kernel reads."""
         walls = np.array([a - b for a, b in zip(faces, high, strict=True)])
         size = np.sqrt((walls**2).sum(axis=0))
@@ -131,7 +129,8 @@ def _open_part(corners: np.ndarray, low: Sequence[float], high: Sequence[float],
 
     Args:
         corners: shape (2, ..., 2, n), the last axis of the cube first.
-        low, high: of the box along each axis.
+        low: of the box along each axis.
+        high: likewise.
         samples: along each axis of the box.
     """
     total = np.zeros(corners.shape[-1])
@@ -167,7 +166,7 @@ def _open_faces(grid: StaggeredGrid, faces: list[np.ndarray], distance: np.ndarr
         for layer in (1, grid.counts[axis] + 1):
             at = [slice(1, -1)] * 3
             at[2 - axis] = slice(layer, layer + 1)
-            part = corners[(..., *at)]
+            part = corners[:, :, *at] if len(others) == 2 else corners[:, *at]
             flat = part.reshape(*(2,) * len(others), -1)
             found = _open_part(flat, [0.0] * len(others), [1.0] * len(others), 2 * SAMPLES[grid.dimension])
             face[tuple(at)] = found.reshape(part.shape[len(others) :])

@@ -6,7 +6,7 @@ import functools
 import warp as wp
 
 from granular.stress_kernels import NEXT_S, NOW_S
-from granular.yield_set import COLUMNS, SHAPE, native
+from granular.yield_set import SHAPE, native
 
 # Coulomb friction of the wall in a cell, within mu times its load, against the sand's slip along it: the mean of its faces' velocities by
 # what is open of them, without the part along the wall's normal n. A layer holds the traction times the wall's area over what is open of

@@ -109,7 +109,8 @@ def cell_kernel(
 @wp.kernel(**options)
 @typing.no_type_check
 def face_kernel(
-    cells: CellRange, axis: int, base: _I8, fraction: _F32, velocity: _F32, solid: _F32, openings: _F32X, start: _F32, mass: _F32, inverse: _F32,
+    cells: CellRange, axis: int, base: _I8, fraction: _F32, velocity: _F32, solid: _F32, openings: _F32X,
+    start: _F32, mass: _F32, inverse: _F32,
 ):  # fmt: skip
     """Mass of a face in units of a full one, its inverse, and the velocity that the stress acts on.
 

@@ -87,8 +87,8 @@ class SandSolids:
     """
 
     def __init__(
-        self, grid: StaggeredGrid, placed: Sequence[PlacedSolid], boundary: Boundary, friction: Sequence[float], *, prescribed: bool = False,
-        cuts: bool = False,
+        self, grid: StaggeredGrid, placed: Sequence[PlacedSolid], boundary: Boundary, friction: Sequence[float], *,
+        prescribed: bool = False, cuts: bool = False,
     ) -> None:  # fmt: skip
         """Find the cells."""
         self.grid, self._placed, self._boundary, self._friction = grid, tuple(placed), boundary, list(friction)

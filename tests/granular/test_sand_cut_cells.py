@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from granular.cut_walls import CutWalls
 from granular.coupled import AcceleratedProjection
+from granular.cut_walls import CutWalls
 from granular.packing import SHEARS, Packing
 from granular.scene import SandScene
 from granular.simulator import GranularSimulator, SandSimulation
@@ -35,8 +35,8 @@ class Case:
         self.grid = grid = StaggeredGrid(counts, DX, dimension)
         self.normal = np.array(tilt) / np.linalg.norm(tilt)
         point = DX * np.array([0.52 * counts[0], 0.43 * counts[1], 0.47 * counts[2] if dimension == 3 else 0.0])
-        plane = PlacedSolid(geometry=Plane(point=point[:dimension].tolist(), normal=self.normal[:dimension].tolist()), separating=True, name="plane")
-        cut = CutCells(grid, [plane], wall_separating=True)
+        half = Plane(point=point[:dimension].tolist(), normal=self.normal[:dimension].tolist())
+        cut = CutCells(grid, [PlacedSolid(geometry=half, separating=True, name="plane")], wall_separating=True)
         self.walls = CutWalls(grid, cut, [0.0, mu])
         self.point, self.k, self.mu = point, k, mu
         self.packing = Packing(grid, cut.base, wp.full(grid.shape, 1.0, dtype=wp.float32, device=grid.device), cut=self.walls)
@@ -45,9 +45,7 @@ class Case:
         self.stress = Stress(self.packing, Walls(grid, ring, [0.0, mu], rubbing_only=True))
         self.openings = self.walls.openings.numpy().astype(float)
 
-    def begin(
-        self, velocity: list[np.ndarray], gravity: np.ndarray, *, cohesion: float = 0.0, filled: np.ndarray | None = None
-    ) -> None:
+    def begin(self, velocity: list[np.ndarray], gravity: np.ndarray, *, cohesion: float = 0.0, filled: np.ndarray | None = None) -> None:
         density = np.ones(self.grid.shape) if filled is None else filled
         one = wp.array(density.astype(np.float32), dtype=wp.float32, device=self.grid.device)
         fields = [wp.array(np.broadcast_to(u, self.grid.shape).astype(np.float32), dtype=wp.float32) for u in velocity]
@@ -240,7 +238,8 @@ def test_solids_of_whole_cells_stay_so() -> None:
     grid = StaggeredGrid((8, 8, 1), 0.125, 2)
 
     def cut(normal: list[float], point: list[float]) -> CutCells:
-        return CutCells(grid, [PlacedSolid(geometry=Plane(point=point, normal=normal), separating=True, name="plane")], wall_separating=True)
+        half = Plane(point=point, normal=normal)
+        return CutCells(grid, [PlacedSolid(geometry=half, separating=True, name="plane")], wall_separating=True)
 
     assert cut([0.0, 1.0], [0.0, 0.25]).whole_cells
     assert not cut([math.sqrt(0.5), math.sqrt(0.5)], [0.5, 0.5]).whole_cells
