@@ -4,7 +4,7 @@
 Noise in the fraction feeds the pattern and no equation takes it away. Where p = (-1)^(i + j), the shear stress with -p at a cell's low-low
 corner, +p at the two mixed ones and -p at high-high cancels grad p; in 3-D half of that on the edges of each shear does. So a part of what
 of the pressure alternates in all directions, (-1, 2, -1)/4 along each axis, can be taken from p and added to the copies with those signs,
-and no velocity changes. Only cells deep in dense sand take part.
+and no velocity changes. Only cells deep in dense sand take part, away from solids that cut cells.
 """
 
 import functools
@@ -22,7 +22,7 @@ DAMP = (
     const unsigned char* flags = flags_.data + row; const float* from = from_.data + row; float* now = now_.data + row;
     const float* share[3] = {share_x.data + row, share_y.data + (DIM == 3 ? row : 0), share_z.data + (DIM == 3 ? row : 0)};
     for (int i = first; i < last; ++i) {
-        if (!(flags[i] & SHEARS_HERE)) continue;
+        if (!(flags[i] & SHEARS_HERE) || flags[i] & PARTLY) continue;
         bool deep = true; float pattern = 0.0f;
         for (int c = DIM == 3 ? -1 : 0; c <= (DIM == 3 ? 1 : 0); ++c) for (int b = -1; b <= 1; ++b) for (int a = -1; a <= 1; ++a) {
             const long long o = i + a + b*s[1] + c*s[2];

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -11,6 +12,9 @@ from granular import packing_kernels as kernels
 from warp_lcp.grid.periodic import PeriodicSides
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.operators.grid_poisson import SOLID
+
+if TYPE_CHECKING:
+    from granular.cut_walls import CutWalls
 
 SHEARS = {2: ((0, 1),), 3: ((0, 1), (0, 2), (1, 2))}  # the axes of each shear
 
@@ -28,6 +32,7 @@ class Packing:
         base: int8, SOLID or AIR.
         capacity: float32, share of a cell's kernel that is open.
         sides: of axes without an end, if there are any.
+        cut: solids that cut cells, if there are any; `base` has those cells alone that they leave nothing of.
 
     Attributes:
         base: that of the arguments.
@@ -43,9 +48,11 @@ class Packing:
         nodes: the window of lower faces and edges of all cells and the domain's upper side.
     """
 
-    def __init__(self, grid: StaggeredGrid, base: wp.array, capacity: wp.array, *, sides: PeriodicSides | None = None) -> None:
+    def __init__(
+        self, grid: StaggeredGrid, base: wp.array, capacity: wp.array, *, sides: PeriodicSides | None = None, cut: CutWalls | None = None
+    ) -> None:
         """Allocate the fields."""
-        self.grid, self.base, self._capacity, self.sides = grid, base, capacity, sides
+        self.grid, self.base, self._capacity, self.sides, self.cut = grid, base, capacity, sides, cut
         self.fraction, self.kind, self.flags, self.drive = grid.field(), grid.field(wp.int8), grid.field(wp.uint8), grid.field()
         wp.copy(self.kind, base)
         self.mass, self.inverse, self.start = grid.faces(), grid.faces(), grid.faces()
@@ -74,20 +81,21 @@ class Packing:
         if self.sides is not None:
             self.sides.wrap(self.fraction)
         rate = grid.spacing / dt
-        domain.launch(kernels.cell_kernel, [self.base, self.fraction, grid.planes, rate, self.kind, self.flags, self.drive])
+        openings, volume, around = (None, None, [None] * 3) if self.cut is None else (self.cut.openings, self.cut.volume, self.cut.around)
+        domain.launch(kernels.cell_kernel, [self.base, self.fraction, grid.planes, rate, volume, self.kind, self.flags, self.drive])
         if self.sides is not None:
             self.sides.wrap(self.flags, self.kind)
         for axis in range(dimension):
             moving = solid[axis] if solid else None
-            fields = [velocity[axis], moving, self.start[axis], self.mass[axis], self.inverse[axis]]
+            fields = [velocity[axis], moving, openings, self.start[axis], self.mass[axis], self.inverse[axis]]
             nodes.launch(kernels.face_kernel, [axis, self.base, self.fraction, *fields])
             if self.sides is not None:
                 self.sides.wrap(self.start[axis], self.mass[axis], self.inverse[axis])
-        for (alpha, beta), share in zip(SHEARS[dimension], self.share, strict=True):
+        for (alpha, beta), part, share in zip(SHEARS[dimension], around, self.share, strict=False):
             nodes.launch(
-                kernels.edge_kernel, [alpha, beta, self.base, self.flags, self.inverse[alpha], self.inverse[beta], share]
+                kernels.edge_kernel, [alpha, beta, self.base, self.flags, self.inverse[alpha], self.inverse[beta], part, share]
             )  # fmt: skip
-        domain.launch(kernels.stiffness_kernel, [dimension, self.flags, *three(self.inverse), *three(self.share), self.stiff])
+        domain.launch(kernels.stiffness_kernel, [dimension, self.flags, *three(self.inverse), *three(self.share), openings, self.stiff])
         if self.sides is not None:
             return  # the spans are whole rows
         domain.launch_rows(kernels.span_kernel, [self.flags, self._own])

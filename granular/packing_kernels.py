@@ -4,7 +4,7 @@ import typing
 
 import warp as wp
 
-from granular.yield_set import FIRM, HOLDS, SHEARS_HERE
+from granular.yield_set import FIRM, HOLDS, PARTLY, SHEARS_HERE
 from warp_lcp.grid.staggered import CellRange
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 
@@ -17,11 +17,13 @@ LEAST_MASS = 0.1  # of a face, in units of a full one: lighter ones would make t
 DENSE = 0.5  # the fraction from which a cell carries shear
 SURFACE = 0.3  # the fraction from which a cell beside air counts as full: a partly filled one has no pressure, and so no friction
 FULL = 0.95  # the fraction from which a cell counts as full: less than 1 by the sampling's noise, whose gaps would close as falls
+WALL_NOISE = 0.25  # by which it is less where a wall takes nearly all of a cell: half the distance of two particles
 FIRM_FRACTION = 0.9  # from which cohesion holds a cell together
 LANES = 16  # cells of a vector
 ROUNDING = 1e-6  # by which a fraction may differ from 1 and count as 1
 
 _F32 = wp.array3d(dtype=wp.float32)
+_F32X = wp.array4d(dtype=wp.float32)
 _I8 = wp.array3d(dtype=wp.int8)
 _U8 = wp.array3d(dtype=wp.uint8)
 options: dict[str, typing.Any] = {"enable_backward": False, "module": "granular.packing"}
@@ -47,12 +49,13 @@ def fraction_kernel(cells: CellRange, base: _I8, capacity: _F32, splatted: _F32,
 @wp.kernel(**options)
 @typing.no_type_check
 def cell_kernel(
-    cells: CellRange, base: _I8, fraction: _F32, planes: int, rate: float, kind: _I8, flags: _U8, drive: _F32,
+    cells: CellRange, base: _I8, fraction: _F32, planes: int, rate: float, volume: _F32, kind: _I8, flags: _U8, drive: _F32,
 ):  # fmt: skip
     """Which cells hold sand, and what of them is still free: drive = max(FULL - saturation, 0) dx / dt [m/s].
 
     Never negative: what is too dense is a matter of positions, which the density correction moves apart. Pushed out by the stresses it
-    would be a velocity, which friction works against (a silo's walls would pull its sand down), and the larger the shorter the step.
+    would be a velocity, which friction works against (a silo's walls would pull its sand down), and the larger the shorter the step. Where
+    solids cut cells, `volume` is what they leave open of each.
     """
     plane, row, chunk = wp.tid()
     k = cells.k + plane
@@ -81,8 +84,20 @@ def cell_kernel(
                             air = True
                 if air:
                     full = wp.max(phi, 1.0)
+        free = wp.max(FULL - full, 0.0) * rate
+        if volume:
+            open = volume[k, j, i]
+            free = wp.max(FULL - WALL_NOISE * (1.0 - open) - full, 0.0) * rate * open
+            if mark != 0:
+                least = float(1.0)
+                for c in range(-planes + 1, planes):
+                    for b in range(-1, 2):
+                        for a in range(-1, 2):
+                            least = wp.min(least, volume[k + c, j + b, i + a])
+                if least < 1.0:
+                    mark = mark | PARTLY
         flags[k, j, i] = wp.uint8(mark)
-        drive[k, j, i] = wp.max(FULL - full, 0.0) * rate
+        drive[k, j, i] = free
         if solid:
             kind[k, j, i] = _SOLID
         elif mark != 0:
@@ -94,7 +109,8 @@ def cell_kernel(
 @wp.kernel(**options)
 @typing.no_type_check
 def face_kernel(
-    cells: CellRange, axis: int, base: _I8, fraction: _F32, velocity: _F32, solid: _F32, start: _F32, mass: _F32, inverse: _F32,
+    cells: CellRange, axis: int, base: _I8, fraction: _F32, velocity: _F32, solid: _F32, openings: _F32X,
+    start: _F32, mass: _F32, inverse: _F32,
 ):  # fmt: skip
     """Mass of a face in units of a full one, its inverse, and the velocity that the stress acts on.
 
@@ -102,7 +118,7 @@ def face_kernel(
     along), and its velocity the solid's. A face of no mass stays out of it: 0 in all three. A cell that is filled less than the surface
     has no pressure: a face between it and one that has bears all of it, not half. Else half of it would weigh on nothing, the pressure
     and thus the friction below would be too small by what lies in it, and the uppermost row would slide off slopes that it should rest
-    on.
+    on. Of a face that a solid cuts the open part has mass, at least a least one.
     """
     plane, row, chunk = wp.tid()
     k = cells.k + plane
@@ -128,6 +144,13 @@ def face_kernel(
                 m = wp.max(mean, LEAST_MASS)
                 light = 1.0 / m
                 u = velocity[k, j, i]
+                if openings:
+                    open = openings[axis, k, j, i]
+                    light = 1.0 / wp.max(open * m, LEAST_MASS)
+                    if open == 0.0:
+                        m = 0.0
+                        light = 0.0
+                        u = 0.0
         mass[k, j, i] = m
         inverse[k, j, i] = light
         start[k, j, i] = u
@@ -136,9 +159,13 @@ def face_kernel(
 @wp.kernel(**options)
 @typing.no_type_check
 def edge_kernel(
-    cells: CellRange, alpha: int, beta: int, base: _I8, flags: _U8, inverse_alpha: _F32, inverse_beta: _F32, share: _F32,
+    cells: CellRange, alpha: int, beta: int, base: _I8, flags: _U8, inverse_alpha: _F32, inverse_beta: _F32,
+    around: _F32, share: _F32,
 ):  # fmt: skip
-    """The weight of a copy on an edge: 1 / dense cells around it, or -1 / cells with a wall face that ends there, or 0."""
+    """The weight of a copy on an edge: 1 / dense cells around it, or -1 / cells with a wall face that ends there, or 0.
+
+    Where solids cut cells, times what is open around it.
+    """
     plane, row, chunk = wp.tid()
     k = cells.k + plane
     j = cells.j + row
@@ -181,6 +208,8 @@ def edge_kernel(
                 count += p11 & HOLDS
             if count > 0:
                 weight = -1.0 / float(count)
+        if around:
+            weight = weight * around[k, j, i]
         share[k, j, i] = weight
 
 
@@ -188,7 +217,7 @@ def edge_kernel(
 @typing.no_type_check
 def stiffness_kernel(
     cells: CellRange, dimension: int, flags: _U8, inverse_x: _F32, inverse_y: _F32, inverse_z: _F32,
-    share_x: _F32, share_y: _F32, share_z: _F32, stiff: _F32,
+    share_x: _F32, share_y: _F32, share_z: _F32, openings: _F32X, stiff: _F32,
 ):  # fmt: skip
     """What bounds the friction's part of a step in a cell: the largest diagonal in the metric of its yield set. 0: it carries no shear."""
     plane, row, chunk = wp.tid()
@@ -200,12 +229,17 @@ def stiffness_kernel(
         if int(flags[k, j, i]) & SHEARS_HERE:
             x = inverse_x[k, j, i] + inverse_x[k, j, i + 1]
             y = inverse_y[k, j, i] + inverse_y[k, j + 1, i]
-            most = 2.0 * wp.max(x, y)
             can = x > 0.0 and y > 0.0
+            if openings:
+                x = x * wp.pow(openings[dimension, k, j, i], 2.0)
+                y = y * wp.pow(openings[dimension + 1, k, j, i], 2.0)
+            most = 2.0 * wp.max(x, y)
             if dimension == 3:
                 z = inverse_z[k, j, i] + inverse_z[k + 1, j, i]
-                most = wp.max(most, 2.0 * z)
                 can = can and z > 0.0
+                if openings:
+                    z = z * wp.pow(openings[dimension + 2, k, j, i], 2.0)
+                most = wp.max(most, 2.0 * z)
             for b in range(2):
                 for a in range(2):
                     most = wp.max(most, _edge(share_x, inverse_x, inverse_y, k, j + b, i + a, 0, 1, 0, 0, 0, 1))

@@ -47,13 +47,16 @@ class Outcome:
         self.ratio, self.contact, self.known = grid.field(), grid.field(wp.uint8), grid.faces(wp.int8)
         self._rows = int(np.prod(grid.shape[:2]))
         self._sums = wp.zeros(REPORT_COLUMNS * self._rows, dtype=wp.float64, device=grid.device)
-        self._kernels = report_kernels(grid.dimension, stress.rate)
+        cut = stress.packing.cut
+        self._openings = None if cut is None else cut.openings
+        self._kernels = report_kernels(grid.dimension, stress.rate, cut is not None)
+        self._base = stress.packing.base if cut is None else grid.field(wp.int8)  # no face inside a solid that cuts cells is left unknown
 
     def take(self, velocity: Sequence[wp.array]) -> None:
         """Give the faces that stresses act on the velocity that they leave [m/s], and find `known` and `contact`."""
         stress, packing = self.stress, self.stress.packing
         for axis, field in enumerate(velocity):
-            fields = [packing.base, packing.inverse[axis], stress.checked.u[axis], field, self.known[axis]]
+            fields = [self._base, packing.inverse[axis], stress.checked.u[axis], field, self.known[axis]]
             packing.grid.everywhere.launch(self._kernels.take, [axis, *fields])
         inputs = [wp.uint8(HELD), wp.uint8(RELEASED), packing.flags, stress.now, self.contact]
         packing.grid.domain.launch(self._kernels.contact, inputs)
@@ -61,7 +64,7 @@ class Outcome:
     def report(self) -> Report:
         """Return the figures of the last solve."""
         stress, p = self.stress, self.stress.packing
-        fields = [*three(p.share), *three(stress.checked.edge), *three(stress.checked.u), *three(p.mass)]
+        fields = [*three(p.share), *three(stress.checked.edge), *three(stress.checked.u), *three(p.mass), self._openings]
         inputs = [p.flags, stress.now, p.drive, *fields, stress.numbers, self.ratio, self._sums]
         p.grid.domain.launch_rows(self._kernels.report, inputs)
         cells, yielded, taken, most = self._sums.numpy().reshape(REPORT_COLUMNS, self._rows)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from granular.yield_set import FLUX, RATE_BOUND, SHAPE, native
+from granular.yield_set import FLUX, OPENINGS, RATE_BOUND, SHAPE, native
 from warp_lcp.grid.extrapolate import BLOCKED
 from warp_lcp.grid.staggered import CellRange
 from warp_lcp.operators.grid_poisson import SOLID
@@ -18,6 +18,7 @@ REPORT_COLUMNS = (
 
 REPORT = (
     SHAPE
+    + OPENINGS
     + FLUX
     + RATE_BOUND
     + """
@@ -34,8 +35,8 @@ REPORT = (
         const double full = fullness(w*numbers.data[STEP_OF_CELL]);
         for (int axis = 0; axis < DIM; ++axis) {
             const long long o = i + s[axis];
-            e[axis] = u[axis][o] - u[axis][i]; mean += e[axis]/DIM;
-            w += passes(mass[axis][o], full)*u[axis][o] - passes(mass[axis][i], full)*u[axis][i];
+            e[axis] = counted(axis, i)*(u[axis][o] - u[axis][i]); mean += e[axis]/DIM;
+            w += open(axis, o)*passes(mass[axis][o], full)*u[axis][o] - open(axis, i)*passes(mass[axis][i], full)*u[axis][i];
         }
         if (DIM == 2) { const float a = now[layer + i]; size = a*a; taken += a*(e[0] - e[1]); fast2 = (e[0] - e[1])*(e[0] - e[1]); }
         else for (int c = 0; c < NORMALS; ++c) {
@@ -69,15 +70,15 @@ _STRESS = wp.array4d(dtype=wp.float32)
 
 
 @functools.cache
-def report_kernels(dimension: int, rate: bool = False) -> SimpleNamespace:
+def report_kernels(dimension: int, rate: bool = False, cut: bool = False) -> SimpleNamespace:
     """Return the kernels for 2 or 3 dimensions."""
     words = {"REPORT_COLUMNS": REPORT_COLUMNS, "RATIO_YIELDS": RATIO_YIELDS}
-    name = f"granular.report_{dimension}d{'_rate' if rate else ''}"
+    name = f"granular.report_{dimension}d{'_rate' if rate else ''}{'_cut' if cut else ''}"
 
-    @wp.func_native(native(REPORT, dimension, wp.float64, rate=rate, **words))
+    @wp.func_native(native(REPORT, dimension, wp.float64, rate=rate, cut=cut, **words))
     def report_row(
         flags_: _U8, now_: _STRESS, drive_: _F32, share_x: _F32, share_y: _F32, share_z: _F32, b_x: _F64, b_y: _F64, b_z: _F64,
-        u_x: _F64, u_y: _F64, u_z: _F64, mass_x: _F32, mass_y: _F32, mass_z: _F32, numbers: wp.array(dtype=wp.float32),
+        u_x: _F64, u_y: _F64, u_z: _F64, mass_x: _F32, mass_y: _F32, mass_z: _F32, cut_: _STRESS, numbers: wp.array(dtype=wp.float32),
         ratio_: _F32, sums_: wp.array(dtype=wp.float64), k: int, j: int, first: int, last: int,
     ): ...  # fmt: skip
 
@@ -85,11 +86,11 @@ def report_kernels(dimension: int, rate: bool = False) -> SimpleNamespace:
     def report(
         cells: CellRange, flags: _U8, now: _STRESS, drive: _F32, share_x: _F32, share_y: _F32, share_z: _F32,
         b_x: _F64, b_y: _F64, b_z: _F64, u_x: _F64, u_y: _F64, u_z: _F64, mass_x: _F32, mass_y: _F32, mass_z: _F32,
-        numbers: wp.array(dtype=wp.float32), ratio: _F32, sums: wp.array(dtype=wp.float64),
+        openings: _STRESS, numbers: wp.array(dtype=wp.float32), ratio: _F32, sums: wp.array(dtype=wp.float64),
     ):  # fmt: skip
         plane, row = wp.tid()
         report_row(
-            flags, now, drive, share_x, share_y, share_z, b_x, b_y, b_z, u_x, u_y, u_z, mass_x, mass_y, mass_z, numbers,
+            flags, now, drive, share_x, share_y, share_z, b_x, b_y, b_z, u_x, u_y, u_z, mass_x, mass_y, mass_z, openings, numbers,
             ratio, sums, cells.k + plane, cells.j + row, cells.i, cells.end,
         )  # fmt: skip
 

@@ -31,6 +31,7 @@ from warp_lcp.driver.shapes import (
 )
 
 STRESS_BYTES = {2: 160, 3: 330}  # a cell: the coupled solve's fields
+CUT_STRESS_BYTES = {2: 48, 3: 76}  # and where solids cut cells
 STEEPEST = {2: 1.0, 3: math.sqrt(0.75)}  # slope of a cone from which on it holds stresses with tension
 STEEPEST_ANGLE = {"repose": {2: 45.0, 3: 40.8}, "triaxial-compression": {3: 36.8}}  # degrees
 GLASS = 0.279  # inertial number at which half of the growth of glass beads' friction is there [Jop, Forterre & Pouliquen 2006]
@@ -382,4 +383,5 @@ class SandScene(ParticleScene):
 
     def own_memory_parts(self) -> dict[str, int]:
         """Return what the stresses take at most on the device [bytes]."""
-        return {"stresses": self.counted_cells * STRESS_BYTES[self.dimension]}
+        cut = CUT_STRESS_BYTES[self.dimension] if self.cuts_cells else 0
+        return {"stresses": self.counted_cells * (STRESS_BYTES[self.dimension] + cut)}

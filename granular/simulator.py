@@ -92,7 +92,7 @@ class SandSimulation(ParticleSimulation):
         self._join = None if self.sides is None else self.sides.wrap
         self.method: CoupledMethod = METHODS[scene.solver.method]()
         self._base, self.density = grid.field(wp.int8), grid.field()
-        self.packing = Packing(grid, self._base, boundary.capacity, sides=self.sides)
+        self.packing = Packing(grid, self._base, boundary.capacity, sides=self.sides, cut=solids.cut)
         self.carried = None if bodies is None else SandBodies(grid, bodies.numbers)
         box, rate = scene.friction.model == "box", scene.friction.dynamic_angle is not None
         self.stress = Stress(self.packing, solids.walls, box=box, rate=rate, bodies=self.carried)
@@ -321,6 +321,11 @@ class SandSimulation(ParticleSimulation):
     def _extend(self, window: Window) -> None:
         """Continue the velocity into air and walls."""
         outcome, solids = self.outcome, self.solids
+        if solids.cut is not None:
+            self.extend(window, outcome.known, self.packing.kind, outcome.contact)
+            if self.sources is not None:
+                self.sources.hold(self.velocity, [], self.packing.kind)
+            return
         with self.watch.stage("extrapolation", *self.velocity, *self.weights, *outcome.known):
             extend_velocity(
                 window, self.velocity, self.weights, outcome.known, self.packing.kind, outcome.contact, solids.index, solids.separating,
@@ -380,7 +385,8 @@ class GranularSimulator:
         placed = placed_solids(scene, folder)
         bodies = make_bodies(scene, placed)
         boundary, warnings = make_boundary(scene, grid, folder, solids=placed)
-        solids = SandSolids(grid, placed, boundary, scene.wall_frictions(), prescribed=bool(scene.source))
+        cuts = scene.solver.method == "accelerated-projection"
+        solids = SandSolids(grid, placed, boundary, scene.wall_frictions(), prescribed=bool(scene.source), cuts=cuts)
         particles, notes = make_particles(scene, grid, boundary, folder)
         sources, outlets = make_sources(scene, grid, boundary, folder), make_outlets(scene, grid, folder)
         return SandSimulation(

@@ -1,4 +1,4 @@
-"""Solids as sand meets them: whole cells that push and rub, however finely particles keep off their surfaces."""
+"""Solids as sand meets them: whole cells that push and rub, or what `granular.cut_walls` makes of those that cut cells."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
+from granular.cut_walls import CutWalls
 from granular.stress import Walls
 from warp_lcp.grid.staggered import CellRange, StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid, voxelize
@@ -73,8 +74,10 @@ class SandSolids:
         boundary: where particles may go.
         friction: Coulomb's coefficient of the domain's walls and of each solid.
         prescribed: keep velocities on faces even if nothing moves: sources prescribe some.
+        cuts: let solids that stand still cut cells for the stresses too, if `boundary` has them so.
 
     Attributes:
+        cut: what they leave open and where they rub; None: they are whole cells.
         index: int32, -1 in open cells, the wall's number elsewhere.
         base: int8, SOLID or AIR.
         velocity: of the solids on each component's faces [m/s]; empty if they stand still.
@@ -84,14 +87,17 @@ class SandSolids:
     """
 
     def __init__(
-        self, grid: StaggeredGrid, placed: Sequence[PlacedSolid], boundary: Boundary, friction: Sequence[float], *, prescribed: bool = False
-    ) -> None:
+        self, grid: StaggeredGrid, placed: Sequence[PlacedSolid], boundary: Boundary, friction: Sequence[float], *,
+        prescribed: bool = False, cuts: bool = False,
+    ) -> None:  # fmt: skip
         """Find the cells."""
         self.grid, self._placed, self._boundary, self._friction = grid, tuple(placed), boundary, list(friction)
         self.base = grid.field(wp.int8)
         self.separating = wp.full(1 + len(placed), 1, dtype=wp.uint8, device=grid.device)
         self.velocity: Faces = grid.faces() if boundary.moves or prescribed else []
         self._cells: np.ndarray | None = None  # `index` as `walls` know it
+        fits = cuts and isinstance(boundary, CutBoundary) and not boundary.moves and boundary.sides is None
+        self.cut = CutWalls(grid, boundary.cut, friction) if fits and isinstance(boundary, CutBoundary) else None
         self.place(0.0)
         self.notes = self._thin_notes()
 
@@ -118,6 +124,10 @@ class SandSolids:
             self._boundary.sides.wrap(self.index)
         grid.everywhere.launch(base_kernel, [self.index, self.base])
         cells = self.index.numpy()
+        if self.cut is not None:  # the domain's walls alone are whole cells
+            wp.copy(self.base, self._boundary.base)
+            cells = cells.copy()
+            grid.interior(cells)[...] = -1
         if self._cells is None or not np.array_equal(cells, self._cells):  # else what is recorded for these walls stays valid
             self._cells, self.walls = cells.copy(), Walls(grid, cells, self._friction, rubbing_only=not self.moves)
 
@@ -126,7 +136,7 @@ class SandSolids:
         return tuple(
             f"{solid.name} holds no center of a cell of {self.grid.spacing:.4g} m: it stops particles, but bears no sand"
             for solid, cells in zip(self._placed, self._covered, strict=True)
-            if not cells and solid.motion is None
+            if self.cut is None and not cells and solid.motion is None
         )
 
     def begin_step(self, time: float, dt: float) -> None:

@@ -101,7 +101,9 @@ class Velocity:
         self.packing, self.real, self.box, self.rate = packing, real, box, rate
         self.u = grid.faces(real)
         self.edge = [grid.field(real) for _ in SHEARS[grid.dimension]]
-        self.kernels = stress_kernels(grid.dimension, real, residual=real is wp.float64, box=box, rate=rate)
+        cut, residual = packing.cut, real is wp.float64
+        self.openings = None if cut is None else cut.openings
+        self.kernels = stress_kernels(grid.dimension, real, residual=residual, box=box, rate=rate, cut=cut is not None)
 
     def find(self, stress: wp.array, *, launch: Launch = wp.launch, bodies: SandBodies | None = None, respond: bool = False) -> None:
         """Find velocity and rates of strain under a field of stresses.
@@ -117,7 +119,7 @@ class Velocity:
         if p.sides is not None:
             p.sides.wrap(stress, launch=launch)
         window.launch(kernels.edge_stress, [p.spans, stress, *share, *edge], launch=launch)
-        faces = [*three(p.start), *three(p.inverse), *u]
+        faces = [*three(p.start), *three(p.inverse), *u, self.openings]
         window.launch(kernels.face_velocity, [p.spans, stress, share[0], *edge, *faces], launch=launch)
         if bodies is not None:
             if respond:
@@ -158,7 +160,8 @@ class Stress:
         """Allocate the fields."""
         grid, self.packing, self.walls, self.box, self.rate, self.bodies = packing.grid, packing, walls, box, rate, bodies
         normals, shears = (3, 3) if grid.dimension == 3 else (1, 1)
-        shape = (1 + normals + 4 * shears, *grid.shape)
+        tractions = 0 if packing.cut is None else grid.dimension
+        shape = (1 + normals + 4 * shears + tractions, *grid.shape)
         self.now, self._before, self._point = (wp.zeros(shape, dtype=wp.float32, device=grid.device) for _ in range(3))
         self.velocity, self.checked = (Velocity(packing, real, box=box, rate=rate) for real in (wp.float32, wp.float64))
         self.numbers = wp.zeros(NUMBERS, dtype=wp.float32, device=grid.device)
@@ -180,7 +183,9 @@ class Stress:
         device = self.packing.grid.device
         self.walls, self._program, self._check = walls, None, None
         self._grain = 1 if device.is_cuda else WALL_GRAIN
-        threads = -(-walls.count // self._grain)
+        cut = self.packing.cut
+        self._cut_threads = 0 if cut is None else -(-cut.count // self._grain)
+        threads = -(-walls.count // self._grain) + self._cut_threads
         self._wall_sums = Reduction(max(threads, 1), device, self._sums, columns=COLUMNS, threads=threads) if threads else None
 
     def begin(self, bound: YieldSet, gravity: np.ndarray, dt: float, kick_dt: float, *, decay: float = 1.0) -> None:
@@ -278,14 +283,17 @@ class Stress:
         p, walls, kernels = self.packing, self.walls, velocity.kernels
         grid, share, edge, inverse = p.grid, three(p.share), three(velocity.edge), three(p.inverse)
         stress = [self.now, self._before, self._point]
-        fields = [p.drive, p.stiff, *share, *edge, *three(p.mass), *inverse, *three(velocity.u)]
+        fields = [p.drive, p.stiff, *share, *edge, *three(p.mass), *inverse, *three(velocity.u), velocity.openings]
         scalars = [self._momentum, self.numbers]
         inputs = [p.spans, p.flags, *stress, *fields, *scalars, self._cell_sums.partials, grid.domain.chunks]
         grid.domain.launch(kernels.step, inputs, launch=launch)
         if self._wall_sums is not None:
             faces = [walls.cells, walls.sides, walls.walls, walls.friction, walls.active, p.fraction]
             inputs = [self._grain, *faces, *stress, *share, *edge, *inverse, *scalars, self._wall_sums.partials]
-            launch(kernels.wall, self._wall_sums.threads, inputs, device=grid.device)
+            if walls.count:
+                launch(kernels.wall, self._wall_sums.threads - self._cut_threads, inputs, device=grid.device)
+            if p.cut is not None:
+                p.cut.project(p, velocity, stress, scalars, self._wall_sums.partials, self._grain, self._cut_threads, launch)
 
     def _add_up(self, launch: Launch) -> None:
         self._cell_sums.add_up(0, COLUMNS, launch=launch)

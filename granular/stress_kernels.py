@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from granular.yield_set import COLUMNS, FLUX, RATE_BOUND, SHAPE, WALL_FACE, YIELD, native
+from granular.yield_set import COLUMNS, FLUX, OPENINGS, RATE_BOUND, SHAPE, WALL_FACE, YIELD, native
 from warp_lcp.grid.staggered import CellRange
 
 # The momentum's state: steps done; the most of it for pressure and friction; that of this step; that of the next; estimates of the natural
@@ -47,10 +47,12 @@ EDGE_STRESS = (
 """
 )
 
-# The velocity that a stress leaves: u = u* + (div sigma) / mass, sigma = -x + s.
+# The velocity that a stress leaves: u = u* + (div sigma) / mass, sigma = -x + s. On a face that a solid cuts the pressure acts on what is
+# open, the deviator by what it stands for in the cell (the adjoint of its rate of strain), and the tractions of the walls in both cells.
 FACE_VELOCITY = (
     SPAN
     + SHAPE
+    + OPENINGS
     + """
     const float* y = y_.data + row;
     const T* b[3] = {b_x.data + row, b_y.data + (DIM == 3 ? row : 0), b_z.data + (DIM == 3 ? row : 0)};
@@ -61,6 +63,7 @@ FACE_VELOCITY = (
         const long long sa = s[axis];
         const float* n = y + (DIM == 3 ? 1 + axis : 1)*layer;
         const T sign = DIM == 2 && axis == 1 ? (T)-1 : (T)1;
+        const long long traction = (FIRST + 4*SHEARS + axis)*layer;
         // the two shears on this face: (shear, other axis)
         const int d0 = axis == 2 ? 1 : 0, d1 = axis == 0 ? 1 : 2, o0 = axis == 0 ? 1 : 0, o1 = axis == 2 ? 1 : 2;
         const T* b0 = b[d0]; const T* b1 = DIM == 3 ? b[d1] : b[d0]; const long long t0 = s[o0], t1 = DIM == 3 ? s[o1] : 0;
@@ -68,7 +71,13 @@ FACE_VELOCITY = (
         if ((axis != 2 && k > share_x.shape[0] - 2) || (axis != 1 && j > share_x.shape[1] - 2)) continue;  // beyond the domain's last face
         const int end = axis == 0 || last < nx - 1 ? last : (int)nx - 1;
         MASKED for (int i = first; i < end; ++i) {
+        #if CUT
+            const T wall = (T)y[i + traction] + (T)y[i - sa + traction];
+            const T normal = open(axis, i)*((T)y[i - sa] - (T)y[i] + wall)
+                + sign*(counted(axis, i)*(T)n[i] - counted(axis, i - sa)*(T)n[i - sa]);
+        #else
             const T normal = (sign*(T)n[i] - (T)y[i]) - (sign*(T)n[i - sa] - (T)y[i - sa]);
+        #endif
             const T shear = (b0[i + t0] - b0[i]) + (b1[i + t1] - b1[i]);
             u[i] = (T)from[i] + (T)light[i]*(normal + shear);
         }
@@ -106,6 +115,7 @@ CELLS = (
 """
     + SPAN
     + SHAPE
+    + OPENINGS
     + FLUX
     + RATE_BOUND
     + YIELD
@@ -134,10 +144,10 @@ CELLS = (
         T w = (T)drive[i], diagonal = 0, e[DIM], mean = 0;
         UNROLL for (int axis = 0; axis < DIM; ++axis) {
             const long long o = i + s[axis];
-            const T beyond = passes((T)mass[axis][o], full), here = passes((T)mass[axis][i], full);
+            const T beyond = open(axis, o)*passes((T)mass[axis][o], full), here = open(axis, i)*passes((T)mass[axis][i], full);
             w += beyond*u[axis][o] - here*u[axis][i];
-            diagonal += beyond*(T)inverse[axis][o] + here*(T)inverse[axis][i];
-            e[axis] = u[axis][o] - u[axis][i];
+            diagonal += open(axis, o)*beyond*(T)inverse[axis][o] + open(axis, i)*here*(T)inverse[axis][i];
+            e[axis] = counted(axis, i)*(u[axis][o] - u[axis][i]);
             mean += e[axis];
         }
         mean *= (T)1/(T)DIM;
@@ -255,6 +265,7 @@ ADMIT = (
             const long long at = (FIRST + 4*d + q)*layer + i;
             put(at, (weight > 0.0f && sheared) || (weight < 0.0f && sand) ? now[at]*ratio : 0.0f);
         }
+        if (CUT) for (int c = FIRST + 4*SHEARS; c < FIRST + 4*SHEARS + DIM; ++c) put(c*layer + i, sand ? now[c*layer + i]*ratio : 0.0f);
     }
 """
 )
@@ -263,21 +274,23 @@ _F32, _F64, _U8 = (wp.array3d(dtype=t) for t in (wp.float32, wp.float64, wp.uint
 _STRESS, _SPANS = wp.array4d(dtype=wp.float32), wp.array3d(dtype=wp.int32)
 
 
-def step_source(text: str, dimension: int, real, *, box: bool, rate: bool = False, residual: bool = False, trial: bool = False) -> str:
+def step_source(
+    text: str, dimension: int, real, *, box: bool, rate: bool = False, residual: bool = False, trial: bool = False, cut: bool = False
+) -> str:
     """Return native code for 2 or 3 dimensions: of a step, of what the natural residual would move, or of a trial step."""
     words = {"NOW_X": NOW_X, "NOW_S": NOW_S, "NEXT_X": NEXT_X, "NEXT_S": NEXT_S, "RESIDUAL": int(residual), "TRIAL": int(trial)}
-    return native(text, dimension, real, box=box, rate=rate, **words)
+    return native(text, dimension, real, box=box, rate=rate, cut=cut, **words)
 
 
 @functools.cache
-def stress_kernels(dimension: int, real, residual: bool, box: bool, rate: bool = False) -> SimpleNamespace:
+def stress_kernels(dimension: int, real, residual: bool, box: bool, rate: bool = False, cut: bool = False) -> SimpleNamespace:
     """Return the kernels for 2 or 3 dimensions, velocities of `real`; steps, or what the natural residual would move."""
-    kind = f"{'residual' if residual else 'step'}{'_box' if box else ''}{'_rate' if rate else ''}"
+    kind = ("residual" if residual else "step") + ("_box" if box else "") + ("_rate" if rate else "") + ("_cut" if cut else "")
     name = f"granular.stress_{dimension}d_{real.__name__}_{kind}"
     field = wp.array3d(dtype=real)
 
     def source(text: str) -> str:
-        return step_source(text, dimension, real, box=box, rate=rate, residual=residual)
+        return step_source(text, dimension, real, box=box, rate=rate, residual=residual, cut=cut)
 
     @wp.func_native(source(EDGE_STRESS))
     def edge_stress_row(
@@ -297,20 +310,21 @@ def stress_kernels(dimension: int, real, residual: bool, box: bool, rate: bool =
     @wp.func_native(source(FACE_VELOCITY))
     def face_velocity_row(
         spans_: _SPANS, y_: _STRESS, share_x: _F32, b_x: field, b_y: field, b_z: field, start_x: _F32, start_y: _F32, start_z: _F32,
-        inverse_x: _F32, inverse_y: _F32, inverse_z: _F32, u_x: field, u_y: field, u_z: field, k: int, j: int, first: int, last: int,
+        inverse_x: _F32, inverse_y: _F32, inverse_z: _F32, u_x: field, u_y: field, u_z: field, cut_: _STRESS,
+        k: int, j: int, first: int, last: int,
     ): ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module=name)
     def face_velocity(
         cells: CellRange, spans: _SPANS, y: _STRESS, share_x: _F32, b_x: field, b_y: field, b_z: field,
         start_x: _F32, start_y: _F32, start_z: _F32, inverse_x: _F32, inverse_y: _F32, inverse_z: _F32,
-        u_x: field, u_y: field, u_z: field,
+        u_x: field, u_y: field, u_z: field, openings: _STRESS,
     ):  # fmt: skip
         plane, row, chunk = wp.tid()
         first = cells.i + chunk * cells.grain
         last = wp.min(first + cells.grain, cells.end)
         face_velocity_row(
-            spans, y, share_x, b_x, b_y, b_z, start_x, start_y, start_z, inverse_x, inverse_y, inverse_z, u_x, u_y, u_z,
+            spans, y, share_x, b_x, b_y, b_z, start_x, start_y, start_z, inverse_x, inverse_y, inverse_z, u_x, u_y, u_z, openings,
             cells.k + plane, cells.j + row, first, last,
         )  # fmt: skip
 
@@ -331,7 +345,7 @@ def stress_kernels(dimension: int, real, residual: bool, box: bool, rate: bool =
     def step_row(
         spans_: _SPANS, flags_: _U8, now_: _STRESS, before_: _STRESS, point_: _STRESS, drive_: _F32, stiff_: _F32,
         share_x: _F32, share_y: _F32, share_z: _F32, b_x: field, b_y: field, b_z: field, mass_x: _F32, mass_y: _F32, mass_z: _F32,
-        inverse_x: _F32, inverse_y: _F32, inverse_z: _F32, u_x: field, u_y: field, u_z: field,
+        inverse_x: _F32, inverse_y: _F32, inverse_z: _F32, u_x: field, u_y: field, u_z: field, cut_: _STRESS,
         momentum: wp.array(dtype=wp.float64), numbers: wp.array(dtype=wp.float32),
         partials: wp.array(dtype=wp.float64), chunks: int, chunk: int, k: int, j: int, first: int, last: int,
     ): ...  # fmt: skip
@@ -340,7 +354,7 @@ def stress_kernels(dimension: int, real, residual: bool, box: bool, rate: bool =
     def step(
         cells: CellRange, spans: _SPANS, flags: _U8, now: _STRESS, before: _STRESS, point: _STRESS, drive: _F32, stiff: _F32,
         share_x: _F32, share_y: _F32, share_z: _F32, b_x: field, b_y: field, b_z: field, mass_x: _F32, mass_y: _F32, mass_z: _F32,
-        inverse_x: _F32, inverse_y: _F32, inverse_z: _F32, u_x: field, u_y: field, u_z: field,
+        inverse_x: _F32, inverse_y: _F32, inverse_z: _F32, u_x: field, u_y: field, u_z: field, openings: _STRESS,
         momentum: wp.array(dtype=wp.float64), numbers: wp.array(dtype=wp.float32),
         partials: wp.array(dtype=wp.float64), chunks: int,
     ):  # fmt: skip
@@ -349,7 +363,7 @@ def stress_kernels(dimension: int, real, residual: bool, box: bool, rate: bool =
         last = wp.min(first + cells.grain, cells.end)
         step_row(
             spans, flags, now, before, point, drive, stiff, share_x, share_y, share_z, b_x, b_y, b_z, mass_x, mass_y, mass_z,
-            inverse_x, inverse_y, inverse_z, u_x, u_y, u_z, momentum, numbers, partials, chunks, chunk,
+            inverse_x, inverse_y, inverse_z, u_x, u_y, u_z, openings, momentum, numbers, partials, chunks, chunk,
             cells.k + plane, cells.j + row, first, last,
         )  # fmt: skip
 

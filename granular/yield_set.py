@@ -5,7 +5,8 @@ stresses has layers of the grid's shape: x, the normal parts of the deviator (2-
 shear four *copies*, which belong to the cell: copy q of the shear of axes (alpha, beta) lies on the cell's edge at the low (0) or high
 (1) side along alpha, q & 1, and along beta, q >> 1. Shears are ordered xy, xz, yz. An edge, stored at the cell whose low side it is, has
 the mean of the copies of the cells that take part in it; `share` holds the weight of a copy there: > 0 between cells, < 0 (and its
-absolute value the weight) on a wall, 0 where there is no shear.
+absolute value the weight) on a wall, 0 where there is no shear. Where solids cut cells DIM layers follow: the traction of the wall in a
+cell, see `granular.cut_walls`.
 """
 
 import re
@@ -23,14 +24,15 @@ GAIN, HALFWAY, NUMBERS = 10, 11, 12
 
 HOLDS = 1  # bits of a cell: it holds sand, and so a pressure,
 SHEARS_HERE = 2  # enough of it to carry shear,
-FIRM = 4  # so much that cohesion may hold it together
+FIRM = 4  # so much that cohesion may hold it together,
+PARTLY = 8  # and a solid cuts it, or a cell beside it
 NEARLY = 0.05  # of a cell free, below which what passes its faces counts as volume, whatever its neighbors hold, see FLUX
 LEAST_RADIUS = 1e-30  # [m/s], of a yield set that holds only zero
 
 CONSTANTS = {
     "NEWTON": NEWTON, "COLUMNS": COLUMNS, "LEAST_RADIUS": LEAST_RADIUS, "FRICTION": FRICTION, "COHESION": COHESION,
     "TENSION": TENSION, "WEIGHT": WEIGHT, "PRESSURE_STEP": PRESSURE_STEP, "SHEAR_STEP": SHEAR_STEP, "LOOKAHEAD": LOOKAHEAD,
-    "HOLDS": HOLDS, "SHEARS_HERE": SHEARS_HERE, "FIRM": FIRM, "STEP_OF_CELL": STEP_OF_CELL, "NEARLY": NEARLY,
+    "HOLDS": HOLDS, "SHEARS_HERE": SHEARS_HERE, "FIRM": FIRM, "PARTLY": PARTLY, "STEP_OF_CELL": STEP_OF_CELL, "NEARLY": NEARLY,
     "GAIN": GAIN, "HALFWAY": HALFWAY,
 }  # fmt: skip
 
@@ -192,7 +194,19 @@ INLINE = """
 """
 
 
-def native(source: str, dimension: int, real: Any, *, box: bool = False, rate: bool = False, **numbers: int) -> str:
+# Where solids cut cells (CUT): the open part of a cell's lower faces, and how much of a cell its differences along an axis stand for.
+OPENINGS = """
+#if CUT
+    auto open = [&](int axis, long long i) INLINE { return (T)cut_.data[axis*layer + row + i]; };
+    auto counted = [&](int axis, long long i) INLINE { return (T)cut_.data[(DIM + axis)*layer + row + i]; };
+#else
+    auto open = [](int, long long) INLINE { return (T)1; };
+    auto counted = open;
+#endif
+"""
+
+
+def native(source: str, dimension: int, real: Any, *, box: bool = False, rate: bool = False, cut: bool = False, **numbers: int) -> str:
     """Return the body of a native function for 2 or 3 dimensions and velocities of `real`; words in `numbers` become their values.
 
     `UNROLL for` becomes a loop that is unrolled: a vectorized loop may have no other inside.
@@ -203,9 +217,10 @@ def native(source: str, dimension: int, real: Any, *, box: bool = False, rate: b
         real: wp.float32 or wp.float64.
         box: Narain's box instead of the cone.
         rate: friction grows with the rate of shear.
+        cut: solids cut cells.
         numbers: more words and their values.
     """
     source = INLINE + f"typedef {C_TYPES[real]} T;\n" + source
-    for word, value in (CONSTANTS | {"DIM": dimension, "BOX": int(box), "RATE": int(rate)} | numbers).items():
+    for word, value in (CONSTANTS | {"DIM": dimension, "BOX": int(box), "RATE": int(rate), "CUT": int(cut)} | numbers).items():
         source = re.sub(rf"\b{word}\b", str(value), source)
     return simd(source.replace("UNROLL ", "\n#ifndef __CUDA_ARCH__\n#pragma clang loop unroll(full)\n#endif\n"))

@@ -16,6 +16,7 @@ import warp_lcp as wl
 from fluids.pressure_kernels import pressure_kernels
 from granular.bodies_kernels import body_kernels
 from granular.checkerboard import damping_kernel
+from granular.cut_walls_kernels import traction_kernel
 from granular.interleaved_kernels import interleaved_kernels
 from granular.report_kernels import report_kernels
 from granular.stress_kernels import stress_kernels
@@ -149,12 +150,15 @@ def use_sand_kernels():
     """Instantiate the kernels of sand in 2-D and 3-D, with both yield sets."""
     for dimension in (2, 3):
         damping_kernel(dimension)
-        for rate in (False, True):
-            report_kernels(dimension, rate)
+        traction_kernel(dimension, wp.float32, residual=False)
+        traction_kernel(dimension, wp.float64, residual=True)
+        for rate, cut in itertools.product((False, True), repeat=2):
+            report_kernels(dimension, rate, cut)
         for box, rate in ((False, False), (True, False), (False, True)):
             interleaved_kernels(dimension, box, rate)
-            stress_kernels(dimension, wp.float32, residual=False, box=box, rate=rate)
-            stress_kernels(dimension, wp.float64, residual=True, box=box, rate=rate)
+            for cut in (False, True):
+                stress_kernels(dimension, wp.float32, residual=False, box=box, rate=rate, cut=cut)
+                stress_kernels(dimension, wp.float64, residual=True, box=box, rate=rate, cut=cut)
             for real in (wp.float32, wp.float64):
                 body_kernels(dimension, real, box, rate)
 

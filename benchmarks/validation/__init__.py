@@ -21,6 +21,7 @@ from benchmarks.validation import (
     sand_collapse,
     sand_hourglass,
     sand_invariants,
+    sand_oblique,
     sand_rest,
     slope,
     sloshing,
@@ -49,6 +50,7 @@ CHECKS = {
     "sand collapse": sand_collapse,
     "sand hourglass": sand_hourglass,
     "sand invariants": sand_invariants,
+    "sand oblique": sand_oblique,
     "sand rest": sand_rest,
 }
 

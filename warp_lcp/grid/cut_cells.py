@@ -22,6 +22,8 @@ from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.operators.grid_poisson import SOLID
 
+DEEP = 1e-2  # cells: nodes within it of a solid's surface lie on it
+
 
 class CutCells:
     """Say what solids leave open of the faces and cells of a grid, at a time.
@@ -51,7 +53,7 @@ class CutCells:
         separating: uint8 of shape (1 + solids,).
         names: of those numbers, the first "domain".
         notes: warnings worth a line at the start of a run.
-        whole_cells: whether every face is open or closed and nothing moves.
+        whole_cells: whether every face is open or closed, no solid reaches into a cell with an open face and nothing moves.
         moves: whether a solid moves.
 
     Raises:
@@ -96,7 +98,7 @@ class CutCells:
             self._enter_moving(0.0)
         self._refresh()
         dropped, partial = self._counts.numpy().tolist()
-        self.whole_cells = partial == 0 and not self.moves
+        self.whole_cells = partial == 0 and not self.moves and not self._reaches_into_open_cells()
         self.notes = (*notes, *(self._result_notes(dropped) if remarks else ()))
         if not self.moves:  # needed by `place` only
             del self._sampler, self._nodes, self._marks
@@ -231,6 +233,13 @@ class CutCells:
         low[axis] = high[axis] = face
         inputs = [grid.planes, axis, self._nodes.near, self._nodes.arrays[1], self.open[axis], self.wall[axis], self._counts]
         grid.window(low, high).launch(kernels.side_kernel, inputs)
+
+    def _reaches_into_open_cells(self) -> bool:
+        """Return whether a corner of a cell with an open face lies in a solid: diagonals through corners leave faces open or closed too."""
+        corners = self.distance.numpy()
+        for axis in range(self.grid.dimension):
+            corners = np.minimum(corners, np.roll(corners, -1, axis=2 - axis))
+        return bool((self.grid.interior(corners)[self.grid.interior(self.base.numpy()) != SOLID] < -DEEP).any())
 
     def _solid_notes(self) -> list[str]:
         """Return what is to be said about the solids before they are sampled."""

@@ -1,0 +1,189 @@
+"""Solids that cut cells as the stresses of sand meet them: what they leave open, and friction on their true surface.
+
+The discrete power of the stresses is that of what is open: pressure on the open part of a face, a deviator on the open part of its cell
+or edge. Rates of strain are differences between faces that can move, so that sliding along a wall strains nothing, and forces are their
+adjoint, so that stresses exchange momentum without loss. No deviator acts on a wall: in the cells that it cuts the pressure is the whole
+load, and its friction is a traction of its own.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from granular.cut_walls_kernels import traction_kernel
+from granular.packing import SHEARS, Packing, three
+from granular.yield_set import COLUMNS
+from warp_lcp.grid.cut_cells import CutCells
+from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.operators.grid_poisson import SOLID
+from warp_lcp.program import Launch
+
+if TYPE_CHECKING:
+    from granular.stress import Velocity
+
+SAMPLES = {2: 8, 3: 4}  # of a half cell along each axis, for its volume
+LEAST_WALL = 1e-4  # of a cell's face, below which there is no wall
+
+
+class CutWalls:
+    """Solids that stand still and cut cells.
+
+    Args:
+        grid: the grid.
+        cut: the solids.
+        friction: Coulomb's coefficient of the domain's walls and of each solid, >= 0; inf sticks.
+
+    Attributes:
+        openings: float32: what solids leave open of the lower faces of each axis, then what of each cell the differences of velocity
+            along each axis stand for: its volume where solids leave both faces open in part, else 0; shape (2 dimension, *grid.shape).
+        volume: float32 open part of each cell.
+        around: float32 open part of what surrounds the edges of each shear.
+        count: cells with a wall.
+        cells: int32, their flat index.
+        normal: unit, out of the sand, shape (count, 3), on the host.
+        area: of each, in units of a cell's face, on the host.
+    """
+
+    def __init__(self, grid: StaggeredGrid, cut: CutCells, friction: Sequence[float]) -> None:
+        """Find volumes, areas and normals."""
+        self.grid, device, dimension = grid, grid.device, grid.dimension
+        distance, solid = cut.distance.numpy().astype(np.float64), cut.base.numpy() == SOLID
+        octants = _octants(distance, dimension)
+        volume = octants.reshape(-1, *grid.shape).mean(axis=0)
+        inner = np.zeros(grid.shape, dtype=bool)
+        inner[1:-1, 1:-1, 1:-1] = True
+        volume[~inner] = 1.0
+        volume[inner & solid] = 0.0
+        faces = _open_faces(grid, [field.numpy().astype(np.float64) for field in cut.open], distance)
+        high = [np.roll(face, -1, axis=2 - axis) for axis, face in enumerate(faces)]
+        counted = [np.where((a > 0.0) & (b > 0.0), volume, 0.0) for a, b in zip(faces, high, strict=True)]
+        self.openings = wp.array(np.array([*faces, *counted]), dtype=wp.float32, device=device)
+        self.volume = wp.array(volume, dtype=wp.float32, device=device)
+        self.around = [
+            wp.array(_around(octants, inner, inner & solid, alpha, beta), dtype=wp.float32, device=device)
+            for alpha, beta in SHEARS[dimension]
+        ]
+        self._find_walls(cut, inner & ~solid, faces, high, volume)
+        self._friction = wp.array(np.minimum(friction, 1e6), dtype=wp.float32, device=device)
+
+    def _find_walls(self, cut: CutCells, open_: np.ndarray, faces: list[np.ndarray], high: list[np.ndarray], volume: np.ndarray) -> None:
+        """Find the cells with a wall, and what their kernel reads."""
+        walls = np.array([a - b for a, b in zip(faces, high, strict=True)])
+        size = np.sqrt((walls**2).sum(axis=0))
+        at = np.flatnonzero(open_ & (size > LEAST_WALL))
+        self.count, self.area = len(at), size.ravel()[at]
+        self.normal = np.zeros((len(at), 3))
+        missing = np.zeros((len(at), 3))
+        numbers, closed = np.zeros(len(at), dtype=np.int32), np.full(len(at), -1.0)
+        for axis, (a, b) in enumerate(zip(faces, high, strict=True)):
+            self.normal[:, axis] = walls[axis].ravel()[at] / self.area
+            missing[:, axis] = (volume - 0.5 * (a + b)).ravel()[at]
+            number = cut.wall[axis].numpy()
+            for part, who in ((a, number), (b, np.roll(number, -1, axis=2 - axis))):
+                more = (1.0 - part.ravel()[at] > closed) & (who.ravel()[at] > 0)
+                numbers[more], closed[more] = who.ravel()[at][more], 1.0 - part.ravel()[at][more]
+        entries = np.concatenate([self.normal, self.area[:, None], missing, volume.ravel()[at][:, None]], axis=1)
+        device = self.grid.device
+        self.cells = wp.array(at, dtype=wp.int32, device=device)
+        self._numbers = wp.array(numbers, dtype=wp.int32, device=device)
+        self._entries = wp.array(entries.ravel(), dtype=wp.float32, device=device)
+
+    def project(
+        self, packing: Packing, velocity: Velocity, stress: Sequence[wp.array], scalars: Sequence[wp.array], partials: wp.array,
+        grain: int, threads: int, launch: Launch,
+    ) -> None:  # fmt: skip
+        """Take a projected step of the tractions, or find what the natural residual would move.
+
+        Args:
+            packing: where sand is.
+            velocity: that the stresses leave.
+            stress: now, before, point.
+            scalars: state of the momentum, numbers.
+            partials: sums; the last `threads` of each column are these.
+            grain: cells a thread takes.
+            threads: of the launch.
+            launch: launches or records.
+        """
+        kernel = traction_kernel(self.grid.dimension, velocity.real, velocity.real is wp.float64)
+        behind = partials.shape[0] // COLUMNS - threads
+        walls = [self.cells, self._numbers, self._entries, self._friction, packing.flags, packing.fraction, self.openings]
+        fields = [packing.share[0], *three(velocity.u), *three(packing.inverse)]
+        launch(kernel, threads, [grain, behind, *walls, *stress, *fields, *scalars, partials], device=self.grid.device)
+
+
+def _corners(distance: np.ndarray, axes: Sequence[int]) -> np.ndarray:
+    """Return the distances at the corners of each cell along some axes, shape (2, ..., 2, *grid.shape), the last axis first."""
+    found = distance
+    for axis in axes:
+        found = np.stack([found, np.roll(found, -1, axis=-1 - axis)])
+    return found
+
+
+def _open_part(corners: np.ndarray, low: Sequence[float], high: Sequence[float], samples: int) -> np.ndarray:
+    """Return the part of boxes where the distance, linear between its values at the corners of a unit cube, is positive.
+
+    Args:
+        corners: shape (2, ..., 2, n), the last axis of the cube first.
+        low: of the box along each axis.
+        high: likewise.
+        samples: along each axis of the box.
+    """
+    total = np.zeros(corners.shape[-1])
+    places = [a + (b - a) * (np.arange(samples) + 0.5) / samples for a, b in zip(low, high, strict=True)]
+    step = max(b - a for a, b in zip(low, high, strict=True)) / samples
+    for point in itertools.product(*places):
+        value = corners
+        for x in reversed(point):
+            value = (1.0 - x) * value[0] + x * value[1]
+        total += np.clip(0.5 + value / step, 0.0, 1.0)
+    return total / samples ** len(places)
+
+
+def _octants(distance: np.ndarray, dimension: int) -> np.ndarray:
+    """Return the open part of each half of each cell along all axes, shape (2, ..., 2, *grid.shape), the last axis first."""
+    corners = _corners(distance, range(dimension))
+    flat = corners.reshape(*(2,) * dimension, -1)
+    least, most = (f(flat.reshape(2**dimension, -1), axis=0) for f in (np.min, np.max))
+    mixed = np.flatnonzero((least < 0.0) & (most > 0.0))
+    found = np.zeros((2,) * dimension + (flat.shape[-1],))
+    found[..., least >= 0.0] = 1.0
+    for halves in itertools.product((0, 1), repeat=dimension):  # of the last axis first
+        low = [0.5 * half for half in reversed(halves)]
+        found[halves][mixed] = _open_part(flat[..., mixed], low, [a + 0.5 for a in low], SAMPLES[dimension])
+    return found.reshape((2,) * dimension + distance.shape)
+
+
+def _open_faces(grid: StaggeredGrid, faces: list[np.ndarray], distance: np.ndarray) -> list[np.ndarray]:
+    """Return what solids leave open of faces, those of the domain's sides too, which its walls close."""
+    for axis, face in enumerate(faces):
+        others = [other for other in range(grid.dimension) if other != axis]
+        corners = _corners(distance, others)
+        for layer in (1, grid.counts[axis] + 1):
+            at = [slice(1, -1)] * 3
+            at[2 - axis] = slice(layer, layer + 1)
+            part = corners[:, :, *at] if len(others) == 2 else corners[:, *at]
+            flat = part.reshape(*(2,) * len(others), -1)
+            found = _open_part(flat, [0.0] * len(others), [1.0] * len(others), 2 * SAMPLES[grid.dimension])
+            face[tuple(at)] = found.reshape(part.shape[len(others) :])
+    return faces
+
+
+def _around(octants: np.ndarray, inner: np.ndarray, solid: np.ndarray, alpha: int, beta: int) -> np.ndarray:
+    """Return the open part of what surrounds the edges of a shear; 0 beside cells that solids fill but on the domain's walls."""
+    dimension = octants.ndim - 3
+    total, count, filled = np.zeros(inner.shape), np.zeros(inner.shape), np.zeros(inner.shape, dtype=bool)
+    for a, b in itertools.product((0, 1), repeat=2):  # the cells one back along alpha, along beta
+        at: list[slice | int] = [slice(None)] * dimension
+        at[dimension - 1 - alpha], at[dimension - 1 - beta] = 1 if a else 0, 1 if b else 0
+        part = octants[tuple(at)].reshape(-1, *inner.shape).mean(axis=0)
+        moved = [np.roll(f, (a, b), axis=(2 - alpha, 2 - beta)) for f in (part, inner, solid)]
+        total += np.where(moved[1], moved[0], 0.0)
+        count += moved[1]
+        filled |= moved[2].astype(bool)
+    mean = np.divide(total, count, out=np.ones_like(total), where=count > 0)
+    return np.where(filled & (count == 4), 0.0, mean)
