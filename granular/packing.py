@@ -74,7 +74,7 @@ class Packing:
         if self.sides is not None:
             self.sides.wrap(self.fraction)
         rate = grid.spacing / dt
-        domain.launch(kernels.cell_kernel, [self.base, self.fraction, grid.planes, rate, self.kind, self.flags, self.drive])
+        domain.launch(kernels.cell_kernel, [self.base, self._capacity, self.fraction, grid.planes, rate, self.kind, self.flags, self.drive])
         if self.sides is not None:
             self.sides.wrap(self.flags, self.kind)
         for axis in range(dimension):
