@@ -18,6 +18,7 @@ from granular.stress_kernels import PERIOD
 BETTER = 0.95  # of the best estimate: progress
 NEAR_BEST = 1.2
 NOTHING = 1e-3  # of the tolerance: nothing to solve, as in free fall
+STILL = 1e-2  # of the tolerance, which leaves sand at rest
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,9 @@ class AcceleratedProjection:
         patience: steps without a better estimate after which the next that is nearly as good as the best is taken.
         least: steps that a solve takes, whatever its residual, unless that is next to nothing. Smooth errors hardly show in the residual
             and add up from one time step to the next: without these steps, packed sand at rest creeps two to four times as far.
+        cold: the same of a solve that starts from much less than its forces make, unless the residual is next to nothing before. What it
+            leaves is how far sand put down at rest falls, and walls keep the marks of the rebound: in a silo 126 cells deep it is 2e-4 of
+            the height, and friction points down in the uppermost rows.
     """
 
     pressure_step: float = 1.0 / 1.2
@@ -92,6 +96,7 @@ class AcceleratedProjection:
     check_every: int = 2
     patience: int = 300
     least: int = 80
+    cold: int = 600
 
     def solve(self, stress: Stress, *, scale: float, tolerance: float, max_iterations: int) -> CoupledOutcome:
         """Solve from the stresses as they are."""
@@ -102,11 +107,12 @@ class AcceleratedProjection:
             momentum=self.momentum,
         )  # fmt: skip
         aim, best, best_at = tolerance * scale, math.inf, 0
-        least = min(self.least, max_iterations) if history[0][1] > NOTHING * tolerance else 0
+        least, still = (self.cold, STILL * aim) if stress.cold else (self.least, 0.0)
+        least = min(least, max_iterations) if history[0][1] > NOTHING * tolerance else 0
         status = None if least > 0 and math.isfinite(history[0][1]) else _status(history, tolerance, max_iterations, done)
         while status is None:
             estimate, stagnates = math.inf, False
-            while (estimate > aim or done < least) and done < max_iterations and not stagnates:
+            while (estimate > aim or (done < least and estimate > still)) and done < max_iterations and not stagnates:
                 estimate = stress.advance(self.check_every)
                 done += self.check_every * PERIOD
                 if not estimate < BETTER * best:
