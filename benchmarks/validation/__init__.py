@@ -22,6 +22,7 @@ from benchmarks.validation import (
     sand_hourglass,
     sand_invariants,
     sand_rest,
+    sand_silo,
     slope,
     sloshing,
     spin,
@@ -50,6 +51,7 @@ CHECKS = {
     "sand hourglass": sand_hourglass,
     "sand invariants": sand_invariants,
     "sand rest": sand_rest,
+    "sand silo": sand_silo,
 }
 
 KNOWN = {  # why a check is known not to hold everywhere; the report says so where it does not
