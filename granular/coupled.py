@@ -18,6 +18,8 @@ from granular.stress_kernels import PERIOD
 BETTER = 0.95  # of the best estimate: progress
 NEAR_BEST = 1.2
 NOTHING = 1e-3  # of the tolerance: nothing to solve, as in free fall
+SWING = 1.9  # 1 - momentum, times the cells of a side, of cold solves: with less than 2 sqrt(pressure_step / 4) pi / 2 = 1.4 the longest
+# wave, a quarter of which fits into a column's depth, swings back, and walls hold down what they have let rise; friction asks for more
 STILL = 1e-2  # of the tolerance, which leaves sand at rest
 
 
@@ -107,13 +109,15 @@ class AcceleratedProjection:
             momentum=self.momentum,
         )  # fmt: skip
         aim, best, best_at = tolerance * scale, math.inf, 0
-        least, still = (self.cold, STILL * aim) if stress.cold else (self.least, 0.0)
+        least, still, most = (
+            (self.cold, STILL * aim, 1.0 - SWING / max(stress.packing.grid.counts)) if stress.cold else (self.least, 0.0, 1.0)
+        )
         least = min(least, max_iterations) if history[0][1] > NOTHING * tolerance else 0
         status = None if least > 0 and math.isfinite(history[0][1]) else _status(history, tolerance, max_iterations, done)
         while status is None:
             estimate, stagnates = math.inf, False
             while (estimate > aim or (done < least and estimate > still)) and done < max_iterations and not stagnates:
-                estimate = stress.advance(self.check_every)
+                estimate = stress.advance(self.check_every, most=most)
                 done += self.check_every * PERIOD
                 if not estimate < BETTER * best:
                     stagnates = not math.isfinite(estimate) or (done - best_at >= self.patience and estimate < NEAR_BEST * best)

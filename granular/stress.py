@@ -235,8 +235,12 @@ class Stress:
         if self.bodies is not None:
             self.bodies.prepare(self.packing, self.numbers, pressure_step=pressure_step, shear_step=shear_step)
 
-    def advance(self, periods: int) -> float:
-        """Take some periods of steps with momentum, see `PERIOD`; return an estimate of the natural residual [m/s]."""
+    def advance(self, periods: int, *, most: float = 1.0) -> float:
+        """Take some periods of steps with momentum, at first at `most`, see `PERIOD`; return an estimate of the natural residual [m/s]."""
+        if most < 1.0:
+            state = self._momentum.numpy().copy()
+            state[[BETA_X, BETA_X + 1]] = np.minimum(state[[BETA_X, BETA_X + 1]], most)
+            self._momentum.assign(state)
         if self._program is None:
             self._program = Program(self.packing.grid.device)
             for _ in range(PERIOD):
