@@ -39,7 +39,7 @@ class Packing:
         fraction: phi, float32.
         kind: int8 FLUID where a cell holds sand (phi > 0.02), AIR, SOLID.
         flags: uint8 bits of a cell, see `granular.yield_set`.
-        drive: max(FULL - phi, 0) dx / dt [m/s] of the pressure's problem, float32.
+        drive: what of a cell is free, at most FULL - phi and what is free around it, times dx / dt [m/s], float32.
         mass, inverse: of each component's faces, in units of a full face's, float32; inverse is 0 where nothing can be moved.
         start: velocity of each component that the stresses act on [m/s], float32.
         share: weight of a cell's copy on the edges of each shear, float32, see `granular.yield_set`.
@@ -82,7 +82,8 @@ class Packing:
             self.sides.wrap(self.fraction)
         rate = grid.spacing / dt
         openings, volume, around = (None, None, [None] * 3) if self.cut is None else (self.cut.openings, self.cut.volume, self.cut.around)
-        domain.launch(kernels.cell_kernel, [self.base, self.fraction, grid.planes, rate, volume, self.kind, self.flags, self.drive])
+        inputs = [self.base, self._capacity, self.fraction, grid.planes, rate, volume, self.kind, self.flags, self.drive]
+        domain.launch(kernels.cell_kernel, inputs)
         if self.sides is not None:
             self.sides.wrap(self.flags, self.kind)
         for axis in range(dimension):

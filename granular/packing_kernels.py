@@ -49,9 +49,11 @@ def fraction_kernel(cells: CellRange, base: _I8, capacity: _F32, splatted: _F32,
 @wp.kernel(**options)
 @typing.no_type_check
 def cell_kernel(
-    cells: CellRange, base: _I8, fraction: _F32, planes: int, rate: float, volume: _F32, kind: _I8, flags: _U8, drive: _F32,
+    cells: CellRange, base: _I8, capacity: _F32, fraction: _F32, planes: int, rate: float, volume: _F32, kind: _I8, flags: _U8, drive: _F32,
 ):  # fmt: skip
     """Which cells hold sand, and what of them is still free: drive = max(FULL - saturation, 0) dx / dt [m/s].
+
+    What is free in a cell must be free around it as well: a gap that its neighbors' surplus fills is the particles' sampling, no room.
 
     Never negative: what is too dense is a matter of positions, which the density correction moves apart. Pushed out by the stresses it
     would be a velocity, which friction works against (a silo's walls would pull its sand down), and the larger the shorter the step. Where
@@ -84,10 +86,9 @@ def cell_kernel(
                             air = True
                 if air:
                     full = wp.max(phi, 1.0)
-        free = wp.max(FULL - full, 0.0) * rate
+        open = float(1.0)
         if volume:
             open = volume[k, j, i]
-            free = wp.max(FULL - WALL_NOISE * (1.0 - open) - full, 0.0) * rate * open
             if mark != 0:
                 least = float(1.0)
                 for c in range(-planes + 1, planes):
@@ -97,13 +98,30 @@ def cell_kernel(
                 if least < 1.0:
                     mark = mark | PARTLY
         flags[k, j, i] = wp.uint8(mark)
-        drive[k, j, i] = free
+        free = FULL - WALL_NOISE * (1.0 - open) - full
+        if mark != 0 and free > 0.0:
+            free = wp.min(free, _free_around(base, capacity, fraction, planes, k, j, i))
+        drive[k, j, i] = wp.max(free, 0.0) * rate * open
         if solid:
             kind[k, j, i] = _SOLID
         elif mark != 0:
             kind[k, j, i] = _FLUID
         else:
             kind[k, j, i] = _AIR
+
+
+@wp.func
+@typing.no_type_check
+def _free_around(base: _I8, capacity: _F32, fraction: _F32, planes: int, k: int, j: int, i: int):
+    """What of a cell would be free if all that is free around it, weighed by (1, 2, 1)/4 along each axis, were in it."""
+    free = float(0.0)
+    for c in range(1 - planes, planes):
+        for b in range(-1, 2):
+            for a in range(-1, 2):
+                if base[k + c, j + b, i + a] != _SOLID:
+                    weight = wp.max(capacity[k + c, j + b, i + a], 0.1) / float((1 + wp.abs(a)) * (1 + wp.abs(b)) * (1 + wp.abs(c)))
+                    free += weight * (FULL - fraction[k + c, j + b, i + a])
+    return free / wp.max(capacity[k, j, i], 0.1)
 
 
 @wp.kernel(**options)

@@ -20,6 +20,7 @@ from warp_lcp.vectors import Reduction
 
 WALL_GRAIN = 256  # wall faces a CPU thread takes
 MOST_MOMENTUM = 0.985  # unless a method wants less
+GROWN = 1.5  # of the time for which forces act in a step: its stresses are no guess to trust
 SHARE = 0.7**0.5  # by which a step of the friction, over its length, exceeds the natural residual: measured
 
 
@@ -152,6 +153,7 @@ class Stress:
     Attributes:
         now: the stresses, see `granular.yield_set`, float32.
         kick_dt: how long forces acted in the step that they belong to [s]; 0 before the first.
+        cold: whether forces act for much longer in the step that has begun than in the last, as in the first two steps.
         checked: the velocity that they leave, in float64, since the last `residual`.
         last_residual: that of pressure and friction [m/s].
     """
@@ -175,7 +177,7 @@ class Stress:
         self._check: Program | None = None  # of the residual
         self._cells = 1
         self.last_residual = 0.0, 0.0
-        self.kick_dt = 0.0
+        self.kick_dt, self.cold = 0.0, True
         self.face(walls)
 
     def face(self, walls: Walls) -> None:
@@ -207,6 +209,7 @@ class Stress:
         flags = p.flags.numpy()
         self._cells = max(int(np.count_nonzero(p.grid.interior(flags))), 1)
         self.walls.activate(flags)
+        self.cold = kick_dt > GROWN * self.kick_dt
         ratio = decay * (kick_dt / self.kick_dt if self.kick_dt > 0.0 else 1.0)
         inputs = [p.flags, p.stiff, *three(p.share), ratio, self.now, self._before, self._point]
         p.grid.domain.launch(self.velocity.kernels.admit, inputs)

@@ -23,6 +23,7 @@ from benchmarks.validation import (
     sand_invariants,
     sand_oblique,
     sand_rest,
+    sand_silo,
     slope,
     sloshing,
     spin,
@@ -52,6 +53,7 @@ CHECKS = {
     "sand invariants": sand_invariants,
     "sand oblique": sand_oblique,
     "sand rest": sand_rest,
+    "sand silo": sand_silo,
 }
 
 KNOWN = {  # why a check is known not to hold everywhere; the report says so where it does not

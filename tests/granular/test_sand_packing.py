@@ -68,6 +68,12 @@ def test_surface_cells_count_as_full_and_loose_ones_do_not() -> None:
     assert plane(packed([":::"] * 3).drive)[1, 1] == pytest.approx(0.55 * DX / DT, rel=1e-5)
 
 
+def test_a_gap_that_its_neighbors_fill_is_no_room() -> None:
+    """Free is what a cell and those around it, by halves along each axis, have free in all: 0.95 less the fractions of eight neighbors."""
+    assert plane(packed(["+++", "+:+", "+++"]).drive)[1, 1] == 0.0
+    assert plane(packed(["ooo", "o:o", "ooo"]).drive)[1, 1] == pytest.approx((0.55 - 3 * 0.05) * DX / DT, rel=1e-5)
+
+
 @pytest.mark.parametrize(
     ("picture", "expected"),
     [

@@ -1,0 +1,255 @@
+"""Sand at rest between walls presses on the ground as Janssen's law says: what is deep rests on the walls, and hardly more on the ground.
+
+    sigma(z) / (rho g W) = (1 - exp(-c mu K z / W)) / (c mu K),
+
+c = 2 between two walls, 4 in a square of four [Janssen 1895]. K, how much of the vertical stress presses on the walls, lies between 1/3,
+where sand of a sine of 1/2 gives way sideways, and 1: bounds are a tenth beyond either. The vertical stress is the pressure less the
+deviator's part, averaged over a cross-section; depth is the mass above it over rho W, which holds wherever the surface may be.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from benchmarks.record import Chart, Lines
+from benchmarks.validation.finding import Findings, Trial, attempt
+from benchmarks.validation.sand_pit import GRAVITY, Row, create
+from granular.simulator import SandSimulation
+
+RESOLUTIONS = {2: (16, 24), 3: (16,)}  # cells of the width, by dimension
+SLOT = 4  # cells along z of a silo without an end there
+FRICTIONS = (0.2, 0.5, 0.8)  # of the walls
+RATIOS, BEYOND = (1.0 / 3.0, 1.0), 0.1  # least and largest K, and what loads may lie beyond theirs
+DEEP = {2: 5.25, 3: 3.25}  # widths of sand
+WIDTH = 0.2  # [m]
+DENSITY = 1600.0  # [kg/m^3]
+HEADROOM = 4  # cells above the sand
+RESTS = 0.3  # [s]
+TINY, PERIOD = 1e-5, 20  # [s] of a short step, and how many steps there are from one to the next
+LOAD, LID = 2.0, 0.25  # [rho g W] of a lid; its height [widths]
+CLEAR = 1e-3  # of a cell between a lid and the walls
+NEAR = 0.25  # [widths]: rows nearer to the surface have no walls beside them in part of their cells' kernels
+RISE = 0.01  # [m/s] of a floor
+Step = Callable[[SandSimulation, float], None]
+
+
+@dataclass(frozen=True)
+class Silo:
+    """What a silo bears.
+
+    Attributes:
+        depth: of each row of cells, the uppermost first: the mass above its centers [widths], shape (rows,).
+        load: the vertical stress there [rho g W], shape (rows,).
+        shear: what walls bear, upward, over the load, shape (rows,).
+        fell: how far the center of mass has gone at most, over the height.
+        rows: of the log.
+    """
+
+    depth: np.ndarray
+    load: np.ndarray
+    shear: np.ndarray
+    fell: float
+    rows: list[Row]
+
+    def at(self, depth: float) -> float:
+        """Return the vertical stress [rho g W] at a depth [widths]."""
+        return float(np.interp(depth, self.depth, self.load))
+
+
+def janssen(depth: float, friction: float, ratio: float, walls: int = 2) -> float:
+    """Return Janssen's vertical stress [rho g W] at a depth [widths] for K = ratio, between `walls` walls."""
+    rate = walls * friction * ratio
+    return depth if rate == 0.0 else (1.0 - math.exp(-rate * depth)) / rate
+
+
+def check(device: str) -> tuple[list[Trial], list[Chart]]:
+    """Run the check at its resolutions."""
+    trials = [trial(n, dimension, device) for dimension, cells in RESOLUTIONS.items() for n in cells]
+    trials += [slot(n, device) for n in RESOLUTIONS[2]] + [controls(RESOLUTIONS[2][0], device)]
+    curves: dict[str, Any] = {f"{t.resolution}: {label}": curve for t in trials for label, curve in t.curves.items()}
+    depths = np.linspace(0.0, DEEP[2], 40).tolist()
+    for ratio in RATIOS:
+        curves[f"Janssen, mu = 0.5, K = {ratio:.2g}"] = (depths, [janssen(z, 0.5, ratio) for z in depths])
+    title = "Vertical stress in a silo"
+    return trials, [Lines("sand-silo", title, "z / W", "sigma / (rho g W)", curves, logarithmic_x=False, logarithmic_y=False)]
+
+
+def trial(cells: int, dimension: int = 2, device: str = "cpu", frictions: tuple[float, ...] = FRICTIONS, deep: float = 0.0) -> Trial:
+    """Compare what a silo bears with Janssen's law: as it is, with short steps, under a lid, and between walls without friction."""
+
+    def run(found: Findings) -> None:
+        more: dict[str, Any] = {"deep": deep or DEEP[dimension], "square": dimension == 3, "device": device}
+        depths = range(1, math.ceil(more["deep"]))
+        for friction in frictions:
+            bears(found, f"mu = {friction:g}", rest(fill(cells, friction, **more)), friction, depths, walls=2 * dimension - 2)
+        friction = frictions[len(frictions) // 2]
+        plain, short = (rest(fill(cells, friction, **more), tiny=tiny) for tiny in (0.0, TINY))
+        found.add(f"a step of {TINY:g} s every {PERIOD}: largest change of a load", change(plain, short, depths), high=0.02)
+        lid = rest(fill(cells, friction, lid=LOAD, **more))
+        left = np.array([lid.at(z) - plain.at(z) for z in depths])
+        found.add("a lid: what a width leaves of its load, at most", float((left[1:] / left[:-1]).max()), high=1.0)
+        found.add("a lid: what is left of its load one width down", left[0] / LOAD, low=0.0, high=1.0)
+        level = rest(fill(cells, 0.0, **more))
+        found.add("mu = 0: largest load off the weight above", max(abs(level.at(z) / z - 1.0) for z in depths), high=0.02)
+
+    return attempt("sand silo", f"{cells} cells of width, {dimension}-D", run)
+
+
+def slot(cells: int, device: str = "cpu") -> Trial:
+    """Compare a silo of two walls in 3-D with Janssen's law."""
+
+    def run(found: Findings) -> None:
+        bears(found, "mu = 0.5", rest(fill(cells, 0.5, deep=DEEP[3], deeper=SLOT, device=device)), 0.5, range(1, math.ceil(DEEP[3])))
+
+    return attempt("sand silo", f"{cells} cells between two walls, 3-D", run)
+
+
+def controls(cells: int, device: str = "cpu") -> Trial:
+    """Push sand up, which turns the walls' friction over, and pack and start solves as was done before: all must miss the law."""
+
+    def run(found: Findings) -> None:
+        depths = range(1, 6)
+        plain = rest(fill(cells, 0.5, device=device))
+        for label, silo in (
+            ("a floor that rises", rest(fill(cells, 0.5, rise=RISE, device=device))),
+            ("sand that is too dense is pushed out", rest(fill(cells, 0.5, device=device), each=_pack_as_before)),
+        ):
+            most = max(silo.at(z) / janssen(z, 0.5, RATIOS[0]) for z in depths)
+            found.must_break(f"{label}: largest load over that of K = 1/3", most, high=1.0 + BEYOND)
+            found.must_break(f"{label}: least shear of the walls, upward", float(silo.shear[silo.depth > NEAR].min()), low=0.0)
+            found.curves[label] = (silo.depth.tolist(), silo.load.tolist())
+        gaps = rest(fill(cells, 0.5, device=device), each=_close_all_gaps)
+        found.must_break("gaps of the sampling close: way of the center of mass over the height", gaps.fell, high=2e-4)
+        short = rest(fill(cells, 0.5, device=device), tiny=TINY, each=_keep_impulses)
+        found.must_break("impulses of steps of other lengths: largest change of a load", change(plain, short, depths), high=0.02)
+
+    return attempt("sand silo, wrong", f"{cells} cells of width, 2-D", run)
+
+
+def bears(found: Findings, label: str, silo: Silo, friction: float, depths: range, walls: int = 2) -> None:
+    """Add what a silo bears at whole widths of depth."""
+    loads = np.array([silo.at(z) for z in depths])
+    least, most = (np.array([janssen(z, friction, ratio, walls) for z in depths]) for ratio in reversed(RATIOS))
+    rises = np.diff(np.append(0.0, loads))
+    found.add(f"{label}: least load over that of K = 1", float((loads / least).min()), low=1.0 - BEYOND)
+    found.add(f"{label}: largest load over that of K = 1/3", float((loads / most).max()), high=1.0 + BEYOND)
+    found.add(f"{label}: least rise of the load in a width", float(rises.min()), low=0.0, unit="rho g W")
+    found.add(f"{label}: largest ratio of a rise to that before", float((rises[1:] / rises[:-1]).max()), high=1.0)
+    below = (silo.depth > NEAR) & (silo.depth < depths[-1])
+    found.add(f"{label}: least shear of the walls over the load, upward", float(silo.shear[below].min()), low=0.0)
+    found.add(f"{label}: way of the center of mass over the height", silo.fell, high=2e-4)
+    found.curves[label] = (silo.depth.tolist(), silo.load.tolist())
+
+
+def change(one: Silo, other: Silo, depths: range) -> float:
+    """Return by how much the loads of a silo differ from another's at most, relative."""
+    return max(abs(other.at(z) / one.at(z) - 1.0) for z in depths)
+
+
+def fill(
+    cells: int, friction: float | str, *, deep: float = DEEP[2], deeper: int = 1, lid: float = 0.0, square: bool = False,
+    rise: float = 0.0, device: str = "cpu", **tables: Any,
+) -> SandSimulation:  # fmt: skip
+    """Return a silo filled at rest.
+
+    Args:
+        cells: of its width.
+        friction: of its walls.
+        deep: height of the sand [widths].
+        deeper: cells along z; 1: two dimensions.
+        lid: what lies on the sand [rho g W].
+        square: whether z has walls as x has; else it has no end.
+        rise: speed of the floor [m/s], in 2-D.
+        device: where it runs.
+        tables: of the scene.
+    """
+    dx, high = WIDTH / cells, round(deep * cells)
+    more = [cells * dx] if square else [deeper * dx] if deeper > 1 else []
+    ny = high + HEADROOM + (math.ceil(LID * cells) if lid else 0)
+    solids = []
+    if lid:
+        low, top, gap = high * dx, (high + math.ceil(LID * cells)) * dx, CLEAR * dx
+        mass = lid * DENSITY * WIDTH**2 * (more[0] if more else 1.0)
+        ends = [[gap, low, gap], [WIDTH - gap, top, WIDTH - gap]]
+        solids = [{"shape": "box", "min": ends[0][: 2 + len(more)], "max": ends[1][: 2 + len(more)], "mass": mass, "friction": 0.0}]
+    if more and not square:
+        tables["domain"] = {"size": [WIDTH, ny * dx, *more], "resolution": ny, "friction": friction, "periodic": [False, False, True]}
+    tables = {"physics": {"gravity": [0.0, -GRAVITY, 0.0][: 2 + len(more)], "density": DENSITY}, "walls": friction} | tables
+    floor = dx if rise else 0.0
+    if rise:
+        piston = {"shape": "box", "min": [-1.0, -1.0], "max": [2.0 * WIDTH, floor], "friction": 0.0}
+        solids, ny = [piston | {"motion": {"kind": "translation", "velocity": [0.0, rise]}}], ny + 2
+    sand = {"shape": "box", "min": [0.0, floor, 0.0][: 2 + len(more)], "max": [WIDTH, floor + high * dx, *more]}
+    return create([WIDTH, ny * dx, *more], ny, [sand], solids, device=device, **tables)
+
+
+def rest(simulation: SandSimulation, duration: float = RESTS, tiny: float = 0.0, each: Step | None = None) -> Silo:
+    """Let sand rest and measure what it bears.
+
+    Args:
+        simulation: of `fill`.
+        duration: [s].
+        tiny: length of a short step after `PERIOD` others [s]; 0: there are none.
+        each: called before each step with its length [s].
+    """
+    rows: list[Row] = []
+    while simulation.time < duration:
+        dt = min(simulation.stable_dt(), simulation.scene.time.dt_max)
+        if tiny and simulation.step_count % PERIOD == PERIOD // 2:
+            dt = tiny
+        if each is not None:
+            each(simulation, dt)
+        rows.append({**simulation.step(dt), "dt": dt})
+    return measure(simulation, rows)
+
+
+def measure(simulation: SandSimulation, rows: list[Row]) -> Silo:
+    """Return what the last step's stresses are."""
+    grid, packing = simulation.grid, simulation.packing
+    inner = tuple(slice(low, high) for low, high in zip(grid.domain.low, grid.domain.high, strict=True))
+    x = simulation.stress.now.numpy()[(slice(None), *inner)].astype(np.float64)
+    flat, across, cells = grid.dimension == 2, (0, 2), x.shape[3]
+    unit = GRAVITY * simulation.stress.kick_dt * cells  # of rho g W
+    load = (x[0] + x[1] if flat else x[0] - x[2]).mean(axis=across) / unit
+    xy = x[2:6] if flat else x[4:8]  # what walls bear of a row is the mean of its copies, see `granular.yield_set`
+    sides = [xy[1::2, :, :, -1].mean(axis=(0, 1)), -xy[::2, :, :, 0].mean(axis=(0, 1))]
+    if not flat and not simulation.scene.endless:
+        sides += [x[14:16, -1].mean(axis=(0, 2)), -x[12:14, 0].mean(axis=(0, 2))]
+    phi = packing.fraction.numpy()[inner].mean(axis=across)
+    depth = (np.cumsum(phi[::-1]) - 0.5 * phi[::-1]) / cells
+    shear = np.mean(sides, axis=0) / unit / np.maximum(load, 1e-12)
+    heights = [row["center_of_mass_y"] for row in rows]
+    return Silo(depth, load[::-1], shear[::-1], float(np.ptp(heights) / (2.0 * heights[0])), rows)
+
+
+def _pack_as_before(simulation: SandSimulation, dt: float) -> None:
+    """Let what is too dense expand through the stresses: drive = (1 - phi) dx / dt of either sign below the surface."""
+    _drive(simulation, dt, lambda phi, drive: np.where(phi >= 0.9, 1.0 - phi, drive))
+
+
+def _close_all_gaps(simulation: SandSimulation, dt: float) -> None:
+    """Count a cell as full at the nominal density, and no sooner."""
+    _drive(simulation, dt, lambda phi, drive: np.where(phi >= 0.9, np.maximum(1.0 - phi, 0.0), drive))
+
+
+def _drive(simulation: SandSimulation, dt: float, rule: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> None:
+    """Have the packing's drive follow a rule of fractions and what it was [cells a step]."""
+    packing, rate = simulation.packing, simulation.grid.spacing / dt
+
+    def update(density: wp.array, velocity: Sequence[wp.array], dt: float, solid: Sequence[wp.array] = ()) -> None:
+        type(packing).update(packing, density, velocity, dt, solid)
+        new = rule(packing.fraction.numpy(), packing.drive.numpy() / rate)
+        packing.drive.assign((new * rate).astype(np.float32))
+
+    packing.update = update  # type: ignore[method-assign]
+
+
+def _keep_impulses(simulation: SandSimulation, dt: float) -> None:
+    """Start a solve from the last impulses, however long they acted."""
+    simulation.stress.kick_dt = 0.5 * (simulation.last_dt + dt)
