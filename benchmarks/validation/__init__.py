@@ -19,6 +19,7 @@ from benchmarks.validation import (
     inclined,
     rest,
     sand_collapse,
+    sand_heap,
     sand_hourglass,
     sand_invariants,
     sand_rest,
@@ -50,6 +51,7 @@ CHECKS = {
     "sand hourglass": sand_hourglass,
     "sand invariants": sand_invariants,
     "sand rest": sand_rest,
+    "sand heap": sand_heap,
 }
 
 KNOWN = {  # why a check is known not to hold everywhere; the report says so where it does not
