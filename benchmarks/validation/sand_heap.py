@@ -1,7 +1,8 @@
 """Heaps of sand that is poured slowly: how steep they are, that they are wedges and stay; and that wedges which are flatter stay too.
 
 In sand whose yield set has the slope k a layer that runs stops at atan k: what slides along a slope shears alone, under equal normal
-stresses. Sand that rests has pushed against itself along the slope, and so holds up to asin k. A heap lies between.
+stresses. Sand that rests has pushed against itself along the slope, and so holds up to asin k: by 1, 5
+and 17 degrees more at 20, 30 and 40. A heap lies between, and the check says by how much it is off the angle at which layers stop.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ SEED_WIDTH, SEED_HEIGHT = 0.1, 0.025  # [m]: of the sand that is there at the st
 SETTLES, LASTS = 1.0, 5.0  # [s] from the end of the pouring to the first look, and to the last
 NEAR, ALIKE, CREEP = 2.0, 1.5, 0.2  # degrees; degrees between two resolutions; degrees a second
 BELOW, BASE, STANDS, SHRINKS = 3.0, 0.9, 5.0, 0.01  # of a wedge: degrees below the angle; [m]; [s]; share of its height
-CONTROLLED = 30.0  # degrees: of the negative controls
+CONTROLLED = 30.0  # degrees: of the negative control
 HIGHEST = 3  # columns that the height is the mean of
 Outline = tuple[np.ndarray, np.ndarray]  # x and y [m]
 
@@ -62,7 +63,12 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
     def compare(found: Findings) -> None:
         for angle in ANGLES:
             what = f"{angle:g} degrees: heap"
-            found.add(f"{angle:g} degrees: |difference of the heaps|", abs(fine[what] - coarse[what]), high=ALIKE, unit="degrees")
+            found.add(
+                f"{angle:g} degrees: |difference of the heaps|",
+                abs(fine.get(what, math.nan) - coarse.get(what, math.nan)),
+                high=ALIKE,
+                unit="degrees",
+            )
 
     trials.append(attempt("sand heap", "both", compare))
     curves: dict[str, Any] = {f"{t.resolution}: {label}": curve for t in trials for label, curve in t.curves.items()}
@@ -70,30 +76,28 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
 
 
 def heaps(cells: int, device: str = "cpu", angles: Sequence[float] = ANGLES, *, controls: bool = True) -> Trial:
-    """Pour heaps; the controls have half the friction, and a packing whose excess the stresses push out.
+    """Pour heaps; the control has half the friction.
 
     Args:
         cells: of the domain's length.
         device: where it runs.
         angles: at which layers stop [degrees].
-        controls: run the negative controls too, at the least resolution.
+        controls: run the negative control too, at the least resolution.
     """
 
     def run(found: Findings) -> None:
         for angle in angles:
             heap = pour(cells, angle, device)
-            low, high = bounds(angle)
+            low, high = angle - NEAR, angle + NEAR
             found.add(f"{angle:g} degrees: heap", heap.angle, low=low, high=high, unit="degrees")
             found.add(f"{angle:g} degrees: creep", abs(heap.creep), high=CREEP, unit="degrees/s")
             found.add(f"{angle:g} degrees: distance from a wedge, over the height", heap.wedge, high=0.08)
             found.add(f"{angle:g} degrees: steps with stresses to 1e-3", heap.solved, low=95.0, unit="%")
             found.curves[f"{angle:g} degrees"] = (heap.outline[0].tolist(), heap.outline[1].tolist())
         if controls and cells == RESOLUTIONS[0]:
-            low, high = bounds(CONTROLLED)
+            low, high = CONTROLLED - NEAR, CONTROLLED + NEAR
             flat = pour(cells, half_as_steep(CONTROLLED), device, lasts=SETTLES).angle
             found.must_break("half the friction: heap", flat, low=low, high=high, unit="degrees")
-            pushed = pour(cells, CONTROLLED, device, lasts=SETTLES, prepare=push_excess_out).angle
-            found.must_break("excess pushed out by the stresses: heap", pushed, low=low, high=high, unit="degrees")
 
     return attempt("sand heap", f"{cells} cells of length", run)
 
@@ -110,20 +114,12 @@ def wedges(cells: int, device: str = "cpu", angles: Sequence[float] = ANGLES) ->
     return attempt("sand wedge", f"{cells} cells of length", run)
 
 
-def bounds(angle: float) -> tuple[float, float]:
-    """Return between which angles a heap may lie where a layer stops at an angle [degrees], and sand at rest holds up to asin k."""
-    return angle - NEAR, math.degrees(math.asin(math.tan(math.radians(angle)))) + NEAR
-
-
 def half_as_steep(angle: float) -> float:
     """Return the angle of half the tangent [degrees]."""
     return math.degrees(math.atan(0.5 * math.tan(math.radians(angle))))
 
 
-def pour(
-    cells: int, angle: float, device: str = "cpu", *, lasts: float = LASTS, prepare: Callable[[SandSimulation], None] | None = None,
-    **tables: Any,
-) -> Heap:  # fmt: skip
+def pour(cells: int, angle: float, device: str = "cpu", *, lasts: float = LASTS, **tables: Any) -> Heap:
     """Pour a heap, and watch it.
 
     Args:
@@ -131,7 +127,6 @@ def pour(
         angle: at which a layer stops [degrees].
         device: where it runs.
         lasts: how long after the pouring the last look is [s].
-        prepare: gets the simulation before it starts.
         tables: of the scene.
     """
     middle, stop = 0.5 * LENGTH, AREA / (SPEED * MOUTH)
@@ -140,8 +135,6 @@ def pour(
     source = [{"shape": "box", **mouth, "velocity": [0.0, -SPEED], "stop": stop}]
     tables = {"walls": "stick", "material": {"friction_angle": angle}, "source": source} | tables
     simulation = create([LENGTH, HEIGHT], cells, [seed], device=device, **tables)
-    if prepare is not None:
-        prepare(simulation)
     rows = list(steps(simulation, stop)) + list(steps(simulation, stop + SETTLES))
     first, *_ = fit(outline(simulation), wedge)
     rows += steps(simulation, stop + lasts)
@@ -214,17 +207,3 @@ def fit(line: Outline, shape: Callable[[np.ndarray], np.ndarray]) -> tuple[float
     best = minimize(distance, start, method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-12, "maxiter": 2000})
     top, half, _ = best.x
     return math.degrees(math.atan(top / half)), math.sqrt(best.fun / np.count_nonzero(y)), float(top)
-
-
-def push_excess_out(simulation: SandSimulation) -> None:
-    """Let the stresses push apart what is too dense, as a velocity, and sand below the densest close: what made heaps spread."""
-    packing, update = simulation.packing, simulation.packing.update
-
-    def wrong(density: Any, velocity: Any, dt: float, solid: Any = ()) -> None:
-        update(density, velocity, dt, solid)
-        fraction, drive = packing.fraction.numpy(), packing.drive.numpy()
-        beside_air = (drive == 0.0) & (fraction < 1.0)
-        drive = np.where(beside_air, np.minimum(drive, 0.0), (1.0 - fraction) * simulation.grid.spacing / dt)
-        packing.drive.assign(drive.astype(np.float32))
-
-    packing.update = wrong  # type: ignore[method-assign]
