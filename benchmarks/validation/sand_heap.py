@@ -1,0 +1,209 @@
+"""Heaps of sand that is poured slowly: how steep they are, that they are wedges and stay; and that wedges which are flatter stay too.
+
+In sand whose yield set has the slope k a layer that runs stops at atan k: what slides along a slope shears alone, under equal normal
+stresses. Sand that rests has pushed against itself along the slope, and so holds up to asin k: by 1, 5
+and 17 degrees more at 20, 30 and 40. A heap lies between, and the check says by how much it is off the angle at which layers stop.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize
+
+from benchmarks.record import Chart, Lines
+from benchmarks.validation.finding import Findings, Trial, attempt
+from benchmarks.validation.sand_pit import create, positions, share_solved, steps
+from granular.simulator import SandSimulation
+
+ANGLES = (20.0, 30.0, 40.0)  # degrees, at which a layer stops
+RESOLUTIONS = (96, 144)  # cells of the domain's length
+LENGTH, HEIGHT = 1.2, 0.5  # [m]: of the domain
+DROP, MOUTH, LIP, SPEED = 0.3, 0.05, 0.02, 0.125  # [m], [m], [m], [m/s]: of the source
+AREA = 0.04  # [m^2]: what it pours
+SEED_WIDTH, SEED_HEIGHT = 0.1, 0.025  # [m]: of the sand that is there at the start
+SETTLES, LASTS = 1.0, 5.0  # [s] from the end of the pouring to the first look, and to the last
+NEAR, ALIKE, CREEP = 2.0, 1.5, 0.2  # degrees; degrees between two resolutions; degrees a second
+BELOW, BASE, STANDS, SHRINKS = 3.0, 0.9, 5.0, 0.01  # of a wedge: degrees below the angle; [m]; [s]; share of its height
+CONTROLLED = 30.0  # degrees: of the negative control
+HIGHEST = 3  # columns that the height is the mean of
+Outline = tuple[np.ndarray, np.ndarray]  # x and y [m]
+
+
+@dataclass(frozen=True)
+class Heap:
+    """What has been poured.
+
+    Attributes:
+        angle: of the wedge that fits best [degrees], a while after the pouring has ended.
+        creep: by how much it falls from then on [degrees/s].
+        wedge: distance of the outline from that wedge, root mean square, over its height.
+        dome: from the parabola that fits best, over the same height.
+        solved: share of the steps whose stresses are within the tolerance [%].
+        outline: at the end.
+    """
+
+    angle: float
+    creep: float
+    wedge: float
+    dome: float
+    solved: float
+    outline: Outline
+
+
+def check(device: str) -> tuple[list[Trial], list[Chart]]:
+    """Run the check at its resolutions."""
+    trials = [heaps(n, device) for n in RESOLUTIONS] + [wedges(n, device) for n in RESOLUTIONS]
+    coarse, fine = ({f.what: f.value for f in t.findings} for t in trials[:2])
+
+    def compare(found: Findings) -> None:
+        for angle in ANGLES:
+            what = f"{angle:g} degrees: heap"
+            found.add(
+                f"{angle:g} degrees: |difference of the heaps|",
+                abs(fine.get(what, math.nan) - coarse.get(what, math.nan)),
+                high=ALIKE,
+                unit="degrees",
+            )
+
+    trials.append(attempt("sand heap", "both", compare))
+    curves: dict[str, Any] = {f"{t.resolution}: {label}": curve for t in trials for label, curve in t.curves.items()}
+    return trials, [Lines("sand-heaps", "Heaps and wedges", "x [m]", "y [m]", curves, logarithmic_x=False, logarithmic_y=False)]
+
+
+def heaps(cells: int, device: str = "cpu", angles: Sequence[float] = ANGLES, *, controls: bool = True) -> Trial:
+    """Pour heaps; the control has half the friction.
+
+    Args:
+        cells: of the domain's length.
+        device: where it runs.
+        angles: at which layers stop [degrees].
+        controls: run the negative control too, at the least resolution.
+    """
+
+    def run(found: Findings) -> None:
+        for angle in angles:
+            heap = pour(cells, angle, device)
+            low, high = angle - NEAR, angle + NEAR
+            found.add(f"{angle:g} degrees: heap", heap.angle, low=low, high=high, unit="degrees")
+            found.add(f"{angle:g} degrees: creep", abs(heap.creep), high=CREEP, unit="degrees/s")
+            found.add(f"{angle:g} degrees: distance from a wedge, over the height", heap.wedge, high=0.08)
+            found.add(f"{angle:g} degrees: steps with stresses to 1e-3", heap.solved, low=95.0, unit="%")
+            found.curves[f"{angle:g} degrees"] = (heap.outline[0].tolist(), heap.outline[1].tolist())
+        if controls and cells == RESOLUTIONS[0]:
+            low, high = CONTROLLED - NEAR, CONTROLLED + NEAR
+            flat = pour(cells, half_as_steep(CONTROLLED), device, lasts=SETTLES).angle
+            found.must_break("half the friction: heap", flat, low=low, high=high, unit="degrees")
+
+    return attempt("sand heap", f"{cells} cells of length", run)
+
+
+def wedges(cells: int, device: str = "cpu", angles: Sequence[float] = ANGLES) -> Trial:
+    """Let wedges stand that are flatter than a layer that stops; the control has half the friction."""
+
+    def run(found: Findings) -> None:
+        for angle in angles:
+            found.add(f"{angle - BELOW:g} of {angle:g} degrees: height lost", lost(cells, angle, device), high=SHRINKS)
+        flows = lost(cells, CONTROLLED, device, duration=SETTLES, material={"friction_angle": half_as_steep(CONTROLLED)})
+        found.must_break(f"half the friction, {CONTROLLED - BELOW:g} degrees: height lost", flows, high=SHRINKS)
+
+    return attempt("sand wedge", f"{cells} cells of length", run)
+
+
+def half_as_steep(angle: float) -> float:
+    """Return the angle of half the tangent [degrees]."""
+    return math.degrees(math.atan(0.5 * math.tan(math.radians(angle))))
+
+
+def pour(cells: int, angle: float, device: str = "cpu", *, lasts: float = LASTS, **tables: Any) -> Heap:
+    """Pour a heap, and watch it.
+
+    Args:
+        cells: of the domain's length.
+        angle: at which a layer stops [degrees].
+        device: where it runs.
+        lasts: how long after the pouring the last look is [s].
+        tables: of the scene.
+    """
+    middle, stop = 0.5 * LENGTH, AREA / (SPEED * MOUTH)
+    seed = {"shape": "box", "min": [middle - 0.5 * SEED_WIDTH, 0.0], "max": [middle + 0.5 * SEED_WIDTH, SEED_HEIGHT]}
+    mouth = {"min": [middle - 0.5 * MOUTH, DROP], "max": [middle + 0.5 * MOUTH, DROP + LIP]}
+    source = [{"shape": "box", **mouth, "velocity": [0.0, -SPEED], "stop": stop}]
+    tables = {"walls": "stick", "material": {"friction_angle": angle}, "source": source} | tables
+    simulation = create([LENGTH, HEIGHT], cells, [seed], device=device, **tables)
+    rows = list(steps(simulation, stop)) + list(steps(simulation, stop + SETTLES))
+    first, *_ = fit(outline(simulation), wedge)
+    rows += steps(simulation, stop + lasts)
+    x, y = outline(simulation)
+    last, misses, top = fit((x, y), wedge)
+    _, domed, _ = fit((x, y), dome)
+    creep = (first - last) / (lasts - SETTLES) if lasts > SETTLES else 0.0
+    return Heap(first, creep, misses / top, domed / top, share_solved(rows), (x, y))
+
+
+def lost(cells: int, angle: float, device: str = "cpu", *, duration: float = STANDS, **tables: Any) -> float:
+    """Return the share of its height that a wedge, `BELOW` flatter than an angle [degrees], loses in a time [s]."""
+    simulation = cut_wedge(cells, angle - BELOW, device, **({"material": {"friction_angle": angle}} | tables))
+    before = height(simulation)
+    for _ in steps(simulation, duration):
+        pass
+    return 1.0 - height(simulation) / before
+
+
+def cut_wedge(cells: int, slope: float, device: str = "cpu", **tables: Any) -> SandSimulation:
+    """Return a wedge of a slope [degrees], cut from a box of sand."""
+    middle, tangent = 0.5 * LENGTH, math.tan(math.radians(slope))
+    top, dx = 0.5 * BASE * tangent, LENGTH / cells
+    box = {"shape": "box", "min": [middle - 0.5 * BASE, 0.0], "max": [middle + 0.5 * BASE, top]}
+    size = [LENGTH, math.ceil(top / dx + 4.0) * dx]
+    simulation = create(size, cells, [box], device=device, **({"walls": "stick"} | tables))
+    x, y = positions(simulation).T
+    keep = y < top - np.abs(x - middle) * tangent
+    simulation.particles.assign({name: array.numpy()[keep] for name, array in simulation.particles.arrays().items()})
+    simulation.particles.sort()
+    simulation.mark()
+    return simulation
+
+
+def outline(simulation: SandSimulation) -> Outline:
+    """Return the middle of each column of cells, and how high its sand would stand at its densest [m]."""
+    counts, dx = simulation.grid.counts, simulation.grid.spacing
+    column = np.minimum(positions(simulation)[:, 0] / dx, counts[0] - 1).astype(int)
+    area = simulation.particle_mass / simulation.scene.physics.density
+    return (np.arange(counts[0]) + 0.5) * dx, np.bincount(column, minlength=counts[0]) * area / dx
+
+
+def height(simulation: SandSimulation) -> float:
+    """Return the mean height of the highest columns [m]."""
+    return float(np.sort(outline(simulation)[1])[-HIGHEST:].mean())
+
+
+def wedge(across: np.ndarray) -> np.ndarray:
+    """Return a wedge's height over the distance from its middle, in units of its own."""
+    return np.maximum(1.0 - np.abs(across), 0.0)
+
+
+def dome(across: np.ndarray) -> np.ndarray:
+    """Return a parabola's height over the distance from its middle, in units of its own."""
+    return np.maximum(1.0 - across**2, 0.0)
+
+
+def fit(line: Outline, shape: Callable[[np.ndarray], np.ndarray]) -> tuple[float, float, float]:
+    """Return the angle of a shape that is fitted to an outline by least squares [degrees], how far it is off [m], and its height [m].
+
+    All columns take part, so that single ones, which may be denser or looser than others, matter little.
+    """
+    x, y = line
+    middle = float(np.average(x, weights=y))
+    start = [float(y.max()), math.sqrt(6.0 * float(np.average((x - middle) ** 2, weights=y))), middle]  # a wedge's half width
+
+    def distance(p: np.ndarray) -> float:
+        return float(np.sum((p[0] * shape((x - p[2]) / p[1]) - y) ** 2))
+
+    best = minimize(distance, start, method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-12, "maxiter": 2000})
+    top, half, _ = best.x
+    return math.degrees(math.atan(top / half)), math.sqrt(best.fun / np.count_nonzero(y)), float(top)

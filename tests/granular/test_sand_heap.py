@@ -1,0 +1,62 @@
+"""Wedges of sand that must stand, and how heaps are measured; heaps at all resolutions are in the suite `validation`."""
+
+import math
+
+import numpy as np
+import pytest
+
+from benchmarks.validation import sand_heap
+from benchmarks.validation.sand_pit import positions, steps
+
+CELLS, STANDS = 40, 0.5  # cells of length; [s]
+
+
+def sinks(friction_angle: float, duration: float = STANDS) -> tuple[float, float]:
+    """Return what a wedge of 27 degrees loses of its height and of its center's."""
+    simulation = sand_heap.cut_wedge(CELLS, 27.0, material={"friction_angle": friction_angle})
+    top, center = sand_heap.height(simulation), positions(simulation)[:, 1].mean()
+    for _ in steps(simulation, duration):
+        pass
+    return 1.0 - sand_heap.height(simulation) / top, 1.0 - float(positions(simulation)[:, 1].mean() / center)
+
+
+def test_a_wedge_flatter_than_a_layer_that_stops_stands() -> None:
+    """Were partly filled cells beside air no part of the pressure's problem, its center would sink by 5 % in a second."""
+    top, center = sinks(30.0)
+    assert top < sand_heap.SHRINKS
+    assert center < 0.015  # loose grains of the cut surface settle once
+
+
+def test_a_wedge_twice_as_steep_as_its_friction_slumps() -> None:
+    top, center = sinks(sand_heap.half_as_steep(27.0), duration=0.25)
+    assert top > 5.0 * sand_heap.SHRINKS
+    assert center > 0.05
+
+
+def test_a_wedge_and_a_dome_are_told_apart_wherever_they_stand() -> None:
+    x = np.arange(0.0, 1.2, 0.0125)
+    steep = math.tan(math.radians(33.0))
+    wedge = np.maximum(0.2 - np.abs(x - 0.5037) * steep, 0.0)
+    dome = 0.2 * np.maximum(1.0 - ((x - 0.5037) / 0.3) ** 2, 0.0)
+    angle, off, top = sand_heap.fit((x, wedge), sand_heap.wedge)
+    assert (angle, top) == (pytest.approx(33.0, abs=1e-2), pytest.approx(0.2, rel=1e-3))
+    assert off < 1e-4 * top
+    assert sand_heap.fit((x, wedge), sand_heap.dome)[1] > 0.04 * top
+    assert sand_heap.fit((x, dome), sand_heap.wedge)[1] > 0.04 * top
+    assert sand_heap.fit((x, dome), sand_heap.dome)[1] < 1e-4 * top
+
+
+def test_an_outline_holds_the_sand() -> None:
+    simulation = sand_heap.cut_wedge(CELLS, 27.0)
+    x, y = sand_heap.outline(simulation)
+    area = 0.25 * sand_heap.BASE**2 * math.tan(math.radians(27.0))
+    assert float(y.sum() * simulation.grid.spacing) == pytest.approx(area, rel=0.01)
+    assert float(np.average(x, weights=y)) == pytest.approx(0.5 * sand_heap.LENGTH, abs=1e-3)
+    assert sand_heap.fit((x, y), sand_heap.wedge)[0] == pytest.approx(27.0, abs=0.3)
+
+
+@pytest.mark.slow
+def test_a_heap_poured_slowly_lies_where_sand_stops_and_stays() -> None:
+    heap = sand_heap.pour(96, 20.0, lasts=2.0)
+    assert heap.angle == pytest.approx(20.0, abs=sand_heap.NEAR)
+    assert abs(heap.creep) < sand_heap.CREEP
