@@ -26,13 +26,17 @@ def silo(cells: int, depth: int, slot: int, **tables: Any) -> SandSimulation:
 @pytest.mark.parametrize("friction", [0.0, 0.5])
 @pytest.mark.parametrize("cells", [32, 64, 96])
 def test_a_cold_start_takes_iterations_as_the_sand_is_deep(cells: int, friction: float) -> None:
-    """Waves as long as the depth keep their momentum: a solve that limits it before they are gone takes twice as long."""
+    """Waves as long as the depth keep their momentum: a solve that limits it before they are gone takes twice as long.
+
+    To the tolerance, that is; by itself the first step's solve goes on from there.
+    """
     dx = 0.02
     sand = [box([0.0, 0.0], [8 * dx, cells * dx])]
     simulation = create(scene(size=[8 * dx, (cells + 4) * dx], resolution=cells + 4, sand=sand, friction=friction))
+    simulation.method = AcceleratedProjection(cold=AcceleratedProjection().least)
     row = simulation.step(0.5 * float(np.sqrt(dx / GRAVITY)))
     assert row["solve_status"] == "CONVERGED"
-    assert row["solve_iterations"] <= (3.0 if friction else 4.0) * cells + 40
+    assert row["solve_iterations"] <= (3.0 if friction else 5.0) * cells + 40
 
 
 def test_a_limit_of_the_momentum_leaves_less_of_the_residual_where_deep_sand_yields() -> None:
