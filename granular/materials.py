@@ -21,7 +21,7 @@ class Material:
     """A granular material.
 
     Attributes:
-        friction_angle: of a heap of it [degrees].
+        friction_angle: at which it stops on a slope of itself [degrees].
         density: of the material at its densest [kg/m^3], air included.
         max_fraction: of space that grains fill at their densest.
         wall_friction: Coulomb's coefficient against solids.
@@ -41,10 +41,11 @@ MATERIALS = {
 
 
 def repose_slope(angle: float) -> float:
-    """Return k of the yield set |s|_F / sqrt(2) <= k p whose heaps and running layers lie at an angle [degrees], k = tan(angle).
+    """Return k of the yield set |s|_F / sqrt(2) <= k p whose layers stop at an angle [degrees], k = tan(angle).
 
     What slides along a slope shears alone, under equal normal stresses: its shear stress over its pressure is the slope's tangent. Sand
-    that rests and has pushed against itself along the slope holds up to asin(k), 35.3 degrees where k = tan(30 degrees).
+    that rests and has pushed against itself along the slope holds up to asin(k), 35.3 degrees where k = tan(30 degrees): heaps that are
+    poured slowly lie between both.
 
     >>> round(repose_slope(26.565), 3)
     0.5

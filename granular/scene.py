@@ -60,7 +60,7 @@ class MaterialTable(Table):
     """[material]: what kind of grains."""
 
     name: Literal["dry-sand", "gravel", "sugar"] = Field(default="dry-sand", description="gives what the table does not")
-    friction_angle: Angle | None = Field(default=None, description="degrees: what a heap lies at; see angle_of")
+    friction_angle: Angle | None = Field(default=None, description="degrees: the slope at which sand that runs stops; see angle_of")
     density: float | None = Field(default=None, gt=0, description="at the densest, air included [kg/m^3]")
     max_fraction: float | None = Field(default=None, gt=0, lt=1, description="of space that grains fill at the densest")
     wall_friction: WallFriction | None = Field(default=None, description=f"against solids: {FRICTIONS}")
@@ -70,8 +70,9 @@ class MaterialTable(Table):
     tensile_strength: float = Field(default=0.0, ge=0, description="the tension it bears where it is densely packed [Pa]")
     angle_of: AngleOf = Field(
         default="repose",
-        description="what friction_angle is of: repose, the slope of heaps and of layers that run (k = tan); or a test of soil mechanics,"
-        " plane-strain (k = sin: heaps of 30 degrees lie at 26.6) or triaxial-compression",
+        description="what friction_angle is of: repose, the slope at which layers stop (k = tan); sand at rest holds up to asin(k), so"
+        " heaps poured slowly lie up to 5 degrees steeper; or a test of soil mechanics, plane-strain (k = sin: layers of 30 degrees stop at 26.6,"
+        " heaps lie at 30) or triaxial-compression",
     )
 
 

@@ -136,7 +136,7 @@ class Stress:
 
     With x = kick_dt p / (rho dx) and s alike, u = u* + (1/m) (-grad x + div s) on faces of mass m, the stress is the solution of
 
-        0 <= x  complementary to  w = max(FULL - phi, 0) dx / dt + div(m' u) >= 0,
+        0 <= x  complementary to  w = drive + div(m' u) >= 0, drive of `granular.packing.Packing`,
         s = the nearest point of the yield set of x to s + r E u,
 
     for any r > 0, m' = m in loose cells and 1 in full ones [Narain, Golas & Lin 2010; Daviet & Bertails-Descoubes 2016]: sand is never
