@@ -71,8 +71,8 @@ class MaterialTable(Table):
     angle_of: AngleOf = Field(
         default="repose",
         description="what friction_angle is of: repose, the slope at which layers stop (k = tan); sand at rest holds up to asin(k), so"
-        " heaps poured slowly lie up to 5 degrees steeper; or a test of soil mechanics, plane-strain (k = sin: layers of 30 degrees stop at 26.6,"
-        " heaps lie at 30) or triaxial-compression",
+        " heaps poured slowly lie up to 5 degrees steeper; or a test of soil mechanics, plane-strain (k = sin: layers of 30 degrees stop"
+        " at 26.6, heaps lie at 30) or triaxial-compression",
     )
 
 
