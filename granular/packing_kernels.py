@@ -19,6 +19,7 @@ SURFACE = 0.3  # the fraction from which a cell beside air counts as full: a par
 FULL = 0.95  # the fraction from which a cell counts as full: less than 1 by the sampling's noise, whose gaps would close as falls
 WALL_NOISE = 0.25  # by which it is less where a wall takes nearly all of a cell: half the distance of two particles
 FIRM_FRACTION = 0.9  # from which cohesion holds a cell together
+LEAST_OPEN = 0.02  # of a cell, below which it bears nothing: its faces are slits, through which only huge pressures would move sand
 LANES = 16  # cells of a vector
 ROUNDING = 1e-6  # by which a fraction may differ from 1 and count as 1
 
@@ -97,7 +98,10 @@ def cell_kernel(
                             least = wp.min(least, volume[k + c, j + b, i + a])
                 if least < 1.0:
                     mark = mark | PARTLY
-        flags[k, j, i] = wp.uint8(mark)
+        bears = mark
+        if open < LEAST_OPEN:
+            bears = 0
+        flags[k, j, i] = wp.uint8(bears)
         free = FULL - WALL_NOISE * (1.0 - open) - full
         if mark != 0 and free > 0.0:
             free = wp.min(free, _free_around(base, capacity, fraction, planes, k, j, i))

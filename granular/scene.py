@@ -95,7 +95,7 @@ class Friction(Table):
     )
     grain_size: float | None = Field(default=None, gt=0, description="diameter of the grains, with dynamic_angle [m]")
     inertial_number: float | None = Field(
-        default=None, gt=0, description=f"at which half of the growth is there, with dynamic_angle; {GLASS:g}, of glass beads, unless given"
+        default=None, ge=1e-9, description=f"at which half of the growth is there, with dynamic_angle; {GLASS:g}, of glass beads, unless given"
     )
 
 
@@ -252,7 +252,7 @@ class SandScene(ParticleScene):
     @property
     def intercept(self) -> float:
         """Return what |s|_F / sqrt(2) may be without pressure [Pa]."""
-        return self.cohesion * (1.0 if self.material.angle_of == "repose" else math.cos(math.radians(self.friction_angle)))
+        return self.slope * self.cohesion / math.tan(math.radians(self.friction_angle))
 
     def growth(self, spacing: float, kick_dt: float) -> dict[str, float]:
         """Return `gain` and `halfway` of the yield set in a step, empty if friction does not grow with the rate of shear.

@@ -134,7 +134,7 @@ class SandSolids:
     def _thin_notes(self) -> tuple[str, ...]:
         """Return a warning for each solid that stands still and that no stress feels."""
         return tuple(
-            f"{solid.name} holds no center of a cell of {self.grid.spacing:.4g} m: it stops particles, but bears no sand"
+            f"{solid.name} holds no center of a cell of {self.grid.spacing:.4g} m: it bears no sand, and particles may pass"
             for solid, cells in zip(self._placed, self._covered, strict=True)
             if self.cut is None and not cells and solid.motion is None
         )
