@@ -95,7 +95,7 @@ class Friction(Table):
     )
     grain_size: float | None = Field(default=None, gt=0, description="diameter of the grains, with dynamic_angle [m]")
     inertial_number: float | None = Field(
-        default=None, ge=1e-9, description=f"at which half of the growth is there, with dynamic_angle; {GLASS:g}, of glass beads, unless given"
+        default=None, ge=1e-9, description=f"at which half of the growth is there, with dynamic_angle; {GLASS:g} of glass beads by itself"
     )
 
 
