@@ -19,7 +19,7 @@ SURFACE = 0.3  # the fraction from which a cell beside air counts as full: a par
 FULL = 0.95  # the fraction from which a cell counts as full: less than 1 by the sampling's noise, whose gaps would close as falls
 WALL_NOISE = 0.25  # by which it is less where a wall takes nearly all of a cell: half the distance of two particles
 FIRM_FRACTION = 0.9  # from which cohesion holds a cell together
-LEAST_OPEN = 0.02  # of a cell, below which it bears nothing: its faces are slits, through which only huge pressures would move sand
+LEAST_OPEN = 5e-4  # of a cell, below which it bears nothing: its faces are slits, through which only huge pressures would move sand
 LANES = 16  # cells of a vector
 ROUNDING = 1e-6  # by which a fraction may differ from 1 and count as 1
 
