@@ -6,7 +6,7 @@ MPI_VENV ?= .venv-mpi
 
 OUT ?= out/dam-break
 
-.PHONY: demo test test-distributed slow docs wheel-check clean
+.PHONY: demo test test-distributed slow fuzz docs wheel-check clean
 
 demo: $(VENV)/.run
 	$(BIN)/warp-lcp run dam-break --out $(OUT) --force $(DEMO_ARGS)
@@ -28,6 +28,10 @@ test-distributed:
 
 slow: $(VENV)/.dev
 	$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)
+
+# Files and arguments that are wrong in ways nobody thought of, FUZZ_EXAMPLES of each kind, other ones every time.
+fuzz: $(VENV)/.dev
+	$(BIN)/python -m pytest tests/fuzz --hypothesis-profile=fuzz --hypothesis-show-statistics $(PYTEST_ARGS)
 
 # The documentation's site, in build/site; a link or an anchor that leads nowhere ends it.
 docs: $(VENV)/.docs

@@ -1,9 +1,17 @@
-"""Shared by all tests: quiet Warp, devices."""
+"""Shared by all tests: quiet Warp, devices, and how many examples Hypothesis draws."""
+
+import os
 
 import pytest
 import warp as wp
+from hypothesis import HealthCheck, settings
 
 wp.config.log_level = wp.LOG_ERROR
+
+UNHURRIED = {"deadline": None, "database": None, "suppress_health_check": [HealthCheck.too_slow, HealthCheck.data_too_large]}
+settings.register_profile("few", max_examples=100, derandomize=True, **UNHURRIED)
+settings.register_profile("fuzz", max_examples=int(os.environ.get("FUZZ_EXAMPLES", "10000")), **UNHURRIED)
+settings.load_profile("few")
 
 
 def pytest_collection_modifyitems(items):

@@ -36,7 +36,9 @@ def test_pressure_far_from_air_is_that_of_the_linear_system(name):
 
 
 @pytest.mark.parametrize("method", ["projected-multigrid", "minimum-map-newton", "mprgp"])
-@pytest.mark.parametrize("problem", [torsion(250, device="cpu"), torsion(250, 20.0, device="cpu"), dam(257, 385, device="cpu")], ids=str)
+@pytest.mark.parametrize(
+    "problem", [torsion(250, device="cpu"), torsion(250, 20.0, device="cpu"), dam(257, 385, device="cpu")], ids=lambda p: p.name
+)
 def test_boundaries_of_contact_do_not_creep(problem, method):
     result = wl.solve(problem.lcp(), wl.METHODS[method]())
     assert result, result.status
@@ -53,7 +55,9 @@ def test_boundaries_of_contact_do_not_creep_on_large_grids(make):
     assert result.iterations <= 15
 
 
-@pytest.mark.parametrize("problem", [torsion(6, device="cpu"), torsion(6, 12.0, device="cpu"), dam(6, 8, device="cpu")], ids=str)
+@pytest.mark.parametrize(
+    "problem", [torsion(6, device="cpu"), torsion(6, 12.0, device="cpu"), dam(6, 8, device="cpu")], ids=lambda p: p.name
+)
 def test_obstacles_against_lemke(problem):
     dense = problem.dense()
     result = wl.solve(problem.lcp(), stopping=wl.StoppingCriteria(rtol=1e-10))

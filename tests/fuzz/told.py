@@ -1,0 +1,46 @@
+"""Runs the command line in this process, and asserts what every command promises whatever its files hold."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from typer.testing import CliRunner
+
+from warp_lcp.driver import cli
+
+try:
+    import resource
+except ImportError:  # not on Windows
+    resource = None
+
+MEMORY = 1 << 30  # bytes that reading one small file may take
+
+
+def told(*arguments: str | Path) -> int:
+    """Run a command that reads files; return its exit code, 0 or 2.
+
+    It ends without a traceback, takes no more than MEMORY, and says why when it refuses.
+    """
+    with limited():
+        result = CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
+    assert result.exception is None or isinstance(result.exception, SystemExit), repr(result.exception)
+    assert result.exit_code in (0, cli.WRONG_INPUT), (result.exit_code, result.output)
+    assert result.exit_code == 0 or result.stderr.strip(), "refused without a word"
+    return result.exit_code
+
+
+@contextmanager
+def limited(memory: int = MEMORY) -> Iterator[None]:
+    """Let this process take no more than `memory` more bytes of address space; beyond it allocations fail."""
+    if resource is None or not Path("/proc/self/statm").exists():
+        yield
+        return
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + memory, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
