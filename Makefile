@@ -5,6 +5,7 @@ BIN = $(VENV)/bin
 MPI_VENV ?= .venv-mpi
 
 OUT ?= out/dam-break
+WORKERS ?= 2  # processes that run the tests
 
 .PHONY: demo test test-distributed slow fuzz docs wheel-check clean
 
@@ -16,7 +17,7 @@ test: $(VENV)/.dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n $(WORKERS) $(PYTEST_ARGS)
 
 # The tests on several ranks, in an environment of the system's Python with Debian's MPI and PETSc (installed by apt-get if this is root).
 test-distributed:
@@ -37,13 +38,19 @@ fuzz: $(VENV)/.dev
 docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
-# A wheel holds everything a run needs: install it alone and run a built-in scene away from the source tree.
+# A wheel holds everything a run needs: install it alone, with the oldest versions that pyproject.toml allows (those of the oldest Python),
+# and away from the source tree run a built-in scene of each simulator, and see that a type checker would see types.
 wheel-check: $(VENV)/.run
 	rm -rf build/wheel-check
 	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir build/wheel-check .
+	$(BIN)/python -c "import sys, tomllib; floors = tomllib.load(open('pyproject.toml', 'rb'))['project']['dependencies']; \
+		print(*(floor.replace('>=', '==') for floor in floors if sys.version_info[:2] == (3, 11)), sep='\n')" > build/wheel-check/floors.txt
 	$(PYTHON) -m venv build/wheel-check/venv
-	build/wheel-check/venv/bin/python -m pip install --quiet build/wheel-check/*.whl
+	build/wheel-check/venv/bin/python -m pip install --quiet --constraint build/wheel-check/floors.txt build/wheel-check/*.whl
 	cd build/wheel-check && venv/bin/warp-lcp run ceiling-drop --out run --set time.duration=0.05
+	cd build/wheel-check && venv/bin/warp-lcp run hourglass-2d --out sand --set time.duration=0.01 --set domain.resolution=24
+	cd build/wheel-check && venv/bin/python -c "from importlib.resources import files; \
+		assert all((files(package) / 'py.typed').is_file() for package in ('warp_lcp', 'fluids', 'granular'))"
 
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
