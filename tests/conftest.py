@@ -15,6 +15,7 @@ settings.load_profile("few")
 
 
 def pytest_collection_modifyitems(items):
+    items.sort(key=lambda item: item.name.startswith("test_kernels_compile_for_cuda"), reverse=True)  # the longest: others run beside it
     if not wp.is_cuda_available():
         skip = pytest.mark.skip(reason="no CUDA device on this machine")
         for item in items:

@@ -3,6 +3,7 @@
 import importlib
 import itertools
 import pkgutil
+import re
 from pathlib import Path
 
 import numpy as np
@@ -41,12 +42,12 @@ METHODS = [
 ]
 
 
-def use_every_kernel():
+def use_every_kernel(reals):
     """Instantiate the kernels that are made on demand by solving small problems in every precision."""
     cells = np.ones((4, 4, 4), dtype=int)
     cells[-1] = wl.AIR
     face = np.full((4, 4, 5), 0.5)
-    for dtype in (wp.float32, wp.float64):
+    for dtype in reals:
         for faces in ({}, {"face_x": 2.0}, {"face_x": face}):
             problem = wl.LCP(wl.GridPoisson(cells, device="cpu", dtype=dtype, **faces), -np.ones(cells.shape))
             for solver in METHODS:
@@ -56,11 +57,11 @@ def use_every_kernel():
     wl.solve(wl.LCP(wl.DenseOperator(np.eye(3), device="cpu"), -np.ones(3)), wl.MinimumMapNewton(precision="single"))
 
 
-def use_sparse_kernels():
+def use_sparse_kernels(reals):
     """Instantiate the kernels of sparse matrices, sums and shifted principal systems."""
     cells = np.ones((4, 4), dtype=int)
     T = scipy.sparse.diags_array([-1.0, 3.0, -1.5], offsets=[-1, 0, 1], shape=(100, 100)).tocsr()
-    for dtype in (wp.float32, wp.float64):
+    for dtype in reals:
         low = wl.LowRankOperator(np.full((4, 4, 1), 0.1), [1.0], device="cpu", dtype=dtype)
         grid = wl.GridPoisson(cells, device="cpu", dtype=dtype, shift=1.0)
         operators = [wl.SparseOperator(m, device="cpu", dtype=dtype) for m in (T, (T + T.T).tocsr())]
@@ -77,11 +78,11 @@ def use_sparse_kernels():
             A.relax(*(wp.ones(100, dtype=wp.float64, device="cpu") for _ in range(4)), 1.0, colored=True)
 
 
-def use_sweeping_kernels():
+def use_sweeping_kernels(reals):
     """Instantiate the kernels of sweeps, small blocks and first-order methods."""
     T = scipy.sparse.diags_array([-1.0, 3.0, -1.0], offsets=[-1, 0, 1], shape=(30, 30)).tocsr()
     friction = wl.AffineBounds.friction([-1, 0], 0.5)
-    for dtype in (wp.float32, wp.float64):
+    for dtype in reals:
         dense = wl.LCP(wl.DenseOperator(T.toarray(), device="cpu", dtype=dtype), -np.ones(30))
         sparse = wl.LCP(wl.SparseOperator(T, device="cpu", dtype=dtype), -np.ones(30))
         grid = wl.LCP(wl.GridPoisson(np.array([[0, 1, 1, 1]]), device="cpu", dtype=dtype), -np.ones((1, 4)))
@@ -100,11 +101,11 @@ def use_sweeping_kernels():
         assert wl.solve(wl.LCP(wl.DenseOperator(np.eye(2), device="cpu", dtype=dtype), -np.ones(2), *friction), wl.ProjectedSOR())
 
 
-def use_gradient_projection_kernels():
+def use_gradient_projection_kernels(reals):
     """Instantiate the kernels of MPRGP on all operators."""
     T = scipy.sparse.diags_array([-1.0, 3.0, -1.0], offsets=[-1, 0, 1], shape=(100, 100)).tocsr()
     cells = np.array([[0, 1, 1, 1]])
-    for dtype in (wp.float32, wp.float64):
+    for dtype in reals:
         operators = [wl.DenseOperator(T.toarray(), device="cpu", dtype=dtype), wl.SparseOperator(T, device="cpu", dtype=dtype)]
         for faces in ({}, {"face_x": 2.0}, {"face_x": np.ones((1, 5))}):
             operators.append(wl.GridPoisson(cells, device="cpu", dtype=dtype, **faces))
@@ -113,12 +114,12 @@ def use_gradient_projection_kernels():
                 assert wl.solve(wl.LCP(A, -np.ones(A.shape)), MPRGP(precision=precision))
 
 
-def use_newton_kernels():
+def use_newton_kernels(reals):
     """Instantiate the kernels of Newton-type methods on grids, and of cold starts and scalings of sparse matrices."""
     T = scipy.sparse.diags_array([-1.0, 2.01, -1.0], offsets=[-1, 0, 1], shape=(1200, 1200)).tocsr()
     cells = np.ones((4, 4, 4), dtype=int)
     cells[-1] = wl.AIR
-    for dtype in (wp.float32, wp.float64):
+    for dtype in reals:
         operators = [wl.SparseOperator(T, device="cpu", dtype=dtype)]
         for faces in ({}, {"face_x": 2.0}, {"face_x": np.full((4, 4, 5), 0.5)}):
             operators.append(wl.GridPoisson(cells, device="cpu", dtype=dtype, **faces))
@@ -130,13 +131,13 @@ def use_newton_kernels():
                 assert wl.solve(problem, wl.InteriorPoint(precision=precision, crossover=1e-1), stopping=wl.StoppingCriteria(rtol=1e-4))
 
 
-def use_coupled_kernels():
+def use_coupled_kernels(reals):
     """Instantiate the kernels of grids with a term of low rank, heavy enough that the preconditioner is corrected for it."""
     cells = np.ones((4, 4, 4), dtype=int)
     cells[-1] = wl.AIR
     columns = np.zeros((4, 4, 4, 2))
     columns[1, 1:3, 1:3] = [[[1.0, 0.5], [-1.0, 0.5]], [[1.0, -0.5], [-1.0, 0.2]]]
-    for dtype in (wp.float32, wp.float64):
+    for dtype in reals:
         low = wl.LowRankOperator(columns, [100.0, 100.0], device="cpu", dtype=dtype)
         for faces in ({}, {"face_x": 2.0}, {"face_x": np.full((4, 4, 5), 0.5)}):
             A = wl.SumOperator(wl.GridPoisson(cells, device="cpu", dtype=dtype, **faces), low)
@@ -163,11 +164,23 @@ def use_sand_kernels():
                 body_kernels(dimension, real, box, rate)
 
 
-def test_all_kernels_compile_for_sm_80_and_sm_90(tmp_path):
+def family(name):
+    """Return what the variants of a module share: its name without the types and switches that they were made for."""
+    package, module, *variant = name.split(".")
+    return package, module, *(re.match("[a-z]*", word)[0] for word in variant)
+
+
+@pytest.mark.parametrize(
+    ("reals", "archs"),
+    [((wp.float64,), [80]), pytest.param((wp.float32, wp.float64), [80, 90], marks=pytest.mark.slow)],
+    ids=["one", "all"],
+)
+def test_kernels_compile_for_cuda(reals, archs, tmp_path):
+    """One variant of each family of modules, or all of them."""
     for package in (wl, fluids, granular):
         for found in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
             importlib.import_module(found.name)
-    use_every_kernel()
+    use_every_kernel(reals)
     for cut in (False, True):
         displacement_kernel(cut)
     for endless in (0, 1, 4, 5):
@@ -181,24 +194,26 @@ def test_all_kernels_compile_for_sm_80_and_sm_90(tmp_path):
         ring_kernels(dtype)
     for d_type, real in itertools.product((wp.uint8, wp.float32, wp.float64), (wp.float32, wp.float64)):
         copy_kernels(d_type, real)
-    use_sparse_kernels()
-    use_sweeping_kernels()
-    use_gradient_projection_kernels()
-    use_newton_kernels()
-    use_coupled_kernels()
+    use_sparse_kernels(reals)
+    use_sweeping_kernels(reals)
+    use_gradient_projection_kernels(reals)
+    use_newton_kernels(reals)
+    use_coupled_kernels(reals)
     use_sand_kernels()
     from warp._src.context import user_modules
 
     names = sorted(name for name, module in user_modules.items() if name.startswith(("warp_lcp", "fluids", "granular")) and module.kernels)
     assert len(names) > 15
-    known = Path(wp.config.kernel_cache_dir) / "compiled-for-cuda"  # two minutes for all modules, so each once while it stays as it is
+    if len(archs) == 1:
+        names = list({family(name): name for name in sorted(names, key=len)}.values())
+    known = Path(wp.config.kernel_cache_dir) / "compiled-for-cuda"  # minutes for all modules, so each once while it stays as it is
     known.mkdir(exist_ok=True)
     for name in names:
-        mark = known / f"{name}-{user_modules[name].hash_module().hex()}-80-90"
+        mark = known / f"{name}-{user_modules[name].hash_module().hex()}-{'-'.join(map(str, archs))}"
         if mark.exists():
             continue
         try:
-            wp.compile_aot_module(name, device=None, arch=[80, 90], module_dir=tmp_path / name, use_ptx=True)
+            wp.compile_aot_module(name, device=None, arch=archs, module_dir=tmp_path / name, use_ptx=True)
         except (RuntimeError, OSError) as error:
             pytest.fail(f"{name} does not compile: {error}")
         mark.touch()
