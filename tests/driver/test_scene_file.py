@@ -1,5 +1,6 @@
 """Scene files: found, parsed, overridden, and written back."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -67,10 +68,16 @@ def test_the_simulator_decides(scene_file, text, expected):
 
 def test_overrides_are_toml_values_or_words(scene_file):
     write(scene_file, '[[solid]]\nshape = "box"\nmin = [0, 0]\nmax = [0.5, 0.5]\n')
-    overrides = ["time.duration=0.25", "domain.wall=free-slip", "solid.0.max=[0.75, 0.5]", "physics.gravity = [1.0, 0]", 'scene.name="a=b"']
+    overrides = [
+        "time.duration=0.25",
+        "domain.wall=free-slip",
+        "solid.0.max=[0.75, 0.5]",
+        "physics.gravity = [1.0, 0]",
+        'scene.description="a=b"',
+    ]
     scene = load_scene(scene_file, overrides)
     assert (scene.time.duration, scene.domain.wall, scene.solid[0].max) == (0.25, "free-slip", [0.75, 0.5])
-    assert (scene.physics.gravity, scene.scene.name) == ([1.0, 0.0], "a=b")
+    assert (scene.physics.gravity, scene.scene.description) == ([1.0, 0.0], "a=b")
 
 
 @pytest.mark.parametrize(
@@ -136,3 +143,43 @@ def test_the_promised_scenes_are_there():
     promised |= {"wave-maker", "retracting-wall", "stirred-tank"}
     promised |= {"column-collapse-2d", "column-collapse", "hourglass-2d", "hourglass", "pouring-pile", "sand-on-mesh"}
     assert promised <= built_in_scenes().keys()
+
+
+NAMES = ["../../../x", "a/b", "a\\b", "/etc/x", "..", ".", "...", ".x", "x.", " x", "x ", "a\0b", "a\nb", "\x1b[2J", "a:b"]
+NAMES += ["*", "x" * 61, "~/x", "a\u0300"]
+
+
+@pytest.mark.parametrize("name", NAMES, ids=ascii)
+def test_names_that_would_lead_elsewhere(scene_file, name):
+    with pytest.raises(SceneError, match=r"scene\.name = .*: must be a name of at most 60 letters"):
+        load_scene(scene_file, [f"scene.name={json.dumps(name)}"])
+    written = scene_file.read_text().replace("[scene]", f"[scene]\nname = {json.dumps(name)}")
+    scene_file.write_text(written)
+    with pytest.raises(SceneError, match=r"scene\.name"):
+        load_scene(scene_file)
+
+
+@pytest.mark.parametrize("name", ["dam-break", "Dam break 2", "v1.2_b", "\u00fcber", "\u6c34", "x" * 60])
+def test_names(scene_file, tmp_path, name):
+    assert load_scene(scene_file, [f"scene.name={json.dumps(name)}"]).scene.name == name
+    file = tmp_path / f"{name}.toml"
+    file.write_text(scene_file.read_text())
+    assert load_scene(file).scene.name == name
+
+
+@pytest.mark.parametrize(
+    ("file", "name"),
+    [
+        ("a (1).toml", "a -1-"),
+        ("..x.toml", "x"),
+        ("...toml", "scene"),
+        ("a=b.toml", "a-b"),
+        ("u\u0308.toml", "\u00fc"),
+        ("x" * 99 + ".toml", "x" * 60),
+    ],
+    ids=ascii,
+)
+def test_the_name_of_a_file_becomes_one(scene_file, tmp_path, file, name):
+    (tmp_path / file).write_text(scene_file.read_text())
+    assert load_scene(tmp_path / file).scene.name == name
+    assert load_scene(tmp_path / file, ['scene.name=""']).scene.name == name

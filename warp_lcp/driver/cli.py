@@ -5,16 +5,15 @@ from __future__ import annotations
 import json
 import math
 import signal
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any, NoReturn
 
 import typer
 import warp as wp
-from rich.console import Console
 
 from warp_lcp.driver.benchmark import benchmarks
 from warp_lcp.driver.calibrate import step_seconds
@@ -35,6 +34,7 @@ from warp_lcp.driver.simulator import SimulationFailed, StepFailed
 from warp_lcp.driver.solve_file import Outcome, ProblemError, solve_files
 from warp_lcp.driver.solve_recorded import SUFFIX, check_recorded, file_digest, solve_recorded
 from warp_lcp.driver.table import SceneError
+from warp_lcp.driver.terminal import Commands, Terminal, say, tell
 from warp_lcp.driver.tune import FRAMES, Tuning, tune, write_tuned
 from warp_lcp.driver.versions import shadowing_distributions, versions
 from warp_lcp.driver.viewer import view_run
@@ -46,6 +46,7 @@ RANKED_SUITE, RANKED_GROUP = "scaling", "distributed"  # what `bench --engine pe
 
 app = typer.Typer(
     name="warp-lcp",
+    cls=Commands,
     help="Simulate scenes with complementarity solvers. Exit codes: 0 done, 1 the run failed or was stopped, 2 the input is wrong.",
     no_args_is_help=True,
     add_completion=False,
@@ -110,7 +111,7 @@ def run(
         chosen = crew.choose_device(device)
         folder = out or Path("out") / loaded.scene.name
         console = crew.console
-        console.print(f"{loaded.scene.name} on {crew.place(chosen)}, into {folder}", markup=False, highlight=False, soft_wrap=True)
+        say(console, f"{loaded.scene.name} on {crew.place(chosen)}, into {folder}")
         with _interruptible(console, crew.signals) as stop, Bar(console) if console.is_terminal else Lines(console) as observer:
             watch = Profile(chosen) if profile and crew.speaks else None
             record = crew.run(
@@ -120,7 +121,7 @@ def run(
     if not crew.speaks:
         raise typer.Exit(0 if record.status == "finished" else FAILED)
     if watch:
-        typer.echo("\n".join(watch.table(record.steps - (record.resumed_from_step or 0), record.seconds)))
+        tell("\n".join(watch.table(record.steps - (record.resumed_from_step or 0), record.seconds)))
     _report(record, folder)
 
 
@@ -148,7 +149,7 @@ def render(
     """Draw a run's frames as PNG images or as a film (needs the extra `render`)."""
     images = []
     devices()  # starts Warp, which draws surfaces and samples 2-D solids, without its native messages
-    with _wrong_input(), Console(stderr=True).status("drawing") as status:
+    with _wrong_input(), Terminal(stderr=True).status("drawing") as status:
         looks = Looks(size=parse_size(size), color=color, show=show, cut=cut, at=at, overrides=overrides or ())
         if film is not None:
             if frame or sheet or out:
@@ -157,14 +158,14 @@ def render(
             for number in film_run(folder, film, looks=looks, rate=check_rate(fps)):
                 status.update(f"drew frame {number}")
                 count += 1
-            typer.echo(f"{film}: {count} frames")
+            tell(f"{film}: {count} frames")
             return
         if fps is not None:
             raise RenderError("--fps: is of a film; give --film")
         for image in render_run(folder, frames=frame or (), looks=looks, out=out, sheet=sheet):
             images.append(image)
             status.update(f"drew {image.name}")
-    typer.echo(f"{images[0]}" if len(images) == 1 else f"{len(images)} images, {images[0]} to {images[-1].name}")
+    tell(f"{images[0]}" if len(images) == 1 else f"{len(images)} images, {images[0]} to {images[-1].name}")
 
 
 @app.command()
@@ -222,10 +223,8 @@ def tune_scene(
         if out is not None and (out.is_dir() or not out.parent.is_dir()):
             raise OutputError(f"--out {out}: must be a file in a folder that is there")
         check_memory(loaded, chosen)
-        console = Console(stderr=True)
-        say = lambda text: console.print(text, markup=False, highlight=False, soft_wrap=True)  # noqa: E731
         try:
-            tuning = tune(loaded, accuracy=accuracy, device=chosen, frames=frames, say=say)
+            tuning = tune(loaded, accuracy=accuracy, device=chosen, frames=frames, say=partial(say, Terminal(stderr=True)))
         except (StepFailed, SimulationFailed) as error:
             _end(str(error), FAILED)
         if out is not None:
@@ -250,7 +249,7 @@ def schema(simulator: Annotated[str, typer.Option(help="Whose scenes.")] = "flui
         installed = installed_simulators()
     if simulator not in installed:
         _end(f"--simulator {simulator}: no such simulator; {nearest(simulator, installed)}", WRONG_INPUT)
-    typer.echo(json.dumps(installed[simulator].scene_model.model_json_schema(by_alias=True), indent=2))
+    tell(json.dumps(installed[simulator].scene_model.model_json_schema(by_alias=True), indent=2))
 
 
 @app.command()
@@ -301,12 +300,12 @@ def solve(
             outcome.write(out)
     if not crew.speaks:
         raise typer.Exit(0 if outcome.result else FAILED)
-    console = Console(soft_wrap=True, highlight=False)
-    console.print(outcome.heading(), markup=False)
+    console = Terminal(soft_wrap=True, highlight=False)
+    say(console, outcome.heading())
     console.print(outcome.table())
     if not outcome.result:
         _end(outcome.ending(), FAILED)
-    console.print(outcome.ending(), markup=False)
+    say(console, outcome.ending())
 
 
 @app.command()
@@ -358,7 +357,7 @@ def bench(
         group = RANKED_GROUP
     try:
         if compare is not None:
-            typer.echo(installed[suite].compare(*compare))
+            tell(installed[suite].compare(*compare))
             return
         asked: dict[str, Any] = {} if problems is None and not method else {"problems": problems, "methods": tuple(method or ())}
         asked |= ({"group": group} if group else {}) | ({"scene": scene} if scene else {}) | ({} if seed is None else {"seed": seed})
@@ -368,7 +367,7 @@ def bench(
     except RuntimeError as error:
         _end(str(error), FAILED)
     for file in files:
-        typer.echo(file)
+        tell(file)
 
 
 @app.command()
@@ -379,7 +378,7 @@ def info() -> None:
     lines += [("CUDA driver", cuda_driver()), ("kernel cache", str(wp.config.kernel_cache_dir))]
     _print_pairs(lines)
     for other in shadowing_distributions():
-        typer.echo(f"warning: the distribution {other} installs a package that has a simulator's name; uninstall it", err=True)
+        tell(f"warning: the distribution {other} installs a package that has a simulator's name; uninstall it", error=True)
     with _wrong_input():
         _print_pairs([(f"simulator {name}", simulator.summary) for name, simulator in installed_simulators().items()])
 
@@ -389,15 +388,15 @@ def _print_tuning(tuning: Tuning, accuracy: str, device: str) -> None:
     rows = tuning.rows()
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     for row in rows:
-        typer.echo("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
-    typer.echo(f"{tuning.frames} frames on {device}; distance: share of the mass elsewhere than in a run of {tuning.reference.steps} steps")
+        tell("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    tell(f"{tuning.frames} frames on {device}; distance: share of the mass elsewhere than in a run of {tuning.reference.steps} steps")
     for line in tuning.verdict(accuracy):
-        typer.echo(line)
+        tell(line)
 
 
 def _print_pairs(pairs: list[tuple[str, str]]) -> None:
     for word, line in pairs:
-        typer.echo(f"{word:<20}  {line}")
+        tell(f"{word:<20}  {line}")
 
 
 @contextmanager
@@ -409,7 +408,7 @@ def _wrong_input() -> Iterator[None]:
 
 
 @contextmanager
-def _interruptible(console: Console, signals: tuple[signal.Signals, ...]) -> Iterator[Callable[[], bool]]:
+def _interruptible(console: Terminal, signals: tuple[signal.Signals, ...]) -> Iterator[Callable[[], bool]]:
     """Give a function that says whether Ctrl-C was pressed or another signal came; a second Ctrl-C does not wait for the step's end."""
     pressed = False
 
@@ -420,7 +419,7 @@ def _interruptible(console: Console, signals: tuple[signal.Signals, ...]) -> Ite
         if number == signal.SIGINT:  # SIGTERM may come several times, to the process and to its group
             signal.signal(number, previous[number])
             again = "; press Ctrl-C again to end now"
-        console.print(f"stopping after this step{again}", highlight=False)
+        say(console, f"stopping after this step{again}")
 
     previous = {number: signal.signal(number, press) for number in signals}
     try:
@@ -434,7 +433,7 @@ def _report(record: RunRecord, folder: Path) -> None:
     """Say how a run ended."""
     taken = f"{record.steps} steps, {record.time:.6g} s simulated in {record.seconds:.1f} s"
     if record.status == "finished":
-        typer.echo(f"finished: {record.reason}; {taken}; ParaView opens the .pvd files in {folder}")
+        tell(f"finished: {record.reason}; {taken}; ParaView opens the .pvd files in {folder}")
         return
     message = f"{record.status}: {record.reason}\n{taken}; frames 0 to {record.frames} are in {folder}"
     newest = max(folder.glob("checkpoints/step_*.npz"), key=lambda file: int(file.stem.removeprefix("step_")), default=None)
@@ -447,5 +446,5 @@ def _report(record: RunRecord, folder: Path) -> None:
 
 
 def _end(message: str, code: int) -> NoReturn:
-    sys.stderr.write(f"{message}\n")
+    tell(message, error=True)
     raise typer.Exit(code)

@@ -8,8 +8,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-
 from warp_lcp.driver.devices import choose_device
 from warp_lcp.driver.engine import Engine
 from warp_lcp.driver.profile import Profile
@@ -18,6 +16,7 @@ from warp_lcp.driver.run import run_scene
 from warp_lcp.driver.run_folder import RunRecord
 from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.scene_file import load_scene
+from warp_lcp.driver.terminal import Terminal
 
 if TYPE_CHECKING:
     from warp_lcp.distributed.ranks import Ranks
@@ -34,9 +33,9 @@ class Crew:
 
     signals: tuple[signal.Signals, ...] = (signal.SIGINT, signal.SIGTERM)
 
-    def __init__(self, console: Console | None = None, *, speaks: bool = True) -> None:
+    def __init__(self, console: Terminal | None = None, *, speaks: bool = True) -> None:
         """Speak to the error stream."""
-        self.console = console or Console(stderr=True)
+        self.console = console or Terminal(stderr=True)
         self.speaks = speaks
 
     def load(self, scene: str, overrides: Sequence[str], options: Mapping[str, Any]) -> Scene:

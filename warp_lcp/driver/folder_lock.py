@@ -12,6 +12,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from warp_lcp.driver.foreign import one_line
+
 try:
     import fcntl
 except ImportError:  # Windows
@@ -90,6 +92,6 @@ def _describe(text: bytes) -> str:
     """Return who wrote a lock file."""
     try:
         holder: Any = json.loads(text)
-        return f"process {int(holder['pid'])} on {holder['host']}, since {holder['since']}"
+        return one_line(f"process {int(holder['pid'])} on {holder['host']}, since {holder['since']}")
     except (ValueError, KeyError, TypeError):
         return "an unknown process"

@@ -6,14 +6,12 @@ import hashlib
 import os
 import pickle
 import signal
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import typer
-from rich.console import Console
 
 from warp_lcp.distributed.devices import device_of_rank
 from warp_lcp.distributed.meeting import Meeting, RankFailed
@@ -31,6 +29,7 @@ from warp_lcp.driver.scene_file import keys
 from warp_lcp.driver.simulator import SimulationFailed, StepFailed
 from warp_lcp.driver.solve_file import ProblemError
 from warp_lcp.driver.table import SceneError, written
+from warp_lcp.driver.terminal import Terminal, say, tell
 
 WRONG_INPUT = (SceneError, OutputError, DeviceError, EngineError, ProblemError)
 PLANNED = (OSError, *WRONG_INPUT, StepFailed, SimulationFailed)
@@ -51,7 +50,7 @@ class RankCrew(Crew):
 
     def __init__(self, ranks: Ranks) -> None:
         """Let the first rank speak."""
-        super().__init__(Console(stderr=True, quiet=not ranks.first), speaks=ranks.first)
+        super().__init__(Terminal(stderr=True, quiet=not ranks.first), speaks=ranks.first)
         self.meeting = Meeting(ranks, PLANNED, self._last_words)
         self._folder: RunFolder | None = None
 
@@ -141,8 +140,7 @@ class RankCrew(Crew):
 
     def _last_words(self, text: str) -> None:
         """Say why all processes end now, and write it into run.json, which the first rank cannot do from inside MPI."""
-        sys.stderr.write(f"{text}\n")
-        sys.stderr.flush()
+        tell(text, error=True)
         if self._folder is not None:
             with suppress(OSError):
                 lines = text.splitlines()
@@ -175,7 +173,7 @@ def ranks_together() -> Iterator[RankCrew]:
         with crew.meeting.together():
             yield crew
     except RankFailed as error:
-        crew.console.print(str(error), markup=False, highlight=False, soft_wrap=True)
+        say(crew.console, str(error))
         raise typer.Exit(1) from error
     except PLANNED as error:
         if ranks.first:

@@ -13,7 +13,9 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from rich.table import Column
 
+from warp_lcp.driver.foreign import one_line
 from warp_lcp.driver.log import Value
+from warp_lcp.driver.terminal import say
 
 WINDOW = 20.0  # seconds of the recent past that the time left is judged by
 
@@ -91,7 +93,7 @@ class Lines:
 
     def note(self, text: str) -> None:
         """Write a remark."""
-        self._write(text)
+        self._write(one_line(text))
 
     def start(self, time: float, end: float) -> None:
         """Learn the time [s] that the run begins and ends at."""
@@ -111,7 +113,7 @@ class Lines:
         )
 
     def _write(self, text: str) -> None:
-        self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+        say(self._console, text)
 
 
 class Bar:
@@ -122,6 +124,7 @@ class Bar:
         text = TextColumn("{task.description}", table_column=Column(no_wrap=True))
         bar = BarColumn(bar_width=None, table_column=Column(ratio=1))  # what the text leaves of the line
         percent = TaskProgressColumn(table_column=Column(no_wrap=True, width=4))
+        self._console = console
         self._progress = Progress(bar, percent, text, console=console, refresh_per_second=4, expand=True)
         self._task = self._progress.add_task("first step: loading kernels", total=None)
         self._left = TimeLeft()
@@ -137,7 +140,7 @@ class Bar:
 
     def note(self, text: str) -> None:
         """Write a remark above the bar."""
-        self._progress.console.print(text, markup=False, highlight=False)
+        say(self._console, one_line(text))
 
     def start(self, time: float, end: float) -> None:
         """Learn the time [s] that the run begins and ends at."""

@@ -17,6 +17,7 @@ from warp_lcp.driver.atomic import SUFFIX, write_text
 from warp_lcp.driver.checkpoint import CHECKPOINT_FILE, REFUSED_FILE, Checkpoint, CheckpointFolder
 from warp_lcp.driver.continuation import MAY_CHANGE, RESOLUTION, Change, differences, fingerprint, mesh_digests
 from warp_lcp.driver.folder_lock import LOCK, FolderBusyError, locked
+from warp_lcp.driver.foreign import one_line
 from warp_lcp.driver.frames import FRAME_FILE, FrameFolder, FrameWriter
 from warp_lcp.driver.log import Log
 from warp_lcp.driver.profile import Stopwatch
@@ -155,7 +156,7 @@ class RunFolder:
         if not foreign and all(path.name == f".{RECORD}{SUFFIX}" for path in own):  # nothing, or killed with its first file
             return
         if foreign or self.path / RECORD not in own:
-            shown = ", ".join(str(path.relative_to(self.path)) for path in [*foreign, *own][:3])
+            shown = ", ".join(one_line(str(path.relative_to(self.path))) for path in [*foreign, *own][:3])
             raise OutputError(f"{self.path}: holds files that are no run's ({shown}), which --force does not delete; choose another folder")
         if not force:
             raise OutputError(f"{self.path}: holds a run already; --resume continues it, --force deletes it, --out takes another folder")

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any, ClassVar, Literal, Self
+from unicodedata import normalize
 
 import numpy as np
-from pydantic import Field, WrapValidator, model_validator
-from pydantic_core import PydanticKnownError
+from pydantic import AfterValidator, Field, WrapValidator, model_validator
+from pydantic_core import PydanticCustomError, PydanticKnownError
 
 from warp_lcp.driver.camera import Camera
 from warp_lcp.driver.presets import PresetName, fill_in, preset_line
@@ -44,14 +45,30 @@ Tolerance = Annotated[
 
 PRESET_KEY = "sets time step, tolerance and more, where the scene does not; none unless given"
 
+LONGEST_NAME = 60  # characters; file systems take 255 bytes, and a letter has up to four
+NAME_RULE = f'must be a name of at most {LONGEST_NAME} letters, digits, "-", "_", "." and spaces, without a dot or space at its ends'
+
 WHOLE_CELLS = 1e-6  # how far a side may be from a whole number of cells, relative
+
+
+def _name(text: str) -> str:
+    """Return a name that may be a folder's, whatever stands before it; "" is none."""
+    if len(text) > LONGEST_NAME or text != text.strip(". ") or set(text) - set(file_name(text)):
+        raise PydanticCustomError("name", NAME_RULE)
+    return text
+
+
+def file_name(text: str) -> str:
+    """Return a text as a name that `scene.name` may be, "scene" if nothing is left of it."""
+    kept = "".join(c if c.isalnum() or c in "-_. " else "-" for c in normalize("NFC", text))[:LONGEST_NAME].strip(". ")
+    return kept or "scene"
 
 
 class About(Table):
     """[scene]: what the file is."""
 
     simulator: str = Field(description="the plug-in that runs the scene, such as fluids")
-    name: str = Field(default="", description="a short name; the file's unless given")
+    name: Annotated[str, AfterValidator(_name)] = Field(default="", description="a short name; the file's unless given")
     description: str = Field(default="", description="a sentence about what there is to see")
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import tomli_w
 
-from warp_lcp.driver.scene import Scene
+from warp_lcp.driver.scene import Scene, file_name
 from warp_lcp.driver.shapes import BUILTIN
 from warp_lcp.driver.simulator import Simulator, simulators
 from warp_lcp.driver.table import Problem, SceneError, validate, written
@@ -62,7 +62,7 @@ def load_scene(path_or_name: str | Path, overrides: Sequence[str] = ()) -> Scene
     _resolve_paths(data, Path.cwd() if source in built_in_scenes() else Path(source).resolve().parent)
     model = _scene_model(data, source)
     about = data["scene"]
-    data["scene"] = {"name": file.name.removesuffix(".toml"), **about}
+    data["scene"] = {**about, "name": about.get("name") or file_name(file.name.removesuffix(".toml"))}
     scene = validate(model, data, source)
     _find_meshes(scene, source)
     return scene

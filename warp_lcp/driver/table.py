@@ -11,6 +11,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
+from warp_lcp.driver.foreign import one_line
 from warp_lcp.nearest import nearest
 
 ModelT = TypeVar("ModelT", bound="Table")
@@ -28,6 +29,7 @@ MESSAGES = {
     "int_from_float": "must be a whole number",
     "bool_type": "must be true or false",
     "string_type": "must be text in quotes",
+    "string_unicode": "must be UTF-8 text",
     "string_too_short": "must not be empty",
     "list_type": "must be a list, such as [0.0, 1.0]",
     "too_short": "must have at least {min_length} entries",
@@ -75,7 +77,7 @@ class Problem:
     def __str__(self) -> str:
         """Return one line, such as `time.cfl = 0: must be greater than 0`."""
         where = f"{self.path} = {self.value}" if self.value else self.path
-        return f"{where}: {self.message}" if where else self.message
+        return one_line(f"{where}: {self.message}" if where else self.message)
 
 
 class SceneError(ValueError):
@@ -86,9 +88,9 @@ class SceneError(ValueError):
         self.source = source
         self.problems = tuple(problems)
         if len(self.problems) == 1:
-            text = f"{source}: {self.problems[0]}"
+            text = f"{one_line(source)}: {self.problems[0]}"
         else:
-            text = "\n  ".join([f"{source}: {len(self.problems)} errors", *map(str, self.problems)])
+            text = "\n  ".join([f"{one_line(source)}: {len(self.problems)} errors", *map(str, self.problems)])
         super().__init__(text)
 
 
