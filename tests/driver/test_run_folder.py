@@ -10,6 +10,7 @@ from warp_lcp.driver.continuation import fingerprint
 from warp_lcp.driver.run_folder import OutputError, RunFolder, RunRecord
 from warp_lcp.driver.scene_file import load_scene
 
+SPARE = ".run.json.spare.part"  # room for the last run.json, while a run is on
 RUN_FILES = ["run.json", "scene.toml", "log.csv", "profile.json", "particles.pvd", "frames/grid_000003.vtu", "checkpoints/step_000050.npz"]
 
 
@@ -33,10 +34,10 @@ def test_a_new_or_empty_folder_is_taken(folder):
 
 
 def test_a_folder_where_a_run_died_at_its_first_file_is_taken(folder):
-    fill(folder, [".run.json.part"])
+    fill(folder, [".run.json.part", SPARE])
     folder.check_new(force=False)
     folder.start(RunRecord("dots", "dots", "cpu"))
-    assert sorted(path.name for path in folder.path.iterdir()) == ["run.json", "scene.toml"]
+    assert sorted(path.name for path in folder.path.iterdir()) == [SPARE, "run.json", "scene.toml"]
 
 
 def test_an_earlier_run_needs_force(folder):
@@ -46,14 +47,14 @@ def test_an_earlier_run_needs_force(folder):
     folder.check_new(force=True)
     folder.start(RunRecord("dots", "dots", "cpu"))
     files = sorted(path.name for path in folder.path.rglob("*") if path.is_file())
-    assert files == ["run.json", "scene.toml"]
+    assert files == [SPARE, "run.json", "scene.toml"]
 
 
 def test_leftovers_of_a_killed_run_go_too(folder):
     fill(folder, [*RUN_FILES, ".log.csv.part", "frames/.grid_000004.vtu.part"])
     folder.check_new(force=True)
     folder.start(RunRecord("dots", "dots", "cpu"))
-    assert not list(folder.path.rglob("*.part"))
+    assert [path.name for path in folder.path.rglob("*.part")] == [SPARE]
 
 
 @pytest.mark.parametrize(
@@ -241,7 +242,7 @@ def test_going_on_clears_what_was_half_written(folder):
         folder.checkpoints.write(Checkpoint(step, step / 20, {}))
     fill(folder, [".log.csv.part", "frames/.grid_000004.vtu.part", "checkpoints/.step_000016.npz.part", "frames/grid_000001.vtu"])
     folder.go_on(RunRecord("dots", "dots", "cpu"), 8)
-    assert not list(folder.path.rglob(".*"))
+    assert [path.name for path in folder.path.rglob(".*")] == [SPARE]
     assert sorted(path.name for path in folder.checkpoints.folder.iterdir()) == [
         "refused_000012.npz",
         "step_000004.npz",

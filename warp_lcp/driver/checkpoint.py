@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.driver.atomic import replacing
+from warp_lcp.driver.atomic import make_folder, replacing
 from warp_lcp.driver.rank_folder import in_ranks, rank_folder
 
 FORMAT = 2
@@ -116,7 +116,7 @@ class CheckpointFolder:
         pickled = [name for name, array in checkpoint.state.items() if array.dtype.hasobject]
         if pickled:
             raise ValueError(f"these arrays hold Python objects, which would need a pickle: {', '.join(pickled)}")
-        self.folder.mkdir(exist_ok=True)
+        make_folder(self.folder)
         meta = {
             "format": FORMAT,
             "scene": self.fingerprint,

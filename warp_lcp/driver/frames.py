@@ -9,7 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Literal, Self
 
-from warp_lcp.driver.atomic import write_text
+from warp_lcp.driver.atomic import make_folder, write_text
 from warp_lcp.driver.nvdb import nvdb_bytes, write_nvdb
 from warp_lcp.driver.ply import ply_bytes, write_ply
 from warp_lcp.driver.profile import NoStopwatch, Stopwatch
@@ -55,7 +55,7 @@ class FrameFolder:
         Raises:
             OSError: a file cannot be written; the earlier ones are intact.
         """
-        self.frames.mkdir(exist_ok=True)
+        make_folder(self.frames)
         files = []
         for part in frame:
             file = self.write_part(self.frames / f"{part.name}_{index:06d}", part)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from warp_lcp.distributed.meeting import Meeting
+from warp_lcp.driver.atomic import make_folder
 from warp_lcp.driver.checkpoint import PIECES, Checkpoint, CheckpointError, CheckpointFolder
 
 
@@ -47,7 +48,7 @@ class ParallelCheckpoints(CheckpointFolder):
         if checkpoint.step == self._continued:
             return self.path(checkpoint.step)
         with self._meeting.together():
-            self.folder.mkdir(exist_ok=True)
+            make_folder(self.folder)
             file = self.of_rank(self._ranks.rank).write(checkpoint)
         checksums = self._meeting.exchange(checkpoint.checksum)
         with self._meeting.led():

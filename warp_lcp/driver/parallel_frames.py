@@ -6,6 +6,7 @@ from collections import deque
 from pathlib import Path
 
 from warp_lcp.distributed.meeting import Meeting
+from warp_lcp.driver.atomic import make_folder
 from warp_lcp.driver.frames import FrameFolder, FrameWriter, GridFormat
 from warp_lcp.driver.pieces import WHOLE, Kind, Piece, describe, write_whole
 from warp_lcp.driver.profile import Stopwatch
@@ -44,7 +45,7 @@ class ParallelFrames(FrameFolder):
         Raises:
             OSError: a file cannot be written; the earlier ones are intact.
         """
-        self.pieces.mkdir(parents=True, exist_ok=True)
+        make_folder(self.pieces)
         return [self.write_part(self.pieces / f"{part.name}_{index:06d}", part) for part in frame]
 
     def resume(self, times: list[float]) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_lcp.driver.atomic import replacing, write_text
+from warp_lcp.driver.atomic import make_folder, replacing, write_text
 from warp_lcp.driver.run_folder import OutputError
 from warp_lcp.gallery.recorded import DESCRIPTION, files
 
@@ -31,7 +31,7 @@ class ProblemFolder:
         if not more and files(folder):
             raise OutputError(f"--record-problems {folder}: holds recorded problems already; name another folder")
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            make_folder(folder)
             write_text(folder / README, DESCRIPTION)
         except OSError as error:
             raise OutputError(f"--record-problems {folder}: {error}") from error

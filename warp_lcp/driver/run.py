@@ -6,7 +6,7 @@ import errno
 import math
 import time as clock
 from collections.abc import Callable, Sequence
-from contextlib import closing, nullcontext
+from contextlib import ExitStack, closing, nullcontext
 from pathlib import Path
 
 from warp_lcp.driver.check import check_memory
@@ -326,9 +326,11 @@ class Run:
     def _start(self, last: int, frame: list[Part]) -> Log:
         """Write what there is before the first step."""
         self.folder.start(self.record)
-        log = self.folder.open_log(self._columns())
-        self._write_frame(0, last, frame)
-        self._write_checkpoint(log)  # so that a run can be continued from its first moment on
+        with ExitStack() as stack:
+            log = stack.enter_context(closing(self.folder.open_log(self._columns())))
+            self._write_frame(0, last, frame)
+            self._write_checkpoint(log)  # so that a run can be continued from its first moment on
+            stack.pop_all()
         return log
 
     def _resume(self) -> Log:

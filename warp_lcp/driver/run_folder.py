@@ -8,12 +8,12 @@ import shutil
 import tempfile
 import tomllib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from warp_lcp.driver.atomic import SUFFIX, write_text
+from warp_lcp.driver.atomic import SPARE, SUFFIX, make_folder, reserve, sync_folder, write_text
 from warp_lcp.driver.checkpoint import CHECKPOINT_FILE, REFUSED_FILE, Checkpoint, CheckpointFolder
 from warp_lcp.driver.continuation import MAY_CHANGE, RESOLUTION, Change, differences, fingerprint, mesh_digests
 from warp_lcp.driver.folder_lock import LOCK, FolderBusyError, locked
@@ -32,7 +32,8 @@ Status = Literal["running", "finished", "stopped", "failed"]
 RECORD = "run.json"
 SCENE = "scene.toml"
 ROUNDING = 1e-9
-OWN_FILES = re.compile(r"scene\.toml|run\.json|profile\.json|log\.csv|[a-z][a-z_]*\.pvd")
+LAST_WORDS = 8192  # bytes that run.json may grow by until the run ends, with the reason and warnings
+OWN_FILES = re.compile(rf"scene\.toml|run\.json(?:{re.escape(SPARE)})?|profile\.json|log\.csv|[a-z][a-z_]*\.pvd")
 IMAGE_FILE = re.compile(r"(?:(?:frame|slice)_\d{6,}|sheet)\.png")
 CHECKPOINTS = "checkpoints"
 STORED_STATE = re.compile(f"{CHECKPOINT_FILE.pattern}|{REFUSED_FILE.pattern}")
@@ -134,11 +135,14 @@ class RunFolder:
         if resume:
             self._check_run()
         _probe(self.path)
-        try:
-            with locked(self.path) as remarks:
-                yield remarks
-        except FolderBusyError as error:
-            raise OutputError(str(error)) from error
+        with ExitStack() as stack:
+            try:
+                remarks = stack.enter_context(locked(self.path))
+            except FolderBusyError as error:
+                raise OutputError(str(error)) from error
+            except OSError as error:
+                raise OutputError(f"{self.path}: cannot be written: {error.strerror}") from error
+            yield remarks
 
     def check_new(self, *, force: bool) -> None:
         """Refuse what a new run may not overwrite, and folders that cannot be written.
@@ -153,7 +157,7 @@ class RunFolder:
             raise OutputError(f"{self.path}: is not a folder")
         _probe(self.path)
         own, foreign = self._contents()
-        if not foreign and all(path.name == f".{RECORD}{SUFFIX}" for path in own):  # nothing, or killed with its first file
+        if not foreign and all(path.name.startswith(f".{RECORD}") for path in own):  # nothing, or killed with its first files
             return
         if foreign or self.path / RECORD not in own:
             shown = ", ".join(one_line(str(path.relative_to(self.path))) for path in [*foreign, *own][:3])
@@ -172,6 +176,8 @@ class RunFolder:
         for file in own:
             if file.name != RECORD:  # replaced below: at every moment the folder is a run's
                 file.unlink()
+        if self.checkpoints.folder.is_dir():
+            sync_folder(self.checkpoints.folder)  # before there is a run that could take them for its own
         for name in OWN_FOLDERS:
             remove_empty_ranks(self.path / name)
         self.write_record(record)
@@ -218,7 +224,8 @@ class RunFolder:
         self.write_record(record)
         write_text(self.path / SCENE, dump_scene(self.scene))
         for file in (path for path, _ in _walk(self.path) if path.name.endswith(SUFFIX) and path.name.startswith(".")):
-            file.unlink()
+            if SPARE not in file.name:
+                file.unlink()
         self.checkpoints.set_aside(step)
 
     def open_log(self, columns: tuple[str, ...], *, after_step: int | None = None) -> Log:
@@ -230,12 +237,15 @@ class RunFolder:
         return FrameWriter(self.frames, watch)
 
     def write_record(self, record: RunRecord) -> None:
-        """Write run.json.
+        """Write run.json; that of a run that begins keeps room for the one of its end, which is written even if the disk is full.
 
         Raises:
-            OSError: the disk is full.
+            OSError: the disk is full before the run begins, or cannot be written at all.
         """
-        write_text(self.path / RECORD, json.dumps(asdict(record), indent=2) + "\n")
+        text, begins = json.dumps(asdict(record), indent=2) + "\n", record.status == "running"
+        if begins:
+            reserve(self.path / RECORD, len(text) + LAST_WORDS)
+        write_text(self.path / RECORD, text, spare=not begins)
 
     def mark_failed(self, reason: str) -> None:
         """Write into run.json that the run has failed, if it says that it is running; for a process that does not have its record.
@@ -245,7 +255,7 @@ class RunFolder:
         """
         record = self._record()
         if record.get("status") == "running":
-            write_text(self.path / RECORD, json.dumps({**record, "status": "failed", "reason": reason}, indent=2) + "\n")
+            write_text(self.path / RECORD, json.dumps({**record, "status": "failed", "reason": reason}, indent=2) + "\n", spare=True)
 
     def check_space(self, needed: int) -> None:
         """Refuse a run whose output does not fit.
@@ -348,7 +358,7 @@ def _walk(folder: Path) -> Iterator[tuple[Path, re.Pattern[str]]]:
 def _probe(folder: Path) -> None:
     """Make the folder if it is not there, and see whether files can be written in it."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         with tempfile.TemporaryFile(dir=folder) as file:
             file.write(bytes(4096))
             file.flush()
