@@ -174,7 +174,7 @@ def test_a_second_process_is_refused_and_sigterm_leaves_a_checkpoint(tmp_path):
     assert process.returncode == 1, text
     assert "stopping after this step" in text
     found = record(out)
-    assert (found["status"], found["reason"]) == ("stopped", "interrupted")
+    assert (found["status"], found["reason"]) == ("stopped", "interrupted by SIGTERM")
     assert newest_step(out) == found["steps"]
     assert f"step_{found['steps']:06d}.npz" in text
     assert not (out / "run.lock").exists()

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from types import FrameType
 from typing import Annotated, Any, NoReturn
 
 import typer
@@ -22,6 +20,7 @@ from warp_lcp.driver.crew import crew_of
 from warp_lcp.driver.devices import DeviceError, choose_device, cuda_driver, devices
 from warp_lcp.driver.engine import Engine, EngineError, EngineOption
 from warp_lcp.driver.film import check_rate
+from warp_lcp.driver.interruption import Interrupted, Interruption
 from warp_lcp.driver.particle_scene import ParticleScene
 from warp_lcp.driver.presets import PresetName
 from warp_lcp.driver.profile import Profile
@@ -112,7 +111,8 @@ def run(
         folder = out or Path("out") / loaded.scene.name
         console = crew.console
         say(console, f"{loaded.scene.name} on {crew.place(chosen)}, into {folder}")
-        with _interruptible(console, crew.signals) as stop, Bar(console) if console.is_terminal else Lines(console) as observer:
+        stop = Interruption(partial(say, console), at_once=crew.ranks is None)
+        with stop, Bar(console) if console.is_terminal else Lines(console) as observer:
             watch = Profile(chosen) if profile and crew.speaks else None
             record = crew.run(
                 loaded, folder, device=chosen, observer=observer, last_frame=frames, resume=resume, force=force, force_memory=force_memory,
@@ -405,28 +405,8 @@ def _wrong_input() -> Iterator[None]:
         yield
     except (SceneError, OutputError, DeviceError, RenderError, ProblemError, EngineError) as error:
         _end(str(error), WRONG_INPUT)
-
-
-@contextmanager
-def _interruptible(console: Terminal, signals: tuple[signal.Signals, ...]) -> Iterator[Callable[[], bool]]:
-    """Give a function that says whether Ctrl-C was pressed or another signal came; a second Ctrl-C does not wait for the step's end."""
-    pressed = False
-
-    def press(given: int, frame: FrameType | None) -> None:
-        nonlocal pressed
-        pressed = True
-        number, again = signal.Signals(given), ""
-        if number == signal.SIGINT:  # SIGTERM may come several times, to the process and to its group
-            signal.signal(number, previous[number])
-            again = "; press Ctrl-C again to end now"
-        say(console, f"stopping after this step{again}")
-
-    previous = {number: signal.signal(number, press) for number in signals}
-    try:
-        yield lambda: pressed
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+    except Interrupted as error:
+        _end(f"stopped: interrupted by {error} before the run began", FAILED)
 
 
 def _report(record: RunRecord, folder: Path) -> None:

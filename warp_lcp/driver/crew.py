@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -28,10 +27,7 @@ class Crew:
     Attributes:
         console: takes messages.
         speaks: this process tells the user what happens.
-        signals: that end a run after its step.
     """
-
-    signals: tuple[signal.Signals, ...] = (signal.SIGINT, signal.SIGTERM)
 
     def __init__(self, console: Terminal | None = None, *, speaks: bool = True) -> None:
         """Speak to the error stream."""
@@ -90,7 +86,7 @@ class Crew:
         resume: bool,
         force: bool,
         force_memory: bool,
-        stop: Callable[[], bool],
+        stop: Callable[[], bool | str],
         profile: Profile | None,
         record_problems: Path | None,
     ) -> RunRecord:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import os
 import pickle
-import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -35,7 +34,6 @@ WRONG_INPUT = (SceneError, OutputError, DeviceError, EngineError, ProblemError)
 PLANNED = (OSError, *WRONG_INPUT, StepFailed, SimulationFailed)
 SIZES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE")  # how many processes mpiexec has started, as it tells them
 NUMBERS = ("OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK")  # which of them this one is
-SIGNALS = tuple(number for number in signal.Signals if number.name == "SIGUSR1")  # mpiexec and batch systems pass it on to all ranks
 SHOWN = 4  # differences in one message
 
 
@@ -45,8 +43,6 @@ class RankCrew(Crew):
     Args:
         ranks: all of them.
     """
-
-    signals = (*Crew.signals, *SIGNALS)
 
     def __init__(self, ranks: Ranks) -> None:
         """Let the first rank speak."""
@@ -96,7 +92,7 @@ class RankCrew(Crew):
         resume: bool,
         force: bool,
         force_memory: bool,
-        stop: Callable[[], bool],
+        stop: Callable[[], bool | str],
         profile: Profile | None,
         record_problems: Path | None,
     ) -> RunRecord:

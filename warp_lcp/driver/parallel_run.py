@@ -136,7 +136,7 @@ def run_on_ranks(
     resume: bool = False,
     force: bool = False,
     force_memory: bool = False,
-    stop: Callable[[], bool] = lambda: False,
+    stop: Callable[[], bool | str] = lambda: False,
     profile: Profile | None = None,
 ) -> RunRecord:
     """Simulate a scene into a folder that all ranks see; collective.

@@ -12,6 +12,7 @@ from pathlib import Path
 from warp_lcp.driver.check import check_memory
 from warp_lcp.driver.checkpoint import PIECES, Checkpoint
 from warp_lcp.driver.frames import frame_bytes
+from warp_lcp.driver.interruption import Interrupted
 from warp_lcp.driver.log import Log, Value
 from warp_lcp.driver.problem_folder import ProblemFolder
 from warp_lcp.driver.profile import NoStopwatch, Profile, Stopwatch
@@ -52,7 +53,7 @@ def run_scene(
     resume: bool = False,
     force: bool = False,
     force_memory: bool = False,
-    stop: Callable[[], bool] = lambda: False,
+    stop: Callable[[], bool | str] = lambda: False,
     profile: Profile | None = None,
     record_problems: Path | None = None,
 ) -> RunRecord:
@@ -67,7 +68,7 @@ def run_scene(
         resume: continue the run in the folder.
         force: delete the run in the folder.
         force_memory: run even what will not fit into the device's free memory.
-        stop: asked after every step; True ends the run with a checkpoint.
+        stop: asked after every step; True, or what it is interrupted by, ends the run with a checkpoint.
         profile: measures the run's stages; written to profile.json at the end.
         record_problems: folder that takes the problem of each step, see `warp_lcp.gallery.recorded`.
 
@@ -112,7 +113,7 @@ def run_in_folder(
     last_frame: int | None,
     resume: bool,
     force: bool,
-    stop: Callable[[], bool],
+    stop: Callable[[], bool | str],
     profile: Profile | None,
     somewhere: Callable[[bool], bool] = bool,
 ) -> RunRecord:
@@ -287,7 +288,7 @@ class Run:
         self._checkpointed: int | None = None  # the newest checkpoint's step
         self._checkpoint_time = clock.monotonic()
 
-    def execute(self, last_frame: int | None, stop: Callable[[], bool], *, resumed: bool) -> RunRecord:
+    def execute(self, last_frame: int | None, stop: Callable[[], bool | str], *, resumed: bool) -> RunRecord:
         """Run to the last frame, and write in run.json how that ended, whatever happened."""
         count = self.time.frame_count
         last = count if last_frame is None else min(last_frame, count)
@@ -299,7 +300,9 @@ class Run:
                 stopped = self._advance(log, last, stop)
                 self._write_checkpoint(log)
             self.record.status = "stopped" if stopped else "finished"
-            self.record.reason = "interrupted" if stopped else f"frame {last} of {count} reached"
+            self.record.reason = stopped or f"frame {last} of {count} reached"
+        except Interrupted as error:  # the checkpoint before the first step is there
+            self.record.status, self.record.reason = "stopped", f"interrupted by {error} before its first step had ended"
         except (StepFailed, SimulationFailed) as error:
             self._fail(str(error))
             self._try_to(self.writer.flush)
@@ -348,8 +351,8 @@ class Run:
     def _columns(self) -> tuple[str, ...]:
         return ("step", "time", "dt", *self.simulation.columns(), "retries", "seconds")
 
-    def _advance(self, log: Log, last: int, stop: Callable[[], bool]) -> bool:
-        """Step until the last frame is written; return whether the user stopped the run before."""
+    def _advance(self, log: Log, last: int, stop: Callable[[], bool | str]) -> str:
+        """Step until the last frame is written; return why the run stopped before, "" if it did not."""
         frame = self._frames_done() + 1
         while frame <= last:
             row = self._step(self.time.frame_time(frame))
@@ -361,9 +364,10 @@ class Run:
                 frame += 1
             if self._checkpoint_is_due():
                 self._write_checkpoint(log)
-            if self._somewhere(stop()) and frame <= last:
-                return True
-        return False
+            asked = stop()
+            if self._somewhere(bool(asked)) and frame <= last:
+                return f"interrupted by {asked}" if isinstance(asked, str) and asked else "interrupted"  # "": another rank was asked
+        return ""
 
     def _step(self, end: float) -> dict[str, Value]:
         """Take a step towards a time [s] and return its row of the log."""

@@ -63,6 +63,9 @@ class Commands(TyperGroup):
         except Refusal as error:
             error.message = visible(error.message)
             raise
+        except KeyboardInterrupt as error:
+            tell("stopped: interrupted", error=True)
+            raise typer.Exit(1) from error
 
 
 def say(console: Console, text: str) -> None:

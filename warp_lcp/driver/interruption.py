@@ -1,0 +1,87 @@
+"""Signals that end a run: after its step, with a checkpoint; before the first step has ended, at once."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Callable
+from types import FrameType, TracebackType
+from typing import Any, Self
+
+ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR1", "SIGUSR2", "SIGXCPU")  # batch systems send those of the user's, too
+SIGNALS = tuple(number for number in signal.Signals if number.name in ENDING)
+OVER = b"\0"
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal came before the first step had ended; the text is its name."""
+
+
+class Interruption:
+    """A `with` block in which signals ask a run to end; called after each step, it says which signal did, "" if none.
+
+    Until it is called first there is nothing to lose, and much to wait for, as kernels are compiled: there a signal raises `Interrupted`.
+    Python hands a signal on only once the compiler is back, so a thread of its own says at once that it has come. What a signal is
+    ignored by, such as SIGHUP by nohup, stays. A second Ctrl-C does not wait for the step's end.
+
+    Args:
+        say: takes a line for the user.
+        at_once: raise before the first step has ended; ranks, which wait for each other, do not.
+    """
+
+    def __init__(self, say: Callable[[str], None], *, at_once: bool = True) -> None:
+        """Wait for nothing yet."""
+        self._say, self._early = say, at_once
+        self._name = ""
+        self._previous: dict[signal.Signals, Any] = {}
+
+    def __call__(self) -> str:
+        """Return the name of the signal that came first."""
+        self._early = False
+        return self._name
+
+    def __enter__(self) -> Self:
+        """Take the signals."""
+        self._read, self._write = os.pipe()
+        if hasattr(os, "set_blocking"):
+            os.set_blocking(self._write, False)
+        self._wakeup = signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
+        self._thread = threading.Thread(target=self._announce, name="signals", daemon=True)
+        self._thread.start()
+        for number in SIGNALS:
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                self._previous[number] = signal.signal(number, self._take)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """Give the signals back."""
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+        signal.set_wakeup_fd(self._wakeup)
+        os.write(self._write, OVER)
+        self._thread.join()
+        os.close(self._read)
+        os.close(self._write)
+
+    def _take(self, given: int, frame: FrameType | None) -> None:
+        number = signal.Signals(given)
+        if number == signal.SIGINT:  # SIGTERM may come several times, to the process and to its group
+            signal.signal(number, self._previous[number])
+        if not self._name:
+            self._name = number.name
+            if self._early:
+                raise Interrupted(number.name)
+
+    def _announce(self) -> None:
+        """Say which signal has come, once."""
+        while (given := os.read(self._read, 1)) != OVER:
+            number = signal.Signals(given[0])
+            if number not in self._previous:
+                continue
+            again = "; press Ctrl-C again to end now" if number == signal.SIGINT else ""
+            early = "stopping before the first step has ended, once the kernel that is being compiled, if there is one, is ready"
+            self._say(f"{number.name}: {early if self._early else f'stopping after this step{again}'}")
+            while os.read(self._read, 1) != OVER:
+                pass
+            return
