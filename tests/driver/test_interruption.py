@@ -1,21 +1,19 @@
 """Every signal that asks a process to end leaves a checkpoint, a status that is true and a message; before the first step at once."""
 
-import ctypes
 import json
 import os
 import signal
-import sys
 import threading
-import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 from typer.testing import CliRunner, Result
 
-from warp_lcp.driver import cli
-from warp_lcp.driver.interruption import SIGNALS, Interrupted, Interruption
+from warp_lcp.driver import cli, interruption
+from warp_lcp.driver.interruption import SIGNALS, Interruption
 from warp_lcp.driver.run import run_scene
+from warp_lcp.driver.run_folder import mark_stopped
 
 EACH = pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
 
@@ -23,7 +21,7 @@ EACH = pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name
 @pytest.fixture
 def run(scene_file, tmp_path):
     def call(*more: object) -> Result:
-        arguments = ["run", scene_file, "--out", tmp_path / "out", "--device", "cpu", *more]
+        arguments = ["run", scene_file, "--out", tmp_path / "out", "--device", "cpu", "--set", "time.duration=0.2", *more]
         return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
 
     return call
@@ -65,7 +63,7 @@ def test_before_the_first_step_has_ended(dots, run, tmp_path, number, frames):
     dots.before_step = at(0, number)
     result = run("--frames", frames)
     assert result.exit_code == 1
-    assert f"{number.name}: stopping before the first step has ended, once the kernel that is being compiled" in result.stderr
+    assert f"{number.name}: stopping before the first step has ended" in result.stderr
     found = record(tmp_path)
     assert (found["status"], found["steps"]) == ("stopped", 0)
     assert found["reason"] == f"interrupted by {number.name} before its first step had ended"
@@ -116,28 +114,31 @@ def test_what_is_ignored_stays_ignored(dots, run, tmp_path):
     assert record(tmp_path)["status"] == "finished"
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="its mutex")
-def test_it_is_said_while_a_compiler_runs():
-    """Nothing in Python can interrupt native code; what waits here is released only by the words."""
-    libc, mutex, said = ctypes.CDLL(None), ctypes.create_string_buffer(64), []
-    locked = threading.Event()
+def test_a_compiler_is_not_waited_for(monkeypatch):
+    """Python hands a signal on only once native code is back."""
 
-    def hold() -> None:
-        libc.pthread_mutex_lock(mutex)
-        locked.set()
-        os.kill(os.getpid(), signal.SIGINT)
-        while not said:
-            time.sleep(0.001)
-        libc.pthread_mutex_unlock(mutex)
+    class Compiling(Interruption):
+        def _take(self, given: int, frame: Any) -> None:
+            pass
 
-    helper = threading.Thread(target=hold)
-    with pytest.raises(Interrupted), Interruption(said.append):
-        helper.start()
-        locked.wait()
-        libc.pthread_mutex_lock(mutex)
-        raise AssertionError("went on")
-    helper.join()
-    assert len(said) == 1
+    said, ended = [], threading.Event()
+    monkeypatch.setattr(interruption, "GRACE", 0.01)
+    monkeypatch.setattr(os, "_exit", lambda code: (said.append(code), ended.set()))
+    with Compiling(said.append, last=said.append):
+        signal.raise_signal(signal.SIGINT)
+        ended.wait()
+    assert said == ["SIGINT: stopping before the first step has ended", "SIGINT", 1]
+
+
+def test_the_record_of_a_run_that_is_ended(run, tmp_path):
+    assert run("--frames", 0).exit_code == 0
+    mark_stopped(tmp_path / "out", "SIGINT")
+    assert record(tmp_path)["status"] == "finished"
+    (tmp_path / "out" / "run.json").write_text(json.dumps({**record(tmp_path), "status": "running"}))
+    mark_stopped(tmp_path / "out", "SIGINT")
+    found = record(tmp_path)
+    assert (found["status"], found["reason"]) == ("stopped", "interrupted by SIGINT before its first step had ended")
+    mark_stopped(tmp_path, "SIGINT")  # of a run that has not begun
 
 
 def test_ranks_wait_for_each_other():

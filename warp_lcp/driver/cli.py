@@ -27,7 +27,7 @@ from warp_lcp.driver.profile import Profile
 from warp_lcp.driver.progress import Bar, Lines
 from warp_lcp.driver.recording import Color, RenderError, Show
 from warp_lcp.driver.render import Looks, film_run, parse_size, render_run
-from warp_lcp.driver.run_folder import OutputError, RunRecord
+from warp_lcp.driver.run_folder import OutputError, RunRecord, mark_stopped
 from warp_lcp.driver.scene_file import built_in_scenes, installed_simulators, load_scene
 from warp_lcp.driver.simulator import SimulationFailed, StepFailed
 from warp_lcp.driver.solve_file import Outcome, ProblemError, solve_files
@@ -111,7 +111,7 @@ def run(
         folder = out or Path("out") / loaded.scene.name
         console = crew.console
         say(console, f"{loaded.scene.name} on {crew.place(chosen)}, into {folder}")
-        stop = Interruption(partial(say, console), at_once=crew.ranks is None)
+        stop = Interruption(partial(say, console), at_once=crew.ranks is None, last=partial(mark_stopped, folder))
         with stop, Bar(console) if console.is_terminal else Lines(console) as observer:
             watch = Profile(chosen) if profile and crew.speaks else None
             record = crew.run(

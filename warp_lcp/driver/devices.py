@@ -10,6 +10,8 @@ from pathlib import Path
 
 import warp as wp
 
+from warp_lcp.driver.kernel_cache import cache_error, watch_loads
+
 MEMORY = Path("/proc/meminfo")
 
 
@@ -18,9 +20,17 @@ class DeviceError(ValueError):
 
 
 def devices() -> dict[str, str]:
-    """Return the devices of this machine with their descriptions, the preferred one first."""
-    with _native_messages_dropped():
-        wp.init()
+    """Return the devices of this machine with their descriptions, the preferred one first.
+
+    Raises:
+        KernelCacheError: there is no place for compiled kernels.
+    """
+    try:
+        with _native_messages_dropped():
+            wp.init()
+    except OSError as error:
+        raise cache_error(error) from error
+    watch_loads()
     found = [*wp.get_cuda_devices(), wp.get_device("cpu")]
     return {device.alias: _describe(device) for device in found}
 

@@ -12,6 +12,8 @@ from typing import Any, Self
 ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR1", "SIGUSR2", "SIGXCPU")  # batch systems send those of the user's, too
 SIGNALS = tuple(number for number in signal.Signals if number.name in ENDING)
 OVER = b"\0"
+GRACE = 1.0  # seconds that native code may take before a process that has nothing to lose is ended
+FAILED = 1
 
 
 class Interrupted(KeyboardInterrupt):
@@ -22,17 +24,20 @@ class Interruption:
     """A `with` block in which signals ask a run to end; called after each step, it says which signal did, "" if none.
 
     Until it is called first there is nothing to lose, and much to wait for, as kernels are compiled: there a signal raises `Interrupted`.
-    Python hands a signal on only once the compiler is back, so a thread of its own says at once that it has come. What a signal is
-    ignored by, such as SIGHUP by nohup, stays. A second Ctrl-C does not wait for the step's end.
+    Python hands a signal on only once the compiler is back, which may take many seconds, so a thread of its own says at once that it has
+    come, and ends the process if it is not handed on soon. What ignores a signal, as nohup does SIGHUP, goes on ignoring it. A second
+    Ctrl-C does not wait for the step's end.
 
     Args:
         say: takes a line for the user.
         at_once: raise before the first step has ended; ranks, which wait for each other, do not.
+        last: called with the signal's name before a process that compiles is ended.
     """
 
-    def __init__(self, say: Callable[[str], None], *, at_once: bool = True) -> None:
+    def __init__(self, say: Callable[[str], None], *, at_once: bool = True, last: Callable[[str], None] = lambda name: None) -> None:
         """Wait for nothing yet."""
-        self._say, self._early = say, at_once
+        self._say, self._early, self._last = say, at_once, last
+        self._taken = threading.Event()
         self._name = ""
         self._previous: dict[signal.Signals, Any] = {}
 
@@ -68,6 +73,7 @@ class Interruption:
         number = signal.Signals(given)
         if number == signal.SIGINT:  # SIGTERM may come several times, to the process and to its group
             signal.signal(number, self._previous[number])
+        self._taken.set()
         if not self._name:
             self._name = number.name
             if self._early:
@@ -80,8 +86,11 @@ class Interruption:
             if number not in self._previous:
                 continue
             again = "; press Ctrl-C again to end now" if number == signal.SIGINT else ""
-            early = "stopping before the first step has ended, once the kernel that is being compiled, if there is one, is ready"
-            self._say(f"{number.name}: {early if self._early else f'stopping after this step{again}'}")
+            early = self._early
+            self._say(f"{number.name}: stopping {'before the first step has ended' if early else f'after this step{again}'}")
+            if early and not self._taken.wait(GRACE):
+                self._last(number.name)
+                os._exit(FAILED)  # nothing less ends a compiler; no step is lost, and no file that counts is half-written
             while os.read(self._read, 1) != OVER:
                 pass
             return

@@ -17,7 +17,7 @@ from warp_lcp.driver.log import Log, Value
 from warp_lcp.driver.problem_folder import ProblemFolder
 from warp_lcp.driver.profile import NoStopwatch, Profile, Stopwatch
 from warp_lcp.driver.progress import Observer
-from warp_lcp.driver.run_folder import Continuation, OutputError, RunFolder, RunRecord
+from warp_lcp.driver.run_folder import BEFORE, Continuation, OutputError, RunFolder, RunRecord
 from warp_lcp.driver.scene import Scene, Time
 from warp_lcp.driver.simulator import (
     Cells,
@@ -302,7 +302,7 @@ class Run:
             self.record.status = "stopped" if stopped else "finished"
             self.record.reason = stopped or f"frame {last} of {count} reached"
         except Interrupted as error:  # the checkpoint before the first step is there
-            self.record.status, self.record.reason = "stopped", f"interrupted by {error} before its first step had ended"
+            self.record.status, self.record.reason = "stopped", f"interrupted by {error} {BEFORE}"
         except (StepFailed, SimulationFailed) as error:
             self._fail(str(error))
             self._try_to(self.writer.flush)

@@ -8,7 +8,7 @@ import shutil
 import tempfile
 import tomllib
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -32,6 +32,7 @@ Status = Literal["running", "finished", "stopped", "failed"]
 RECORD = "run.json"
 SCENE = "scene.toml"
 ROUNDING = 1e-9
+BEFORE = "before its first step had ended"
 LAST_WORDS = 8192  # bytes that run.json may grow by until the run ends, with the reason and warnings
 OWN_FILES = re.compile(rf"scene\.toml|run\.json(?:{re.escape(SPARE)})?|profile\.json|log\.csv|[a-z][a-z_]*\.pvd")
 IMAGE_FILE = re.compile(r"(?:(?:frame|slice)_\d{6,}|sheet)\.png")
@@ -253,9 +254,7 @@ class RunFolder:
         Raises:
             OSError: it cannot be written.
         """
-        record = self._record()
-        if record.get("status") == "running":
-            write_text(self.path / RECORD, json.dumps({**record, "status": "failed", "reason": reason}, indent=2) + "\n", spare=True)
+        _end_record(self.path, "failed", reason)
 
     def check_space(self, needed: int) -> None:
         """Refuse a run whose output does not fit.
@@ -280,7 +279,7 @@ class RunFolder:
     def _check_same_scene(self) -> None:
         """Refuse other values of keys that must not change, and mesh files that hold something else."""
         before, now = _recorded_keys(self.path / SCENE), keys(self.scene)
-        known = self._record().get("mesh_files")
+        known = _record(self.path).get("mesh_files")
         files = known if isinstance(known, dict) else {}
         if before is None:  # killed before it was written: the checkpoints tell whose they are
             before = now
@@ -304,17 +303,9 @@ class RunFolder:
         except FileNotFoundError:
             return False
 
-    def _record(self) -> dict[str, Any]:
-        """Return what run.json says; nothing if it cannot be read."""
-        try:
-            record = json.loads((self.path / RECORD).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            return {}
-        return record if isinstance(record, dict) else {}
-
     def _other_versions(self) -> list[str]:
         """Return a remark if the run began with other software, which need not give the same bits."""
-        before = self._record().get("versions")
+        before = _record(self.path).get("versions")
         if not isinstance(before, dict):
             return []
         now = versions()
@@ -331,6 +322,28 @@ class RunFolder:
             is_own = path.is_file() and not path.is_symlink() and pattern.fullmatch(name)
             (own if is_own else foreign).append(path)
         return own, foreign
+
+
+def mark_stopped(folder: Path, signal: str) -> None:
+    """Write into run.json that a signal has stopped the run before its first step; for a thread that ends the process."""
+    with suppress(OSError):
+        _end_record(folder, "stopped", f"interrupted by {signal} {BEFORE}")
+
+
+def _end_record(folder: Path, status: Status, reason: str) -> None:
+    """Write into run.json how the run has ended, if it says that it is running."""
+    record = _record(folder)
+    if record.get("status") == "running":
+        write_text(folder / RECORD, json.dumps({**record, "status": status, "reason": reason}, indent=2) + "\n", spare=True)
+
+
+def _record(folder: Path) -> dict[str, Any]:
+    """Return what run.json says; nothing if it cannot be read."""
+    try:
+        record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return record if isinstance(record, dict) else {}
 
 
 def _recorded_keys(path: Path) -> dict[str, Any] | None:

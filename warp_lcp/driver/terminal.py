@@ -13,6 +13,7 @@ from rich.segment import Segment
 from typer.core import TyperGroup
 
 from warp_lcp.driver.foreign import one_line, visible
+from warp_lcp.driver.kernel_cache import KernelCacheError
 
 FREE_TEXT = "--set"  # its values may be arrays of several lines
 Refusal: Any = typer.BadParameter.__mro__[2]  # click's ClickException, which new versions of typer have inside them
@@ -63,8 +64,8 @@ class Commands(TyperGroup):
         except Refusal as error:
             error.message = visible(error.message)
             raise
-        except KeyboardInterrupt as error:
-            tell("stopped: interrupted", error=True)
+        except (KernelCacheError, KeyboardInterrupt) as error:
+            tell(error if isinstance(error, KernelCacheError) else "stopped: interrupted", error=True)
             raise typer.Exit(1) from error
 
 

@@ -1,0 +1,93 @@
+"""Compiled kernels on the disk: what a full disk or a power failure has damaged there is compiled again, and not a riddle."""
+
+from __future__ import annotations
+
+import functools
+import json
+import shutil
+import struct
+import sys
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+
+ELF = b"\x7fELF"
+BINARIES = (".o", ".cubin", ".ptx")
+
+
+class KernelCacheError(OSError):
+    """The folder of compiled kernels cannot be used; the message names it and says what to do."""
+
+
+def watch_loads() -> None:
+    """Look at the files of each module of kernels before Warp loads it first; Warp itself loads whatever is there, and fails for good."""
+    load = wp.Module.load
+    if hasattr(load, "__wrapped__") or not hasattr(wp.Module, "get_module_identifier"):
+        return
+
+    @functools.wraps(load)
+    def checked(module: wp.Module, device: Any, block_dim: int | None = None, *more: Any, **options: Any) -> Any:
+        if module.execs:  # as at every launch but the first
+            return load(module, device, block_dim, *more, **options)
+        try:
+            mend(Path(wp.config.kernel_cache_dir) / module.get_module_identifier(block_dim or module.options["block_dim"]))
+            return load(module, device, block_dim, *more, **options)
+        except OSError as error:
+            raise cache_error(error) from error
+
+    wp.Module.load = checked
+
+
+def cache_error(error: OSError) -> KernelCacheError:
+    """Return what to say of the cache's folder."""
+    where = f" {wp.config.kernel_cache_dir}" if wp.config.kernel_cache_dir else ""
+    file = f" ({error.filename})" if error.filename else ""
+    text = f"the folder of compiled kernels{where} cannot be used{file}; repair or delete it, or have WARP_CACHE_PATH name another one"
+    return KernelCacheError(error.errno, f"{error.strerror or error}: {text}")
+
+
+def mend(folder: Path) -> bool:
+    """Delete the folder of a module of kernels if a file in it is damaged; return whether it was.
+
+    Raises:
+        OSError: it is damaged, and cannot be deleted.
+    """
+    if folder.is_dir() and not folder.is_symlink():
+        if not any(_damaged(file) for file in folder.iterdir()):
+            return False
+        shutil.rmtree(folder)
+    elif folder.exists():
+        folder.unlink()
+    else:
+        return False
+    return True
+
+
+def _damaged(file: Path) -> bool:
+    """Return whether a file is cut short, empty or of zeros; what is wrong within is not seen."""
+    if file.suffix not in (*BINARIES, ".meta"):
+        return False
+    if not file.is_file():
+        return True
+    data = file.read_bytes()
+    if file.suffix == ".meta":
+        try:
+            return not isinstance(json.loads(data), dict)
+        except ValueError:
+            return True
+    if file.suffix == ".ptx":
+        return not data.rstrip(b"\0 \n").endswith(b"}")
+    if not data.startswith(ELF):
+        return sys.platform == "linux" or not data.strip(b"\0")
+    return _cut(data)
+
+
+def _cut(data: bytes) -> bool:
+    """Return whether the table of sections, which is at the end of ELF files of 64 bits, is not there."""
+    if len(data) < 64:
+        return True
+    (begin,) = struct.unpack_from("<Q", data, 0x28)
+    size, count = struct.unpack_from("<HH", data, 0x3A)
+    table = data[begin : begin + size * count]
+    return not count or len(table) < size * count or not table[size:].strip(b"\0")
