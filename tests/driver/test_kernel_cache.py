@@ -98,7 +98,7 @@ def test_whole_modules_are_left_alone(compiled):
 
 
 def test_a_cache_that_cannot_be_written(compiled, tmp_path):
-    folder, launch = compiled
+    _, launch = compiled
     before = wp.config.kernel_cache_dir
     (tmp_path / "file").write_text("")
     wp.config.kernel_cache_dir = str(tmp_path / "file" / "cache")
