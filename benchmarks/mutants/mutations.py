@@ -110,17 +110,17 @@ def draw(root: Path, count: int, seed: int) -> list[Mutant]:
     """
     rng = random.Random(seed)
     files = sorted(str(f.relative_to(root)) for package in PACKAGES for f in (root / package).rglob("*.py"))
-    lines = [(f, n + 1) for f in files if not APART.search(f) for n, text in enumerate((root / f).open()) if text.strip()]
+    lines = [(f, n + 1) for f in files if not APART.search(f) for n, text in enumerate((root / f).read_text().splitlines()) if text.strip()]
     start = rng.random()
     wanted = [lines[int((start + i) * len(lines) / count)] for i in range(count)]
-    places = {module: _places((root / module).read_text()) for module in {module for module, _ in wanted}}
+    sources = {module: (root / module).read_text() for module in {module for module, _ in wanted}}
+    places = {module: _places(source) for module, source in sources.items()}
     found = []
     for module, line in wanted:
         if places[module]:
             nearest = min(abs(at - line) for at, *_ in places[module])
             at, name, occurrence = rng.choice([place for place in places[module] if abs(place[0] - line) == nearest])
-            source = (root / module).read_text()
-            old, new = source.splitlines(), mutated(source, name, occurrence).splitlines()
+            old, new = (text.splitlines() for text in (sources[module], mutated(sources[module], name, occurrence)))
             found.append(Mutant(module, at, name, occurrence, old[at - 1].strip(), new[at - 1].strip()))
     return found
 
