@@ -82,7 +82,7 @@ def tests(arguments: list[str], *, brief: bool = False) -> tuple[str, str, float
         brief: whether to run each test with one of its parameters.
 
     Returns:
-        "passed", "failed" or "timeout", the end of what it printed, and its processor time [s].
+        "passed", "failed", "crashed" or "timeout", the end of what it printed, and its processor time [s].
     """
     log, limit = TREE / "mutant.log", int(SECONDS * len(arguments) + HANGS)
     child = os.fork()
@@ -94,9 +94,9 @@ def tests(arguments: list[str], *, brief: bool = False) -> tuple[str, str, float
             os.killpg(child, signal.SIGKILL)
         time.sleep(0.05)
     _, status, usage = found
-    hung = os.WIFSIGNALED(status) and os.WTERMSIG(status) in (signal.SIGKILL, signal.SIGXCPU)
-    verdict = "passed" if status == 0 else "timeout" if hung else "failed"
-    return verdict, log.read_text(errors="replace")[-20000:], usage.ru_utime + usage.ru_stime
+    ended_by = os.WTERMSIG(status) if os.WIFSIGNALED(status) else 0
+    verdict = {0: "failed", signal.SIGKILL: "timeout", signal.SIGXCPU: "timeout"}.get(ended_by, "crashed")
+    return verdict if status else "passed", log.read_text(errors="replace")[-20000:], usage.ru_utime + usage.ru_stime
 
 
 def _become_pytest(arguments: list[str], budget: Budget, limit: int, log: Path) -> NoReturn:
@@ -134,8 +134,8 @@ def judge(mutant: Mutant) -> dict[str, object]:
         spent += took
         if outcome != "passed":
             names = re.findall(r"^(?:FAILED|ERROR) (.+?)(?: - |$)", text, re.MULTILINE)
-            verdict = outcome if outcome == "timeout" else "killed" if names else "broken test"
-            by = "" if outcome == "timeout" else names[0] if names else text[-300:]
+            verdict = outcome if outcome == "timeout" else "killed" if names or outcome == "crashed" else "broken test"
+            by = names[0] if names else text[-300:]
             break
     path.write_text(whole)
     os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
