@@ -7,7 +7,7 @@ MPI_VENV ?= .venv-mpi
 OUT ?= out/dam-break
 WORKERS ?= 2  # processes that run the tests
 
-.PHONY: demo test test-distributed slow fuzz docs wheel-check clean
+.PHONY: demo test test-distributed slow fuzz mutants docs wheel-check clean
 
 demo: $(VENV)/.run
 	$(BIN)/warp-lcp run dam-break --out $(OUT) --force $(DEMO_ARGS)
@@ -33,6 +33,11 @@ slow: $(VENV)/.dev
 # Files and arguments that are wrong in ways nobody thought of, FUZZ_EXAMPLES of each kind, other ones every time.
 fuzz: $(VENV)/.dev
 	$(BIN)/python -m pytest tests/fuzz --hypothesis-profile=fuzz --hypothesis-show-statistics $(PYTEST_ARGS)
+
+# Change the code in 50 places, one at a time, and see whether the tests notice; MUTANTS_ARGS="--count 200 --seed 5 --jobs 8" for more.
+mutants: $(VENV)/.dev
+	$(BIN)/python -m pip install --quiet --editable '.[mutation]'
+	$(BIN)/python -m benchmarks.mutants $(MUTANTS_ARGS)
 
 # The documentation's site, in build/site; a link or an anchor that leads nowhere ends it.
 docs: $(VENV)/.docs

@@ -125,6 +125,16 @@ def test_a_piston_that_retracts_lets_go_of_a_separating_wall_and_sucks_on_a_free
     assert stuck.velocity[1].numpy()[1, 5, 2:-1].sum() == pytest.approx(-4 * 0.3, abs=1e-5)
 
 
+def test_a_cell_under_pressure_is_held_whatever_flows_out_of_it() -> None:
+    tank = Tank(liquid(slice(0, 4)))
+    tank.velocity[1].fill_(-0.5)
+    unknowns = tank.projection.prepare(tank.velocity, 0.01, 0.01)
+    result, criteria = tank.projection.solve(1.0, unknowns)
+    tank.velocity[1].fill_(0.5)
+    assert tank.projection.project(tank.velocity, tank.grid.everywhere, result, criteria, unknowns).released == 0
+    assert (tank.contact[0] == HELD).all()
+
+
 def test_a_full_box_with_a_retracting_piston_needs_a_separating_wall() -> None:
     full = liquid(slice(None), slice(1, None))
     free, stuck = (Tank(full, separating=separating, piston=-0.3) for separating in (True, False))

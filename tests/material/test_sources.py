@@ -143,6 +143,14 @@ def test_cells_that_are_full_already_are_not_filled() -> None:
     assert tap(liquid=[box([0.0, 0.0], [1.0, 0.75])]).particles.count == 4 * 32 * 24
 
 
+@pytest.mark.parametrize(("there", "comes"), [(1, 4), (2, 0), (3, 0)])
+def test_cells_are_filled_that_hold_fewer_than_half(there: int, comes: int) -> None:
+    source = box([0.5, 0.5], [0.53125, 0.53125], velocity=[1.0, 0.0], start=0.01)
+    simulation = tap([source], physics={"gravity": [0.0, 0.0]})
+    simulation.particles.append(np.full((there, 3), [0.51, 0.51, 0.0], np.float32), np.zeros((there, 3), np.float32))
+    assert simulation.step(0.011)["emitted"] == comes
+
+
 def test_a_box_that_is_full_ends_the_run_with_a_reason() -> None:
     simulation = tap(liquid=[box([0.0, 0.0], [1.0, 1.0])])
     with pytest.raises(SimulationFailed, match="sources run"):

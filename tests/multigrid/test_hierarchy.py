@@ -73,6 +73,14 @@ def test_coarse_levels_are_galerkin_products(shape, periodic, arrays, device):
         np.testing.assert_allclose(level_matrix(coarse.stencil), expected, atol=1e-12)
 
 
+@pytest.mark.parametrize("interval", [(0.5, 2.0), (0.1, 1.0), (0.9, 1.1)])
+def test_two_sweeps_contract_an_interval_of_eigenvalues_as_no_other_two_do(interval):
+    """By 1/T2((b + a)/(b - a)), the least that a polynomial of degree 2 with value 1 at 0 can."""
+    (first, second), t = CycleSettings(interval=interval).weights, np.linspace(*interval, 1001)
+    best = 1 / (2 * (sum(interval) / (interval[1] - interval[0])) ** 2 - 1)
+    assert np.abs((1 - first * t) * (1 - second * t)).max() == pytest.approx(best, rel=1e-5)
+
+
 @pytest.mark.parametrize("strength", [(1.0, 1.0, 100.0), (100.0, 1.0, 100.0), (1.0, 1.0, 1.0)])
 def test_only_strong_axes_are_coarsened_until_the_others_have_caught_up(strength, device):
     cells = np.full((16, 16, 16), wl.FLUID)

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 from bodies_at_hand import GRAVITY, SIDES, bodies_of, run
 
-from warp_lcp.grid.motion import Rotation, Translation
+from warp_lcp.grid.motion import Pose, Rotation, Translation
 from warp_lcp.grid.solids import Box, Capsule, Placement, Plane, Sphere, TriangleMesh
 from warp_lcp.grid.triangle_mesh import builtin_mesh
 from warp_lcp.grid.voxelize import PlacedSolid
-from warp_lcp.rigid.contacts import between
+from warp_lcp.rigid.contact_shape import ContactShape
+from warp_lcp.rigid.contacts import between, on_planes
 from warp_lcp.rigid.surroundings import Obstacle
 
 G = 9.81
@@ -266,9 +267,6 @@ def test_contacts_point_from_the_other_to_the_one():
         Capsule(start=[-0.05, 0.0, 0.0], end=[0.05, 0.0, 0.0], radius=0.08),
         TriangleMesh(surface=builtin_mesh("torus"), placement=Placement.from_degrees(0.3, [0.0] * 3, [0.0] * 3, 3)),
     ]
-    from warp_lcp.grid.motion import Pose
-    from warp_lcp.rigid.contact_shape import ContactShape
-
     made = [ContactShape.of(shape, 3) for shape in shapes]
     for one in made:
         for other in made:
@@ -283,6 +281,14 @@ def test_contacts_point_from_the_other_to_the_one():
             after = between(one, apart, other, Pose.identity(), 1.0, 3)
             assert after.gap.min() > touch.gap.min() + 0.002
             assert after.gap.min() < touch.gap.min() + 0.0105
+
+
+@pytest.mark.parametrize("gap", [0.06, -0.02])
+def test_a_contact_lies_halfway_between_the_surfaces(gap):
+    shape, pose = ContactShape.of(Sphere(center=[0.0, 0.0, 0.0], radius=0.1), 3), Pose(np.eye(3), np.array([0.5, 0.1 + gap, 0.5]))
+    touch = on_planes(shape, pose, np.zeros((1, 3)), np.array([[0.0, 1.0, 0.0]]), 0.1, 3)
+    np.testing.assert_allclose(touch.point, [[0.5, 0.5 * gap, 0.5]], atol=1e-12)
+    np.testing.assert_allclose(touch.gap, gap)
 
 
 def test_obstacles_need_no_name_to_be_found():

@@ -163,6 +163,9 @@ def test_limit_counts_single_pivots_where_asked_for():
     short = solve(A, b, solver=Lemke(pivots_per_step=1), stopping=wl.StoppingCriteria(rtol=1e-10, max_iterations=4, patience=1))
     assert short.status is wl.SolveStatus.MAX_ITERATIONS
     assert short.iterations == 4
+    x = short.x.numpy()
+    assert x.any()  # where it stands: complementary but for the covering variable
+    np.testing.assert_allclose(np.minimum(x, A @ x + b - (A @ x + b).min()), 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("settings", [{"pivots_per_step": 0}, {"covering_vectors": 0}])

@@ -1,0 +1,211 @@
+"""Draw mutants, run the tests of each and report who survives: `python -m benchmarks.mutants --count 50 --seed 7`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import random
+import re
+import resource
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter, defaultdict
+from pathlib import Path
+from typing import Any, NoReturn
+
+from benchmarks.mutants.mutations import Mutant, draw, mutated
+from benchmarks.mutants.tests_of import tests_of
+
+ROOT = Path(__file__).resolve().parents[2]
+HANGS = 40  # seconds of processor time that no single test takes
+PYTEST = ["-x", "-q", "--no-header", "-p", "no:cacheprovider", "--hypothesis-seed=7"]
+FILES = (1, 4)  # of tests: these first, with one of its parameters for each function, then these with all where a mutant survives
+TREE: Path
+SECONDS = 5.0
+
+
+def prepare(folder: str, files: tuple[int, int] = FILES, seconds: float = 60.0) -> None:
+    """Copy the tree for one worker and import what a mutant cannot change, so that forks start with it."""
+    global TREE, FILES, SECONDS  # a worker's own
+    TREE, FILES, SECONDS = Path(tempfile.mkdtemp(dir=folder)), files, seconds
+    ignore = shutil.ignore_patterns(".git", ".venv*", "out", "build", "results", ".*_cache", ".hypothesis")
+    shutil.copytree(ROOT, TREE, ignore=ignore, dirs_exist_ok=True)
+    import pyamg  # noqa: F401
+    import pydantic  # noqa: F401
+    import pytest  # noqa: F401
+    import rich  # noqa: F401
+    import scipy.sparse.linalg  # noqa: F401
+    import typer  # noqa: F401
+    import warp  # noqa: F401  # not yet initialized: no threads, no device
+
+
+class Budget:
+    """A plug-in of pytest that leaves out the tests of a file which start after its time, and all but one parameter of each if asked to."""
+
+    def __init__(self, seconds: float, *, brief: bool) -> None:
+        self.seconds, self.brief, self.began = seconds, brief, 0.0
+        self.spent: defaultdict[str, float] = defaultdict(float)
+
+    def pytest_collection_modifyitems(self, items: list[Any]) -> None:
+        """Keep the first of each function's parameters."""
+        if self.brief:
+            items[:] = {item.nodeid.split("[")[0]: item for item in reversed(items)}.values()
+            items.reverse()
+
+    def pytest_runtest_setup(self, item: Any) -> None:
+        """Leave out a test that starts too late."""
+        import pytest
+
+        if self.spent[str(item.path)] > self.seconds:
+            pytest.skip("no time left for this file")
+
+    def pytest_runtest_logstart(self) -> None:
+        """Note the time."""
+        self.began = time.process_time()
+
+    def pytest_runtest_logfinish(self, location: tuple[str, int, str]) -> None:
+        """Add the time of a test to its file's."""
+        self.spent[str(TREE / location[0])] += time.process_time() - self.began
+
+
+def tests(arguments: list[str], *, brief: bool = False) -> tuple[str, str, float]:
+    """Run pytest on this worker's tree in a process of its own.
+
+    Args:
+        arguments: for pytest.
+        brief: whether to run each test with one of its parameters.
+
+    Returns:
+        "passed", "failed", "crashed" or "timeout", the end of what it printed, and its processor time [s].
+    """
+    log, limit = TREE / "mutant.log", int(SECONDS * len(arguments) + HANGS)
+    child = os.fork()
+    if child == 0:
+        _become_pytest(arguments, Budget(SECONDS, brief=brief), limit, log)
+    deadline = time.monotonic() + 8 * limit
+    while not (found := os.wait4(child, os.WNOHANG))[0]:
+        if time.monotonic() > deadline:
+            os.killpg(child, signal.SIGKILL)
+        time.sleep(0.05)
+    _, status, usage = found
+    ended_by = os.WTERMSIG(status) if os.WIFSIGNALED(status) else 0
+    verdict = {0: "failed", signal.SIGKILL: "timeout", signal.SIGXCPU: "timeout"}.get(ended_by, "crashed")
+    return verdict if status else "passed", log.read_text(errors="replace")[-20000:], usage.ru_utime + usage.ru_stime
+
+
+def _become_pytest(arguments: list[str], budget: Budget, limit: int, log: Path) -> NoReturn:
+    """Turn this fork into a run of pytest on the worker's tree."""
+    os.setsid()
+    os.chdir(TREE)
+    os.dup2(os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 1)
+    os.dup2(1, 2)
+    resource.setrlimit(resource.RLIMIT_CPU, (limit, limit))
+    resource.setrlimit(resource.RLIMIT_AS, (12 << 30, 12 << 30))
+    os.environ["PYTHONPATH"] = str(TREE)
+    sys.path[:] = [str(TREE), *(p for p in sys.path if Path(p or ".").resolve() != ROOT)]
+    for name in [name for name in sys.modules if name.split(".")[0] == "benchmarks"]:
+        del sys.modules[name]
+    import pytest
+
+    status: int = pytest.ExitCode.INTERNAL_ERROR
+    try:
+        status = pytest.main([*PYTEST, *arguments], plugins=[budget])
+    except BaseException:  # what a mutant raises
+        traceback.print_exc(file=sys.stdout)
+    finally:
+        sys.stdout.flush()
+        os._exit(status)
+
+
+def judge(mutant: Mutant) -> dict[str, object]:
+    """Apply a mutant, run its tests and take it back."""
+    path = TREE / mutant.module
+    whole, stat = path.read_text(), path.stat()
+    chosen, spent, verdict, by = tests_of(TREE, mutant.module), 0.0, "alive", ""
+    path.write_text(mutated(whole, mutant.operator, mutant.occurrence))
+    for number in FILES:
+        outcome, text, took = tests(chosen[:number], brief=number == FILES[0])
+        spent += took
+        if outcome != "passed":
+            names = re.findall(r"^(?:FAILED|ERROR) (.+?)(?: - |$)", text, re.MULTILINE)
+            verdict = outcome if outcome == "timeout" else "killed" if names or outcome == "crashed" else "broken test"
+            by = names[0] if names else text[-300:]
+            break
+    path.write_text(whole)
+    os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    return {**mutant._asdict(), "verdict": verdict, "by": by, "tests": chosen[:number], "seconds": round(spent, 1)}
+
+
+def false_alarms(results: list[dict[str, object]], folder: str) -> None:
+    """Run the tests that killed on the tree as it is: a mutant that was killed by a test that fails anyway is not killed."""
+    prepare(folder)
+    names = sorted({str(r["by"]) for r in results if r["verdict"] == "killed" and "::" in str(r["by"])})
+    _, text, _ = tests(["--maxfail=1000", *names]) if names else ("", "", 0.0)
+    failed = set(re.findall(r"^(?:FAILED|ERROR) (.+?)(?: - |$)", text, re.MULTILINE))
+    for result in results:
+        if result["by"] in failed:
+            result["verdict"] = "broken test"
+
+
+def report(results: list[dict[str, object]], out: Path, seed: int) -> None:
+    """Write mutants.json and mutants.md, which names each survivor, and print the latter."""
+    (out / "mutants.json").write_text(json.dumps(results, indent=1))
+    counts = Counter(str(r["verdict"]) for r in results)
+    seconds = sum(float(str(r["seconds"])) for r in results)
+    lines = [f"# {len(results)} mutants of seed {seed}: {', '.join(f'{n} {verdict}' for verdict, n in sorted(counts.items()))}"]
+    lines += [f"{seconds:.0f} s of processor time", "", "| where | before | after | verdict |", "|---|---|---|---|"]
+    left = [r for r in results if r["verdict"] != "killed"]
+    lines += [f"| `{r['module']}:{r['line']}` | `{r['before']}` | `{r['after']}` | {r['verdict']} |" for r in left]
+    (out / "mutants.md").write_text("\n".join(lines) + "\n")
+    print("\n".join(lines))
+
+
+def options() -> argparse.Namespace:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.mutants", description=__doc__)
+    parser.add_argument("--count", type=int, default=50, help="how many mutants, spread over all modules")
+    parser.add_argument("--seed", type=int, default=7, help="of which ones")
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
+    parser.add_argument("--out", type=Path, default=ROOT / "out/mutants", help="folder of the report; of a run that was stopped: go on")
+    parser.add_argument("--again", type=Path, help="a mutants.json whose survivors are tried, instead of new ones")
+    parser.add_argument("--files", type=int, nargs=2, default=FILES, help="so many test files, then so many where a mutant survives")
+    parser.add_argument(
+        "--seconds", type=float, default=5.0, help="of processor time for the tests of a file: one that starts later is left out"
+    )
+    return parser.parse_args()
+
+
+def main() -> None:
+    """Run the command line."""
+    given = options()
+    given.out.mkdir(parents=True, exist_ok=True)
+    kernels, usual, kept = given.out.parent / "kernels-of-mutants", Path("~/.cache/warp").expanduser(), given.out / "mutants.json"
+    if usual.exists() and not kernels.exists():
+        shutil.copytree(usual, kernels)
+    os.environ["WARP_CACHE_PATH"] = str(kernels)
+    if given.again:
+        drawn = [Mutant(*(r[name] for name in Mutant._fields)) for r in json.loads(given.again.read_text()) if r["verdict"] != "killed"]
+    else:
+        drawn = draw(ROOT, given.count, given.seed)
+    results = json.loads(kept.read_text()) if kept.exists() else []
+    done = {tuple(r[name] for name in Mutant._fields[:4]) for r in results}
+    todo = [mutant for mutant in drawn if mutant[:4] not in done]
+    random.Random(given.seed).shuffle(todo)  # a run that is stopped has seen all packages
+    with tempfile.TemporaryDirectory() as folder:
+        with multiprocessing.get_context("fork").Pool(given.jobs, prepare, (folder, given.files, given.seconds)) as pool:
+            for result in pool.imap_unordered(judge, todo):
+                results.append(result)
+                print("{verdict:8}{seconds:6} s {module}:{line} {after}".format(**result), flush=True)
+                kept.write_text(json.dumps(results, indent=1))
+        false_alarms(results, folder)
+    report(results, given.out, given.seed)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,154 @@
+"""What is changed: cosmic-ray's operators that leave code plausible, calls left out, and operators within native C++ snippets."""
+
+from __future__ import annotations
+
+import random
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import parso
+from cosmic_ray.ast import ast_nodes
+from cosmic_ray.mutating import mutate_code
+from cosmic_ray.operators.operator import Operator
+from cosmic_ray.plugins import get_operator
+
+PACKAGES = ("warp_lcp", "fluids", "granular")
+APART = re.compile(r"/distributed|/__init__\.py$|parallel_|_table\.py$")  # needs ranks of MPI; names; tables of numbers
+
+BINARY = "Add_Sub Sub_Add Mul_Div Div_Mul FloorDiv_Mul Mod_FloorDiv Pow_Mul BitAnd_BitOr BitOr_BitAnd LShift_RShift"
+COMPARISON = "Lt_LtE Lt_GtE LtE_Lt LtE_Gt Gt_GtE Gt_LtE GtE_Gt GtE_Lt Eq_NotEq NotEq_Eq Is_IsNot IsNot_Is"
+PLAIN = "AddNot NumberReplacer ReplaceAndWithOr ReplaceOrWithAnd ReplaceTrueWithFalse ReplaceFalseWithTrue ReplaceBreakWithContinue"
+NAMES = (
+    *(f"core/ReplaceBinaryOperator_{name}" for name in BINARY.split()),
+    *(f"core/ReplaceComparisonOperator_{name}" for name in COMPARISON.split()),
+    *(f"core/{name}" for name in PLAIN.split()),
+    "core/ReplaceUnaryOperator_Delete_Not",
+    "core/ReplaceUnaryOperator_USub_UAdd",
+)
+SWAPS = {"+": "-", "-": "+", "*": "/", "/": "*", "<": "<=", "<=": "<", ">": ">=", ">=": ">", "==": "!=", "!=": "==", "&&": "||", "||": "&&"}
+SWAPS |= {"&": "|", "|": "&"}
+NATIVE = re.compile(r"(?<=[\w\])] )(?:[<>=!]=|&&|\|\||[-+*/<>&|])(?= [\w(!-])|(?<=[\w\])])[*/](?=[\w(])")
+
+
+class LeaveOut(Operator):
+    """Replace a statement that is a call, or that changes a variable in place, by `pass`."""
+
+    def mutation_positions(self, node: Any) -> Iterator[tuple[Any, Any]]:
+        """Yield where such a statement starts and ends."""
+        statement = node.parent is not None and node.parent.type == "simple_stmt"
+        call = node.type == "atom_expr" and getattr(node.children[-1], "children", [""])[0] == "("
+        inplace = node.type == "expr_stmt" and getattr(node.children[1], "value", node.children[1].type) not in ("=", "annassign")
+        if statement and (call or inplace):
+            yield node.start_pos, node.end_pos
+
+    def mutate(self, node: Any, index: int) -> Any:
+        """Return `pass`."""
+        return parso.python.tree.Keyword("pass", node.start_pos, node.get_first_leaf().prefix)
+
+    @classmethod
+    def examples(cls) -> tuple[()]:
+        """Return none."""
+        return ()
+
+
+class NativeSwap(LeaveOut):
+    """Swap one operator in the text of a native function."""
+
+    def mutation_positions(self, node: Any) -> Iterator[tuple[Any, Any]]:
+        """Yield where the operators of a string that reads like C++ stand."""
+        if node.type != "string" or node.parent.type == "simple_stmt" or ";" not in node.value:
+            return
+        line, column = node.start_pos
+        for match in self._matches(node.value):
+            before = node.value[: match.start()]
+            start = (line + before.count("\n"), match.start() - before.rfind("\n") - 1 if "\n" in before else column + match.start())
+            yield start, (start[0], start[1] + len(match[0]))
+
+    @staticmethod
+    def _matches(text: str) -> list[re.Match[str]]:
+        """Return the operators outside of comments and of the preprocessor's lines."""
+        return [m for m in NATIVE.finditer(text) if not re.search(r"//|^\s*#", text[text.rfind("\n", 0, m.start()) + 1 : m.start()])]
+
+    def mutate(self, node: Any, index: int) -> Any:
+        """Return the string with that operator swapped."""
+        match = self._matches(node.value)[index]
+        text = node.value[: match.start()] + SWAPS[match[0]] + node.value[match.end() :]
+        return parso.python.tree.String(text, node.start_pos, node.prefix)
+
+
+class Mutant(NamedTuple):
+    """One change: file, line, operator's name, which of the operator's places in the file, and the lines before and after."""
+
+    module: str
+    line: int
+    operator: str
+    occurrence: int
+    before: str
+    after: str
+
+
+def operator(name: str) -> Operator:
+    """Return a mutation operator by name."""
+    own = {"LeaveOut": LeaveOut, "NativeSwap": NativeSwap}
+    return own[name]() if name in own else get_operator(name)()
+
+
+def mutated(source: str, name: str, occurrence: int) -> str:
+    """Return the source with one change."""
+    return str(mutate_code(source, operator(name), occurrence))
+
+
+def draw(root: Path, count: int, seed: int) -> list[Mutant]:
+    """Return mutants at lines equally spaced over all modules, each with an operator that has a place there or next to there.
+
+    Args:
+        root: folder of the packages.
+        count: how many.
+        seed: of the first line and of the operators.
+    """
+    rng = random.Random(seed)
+    files = sorted(str(f.relative_to(root)) for package in PACKAGES for f in (root / package).rglob("*.py"))
+    lines = [(f, n + 1) for f in files if not APART.search(f) for n, text in enumerate((root / f).read_text().splitlines()) if text.strip()]
+    start = rng.random()
+    wanted = [lines[int((start + i) * len(lines) / count)] for i in range(count)]
+    sources = {module: (root / module).read_text() for module in {module for module, _ in wanted}}
+    places = {module: _places(source) for module, source in sources.items()}
+    found = []
+    for module, line in wanted:
+        if places[module]:
+            nearest = min(abs(at - line) for at, *_ in places[module])
+            at, name, occurrence = rng.choice([place for place in places[module] if abs(place[0] - line) == nearest])
+            old, new = (text.splitlines() for text in (sources[module], mutated(sources[module], name, occurrence)))
+            found.append(Mutant(module, at, name, occurrence, old[at - 1].strip(), new[at - 1].strip()))
+    return found
+
+
+def _places(source: str) -> list[tuple[int, str, int]]:
+    """Return line, operator's name and occurrence of all changes of a module but those in annotations and in what is raised."""
+    nodes = [(node, _inert(node)) for node in ast_nodes(parso.parse(source))]
+    places = []
+    for name in (*NAMES, "LeaveOut", "NativeSwap"):
+        change, occurrence = operator(name), 0
+        for node, inert in nodes:
+            for begin, _ in change.mutation_positions(node):
+                if not inert:
+                    places.append((begin[0], name, occurrence))
+                occurrence += 1
+    return places
+
+
+def _inert(node: Any) -> bool:
+    """Return whether a node lies in an annotation, a decorator or what is raised, or is a bare `*` between parameters."""
+    if node.parent is not None and node.parent.type == "parameters":
+        return True
+    while node.parent is not None:
+        before = node.get_previous_sibling()
+        annotated = node.parent.type in ("tfpdef", "annassign", "funcdef") and node.type != "suite"
+        if annotated and getattr(before, "value", "") in (":", "->"):
+            return True
+        node = node.parent
+        if node.type in ("raise_stmt", "decorator"):
+            return True
+    return False

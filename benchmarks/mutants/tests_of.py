@@ -1,0 +1,53 @@
+"""Which tests are run for a change of a module: those that bear its name, then those that name what it defines, then those of its users."""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from functools import cache
+from pathlib import Path
+
+# minutes each, or about other things: compilation for CUDA, pages and notebooks, ranks, runs that are killed
+NEVER = re.compile(
+    r"_slow|cuda_compiles|test_docs|notebook|readme|tutorial|gallery_page|on_ranks|tests/(distributed|benchmarks|fuzz)|killed_run|crash_points"
+)
+WORD = re.compile(r"\w+")
+
+
+@cache
+def _tests(root: Path) -> dict[str, set[str]]:
+    """Return the words of each test file."""
+    files = (str(f.relative_to(root)) for f in sorted((root / "tests").rglob("test_*.py")))
+    return {f: set(WORD.findall((root / f).read_text())) for f in files if not NEVER.search(f)}
+
+
+@cache
+def _users(root: Path) -> dict[str, set[str]]:
+    """Return the modules that import each module, by its last name and its package's."""
+    users = defaultdict(set)
+    for package in ("warp_lcp", "fluids", "granular"):
+        for file in (root / package).rglob("*.py"):
+            for whole, names in re.findall(r"^\s*from ([\w.]+) import (.+)$", file.read_text(), re.MULTILINE):
+                for name in [whole, *(f"{whole}.{word}" for word in WORD.findall(names))]:
+                    if file.name != "__init__.py":
+                        users[name.replace(".", "/") + ".py"].add(str(file.relative_to(root)))
+    return users
+
+
+def tests_of(root: Path, module: str) -> list[str]:
+    """Return test files, the likeliest to notice a change of a module first."""
+    score: dict[str, float] = defaultdict(float)
+    front, weight, seen = {module}, 1.0, set[str]()
+    for _ in range(3):
+        for file in front:
+            name = Path(file).stem.removesuffix("_kernels")
+            defined = set(re.findall(r"^(?:def|class) ([A-Za-z]\w{4,})|^([A-Z_]{5,}) =", (root / file).read_text(), re.MULTILINE))
+            words = {word for pair in defined for word in pair if word} | ({name} if len(name) > 4 else set())
+            for test, there in _tests(root).items():
+                same = name in test.rsplit("/", 1)[1]
+                place = Path(test).parent.name in file
+                score[test] += weight * (8 * same + len(words & there) ** 0.5 * (2 if place else 1)) / len(front) ** 0.5
+        seen |= front
+        front = {user for file in front for user in _users(root).get(file, ())} - seen
+        weight /= 4
+    return [test for test in sorted(score, key=lambda t: (-score[t], t)) if score[test] > 0]

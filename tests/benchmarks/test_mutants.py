@@ -1,0 +1,40 @@
+"""Mutants: drawn by seed from all packages, one change each, that leaves code; tests by the name of what is changed."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+from benchmarks.mutants.tests_of import tests_of as chosen_for
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_tests_that_bear_a_modules_name_come_first():
+    assert chosen_for(ROOT, "warp_lcp/multigrid/hierarchy.py")[0] == "tests/multigrid/test_hierarchy.py"
+    assert chosen_for(ROOT, "warp_lcp/material/sources_kernels.py")[0] == "tests/material/test_sources.py"
+
+
+def test_a_mutant_is_one_change_that_still_is_python():
+    pytest.importorskip("cosmic_ray")
+    from benchmarks.mutants.mutations import draw, mutated
+
+    drawn = draw(ROOT, 3, 5)
+    assert drawn == draw(ROOT, 3, 5)
+    assert len({mutant.module for mutant in drawn}) == 3
+    for mutant in drawn:
+        before = (ROOT / mutant.module).read_text()
+        after = mutated(before, mutant.operator, mutant.occurrence)
+        ast.parse(after)
+        pairs = list(zip(before.splitlines(), after.splitlines(), strict=False))
+        assert (mutant.before, mutant.after) in [(a.strip(), b.strip()) for a, b in pairs if a != b]
+
+
+def test_native_text_is_changed_between_operands_only():
+    pytest.importorskip("cosmic_ray")
+    from benchmarks.mutants.mutations import mutated
+
+    source = 'X = """\n#if A && B\n    const float* x = (const float*)y + row;  // a < b\n    if (*x < -1) { z = a*b; }\n"""\n'
+    swapped = {mutated(source, "NativeSwap", n) for n in range(3)}
+    assert swapped == {source.replace(*pair) for pair in [("y + row", "y - row"), ("x < -1", "x <= -1"), ("a*b", "a/b")]}
+    assert mutated(source, "NativeSwap", 3) == "None"
