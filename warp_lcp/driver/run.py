@@ -16,7 +16,7 @@ from warp_lcp.driver.log import Log, Value
 from warp_lcp.driver.problem_folder import ProblemFolder
 from warp_lcp.driver.profile import NoStopwatch, Profile, Stopwatch
 from warp_lcp.driver.progress import Observer
-from warp_lcp.driver.run_folder import Continuation, OutputError, RunFolder, RunRecord
+from warp_lcp.driver.run_folder import Continuation, OutputError, RunFolder, RunRecord, read_record
 from warp_lcp.driver.scene import Scene, Time
 from warp_lcp.driver.simulator import (
     Cells,
@@ -48,6 +48,7 @@ def run_scene(
     *,
     device: str,
     observer: Observer,
+    overrides: Sequence[dict[str, str]] = (),
     last_frame: int | None = None,
     resume: bool = False,
     force: bool = False,
@@ -63,6 +64,7 @@ def run_scene(
         out: the run's folder.
         device: a Warp device, such as `cuda:0`.
         observer: learns of every step.
+        overrides: by which the scene differs from its file, for run.json, see `warp_lcp.driver.given_scene`.
         last_frame: end after this frame; the scene's last one without it.
         resume: continue the run in the folder.
         force: delete the run in the folder.
@@ -89,7 +91,7 @@ def run_scene(
             _record_problems(simulation, scene, record_problems, more=resume)
         return simulation, notes
 
-    record = RunRecord(scene.scene.name, scene.scene.simulator, device)
+    record = RunRecord(scene.scene.name, scene.scene.simulator, device, overrides=list(overrides))
     return run_in_folder(
         folder,
         record,
@@ -142,6 +144,7 @@ def run_in_folder(
         continued: Continuation | None = None
         if resume:
             continued = folder.resume()
+            record.overrides = record.overrides or read_record(folder.path).get("overrides", [])
             record.warnings += continued.remarks
             record.changed, record.resampled_from_resolution = continued.changed, continued.resampled_from
             record.resumed_from_step = continued.checkpoint.step if continued.checkpoint else 0
@@ -151,6 +154,8 @@ def run_in_folder(
         record.warnings += notes
         for note in record.warnings:
             observer.note(note)
+        for change in record.changed:
+            observer.note(f"changed: {change}")
         checkpoint = continued.checkpoint if continued else None
         run = Run(folder.scene, simulation, folder, record, observer, profile, somewhere)
         with profile.kernels_apart() if profile else nullcontext():

@@ -61,6 +61,7 @@ class RunRecord:
         changed: the scene's keys that have other values than in the part before, with both.
         resampled_from_resolution: domain.resolution of the checkpoint, if the state was brought to another grid.
         mesh_files: a digest of what is in each mesh file, by its key.
+        overrides: what `--set` was given for this run, with the values of the scene's file, see `warp_lcp.driver.given_scene`.
         seconds: that this part of the run took.
         warnings: what the user should know about the results.
         versions: of the software.
@@ -80,6 +81,7 @@ class RunRecord:
     changed: list[str] = field(default_factory=list)
     resampled_from_resolution: int | None = None
     mesh_files: dict[str, str] = field(default_factory=dict)
+    overrides: list[dict[str, str]] = field(default_factory=list)
     seconds: float = 0.0
     warnings: list[str] = field(default_factory=list)
     versions: dict[str, str] = field(default_factory=versions)
@@ -242,7 +244,7 @@ class RunFolder:
         Raises:
             OSError: it cannot be written.
         """
-        record = self._record()
+        record = read_record(self.path)
         if record.get("status") == "running":
             write_text(self.path / RECORD, json.dumps({**record, "status": "failed", "reason": reason}, indent=2) + "\n")
 
@@ -268,8 +270,8 @@ class RunFolder:
 
     def _check_same_scene(self) -> None:
         """Refuse other values of keys that must not change, and mesh files that hold something else."""
-        before, now = _recorded_keys(self.path / SCENE), keys(self.scene)
-        known = self._record().get("mesh_files")
+        before, now = recorded_keys(self.path / SCENE), keys(self.scene)
+        known = read_record(self.path).get("mesh_files")
         files = known if isinstance(known, dict) else {}
         if before is None:  # killed before it was written: the checkpoints tell whose they are
             before = now
@@ -293,17 +295,9 @@ class RunFolder:
         except FileNotFoundError:
             return False
 
-    def _record(self) -> dict[str, Any]:
-        """Return what run.json says; nothing if it cannot be read."""
-        try:
-            record = json.loads((self.path / RECORD).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            return {}
-        return record if isinstance(record, dict) else {}
-
     def _other_versions(self) -> list[str]:
         """Return a remark if the run began with other software, which need not give the same bits."""
-        before = self._record().get("versions")
+        before = read_record(self.path).get("versions")
         if not isinstance(before, dict):
             return []
         now = versions()
@@ -322,7 +316,16 @@ class RunFolder:
         return own, foreign
 
 
-def _recorded_keys(path: Path) -> dict[str, Any] | None:
+def read_record(folder: Path) -> dict[str, Any]:
+    """Return what run.json says; nothing if it cannot be read."""
+    try:
+        record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return record if isinstance(record, dict) else {}
+
+
+def recorded_keys(path: Path) -> dict[str, Any] | None:
     """Return the keys of the scene as it ran; None if there is no such file or it is not a scene's."""
     try:
         return keys(load_scene(path))

@@ -286,7 +286,8 @@ class NarrowBand:
         for axis, field in enumerate(self.velocity):
             field.assign(state[f"interior_velocity_{axis}"])
         self.held = int(held)
-        self.interior = Interior(int(cells), squares, *np.reshape(vectors, (4, 3)), fastest)
+        velocity, center, low, high = np.reshape(vectors, (4, 3))
+        self.interior = Interior(int(cells), squares, velocity, center, low, high, fastest)
 
     def forget(self) -> None:
         """Begin with particles everywhere; the next exchange removes those deeper than the band."""
