@@ -299,7 +299,7 @@ class Run:
         start = self._frame()
         self._check_space(last, start)
         try:
-            with self.writer, closing(self._resume() if resumed else self._start(last, start)) as log:
+            with self.writer, closing(self._resume(start) if resumed else self._start(last, start)) as log:
                 self.observer.start(self.simulation.time, self.time.frame_time(last))
                 stopped = self._advance(log, last, stop)
                 self._write_checkpoint(log)
@@ -336,17 +336,17 @@ class Run:
         self._write_checkpoint(log)  # so that a run can be continued from its first moment on
         return log
 
-    def _resume(self) -> Log:
-        """Take back what an interrupted run wrote after its checkpoint."""
+    def _resume(self, frame: list[Part]) -> Log:
+        """Take back what an interrupted run wrote after its checkpoint, and tell what is missing of what it wrote before."""
         self.record.frames = self._frames_done()
         self._first_step = self.simulation.step_count
         self._count()
+        times = [self.time.frame_time(index) for index in range(self.record.frames + 1)]
+        for gap in self.folder.gaps(self._columns(), self._first_step, times, frame):
+            self._warn(gap)
         self.folder.go_on(self.record, self._first_step)
-        self.folder.frames.resume([self.time.frame_time(index) for index in range(self.record.frames + 1)])
-        try:
-            return self.folder.open_log(self._columns(), after_step=self.simulation.step_count)
-        except ValueError as error:
-            raise OutputError(str(error)) from error
+        self.folder.frames.resume(times)
+        return self.folder.open_log(self._columns(), after_step=self._first_step)
 
     def _columns(self) -> tuple[str, ...]:
         return ("step", "time", "dt", *self.simulation.columns(), "retries", "seconds")

@@ -18,11 +18,13 @@ from warp_lcp.driver.checkpoint import CHECKPOINT_FILE, REFUSED_FILE, Checkpoint
 from warp_lcp.driver.continuation import MAY_CHANGE, RESOLUTION, Change, differences, fingerprint, mesh_digests
 from warp_lcp.driver.folder_lock import LOCK, FolderBusyError, locked
 from warp_lcp.driver.frames import FRAME_FILE, FrameFolder, FrameWriter
+from warp_lcp.driver.gaps import gaps
 from warp_lcp.driver.log import Log
 from warp_lcp.driver.profile import Stopwatch
 from warp_lcp.driver.rank_folder import in_ranks, remove_empty_ranks
 from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.scene_file import dump_scene, keys, load_scene, table_keys
+from warp_lcp.driver.simulator import Part
 from warp_lcp.driver.table import SceneError
 from warp_lcp.driver.versions import versions
 
@@ -198,7 +200,8 @@ class RunFolder:
                 f"{self.path}: time.duration = {self.scene.time.duration:g} s ends before the checkpoint's time, {checkpoint.time:.6g} s: "
                 "frames would be lost; choose a longer one"
             )
-        remarks = [*refused, *self._other_versions()]
+        lost = [name for name, found in ((RECORD, read_record(self.path)), (SCENE, recorded_keys(self.path / SCENE))) if not found]
+        remarks = [*refused, *self._other_versions(), *(f"{name}: was missing or damaged; written anew" for name in lost)]
         if refused:
             remarks.append(f"continuing from step {checkpoint.step} instead; refused checkpoints stay as checkpoints/refused_*.npz")
         now = keys(self.scene)
@@ -209,6 +212,18 @@ class RunFolder:
         old = int(before.get(RESOLUTION, now[RESOLUTION]))
         changed = differences(before, now, Change.SAME_STEPS, Change.OTHER_STEPS, Change.RESAMPLED)
         return Continuation(checkpoint, remarks, changed, None if old == now[RESOLUTION] else old)
+
+    def gaps(self, columns: tuple[str, ...], step: int, times: list[float], frame: list[Part]) -> list[str]:
+        """Return a line for what the folder lacks of what was written up to a step, see `warp_lcp.driver.gaps`.
+
+        Raises:
+            OSError: a file cannot be read.
+            OutputError: the log has other columns.
+        """
+        try:
+            return gaps(self.log, columns, self.frames, self.checkpoints, step=step, times=times, frame=frame)
+        except ValueError as error:
+            raise OutputError(str(error)) from error
 
     def go_on(self, record: RunRecord, step: int) -> None:
         """Begin to write behind a step, once everything is known to fit: what a killed process left half-written goes.
@@ -289,11 +304,12 @@ class RunFolder:
             raise OutputError("\n  ".join([head, *changes, f"may change: {MAY_CHANGE}"]))
 
     def _has_steps(self) -> bool:
-        """Return whether the log has a row."""
-        try:
-            return len(self.log.read_text(encoding="utf-8").splitlines()) > 1
-        except FileNotFoundError:
-            return False
+        """Return whether the log has a row, or a frame or the record tells of a step."""
+        rows = self.log.read_bytes().count(b"\n") if self.log.is_file() else 0
+        later = any(
+            match and int(match["index"]) for match in map(FRAME_FILE.fullmatch, (file.name for file in in_ranks(self.frames.frames)))
+        )
+        return rows > 1 or later or bool(read_record(self.path).get("steps"))
 
     def _other_versions(self) -> list[str]:
         """Return a remark if the run began with other software, which need not give the same bits."""
