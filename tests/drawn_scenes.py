@@ -30,13 +30,12 @@ def _tables(rng: random.Random) -> Tables:
     data: Tables = {
         "scene": {"simulator": "fluids" if liquid else "granular", "name": "drawn"},
         "time": {"duration": 5.0, "frames_per_second": rng.choice([20, 60])},
-        "domain": {"size": size, "resolution": rng.choice([10, 12] if dimension == 3 else [20, 28])},
+        "domain": {"size": size, "resolution": 10 if dimension == 3 else rng.choice([20, 25])},
         "output": {"surface": _half(rng), "volume": dimension == 3 and _half(rng), "diagnostics": _half(rng)},
         "particles": {"transfer": rng.choice(["apic", "apic", "flip", "pic"])},
     }
     domain = data["domain"]
-    domain["solids"] = rng.choice(["cut-cell", "cut-cell", "voxel"])
-    domain["wall"] = rng.choice(["separating", "free-slip"])
+    domain["wall"] = rng.choice(["separating", "free-slip"]) if liquid else "separating"
     if _half(rng, 0.3):
         domain["open"] = rng.sample(["left", "right", "top", "bottom"], rng.choice([1, 2]))
     if _half(rng):
@@ -49,6 +48,8 @@ def _tables(rng: random.Random) -> Tables:
         low = [rng.uniform(0.0, 0.7), *[0.0] * (dimension - 1)]
         data["drain"] = [_box(low, [low[0] + 0.2, 0.1, 0.6][:dimension]) | {"start": rng.choice([0.0, 0.05, 0.12])}]
     data["solid"] = _solids(rng, dimension, bodies=_half(rng), sand=not liquid)
+    if not any("motion" in solid or "density" in solid for solid in data["solid"]):
+        domain["solids"] = rng.choice(["cut-cell", "voxel"])
     material = [_box([0.0] * dimension, [rng.uniform(0.3, 1.0), rng.uniform(0.3, 0.6), 0.6][:dimension])]
     if _half(rng, 0.4):
         velocity = [rng.uniform(-2.0, 2.0) for _ in range(dimension)]
@@ -67,7 +68,7 @@ def _liquid(rng: random.Random, data: Tables, material: list[Tables], dimension:
         data["pressure"]["surface"] = "ghost-fluid"
         material[0]["max"][:2] = [rng.uniform(0.7, 1.0), rng.uniform(0.5, 0.65)]
         if dimension == 2:
-            data["domain"]["resolution"] = rng.choice([36, 44])
+            data["domain"]["resolution"] = rng.choice([35, 40])
     data["solver"] = {"method": rng.choice(LIQUID_METHODS), "max_iterations": 2000, "precision": rng.choice(["mixed", "single", "double"])}
     if _half(rng, 0.2):
         data["solver"]["tolerance"] = "auto"
