@@ -74,6 +74,7 @@ def revive(scene: Path, out: Path) -> int:
         resumed = go(scene, out)
         assert resumed.resumed_from_step is None
     assert resumed.status == "finished"
+    assert not [warning for warning in resumed.warnings if "missing" in warning]
     assert json.loads((out / "run.json").read_text())["resumed_from_step"] == resumed.resumed_from_step
     return resumed.resumed_from_step or 0
 

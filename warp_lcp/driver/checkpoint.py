@@ -89,6 +89,9 @@ class CheckpointFolder:
         folder: made when the first checkpoint is written.
         fingerprint: tells the run's scene from others, whatever may change when it goes on.
         keys: of the scene, with their values, written with each checkpoint.
+
+    Attributes:
+        spared: steps whose checkpoints `prune` leaves, as something that is missing can be made again from them.
     """
 
     def __init__(self, folder: Path, fingerprint: str, keys: Mapping[str, Any] | None = None) -> None:
@@ -96,6 +99,7 @@ class CheckpointFolder:
         self.folder = folder
         self.fingerprint = fingerprint
         self.keys = dict(keys or {})
+        self.spared: set[int] = set()
 
     def path(self, step: int) -> Path:
         """Return the file of a step."""
@@ -132,13 +136,14 @@ class CheckpointFolder:
         return self.path(checkpoint.step)
 
     def prune(self, kept: int) -> None:
-        """Delete all but the newest `kept`, and pieces that belong to none.
+        """Delete all but the newest `kept` and those that are spared, and pieces that belong to none.
 
         Raises:
             OSError: a file cannot be deleted.
         """
         for step in self.steps()[kept:]:
-            self.path(step).unlink()
+            if step not in self.spared:
+                self.path(step).unlink()
         steps = self.steps()
         for step, piece in self._all_pieces():
             if step not in steps:

@@ -16,7 +16,7 @@ import warp as wp
 from warp_lcp.driver.benchmark import benchmarks
 from warp_lcp.driver.calibrate import step_seconds
 from warp_lcp.driver.check import check_memory, check_scene
-from warp_lcp.driver.crew import crew_of
+from warp_lcp.driver.crew import crew_of, default_folder
 from warp_lcp.driver.devices import DeviceError, choose_device, cuda_driver, devices
 from warp_lcp.driver.engine import Engine, EngineError, EngineOption
 from warp_lcp.driver.film import check_rate
@@ -87,11 +87,20 @@ def quiet() -> None:
 
 @app.command()
 def run(
-    scene: SceneArgument,
+    scene: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="SCENE",
+            help="A scene file, or the name of a built-in scene (see `warp-lcp scenes`); --resume --out DIR does without.",
+            show_default=False,
+        ),
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="The run's folder; out/NAME unless given.", show_default=False)] = None,
     device: Annotated[str | None, typer.Option(help="cpu or cuda:N; a GPU where there is one unless given.", show_default=False)] = None,
     frames: Annotated[int | None, typer.Option(min=0, metavar="N", help="End after frame N.", show_default=False)] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue the run in the folder from its newest checkpoint.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue the run in the folder, with what --set gave it, from its newest checkpoint.")
+    ] = False,
     force: Annotated[bool, typer.Option("--force", help="Delete the run in the folder first.")] = False,
     force_memory: ForceMemory = False,
     profile: Annotated[bool, typer.Option("--profile", help="Measure where the time goes; also into profile.json.")] = False,
@@ -107,10 +116,11 @@ def run(
         if resume and force:
             raise OutputError("--resume continues a run and --force deletes it: choose one")
         loaded = crew.load(scene, overrides or (), given)
-        chosen = crew.choose_device(device)
-        folder = out or Path("out") / loaded.scene.name
-        console = crew.console
-        say(console, f"{loaded.scene.name} on {crew.place(chosen)}, into {folder}")
+        chosen, console = crew.choose_device(device), crew.console
+        folder, name = out or default_folder(loaded.scene), loaded.scene.scene.name
+        say(console, f"{name} on {crew.place(chosen)}, into {folder}")
+        if loaded.kept:
+            say(console, f"--set as before: {', '.join(loaded.kept)}")
         stop = Interruption(partial(say, console), at_once=crew.ranks is None, last=partial(mark_stopped, folder))
         with stop, Bar(console) if console.is_terminal else Lines(console) as observer:
             watch = Profile(chosen) if profile and crew.speaks else None

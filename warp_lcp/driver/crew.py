@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 from warp_lcp.driver.devices import choose_device
 from warp_lcp.driver.engine import Engine
+from warp_lcp.driver.given_scene import GivenScene, given_scene, scene_to_resume
 from warp_lcp.driver.profile import Profile
 from warp_lcp.driver.progress import Observer
 from warp_lcp.driver.run import run_scene
-from warp_lcp.driver.run_folder import RunRecord
+from warp_lcp.driver.run_folder import OutputError, RunRecord
 from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.scene_file import load_scene
 from warp_lcp.driver.terminal import Terminal
@@ -34,18 +35,26 @@ class Crew:
         self.console = console or Terminal(stderr=True)
         self.speaks = speaks
 
-    def load(self, scene: str, overrides: Sequence[str], options: Mapping[str, Any]) -> Scene:
-        """Return a scene.
+    def load(self, scene: str | None, overrides: Sequence[str], options: Mapping[str, Any]) -> GivenScene:
+        """Return the scene of a run, or of one that goes on.
 
         Args:
-            scene: as of `load_scene`.
+            scene: as of `load_scene`; None: that of the folder.
             overrides: as of `load_scene`.
             options: of the command, by their names.
 
         Raises:
+            OutputError: there is no run to go on with.
             SceneError: listing everything that is wrong.
         """
-        return load_scene(scene, overrides)
+        out = options.get("--out")
+        if not options.get("--resume"):
+            if scene is None:
+                raise OutputError("SCENE is missing: a scene file or the name of a built-in one; --resume --out DIR goes on without")
+            return given_scene(scene, overrides)
+        if out is None and scene is None:
+            raise OutputError("--resume: needs SCENE or --out DIR, the folder of the run")
+        return scene_to_resume(out or default_folder(load_scene(scene or "", overrides)), scene, overrides)
 
     def agree(self, given: Mapping[str, Any]) -> None:
         """Check that all were given the same values, by their names.
@@ -77,7 +86,7 @@ class Crew:
 
     def run(
         self,
-        scene: Scene,
+        given: GivenScene,
         out: Path,
         *,
         device: str,
@@ -90,16 +99,21 @@ class Crew:
         profile: Profile | None,
         record_problems: Path | None,
     ) -> RunRecord:
-        """Simulate a scene, as `run_scene` does.
+        """Simulate a scene that `load` returned, as `run_scene` does.
 
         Raises:
             OutputError: the folder cannot take the run.
             SceneError: the scene cannot be simulated.
         """
         return run_scene(
-            scene, out, device=device, observer=observer, last_frame=last_frame, resume=resume, force=force, force_memory=force_memory,
-            stop=stop, profile=profile, record_problems=record_problems,
+            given.scene, out, overrides=given.overrides, device=device, observer=observer, last_frame=last_frame, resume=resume,
+            force=force, force_memory=force_memory, stop=stop, profile=profile, record_problems=record_problems,
         )  # fmt: skip
+
+
+def default_folder(scene: Scene) -> Path:
+    """Return the folder of a scene's run where none is given."""
+    return Path("out") / scene.scene.name
 
 
 @contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import deque
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
@@ -11,6 +12,7 @@ from typing import Literal, Self
 
 from warp_lcp.driver.atomic import make_folder, write_text
 from warp_lcp.driver.nvdb import nvdb_bytes, write_nvdb
+from warp_lcp.driver.pieces import WHOLE, piece_files
 from warp_lcp.driver.ply import ply_bytes, write_ply
 from warp_lcp.driver.profile import NoStopwatch, Stopwatch
 from warp_lcp.driver.rank_folder import in_ranks
@@ -98,6 +100,23 @@ class FrameFolder:
                 self._times.setdefault(match["name"], []).append((times[index], f"frames/{file.name}"))
         for name, entries in self._times.items():
             write_text(self.folder / f"{name}.pvd", collection(entries))
+
+    def kinds(self, frame: Sequence[Part]) -> list[str]:
+        """Return what `missing` looks for in a frame: the names of its parts, with `.ply` where a part has such a file too."""
+        return [part.name for part in frame] + [f"{part.name}.ply" for part in frame if self.surface_ply and isinstance(part, Surface)]
+
+    def missing(self, kind: str, count: int) -> list[int]:
+        """Return which of the first `count` frames have no file of a kind, or not all pieces of one that ranks wrote.
+
+        Raises:
+            OSError: a file cannot be read.
+        """
+        found, ply = set(), kind.endswith(".ply")
+        for file in self.frames.iterdir() if self.frames.is_dir() else ():
+            match = FRAME_FILE.fullmatch(file.name)
+            if match and match["name"] == kind.removesuffix(".ply") and (match["format"] == "ply") == ply and _is_whole(file):
+                found.add(int(match["index"]))
+        return sorted({*range(count)} - found)
 
     def write_part(self, path: Path, part: Part) -> Path:
         """Write a part to a path that gets the suffix of its format; return the file.
@@ -201,6 +220,14 @@ def frame_bytes(frame: list[Part], grid_format: GridFormat = "vtu", *, surface_p
     """
     more = sum(ply_bytes(part) for part in frame if surface_ply and isinstance(part, Surface))
     return more + sum(_bytes(part, grid_format) for part in frame)
+
+
+def _is_whole(file: Path) -> bool:
+    """Return whether all files are there that one with the pieces of ranks names."""
+    try:
+        return file.suffix[1:] not in WHOLE.values() or all(piece.is_file() for piece in piece_files(file))
+    except ValueError:
+        return False
 
 
 def collection(entries: list[tuple[float, str]]) -> str:

@@ -31,7 +31,7 @@ class Log:
         """
         self.columns = columns
         header = ",".join(columns)
-        lines = [header] if after_step is None else _rows_until(path, header, after_step)
+        lines = [header] if after_step is None else rows_until(path, header, after_step)
         write_text(path, "".join(f"{line}\n" for line in lines))
         self._file: TextIO = open(path, "a", buffering=1, encoding="utf-8", newline="")  # noqa: SIM115 - `close` closes it
         self._writer = csv.DictWriter(self._file, columns, lineterminator="\n")
@@ -67,15 +67,25 @@ def _cell(value: Value) -> Value:
     return value
 
 
-def _rows_until(path: Path, header: str, step: int) -> list[str]:
-    if not path.is_file():
-        return [header]
-    found, *rows = path.read_text(encoding="utf-8").splitlines() or [""]
-    if found != header:
+def rows_until(path: Path, header: str, step: int) -> list[str]:
+    """Return the header of a log and its rows up to a step, in their order; rows that are cut short or of no step are left out.
+
+    Args:
+        path: the file; there may be none.
+        header: that it must have, unless it was cut even there.
+        step: the last one.
+
+    Raises:
+        ValueError: the file has other columns.
+    """
+    text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else f"{header}\n"
+    found, *rows = text.split("\n")[:-1] or [""]  # what no line break ends was cut
+    if found != header and (rows or not header.startswith(found)):
         raise ValueError(f"{path}: its columns are {found!r}, this run's are {header!r}")
-    kept = [header]
+    kept, last = [header], 0
     for row in rows:
         number = row.split(",", 1)[0]
-        if row.count(",") >= header.count(",") and number.isdecimal() and int(number) <= step:
+        if row.count(",") >= header.count(",") and number.isdecimal() and last < int(number) <= step:
             kept.append(row)
+            last = int(number)
     return kept

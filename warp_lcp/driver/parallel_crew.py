@@ -19,11 +19,11 @@ from warp_lcp.driver.continuation import mesh_digests
 from warp_lcp.driver.crew import Crew
 from warp_lcp.driver.devices import DeviceError, devices
 from warp_lcp.driver.engine import EngineError
+from warp_lcp.driver.given_scene import GivenScene
 from warp_lcp.driver.parallel_run import run_on_ranks
 from warp_lcp.driver.profile import Profile
 from warp_lcp.driver.progress import Observer
 from warp_lcp.driver.run_folder import OutputError, RunFolder, RunRecord
-from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.scene_file import keys
 from warp_lcp.driver.simulator import SimulationFailed, StepFailed
 from warp_lcp.driver.solve_file import ProblemError
@@ -50,7 +50,7 @@ class RankCrew(Crew):
         self.meeting = Meeting(ranks, PLANNED, self._last_words)
         self._folder: RunFolder | None = None
 
-    def load(self, scene: str, overrides: Sequence[str], options: Mapping[str, Any]) -> Scene:
+    def load(self, scene: str | None, overrides: Sequence[str], options: Mapping[str, Any]) -> GivenScene:
         """Return a scene that is the same on all ranks.
 
         Raises:
@@ -58,10 +58,10 @@ class RankCrew(Crew):
             OutputError: ranks were started with different scenes or options; the message names what differs.
         """
         with self.meeting.together():
-            loaded = super().load(scene, overrides, options)
-            given = {**options, **keys(loaded), **{f"the content of {key}": value for key, value in mesh_digests(loaded).items()}}
-        self.agree(given)
-        return loaded
+            given = super().load(scene, overrides, options)
+            meshes = {f"the content of {key}": value for key, value in mesh_digests(given.scene).items()}
+        self.agree({**options, **keys(given.scene), **meshes})
+        return given
 
     def choose_device(self, name: str | None) -> str:
         """Return the device of this rank.
@@ -83,7 +83,7 @@ class RankCrew(Crew):
 
     def run(
         self,
-        scene: Scene,
+        given: GivenScene,
         out: Path,
         *,
         device: str,
@@ -96,7 +96,7 @@ class RankCrew(Crew):
         profile: Profile | None,
         record_problems: Path | None,
     ) -> RunRecord:
-        """Simulate a scene, as `run_on_ranks` does.
+        """Simulate a scene that `load` returned, as `run_on_ranks` does.
 
         Raises:
             OutputError: the folder cannot take the run.
@@ -104,10 +104,10 @@ class RankCrew(Crew):
         """
         if record_problems is not None:
             raise OutputError("--record-problems: not with --engine petsc, whose ranks have but parts of a problem")
-        self._folder = RunFolder(out, scene)
+        self._folder = RunFolder(out, given.scene)
         return run_on_ranks(
-            scene, out, meeting=self.meeting, device=device, observer=observer, last_frame=last_frame, resume=resume, force=force,
-            force_memory=force_memory, stop=stop, profile=profile,
+            given.scene, out, meeting=self.meeting, device=device, observer=observer, overrides=given.overrides, last_frame=last_frame,
+            resume=resume, force=force, force_memory=force_memory, stop=stop, profile=profile,
         )  # fmt: skip
 
     @property

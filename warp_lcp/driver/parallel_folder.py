@@ -18,6 +18,7 @@ from warp_lcp.driver.parallel_frames import ParallelFrames, ParallelFrameWriter
 from warp_lcp.driver.profile import Stopwatch
 from warp_lcp.driver.run_folder import CHECKPOINTS, RECORD, Continuation, OutputError, RunFolder, RunRecord
 from warp_lcp.driver.scene import Scene
+from warp_lcp.driver.simulator import Part
 
 
 class ParallelLog(Log):
@@ -156,6 +157,11 @@ class ParallelRunFolder(RunFolder):
             with self.meeting.together():
                 state = whole if self._first else self.checkpoints.read(checkpoint.step).state
             return replace(continued, checkpoint=replace(checkpoint, state=state))
+
+    def gaps(self, columns: tuple[str, ...], step: int, times: list[float], frame: list[Part]) -> list[str]:
+        """Return a line for what the folder lacks, as `RunFolder.gaps` does."""
+        with self.meeting.led():
+            return super().gaps(columns, step, times, frame) if self._first else []
 
     def go_on(self, record: RunRecord, step: int) -> None:
         """Begin to write behind a step, as `RunFolder.go_on` does."""

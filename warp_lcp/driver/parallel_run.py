@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -132,6 +132,7 @@ def run_on_ranks(
     meeting: Meeting,
     device: str,
     observer: Observer,
+    overrides: Sequence[dict[str, str]] = (),
     last_frame: int | None = None,
     resume: bool = False,
     force: bool = False,
@@ -147,6 +148,7 @@ def run_on_ranks(
         meeting: of the ranks.
         device: of this rank.
         observer: learns of every step; one that says nothing, but on the first rank.
+        overrides: as of `run_scene`.
         last_frame: as of `run_scene`.
         resume: as of `run_scene`; the run may have had another number of ranks.
         force: as of `run_scene`.
@@ -174,7 +176,9 @@ def run_on_ranks(
         return AgreedSimulation(simulation, meeting), simulation.notes()
 
     ranks = meeting.ranks
-    record = RunRecord(scene.scene.name, scene.scene.simulator, device, engine=Engine.PETSC.value, ranks=ranks.size)
+    record = RunRecord(
+        scene.scene.name, scene.scene.simulator, device, engine=Engine.PETSC.value, ranks=ranks.size, overrides=list(overrides)
+    )  # fmt: skip
     return run_in_folder(
         folder, record, create, observer=observer, last_frame=last_frame, resume=resume, force=force, stop=stop, profile=profile,
         somewhere=ranks.any,

@@ -17,7 +17,7 @@ from warp_lcp.driver.log import Log, Value
 from warp_lcp.driver.problem_folder import ProblemFolder
 from warp_lcp.driver.profile import NoStopwatch, Profile, Stopwatch
 from warp_lcp.driver.progress import Observer
-from warp_lcp.driver.run_folder import BEFORE, Continuation, OutputError, RunFolder, RunRecord
+from warp_lcp.driver.run_folder import BEFORE, Continuation, OutputError, RunFolder, RunRecord, read_record
 from warp_lcp.driver.scene import Scene, Time
 from warp_lcp.driver.simulator import (
     Cells,
@@ -49,6 +49,7 @@ def run_scene(
     *,
     device: str,
     observer: Observer,
+    overrides: Sequence[dict[str, str]] = (),
     last_frame: int | None = None,
     resume: bool = False,
     force: bool = False,
@@ -64,6 +65,7 @@ def run_scene(
         out: the run's folder.
         device: a Warp device, such as `cuda:0`.
         observer: learns of every step.
+        overrides: by which the scene differs from its file, for run.json, see `warp_lcp.driver.given_scene`.
         last_frame: end after this frame; the scene's last one without it.
         resume: continue the run in the folder.
         force: delete the run in the folder.
@@ -90,7 +92,7 @@ def run_scene(
             _record_problems(simulation, scene, record_problems, more=resume)
         return simulation, notes
 
-    record = RunRecord(scene.scene.name, scene.scene.simulator, device)
+    record = RunRecord(scene.scene.name, scene.scene.simulator, device, overrides=list(overrides))
     return run_in_folder(
         folder,
         record,
@@ -143,6 +145,7 @@ def run_in_folder(
         continued: Continuation | None = None
         if resume:
             continued = folder.resume()
+            record.overrides = record.overrides or read_record(folder.path).get("overrides", [])
             record.warnings += continued.remarks
             record.changed, record.resampled_from_resolution = continued.changed, continued.resampled_from
             record.resumed_from_step = continued.checkpoint.step if continued.checkpoint else 0
@@ -152,6 +155,8 @@ def run_in_folder(
         record.warnings += notes
         for note in record.warnings:
             observer.note(note)
+        for change in record.changed:
+            observer.note(f"changed: {change}")
         checkpoint = continued.checkpoint if continued else None
         run = Run(folder.scene, simulation, folder, record, observer, profile, somewhere)
         with profile.kernels_apart() if profile else nullcontext():
@@ -295,7 +300,7 @@ class Run:
         start = self._frame()
         self._check_space(last, start)
         try:
-            with self.writer, closing(self._resume() if resumed else self._start(last, start)) as log:
+            with self.writer, closing(self._resume(start) if resumed else self._start(last, start)) as log:
                 self.observer.start(self.simulation.time, self.time.frame_time(last))
                 stopped = self._advance(log, last, stop)
                 self._write_checkpoint(log)
@@ -336,17 +341,17 @@ class Run:
             stack.pop_all()
         return log
 
-    def _resume(self) -> Log:
-        """Take back what an interrupted run wrote after its checkpoint."""
+    def _resume(self, frame: list[Part]) -> Log:
+        """Take back what an interrupted run wrote after its checkpoint, and tell what is missing of what it wrote before."""
         self.record.frames = self._frames_done()
         self._first_step = self.simulation.step_count
         self._count()
+        times = [self.time.frame_time(index) for index in range(self.record.frames + 1)]
+        for gap in self.folder.gaps(self._columns(), self._first_step, times, frame):
+            self._warn(gap)
         self.folder.go_on(self.record, self._first_step)
-        self.folder.frames.resume([self.time.frame_time(index) for index in range(self.record.frames + 1)])
-        try:
-            return self.folder.open_log(self._columns(), after_step=self.simulation.step_count)
-        except ValueError as error:
-            raise OutputError(str(error)) from error
+        self.folder.frames.resume(times)
+        return self.folder.open_log(self._columns(), after_step=self._first_step)
 
     def _columns(self) -> tuple[str, ...]:
         return ("step", "time", "dt", *self.simulation.columns(), "retries", "seconds")

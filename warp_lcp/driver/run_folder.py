@@ -19,11 +19,13 @@ from warp_lcp.driver.continuation import MAY_CHANGE, RESOLUTION, Change, differe
 from warp_lcp.driver.folder_lock import LOCK, FolderBusyError, locked
 from warp_lcp.driver.foreign import one_line
 from warp_lcp.driver.frames import FRAME_FILE, FrameFolder, FrameWriter
+from warp_lcp.driver.gaps import gaps
 from warp_lcp.driver.log import Log
 from warp_lcp.driver.profile import Stopwatch
 from warp_lcp.driver.rank_folder import in_ranks, remove_empty_ranks
 from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.scene_file import dump_scene, keys, load_scene, table_keys
+from warp_lcp.driver.simulator import Part
 from warp_lcp.driver.table import SceneError
 from warp_lcp.driver.versions import versions
 
@@ -64,6 +66,7 @@ class RunRecord:
         changed: the scene's keys that have other values than in the part before, with both.
         resampled_from_resolution: domain.resolution of the checkpoint, if the state was brought to another grid.
         mesh_files: a digest of what is in each mesh file, by its key.
+        overrides: what `--set` was given for this run, with the values of the scene's file, see `warp_lcp.driver.given_scene`.
         seconds: that this part of the run took.
         warnings: what the user should know about the results.
         versions: of the software.
@@ -83,6 +86,7 @@ class RunRecord:
     changed: list[str] = field(default_factory=list)
     resampled_from_resolution: int | None = None
     mesh_files: dict[str, str] = field(default_factory=dict)
+    overrides: list[dict[str, str]] = field(default_factory=list)
     seconds: float = 0.0
     warnings: list[str] = field(default_factory=list)
     versions: dict[str, str] = field(default_factory=versions)
@@ -204,7 +208,8 @@ class RunFolder:
                 f"{self.path}: time.duration = {self.scene.time.duration:g} s ends before the checkpoint's time, {checkpoint.time:.6g} s: "
                 "frames would be lost; choose a longer one"
             )
-        remarks = [*refused, *self._other_versions()]
+        lost = [name for name, found in ((RECORD, read_record(self.path)), (SCENE, recorded_keys(self.path / SCENE))) if not found]
+        remarks = [*refused, *self._other_versions(), *(f"{name}: was missing or damaged; written anew" for name in lost)]
         if refused:
             remarks.append(f"continuing from step {checkpoint.step} instead; refused checkpoints stay as checkpoints/refused_*.npz")
         now = keys(self.scene)
@@ -215,6 +220,18 @@ class RunFolder:
         old = int(before.get(RESOLUTION, now[RESOLUTION]))
         changed = differences(before, now, Change.SAME_STEPS, Change.OTHER_STEPS, Change.RESAMPLED)
         return Continuation(checkpoint, remarks, changed, None if old == now[RESOLUTION] else old)
+
+    def gaps(self, columns: tuple[str, ...], step: int, times: list[float], frame: list[Part]) -> list[str]:
+        """Return a line for what the folder lacks of what was written up to a step, see `warp_lcp.driver.gaps`.
+
+        Raises:
+            OSError: a file cannot be read.
+            OutputError: the log has other columns.
+        """
+        try:
+            return gaps(self.log, columns, self.frames, self.checkpoints, step=step, times=times, frame=frame)
+        except ValueError as error:
+            raise OutputError(str(error)) from error
 
     def go_on(self, record: RunRecord, step: int) -> None:
         """Begin to write behind a step, once everything is known to fit: what a killed process left half-written goes.
@@ -278,8 +295,8 @@ class RunFolder:
 
     def _check_same_scene(self) -> None:
         """Refuse other values of keys that must not change, and mesh files that hold something else."""
-        before, now = _recorded_keys(self.path / SCENE), keys(self.scene)
-        known = _record(self.path).get("mesh_files")
+        before, now = recorded_keys(self.path / SCENE), keys(self.scene)
+        known = read_record(self.path).get("mesh_files")
         files = known if isinstance(known, dict) else {}
         if before is None:  # killed before it was written: the checkpoints tell whose they are
             before = now
@@ -297,15 +314,16 @@ class RunFolder:
             raise OutputError("\n  ".join([head, *changes, f"may change: {MAY_CHANGE}"]))
 
     def _has_steps(self) -> bool:
-        """Return whether the log has a row."""
-        try:
-            return len(self.log.read_text(encoding="utf-8").splitlines()) > 1
-        except FileNotFoundError:
-            return False
+        """Return whether the log has a row, or a frame or the record tells of a step."""
+        rows = self.log.read_bytes().count(b"\n") if self.log.is_file() else 0
+        later = any(
+            match and int(match["index"]) for match in map(FRAME_FILE.fullmatch, (file.name for file in in_ranks(self.frames.frames)))
+        )
+        return rows > 1 or later or bool(read_record(self.path).get("steps"))
 
     def _other_versions(self) -> list[str]:
         """Return a remark if the run began with other software, which need not give the same bits."""
-        before = _record(self.path).get("versions")
+        before = read_record(self.path).get("versions")
         if not isinstance(before, dict):
             return []
         now = versions()
@@ -332,12 +350,12 @@ def mark_stopped(folder: Path, signal: str) -> None:
 
 def _end_record(folder: Path, status: Status, reason: str) -> None:
     """Write into run.json how the run has ended, if it says that it is running."""
-    record = _record(folder)
+    record = read_record(folder)
     if record.get("status") == "running":
         write_text(folder / RECORD, json.dumps({**record, "status": status, "reason": reason}, indent=2) + "\n", spare=True)
 
 
-def _record(folder: Path) -> dict[str, Any]:
+def read_record(folder: Path) -> dict[str, Any]:
     """Return what run.json says; nothing if it cannot be read."""
     try:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
@@ -346,7 +364,7 @@ def _record(folder: Path) -> dict[str, Any]:
     return record if isinstance(record, dict) else {}
 
 
-def _recorded_keys(path: Path) -> dict[str, Any] | None:
+def recorded_keys(path: Path) -> dict[str, Any] | None:
     """Return the keys of the scene as it ran; None if there is no such file or it is not a scene's."""
     try:
         return keys(load_scene(path))

@@ -68,6 +68,31 @@ def load_scene(path_or_name: str | Path, overrides: Sequence[str] = ()) -> Scene
     return scene
 
 
+def override_key(override: str) -> str:
+    """Return the key that an override sets, such as `liquid.0.max`."""
+    return override.partition("=")[0].strip()
+
+
+def override_value(override: str) -> str:
+    """Return the value that an override sets, in words."""
+    return written(_value(override.partition("=")[2].strip()))
+
+
+def scene_value(path_or_name: str, override: str) -> str:
+    """Return the value that a scene's file has where an override sets one, in words; `null` if there is none.
+
+    Raises:
+        SceneError: the file cannot be read.
+    """
+    value: Any = _parse(_find(path_or_name), path_or_name)
+    for key in override_key(override).split("."):
+        if isinstance(value, list) and key.isdecimal() and int(key) < len(value):
+            value = value[int(key)]
+        else:
+            value = value.get(key) if isinstance(value, dict) else None
+    return written(value)
+
+
 def check_shapes(scene: Scene, source: str) -> None:
     """Build every shape of a scene, which reads its meshes.
 

@@ -270,7 +270,8 @@ class NarrowBand:
         for axis, field in enumerate(self.velocity):
             near = wanted | np.roll(wanted, 1, axis=2 - axis)
             faces[f"interior_velocity_{axis}"] = np.where(near, field.numpy(), np.float32(0.0))
-        return {"depth": np.where(wanted, depth, np.float32(0.0)), "interior": np.array([self.held, self.width])} | faces
+        sums = np.hstack([self.held, self.width, *vars(self.interior).values()])  # over where solids were, in an order that windows set
+        return {"depth": np.where(wanted, depth, np.float32(0.0)), "interior": sums} | faces
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from `state`.
@@ -278,14 +279,15 @@ class NarrowBand:
         Raises:
             ValueError: the band had another width.
         """
-        held, width = state["interior"]
+        held, width, cells, squares, *vectors, fastest = state["interior"].tolist()
         if width != self.width:
             raise ValueError(f"the state's narrow band is {width:g} cells wide: this scene's is {self.width:g}")
         self.depth.assign(state["depth"])
         for axis, field in enumerate(self.velocity):
             field.assign(state[f"interior_velocity_{axis}"])
         self.held = int(held)
-        self.interior = self._summed(self.grid.everywhere)
+        velocity, center, low, high = np.reshape(vectors, (4, 3))
+        self.interior = Interior(int(cells), squares, velocity, center, low, high, fastest)
 
     def forget(self) -> None:
         """Begin with particles everywhere; the next exchange removes those deeper than the band."""
