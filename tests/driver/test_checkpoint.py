@@ -101,7 +101,7 @@ def damage(path: Path, how: str) -> None:
         ("text", "cut short, damaged or not a checkpoint"),
         ("flipped", "cut short, damaged or not a checkpoint"),
         ("no meta", "cut short, damaged or not a checkpoint"),
-        ("foreign key", "holds arrays that no run writes: surprise"),
+        ("foreign key", "holds arrays that no run writes: 'surprise'"),
         ("lost key", "its checksum does not fit"),
         ("other scene", "belongs to another scene"),
         ("other format", "written in format 99, this version reads format 2"),
