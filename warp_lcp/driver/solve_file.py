@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ import scipy.io
 import scipy.sparse
 from rich.table import Table
 
+from warp_lcp.claims import ClaimError, check_claim
 from warp_lcp.driver.atomic import replacing
 from warp_lcp.nearest import nearest
 from warp_lcp.operators import DenseOperator, SparseOperator
@@ -23,6 +26,10 @@ from warp_lcp.stopping import StoppingCriteria
 
 MOST_ROWS = 40  # of the table of iterations: a longer history shows its first and last ones
 FORMAT = "a Matrix Market file (https://math.nist.gov/MatrixMarket/formats.html)"
+
+
+PACKED = (".gz", ".bz2")  # files that are unpacked as they are read
+NUMBER, INDEX = 8, 4  # bytes
 
 
 class ProblemError(ValueError):
@@ -147,10 +154,7 @@ def read_matrix(path: Path) -> Any:
     Raises:
         ProblemError: the file cannot be read, or holds no finite real square matrix.
     """
-    matrix = _read(path)
-    if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1] or matrix.shape[0] == 0:
-        raise ProblemError(f"{path}: has shape {_size(matrix)}: A must be square")
-    return matrix
+    return _read(path, lambda rows, columns: rows == columns > 0, "A must be square")
 
 
 def read_vector(path: Path, n: int, *, infinite: bool = False) -> np.ndarray:
@@ -159,11 +163,9 @@ def read_vector(path: Path, n: int, *, infinite: bool = False) -> np.ndarray:
     Raises:
         ProblemError: the file cannot be read, or holds something else.
     """
-    matrix = _read(path, infinite=infinite)
-    dense = matrix.toarray() if scipy.sparse.issparse(matrix) else np.asarray(matrix)
-    if dense.shape not in ((n, 1), (1, n), (n,)):
-        raise ProblemError(f"{path}: has shape {_size(dense)}: expected {n} x 1, a number for each row of A")
-    return dense.ravel()
+    expected = f"expected {n} x 1, a number for each row of A"
+    matrix = _read(path, lambda rows, columns: (rows, columns) in ((n, 1), (1, n)), expected, infinite=infinite)
+    return (matrix.toarray() if scipy.sparse.issparse(matrix) else matrix).ravel()
 
 
 def write_vector(path: Path, x: np.ndarray) -> None:
@@ -179,23 +181,45 @@ def write_vector(path: Path, x: np.ndarray) -> None:
         raise ProblemError(f"--out {path}: {error.strerror}") from error
 
 
-def _read(path: Path, *, infinite: bool = False) -> Any:
-    """Return what a file holds: finite real numbers, or also infinite ones."""
+def _read(path: Path, fits: Callable[[int, int], bool], expected: str, *, infinite: bool = False) -> Any:
+    """Return what a file of a shape that fits holds: finite real numbers, or also infinite ones."""
+    if path.exists() and not path.is_file():
+        raise ProblemError(f"{path}: is no file")
     try:
+        _check_size(path, fits, expected)
         matrix = scipy.io.mmread(path)
     except FileNotFoundError as error:
         raise ProblemError(f"{path}: no such file") from error
     except OSError as error:
         raise ProblemError(f"{path}: {error.strerror or error}") from error
-    except (ValueError, OverflowError, TypeError) as error:
+    except ProblemError:
+        raise
+    except ClaimError as error:
+        raise ProblemError(f"{path}: {error}") from error
+    except (ValueError, OverflowError, TypeError, EOFError, zlib.error) as error:
         raise ProblemError(f"{path}: is not {FORMAT}: {error}") from error
-    if matrix.dtype.kind == "c":
-        raise ProblemError(f"{path}: holds complex numbers: A, b and bounds must be real")
     values = matrix.data if scipy.sparse.issparse(matrix) else np.asarray(matrix)
     wrong = np.isnan(values) if infinite else ~np.isfinite(values)
     if wrong.any():
         raise ProblemError(f"{path}: holds {np.count_nonzero(wrong)} values that are {'NaN' if infinite else 'not finite'}")
     return matrix.tocsr() if scipy.sparse.issparse(matrix) else np.asarray(matrix, dtype=np.float64)
+
+
+def _check_size(path: Path, fits: Callable[[int, int], bool], expected: str) -> None:
+    """Compare what a file's header claims with what is expected, with the file's size and with the free memory."""
+    rows, columns, entries, form, field, symmetry = scipy.io.mminfo(path)
+    if not fits(rows, columns):
+        raise ProblemError(f"{path}: has shape {rows} x {columns}: {expected}")
+    if field == "complex":
+        raise ProblemError(f"{path}: holds complex numbers: A, b and bounds must be real")
+    held = None if path.suffix in PACKED else path.stat().st_size
+    if form == "array":
+        numbers = rows * columns if symmetry == "general" else rows * (columns - 1) // 2
+        check_claim(f"{rows} x {columns} values", NUMBER * rows * columns, stored=len("1\n") * numbers - 1, held=held)
+    else:
+        needed = NUMBER * (rows + columns) + entries * (NUMBER + 2 * INDEX) * (1 if symmetry == "general" else 2)
+        stored = len("1 1\n" if field == "pattern" else "1 1 1\n") * entries - 1
+        check_claim(f"{rows} x {columns} with {entries} entries", needed, stored=stored, held=held)
 
 
 def _bound(value: str, n: int, option: str) -> float | np.ndarray:
@@ -220,7 +244,3 @@ def _method(name: str, operator: Any) -> Any:
         return METHODS[name]()
     except (ImportError, TypeError) as error:
         raise ProblemError(f"--method {name}: {error}") from error
-
-
-def _size(matrix: Any) -> str:
-    return " x ".join(map(str, matrix.shape))
