@@ -39,6 +39,24 @@ def check_claim(what: str, needed: int, *, stored: int | None = None, held: int 
         raise ClaimError(f"{what}: these need {_bytes(needed)} of memory, and {_bytes(free)} are free")
 
 
+def read_whole(path: Path, *, copies: int = 2) -> bytes:
+    """Return what is in a file, which must be one: a device or a pipe has no end.
+
+    Args:
+        path: the file.
+        copies: of its bytes that its reader makes in memory, at least.
+
+    Raises:
+        OSError: it cannot be read.
+        ClaimError: it is no file, or does not fit the free memory.
+    """
+    size = path.stat().st_size
+    if not path.is_file():
+        raise ClaimError("it is no file")
+    check_claim("what is in it", copies * size)
+    return path.read_bytes()
+
+
 def free_host_memory() -> int | None:
     """Return the memory that this process may still take [bytes]: what the machine has free and its own limit allows; None: not known."""
     found: list[int] = []
