@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,8 +13,8 @@ import scipy.io
 import scipy.sparse
 from rich.table import Table
 
-from warp_lcp.claims import ClaimError, check_claim
 from warp_lcp.driver.atomic import replacing
+from warp_lcp.driver.matrix_market import MarketError, read_market
 from warp_lcp.nearest import nearest
 from warp_lcp.operators import DenseOperator, SparseOperator
 from warp_lcp.problem import LCP
@@ -26,10 +25,6 @@ from warp_lcp.stopping import StoppingCriteria
 
 MOST_ROWS = 40  # of the table of iterations: a longer history shows its first and last ones
 FORMAT = "a Matrix Market file (https://math.nist.gov/MatrixMarket/formats.html)"
-
-
-PACKED = (".gz", ".bz2")  # files that are unpacked as they are read
-NUMBER, INDEX = 8, 4  # bytes
 
 
 class ProblemError(ValueError):
@@ -183,43 +178,21 @@ def write_vector(path: Path, x: np.ndarray) -> None:
 
 def _read(path: Path, fits: Callable[[int, int], bool], expected: str, *, infinite: bool = False) -> Any:
     """Return what a file of a shape that fits holds: finite real numbers, or also infinite ones."""
-    if path.exists() and not path.is_file():
-        raise ProblemError(f"{path}: is no file")
     try:
-        _check_size(path, fits, expected)
-        matrix = scipy.io.mmread(path)
+        matrix = read_market(path, fits, expected)
     except FileNotFoundError as error:
         raise ProblemError(f"{path}: no such file") from error
     except OSError as error:
         raise ProblemError(f"{path}: {error.strerror or error}") from error
-    except ProblemError:
-        raise
-    except ClaimError as error:
-        raise ProblemError(f"{path}: {error}") from error
-    except (ValueError, OverflowError, TypeError, EOFError, zlib.error) as error:
+    except MarketError as error:
         raise ProblemError(f"{path}: is not {FORMAT}: {error}") from error
-    values = matrix.data if scipy.sparse.issparse(matrix) else np.asarray(matrix)
+    except ValueError as error:
+        raise ProblemError(f"{path}: {error}") from error
+    values = matrix.data if scipy.sparse.issparse(matrix) else matrix
     wrong = np.isnan(values) if infinite else ~np.isfinite(values)
     if wrong.any():
         raise ProblemError(f"{path}: holds {np.count_nonzero(wrong)} values that are {'NaN' if infinite else 'not finite'}")
-    return matrix.tocsr() if scipy.sparse.issparse(matrix) else np.asarray(matrix, dtype=np.float64)
-
-
-def _check_size(path: Path, fits: Callable[[int, int], bool], expected: str) -> None:
-    """Compare what a file's header claims with what is expected, with the file's size and with the free memory."""
-    rows, columns, entries, form, field, symmetry = scipy.io.mminfo(path)
-    if not fits(rows, columns):
-        raise ProblemError(f"{path}: has shape {rows} x {columns}: {expected}")
-    if field == "complex":
-        raise ProblemError(f"{path}: holds complex numbers: A, b and bounds must be real")
-    held = None if path.suffix in PACKED else path.stat().st_size
-    if form == "array":
-        numbers = rows * columns if symmetry == "general" else rows * (columns - 1) // 2
-        check_claim(f"{rows} x {columns} values", NUMBER * rows * columns, stored=len("1\n") * numbers - 1, held=held)
-    else:
-        needed = NUMBER * (rows + columns) + entries * (NUMBER + 2 * INDEX) * (1 if symmetry == "general" else 2)
-        stored = len("1 1\n" if field == "pattern" else "1 1 1\n") * entries - 1
-        check_claim(f"{rows} x {columns} with {entries} entries", needed, stored=stored, held=held)
+    return matrix
 
 
 def _bound(value: str, n: int, option: str) -> float | np.ndarray:
