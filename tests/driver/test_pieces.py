@@ -184,3 +184,43 @@ def test_a_file_that_is_no_index_is_refused(tmp_path):
         piece_files(tmp_path / "particles_000001.pvtu")
     with pytest.raises(RenderError, match="is not a readable frame"):
         recording._read(tmp_path / "particles_000001.pvtu")
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "particles_000001.pvtu",  # itself
+        "/etc/passwd",
+        "../../frames/rank_0000/particles_000001.vtu",
+        "rank_0000/../../secret.vtu",
+        "rank_0000/particles_000001.pvtu",
+        "rank_0000/particles_000002.vtu",
+        "rank_0009/particles_000001.vtu",  # a link that leads out of the folder
+    ],
+)
+def test_a_frame_names_pieces_of_its_own_alone(tmp_path, source):
+    (tmp_path / "frames").mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "frames" / "rank_0009").symlink_to(tmp_path / "elsewhere")
+    whole = tmp_path / "frames" / "particles_000001.pvtu"
+    write_whole(whole, [(source, describe(whole_points(), "vtu"))])
+    with pytest.raises(RenderError, match=r"particles_000001\.pvtu: is not a readable frame: names '.*': a piece is rank_0000/particles"):
+        recording._read(whole)
+
+
+def whole_points() -> Points:
+    return Points("particles", np.zeros((4, 3)), {"velocity": np.zeros((4, 3))})
+
+
+def test_a_piece_is_named_once(tmp_path):
+    write_whole(tmp_path / "a.pvtu", [("rank_0000/a.vtu", describe(whole_points(), "vtu"))] * 2)
+    with pytest.raises(ValueError, match="names a piece twice"):
+        piece_files(tmp_path / "a.pvtu")
+
+
+def test_entities_are_refused(tmp_path):
+    """A few lines that would become 10^9 characters."""
+    lines = "".join(f'<!ENTITY a{n + 1} "{f"&a{n};" * 10}">' for n in range(9))
+    (tmp_path / "a.pvtu").write_text(f'<!DOCTYPE x [<!ENTITY a0 "xxxxxxxxxx">{lines}]><VTKFile>&a9;</VTKFile>')
+    with pytest.raises(ValueError, match="declares a type of its own"):
+        piece_files(tmp_path / "a.pvtu")
