@@ -141,15 +141,16 @@ def test_a_flipped_bit_costs_at_most_one_checkpoint(folder):
     good = path.read_bytes()
     found = {20: 0, 12: 0}
     begin = good.index(b"PK\x01\x02")
-    for at in [*range(begin, begin + 80), *range(begin, len(good), 17)]:
-        path.write_bytes(good[:at] + bytes([good[at] ^ 1 << at % 8]) + good[at + 1 :])
+    first = [(begin + number // 8, number % 8) for number in range(8 * 16)]  # all of the version, the flags and the packing
+    for at, bit in [*first, *((at, at % 8) for at in range(begin, len(good), 11))]:
+        path.write_bytes(good[:at] + bytes([good[at] ^ 1 << bit]) + good[at + 1 :])
         newest, refused = folder.newest()
         assert newest is not None
         found[newest.step] += 1
         for name, array in STATE.items():
             np.testing.assert_array_equal(newest.state[name], array)
         assert len(refused) == (newest.step == 12)
-    assert found[12] > found[20] > 0  # a date, say, is of no importance
+    assert min(found.values()) > 20  # a date, say, is of no importance
 
 
 @pytest.mark.parametrize(

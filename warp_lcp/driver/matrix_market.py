@@ -85,9 +85,9 @@ def _sparse(body: bytes, rows: int, columns: int, entries: int, symmetry: bytes,
     width = 2 if pattern else 3
     what = f"{rows} x {columns} with {entries} entries"
     table = _numbers(body, width * entries, what, NUMBER * (rows + 2 * width * entries)).reshape(entries, width)
-    kind = np.int32 if max(rows, columns) <= np.iinfo(np.int32).max else np.int64
+    kind: Any = np.int32 if max(rows, columns) <= np.iinfo(np.int32).max else np.int64
     with np.errstate(invalid="ignore"):  # a place that is no such number differs from what was read
-        row, column = (table[:, axis].astype(kind) - kind(1) for axis in range(2))
+        row, column = (table[:, axis].astype(kind) - 1 for axis in range(2))
     inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
     if not (inside & (row + 1.0 == table[:, 0]) & (column + 1.0 == table[:, 1])).all():
         raise MarketError(f"an entry is not in one of the rows 1 to {rows} and columns 1 to {columns}")
