@@ -8,7 +8,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import meshio
 import numpy as np
 import pytest
 from dots_on_ranks import COUNT, SCENE, DotsSimulator
@@ -17,6 +16,7 @@ from typer.testing import CliRunner
 from warp_lcp.driver import cli, simulator
 from warp_lcp.driver.pieces import one_mesh, piece_files
 from warp_lcp.driver.recording import Recording
+from warp_lcp.driver.vtu import read_vtu
 
 PROGRAM = Path(__file__).with_name("dots_on_ranks.py")
 
@@ -57,10 +57,9 @@ def particles(folder: Path, index: int) -> dict[str, np.ndarray]:
     """Return the dots of a frame by their numbers, whether it is in pieces or not."""
     whole = folder / "frames" / f"particles_{index:06d}.pvtu"
     files = piece_files(whole) if whole.is_file() else [whole.with_suffix(".vtu")]
-    mesh = one_mesh([meshio.vtu.read(str(file)) for file in files])
-    assert mesh is not None
-    order = np.argsort(mesh.point_data["identity"])
-    return {"points": mesh.points[order], "velocity": mesh.point_data["velocity"][order], "identity": mesh.point_data["identity"][order]}
+    mesh = one_mesh([read_vtu(file) for file in files])
+    order = np.argsort(mesh.fields["identity"])
+    return {"points": mesh.points[order], "velocity": mesh.fields["velocity"][order], "identity": mesh.fields["identity"][order]}
 
 
 def assert_same_run(a: Path, b: Path) -> None:

@@ -1,6 +1,7 @@
 """Checkpoints: exact, verified, and refused with a reason."""
 
 import errno
+import json
 from pathlib import Path
 
 import numpy as np
@@ -101,7 +102,7 @@ def damage(path: Path, how: str) -> None:
         ("text", "cut short, damaged or not a checkpoint"),
         ("flipped", "cut short, damaged or not a checkpoint"),
         ("no meta", "cut short, damaged or not a checkpoint"),
-        ("foreign key", "holds arrays that no run writes: surprise"),
+        ("foreign key", "holds arrays that no run writes: 'surprise'"),
         ("lost key", "its checksum does not fit"),
         ("other scene", "belongs to another scene"),
         ("other format", "written in format 99, this version reads format 2"),
@@ -131,3 +132,33 @@ def test_a_failed_write_leaves_the_file_as_it_was(tmp_path):
         raise OSError(errno.ENOSPC, "No space left on device")
     assert path.read_text() == "before"
     assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_a_flipped_bit_costs_at_most_one_checkpoint(folder):
+    """Bits of the zip's directory: what they change is the kind of an array's packing, its place, size, name and checksum."""
+    folder.write(Checkpoint(20, 0.5, STATE))
+    path = folder.path(20)
+    good = path.read_bytes()
+    found = {20: 0, 12: 0}
+    begin = good.index(b"PK\x01\x02")
+    first = [(begin + number // 8, number % 8) for number in range(8 * 16)]  # all of the version, the flags and the packing
+    for at, bit in [*first, *((at, at % 8) for at in range(begin, len(good), 11))]:
+        path.write_bytes(good[:at] + bytes([good[at] ^ 1 << bit]) + good[at + 1 :])
+        newest, refused = folder.newest()
+        assert newest is not None
+        found[newest.step] += 1
+        for name, array in STATE.items():
+            np.testing.assert_array_equal(newest.state[name], array)
+        assert len(refused) == (newest.step == 12)
+    assert min(found.values()) > 20  # a date, say, is of no importance
+
+
+@pytest.mark.parametrize(
+    "said", [{"time": float("nan")}, {"time": -1.0}, {"time": None}, {"step": "12"}, {"keys": [1]}, {"checksum": 3}, {"format": None}]
+)
+def test_what_a_checkpoint_says_must_be_of_the_right_type(folder, said):
+    arrays = dict(np.load(folder.path(12)))
+    arrays["meta"] = np.array(json.dumps(json.loads(str(arrays["meta"])) | said))
+    np.savez(folder.path(12), **arrays)
+    with pytest.raises(CheckpointError, match="step_000012"):
+        folder.read(12)

@@ -9,7 +9,7 @@ import pytest
 
 from warp_lcp.driver.frames import WAITING, FrameFolder, FrameWriter, frame_bytes
 from warp_lcp.driver.simulator import Cells, Points, Surface
-from warp_lcp.driver.vtu import write_vtu
+from warp_lcp.driver.vtu import read_vtu, write_vtu
 
 RNG = np.random.default_rng(5807)
 
@@ -232,3 +232,27 @@ def test_another_error_is_not_hidden_by_the_writer_s(tmp_path):
     with pytest.raises(RuntimeError, match="first"), FrameWriter(folder) as writer:
         writer.put(0, 0.0, [some_points(3)])
         raise RuntimeError("first")
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (b"Float32", b"Float512"),
+        (b'NumberOfComponents="3"', b'NumberOfComponents="0"'),
+        (b'NumberOfComponents="3"', b'NumberOfComponents="1000000000000"'),
+        (b'format="binary">', b'format="binary">////'),
+        (b'format="binary"', b'format="ascii"'),
+        (b'Name="types"', b'Name="kinds"'),
+        (b"PointData", b"PairData"),
+        (b'header_type="UInt64"', b'header_type="UInt64" compressor="vtkZLibDataCompressor"'),
+        (b"<UnstructuredGrid>", b"<UnstructuredGrid><Piece/></UnstructuredGrid><UnstructuredGrid>"),
+    ],
+)
+def test_a_file_that_says_what_cannot_be_is_refused(tmp_path, old, new):
+    write_vtu(tmp_path / "a.vtu", Points("a", np.ones((4, 3), dtype=np.float32), {"velocity": np.ones((4, 3), dtype=np.float32)}))
+    assert read_vtu(tmp_path / "a.vtu").fields["velocity"].shape == (4, 3)
+    whole = (tmp_path / "a.vtu").read_bytes()
+    assert old in whole
+    (tmp_path / "a.vtu").write_bytes(whole.replace(old, new))
+    with pytest.raises(ValueError, match=r"a\.vtu: is not a readable frame: "):
+        read_vtu(tmp_path / "a.vtu")

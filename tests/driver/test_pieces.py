@@ -125,23 +125,23 @@ def test_a_recording_of_pieces_is_that_of_one_process(dots, tmp_path, grid_forma
 
 def test_pieces_without_points_count_only_if_all_are(tmp_path):
     full, none = (describe(Points("particles", np.zeros((n, 3)), {"velocity": np.zeros((n, 3))}), "vtu") for n in (4, 0))
-    write_whole(tmp_path / "a.pvtu", [("r0/a.vtu", none), ("r1/a.vtu", full)])
-    assert piece_files(tmp_path / "a.pvtu") == [tmp_path / "r1" / "a.vtu"]
-    write_whole(tmp_path / "b.pvtu", [("r0/a.vtu", none), ("r1/a.vtu", none)])
-    assert piece_files(tmp_path / "b.pvtu") == [tmp_path / "r0" / "a.vtu"]
+    write_whole(tmp_path / "a.pvtu", [("rank_0000/a.vtu", none), ("rank_0001/a.vtu", full)])
+    assert piece_files(tmp_path / "a.pvtu") == [tmp_path / "rank_0001" / "a.vtu"]
+    write_whole(tmp_path / "a.pvtu", [("rank_0000/a.vtu", none), ("rank_0001/a.vtu", none)])
+    assert piece_files(tmp_path / "a.pvtu") == [tmp_path / "rank_0000" / "a.vtu"]
     other = describe(Points("particles", np.zeros((4, 3)), {"speed": np.zeros(4)}), "vtu")
-    with pytest.raises(ValueError, match=r"r1/a\.vtu has other fields than r0/a\.vtu"):
-        write_whole(tmp_path / "c.pvtu", [("r0/a.vtu", full), ("r1/a.vtu", other)])
+    with pytest.raises(ValueError, match=r"rank_0001/a\.vtu has other fields than rank_0000/a\.vtu"):
+        write_whole(tmp_path / "c.pvtu", [("rank_0000/a.vtu", full), ("rank_0001/a.vtu", other)])
     assert not (tmp_path / "c.pvtu").exists()
 
 
 def test_images_of_ranks_without_cells_fill_the_whole(tmp_path):
     empty = Cells("grid", np.zeros((0, 3), dtype=int), 0.5, 2, {"pressure": np.zeros(0)}, (8, 4, 1), ((0, 0, 0), (5, 4, 1)))
     full = Cells("grid", np.array([[6, 1, 0]]), 0.5, 2, {"pressure": np.ones(1)}, (8, 4, 1), ((5, 0, 0), (8, 4, 1)))
-    write_whole(tmp_path / "grid.pvti", [("r0/g.vti", describe(empty, "vti")), ("r1/g.vti", describe(full, "vti"))])
+    write_whole(tmp_path / "grid.pvti", [("rank_0000/g.vti", describe(empty, "vti")), ("rank_0001/g.vti", describe(full, "vti"))])
     text = (tmp_path / "grid.pvti").read_text()
     assert 'WholeExtent="0 8 0 4 0 0"' in text
-    assert '<Piece Extent="0 5 0 4 0 0" Source="r0/g.vti"/>\n<Piece Extent="5 8 0 4 0 0" Source="r1/g.vti"/>' in text
+    assert '<Piece Extent="0 5 0 4 0 0" Source="rank_0000/g.vti"/>\n<Piece Extent="5 8 0 4 0 0" Source="rank_0001/g.vti"/>' in text
     assert len(one_grid([empty, full]).index) == 1
 
 
@@ -180,7 +180,47 @@ def places():
 
 def test_a_file_that_is_no_index_is_refused(tmp_path):
     (tmp_path / "particles_000001.pvtu").write_text("<VTKFile")
-    with pytest.raises(ValueError, match="not XML"):
+    with pytest.raises(ValueError, match="is not a readable frame: not XML"):
         piece_files(tmp_path / "particles_000001.pvtu")
     with pytest.raises(RenderError, match="is not a readable frame"):
         recording._read(tmp_path / "particles_000001.pvtu")
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "particles_000001.pvtu",  # itself
+        "/etc/passwd",
+        "../../frames/rank_0000/particles_000001.vtu",
+        "rank_0000/../../secret.vtu",
+        "rank_0000/particles_000001.pvtu",
+        "rank_0000/particles_000002.vtu",
+        "rank_0009/particles_000001.vtu",  # a link that leads out of the folder
+    ],
+)
+def test_a_frame_names_pieces_of_its_own_alone(tmp_path, source):
+    (tmp_path / "frames").mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "frames" / "rank_0009").symlink_to(tmp_path / "elsewhere")
+    whole = tmp_path / "frames" / "particles_000001.pvtu"
+    write_whole(whole, [(source, describe(whole_points(), "vtu"))])
+    with pytest.raises(RenderError, match=r"particles_000001\.pvtu: is not a readable frame: names '.*': a piece is rank_0000/particles"):
+        recording._read(whole)
+
+
+def whole_points() -> Points:
+    return Points("particles", np.zeros((4, 3)), {"velocity": np.zeros((4, 3))})
+
+
+def test_a_piece_is_named_once(tmp_path):
+    write_whole(tmp_path / "a.pvtu", [("rank_0000/a.vtu", describe(whole_points(), "vtu"))] * 2)
+    with pytest.raises(ValueError, match="names a piece twice"):
+        piece_files(tmp_path / "a.pvtu")
+
+
+def test_entities_are_refused(tmp_path):
+    """A few lines that would become 10^9 characters."""
+    lines = "".join(f'<!ENTITY a{n + 1} "{f"&a{n};" * 10}">' for n in range(9))
+    (tmp_path / "a.pvtu").write_text(f'<!DOCTYPE x [<!ENTITY a0 "xxxxxxxxxx">{lines}]><VTKFile>&a9;</VTKFile>')
+    with pytest.raises(ValueError, match="declares a type of its own"):
+        piece_files(tmp_path / "a.pvtu")

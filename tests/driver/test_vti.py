@@ -99,6 +99,39 @@ def test_a_file_cut_short_is_refused(tmp_path):
             read_vti(tmp_path / "a.vti")
 
 
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (b'WholeExtent="', b'WholeExtent="0 1000000 0 1000000 0 1" was="'),
+        (b'WholeExtent="', b'WholeExtent="0 1 0 1" was="'),
+        (b'Spacing="', b'Spacing="nan nan nan" was="'),
+        (b'offset="0"', b'offset="-9"'),
+        (b'offset="0"', b'offset="999999999999"'),
+        (b'type="Float64"', b'type="Float512"'),
+        (b"vtkGhostType", b"no ghosts at all"),
+        (b"UInt64", b"UInt32"),
+        (b"<ImageData", b"<!-- --><ImageData"),
+    ],
+)
+def test_files_that_say_what_cannot_be(tmp_path, old, new):
+    write_vti(tmp_path / "a.vti", some_cells(3))
+    whole = (tmp_path / "a.vti").read_bytes()
+    assert old in whole
+    (tmp_path / "a.vti").write_bytes(whole.replace(old, new, 1))
+    with pytest.raises(ValueError, match=r"a\.vti: is not a readable frame: "):
+        read_vti(tmp_path / "a.vti")
+
+
+def test_arrays_do_not_share_their_bytes(tmp_path):
+    """A name costs a file some bytes, and its reader a whole array."""
+    write_vti(tmp_path / "a.vti", some_cells(3))
+    array = b'<DataArray type="Float64" Name="%d" format="appended" offset="0"/>'
+    whole = (tmp_path / "a.vti").read_bytes()
+    (tmp_path / "a.vti").write_bytes(whole.replace(b"</CellData>", b"".join(array % n for n in range(9)) + b"</CellData>"))
+    with pytest.raises(ValueError, match="its arrays are not those of"):
+        read_vti(tmp_path / "a.vti")
+
+
 def test_cells_outside_the_grid_are_refused(tmp_path):
     with pytest.raises(ValueError, match="the grid of 9 x 8 x 5 cells does not hold all cells of 'grid'"):
         write_vti(tmp_path / "a.vti", some_cells(3, (9, 8, 5)))

@@ -10,11 +10,13 @@ from typer.testing import CliRunner
 import warp_lcp as wl
 from oracle import assemble, natural_residual
 from small_liquids import box, create, dam, scene
+from warp_lcp import claims
 from warp_lcp.driver import cli
 from warp_lcp.driver.problem_folder import ProblemFolder
 from warp_lcp.driver.run_folder import OutputError
 from warp_lcp.driver.simulator import Recorded
 from warp_lcp.gallery.recorded import FORMAT, files, load
+from warp_lcp.gallery.recorded_part import cell_counts
 
 RAMP = box([0.2, -0.2], [0.6, 0.08], rotate=20)  # partly beneath the liquid
 CASES = {
@@ -123,6 +125,35 @@ def test_damaged_files_are_refused(tmp_path):
     np.savez(path, **{**kept, "b": kept["b"][1:]})
     with pytest.raises(ValueError, match="no recorded problem"):
         load(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "array", "message"),
+    [
+        ("b", np.array(1.0), r"b is float64 of shape \(\): must be numbers of shape \("),  # 8 bytes that became a field
+        ("lower", np.zeros(3), "lower is float64 of shape"),
+        ("face_x", np.ones((2, 2)), "face_x is float64 of shape"),
+        ("dt", np.array("soon"), "dt is <U4 of shape"),
+        ("cells", np.zeros(10**6, dtype=np.int8), "cells is .* must be int8 of 2 or 3 axes"),
+        ("format", np.ones(10**6), "format is float64 of shape"),
+    ],
+)
+def test_arrays_must_fit_the_cells(tmp_path, name, array, message):
+    record(CASES["voxel"](), tmp_path, 1)
+    (path,) = files(tmp_path)
+    np.savez_compressed(path, **{**np.load(path), name: array})
+    for read in (load, cell_counts):
+        with pytest.raises(ValueError, match=rf"problem_000000\.npz: no recorded problem: {message}"):
+            read(path)
+
+
+def test_arrays_that_no_problem_has_are_not_read(tmp_path, monkeypatch):
+    record(CASES["voxel"](), tmp_path, 1)
+    (path,) = files(tmp_path)
+    np.savez_compressed(path, **{**np.load(path), "bomb": np.zeros(2**23)})
+    assert path.stat().st_size < 100_000
+    monkeypatch.setattr(claims, "free_host_memory", lambda: 2**25)
+    load(path, device="cpu")
 
 
 def test_a_folder_takes_one_run(tmp_path):

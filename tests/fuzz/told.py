@@ -18,15 +18,15 @@ except ImportError:  # not on Windows
 MEMORY = 1 << 30  # bytes that reading one small file may take
 
 
-def told(*arguments: str | Path) -> int:
-    """Run a command that reads files; return its exit code, 0 or 2.
+def told(*arguments: str | Path, codes: tuple[int, ...] = (0, cli.WRONG_INPUT)) -> int:
+    """Run a command that reads files; return its exit code, one of `codes`, 0 or 2 unless given.
 
     It ends without a traceback, takes no more than MEMORY, and says why when it refuses.
     """
     with limited():
         result = CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
     assert result.exception is None or isinstance(result.exception, SystemExit), repr(result.exception)
-    assert result.exit_code in (0, cli.WRONG_INPUT), (result.exit_code, result.output)
+    assert result.exit_code in codes, (result.exit_code, result.output)
     assert result.exit_code == 0 or result.stderr.strip(), "refused without a word"
     return result.exit_code
 

@@ -117,3 +117,50 @@ def test_wrong_files_are_named(tmp_path):
     write_local(path, np.eye(3), np.zeros(3), np.array([0.1]), solution=np.zeros(2))
     with pytest.raises(ValueError, match="the solution has 2 values"):
         read_fclib(path)
+
+
+def hostile(file, name):
+    """Return what harms: a size that nothing stored can make, places beyond a matrix, and what is in other files."""
+    matrix = file["fclib_local/W"]
+    if name == "size":
+        matrix["m"][0] = matrix["n"][0] = 2**31 - 1
+    elif name == "column":
+        matrix["i"][1] = 10**6
+    elif name == "never written":
+        del matrix["x"]
+        matrix.create_dataset("x", shape=(10**12,), dtype=np.float64)
+    elif name == "packed":
+        del matrix["x"]
+        matrix.create_dataset("x", shape=(10**12,), dtype=np.float64, chunks=(10**6,), compression="gzip")
+    elif name == "link":
+        del matrix["x"]
+        matrix["x"] = h5py.ExternalLink("other.hdf5", "/x")
+    elif name == "group":
+        del matrix["x"]
+        matrix.create_group("x")
+    elif name == "text":
+        del matrix["x"]
+        matrix["x"] = np.bytes_("1.0")
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("size", "W has shape 2147483647 x 2147483647: the vectors beside it ask for 3 x 3"),
+        ("column", "is no sparse matrix"),
+        ("never written", "these take 8e[+]03 GB, and the file has 0 bytes"),
+        ("packed", "and the file has 0 bytes"),
+        ("link", "W/x is in another file"),
+        ("group", "x is no dataset of this file"),
+        ("text", r"x is \|S3: must be finite numbers"),
+    ],
+)
+def test_files_that_could_harm_are_refused(tmp_path, name, message):
+    path = tmp_path / "hostile.hdf5"
+    write_local(path, np.eye(3), np.zeros(3), np.array([0.1]), "rows")
+    write_local(tmp_path / "other.hdf5", np.eye(3), np.zeros(3), np.array([0.1]))
+    with h5py.File(path, "a") as file:
+        hostile(file, name)
+    assert path.stat().st_size < 30_000
+    with pytest.raises(ValueError, match=message):
+        read_fclib(path)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import re
-import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -14,12 +14,13 @@ from typing import Any
 
 import numpy as np
 
+from warp_lcp.archive import Archive, ArchiveError
 from warp_lcp.driver.atomic import make_folder, replacing
 from warp_lcp.driver.rank_folder import in_ranks, rank_folder
 
 FORMAT = 2
-CHECKPOINT_FILE = re.compile(r"step_(?P<step>\d{6,})\.npz")
-REFUSED_FILE = re.compile(r"refused_\d{6,}\.npz")  # set aside when a run continued from an earlier one
+CHECKPOINT_FILE = re.compile(r"step_(?P<step>[0-9]{6,})\.npz")
+REFUSED_FILE = re.compile(r"refused_[0-9]{6,}\.npz")  # set aside when a run continued from an earlier one
 STATE = "state/"
 META = "meta"
 PIECES = "pieces_of_ranks"  # the only array of a checkpoint whose state is in the files of ranks: a checksum of each
@@ -61,15 +62,15 @@ class StoredPiece(Mapping[str, np.ndarray]):
     def __init__(self, path: Path) -> None:
         """Read the arrays' names."""
         self.path = path
-        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
-            self._names = [name.removeprefix(STATE) for name in file.files if name.startswith(STATE)]
+        with Archive(path) as archive:
+            self._names = [name.removeprefix(STATE) for name in archive.headers if name.startswith(STATE)]
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Read an array."""
         if name not in self._names:
             raise KeyError(name)
-        with open(self.path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
-            return np.asarray(file[STATE + name])
+        with Archive(self.path) as archive:
+            return archive.read([STATE + name])[STATE + name]
 
     def __iter__(self) -> Iterator[str]:
         """Iterate over the arrays' names."""
@@ -168,25 +169,24 @@ class CheckpointFolder:
         """
         path = self.path(step)
         try:
-            with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:  # NumPy leaves a broken file open
-                arrays = {name: file[name] for name in file.files}
-            meta = json.loads(str(arrays.pop(META)))
-            found = (meta["format"], meta["scene"], meta["checksum"])
-            written, time, keys = int(meta["step"]), float(meta["time"]), dict(meta.get("keys", {}))
-        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+            with Archive(path) as archive:
+                meta = _meta(archive)
+                if meta["format"] != FORMAT:
+                    raise CheckpointError(f"{path}: written in format {meta['format']!r}, this version reads format {FORMAT}")
+                if meta["scene"] != self.fingerprint:
+                    raise CheckpointError(f"{path}: belongs to another scene")
+                foreign = [name for name in archive.headers if name != META and not name.startswith(STATE)]
+                if foreign:
+                    raise CheckpointError(f"{path}: holds arrays that no run writes: {', '.join(map(repr, foreign))}")
+                arrays = archive.read([name for name in archive.headers if name != META])
+        except ArchiveError as error:
             raise CheckpointError(f"{path}: cut short, damaged or not a checkpoint ({error})") from error
-        if found[0] != FORMAT:
-            raise CheckpointError(f"{path}: written in format {found[0]}, this version reads format {FORMAT}")
-        if found[1] != self.fingerprint:
-            raise CheckpointError(f"{path}: belongs to another scene")
-        foreign = [name for name in arrays if not name.startswith(STATE)]
-        if foreign:
-            raise CheckpointError(f"{path}: holds arrays that no run writes: {', '.join(foreign)}")
-        checkpoint = Checkpoint(step, time, {name.removeprefix(STATE): array for name, array in arrays.items()}, keys)
-        if found[2] != checkpoint.checksum:
+        state = {name.removeprefix(STATE): array for name, array in arrays.items()}
+        checkpoint = Checkpoint(step, float(meta["time"]), state, meta["keys"])
+        if meta["checksum"] != checkpoint.checksum or np.ndim(state.get(PIECES, [])) != 1:
             raise CheckpointError(f"{path}: damaged (its checksum does not fit)")
-        if written != step:
-            raise CheckpointError(f"{path}: holds step {written}, renamed")
+        if meta["step"] != step:
+            raise CheckpointError(f"{path}: holds step {meta['step']}, renamed")
         return checkpoint
 
     def verify(self, checkpoint: Checkpoint) -> None:
@@ -237,6 +237,26 @@ class CheckpointFolder:
             except CheckpointError as error:
                 refused.append(str(error))
         return None, refused
+
+
+def _meta(archive: Archive) -> dict[str, Any]:
+    """Return what a checkpoint says of its state: of format 2, all of the right type.
+
+    Raises:
+        ArchiveError: it says nothing, or something else.
+    """
+    try:
+        meta: Any = json.loads(str(archive.read([META])[META]))
+        if meta["format"] != FORMAT:
+            return {"format": meta["format"]}
+        meta = {"keys": {}, **meta}
+        kinds = {"scene": str, "checksum": str, "step": int, "time": float | int, "keys": dict}
+        wrong = [name for name, kind in kinds.items() if not isinstance(meta[name], kind)]
+        if wrong or not 0.0 <= float(meta["time"]) < math.inf:
+            raise ArchiveError(f"wrong in {META}: {', '.join(wrong) or 'time'}")
+        return meta
+    except (ValueError, TypeError, LookupError, OverflowError, RecursionError) as error:
+        raise ArchiveError(str(error)) from error
 
 
 def _checksum(state: Mapping[str, np.ndarray]) -> str:

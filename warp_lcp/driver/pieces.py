@@ -6,15 +6,16 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
-from xml.etree import ElementTree
 
-import meshio
 import numpy as np
 
+from warp_lcp.claims import read_whole
 from warp_lcp.driver.atomic import write_text
+from warp_lcp.driver.rank_folder import RANK_FOLDER
 from warp_lcp.driver.simulator import Cells, Points, Surface
 from warp_lcp.driver.vti import GHOSTS, extent_of, image_box, image_end
-from warp_lcp.driver.vtk_xml import attributes, opening, writable
+from warp_lcp.driver.vtk_xml import attributes, opening, read_back, root, writable
+from warp_lcp.driver.vtu import Mesh
 
 WHOLE = {"vtu": "pvtu", "vti": "pvti"}  # the suffix of the file that names the pieces, by theirs
 
@@ -80,37 +81,53 @@ def write_whole(path: Path, pieces: Sequence[tuple[str, Piece]]) -> None:
 
 
 def piece_files(path: Path) -> list[Path]:
-    """Return the files of the pieces that a file of `write_whole` names.
+    """Return the files of the pieces that a file of `write_whole` names: of its own name, each in a rank's folder beside it.
 
     Raises:
         OSError: it cannot be read.
-        ValueError: it is no such file.
+        ValueError: it is no such file, or names others, or one twice.
     """
-    try:
-        root = ElementTree.fromstring(path.read_text(encoding="utf-8"))
-    except ElementTree.ParseError as error:
-        raise ValueError(f"{path}: not XML") from error
-    return [path.parent / str(piece.get("Source")) for piece in root.iter("Piece")]
+    with read_back(path):
+        kind = path.suffix.removeprefix(".p")
+        pieces = root(read_whole(path), f"P{'ImageData' if kind == 'vti' else 'UnstructuredGrid'}").iter("Piece")
+        found = [Path(str(piece.get("Source"))) for piece in pieces]
+        for file in found:
+            own = len(file.parts) == 2 and RANK_FOLDER.fullmatch(file.parts[0]) and file.parts[1] == f"{path.stem}.{kind}"
+            if not own or not (path.parent / file).resolve().is_relative_to(path.parent.resolve()):
+                raise ValueError(f"names {str(file)!r}: a piece is rank_0000/{path.stem}.{kind} in its own folder")
+        if len(set(found)) != len(found):
+            raise ValueError("names a piece twice")
+        return [path.parent / file for file in found]
 
 
-def one_mesh(meshes: Sequence[meshio.Mesh]) -> meshio.Mesh | None:
-    """Return the mesh of all pieces, which have one block of cells of the same type each; None for none."""
-    if not meshes:
-        return None
-    first = meshes[0]
-    starts = np.cumsum([0, *(len(mesh.points) for mesh in meshes)])
-    corners = np.concatenate([mesh.cells[0].data + start for mesh, start in zip(meshes, starts[:-1], strict=True)])
-    return meshio.Mesh(
-        np.concatenate([mesh.points for mesh in meshes]),
-        [(first.cells[0].type, corners)],
-        point_data={name: np.concatenate([mesh.point_data[name] for mesh in meshes]) for name in first.point_data},
-        cell_data={name: [np.concatenate([mesh.cell_data[name][0] for mesh in meshes])] for name in first.cell_data},
+def one_mesh(meshes: Sequence[Mesh]) -> Mesh:
+    """Return the mesh of all pieces, of which there is at least one; empty ones need not have the kind of cells of the others.
+
+    Raises:
+        ValueError: they have other fields or cells than each other.
+    """
+    filled = [mesh for mesh in meshes if len(mesh.points)] or list(meshes[:1])
+    first = filled[0]
+    if any(mesh.fields.keys() != first.fields.keys() or mesh.on_cells != first.on_cells for mesh in filled):
+        raise ValueError("its pieces have different fields")
+    starts = np.cumsum([0, *(len(mesh.points) for mesh in filled)])
+    return Mesh(
+        np.concatenate([mesh.points for mesh in filled]),
+        np.concatenate([mesh.corners + start for mesh, start in zip(filled, starts[:-1], strict=True)]),
+        {name: np.concatenate([mesh.fields[name] for mesh in filled]) for name in first.fields},
+        first.on_cells,
     )
 
 
 def one_grid(parts: Sequence[Cells]) -> Cells:
-    """Return the cells of all pieces, of which there is at least one, as one part."""
+    """Return the cells of all pieces, of which there is at least one, as one part.
+
+    Raises:
+        ValueError: they have other fields than each other.
+    """
     first = parts[0]
+    if any(part.fields.keys() != first.fields.keys() for part in parts):
+        raise ValueError("its pieces have different fields")
     fields = {name: np.concatenate([part.fields[name] for part in parts]) for name in first.fields}
     return Cells(first.name, np.concatenate([part.index for part in parts]), first.spacing, first.dimension, fields)
 

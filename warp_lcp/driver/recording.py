@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
 
-import meshio
 import numpy as np
 
 from warp_lcp.driver.frames import FRAME_FILE
@@ -18,6 +18,7 @@ from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.scene_file import check_shapes, load_scene
 from warp_lcp.driver.simulator import Cells, Surface
 from warp_lcp.driver.vti import read_vti
+from warp_lcp.driver.vtu import Mesh, read_vtu
 
 SCALE_FRAMES = 16  # evenly spaced frames that fix the color scale of a run
 SCALE_VALUES = 50_000  # about how many values of each
@@ -179,15 +180,13 @@ class Recording:
             RenderError: a file cannot be read, or lacks the field that colors the particles.
         """
         mesh = _read(self._file("particles", number))
-        if mesh is None:
-            return np.zeros((0, 3)), np.zeros(0)
         points = np.asarray(mesh.points, dtype=np.float64)
         if self.color is Color.PRESSURE:
             values = self._pressure(number, points)
         elif self.color in LABELS:
-            values = self._field(mesh.point_data, self.color)
+            values = self._field(mesh.fields, self.color)
         elif self.color is Color.SPEED:
-            values = np.linalg.norm(self._field(mesh.point_data, "velocity"), axis=1)
+            values = np.linalg.norm(self._field(mesh.fields, "velocity", 3), axis=1)
         else:
             values = np.zeros(len(points))
         finite = np.isfinite(points).all(axis=1) & np.isfinite(values)
@@ -235,35 +234,35 @@ class Recording:
         """Return a surface, those of its triangles or segments whose points are finite."""
         file = self._file(name, number)
         mesh = _read(file)
-        if mesh is None:
-            return Surface(name, np.zeros((0, 3)), np.zeros((0, self.scene.dimension), dtype=np.int32))
-        corners = mesh.cells_dict.get("triangle" if self.scene.dimension == 3 else "line")
-        if corners is None:
+        corners = mesh.corners if len(mesh.corners) else np.zeros((0, self.scene.dimension), dtype=np.int32)
+        if corners.shape[1] != self.scene.dimension:
             raise RenderError(f"{file}: has no {'triangles' if self.scene.dimension == 3 else 'segments'}")
         points = np.asarray(mesh.points, dtype=np.float64)
         finite = np.isfinite(points[corners]).all(axis=(1, 2))
-        return Surface(name, np.where(np.isfinite(points), points, 0.0), np.asarray(corners[finite], dtype=np.int32), dict(mesh.point_data))
+        return Surface(name, np.where(np.isfinite(points), points, 0.0), np.asarray(corners[finite], dtype=np.int32), mesh.fields)
 
     def _cells(self, number: int) -> Cells | None:
         """Return the cells of a frame with their fields."""
         file = self._file("grid", number)
         if file.suffix in (".vti", ".pvti"):
-            return _read_image(file)
-        mesh = _read(file)
-        if mesh is None:
+            cells = _read_image(file)
+        elif not len((mesh := _read(file)).corners):
             return None
-        block = mesh.cells[0].data
-        fields = {name: np.asarray(values[0]) for name, values in mesh.cell_data.items()}
-        index = np.floor(mesh.points[block].mean(axis=1) / self.scene.spacing).astype(int)
-        return Cells("grid", index, self.scene.spacing, self.scene.dimension, fields)
+        else:
+            low = np.nan_to_num(mesh.points[mesh.corners].mean(axis=1) / self.scene.spacing, nan=-1.0)
+            index = np.floor(np.clip(low, -1.0, max(self.scene.cell_counts))).astype(int)
+            cells = Cells("grid", index, self.scene.spacing, self.scene.dimension, mesh.fields)
+        if not ((cells.index >= 0) & (cells.index < self.scene.cell_counts)).all():
+            raise RenderError(f"{file}: is not a readable frame: a cell lies outside the scene's domain")
+        return cells
 
     def _file(self, name: str, number: int) -> Path:
         path = self.folder / "frames" / f"{name}_{number:06d}"
         files = [path.with_suffix(suffix) for suffix in SUFFIXES]
         return next((file for file in files if file.is_file()), files[-1])
 
-    def _field(self, fields: dict[str, Any], name: str) -> np.ndarray:
-        if name not in fields:
+    def _field(self, fields: dict[str, Any], name: str, components: int = 1) -> np.ndarray:
+        if name not in fields or fields[name].shape[1:] != (components,)[: components - 1]:
             raise RenderError(f"{self.folder}: the frames have no {name}, which --color {self.color} needs; plain needs nothing")
         return np.asarray(fields[name], dtype=np.float64)
 
@@ -284,41 +283,35 @@ def spread(numbers: Sequence[int], count: int) -> list[int]:
     return [numbers[round(place)] for place in places]
 
 
-def _read(file: Path) -> meshio.Mesh | None:
-    """Return a frame's mesh; None if it is empty, which meshio cannot read."""
-    if file.suffix == ".pvtu":
-        return one_mesh([mesh for piece in _pieces(file) if (mesh := _read(piece)) is not None])
-    try:
-        with open(file, "rb") as stream:
-            if b'NumberOfPoints="0"' in stream.read(1000):
-                return None
-        return meshio.vtu.read(str(file))
-    except OSError as error:
-        raise RenderError(f"{file}: cannot be read: {error.strerror}") from error
-    except (meshio.ReadError, ValueError, AttributeError, KeyError) as error:
-        raise RenderError(f"{file}: is not a readable frame") from error
-
-
-def _pieces(file: Path) -> list[Path]:
-    """Return the files of the pieces of a frame."""
-    try:
-        return piece_files(file)
-    except OSError as error:
-        raise RenderError(f"{file}: cannot be read: {error.strerror}") from error
-    except ValueError as error:
-        raise RenderError(f"{file}: is not a readable frame") from error
+def _read(file: Path) -> Mesh:
+    """Return a frame's mesh."""
+    with _readable(file):
+        return one_mesh([read_vtu(piece) for piece in _pieces(file)]) if file.suffix == ".pvtu" else read_vtu(file)
 
 
 def _read_image(file: Path) -> Cells:
     """Return the cells of a frame that is an image."""
-    if file.suffix == ".pvti":
-        return one_grid(list(map(_read_image, _pieces(file))))
+    with _readable(file):
+        return one_grid([read_vti(piece) for piece in _pieces(file)]) if file.suffix == ".pvti" else read_vti(file)
+
+
+def _pieces(file: Path) -> list[Path]:
+    """Return the files of the pieces of a frame, of which there is at least one."""
+    if found := piece_files(file):
+        return found
+    raise ValueError("names no pieces")
+
+
+@contextmanager
+def _readable(file: Path) -> Iterator[None]:
+    """Say which file of a frame cannot be read, and why."""
     try:
-        return read_vti(file)
+        yield
     except OSError as error:
-        raise RenderError(f"{file}: cannot be read: {error.strerror}") from error
+        raise RenderError(f"{error.filename or file}: cannot be read: {error.strerror}") from error
     except ValueError as error:
-        raise RenderError(f"{file}: is not a readable frame") from error
+        known = "is not a readable frame" in str(error)
+        raise RenderError(str(error) if known else f"{file}: is not a readable frame: {error}") from error
 
 
 def _round_up(value: float) -> float:

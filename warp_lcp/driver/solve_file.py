@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import scipy.sparse
 from rich.table import Table
 
 from warp_lcp.driver.atomic import replacing
+from warp_lcp.driver.matrix_market import MarketError, read_market
 from warp_lcp.nearest import nearest
 from warp_lcp.operators import DenseOperator, SparseOperator
 from warp_lcp.problem import LCP
@@ -147,10 +149,7 @@ def read_matrix(path: Path) -> Any:
     Raises:
         ProblemError: the file cannot be read, or holds no finite real square matrix.
     """
-    matrix = _read(path)
-    if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1] or matrix.shape[0] == 0:
-        raise ProblemError(f"{path}: has shape {_size(matrix)}: A must be square")
-    return matrix
+    return _read(path, lambda rows, columns: rows == columns > 0, "A must be square")
 
 
 def read_vector(path: Path, n: int, *, infinite: bool = False) -> np.ndarray:
@@ -159,11 +158,9 @@ def read_vector(path: Path, n: int, *, infinite: bool = False) -> np.ndarray:
     Raises:
         ProblemError: the file cannot be read, or holds something else.
     """
-    matrix = _read(path, infinite=infinite)
-    dense = matrix.toarray() if scipy.sparse.issparse(matrix) else np.asarray(matrix)
-    if dense.shape not in ((n, 1), (1, n), (n,)):
-        raise ProblemError(f"{path}: has shape {_size(dense)}: expected {n} x 1, a number for each row of A")
-    return dense.ravel()
+    expected = f"expected {n} x 1, a number for each row of A"
+    matrix = _read(path, lambda rows, columns: (rows, columns) in ((n, 1), (1, n)), expected, infinite=infinite)
+    return (matrix.toarray() if scipy.sparse.issparse(matrix) else matrix).ravel()
 
 
 def write_vector(path: Path, x: np.ndarray) -> None:
@@ -179,23 +176,23 @@ def write_vector(path: Path, x: np.ndarray) -> None:
         raise ProblemError(f"--out {path}: {error.strerror}") from error
 
 
-def _read(path: Path, *, infinite: bool = False) -> Any:
-    """Return what a file holds: finite real numbers, or also infinite ones."""
+def _read(path: Path, fits: Callable[[int, int], bool], expected: str, *, infinite: bool = False) -> Any:
+    """Return what a file of a shape that fits holds: finite real numbers, or also infinite ones."""
     try:
-        matrix = scipy.io.mmread(path)
+        matrix = read_market(path, fits, expected)
     except FileNotFoundError as error:
         raise ProblemError(f"{path}: no such file") from error
     except OSError as error:
         raise ProblemError(f"{path}: {error.strerror or error}") from error
-    except (ValueError, OverflowError, TypeError) as error:
+    except MarketError as error:
         raise ProblemError(f"{path}: is not {FORMAT}: {error}") from error
-    if matrix.dtype.kind == "c":
-        raise ProblemError(f"{path}: holds complex numbers: A, b and bounds must be real")
-    values = matrix.data if scipy.sparse.issparse(matrix) else np.asarray(matrix)
+    except ValueError as error:
+        raise ProblemError(f"{path}: {error}") from error
+    values = matrix.data if scipy.sparse.issparse(matrix) else matrix
     wrong = np.isnan(values) if infinite else ~np.isfinite(values)
     if wrong.any():
         raise ProblemError(f"{path}: holds {np.count_nonzero(wrong)} values that are {'NaN' if infinite else 'not finite'}")
-    return matrix.tocsr() if scipy.sparse.issparse(matrix) else np.asarray(matrix, dtype=np.float64)
+    return matrix
 
 
 def _bound(value: str, n: int, option: str) -> float | np.ndarray:
@@ -220,7 +217,3 @@ def _method(name: str, operator: Any) -> Any:
         return METHODS[name]()
     except (ImportError, TypeError) as error:
         raise ProblemError(f"--method {name}: {error}") from error
-
-
-def _size(matrix: Any) -> str:
-    return " x ".join(map(str, matrix.shape))

@@ -120,7 +120,9 @@ def check_recorded(path: Path, *, right_side: Path | None, lower: str | None, up
 
 
 def file_digest(path: Path) -> str | None:
-    """Return what tells a file's content from another's; None if it cannot be read."""
+    """Return what tells a file's content from another's; None if it cannot be read, or has no end as a device has none."""
+    if not path.is_file():
+        return None
     try:
         with path.open("rb") as stream:
             return hashlib.file_digest(stream, "blake2b").hexdigest()[:16]

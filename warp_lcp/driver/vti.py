@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 
+from warp_lcp.claims import read_whole
 from warp_lcp.driver.atomic import replacing
 from warp_lcp.driver.simulator import Cells
-from warp_lcp.driver.vtk_xml import LENGTH_BYTES, attributes, length, opening, raw, writable
+from warp_lcp.driver.vtk_xml import LENGTH_BYTES, array_values, attributes, length, opening, raw, read_back, root, writable
 
 HIDDEN = 32  # vtkDataSetAttributes::HIDDENCELL
 GHOSTS = "vtkGhostType"  # the array by whose name VTK knows which cells are hidden
@@ -68,33 +68,25 @@ def read_vti(path: Path) -> Cells:
         OSError: the file cannot be read.
         ValueError: it is no such file, or cut short.
     """
-    text, mark, data = path.read_bytes().partition(APPENDED)
-    if not mark:
-        raise ValueError(f"{path}: no file of cells with raw bytes")
-    try:
-        image = ElementTree.fromstring(text + b"</VTKFile>").find("ImageData")
-    except ElementTree.ParseError as error:
-        raise ValueError(f"{path}: not XML") from error
-    if image is None:
-        raise ValueError(f"{path}: no image")
-    extent = np.array(image.get("WholeExtent", "").split(), dtype=int).reshape(3, 2)
-    spacing = float(image.get("Spacing", "").split()[0])
-    arrays = {str(array.get("Name")): _array(array, data) for array in image.iter("DataArray")}
-    low, counts = extent[:, 0], np.maximum(extent[:, 1] - extent[:, 0], 1)
-    shown = np.flatnonzero(arrays.pop(GHOSTS) == 0)
-    index = np.stack(np.unravel_index(shown, tuple(counts), order="F"), axis=-1) + low
-    fields = {name: values[shown] for name, values in arrays.items()}
-    return Cells(path.stem.rpartition("_")[0], index, spacing, 2 if extent[2, 0] == extent[2, 1] else 3, fields)
-
-
-def _array(array: ElementTree.Element, data: bytes) -> np.ndarray:
-    """Return an array, shape (n,) or (n, components), from the bytes behind the text."""
-    kind, _, bits = str(array.get("type")).rpartition("t")
-    dtype = np.dtype(f"<{kind[0].lower()}{int(bits) // 8}")
-    begin, components = int(str(array.get("offset"))), int(array.get("NumberOfComponents", 1))
-    size = int.from_bytes(data[begin : begin + LENGTH_BYTES], "little")
-    values = np.frombuffer(data, dtype, size // dtype.itemsize, begin + LENGTH_BYTES)
-    return values.reshape(-1, components) if components > 1 else values
+    with read_back(path):
+        text, mark, data = read_whole(path).partition(APPENDED)
+        if not mark:
+            raise ValueError("no cells with raw bytes")
+        image = root(text + b"</VTKFile>", "ImageData")
+        extent = [int(number) for number in image.get("WholeExtent", "").split()]
+        low, end = np.array(extent[::2], dtype=np.int64), np.array(extent[1::2], dtype=np.int64)
+        spacing = float(image.get("Spacing", "").split()[0])
+        counts = [max(last - first, 1) for first, last in zip(extent[::2], extent[1::2], strict=True)]
+        arrays = {str(array.get("Name")): array_values(array, data, int(array.get("offset", "0"))) for array in image.iter("DataArray")}
+        fits = all(len(array) == math.prod(counts) for array in arrays.values()) and sum(array.nbytes for array in arrays.values()) <= len(
+            data
+        )
+        if len(extent) != 6 or not 0.0 < spacing < math.inf or not fits:
+            raise ValueError(f"its arrays are not those of {' x '.join(map(str, counts))} cells")
+        shown = np.flatnonzero(arrays.pop(GHOSTS) == 0)
+        index = np.stack(np.unravel_index(shown, counts, order="F"), axis=-1) + low
+        fields = {name: array[shown] for name, array in arrays.items()}
+        return Cells(path.stem.rpartition("_")[0], index, spacing, 2 if low[2] == end[2] else 3, fields)
 
 
 def image_box(cells: Cells) -> tuple[np.ndarray, np.ndarray]:

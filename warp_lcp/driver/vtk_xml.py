@@ -1,13 +1,18 @@
-"""Arrays as VTK's XML files hold them: their types, and their bytes as base64 text."""
+"""Arrays as VTK's XML files hold them: their types, and their bytes as base64 text; and the same read back, whatever a file holds."""
 
 from __future__ import annotations
 
 import base64
+import re
 from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 
 ENCODED = 3 * 2**18  # bytes encoded at a time, a multiple of 3: memory stays small, and other threads go on in between
+TYPE = re.compile(r"(?P<kind>Float|Int|UInt)(?P<bits>8|16|32|64)")
 LENGTH_BYTES = 8  # before each array, as header_type says
 
 
@@ -71,3 +76,79 @@ def inline(name: str, values: np.ndarray) -> Iterator[bytes]:
     for begin in range(head, len(data), ENCODED):
         yield base64.b64encode(data[begin : begin + ENCODED])
     yield b"</DataArray>\n"
+
+
+@contextmanager
+def read_back(path: Path) -> Iterator[None]:
+    """Turn what is wrong in a file, while it is read, into one error that names it.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is not what a run writes.
+    """
+    try:
+        yield
+    except (ValueError, LookupError, TypeError, OverflowError, MemoryError, AttributeError, ElementTree.ParseError) as error:
+        raise ValueError(f"{path}: is not a readable frame: {str(error) or type(error).__name__}") from error
+
+
+def root(text: bytes, kind: str) -> ElementTree.Element:
+    """Return the data set of a file that `opening` began.
+
+    Raises:
+        ValueError: it is another one, or declares entities, of which a few bytes may become any number.
+        ParseError: it is not XML.
+    """
+    if b"<!" in text:
+        raise ValueError("declares a type of its own")
+    try:
+        file = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise ValueError(f"not XML: {error}") from error
+    data = file.find(kind)
+    if data is None or (file.get("byte_order"), file.get("header_type")) != ("LittleEndian", "UInt64") or file.get("compressor"):
+        raise ValueError(f"no {kind} as a run writes it, little-endian, with lengths of 64 bits and without compression")
+    return data
+
+
+def data_type(array: ElementTree.Element) -> np.dtype:
+    """Return the type of a data array.
+
+    Raises:
+        ValueError: VTK has no such type.
+    """
+    match = TYPE.fullmatch(array.get("type", ""))
+    if match is None or (match["kind"], match["bits"]) in (("Float", "8"), ("Float", "16")):
+        raise ValueError(f"{array.get('Name')!r} is of the type {array.get('type')!r}")
+    return np.dtype(f"<{match['kind'][0].lower()}{int(match['bits']) // 8}")
+
+
+def array_values(array: ElementTree.Element, data: bytes, at: int = 0) -> np.ndarray:
+    """Return a data array, shape (n,) or (n, components), from bytes that begin with its length.
+
+    Args:
+        array: its attributes.
+        data: the bytes.
+        at: where they begin.
+
+    Raises:
+        ValueError: they are fewer than their length says, or do not make whole rows.
+    """
+    dtype, components = data_type(array), int(array.get("NumberOfComponents", "1"))
+    size = int.from_bytes(data[at : at + LENGTH_BYTES], "little")
+    held = len(data) - at - LENGTH_BYTES
+    if at < 0 or not 0 <= size <= held or components < 1 or size % (components * dtype.itemsize):
+        raise ValueError(f"{array.get('Name')!r} of {size} bytes is cut short, or has no rows of {components}")
+    found = np.frombuffer(data, dtype, size // dtype.itemsize, at + LENGTH_BYTES)
+    return found.reshape(-1, components) if components > 1 else found
+
+
+def inline_values(array: ElementTree.Element) -> np.ndarray:
+    """Return a data array that `inline` wrote.
+
+    Raises:
+        ValueError: it is none.
+    """
+    if array.get("format") != "binary":
+        raise ValueError(f"{array.get('Name')!r} is not base64 text")
+    return array_values(array, base64.b64decode((array.text or "").strip(), validate=True))

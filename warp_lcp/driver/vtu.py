@@ -3,25 +3,43 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from warp_lcp.claims import read_whole
 from warp_lcp.driver.atomic import replacing
 from warp_lcp.driver.simulator import Cells, Points, Surface
-from warp_lcp.driver.vtk_xml import inline, opening, writable
+from warp_lcp.driver.vtk_xml import inline, inline_values, opening, read_back, root, writable
 
 # Corners of a cell in VTK's order for quadrilaterals (the first four) and hexahedra, as x, y, z.
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
 VTK_TYPES = {1: 1, 2: 3, 3: 5, 4: 9, 8: 12}  # vertex, line, triangle, quadrilateral and hexahedron by their corners
+VTK_CORNERS = {kind: corners for corners, kind in VTK_TYPES.items()}
 BASE64 = 4 / 3  # what the encoding adds to the bytes
 XML_BYTES = 2000  # of the text around the arrays
 OFFSET_BYTES, TYPE_BYTES, POINT_BYTES = 4, 1, 12
 
-Mesh = Points | Cells | Surface
+
+@dataclass(frozen=True)
+class Mesh:
+    """What a VTU file holds.
+
+    Args:
+        points: [m], shape (n, 3).
+        corners: of the cells among them, shape (m, corners of a cell).
+        fields: at the points, or in the cells, of shape (n,) or (n, 3).
+        on_cells: the fields are those of cells.
+    """
+
+    points: np.ndarray
+    corners: np.ndarray
+    fields: dict[str, np.ndarray]
+    on_cells: bool = False
 
 
-def write_vtu(path: Path, part: Mesh) -> None:
+def write_vtu(path: Path, part: Points | Cells | Surface) -> None:
     """Write a part of a frame as a VTU file: binary, uncompressed (compression takes three times as long as writing), atomically.
 
     The arrays are base64 text. Appended raw bytes would take 3/4 of the room and 0.6 to 0.8 of the time, but meshio cannot read them.
@@ -46,7 +64,35 @@ def write_vtu(path: Path, part: Mesh) -> None:
         file.writelines(_vtu(points, corners, fields, "CellData" if isinstance(part, Cells) else "PointData"))
 
 
-def vtu_bytes(part: Mesh) -> int:
+def read_vtu(path: Path) -> Mesh:
+    """Return what a file of `write_vtu` holds.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: it is no such file, or cut short.
+    """
+    with read_back(path):
+        piece = root(read_whole(path, copies=3), "UnstructuredGrid").find("Piece")
+        if piece is None:
+            raise ValueError("no Piece")
+        arrays = {place.tag: {str(array.get("Name")): inline_values(array) for array in place.iter("DataArray")} for place in piece}
+        points, cells = np.reshape(arrays["Points"]["Points"], (-1, 3)), arrays["Cells"]
+        each = VTK_CORNERS[int(cells["types"][0])] if len(cells["types"]) else 1
+        corners = np.reshape(cells["connectivity"], (-1, each))
+        on_cells = "CellData" in arrays
+        fields = arrays["CellData" if on_cells else "PointData"]
+        if (cells["types"] != VTK_TYPES[each]).any() or not np.array_equal(
+            cells["offsets"], np.arange(each, each * len(corners) + 1, each)
+        ):
+            raise ValueError("its cells are not all of one kind")
+        if corners.size and not 0 <= corners.min() <= corners.max() < len(points):
+            raise ValueError(f"a cell names a point that does not exist (there are {len(points)})")
+        if any(len(array) != len(corners if on_cells else points) for array in fields.values()):
+            raise ValueError("a field has not as many values as there are points or cells")
+        return Mesh(points, corners, fields, on_cells)
+
+
+def vtu_bytes(part: Points | Cells | Surface) -> int:
     """Return about how many bytes the file of a part takes; no less for points, a little more for cells that share corners."""
     total = XML_BYTES + sum(values.nbytes for values in part.fields.values())
     if isinstance(part, Points):

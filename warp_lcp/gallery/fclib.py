@@ -17,6 +17,8 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
 
+from warp_lcp.archive import DEFLATED
+from warp_lcp.claims import ClaimError, check_claim
 from warp_lcp.gallery.contact_models import ContactSystem
 
 
@@ -50,8 +52,10 @@ def read_fclib(path: Path | str) -> FclibProblem:
     try:
         with h5py.File(path, "r") as file:
             return _read(file, path)
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read as HDF5: {error}") from error
+    except ClaimError as error:
+        raise ValueError(f"{path}: {error}") from error
+    except (OSError, RuntimeError, KeyError, TypeError, OverflowError, MemoryError) as error:
+        raise ValueError(f"{path}: cannot be read as HDF5: {error or type(error).__name__}") from error
 
 
 def _read(file: Any, path: Path) -> FclibProblem:
@@ -59,8 +63,8 @@ def _read(file: Any, path: Path) -> FclibProblem:
     kind = next((name for name in ("fclib_local", "fclib_global") if name in file), None)
     if kind is None:
         raise ValueError(f"{path}: holds neither fclib_local nor fclib_global")
-    group = file[kind]
-    dim = int(_values(group, "spacedim", path)[0])
+    group = _inside(file, kind, path)
+    dim = _number(group, "spacedim", path)
     if dim not in (2, 3):
         raise ValueError(f"{path}: spacedim = {dim}: must be 2 or 3")
     B, q = (_local if kind == "fclib_local" else _global)(group, path)
@@ -68,7 +72,7 @@ def _read(file: Any, path: Path) -> FclibProblem:
     joints = len(q) - dim * len(mu)
     if joints < 0:
         raise ValueError(f"{path}: mu has {len(mu)} values for {len(q)} rows of {dim} a contact")
-    title = _text(group, "info/title")
+    title = _text(group, "info/title", path)
     free = np.full(joints, np.inf)
     system = ContactSystem(title or path.stem, B, q, mu, -free, free, dim)
     return FclibProblem(system, _solution(file, len(q), joints, path), title)
@@ -76,34 +80,40 @@ def _read(file: Any, path: Path) -> FclibProblem:
 
 def _local(group: Any, path: Path) -> tuple[scipy.sparse.csr_array, np.ndarray]:
     """Return B = [W, V; V', R] and (q, s)."""
-    W, q = _matrix(group, "W", path), _values(group, "vectors/q", path)
+    q = _values(group, "vectors/q", path)
+    W = _matrix(group, "W", (len(q), len(q)), path)
     if "V" not in group:
         return _symmetric(W, path), q
-    V, R, s = _matrix(group, "V", path), _matrix(group, "R", path), _values(group, "vectors/s", path)
+    s = _values(group, "vectors/s", path)
+    V, R = _matrix(group, "V", (len(q), len(s)), path), _matrix(group, "R", (len(s), len(s)), path)
     return _symmetric(scipy.sparse.block_array([[W, V], [V.T, R]]), path), np.concatenate([q, s])
 
 
 def _global(group: Any, path: Path) -> tuple[scipy.sparse.csr_array, np.ndarray]:
     """Return B = C'M^-1 C and C'M^-1 f + (w, b) with C = (H, G)."""
-    M, H, f = _matrix(group, "M", path), _matrix(group, "H", path), _values(group, "vectors/f", path)
-    q = _values(group, "vectors/w", path)
-    C = H
+    f, q = _values(group, "vectors/f", path), _values(group, "vectors/w", path)
+    M, C = _matrix(group, "M", (len(f), len(f)), path), _matrix(group, "H", (len(f), len(q)), path)
     if "G" in group:
-        C = scipy.sparse.csr_array(scipy.sparse.hstack([H, _matrix(group, "G", path)]))
-        q = np.concatenate([q, _values(group, "vectors/b", path)])
-    if M.shape != (len(f), len(f)) or C.shape != (len(f), len(q)):
-        raise ValueError(f"{path}: M has shape {M.shape}, H and G {C.shape}: do not fit f of {len(f)} and w and b of {len(q)} values")
-    solve = scipy.sparse.linalg.splu(scipy.sparse.csc_array(M)).solve
+        b = _values(group, "vectors/b", path)
+        C = scipy.sparse.csr_array(scipy.sparse.hstack([C, _matrix(group, "G", (len(f), len(b)), path)]))
+        q = np.concatenate([q, b])
+    check_claim(f"M^-1 C of {len(f)} x {len(q)} values", 2 * np.dtype(np.float64).itemsize * len(f) * len(q))
+    try:
+        solve = scipy.sparse.linalg.splu(scipy.sparse.csc_array(M)).solve
+    except RuntimeError as error:
+        raise ValueError(f"{path}: M has no inverse: {error}") from error
     response = scipy.sparse.csr_array(np.asarray(solve(C.toarray())))
     return _symmetric(C.T @ response, path), C.T @ np.asarray(solve(f)) + q
 
 
-def _matrix(group: Any, name: str, path: Path) -> scipy.sparse.csr_array:
-    """Return a matrix that is stored in one of FCLIB's three ways."""
+def _matrix(group: Any, name: str, shape: tuple[int, int], path: Path) -> scipy.sparse.csr_array:
+    """Return a matrix of a shape that is stored in one of FCLIB's three ways."""
     if name not in group:
         raise ValueError(f"{path}: {group.name} has no matrix {name}")
-    m, n, nz = (int(_values(group, f"{name}/{key}", path)[0]) for key in ("m", "n", "nz"))
-    p, i = (_values(group, f"{name}/{key}", path).astype(np.int64) for key in ("p", "i"))
+    m, n, nz = (_number(group, f"{name}/{key}", path) for key in ("m", "n", "nz"))
+    if (m, n) != shape:
+        raise ValueError(f"{path}: {group.name}/{name} has shape {m} x {n}: the vectors beside it ask for {shape[0]} x {shape[1]}")
+    p, i = (_values(group, f"{name}/{key}", path, "iu").astype(np.int64) for key in ("p", "i"))
     x = _values(group, f"{name}/x", path)
     try:
         if nz >= 0:
@@ -112,7 +122,9 @@ def _matrix(group: Any, name: str, path: Path) -> scipy.sparse.csr_array:
         made = {-1: scipy.sparse.csc_array, -2: scipy.sparse.csr_array}.get(nz)
         if made is None:
             raise ValueError(f"nz = {nz}: must be >= 0, -1 or -2")
-        return scipy.sparse.csr_array(made((x[:used], i[:used], p), shape=(m, n)))
+        stored = made((x[:used], i[:used], p), shape=(m, n))
+        stored.check_format(full_check=True)  # an index beyond the shape would be written to
+        return scipy.sparse.csr_array(stored)
     except (ValueError, IndexError) as error:
         raise ValueError(f"{path}: {group.name}/{name} is no sparse matrix: {error}") from error
 
@@ -120,23 +132,59 @@ def _matrix(group: Any, name: str, path: Path) -> scipy.sparse.csr_array:
 def _symmetric(B: Any, path: Path) -> scipy.sparse.csr_array:
     """Return B without what rounding has made unsymmetric."""
     B = scipy.sparse.csr_array(B)
-    if B.shape[0] != B.shape[1] or abs(B - B.T).max() > 1e-6 * abs(B).max():
+    if 0 in B.shape or not np.isfinite(B.data).all():
+        raise ValueError(f"{path}: the matrix of the contacts is empty or not finite")
+    if abs(B - B.T).max() > 1e-6 * abs(B).max():
         raise ValueError(f"{path}: the matrix of the contacts is not symmetric")
     return scipy.sparse.csr_array(0.5 * (B + B.T))
 
 
-def _values(group: Any, name: str, path: Path) -> np.ndarray:
-    """Return a dataset as a vector."""
-    if name not in group:
+def _values(group: Any, name: str, path: Path, kinds: str = "iuf") -> np.ndarray:
+    """Return a dataset of numbers of some kinds as a vector."""
+    found = np.asarray(_dataset(group, name, path)[()])
+    if found.dtype.kind not in kinds or not np.isfinite(found).all():
+        raise ValueError(f"{path}: {group.name}/{name} is {found.dtype}: must be finite numbers")
+    return np.atleast_1d(found).ravel()
+
+
+def _number(group: Any, name: str, path: Path) -> int:
+    """Return a dataset of one whole number."""
+    values = _values(group, name, path, "iu")
+    if len(values) != 1:
+        raise ValueError(f"{path}: {group.name}/{name} has {len(values)} values: must be one")
+    return int(values[0])
+
+
+def _dataset(group: Any, name: str, path: Path) -> Any:
+    """Return a dataset that is in this file, and whose size what is stored there can make."""
+    import h5py
+
+    found = group
+    for part in name.split("/"):
+        found = _inside(found, part, path)
+    if not isinstance(found, h5py.Dataset) or found.is_virtual or found.external:
+        raise ValueError(f"{path}: {group.name}/{name} is no dataset of this file")
+    size, stored = int(found.nbytes), int(found.id.get_storage_size())
+    check_claim(f"{name} of {size} bytes", size, stored=-(-size // DEFLATED) if found.chunks else size, held=stored)
+    return found
+
+
+def _inside(group: Any, name: str, path: Path) -> Any:
+    """Return what is in a group, if it is in the same file."""
+    import h5py
+
+    if not isinstance(group, h5py.Group) or name not in group:
         raise ValueError(f"{path}: {group.name} has no {name}")
-    return np.atleast_1d(np.asarray(group[name][()])).ravel()
+    if isinstance(group.get(name, getlink=True), h5py.ExternalLink):
+        raise ValueError(f"{path}: {group.name}/{name} is in another file")
+    return group[name]
 
 
-def _text(group: Any, name: str) -> str:
+def _text(group: Any, name: str, path: Path) -> str:
     """Return a string that a file may hold."""
     if name not in group:
         return ""
-    value = group[name][()]
+    value = _dataset(group, name, path)[()]
     return value.decode(errors="replace").rstrip("\0") if isinstance(value, bytes) else str(value)
 
 

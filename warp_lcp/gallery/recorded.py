@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import re
-import zipfile
-import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from warp_lcp.archive import Archive
+from warp_lcp.claims import check_claim
 from warp_lcp.gallery.problem import Problem
 from warp_lcp.operators.grid_poisson import AXES, FLUID, GridPoisson
 from warp_lcp.problem import LCP
@@ -21,6 +23,8 @@ FORMAT = 1
 PROBLEM_FILE = re.compile(r"problem_(?P<step>\d{6,})\.npz")
 NUMBERS = ("step", "time", "dt", "spacing", "tolerance", "absolute_tolerance")
 REQUIRED = frozenset({"format", "cells", "b", "lower", "upper", "x0", *NUMBERS})
+FIELDS = frozenset({"cells", "b", "lower", "upper", "x0", "face_x", "face_y", "face_z", "shift"})
+KNOWN = REQUIRED | FIELDS  # of a file that holds more the rest is not read
 DESCRIPTION = """\
 # Complementarity problems of a simulation
 
@@ -127,16 +131,14 @@ def load(path: Path, *, device: Any = None, dtype: Any = wp.float32) -> Recorded
     Raises:
         ValueError: the file is none of a problem, or is damaged or of a later version; the message names it.
     """
-    kept = _read(Path(path))
-    try:
+    with opened(path) as archive:
+        kept = archive.read(sorted(KNOWN & archive.headers.keys()))
         coefficients: dict[str, Any] = {name: kept[name] for name in ("face_x", "face_y", "face_z", "shift") if name in kept}
         A = GridPoisson(kept["cells"], device=device, dtype=dtype, **coefficients)
         b, lower, upper, x0 = (np.broadcast_to(kept[name], A.shape).astype(np.float64) for name in ("b", "lower", "upper", "x0"))
         numbers: dict[str, Any] = {name: kept[name].item() for name in NUMBERS}
         facts = {"symmetric", "semidefinite"} | ({"mixed"} if np.isneginf(lower[kept["cells"] == FLUID]).any() else set())
         return RecordedProblem(Path(path).stem, A, b, lower, upper, None, frozenset(facts), x0, **numbers)
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"{path}: no recorded problem: {error}") from error
 
 
 def check(path: Path) -> None:
@@ -145,18 +147,43 @@ def check(path: Path) -> None:
     Raises:
         ValueError: it is not, or is cut short or of a later version; the message names it.
     """
-    _read(path, ("format",))
+    with opened(path):
+        pass
 
 
-def _read(path: Path, wanted: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+@contextmanager
+def opened(path: Path) -> Iterator[Archive]:
+    """Open a problem's file and look whether it is one, without reading its fields.
+
+    Raises:
+        ValueError: it is not, is damaged, of a later version, or larger than the free memory; the message names it. What the block raises
+            of what is in the file is told so too.
+    """
     try:
-        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:  # NumPy leaves a broken file open
-            version = int(file["format"])
-            if version != FORMAT:
-                raise ValueError(f"its format is {version}, this version reads {FORMAT}")
-            missing = sorted(REQUIRED - set(file.files))
-            if missing:
-                raise ValueError(f"it lacks {', '.join(missing)}")
-            return {name: file[name] for name in wanted or file.files}
-    except (OSError, EOFError, KeyError, ValueError, TypeError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
+        with Archive(Path(path)) as archive:
+            _check(archive)
+            yield archive
+    except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: no recorded problem: {error}") from error
+
+
+def _check(archive: Archive) -> None:
+    """Refuse an archive whose arrays are not those of a problem."""
+    headers = archive.headers
+    if "format" in headers and not headers["format"].shape and (version := archive.read(["format"])["format"].item()) != FORMAT:
+        raise ValueError(f"its format is {version!r}, this version reads {FORMAT}")
+    missing = sorted(REQUIRED - headers.keys())
+    if missing:
+        raise ValueError(f"it lacks {', '.join(missing)}")
+    shape = headers["cells"].shape
+    if len(shape) not in (2, 3) or headers["cells"].dtype != np.int8:
+        raise ValueError(f"cells is {headers['cells']}: must be int8 of 2 or 3 axes")
+    faces = {f"face_{axis}": tuple(n + (a == number) for a, n in enumerate(reversed(shape)))[::-1] for number, axis in enumerate(AXES)}
+    for name in KNOWN & headers.keys() - {"cells"}:
+        header, allowed = headers[name], [faces.get(name, shape)] if name in FIELDS else [()]
+        if name in ("lower", "upper"):
+            allowed = [(), shape]
+        if header.shape not in allowed or header.dtype.kind not in "fi":
+            raise ValueError(f"{name} is {header}: must be numbers of shape {' or '.join(map(str, allowed))}")
+    values = prod(shape) * len(FIELDS & headers.keys())
+    check_claim(f"fields of {' x '.join(map(str, reversed(shape)))} cells", values * np.dtype(np.float64).itemsize)

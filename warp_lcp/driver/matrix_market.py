@@ -1,0 +1,137 @@
+"""Matrix Market files of real numbers, read so that no file harms: SciPy's reader (1.17) ends the process where a number is cut short."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import re
+import warnings
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+
+from warp_lcp.claims import ClaimError, check_claim, free_host_memory, read_whole
+
+PACKED: dict[str, Callable[[Path], Any]] = {".gz": gzip.open, ".bz2": bz2.open}
+HEADER = re.compile(
+    rb"%%MatrixMarket[ \t]+matrix[ \t]+(?P<form>coordinate|array)[ \t]+"
+    rb"(?P<field>real|double|integer|unsigned-integer|pattern|complex)[ \t]+"
+    rb"(?P<symmetry>general|symmetric|skew-symmetric|hermitian)[ \t]*\r?\n(?:[ \t]*+(?:%[^\n]*+)?\r?\n)*+"
+    rb"(?P<size>[ \t]*\d{1,18}(?:[ \t]+\d{1,18}){1,2})[ \t]*+(?:\r?\n|\Z)",
+    re.IGNORECASE,
+)
+COPIES = 5  # of the text: the shortest number takes 2 bytes of it, and 8 as it is read
+NUMBER = 8  # bytes
+
+
+class MarketError(ValueError):
+    """A file that is not of this format; the message says why, not which file."""
+
+
+def read_market(path: Path, fits: Callable[[int, int], bool], expected: str) -> Any:
+    """Read a matrix: scipy.sparse (CSR) or numpy as the file says, float64.
+
+    Args:
+        path: the file; .gz and .bz2 are unpacked.
+        fits: whether a shape is allowed, asked before the matrix is read.
+        expected: what the message says of a shape that is not.
+
+    Raises:
+        OSError: the file cannot be read.
+        MarketError: it is not of this format.
+        ValueError: its numbers are complex, or its shape does not fit.
+        ClaimError: it claims more than it has, or than there is memory for.
+    """
+    text = _text(path)
+    header = HEADER.match(text)
+    if header is None:
+        raise MarketError("it does not begin with %%MatrixMarket matrix, form, field and symmetry, and its size")
+    form, field, symmetry = (header[name].lower() for name in ("form", "field", "symmetry"))
+    rows, columns, *more = map(int, header["size"].split())
+    if field == b"complex":
+        raise ValueError("holds complex numbers: A, b and bounds must be real")
+    if not fits(rows, columns):
+        raise ValueError(f"has shape {rows} x {columns}: {expected}")
+    if len(more) != (form == b"coordinate") or (form == b"array" and field == b"pattern"):
+        raise MarketError("its size is not that of its form")
+    if symmetry != b"general" and rows != columns:
+        raise MarketError(f"has shape {rows} x {columns}: symmetric matrices are square")
+    body = text[header.end() :]
+    if form == b"array":
+        return _dense(body, rows, columns, symmetry)
+    return _sparse(body, rows, columns, more[0], symmetry, pattern=field == b"pattern")
+
+
+def _dense(body: bytes, rows: int, columns: int, symmetry: bytes) -> np.ndarray:
+    """Return an array: all of it by columns, or its lower triangle, without the diagonal if that is 0."""
+    skew = symmetry == b"skew-symmetric"
+    count = rows * columns if symmetry == b"general" else rows * (rows - 1 if skew else rows + 1) // 2
+    values = _numbers(body, count, f"{rows} x {columns} values", NUMBER * rows * columns)
+    if symmetry == b"general":
+        return np.ascontiguousarray(values.reshape(columns, rows).T)
+    found = np.zeros((rows, rows))
+    column, row = np.triu_indices(rows, k=int(skew))
+    found[row, column] = values
+    found[column, row] = -values if skew else values
+    return found
+
+
+def _sparse(body: bytes, rows: int, columns: int, entries: int, symmetry: bytes, *, pattern: bool) -> scipy.sparse.csr_array:
+    """Return a matrix of entries (row, column, value), counted from 1."""
+    width = 2 if pattern else 3
+    what = f"{rows} x {columns} with {entries} entries"
+    table = _numbers(body, width * entries, what, NUMBER * (rows + 2 * width * entries)).reshape(entries, width)
+    kind: Any = np.int32 if max(rows, columns) <= np.iinfo(np.int32).max else np.int64
+    with np.errstate(invalid="ignore"):  # a place that is no such number differs from what was read
+        row, column = (table[:, axis].astype(kind) - 1 for axis in range(2))
+    inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+    if not (inside & (row + 1.0 == table[:, 0]) & (column + 1.0 == table[:, 1])).all():
+        raise MarketError(f"an entry is not in one of the rows 1 to {rows} and columns 1 to {columns}")
+    value = np.ones(entries) if pattern else table[:, 2]
+    if symmetry != b"general":
+        other = row != column
+        sign = -1.0 if symmetry == b"skew-symmetric" else 1.0
+        row, column = np.concatenate([row, column[other]]), np.concatenate([column, row[other]])
+        value = np.concatenate([value, sign * value[other]])
+    return scipy.sparse.coo_array((value, (row, column)), shape=(rows, columns)).tocsr()
+
+
+def _numbers(body: bytes, count: int, what: str, needed: int) -> np.ndarray:
+    """Return so many numbers of a text, and no others.
+
+    Args:
+        body: the text.
+        count: how many it must hold.
+        what: names them.
+        needed: memory that they take [bytes].
+    """
+    check_claim(what, needed, stored=len("1\n") * count - 1, held=len(body))
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", DeprecationWarning)  # so NumPy says that something is no number
+            found = np.fromstring(body, dtype=np.float64, sep=" ") if body.strip() else np.zeros(0)
+    except (DeprecationWarning, ValueError) as error:
+        raise MarketError("it holds something that is no number") from error
+    if len(found) != count:
+        raise MarketError(f"it holds {len(found)} numbers, {what} are {count}")
+    return found
+
+
+def _text(path: Path) -> bytes:
+    """Return what is in a file, unpacked if it is packed."""
+    unpack = PACKED.get(path.suffix)
+    if unpack is None:
+        return read_whole(path, copies=COPIES)
+    most = free_host_memory()
+    try:
+        with unpack(path) as stream:
+            text: bytes = stream.read(-1 if most is None else most // COPIES)
+            if most is not None and stream.read(1):
+                raise ClaimError("what is packed in it does not fit the free memory")
+    except (EOFError, zlib.error, MemoryError) as error:
+        raise MarketError(f"cannot be unpacked: {error}") from error
+    return text
