@@ -237,7 +237,7 @@ def test_binary_stl_may_begin_like_a_text_one(tmp_path):
         ("a.stl", "solid a\nfacet\nvertex 0 0 x\nvertex 0 0 0\nvertex 0 0 0\nendfacet\nendsolid a\n", "not a readable STL"),
         ("a.ply", "", "not a readable PLY"),
         ("a.ply", "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\n", "not a readable PLY"),
-        ("a.ply", "ply\nformat ascii 1.0\nelement camera 3\nend_header\n", "not a readable PLY"),
+        ("a.ply", "ply\nformat ascii 1.0\nelement camera 3\nend_header\n", "no vertices"),
         ("a.vtk", "", r"must be one of \.obj, \.ply, \.stl"),
     ],
 )
