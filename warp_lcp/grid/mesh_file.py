@@ -1,17 +1,33 @@
-"""Read the triangles of OBJ, STL and PLY files. What meshio cannot take (texture seams, say) is put right before it sees it."""
+"""Read the triangles of OBJ, STL and PLY files. Nothing is allocated for what a file only promises to hold."""
 
 from __future__ import annotations
 
-import io
+import itertools
 import re
-import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+from warp_lcp.claims import check_claim
+
 FORMATS = (".obj", ".ply", ".stl")
 STL_HEADER = 84  # bytes before the first triangle of a binary STL: 80 of text and a count
-STL_TRIANGLE = 50
+STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("color", "<u2")])
+PLY_TYPES = {
+    name: code
+    for names, code in (
+        ("char int8", "i1"), ("uchar uint8", "u1"), ("short int16", "i2"), ("ushort uint16", "u2"),
+        ("int int32", "i4"), ("uint uint32", "u4"), ("float float32", "f4"), ("double float64", "f8"), ("int64", "i8"), ("uint64", "u8"),
+    )
+    for name in names.split()
+}  # fmt: skip
+PLY_ORDERS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
+PLY_CORNERS = ("vertex_indices", "vertex_index")  # the names of a face's list of corners that are in use
+LARGEST_INDEX = 2**31 - 1
+
+Corners = list[np.ndarray]  # of polygons, each of shape (count, corners)
 
 
 def read_triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -29,8 +45,6 @@ def read_triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         ValueError: the file is missing, of another format or not readable; the message names it.
     """
-    import meshio
-
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
         raise ValueError(f"{path}: a mesh must be one of {', '.join(FORMATS)}")
@@ -43,53 +57,43 @@ def read_triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if suffix == ".stl" and not _is_binary_stl(data):
         return _parse_text_stl(path, data)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about details of the format; what matters here is checked afterwards
-            if suffix == ".stl":
-                mesh = meshio.stl.read(path)
-            elif suffix == ".ply":
-                mesh = meshio.ply.read(io.BytesIO(_standard_ply(data)))
-            else:
-                mesh = meshio.obj.read(io.StringIO(_plain_obj(data)))
-    except (
-        meshio.ReadError,
-        ValueError,
-        KeyError,
-        IndexError,
-        TypeError,
-        AssertionError,
-        AttributeError,
-        EOFError,
-        UnboundLocalError,
-    ) as error:
-        reason = str(error).strip() or type(error).__name__
-        raise ValueError(f"{path}: not a readable {suffix[1:].upper()} file ({reason})") from error
-    return _triangulate(path, np.asarray(mesh.points), [np.asarray(block.data) for block in mesh.cells if len(block.data)])
+        points, blocks = {".obj": _parse_obj, ".ply": _parse_ply, ".stl": _parse_binary_stl}[suffix](data)
+    except ValueError as error:
+        raise ValueError(f"{path}: not a readable {suffix[1:].upper()} file ({error})") from error
+    return _triangulate(path, points, [block for block in blocks if len(block)])
 
 
-def _triangulate(path: Path, points: np.ndarray, blocks: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def _triangulate(path: Path, points: np.ndarray, blocks: Corners) -> tuple[np.ndarray, np.ndarray]:
     """Cut blocks of equal polygons, each of shape (count, corners), into triangles."""
     if points.size == 0:
         raise ValueError(f"{path}: the mesh has no vertices")
     fans = [np.stack([block[:, [0, i, i + 1]] for i in range(1, block.shape[1] - 1)], axis=1) for block in blocks if block.shape[1] >= 3]
     if not fans:
         raise ValueError(f"{path}: the mesh has no triangles")
-    triangles = np.concatenate([fan.reshape(-1, 3) for fan in fans]).astype(np.int64)
+    triangles = np.concatenate([fan.reshape(-1, 3) for fan in fans])
     if triangles.min() < 0 or triangles.max() >= len(points):
         raise ValueError(f"{path}: a triangle names a vertex that does not exist (there are {len(points)})")
-    vertices = np.zeros((len(points), 3))
-    columns = min(points.shape[1], 3)
-    vertices[:, :columns] = points[:, :columns]
-    return vertices, triangles
+    return points, triangles
+
+
+def _blocks(polygons: Sequence[Sequence[int] | np.ndarray]) -> Corners:
+    """Return polygons as arrays, one for each run of them that have as many corners."""
+    return [np.array(list(run), dtype=np.int64) for _, run in itertools.groupby(polygons, key=len)]
 
 
 def _is_binary_stl(data: bytes) -> bool:
     """Tell a binary STL by its length: its first bytes may say "solid" all the same."""
-    return len(data) >= STL_HEADER and len(data) == STL_HEADER + STL_TRIANGLE * int.from_bytes(data[80:84], "little")
+    return len(data) >= STL_HEADER and len(data) == STL_HEADER + STL_TRIANGLE.itemsize * int.from_bytes(data[80:84], "little")
+
+
+def _parse_binary_stl(data: bytes) -> tuple[np.ndarray, Corners]:
+    """Read the corners of a binary STL, three for each triangle."""
+    points = np.frombuffer(data, STL_TRIANGLE, offset=STL_HEADER)["corners"].reshape(-1, 3).astype(np.float64)
+    return points, [np.arange(len(points)).reshape(-1, 3)]
 
 
 def _parse_text_stl(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Read the corners of a text STL (meshio stumbles over blank lines and over words in capitals)."""
+    """Read the corners of a text STL; blank lines and words in capitals do not matter."""
     if not data.lstrip()[:5].lower() == b"solid":
         raise ValueError(f"{path}: not a readable STL file (neither text nor of the length that its number of triangles asks for)")
     corners = re.findall(rb"^\s*vertex\s+(\S+)\s+(\S+)\s+(\S+)\s*$", data, flags=re.MULTILINE | re.IGNORECASE)
@@ -105,27 +109,155 @@ def _parse_text_stl(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
     return vertices, np.arange(len(vertices)).reshape(-1, 3)
 
 
-def _standard_ply(data: bytes) -> bytes:
-    """Give the list of corners the name that meshio knows, of the two in use."""
-    header, end, body = data.partition(b"end_header")
-    if not end:
-        raise ValueError("the header does not end")  # meshio would look for it for ever
-    header = header.replace(b"\r\n", b"\n")
-    return re.sub(rb"\bvertex_index\b", b"vertex_indices", header) + end + body
+@dataclass
+class _Element:
+    """A kind of records of a PLY file: how many it promises, and the name, type and, of a list, type of length of each property."""
+
+    name: str
+    count: int
+    properties: list[tuple[str, str, str | None]] = field(default_factory=list)
 
 
-def _plain_obj(data: bytes) -> str:
-    """Reduce an OBJ to vertices and faces of positive indices: meshio refuses texture seams and misreads relative indices."""
-    lines = []
-    vertices = 0
+def _parse_ply(data: bytes) -> tuple[np.ndarray, Corners]:
+    """Read vertices and faces of a PLY file; other elements and properties are passed over."""
+    head = re.match(rb"ply\s(.*?\n)\s*end_header[ \t]*\r?\n", data, flags=re.DOTALL)
+    if not head:
+        raise ValueError("its header does not begin with ply and end with end_header")
+    order, elements = _ply_header(head[1].decode("ascii", "replace"))
+    points = np.empty((0, 3))
+    polygons: list[Sequence[int] | np.ndarray] = []
+    source = _TextRecords(data[head.end() :]) if order is None else _BinaryRecords(data[head.end() :], order)
+    for element in elements:
+        names = [name for name, _, _ in element.properties]
+        if not names or not element.count:
+            continue
+        check_claim(f"{element.count} x {element.name}", 8 * element.count * len(names), **source.claim(element))
+        if any(length for _, _, length in element.properties):
+            corners = next((names.index(name) for name in PLY_CORNERS if name in names), -1) if element.name == "face" else -1
+            if corners >= 0 and element.properties[corners][1][0] == "f":
+                raise ValueError("its faces name vertices by numbers that are not whole")
+            polygons += source.lists(element, corners)
+        else:
+            table = source.table(element)
+            if element.name == "vertex":
+                if missing := {"x", "y", "z"} - set(names):
+                    raise ValueError(f"its vertices have no {min(missing)}")
+                points = table[:, [names.index(axis) for axis in "xyz"]]
+    return points, _blocks(polygons)
+
+
+def _ply_header(text: str) -> tuple[str | None, list[_Element]]:
+    """Return the order of bytes, None for text, and the elements that a header names."""
+    order: str | None = ""
+    elements: list[_Element] = []
+    for line in text.splitlines():
+        match line.split():
+            case ["format", kind, "1.0"] if kind in PLY_ORDERS:
+                order = PLY_ORDERS[kind]
+            case ["element", name, count] if count.isdecimal() and len(count) < 20:
+                elements.append(_Element(name, int(count)))
+            case ["property", "list", length, kind, name] if elements and kind in PLY_TYPES and PLY_TYPES.get(length, "f")[0] != "f":
+                elements[-1].properties.append((name, PLY_TYPES[kind], PLY_TYPES[length]))
+            case ["property", kind, name] if elements and kind in PLY_TYPES:
+                elements[-1].properties.append((name, PLY_TYPES[kind], None))
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case _:
+                raise ValueError(f"its header says {line[:80]!r}")
+    if order == "":
+        raise ValueError("its header names no format")
+    return order, elements
+
+
+class _TextRecords:
+    """The words of a PLY file's body, one record after the other."""
+
+    def __init__(self, body: bytes) -> None:
+        self.words, self.at = body.split(), 0
+
+    def claim(self, element: _Element) -> dict[str, int]:
+        """Return the least that an element's records take, `stored`, and what is left for them, `held` [bytes, two a word]."""
+        return {"stored": 2 * element.count * len(element.properties), "held": 2 * (len(self.words) - self.at)}
+
+    def table(self, element: _Element) -> np.ndarray:
+        """Return records without lists, float64 of shape (count, properties)."""
+        width = len(element.properties)
+        begin, self.at = self.at, self.at + element.count * width
+        return np.array([float(word) for word in self.words[begin : self.at]]).reshape(element.count, width)
+
+    def lists(self, element: _Element, wanted: int) -> list[Sequence[int]]:
+        """Return a list property of each record, none if `wanted` is -1."""
+        found: list[Sequence[int]] = []
+        for _ in range(element.count):
+            for number, (_, _, length) in enumerate(element.properties):
+                if self.at >= len(self.words):
+                    raise ValueError(f"it ends before the last {element.name}")
+                size = int(self.words[self.at]) if length else 0
+                begin, self.at = self.at + 1, self.at + 1 + size
+                if size < 0 or self.at > len(self.words):
+                    raise ValueError(f"a list of {size} entries does not fit into it")
+                if number == wanted:
+                    found.append([_index(word) for word in self.words[begin : self.at]])
+        return found
+
+
+class _BinaryRecords:
+    """The bytes of a PLY file's body, one record after the other."""
+
+    def __init__(self, body: bytes, order: str) -> None:
+        self.body, self.order, self.at = body, order, 0
+
+    def claim(self, element: _Element) -> dict[str, int]:
+        """Return the least that an element's records take, `stored`, and what is left for them, `held` [bytes]."""
+        least = sum(int((length or kind)[1]) for _, kind, length in element.properties)
+        return {"stored": element.count * least, "held": len(self.body) - self.at}
+
+    def table(self, element: _Element) -> np.ndarray:
+        """Return records without lists, float64 of shape (count, properties)."""
+        record = np.dtype([(str(number), self.order + kind) for number, (_, kind, _) in enumerate(element.properties)])
+        rows = np.frombuffer(self.body, record, element.count, self.at)
+        self.at += rows.nbytes
+        return np.stack([rows[name].astype(np.float64) for name in record.names or ()], axis=1)
+
+    def lists(self, element: _Element, wanted: int) -> list[np.ndarray]:
+        """Return a list property of each record, none if `wanted` is -1."""
+        found = []
+        for _ in range(element.count):
+            for number, (_, kind, length) in enumerate(element.properties):
+                size = int(self._take(length, 1, element)[0]) if length else 1
+                entries = self._take(kind, size, element)
+                if number == wanted:
+                    found.append(entries)
+        return found
+
+    def _take(self, kind: str, count: int, element: _Element) -> np.ndarray:
+        """Return the next numbers of a type."""
+        width = int(kind[1])
+        if not 0 <= count <= (len(self.body) - self.at) // width:
+            raise ValueError(f"it ends within a {element.name}")
+        begin, self.at = self.at, self.at + count * width
+        return np.frombuffer(self.body, self.order + kind, count, begin)
+
+
+def _parse_obj(data: bytes) -> tuple[np.ndarray, Corners]:
+    """Read vertices and faces of an OBJ file, whose indices count from 1, or backwards from the last vertex so far."""
+    vertices: list[list[float]] = []
+    polygons: list[list[int]] = []
     for line in data.decode("utf-8", errors="replace").replace("\\\r\n", " ").replace("\\\n", " ").splitlines():
         words = line.split("#", 1)[0].split()
-        if not words:
-            continue
-        if words[0] == "v":
-            vertices += 1
-            lines.append(" ".join(words[:4]))
-        elif words[0] == "f":
-            indices = [int(word.split("/", 1)[0]) for word in words[1:]]
-            lines.append("f " + " ".join(str(index if index > 0 else index + vertices + 1) if index else "0" for index in indices))
-    return "\n".join(lines)
+        if words[:1] == ["v"]:
+            if len(words) < 4:
+                raise ValueError("a vertex has fewer than three coordinates")
+            vertices.append([float(word) for word in words[1:4]])
+        elif words[:1] == ["f"]:
+            indices = [_index(word.split("/", 1)[0]) for word in words[1:]]
+            polygons.append([index - 1 if index >= 0 else index + len(vertices) for index in indices])
+    return np.array(vertices, dtype=np.float64).reshape(-1, 3), _blocks(polygons)
+
+
+def _index(word: str | bytes) -> int:
+    """Return the number of a vertex, no larger than any mesh has."""
+    index = int(word)
+    if abs(index) > LARGEST_INDEX:
+        raise ValueError(f"a face names a vertex by a number of {len(str(abs(index)))} digits")
+    return index
