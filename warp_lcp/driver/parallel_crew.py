@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import typer
+import warp as wp
 
 from warp_lcp.distributed.devices import device_of_rank
 from warp_lcp.distributed.meeting import Meeting, RankFailed
@@ -47,6 +48,8 @@ class RankCrew(Crew):
     def __init__(self, ranks: Ranks) -> None:
         """Let the first rank speak."""
         super().__init__(Terminal(stderr=True, quiet=not ranks.first), speaks=ranks.first)
+        if not ranks.first:
+            wp.config.log_level = wp.LOG_ERROR
         self.meeting = Meeting(ranks, PLANNED, self._last_words)
         self._folder: RunFolder | None = None
 
