@@ -25,7 +25,7 @@ from warp_lcp.driver.particle_assembly import (
 )
 from warp_lcp.driver.particle_simulation import ParticleSimulation, Row
 from warp_lcp.driver.scene import Scene
-from warp_lcp.driver.simulator import Cells, Part, SimulationFailed, StepFailed
+from warp_lcp.driver.simulator import Cells, Part, SimulationFailed, missed_by_far
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary
@@ -238,10 +238,8 @@ class LiquidSimulation(ParticleSimulation):
                 f"step {self.step_count}: liquid fills a closed space, and walls move or sources run so that its volume would have "
                 'to change; leave air in it, or give the wall that moves away from it wall = "separating"'
             )
-        raise StepFailed(
-            f"step {self.step_count}: the pressure solve ended with {result.status.name} after {result.iterations} iterations at a "
-            f"relative residual of {result.relative_residual:.2e} (tolerance {self.projection.tolerance}): {result.status.value}"
-        )
+        residual = f"relative residual of {result.relative_residual:.2e} (tolerance {self.projection.tolerance})"
+        raise missed_by_far("pressure", result.status, result.iterations, residual, result.status.value)
 
 
 class FluidsSimulator:

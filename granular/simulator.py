@@ -20,7 +20,7 @@ from granular.stress import Stress, YieldSet
 from warp_lcp.driver.particle_assembly import make_bodies, make_boundary, make_outlets, make_particles, make_sources, placed_solids
 from warp_lcp.driver.particle_simulation import ParticleSimulation, Row
 from warp_lcp.driver.scene import Scene
-from warp_lcp.driver.simulator import Cells, Part, SimulationFailed
+from warp_lcp.driver.simulator import Cells, Part, SimulationFailed, missed_by_far
 from warp_lcp.grid.extrapolate import complete
 from warp_lcp.grid.level_set import particle_density
 from warp_lcp.grid.particles import Particles, ParticleTotals
@@ -33,6 +33,8 @@ from warp_lcp.operators.grid_poisson import FLUID, SOLID
 from warp_lcp.rigid.bodies import RigidBodies
 
 FRONT = 99.0  # percentile of the particles that runout and height are of
+FAR = 1.0  # rho g dx: cells are left with a velocity that is off by as much as gravity makes in the step, and sand gains energy
+JAMMED = "solids or a source may leave sand no way out: let them move less or slower; deep sand may need more solver.max_iterations"
 STANDING = 0.05  # of sqrt(g dx): a scale for the residual where there is no gravity
 COLUMNS = (
     "coupled_residual",
@@ -130,9 +132,12 @@ class SandSimulation(ParticleSimulation):
     def step(self, dt: float) -> Row:
         """Advance by dt [s].
 
-        Stresses that miss their tolerance are taken as they are: the log's coupled_residual says how good they are.
+        Stresses that miss their tolerance are taken as they are, unless their residual is beyond `FAR`: the log's coupled_residual says how
+        good they are. They are solved for before any particle moves, so that a failed solve leaves the state as it was, but for the
+        particles' order.
 
         Raises:
+            StepFailed: the stresses are far from what balances the sand; a smaller dt may be tried.
             SimulationFailed: something is not finite, or a particle has left the domain.
             ValueError: dt is not positive.
         """
@@ -286,6 +291,11 @@ class SandSimulation(ParticleSimulation):
         if solved.status is wl.SolveStatus.NON_FINITE:
             self.restore_bodies()
             raise SimulationFailed(f"step {self.step_count}: the stresses are not finite after {solved.iterations} iterations")
+        if solved.status is not wl.SolveStatus.CONVERGED and solved.residual > FAR:
+            self.restore_bodies()
+            stress.take_back()
+            residual = f"residual of {solved.residual:.2e} rho g dx (tolerance {scene.solver.tolerance}, at most {FAR:g} is gone on from)"
+            raise missed_by_far("stress", solved.status, solved.iterations, residual, JAMMED)
         with self.watch.stage("projection", *self.velocity):
             self.outcome.take(self.velocity)
             self._push_bodies(dt)

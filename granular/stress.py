@@ -178,6 +178,7 @@ class Stress:
         self._cells = 1
         self.last_residual = 0.0, 0.0
         self.kick_dt, self.cold = 0.0, True
+        self._last, self._last_kick = wp.zeros_like(self.now), 0.0  # as before `begin`
         self.face(walls)
 
     def face(self, walls: Walls) -> None:
@@ -200,6 +201,8 @@ class Stress:
             kick_dt: how long forces act in it [s]; stresses are impulses, and it is the last step's pressure that goes on.
             decay: factor of the last stresses; less than 1 damps patterns that exert no force.
         """
+        wp.copy(self._last, self.now)
+        self._last_kick = self.kick_dt
         self._host = np.array(
             [bound.k, bound.cohesion, bound.tension, *(gravity * kick_dt), 1.0, 1.0, 0.0, dt / self.packing.grid.spacing, bound.gain,
              bound.halfway], dtype=np.float32,
@@ -220,6 +223,11 @@ class Stress:
         inputs = [p.flags, *three(p.share), self._point, self.now]
         p.grid.domain.launch(damping_kernel(p.grid.dimension), inputs)
         self.kick_dt = kick_dt
+
+    def take_back(self) -> None:
+        """Put the stresses back to what they were before `begin`, as the step is not taken."""
+        wp.copy(self.now, self._last)
+        self.kick_dt = self._last_kick
 
     def restart(self, *, pressure_step: float, shear_step: float, lookahead: float, momentum: float) -> None:
         """Start a sequence of steps with momentum.

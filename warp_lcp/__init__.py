@@ -3,6 +3,7 @@
 from importlib.metadata import PackageNotFoundError, version
 
 from warp_lcp.affine_bounds import AffineBounds
+from warp_lcp.kernel_messages import hear_kernels
 from warp_lcp.operators import (
     AIR,
     FLUID,
@@ -51,6 +52,8 @@ from warp_lcp.solvers import (
     solve_coupled,
 )
 from warp_lcp.stopping import StoppingCriteria
+
+hear_kernels()
 
 try:
     __version__ = version("warp-lcp")

@@ -79,12 +79,6 @@ def main() -> None:
     app()
 
 
-@app.callback()
-def quiet() -> None:
-    """Keep Warp's own messages off the terminal; the command line speaks for itself."""
-    wp.config.log_level = wp.LOG_ERROR
-
-
 @app.command()
 def run(
     scene: SceneArgument,

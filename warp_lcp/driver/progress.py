@@ -14,7 +14,10 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from rich.table import Column
 
 from warp_lcp.driver.log import Value
+from warp_lcp.result import SolveStatus
 
+RESIDUALS = "coupled_residual", "solve_residual"  # the first that a log has is the one that the scene's tolerance is of
+CONVERGED = SolveStatus.CONVERGED.name
 WINDOW = 20.0  # seconds of the recent past that the time left is judged by
 
 
@@ -159,9 +162,20 @@ def describe(row: Mapping[str, Value]) -> str:
     parts = [f"step {row['step']}", f"dt {_number(row, 'dt'):.2g} s"]
     if isinstance(row.get("solve_iterations"), int):
         parts.append(f"{row['solve_iterations']} iterations")
-    if isinstance(row.get("solve_residual"), float):
-        parts.append(f"residual {row['solve_residual']:.1e}")
+    if (residual := residual_of(row)) is not None:
+        parts.append(f"residual {residual:.1e}" + f" ({row['solve_status']})" * missed(row))
     return "  ".join(parts)
+
+
+def residual_of(row: Mapping[str, Value]) -> float | None:
+    """Return what a step's solve left, in the unit of the scene's tolerance; None if there was no solve."""
+    found = next((row[name] for name in RESIDUALS if isinstance(row.get(name), float)), None)
+    return found if isinstance(found, float) else None
+
+
+def missed(row: Mapping[str, Value]) -> bool:
+    """Return whether a step's solve ended short of its tolerance."""
+    return (row.get("solve_status") or CONVERGED) != CONVERGED
 
 
 def _number(row: Mapping[str, Value], name: str) -> float:

@@ -15,7 +15,7 @@ from warp_lcp.driver.frames import frame_bytes
 from warp_lcp.driver.log import Log, Value
 from warp_lcp.driver.problem_folder import ProblemFolder
 from warp_lcp.driver.profile import NoStopwatch, Profile, Stopwatch
-from warp_lcp.driver.progress import Observer
+from warp_lcp.driver.progress import Observer, missed, residual_of
 from warp_lcp.driver.run_folder import Continuation, OutputError, RunFolder, RunRecord
 from warp_lcp.driver.scene import Scene, Time
 from warp_lcp.driver.simulator import (
@@ -284,6 +284,8 @@ class Run:
         self._begun = clock.perf_counter()
         self._first_step = 0
         self._below_dt_min = False
+        self._missed: list[tuple[float, int]] = []  # what solves left that missed their tolerance, and in which steps
+        self._tolerance = scene.solver.tolerance
         self._checkpointed: int | None = None  # the newest checkpoint's step
         self._checkpoint_time = clock.monotonic()
 
@@ -311,6 +313,7 @@ class Run:
         finally:
             if self.record.status == "running":
                 self._fail("the program ended unexpectedly")
+            self._tell_missed()
             self._try_to(self._write_record)
             if self.profile:
                 self._try_to(self._write_profile)
@@ -353,6 +356,8 @@ class Run:
             row = self._step(self.time.frame_time(frame))
             log.append(row)
             self.observer.step(row)
+            if missed(row):
+                self._missed.append((residual_of(row) or 0.0, self.simulation.step_count))
             self.writer.check()
             if self._frames_done() >= frame:
                 self._write_frame(frame, last, self._frame())
@@ -443,6 +448,15 @@ class Run:
     def _write_record(self) -> None:
         self._count()
         self.folder.write_record(self.record)
+
+    def _tell_missed(self) -> None:
+        """Say how many steps of this run's went on from a solve that had missed its tolerance."""
+        if self._missed:
+            (worst, step), steps = max(self._missed), self.simulation.step_count - self._first_step
+            self._warn(
+                f"{len(self._missed)} of {steps} steps missed solver.tolerance = {self._tolerance:g}: the worst, step {step}, "
+                f"left a residual of {worst:.1e}"
+            )
 
     def _fail(self, reason: str) -> None:
         self.record.status = "failed"

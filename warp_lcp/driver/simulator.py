@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from warp_lcp.result import SolveStatus
+
 if TYPE_CHECKING:
     from warp_lcp.distributed.ranks import Ranks
     from warp_lcp.driver.profile import Stopwatch
@@ -20,6 +22,19 @@ GROUP = "warp_lcp.simulators"
 
 class StepFailed(RuntimeError):
     """The step's solve missed its criteria. The state is as before the step, so a smaller dt may be tried."""
+
+
+def missed_by_far(solve: str, status: SolveStatus, iterations: int, residual: str, advice: str) -> StepFailed:
+    """Return what to raise where a solve has ended too far from its tolerance for the step to be taken.
+
+    Args:
+        solve: what was solved for, in a word.
+        status: how it ended.
+        iterations: how many it took.
+        residual: what it left, with its unit and what was asked for, in words.
+        advice: what may help.
+    """
+    return StepFailed(f"the {solve} solve ended with {status.name} after {iterations} iterations at a {residual}: {advice}")
 
 
 class SimulationFailed(RuntimeError):

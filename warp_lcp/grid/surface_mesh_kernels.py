@@ -102,7 +102,7 @@ DISTANCE = """
         SIMD for (int m = 0; m < n; ++m) {
             const float f = share[m] < 1 ? share[m] : 1.0f, z = 2*f - 1, q = z*z;
             const float d = scale*z*(1 + q*(0.26179939f + q*(0.14393173f + q*0.097663620f)));
-            phi[start + m] = beyond | (start + m == 0) | (start + m > nx) ? 1.0f : d;
+            phi[start + m] = (beyond | (start + m == 0) | (start + m > nx)) ? 1.0f : d;
         }
     }
 """
