@@ -50,7 +50,7 @@ class Dots:
         self.position[below, 1] *= -1
         self.time += dt
         self.step_count += 1
-        return {"max_speed": float(np.abs(self.velocity).max(initial=0.0)), "solve_status": "CONVERGED", "volume": None}
+        return {"max_speed": float(np.abs(self.velocity).max(initial=0.0)), "solve_status": self.owner.status, "volume": None}
 
     def columns(self) -> tuple[str, ...]:
         return ("max_speed", "solve_status", "volume")
@@ -89,6 +89,7 @@ class DotsSimulator:
         self.notes: list[str] = []
         self.stable_dt: float | None = None
         self.refuse = ""
+        self.status = "CONVERGED"
         self.before_step: Callable[[Dots, float], None] = lambda simulation, dt: None
 
     def create(self, scene: Scene, *, device: str, folder: Path) -> Dots:

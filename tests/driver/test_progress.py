@@ -34,6 +34,13 @@ def test_describe_leaves_out_what_is_not_there():
     assert describe({"step": 1, "time": 0.5, "dt": 0.01}) == "step 1  dt 0.01 s"
 
 
+def test_the_residual_shown_is_the_one_that_the_tolerance_is_of():
+    sand = ROW | {"solve_status": "STAGNATED", "solve_residual": 9.4e-3, "coupled_residual": 2e-3}
+    assert describe(sand).endswith("residual 2.0e-03 (STAGNATED)")
+    assert describe(sand | {"solve_status": "CONVERGED", "coupled_residual": 8e-4}).endswith("residual 8.0e-04")
+    assert describe({"step": 1, "time": 0.5, "dt": 0.01, "solve_status": None, "coupled_residual": None}) == "step 1  dt 0.01 s"
+
+
 def test_lines_have_one_a_frame():
     stream = io.StringIO()
     with Lines(Console(file=stream, width=200)) as lines:

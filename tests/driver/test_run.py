@@ -478,3 +478,15 @@ def test_notes_reach_the_user_and_the_record(dots, scene_file, tmp_path):
     observer = Watcher()
     assert go(scene_file, tmp_path / "out", observer=observer).warnings == dots.notes
     assert observer.notes == dots.notes
+
+
+def test_a_run_says_how_many_steps_missed_their_tolerance(scene_file, dots, tmp_path):
+    def before_step(simulation: Any, dt: float) -> None:
+        dots.status = "STAGNATED" if simulation.step_count in (3, 5) else "CONVERGED"
+
+    dots.before_step = before_step
+    result = go(scene_file, tmp_path / "out")
+    expected = f"2 of {result.steps} steps missed solver.tolerance = 0.0001"
+    assert result.warnings == record(tmp_path / "out")["warnings"] == [expected]
+    dots.before_step = lambda simulation, dt: None
+    assert go(scene_file, tmp_path / "fine").warnings == []

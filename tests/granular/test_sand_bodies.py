@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from granular.coupled import CoupledOutcome
 from granular.scene import SandScene
-from granular.simulator import GranularSimulator, SandSimulation
+from granular.simulator import FAR, GranularSimulator, SandSimulation
+from granular.stress import Stress
 from warp_lcp.driver.scene_file import load_scene
-from warp_lcp.driver.simulator import SimulationFailed, Surface
+from warp_lcp.driver.simulator import SimulationFailed, StepFailed, Surface
+from warp_lcp.result import SolveStatus
 
 G, DENSITY = 9.81, 1500.0
 
@@ -211,6 +214,38 @@ def test_a_failed_solve_leaves_the_bodies_where_they_were(monkeypatch: pytest.Mo
     with pytest.raises(SimulationFailed, match="not finite"):
         simulation.step(0.004)
     assert np.array_equal(simulation.bodies.state()["bodies"], before)
+
+
+class Misses:
+    """A method for the stresses that leaves a residual."""
+
+    decay = 1.0
+
+    def __init__(self, residual: float) -> None:
+        self.residual = residual
+
+    def solve(self, stress: Stress, **_: Any) -> CoupledOutcome:
+        stress.now.fill_(7.0)
+        stress.residual()
+        return CoupledOutcome(SolveStatus.STAGNATED, 310, self.residual, 0.0, [(0, 5.0), (310, self.residual)])
+
+
+def test_stresses_that_are_far_off_fail_a_step_that_can_be_taken_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next try is that of a simulation that never failed, bit for bit; stresses that are a little off are taken."""
+    twins = [start([ball([0.3, 0.27], 0.05, 3000.0)], size=[0.6, 0.4], depth=0.2, resolution=30) for _ in range(2)]
+    for simulation in twins:
+        simulation.step(0.004)
+    with monkeypatch.context() as patch:
+        patch.setattr(twins[0], "method", Misses(1.5 * FAR))
+        with pytest.raises(StepFailed, match=r"STAGNATED after 310 iterations at a residual of 1.50e\+00 rho g dx .*no way out"):
+            twins[0].step(0.004)
+    for simulation in twins:
+        simulation.step(0.002)
+    first, second = (simulation.state() for simulation in twins)
+    for name, value in first.items():
+        assert np.array_equal(value, second[name]), name
+    monkeypatch.setattr(twins[0], "method", Misses(0.9 * FAR))
+    assert twins[0].step(0.001)["solve_status"] == "STAGNATED"
 
 
 @pytest.mark.parametrize(

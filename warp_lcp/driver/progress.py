@@ -163,7 +163,7 @@ def describe(row: Mapping[str, Value]) -> str:
     if isinstance(row.get("solve_iterations"), int):
         parts.append(f"{row['solve_iterations']} iterations")
     if (residual := residual_of(row)) is not None:
-        parts.append(f"residual {residual:.1e}" + f" ({row['solve_status']})" * missed(row))
+        parts.append(f"residual {residual:.1e}" + f" ({row.get('solve_status')})" * missed(row))
     return "  ".join(parts)
 
 

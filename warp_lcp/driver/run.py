@@ -284,7 +284,7 @@ class Run:
         self._begun = clock.perf_counter()
         self._first_step = 0
         self._below_dt_min = False
-        self._missed: list[tuple[float, int]] = []  # what solves left that missed their tolerance, and in which steps
+        self._missed: list[tuple[float, int]] = []  # what solves left that missed their tolerance, and in which step
         self._tolerance = scene.solver.tolerance
         self._checkpointed: int | None = None  # the newest checkpoint's step
         self._checkpoint_time = clock.monotonic()
@@ -453,10 +453,8 @@ class Run:
         """Say how many steps of this run's went on from a solve that had missed its tolerance."""
         if self._missed:
             (worst, step), steps = max(self._missed), self.simulation.step_count - self._first_step
-            self._warn(
-                f"{len(self._missed)} of {steps} steps missed solver.tolerance = {self._tolerance:g}: the worst, step {step}, "
-                f"left a residual of {worst:.1e}"
-            )
+            left = f": the worst, step {step}, left a residual of {worst:.1e}" * (worst > 0.0)
+            self._warn(f"{len(self._missed)} of {steps} steps missed solver.tolerance = {self._tolerance}{left}")
 
     def _fail(self, reason: str) -> None:
         self.record.status = "failed"
