@@ -7,8 +7,6 @@ import importlib
 import sys
 from pathlib import Path
 
-import warp as wp
-
 from benchmarks import launches
 from benchmarks.timing import Options
 
@@ -31,7 +29,6 @@ def main() -> None:
     parser.add_argument("--scene", default="")
     parser.add_argument("--seed", type=int)
     given = parser.parse_args()
-    wp.config.log_level = wp.LOG_ERROR
     launches.install()  # before anything imports warp_lcp
     suite, report = importlib.import_module(f"benchmarks.{given.suite}"), importlib.import_module("benchmarks.report")
     options = Options(

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 from warp_lcp.driver.atomic import replacing
 from warp_lcp.driver.nvdb import write_nvdb
@@ -143,7 +142,6 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=5)
     parser.add_argument("--device", default="cpu")
     arguments = parser.parse_args()
-    wp.config.log_level = wp.LOG_ERROR
     with tempfile.TemporaryDirectory() as folder:
         if arguments.scene:
             lines = share_table(arguments.scene, arguments.overrides, arguments.repeat, arguments.device, Path(folder))

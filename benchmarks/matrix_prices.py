@@ -8,8 +8,6 @@ from __future__ import annotations
 import argparse
 import time
 
-import warp as wp
-
 import warp_lcp as wl
 from warp_lcp import gallery
 
@@ -44,7 +42,6 @@ def main() -> None:
     parser.add_argument("methods", nargs="*", default=[name for name in wl.METHODS if name not in NOT_FOR_THEM])
     parser.add_argument("--device", default="cpu")
     arguments = parser.parse_args()
-    wp.config.log_level = wp.LOG_ERROR
     problems = {title: make() for title, make in PROBLEMS.items()}
     print("| method | " + " | ".join(problems) + " |\n|" + "---|" * (1 + len(problems)))
     for name in arguments.methods:

@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-import warp as wp
 
 import warp_lcp as wl
 from warp_lcp import gallery
@@ -78,7 +77,6 @@ def exponents(name: str, kind: str) -> str:
 
 def main() -> None:
     """Print both tables."""
-    wp.config.log_level = wp.LOG_ERROR
     print("| method | dense, 200 to 400 | grid, 32^3 to 64^3 |\n|---|---|---|")
     slow = ("projected-jacobi", "gradient-descent")  # thousands of steps on grids
     for name, method in wl.METHODS.items():

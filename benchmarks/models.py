@@ -337,7 +337,6 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--page", type=Path, default=Path("docs/models.md"))
     given = parser.parse_args()
-    wp.config.log_level = wp.LOG_ERROR
     options = Options(given.device, (), given.repeat, lambda text: sys.stderr.write(f"{text}\n"))
     results = measure(options, Path())
     compared = importlib.import_module("benchmarks.automatic_tolerance").measure(options, Path())

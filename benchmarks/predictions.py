@@ -10,8 +10,6 @@ import math
 import sys
 from pathlib import Path
 
-import warp as wp
-
 from benchmarks.models import create, markdown, step_seconds_of
 from benchmarks.record import Record, Results, Table
 from benchmarks.timing import Figure, Options
@@ -66,7 +64,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--device", default="cpu")
     given = parser.parse_args()
-    wp.config.log_level = wp.LOG_ERROR
     sys.stdout.write(f"{markdown(measure(Options(given.device, (), 1, lambda text: None), Path()).tables[0])}\n")
 
 

@@ -16,8 +16,6 @@ from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-import warp as wp
-
 import warp_lcp as wl
 from benchmarks.recommendation_problems import DEVICE, FAMILIES, make
 from warp_lcp import gallery
@@ -284,7 +282,6 @@ def main() -> None:
     measuring.add_argument("--out", type=Path, default=RESULTS)
     actions.add_parser("report").add_argument("--out", type=Path, default=RESULTS)
     arguments = parser.parse_args()
-    wp.config.log_level = wp.LOG_ERROR
     if arguments.action == "report":
         found = [judge(read(arguments.out / f"recommendation-{name}.csv")) for name in ("train", "check")]
         text = report(found[0], found[1])

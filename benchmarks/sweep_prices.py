@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import argparse
 
-import warp as wp
-
 import warp_lcp as wl
 from benchmarks.problems import splash
 from warp_lcp.solvers.accelerated_projected_gradient import AcceleratedProjectedGradient
@@ -58,7 +56,6 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--most", type=int, default=4000, help="the most steps")
     arguments = parser.parse_args()
-    wp.config.log_level = wp.LOG_ERROR
     scene = splash(arguments.n)
     print(f"advised omega {advised_omega(scene.problem('walls', arguments.device)):.3f}")
     print("| bounds | method | steps to 1e-3 (products, time) | to 1e-6 |\n|---|---|---|---|")

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import typer
+import warp as wp
 from rich.console import Console
 
 from warp_lcp.distributed.devices import device_of_rank
@@ -52,6 +53,8 @@ class RankCrew(Crew):
     def __init__(self, ranks: Ranks) -> None:
         """Let the first rank speak."""
         super().__init__(Console(stderr=True, quiet=not ranks.first), speaks=ranks.first)
+        if not ranks.first:
+            wp.config.log_level = wp.LOG_ERROR
         self.meeting = Meeting(ranks, PLANNED, self._last_words)
         self._folder: RunFolder | None = None
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-import warp as wp
-
 from benchmarks.extremes.case import judge
 from benchmarks.extremes.unseen import KINDS
 from benchmarks.extremes.unseen.judging import EveryMethodCase, UnseenCase, summary
@@ -14,7 +12,6 @@ from benchmarks.extremes.unseen.judging import EveryMethodCase, UnseenCase, summ
 
 def main(arguments: Sequence[str]) -> None:
     """Print a line a problem and the table of all."""
-    wp.config.log_level = wp.LOG_ERROR
     small = [a for a in arguments if a == "--every-method"]
     kind, first, *last = [a for a in arguments if a not in small]
     make = EveryMethodCase if small else UnseenCase
