@@ -57,6 +57,7 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
     """Return the kernels of a level whose diagonal has type d_type, all else type `real`."""
     form = "variable" if variable else "uniform"
     name = f"warp_lcp.cycle.{form}_{d_type.__name__}_{real.__name__}"
+    apart = f"{name}.apart"  # single passes, which CUDA and ranks need: one CPU takes them together
     d_array, field = wp.array(dtype=d_type), wp.array(dtype=real)
     head, neighbors = stencil_head(variable, C_TYPES[real]), NEIGHBORS[variable]
     around = neighbors.replace("x[k-s1]", "x[k+down]").replace("x[k+s1]", "x[k+up]")
@@ -261,7 +262,7 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         o = row_start(C, k, j, c, grain)
         bounds_row(A, d, x, lower, upper, lower_c, upper_c, o, p, n, real(1.0) / scale, G.fx, one_plane(G, k), one_row(G, j))
 
-    @wp.kernel(enable_backward=False, module=name)
+    @wp.kernel(enable_backward=False, module=apart)
     def sweep_kernel(
         A: StencilShape, d: d_array, wx: field, wy: field, wz: field, grain: int, from_zero: bool, y: field, x: field, b: field,
         lower: field, upper: field, omega: real, projected: bool,
@@ -274,7 +275,7 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         else:
             sweep_row(A, d, wx, wy, wz, y, x, b, lower, upper, p, n, omega, projected)
 
-    @wp.kernel(enable_backward=False, module=name)
+    @wp.kernel(enable_backward=False, module=apart)
     def restrict_kernel(
         A: StencilShape, d: d_array, wx: field, wy: field, wz: field, grain: int, C: StencilShape, G: Aggregates, x: field, b: field,
         coarse: field,
@@ -284,7 +285,7 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         p = first_cell(A, C, G, k, j, c, grain)
         restrict_row(A, d, wx, wy, wz, coarse, row_start(C, k, j, c, grain), x, b, p, n, G.fx, one_plane(G, k), one_row(G, j))
 
-    @wp.kernel(enable_backward=False, module=name)
+    @wp.kernel(enable_backward=False, module=apart)
     def correct_kernel(
         A: StencilShape, d: d_array, wx: field, wy: field, wz: field, grain: int, C: StencilShape, G: Aggregates, x: field,
         coarse: field, lower: field, upper: field, scale: real, projected: bool,

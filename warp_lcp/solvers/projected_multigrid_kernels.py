@@ -59,6 +59,7 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
     form = "variable" if variable else "uniform"
     name = f"warp_lcp.projected_multigrid.{form}_{d_type.__name__}_{w_type.__name__}_{free_type.__name__}_{real.__name__}"
     name += "_rounded" * rounded
+    apart = f"{name}.apart"  # single passes, which CUDA and ranks need: one CPU takes them together
     near = "(T)(float)" if rounded else ""
     d_array, w_array, free_array, field = (wp.array(dtype=t) for t in (d_type, w_type, free_type, real))
 
@@ -166,7 +167,7 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
                 R.threads, k > slab * R.planes, R.changed, k * R.rows + j, out,
             )  # fmt: skip
 
-    @wp.kernel(enable_backward=False, module=name)
+    @wp.kernel(enable_backward=False, module=apart)
     def measure(
         A: StencilShape, d: free_array, wx: field, wy: field, wz: field, grain: int, R: RowSums, z: field, p: field, g: field, out: f64
     ):
@@ -177,7 +178,7 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
             o = row_start(A, k, j, c, grain)
             measure_row(A, d, wx, wy, wz, z, p, g, o, n, t, R.threads, k > slab * R.planes, out)
 
-    @wp.kernel(enable_backward=False, module=name)
+    @wp.kernel(enable_backward=False, module=apart)
     def update(
         A: StencilShape, grain: int, x: f64, z: field, p: field, lower: f64, lower_value: wp.float64, upper: f64,
         upper_value: wp.float64, code: u8, scalars: f64,
@@ -215,7 +216,7 @@ def row_kernels(variable: bool, d_type: Any, w_type: Any, free_type: Any, real: 
                         slab * R.rows + j, R.threads, k > slab * R.planes, R.changed, k * R.rows + j, out,
                     )  # fmt: skip
 
-    @wp.kernel(enable_backward=False, module=name)
+    @wp.kernel(enable_backward=False, module=apart)
     def update_ghosts(
         A: StencilShape, axis: int, plane: int, x: f64, z: field, p: field, lower: f64, lower_value: wp.float64, upper: f64,
         upper_value: wp.float64, code: u8, scalars: f64,
