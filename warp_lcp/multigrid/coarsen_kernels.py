@@ -281,8 +281,7 @@ def none_changed(changed: wp.array2d(dtype=wp.uint8)):
     return found == 0
 
 
-@wp.kernel(**options)
-def factor_kernel(
+def factor(
     A: StencilShape,
     d: wp.array3d(dtype=Any),
     wx: wp.array3d(dtype=Any),
@@ -421,14 +420,14 @@ def solve_coarsest_kernel(
     solve_rows(inverse, b, x, n[0], n[1], n[2], t * rows, wp.min(inverse.shape[0], (t + 1) * rows))
 
 
-def _overload() -> None:
-    u8 = wp.array2d(dtype=wp.uint8)
-    for real in (wp.float32, wp.float64):
-        f = wp.array3d(dtype=real)
-        for d_type in (wp.uint8, real):
-            d = wp.array3d(dtype=d_type)
-            wp.overload(factor_kernel, [StencilShape, d, f, f, f, wp.vec3i, wp.vec3i, wp.float64, u8, wp.array2d(dtype=wp.float64)])
-        wp.overload(solve_coarsest_kernel, [wp.array2d(dtype=wp.float64), wp.vec3i, int, f, f])
+for _real in (wp.float32, wp.float64):
+    wp.overload(solve_coarsest_kernel, [wp.array2d(dtype=wp.float64), wp.vec3i, int, wp.array3d(dtype=_real), wp.array3d(dtype=_real)])
 
 
-_overload()
+@functools.cache
+def factor_kernel(d_type: Any, real: Any) -> Any:
+    """Return the kernel of `factor` for a type of diagonal and one of weights, in a module of its own: it takes long to compile."""
+    d, f = wp.array3d(dtype=d_type), wp.array3d(dtype=real)
+    kernel = wp.kernel(factor, enable_backward=False, module=f"warp_lcp.coarsen.factor_{d_type.__name__}_{real.__name__}")
+    matrices = [wp.array2d(dtype=wp.uint8), wp.array2d(dtype=wp.float64)]
+    return wp.overload(kernel, [StencilShape, d, f, f, f, wp.vec3i, wp.vec3i, wp.float64, *matrices])

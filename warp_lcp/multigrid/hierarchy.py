@@ -267,7 +267,7 @@ class Hierarchy:
         last, s = self.levels[-1], self.levels[-1].stencil
         sizes = [wp.vec3i(*s.padding.counts), wp.vec3i(*map(int, s.periodic))]
         inputs = [s.shape, *last.grids, *sizes, wp.float64(PINNED[self.real]), last.changed, self._matrix]
-        program.launch(kernels.factor_kernel, 1, inputs, device=self.device)
+        program.launch(kernels.factor_kernel(s.d.dtype, self.real), 1, inputs, device=self.device)
         m = self._matrix.shape[0]
         columns = grain(m, self.device)
         inputs = [last.changed, self._matrix, columns, self._inverse]
