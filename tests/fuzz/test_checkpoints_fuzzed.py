@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mutated import mutated
-from told import limited, told
+from told import costly, limited, told
 
 from warp_lcp.driver.checkpoint import PIECES, Checkpoint, CheckpointError, CheckpointFolder
 
@@ -56,6 +56,7 @@ def newest(folder: CheckpointFolder, path: Path, data: bytes) -> Checkpoint | No
         path.write_bytes(good)
 
 
+@costly
 @given(st.data())
 def test_checkpoints_in_pieces(folder: CheckpointFolder, data: st.DataObject) -> None:
     path = data.draw(st.sampled_from([folder.path(12), folder.of_rank(0).path(12), folder.of_rank(1).path(12)]))
@@ -63,6 +64,7 @@ def test_checkpoints_in_pieces(folder: CheckpointFolder, data: st.DataObject) ->
     assert found is not None
 
 
+@costly
 @given(st.data())
 def test_checkpoints_whose_zip_is_right(folder: CheckpointFolder, data: st.DataObject) -> None:
     """Members are other ones, as in a file that somebody made on purpose."""
@@ -82,6 +84,7 @@ JSON = st.recursive(
 )
 
 
+@costly
 @given(st.dictionaries(st.sampled_from(["format", "scene", "step", "time", "keys", "checksum", "more"]), JSON, max_size=2))
 def test_checkpoints_that_say_something_else(folder: CheckpointFolder, said: dict[str, Any]) -> None:
     with zipfile.ZipFile(folder.path(5)) as archive:

@@ -12,7 +12,7 @@ import scipy.sparse
 from hypothesis import given
 from hypothesis import strategies as st
 from mutated import mutated
-from told import limited
+from told import costly, limited
 
 from warp_lcp.gallery.fclib import read_fclib
 
@@ -71,11 +71,13 @@ def test_good_contacts_are_read(path: Path, data: bytes) -> None:
     assert read_fclib(path).system.dim == 3
 
 
+@costly
 @given(mutated(FILES))
 def test_contacts(path: Path, data: bytes) -> None:
     read(path, data)
 
 
+@costly
 @given(st.data())
 def test_contacts_of_other_numbers(path: Path, data: st.DataObject) -> None:
     kind = data.draw(st.sampled_from([*STORED, "global"]))

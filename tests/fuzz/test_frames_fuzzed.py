@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from mutated import mutated
-from told import limited
+from told import costly, limited
 
 from warp_lcp.driver.frames import FrameFolder
 from warp_lcp.driver.pieces import describe, write_whole
@@ -95,6 +95,7 @@ def known(run: Path) -> list[Recording]:
     return recordings(run)
 
 
+@costly
 @given(st.data())
 def test_frames(run: Path, known: list[Recording], data: st.DataObject) -> None:
     files = sorted(file for file in (run / "frames").rglob("*.*vt?"))
@@ -109,6 +110,7 @@ def test_frames(run: Path, known: list[Recording], data: st.DataObject) -> None:
         file.write_bytes(good)
 
 
+@costly
 @given(mutated([SCENE.encode()]))
 def test_scenes_of_runs(run: Path, scene: bytes) -> None:
     try:
@@ -121,6 +123,7 @@ def test_scenes_of_runs(run: Path, scene: bytes) -> None:
         (run / "scene.toml").write_text(SCENE)
 
 
+@costly
 @given(st.lists(mutated([b"camera.position=[1, 2, 3]", b"camera.look_at=[0.5, 0.5, 0]", b"camera.field_of_view=30"]), max_size=2))
 def test_cameras(run: Path, words: list[bytes]) -> None:
     try:

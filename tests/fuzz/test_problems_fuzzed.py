@@ -13,7 +13,7 @@ import scipy.sparse
 from hypothesis import given
 from hypothesis import strategies as st
 from mutated import mutated
-from told import told
+from told import costly, told
 
 from warp_lcp.driver import cli
 
@@ -82,21 +82,25 @@ def solved(folder: Path, **files: bytes) -> int:
     return told("solve", *arguments, "--device", "cpu", "--method", "psor", "--max-iterations", "0", codes=(0, cli.FAILED, cli.WRONG_INPUT))
 
 
+@costly
 @given(matrix=mutated(MATRICES), vector=st.sampled_from(VECTORS))
 def test_matrices(folder: Path, matrix: bytes, vector: bytes) -> None:
     solved(folder, A_mtx=matrix, b_mtx=vector)
 
 
+@costly
 @given(matrix=st.sampled_from(MATRICES), vector=mutated(VECTORS))
 def test_vectors(folder: Path, matrix: bytes, vector: bytes) -> None:
     solved(folder, A_mtx=matrix, b_mtx=vector)
 
 
+@costly
 @given(mutated([archive(MEMBERS), archive(MEMBERS, zipfile.ZIP_STORED)]))
 def test_recorded_problems(folder: Path, problem: bytes) -> None:
     solved(folder, problem_npz=problem)
 
 
+@costly
 @given(st.data())
 def test_recorded_problems_with_right_checksums(folder: Path, data: st.DataObject) -> None:
     name = data.draw(st.sampled_from(sorted(MEMBERS)))

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from hypothesis import settings
 from typer.testing import CliRunner
 
 from warp_lcp.driver import cli
@@ -15,6 +16,8 @@ try:
 except ImportError:  # not on Windows
     resource = None
 
+COUNT = settings().max_examples
+costly = settings(max_examples=COUNT if COUNT > 100 else COUNT // 4)  # a quarter in the short tests, all of them in `make fuzz`
 MEMORY = 1 << 30  # bytes that reading one small file may take
 
 
