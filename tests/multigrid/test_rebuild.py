@@ -177,6 +177,28 @@ def test_new_cells_and_weights_rebuild_the_rows_that_they_change(arrays, real, d
             np.testing.assert_array_equal(one.x.numpy(), other.x.numpy())
 
 
+@pytest.mark.parametrize("real", [wp.float32, wp.float64])
+def test_weights_that_keep_every_diagonal_change_their_rows(real, device):
+    """Up on two faces and down on two around an edge of the grid: the sums of the four cells stay."""
+    cells = np.full((2, 8, 70), wl.FLUID)
+    faces = {f"face_{a}": wp.full((4, 10, 72), 0.5, dtype=wp.float32, device=device) for a in "xyz"}
+    A = wl.GridPoisson(cells, device=device, **faces)
+    hierarchies = [Hierarchy(A.stencil, real, bounded=False, settings=SETTINGS) for _ in range(2)]
+    for column in (None, 1, 30, 66):
+        for axis, moved in (("x", [(4, 1), (5, 1)]), ("y", [(5, 0), (5, 1)])):
+            values = faces[f"face_{axis}"].numpy()
+            for row, right in moved if column else ():
+                values[1, row, column + right] += 0.25 if axis == "x" else -0.25
+            faces[f"face_{axis}"].assign(values)
+        A.update(wp.array(cells, dtype=wp.int8, device=device))
+        for hierarchy, rebuild in zip(hierarchies, (Hierarchy.rebuild_changed, Hierarchy.rebuild), strict=True):
+            hierarchy.refresh()
+            hierarchy.hold(A.stencil.d, stored(A, cells == wl.FLUID))
+            rebuild(hierarchy)
+        for one, other in zip(*map(snapshot, hierarchies), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
 def test_new_cells_that_are_the_old_ones_change_no_row(device):
     rng = np.random.default_rng(831)
     cells, A = operator((16, 16, 40), (False,) * 3, {}, True, device, rng)
