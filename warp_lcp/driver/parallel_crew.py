@@ -12,10 +12,6 @@ from typing import Any
 
 import typer
 import warp as wp
-<<<<<<< HEAD
-=======
-from rich.console import Console
->>>>>>> wk-first
 
 from warp_lcp.distributed.devices import device_of_rank
 from warp_lcp.distributed.meeting import Meeting, RankFailed
@@ -51,11 +47,7 @@ class RankCrew(Crew):
 
     def __init__(self, ranks: Ranks) -> None:
         """Let the first rank speak."""
-<<<<<<< HEAD
         super().__init__(Terminal(stderr=True, quiet=not ranks.first), speaks=ranks.first)
-=======
-        super().__init__(Console(stderr=True, quiet=not ranks.first), speaks=ranks.first)
->>>>>>> wk-first
         if not ranks.first:
             wp.config.log_level = wp.LOG_ERROR
         self.meeting = Meeting(ranks, PLANNED, self._last_words)

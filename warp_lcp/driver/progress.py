@@ -15,10 +15,7 @@ from rich.table import Column
 
 from warp_lcp.driver.foreign import one_line
 from warp_lcp.driver.log import Value
-<<<<<<< HEAD
 from warp_lcp.driver.terminal import say
-=======
->>>>>>> wk-first
 from warp_lcp.result import SolveStatus
 
 RESIDUALS = "coupled_residual", "solve_residual"  # the first that a log has is the one that the scene's tolerance is of

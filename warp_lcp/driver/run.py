@@ -17,11 +17,7 @@ from warp_lcp.driver.log import Log, Value
 from warp_lcp.driver.problem_folder import ProblemFolder
 from warp_lcp.driver.profile import NoStopwatch, Profile, Stopwatch
 from warp_lcp.driver.progress import Observer, missed, residual_of
-<<<<<<< HEAD
 from warp_lcp.driver.run_folder import BEFORE, Continuation, OutputError, RunFolder, RunRecord, read_record
-=======
-from warp_lcp.driver.run_folder import Continuation, OutputError, RunFolder, RunRecord
->>>>>>> wk-first
 from warp_lcp.driver.scene import Scene, Time
 from warp_lcp.driver.simulator import (
     Cells,
