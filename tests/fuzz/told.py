@@ -10,6 +10,7 @@ from hypothesis import settings
 from typer.testing import CliRunner
 
 from warp_lcp.driver import cli
+from warp_lcp.driver.foreign import visible
 
 try:
     import resource
@@ -24,13 +25,14 @@ MEMORY = 1 << 30  # bytes that reading one small file may take
 def told(*arguments: str | Path, codes: tuple[int, ...] = (0, cli.WRONG_INPUT)) -> int:
     """Run a command that reads files; return its exit code, one of `codes`, 0 or 2 unless given.
 
-    It ends without a traceback, takes no more than MEMORY, and says why when it refuses.
+    It ends without a traceback, takes no more than MEMORY, says why when it refuses, and prints nothing that a terminal obeys.
     """
     with limited():
         result = CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
     assert result.exception is None or isinstance(result.exception, SystemExit), repr(result.exception)
     assert result.exit_code in codes, (result.exit_code, result.output)
     assert result.exit_code == 0 or result.stderr.strip(), "refused without a word"
+    assert visible(result.output) == result.output
     return result.exit_code
 
 

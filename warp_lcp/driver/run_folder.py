@@ -359,7 +359,7 @@ def read_record(folder: Path) -> dict[str, Any]:
     """Return what run.json says; nothing if it cannot be read."""
     try:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return record if isinstance(record, dict) else {}
 
@@ -372,7 +372,7 @@ def recorded_keys(path: Path) -> dict[str, Any] | None:
         pass  # a mesh has been moved, perhaps; what the file says still counts
     try:
         return table_keys(tomllib.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
 
 
