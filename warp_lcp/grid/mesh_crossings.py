@@ -1,0 +1,225 @@
+"""Where a closed surface crosses itself, or lies inside itself: there the winding number is neither 0 nor 1.
+
+Two triangles cross where the segments that each has in common with the other's plane overlap [Moller 1997]. Parts that only touch do so
+too, face to face or along edges; so winding numbers on the four sides of the crossing decide. Parts that do not cross have the same winding
+number all over, which one of their triangles tells.
+"""
+
+import typing
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+MODULE = "warp_lcp.grid.mesh_crossings"
+NEAR = wp.constant(1.0e-9)  # half diagonals of the mesh: closer than rounding of float64 coordinates tells
+SHORT = wp.constant(1.0e-5)  # a common segment that is shorter counts as a point: vertices are equal within 1e-6
+ASIDE = wp.constant(1.0e-4)  # from the surface, where winding numbers are looked at; float32 tells it from 0
+DOUBLED = wp.constant(1)
+INVERTED = wp.constant(2)
+
+
+@dataclass(frozen=True)
+class Crossings:
+    """What is wrong with where a surface's triangles lie.
+
+    Attributes:
+        count: triangles that cross others.
+        place: of the first of them, or else of a part that lies inside another, in the mesh's units, shape (3,); None: all is well.
+        doubled: share of the surface's area that lies inside the solid, or bounds what is surrounded twice.
+        inverted: share of the area that is turned inside out, whose inside counts as outside.
+    """
+
+    count: int = 0
+    place: np.ndarray | None = None
+    doubled: float = 0.0
+    inverted: float = 0.0
+
+
+@wp.func
+@typing.no_type_check
+def side_of(mesh: wp.uint64, point: wp.vec3d) -> int:
+    """Return whether a point is surrounded more than once, DOUBLED, or less than never, INVERTED; else 0."""
+    x = wp.vec3(point)
+    if wp.mesh_query_point_sign_winding_number(mesh, x, 1.0e10, 2.0, 1.5).sign < 0.0:
+        return DOUBLED
+    if wp.mesh_query_point_sign_winding_number(mesh, x, 1.0e10, 2.0, -0.5).sign > 0.0:
+        return INVERTED
+    return 0
+
+
+@wp.func
+@typing.no_type_check
+def cut_by_plane(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, h: wp.vec3d, along: wp.vec3d):
+    """Return the first and last point that a triangle has in a plane, which its corners have the heights `h` above, and how many."""
+    low = a
+    high = a
+    found = int(0)
+    for side in range(3):
+        p = wp.where(side == 0, a, wp.where(side == 1, b, c))
+        q = wp.where(side == 0, b, wp.where(side == 1, c, a))
+        hp = h[side]
+        hq = h[(side + 1) % 3]
+        x = p
+        meets = hp == wp.float64(0.0)
+        if hp * hq < wp.float64(0.0):
+            x = p + (q - p) * (hp / (hp - hq))
+            meets = True
+        if meets:
+            if found == 0 or wp.dot(x, along) < wp.dot(low, along):
+                low = x
+            if found == 0 or wp.dot(x, along) > wp.dot(high, along):
+                high = x
+            found += 1
+    return low, high, found
+
+
+@wp.func
+@typing.no_type_check
+def height(x: wp.vec3d, origin: wp.vec3d, normal: wp.vec3d, shared: bool) -> wp.float64:
+    """Return how far a point is above a plane; 0 for a corner that lies in it."""
+    h = wp.dot(x - origin, normal)
+    return wp.where(shared or wp.abs(h) < wp.float64(NEAR), wp.float64(0.0), h)
+
+
+@wp.kernel(enable_backward=False, module=MODULE)
+@typing.no_type_check
+def find_crossings(
+    mesh: wp.uint64,
+    points: wp.array(dtype=wp.vec3d),
+    corners: wp.array2d(dtype=wp.int32),
+    crosses: wp.array(dtype=wp.uint8),
+):
+    """Mark the triangles that cross another one."""
+    t = wp.tid()
+    a = points[corners[t, 0]]
+    b = points[corners[t, 1]]
+    c = points[corners[t, 2]]
+    n = wp.normalize(wp.cross(b - a, c - a))
+    margin = wp.vec3d(wp.float64(1.0e-6))
+    low = wp.vec3(wp.min(wp.min(a, b), c) - margin)
+    high = wp.vec3(wp.max(wp.max(a, b), c) + margin)
+    query = wp.mesh_query_aabb(mesh, low, high)
+    other = int(0)
+    while wp.mesh_query_aabb_next(query, other):
+        if other == t or crosses[t] > wp.uint8(0):
+            continue
+        shared = int(0)
+        ours = wp.vec3i(0)
+        theirs = wp.vec3i(0)
+        for i in range(3):
+            for j in range(3):
+                if corners[t, i] == corners[other, j]:
+                    shared += 1
+                    ours[i] = 1
+                    theirs[j] = 1
+        if shared >= 2:  # neighbors
+            continue
+        d = points[corners[other, 0]]
+        e = points[corners[other, 1]]
+        f = points[corners[other, 2]]
+        m = wp.normalize(wp.cross(e - d, f - d))
+        line = wp.cross(n, m)
+        if wp.length(line) < wp.float64(1.0e-6):  # in parallel planes
+            continue
+        along = wp.normalize(line)
+        h = wp.vec3d(height(a, d, m, ours[0] == 1), height(b, d, m, ours[1] == 1), height(c, d, m, ours[2] == 1))
+        g = wp.vec3d(height(d, a, n, theirs[0] == 1), height(e, a, n, theirs[1] == 1), height(f, a, n, theirs[2] == 1))
+        low1, high1, found1 = cut_by_plane(a, b, c, h, along)
+        low2, high2, found2 = cut_by_plane(d, e, f, g, along)
+        if found1 < 2 or found2 < 2:
+            continue
+        first = low1
+        if wp.dot(low2, along) > wp.dot(low1, along):
+            first = low2
+        last = high1
+        if wp.dot(high2, along) < wp.dot(high1, along):
+            last = high2
+        if wp.dot(last - first, along) < wp.float64(SHORT):
+            continue
+        middle = (first + last) * wp.float64(0.5)
+        trouble = int(0)
+        for quadrant in range(4):
+            s = wp.float64(ASIDE) * wp.where(quadrant % 2 == 0, wp.float64(1.0), wp.float64(-1.0))
+            r = wp.float64(ASIDE) * wp.where(quadrant // 2 == 0, wp.float64(1.0), wp.float64(-1.0))
+            trouble = wp.max(trouble, side_of(mesh, middle + n * s + m * r))
+        if trouble > 0:
+            crosses[t] = wp.uint8(1)
+
+
+@wp.kernel(enable_backward=False, module=MODULE)
+@typing.no_type_check
+def look_beside(
+    mesh: wp.uint64,
+    points: wp.array(dtype=wp.vec3d),
+    corners: wp.array2d(dtype=wp.int32),
+    which: wp.array(dtype=wp.int32),
+    kind: wp.array(dtype=wp.uint8),
+):
+    """Tell on which triangles one side is surrounded twice, DOUBLED, or less than never, INVERTED."""
+    i = wp.tid()
+    t = which[i]
+    a = points[corners[t, 0]]
+    b = points[corners[t, 1]]
+    c = points[corners[t, 2]]
+    n = wp.normalize(wp.cross(b - a, c - a)) * wp.float64(ASIDE)
+    middle = (a + b + c) / wp.float64(3.0)
+    outside = side_of(mesh, middle + n)
+    inside = side_of(mesh, middle - n)
+    kind[i] = wp.uint8(wp.max(outside, inside))
+
+
+def find(mesh: wp.Mesh, vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return which triangles of a closed surface cross others, bool of shape (m,), and what is beside triangles, `which` of whom say.
+
+    Args:
+        mesh: the surface, on the CPU.
+        vertices: of it, float64 of shape (n, 3).
+        triangles: of it, int32 of shape (m, 3).
+
+    Returns:
+        Whether each triangle crosses another, shape (m,); the kind of each, DOUBLED, INVERTED or 0, shape (m,), all 0 if all is well.
+    """
+    device = mesh.points.device
+    inputs = [mesh.id, wp.array(vertices, dtype=wp.vec3d, device=device), wp.array(triangles, dtype=wp.int32, device=device)]
+    crosses = wp.zeros(len(triangles), dtype=wp.uint8, device=device)
+    wp.launch(find_crossings, len(triangles), inputs, outputs=[crosses], device=device)
+
+    def beside(which: np.ndarray) -> np.ndarray:
+        kind = wp.zeros(len(which), dtype=wp.uint8, device=device)
+        wp.launch(look_beside, len(which), [*inputs, wp.array(which, dtype=wp.int32, device=device)], outputs=[kind], device=device)
+        return kind.numpy()
+
+    found = crosses.numpy().astype(bool)
+    count, part = _parts(triangles, len(vertices))
+    first = np.unique(part, return_index=True)[1]
+    if not found.any() and (count == 1 or not beside(first).any()):
+        return found, np.zeros(len(triangles), dtype=np.uint8)
+    return found, beside(np.arange(len(triangles)))
+
+
+def crossings(mesh: wp.Mesh, vertices: np.ndarray, triangles: np.ndarray) -> Crossings:
+    """Return where a closed surface crosses itself or lies inside itself; arguments as of `find`, vertices in half diagonals."""
+    found, kind = find(mesh, vertices, triangles)
+    if not found.any() and not kind.any():
+        return Crossings()
+    corners = vertices[triangles]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    first = int(np.argmax(found if found.any() else kind > 0))
+    shares = [float(area[kind == what].sum() / area.sum()) for what in (1, 2)]
+    return Crossings(int(found.sum()), corners[first].mean(axis=0), *shares)
+
+
+def _parts(triangles: np.ndarray, vertices: int) -> tuple[int, np.ndarray]:
+    """Return the number of parts that have no vertex in common, and each triangle's."""
+    rows, columns = triangles[:, [0, 1]].T
+    more = triangles[:, [1, 2]].T
+    links = coo_array(
+        (np.ones(2 * len(triangles), dtype=bool), (np.concatenate([rows, more[0]]), np.concatenate([columns, more[1]]))),
+        shape=(vertices, vertices),
+    )
+    _, label = connected_components(links, directed=False)
+    part = label[triangles[:, 0]]
+    return len(np.unique(part)), part
