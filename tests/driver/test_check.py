@@ -11,6 +11,7 @@ from typer.testing import CliRunner, Result
 
 from benchmarks.memory import array_bytes, forget_peak
 from fluids.simulator import FluidsSimulator
+from warp_lcp import claims
 from warp_lcp.driver import check, cli, devices
 from warp_lcp.driver.calibrate import MOST, step_seconds
 from warp_lcp.driver.check import check_memory, check_scene
@@ -85,7 +86,7 @@ def test_a_scene_of_unknown_memory_is_not_refused(dots: Any, scene_file: Path, m
 def test_a_system_that_does_not_tell_its_free_memory_refuses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = devices.free_memory("cpu")
     assert found is None or found > 2**20
-    monkeypatch.setattr(devices, "MEMORY", tmp_path / "nothing")
+    monkeypatch.setattr(claims, "MEMORY", tmp_path / "nothing")
     assert devices.free_memory("cpu") is None
     check_memory(load_scene("dam-break", ["domain.resolution=4096"]), "cpu")
 

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import warp as wp
 
-MEMORY = Path("/proc/meminfo")
+from warp_lcp.claims import free_host_memory
 
 
 class DeviceError(ValueError):
@@ -45,11 +43,7 @@ def free_memory(name: str) -> int | None:
     device = wp.get_device(name)
     if device.is_cuda:
         return int(device.free_memory)
-    if MEMORY.exists():
-        found = re.search(r"MemAvailable:\s+(\d+) kB", MEMORY.read_text(encoding="ascii"))
-        if found:
-            return 1024 * int(found[1])
-    return None
+    return free_host_memory()
 
 
 def cuda_driver() -> str:
