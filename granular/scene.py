@@ -53,6 +53,11 @@ class SandDomain(Domain):
     friction: WallFriction | None = Field(
         default=None, description=f"of the domain's walls: {FRICTIONS}; material.wall_friction unless given"
     )
+    solids: Literal["cut-cell", "voxel"] = Field(
+        default="cut-cell",
+        description="cut-cell: solids cut through cells as their surfaces do, but where a solid moves, an axis is periodic or"
+        ' solver.method = "interleaved-sweeps": there, to the stresses, they fill whole cells, as with voxel',
+    )
     periodic: list[bool] | None = Field(default=None, description="which axes have no end, [x, y] or [x, y, z]; not y")  # type: ignore[assignment]
 
 
@@ -303,11 +308,21 @@ class SandScene(ParticleScene):
             message = f"must be at most {most:.4g}, the cohesion over the tangent of the friction angle"
             return [Complaint(("material", "tensile_strength"), material.tensile_strength, message)]
         if self._slope_of(self.friction_angle) > STEEPEST[self.dimension]:
-            return [Complaint(("material", "friction_angle"), self.friction_angle, self._at_most())]
+            return [self._too_steep()]
         if material.density is not None and material.density != self.physics.density:
             message = f"differs from physics.density = {self.physics.density:g}; give one of them"
             return [Complaint(("material", "density"), material.density, message)]
         return []
+
+    def _too_steep(self) -> Complaint:
+        """Return the complaint about a friction angle, at the key that gives it."""
+        number = next((number for number, sand in enumerate(self.sand) if sand.friction_angle is not None), None)
+        if number is not None:
+            return Complaint(("sand", number, "friction_angle"), self.friction_angle, self._at_most())
+        if self.material.friction_angle is not None:
+            return Complaint(("material", "friction_angle"), self.friction_angle, self._at_most())
+        message = f"has a friction angle of {self.friction_angle:g} degrees, which {self._at_most()}"
+        return Complaint(("material", "name"), self.material.name, message)
 
     def _at_most(self) -> str:
         """Return what is said of an angle that is too steep."""

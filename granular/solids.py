@@ -99,7 +99,8 @@ class SandSolids:
         fits = cuts and isinstance(boundary, CutBoundary) and not boundary.moves and boundary.sides is None
         self.cut = CutWalls(grid, boundary.cut, friction) if fits and isinstance(boundary, CutBoundary) else None
         self.place(0.0)
-        self.notes = self._thin_notes()
+        whole = isinstance(boundary, CutBoundary) and self.cut is None
+        self.notes = (*self._thin_notes(), *((self._whole_note(cuts),) if whole else ()))
 
     @property
     def moves(self) -> bool:
@@ -137,6 +138,14 @@ class SandSolids:
             f"{solid.name} holds no center of a cell of {self.grid.spacing:.4g} m: it bears no sand, and particles may pass"
             for solid, cells in zip(self._placed, self._covered, strict=True)
             if self.cut is None and not cells and solid.motion is None
+        )
+
+    def _whole_note(self, cuts: bool) -> str:
+        """Return why solids that cut cells do not do so for the stresses."""
+        reason = "some move" if self.moves else "an axis is periodic" if cuts else 'solver.method is "interleaved-sweeps"'
+        return (
+            f'to the stresses of the sand solids are whole cells, as with domain.solids = "voxel", since {reason}: they bear it up to half '
+            "a cell off their surfaces, which the particles meet"
         )
 
     def begin_step(self, time: float, dt: float) -> None:

@@ -145,7 +145,11 @@ def shape_section(schema: Definition) -> str:
         kept = frozenset(common | timed)
         own.append(f'### shape = "{shape}"\n\n{table(definition, kept)}')
     everywhere = {**drains["box"], "properties": {key: prop for key, prop in drains["box"]["properties"].items() if key in common - timed}}
-    placed = "Any shape may be moved from where its keys put it, in this order: `scale`, `rotate`, `translate`."
+    placed = "Any shape may be moved from where its keys put it, in this order: `scale`, `rotate`, `translate`. "
+    placed += (
+        "The\nfirst two leave the origin where it is, not the shape's center, unless `about` names another point: `about = [0.5, 0.2]` with"
+        "\n`rotate = 30.0` turns a box around [0.5, 0.2] on the spot. Angles are in degrees everywhere in a scene."
+    )
     return "\n".join(
         ["## Shapes\n", "A `[[liquid]]`, `[[sand]]`, `[[solid]]`, `[[source]]` or `[[drain]]` is a shape: `shape` and its keys.\n", *own]
     ) + (f"\n### Placing a shape\n\n{placed}\n\n{table(everywhere)}")

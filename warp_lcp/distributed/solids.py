@@ -45,7 +45,7 @@ def boundary_of_part(
     notes: list[str] = []
     for solid in solids:
         notes += placement_notes(solid.geometry, solid.name, whole, grid.spacing, grid.dimension)
-        notes += thin_notes(solid.geometry, solid.name, grid.spacing, grid.device)
+        notes += thin_notes(solid.geometry, solid.name, solid.among, grid.spacing, grid.device)
     voxels = voxelize(
         grid.counts, grid.spacing, grid.dimension, solids, wall_separating=wall_separating, device=grid.device, open_sides=part.cuts,
         origin=grid.origin, remarks=False,

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import statistics
 import time as clock
-from pathlib import Path
 
 import warp as wp
 
+from warp_lcp.driver.check import start
 from warp_lcp.driver.run import plan_dt
 from warp_lcp.driver.scene import Scene
-from warp_lcp.driver.simulator import simulators
-from warp_lcp.driver.table import Problem, SceneError
 
 LEAST, MOST = 3, 30  # steps that are measured
 ENOUGH = 2.0  # seconds of them, LEAST apart
@@ -28,10 +26,7 @@ def step_seconds(scene: Scene, *, device: str) -> tuple[float, int]:
         StepFailed: a step missed its criteria.
         SimulationFailed: the simulation cannot go on.
     """
-    try:
-        simulation = simulators()[scene.scene.simulator].create(scene, device=device, folder=Path.cwd())
-    except ValueError as error:
-        raise SceneError(scene.scene.name, [Problem("", str(error))]) from error
+    simulation = start(scene, device)
     seconds: list[float] = []  # the first step compiles kernels and allocates
     while len(seconds) <= LEAST or (len(seconds) <= MOST and sum(seconds[1:]) < ENOUGH):
         begun = clock.perf_counter()

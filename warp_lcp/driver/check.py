@@ -9,6 +9,7 @@ from warp_lcp.driver.devices import free_memory
 from warp_lcp.driver.particle_scene import ParticleScene
 from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.scene_file import check_shapes, load_scene
+from warp_lcp.driver.simulator import Simulation, simulators
 from warp_lcp.driver.table import Problem, SceneError
 
 
@@ -48,6 +49,22 @@ def check_memory(scene: Scene, device: str, *, share: float = 1.0) -> None:
             f"{device}; lower domain.resolution, or run it anyway with --force-memory"
         )
         raise SceneError(scene.scene.name, [Problem("domain.resolution", message, str(scene.domain.resolution))])
+
+
+def start(scene: Scene, device: str) -> Simulation:
+    """Return the simulation of a scene where a run begins, which refuses what a run would refuse before its first step.
+
+    Args:
+        scene: what would run.
+        device: a Warp device's name.
+
+    Raises:
+        SceneError: the scene cannot be simulated.
+    """
+    try:
+        return simulators()[scene.scene.simulator].create(scene, device=device, folder=Path.cwd())
+    except ValueError as error:
+        raise SceneError(scene.scene.name, [Problem("", str(error))]) from error
 
 
 def _check_bodies(scene: Scene, source: str) -> None:

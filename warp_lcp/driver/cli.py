@@ -18,7 +18,7 @@ from rich.console import Console
 
 from warp_lcp.driver.benchmark import benchmarks
 from warp_lcp.driver.calibrate import step_seconds
-from warp_lcp.driver.check import check_memory, check_scene
+from warp_lcp.driver.check import check_memory, check_scene, start
 from warp_lcp.driver.crew import crew_of
 from warp_lcp.driver.devices import DeviceError, choose_device, cuda_driver, devices
 from warp_lcp.driver.engine import Engine, EngineError, EngineOption
@@ -188,13 +188,14 @@ def check(
     force_memory: ForceMemory = False,
     overrides: SetOption = None,
 ) -> None:
-    """Say whether a scene is valid and fits into memory, and what a run of it would do."""
+    """Say whether a scene is valid and fits into memory, what a run of it would do, and what it would say at its start."""
     with _wrong_input():
         chosen = choose_device(device)
         loaded, lines = check_scene(scene, overrides or ())
         _print_pairs(lines)
         if not force_memory:
             check_memory(loaded, chosen)
+            _print_pairs([("note", note) for note in start(loaded, chosen).notes()])
         if not calibrate:
             return
         try:

@@ -90,12 +90,12 @@ class RotationMotion(PrescribedMotion):
 
 
 class SinusoidMotion(PrescribedMotion):
-    """A swing of sin(2 pi time / period + phase) times a shift, an angle or both."""
+    """A swing of sin(360 degrees time / period + phase) times a shift, an angle or both."""
 
     kind: Literal["sinusoid"] = "sinusoid"
     period: float = Field(gt=0, description="[s]")
     amplitude: Vector | None = Field(default=None, description="of the shift, along each axis [m]")
-    phase: float = Field(default=0.0, description="[degrees]; 0: in the middle at time 0, -90: at rest at one end")
+    phase: float = Field(default=0.0, description="[degrees, not radians]; 0: in the middle at time 0, -90: at rest at one end")
     angle: float | None = Field(default=None, description="amplitude of the turn [degrees]")
     center: Vector | None = Field(default=None, description=CENTER)
     axis: Axis | None = Field(default=None, description=AXIS)
@@ -109,6 +109,12 @@ class SinusoidMotion(PrescribedMotion):
             period=self.period, amplitude=self.amplitude or zeros, phase=self.phase,
             angle=self.angle or 0.0, center=self.center or zeros, axis=_or_z(self.axis),
         )  # fmt: skip
+
+    @property
+    def phase_in_degrees(self) -> float | None:
+        """Return the phase [degrees] that was meant, if its number is one that radians have: a multiple of pi / 4, to three digits."""
+        eighths = round(self.phase / (0.25 * np.pi))
+        return 45.0 * eighths if eighths and abs(self.phase - 0.25 * np.pi * eighths) < 1e-3 * abs(self.phase) else None
 
     def _size_complaints(self, dimension: int) -> list[Complaint]:
         found = super()._size_complaints(dimension)

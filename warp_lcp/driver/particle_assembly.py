@@ -46,7 +46,7 @@ def placed_solids(scene: ParticleScene, folder: Path) -> list[PlacedSolid]:
         if solid.is_body:
             motion = BodyMotion(_body(solid, geometry, name, friction, scene.dimension))
         separating = (solid.wall or scene.domain.wall) == "separating"
-        placed.append(PlacedSolid(geometry=geometry, separating=separating, name=name, motion=motion))
+        placed.append(PlacedSolid(geometry=geometry, separating=separating, name=name, motion=motion, among=scene.materials()[0]))
     return placed
 
 

@@ -438,7 +438,7 @@ class ParticleSimulation(ABC):
         """Return warnings and facts worth a line at the start of a run."""
         nx, ny, nz = self.grid.counts
         cells = f"{nx} x {ny}" + (f" x {nz}" if self.grid.dimension == 3 else "")
-        return [f"{self.particles.count} particles, {cells} cells of {self.grid.spacing:.4g} m", *self._notes]
+        return [f"{self.particles.count} particles, {cells} cells of {self.grid.spacing:.4g} m", *self.scene.notes(), *self._notes]
 
     def checked_totals(self, when: str) -> ParticleTotals:
         """Return sums over the particles.

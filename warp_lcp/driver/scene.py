@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -11,10 +11,12 @@ from pydantic import Field, WrapValidator, model_validator
 from pydantic_core import PydanticKnownError
 
 from warp_lcp.driver.camera import Camera
+from warp_lcp.driver.motions import SinusoidMotion
 from warp_lcp.driver.presets import PresetName, fill_in, preset_line
 from warp_lcp.driver.shapes import Liquid, Shape, Solid, Wall
 from warp_lcp.driver.table import Complaint, Problem, SceneError, Table, Vector, refuse, validate
 from warp_lcp.grid.sides import SIDES
+from warp_lcp.grid.solid_notes import STRAY
 from warp_lcp.solvers.registry import grid_methods
 
 __all__ = ["Complaint", "Liquid", "Problem", "Scene", "SceneError", "Shape", "Solid", "Table", "Vector", "Wall", "validate"]
@@ -226,6 +228,30 @@ class Scene(Table):
             return float(size.prod())
         low, high = (corner[: self.dimension] for corner in bounds)
         return float(np.maximum(np.minimum(high, size) - np.maximum(low, 0.0), 0.0).prod())
+
+    def shapes(self) -> Iterator[tuple[str, Shape]]:
+        """Yield every shape with its place in the file, such as `solid[0]`."""
+        for key, entries in self:
+            for index, entry in enumerate(entries if isinstance(entries, list) else ()):
+                if isinstance(entry, Shape):
+                    yield f"{key}[{index}]", entry
+
+    def notes(self) -> list[str]:
+        """Return what is allowed and was hardly meant, a line each, for the start of a run."""
+        found = []
+        for place, shape in self.shapes():
+            turned = shape.turned_out(self.domain.size)
+            if turned is not None and turned[0] > STRAY * self.spacing:
+                center = [float(f"{coordinate:.6g}") for coordinate in turned[1]]
+                found.append(
+                    f"{place} ({shape.shape}): rotate turns it about the origin, {turned[0]:.4g} m out of the domain; about its center it "
+                    f"turns with about = {center}"
+                )
+            motion = getattr(shape, "motion", None)
+            if isinstance(motion, SinusoidMotion) and motion.phase_in_degrees is not None:
+                degrees = motion.phase_in_degrees
+                found.append(f"{place}.motion.phase = {motion.phase:g} is in degrees; if radians were meant, it is {degrees:g}")
+        return found
 
     def memory_parts(self) -> dict[str, int]:
         """Return about how much memory each part of a run takes on its device [bytes]. Subclasses that know it say so."""

@@ -39,7 +39,7 @@ BODY_FRICTION = 0.5  # of a rigid body unless its scene says otherwise
 
 
 class Shape(Table):
-    """A region of space, placed by p = rotation (scale q) + translation.
+    """A region of space, placed by p = about + rotation (scale (q - about)) + translation; `about` is the origin unless given.
 
     `rotate` is in degrees: one angle in 2-D, angles about the fixed axes x, y, z (in that order) in 3-D. `invert` swaps inside and outside.
     """
@@ -47,7 +47,13 @@ class Shape(Table):
     if TYPE_CHECKING:
         shape: str  # of the file's key; each kind of shape has a value of its own
     translate: Vector | None = Field(default=None, description="a shift [m]")
-    rotate: Angles | None = Field(default=None, description="degrees: one angle in 2-D, [x, y, z] in 3-D")
+    rotate: Angles | None = Field(
+        default=None, description="degrees: one angle in 2-D, [x, y, z] in 3-D; it turns the shape about the origin, or the point of about"
+    )
+    about: Vector | None = Field(
+        default=None,
+        description="the point that scale and rotate leave where it is, such as the shape's center [m]; else the origin",
+    )
     scale: float = Field(default=1.0, gt=0, description="a factor, the same along every axis")
     invert: bool = Field(default=False, description="true: everything but the shape")
 
@@ -68,7 +74,23 @@ class Shape(Table):
         from warp_lcp.grid.solids import Placement
 
         zeros = [0.0] * dimension
-        return Placement.from_degrees(self.scale, self.rotate or zeros[: 1 if dimension == 2 else 3], self.translate or zeros, dimension)
+        placed = Placement.from_degrees(self.scale, self.rotate or zeros[: 1 if dimension == 2 else 3], self.translate or zeros, dimension)
+        return placed if self.about is None else placed.about(self.about)
+
+    def turned_out(self, domain: list[float]) -> tuple[float, list[float]] | None:
+        """Return how far `rotate` takes the shape out of a domain of these sides [m], and its center before [m]; None: it does not.
+
+        Of a shape that turns about the origin, which may not have been meant.
+        """
+        if self.about is not None or not any(self.rotate or []) or self.invert:
+            return None
+        dimension, unturned = len(domain), self.model_copy(update={"rotate": None})
+        placed = [shape.to_geometry(Path(), dimension).bounds() for shape in (unturned, self)]
+        if placed[0] is None or placed[1] is None:
+            return None
+        corners = [box[:, :dimension] for box in placed if box is not None]
+        before, now = (max(float(-low.min()), float((high - domain).max()), 0.0) for low, high in corners)
+        return (now, corners[0].mean(axis=0).tolist()) if now > before else None
 
     def bounds(self, dimension: int) -> np.ndarray | None:
         """Return the low and high corner [m] of a box around the shape, shape (2, 3).
@@ -85,7 +107,11 @@ class Shape(Table):
             Complaint((type(self).model_fields[name].alias or name,), value, f"must {counted(count)} in {dimension}-D")
             for name, count in wanted.items()
             if len(value := getattr(self, name)) != count
-        ]
+        ] + ([Complaint(("about",), self.about, "has no effect without rotate or scale")] if self._about_idles else [])
+
+    @property
+    def _about_idles(self) -> bool:
+        return self.about is not None and self.rotate is None and self.scale == 1.0
 
 
 class Box(Shape):

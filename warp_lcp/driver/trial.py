@@ -5,14 +5,14 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import warp as wp
 
+from warp_lcp.driver.check import start
 from warp_lcp.driver.run import SAME_TIME, take_step
 from warp_lcp.driver.scene import Scene
-from warp_lcp.driver.simulator import Points, Simulation, simulators
+from warp_lcp.driver.simulator import Points, Simulation
 from warp_lcp.driver.table import Problem, SceneError
 
 FRONT = 99.0  # percentile of the particles that the front is of
@@ -124,10 +124,7 @@ def trial(
         StepFailed: a step missed its criteria, with shorter steps too.
         SimulationFailed: the run cannot go on.
     """
-    try:
-        simulation = simulators()[scene.scene.simulator].create(scene, device=device, folder=Path.cwd())
-    except ValueError as error:
-        raise SceneError(scene.scene.name, [Problem("", str(error))]) from error
+    simulation = start(scene, device)
     ran = _Trial(scene, simulation, device, box or BIN * scene.spacing)
     found = ran.run(look_times(scene, frames), min(frames, scene.time.frame_count))
     if inspect is not None:

@@ -250,7 +250,7 @@ class CutCells:
                 notes += placement_notes(geometry, solid.name, grid.whole or grid.counts, grid.spacing, grid.dimension)
             else:  # it may come in later
                 notes += repair_notes(geometry, solid.name)
-            notes += thin_notes(geometry, solid.name, grid.spacing, grid.device)
+            notes += thin_notes(geometry, solid.name, solid.among, grid.spacing, grid.device)
         return notes
 
     def _result_notes(self, dropped: int) -> list[str]:

@@ -19,6 +19,7 @@ SHORT = wp.constant(1.0e-5)  # a common segment that is shorter counts as a poin
 ASIDE = wp.constant(1.0e-4)  # from the surface, where winding numbers are looked at; float32 tells it from 0
 DOUBLED = wp.constant(1)
 INVERTED = wp.constant(2)
+SAMPLE = 4096  # points of the surface whose sides are looked at, to tell how much of it is wrong: to 1 %
 
 
 @dataclass(frozen=True)
@@ -28,8 +29,8 @@ class Crossings:
     Attributes:
         count: triangles that cross others.
         place: of the first of them, or else of a part that lies inside another, in the mesh's units, shape (3,); None: all is well.
-        doubled: share of the surface's area that lies inside the solid, or bounds what is surrounded twice.
-        inverted: share of the area that is turned inside out, whose inside counts as outside.
+        doubled: about which share of the surface's area lies inside the solid, between what is surrounded once and twice.
+        inverted: about which share of it is turned inside out, so that what it surrounds counts as outside.
     """
 
     count: int = 0
@@ -156,70 +157,59 @@ def look_beside(
     points: wp.array(dtype=wp.vec3d),
     corners: wp.array2d(dtype=wp.int32),
     which: wp.array(dtype=wp.int32),
+    at: wp.array(dtype=wp.vec3d),
     kind: wp.array(dtype=wp.uint8),
 ):
-    """Tell on which triangles one side is surrounded twice, DOUBLED, or less than never, INVERTED."""
+    """Tell at which points of triangles `which` one side is surrounded twice, DOUBLED, or less than never, INVERTED."""
     i = wp.tid()
     t = which[i]
     a = points[corners[t, 0]]
     b = points[corners[t, 1]]
     c = points[corners[t, 2]]
     n = wp.normalize(wp.cross(b - a, c - a)) * wp.float64(ASIDE)
-    middle = (a + b + c) / wp.float64(3.0)
-    outside = side_of(mesh, middle + n)
-    inside = side_of(mesh, middle - n)
+    outside = side_of(mesh, at[i] + n)
+    inside = side_of(mesh, at[i] - n)
     kind[i] = wp.uint8(wp.max(outside, inside))
 
 
-def find(mesh: wp.Mesh, vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return which triangles of a closed surface cross others, bool of shape (m,), and what is beside triangles, `which` of whom say.
+def find_self_crossings(mesh: wp.Mesh, vertices: np.ndarray, triangles: np.ndarray) -> Crossings:
+    """Return where a closed surface crosses itself or lies inside itself.
 
     Args:
-        mesh: the surface, on the CPU.
-        vertices: of it, float64 of shape (n, 3).
+        mesh: the surface.
+        vertices: of it, in half diagonals of its bounding box from its center, float64 of shape (n, 3).
         triangles: of it, int32 of shape (m, 3).
-
-    Returns:
-        Whether each triangle crosses another, shape (m,); the kind of each, DOUBLED, INVERTED or 0, shape (m,), all 0 if all is well.
     """
     device = mesh.points.device
     inputs = [mesh.id, wp.array(vertices, dtype=wp.vec3d, device=device), wp.array(triangles, dtype=wp.int32, device=device)]
-    crosses = wp.zeros(len(triangles), dtype=wp.uint8, device=device)
-    wp.launch(find_crossings, len(triangles), inputs, outputs=[crosses], device=device)
+    marks = wp.zeros(len(triangles), dtype=wp.uint8, device=device)
+    wp.launch(find_crossings, len(triangles), inputs, outputs=[marks], device=device)
+    crossing = np.flatnonzero(marks.numpy())
 
-    def beside(which: np.ndarray) -> np.ndarray:
+    corners = vertices[triangles]
+
+    def beside(which: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        points = np.einsum("ij,ijk->ik", weights, corners[which])
+        sides = [wp.array(which, dtype=wp.int32, device=device), wp.array(points, dtype=wp.vec3d, device=device)]
         kind = wp.zeros(len(which), dtype=wp.uint8, device=device)
-        wp.launch(look_beside, len(which), [*inputs, wp.array(which, dtype=wp.int32, device=device)], outputs=[kind], device=device)
+        wp.launch(look_beside, len(which), [*inputs, *sides], outputs=[kind], device=device)
         return kind.numpy()
 
-    found = crosses.numpy().astype(bool)
-    count, part = _parts(triangles, len(vertices))
-    first = np.unique(part, return_index=True)[1]
-    if not found.any() and (count == 1 or not beside(first).any()):
-        return found, np.zeros(len(triangles), dtype=np.uint8)
-    return found, beside(np.arange(len(triangles)))
-
-
-def crossings(mesh: wp.Mesh, vertices: np.ndarray, triangles: np.ndarray) -> Crossings:
-    """Return where a closed surface crosses itself or lies inside itself; arguments as of `find`, vertices in half diagonals."""
-    found, kind = find(mesh, vertices, triangles)
-    if not found.any() and not kind.any():
+    firsts = _first_of_parts(triangles, len(vertices))
+    nested = firsts[beside(firsts, np.full((len(firsts), 3), 1.0 / 3.0)) > 0] if len(firsts) > 1 else firsts[:0]
+    if not len(crossing) and not len(nested):
         return Crossings()
-    corners = vertices[triangles]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    first = int(np.argmax(found if found.any() else kind > 0))
-    shares = [float(area[kind == what].sum() / area.sum()) for what in (1, 2)]
-    return Crossings(int(found.sum()), corners[first].mean(axis=0), *shares)
+    chance = np.random.default_rng(SAMPLE)
+    which = np.searchsorted(np.cumsum(area), area.sum() * (np.arange(SAMPLE) + 0.5) / SAMPLE).clip(max=len(triangles) - 1)
+    kind = beside(which, chance.dirichlet(np.ones(3), SAMPLE))
+    first = crossing[0] if len(crossing) else nested[0]
+    return Crossings(len(crossing), corners[first].mean(axis=0), *(float((kind == int(what)).mean()) for what in (DOUBLED, INVERTED)))
 
 
-def _parts(triangles: np.ndarray, vertices: int) -> tuple[int, np.ndarray]:
-    """Return the number of parts that have no vertex in common, and each triangle's."""
-    rows, columns = triangles[:, [0, 1]].T
-    more = triangles[:, [1, 2]].T
-    links = coo_array(
-        (np.ones(2 * len(triangles), dtype=bool), (np.concatenate([rows, more[0]]), np.concatenate([columns, more[1]]))),
-        shape=(vertices, vertices),
-    )
+def _first_of_parts(triangles: np.ndarray, vertices: int) -> np.ndarray:
+    """Return the first triangle of each part that has no vertex in common with others."""
+    rows, columns = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]]]).T
+    links = coo_array((np.ones(rows.size, dtype=bool), (rows, columns)), shape=(vertices, vertices))
     _, label = connected_components(links, directed=False)
-    part = label[triangles[:, 0]]
-    return len(np.unique(part)), part
+    return np.unique(label[triangles[:, 0]], return_index=True)[1]

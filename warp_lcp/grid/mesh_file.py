@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from warp_lcp.claims import check_claim
+
 FORMATS = (".obj", ".ply", ".stl")
 STL_HEADER = 84  # bytes before the first triangle of a binary STL: 80 of text and a count
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("color", "<u2")])
@@ -122,18 +124,19 @@ def _parse_ply(data: bytes) -> tuple[np.ndarray, Corners]:
     if not head:
         raise ValueError("its header does not begin with ply and end with end_header")
     order, elements = _ply_header(head[1].decode("ascii", "replace"))
-    points, polygons = np.empty((0, 3)), []
+    points = np.empty((0, 3))
+    polygons: list[Sequence[int] | np.ndarray] = []
     source = _TextRecords(data[head.end() :]) if order is None else _BinaryRecords(data[head.end() :], order)
     for element in elements:
         names = [name for name, _, _ in element.properties]
         if not names or not element.count:
             continue
-        if element.count > source.room(element):
-            raise ValueError(f"it promises {element.count} records of {element.name}, more than the rest of the file has room for")
+        check_claim(f"{element.count} x {element.name}", 8 * element.count * len(names), **source.claim(element))
         if any(length for _, _, length in element.properties):
             corners = next((names.index(name) for name in PLY_CORNERS if name in names), -1) if element.name == "face" else -1
-            found = source.lists(element, corners)
-            polygons += found
+            if corners >= 0 and element.properties[corners][1][0] == "f":
+                raise ValueError("its faces name vertices by numbers that are not whole")
+            polygons += source.lists(element, corners)
         else:
             table = source.table(element)
             if element.name == "vertex":
@@ -145,7 +148,8 @@ def _parse_ply(data: bytes) -> tuple[np.ndarray, Corners]:
 
 def _ply_header(text: str) -> tuple[str | None, list[_Element]]:
     """Return the order of bytes, None for text, and the elements that a header names."""
-    order, elements = "", []
+    order: str | None = ""
+    elements: list[_Element] = []
     for line in text.splitlines():
         match line.split():
             case ["format", kind, "1.0"] if kind in PLY_ORDERS:
@@ -171,9 +175,9 @@ class _TextRecords:
     def __init__(self, body: bytes) -> None:
         self.words, self.at = body.split(), 0
 
-    def room(self, element: _Element) -> int:
-        """Return how many records the rest has room for at most."""
-        return (len(self.words) - self.at) // len(element.properties)
+    def claim(self, element: _Element) -> dict[str, int]:
+        """Return the least that an element's records take, `stored`, and what is left for them, `held` [bytes, two a word]."""
+        return {"stored": 2 * element.count * len(element.properties), "held": 2 * (len(self.words) - self.at)}
 
     def table(self, element: _Element) -> np.ndarray:
         """Return records without lists, float64 of shape (count, properties)."""
@@ -203,9 +207,10 @@ class _BinaryRecords:
     def __init__(self, body: bytes, order: str) -> None:
         self.body, self.order, self.at = body, order, 0
 
-    def room(self, element: _Element) -> int:
-        """Return how many records the rest has room for at most."""
-        return (len(self.body) - self.at) // sum(int((length or kind)[1]) for _, kind, length in element.properties)
+    def claim(self, element: _Element) -> dict[str, int]:
+        """Return the least that an element's records take, `stored`, and what is left for them, `held` [bytes]."""
+        least = sum(int((length or kind)[1]) for _, kind, length in element.properties)
+        return {"stored": element.count * least, "held": len(self.body) - self.at}
 
     def table(self, element: _Element) -> np.ndarray:
         """Return records without lists, float64 of shape (count, properties)."""

@@ -9,6 +9,7 @@ from warp_lcp.grid.solids import Geometry, TriangleMesh
 
 STRAY = 0.5  # of a cell: a mesh may reach this far out of the domain before anyone is told
 THIN_SHARE = 0.01  # of a mesh's surface, from which thin parts are worth a warning
+INVERTED_SHARE = 0.01  # of a mesh's surface, from which what is inside out is no longer a blemish: its inside would be missing
 
 
 def placement_notes(geometry: Geometry, name: str, counts: tuple[int, int, int], spacing: float, dimension: int) -> list[str]:
@@ -48,15 +49,32 @@ def placement_notes(geometry: Geometry, name: str, counts: tuple[int, int, int],
 
 
 def repair_notes(geometry: Geometry, name: str) -> list[str]:
-    """Return what a mesh needed repaired, a line each."""
-    return [f"{name}: {warning}" for warning in geometry.surface.warnings] if isinstance(geometry, TriangleMesh) else []
+    """Return what a mesh needed repaired and where it crosses itself, a line each.
+
+    Raises:
+        ValueError: a part of the mesh is turned inside out, so that its inside would count as outside.
+    """
+    if not isinstance(geometry, TriangleMesh):
+        return []
+    surface, found = geometry.surface, geometry.surface.crossings
+    notes = [f"{name}: {warning}" for warning in surface.warnings]
+    if found.place is None:
+        return notes
+    what = f"{found.count} of its {len(surface.triangles)} triangles cross others, first" if found.count else "a part lies inside another,"
+    what += f" at {[float(f'{coordinate:.4g}') for coordinate in found.place]}"
+    if found.inverted > INVERTED_SHARE:
+        raise ValueError(
+            f"{name}: {surface.name}: {what}, and about {found.inverted:.0%} of its surface is inside out there: what that surrounds would "
+            "count as outside. Repair the mesh (in Blender: a Remesh modifier; in MeshLab: Remove Self Intersecting Faces, Close Holes)"
+        )
+    return [*notes, f"{name}: {surface.name}: {what}; what is surrounded twice counts as inside, once"]
 
 
-def thin_notes(geometry: Geometry, name: str, spacing: float, device: wp.Device) -> list[str]:
-    """Return a warning when a mesh has walls that the cells may miss: thinner than `spacing` [m]."""
+def thin_notes(geometry: Geometry, name: str, among: str, spacing: float, device: wp.Device) -> list[str]:
+    """Return a warning when a mesh has walls that the cells may miss, so that what it is `among` may pass: thinner than `spacing` [m]."""
     if not isinstance(geometry, TriangleMesh) or geometry.invert:
         return []
     thin = geometry.thin_fraction(spacing, device)
     if thin <= THIN_SHARE:
         return []
-    return [f"{name} is thinner than a cell of {spacing:.4g} m under {thin:.0%} of its surface: liquid may pass there"]
+    return [f"{name} is thinner than a cell of {spacing:.4g} m under {thin:.0%} of its surface: {among} may pass there"]

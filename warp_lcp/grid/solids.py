@@ -145,6 +145,11 @@ class Placement:
         """Return `points`, shape (m, 3), of the shape's coordinates in the domain's [m]."""
         return self.scale * np.asarray(points) @ self.rotation.T + self.translation
 
+    def about(self, point: Vector) -> Placement:
+        """Return this placement with scale and rotation about a point [m], of two or three coordinates, instead of the origin."""
+        center = _in_space(_vector("about", point))
+        return replace(self, translation=self.translation + center - self.scale * self.rotation @ center)
+
     def moved(self, pose: Pose) -> Placement:
         """Return this placement followed by a change of place."""
         rotation, translation = pose.rotation @ self.rotation, pose.apply(self.translation)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from warp_lcp.grid.builtin_mesh import BUILTIN
+from warp_lcp.grid.mesh_crossings import Crossings, find_self_crossings
 from warp_lcp.grid.mesh_file import read_triangles
 from warp_lcp.grid.solids_kernels import mesh_thickness
 
@@ -20,6 +21,8 @@ BUILTIN_PREFIX = "builtin:"
 WELD = 1e-6  # of the mesh's diagonal: coarser than float32 coordinates, far finer than a cell
 FLAT = 1e-12  # twice the area over the longest edge squared, below which a triangle has none
 NO_VOLUME = 1e-9  # of the mesh's diagonal cubed
+LARGEST = 1e18  # of a coordinate, as of a scene's numbers
+CLOSE_VERTICES = 64  # to merge with each, on the average, at most: more are a mesh that shrank to a point beside a vertex astray
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -65,6 +68,13 @@ class ClosedSurface:
             mesh = wp.Mesh(points, indices, support_winding_number=True)
             self._meshes[str(device)] = mesh
         return mesh
+
+    @cached_property
+    def crossings(self) -> Crossings:
+        """Return where the surface crosses itself or lies inside itself; found on the CPU."""
+        mesh = self.on_device(wp.get_device("cpu"))
+        found = find_self_crossings(mesh, (self.vertices - self.center) / self.size, self.triangles)
+        return found if found.place is None else replace(found, place=self.center + self.size * found.place)
 
     def thin_fraction(self, thickness: float, device: wp.Device) -> float:
         """Return the share of the surface's area behind which the solid is thinner than `thickness` (in the mesh's units)."""
@@ -131,25 +141,34 @@ def close_surface(vertices: np.ndarray, triangles: np.ndarray, name: str) -> Clo
         )
     if not len(triangles):
         raise ValueError(f"{name}: the mesh has no triangles")
-    vertices, triangles = weld(vertices, triangles)
+    if np.abs(vertices).max() > LARGEST:
+        raise ValueError(f"{name}: a vertex lies {np.abs(vertices).max():.3g} from the origin: coordinates must not be beyond {LARGEST:g}")
+    try:
+        vertices, triangles = weld(vertices, triangles)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
     warnings = []
     corners = np.sort(triangles, axis=1)
     keep = (corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2])
     degenerate = int((~keep).sum())
+    nothing = vertices[triangles[~keep]][:1]  # the first one's corners
     triangles = triangles[keep]
     if not len(triangles):
         raise ValueError(f"{name}: all {degenerate} triangles are degenerate (without area)")
-    triangles, repeated = _drop_repeated(triangles)
-    if repeated:
-        warnings.append(f"{name}: dropped {repeated} repeated triangles")
-    _check_closed(triangles, name)
+    kept = _without_repeated(triangles)
+    if len(kept) < len(triangles):
+        again = np.setdiff1d(np.arange(len(triangles)), kept)
+        warnings.append(f"{name}: dropped {len(again)} repeated triangles, {_first(vertices[triangles[again]])}")
+        triangles = triangles[kept]
+    _check_closed(vertices, triangles, name)
     triangles, flipped = _orient(vertices, triangles, name)
     warnings += flipped
     # Only now: a triangle without area may be what closes the seam between a long edge and the halves that meet it.
     flat = _flat(vertices, triangles)
     degenerate += int(flat.sum())
     if degenerate:
-        warnings.append(f"{name}: dropped {degenerate} degenerate triangles (without area)")
+        where = _first(np.concatenate([nothing, vertices[triangles[flat]]]))
+        warnings.append(f"{name}: dropped {degenerate} degenerate triangles (without area), {where}")
     surface = ClosedSurface(name=name, vertices=vertices, triangles=triangles[~flat].astype(np.int32), warnings=tuple(warnings))
     if not flat.all() and surface.volume > NO_VOLUME * _diagonal(vertices) ** 3:
         return surface
@@ -157,10 +176,19 @@ def close_surface(vertices: np.ndarray, triangles: np.ndarray, name: str) -> Clo
 
 
 def weld(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Merge vertices closer than 1e-6 of the mesh's diagonal, and leave out those that no triangle uses."""
+    """Merge vertices closer than 1e-6 of the mesh's diagonal, and leave out those that no triangle uses.
+
+    Raises:
+        ValueError: nearly all are that close together.
+    """
     used, flat = np.unique(triangles, return_inverse=True)
     exact, same = np.unique(vertices[used], axis=0, return_inverse=True)
-    pairs = cKDTree(exact).query_pairs(WELD * _diagonal(exact), output_type="ndarray")
+    tree, near = cKDTree(exact), WELD * _diagonal(exact)
+    if len(exact) > CLOSE_VERTICES and tree.count_neighbors(tree, near) > (1 + CLOSE_VERTICES) * len(exact):
+        low, high = exact.min(axis=0), exact.max(axis=0)
+        spans = f"the mesh spans {_point(low)} to {_point(high)}"
+        raise ValueError(f"most vertices lie within {near:.3g} of others, where {spans}: is one astray?")
+    pairs = tree.query_pairs(near, output_type="ndarray")
     links = coo_array((np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(len(exact), len(exact)))
     count, label = connected_components(links, directed=False)
     merged = np.empty((count, 3))
@@ -191,12 +219,27 @@ def _cone_volumes(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0
 
 
-def _drop_repeated(triangles: np.ndarray) -> tuple[np.ndarray, int]:
-    """Keep one of the triangles that have the same corners in the same orientation."""
+def _without_repeated(triangles: np.ndarray) -> np.ndarray:
+    """Return the numbers of triangles without those that there are before with the same corners.
+
+    Of triangles that are there in both orientations one is left where that closes the surface; where it does not, as in a fin without
+    thickness, they belong there.
+    """
     first = triangles.argmin(axis=1)[:, None]
     turned = np.take_along_axis(triangles, (first + np.arange(3)) % 3, axis=1)
-    _, index = np.unique(turned, axis=0, return_index=True)
-    return triangles[np.sort(index)], len(triangles) - len(index)
+    once = np.sort(np.unique(np.sort(triangles, axis=1), axis=0, return_index=True)[1])
+    if len(once) < len(triangles) and not (_edges(triangles[once])[2] % 2).any():
+        return once
+    return np.sort(np.unique(turned, axis=0, return_index=True)[1])
+
+
+def _point(point: np.ndarray) -> str:
+    return f"[{', '.join(f'{coordinate:.4g}' for coordinate in point)}]"
+
+
+def _first(corners: np.ndarray) -> str:
+    """Return where the first of some triangles is, `corners` of shape (m, 3, 3), in the mesh's units."""
+    return f"the first at {_point(corners[0].mean(axis=0))}"
 
 
 def _edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -207,13 +250,15 @@ def _edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return edge.ravel(), forward, uses
 
 
-def _check_closed(triangles: np.ndarray, name: str) -> None:
-    _, _, uses = _edges(triangles)
+def _check_closed(vertices: np.ndarray, triangles: np.ndarray, name: str) -> None:
+    edge, _, uses = _edges(triangles)
     odd = int((uses % 2).sum())
     if odd:
+        where = _first(vertices[triangles[(uses[edge] % 2).reshape(-1, 3).any(axis=1)]])
         raise ValueError(
-            f"{name}: the surface is not closed: {odd} of its {len(uses)} edges are open, so inside and outside are undefined and liquid "
-            "would leak through. Fill the holes (in Blender: Mesh > Clean Up > Merge by Distance, Fill Holes; in MeshLab: Close Holes)"
+            f"{name}: the surface is not closed: {odd} of its {len(uses)} edges are open, {where}, so inside and outside are undefined "
+            "and the material would leak through. "
+            "Fill the holes (in Blender: Mesh > Clean Up > Merge by Distance, Fill Holes; in MeshLab: Close Holes)"
         )
 
 
@@ -232,7 +277,10 @@ def _orient(vertices: np.ndarray, triangles: np.ndarray, name: str) -> tuple[np.
                 f"{name}: at {tangled} edges more than two triangles meet without a consistent orientation, so inside and outside are "
                 "undefined. Separate the parts that touch there, or repair the mesh (in MeshLab: Repair non Manifold Edges)"
             )
-        warnings.append(f"{name}: turned {int(turn.sum())} of {len(triangles)} triangles that disagreed with their neighbors' orientation")
+        where = _first(vertices[triangles[turn]])
+        warnings.append(
+            f"{name}: turned {int(turn.sum())} of {len(triangles)} triangles that disagreed with their neighbors' orientation, {where}"
+        )
     parts, part = _parts(edge, forward, uses)
     volume = np.bincount(part, weights=_cone_volumes(vertices - vertices.mean(axis=0), triangles), minlength=parts)
     turn = np.zeros(parts, dtype=bool)
@@ -244,8 +292,9 @@ def _orient(vertices: np.ndarray, triangles: np.ndarray, name: str) -> tuple[np.
         corners = vertices[np.where(turn[part[others]][:, None], triangles[others][:, ::-1], triangles[others])]
         turn[p] ^= winding_number(vertices[triangles[part == p][0, 0]], corners) < 0.5
     if turn.any():
-        what = "the mesh was" if turn.all() else f"{int(turn.sum())} of its {parts} parts were"
-        warnings.append(f"{name}: {what} inside out; turned")
+        where = _first(vertices[triangles[turn[part]]])
+        what = "the mesh was inside out" if turn.all() else f"{int(turn.sum())} of its {parts} parts were inside out, {where}"
+        warnings.append(f"{name}: {what}; turned")
         triangles = np.where(turn[part][:, None], triangles[:, ::-1], triangles)
     return triangles, warnings
 

@@ -28,12 +28,14 @@ class PlacedSolid:
         separating: whether liquid may leave its wall (otherwise it slides along it only).
         name: what messages call it, for example `solid[2] (sphere)`.
         motion: takes the geometry from where it is placed to where it is; None: it stands still.
+        among: what messages call the material around it.
     """
 
     geometry: Geometry
     separating: bool
     name: str
     motion: Motion | None = None
+    among: str = "material"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +99,7 @@ def voxelize(
     for number, solid in enumerate(solids, start=1):
         if remarks:
             notes += placement_notes(solid.geometry, solid.name, counts, spacing, dimension)
-            notes += thin_notes(solid.geometry, solid.name, spacing, device)
+            notes += thin_notes(solid.geometry, solid.name, solid.among, spacing, device)
         _claim(index, covered, solid.geometry, number, spacing, dimension, origin)
     claimed = covered.numpy()[1:]
     notes += [

@@ -12,6 +12,7 @@ from warp_lcp.grid.solids import Box, Capsule, Geometry, Placement, Sphere, Tria
 from warp_lcp.rigid.outline import mesh_outline
 
 ROUND = 1e-9  # relative: an inertia that is less symmetric is none
+TWICE = 0.01  # of a mesh's surface, from which what lies inside the mesh itself would weigh too much
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -65,7 +66,7 @@ def mass_properties(geometry: Geometry, dimension: int, *, mass: float | None = 
         density: [kg/m^3]; one of mass and density.
 
     Raises:
-        ValueError: both or none of mass and density, or a shape without a volume of its own.
+        ValueError: both or none of mass and density, a shape without a volume of its own, or a mesh whose parts overlap.
     """
     if (mass is None) == (density is None):
         raise ValueError("give either mass or density")
@@ -117,6 +118,11 @@ def _placed(
 
 def _mesh(mesh: TriangleMesh, dimension: int) -> tuple[float, np.ndarray, np.ndarray]:
     """Return volume, center and inertia at density 1 of a mesh as placed, or of its cut by z = 0."""
+    if mesh.surface.crossings.doubled > TWICE:
+        raise ValueError(
+            f"{mesh.surface.name}: about {mesh.surface.crossings.doubled:.0%} of its surface lies inside itself, which would weigh twice; "
+            "unite its parts (in Blender: Boolean, Union)"
+        )
     vertices = mesh.placement.apply(mesh.surface.vertices)
     if dimension == 2:
         segments = mesh_outline(mesh)
