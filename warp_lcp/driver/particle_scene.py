@@ -32,6 +32,7 @@ SPREAD = 2.0  # how much a narrow band may grow as its surface does: 1.3 times i
 PLANES = 2.5  # that a 2-D cell counts for: its fields have three, the solver's one
 VECTOR_BYTES, KEY_BYTES = 12, 16  # a particle's vectors, one of them spare, and its sort keys
 SEEDING_BYTES = 136  # a particle on the host, while the material is made and the solver is not
+SITE_SLACK = 1e-3  # of the distance of particles: their float32 coordinates may be off by that on 4096 cells
 LATTICE_BYTES = 50  # a point of one plane of cells, while particles are chosen from them
 
 
@@ -192,19 +193,51 @@ class ParticleScene(Scene):
         return [STICKS if friction == "stick" else float(friction) for friction in given]
 
     def particle_estimate(self, *, later: bool = True) -> int:
-        """Return about how many particles the scene has at most: meshes and slanted shapes count as the boxes around them.
+        """Return how many particles the scene has at most: meshes and slanted shapes count as the boxes around them.
 
-        Sources may fill the domain; whether they do, and what leaves it, is not known before.
+        Sources may fill the domain; whether they do, and what leaves it, is not known before. How a narrow band grows is not known either:
+        with one it is an estimate.
 
         Args:
             later: count what sources let in; False: what is there at the start.
         """
-        let_in = sum(self._source_volume(source, later=later) for source in self.source)
-        volume = min(sum(self.enclosed_volume(shape) for shape in self.materials()[1]) + let_in, math.prod(self.domain.size))
+        let_in = sum(self._source_sites(source, later=later) for source in self.source)
+        at_start = sum(int(self._sites(shape.bounds(self.dimension)).prod()) for shape in self.materials()[1])
+        count = min(at_start + let_in, math.prod(self.cell_counts) * self.particles.per_axis**self.dimension)
         if self.particles.narrow_band is not None:
             band = sum(self._band_volume(shape, self.particles.narrow_band.width) for shape in self.materials()[1])
-            volume = min(volume, (SPREAD if later else 1.0) * (band + let_in))
-        return round(volume / self.spacing**self.dimension * self.particles.per_axis**self.dimension)
+            sites = band / self.spacing**self.dimension * self.particles.per_axis**self.dimension
+            count = min(count, round((SPREAD if later else 1.0) * (sites + let_in)))
+        return count
+
+    def _sites(self, box: np.ndarray | None, *, whole_cells: bool = False) -> np.ndarray:
+        """Return how many points the jittered lattice of the start has in a box along each axis, shape (dimension,), at most.
+
+        Args:
+            box: low and high corner [m], shape (2, 3); None: the domain.
+            whole_cells: of the cells whose centers lie in the box.
+        """
+        count = np.array(self.cell_counts[: self.dimension]) * self.particles.per_axis
+        if box is None:
+            return count
+        step = self.spacing if whole_cells else self.spacing / self.particles.per_axis
+        reach = SITE_SLACK + (0.0 if whole_cells else 0.5 * self.particles.jitter)
+        low, high = np.clip(box[:, : self.dimension] / step, -1.0, count + 1.0)
+        first, last = np.ceil(low - 0.5 - reach), np.floor(high - 0.5 + reach)
+        most = count // self.particles.per_axis if whole_cells else count
+        found = (np.minimum(last, most - 1) - np.maximum(first, 0) + 1).clip(min=0).astype(int)
+        return found * self.particles.per_axis if whole_cells else found
+
+    def _source_sites(self, source: Source, *, later: bool) -> int:
+        """Return how many particles a source's cells hold at most when it starts, and with those that it lets in until the run ends."""
+        held = self._sites(source.bounds(self.dimension), whole_cells=True)
+        at_start = int(held.prod()) if later or source.begin == 0.0 else 0
+        seconds = max(min(source.stop or math.inf, self.time.duration) - source.begin, 0.0)
+        speed = np.abs(source.velocity)
+        across = held + (speed > 0.0)  # a lattice that moves along an axis may have one more point there
+        layers = np.where(speed > 0.0, np.ceil(speed * seconds * self.particles.per_axis / self.spacing) + 1.0, 0.0)
+        let_in = sum(layers[axis] * np.delete(across, axis).prod(dtype=float) for axis in range(self.dimension))
+        return at_start + (int(min(let_in, 2.0**62)) if later and held.all() else 0)
 
     def _band_volume(self, shape: MaterialProperties, width: float) -> float:
         """Return the part of the box around a shape that is no deeper than a band below a free side [m^3; m^2 in 2-D]."""
@@ -215,26 +248,15 @@ class ParticleScene(Scene):
         inner = high - low - deep * ((low > 0.0).astype(float) + (high < size))
         return float(np.maximum(high - low, 0.0).prod() - np.maximum(inner, 0.0).prod())
 
-    def _source_volume(self, source: Source, *, later: bool) -> float:
-        """Return an upper bound of what a source holds and lets in, or of what it holds at the start [m^3; m^2 in 2-D]."""
-        size = np.array(self.domain.size)
-        bounds = source.bounds(self.dimension)
-        low, high = (np.zeros_like(size), size) if bounds is None else (corner[: self.dimension] for corner in bounds)
-        sides = np.maximum(np.minimum(high, size) - np.maximum(low, 0.0), 0.0)
-        seconds = max(min(source.stop or math.inf, self.time.duration) - source.begin, 0.0)
-        areas = np.array([np.delete(sides, axis).prod() for axis in range(self.dimension)])
-        if not later:
-            return float(sides.prod()) if source.begin == 0.0 else 0.0
-        return float(sides.prod() + areas @ np.abs(source.velocity) * seconds)
-
     def plan(self) -> list[tuple[str, str]]:
         """Return what a run would do."""
         particles = self.particle_estimate()
         settings = self.particles
         at_first = f"{self.particle_estimate(later=False):,} at the start, " if self.source else ""
+        most = "about" if settings.narrow_band is not None else "at most"
         return [
             *super().plan(),
-            ("particles", f"{at_first}at most {particles:,}, {settings.per_axis**self.dimension} a cell, {settings.transfer}"),
+            ("particles", f"{at_first}{most} {particles:,}, {settings.per_axis**self.dimension} a cell, {settings.transfer}"),
             *self._rearrangement(),
             *self.model_plan(),
             ("memory", f"about {_megabytes(self.memory_estimate())} MB"),

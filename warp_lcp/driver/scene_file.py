@@ -19,6 +19,7 @@ from warp_lcp.driver.table import Problem, SceneError, validate, written
 from warp_lcp.nearest import nearest
 
 DEEPEST = 16  # tables and arrays in each other; a scene needs six
+MOST_TABLES = 10_000  # in an array of them, such as [[liquid]]: each is a shape whose distances are taken by itself
 LARGEST = 1e18  # of a number: its square is a float32, and sums of cubes are float64
 
 HEADER = "# The scene as it ran: defaults filled in, overrides applied, paths absolute.\n"
@@ -149,6 +150,9 @@ def _refuse_extremes(data: dict[str, Any], source: str) -> None:
             raise SceneError(source, [Problem(path, "is nested too deeply")])
         if isinstance(value, dict):
             waiting += [(f"{path}.{key}", entry, depth + 1) for key, entry in value.items()]
+        elif isinstance(value, list) and len(value) > MOST_TABLES and isinstance(value[0], dict):
+            message = f"has {len(value):,} entries, of which a scene may have {MOST_TABLES:,}; a mesh holds more of them in one"
+            problems.append(Problem(path, message))
         elif isinstance(value, list):
             waiting += [(f"{path}[{index}]", entry, depth + 1) for index, entry in enumerate(value)]
         elif isinstance(value, int) and abs(value) >= 2**63:

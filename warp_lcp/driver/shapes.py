@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -97,7 +98,13 @@ class Shape(Table):
 
         None when the shape has no limits, or only its file knows them.
         """
-        return self.to_geometry(Path(), dimension).bounds()
+        if dimension not in self._boxes:
+            self._boxes[dimension] = self.to_geometry(Path(), dimension).bounds()
+        return self._boxes[dimension]
+
+    @cached_property
+    def _boxes(self) -> dict[int, np.ndarray | None]:
+        return {}
 
     def complaints(self, dimension: int) -> list[Complaint]:
         """Return what is wrong with the shape in a scene of 2 or 3 dimensions."""

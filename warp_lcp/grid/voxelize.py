@@ -142,7 +142,8 @@ def inside(geometries: Sequence[Geometry], points: np.ndarray, *, device: wp.Dev
         bounds = geometry.bounds()
         near = ~result
         if bounds is not None:
-            near &= ((points >= bounds[0]) & (points <= bounds[1])).all(axis=1)
+            for axis, column in enumerate(points.T):
+                near &= (column >= bounds[0][axis]) & (column <= bounds[1][axis])
         wanted = np.flatnonzero(near)
         for first in range(0, len(wanted), CHUNK):
             part = wanted[first : first + CHUNK]
