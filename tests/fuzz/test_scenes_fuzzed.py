@@ -1,4 +1,4 @@
-"""Scene files that are wrong in ways nobody thought of: `check` accepts or refuses them, quickly, and does nothing else."""
+"""Scene files that are wrong in ways nobody thought of: `check` accepts or refuses them, and does nothing else."""
 
 from __future__ import annotations
 
@@ -6,25 +6,26 @@ import copy
 import datetime
 import math
 import random
-import signal
+import re
 import tomllib
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
 import tomli_w
-from typer.testing import CliRunner
+from hypothesis import given
+from hypothesis import strategies as st
+from mutated import mutated
+from told import limited, told
 
-from warp_lcp.driver import cli
+from warp_lcp.driver import check
 from warp_lcp.driver.check import check_scene
 from warp_lcp.driver.scene_file import built_in_scenes
 from warp_lcp.driver.table import SceneError
 
-SECONDS = 5.0  # for one file, on a busy machine; usual ones take milliseconds
-CHUNK = 100
+ROOM = 8 << 20  # bytes of memory that a scene may take to be made: those of a few thousand cells
 NUMBERS = [0, -1, 1, 2, 3, 7, 4096, 10**9, 2**63 - 1, -(2**63), 2**64, 10**400, math.nan, math.inf, -math.inf]
 NUMBERS += [0.0, -0.0, 0.5, -2.5, 1e-320, 1e-30, 1e-9, 1e12, 1e30, 1e200, 1.7e308, -1e308]
 FACTORS = [2, 3, 10, 1000, 10**6, 10**15, 1e-3, 1e-15, 1e-200, 1e-320, 1e30, 1e200, -1]
@@ -45,22 +46,35 @@ INSERTS = [
     b"\ntime" + b".a" * 3000 + b" = 1\n",
 ]
 
+SMALL = [
+    re.sub(rb"resolution = \d+", b"resolution = 20", built_in_scenes()[name].read_bytes())
+    for name in ("column-collapse-2d", "dam-break-2d", "floating-bodies-2d", "hourglass-2d", "retracting-wall", "tap-and-drain")
+]
 
-def test_three_hundred_fuzzed_files_are_accepted_or_refused(tmp_path: Path) -> None:
-    outcomes = [_outcome(seed, tmp_path) for seed in range(300)]
-    assert min(outcomes.count(True), outcomes.count(False)) > 20, "mutations that all do the same test nothing"
+
+@given(st.integers(0, 2**32).map(lambda seed: fuzzed(random.Random(seed))))
+def test_changed_scenes(data: bytes) -> None:
+    """Keys and values that have changed places: `check_scene` takes the scene or says what is wrong."""
+    with TemporaryDirectory() as folder:
+        file = Path(folder, "scene.toml")
+        file.write_bytes(data)
+        try:
+            with limited():
+                _, lines = check_scene(str(file))
+        except SceneError as error:
+            assert error.problems and len(str(error)) < 200_000
+        else:
+            assert dict(lines)["grid"]
 
 
-def test_the_command_ends_with_0_or_2(tmp_path: Path) -> None:
-    file = tmp_path / "scene.toml"
-    codes = []
-    for seed in range(500, 540):
-        file.write_bytes(fuzzed(random.Random(seed)))
-        result = CliRunner().invoke(cli.app, ["check", str(file), "--device", "cpu"])
-        codes.append(result.exit_code)
-        assert result.exception is None or isinstance(result.exception, SystemExit), f"seed {seed}"
-        assert (result.exit_code == cli.WRONG_INPUT) == bool(result.stderr), f"seed {seed}"
-    assert set(codes) == {0, cli.WRONG_INPUT}
+@given(mutated(SMALL) | st.sampled_from(SMALL).flatmap(lambda data: st.integers(0, 2**32).map(lambda s: fuzzed(random.Random(s), data))))
+def test_mutated_scenes(data: bytes) -> None:
+    """Bytes and values: `check` makes what it takes, and ends with 0, or with 2 and a message."""
+    with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(check, "free_memory", lambda device: ROOM)
+        file = Path(folder, "scene.toml")
+        file.write_bytes(data)
+        told("check", file, "--device", "cpu")
 
 
 @pytest.mark.parametrize(
@@ -103,52 +117,10 @@ def test_a_folder_is_no_scene_and_no_mesh(tmp_path: Path) -> None:
         check_scene("mesh-obstacle", [f"solid.0.file={tmp_path}"])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("first", range(0, 10_000, CHUNK))
-def test_ten_thousand_fuzzed_files_are_accepted_or_refused(first: int, tmp_path: Path) -> None:
-    outcomes = [_outcome(seed, tmp_path) for seed in range(first, first + CHUNK)]
-    assert outcomes.count(False) > CHUNK // 5
-
-
-def _outcome(seed: int, folder: Path) -> bool:
-    """Return whether `check` takes the scene of this seed (exit code 0) or refuses it (2); anything else fails."""
-    file = folder / "scene.toml"
-    file.write_bytes(fuzzed(random.Random(seed)))
-    try:
-        with at_most(SECONDS):
-            _, lines = check_scene(str(file))
-    except SceneError as error:
-        assert error.problems and len(str(error)) < 200_000, f"seed {seed}"
-        return False
-    except BaseException as error:
-        raise AssertionError(f"seed {seed}: {error!r}") from error
-    assert dict(lines)["grid"], f"seed {seed}"
-    return True
-
-
-class TooLongError(Exception):
-    """A file that takes too long."""
-
-
-@contextmanager
-def at_most(seconds: float) -> Iterator[None]:
-    """Interrupt what takes longer."""
-
-    def ring(number: int, frame: FrameType | None) -> None:
-        raise TooLongError(f"longer than {seconds} s")
-
-    before = signal.signal(signal.SIGALRM, ring)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
-
-
-def fuzzed(chance: random.Random) -> bytes:
-    """Return a built-in scene with a few random changes of its keys and values, and sometimes of its bytes."""
-    data = tomllib.loads(chance.choice(list(built_in_scenes().values())).read_text("utf-8"))
+def fuzzed(chance: random.Random, original: bytes | None = None) -> bytes:
+    """Return a scene, a built-in one unless given, with a few random changes of its keys and values, and sometimes of its bytes."""
+    text = chance.choice(list(built_in_scenes().values())).read_bytes() if original is None else original
+    data = tomllib.loads(text.decode())
     change = chance.choice([_change, _change_number])
     for _ in range(chance.choice([1, 1, 1, 2, 3, 5])):
         change(data, chance)
@@ -197,9 +169,7 @@ def _change(data: dict[str, Any], chance: random.Random) -> None:
     elif kind == "repeat" and isinstance(old, list) and old:
         owner[key] = [copy.deepcopy(chance.choice(old)) for _ in range(chance.choice([2, 3, 10, 200]))]
     elif kind == "add" and isinstance(old, dict):
-        old[chance.choice([*WORDS, "scale", "rotate", "translate", "motion", "file", "invert", "smoothing", "open", "shape"])] = _value(
-            chance
-        )
+        old[chance.choice(KEYS)] = _value(chance)
     elif kind == "text" and isinstance(old, str):
         owner[key] = chance.choice(WORDS)
     else:
@@ -221,20 +191,4 @@ def _scramble(text: bytes, chance: random.Random) -> bytes:
     if kind == 4:
         chance.shuffle(lines)
         return b"".join(lines)
-    return (
-        text[:at]
-        + chance.choice(
-            [
-                b"[" * 3000,
-                b"[[x]]\n",
-                b"\n[time]\n",
-                b"=",
-                b"\r",
-                b'"""',
-                b"9" * 5000,
-                b"\ntime" + b".a" * 3000 + b" = 1\n",
-                b"0x" + b"f" * 5000,
-            ]
-        )
-        + text[at:]
-    )
+    return text[:at] + chance.choice(INSERTS) + text[at:]
