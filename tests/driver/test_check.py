@@ -49,7 +49,7 @@ def test_the_plan_has_a_line_for_each_part() -> None:
 def test_sources_count_later() -> None:
     scene, lines = check_scene("tap-and-drain")
     simulation = FluidsSimulator().create(scene, device="cpu", folder=Path.cwd())
-    assert dict(lines)["particles"].startswith(f"{simulation.particles.count} at the start, at most 3,904, ")
+    assert dict(lines)["particles"].startswith(f"{simulation.particles.count} at the start, at most 3,912, ")
     later, _ = check_scene("tap-and-drain", ["source.0.start=0.5"])
     assert dict(later.plan())["particles"].startswith("0 at the start, ")
 

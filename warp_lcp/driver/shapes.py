@@ -39,6 +39,13 @@ STICKS = 1e6  # Coulomb's coefficient of a wall that holds what presses against 
 BODY_FRICTION = 0.5  # of a rigid body unless its scene says otherwise
 
 
+class _Boxes:
+    """The boxes around a shape that were asked for, by dimension: equal to no others, so that shapes compare by their keys alone."""
+
+    def __init__(self) -> None:
+        self.known: dict[int, np.ndarray | None] = {}
+
+
 class Shape(Table):
     """A region of space, placed by p = about + rotation (scale (q - about)) + translation; `about` is the origin unless given.
 
@@ -98,13 +105,14 @@ class Shape(Table):
 
         None when the shape has no limits, or only its file knows them.
         """
-        if dimension not in self._boxes:
-            self._boxes[dimension] = self.to_geometry(Path(), dimension).bounds()
-        return self._boxes[dimension]
+        known = self._boxes.known
+        if dimension not in known:
+            known[dimension] = self.to_geometry(Path(), dimension).bounds()
+        return known[dimension]
 
     @cached_property
-    def _boxes(self) -> dict[int, np.ndarray | None]:
-        return {}
+    def _boxes(self) -> _Boxes:
+        return _Boxes()
 
     def complaints(self, dimension: int) -> list[Complaint]:
         """Return what is wrong with the shape in a scene of 2 or 3 dimensions."""
