@@ -29,6 +29,20 @@ source lets in is exact all the same, the flow has its velocity in the steps in 
 step in part of which it is open.
 """
 
+PLACED = """Any shape may be moved from where its keys put it, in this order: `scale`, `rotate`, `translate`. The first two leave the origin
+where it is, not the shape's center, unless `about` names another point: `about = [0.5, 0.2]` with `rotate = 30.0` turns a box around
+[0.5, 0.2] on the spot. Angles are in degrees everywhere in a scene."""
+
+MESHES = """A mesh is a closed surface: what its triangles surround, counted by the winding number, is inside. `warp-lcp check` and the
+start of a run say what was put right, with the file, how many triangles and where the first is:
+
+- vertices closer than a millionth of the mesh's size become one; repeated triangles and those without area are dropped;
+- triangles that disagree with their neighbors are turned, and so are parts that are inside out, but for the walls of hollows;
+- triangles that cross others, and parts inside other parts, stay: what is surrounded twice is inside. Such a mesh is no rigid body, since
+  what is there twice would weigh twice; and it is refused where more than 1 % of it is inside out, since that much would be missing.
+
+Open surfaces, surfaces with one side only and surfaces without a volume are refused."""
+
 
 def reference(prop: Definition) -> str | None:
     """Return the name of the definition that a property refers to, itself or as one of its alternatives."""
@@ -143,16 +157,11 @@ def shape_section(schema: Definition) -> str:
     own = []
     for shape, definition in drains.items():
         kept = frozenset(common | timed)
-        own.append(f'### shape = "{shape}"\n\n{table(definition, kept)}')
+        own.append(f'### shape = "{shape}"\n\n{table(definition, kept)}' + (f"\n{MESHES}\n" if shape == "mesh" else ""))
     everywhere = {**drains["box"], "properties": {key: prop for key, prop in drains["box"]["properties"].items() if key in common - timed}}
-    placed = "Any shape may be moved from where its keys put it, in this order: `scale`, `rotate`, `translate`. "
-    placed += (
-        "The\nfirst two leave the origin where it is, not the shape's center, unless `about` names another point: `about = [0.5, 0.2]` with"
-        "\n`rotate = 30.0` turns a box around [0.5, 0.2] on the spot. Angles are in degrees everywhere in a scene."
-    )
     return "\n".join(
         ["## Shapes\n", "A `[[liquid]]`, `[[sand]]`, `[[solid]]`, `[[source]]` or `[[drain]]` is a shape: `shape` and its keys.\n", *own]
-    ) + (f"\n### Placing a shape\n\n{placed}\n\n{table(everywhere)}")
+    ) + (f"\n### Placing a shape\n\n{PLACED}\n\n{table(everywhere)}")
 
 
 def motion_section(schema: Definition) -> str:
