@@ -1,6 +1,6 @@
 """Where a closed surface crosses itself, or lies inside itself: there the winding number is neither 0 nor 1.
 
-Two triangles cross where the segments that each has in common with the other's plane overlap [Moller 1997]. Parts that only touch do so
+Two triangles cross where the segments that each has in common with the other's plane overlap. Parts that only touch do so
 too, face to face or along edges; so winding numbers on the four sides of the crossing decide. Parts that do not cross have the same winding
 number all over, which one of their triangles tells.
 """
