@@ -9,6 +9,20 @@ from warp_lcp.driver.frames import FrameFolder
 from warp_lcp.driver.scene_file import dump_scene, load_scene
 from warp_lcp.driver.simulator import Part, Surface
 
+MINIMAL = """
+[scene]
+simulator = "dots"
+[time]
+duration = 0.5
+frames_per_second = 20
+dt_max = 0.02
+[domain]
+size = [1.0, 1.0]
+resolution = 8
+[output]
+checkpoint_every = 4
+"""
+
 
 def write_run(folder: Path, frames: Sequence[list[Part]], text: str = "", size: Sequence[float] = (1.0, 1.0)) -> Path:
     """Write a run of the simulator `dots`: 10 cells along a side of 1 m, 20 frames a second."""

@@ -8,23 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from small_runs import MINIMAL
 from warp_lcp.driver import simulator as plug_ins
 from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.simulator import Cells, Part, Points
-
-MINIMAL = """
-[scene]
-simulator = "dots"
-[time]
-duration = 0.5
-frames_per_second = 20
-dt_max = 0.02
-[domain]
-size = [1.0, 1.0]
-resolution = 8
-[output]
-checkpoint_every = 4
-"""
 
 
 class Dots:

@@ -11,7 +11,7 @@ import pytest
 from rich.table import Table
 from typer.testing import CliRunner, Result
 
-from conftest import MINIMAL
+from small_runs import MINIMAL
 from warp_lcp.driver import cli, run_folder
 from warp_lcp.driver.foreign import one_line, visible
 from warp_lcp.driver.progress import Lines

