@@ -5,7 +5,8 @@ BIN = $(VENV)/bin
 MPI_VENV ?= .venv-mpi
 
 OUT ?= out/dam-break
-WORKERS ?= 2  # processes that run the tests
+# Processes that run the tests.
+WORKERS ?= 2
 
 .PHONY: demo test test-distributed slow fuzz mutants docs wheel-check clean
 
@@ -17,7 +18,7 @@ test: $(VENV)/.dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest -n $(WORKERS) $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal $(PYTEST_ARGS)
 
 # The tests on several ranks, in an environment of the system's Python with Debian's MPI and PETSc (installed by apt-get if this is root).
 test-distributed:
