@@ -15,6 +15,7 @@ from warp_lcp.solvers.interior_point_grid import GridPath
 from warp_lcp.solvers.nonsmooth_map import Kink, NonsmoothMap, Reformulation
 from warp_lcp.solvers.nonsmooth_map_grid import GridMap
 from warp_lcp.solvers.principal_system import GridSystem
+from warp_lcp.solvers.projected_multigrid_kernels import BETA, CARRY, NORM, SIZE, SLOTS, STEP, plan_whole_step_kernel
 
 SHAPE = (6, 7, 21)
 FACES = [{}, {"face_y": 3.0}, "arrays"]
@@ -246,3 +247,14 @@ def test_the_best_iterate_is_returned_however_the_solve_is_cut_short(precision, 
             x = problem.layout.load(result.x.numpy().astype(np.float64), wp.float64)
             assert check.evaluate(x) == pytest.approx(result.residual, rel=1e-6)
     assert risen > 0
+
+
+def test_the_step_of_a_projected_cycle_is_its_correction_alone():
+    """Such a correction keeps to the bounds; with a share of the last direction it would not."""
+    scalars = wp.array(np.linspace(2.0, 5.0, SLOTS), dtype=wp.float64, device="cpu")
+    before = scalars.numpy().copy()
+    wp.launch(plan_whole_step_kernel, 1, [scalars], device="cpu")
+    after = scalars.numpy()
+    assert (after[int(BETA)], after[int(CARRY)]) == (0.0, 0.0)
+    assert after[int(STEP)] == before[int(SIZE)]  # the correction's unit, which changes for the next one
+    assert after[int(SIZE)] == np.sqrt(before[int(NORM)])
