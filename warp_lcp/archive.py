@@ -80,6 +80,8 @@ class Archive:
     def __init__(self, path: Path) -> None:
         """Open a file and read what it says of its arrays."""
         with _faults_named():
+            if path.exists() and not path.is_file():  # a pipe would be waited for
+                raise ArchiveError("it is no file")
             self._stream = open(path, "rb")  # noqa: SIM115 - `close` closes it; zipfile leaves a broken file open
         try:
             with _faults_named():

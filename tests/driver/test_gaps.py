@@ -74,7 +74,7 @@ def test_a_log_that_was_cut_or_deleted(out, share):
         cut(out / "log.csv", share)
     left = steps(out)[:-1] if share == 0.33 else []  # the last row is cut
     (line,) = resumed(out)
-    assert line.startswith(f"log.csv: the rows of steps {len(left) + 1} to {STEP} are missing; no checkpoint is from before them")
+    assert line.startswith(f"log.csv: rows are missing, of steps {len(left) + 1} to {STEP}; no checkpoint is from before them")
     assert steps(out)[: len(left) + 1] == [*left, STEP + 1]
 
 
@@ -88,8 +88,8 @@ def test_what_is_missing_is_made_again_as_the_line_says(out, scene_file, tmp_pat
     (out / "log.csv").write_text("".join(rows[:18] + rows[20:]))
     again = "to have them again, move the checkpoint{} away and resume from that of step {}"
     assert resumed(out) == [
-        f"log.csv: the rows of steps 18 to 19 are missing; {again.format(' of step 20', 16)}",
-        f"frames: grid {lost} are missing; {again.format('s of steps 16 to 20', 12)}",
+        f"log.csv: rows are missing, of steps 18 to 19; {again.format(' of step 20', 16)}",
+        f"frames: grid {lost} are missing or cut; {again.format('s of steps 16 to 20', 12)}",
     ]
     for file in out.glob("checkpoints/*.npz"):
         if int(file.stem[-6:]) > 12:
@@ -143,9 +143,9 @@ def test_whatever_is_missing_is_named(out, seed):
     lost = [f"{kind}.pvd" for kind in KINDS if not (out / f"{kind}.pvd").exists()]
     lines = resumed(out)
     holes = sorted({*range(1, STEP + 1)} - {*steps(out)})
-    told = [f"log.csv: the rows of steps {spans(holes)} are missing"] if holes else []
+    told = [f"log.csv: rows are missing, of steps {spans(holes)}"] if holes else []
     listed = ", ".join(f"{kind} {spans(numbers)}" for kind, numbers in missing.items() if numbers)
-    told += [f"frames: {listed} are missing"] if listed else []
+    told += [f"frames: {listed} are missing or cut"] if listed else []
     told += [f"{name}: is missing" for name in lost]
     assert [line.split(";")[0] for line in lines] == told
     assert steps(out) == sorted({*steps(out)})

@@ -163,7 +163,7 @@ def test_a_failed_solve_leaves_the_state_as_it_was(steps: int) -> None:
     before, frame = twin.state(), twin.frame()
     simulation.projection.max_iterations = 0
     for _ in range(2):
-        with pytest.raises(StepFailed, match=rf"step {steps}: .*MAX_ITERATIONS.*relative residual"):
+        with pytest.raises(StepFailed, match=r"MAX_ITERATIONS .*relative residual"):
             simulation.step(0.02)
     assert simulation.step_count == steps
     assert same(before, simulation.state())

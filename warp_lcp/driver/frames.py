@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections import deque
 from collections.abc import Sequence
@@ -23,6 +24,7 @@ from warp_lcp.driver.vtu import vtu_bytes, write_vtu
 FRAME_FILE = re.compile(r"(?P<name>[a-z][a-z_]*)_(?P<index>\d{6,})\.(?P<format>p?vtu|p?vti|ply|nvdb)")
 COLLECTED = ("vtu", "vti", "pvtu", "pvti")  # what ParaView opens as a series
 WAITING = 2  # frames in memory, the one being written included
+END = b"</VTKFile>\n"  # of those that are whole
 
 GridFormat = Literal["vtu", "vti"]
 
@@ -223,11 +225,20 @@ def frame_bytes(frame: list[Part], grid_format: GridFormat = "vtu", *, surface_p
 
 
 def _is_whole(file: Path) -> bool:
-    """Return whether all files are there that one with the pieces of ranks names."""
+    """Return whether a frame's file has an end, and so have all that one with the pieces of ranks names."""
     try:
-        return file.suffix[1:] not in WHOLE.values() or all(piece.is_file() for piece in piece_files(file))
+        return _has_end(file) and (file.suffix[1:] not in WHOLE.values() or all(map(_has_end, piece_files(file))))
     except ValueError:
         return False
+
+
+def _has_end(file: Path) -> bool:
+    """Return whether a file is there and was not cut."""
+    if not file.is_file():
+        return False
+    with open(file, "rb") as stream:
+        stream.seek(-min(file.stat().st_size, len(END)), os.SEEK_END)
+        return stream.read() == END if file.suffix.endswith(("vtu", "vti")) else stream.tell() > 0
 
 
 def collection(entries: list[tuple[float, str]]) -> str:

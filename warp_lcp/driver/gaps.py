@@ -35,12 +35,12 @@ def gaps(
     steps = sorted({*range(1, step + 1)} - rows)
     if steps:
         again = _again(checkpoints, lambda found, _: found < steps[0])
-        lines.append(f"{log.name}: the rows of steps {spans(steps)} are missing; {again}")
+        lines.append(f"{log.name}: rows are missing, of steps {spans(steps)}; {again}")
     missing = {name: numbers for name in frames.kinds(frame) if (numbers := frames.missing(name, len(times)))}
     if missing:
         first = times[min(min(numbers) for numbers in missing.values())]
         listed = ", ".join(f"{name} {spans(numbers)}" for name, numbers in missing.items())
-        lines.append(f"{frames.frames.name}: {listed} are missing; {_again(checkpoints, lambda _, time: time < first)}")
+        lines.append(f"{frames.frames.name}: {listed} are missing or cut; {_again(checkpoints, lambda _, time: time < first)}")
     lost = [part.name for part in frame if not isinstance(part, Volume) and not (frames.folder / f"{part.name}.pvd").is_file()]
     return [*lines, *(f"{name}.pvd: is missing; written anew from the frames that are there" for name in lost)]
 

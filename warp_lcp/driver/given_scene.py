@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from warp_lcp.driver.continuation import RESOLUTION
-from warp_lcp.driver.run_folder import RECORD, SCENE, OutputError, read_record, recorded_keys
+from warp_lcp.driver.run_folder import SCENE, OutputError, holds_run, read_record, recorded_keys
 from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.scene_file import keys, load_scene, override_key, override_value, scene_value
 
@@ -57,7 +57,7 @@ def scene_to_resume(folder: Path, source: str | None, overrides: Sequence[str]) 
         OutputError: there is no run, or its grid would become another one without being asked for.
         SceneError: listing everything that is wrong.
     """
-    if not (folder / RECORD).is_file():
+    if not holds_run(folder):
         raise OutputError(f"{folder}: there is no run to resume")
     own, asked = folder / SCENE, [override_key(override) for override in overrides]
     before = [entry for entry in _recorded(folder) if override_key(entry["set"]) not in asked]

@@ -164,7 +164,7 @@ class RunFolder:
         own, foreign = self._contents()
         if not foreign and all(path.name.startswith(f".{RECORD}") for path in own):  # nothing, or killed with its first files
             return
-        if foreign or self.path / RECORD not in own:
+        if foreign or not holds_run(self.path):
             shown = ", ".join(one_line(str(path.relative_to(self.path))) for path in [*foreign, *own][:3])
             raise OutputError(f"{self.path}: holds files that are no run's ({shown}), which --force does not delete; choose another folder")
         if not force:
@@ -210,6 +210,8 @@ class RunFolder:
             )
         lost = [name for name, found in ((RECORD, read_record(self.path)), (SCENE, recorded_keys(self.path / SCENE))) if not found]
         remarks = [*refused, *self._other_versions(), *(f"{name}: was missing or damaged; written anew" for name in lost)]
+        if RECORD in lost:
+            remarks.append("what --set gave the run before is not known: what is not given again is the scene's")
         if refused:
             remarks.append(f"continuing from step {checkpoint.step} instead; refused checkpoints stay as checkpoints/refused_*.npz")
         now = keys(self.scene)
@@ -290,7 +292,7 @@ class RunFolder:
             )
 
     def _check_run(self) -> None:
-        if not (self.path / RECORD).is_file():
+        if not holds_run(self.path):
             raise OutputError(f"{self.path}: there is no run to resume")
 
     def _check_same_scene(self) -> None:
@@ -342,6 +344,11 @@ class RunFolder:
         return own, foreign
 
 
+def holds_run(folder: Path) -> bool:
+    """Return whether there is a run in a folder: its record, or a checkpoint where somebody has deleted that."""
+    return (folder / RECORD).is_file() or any(CHECKPOINT_FILE.fullmatch(file.name) for file in folder.glob(f"{CHECKPOINTS}/*"))
+
+
 def mark_stopped(folder: Path, signal: str) -> None:
     """Write into run.json that a signal has stopped the run before its first step; for a thread that ends the process."""
     with suppress(OSError):
@@ -371,7 +378,8 @@ def recorded_keys(path: Path) -> dict[str, Any] | None:
     except SceneError:
         pass  # a mesh has been moved, perhaps; what the file says still counts
     try:
-        return table_keys(tomllib.loads(path.read_text(encoding="utf-8")))
+        found = table_keys(tomllib.loads(path.read_text(encoding="utf-8")))
+        return found if "scene.simulator" in found else None
     except (OSError, ValueError, RecursionError):
         return None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import files
@@ -248,7 +249,7 @@ def _find_meshes(scene: Scene, source: str) -> None:
     problems = [
         Problem(path, "there is no such file", written(file))
         for path, file in _leaves(scene.model_dump())
-        if path.endswith("].file") and not file.startswith(BUILTIN) and not Path(file).is_file()
+        if path.endswith("].file") and not file.startswith(BUILTIN) and not os.path.isfile(file)
     ]
     if problems:
         raise SceneError(source, problems)

@@ -230,8 +230,8 @@ class SolidProperties(Shape):
     rubs: ClassVar[bool] = False  # whether the material rubs against solids that stand
     wall: Wall | None = Field(default=None, description="whether material may let go of it; domain.wall unless given")
     motion: Motion | None = Field(default=None, description="how it moves, from where it is placed; it stands still unless given")
-    mass: float | None = Field(default=None, gt=0, description="makes it a rigid body that the material moves [kg; kg/m in 2-D]")
-    density: float | None = Field(default=None, gt=0, description="in place of mass: of the solid, filled evenly [kg/m^3]")
+    mass: float | None = Field(default=None, ge=1e-18, description="makes it a rigid body that the material moves [kg; kg/m in 2-D]")
+    density: float | None = Field(default=None, ge=1e-18, description="in place of mass: of the solid, filled evenly [kg/m^3]")
     velocity: Vector | None = Field(default=None, description="of a rigid body at the start [m/s]; at rest unless given")
     angular_velocity: Angles | None = Field(
         default=None,
