@@ -28,6 +28,8 @@ PYTEST = ["-x", "-q", "--no-header", "-p", "no:cacheprovider", "--hypothesis-see
 FILES = (1, 4)  # of tests: these first, with one of its parameters for each function, then these with all where a mutant survives
 TREE: Path
 SECONDS = 5.0
+SOUND: set[str] = set()  # tests that pass where nothing is changed, and those that do not
+BROKEN: set[str] = set()
 
 
 def prepare(folder: str, files: tuple[int, int] = FILES, seconds: float = 60.0) -> None:
@@ -124,33 +126,27 @@ def _become_pytest(arguments: list[str], budget: Budget, limit: int, log: Path) 
 
 
 def judge(mutant: Mutant) -> dict[str, object]:
-    """Apply a mutant, run its tests and take it back."""
+    """Apply a mutant, run its tests and take it back; tests that fail without it too are left out from then on."""
     path = TREE / mutant.module
     whole, stat = path.read_text(), path.stat()
     chosen, spent, verdict, by = tests_of(TREE, mutant.module), 0.0, "alive", ""
-    path.write_text(mutated(whole, mutant.operator, mutant.occurrence))
-    for number in FILES:
-        outcome, text, took = tests(chosen[:number], brief=number == FILES[0])
+    rounds = list(FILES)
+    while rounds and verdict == "alive":
+        path.write_text(mutated(whole, mutant.operator, mutant.occurrence))
+        outcome, text, took = tests([*chosen[: rounds[0]], *(f"--deselect={name}" for name in BROKEN)], brief=rounds[0] == FILES[0])
+        path.write_text(whole)
+        os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
         spent += took
+        names = re.findall(r"^(?:FAILED|ERROR) (.+?)(?: - |$)", text, re.MULTILINE)
+        if outcome == "failed" and names and "::" in names[0] and names[0] not in SOUND:
+            (SOUND if tests(names[:1])[0] == "passed" else BROKEN).add(names[0])
+        if names and names[0] in BROKEN:
+            continue
         if outcome != "passed":
-            names = re.findall(r"^(?:FAILED|ERROR) (.+?)(?: - |$)", text, re.MULTILINE)
             verdict = outcome if outcome == "timeout" else "killed" if names or outcome == "crashed" else "broken test"
             by = names[0] if names else text[-300:]
-            break
-    path.write_text(whole)
-    os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+        number = rounds.pop(0)
     return {**mutant._asdict(), "verdict": verdict, "by": by, "tests": chosen[:number], "seconds": round(spent, 1)}
-
-
-def false_alarms(results: list[dict[str, object]], folder: str) -> None:
-    """Run the tests that killed on the tree as it is: a mutant that was killed by a test that fails anyway is not killed."""
-    prepare(folder)
-    names = sorted({str(r["by"]) for r in results if r["verdict"] == "killed" and "::" in str(r["by"])})
-    _, text, _ = tests(["--maxfail=1000", *names]) if names else ("", "", 0.0)
-    failed = set(re.findall(r"^(?:FAILED|ERROR) (.+?)(?: - |$)", text, re.MULTILINE))
-    for result in results:
-        if result["by"] in failed:
-            result["verdict"] = "broken test"
 
 
 def report(results: list[dict[str, object]], out: Path, seed: int) -> None:
@@ -197,13 +193,13 @@ def main() -> None:
     done = {tuple(r[name] for name in Mutant._fields[:4]) for r in results}
     todo = [mutant for mutant in drawn if mutant[:4] not in done]
     random.Random(given.seed).shuffle(todo)  # a run that is stopped has seen all packages
-    with tempfile.TemporaryDirectory() as folder:
-        with multiprocessing.get_context("fork").Pool(given.jobs, prepare, (folder, given.files, given.seconds)) as pool:
-            for result in pool.imap_unordered(judge, todo):
-                results.append(result)
-                print("{verdict:8}{seconds:6} s {module}:{line} {after}".format(**result), flush=True)
-                kept.write_text(json.dumps(results, indent=1))
-        false_alarms(results, folder)
+    started = (given.jobs, prepare, (folder := tempfile.mkdtemp(), given.files, given.seconds))
+    with multiprocessing.get_context("fork").Pool(*started) as pool:
+        for result in pool.imap_unordered(judge, todo):
+            results.append(result)
+            print("{verdict:8}{seconds:6} s {module}:{line} {after}".format(**result), flush=True)
+            kept.write_text(json.dumps(results, indent=1))
+    shutil.rmtree(folder)
     report(results, given.out, given.seed)
 
 

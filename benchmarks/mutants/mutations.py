@@ -15,6 +15,8 @@ from cosmic_ray.operators.operator import Operator
 from cosmic_ray.plugins import get_operator
 
 PACKAGES = ("warp_lcp", "fluids", "granular")
+# lines that only a type checker, the time of a compiler or an eye can tell
+UNSEEN = re.compile(r"TYPE_CHECKING|enable_backward|\(\d+, \d+, \d+\)|\[\d+, \d+, \d+\]")
 APART = re.compile(r"/distributed|/__init__\.py$|parallel_|_table\.py$")  # needs ranks of MPI; names; tables of numbers
 
 BINARY = "Add_Sub Sub_Add Mul_Div Div_Mul FloorDiv_Mul Mod_FloorDiv Pow_Mul BitAnd_BitOr BitOr_BitAnd LShift_RShift"
@@ -126,14 +128,14 @@ def draw(root: Path, count: int, seed: int) -> list[Mutant]:
 
 
 def _places(source: str) -> list[tuple[int, str, int]]:
-    """Return line, operator's name and occurrence of all changes of a module but those in annotations and in what is raised."""
+    """Return line, operator's name and occurrence of a module's changes but those in annotations, in what is raised and on UNSEEN lines."""
     nodes = [(node, _inert(node)) for node in ast_nodes(parso.parse(source))]
-    places = []
+    places, lines = [], source.splitlines()
     for name in (*NAMES, "LeaveOut", "NativeSwap"):
         change, occurrence = operator(name), 0
         for node, inert in nodes:
             for begin, _ in change.mutation_positions(node):
-                if not inert:
+                if not inert and not UNSEEN.search(lines[begin[0] - 1]):
                     places.append((begin[0], name, occurrence))
                 occurrence += 1
     return places
