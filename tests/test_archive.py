@@ -63,6 +63,8 @@ def test_a_box_is_part_of_the_array(path, name):
 def test_other_versions_of_the_format_are_read(tmp_path):
     for version in ((1, 0), (2, 0), (3, 0)):
         np.testing.assert_array_equal(read(zipped(tmp_path / "a.npz", {"a.npy": member(DESCR, version=version)})), [0.0, 0.0])
+    indented = member(DESCR + "\r\n   ")  # which NumPy takes for one of Python 2 and warns of
+    np.testing.assert_array_equal(read(zipped(tmp_path / "a.npz", {"a.npy": indented})), [0.0, 0.0])
 
 
 @pytest.mark.parametrize(

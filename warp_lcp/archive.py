@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import struct
+import warnings
 import zipfile
 import zlib
 from collections.abc import Collection, Iterator
@@ -195,7 +196,8 @@ class Archive:
 def _faults_named(name: str = "") -> Iterator[None]:
     """Turn what can go wrong while an archive is read into one error, which names the array."""
     try:
-        yield
+        with warnings.catch_warnings(action="ignore", category=UserWarning):  # of NumPy, on headers that Python 2 wrote
+            yield
     except FAULTS as error:
         if isinstance(error, ArchiveError) and not name:
             raise

@@ -41,6 +41,17 @@ def test_a_profile_is_shown_and_written(scene_file, out):
     assert not (out / "profile.json").exists()
 
 
+@pytest.mark.parametrize("name", ["x" * 5000, "x" * 300], ids=["path", "part"])
+@pytest.mark.parametrize(
+    "words", ["check {}", "run {}", "run dam-break-2d --out {}", "run --resume --out {}", "render {}", "solve {}", "tune {}"]
+)
+def test_paths_that_no_file_can_have(words, name):
+    result = call(*words.format(name).split())
+    assert result.exit_code == 2
+    assert name in result.stderr
+    assert result.stderr.endswith(": File name too long\n")
+
+
 def test_the_folder_is_named_after_the_scene(scene_file, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert call("run", scene_file, "--frames", 1, "--device", "cpu").exit_code == 0

@@ -91,6 +91,7 @@ def test_the_surface_is_shown_where_there_is_one(dots, tmp_path):
 def test_surfaces_come_back_as_they_were_written(dots, tmp_path):
     surface = ball([0.5, 0.4, 0.3], 0.2)
     surface.points[7] = np.nan
+    surface.points[7:8].view(np.uint32)[0, 0] = 0x7FA00000  # one that raises "invalid" when it is converted
     read = Recording(write_run(tmp_path / "run", [[surface]], size=ROOM)).frame(0).surface
     whole = ~(surface.corners == 7).any(axis=1)
     np.testing.assert_array_equal(read.corners, surface.corners[whole])

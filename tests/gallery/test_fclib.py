@@ -101,9 +101,10 @@ def test_wrong_files_are_named(tmp_path):
     with pytest.raises(ValueError, match="neither fclib_local nor fclib_global"):
         read_fclib(path)
     unsymmetric = np.eye(3) + np.eye(3, k=1)
-    for W, mu, message in ((unsymmetric, [0.1], "not symmetric"), (np.eye(3), [0.1, 0.2], "mu has 2 values")):
+    cases = [(unsymmetric, [0.1], "not symmetric"), (np.eye(3), [0.1, 0.2], "mu has 2 values"), (np.eye(3), [-0.1], "friction holds")]
+    for W, mu, message in cases:
         write_local(path, W, np.zeros(3), np.array(mu))
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises(ValueError, match=f"{path}: .*{message}"):
             read_fclib(path)
     write_local(path, np.eye(3), np.zeros(3), np.array([0.1]))
     with h5py.File(path, "a") as file:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 from collections.abc import Iterator
@@ -410,6 +411,10 @@ def _wrong_input() -> Iterator[None]:
         yield
     except (SceneError, OutputError, DeviceError, RenderError, ProblemError, EngineError) as error:
         _end(str(error), WRONG_INPUT)
+    except OSError as error:
+        if error.errno not in (errno.ENAMETOOLONG, errno.EACCES, errno.ENOTDIR):
+            raise
+        _end(f"{error.filename}: {error.strerror}", WRONG_INPUT)
     except Interrupted as error:
         _end(f"stopped: interrupted by {error} before the run began", FAILED)
 

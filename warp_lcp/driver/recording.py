@@ -173,6 +173,7 @@ class Recording:
         """
         return self._surface("bodies", number) if self._file("bodies", number).is_file() else None
 
+    @np.errstate(invalid="ignore")  # what is no number is left out
     def read(self, number: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the particles of a frame, those with finite numbers: positions [m], shape (n, 3), and what colors them, shape (n,).
 
@@ -230,6 +231,7 @@ class Recording:
             raise RenderError(f"{self.folder}: holds no frame of both {' and '.join(parts)}")
         return numbers
 
+    @np.errstate(invalid="ignore")  # what is no number is left out
     def _surface(self, name: str, number: int) -> Surface:
         """Return a surface, those of its triangles or segments whose points are finite."""
         file = self._file(name, number)

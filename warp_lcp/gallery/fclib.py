@@ -74,7 +74,10 @@ def _read(file: Any, path: Path) -> FclibProblem:
         raise ValueError(f"{path}: mu has {len(mu)} values for {len(q)} rows of {dim} a contact")
     title = _text(group, "info/title", path)
     free = np.full(joints, np.inf)
-    system = ContactSystem(title or path.stem, B, q, mu, -free, free, dim)
+    try:
+        system = ContactSystem(title or path.stem, B, q, mu, -free, free, dim)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
     return FclibProblem(system, _solution(file, len(q), joints, path), title)
 
 
