@@ -102,20 +102,18 @@ def test_reused_workspace_gives_the_same_answer_bit_for_bit(method):
 @pytest.mark.parametrize("name", grid_methods())
 def test_in_place_problem_follows_changed_cells_and_b(name):
     """Cells go, and others come to the right of the last ones in their rows: a workspace takes the steps of a new one."""
-    A, b = poisson()
-    shape = A.layout.stored_shape
-    fields = [wp.zeros(shape, dtype=wp.float64, device="cpu") for _ in range(3)]
-    fields[2].fill_(np.inf)
-    problem, solver = wl.LCP(A, *fields), wl.METHODS[name]()
+    solver, b, cells = wl.METHODS[name](), np.random.default_rng(7).standard_normal((12, 40)), np.full((3, 12, 40), wl.AIR, dtype=np.int8)
+    cells[0, 1:-1, :9], cells[1, 1:-1, 4:], cells[2, :-1, :5] = wl.FLUID, wl.FLUID, wl.FLUID
+    A = wl.GridPoisson(cells[0], device="cpu")
+    fields = [wp.full(A.layout.stored_shape, value, dtype=wp.float64, device="cpu") for value in (0.0, 0.0, np.inf)]
+    problem = wl.LCP(A, *fields)
     work = solver.init(problem)
-    for liquid in (np.s_[:10], np.s_[:, :5], np.s_[:10, 3:]):
-        cells = np.full((16, 16), wl.AIR, dtype=np.int8)
-        cells[liquid] = wl.FLUID
-        A.update(wp.array(np.pad(cells[None], 1), device="cpu"))
+    for now in cells[1:]:
+        A.update(wp.array(np.pad(now[None], 1), device="cpu"))
         fields[0].assign(np.pad(b[None], 1))
         result = wl.solve(problem, solver, workspace=work)
-        new = wl.solve(wl.LCP(wl.GridPoisson(cells, device="cpu"), b), solver)
-        assert tuple(result.x.shape) == shape
+        new = wl.solve(wl.LCP(wl.GridPoisson(now, device="cpu"), b), solver)
+        assert tuple(result.x.shape) == A.layout.stored_shape
         assert (result.status, result.iterations, result.linear_iterations) == (new.status, new.iterations, new.linear_iterations)
         np.testing.assert_allclose(result.x.numpy()[1, 1:-1, 1:-1], new.x.numpy(), atol=1e-5)
 
