@@ -67,7 +67,7 @@ def test_boxes_and_the_energy(device):
 
 def test_an_unknown_in_no_aggregate_is_not_moved_with_one(device):
     """Stiff, and all but on its own: what another's correction did to it would come out of its neighbor's energy."""
-    n, stiff, coupling = 20, 1e8, 18.0  # 0.9e-3 of sqrt(a_ii a_jj)
+    n, stiff, coupling = 20, 1e12, 1999.0  # almost 1e-3 of sqrt(a_ii a_jj), from which on unknowns aggregate
     A = scipy.sparse.block_array([[scipy.sparse.eye_array(1) * stiff, None], [None, convection_diffusion(n, 0.0)]]).tolil()
     A[0, 1] = A[1, 0] = -coupling
     A, b = A.tocsr(), np.concatenate([[0.0], load(n)])
