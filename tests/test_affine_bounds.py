@@ -102,6 +102,15 @@ def test_a_block_slides_where_the_slope_is_steeper_than_friction_holds(angle, de
     np.testing.assert_allclose(result.x.numpy(), expected, atol=1e-12)
 
 
+def test_a_block_is_pressed_no_harder_than_it_may(device):
+    """The most normal force bounds the friction too: both bounds of the friction are at hand at the largest n, whatever their signs."""
+    low, high = wl.AffineBounds.friction([-1, 0], 0.3, upper=0.5)
+    problem = wl.LCP(wl.DenseOperator(np.eye(2), device=device), [-1.0, -1.0], low, high)
+    result = wl.solve(problem, wl.ProjectedSOR(omega=1.0), stopping=TIGHT)
+    assert result, result.status
+    np.testing.assert_allclose(result.x.numpy(), [0.5, 0.15], atol=1e-12)
+
+
 def test_grid_fields_take_affine_bounds(device):
     """On grids bounds are evaluated once a sweep; a cell whose upper bound is half of another cell's value."""
     cells = np.array([[wl.AIR, wl.FLUID, wl.FLUID, wl.AIR]])

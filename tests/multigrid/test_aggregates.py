@@ -65,6 +65,23 @@ def test_boxes_and_the_energy(device):
     )
 
 
+def test_an_unknown_in_no_aggregate_is_not_moved_with_one(device):
+    """Stiff, and all but on its own: what another's correction did to it would come out of its neighbor's energy."""
+    n, stiff, coupling = 20, 1e12, 1999.0  # almost 1e-3 of sqrt(a_ii a_jj), from which on unknowns aggregate
+    A = scipy.sparse.block_array([[scipy.sparse.eye_array(1) * stiff, None], [None, convection_diffusion(n, 0.0)]]).tolil()
+    A[0, 1] = A[1, 0] = -coupling
+    A, b = A.tocsr(), np.concatenate([[0.0], load(n)])
+    cycles = AggregateCycles(wl.SparseOperator(A, device=device))
+    assert cycles.refresh()
+    x, right, lower, upper = fields(device, np.zeros(n * n + 1), b, np.full(n * n + 1, -1.0), np.full(n * n + 1, 1.0))
+    energies = []
+    for _ in range(12):
+        host = x.numpy()
+        energies.append(0.5 * host @ (A @ host) + b @ host)
+        cycles.cycle(x, right, lower, upper)
+    assert (np.diff(energies) <= 1e-12 * abs(energies[-1])).all()
+
+
 def test_a_matrix_may_change_and_so_may_the_fields():
     n = 15
     A, b = convection_diffusion(n, 30.0), load(n)

@@ -124,11 +124,13 @@ def test_cycle_is_symmetric_positive_definite(gamma, device):
     assert not Mr[~inside].any()
 
 
+@pytest.mark.parametrize("shape", [(8, 12, 10), (4, 3, 5)])  # the coarsest level's sweeps are followed by others, or are the last
 @pytest.mark.parametrize("periodic", [(False,) * 3, (True, False, False)])
-def test_monotone_cycle_keeps_bounds_and_lowers_the_energy(periodic, device):
+def test_monotone_cycle_keeps_bounds_and_lowers_the_energy(periodic, shape, device):
     rng = np.random.default_rng(59)
-    cells = rng.choice(3, (8, 12, 10), p=[0.1, 0.85, 0.05])
+    cells = rng.choice(3, shape, p=[0.1, 0.85, 0.05])
     A, hierarchy = masked_hierarchy(cells, np.ones(cells.shape), periodic, device, bounded=True)
+    assert (len(hierarchy.levels) == 1) == (cells.size < 100)
     inside = np.pad(cells == wl.FLUID, 1).ravel()
     finest = hierarchy.finest
     r = rng.standard_normal(inside.size) * inside

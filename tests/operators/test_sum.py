@@ -104,6 +104,24 @@ def test_weights_that_are_symmetric_but_for_rounding(cells, dtype, device):
     np.testing.assert_allclose(result.x.numpy().ravel()[fluid], expected, atol=1e-7 if dtype is wp.float64 else 1e-5)
 
 
+@pytest.mark.parametrize("felt", [(), (0,), (1,), (0, 2), (0, 1, 2)])
+def test_chambers_that_a_body_feels_do_not_float(felt, device):
+    """Three closed chambers: the null space is the constants of those that no column touches."""
+    cells, U = np.full((4, 11), wl.SOLID), np.zeros((4, 11, 1))
+    chambers = [np.arange(44).reshape(4, 11)[chamber].ravel() for chamber in (np.s_[:, :3], np.s_[:3, 4:7], np.s_[1:, 8:])]
+    cells.ravel()[np.concatenate(chambers)] = wl.FLUID
+    for k in felt:
+        U.ravel()[chambers[k]] = 1.0
+    A = wl.SumOperator(wl.GridPoisson(cells, device=device), wl.LowRankOperator(U, [2.0], device=device))
+    found = A.floating_components()
+    count = 0 if found is None else found.count
+    label = np.zeros(44) if found is None else found.label.reshape(A.layout.stored_shape)[1, 1:-1, 1:-1].ravel()
+    assert {frozenset(np.flatnonzero(label == c)) for c in range(count)} == {frozenset(c) for k, c in enumerate(chambers) if k not in felt}
+    fluid = cells.ravel() == wl.FLUID
+    block = dense_of(A)[np.ix_(fluid, fluid)]
+    assert len(block) - np.linalg.matrix_rank(block) == count + max(0, len(felt) - 1)  # one column holds one constant
+
+
 def test_an_unsymmetric_sum_in_a_solver(device):
     rng = np.random.default_rng(17)
     S = (scipy.sparse.random_array((30, 30), density=0.1, rng=rng) + 4 * scipy.sparse.eye_array(30)).tocsr()

@@ -73,6 +73,17 @@ def test_a_solve_that_never_rises_keeps_one_iterate():
     assert work._best is None
 
 
+@pytest.mark.parametrize("solver", [wl.FischerNewton(), wl.InteriorPoint()])
+def test_cycles_that_serve_another_method_keep_no_iterate(solver):
+    """The method that they start keeps the best one itself: a second copy would be a field of memory."""
+    problem, _, _ = started()
+    work = solver.init(problem)
+    result = wl.solve(problem, solver, workspace=work, stopping=wl.StoppingCriteria(rtol=1e-6))
+    assert result, result.status
+    assert [record.step for record in result.history].count("monotone cycle") >= 2
+    assert work.active_set._best is None
+
+
 def test_the_carried_curvature_is_that_of_the_direction():
     problem, solver, work = started()
     for _ in range(4):

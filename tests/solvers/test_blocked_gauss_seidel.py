@@ -49,6 +49,18 @@ def test_a_sweep_solves_each_block_exactly(size, device):
         np.testing.assert_allclose(work_x, expected, atol=1e-11)
 
 
+def test_contacts_in_space_are_blocks_without_being_asked_for(device):
+    """Three unknowns each: where nothing else couples them, one sweep solves all."""
+    rng = np.random.default_rng(163)
+    contacts, b = [spd(3, seed) for seed in range(5)], -rng.random(15)
+    A = scipy.sparse.block_diag(contacts).toarray()
+    expected = np.concatenate([boxed(a, b[3 * i : 3 * i + 3], np.zeros(3), np.full(3, np.inf)) for i, a in enumerate(contacts)])
+    for operator in operators(A, device):
+        result = wl.solve(wl.LCP(operator, b), BlockedGaussSeidel(), stopping=TIGHT)
+        assert (result.status, result.iterations) == (wl.SolveStatus.CONVERGED, 1)
+        np.testing.assert_allclose(result.x.numpy(), expected, atol=1e-12)
+
+
 def test_blocks_of_one_are_projected_gauss_seidel(device):
     rng = np.random.default_rng(151)
     A, b = spd(20, 3), rng.standard_normal(20)

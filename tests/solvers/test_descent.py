@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
-from oracle import assemble, lemke
+from oracle import assemble, boxed, lemke
 from warp_lcp.gallery import dam, torsion
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.solve import EPS
@@ -105,6 +105,25 @@ def test_energy_is_that_of_the_definition(method, faces):
     work.residual.evaluate(work.x)
     inside = np.where(cells == 1, b, 0.0).ravel()
     assert work.residual.energy == pytest.approx(0.5 * x.ravel() @ dense @ x.ravel() + inside @ x.ravel(), rel=1e-12)
+
+
+@pytest.mark.parametrize("method", [wl.ProjectedMultigrid(), wl.MinimumMapNewton()])
+@pytest.mark.parametrize("size", [1e-3, 40.0])
+def test_a_projected_cycle_solves_a_few_cells(size, method):
+    """All of them are on the coarsest level, whose sweeps come to the solution: of the problem itself, whatever its size."""
+    cells, rng = np.pad(np.ones((2, 3), dtype=np.int8), 1, constant_values=wl.AIR), np.random.default_rng(23)
+    inside = cells.ravel() == wl.FLUID
+    A, free = assemble(cells)[np.ix_(inside, inside)], 0
+    for _ in range(10):
+        b, low, high = size * rng.standard_normal((3, *cells.shape))
+        low, high = -abs(low) / 4, abs(high) / 4
+        problem = wl.LCP(wl.GridPoisson(cells, device="cpu"), b, low, high)
+        result = wl.solve(problem, method, stopping=wl.StoppingCriteria(rtol=0.0, max_iterations=1))
+        assert result.history[1].step == "monotone cycle"
+        expected = boxed(A, *(v.ravel()[inside] for v in (b, low, high)))
+        np.testing.assert_allclose(result.x.numpy().ravel()[inside], expected, atol=1e-4 * size)
+        free += np.count_nonzero((expected > low.ravel()[inside]) & (expected < high.ravel()[inside]))
+    assert 10 < free < 50
 
 
 def test_projected_sweeps_lower_the_energy_from_anywhere():

@@ -115,6 +115,20 @@ def test_entries_bounds_and_b_may_change_in_place(kind):
         np.testing.assert_allclose(again.x.numpy() * units, fresh.x.numpy() * units, atol=1e-6)
 
 
+@pytest.mark.parametrize("kind", ["dense", "sparse"])
+def test_a_guess_counts_in_any_units(kind):
+    rng = np.random.default_rng(127)
+    A, b, D = matrix(kind, rng), rng.standard_normal(N), 4.0 ** rng.integers(-13, 14, N)
+    x, counts = lemke(A, b), []
+    for units, guess in ((np.ones(N), None), (np.ones(N), x + 0.01), (D, x + 0.01)):
+        p = problem(units[:, None] * A * units, units * b, kind)
+        result = wl.solve(p, InteriorPoint(), x0=None if guess is None else guess / units, stopping=TIGHT)
+        assert result, result.status
+        np.testing.assert_allclose(result.x.numpy() * units, x, atol=1e-6)
+        counts.append(result.iterations)
+    assert max(counts[1:]) <= counts[0] - 3
+
+
 def test_a_guess_and_rows_without_a_diagonal_entry():
     rng = np.random.default_rng(113)
     D = np.array([1e-5, 1e4])

@@ -83,6 +83,19 @@ def test_gradient_steps_are_the_proximal_iteration(device):
         np.testing.assert_allclose(got.x.numpy(), expected, atol=1e-13)
 
 
+@pytest.mark.parametrize("n", [5, 40])
+def test_the_first_step_is_as_long_as_the_spectrum_allows(n, device):
+    """Without bounds it is -D^-1 b / L, and L need not be far above the largest eigenvalue of D^-1/2 A D^-1/2."""
+    rng = np.random.default_rng(113)
+    B = rng.standard_normal((n, n))
+    A, b = B @ B.T / n + 0.5 * np.eye(n), rng.standard_normal(n)
+    problem = wl.LCP(wl.DenseOperator(A, device=device), b, lower=-np.inf)
+    x = wl.solve(problem, AcceleratedProjectedGradient(), stopping=wl.StoppingCriteria(rtol=0.0, max_iterations=1)).x.numpy()
+    L = -b / (np.diag(A) * x)
+    np.testing.assert_allclose(L, L[0], rtol=1e-12)
+    assert 1 <= L[0] / np.linalg.eigvalsh(A / np.sqrt(np.outer(np.diag(A), np.diag(A))))[-1] <= 1.1
+
+
 @pytest.mark.parametrize("start", [1e-3, 100.0])
 def test_a_wrong_lipschitz_constant_is_corrected_or_only_slow(start, device):
     """Too small a constant would diverge; it grows until the steps' curvature is covered. Too large a one is slow."""

@@ -210,6 +210,21 @@ def test_minimum_map_newton_leaves_the_cycle_of_period_three():
         np.testing.assert_allclose(PERIOD_THREE @ result.x.numpy(), np.ones(3), atol=1e-8)
 
 
+def test_levenberg_marquardt_steps_lower_the_residual_from_anywhere():
+    """What follows where no share of Newton's step does: a descent direction, on P-matrices all the way to a solution."""
+    rng = np.random.default_rng(229)
+    for n in (3, 8, 20):
+        B, S = rng.standard_normal((2, n, n))
+        A, b, high = B @ B.T / n + 0.1 * np.eye(n) + S - S.T, rng.standard_normal(n), rng.uniform(0.5, 2.0, n)
+        work = wl.MinimumMapNewton().init(wl.LCP(wl.DenseOperator(A, device="cpu"), b, 0.0, high))
+        for _ in range(10):
+            before = high * rng.random(n)
+            work.x.assign(before)
+            assert work._regularized(work.x, np.inf)
+            own = [natural_residual(A, b, np.zeros(n), high, x) for x in (before, work.x.numpy())]
+            assert own[1] < own[0]
+
+
 @pytest.mark.parametrize(
     ("method", "growth"), [(wl.MinimumMapNewton(), 2), (FischerNewton(), 2), (InteriorPoint(), 4)], ids=lambda m: type(m).__name__
 )

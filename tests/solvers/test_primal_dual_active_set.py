@@ -94,3 +94,32 @@ def test_settings_are_checked():
         PrimalDualActiveSet(eta=0.0)
     with pytest.raises(ValueError, match="monotone_cycles"):
         PrimalDualActiveSet(monotone_cycles=-1)
+
+
+def whole_steps(A, b, lower, upper):
+    """Plain steps in NumPy until a set comes again; return whether that is the last one, and how often only sides have changed."""
+    x, d, seen = np.clip(np.zeros(len(b)), lower, upper), np.diag(A), []
+    while True:
+        target = x - (A @ x + b) / d
+        place = np.where(target < lower, -1, np.where(target > upper, 1, 0))
+        if any((place == other).all() for other in seen):
+            turned = sum(((one == 0) == (other == 0)).all() for one, other in itertools.combinations(seen, 2))
+            return (place == seen[-1]).all(), turned
+        seen.append(place)
+        free, x = place == 0, np.where(place < 0, lower, np.where(place > 0, upper, 0.0))
+        x[free] = np.linalg.solve(A[np.ix_(free, free)], -(b + A @ x)[free])
+
+
+def test_an_unknown_that_turns_to_its_other_bound_makes_another_set():
+    """Steps go on where the free unknowns are those of before, but not all at the same bounds; pivots are for sets that come again."""
+    rng, turned = np.random.default_rng(5), 0
+    for _ in range(120):
+        B, S = rng.standard_normal((2, 6, 6))
+        A, b, half = B @ B.T / 6 + 0.1 * np.eye(6) + S - S.T, rng.standard_normal(6), rng.uniform(0.1, 0.5, 6)
+        ends, turns = whole_steps(A, b, -half, half)
+        if ends:
+            result = wl.solve(wl.LCP(wl.DenseOperator(A, device="cpu"), b, -half, half), PrimalDualActiveSet(), stopping=TIGHT)
+            assert result, result.status
+            assert "least index" not in {r.step for r in result.history}
+            turned += turns
+    assert turned > 5

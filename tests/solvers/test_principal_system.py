@@ -123,6 +123,21 @@ def test_the_methods_suit_the_matrices():
     assert not suits_multigrid(scipy.sparse.diags_array([1.0, 0.0]).tocsr())
 
 
+def test_incomplete_factors_leave_little_to_iterate():
+    """More unknowns than are factored completely; with the diagonal alone GMRES takes 29 iterations."""
+    rng, n, offsets = np.random.default_rng(3), 2100, [-30, -3, -1, 1, 3, 40]
+    matrix = scipy.sparse.diags_array([*rng.uniform(-1, 1, (6, n)), np.full(n, 2.4)], offsets=[*offsets, 0], shape=(n, n)).tocsr()
+    system, r = (
+        principal_system(wl.LCP(wl.SparseOperator(matrix, device="cpu"), np.zeros(n)), wp.float64, bounded=False),
+        rng.standard_normal(n),
+    )
+    assert isinstance(system.preconditioner, IncompleteFactors)
+    system.restrict(wp.array(np.ones(n, dtype=np.uint8), device="cpu"))
+    system.r.assign(r)
+    assert system.solve(1e-6 * system.norm(), 50)[0] <= 4
+    assert np.linalg.norm(matrix @ system.e.numpy() - r) <= 2e-6 * np.linalg.norm(r)
+
+
 def test_singular_blocks_still_get_factors():
     """Two equal rows: no factorization exists, and GMRES must still return the best there is."""
     matrix = scipy.sparse.csr_array(np.array([[1.0, 2.0, 0.0], [1.0, 2.0, 0.0], [0.5, 0.0, -1.0]]))

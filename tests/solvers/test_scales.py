@@ -42,6 +42,21 @@ def test_iterations_do_not_depend_on_units(name, family, device):
         np.testing.assert_allclose(result.x.numpy() / x, plain.x.numpy(), atol=1e-4)
 
 
+@pytest.mark.parametrize("precision", ["mixed", "single"])
+@pytest.mark.parametrize(("name", "family"), CASES)
+def test_a_power_of_two_in_x_changes_no_step(name, family, precision, device):
+    """Rounding has no say in it: what differs is a number that should have had x's unit."""
+    if name == "quadratic-program":
+        pytest.importorskip("piqp")
+    cls, stopping = wl.METHODS[name], wl.StoppingCriteria(rtol=1e-4, max_iterations=50)
+    method = cls(precision=precision) if hasattr(cls, "precision") else cls()
+    plain = wl.solve(problem(family, 1.0, 1.0, device), method, stopping=stopping)
+    for unit in (2.0**-20, 2.0**20):
+        result = wl.solve(problem(family, 1.0, unit, device), method, stopping=stopping)
+        assert (result.status, result.iterations, result.linear_iterations) == (plain.status, plain.iterations, plain.linear_iterations)
+        np.testing.assert_array_equal(result.x.numpy(), plain.x.numpy() * unit)
+
+
 def test_enumeration_of_rows_in_different_units(device):
     """S A S with S from 1e-8 to 1e8: pivots differ by 1e32, and all count."""
     rng = np.random.default_rng(77)
