@@ -119,7 +119,7 @@ class GhostFluidSurface:
     """
 
     def __init__(
-        self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int, smoothing: int = 0, fill: Fill | None = None
+        self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int, smoothing: int, fill: Fill | None = None
     ) -> None:
         """Allocate the level set."""
         self.grid, self.boundary, self._fill = grid, boundary, fill
