@@ -45,7 +45,7 @@ class DistributedPressure(PressureProjection):
         solver: Any,
         *,
         tolerance: float | Literal["auto"],
-        max_iterations: int = 100,
+        max_iterations: int,
         phi: wp.array | None = None,
         lets_go: bool = True,
         weights: Sequence[wp.array] | None = None,

@@ -87,7 +87,7 @@ class PressureProjection:
         solver: Any,
         *,
         tolerance: float | Literal["auto"],
-        max_iterations: int = 100,
+        max_iterations: int,
         phi: wp.array | None = None,
         coupling: BodyCoupling | None = None,
         lets_go: bool = True,

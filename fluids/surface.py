@@ -118,9 +118,7 @@ class GhostFluidSurface:
         fill: adds to the density what no particle stands for.
     """
 
-    def __init__(
-        self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int, smoothing: int = 0, fill: Fill | None = None
-    ) -> None:
+    def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int, smoothing: int, fill: Fill | None = None) -> None:
         """Allocate the level set."""
         self.grid, self.boundary, self._fill = grid, boundary, fill
         self.level_set = LevelSet(grid, particles_a_cell=particles_a_cell, smoothing=smoothing)

@@ -78,7 +78,7 @@ class UnilateralPressure(PressureProjection):
         level_set: LevelSet,
         weights: Sequence[wp.array],
         tolerance: float | Literal["auto"],
-        max_iterations: int = 100,
+        max_iterations: int,
         coupling: BodyCoupling | None = None,
         gravity: float = 0.0,
     ) -> None:

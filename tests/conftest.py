@@ -1,12 +1,16 @@
 """Shared by all tests: quiet Warp, devices, and how many examples Hypothesis draws."""
 
 import os
+import signal
 
 import pytest
 import warp as wp
 from hypothesis import HealthCheck, settings
 
 wp.config.log_level = wp.LOG_ERROR
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as shells have both for what they start in the background; tests send them
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGQUIT, signal.SIG_DFL)
 
 UNHURRIED = {"deadline": None, "database": None, "suppress_health_check": [HealthCheck.too_slow, HealthCheck.data_too_large]}
 settings.register_profile("few", max_examples=100, derandomize=True, **UNHURRIED)

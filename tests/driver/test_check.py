@@ -86,8 +86,8 @@ def test_a_scene_of_unknown_memory_is_not_refused(dots: Any, scene_file: Path, m
 def test_a_system_that_does_not_tell_its_free_memory_refuses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = devices.free_memory("cpu")
     assert found is None or found > 2**20
-    for file in ("MEMORY", "OWN_SIZE"):
-        monkeypatch.setattr(claims, file, tmp_path / "nothing")
+    for source in ("MEMORY", "OWN_SIZE"):  # of the machine, and of a limit that this process may have
+        monkeypatch.setattr(claims, source, tmp_path / "nothing")
     assert devices.free_memory("cpu") is None
     check_memory(load_scene("dam-break", ["domain.resolution=4096"]), "cpu")
 

@@ -41,6 +41,7 @@ def test_the_file_says_who_and_goes_with_the_lock(tmp_path):
     with locked(tmp_path) as remarks:
         assert remarks == []
         assert json.loads((tmp_path / LOCK).read_text())["pid"] == os.getpid()
+        assert (tmp_path / LOCK).stat().st_mode & 0o133 == 0  # nobody else writes it, and it is no program
     assert list(tmp_path.iterdir()) == []
 
 

@@ -95,6 +95,9 @@ def test_whole_modules_are_left_alone(compiled):
     assert launch() == 3.0
     assert {file.name: file.stat().st_mtime_ns for file in folder.iterdir()} == before
     assert not mend(folder.with_name("none"))
+    load = wp.Module.load
+    watch_loads()
+    assert wp.Module.load is load  # it is watched already
 
 
 def test_a_cache_that_cannot_be_written(compiled, tmp_path):

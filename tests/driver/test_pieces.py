@@ -118,7 +118,9 @@ def test_a_recording_of_pieces_is_that_of_one_process(dots, tmp_path, grid_forma
     surface = Recording(tmp_path / "many").frame(0).surface
     assert surface is not None
     np.testing.assert_array_equal(surface.points[surface.corners], whole()[2].points.reshape(2, 3, 3))
+    assert FrameFolder(tmp_path / "many").missing("particles", 2) == []
     (tmp_path / "many" / "frames" / "rank_0001" / "particles_000001.vtu").unlink()
+    assert FrameFolder(tmp_path / "many").missing("particles", 2) == [1]  # as if the rank had not written it
     with pytest.raises(RenderError, match=r"rank_0001.particles_000001.vtu: cannot be read"):
         many.read(1)
 

@@ -12,7 +12,7 @@ from warp_lcp.driver import cli
 from warp_lcp.driver.camera import MARGIN
 from warp_lcp.driver.frames import FrameFolder
 from warp_lcp.driver.page import Page
-from warp_lcp.driver.recording import Color, Recording, RenderError, Scale, _round_up, spread
+from warp_lcp.driver.recording import VIRIDIS, Color, Recording, RenderError, Scale, _round_up, spread
 from warp_lcp.driver.render import INSTALL, Looks, parse_size, render_run
 from warp_lcp.driver.scene_file import dump_scene, load_scene
 from warp_lcp.driver.scenery import Outline
@@ -343,6 +343,11 @@ def test_scales_end_at_round_numbers():
     assert [_round_up(value) for value in (0.0, 0.7, 1.0, 2.1, 9.7, 10.0, 4321.0)] == [1.0, 0.8, 1.0, 2.5, 10.0, 10.0, 5000.0]
     scale = Scale("", 0.0, 2.0, np.array([[0, 0, 0], [100, 50, 0]]))
     np.testing.assert_allclose(scale.colors(np.array([-1.0, 1.0, 2.0, 9.0])), [[0, 0, 0], [50, 25, 0], [100, 50, 0], [100, 50, 0]])
+
+
+def test_the_colors_of_pressure_are_viridis():
+    colormaps = pytest.importorskip("matplotlib").colormaps
+    np.testing.assert_array_equal(VIRIDIS, np.round(255 * colormaps["viridis"](np.linspace(0, 1, len(VIRIDIS)))[:, :3]))
 
 
 def test_negative_pressure_extends_the_scale(pyvista, make_run):

@@ -24,7 +24,7 @@ def made(distance: float, seconds: float, drift: float = 0.0) -> Trial:
     """Return a run whose distance from made(0.0, ...) is `distance`."""
     mass = np.array([1.0 - distance, distance])
     looks = tuple(Look(time, mass, 1.0, 0.5) for time in (0.0, 0.1, 0.2))
-    return Trial(seconds, 10, 10, 10, looks, volume=(1.0, 1.0 + drift))
+    return Trial(seconds, 10, 10, 10, looks, 0.0, volume=(1.0, 1.0 + drift))
 
 
 def test_points_are_spread_with_their_mass_and_center() -> None:
@@ -45,7 +45,7 @@ def test_points_are_spread_with_their_mass_and_center() -> None:
 @pytest.mark.parametrize(("moved", "distance"), [(0.0, 0.0), (0.05, 0.5), (0.1, 1.0), (0.3, 1.0)])
 def test_the_distance_of_a_point_that_moves(moved: float, distance: float) -> None:
     runs = [
-        Trial(1.0, 1, 1, 1, tuple(Look(t, 3.0 * spread(np.array([[x, 0.45]]), [1.0, 1.0], 0.1), 1.0, x) for t in (0.0, 1.0)))
+        Trial(1.0, 1, 1, 1, tuple(Look(t, 3.0 * spread(np.array([[x, 0.45]]), [1.0, 1.0], 0.1), 1.0, x) for t in (0.0, 1.0)), 0.0)
         for x in (0.25, 0.25 + moved)
     ]
     assert runs[1].distance(runs[0]) == pytest.approx(distance, abs=1e-9)

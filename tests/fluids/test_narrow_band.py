@@ -290,7 +290,8 @@ def test_another_resolution(resolution, particles):
 def test_refusals():
     """Each says what would do instead."""
     with pytest.raises(ValidationError, match=r"greater than or equal to 3"):
-        tank(particles={"narrow_band": {"width": 2.0}})
+        tank(particles={"narrow_band": {"width": 2.99}})
+    assert without(tank(particles={"narrow_band": {"width": 3.0}})).width == 3.0
     with pytest.raises(ValidationError, match="may come apart anywhere inside"):
         tank(pressure={"model": "unilateral"})
     with pytest.raises(ValidationError, match=r'needs pressure\.surface = "ghost-fluid"'):

@@ -30,7 +30,7 @@ class Tank:
         flags = wp.array(np.broadcast_to(separating, 2).astype(np.uint8), device="cpu")
         names = ("domain", "solid[0] (box)")
         solids = VoxelSolids(index=wp.array(index, device="cpu"), separating=flags, names=names, covered=(0,), notes=())
-        self.boundary = WholeCells(self.grid, solids, velocity)
+        self.boundary = WholeCells(self.grid, solids, velocity, open_sides=0)
         self.projection = PressureProjection(self.grid, self.boundary, wl.MinimumMapNewton(), tolerance=tolerance, max_iterations=50)
         stored = np.zeros(self.grid.shape, bool)
         stored[1, 1:-1, 1:-1] = liquid
@@ -187,4 +187,4 @@ def test_noise_of_a_uniform_fall_is_not_iterated_on() -> None:
 def test_wall_velocities_of_another_number_of_walls_are_refused() -> None:
     tank = Tank(liquid(slice(0, 4)))
     with pytest.raises(ValueError, match="wall_velocity"):
-        WholeCells(tank.grid, tank.boundary.solids, np.zeros((3, 3)))
+        WholeCells(tank.grid, tank.boundary.solids, np.zeros((3, 3)), open_sides=0)

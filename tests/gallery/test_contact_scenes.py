@@ -73,6 +73,13 @@ def test_the_ground_carries_the_weight(world):
     np.testing.assert_allclose(assembly.velocity(r), 0, atol=1e-8)
 
 
+def test_a_stack_by_its_name_is_of_boxes_of_water_about_to_fall_for_a_hundredth_of_a_second():
+    world = box_stack(2)
+    assert world.bodies.mass == pytest.approx(1000.0 * 0.5**3)
+    assert (world.assemble(DT).system.friction == 0.5).all()
+    assert contact_scene("box-stack", 2).b.min() == pytest.approx(-9.81 * 0.01)  # all contacts are closed and at rest
+
+
 @pytest.mark.parametrize("mu", [0.2, 0.5])
 @pytest.mark.parametrize("steeper", [0.95, 1.05, 1.5])
 def test_a_box_sticks_below_the_angle_of_friction_and_slides_above(mu, steeper):

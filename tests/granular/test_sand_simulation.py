@@ -118,7 +118,7 @@ def test_what_every_step_keeps(dimension: int, model: str, method: str) -> None:
     """Mass exactly; pressure only pushes; friction only takes energy; no cell is predicted to be too dense; energy falls."""
     solver = {"method": method, "tolerance": 1e-3, "max_iterations": 1000}
     simulation = column(dimension, friction=0.4, solver=solver, density_correction={}) if model == "cone" else boxed(dimension, solver)
-    mass, energy, rows = simulation.particles.count * simulation.particle_mass, math.inf, []
+    mass, energy, rows, total = simulation.particles.count * simulation.particle_mass, math.inf, [], []
     for _ in range(30):
         row = simulation.step(min(simulation.stable_dt(), 5e-3))
         assert row["mass"] == pytest.approx(mass, rel=1e-12)
@@ -131,6 +131,9 @@ def test_what_every_step_keeps(dimension: int, model: str, method: str) -> None:
         after = row["kinetic_energy"] + row["potential_energy"]
         assert after <= energy + 1e-3 * mass * GRAVITY * simulation.grid.spacing
         energy = after
+        total.append(energy)
+    taken = sum(row["dissipation"] for row in rows[1:]) / (total[0] - total[-1])
+    assert 0.8 < taken < 1.0  # friction has taken what is lost; the rest is the transfers' and the floor's
     reached = np.mean([row["coupled_residual"] <= 1e-3 for row in rows])
     assert reached >= (0.4 if model == "box" else 0.9)  # the box's flow has steps that no method has been seen to solve
 

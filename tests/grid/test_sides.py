@@ -32,16 +32,17 @@ def test_fields_go_on_beyond_the_side_and_nowhere_else(side: str) -> None:
     np.testing.assert_array_equal(field.numpy(), expected)
 
 
+@pytest.mark.parametrize("beyond", [0.1, 0.0, -0.01])
 @pytest.mark.parametrize("side", SIDES)
-def test_particles_beyond_the_side_are_gone(side: str) -> None:
+def test_particles_on_the_side_or_beyond_are_gone(side: str, beyond: float) -> None:
     grid = StaggeredGrid((3, 4, 5), 0.5, 3, "cpu")
     number = SIDES.index(side)
     points = np.full((6, 3), 0.75, dtype=np.float32)
     for other in range(6):
-        points[other, other >> 1] = grid.counts[other >> 1] * 0.5 + 0.1 if other & 1 else -0.1
+        points[other, other >> 1] = grid.counts[other >> 1] * 0.5 + beyond if other & 1 else -beyond
     marks = wp.full(6, 7, dtype=wp.int32, device="cpu")
     mark_gone(grid, side_bits([side]), wp.array(points, dtype=wp.vec3, device="cpu"), marks)
-    np.testing.assert_array_equal(marks.numpy(), np.arange(6) == number)
+    np.testing.assert_array_equal(marks.numpy(), (np.arange(6) == number) & (beyond >= 0.0))
 
 
 def test_unknown_sides_are_refused() -> None:

@@ -238,6 +238,8 @@ def test_binary_stl_may_begin_like_a_text_one(tmp_path):
         ("a.ply", "", "not a readable PLY"),
         ("a.ply", "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\n", "not a readable PLY"),
         ("a.ply", "ply\nformat ascii 1.0\nelement camera 3\nend_header\n", "no vertices"),
+        ("a.ply", "ply\nformat ascii 1.0\nelement vertex 3\nproperty quad x\nend_header\n", "its header says 'property quad x'"),
+        ("a.ply", "ply\nformat ascii 1.0\nproperty float x\nelement vertex 3\nend_header\n", "its header says 'property float x'"),
         ("a.vtk", "", r"must be one of \.obj, \.ply, \.stl"),
     ],
 )

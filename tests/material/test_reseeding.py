@@ -41,7 +41,7 @@ def counts(grid: Any, particles: Particles) -> np.ndarray:
 
 def reseeding(simulation: Any, least: int, most: int) -> Reseeding:
     """Return one that is sure of its arguments."""
-    return Reseeding(simulation.grid, simulation.boundary, least=least, most=most, particles_a_cell=2**simulation.grid.dimension)
+    return Reseeding(simulation.grid, simulation.boundary, least=least, most=most, particles_a_cell=2**simulation.grid.dimension, every=1)
 
 
 @pytest.mark.parametrize(("dimension", "least", "most"), [(2, 3, 6), (3, 5, 12)])

@@ -10,6 +10,7 @@ from fluids import LiquidSimulation
 from small_liquids import advance, box, create, scene
 from warp_lcp.driver.run import take_step
 from warp_lcp.driver.simulator import SimulationFailed
+from warp_lcp.operators.grid_poisson import FLUID, SOLID
 
 TAP = box([0.0, 0.5], [0.125, 0.625], velocity=[1.0, 0.0])
 BALL = {"shape": "sphere", "center": [0.8, 0.1], "radius": 0.1}
@@ -60,6 +61,11 @@ def test_the_rate_in_three_dimensions() -> None:
     simulation = create(scene(size=[0.5, 0.5, 0.375], resolution=16, liquid=[], source=[source]))
     rows = advance(simulation, 0.2)
     assert emitted(rows) == pytest.approx(0.125**2 * 2.0 * 0.2 * 32**3 * 8, rel=0.02)
+    kind = simulation.projection.kind.numpy()
+    expected = np.zeros((12, 16, 16), dtype=bool)
+    expected[4:8, 8:12, :4] = True
+    np.testing.assert_array_equal(simulation.grid.interior(kind) == SOLID, expected)  # no pressure where velocities are given
+    assert simulation.projection.unknowns() == (kind == FLUID).sum() > 0
 
 
 @pytest.mark.parametrize("velocity", [[-1.0, 0.0], [0.0, 2.0], [0.7, -0.7]])

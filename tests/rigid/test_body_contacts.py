@@ -103,6 +103,18 @@ def test_an_impact_keeps_the_momentum_and_returns_the_speed(restitution, shapes)
     assert energy - bodies.kinetic_energy() == pytest.approx(lost, rel=1e-6, abs=1e-6 * energy)
 
 
+@pytest.mark.parametrize("fast", [0, 1])
+def test_a_ball_does_not_fly_through_another_in_a_step(fast):
+    """It would go seven of its diameters; which of the two is named first makes no difference."""
+    centers, settings = [[0.6, 0.5], [0.6, 0.5]], [{}, {}]
+    centers[fast], settings[fast] = [0.2, 0.5], {"velocity": np.array([70.0, 0.0, 0.0])}
+    bodies = bodies_of([Sphere(center=center, radius=0.05) for center in centers], 2, open_sides=SIDES, settings=settings)
+    run(bodies, 0.02, gravity=np.zeros(3))
+    behind, ahead = bodies.bodies[fast], bodies.bodies[1 - fast]
+    assert ahead.position[0] - behind.position[0] == pytest.approx(0.1, abs=1e-3)
+    assert behind.velocity[0] == pytest.approx(35.0) == ahead.velocity[0]
+
+
 def test_an_oblique_impact_keeps_momentum_and_angular_momentum():
     """In space, with spin and friction."""
     made = [Sphere(center=[0.3, 0.45, 0.5], radius=0.1), box([0.5, 0.4], [0.7, 0.6], 3, 0.0)]
@@ -352,6 +364,15 @@ def test_a_step_undone_leaves_nothing():
     assert body.hold is None
     with pytest.raises(RuntimeError, match="begin_step"):
         bodies.end_step(0.01)
+
+
+def test_a_step_begun_anew_knows_nothing_of_the_first():
+    (bodies, body, weight), (once, _, _) = begun(), begun()
+    body.apply_impulse(np.array([weight, weight, weight]))
+    bodies.begin_step(0.0, 0.01, GRAVITY, 0.01)
+    for each in (bodies, once):
+        each.end_step(0.01)
+    np.testing.assert_array_equal(bodies.state()["bodies"], once.state()["bodies"])
 
 
 def test_a_smooth_body_slides_away_under_a_rough_one():

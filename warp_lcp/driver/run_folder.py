@@ -400,6 +400,5 @@ def _probe(folder: Path) -> None:
         make_folder(folder)
         with tempfile.TemporaryFile(dir=folder) as file:
             file.write(bytes(4096))
-            file.flush()
     except OSError as error:
         raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error

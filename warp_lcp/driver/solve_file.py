@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -89,13 +88,13 @@ def solve_files(
     matrix: Path,
     right_side: Path,
     *,
-    lower: str = "0",
-    upper: str = "inf",
-    method: str | None = None,
-    tolerance: float = 1e-6,
-    max_iterations: int = 1000,
-    max_seconds: float = math.inf,
-    device: str = "cpu",
+    lower: str,
+    upper: str,
+    method: str | None,
+    tolerance: float,
+    max_iterations: int,
+    max_seconds: float,
+    device: str,
 ) -> Outcome:
     """Solve y = A x + b, lower <= x <= upper, from files.
 

@@ -47,8 +47,8 @@ class Trial:
         iterations: of the method, in all steps.
         linear_iterations: on the finest grid, in all steps.
         looks: at the start and then at equal distances in time.
-        volume: at the start of the first step and of the last [m^3; 2-D: m^2]; None: the log has no volume.
         residual: the largest relative residual of a step, coupled residual of sand.
+        volume: at the start of the first step and of the last [m^3; 2-D: m^2]; None: the log has no volume.
         packing: the most of a cell at the start of a step, in units of the densest packing; None: the log does not say.
         penetration: share of the particles that have ended inside solids or walls; None: the simulation does not tell.
     """
@@ -58,8 +58,8 @@ class Trial:
     iterations: int
     linear_iterations: int
     looks: tuple[Look, ...]
+    residual: float
     volume: tuple[float, float] | None = None
-    residual: float = 0.0
     packing: float | None = None
     penetration: float | None = None
 

@@ -96,7 +96,7 @@ class WholeCells:
     moves = False
 
     def __init__(
-        self, grid: StaggeredGrid, solids: VoxelSolids, wall_velocity: np.ndarray | None = None, *, open_sides: int = 0,
+        self, grid: StaggeredGrid, solids: VoxelSolids, wall_velocity: np.ndarray | None = None, *, open_sides: int,
         sides: PeriodicSides | None = None,
     ) -> None:  # fmt: skip
         """Allocate the fields."""

@@ -40,7 +40,7 @@ class Reseeding:
         ValueError: `least` <= `particles_a_cell` <= `most` does not hold.
     """
 
-    def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, least: int, most: int, particles_a_cell: int, every: int = 1) -> None:
+    def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, least: int, most: int, particles_a_cell: int, every: int) -> None:
         """Allocate the fields."""
         if not 1 <= least <= particles_a_cell <= most:
             raise ValueError(f"least = {least}, most = {most}: must be at least 1, and {particles_a_cell} between them")
