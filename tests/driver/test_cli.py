@@ -62,7 +62,7 @@ def test_the_folder_is_named_after_the_scene(scene_file, tmp_path, monkeypatch):
     ("arguments", "expected"),
     [
         (["run", "no-such-scene"], "no such built-in scene"),
-        (["run", "{scene}", "--set", "time.cfl=0"], "time.cfl = 0: must be greater than 0"),
+        (["run", "{scene}", "--set", "time.cfl=0"], "time.cfl = 0: must be at least 0.001"),
         (["run", "{scene}", "--device", "cuda:77"], "--device cuda:77: there is no such device; choose from"),
         (["run", "{scene}", "--resume"], "there is no run to resume"),
         (["run", "{scene}", "--resume", "--force"], "choose one"),

@@ -58,7 +58,7 @@ def test_frame_times_end_with_the_run():
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"time.cfl": 0}, "time.cfl = 0: must be greater than 0 (a Courant number, usually 1 to 4)"),
+        ({"time.cfl": 0}, "time.cfl = 0: must be at least 0.001 (a Courant number, usually 1 to 4)"),
         ({"time.duration": math.nan}, "time.duration = NaN: must be finite (the simulated time [s])"),
         ({"time.dt_max": math.inf}, "time.dt_max = Infinity: must be finite"),
         ({"time.duration": "2"}, 'time.duration = "2": must be a number'),

@@ -79,7 +79,7 @@ class Time(Table):
 
     duration: float = Field(gt=0, description="the simulated time [s]")
     frames_per_second: float = Field(default=30.0, gt=0, description="frames per simulated second [1/s]")
-    cfl: float = Field(default=2.0, gt=0, description="a Courant number, usually 1 to 4")
+    cfl: float = Field(default=2.0, ge=1e-3, description="a Courant number, usually 1 to 4")
     dt_max: float = Field(default=0.02, gt=0, description="the longest step [s]")
     dt_min: float = Field(default=1e-6, gt=0, description="the shortest step that the CFL number or a retry may ask for [s]")
 
