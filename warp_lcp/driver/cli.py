@@ -412,7 +412,7 @@ def _wrong_input() -> Iterator[None]:
     except (SceneError, OutputError, DeviceError, RenderError, ProblemError, EngineError) as error:
         _end(str(error), WRONG_INPUT)
     except OSError as error:
-        if error.errno not in (errno.ENAMETOOLONG, errno.EACCES, errno.ENOTDIR):
+        if error.filename is None or error.errno not in (errno.ENAMETOOLONG, errno.EACCES, errno.ENOTDIR):
             raise
         _end(f"{error.filename}: {error.strerror}", WRONG_INPUT)
     except Interrupted as error:

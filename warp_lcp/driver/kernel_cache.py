@@ -42,7 +42,7 @@ def watch_loads() -> None:
 def cache_error(error: OSError) -> KernelCacheError:
     """Return what to say of the cache's folder."""
     where = f" {wp.config.kernel_cache_dir}" if wp.config.kernel_cache_dir else ""
-    file = f" ({error.filename})" if error.filename else ""
+    file = f" ({error.filename})" if error.filename and f" {error.filename}" != where else ""
     text = f"the folder of compiled kernels{where} cannot be used{file}; repair or delete it, or have WARP_CACHE_PATH name another one"
     return KernelCacheError(error.errno, f"{error.strerror or error}: {text}")
 
