@@ -239,17 +239,6 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         inverse: real, fx: int, one_plane: bool, one_row: bool,
     ): ...  # fmt: skip
 
-    @wp.func
-    def correct_plane(
-        A: StencilShape, d: d_array, wx: field, wy: field, wz: field, C: StencilShape, G: Aggregates, k: int, x: field, coarse: field,
-        lower: field, upper: field, scale: real, projected: bool,
-    ):  # fmt: skip
-        for j in range(G.ny):
-            o = coarse_start(A, C, G, k, j, 0, A.nx)
-            p = row_start(A, k, j, 0, A.nx)
-            n = row_count(A, k, j, 0, A.nx)
-            correct_row(A, d, wx, wy, wz, x, p, coarse, o, lower, upper, n, G.fx - 1, scale, projected)
-
     @wp.kernel(enable_backward=False, module=name)
     def bounds_kernel(
         A: StencilShape, d: d_array, grain: int, C: StencilShape, G: Aggregates, x: field, lower: field, upper: field, scale: real,
@@ -261,19 +250,6 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
         p = first_cell(A, C, G, k, j, c, grain)
         o = row_start(C, k, j, c, grain)
         bounds_row(A, d, x, lower, upper, lower_c, upper_c, o, p, n, real(1.0) / scale, G.fx, one_plane(G, k), one_row(G, j))
-
-    @wp.kernel(enable_backward=False, module=apart)
-    def sweep_kernel(
-        A: StencilShape, d: d_array, wx: field, wy: field, wz: field, grain: int, from_zero: bool, y: field, x: field, b: field,
-        lower: field, upper: field, omega: real, projected: bool,
-    ):  # fmt: skip
-        k, j, c = wp.tid()
-        p = row_start(A, k, j, c, grain)
-        n = row_count(A, k, j, c, grain)
-        if from_zero:
-            first_sweep_row(A, d, wx, wy, wz, y, x, b, lower, upper, p, n, omega, projected)
-        else:
-            sweep_row(A, d, wx, wy, wz, y, x, b, lower, upper, p, n, omega, projected)
 
     @wp.kernel(enable_backward=False, module=apart)
     def restrict_kernel(
@@ -319,22 +295,6 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
                 k += 1
 
     @wp.kernel(enable_backward=False, module=name)
-    def ascend_kernel(
-        A: StencilShape, d: d_array, wx: field, wy: field, wz: field, C: StencilShape, G: Aggregates, x: field, b: field, t: field,
-        lower: field, upper: field, coarse: field, first: real, second: real, scale: real, projected: bool,
-    ):  # fmt: skip
-        """Correction and two sweeps by one CPU thread, each a plane behind the one before."""
-        for s in range(G.nz + 2):
-            if s < G.nz:
-                correct_plane(A, d, wx, wy, wz, C, G, s, x, coarse, lower, upper, scale, projected)
-            i = s - 1
-            if i >= 0 and i < G.nz:
-                sweep_plane_into_ring(A, d, wx, wy, wz, G.ny, i, False, t, x, b, lower, upper, first, projected)
-            i = s - 2
-            if i >= 0:
-                sweep_plane_out_of_ring(A, d, wx, wy, wz, G.nz, G.ny, i, x, t, b, lower, upper, second, projected)
-
-    @wp.kernel(enable_backward=False, module=name)
     def relax_kernel(
         A: StencilShape, d: d_array, wx: field, wy: field, wz: field, planes: int, rows: int, pairs: int, from_zero: bool, x: field,
         b: field, t: field, lower: field, upper: field, first: real, second: real,
@@ -357,16 +317,13 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
                     sweep_row(A, d, wx, wy, wz, x, t, b, lower, upper, p, n, omega, True)
 
     return SimpleNamespace(
-        sweep=sweep_kernel,
         restrict=restrict_kernel,
         correct=correct_kernel,
         bounds=bounds_kernel,
         descend=descend_kernel,
-        ascend=ascend_kernel,
         relax=relax_kernel,
         rows=SimpleNamespace(sweep=sweep_row, first_sweep=first_sweep_row, restrict=restrict_row, bounds=bounds_row, correct=correct_row),
         parts=SimpleNamespace(
             first_sweep_to=first_sweep_to, sweep_between=sweep_between, clear_around=clear_around, correct_row=correct_row
         ),
-        planes=SimpleNamespace(correct=correct_plane, into_ring=sweep_plane_into_ring, out_of_ring=sweep_plane_out_of_ring),
     )

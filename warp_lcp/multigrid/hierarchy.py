@@ -14,6 +14,7 @@ from warp_lcp.layout import Padding, zeros
 from warp_lcp.multigrid import coarsen_kernels as kernels
 from warp_lcp.multigrid.coarsen_kernels import UNBOUNDED
 from warp_lcp.multigrid.cycle_kernels import Aggregates, cycle_kernels
+from warp_lcp.multigrid.cycle_passes import ASCEND, CORRECT, SWEEP, SWEEP_INTO_RING, SWEEP_OUT_OF_RING
 from warp_lcp.multigrid.renew_kernels import renew_kernels
 from warp_lcp.multigrid.shared_levels import share_changes, whole_counts
 from warp_lcp.multigrid.small_levels import SmallLevels, first_small
@@ -21,6 +22,7 @@ from warp_lcp.native import Spans, grain
 from warp_lcp.operators.stencil import Stencil
 from warp_lcp.operators.stencil_kernels import coarsen_spans_kernel
 from warp_lcp.program import Launch, Program
+from warp_lcp.rows import Bound, RowPass
 from warp_lcp.vectors import convert, launch_spans
 
 # of a coarsest level's diagonal: what rounding leaves of a singular component's last pivot, with a margin
@@ -106,6 +108,13 @@ class Level:
         empty = wp.empty((0, 0, 0), dtype=self.real, device=s.device)
         return [s.d.reshape(shape), *((w.reshape(shape) for w in s.weights) if s.weights else (empty,) * 3)]
 
+    def sweeping(
+        self, y: wp.array[Any], x: wp.array[Any], omega: float, *, projected: bool, from_zero: bool = False, kind: RowPass = SWEEP
+    ) -> Bound:
+        """Return the pass that `sweep` launches, or one of its kind that goes into or out of a ring."""
+        fields = {"x": x, "y": y, "b": self.b, "lower": self.lower, "upper": self.upper}
+        return kind.bind(self.stencil.rows, stencil=self.stencil, omega=omega, projected=projected, from_zero=from_zero, **fields)
+
     def sweep(
         self, y: wp.array[Any], x: wp.array[Any], omega: float, *, projected: bool, from_zero: bool = False, launch: Launch = wp.launch
     ) -> None:
@@ -113,8 +122,7 @@ class Level:
         s = self.stencil
         if not from_zero:
             s.wrap(x, launch=launch)
-        inputs = [*self.operands, s.grain, from_zero, y, x, self.b, self.lower, self.upper, omega, projected]
-        launch(self.kernels.sweep, s.threads, inputs, device=s.device)
+        self.sweeping(y, x, omega, projected=projected, from_zero=from_zero).launch(launch)
 
 
 class Hierarchy:
@@ -307,8 +315,8 @@ class Hierarchy:
         """The linear cycle without its last sweep, where ghost cells must be filled before that and a caller goes on; None elsewhere."""
         return None
 
-    def last_leg(self) -> list[Any]:
-        """Return what the last leg of a linear cycle takes, as `ascend` in `cycle_kernels` does."""
+    def last_leg(self) -> tuple[Bound, ...]:
+        """Return the passes of a linear cycle's last leg, as `ASCEND` takes them."""
         return self._ascent(0, projected=False)
 
     def visits(self, count: int, *, projected: bool) -> Program:
@@ -363,7 +371,7 @@ class Hierarchy:
         """Correct a level from the next one, and sweep it."""
         L = self.levels[level]
         if self._fuses(L):
-            launch(L.kernels.ascend, 1, self._ascent(level, projected=projected), device=self.device)
+            ASCEND.launch(*self._ascent(level, projected=projected), launch=launch)
         else:
             self._correct(level, launch, projected=projected)
             self._pair(L, launch, reverse=True, projected=projected)
@@ -384,12 +392,16 @@ class Hierarchy:
         inputs = [*L.operands, C.stencil.shape, C.aggregates, planes, rows, from_zero, *fields]
         launch(L.kernels.descend, 1, inputs, device=self.device)
 
-    def _ascent(self, level: int, *, projected: bool) -> list[Any]:
-        """Return the inputs of correction and sweeps in one launch of one CPU thread."""
+    def _ascent(self, level: int, *, projected: bool) -> tuple[Bound, ...]:
+        """Return the passes of a leg up: correction and sweeps."""
         L, C = self.levels[level], self.levels[level + 1]
-        first, second = reversed(self.settings.weights)
-        fields = [L.x, L.b, L.t, L.lower, L.upper, C.x, first, second, self.settings.over_correction, projected]
-        return [*L.operands, C.stencil.shape, C.aggregates, *fields]
+        assert C.aggregates is not None
+        G, first, second = C.aggregates, *reversed(self.settings.weights)
+        rows = L.stencil.rows.beside(C.stencil.rows, (-G.fx, -G.fy, -G.fz))
+        fields = {"x": L.x, "coarse": C.x, "lower": L.lower, "upper": L.upper}
+        correct = CORRECT.bind(rows, stencil=L.stencil, scale=self.settings.over_correction, projected=projected, **fields)
+        into_ring = L.sweeping(L.t, L.x, first, projected=projected, kind=SWEEP_INTO_RING)
+        return correct, into_ring, L.sweeping(L.x, L.t, second, projected=projected, kind=SWEEP_OUT_OF_RING)
 
     def _solve_coarsest(self, launch: Launch, *, projected: bool, from_zero: bool) -> None:
         """Multiply by the inverse; projected sweeps stand for that where there are bounds."""

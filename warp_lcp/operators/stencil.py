@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,6 +13,7 @@ from warp_lcp.layout import Padding
 from warp_lcp.native import grain
 from warp_lcp.operators.stencil_kernels import StencilShape, product_kernels, wrap_kernel
 from warp_lcp.program import Launch, perform
+from warp_lcp.rows import Rows
 
 
 class Ghosts(Protocol):
@@ -77,6 +78,11 @@ class Stencil:
         self.grain = grain(nx, self.device)
         self.threads = (nz, ny, -(-nx // self.grain))
         self.operands = [self.shape, self.d, *(self.weights or [wp.empty(0, dtype=wp.float32, device=self.device)] * 3), self.grain]
+
+    @cached_property
+    def rows(self) -> Rows:
+        """The rows that passes visit."""
+        return Rows.of(self.padding, self.device, self.spans)
 
     @property
     def storage(self) -> tuple[bool, Any, Any]:
