@@ -30,6 +30,8 @@ class RowLayout:
     o0: wp.int64  # the other level of a transfer: element of its first cell, elements from plane to plane and from row to row
     o1: wp.int64
     o2: wp.int64
+    n1: int  # its planes, its rows
+    n2: int
     fx: int  # cells of it that one of ours stands for; below 0: of ours that one of its stands for
     fy: int
     fz: int
@@ -119,6 +121,7 @@ class Rows:
         for L, ours in zip(layouts, (self.summed, self.single), strict=True):
             L.assign(ours)
             L.o0, L.o1, L.o2 = other.single.base, other.single.s1, other.single.s2
+            L.n1, L.n2 = other.single.planes, other.single.rows
             L.fx, L.fy, L.fz = factors
             if not self.device.is_cpu and factors[0] < 0:  # a thread takes the cells of one of the other level's
                 L.grain = -factors[0]

@@ -52,9 +52,12 @@ class RowPass:
         reads: fields, pointers to the piece's first cell.
         writes: likewise, written.
         ring: which of those keep three planes only; the pointer is to its place there, `down` and `up` lead to the planes around it.
-        other: fields of the other level of a transfer, pointers to the element that belongs to the first cell.
+        other: fields of the other level of a transfer, pointers to the element that belongs to the first cell. Cells belong together in
+            `pairs` along x or not; `deep` planes and `wide` rows of a finer level belong to one of ours.
+        finer: whether the stencil and the offsets are those of the other level, which is finer.
         by_row: one element a row of the grid: pointers to the first row's; `P.row` counts.
         whole: small arrays: pointers to the first element.
+        optional: which arrays may be None, or empty: their pointers are null then.
         numbers: given by the host.
         sums: variables of the row function that are summed over the cells.
         constants: integers that are known when the kernel is made, with their usual values.
@@ -69,8 +72,10 @@ class RowPass:
     writes: Mapping[str, Any] = field(default_factory=dict)
     ring: tuple[str, ...] = ()
     other: Mapping[str, Any] = field(default_factory=dict)
+    finer: bool = False
     by_row: Mapping[str, Any] = field(default_factory=dict)
     whole: Mapping[str, Any] = field(default_factory=dict)
+    optional: tuple[str, ...] = ()
     numbers: Mapping[str, Any] = field(default_factory=dict)
     sums: tuple[str, ...] = ()
     constants: Mapping[str, int] = field(default_factory=dict)
@@ -88,7 +93,7 @@ class RowPass:
             rows: which rows.
             stencil: a `warp_lcp.operators.stencil.Stencil`.
             bounds: operands of a `warp_lcp.bounds.Bounds`.
-            given: arrays, numbers, and constants that are not as usual, by name. None, or an empty array, is a null pointer.
+            given: arrays, numbers, and constants that are not as usual, by name.
 
         Raises:
             TypeError: one is missing, unknown, or of the wrong type.
@@ -115,7 +120,7 @@ class RowPass:
             pairs += [("the stencil's d", self.stencil[0], stencil.d)]
             pairs += [("the stencil's weights", self.stencil[1], stencil.weights[0])] if stencil.weights else []
         for name, kind, value in pairs:
-            if value is None:
+            if value is None and name in self.optional:
                 continue
             found = value.dtype if isinstance(value, wp.array) else type(value)
             expected = letters.setdefault(kind, found) if isinstance(kind, str) else kind
@@ -130,7 +135,8 @@ class RowPass:
         lengths = dict.fromkeys({**self.reads, **self.writes}, rows.size) | dict.fromkeys(self.other, rows.other_size)
         lengths |= dict.fromkeys(self.by_row, rows.single.planes * rows.single.rows)
         for name, length in lengths.items():
-            if given[name] is not None and given[name].size not in (0, length):
+            absent = name in self.optional and (given[name] is None or given[name].size == 0)
+            if not absent and given[name].size != length:
                 raise ValueError(f"{self.name}: {name} has {given[name].size} elements, not {length}")
         least = len(self.sums) * rows.places
         if self.sums and given["out"].size < least:
@@ -177,11 +183,21 @@ class Form:
         head = [f"typedef {C[t]} {n};" for n, t in letters.items()] + [f"typedef {C[of(d.compute)]} T;"] * ("T" not in letters)
         head += [f"constexpr int {n} = {int(v)};" for n, v in switches.items()]
         at = {n: " + p + P.ring" if n in d.ring else " + p" for n in (*d.reads, *d.writes)} | dict.fromkeys(d.other, " + P.q")
-        each = ["const Piece P = piece(k_i, j_i, c_); const int n = P.n;"]
-        each += ["const long long p = P.p, ym = P.ym, yp = P.yp, zm = P.zm, zp = P.zp;"]
+        each = ["const Piece P = piece(k_i, j_i, c_); const int n = P.n; const long long p = P.p;"]
+        each += [f"const long long yp = {'L.o2' if d.finer else 'P.yp'}, zp = {'L.o1' if d.finer else 'P.zp'};"]
+        each += [f"const long long ym = {'-yp' if d.finer else 'P.ym'}, zm = {'-zp' if d.finer else 'P.zm'};"]
         each += ["const long long down = P.down, up = P.up;" if d.ring and not into else "const long long down = zm, up = zp;"]
-        each += [f"{'const ' * (n in d.reads)}auto* {n} = given.{n}.data{at.get(n, '')};" for n in d.arrays if n != "out"]
+        if d.other:
+            each += ["const bool pairs = L.fx > 1 || L.fx < -1; const int deep = L.fz == 1 || 2*P.k + 2 > L.n1 ? 1 : 2;"]
+            each += ["const int wide = L.fy == 1 || 2*P.j + 2 > L.n2 ? 1 : 2;"]
+        for n in (n for n in d.arrays if n != "out"):
+            pointer = f"given.{n}.data{at.get(n, '')}"
+            pointer = f"given.{n}.data ? {pointer} : nullptr" if n in d.optional else pointer
+            each += [f"{'const ' * (n in d.reads)}auto* {n} = {pointer};"]
         each += [f"const auto {n} = given.{n};" for n in d.numbers]
+        if d.stencil:
+            each += [f"const auto* {n} = given.stencil.{n}.data + {'P.q' if d.finer else 'p'};" for n in ("d", "wx", "wy", "wz")]
+            each += [f"const T {n} = (T)given.stencil.{n};" for n in ("unit", "cx", "cy", "cz")]
         sums = [f"const double all_[] = {{{', '.join(f'(double){s}' for s in d.sums)}}}; double* sums_ = given.out.data + P.t;"]
         sums += [f"for (int s = 0; s < {len(d.sums)}; ++s, sums_ += places) *sums_ = P.more ? all_[s] + *sums_ : all_[s];"]
         shared = [text(HEADERS / h) for h, used in (("stencil.h", d.stencil), ("bounds.h", d.bounds)) if used]
@@ -268,6 +284,17 @@ class Wave:
 
 
 @wp.func
+def plane_after(L: RowLayout, i: int):
+    """Plane whose turn it is once plane i of the wave is done; on a coarser level, when its last finer one is; -1: none."""
+    k = i
+    if L.fz > 1:
+        k = i // L.fz
+        if (i + 1) % L.fz != 0 and i != L.n1 - 1:
+            k = -1
+    return k
+
+
+@wp.func
 def nothing(L: RowLayout, F: Nothing, k: int, end: int, j: int, last: int, c: int):
     """Stand for a pass that a wave does not have."""
 
@@ -291,9 +318,12 @@ def _wave_kernel(name: str, forms: tuple[Form, ...], lags: tuple[int, ...]) -> A
     def wave(L1: RowLayout, F1: One, L2: RowLayout, F2: Two, L3: RowLayout, F3: Three, L4: RowLayout, F4: Four):
         for s in range(wp.max(L1.planes, L2.planes) + most):
             first(L1, F1, s, s + 1, 0, L1.rows, 0)
-            second(L2, F2, s - two, s - two + 1, 0, L2.rows, 0)
-            third(L3, F3, s - three, s - three + 1, 0, L3.rows, 0)
-            fourth(L4, F4, s - four, s - four + 1, 0, L4.rows, 0)
+            k = plane_after(L2, s - two)
+            second(L2, F2, k, k + 1, 0, L2.rows, 0)
+            k = plane_after(L3, s - three)
+            third(L3, F3, k, k + 1, 0, L3.rows, 0)
+            k = plane_after(L4, s - four)
+            fourth(L4, F4, k, k + 1, 0, L4.rows, 0)
 
     return _make_kernel(wave, name, f"warp_lcp.{name}.{variant}")
 

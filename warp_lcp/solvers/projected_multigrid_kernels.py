@@ -41,7 +41,7 @@ UPDATE = RowPass(
 ASSESS = RowPass(
     "projected_multigrid.assess", HEADERS / "assess.h", wp.float64, stencil=("D", "W"), bounds=True,
     reads={"x": wp.float64, "b": wp.float64, "unknown": wp.int8}, writes={"free": "F", "g": "S"},
-    by_row={"changed": wp.uint8, "away": wp.uint8}, whole={"scalars": wp.float64}, numbers={"classify": bool},
+    by_row={"changed": wp.uint8, "away": wp.uint8}, optional=("away",), whole={"scalars": wp.float64}, numbers={"classify": bool},
     sums=("norm", "moved", "active", "energy"), constants=SLOT | {"MINIMUM_MAP": 0, "ROUNDED": 0},
 )  # fmt: skip
 ADVANCE = Wave("projected_multigrid.advance", (UPDATE, 0), (ASSESS, 1))  # a plane is assessed when the one above it has moved
@@ -61,7 +61,7 @@ RIGHT_SIDE = RowPass(
 )  # fmt: skip
 GAPS = RowPass(
     "projected_multigrid.gaps", HEADERS / "gaps.h", wp.float64, bounds=True, reads={"x": wp.float64, "unknown": wp.int8},
-    writes={"lo": "S", "hi": "S"}, whole={"scalars": wp.float64}, constants=SLOT,
+    writes={"lo": "S", "hi": "S"}, optional=("hi",), whole={"scalars": wp.float64}, constants=SLOT,
 )  # fmt: skip
 UNDO = RowPass(
     "projected_multigrid.undo", HEADERS / "undo.h", wp.float64, bounds=True, reads={"x": wp.float64, "q": "S", "unknown": wp.int8},

@@ -1,5 +1,4 @@
 // x += scale times the correction of its aggregate, clipped to the bounds if projected.
-const bool pairs = L.fx < -1;
 if (projected) {
     T e[2*M];  // the correction of each cell, so that what follows reads all fields in steps of one
     for (int begin = 0; begin < n; begin += 2*M) {
@@ -9,7 +8,7 @@ if (projected) {
             SIMD for (int k = 0; k < m / 2; ++k) { const T v = scale*c[k]; e[2*k] = v; e[2*k+1] = v; }
             if (m % 2) e[m-1] = scale*c[m/2]; }
         const auto* at = d + begin; T* to = x + begin; const T *lo = lower + begin, *hi = upper + begin;
-        if (given.upper.data) SIMD for (int k = 0; k < m; ++k) { const T v = at[k] != 0 ? to[k] + e[k] : (T)0; to[k] = clipped(v, lo[k], hi[k]); }
+        if (upper) SIMD for (int k = 0; k < m; ++k) { const T v = at[k] != 0 ? to[k] + e[k] : (T)0; to[k] = clipped(v, lo[k], hi[k]); }
         else SIMD for (int k = 0; k < m; ++k) { const T v = at[k] != 0 ? to[k] + e[k] : (T)0; to[k] = v < lo[k] ? lo[k] : v; } }
 } else if (!pairs) {
     SIMD for (int k = 0; k < n; ++k) x[k] += d[k] != 0 ? scale*coarse[k] : (T)0;

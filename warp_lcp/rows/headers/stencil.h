@@ -1,7 +1,4 @@
 // The 7-point stencil at cell k of the piece: e x - sum of w x_neighbor where e != 0, else 0.
-const auto* d = given.stencil.d.data + p;
-const auto *wx = given.stencil.wx.data + p, *wy = given.stencil.wy.data + p, *wz = given.stencil.wz.data + p;
-const T unit = (T)given.stencil.unit, cx = (T)given.stencil.cx, cy = (T)given.stencil.cy, cz = (T)given.stencil.cz;
 const auto diagonal = [&](int k) -> T { return unit*(T)d[k]; };
 const auto around = [&](const auto* x, int k, long long down, long long up) -> T {  // of a field with other planes around it
     if constexpr (VARIABLE) return wx[k]*x[k-1] + wx[k+1]*x[k+1] + wy[k]*x[k+ym] + wy[k+yp]*x[k+yp] + wz[k]*x[k+down] + wz[k+zp]*x[k+up];
