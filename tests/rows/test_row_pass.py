@@ -7,6 +7,7 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
+from code_blocks import blocks, run
 from oracle import assemble
 from warp_lcp.layout import Padding
 from warp_lcp.rows import RowPass, Rows, Wave
@@ -170,3 +171,16 @@ def test_a_changed_header_is_compiled_anew(tmp_path):
             '#line 2 "fill.h"',
         ]
     assert hashes[0] != hashes[1]
+
+
+def test_the_example_of_a_new_pass_runs_and_compiles_for_cuda(tmp_path, monkeypatch):
+    page = Path(__file__).parents[2] / "CONTRIBUTING.md"
+    (header,), (code,) = blocks(page, "cpp"), blocks(page, "python")
+    assert header.count("\n") + code.count("\n") < 40
+    (tmp_path / "energy.h").write_text(header)
+    monkeypatch.chdir(tmp_path)
+    run(code, page)
+    for arch in (80, 90):
+        wp.compile_aot_module(
+            "warp_lcp.mine.energy.uniform_uint8_float32_float32", device=None, arch=arch, module_dir=tmp_path, use_ptx=True
+        )
