@@ -10,7 +10,7 @@ import warp_lcp as wl
 from code_blocks import blocks, run
 from oracle import assemble
 from warp_lcp.layout import Padding
-from warp_lcp.rows import RowPass, Rows, Wave
+from warp_lcp.rows import RowPass, Rows, Wave, layout
 from warp_lcp.rows.row_pass import text
 
 SHAPE = (5, 6, 37)
@@ -50,7 +50,7 @@ def test_a_product_and_its_sum(product, real, faces):
     assert out.numpy().sum() == pytest.approx(host.ravel() @ expected, rel=10 * tol)
 
 
-def test_slabs_chunks_and_spans_share_the_same_cells_out(product):
+def test_slabs_chunks_and_spans_share_the_same_cells_out(product, monkeypatch):
     """As on CUDA: a cell a thread, several planes a place for sums; cells outside the spans are not visited."""
     A, _, x, _ = scene(wp.float64, {})
     whole, y = wp.zeros_like(x), wp.zeros_like(x)
@@ -58,9 +58,10 @@ def test_slabs_chunks_and_spans_share_the_same_cells_out(product):
     s = A.stencil
     product.bind(Rows.of(s.padding, s.device), stencil=s, x=x, y=whole, out=out).launch()
     total = out.numpy().sum()
+    monkeypatch.setitem(layout.PLANES_A_THREAD, "cpu", 2)
     rows = Rows.of(s.padding, s.device)
-    for layout, slab in ((rows.summed, 2), (rows.single, 1)):
-        layout.grain, layout.chunks, layout.slab = 1, 37, slab
+    rows.summed.grain, rows.summed.chunks = 1, 37
+    monkeypatch.undo()
     out.zero_()
     product.bind(rows, stencil=s, x=x, y=y, out=out).launch()
     np.testing.assert_array_equal(y.numpy(), whole.numpy())

@@ -14,6 +14,7 @@ from warp_lcp.native import grain
 from warp_lcp.operators.stencil_kernels import StencilShape, product_kernels, wrap_kernel
 from warp_lcp.program import Launch, perform
 from warp_lcp.rows import Rows
+from warp_lcp.rows.layout import put, stencil_struct
 
 
 class Ghosts(Protocol):
@@ -83,6 +84,14 @@ class Stencil:
     def rows(self) -> Rows:
         """The rows that passes visit."""
         return Rows.of(self.padding, self.device, self.spans)
+
+    @cached_property
+    def struct(self) -> Any:
+        """What passes take of it."""
+        variable, d, w = self.storage
+        numbers = {"unit": self.unit, **dict(zip(("cx", "cy", "cz"), self.coefficients, strict=True))}
+        weights = dict(zip(("wx", "wy", "wz"), self.weights or (), strict=False)) if variable else {}
+        return put(stencil_struct(d, w)(), numbers | {"d": self.d} | weights)
 
     @property
     def storage(self) -> tuple[bool, Any, Any]:

@@ -14,7 +14,7 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.native import C_TYPES
-from warp_lcp.rows.layout import Bounds, RowLayout, Rows, make_struct, no_rows, stencil_struct, threads
+from warp_lcp.rows.layout import Bounds, RowLayout, Rows, make_struct, no_rows, put, stencil_struct, threads
 
 HEADERS = Path(__file__).parent / "headers"
 C = {**C_TYPES, wp.int8: "signed char", wp.int32: "int", wp.bool: "bool"}
@@ -163,7 +163,7 @@ class Form:
         differing = [f"{name.lower()}{value}" for name, value in constants.items() if value != d.constants[name]]
         shape = ["variable" if variable else "uniform"] if d.stencil else []
         self.words = [*shape, *(t.__name__ for _, t in sorted(letters.items())), *differing]
-        parts = {"stencil": stencil_struct(*map(of, d.stencil))} if d.stencil else {}
+        parts = {"stencil": stencil_struct(of(d.stencil[0]), of(d.stencil[1]) if variable else wp.float32)} if d.stencil else {}
         parts |= {"bounds": Bounds} if d.bounds else {}
         self.types = {name: of(kind) for name, kind in d.arrays.items()}
         members = {n: wp.array(dtype=t) for n, t in self.types.items()} | {n: of(t) for n, t in d.numbers.items()}
@@ -214,14 +214,10 @@ class Form:
         """Return the struct of arguments."""
         F = self.fields()
         if stencil is not None:
-            S = F.stencil
-            S.unit, (S.cx, S.cy, S.cz), S.d = stencil.unit, stencil.coefficients, stencil.d
-            S.wx, S.wy, S.wz = stencil.weights or (None, None, None)
+            put(F, {"stencil": stencil.struct})
         if bounds is not None:
-            F.bounds.lower, F.bounds.least, F.bounds.upper, F.bounds.most, F.bounds.code = bounds
-        for name, value in given.items():
-            setattr(F, name, value)
-        return F
+            put(F, {"bounds": put(Bounds(), dict(zip(("lower", "least", "upper", "most", "code"), bounds, strict=True)))})
+        return put(F, given)
 
     @functools.cached_property
     def kernel(self) -> Any:
