@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 SEED = 20150611
-COEFFICIENTS = ("wx", "wy", "wz", "face_x", "face_y", "face_z", "shift")  # absent where they are numbers
+COEFFICIENTS = ("wx", "wy", "wz", "face_x", "face_y", "face_z", "shift", "spans")  # absent where they are numbers, or rows whole
 
 
 @dataclass
@@ -44,8 +44,9 @@ class Launch:
         """Area and name of the kernel, types, flags that are set, fields that are absent: `cycle.sweep uniform_uint8_float32 from_zero`."""
         _, _, rest = self.kernel.module.name.partition(".")
         area, _, types = rest.partition(".")
+        types = types.rpartition(".")[2]
         called = self.kernel.func.__name__.removesuffix("_kernel")
-        absent = [f"-{label}" for label, a in self._given() if isinstance(a, wp.array) and a.size == 0 and label not in COEFFICIENTS]
+        absent = [f"-{label}" for label, a in self._given() if _is_nothing(a) and label not in COEFFICIENTS]
         flags = [label for label, value in self._given() if value is True]
         return " ".join(part for part in (f"{area}.{called}", types, *flags, *absent) if part)
 
@@ -70,7 +71,25 @@ class Launch:
         self._command.launch()
 
     def _given(self) -> list[tuple[str, Any]]:
-        return list(zip((a.label for a in self.kernel.adj.args), self.arguments, strict=True))
+        pairs = zip((a.label for a in self.kernel.adj.args), self.arguments, strict=True)
+        found: dict[str, Any] = {}
+        for label, value in (member for pair in pairs for member in _members(*pair)):
+            known = isinstance(value, wp.array) and isinstance(found.get(label), wp.array) and found[label].ptr != value.ptr
+            found.setdefault(f"{label} of another pass" if known else label, value)
+        return list(found.items())
+
+
+def _members(label: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """Yield an argument, or what is in a struct."""
+    if not hasattr(value, "_cls"):
+        yield label, value
+        return
+    for name in value._cls.vars:
+        yield from _members(name, getattr(value, name))
+
+
+def _is_nothing(value: Any) -> bool:
+    return value is None or (isinstance(value, wp.array) and value.size == 0)
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,7 @@ def source_digest() -> str:
     digest = hashlib.sha256()
     for package in (warp_lcp, fluids, granular):
         root = Path(package.__path__[0])
-        for path in sorted(root.rglob("*.py")):
+        for path in sorted([*root.rglob("*.py"), *root.rglob("*.h")]):
             digest.update(str(path.relative_to(root)).encode() + path.read_bytes())
     return digest.hexdigest()[:12]
 

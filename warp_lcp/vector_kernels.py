@@ -33,6 +33,10 @@ CODED = BOUNDED.replace(
         if (code_.data) body(coded_low, coded_high); else if (l_.data && u_.data)""",
 )  # the same for bounds that may be coded, see `warp_lcp.bounds`
 
+AT_ROW = CODED  # the same for cells of a row that begins at element p
+for _field in ("l_", "u_", "code_"):
+    AT_ROW = AT_ROW.replace(f"{_field}.data[i]", f"{_field}.data[p + i]")
+
 
 def flat(source: str) -> str:
     """Return the body of a native function over a span: `EACH {...}` visits its elements i."""

@@ -7,7 +7,7 @@ import warp_lcp as wl
 from benchmarks import problems
 from warp_lcp import program
 from warp_lcp.multigrid import Hierarchy
-from warp_lcp.solvers import projected_multigrid_workspace
+from warp_lcp.rows import layout
 
 BOUNDS = ["none", "walls", "everywhere"]
 
@@ -107,7 +107,7 @@ def test_every_way_to_launch_gives_the_same_iterates(bounds, monkeypatch):
     monkeypatch.setattr(Hierarchy, "_fuses", lambda self, level: False)
     _, unfused = solve(24, bounds, "multigrid")
     np.testing.assert_array_equal(unfused.x.numpy(), plain.x.numpy())
-    monkeypatch.setitem(projected_multigrid_workspace.PLANES_A_THREAD, "cpu", 5)
+    monkeypatch.setitem(layout.PLANES_A_THREAD, "cpu", 5)
     _, slabs = solve(24, bounds, "multigrid")
     monkeypatch.setattr(program, "CPU_RUNS_BEFORE_CAPTURE", 1)
     _, captured = solve(24, bounds, "multigrid")

@@ -14,6 +14,16 @@ from warp_lcp.layout import Padding, zeros
 from warp_lcp.multigrid import coarsen_kernels as kernels
 from warp_lcp.multigrid.coarsen_kernels import UNBOUNDED
 from warp_lcp.multigrid.cycle_kernels import Aggregates, cycle_kernels
+from warp_lcp.multigrid.cycle_passes import (
+    ASCEND,
+    COARSE_BOUNDS,
+    CORRECT,
+    DESCEND,
+    RESTRICT,
+    SWEEP,
+    SWEEP_INTO_RING,
+    SWEEP_OUT_OF_RING,
+)
 from warp_lcp.multigrid.renew_kernels import renew_kernels
 from warp_lcp.multigrid.shared_levels import share_changes, whole_counts
 from warp_lcp.multigrid.small_levels import SmallLevels, first_small
@@ -21,6 +31,7 @@ from warp_lcp.native import Spans, grain
 from warp_lcp.operators.stencil import Stencil
 from warp_lcp.operators.stencil_kernels import coarsen_spans_kernel
 from warp_lcp.program import Launch, Program
+from warp_lcp.rows import Bound, RowPass
 from warp_lcp.vectors import convert, launch_spans
 
 # of a coarsest level's diagonal: what rounding leaves of a singular component's last pivot, with a margin
@@ -100,11 +111,24 @@ class Level:
         launch(renew_kernels(s.d.dtype, self.real).renew, s.padding.counts[:2], inputs, device=s.device)
 
     @property
+    def factors(self) -> tuple[int, int, int]:
+        """Cells of the finer level along x, y and z that one of this level stands for."""
+        assert self.aggregates is not None
+        return self.aggregates.fx, self.aggregates.fy, self.aggregates.fz
+
+    @property
     def grids(self) -> list[wp.array[Any]]:
         """The diagonal and the weights as three-dimensional arrays; empty ones for uniform weights."""
         shape, s = self.stencil.padding.shape, self.stencil
         empty = wp.empty((0, 0, 0), dtype=self.real, device=s.device)
         return [s.d.reshape(shape), *((w.reshape(shape) for w in s.weights) if s.weights else (empty,) * 3)]
+
+    def sweeping(
+        self, y: wp.array[Any], x: wp.array[Any], omega: float, *, projected: bool, from_zero: bool = False, kind: RowPass = SWEEP
+    ) -> Bound:
+        """Return the pass that `sweep` launches, or one of its kind that goes into or out of a ring."""
+        fields = {"x": x, "y": y, "b": self.b, "lower": self.lower, "upper": self.upper}
+        return kind.bind(self.stencil.rows, stencil=self.stencil, omega=omega, projected=projected, from_zero=from_zero, **fields)
 
     def sweep(
         self, y: wp.array[Any], x: wp.array[Any], omega: float, *, projected: bool, from_zero: bool = False, launch: Launch = wp.launch
@@ -113,8 +137,7 @@ class Level:
         s = self.stencil
         if not from_zero:
             s.wrap(x, launch=launch)
-        inputs = [*self.operands, s.grain, from_zero, y, x, self.b, self.lower, self.upper, omega, projected]
-        launch(self.kernels.sweep, s.threads, inputs, device=s.device)
+        self.sweeping(y, x, omega, projected=projected, from_zero=from_zero).launch(launch)
 
 
 class Hierarchy:
@@ -307,8 +330,8 @@ class Hierarchy:
         """The linear cycle without its last sweep, where ghost cells must be filled before that and a caller goes on; None elsewhere."""
         return None
 
-    def last_leg(self) -> list[Any]:
-        """Return what the last leg of a linear cycle takes, as `ascend` in `cycle_kernels` does."""
+    def last_leg(self) -> tuple[Bound, ...]:
+        """Return the passes of a linear cycle's last leg, as `ASCEND` takes them."""
         return self._ascent(0, projected=False)
 
     def visits(self, count: int, *, projected: bool) -> Program:
@@ -363,7 +386,7 @@ class Hierarchy:
         """Correct a level from the next one, and sweep it."""
         L = self.levels[level]
         if self._fuses(L):
-            launch(L.kernels.ascend, 1, self._ascent(level, projected=projected), device=self.device)
+            ASCEND.launch(*self._ascent(level, projected=projected), launch=launch)
         else:
             self._correct(level, launch, projected=projected)
             self._pair(L, launch, reverse=True, projected=projected)
@@ -378,18 +401,20 @@ class Hierarchy:
 
     def _descending_leg(self, level: int, launch: Launch, *, projected: bool, from_zero: bool) -> None:
         """Sweeps, residual and restriction in one launch of one CPU thread."""
-        L, C = self.levels[level], self.levels[level + 1]
-        planes, rows, _ = C.stencil.padding.counts
-        fields = [L.x, L.b, L.t, L.lower, L.upper, C.b, *self.settings.weights, projected]
-        inputs = [*L.operands, C.stencil.shape, C.aggregates, planes, rows, from_zero, *fields]
-        launch(L.kernels.descend, 1, inputs, device=self.device)
+        L, (first, second) = self.levels[level], self.settings.weights
+        into_ring = L.sweeping(L.t, L.x, first, projected=projected, from_zero=from_zero, kind=SWEEP_INTO_RING)
+        out_of_ring = L.sweeping(L.x, L.t, second, projected=projected, kind=SWEEP_OUT_OF_RING)
+        DESCEND.launch(into_ring, out_of_ring, self._restricting(level), launch=launch)
 
-    def _ascent(self, level: int, *, projected: bool) -> list[Any]:
-        """Return the inputs of correction and sweeps in one launch of one CPU thread."""
-        L, C = self.levels[level], self.levels[level + 1]
-        first, second = reversed(self.settings.weights)
-        fields = [L.x, L.b, L.t, L.lower, L.upper, C.x, first, second, self.settings.over_correction, projected]
-        return [*L.operands, C.stencil.shape, C.aggregates, *fields]
+    def _ascent(self, level: int, *, projected: bool) -> tuple[Bound, ...]:
+        """Return the passes of a leg up: correction and sweeps."""
+        L, (first, second) = self.levels[level], reversed(self.settings.weights)
+        into_ring = L.sweeping(L.t, L.x, first, projected=projected, kind=SWEEP_INTO_RING)
+        return (
+            self._correcting(level, projected=projected),
+            into_ring,
+            L.sweeping(L.x, L.t, second, projected=projected, kind=SWEEP_OUT_OF_RING),
+        )
 
     def _solve_coarsest(self, launch: Launch, *, projected: bool, from_zero: bool) -> None:
         """Multiply by the inverse; projected sweeps stand for that where there are bounds."""
@@ -418,23 +443,31 @@ class Hierarchy:
         L.sweep(L.x, L.t, second, projected=projected, launch=launch)
 
     def _restrict(self, level: int, launch: Launch) -> None:
-        L, C = self.levels[level], self.levels[level + 1]
+        L = self.levels[level]
         L.stencil.wrap(L.x, launch=launch)
-        inputs = [*L.operands, C.stencil.grain, C.stencil.shape, C.aggregates, L.x, L.b, C.b]
-        launch(L.kernels.restrict, C.stencil.threads, inputs, device=self.device)
+        self._restricting(level).launch(launch)
 
     def _restrict_bounds(self, level: int, launch: Launch) -> None:
         L, C = self.levels[level], self.levels[level + 1]
-        fields = [L.x, L.lower, L.upper, self.settings.over_correction, C.lower, C.upper]
-        inputs = [L.stencil.shape, L.stencil.d, C.stencil.grain, C.stencil.shape, C.aggregates, *fields]
-        launch(L.kernels.bounds, C.stencil.threads, inputs, device=self.device)
+        rows, scale = C.stencil.rows.beside(L.stencil.rows, C.factors), self.settings.over_correction
+        fields = {"x": L.x, "lower": L.lower, "upper": L.upper, "coarse_lower": C.lower, "coarse_upper": C.upper}
+        COARSE_BOUNDS.bind(rows, stencil=L.stencil, scale=scale, **fields).launch(launch)
 
     def _correct(self, level: int, launch: Launch, *, projected: bool) -> None:
+        self._correcting(level, projected=projected).launch(launch)
+
+    def _restricting(self, level: int) -> Bound:
         L, C = self.levels[level], self.levels[level + 1]
-        nz, ny, _ = L.stencil.padding.counts
-        fields = [L.x, C.x, L.lower, L.upper, self.settings.over_correction, projected]
-        inputs = [*L.operands, C.stencil.grain, C.stencil.shape, C.aggregates, *fields]
-        launch(L.kernels.correct, (nz, ny, C.stencil.threads[2]), inputs, device=self.device)
+        rows = C.stencil.rows.beside(L.stencil.rows, C.factors)
+        return RESTRICT.bind(rows, stencil=L.stencil, x=L.x, b=L.b, coarse=C.b)
+
+    def _correcting(self, level: int, *, projected: bool) -> Bound:
+        L, C = self.levels[level], self.levels[level + 1]
+        fx, fy, fz = C.factors
+        rows, scale = L.stencil.rows.beside(C.stencil.rows, (-fx, -fy, -fz)), self.settings.over_correction
+        return CORRECT.bind(
+            rows, stencil=L.stencil, x=L.x, coarse=C.x, lower=L.lower, upper=L.upper, scale=scale, projected=projected
+        )  # fmt: skip
 
     def _coarser(self, fine: Level, *, bounded: bool) -> Level:
         """Return the next level: aggregates of two cells along every axis, or along the strong ones only where axes differ much."""

@@ -42,12 +42,13 @@ def coarse_index(i: int, n: int, f: int, coarse: int):
 def shared_cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
     """Return `descend`, two sweeps from zero, and `ascend`, the correction and a sweep; types as of `cycle_kernels`."""
     rows_of = cycle_kernels(variable, d_type, real).parts
-    first_sweep_to, sweep_between, clear_around, correct_row = (
-        rows_of.first_sweep_to, rows_of.sweep_between, rows_of.clear_around, rows_of.correct_row,
-    )  # fmt: skip
+    first_sweep_to, sweep_between, correct_row = rows_of.first_sweep_to, rows_of.sweep_between, rows_of.correct_row
     form = "variable" if variable else "uniform"
     name = f"warp_lcp.shared_cycle.{form}_{d_type.__name__}_{real.__name__}"
     d_array, field = wp.array(dtype=d_type), wp.array(dtype=real)
+
+    @wp.func_native("""for (int k = 0; k < nx; ++k) if (k < first || k >= first + n) t_.data[row + k] = 0;""")
+    def clear_around(t_: field, row: wp.int64, first: int, n: int, nx: int): ...
 
     @wp.func
     def first_sweep_row_to(

@@ -137,7 +137,9 @@ def small_levels_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamesp
             row = one_row(C.G, j)
             restrict_row(L.A, L.d, L.wx, L.wy, L.wz, C.b, o, L.x, L.b, p, n, C.G.fx, plane, row)
             if projected:
-                bounds_row(L.A, L.d, L.x, L.lower, L.upper, C.lower, C.upper, o, p, n, real(1.0) / scale, C.G.fx, plane, row)
+                bounds_row(
+                    L.A, L.d, L.wx, L.wy, L.wz, L.x, L.lower, L.upper, C.lower, C.upper, o, p, n, scale, C.G.fx, plane, row
+                )  # fmt: skip
 
     @wp.func
     def correct(levels: level_array, l: int, t: int, threads: int, projected: bool, scale: real):

@@ -14,6 +14,7 @@ from warp_lcp.multigrid.hierarchy import CycleSettings, Hierarchy
 from warp_lcp.multigrid.turning_kernels import sample_kernel
 from warp_lcp.operators.stencil import Stencil
 from warp_lcp.program import Program
+from warp_lcp.rows import Bound
 
 Strength = list[float]  # mean weights along x, y and z, in units of the largest
 
@@ -88,7 +89,7 @@ class TurningHierarchy(Hierarchy):
         self.companions[0]._descend(0, program, projected=False, from_zero=False, whole=False)
         return program
 
-    def last_leg(self) -> list[Any]:
+    def last_leg(self) -> tuple[Bound, ...]:
         """Return what the last leg of a linear cycle takes."""
         return self.companions[0].last_leg()
 

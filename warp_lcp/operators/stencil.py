@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,6 +13,8 @@ from warp_lcp.layout import Padding
 from warp_lcp.native import grain
 from warp_lcp.operators.stencil_kernels import StencilShape, product_kernels, wrap_kernel
 from warp_lcp.program import Launch, perform
+from warp_lcp.rows import Rows
+from warp_lcp.rows.layout import put, stencil_struct
 
 
 class Ghosts(Protocol):
@@ -77,6 +79,19 @@ class Stencil:
         self.grain = grain(nx, self.device)
         self.threads = (nz, ny, -(-nx // self.grain))
         self.operands = [self.shape, self.d, *(self.weights or [wp.empty(0, dtype=wp.float32, device=self.device)] * 3), self.grain]
+
+    @cached_property
+    def rows(self) -> Rows:
+        """The rows that passes visit."""
+        return Rows.of(self.padding, self.device, self.spans)
+
+    @cached_property
+    def struct(self) -> Any:
+        """What passes take of it."""
+        variable, d, w = self.storage
+        numbers = {"unit": self.unit, **dict(zip(("cx", "cy", "cz"), self.coefficients, strict=True))}
+        weights = dict(zip(("wx", "wy", "wz"), self.weights or (), strict=False)) if variable else {}
+        return put(stencil_struct(d, w)(), numbers | {"d": self.d} | weights)
 
     @property
     def storage(self) -> tuple[bool, Any, Any]:

@@ -30,16 +30,13 @@ class GridConjugateGradient:
         r, s = finest.b, finest.stencil
         self.device, self.x, self._p = device, wp.zeros_like(r), wp.zeros_like(r)
         planes, rows, _ = s.padding.counts
-        R = engine.RowSums()
-        R.planes, R.all_planes, R.rows, R.chunks, R.threads, R.changed = 1, planes, rows, 1, planes * rows, finest.changed.flatten()
         self._scalars = wp.zeros(kernels.SLOTS, dtype=wp.float64, device=device)
         self._going = wp.zeros(1, dtype=wp.int32, device=device)
-        sums = Reduction(r.size, device, self._scalars, columns=4, threads=R.threads)
+        sums = Reduction(r.size, device, self._scalars, columns=4, threads=s.rows.places)
         program = self._program = Program(device)
         assert hierarchy.open_cycle is not None
         program.extend(hierarchy.open_cycle)
-        climb = engine.climb_kernel(*source.storage, s.d.dtype, r.dtype)
-        program.launch(climb, 1, [*hierarchy.last_leg(), R, self._p, sums.partials], device=device)
+        engine.CLIMB.launch(*hierarchy.last_leg(), engine.measuring(finest, self._p, sums.partials), launch=program.launch)
         sums.add_up(int(engine.ZAZ), columns=4, launch=program.launch)
         program.launch(engine.plan_step_kernel, 1, [self._scalars], device=device)
         fields = [finest.x, self._p, self.x, r, self._scalars, weighted, sums.partials]

@@ -10,7 +10,7 @@ import warp as wp
 from warp_lcp.native import BLOCK, C_TYPES, fetch, simd
 from warp_lcp.operators.stencil_kernels import NEIGHBORS, StencilShape, row_count, row_start, stencil_head
 from warp_lcp.solvers.interior_point_kernels import INFINITE, MULTIPLIERS, UPPER_MULTIPLIERS
-from warp_lcp.solvers.projected_multigrid_kernels import AT_ROW
+from warp_lcp.vector_kernels import AT_ROW
 
 # sums: of the natural residual, of the right-hand side in the norm of its system, of the products w s and v t, of dw ds + dv dt
 COLUMNS = 3

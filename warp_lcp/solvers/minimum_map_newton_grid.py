@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import warp as wp
@@ -13,10 +12,8 @@ from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
 from warp_lcp.solve import Precision, Step
-from warp_lcp.solvers import minimum_map_newton_grid_kernels as kernels
 from warp_lcp.solvers import projected_multigrid_kernels as engine
 from warp_lcp.solvers.projected_multigrid_workspace import AssessedResidual, MultigridWorkspace
-from warp_lcp.vectors import launch_spans
 
 if TYPE_CHECKING:
     from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
@@ -31,16 +28,13 @@ class MinimumMapResidual(AssessedResidual):
         away: whether unknowns that are held are not at their bounds yet.
     """
 
+    _away: wp.array[Any]
+    _minimum_map = True
+
     def __init__(self, problem: LCP, A: GridPoisson, hierarchy: Hierarchy, *, rounded: bool) -> None:
         super().__init__(problem, A, hierarchy, rounded=rounded)
         planes, rows, _ = A.stencil.threads
         self._away = wp.zeros(planes * rows, dtype=wp.uint8, device=A.device)  # rows with such unknowns
-        own = kernels.row_kernels(*self.storage, rounded=rounded)
-        self.row_kernels = SimpleNamespace(**{**vars(self.row_kernels), "assess": own.assess, "advance": own.advance})
-        self._hold, self._right_side = own.hold, own.right_side
-
-    def _assessed(self) -> list[Any]:
-        return [*super()._assessed(), self._away]
 
     @property
     def away(self) -> bool:
@@ -50,15 +44,14 @@ class MinimumMapResidual(AssessedResidual):
 
     def hold(self, x: wp.array[Any]) -> None:
         """Move held unknowns onto their bounds, and the right-hand side with them."""
-        p, s, R, finest = self.problem, self._A.stencil, self.row_sums, self._finest
-        inputs = [s.shape, s.grain, R, x, finest.b, *p.bounds.operands, self._away]
-        wp.launch(self._hold, s.threads, inputs, device=p.device)
+        p, s, finest = self.problem, self._A.stencil, self._finest
+        engine.HOLD.bind(s.rows, bounds=p.bounds.operands, x=x, g=finest.b, away=self._away, ROUNDED=self._rounded).launch(wp.launch)
         s.wrap(x)
         if s.ghosts is not None:
             self._away.fill_(1)  # which rows beside a cut have moved, others know
-        fields = [x, p.b, finest.stencil.d, finest.b, self.scalars, self._away]
-        inputs = [*s.operands, R, wp.vec3i(*map(int, s.periodic)), *fields]
-        wp.launch(self._right_side, s.threads, inputs, device=p.device)
+        fields = {"x": x, "b": p.b, "free": finest.stencil.d, "g": finest.b, "away": self._away, "scalars": self.scalars}
+        _, around_y, around_z = s.periodic
+        engine.RIGHT_SIDE.bind(s.rows, stencil=s, around_y=around_y, around_z=around_z, **fields).launch(wp.launch)
         self._away.zero_()
 
 
@@ -149,9 +142,8 @@ class GridNewtonWorkspace(MultigridWorkspace):
 
     def _set_length(self, old: float, new: float, whole: float) -> None:
         """Change how far x has moved along the last direction, in parts of the whole step."""
-        p, residual = self.problem, self.residual
+        residual = self.residual
         residual.set(engine.STEP, (old - new) * whole)
-        inputs = [self.x, self._p, *p.bounds.operands, p.unknown, self.x, residual.scalars]
-        launch_spans(self._flat.undo, self._spans, inputs, [], p.device)
+        self._undo(self.x)
         self._round(self.x)
         residual.set(engine.STEP, new * whole)

@@ -23,7 +23,6 @@ from warp_lcp.solvers.descent import Descent
 from warp_lcp.solvers.minimum_map_newton_kernels import all_free_kernel
 from warp_lcp.solvers.principal_system import DiagonalSystem, principal_system
 from warp_lcp.solvers.principal_system_sparse import SparseSystem
-from warp_lcp.solvers.projected_multigrid_workspace import PLANES_A_THREAD
 from warp_lcp.solvers.sweep import Diagonal
 from warp_lcp.vectors import Reduction, launch_spans
 
@@ -150,9 +149,8 @@ class SplitResidual(NaturalResidual):
         if self._stencil is None:
             self._split = Reduction(problem.layout.size, device, self.scalars, columns=kernels.COLUMNS)
             return
-        self._assess = kernels.row_kernels(*self._stencil.storage, r.dtype)
-        self._rows = row_sums(self._stencil.threads, device)
-        self._split = Reduction(problem.layout.size, device, self.scalars, columns=kernels.COLUMNS, threads=self._rows.threads)
+        places = self._stencil.rows.places
+        self._split = Reduction(problem.layout.size, device, self.scalars, columns=kernels.COLUMNS, threads=places)
 
     def start(self, x: wp.array[Any], *, keep: bool) -> None:
         """Set x to clip(x, l, u) or clip(0, l, u)."""
@@ -170,17 +168,17 @@ class SplitResidual(NaturalResidual):
         p = self.problem
         if 0 < self.norm < math.inf:
             self.size = self.norm
-        numbers = [wp.float64(1 / self.size), wp.float64(self._slack)]
-        written = [self.free, self._r, self._chopped_step, *numbers]
         if self._stencil is None:
+            written = [self.free, self._r, self._chopped_step, wp.float64(1 / self.size), wp.float64(self._slack)]
             self.affine(x)
             before = [x, self.y, self.diagonal, wp.float64(self.unit), *p.bounds.operands, p.unknown, p.b, *written]
             launch_spans(self.kernels.split, self._split.spans, before, [self._split.threads, self._split.partials], p.device)
         else:
-            s, R = self._stencil, self._rows
+            s = self._stencil
             s.wrap(x)
-            inputs = [*s.operands, R, x, p.b, *p.bounds.operands, p.unknown, *written, self._split.partials]
-            wp.launch(self._assess, (-(-R.all_planes // R.planes), R.rows, R.chunks), inputs, device=p.device)
+            fields = {"x": x, "b": p.b, "unknown": p.unknown, "free": self.free, "g": self._r, "step": self._chopped_step}
+            numbers = {"inverse": 1 / self.size, "slack": self._slack}
+            kernels.SPLIT.bind(s.rows, stencil=s, bounds=p.bounds.operands, out=self._split.partials, **fields, **numbers).launch(wp.launch)
         self._split.add_up(kernels.SQUARE, columns=kernels.COLUMNS)
         square, self.chopped, self.reduced, self.release, moved, active, self.energy = (
             float(v) for v in self.scalars.numpy()[: kernels.COLUMNS]
@@ -190,10 +188,7 @@ class SplitResidual(NaturalResidual):
 
     def measure(self, finest: Level, p: wp.array[Any]) -> None:
         """Write z'Az, z'Ap, r'z and r'p to the first scalars, on a grid's finest level with its x = z and b = r."""
-        R, s = self._rows, self.problem.A.stencil  # type: ignore[attr-defined]
-        measure = engine.row_kernels(*s.storage, finest.stencil.d.dtype, finest.real).measure
-        inputs = [*finest.operands, finest.stencil.grain, R, finest.x, p, finest.b, self._split.partials]
-        wp.launch(measure, (-(-R.all_planes // R.planes), R.rows, R.chunks), inputs, device=self.problem.device)
+        engine.measuring(finest, p, self._split.partials).launch(wp.launch)
         self._split.add_up(0, columns=4)
 
 
@@ -407,15 +402,6 @@ class GradientWorkspace(RoundedIterate):
 
     def _flat(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
         launch_spans(kernel, self.residual.sums.spans, inputs, [], self.problem.device)
-
-
-def row_sums(threads: tuple[int, int, int], device: wp.Device) -> Any:
-    """Return how a grid's rows are shared out to places for sums."""
-    planes, rows, chunks = threads
-    slab = PLANES_A_THREAD["cuda" if device.is_cuda else "cpu"]
-    R = engine.RowSums()
-    R.planes, R.all_planes, R.rows, R.chunks, R.threads = slab, planes, rows, chunks, -(-planes // slab) * rows * chunks
-    return R
 
 
 def _preconditioner(problem: LCP, real: Any, cycle: CycleSettings, system: Any) -> tuple[Any, Any]:

@@ -2,15 +2,15 @@
 """Kernels of MPRGP: the residual split into its free and chopped parts, the directions, the projected step."""
 
 import functools
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
-from warp_lcp.native import BLOCK, C_TYPES, fetch, simd
-from warp_lcp.operators.stencil_kernels import NEIGHBORS, StencilShape, row_count, row_start, stencil_head
+from warp_lcp.native import C_TYPES
 from warp_lcp.residual_kernels import NATURAL
-from warp_lcp.solvers.projected_multigrid_kernels import AT_ROW, RowSums
+from warp_lcp.rows import RowPass
 from warp_lcp.vector_kernels import CODED, flat, span_end, span_start
 
 # Sums of a split, slots of the device scalars: of the residual's square, of that on held unknowns, of residual times y on the free
@@ -218,65 +218,9 @@ def kernels(d_type: Any, real: Any) -> SimpleNamespace:
     )
 
 
-@functools.cache
-def row_kernels(variable: bool, d_type: Any, w_type: Any, real: Any) -> Any:
-    """Return `assess`: a grid's `split` in one pass, y = A x + b included and not stored."""
-    form = "variable" if variable else "uniform"
-    name = f"warp_lcp.mprgp.{form}_{d_type.__name__}_{w_type.__name__}_{real.__name__}"
-    d_array, w_array, field, R = wp.array(dtype=d_type), wp.array(dtype=w_type), wp.array(dtype=real), C_TYPES[real]
-
-    @wp.func_native(
-        simd(
-            BLOCK
-            + AT_ROW
-            + stencil_head(variable, "double")
-            + f"""const T *x = x_.data + p, *over = x + s1, *b = b_.data + p; {R} *g = g_.data + p, *c_ = step_.data + p;
-        unsigned char* free = free_.data + p; const auto* m = m_.data + p; T s = 0, chopped = 0, reduced = 0, release = 0, energy = 0;
-        int moved = 0, active = 0; unsigned char now[M];
-        for (int begin = 0; begin < n; begin += M) {{
-            const int end = n - begin < M ? n : begin + (int)M; T y[M];
-            {fetch("begin", "end", over=8, b=8, g=4, c_=4, d=1, m=1, free=1)}
-            SIMD8 for (int k = begin; k < end; ++k) {{
-                const T e = unit*(T)d[k], v = e*x[k] - {NEIGHBORS[variable]}; y[k - begin] = (e != 0 ? v : (T)0) + b[k]; }}
-            unsigned char changed = 0, count = 0;
-            with_bounds([&](auto lower, auto upper) {{
-                SIMD8 for (int k = begin; k < end; ++k) {{
-                    const T e = unit*(T)d[k], f = e != 0 ? e : (T)1, l = lower(k), u = upper(k), v = y[k - begin];
-                    const T below = f*(x[k] - l), above = f*(x[k] - u), least = below < v ? below : v, r0 = above > least ? above : least;
-                    const bool in = m[k] == 1, held = in & ((x[k] <= l + slack*(l < 0 ? -l : l)) | (x[k] >= u - slack*(u < 0 ? -u : u)));
-                    const T r = in ? r0 : (T)0, h = held ? r : (T)0;
-                    const {R} w = ({R})(-h*inverse)/({R})f;  // division is what would take longest in double precision
-                    s += r*r; chopped += h*h; reduced += held ? (T)0 : r*v; release -= h*inverse*(T)w;
-                    energy += in ? (T)0.5*x[k]*(v + b[k]) : (T)0;
-                    now[k - begin] = in & !held; g[k] = ({R})((in & !held) ? -v*inverse : (T)0); c_[k] = w; }} }});
-            SIMD64 for (int k = begin; k < end; ++k) {{
-                const unsigned char one = now[k - begin] != free[k], two = (m[k] == 1) & !now[k - begin];
-                changed |= one; count += two; free[k] = now[k - begin]; }}
-            moved += changed; active += count; }}
-        const double all[{COLUMNS}] = {{s, chopped, reduced, release, (double)moved, (double)active, energy}}; double* sums = out.data + t;
-        for (int c = 0; c < {COLUMNS}; ++c) sums[c*threads] = more ? all[c] + sums[c*threads] : all[c];"""
-        )
-    )
-    def assess_row(
-        A: StencilShape, d_: d_array, wx_: w_array, wy_: w_array, wz_: w_array, x_: f64, b_: f64, l_: f64, l_value: wp.float64, u_: f64,
-        u_value: wp.float64, code_: u8, m_: i8, free_: u8, g_: field, step_: field, inverse: wp.float64, slack: wp.float64, p: wp.int64,
-        n: int, t: int, threads: int, more: bool, out: f64,
-    ): ...  # fmt: skip
-
-    @wp.kernel(enable_backward=False, module=name)
-    def assess(
-        A: StencilShape, d: d_array, wx: w_array, wy: w_array, wz: w_array, grain: int, S: RowSums, x: f64, b: f64, lower: f64,
-        lower_value: wp.float64, upper: f64, upper_value: wp.float64, code: u8, unknown: i8, free: u8, g: field, step: field,
-        inverse: wp.float64, slack: wp.float64, out: f64,
-    ):  # fmt: skip
-        slab, j, c = wp.tid()
-        t = (slab * S.rows + j) * S.chunks + c
-        for k in range(slab * S.planes, wp.min((slab + 1) * S.planes, S.all_planes)):
-            n = row_count(A, k, j, c, grain)
-            p = row_start(A, k, j, c, grain)
-            assess_row(
-                A, d, wx, wy, wz, x, b, lower, lower_value, upper, upper_value, code, unknown, free, g, step, inverse, slack, p, n, t,
-                S.threads, k > slab * S.planes, out,
-            )  # fmt: skip
-
-    return assess
+SPLIT = RowPass(  # a grid's `split` in one pass, y = A x + b included and not stored
+    "mprgp.split", Path(__file__).parent / "headers" / "split.h", wp.float64, stencil=("D", "W"), bounds=True,
+    reads={"x": wp.float64, "b": wp.float64, "unknown": wp.int8}, writes={"free": wp.uint8, "g": "S", "step": "S"},
+    numbers={"inverse": wp.float64, "slack": wp.float64},
+    sums=("norm", "chopped", "reduced", "release", "moved", "active", "energy"),
+)  # fmt: skip

@@ -10,7 +10,7 @@ import warp as wp
 from warp_lcp.native import BLOCK, C_TYPES, fetch, simd
 from warp_lcp.operators.stencil_kernels import NEIGHBORS, StencilShape, row_count, row_start, stencil_head
 from warp_lcp.solvers.nonsmooth_map_kernels import FISCHER, KINK, LEAST_Q, NO_PENALTY, NO_UPPER, PENALTY, PLAIN, UPPER, Form, Map
-from warp_lcp.solvers.projected_multigrid_kernels import AT_ROW
+from warp_lcp.vector_kernels import AT_ROW
 
 SQUARE, MERIT, WEIGHTED = range(3)  # sums: of the natural residual, of the map, of the right-hand side in the norm of its system
 COLUMNS = 3

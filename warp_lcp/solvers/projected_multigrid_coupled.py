@@ -33,7 +33,7 @@ class CoupledResidual(AssessedResidual):
     def __init__(self, problem: LCP, A: GridPoisson, low: LowRankOperator, hierarchy: Hierarchy, *, rounded: bool) -> None:
         super().__init__(problem, A, hierarchy, rounded=rounded)
         self.diagonal, self.unit, self._diagonal_of = A.stencil.d, float(A.stencil.unit), None
-        self._low, self._b = low, wp.zeros_like(problem.b)
+        self._low, self._b = low, wp.zeros_like(problem.b)  # in the place of the problem's
         self._low_version = -1
 
     def start(self, x: wp.array[Any], *, keep: bool) -> None:
@@ -60,10 +60,6 @@ class CoupledResidual(AssessedResidual):
         """Launch the step and the evaluation where it ends; U'x is needed between them."""
         self.update(x, direction, launch=launch)
         self.assess(x, launch=launch)
-
-    def _assessed(self) -> list[Any]:
-        fields = super()._assessed()
-        return [self._b, *fields[1:]]
 
 
 class CoupledWorkspace(MultigridWorkspace):
@@ -173,9 +169,7 @@ class CoupledWorkspace(MultigridWorkspace):
         """Sum the products that beta and the step need, with A + U W U'."""
         residual, finest, device, columns = self.residual, self.hierarchy.finest, self.A.device, self._low.columns
         finest.stencil.wrap(finest.x, launch=launch)
-        fields = [finest.x, self._p, finest.b, residual.sums.partials]
-        inputs = [*finest.operands, finest.stencil.grain, residual.row_sums, *fields]
-        launch(residual.row_kernels.measure, residual.threads, inputs, device=device)
+        kernels.measuring(finest, self._p, residual.sums.partials).launch(launch)
         residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=launch)
         launch(coupling.copy_kernel, self._low.rank, [columns.gather(self._p, launch=launch), self._along], device=device)
         inputs = [self._low.weights.flatten(), columns.gather(finest.x, launch=launch), self._along, self._low.rank, residual.scalars]

@@ -16,17 +16,15 @@ from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
 from warp_lcp.program import Launch, Program, perform
 from warp_lcp.residual import NaturalResidual
+from warp_lcp.rows import Bound, Rows
 from warp_lcp.solve import FLOOR_MARGIN, Precision, RoundedIterate, Step
 from warp_lcp.solvers import projected_multigrid_kernels as kernels
 from warp_lcp.solvers.algebraic_steps import AlgebraicSteps, Pace
 from warp_lcp.solvers.descent import Descent
-from warp_lcp.vectors import Reduction, launch_spans
+from warp_lcp.vectors import Reduction
 
 if TYPE_CHECKING:
     from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
-
-# planes that a thread sums over: on CUDA, a place for the sums of every cell would cost more memory than the rest of the method
-PLANES_A_THREAD = {"cpu": 1, "cuda": 16}
 
 
 class AssessedResidual(NaturalResidual):
@@ -37,23 +35,18 @@ class AssessedResidual(NaturalResidual):
         stale: whether the free set has changed since the hierarchy was built.
         active: unknowns held.
         energy: x'Ax/2 + b'x.
-        storage: form and types that choose the kernels.
     """
+
+    _minimum_map = False
 
     def __init__(self, problem: LCP, A: GridPoisson, hierarchy: Hierarchy, *, rounded: bool) -> None:
         super().__init__(problem)
         self._A, self._finest, self._hierarchy, self._version = A, hierarchy.finest, hierarchy, A.version
-        s = A.stencil
-        planes, rows, chunks = s.threads
-        slab = PLANES_A_THREAD["cuda" if A.device.is_cuda else "cpu"]
-        self.threads = (-(-planes // slab), rows, chunks)
-        R = self.row_sums = kernels.RowSums()
-        R.planes, R.all_planes, R.rows, R.chunks, R.threads = slab, planes, rows, chunks, math.prod(self.threads)
-        R.changed = self._finest.changed.flatten()
+        self._rounded, self._b = rounded, problem.b
+        self._away: wp.array[Any] | None = None
         self.scalars = wp.zeros(kernels.SLOTS, dtype=wp.float64, device=A.device)
-        self.sums = Reduction(problem.layout.size, A.device, self.scalars, columns=4, threads=R.threads, across=problem.layout.across)
-        self.storage = (*s.storage, self._finest.stencil.d.dtype, hierarchy.real)
-        self.row_kernels = kernels.row_kernels(*self.storage, rounded=rounded)
+        places = A.stencil.rows.places
+        self.sums = Reduction(problem.layout.size, A.device, self.scalars, columns=4, threads=places, across=problem.layout.across)
         self.classify, self.stale, self.active, self.energy, self._norm_of_b = False, True, 0, 0.0, 0.0
 
     def start(self, x: wp.array[Any], *, keep: bool) -> None:
@@ -83,17 +76,13 @@ class AssessedResidual(NaturalResidual):
 
     def assess(self, x: wp.array[Any], *, launch: Launch = wp.launch) -> None:
         """Launch the evaluation."""
-        p, s = self.problem, self._A.stencil
-        s.wrap(x, launch=launch)
-        inputs = [*s.operands, self.row_sums, x, *self._assessed()]
-        launch(self.row_kernels.assess, self.threads, inputs, device=p.device)
+        self._A.stencil.wrap(x, launch=launch)
+        kernels.ADVANCE.launch(None, self._assessing(x), launch=launch)
         self.sums.add_up(int(kernels.NORM), columns=4, launch=launch)
 
     def update(self, x: wp.array[Any], direction: wp.array[Any], *, launch: Launch = wp.launch) -> None:
         """Launch the step from x along the direction that the cycle's correction gives."""
-        p, s = self.problem, self._A.stencil
-        inputs = [s.shape, s.grain, x, self._finest.x, direction, *p.bounds.operands, self.scalars]
-        launch(self.row_kernels.update, s.threads, inputs, device=p.device)
+        self._updating(self._A.stencil.rows, x, direction).launch(launch)
 
     def advance(self, x: wp.array[Any], direction: wp.array[Any], *, launch: Launch = wp.launch) -> None:
         """Launch the step and the evaluation where it ends: one launch on the CPU, unless periodic ghost cells must be filled between.
@@ -105,21 +94,22 @@ class AssessedResidual(NaturalResidual):
             self.update(x, direction, launch=launch)
             self.assess(x, launch=launch)
             return
-        nz, ny, nx = s.padding.counts
-        for axis, side in s.ghosts.cuts if s.ghosts is not None else ():
-            lines = [(nz, ny), (nz, 1), (ny, 1)][axis]
-            plane = side * ((nx, ny, nz)[axis] + 1)
-            inputs = [s.shape, axis, plane, x, self._finest.x, direction, *p.bounds.operands, self.scalars]
-            launch(self.row_kernels.update_ghosts, lines, inputs, device=p.device)
-        inputs = [*s.operands[:-1], self.row_sums, x, self._finest.x, direction, *self._assessed()]
-        launch(self.row_kernels.advance, 1, inputs, device=p.device)
+        for axis, end in s.ghosts.cuts if s.ghosts is not None else ():
+            self._updating(Rows.beyond(s.padding, p.device, axis, end), x, direction).launch(launch)
+        kernels.ADVANCE.launch(self._updating(s.rows, x, direction), self._assessing(x), launch=launch)
         self.sums.add_up(int(kernels.NORM), columns=4, launch=launch)
 
-    def _assessed(self) -> list[Any]:
-        """Return what the evaluation takes besides the stencil and x."""
+    def _updating(self, rows: Rows, x: wp.array[Any], direction: wp.array[Any]) -> Bound:
+        bounds = self.problem.bounds.operands
+        return kernels.UPDATE.bind(rows, bounds=bounds, x=x, z=self._finest.x, q=direction, scalars=self.scalars)
+
+    def _assessing(self, x: wp.array[Any]) -> Bound:
         p, finest = self.problem, self._finest
-        fields = [p.b, *p.bounds.operands, p.unknown, finest.stencil.d, finest.b]
-        return [*fields, self.scalars, self.classify, self.sums.partials]
+        return kernels.ASSESS.bind(
+            self._A.stencil.rows, stencil=self._A.stencil, bounds=p.bounds.operands, x=x, b=self._b, unknown=p.unknown,
+            free=finest.stencil.d, g=finest.b, changed=finest.changed.flatten(), away=self._away, scalars=self.scalars,
+            classify=self.classify, out=self.sums.partials, MINIMUM_MAP=self._minimum_map, ROUNDED=self._rounded,
+        )  # fmt: skip
 
     def read(self) -> float:
         """Read what the evaluation found; a step that is not finite was not taken, and its residual is no number."""
@@ -153,8 +143,7 @@ class MultigridWorkspace(RoundedIterate):
         upper = problem.layout.zeros(real) if problem.bounds.may_bind[1] else wp.empty(0, dtype=real, device=A.device)
         self.hierarchy = make_hierarchy(A.stencil, real, bounded=self.bounded, settings=settings.cycle, bounds=(self._p, upper))
         self.residual = AssessedResidual(problem, A, self.hierarchy, rounded=self.precision is Precision.SINGLE)
-        self._flat = kernels.flat_kernels(real)
-        self._spans = self.residual._reduction.spans
+        self._flat = Rows.flat(problem.layout.size, A.device)
         self._rounded = problem.layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
         self._programs: dict[tuple[Any, ...], Program] = {}  # truncated cycles
         self._mask: wp.array[Any] | None = None
@@ -210,9 +199,9 @@ class MultigridWorkspace(RoundedIterate):
 
     def _undo(self, out: wp.array[Any]) -> None:
         """Write where the last step began."""
-        p = self.problem
-        inputs = [self.x, self._p, *p.bounds.operands, p.unknown, out, self.residual.scalars]
-        launch_spans(self._flat.undo, self._spans, inputs, [], p.device)
+        p, scalars = self.problem, self.residual.scalars
+        fields = {"x": self.x, "q": self._p, "unknown": p.unknown, "before": out}
+        kernels.UNDO.bind(self._flat, bounds=p.bounds.operands, scalars=scalars, **fields).launch(wp.launch)
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the search direction; the operator may have changed."""
@@ -278,8 +267,8 @@ class MultigridWorkspace(RoundedIterate):
         p, finest, descent = self.problem, self.hierarchy.finest, self._descent
         self._rebuild()
         self._leave()
-        before = [self.x, *p.bounds.operands, p.unknown, finest.lower, finest.upper, self.residual.scalars]
-        launch_spans(self._flat.gaps, self._spans, before, [], p.device)
+        fields = {"x": self.x, "unknown": p.unknown, "lo": finest.lower, "hi": finest.upper, "scalars": self.residual.scalars}
+        kernels.GAPS.bind(self._flat, bounds=p.bounds.operands, **fields).launch(wp.launch)
         (self.hierarchy.projected_sweep if descent.safe else self.hierarchy.monotone_cycle).run()
         self._plan_monotone_step()
         self._cycles_left -= 1
@@ -355,26 +344,26 @@ class MultigridWorkspace(RoundedIterate):
             self._measure(launch=program.launch)
             return
         program.extend(hierarchy.open_cycle)
-        inputs = [*hierarchy.last_leg(), residual.row_sums, self._p, residual.sums.partials]
-        program.launch(kernels.climb_kernel(*residual.storage), 1, inputs, device=device)
+        measuring = kernels.measuring(hierarchy.finest, self._p, residual.sums.partials)
+        kernels.CLIMB.launch(*hierarchy.last_leg(), measuring, launch=program.launch)
         residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=program.launch)
         program.launch(kernels.plan_step_kernel, 1, [residual.scalars], device=device)
 
     def _sweep_and_measure(self, launch: Launch) -> None:
         """Make a shared cycle's last sweep, measure its correction, and plan the step."""
         residual, finest, device = self.residual, self.hierarchy.finest, self.A.device
-        s, made = finest.stencil, kernels.sweep_and_measure_kernels(*residual.storage)
+        s = finest.stencil
         assert s.ghosts is not None
         s.wrap(finest.t, launch=launch)
         perform(partial(clear_ghosts, s, finest.x), launch)
-        fields = [finest.x, finest.b, finest.t, finest.lower, finest.upper, self.hierarchy.settings.weights[0]]
-        launch(made.sweep, 1, [*finest.operands, *fields, residual.row_sums, self._p, residual.sums.partials], device=device)
+        sweep = finest.sweeping(finest.x, finest.t, self.hierarchy.settings.weights[0], projected=False)
+        kernels.SWEEP_AND_MEASURE.launch(sweep, kernels.measuring(finest, self._p, residual.sums.partials), launch=launch)
         s.wrap(finest.x, launch=launch)
         nz, ny, nx = s.padding.counts
         for axis, end in s.ghosts.cuts:
             lines, last = [(nz, ny), (nz, 1), (1, ny)][axis], (nx, ny, nz)[axis] - 1
-            inputs = [*finest.operands, axis, end, last, residual.row_sums, finest.x, self._p, residual.sums.partials]
-            launch(made.add_side, lines, inputs, device=device)
+            inputs = [*finest.operands, axis, end, last, ny, s.rows.places, finest.x, self._p, residual.sums.partials]
+            launch(kernels.add_side_kernel(s.weights is not None, s.d.dtype, finest.real), lines, inputs, device=device)
         residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=launch)
         launch(kernels.plan_step_kernel, 1, [residual.scalars], device=device)
 
@@ -382,9 +371,7 @@ class MultigridWorkspace(RoundedIterate):
         """Measure the cycle's correction and plan the step."""
         residual, finest, device = self.residual, self.hierarchy.finest, self.A.device
         finest.stencil.wrap(finest.x, launch=launch)
-        fields = [finest.x, self._p, finest.b, residual.sums.partials]
-        inputs = [*finest.operands, finest.stencil.grain, residual.row_sums, *fields]
-        launch(residual.row_kernels.measure, residual.threads, inputs, device=device)
+        kernels.measuring(finest, self._p, residual.sums.partials).launch(launch)
         residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=launch)
         launch(kernels.plan_step_kernel, 1, [residual.scalars], device=device)
 

@@ -1,0 +1,142 @@
+"""Digests of what solvers compute on grids, to the last bit: `python -m benchmarks.bits --out before.txt`, then `diff`.
+
+A line a solve: the problem, the method, its status, steps, a digest of x and one of the residuals of all iterates.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import itertools
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+from rich.console import Console
+
+import warp_lcp as wl
+from benchmarks.problems import cut_cells, splash
+from warp_lcp.driver.progress import Lines
+from warp_lcp.driver.run import run_scene
+from warp_lcp.driver.scene_file import load_scene
+from warp_lcp.solvers.mprgp import MPRGP
+
+SHAPES = {"2-D": (11, 38), "3-D": (9, 14, 21), "long rows": (4, 5, 300), "flat": (5, 1, 24)}
+PRECISIONS = ("mixed", "double", "single")
+STOPPING = wl.StoppingCriteria(rtol=1e-7, max_iterations=12)
+SCENES = {"dam-break": (24, 0.1), "floating-bodies": (20, 0.1), "column-collapse": (16, 0.02)}  # resolution, seconds
+
+
+def bounds_of(shape: tuple[int, ...]) -> dict[str, tuple[Any, Any]]:
+    """Return lower and upper bounds of each kind that kernels tell apart."""
+    rng = np.random.default_rng(2718)
+    low, high, some = -rng.random(shape), rng.random(shape), rng.random(shape) < 0.3
+    return {
+        "none": (-np.inf, np.inf),
+        "number": (0.0, np.inf),
+        "numbers": (-0.2, 0.3),
+        "coded": (np.where(some, 0.0, -np.inf), np.inf),
+        "coded twice": (np.where(some, 0.0, -np.inf), np.where(some, np.inf, 0.4)),
+        "field": (low, np.inf),
+        "fields": (low, high),
+        "field above": (-0.2, high),
+        "only above": (-np.inf, np.where(some, high, np.inf)),
+    }
+
+
+def faces_of(shape: tuple[int, ...]) -> dict[str, dict[str, Any]]:
+    """Return coefficients of each form: one, a number an axis, arrays."""
+    rng, names = np.random.default_rng(31), "xyz"[: len(shape)]
+    axes = enumerate(reversed(names))
+    arrays = {f"face_{a}": 0.2 + rng.random([n + (i == j) for j, n in enumerate(shape)]) for i, a in axes}
+    return {"unit": {}, "number": {"face_y": 3.0}, "arrays": arrays}
+
+
+def small_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
+    """Yield name, problem, method and start on small random sets of cells: all forms of storage, sides and bounds."""
+    for (name, shape), form, real in itertools.product(SHAPES.items(), ("unit", "number", "arrays"), (wp.float32, wp.float64)):
+        rng = np.random.default_rng(97)
+        cells = rng.choice([wl.AIR, wl.FLUID, wl.SOLID], size=shape, p=[0.1, 0.8, 0.1])
+        b, faces, bounds = rng.standard_normal(shape), faces_of(shape)[form], bounds_of(shape)
+        start = rng.standard_normal(shape)
+        for precision, (kind, sides) in itertools.product(PRECISIONS, bounds.items()):
+            if name != "3-D" and kind not in ("number", "coded", "fields"):
+                continue
+            A = wl.GridPoisson(cells, device="cpu", dtype=real, **faces)
+            for method in (wl.ProjectedMultigrid, wl.MinimumMapNewton):
+                what = f"{name} {form} {real.__name__} {kind}"
+                yield what, wl.LCP(A, b, *sides), method(precision=precision), None
+                if kind in ("coded", "fields"):
+                    yield f"{what} warm", wl.LCP(A, b, *sides), method(precision=precision), start
+        for periodic in ((True,) * len(shape), (True,) + (False,) * (len(shape) - 1)):
+            A = wl.GridPoisson(cells, device="cpu", dtype=real, periodic=periodic, **({} if form == "arrays" else faces))
+            for made in (wl.ProjectedMultigrid(), wl.MinimumMapNewton(), wl.MinimumMapNewton(precision="single")):
+                yield f"{name} {form} {real.__name__} periodic {periodic}", wl.LCP(A, b, *bounds["coded twice"]), made, None
+
+
+def other_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
+    """Yield solves of what lies around those: splashes, closed boxes, low rank, other methods on the same kernels."""
+    box, shape = np.full((8, 9, 20), wl.FLUID), (8, 9, 20)
+    b = np.random.default_rng(5).standard_normal(shape)
+    columns = np.zeros((*shape, 2))
+    columns[2, 2:5, 3:7] = np.random.default_rng(7).standard_normal((3, 4, 2))
+    for precision in PRECISIONS[:2]:
+        for method in (wl.ProjectedMultigrid, wl.MinimumMapNewton, MPRGP, wl.InteriorPoint, wl.FischerNewton):
+            made = method(precision=precision)
+            for kind in ("walls", "everywhere", "linear"):
+                yield f"splash 32 {kind}", splash(32).problem(kind, "cpu"), made, None
+            yield "cut splash 32", cut_cells(splash(32)).problem("walls", "cpu"), made, None
+            yield "closed box", wl.LCP(wl.GridPoisson(box, device="cpu"), b - b.mean(), 0.0), made, None
+        low = wl.LowRankOperator(columns, [100.0, 100.0], device="cpu")
+        A = wl.SumOperator(wl.GridPoisson(np.where(b > 1.5, wl.AIR, wl.FLUID), device="cpu"), low)
+        for coupled in (wl.ProjectedMultigrid(precision=precision), wl.MinimumMapNewton(precision=precision)):
+            yield "low rank", wl.LCP(A, b, 0.0), coupled, None
+    for sweeping in (wl.ProjectedSOR(), wl.NNCG()):
+        yield "splash 32 walls", splash(32).problem("walls", "cpu"), sweeping, None
+
+
+def line(what: str, problem: wl.LCP, method: Any, start: Any) -> str:
+    """Solve, and return the line."""
+    result = wl.solve(problem, method, stopping=STOPPING, x0=start)
+    steps = "".join(record.step[0] for record in result.history)
+    norms = np.array([record.residual for record in result.history])
+    called = f"{type(method).__name__} {getattr(method, 'precision', '')}".strip()
+    return f"{what}, {called}: {result.status.name} {steps} {_digest(result.x.numpy())} {_digest(norms)}"
+
+
+def frames(name: str, resolution: int, duration: float) -> str:
+    """Run a scene, and return a line with a digest of its frames."""
+    with tempfile.TemporaryDirectory() as out:
+        scene = load_scene(name, [f"domain.resolution={resolution}", f"time.duration={duration}"])
+        run_scene(scene, Path(out) / "run", device="cpu", observer=Lines(Console(quiet=True)))
+        found = sorted(p for p in Path(out, "run", "frames").rglob("*") if p.is_file())
+        return f"{name}: {len(found)} files {_digest(*(p.read_bytes() for p in found))}"
+
+
+def _digest(*parts: Any) -> str:
+    made = hashlib.sha256()
+    for part in parts:
+        made.update(part if isinstance(part, bytes) else np.ascontiguousarray(part).tobytes())
+    return made.hexdigest()[:12]
+
+
+def main() -> None:
+    """Write the lines."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.bits", description=__doc__)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--part", choices=("small", "other", "frames"), action="append")
+    args = parser.parse_args()
+    parts, lines = args.part or ["small", "other", "frames"], list[str]()
+    for part, solves in (("small", small_solves), ("other", other_solves)):
+        if part in parts:
+            lines += [line(*solve) for solve in solves()]
+    if "frames" in parts:
+        lines += [frames(name, *of) for name, of in SCENES.items()]
+    args.out.write_text("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,29 @@
+// A piece: cells in x that lie side by side. What a cell's address is, is known here and nowhere else.
+struct Piece {
+    long long p;                // element of the first cell
+    int n;                      // cells
+    long long ym, yp, zm, zp;   // offsets to the rows beside it: below and above along y, down and up along z
+    long long ring, down, up;   // of a field that keeps three planes: offset to its place there, and from there to the planes around it
+    long long q;                // element of the other level that holds, or begins, the first cell
+    int k, j, first, row;       // plane, row in it, first cell, counted from 0; row of all
+    int t; bool more;           // place of the thread's sums, and whether something is there already
+};
+const long long places = (L.planes + L.slab - 1)/L.slab*L.rows*L.chunks;  // of the sums of all threads
+const auto over = [](int i, int f) -> long long { return f > 0 ? (long long)i*f : i / -f; };  // along an axis, from level to level
+const auto piece = [&](int k, int j, int c) -> Piece {
+    Piece P; int first = c*L.grain, last = L.nx < first + L.grain ? L.nx : first + L.grain;
+    P.k = k; P.j = j; P.row = k*L.rows + j;
+    if (L.spans.data) {
+        const auto span = L.spans.data[P.row];
+        first = first > span[0] ? first : span[0]; last = last < span[1] ? last : span[1]; }
+    P.first = first; P.n = last > first ? last - first : 0;
+    P.p = L.base + k*L.s1 + j*L.s2 + first;
+    P.ym = -L.s2; P.yp = L.s2; P.zm = -L.s1; P.zp = L.s1;
+    if constexpr (RINGS) {  // the plane below the ring stands below the first plane and above the last one
+        const int slot = k % 3;
+        P.ring = (slot - k)*L.s1;
+        P.down = slot == 0 && k > 0 ? 2*L.s1 : -L.s1;
+        P.up = k == L.planes - 1 ? (-1 - slot)*L.s1 : slot == 2 ? -2*L.s1 : L.s1; }
+    if constexpr (LEVELS) P.q = L.o0 + over(k, L.fz)*L.o1 + over(j, L.fy)*L.o2 + over(first, L.fx);
+    P.t = (k / L.slab*L.rows + j)*L.chunks + c; P.more = k % L.slab > 0;
+    return P; };

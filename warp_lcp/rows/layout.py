@@ -1,0 +1,153 @@
+"""Where rows lie, and the structs that hand stencils and bounds to kernels."""
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from warp_lcp.layout import Padding
+from warp_lcp.native import CPU_CHUNK, grain
+
+# planes that a thread sums over: on CUDA, a place for the sums of every cell would cost more memory than the rest of a method
+PLANES_A_THREAD = {"cpu": 1, "cuda": 16}
+
+
+@wp.struct
+class RowLayout:
+    """Where the rows lie, and how threads share them: a thread takes a chunk of a row in a slab of planes."""
+
+    base: wp.int64  # element of the first cell
+    s1: wp.int64  # elements from plane to plane
+    s2: wp.int64  # elements from row to row
+    nx: int  # cells of a row
+    rows: int  # of a plane
+    planes: int
+    grain: int  # cells that a thread takes
+    chunks: int  # threads of a row
+    slab: int  # planes that a thread takes
+    spans: wp.array2d(dtype=wp.vec2i)  # first and one past the last cell of each row (k, j) that may hold unknowns; null: all
+    o0: wp.int64  # the other level of a transfer: element of its first cell, elements from plane to plane and from row to row
+    o1: wp.int64
+    o2: wp.int64
+    n1: int  # its planes, its rows
+    n2: int
+    fx: int  # cells of it that one of ours stands for; below 0: of ours that one of its stands for
+    fy: int
+    fz: int
+
+
+@wp.struct
+class Bounds:
+    """Bounds of x as `warp_lcp.bounds.Bounds.operands` has them."""
+
+    lower: wp.array(dtype=wp.float64)
+    least: wp.float64
+    upper: wp.array(dtype=wp.float64)
+    most: wp.float64
+    code: wp.array(dtype=wp.uint8)
+
+
+def put(struct: Any, members: Mapping[str, Any]) -> Any:
+    """Set members of a Warp struct whose types have been checked, and return it: in a third of the time that attributes take."""
+    native, known = struct.__ctype__(), struct.__dict__
+    for name, value in members.items():
+        if value is not None:
+            setattr(native, name, value.__ctype__() if hasattr(value, "__ctype__") else getattr(value, "value", value))
+            known[name] = value  # keeps the memory
+    return struct
+
+
+@functools.cache
+def stencil_struct(d: Any, w: Any) -> Any:
+    """Return the struct of a stencil whose diagonal and weights have these types."""
+    members = dict.fromkeys(("unit", "cx", "cy", "cz"), wp.float64) | {"d": wp.array(dtype=d)}
+    return make_struct(f"Stencil_{d.__name__}_{w.__name__}", members | dict.fromkeys(("wx", "wy", "wz"), wp.array(dtype=w)))
+
+
+def make_struct(name: str, members: dict[str, Any]) -> Any:
+    """Return a Warp struct with these members. Make one once: annotations of arrays do not compare equal."""
+    return wp.struct(type(name, (), {"__annotations__": members, "__module__": __name__, "__qualname__": name}))
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The rows that a pass visits.
+
+    Attributes:
+        summed: their layout for a pass that sums.
+        single: their layout for one that does not: a plane a thread.
+        size: elements of a field.
+        other_size: elements of a field of the other level of a transfer; 0: there is none.
+        device: where the fields are.
+    """
+
+    summed: Any
+    single: Any
+    size: int
+    other_size: int
+    device: wp.Device
+
+    @staticmethod
+    def of(padding: Padding, device: wp.Device, spans: Any = None) -> "Rows":
+        """Return the rows of a padded grid, or what their spans have of them."""
+        return Rows._make(padding.size, device, (padding.plane + padding.row + 1, padding.plane, padding.row), padding.counts, spans)
+
+    @staticmethod
+    def beyond(padding: Padding, device: wp.Device, axis: int, end: int) -> "Rows":
+        """Return the ghost cells beside those of a padded grid: beyond the lower (0) or upper (1) side of axis 0, 1, 2 for x, y, z."""
+        strides = (padding.plane, padding.row, 1)
+        counts = [1 if 2 - axis == a else n for a, n in enumerate(padding.counts)]
+        starts = [end * (padding.counts[a] + 1) if 2 - axis == a else 1 for a in range(3)]
+        first = sum(start * stride for start, stride in zip(starts, strides, strict=True))
+        return Rows._make(padding.size, device, (first, padding.plane, padding.row), tuple(counts), None)
+
+    @staticmethod
+    def flat(size: int, device: wp.Device) -> "Rows":
+        """Return a flat field as one row."""
+        return Rows._make(size, device, (0, 0, 0), (1, 1, size), None, cells=1 if device.is_cuda else CPU_CHUNK)
+
+    @staticmethod
+    def _make(size: int, device: wp.Device, strides: Any, counts: Any, spans: Any, cells: int | None = None) -> "Rows":
+        slab, cells = PLANES_A_THREAD["cuda" if device.is_cuda else "cpu"], cells or grain(counts[2], device)
+        names = ("base", "s1", "s2", "planes", "rows", "nx")
+        shared = dict(zip(names, (*strides, *counts), strict=True)) | {"grain": cells, "chunks": -(-counts[2] // cells), "spans": spans}
+        single = put(RowLayout(), shared | {"slab": 1})
+        return Rows(single if slab == 1 else put(RowLayout(), shared | {"slab": slab}), single, size, 0, device)
+
+    def beside(self, other: "Rows", factors: tuple[int, int, int]) -> "Rows":
+        """Return the same rows with another level's beside them.
+
+        Args:
+            other: the rows of that level.
+            factors: cells of it along x, y, z that one of ours stands for; below 0: of ours that one of its stands for.
+        """
+        L, theirs = self.single, other.single
+        members = {name: getattr(L, name) for name in L._cls.vars}
+        members |= {"o0": theirs.base, "o1": theirs.s1, "o2": theirs.s2, "n1": theirs.planes, "n2": theirs.rows}
+        members |= dict(zip(("fx", "fy", "fz"), factors, strict=True))
+        if not self.device.is_cpu and factors[0] < 0:  # a thread takes the cells of one of the other level's
+            members |= {"grain": -factors[0], "chunks": -(L.nx // factors[0])}
+        single = put(RowLayout(), members)
+        summed = single if self.summed is L else put(RowLayout(), members | {"slab": self.summed.slab})
+        return Rows(summed, single, self.size, other.size, self.device)
+
+    @property
+    def places(self) -> int:
+        """How many sums a pass makes of each kind, one a thread."""
+        planes, rows, chunks = threads(self.summed)
+        return planes * rows * chunks
+
+
+@functools.cache
+def no_rows() -> Any:
+    """Return the layout of a pass that is left out."""
+    L = RowLayout()
+    L.slab = 1
+    return L
+
+
+def threads(layout: Any) -> tuple[int, int, int]:
+    """Return the threads of a launch."""
+    return -(-layout.planes // layout.slab), layout.rows, layout.chunks

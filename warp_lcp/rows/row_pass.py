@@ -1,0 +1,329 @@
+# mypy: ignore-errors
+"""Row passes: declared by fields with roles and a C++ row function, launched by name, composed to waves.
+
+A row function sees a piece: pointers to its first cell, the number n of its cells, the offsets ym, yp, zm, zp of the rows beside it.
+"""
+
+import functools
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+
+from warp_lcp.native import C_TYPES
+from warp_lcp.rows.layout import Bounds, RowLayout, Rows, make_struct, no_rows, put, stencil_struct, threads
+
+HEADERS = Path(__file__).parent / "headers"
+C = {**C_TYPES, wp.int8: "signed char", wp.int32: "int", wp.bool: "bool"}
+LARGEST = 4  # passes of a wave
+
+
+@functools.cache
+def text(path: Path) -> str:
+    """Return a header with the headers that it includes. As text, Warp sees changes of it; the compiler still knows file and line."""
+    lines = [f'#line 1 "{path.name}"']
+    for number, line in enumerate(path.read_text().splitlines(), 1):
+        found = re.fullmatch(r'#include "(\w+\.h)"', line)
+        lines += [text(path.with_name(found[1])), f'#line {number + 1} "{path.name}"'] if found else [line]
+    return "\n".join(lines)
+
+
+@wp.struct
+class Nothing:
+    """Fields of a pass that a wave does not have."""
+
+
+@dataclass(frozen=True, eq=False)
+class RowPass:
+    """What is done to the cells of a row.
+
+    Types of fields are Warp's, or letters: a letter stands for one type, that of the arrays given, and is the name of it in the row
+    function. `T` there is the type of computations.
+
+    Args:
+        name: of the kernel, with the area before it: `projected_multigrid.assess`.
+        header: C++ row function.
+        compute: what T stands for.
+        stencil: types of the diagonal and the weights of `stencil.h`, if it has one.
+        bounds: whether it has those of `bounds.h`.
+        reads: fields, pointers to the piece's first cell.
+        writes: likewise, written.
+        ring: which of those keep three planes only; the pointer is to its place there, `down` and `up` lead to the planes around it.
+        other: fields of the other level of a transfer, pointers to the element that belongs to the first cell. Cells belong together in
+            `pairs` along x or not; `deep` planes and `wide` rows of a finer level belong to one of ours.
+        finer: whether the stencil and the offsets are those of the other level, which is finer.
+        by_row: one element a row of the grid: pointers to the first row's; `P.row` counts.
+        whole: small arrays: pointers to the first element.
+        optional: which arrays may be None, or empty: their pointers are null then.
+        numbers: given by the host.
+        sums: variables of the row function that are summed over the cells.
+        constants: integers that are known when the kernel is made, with their usual values.
+    """
+
+    name: str
+    header: Path
+    compute: Any
+    stencil: tuple[Any, Any] | None = None
+    bounds: bool = False
+    reads: Mapping[str, Any] = field(default_factory=dict)
+    writes: Mapping[str, Any] = field(default_factory=dict)
+    ring: tuple[str, ...] = ()
+    other: Mapping[str, Any] = field(default_factory=dict)
+    finer: bool = False
+    by_row: Mapping[str, Any] = field(default_factory=dict)
+    whole: Mapping[str, Any] = field(default_factory=dict)
+    optional: tuple[str, ...] = ()
+    numbers: Mapping[str, Any] = field(default_factory=dict)
+    sums: tuple[str, ...] = ()
+    constants: Mapping[str, int] = field(default_factory=dict)
+
+    @functools.cached_property
+    def arrays(self) -> dict[str, Any]:
+        """Types of all arrays by name; `out` receives the sums, a column each."""
+        out = {"out": wp.float64} if self.sums else {}
+        return {**self.reads, **self.writes, **self.other, **self.by_row, **self.whole, **out}
+
+    def bind(self, rows: Rows, *, stencil: Any = None, bounds: list[Any] | None = None, **given: Any) -> "Bound":
+        """Check and take what a launch needs.
+
+        Args:
+            rows: which rows.
+            stencil: a `warp_lcp.operators.stencil.Stencil`.
+            bounds: operands of a `warp_lcp.bounds.Bounds`.
+            given: arrays, numbers, and constants that are not as usual, by name.
+
+        Raises:
+            TypeError: one is missing, unknown, or of the wrong type.
+            ValueError: an array has the wrong length.
+        """
+        for name, wanted, value in (("stencil", self.stencil, stencil), ("bounds", self.bounds, bounds)):
+            if bool(wanted) != (value is not None):
+                raise TypeError(f"{self.name}: {'needs' if wanted else 'takes no'} {name}")
+        constants = {**self.constants, **{n: int(given.pop(n)) for n in self.constants if n in given}}
+        wanted = {*self.arrays, *self.numbers}
+        if given.keys() != wanted:
+            raise TypeError(f"{self.name}: missing {sorted(wanted - given.keys())}, unknown {sorted(given.keys() - wanted)}")
+        letters = self._letters(stencil, given)
+        self._check_lengths(rows, given)
+        made = _form(self, tuple(sorted(letters.items())), tuple(constants.items()), stencil is not None and stencil.weights is not None)
+        return Bound(made, rows, made.fill(stencil, bounds, given))
+
+    def _letters(self, stencil: Any, given: dict[str, Any]) -> dict[str, Any]:
+        """Find what the letters stand for, and check the types of all arrays."""
+        letters: dict[str, Any] = {}
+        seen: dict[str, str] = {}
+        pairs = [(name, kind, given[name]) for name, kind in self.arrays.items()]
+        if self.stencil is not None:
+            pairs += [("the stencil's d", self.stencil[0], stencil.d)]
+            pairs += [("the stencil's weights", self.stencil[1], stencil.weights[0])] if stencil.weights else []
+        for name, kind, value in pairs:
+            if value is None and name in self.optional:
+                continue
+            found = value.dtype if isinstance(value, wp.array) else type(value)
+            expected = letters.setdefault(kind, found) if isinstance(kind, str) else kind
+            if not isinstance(value, wp.array) or found is not expected:
+                why = f", as {seen[kind]}" if isinstance(kind, str) and kind in seen else ""
+                raise TypeError(f"{self.name}: {name} is {found.__name__}, not an array of {expected.__name__}{why}")
+            seen.setdefault(kind, name)
+        used = {kind for kind in (*self.arrays.values(), *(self.stencil or ())) if isinstance(kind, str)}
+        return letters | dict.fromkeys(used - letters.keys(), wp.float32)  # of what is absent
+
+    def _check_lengths(self, rows: Rows, given: dict[str, Any]) -> None:
+        lengths = dict.fromkeys({**self.reads, **self.writes}, rows.size) | dict.fromkeys(self.other, rows.other_size)
+        lengths |= dict.fromkeys(self.by_row, rows.single.planes * rows.single.rows)
+        for name, length in lengths.items():
+            absent = name in self.optional and (given[name] is None or given[name].size == 0)
+            if not absent and given[name].size != length:
+                raise ValueError(f"{self.name}: {name} has {given[name].size} elements, not {length}")
+        least = len(self.sums) * rows.places
+        if self.sums and given["out"].size < least:
+            raise ValueError(f"{self.name}: out has {given['out'].size} elements, fewer than {least}: {rows.places} threads for each sum")
+
+
+@functools.cache
+def _form(declared: RowPass, letters: Any, constants: Any, variable: bool) -> "Form":
+    return Form(declared, dict(letters), dict(constants), variable=variable)
+
+
+class Form:
+    """A pass whose types and constants are known.
+
+    Attributes:
+        words: what tells it from other forms.
+        fields: struct of its arguments.
+        run: native function (layout, fields, planes k ... end, rows j ... last, chunk).
+    """
+
+    def __init__(self, declared: RowPass, letters: dict[str, Any], constants: dict[str, int], *, variable: bool) -> None:
+        self.declared, self.letters, d = declared, letters, declared
+        of = lambda kind: letters[kind] if isinstance(kind, str) else kind  # noqa: E731
+        differing = [f"{name.lower()}{value}" for name, value in constants.items() if value != d.constants[name]]
+        shape = ["variable" if variable else "uniform"] if d.stencil else []
+        self.words = [*shape, *(t.__name__ for _, t in sorted(letters.items())), *differing]
+        parts = {"stencil": stencil_struct(of(d.stencil[0]), of(d.stencil[1]) if variable else wp.float32)} if d.stencil else {}
+        parts |= {"bounds": Bounds} if d.bounds else {}
+        self.types = {name: of(kind) for name, kind in d.arrays.items()}
+        members = {n: wp.array(dtype=t) for n, t in self.types.items()} | {n: of(t) for n, t in d.numbers.items()}
+        self.fields = Fields = make_struct(f"{d.name.replace('.', '_')}_{'_'.join(self.words)}", parts | members)
+
+        def run(L: RowLayout, given: Fields, k_: int, end_: int, j_: int, last_: int, c_: int): ...
+
+        run.__module__ = f"warp_lcp.{d.name}.{'_'.join(self.words)}"  # apart from other forms, which Warp would take for overloads
+        run.__qualname__ = f"{d.name.rpartition('.')[2]}_rows"
+        self.run = wp.func_native(self._source(letters, constants, variable, of))(run)
+
+    def _source(self, letters: dict[str, Any], constants: dict[str, int], variable: bool, of: Any) -> str:
+        """Return the body: a loop over pieces, in it pointers by name, the shared functions, the row function, the sums."""
+        d = self.declared
+        into = not {*d.ring}.isdisjoint(d.writes)
+        switches = {"RINGS": bool(d.ring), "INTO_RING": into, "LEVELS": bool(d.other), "VARIABLE": variable} | constants
+        head = [f"typedef {C[t]} {n};" for n, t in letters.items()] + [f"typedef {C[of(d.compute)]} T;"] * ("T" not in letters)
+        head += [f"constexpr int {n} = {int(v)};" for n, v in switches.items()]
+        at = {n: " + p + P.ring" if n in d.ring else " + p" for n in (*d.reads, *d.writes)} | dict.fromkeys(d.other, " + P.q")
+        each = ["const Piece P = piece(k_i, j_i, c_); const int n = P.n; const long long p = P.p;"]
+        each += [f"const long long yp = {'L.o2' if d.finer else 'P.yp'}, zp = {'L.o1' if d.finer else 'P.zp'};"]
+        each += [f"const long long ym = {'-yp' if d.finer else 'P.ym'}, zm = {'-zp' if d.finer else 'P.zm'};"]
+        each += ["const long long down = P.down, up = P.up;" if d.ring and not into else "const long long down = zm, up = zp;"]
+        if d.other:
+            each += ["const bool pairs = L.fx > 1 || L.fx < -1; const int deep = L.fz == 1 || 2*P.k + 2 > L.n1 ? 1 : 2;"]
+            each += ["const int wide = L.fy == 1 || 2*P.j + 2 > L.n2 ? 1 : 2;"]
+        for n in (n for n in d.arrays if n != "out"):
+            pointer = f"given.{n}.data{at.get(n, '')}"
+            pointer = f"given.{n}.data ? {pointer} : nullptr" if n in d.optional else pointer
+            each += [f"{'const ' * (n in d.reads)}auto* {n} = {pointer};"]
+        each += [f"const auto {n} = given.{n};" for n in d.numbers]
+        if d.stencil:
+            each += [f"const auto* {n} = given.stencil.{n}.data + {'P.q' if d.finer else 'p'};" for n in ("d", "wx", "wy", "wz")]
+            each += [f"const T {n} = (T)given.stencil.{n};" for n in ("unit", "cx", "cy", "cz")]
+        sums = [f"const double all_[] = {{{', '.join(f'(double){s}' for s in d.sums)}}}; double* sums_ = given.out.data + P.t;"]
+        sums += [f"for (int s = 0; s < {len(d.sums)}; ++s, sums_ += places) *sums_ = P.more ? all_[s] + *sums_ : all_[s];"]
+        shared = [text(HEADERS / h) for h, used in (("stencil.h", d.stencil), ("bounds.h", d.bounds)) if used]
+        loops = ["for (int k_i = k_ < 0 ? 0 : k_; k_i < end_ && k_i < L.planes; ++k_i)", "for (int j_i = j_; j_i < last_; ++j_i) {"]
+        before = [text(HEADERS / "native.h"), '#line 1 "types"', *head, text(HEADERS / "piece.h"), '#line 1 "fields"', *loops, *each]
+        return "\n".join(["", *before, *shared, text(d.header), '#line 1 "sums"', *(sums if d.sums else []), "}", ""])
+
+    def alike(self, declared: RowPass) -> "Form":
+        """Return another pass without a stencil in the form that has the same types."""
+        letters = {kind: self.letters[kind] for kind in declared.arrays.values() if isinstance(kind, str)}
+        return _form(declared, tuple(sorted(letters.items())), tuple(declared.constants.items()), False)
+
+    def fill(self, stencil: Any, bounds: Any, given: dict[str, Any]) -> Any:
+        """Return the struct of arguments."""
+        F = self.fields()
+        if stencil is not None:
+            put(F, {"stencil": stencil.struct})
+        if bounds is not None:
+            put(F, {"bounds": put(Bounds(), dict(zip(("lower", "least", "upper", "most", "code"), bounds, strict=True)))})
+        return put(F, given)
+
+    @functools.cached_property
+    def kernel(self) -> Any:
+        """The kernel of the pass alone."""
+        run, Fields = self.run, self.fields
+
+        def alone(L: RowLayout, F: Fields):
+            i, j, c = wp.tid()
+            run(L, F, i * L.slab, (i + 1) * L.slab, j, j + 1, c)
+
+        return _make_kernel(alone, self.declared.name, run.module.name)
+
+
+@dataclass(frozen=True)
+class Bound:
+    """A pass with its arguments."""
+
+    form: Form
+    rows: Rows
+    fields: Any
+
+    @property
+    def layout(self) -> Any:
+        """Where the rows are."""
+        return self.rows.summed if self.form.declared.sums else self.rows.single
+
+    def launch(self, launch: Any = wp.launch) -> None:
+        """Launch the pass, or record it."""
+        launch(self.form.kernel, threads(self.layout), [self.layout, self.fields], device=self.rows.device)
+
+
+class Wave:
+    """Passes each of which follows some planes behind the one before: one CPU thread streams through memory once; on CUDA, launches.
+
+    Args:
+        name: of the kernel, as a pass has one.
+        stages: passes, each with how many planes it is behind the first.
+    """
+
+    def __init__(self, name: str, *stages: tuple[RowPass, int]) -> None:
+        self.name, self.stages = name, stages
+
+    def launch(self, *passes: Bound | None, launch: Any = wp.launch) -> None:
+        """Launch the passes, or record them; None leaves one out, and no other kernel is needed for the rest."""
+        declared = tuple(stage for stage, _ in self.stages)
+        given = [b for b in passes if b is not None]
+        if len(passes) != len(declared) or any(b and b.form.declared is not stage for b, stage in zip(passes, declared, strict=True)):
+            raise TypeError(f"{self.name}: takes {', '.join(stage.name for stage in declared)}, in this order")
+        if given[0].rows.device.is_cuda:
+            for bound in given:
+                bound.launch(launch)
+            return
+        forms = tuple(b.form if b else given[0].form.alike(stage) for b, stage in zip(passes, declared, strict=True))
+        inputs: list[Any] = []
+        for b, form in zip(passes, forms, strict=True):
+            inputs += [b.layout, b.fields] if b else [no_rows(), form.fields()]
+        inputs += [no_rows(), Nothing()] * (LARGEST - len(passes))
+        kernel = _wave_kernel(self.name, forms, tuple(lag for _, lag in self.stages))
+        launch(kernel, 1, inputs, device=given[0].rows.device)
+
+
+@wp.func
+def plane_after(L: RowLayout, i: int):
+    """Plane whose turn it is once plane i of the wave is done; on a coarser level, when its last finer one is; -1: none."""
+    k = i
+    if L.fz > 1:
+        k = i // L.fz
+        if (i + 1) % L.fz != 0 and i != L.n1 - 1:
+            k = -1
+    return k
+
+
+@wp.func
+def nothing(L: RowLayout, F: Nothing, k: int, end: int, j: int, last: int, c: int):
+    """Stand for a pass that a wave does not have."""
+
+
+@functools.cache
+def _wave_kernel(name: str, forms: tuple[Form, ...], lags: tuple[int, ...]) -> Any:
+    first, second, third, fourth = (*(f.run for f in forms), *(nothing,) * (LARGEST - len(forms)))
+    One, Two, Three, Four = (*(f.fields for f in forms), *(Nothing,) * (LARGEST - len(forms)))
+    _, two, three, four = (*lags, *(0,) * (LARGEST - len(lags)))
+    most = max(lags)
+    letters: dict[str, Any] = {}
+    for form in forms:
+        for letter, kind in form.letters.items():
+            if letters.setdefault(letter, kind) is not kind:
+                raise TypeError(f"{name}: {letter} is {kind.__name__} in {form.declared.name}, {letters[letter].__name__} before")
+    types = [kind.__name__ for _, kind in sorted(letters.items())]
+    words = dict.fromkeys([word for f in forms for word in f.words if word not in types])
+    shape = [word for word in words if word in ("uniform", "variable")]
+    variant = "_".join([*shape, *types, *(word for word in words if word not in shape)])
+
+    def wave(L1: RowLayout, F1: One, L2: RowLayout, F2: Two, L3: RowLayout, F3: Three, L4: RowLayout, F4: Four):
+        for s in range(wp.max(L1.planes, L2.planes) + most):
+            first(L1, F1, s, s + 1, 0, L1.rows, 0)
+            k = plane_after(L2, s - two)
+            second(L2, F2, k, k + 1, 0, L2.rows, 0)
+            k = plane_after(L3, s - three)
+            third(L3, F3, k, k + 1, 0, L3.rows, 0)
+            k = plane_after(L4, s - four)
+            fourth(L4, F4, k, k + 1, 0, L4.rows, 0)
+
+    return _make_kernel(wave, name, f"warp_lcp.{name}.{variant}")
+
+
+def _make_kernel(function: Any, name: str, module: str) -> Any:
+    function.__name__ = function.__qualname__ = name.rpartition(".")[2]
+    return wp.kernel(enable_backward=False, module=module)(function)
