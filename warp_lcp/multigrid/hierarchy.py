@@ -12,18 +12,9 @@ import warp as wp
 
 from warp_lcp.layout import Padding, zeros
 from warp_lcp.multigrid import coarsen_kernels as kernels
+from warp_lcp.multigrid import cycle_passes as passes
 from warp_lcp.multigrid.coarsen_kernels import UNBOUNDED
 from warp_lcp.multigrid.cycle_kernels import Aggregates, cycle_kernels
-from warp_lcp.multigrid.cycle_passes import (
-    ASCEND,
-    COARSE_BOUNDS,
-    CORRECT,
-    DESCEND,
-    RESTRICT,
-    SWEEP,
-    SWEEP_INTO_RING,
-    SWEEP_OUT_OF_RING,
-)
 from warp_lcp.multigrid.renew_kernels import renew_kernels
 from warp_lcp.multigrid.shared_levels import share_changes, whole_counts
 from warp_lcp.multigrid.small_levels import SmallLevels, first_small
@@ -124,7 +115,7 @@ class Level:
         return [s.d.reshape(shape), *((w.reshape(shape) for w in s.weights) if s.weights else (empty,) * 3)]
 
     def sweeping(
-        self, y: wp.array[Any], x: wp.array[Any], omega: float, *, projected: bool, from_zero: bool = False, kind: RowPass = SWEEP
+        self, y: wp.array[Any], x: wp.array[Any], omega: float, *, projected: bool, from_zero: bool = False, kind: RowPass = passes.SWEEP
     ) -> Bound:
         """Return the pass that `sweep` launches, or one of its kind that goes into or out of a ring."""
         fields = {"x": x, "y": y, "b": self.b, "lower": self.lower, "upper": self.upper}
@@ -386,9 +377,9 @@ class Hierarchy:
         """Correct a level from the next one, and sweep it."""
         L = self.levels[level]
         if self._fuses(L):
-            ASCEND.launch(*self._ascent(level, projected=projected), launch=launch)
+            passes.ASCEND.launch(*self._ascent(level, projected=projected), launch=launch)
         else:
-            self._correct(level, launch, projected=projected)
+            self._correcting(level, projected=projected).launch(launch)
             self._pair(L, launch, reverse=True, projected=projected)
 
     def _visits(self, level: int) -> int:
@@ -402,19 +393,16 @@ class Hierarchy:
     def _descending_leg(self, level: int, launch: Launch, *, projected: bool, from_zero: bool) -> None:
         """Sweeps, residual and restriction in one launch of one CPU thread."""
         L, (first, second) = self.levels[level], self.settings.weights
-        into_ring = L.sweeping(L.t, L.x, first, projected=projected, from_zero=from_zero, kind=SWEEP_INTO_RING)
-        out_of_ring = L.sweeping(L.x, L.t, second, projected=projected, kind=SWEEP_OUT_OF_RING)
-        DESCEND.launch(into_ring, out_of_ring, self._restricting(level), launch=launch)
+        into_ring = L.sweeping(L.t, L.x, first, projected=projected, from_zero=from_zero, kind=passes.SWEEP_INTO_RING)
+        out_of_ring = L.sweeping(L.x, L.t, second, projected=projected, kind=passes.SWEEP_OUT_OF_RING)
+        passes.DESCEND.launch(into_ring, out_of_ring, self._restricting(level), launch=launch)
 
     def _ascent(self, level: int, *, projected: bool) -> tuple[Bound, ...]:
         """Return the passes of a leg up: correction and sweeps."""
         L, (first, second) = self.levels[level], reversed(self.settings.weights)
-        into_ring = L.sweeping(L.t, L.x, first, projected=projected, kind=SWEEP_INTO_RING)
-        return (
-            self._correcting(level, projected=projected),
-            into_ring,
-            L.sweeping(L.x, L.t, second, projected=projected, kind=SWEEP_OUT_OF_RING),
-        )
+        into_ring = L.sweeping(L.t, L.x, first, projected=projected, kind=passes.SWEEP_INTO_RING)
+        out_of_ring = L.sweeping(L.x, L.t, second, projected=projected, kind=passes.SWEEP_OUT_OF_RING)
+        return self._correcting(level, projected=projected), into_ring, out_of_ring
 
     def _solve_coarsest(self, launch: Launch, *, projected: bool, from_zero: bool) -> None:
         """Multiply by the inverse; projected sweeps stand for that where there are bounds."""
@@ -443,31 +431,26 @@ class Hierarchy:
         L.sweep(L.x, L.t, second, projected=projected, launch=launch)
 
     def _restrict(self, level: int, launch: Launch) -> None:
-        L = self.levels[level]
-        L.stencil.wrap(L.x, launch=launch)
+        self.levels[level].stencil.wrap(self.levels[level].x, launch=launch)
         self._restricting(level).launch(launch)
 
     def _restrict_bounds(self, level: int, launch: Launch) -> None:
         L, C = self.levels[level], self.levels[level + 1]
         rows, scale = C.stencil.rows.beside(L.stencil.rows, C.factors), self.settings.over_correction
         fields = {"x": L.x, "lower": L.lower, "upper": L.upper, "coarse_lower": C.lower, "coarse_upper": C.upper}
-        COARSE_BOUNDS.bind(rows, stencil=L.stencil, scale=scale, **fields).launch(launch)
-
-    def _correct(self, level: int, launch: Launch, *, projected: bool) -> None:
-        self._correcting(level, projected=projected).launch(launch)
+        passes.COARSE_BOUNDS.bind(rows, stencil=L.stencil, scale=scale, **fields).launch(launch)
 
     def _restricting(self, level: int) -> Bound:
         L, C = self.levels[level], self.levels[level + 1]
         rows = C.stencil.rows.beside(L.stencil.rows, C.factors)
-        return RESTRICT.bind(rows, stencil=L.stencil, x=L.x, b=L.b, coarse=C.b)
+        return passes.RESTRICT.bind(rows, stencil=L.stencil, x=L.x, b=L.b, coarse=C.b)
 
     def _correcting(self, level: int, *, projected: bool) -> Bound:
         L, C = self.levels[level], self.levels[level + 1]
         fx, fy, fz = C.factors
         rows, scale = L.stencil.rows.beside(C.stencil.rows, (-fx, -fy, -fz)), self.settings.over_correction
-        return CORRECT.bind(
-            rows, stencil=L.stencil, x=L.x, coarse=C.x, lower=L.lower, upper=L.upper, scale=scale, projected=projected
-        )  # fmt: skip
+        fields = {"x": L.x, "coarse": C.x, "lower": L.lower, "upper": L.upper}
+        return passes.CORRECT.bind(rows, stencil=L.stencil, scale=scale, projected=projected, **fields)
 
     def _coarser(self, fine: Level, *, bounded: bool) -> Level:
         """Return the next level: aggregates of two cells along every axis, or along the strong ones only where axes differ much."""

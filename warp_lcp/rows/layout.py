@@ -59,6 +59,14 @@ def put(struct: Any, members: Mapping[str, Any]) -> Any:
     return struct
 
 
+def copy_of(struct: Any) -> Any:
+    """Return a copy of a Warp struct, in a fraction of the time that it takes to make one with others in it."""
+    native = struct.__ctype__()
+    made = object.__new__(type(struct))
+    made.__dict__.update(struct.__dict__, _ctype=type(native).from_buffer_copy(native))
+    return made
+
+
 @functools.cache
 def stencil_struct(d: Any, w: Any) -> Any:
     """Return the struct of a stencil whose diagonal and weights have these types."""

@@ -14,11 +14,14 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.native import C_TYPES
-from warp_lcp.rows.layout import Bounds, RowLayout, Rows, make_struct, no_rows, put, stencil_struct, threads
+from warp_lcp.rows.layout import Bounds, RowLayout, Rows, copy_of, make_struct, no_rows, put, stencil_struct, threads
 
 HEADERS = Path(__file__).parent / "headers"
 C = {**C_TYPES, wp.int8: "signed char", wp.int32: "int", wp.bool: "bool"}
 LARGEST = 4  # passes of a wave
+
+
+NO_BOUNDS = Bounds()
 
 
 @functools.cache
@@ -171,6 +174,7 @@ class Form:
 
         def run(L: RowLayout, given: Fields, k_: int, end_: int, j_: int, last_: int, c_: int): ...
 
+        self._blank = Fields()
         run.__module__ = f"warp_lcp.{d.name}.{'_'.join(self.words)}"  # apart from other forms, which Warp would take for overloads
         run.__qualname__ = f"{d.name.rpartition('.')[2]}_rows"
         self.run = wp.func_native(self._source(letters, constants, variable, of))(run)
@@ -212,11 +216,11 @@ class Form:
 
     def fill(self, stencil: Any, bounds: Any, given: dict[str, Any]) -> Any:
         """Return the struct of arguments."""
-        F = self.fields()
+        F = copy_of(self._blank)
         if stencil is not None:
             put(F, {"stencil": stencil.struct})
         if bounds is not None:
-            put(F, {"bounds": put(Bounds(), dict(zip(("lower", "least", "upper", "most", "code"), bounds, strict=True)))})
+            put(F, {"bounds": put(copy_of(NO_BOUNDS), dict(zip(("lower", "least", "upper", "most", "code"), bounds, strict=True)))})
         return put(F, given)
 
     @functools.cached_property
