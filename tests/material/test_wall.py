@@ -132,6 +132,27 @@ def test_spray_beyond_one_layer_keeps_its_own_velocity() -> None:
     assert v[6, 3] == -2.0  # what follows is extrapolated from both
 
 
+def test_spray_above_each_other_in_3d_keeps_its_own_velocity() -> None:
+    """As `test_spray_beyond_one_layer_keeps_its_own_velocity`, with z upwards, along which a window is launched in planes."""
+    grid = StaggeredGrid((5, 5, 12), 0.1, 3, "cpu")
+    kind = np.full(grid.shape, SOLID, np.int8)
+    kind[1:-1, 1:-1, 1:-1] = AIR
+    kind[1, 1:-1, 1:-1] = FLUID
+    velocity, weights, known = grid.faces(), grid.faces(), grid.faces(wp.int8)
+    for axis in range(3):
+        below = np.roll(kind, 1, 2 - axis)
+        projected = (kind != SOLID) & (below != SOLID) & ((kind == FLUID) | (below == FLUID))
+        known[axis].assign(np.where((kind == SOLID) & (below == SOLID), -1, projected).astype(np.int8))
+    drops = range(4, 12)
+    for plane in drops:
+        velocity[2].numpy()[plane, 3, 3] = -plane
+        weights[2].numpy()[plane, 3, 3] = 1.0
+    index = wp.array(np.where(kind == SOLID, 0, -1).astype(np.int32), device="cpu")
+    walls = [wp.array(kind, device="cpu"), grid.field(wp.uint8), index, wp.array([1], dtype=wp.uint8, device="cpu")]
+    extend_velocity(grid.everywhere, velocity, weights, known, *walls, [], 12)
+    assert [velocity[2].numpy()[plane, 3, 3] for plane in drops] == [-plane for plane in drops]
+
+
 def test_a_closed_face_is_no_source_of_spray() -> None:
     air = Air(cells(*((x, 0) for x in range(5))), (0.0, 0.0))
     air.velocity[0].numpy()[1, 6, 1] = 3.0
