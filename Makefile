@@ -8,17 +8,19 @@ OUT ?= out/dam-break
 # Processes that run the tests.
 WORKERS ?= 2
 
-.PHONY: demo test test-distributed slow fuzz mutants docs wheel-check clean
+.PHONY: demo test check test-distributed slow fuzz mutants docs wheel-check clean
 
 demo: $(VENV)/.run
 	$(BIN)/warp-lcp run dam-break --out $(OUT) --force $(DEMO_ARGS)
 
-test: $(VENV)/.dev
+test: check
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal $(PYTEST_ARGS)
+
+check: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal $(PYTEST_ARGS)
 
 # The tests on several ranks, in an environment of the system's Python with Debian's MPI and PETSc (installed by apt-get if this is root).
 test-distributed:

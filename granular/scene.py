@@ -42,7 +42,7 @@ Angle = Annotated[float, Field(gt=0, lt=60)]
 class SandTime(Time):
     """[time], with steps short enough for sand: what moves further than a cell a step packs unevenly."""
 
-    cfl: float = Field(default=0.8, gt=0, description="a Courant number, usually 0.5 to 1")
+    cfl: float = Field(default=0.8, ge=1e-3, description="a Courant number, usually 0.5 to 1")
     dt_max: float = Field(default=5e-3, gt=0, description="the longest step [s]")
 
 

@@ -161,7 +161,7 @@ def test_a_rank_that_fails_alone_ends_the_others(run, tmp_path, trouble, expecte
 WRONG = {  # commands, with what is said of each
     "run dots.toml --out out": "holds a run already",
     "run dots.toml --out out --resume --force": "choose one",
-    "run dots.toml --out out --set time.cfl=0": "time.cfl = 0: must be greater than 0",
+    "run dots.toml --out out --set time.cfl=0": "time.cfl = 0: must be at least 0.001",
     "run dots.toml --out out --force --set output.surface_ply=true": "output.surface_ply = true: ",
     "run dots.toml --out out --force --record-problems problems": "--record-problems: not with --engine petsc",
     "DOTS_REFUSE=liquid[0] run dots.toml --out out --force": "dots: liquid[0]",

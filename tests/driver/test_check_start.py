@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +57,16 @@ def test_what_a_run_refuses_at_its_start_check_refuses_with_the_same_words(table
     with pytest.raises(SceneError, match=message):
         start(load_scene(scene), "cpu")
     assert checked.stderr and ran.stderr.endswith(checked.stderr)
+
+
+def test_both_name_the_shape_whose_mesh_is_open(tmp_path: Path) -> None:
+    (tmp_path / "sheet.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    pool = {"shape": "box", "min": [0.0, 0.0, 0.0], "max": [1.0, 0.3, 1.0]}
+    domain, solid = {"size": [1.0, 1.0, 1.0]}, [{"shape": "mesh", "file": "sheet.obj"}]
+    scene = written(tmp_path / "scene.toml", [pool], domain=domain, solid=solid)
+    for result in (call("check", scene), call("run", scene, "--out", tmp_path / "out")):
+        assert result.exit_code == cli.WRONG_INPUT
+        assert re.search(r"solid\[0\]: \S*sheet.obj: the surface is not closed", result.stderr)
 
 
 def test_check_says_what_a_run_says(tmp_path: Path) -> None:

@@ -108,13 +108,25 @@ def test_frames_without_checkpoints_and_log_are_not_thrown_away(out, scene_file)
     assert frames(out, "grid") == [0, 1, 2, 3]
 
 
-def test_files_that_say_what_ran(out, scene_file):
+@pytest.mark.parametrize("record", ["{", "[]", '{"steps": "many"}', '{"overrides": 3}', '{"overrides": ["a"]}', '{"mesh_files": [1]}'])
+def test_files_that_say_what_ran(out, scene_file, record):
     (out / "scene.toml").unlink()
-    (out / "run.json").write_text("{")
+    (out / "run.json").write_text(record)
     result = CliRunner().invoke(cli.app, ["run", str(scene_file), "--resume", "--out", str(out), "--device", "cpu", "--frames", "9"])
     assert result.exit_code == 0, result.stderr
     assert "run.json: was missing or damaged" in result.stderr
     assert "scene.toml: was missing or damaged" in result.stderr
+
+
+@pytest.mark.parametrize("name", ["log.csv", "scene.toml", "frames", "checkpoints"])
+def test_a_folder_in_the_place_of_a_file_or_a_file_in_that_of_a_folder(out, scene_file, name):
+    path = out / name
+    kind = "a file where a run has a folder" if path.is_dir() else "a folder where a run has a file"
+    path.rename(out.parent / "aside")
+    path.mkdir() if path.suffix else path.touch()
+    result = CliRunner().invoke(cli.app, ["run", str(scene_file), "--resume", "--out", str(out), "--device", "cpu", "--frames", "9"])
+    assert result.exit_code == 2
+    assert f"{path}: is {kind}; move it away" in result.stderr
 
 
 @pytest.mark.parametrize("seed", [*range(8800, 8806), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(8806, 8900))])

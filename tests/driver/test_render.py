@@ -1,5 +1,6 @@
 """Images of a run. What needs pyvista is skipped where it is missing."""
 
+import re
 import sys
 from pathlib import Path
 
@@ -163,6 +164,18 @@ def test_a_sheet_shows_evenly_spaced_frames(pyvista, make_run):
     frames = spread(range(8), 6)
     assert frames == [0, 1, 3, 4, 6, 7]
     np.testing.assert_allclose(np.array(areas) / areas[0], np.array(frames) + 1, rtol=0.25)
+
+
+@pytest.mark.parametrize(("rate", "label"), [(20, "t = 0.05 s"), (100, "t = 0.01 s"), (1000, "t = 0.001 s")])
+def test_each_picture_tells_its_own_time(pyvista, make_run, monkeypatch, rate, label):
+    folder = make_run([drops(1), drops(1)])
+    text = folder / "scene.toml"
+    text.write_text(re.sub(r"frames_per_second = [0-9.]+", f"frames_per_second = {rate}", text.read_text()))
+    page, texts = Page(Recording(folder, Color.SPEED), (400, 300), 2, Stage), []
+    monkeypatch.setattr(page, "_write", lambda pen, text, x, y, anchor: texts.append(text) or x)
+    page.draw([0, 1])
+    page.painter.close()
+    assert label in texts
 
 
 def test_discs_have_the_size_of_the_particles(pyvista, make_run):

@@ -54,6 +54,17 @@ def test_particles_are_near_the_surface_only(dimension):
     assert simulation.surface.volume(0) == pytest.approx(everywhere.surface.volume(0), rel=1e-6)
 
 
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_particles_below_the_band_are_around_solids_inside_only(dimension):
+    """And not along the domain's walls, whichever side they are on."""
+    center, radius = np.array([0.5, 0.3, 0.25])[:dimension], 0.08
+    simulation = tank(dimension, solid=[{"shape": "sphere", "center": center.tolist(), "radius": radius}])
+    assert simulation.boundary.distance is not None
+    held = (np.argwhere(counts(simulation)[:, :19] > 0)[:, ::-1][:, :dimension] + 0.5) / 32
+    gap = 32 * (np.linalg.norm(held - center, axis=1) - radius)
+    assert 4.0 < gap.max() < 1.0 + WIDTH + 1.0
+
+
 def test_nothing_is_there_without_the_table():
     """No field, no column, no entry of the state."""
     simulation = tank(particles={})

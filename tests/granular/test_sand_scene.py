@@ -69,7 +69,7 @@ def complaint(tmp_path: Any, *overrides: str) -> str:
         ("solver.tolerance=auto", 'solver.tolerance = "auto": is for liquids only'),
         ("solver.max_iterations=0", "solver.max_iterations = 0: must be at least 10"),
         ("solver.precision=double", "solver.precision = \"double\": must be 'single'"),
-        ("time.cfl=0", "time.cfl = 0: must be greater than 0"),
+        ("time.cfl=0", "time.cfl = 0: must be at least 0.001"),
         ("pressure.model=unilateral", 'pressure: needs scene.simulator = "fluids"'),
         ("liquid=[]", "--set liquid=[]: must read section.key=value"),
     ],

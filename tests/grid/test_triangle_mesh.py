@@ -141,8 +141,8 @@ def test_winding_number_counts():
 
 def test_thickness():
     surface = close_surface(CUBE * [1.0, 0.05, 1.0], CUBE_TRIANGLES, "plate")
-    assert surface.thin_fraction(0.06, CPU) == pytest.approx(2.0 / 2.2, abs=1e-3)  # all but the narrow sides
-    assert surface.thin_fraction(0.04, CPU) == 0.0
+    assert surface.thin_fraction(0.05002, CPU) == pytest.approx(2.0 / 2.2, abs=1e-3)  # all but the narrow sides
+    assert surface.thin_fraction(0.04998, CPU) == 0.0
 
 
 # --- files ---

@@ -3,7 +3,7 @@ import pytest
 import warp as wp
 
 from warp_lcp import AIR, FLUID, SOLID
-from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.contact import HELD, RELEASED
 from warp_lcp.material.wall import extend_velocity
 
@@ -130,6 +130,27 @@ def test_spray_beyond_one_layer_keeps_its_own_velocity() -> None:
     assert v[3, 3] == 0.0  # the first layer above the pool's own faces
     assert v[5, 3] == -2.0
     assert v[6, 3] == -2.0  # what follows is extrapolated from both
+
+
+def test_spray_above_each_other_in_3d_keeps_its_own_velocity() -> None:
+    """As `test_spray_beyond_one_layer_keeps_its_own_velocity`, with z upwards, in a window of some planes."""
+    grid = StaggeredGrid((5, 5, 12), 0.1, 3, "cpu")
+    kind = np.full(grid.shape, SOLID, np.int8)
+    kind[1:-1, 1:-1, 1:-1] = AIR
+    kind[1, 1:-1, 1:-1] = FLUID
+    velocity, weights, known = grid.faces(), grid.faces(), grid.faces(wp.int8)
+    for axis in range(3):
+        below = np.roll(kind, 1, 2 - axis)
+        projected = (kind != SOLID) & (below != SOLID) & ((kind == FLUID) | (below == FLUID))
+        known[axis].assign(np.where((kind == SOLID) & (below == SOLID), -1, projected).astype(np.int8))
+    drops = range(4, 12)
+    for plane in drops:
+        velocity[2].numpy()[plane, 3, 3] = -plane
+        weights[2].numpy()[plane, 3, 3] = 1.0
+    index = wp.array(np.where(kind == SOLID, 0, -1).astype(np.int32), device="cpu")
+    walls = [wp.array(kind, device="cpu"), grid.field(wp.uint8), index, wp.array([1], dtype=wp.uint8, device="cpu")]
+    extend_velocity(Window((3, 0, 0), grid.shape, grid.everywhere.device), velocity, weights, known, *walls, [], 12)
+    assert [velocity[2].numpy()[plane, 3, 3] for plane in drops] == [-plane for plane in drops]
 
 
 def test_a_closed_face_is_no_source_of_spray() -> None:

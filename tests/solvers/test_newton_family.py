@@ -65,6 +65,27 @@ def test_equations_alone_are_a_linear_solve(method):
     np.testing.assert_allclose(result.x.numpy(), np.linalg.solve(A, -b), atol=1e-7)
 
 
+@pytest.mark.parametrize("kink", KINKS)
+def test_one_unknown(kink):
+    """Directions of norm 1 and units of 1: guards that compare with another number than 0 would see them."""
+    for a, b, expected in ((1.0, -3.0, 3.0), (1.0, 2.0, 0.0), (4.0, -2.0, 0.5)):
+        result = wl.solve(dense(np.array([[a]]), np.array([b])), FischerNewton(kink=kink), stopping=TIGHT)
+        assert result and result.x.numpy() == pytest.approx([expected], abs=1e-9)
+
+
+def test_finite_differences_step_on_a_grid_with_walls_as_on_the_matrix_of_its_unknowns():
+    rng = np.random.default_rng(2219)
+    cells = rng.choice(3, (6, 7, 5), p=[0.2, 0.6, 0.2])
+    fluid, b = cells.ravel() == wl.FLUID, rng.standard_normal(cells.shape)
+    matrix = scipy.sparse.csr_array(assemble(cells)[np.ix_(fluid, fluid)])
+    method = FischerNewton(kink="approximation")
+    grid = wl.solve(wl.LCP(wl.GridPoisson(cells, device="cpu"), b), method, stopping=TIGHT)
+    unknowns = wl.solve(wl.LCP(wl.SparseOperator(matrix, device="cpu"), b.ravel()[fluid]), method, stopping=TIGHT)
+    assert grid and unknowns
+    assert (grid.iterations, grid.linear_iterations) == (unknowns.iterations, unknowns.linear_iterations)
+    np.testing.assert_allclose(grid.x.numpy().ravel()[fluid], unknowns.x.numpy(), atol=1e-8)
+
+
 @pytest.mark.parametrize("method", [InteriorPoint(), InteriorPoint(precision="double"), FischerNewton(), FischerNewton(share=0.95)])
 @pytest.mark.parametrize("upper", [np.inf, 0.4])
 def test_grid_against_a_dense_matrix(method, upper, device):

@@ -64,6 +64,7 @@ def start(scene: Scene, device: str) -> Simulation:
     try:
         return simulators()[scene.scene.simulator].create(scene, device=device, folder=Path.cwd())
     except ValueError as error:
+        check_shapes(scene, scene.scene.name)  # whose message names the shape
         raise SceneError(scene.scene.name, [Problem("", str(error))]) from error
 
 

@@ -86,5 +86,4 @@ def _noted(source: str, overrides: Sequence[str]) -> Overrides:
 
 def _recorded(folder: Path) -> Overrides:
     """Return what run.json says of the overrides; nothing if it cannot be read."""
-    found = read_record(folder).get("overrides")
-    return [entry for entry in found if isinstance(entry, dict) and isinstance(entry.get("set"), str)] if isinstance(found, list) else []
+    return [entry for entry in read_record(folder).get("overrides", []) if "set" in entry]

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing, nullcontext
 from pathlib import Path
 
-from warp_lcp.driver.check import check_memory
+from warp_lcp.driver.check import check_memory, start
 from warp_lcp.driver.checkpoint import PIECES, Checkpoint
 from warp_lcp.driver.frames import frame_bytes
 from warp_lcp.driver.interruption import Interrupted
@@ -33,7 +33,6 @@ from warp_lcp.driver.simulator import (
     StepFailed,
     Surface,
     Volume,
-    simulators,
 )
 from warp_lcp.driver.table import Problem, SceneError
 
@@ -166,8 +165,8 @@ def run_in_folder(
 def _create(folder: RunFolder, device: str, continued: Continuation | None) -> tuple[Simulation, list[str]]:
     """Return the simulation where the run begins or goes on, and what it has to say."""
     scene = folder.scene
+    simulation = start(scene, device)
     try:
-        simulation = simulators()[scene.scene.simulator].create(scene, device=device, folder=Path.cwd())
         notes: list[str] = []
         if continued and continued.checkpoint:
             state = continued.checkpoint.state

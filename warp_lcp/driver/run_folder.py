@@ -10,8 +10,11 @@ import tomllib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field
+from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_type_hints
+
+from pydantic import TypeAdapter
 
 from warp_lcp.driver.atomic import SPARE, SUFFIX, make_folder, reserve, sync_folder, write_text
 from warp_lcp.driver.checkpoint import CHECKPOINT_FILE, REFUSED_FILE, Checkpoint, CheckpointFolder
@@ -294,12 +297,16 @@ class RunFolder:
     def _check_run(self) -> None:
         if not holds_run(self.path):
             raise OutputError(f"{self.path}: there is no run to resume")
+        wrong = [self.path / name for name in OWN_FOLDERS if (self.path / name).exists() and not (self.path / name).is_dir()]
+        wrong += [path for path in (self.path / RECORD, self.path / SCENE, self.log) if path.is_dir()]
+        if wrong:
+            kind = "is a folder where a run has a file" if wrong[0].is_dir() else "is a file where a run has a folder"
+            raise OutputError(f"{wrong[0]}: {kind}; move it away")
 
     def _check_same_scene(self) -> None:
         """Refuse other values of keys that must not change, and mesh files that hold something else."""
         before, now = recorded_keys(self.path / SCENE), keys(self.scene)
-        known = read_record(self.path).get("mesh_files")
-        files = known if isinstance(known, dict) else {}
+        files = read_record(self.path).get("mesh_files", {})
         if before is None:  # killed before it was written: the checkpoints tell whose they are
             before = now
         for key, digest in self.mesh_files.items():
@@ -325,10 +332,7 @@ class RunFolder:
 
     def _other_versions(self) -> list[str]:
         """Return a remark if the run began with other software, which need not give the same bits."""
-        before = read_record(self.path).get("versions")
-        if not isinstance(before, dict):
-            return []
-        now = versions()
+        before, now = read_record(self.path).get("versions", {}), versions()
         now.pop("platform", None)  # its name tells the kernel, not the processor
         other = [f"{name} {before[name]}, now {now[name]}" for name in sorted(before.keys() & now.keys()) if before[name] != now[name]]
         return [f"written with other software ({'; '.join(other)}): results need not be the same bit for bit"] if other else []
@@ -363,12 +367,21 @@ def _end_record(folder: Path, status: Status, reason: str) -> None:
 
 
 def read_record(folder: Path) -> dict[str, Any]:
-    """Return what run.json says; nothing if it cannot be read."""
+    """Return what run.json says; nothing if it cannot be read, or a value is of a type that no run writes."""
     try:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        for key, kind in _record_types().items():
+            if key in record:
+                kind.validate_python(record[key])
+    except (OSError, ValueError, RecursionError, TypeError):
         return {}
     return record if isinstance(record, dict) else {}
+
+
+@cache
+def _record_types() -> dict[str, TypeAdapter[Any]]:
+    """Return what validates each value of a record."""
+    return {key: TypeAdapter(hint) for key, hint in get_type_hints(RunRecord).items()}
 
 
 def recorded_keys(path: Path) -> dict[str, Any] | None:

@@ -9,7 +9,6 @@ from warp_lcp.native import BLOCK, simd
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 
 NEAR = 1.0  # cells from a solid inside the domain within which particles stay
-CLEAR = 0.01  # cells by which a solid must be nearer than the domain's walls to be one of its own
 INSET = 1e-3  # of a cell: particles are put no nearer to its faces
 COLUMNS = 15  # of a row's sums, see `sum_kernel`
 
@@ -67,18 +66,12 @@ def relax_kernel(cells: CellRange, planes: int, last_plane: int, last_row: int, 
 
 @wp.func
 def solid_inside(distance: _F32, k: int, j: int, i: int, planes: int):
-    """Tell whether a solid other than the domain's walls is near one of a cell's corners."""
+    """Tell whether a solid is near one of a cell's corners; the domain's walls are not in the distance."""
     result = bool(False)
     for c in range(planes):
         for b in range(2):
             for a in range(2):
-                z = k + c
-                y = j + b
-                x = i + a
-                wall = float(wp.min(wp.min(x - 1, distance.shape[2] - 1 - x), wp.min(y - 1, distance.shape[1] - 1 - y)))
-                if planes == 2:
-                    wall = wp.min(wall, float(wp.min(z - 1, distance.shape[0] - 1 - z)))
-                if distance[z, y, x] < wp.min(wall - CLEAR, NEAR):
+                if distance[k + c, j + b, i + a] < NEAR:
                     result = True
     return result
 

@@ -60,7 +60,7 @@ class Stencil:
     padding: Padding
     d: wp.array[Any]
     weights: tuple[wp.array[Any], wp.array[Any], wp.array[Any]] | None
-    coefficients: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    coefficients: tuple[float, float, float]
     unit: float = 1.0
     periodic: tuple[bool, bool, bool] = (False, False, False)
     spans: wp.array[Any] | None = None
