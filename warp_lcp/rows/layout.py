@@ -49,6 +49,9 @@ class Bounds:
     code: wp.array(dtype=wp.uint8)
 
 
+BLANK = RowLayout()
+
+
 def put(struct: Any, members: Mapping[str, Any]) -> Any:
     """Set members of a Warp struct whose types have been checked, and return it: in a third of the time that attributes take."""
     native, known = struct.__ctype__(), struct.__dict__
@@ -121,8 +124,8 @@ class Rows:
         slab, cells = PLANES_A_THREAD["cuda" if device.is_cuda else "cpu"], cells or grain(counts[2], device)
         names = ("base", "s1", "s2", "planes", "rows", "nx")
         shared = dict(zip(names, (*strides, *counts), strict=True)) | {"grain": cells, "chunks": -(-counts[2] // cells), "spans": spans}
-        single = put(RowLayout(), shared | {"slab": 1})
-        return Rows(single if slab == 1 else put(RowLayout(), shared | {"slab": slab}), single, size, 0, device)
+        single = put(copy_of(BLANK), shared | {"slab": 1})
+        return Rows(single if slab == 1 else put(copy_of(single), {"slab": slab}), single, size, 0, device)
 
     def beside(self, other: "Rows", factors: tuple[int, int, int]) -> "Rows":
         """Return the same rows with another level's beside them.
@@ -132,16 +135,20 @@ class Rows:
             factors: cells of it along x, y, z that one of ours stands for; below 0: of ours that one of its stands for.
         """
         L, theirs = self.single, other.single
-        members = {name: getattr(L, name) for name in L._cls.vars}
-        members |= {"o0": theirs.base, "o1": theirs.s1, "o2": theirs.s2, "n1": theirs.planes, "n2": theirs.rows}
+        members = {"o0": theirs.base, "o1": theirs.s1, "o2": theirs.s2, "n1": theirs.planes, "n2": theirs.rows}
         members |= dict(zip(("fx", "fy", "fz"), factors, strict=True))
         if not self.device.is_cpu and factors[0] < 0:  # a thread takes the cells of one of the other level's
             members |= {"grain": -factors[0], "chunks": -(L.nx // factors[0])}
-        single = put(RowLayout(), members)
-        summed = single if self.summed is L else put(RowLayout(), members | {"slab": self.summed.slab})
+        single = put(copy_of(L), members)
+        summed = single if self.summed is L else put(copy_of(self.summed), members)
         return Rows(summed, single, self.size, other.size, self.device)
 
-    @property
+    @functools.cached_property
+    def count(self) -> int:
+        """How many rows there are."""
+        return int(self.single.planes * self.single.rows)
+
+    @functools.cached_property
     def places(self) -> int:
         """How many sums a pass makes of each kind, one a thread."""
         planes, rows, chunks = threads(self.summed)

@@ -39,6 +39,9 @@ class Nothing:
     """Fields of a pass that a wave does not have."""
 
 
+NOTHING = Nothing()
+
+
 @dataclass(frozen=True, eq=False)
 class RowPass:
     """What is done to the cells of a row.
@@ -105,14 +108,28 @@ class RowPass:
         for name, wanted, value in (("stencil", self.stencil, stencil), ("bounds", self.bounds, bounds)):
             if bool(wanted) != (value is not None):
                 raise TypeError(f"{self.name}: {'needs' if wanted else 'takes no'} {name}")
-        constants = {**self.constants, **{n: int(given.pop(n)) for n in self.constants if n in given}}
-        wanted = {*self.arrays, *self.numbers}
-        if given.keys() != wanted:
-            raise TypeError(f"{self.name}: missing {sorted(wanted - given.keys())}, unknown {sorted(given.keys() - wanted)}")
-        letters = self._letters(stencil, given)
+        constants = tuple([int(given.pop(n, usual)) for n, usual in self.constants.items()]) if self.constants else ()
+        if given.keys() != self._wanted:
+            missing, unknown = sorted(self._wanted - given.keys()), sorted(given.keys() - self._wanted)
+            raise TypeError(f"{self.name}: missing {missing}, unknown {unknown}")
+        types = [getattr(given[n], "dtype", None) for n in self.arrays]
+        weights = stencil.weights if stencil is not None else None
+        key = (constants, stencil.d.dtype if stencil is not None else None, weights[0].dtype if weights else None, *types)
+        made = self._forms.get(key)
+        if made is None:
+            letters = tuple(sorted(self._letters(stencil, given).items()))
+            made = self._forms[key] = _form(self, letters, tuple(zip(self.constants, constants, strict=True)), weights is not None)
         self._check_lengths(rows, given)
-        made = _form(self, tuple(sorted(letters.items())), tuple(constants.items()), stencil is not None and stencil.weights is not None)
         return Bound(made, rows, made.fill(stencil, bounds, given))
+
+    @functools.cached_property
+    def _wanted(self) -> frozenset[str]:
+        return frozenset({*self.arrays, *self.numbers})
+
+    @functools.cached_property
+    def _forms(self) -> dict[Any, "Form"]:
+        """Forms by what is given, so that types are checked once."""
+        return {}
 
     def _letters(self, stencil: Any, given: dict[str, Any]) -> dict[str, Any]:
         """Find what the letters stand for, and check the types of all arrays."""
@@ -135,12 +152,12 @@ class RowPass:
         return letters | dict.fromkeys(used - letters.keys(), wp.float32)  # of what is absent
 
     def _check_lengths(self, rows: Rows, given: dict[str, Any]) -> None:
-        lengths = dict.fromkeys({**self.reads, **self.writes}, rows.size) | dict.fromkeys(self.other, rows.other_size)
-        lengths |= dict.fromkeys(self.by_row, rows.single.planes * rows.single.rows)
-        for name, length in lengths.items():
-            absent = name in self.optional and (given[name] is None or given[name].size == 0)
-            if not absent and given[name].size != length:
-                raise ValueError(f"{self.name}: {name} has {given[name].size} elements, not {length}")
+        lengths = ((self.reads, rows.size), (self.writes, rows.size), (self.other, rows.other_size), (self.by_row, rows.count))
+        for names, length in lengths:
+            for name in names:
+                found = 0 if given[name] is None else given[name].size
+                if found != length and (found or name not in self.optional):
+                    raise ValueError(f"{self.name}: {name} has {found} elements, not {length}")
         least = len(self.sums) * rows.places
         if self.sums and given["out"].size < least:
             raise ValueError(f"{self.name}: out has {given['out'].size} elements, fewer than {least}: {rows.places} threads for each sum")
@@ -156,6 +173,7 @@ class Form:
 
     Attributes:
         words: what tells it from other forms.
+        blank: its arguments, none of them given.
         fields: struct of its arguments.
         run: native function (layout, fields, planes k ... end, rows j ... last, chunk).
     """
@@ -174,7 +192,7 @@ class Form:
 
         def run(L: RowLayout, given: Fields, k_: int, end_: int, j_: int, last_: int, c_: int): ...
 
-        self._blank = Fields()
+        self.blank = Fields()
         run.__module__ = f"warp_lcp.{d.name}.{'_'.join(self.words)}"  # apart from other forms, which Warp would take for overloads
         run.__qualname__ = f"{d.name.rpartition('.')[2]}_rows"
         self.run = wp.func_native(self._source(letters, constants, variable, of))(run)
@@ -216,7 +234,7 @@ class Form:
 
     def fill(self, stencil: Any, bounds: Any, given: dict[str, Any]) -> Any:
         """Return the struct of arguments."""
-        F = copy_of(self._blank)
+        F = copy_of(self.blank)
         if stencil is not None:
             put(F, {"stencil": stencil.struct})
         if bounds is not None:
@@ -277,8 +295,8 @@ class Wave:
         forms = tuple(b.form if b else given[0].form.alike(stage) for b, stage in zip(passes, declared, strict=True))
         inputs: list[Any] = []
         for b, form in zip(passes, forms, strict=True):
-            inputs += [b.layout, b.fields] if b else [no_rows(), form.fields()]
-        inputs += [no_rows(), Nothing()] * (LARGEST - len(passes))
+            inputs += [b.layout, b.fields] if b else [no_rows(), form.blank]
+        inputs += [no_rows(), NOTHING] * (LARGEST - len(passes))
         kernel = _wave_kernel(self.name, forms, tuple(lag for _, lag in self.stages))
         launch(kernel, 1, inputs, device=given[0].rows.device)
 
