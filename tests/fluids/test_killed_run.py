@@ -180,7 +180,7 @@ def kill_and_resume(folder: Path, kills: int, seed: int, begin: Callable[..., An
 
 
 def test_three_kills(tmp_path):
-    steps = kill_and_resume(tmp_path, 3, 4409, Fork, 0.75)
+    steps = kill_and_resume(tmp_path, 3, 4999, Fork, 0.75)
     assert steps
     assert max(steps) > 0
 
