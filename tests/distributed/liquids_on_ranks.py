@@ -78,6 +78,7 @@ def keep(ranks: Ranks, folder: Path) -> None:
     rows = first + advance(simulation, 5)
     if ranks.first:
         (folder / "whole.json").write_text(json.dumps(rows))
+    ranks.comm.Barrier()  # all pieces are there
 
 
 def go_on(ranks: Ranks, folder: Path) -> None:
