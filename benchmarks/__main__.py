@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import importlib
 import sys
 from pathlib import Path
@@ -42,6 +43,8 @@ def main() -> None:
         given.seed,
     )
     given.out.mkdir(parents=True, exist_ok=True)
+    gc.collect()
+    gc.freeze()  # searches for arrays (`benchmarks.memory`) pass over the hundreds of thousands of objects that imports have made
     try:
         results = suite.measure(options, given.out)
     except MemoryError as error:

@@ -169,6 +169,8 @@ def use_sand_kernels():
 def family(name):
     """Return what the variants of a module share: its name without the types and switches that they were made for."""
     package, module, *variant = name.split(".")
+    if package == "granular":  # its switches are in the module's name; the longest variant has walls that cut and a rate, or a box
+        module = re.sub("_(2d|3d|float32|float64|rate|cut)(?=_|$)", "", module)
     return package, module, *(re.match("[a-z]*", word)[0] for word in variant)
 
 

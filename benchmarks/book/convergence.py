@@ -82,8 +82,8 @@ def applicable(problem: Problem) -> dict[str, Any]:
     return methods
 
 
-def solved(problem: Problem, solver: Any, device: str, *, most: int = MOST, rtol: float = DEEP) -> wl.SolveResult:
-    """Solve after a few steps that load kernels; where that is quick, three times, and return the fastest.
+def solved(problem: Problem, solver: Any, device: str, samples: int, *, most: int = MOST, rtol: float = DEEP) -> wl.SolveResult:
+    """Solve after a few steps that load kernels; where that is quick, so many times, and return the fastest.
 
     Raises:
         ValueError: the method does not take the problem.
@@ -94,7 +94,7 @@ def solved(problem: Problem, solver: Any, device: str, *, most: int = MOST, rtol
     stopping = wl.StoppingCriteria(max_iterations=most, patience=most, rtol=rtol)
     results = [wl.solve(lcp, solver, stopping=stopping, workspace=work)]
     if results[0].history[-1].seconds < QUICK:
-        results += [wl.solve(lcp, solver, stopping=stopping, workspace=work) for _ in range(2)]
+        results += [wl.solve(lcp, solver, stopping=stopping, workspace=work) for _ in range(samples - 1)]
     return min(results, key=lambda result: result.history[-1].seconds)
 
 
@@ -112,7 +112,7 @@ def _methods(scale: Scale, device: str, say: Callable[[str], object]) -> Results
         curves, refused = list[Curve](), list[str]()
         for name, solver in applicable(problem).items():
             try:
-                curves.append(Curve(name, solved(problem, solver, device)))
+                curves.append(Curve(name, solved(problem, solver, device, scale.repeat)))
             except ValueError:  # needs a symmetric A, say
                 refused.append(name)
         records += [_record(f"convergence: {label}: {c.name}", c) for c in curves]
@@ -169,7 +169,7 @@ def _kinks(scale: Scale, device: str, say: Callable[[str], object]) -> Results:
         for k in range(few):
             problem = make(k)
             for name, solver in {**{kink: replace(FISCHER, kink=kink) for kink in KINKS}, "penalized": PENALIZED}.items():
-                curves.setdefault(name, []).append(Curve(name, solved(problem, solver, device, most=100)))
+                curves.setdefault(name, []).append(Curve(name, solved(problem, solver, device, scale.repeat, most=100)))
         cells_of_kind = [label]
         for name, of_kink in curves.items():
             steps = [c.solved for c in of_kink if c.solved is not None]
@@ -203,7 +203,8 @@ def _factors(scale: Scale, device: str, say: Callable[[str], object]) -> Results
     records, rows, charts, cells = list[Record](), list[list[str]](), list[Chart](), list[list[str]]()
     for number, (label, problem) in enumerate(problems.items()):
         curves = [
-            Curve(f"{w:g}", solved(problem, wl.ProjectedSOR(omega=w), device, most=50 if w < 1 else SWEEPS, rtol=RTOL)) for w in FACTORS
+            Curve(f"{w:g}", solved(problem, wl.ProjectedSOR(omega=w), device, scale.repeat, most=50 if w < 1 else SWEEPS, rtol=RTOL))
+            for w in FACTORS
         ]
         done = {c.name: c.solved for c in curves if c.solved is not None}
         best = min(done, key=lambda name: done[name] or 0, default="")

@@ -193,9 +193,33 @@ def wrong_input(ranks):
             assert "the number on rank 1" in str(error)
 
 
+def halos(ranks):
+    """Ghost cells of every type are what their owners have."""
+    for counts in ((13, 11, 9), (40, 30, 1)):
+        for width in (1, 3):
+            boxes = Decomposition(counts, ranks)
+            halo = Halo(boxes, width)
+            for dtype in (np.int8, np.int16, np.float32, np.float64):
+                around = boxes.box.grown(width)
+                ranges = (np.arange(low, high) for low, high in zip(around.low[::-1], around.high[::-1], strict=True))
+                z, y, x = np.meshgrid(*ranges, indexing="ij")
+                inside = (x >= 0) & (x < counts[0]) & (y >= 0) & (y < counts[1]) & (z >= 0) & (z < counts[2])
+                everyone = np.where(inside, ((z * 7 + y) * 5 + x) % 101, 0).astype(dtype)
+                field, inner = np.zeros(halo.shape, dtype), (slice(width, -width),) * 3
+                field[inner] = everyone[inner]
+                halo.fill(field)
+                assert (field == everyone).all()
+    if ranks.size > 1:
+        try:
+            Halo(Decomposition((8, 8, 2 * ranks.size), ranks, processes=(1, 1, ranks.size)), 3)
+            raise AssertionError("a halo wider than a box")
+        except ValueError as error:
+            assert "2 cells along z, but 3 ghost cells" in str(error)
+
+
 if __name__ == "__main__":
     wp.config.log_level = wp.LOG_ERROR
     everyone = Ranks.world()
-    for check in (shapes, other_cuts, closed_pools, memory_in_place, as_on_devices, wrong_input):
+    for check in (halos, shapes, other_cuts, closed_pools, memory_in_place, as_on_devices, wrong_input):
         check(everyone)
     sys.stdout.write(f"rank {everyone.rank} of {everyone.size} is done\n")

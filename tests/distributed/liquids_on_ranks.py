@@ -1,4 +1,4 @@
-"""Liquids on ranks, which `test_liquid_on_ranks` starts: `liquids_on_ranks.py WHAT FOLDER`; rows of the log go into the folder."""
+"""Liquids on ranks, which `test_liquid_on_ranks` starts: `liquids_on_ranks.py WHAT,MORE FOLDER`; rows of the log go into the folder."""
 
 import json
 import sys
@@ -78,6 +78,7 @@ def keep(ranks: Ranks, folder: Path) -> None:
     rows = first + advance(simulation, 5)
     if ranks.first:
         (folder / "whole.json").write_text(json.dumps(rows))
+    ranks.comm.Barrier()  # all pieces are there
 
 
 def go_on(ranks: Ranks, folder: Path) -> None:
@@ -134,4 +135,5 @@ def differ(ranks: Ranks, folder: Path) -> None:
 
 if __name__ == "__main__":
     world = Ranks.world()
-    {"run": run, "keep": keep, "go-on": go_on, "fail": fail, "differ": differ, "dam": dam}[sys.argv[1]](world, Path(sys.argv[2]))
+    for what in sys.argv[1].split(","):
+        {"run": run, "keep": keep, "go-on": go_on, "fail": fail, "differ": differ, "dam": dam}[what](world, Path(sys.argv[2]))

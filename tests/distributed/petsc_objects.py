@@ -1,6 +1,6 @@
 """A program for ranks: the grid operator and its cycle as PETSc's objects do what their definitions say.
 
-Usage: petsc_objects.py CHECK with the name of a function here. Fails by an assertion.
+Usage: petsc_objects.py CHECK... with names of functions here. Fails by an assertion.
 """
 
 import sys
@@ -228,4 +228,6 @@ def cycles_of_pcmg():
 
 if __name__ == "__main__":
     wp.config.log_level = wp.LOG_ERROR
-    globals()[sys.argv[1]](*sys.argv[2:])
+    for check in sys.argv[1:]:
+        globals()[check]()
+        sys.stdout.write(f"{check} ")

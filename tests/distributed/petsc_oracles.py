@@ -189,6 +189,6 @@ def differences(x, places, other_x, other_places):
 
 if __name__ == "__main__":
     wp.config.log_level = wp.LOG_ERROR
-    found = {bounds: compare(small(sys.argv[1], bounds)) for bounds in BOUNDS}
+    found = {f"{name}, {bounds}": compare(small(name, bounds)) for name in sys.argv[1:] for bounds in BOUNDS}
     if Ranks.world().first:
         print(json.dumps(found))

@@ -113,15 +113,9 @@ def test_problems_that_change_in_place_keep_their_workspace(mpi):
     assert mpi(1, IN_PLACE).returncode == 0
 
 
-def test_options_of_petsc_count(mpi):
-    assert (
-        mpi(1, WITH_OPTIONS, environment={"PETSC_OPTIONS": "-ksp_type fcg -pc_type jacobi -ksp_max_it 70 -ksp_rtol 1e-12"}).returncode == 0
-    )
-
-
-def test_monitors_speak(mpi):
-    program = WITH_OPTIONS.split("    method =", maxsplit=1)[0]
-    said = mpi(1, program, environment={"PETSC_OPTIONS": "-plain_ksp_monitor -plain_ksp_converged_reason"}).stdout
+def test_options_of_petsc_count_and_its_monitors_speak(mpi):
+    options = "-plain_ksp_monitor -plain_ksp_converged_reason -ksp_type fcg -pc_type jacobi -ksp_max_it 70 -ksp_rtol 1e-12"
+    said = mpi(1, WITH_OPTIONS, environment={"PETSC_OPTIONS": options}).stdout
     assert "0 KSP Residual norm" in said
     assert "Linear plain_ solve converged due to CONVERGED_RTOL" in said
 

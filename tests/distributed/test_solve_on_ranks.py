@@ -58,19 +58,32 @@ def test_two_dimensions_and_boxes(mpi, tmp_path):
     assert (x.min(), x.max()) == (-0.5, 0.75)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        (["none.npz"], "none.npz: no recorded problem"),
-        (["A.mtx", "b.mtx"], "A.mtx: --engine petsc solves problems of grids"),
-        (["problem_000004.npz", "--method", "psor"], "--method psor: does not work on several ranks; choose from minimum-map-newton"),
-        (["problem_000004.npz", "--device", "cuda"], "--device cuda: there is no such device"),
-        (["problem_000004.npz", "--out", "x.mtx"], "--out x.mtx: x of a grid becomes a NumPy array: name a .npy file"),
-    ],
-)
-def test_wrong_input_is_said_once(mpi, problem, arguments, expected):
-    done = call(mpi, 2, *arguments, "--engine", "petsc", exit_code=2)
-    assert done.stderr.count(expected) == 1
+WRONG = {  # commands, with what is said of each
+    "none.npz": "none.npz: no recorded problem",
+    "A.mtx b.mtx": "A.mtx: --engine petsc solves problems of grids",
+    "problem_000004.npz --method psor": "--method psor: does not work on several ranks; choose from minimum-map-newton",
+    "problem_000004.npz --device cuda": "--device cuda: there is no such device",
+    "problem_000004.npz --out x.mtx": "--out x.mtx: x of a grid becomes a NumPy array: name a .npy file",
+}
+
+
+def test_wrong_input_is_said_once(mpi, problem):
+    text = """
+    import sys
+    from warp_lcp.driver.cli import main
+    commands = sys.argv[1:]
+    for command in commands:
+        sys.argv[1:] = ["solve", *command.split(), "--engine", "petsc"]
+        try:
+            main()
+        except SystemExit as end:
+            assert end.code == 2, end.code
+            sys.stderr.write("exit code 2\\n")
+    """
+    done = mpi(2, text, *WRONG)
+    assert done.stderr.count("exit code 2") == 2 * len(WRONG)
+    for expected in WRONG.values():
+        assert done.stderr.count(expected) == 1
     assert "Traceback" not in done.stderr
 
 

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Callable
@@ -109,12 +110,12 @@ def test_killed_everywhere(scene_file, tmp_path):
 @pytest.mark.parametrize("stride", [5, pytest.param(1, marks=pytest.mark.slow)])
 def test_killed_while_it_resumes(scene_file, tmp_path, stride):
     go(scene_file, tmp_path / "whole")
-    expected, count = contents(tmp_path / "whole"), 0
+    expected, count, part = contents(tmp_path / "whole"), 0, tmp_path / "part"
+    assert killed(lambda: go(scene_file, part), part, 57)
+    broken = max(part.glob("checkpoints/step_*.npz"))
+    broken.write_bytes(broken.read_bytes()[:-9])
     for operation in range(1, 10_000, stride):
-        out = tmp_path / f"killed_{operation}"
-        assert killed(lambda out=out: go(scene_file, out), out, 57)
-        broken = max(out.glob("checkpoints/step_*.npz"))
-        broken.write_bytes(broken.read_bytes()[:-9])
+        out = shutil.copytree(part, tmp_path / f"killed_{operation}")
         if not killed(lambda out=out: go(scene_file, out, resume=True), out, operation):
             break
         count += 1
@@ -127,10 +128,10 @@ def test_killed_while_it_resumes(scene_file, tmp_path, stride):
 def test_killed_while_force_deletes(scene_file, tmp_path, stride):
     """Another run lay in the folder: its steps are not continued, nor are its files left over."""
     go(scene_file, tmp_path / "whole")
-    expected, count = contents(tmp_path / "whole"), 0
+    expected, count, other = contents(tmp_path / "whole"), 0, tmp_path / "other"
+    go(scene_file, other, "physics.density=900.0", "time.duration=0.15")
     for operation in range(1, 60, stride):
-        out = tmp_path / f"killed_{operation}"
-        go(scene_file, out, "physics.density=900.0", "time.duration=0.15")
+        out = shutil.copytree(other, tmp_path / f"killed_{operation}")
         assert killed(lambda out=out: go(scene_file, out, force=True), out, operation)
         count += 1
         go(scene_file, out, force=True)

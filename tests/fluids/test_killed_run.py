@@ -1,15 +1,22 @@
 """The command line, killed with SIGKILL at random moments and resumed: every file is that of a run that nothing happened to."""
 
 import json
+import multiprocessing
+import os
 import re
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
+
+from warp_lcp.driver import cli
 
 SCENE = """
 [scene]
@@ -35,22 +42,57 @@ checkpoint_every = 7
 PROGRAM = "from warp_lcp.driver.cli import main; main()"
 LIMIT = 120  # [s] that a process may take
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
+pytestmark = [
+    pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL"),
+    pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning"),
+]
+
+
+def arguments(scene: Path, out: Path, *more: str) -> list[str]:
+    return ["run", str(scene), "--out", str(out), "--device", "cpu", *more]
 
 
 def start(scene: Path, out: Path, *more: str) -> subprocess.Popen:
-    command = [sys.executable, "-c", PROGRAM, "run", str(scene), "--out", str(out), "--device", "cpu", *more]
+    command = [sys.executable, "-c", PROGRAM, *arguments(scene, out, *more)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
-def finish(process: subprocess.Popen) -> str:
-    """Wait for a process, which must succeed, and return what it printed."""
-    text, _ = process.communicate(timeout=LIMIT)
-    assert process.returncode == 0, text
-    return text
+class Fork:
+    """The command line in a fork of this process, which has imported everything: starts in no time, and dies as any other."""
+
+    def __init__(self, scene: Path, out: Path, *more: str) -> None:
+        self.printed = out.with_suffix(".txt")
+        self.process = multiprocessing.get_context("fork").Process(target=self.main, args=[arguments(scene, out, *more)])
+        self.process.start()
+        self.pid = self.process.pid
+
+    def main(self, arguments: list[str]) -> None:
+        with open(self.printed, "w") as file:
+            for stream in (1, 2):
+                os.dup2(file.fileno(), stream)
+        cli.app(arguments)
+
+    def poll(self) -> int | None:
+        return self.process.exitcode
+
+    returncode = property(poll)
+
+    def send_signal(self, number: int) -> None:
+        if self.poll() is None:
+            os.kill(self.process.pid, number)
+
+    def communicate(self, timeout: float) -> tuple[str, None]:
+        self.process.join(timeout)
+        return self.printed.read_text(), None
 
 
-def wait_until_it_holds(process: subprocess.Popen, out: Path) -> None:
+def call(scene: Path, out: Path, *more: str) -> tuple[int, str]:
+    """Run in this process; return the exit code and what was printed."""
+    result = CliRunner().invoke(cli.app, arguments(scene, out, *more))
+    return result.exit_code, result.output
+
+
+def wait_until_it_holds(process: subprocess.Popen | Fork, out: Path) -> None:
     """Wait until the process has the folder, or is over."""
     until = time.monotonic() + LIMIT
     while process.poll() is None and time.monotonic() < until:
@@ -103,20 +145,21 @@ class Before:
         return self.step
 
 
-def kill_and_resume(folder: Path, kills: int, seed: int) -> list[int]:
+def kill_and_resume(folder: Path, kills: int, seed: int, begin: Callable[..., Any], duration: float) -> list[int]:
     """Run, kill, resume and kill again, until `kills` processes died at random moments; return the steps resumed from."""
     scene = folder / "scene.toml"
-    scene.write_text(SCENE)
+    scene.write_text(SCENE.replace("duration = 1.5", f"duration = {duration}"))
     whole = folder / "whole"
-    finish(start(scene, whole))  # compiles what is not compiled yet
-    finish(start(scene, whole, "--force"))
+    for option in (["--set", "time.duration=0.1"], ["--force"]):  # the first loads, and compiles what is not compiled yet
+        code, text = call(scene, whole, *option)
+        assert code == 0, text
     expected, seconds = results(whole), 1.2 * record(whole)["seconds"]
     rng, steps, died = np.random.default_rng(seed), [], 0
     for run in range(10 * kills):
         out, before = folder / f"parts_{run}", None
         while True:
             begun = (out / "run.json").is_file()
-            process = start(scene, out, *(["--resume"] if begun else []))
+            process = begin(scene, out, *(["--resume"] if begun else []))
             if died < kills:
                 wait_until_it_holds(process, out)
                 time.sleep(rng.uniform(0.0, seconds))
@@ -137,14 +180,14 @@ def kill_and_resume(folder: Path, kills: int, seed: int) -> list[int]:
 
 
 def test_three_kills(tmp_path):
-    steps = kill_and_resume(tmp_path, 3, 4409)
+    steps = kill_and_resume(tmp_path, 3, 4999, Fork, 0.75)
     assert steps
     assert max(steps) > 0
 
 
 @pytest.mark.slow
 def test_twenty_kills(tmp_path):
-    steps = kill_and_resume(tmp_path, 20, 80317)
+    steps = kill_and_resume(tmp_path, 20, 80317, start, 1.5)
     print(f"resumed from steps {steps}")
     assert len(steps) >= 15
     assert len(set(steps)) >= 5  # killed all along the run: how far each got is the machine's business
@@ -157,11 +200,10 @@ def test_a_second_process_is_refused_and_sigterm_leaves_a_checkpoint(tmp_path):
     try:
         wait_until_it_holds(process, out)
         for option in ("--resume", "--force"):
-            second = start(scene, out, option)
-            text, _ = second.communicate(timeout=LIMIT)
+            code, text = call(scene, out, option)
             if option == "--resume" and "no run to resume" in text:  # it held the folder, and had not written yet
                 continue
-            assert second.returncode == 2, text
+            assert code == 2, text
             assert re.search(rf"another run writes there \(process {process.pid} on ", text)
             assert "Traceback" not in text
         while newest_step(out) < 7:
