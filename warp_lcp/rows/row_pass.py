@@ -22,6 +22,7 @@ LARGEST = 4  # passes of a wave
 
 
 NO_BOUNDS = Bounds()
+NUMBERS = "numbers"  # that are the same everywhere, infinite ones too; else "coded", "fields"
 
 
 @functools.cache
@@ -113,12 +114,13 @@ class RowPass:
             missing, unknown = sorted(self._wanted - given.keys()), sorted(given.keys() - self._wanted)
             raise TypeError(f"{self.name}: missing {missing}, unknown {unknown}")
         types = [getattr(given[n], "dtype", None) for n in self.arrays]
-        weights = stencil.weights if stencil is not None else None
-        key = (constants, stencil.d.dtype if stencil is not None else None, weights[0].dtype if weights else None, *types)
+        weights, kind = stencil.weights if stencil is not None else None, _kind(bounds) if bounds else NUMBERS
+        key = (constants, kind, stencil.d.dtype if stencil is not None else None, weights[0].dtype if weights else None, *types)
         made = self._forms.get(key)
         if made is None:
             letters = tuple(sorted(self._letters(stencil, given).items()))
-            made = self._forms[key] = _form(self, letters, tuple(zip(self.constants, constants, strict=True)), weights is not None)
+            numbers = tuple(zip(self.constants, constants, strict=True))
+            made = self._forms[key] = _form(self, letters, numbers, weights is not None, kind)
         self._check_lengths(rows, given)
         return Bound(made, rows, made.fill(stencil, bounds, given))
 
@@ -163,9 +165,15 @@ class RowPass:
             raise ValueError(f"{self.name}: out has {given['out'].size} elements, fewer than {least}: {rows.places} threads for each sum")
 
 
+def _kind(bounds: list[Any]) -> str:
+    """Return which of the operands of bounds count."""
+    lower, _, upper, _, code = bounds
+    return "coded" if code.size else "fields" if lower.size or upper.size else NUMBERS
+
+
 @functools.cache
-def _form(declared: RowPass, letters: Any, constants: Any, variable: bool) -> "Form":
-    return Form(declared, dict(letters), dict(constants), variable=variable)
+def _form(declared: RowPass, letters: Any, constants: Any, variable: bool, bounds: str) -> "Form":
+    return Form(declared, dict(letters), dict(constants), variable=variable, bounds=bounds)
 
 
 class Form:
@@ -178,11 +186,12 @@ class Form:
         run: native function (layout, fields, planes k ... end, rows j ... last, chunk).
     """
 
-    def __init__(self, declared: RowPass, letters: dict[str, Any], constants: dict[str, int], *, variable: bool) -> None:
-        self.declared, self.letters, d = declared, letters, declared
+    def __init__(self, declared: RowPass, letters: dict[str, Any], constants: dict[str, int], *, variable: bool, bounds: str) -> None:
+        self.declared, self.letters, self.bounds, d = declared, letters, bounds, declared
         of = lambda kind: letters[kind] if isinstance(kind, str) else kind  # noqa: E731
         differing = [f"{name.lower()}{value}" for name, value in constants.items() if value != d.constants[name]]
         shape = ["variable" if variable else "uniform"] if d.stencil else []
+        shape += [bounds] if d.bounds and bounds != NUMBERS else []
         self.words = [*shape, *(t.__name__ for _, t in sorted(letters.items())), *differing]
         parts = {"stencil": stencil_struct(of(d.stencil[0]), of(d.stencil[1]) if variable else wp.float32)} if d.stencil else {}
         parts |= {"bounds": Bounds} if d.bounds else {}
@@ -195,13 +204,13 @@ class Form:
         self.blank = Fields()
         run.__module__ = f"warp_lcp.{d.name}.{'_'.join(self.words)}"  # apart from other forms, which Warp would take for overloads
         run.__qualname__ = f"{d.name.rpartition('.')[2]}_rows"
-        self.run = wp.func_native(self._source(letters, constants, variable, of))(run)
+        self.run = wp.func_native(self._source(letters, constants | {"VARIABLE": variable}, of))(run)
 
-    def _source(self, letters: dict[str, Any], constants: dict[str, int], variable: bool, of: Any) -> str:
+    def _source(self, letters: dict[str, Any], constants: dict[str, int], of: Any) -> str:
         """Return the body: a loop over pieces, in it pointers by name, the shared functions, the row function, the sums."""
         d = self.declared
         into = not {*d.ring}.isdisjoint(d.writes)
-        switches = {"RINGS": bool(d.ring), "INTO_RING": into, "LEVELS": bool(d.other), "VARIABLE": variable} | constants
+        switches = {"RINGS": bool(d.ring), "INTO_RING": into, "LEVELS": bool(d.other), "BOUNDS": ord(self.bounds[0])} | constants
         head = [f"typedef {C[t]} {n};" for n, t in letters.items()] + [f"typedef {C[of(d.compute)]} T;"] * ("T" not in letters)
         head += [f"constexpr int {n} = {int(v)};" for n, v in switches.items()]
         at = {n: " + p + P.ring" if n in d.ring else " + p" for n in (*d.reads, *d.writes)} | dict.fromkeys(d.other, " + P.q")
@@ -230,7 +239,7 @@ class Form:
     def alike(self, declared: RowPass) -> "Form":
         """Return another pass without a stencil in the form that has the same types."""
         letters = {kind: self.letters[kind] for kind in declared.arrays.values() if isinstance(kind, str)}
-        return _form(declared, tuple(sorted(letters.items())), tuple(declared.constants.items()), False)
+        return _form(declared, tuple(sorted(letters.items())), tuple(declared.constants.items()), False, self.bounds)
 
     def fill(self, stencil: Any, bounds: Any, given: dict[str, Any]) -> Any:
         """Return the struct of arguments."""
@@ -330,7 +339,7 @@ def _wave_kernel(name: str, forms: tuple[Form, ...], lags: tuple[int, ...]) -> A
                 raise TypeError(f"{name}: {letter} is {kind.__name__} in {form.declared.name}, {letters[letter].__name__} before")
     types = [kind.__name__ for _, kind in sorted(letters.items())]
     words = dict.fromkeys([word for f in forms for word in f.words if word not in types])
-    shape = [word for word in words if word in ("uniform", "variable")]
+    shape = [word for word in words if word in ("uniform", "variable", "coded", "fields")]
     variant = "_".join([*shape, *types, *(word for word in words if word not in shape)])
 
     def wave(L1: RowLayout, F1: One, L2: RowLayout, F2: Two, L3: RowLayout, F3: Three, L4: RowLayout, F4: Four):

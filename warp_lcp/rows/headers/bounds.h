@@ -1,5 +1,5 @@
-// Bounds of x. body(lower, upper) is called with functions of the cell, so that a loop over them tests none: fields, numbers, or a code of
-// two bits, see `warp_lcp.bounds`.
+// Bounds of x. body(lower, upper) is called with functions of the cell, so that a loop over them tests none: numbers, a code of two bits, or
+// fields and numbers, see `warp_lcp.bounds`. What there is, BOUNDS, is known when the kernel is made: the rest is not compiled.
 const auto with_bounds = [&](auto body) {
     const double *l = given.bounds.lower.data + p, *u = given.bounds.upper.data + p; const auto* code = given.bounds.code.data + p;
     const double l_value = given.bounds.least, u_value = given.bounds.most;
@@ -7,12 +7,11 @@ const auto with_bounds = [&](auto body) {
     const auto least = [&](int) { return l_value; }; const auto most = [&](int) { return u_value; };
     const auto coded_low = [&](int k) { return code[k] & 1 ? l_value : -(double)INFINITY; };
     const auto coded_high = [&](int k) { return code[k] & 2 ? u_value : (double)INFINITY; };
-    if (given.bounds.code.data) body(coded_low, coded_high);
+    if constexpr (BOUNDS == 'n') body(least, most);
+    else if constexpr (BOUNDS == 'c') body(coded_low, coded_high);
     else if (given.bounds.lower.data && given.bounds.upper.data) body(low, high);
     else if (given.bounds.lower.data) body(low, most);
-    else if (given.bounds.upper.data) body(least, high);
-    else body(least, most); };
-const bool unbounded = !given.bounds.lower.data && !given.bounds.upper.data && !given.bounds.code.data
-    && given.bounds.least == -(double)INFINITY && given.bounds.most == (double)INFINITY;
+    else body(least, high); };
+const bool unbounded = BOUNDS == 'n' && given.bounds.least == -(double)INFINITY && given.bounds.most == (double)INFINITY;
 const auto natural_residual = [](double y, double below, double above) {  // of gaps to the bounds times the diagonal
     const double least = below < y ? below : y; return above > least ? above : least; };
