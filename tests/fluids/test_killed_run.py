@@ -165,7 +165,7 @@ def kill_and_resume(folder: Path, kills: int, seed: int, begin: Callable[..., An
                 time.sleep(rng.uniform(0.0, seconds))
                 process.send_signal(signal.SIGKILL)
             text, _ = process.communicate(timeout=LIMIT)
-            if before and (process.returncode == 0 or (begun and record(out)["resumed_from_step"] == before.step)):
+            if before and begun and (process.returncode == 0 or record(out)["resumed_from_step"] == before.step):
                 steps.append(before.check())
             if process.returncode == 0:
                 break
