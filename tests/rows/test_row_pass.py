@@ -10,7 +10,7 @@ import warp_lcp as wl
 from code_blocks import blocks, run
 from oracle import assemble
 from warp_lcp.layout import Padding
-from warp_lcp.rows import RowPass, Rows, Wave, layout
+from warp_lcp.rows import Known, RowPass, Rows, Wave, layout
 from warp_lcp.rows.row_pass import text
 
 SHAPE = (5, 6, 37)
@@ -48,6 +48,24 @@ def test_a_product_and_its_sum(product, real, faces):
     tol = 1e-5 if real is wp.float32 else 1e-12
     np.testing.assert_allclose(A.layout.unload(y).numpy().ravel(), expected, atol=tol)
     assert out.numpy().sum() == pytest.approx(host.ravel() @ expected, rel=10 * tol)
+
+
+def test_a_product_that_is_known_stands_for_a_stencil(tmp_path):
+    source = "T total = 0;\nSIMD for (int k = 0; k < n; ++k) { const T v = affine(x, b, k)*diagonal(k); y[k] = v; total += v; }\n"
+    fields = {"reads": {"x": "S", "b": "S"}, "writes": {"y": "S"}, "sums": ("total",)}
+    scaled = row_pass(tmp_path, "scaled", source, stencil=("D", "W"), **fields)
+    n = 20_000  # several chunks
+    d, product = RNG.random(n), RNG.standard_normal(n)
+    x, y, rows = (
+        wp.zeros(n, dtype=wp.float64, device="cpu"),
+        wp.zeros(n, dtype=wp.float64, device="cpu"),
+        Rows.flat(n, wp.get_device("cpu")),
+    )
+    out = wp.zeros(rows.places, dtype=wp.float64, device="cpu")
+    known = Known(wp.array(d, dtype=wp.float64, device="cpu"), 2.0, wp.array(product, dtype=wp.float64, device="cpu"))
+    scaled.bind(rows, stencil=known, x=x, b=x, y=y, out=out).launch()
+    np.testing.assert_allclose(y.numpy(), 2 * d * product, rtol=1e-15)
+    assert rows.places == 3 and out.numpy().sum() == pytest.approx((2 * d * product).sum(), rel=1e-12)
 
 
 def test_slabs_chunks_and_spans_share_the_same_cells_out(product, monkeypatch):

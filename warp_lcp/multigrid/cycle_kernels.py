@@ -61,7 +61,7 @@ def cycle_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
 
     def row(header: str, declared: str) -> str:
         """Source of a row function of the cycle's passes for levels whose fields are separate arguments."""
-        types = f"typedef {C_TYPES[real]} S; typedef S T; constexpr int VARIABLE = {int(variable)};"
+        types = f"typedef {C_TYPES[real]} S; typedef S T; constexpr int STENCIL = {ord(form[0])}; const double* known = nullptr;"
         at = " ".join(f"const auto* {w} = {w}_.data + p;" for w in ("d", "wx", "wy", "wz"))
         numbers = " ".join(f"const T {c} = (T)A.{c};" for c in ("unit", "cx", "cy", "cz"))
         strides = "const long long ym = -A.s2, yp = A.s2, zm = -A.s1, zp = A.s1;"

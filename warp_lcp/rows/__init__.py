@@ -1,6 +1,6 @@
 """Rows: what owns layout, bounds, sums, waves and launches of passes over grids; a method supplies what is done to a cell."""
 
-from warp_lcp.rows.layout import Rows
+from warp_lcp.rows.layout import Known, Rows
 from warp_lcp.rows.row_pass import Bound, RowPass, Wave
 
-__all__ = ["Bound", "RowPass", "Rows", "Wave"]
+__all__ = ["Bound", "Known", "RowPass", "Rows", "Wave"]

@@ -73,8 +73,34 @@ def copy_of(struct: Any) -> Any:
 @functools.cache
 def stencil_struct(d: Any, w: Any) -> Any:
     """Return the struct of a stencil whose diagonal and weights have these types."""
-    members = dict.fromkeys(("unit", "cx", "cy", "cz"), wp.float64) | {"d": wp.array(dtype=d)}
+    members = dict.fromkeys(("unit", "cx", "cy", "cz"), wp.float64) | {"d": wp.array(dtype=d), "known": wp.array(dtype=wp.float64)}
     return make_struct(f"Stencil_{d.__name__}_{w.__name__}", members | dict.fromkeys(("wx", "wy", "wz"), wp.array(dtype=w)))
+
+
+@dataclass(frozen=True)
+class Known:
+    """What a pass takes in place of a stencil where the product has been computed: on matrices.
+
+    Args:
+        d: diagonal in units of `unit`, stored; 0 where there is no unknown.
+        unit: value of one unit of d.
+        y: A x + b, stored.
+    """
+
+    d: Any
+    unit: float
+    y: wp.array[Any]
+    weights = None
+
+    @functools.cached_property
+    def struct(self) -> Any:
+        """What passes take of it."""
+        return put(copy_of(_blank_stencil(self.d.dtype)), {"unit": float(self.unit), "d": self.d, "known": self.y})
+
+
+@functools.cache
+def _blank_stencil(d: Any) -> Any:
+    return stencil_struct(d, wp.float32)()
 
 
 def make_struct(name: str, members: dict[str, Any]) -> Any:

@@ -14,7 +14,7 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.native import C_TYPES
-from warp_lcp.rows.layout import Bounds, RowLayout, Rows, copy_of, make_struct, no_rows, put, stencil_struct, threads
+from warp_lcp.rows.layout import Bounds, Known, RowLayout, Rows, copy_of, make_struct, no_rows, put, stencil_struct, threads
 
 HEADERS = Path(__file__).parent / "headers"
 C = {**C_TYPES, wp.int8: "signed char", wp.int32: "int", wp.bool: "bool"}
@@ -23,6 +23,7 @@ LARGEST = 4  # passes of a wave
 
 NO_BOUNDS = Bounds()
 NUMBERS = "numbers"  # that are the same everywhere, infinite ones too; else "coded", "fields"
+UNIFORM, VARIABLE, KNOWN = "uniform", "variable", "known"  # stencils: with a weight an axis, with arrays of them, with a product in place
 
 
 @functools.cache
@@ -54,7 +55,7 @@ class RowPass:
         name: of the kernel, with the area before it: `projected_multigrid.assess`.
         header: C++ row function.
         compute: what T stands for.
-        stencil: types of the diagonal and the weights of `stencil.h`, if it has one.
+        stencil: types of the diagonal and the weights of `stencil.h`, if it has one. `affine` there is A x + b: of the stencil, or known.
         bounds: whether it has those of `bounds.h`.
         reads: fields, pointers to the piece's first cell.
         writes: likewise, written.
@@ -98,7 +99,7 @@ class RowPass:
 
         Args:
             rows: which rows.
-            stencil: a `warp_lcp.operators.stencil.Stencil`.
+            stencil: a `warp_lcp.operators.stencil.Stencil`, or a `Known` product in place of one.
             bounds: operands of a `warp_lcp.bounds.Bounds`.
             given: arrays, numbers, and constants that are not as usual, by name.
 
@@ -115,12 +116,14 @@ class RowPass:
             raise TypeError(f"{self.name}: missing {missing}, unknown {unknown}")
         types = [getattr(given[n], "dtype", None) for n in self.arrays]
         weights, kind = stencil.weights if stencil is not None else None, _kind(bounds) if bounds else NUMBERS
-        key = (constants, kind, stencil.d.dtype if stencil is not None else None, weights[0].dtype if weights else None, *types)
+        stored = (type(stencil), stencil.d.dtype, weights[0].dtype if weights else None) if stencil is not None else ()
+        key = (constants, kind, *stored, *types)
         made = self._forms.get(key)
         if made is None:
             letters = tuple(sorted(self._letters(stencil, given).items()))
             numbers = tuple(zip(self.constants, constants, strict=True))
-            made = self._forms[key] = _form(self, letters, numbers, weights is not None, kind)
+            shape = KNOWN if isinstance(stencil, Known) else VARIABLE if weights else UNIFORM
+            made = self._forms[key] = _form(self, letters, numbers, shape, kind)
         self._check_lengths(rows, given)
         return Bound(made, rows, made.fill(stencil, bounds, given))
 
@@ -172,8 +175,8 @@ def _kind(bounds: list[Any]) -> str:
 
 
 @functools.cache
-def _form(declared: RowPass, letters: Any, constants: Any, variable: bool, bounds: str) -> "Form":
-    return Form(declared, dict(letters), dict(constants), variable=variable, bounds=bounds)
+def _form(declared: RowPass, letters: Any, constants: Any, shape: str, bounds: str) -> "Form":
+    return Form(declared, dict(letters), dict(constants), shape, bounds)
 
 
 class Form:
@@ -186,14 +189,13 @@ class Form:
         run: native function (layout, fields, planes k ... end, rows j ... last, chunk).
     """
 
-    def __init__(self, declared: RowPass, letters: dict[str, Any], constants: dict[str, int], *, variable: bool, bounds: str) -> None:
+    def __init__(self, declared: RowPass, letters: dict[str, Any], constants: dict[str, int], shape: str, bounds: str) -> None:
         self.declared, self.letters, self.bounds, d = declared, letters, bounds, declared
         of = lambda kind: letters[kind] if isinstance(kind, str) else kind  # noqa: E731
         differing = [f"{name.lower()}{value}" for name, value in constants.items() if value != d.constants[name]]
-        shape = ["variable" if variable else "uniform"] if d.stencil else []
-        shape += [bounds] if d.bounds and bounds != NUMBERS else []
-        self.words = [*shape, *(t.__name__ for _, t in sorted(letters.items())), *differing]
-        parts = {"stencil": stencil_struct(of(d.stencil[0]), of(d.stencil[1]) if variable else wp.float32)} if d.stencil else {}
+        kinds = [shape] * bool(d.stencil) + [bounds] * (d.bounds and bounds != NUMBERS)
+        self.words = [*kinds, *(t.__name__ for _, t in sorted(letters.items())), *differing]
+        parts = {"stencil": stencil_struct(of(d.stencil[0]), of(d.stencil[1]) if shape == VARIABLE else wp.float32)} if d.stencil else {}
         parts |= {"bounds": Bounds} if d.bounds else {}
         self.types = {name: of(kind) for name, kind in d.arrays.items()}
         members = {n: wp.array(dtype=t) for n, t in self.types.items()} | {n: of(t) for n, t in d.numbers.items()}
@@ -204,7 +206,7 @@ class Form:
         self.blank = Fields()
         run.__module__ = f"warp_lcp.{d.name}.{'_'.join(self.words)}"  # apart from other forms, which Warp would take for overloads
         run.__qualname__ = f"{d.name.rpartition('.')[2]}_rows"
-        self.run = wp.func_native(self._source(letters, constants | {"VARIABLE": variable}, of))(run)
+        self.run = wp.func_native(self._source(letters, constants | {"STENCIL": ord(shape[0])}, of))(run)
 
     def _source(self, letters: dict[str, Any], constants: dict[str, int], of: Any) -> str:
         """Return the body: a loop over pieces, in it pointers by name, the shared functions, the row function, the sums."""
@@ -227,7 +229,7 @@ class Form:
             each += [f"{'const ' * (n in d.reads)}auto* {n} = {pointer};"]
         each += [f"const auto {n} = given.{n};" for n in d.numbers]
         if d.stencil:
-            each += [f"const auto* {n} = given.stencil.{n}.data + {'P.q' if d.finer else 'p'};" for n in ("d", "wx", "wy", "wz")]
+            each += [f"const auto* {n} = given.stencil.{n}.data + {'P.q' if d.finer else 'p'};" for n in ("d", "wx", "wy", "wz", "known")]
             each += [f"const T {n} = (T)given.stencil.{n};" for n in ("unit", "cx", "cy", "cz")]
         sums = [f"const double all_[] = {{{', '.join(f'(double){s}' for s in d.sums)}}}; double* sums_ = given.out.data + P.t;"]
         sums += [f"for (int s = 0; s < {len(d.sums)}; ++s, sums_ += places) *sums_ = P.more ? all_[s] + *sums_ : all_[s];"]
@@ -239,7 +241,7 @@ class Form:
     def alike(self, declared: RowPass) -> "Form":
         """Return another pass without a stencil in the form that has the same types."""
         letters = {kind: self.letters[kind] for kind in declared.arrays.values() if isinstance(kind, str)}
-        return _form(declared, tuple(sorted(letters.items())), tuple(declared.constants.items()), False, self.bounds)
+        return _form(declared, tuple(sorted(letters.items())), tuple(declared.constants.items()), UNIFORM, self.bounds)
 
     def fill(self, stencil: Any, bounds: Any, given: dict[str, Any]) -> Any:
         """Return the struct of arguments."""
@@ -339,7 +341,7 @@ def _wave_kernel(name: str, forms: tuple[Form, ...], lags: tuple[int, ...]) -> A
                 raise TypeError(f"{name}: {letter} is {kind.__name__} in {form.declared.name}, {letters[letter].__name__} before")
     types = [kind.__name__ for _, kind in sorted(letters.items())]
     words = dict.fromkeys([word for f in forms for word in f.words if word not in types])
-    shape = [word for word in words if word in ("uniform", "variable", "coded", "fields")]
+    shape = [word for word in words if word in (UNIFORM, VARIABLE, KNOWN, "coded", "fields")]
     variant = "_".join([*shape, *types, *(word for word in words if word not in shape)])
 
     def wave(L1: RowLayout, F1: One, L2: RowLayout, F2: Two, L3: RowLayout, F3: Three, L4: RowLayout, F4: Four):

@@ -8,7 +8,7 @@ T norm = 0, energy = 0; int moved = 0, active = 0, off = 0; unsigned char hold[M
 for (int begin = 0; begin < n; begin += M) {
     const int end = n - begin < M ? n : begin + (int)M; T y[M]; unsigned char any = 0, count = 0, far = 0;
     fetch(begin, end, x + zp, b, g, d, unknown, free);
-    SIMD8 for (int k = begin; k < end; ++k) y[k - begin] = product(x, k) + b[k];
+    SIMD8 for (int k = begin; k < end; ++k) y[k - begin] = affine(x, b, k);
     if (unbounded) {
         SIMD8 for (int k = begin; k < end; ++k) {
             const T v = y[k - begin], r = unknown[k] == 1 ? v : (T)0; norm += r*r; g[k] = d[k] != 0 ? -v*inverse : (T)0; }

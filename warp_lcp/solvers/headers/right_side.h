@@ -7,5 +7,5 @@ if (!(flagged(P.k, P.j) || flagged(P.k - 1, P.j) || flagged(P.k + 1, P.j) || fla
 const T inverse = reciprocal(scalars[SIZE]);
 for (int begin = 0; begin < n; begin += M) {
     const int end = n - begin < M ? n : begin + (int)M; T y[M];
-    SIMD8 for (int k = begin; k < end; ++k) y[k - begin] = product(x, k) + b[k];
+    SIMD8 for (int k = begin; k < end; ++k) y[k - begin] = affine(x, b, k);
     SIMD8 for (int k = begin; k < end; ++k) { const T v = y[k - begin]*inverse; g[k] = free[k] != 0 ? -v : (T)0; } }

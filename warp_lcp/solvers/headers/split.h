@@ -4,7 +4,7 @@ T norm = 0, chopped = 0, reduced = 0, release = 0, energy = 0; int moved = 0, ac
 for (int begin = 0; begin < n; begin += M) {
     const int end = n - begin < M ? n : begin + (int)M; T y[M]; unsigned char any = 0, count = 0;
     fetch(begin, end, x + zp, b, g, step, d, unknown, free);
-    SIMD8 for (int k = begin; k < end; ++k) y[k - begin] = product(x, k) + b[k];
+    SIMD8 for (int k = begin; k < end; ++k) y[k - begin] = affine(x, b, k);
     with_bounds([&](auto lower, auto upper) {
         SIMD8 for (int k = begin; k < end; ++k) {
             const T e = diagonal(k), f = e != 0 ? e : (T)1, l = lower(k), u = upper(k), v = y[k - begin];
