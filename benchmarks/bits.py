@@ -1,19 +1,22 @@
 """Digests of what solvers compute on grids, to the last bit: `python -m benchmarks.bits --out before.txt`, then `diff`.
 
-A line a solve: the problem, the method, its status, steps, a digest of x and one of the residuals of all iterates.
+A line a solve: the problem, the method, its status, steps, a digest of x and one of the residuals of all iterates; or what it refuses.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import hashlib
 import itertools
+import math
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy.sparse
 import warp as wp
 from rich.console import Console
 
@@ -23,10 +26,31 @@ from warp_lcp.driver.progress import Lines
 from warp_lcp.driver.run import run_scene
 from warp_lcp.driver.scene_file import load_scene
 from warp_lcp.solvers.mprgp import MPRGP
+from warp_lcp.solvers.registry import METHODS
 
 SHAPES = {"2-D": (11, 38), "3-D": (9, 14, 21), "long rows": (4, 5, 300), "flat": (5, 1, 24)}
+PARTS = ("small", "other", "methods", "frames")
 PRECISIONS = ("mixed", "double", "single")
 STOPPING = wl.StoppingCriteria(rtol=1e-7, max_iterations=12)
+OTHER_SETTINGS: dict[str, tuple[dict[str, Any], ...]] = {  # that take other paths
+    "accelerated-projected-gradient": ({"lipschitz": 20.0},),
+    "fischer-newton": (
+        {"share": 0.9},
+        {"safeguard": False},
+        {"kink": "zero"},
+        {"kink": "random"},
+        {"kink": "approximation"},
+        {"warm_start": 2},
+    ),
+    "gradient-descent": ({"map": "penalized", "share": 0.9}, {"map": "natural"}),
+    "interior-point": ({"mehrotra": False}, {"monotone_cycles": 0}),
+    "minimum-map-newton": ({"monotone_cycles": 0},),
+    "mprgp": ({"monotone_cycles": 0}, {"gamma": 0.1}),
+    "nncg": ({"direction": "forward"},),
+    "projected-multigrid": ({"monotone_cycles": 3},),
+    "psor": ({"direction": "forward"}, {"direction": "symmetric", "omega": 1.5}),
+    "subspace-minimization": ({"sweeps": 1},),
+}
 SCENES = {"dam-break": (24, 0.1), "floating-bodies": (20, 0.1), "column-collapse": (16, 0.02)}  # resolution, seconds
 
 
@@ -98,12 +122,54 @@ def other_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
         yield "splash 32 walls", splash(32).problem("walls", "cpu"), sweeping, None
 
 
+def method_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
+    """Yield every method on grids, matrices and user-made operators that are small enough for it, with bounds of each kind."""
+    for (what, make, shape), kind in itertools.product(_operators(), ("none", "number", "coded", "fields")):
+        rng = np.random.default_rng(577)
+        b, start = rng.standard_normal(shape), rng.standard_normal(shape)
+        sides = bounds_of(shape)[kind]
+        for name, method in METHODS.items():
+            if what.split()[0] not in method.supports or math.prod(shape) > getattr(method, "most_unknowns", math.inf):
+                continue
+            for number, made in enumerate(_variants(name, method)):
+                yield f"{what} {kind} {number}", wl.LCP(make(), b, *sides), made, None
+                if kind == "fields":
+                    yield f"{what} {kind} {number} warm", wl.LCP(make(), b, *sides), made, start
+
+
+def _operators() -> Iterator[tuple[str, Any, tuple[int, ...]]]:
+    rng = np.random.default_rng(1618)
+    factor = rng.standard_normal((40, 40))
+    matrix = factor @ factor.T + 4 * np.eye(40)
+    cells = rng.choice([wl.AIR, wl.FLUID, wl.SOLID], size=(7, 9, 13), p=[0.1, 0.8, 0.1])
+    flat, arrays = rng.choice([wl.AIR, wl.FLUID], size=(15, 22), p=[0.1, 0.9]), faces_of((7, 9, 13))["arrays"]
+    laplacian = scipy.sparse.diags_array([-1.0, -1.0, 4.2, -1.0, -1.0], offsets=[-20, -1, 0, 1, 20], shape=(400, 400)).tocsr()
+    yield "grid 3-D", lambda: wl.GridPoisson(cells, device="cpu", dtype=wp.float64, **arrays), (7, 9, 13)
+    yield "grid 2-D", lambda: wl.GridPoisson(flat, device="cpu"), (15, 22)
+    yield "grid periodic", lambda: wl.GridPoisson(flat, device="cpu", periodic=(True, False)), (15, 22)
+    yield "sparse", lambda: wl.SparseOperator(laplacian, device="cpu"), (400,)
+    yield "sparse float64", lambda: wl.SparseOperator(laplacian, device="cpu", dtype=wp.float64), (400,)
+    yield "dense", lambda: wl.DenseOperator(matrix, device="cpu"), (40,)
+    yield "dense float64", lambda: wl.DenseOperator(matrix, device="cpu", dtype=wp.float64), (40,)
+    yield "dense tiny", lambda: wl.DenseOperator(matrix[:3, :3], device="cpu"), (3,)
+
+
+def _variants(name: str, method: Any) -> list[Any]:
+    """Return a method with each precision, and with settings that take other paths."""
+    chosen = any(field.name == "precision" for field in dataclasses.fields(method))
+    made = [method(precision=p) for p in PRECISIONS] if chosen else [method()]
+    return made + [method(**settings) for settings in OTHER_SETTINGS.get(name, ())]
+
+
 def line(what: str, problem: wl.LCP, method: Any, start: Any) -> str:
     """Solve, and return the line."""
-    result = wl.solve(problem, method, stopping=STOPPING, x0=start)
+    called = f"{type(method).__name__} {getattr(method, 'precision', '')}".strip()
+    try:
+        result = wl.solve(problem, method, stopping=STOPPING, x0=start)
+    except (ValueError, TypeError) as error:
+        return f"{what}, {called}: {type(error).__name__}: {' '.join(str(error).split())}"
     steps = "".join(record.step[0] for record in result.history)
     norms = np.array([record.residual for record in result.history])
-    called = f"{type(method).__name__} {getattr(method, 'precision', '')}".strip()
     return f"{what}, {called}: {result.status.name} {steps} {_digest(result.x.numpy())} {_digest(norms)}"
 
 
@@ -127,10 +193,10 @@ def main() -> None:
     """Write the lines."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.bits", description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--part", choices=("small", "other", "frames"), action="append")
+    parser.add_argument("--part", choices=PARTS, action="append")
     args = parser.parse_args()
-    parts, lines = args.part or ["small", "other", "frames"], list[str]()
-    for part, solves in (("small", small_solves), ("other", other_solves)):
+    parts, lines = args.part or PARTS, list[str]()
+    for part, solves in (("small", small_solves), ("other", other_solves), ("methods", method_solves)):
         if part in parts:
             lines += [line(*solve) for solve in solves()]
     if "frames" in parts:
