@@ -148,7 +148,7 @@ def wrong_launches():
     yield {"out": wp.zeros(7, dtype=wp.float64, device="cpu")}, ValueError, "product: out has 7 elements, fewer than 30"
     yield {"out": short}, TypeError, "product: out is float32, not an array of float64"
     yield {"stencil": None}, TypeError, "product: needs stencil"
-    yield {"bounds": []}, TypeError, "product: takes no bounds"
+    yield {"bounds": []}, TypeError, "product: needs stencil, takes no bounds"
 
 
 @pytest.mark.parametrize(("change", "error", "message"), [*wrong_launches()], ids=lambda v: next(iter(v)) if isinstance(v, dict) else "")
