@@ -143,7 +143,9 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
         elif problem.bounded and settings.crossover > 0:
             self.active_set = NewtonWorkspace(problem, newton)
             self.active_set.residual = self.residual
-        self.system = principal_system(problem, self.precision.correction, bounded=False, settings=settings.cycle, shifted=problem.bounded)
+        self.system: Any = principal_system(
+            problem, self.precision.correction, bounded=False, settings=settings.cycle, shifted=problem.bounded
+        )
         upper = problem.bounds.may_bind[1]
         self._w, self._s = layout.zeros(wp.float64), layout.zeros(wp.float64)
         self._v, self._t = (layout.zeros(wp.float64), layout.zeros(wp.float64)) if upper else (self._w, self._s)
@@ -307,7 +309,7 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
 
     def _advance(self, x: wp.array[Any], tau: float, length: float) -> None:
         """Move, unless the length is 0, and set the residual's norm and the next system there."""
-        sums, rows, form = self._sums[1], self._grid, {"UPPER": self._upper, "FUSED": True}
+        sums, rows, form = self._sums[1], self._grid, dict[str, Any](UPPER=self._upper, FUSED=True)
         move = self._moving(x, 1.0, tau, length)
         self.size = max(self.residual.norm, 1e-300)
         moving = kernels.MOVE.bind(rows, **move, **form, out=sums.partials[2 * rows.places :]) if length else None

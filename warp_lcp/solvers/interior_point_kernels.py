@@ -41,6 +41,7 @@ RATIOS = RowPass(
 )  # fmt: skip
 CENTER = RowPass(
     "interior_point.center", HEADERS / "path_center.h", f64, reads={"e": "S", "y": f64, "free": wp.uint8, "D": "S", **PAIRS},
-    optional=("y", "D"), writes={"a": "S", "r": "S"}, numbers={"scale": f64, "tau": f64, "carried": bool}, sums=("weighted",), constants=FORM,
+    optional=("y", "D"), writes={"a": "S", "r": "S"}, numbers={"scale": f64, "tau": f64, "carried": bool},
+    sums=("weighted",), constants=FORM,
 )  # fmt: skip
 ADVANCE = Wave("interior_point.advance", (MOVE, 0), (CONDENSE, 1))  # a plane is condensed when the one above it has moved
