@@ -12,7 +12,6 @@ from warp_lcp.krylov import ConjugateGradient
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.solvers.interior_point import InteriorPoint
 from warp_lcp.solvers.nonsmooth_map import Kink, NonsmoothMap, Reformulation
-from warp_lcp.solvers.nonsmooth_map_grid import GridMap
 from warp_lcp.solvers.principal_system import GridSystem
 from warp_lcp.solvers.projected_multigrid_kernels import BETA, CARRY, NORM, SIZE, SLOTS, STEP, plan_whole_step_kernel
 
@@ -85,19 +84,18 @@ def test_a_fischer_step_is_its_move_its_residual_and_its_system(form, upper, sha
     s = scene(form, lower=np.where(np.arange(np.prod(SHAPE)) % 3, 0.0, -np.inf).reshape(SHAPE), upper=upper)
     residual = NaturalResidual(s.problem)
     kind = Reformulation.FISCHER if share == 1 else Reformulation.PENALIZED
-    map_ = NonsmoothMap(s.problem, residual, kind, share, real, Kink.PERTURBATION)
+    map_ = NonsmoothMap(s.problem, residual, kind, share, Kink.PERTURBATION)
     system = GridSystem(s.problem.A, real, bounded=False, shifted=True)
     start, e = (s.rng.standard_normal(s.fluid.size) * s.fluid for _ in range(2))
     e, step, scale = e.astype(np.float32).astype(np.float64), 0.3, 0.7
     x, moved = stored(s, start), start + step * e
     system.e.assign(stored(s, e, real))
-    passes = GridMap(map_, system.hierarchy, system.e)
-    merit = passes.advance(x, step, scale, 1)
+    merit = map_.step(x, system.e, step, system.hierarchy.finest, scale, 1)
     np.testing.assert_allclose(inner(x), moved, rtol=1e-12, atol=1e-12)
     lower, tol = np.where(np.arange(s.fluid.size) % 3, 0.0, -np.inf), 1e-5 if real is wp.float32 else 1e-12
     l, u, f = lower[s.fluid], np.full(s.fluid.sum(), upper), np.ix_(s.fluid, s.fluid)
     assert residual.norm == pytest.approx(natural_residual(s.A[f], s.b[s.fluid], l, u, moved[s.fluid]), rel=1e-12)
-    r, d, norm = inner(system.r), inner(system.hierarchy.finest.stencil.d), passes.norm
+    r, d, norm = inner(system.r), inner(system.hierarchy.finest.stencil.d), map_.norm
     shift, free = s.problem.layout.zeros(wp.float64), s.problem.layout.zeros(wp.uint8)
     residual.evaluate(x)
     assert map_.condense(x, shift, system.r, free, scale, 1) == pytest.approx(merit, rel=10 * tol)

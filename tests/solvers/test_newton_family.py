@@ -124,7 +124,7 @@ def test_gradient_of_the_merit(map_):
     A, b, lower, upper = random_boxed(rng)
     problem = dense(A, b, lower, upper)
     residual, x = NaturalResidual(problem), rng.standard_normal(6)
-    f = NonsmoothMap(problem, residual, map_, 0.7, wp.float64)
+    f = NonsmoothMap(problem, residual, map_, 0.7)
 
     def merit(point):
         field = wp.array(point, dtype=wp.float64, device="cpu")
@@ -147,7 +147,7 @@ def test_maps_vanish_at_solutions_only(map_):
     A, b, lower, upper = random_boxed(rng)
     problem = dense(A, b, lower, upper)
     residual, x = NaturalResidual(problem), boxed(A, b, lower, upper)
-    f = NonsmoothMap(problem, residual, map_, 0.95, wp.float64)
+    f = NonsmoothMap(problem, residual, map_, 0.95)
     values = []
     for point in (x, x + 0.01 * np.eye(6)[4], x - 0.01 * np.eye(6)[4]):
         field = wp.array(point, dtype=wp.float64, device="cpu")

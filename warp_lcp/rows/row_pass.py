@@ -19,7 +19,15 @@ from warp_lcp.rows.layout import Bounds, Known, RowLayout, Rows, joined, make_st
 
 HEADERS = Path(__file__).parent / "headers"
 C = {**C_TYPES, wp.int8: "signed char", wp.int32: "int", wp.bool: "bool"}
-PACKED = {wp.float32: "f", wp.float64: "d", wp.int32: "i", int: "i", wp.bool: "?", bool: "?"}  # numbers, as `struct` calls them
+PACKED = {
+    wp.float32: "f",
+    wp.float64: "d",
+    wp.int64: "q",
+    wp.int32: "i",
+    int: "i",
+    wp.bool: "?",
+    bool: "?",
+}  # numbers, as `struct` calls them
 NO_BOUNDS, SIDES = Bounds(), struct.Struct("dd")
 LARGEST = 4  # passes of a wave
 STAGES = ("L1", "F1", "L2", "F2", "L3", "F3", "L4", "F4")  # their layouts and fields
@@ -72,7 +80,7 @@ class RowPass:
         optional: which arrays may be None, or empty: their pointers are null then.
         numbers: given by the host.
         sums: variables of the row function that are summed over the cells.
-        constants: integers that are known when the kernel is made, with their usual values.
+        constants: integers that are known when the kernel is made, macros of the row function, with their usual values.
     """
 
     name: str
@@ -215,15 +223,16 @@ class Form:
         self.blank = Fields()
         run.__module__ = f"warp_lcp.{d.name}.{'_'.join(self.words)}"  # apart from other forms, which Warp would take for overloads
         run.__qualname__ = f"{d.name.rpartition('.')[2]}_rows"
-        self.run = wp.func_native(self._source(letters, constants | {"STENCIL": ord(shape[0])}, of))(run)
+        self.run = wp.func_native(self._source(letters, constants, ord(shape[0]), of))(run)
 
-    def _source(self, letters: dict[str, Any], constants: dict[str, int], of: Any) -> str:
+    def _source(self, letters: dict[str, Any], constants: dict[str, int], stencil: int, of: Any) -> str:
         """Return the body: a loop over pieces, in it pointers by name, the shared functions, the row function, the sums."""
         d = self.declared
         into = not {*d.ring}.isdisjoint(d.writes)
-        switches = {"RINGS": bool(d.ring), "INTO_RING": into, "LEVELS": bool(d.other), "BOUNDS": ord(self.bounds[0])} | constants
+        switches = {"RINGS": bool(d.ring), "INTO_RING": into, "LEVELS": bool(d.other), "BOUNDS": ord(self.bounds[0]), "STENCIL": stencil}
         head = [f"typedef {C[t]} {n};" for n, t in letters.items()] + [f"typedef {C[of(d.compute)]} T;"] * ("T" not in letters)
-        head += [f"constexpr int {n} = {int(v)};" for n, v in switches.items()]
+        head += [f"constexpr int {n} = {int(v)};" for n, v in switches.items()] + [f"#define {n} {v}" for n, v in constants.items()]
+        tail = ['#line 1 "end"', "}", *(f"#undef {n}" for n in constants), ""]
         at = {n: " + p + P.ring" if n in d.ring else " + p" for n in (*d.reads, *d.writes)} | dict.fromkeys(d.other, " + P.q")
         each = ["const Piece P = piece(k_i, j_i, c_); const int n = P.n; const long long p = P.p;"]
         each += [f"const long long yp = {'L.o2' if d.finer else 'P.yp'}, zp = {'L.o1' if d.finer else 'P.zp'};"]
@@ -245,7 +254,7 @@ class Form:
         shared = [text(HEADERS / h) for h, used in (("stencil.h", d.stencil), ("bounds.h", d.bounds)) if used]
         loops = ["for (int k_i = k_ < 0 ? 0 : k_; k_i < end_ && k_i < L.planes; ++k_i)", "for (int j_i = j_; j_i < last_; ++j_i) {"]
         before = [text(HEADERS / "native.h"), '#line 1 "types"', *head, text(HEADERS / "piece.h"), '#line 1 "fields"', *loops, *each]
-        return "\n".join(["", *before, *shared, text(d.header), '#line 1 "sums"', *(sums if d.sums else []), "}", ""])
+        return "\n".join(["", *before, *shared, text(d.header), '#line 1 "sums"', *(sums if d.sums else []), *tail])
 
     def alike(self, declared: RowPass) -> "Form":
         """Return another pass without a stencil in the form that has the same types."""

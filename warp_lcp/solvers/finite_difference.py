@@ -33,7 +33,7 @@ class FiniteDifferenceSystem:
     def __init__(self, problem: LCP, residual: NaturalResidual, map: Reformulation, share: float) -> None:
         layout, self._problem, self._residual = problem.layout, problem, residual
         self.r, self.z, self._f, self._moved = (layout.zeros(wp.float64) for _ in range(4))
-        self._map = NonsmoothMap(problem, residual, map, share, wp.float64, Kink.APPROXIMATION)
+        self._map = NonsmoothMap(problem, residual, map, share, Kink.APPROXIMATION)
         self._sums = wp.zeros(1, dtype=wp.float64, device=problem.device)
         self._reduction = Reduction(layout.size, problem.device, self._sums)
         self._krylov = GMRES(self._product, self)

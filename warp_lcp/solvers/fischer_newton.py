@@ -23,7 +23,6 @@ from warp_lcp.solvers.gradient_descent import GradientDescent, GradientWorkspace
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
 from warp_lcp.solvers.nonsmooth_map import Kink, NonsmoothMap, Reformulation
-from warp_lcp.solvers.nonsmooth_map_grid import GridMap
 from warp_lcp.solvers.principal_system import GridSystem, principal_system
 
 SHARE = 0.95  # lambda of the penalized map for dense problems: measured on frictional contacts
@@ -140,10 +139,9 @@ class FischerWorkspace(IterateInPlace, RoundedIterate):
             if self.kink is Kink.APPROXIMATION
             else principal_system(problem, self.precision.correction, bounded=False, settings=settings.cycle, shifted=True)
         )
-        self.map = NonsmoothMap(problem, self.residual, map_, share, self.system.r.dtype, self.kink)
-        self._passes: GridMap | None = None
-        if isinstance(self.system, GridSystem) and self.system.fused and settings.safeguard and self.precision is not Precision.SINGLE:
-            self._passes = GridMap(self.map, self.system.hierarchy, self.system.e)
+        self.map = NonsmoothMap(problem, self.residual, map_, share, self.kink)
+        grid = isinstance(self.system, GridSystem) and self.system.fused
+        self._fusable = grid and settings.safeguard and self.precision is not Precision.SINGLE
         self._search = NonmonotoneSearch(memory=settings.memory if settings.safeguard else 1)
         self._gradient: GradientWorkspace | None = None
         self._rounded = layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
@@ -174,28 +172,28 @@ class FischerWorkspace(IterateInPlace, RoundedIterate):
         return self.active_set.monotone_step()
 
     @property
-    def _fused(self) -> GridMap | None:
-        """What steps in one pass, where the problem allows that."""
-        return self._passes if self.floating is None else None
+    def _fused(self) -> bool:
+        """Whether a step is one pass over memory, where the problem allows that."""
+        return self._fusable and self.floating is None
 
     def newton_step(self, x: wp.array[Any]) -> Step:
         """Solve for the direction, and search along it."""
         s, fused = self.settings, self._fused
         if self._scale == 0:
-            if fused is None and self.active_set is not None:
+            if not fused and self.active_set is not None:
                 self.residual.affine(x)
             self._condense(x)
         size, merit = 1 / self._scale, self._merit
         self._scale = 0.0
         if isinstance(self.system, FiniteDifferenceSystem):
             self.system.linearize(x, self.free, size)
-        elif fused is not None:
+        elif fused:
             self.system.hierarchy.rebuild()
         else:
             self.system.restrict(self.free, self._shift)
         if self.floating is not None:
             self.floating.project(self.system.r, self._without_bounds)
-        norm = self.system.norm() if fused is None else fused.norm
+        norm = self.map.norm if fused else self.system.norm()
         iterations = self.system.solve(s.eta * norm, s.max_linear_iterations)[0] if norm > 0 else 0
         self._search.remember(merit)
         self._gone = 0.0
@@ -226,8 +224,8 @@ class FischerWorkspace(IterateInPlace, RoundedIterate):
         """Write the system of the next step, and return the merit; move x first, where that is one pass."""
         self.steps += 1
         self._scale = 1 / max(self.residual.norm, 1e-300)
-        if self._fused is not None:
-            self._merit = self._fused.advance(x, move, self._scale, self.steps)
+        if self._fused:
+            self._merit = self.map.step(x, self.system.e, move, self.system.hierarchy.finest, self._scale, self.steps)
             return self._merit
         self._merit = self.map.condense(x, self._shift, self.system.r, self.free, self._scale, self.steps)
         return self._merit
@@ -254,7 +252,7 @@ class FischerWorkspace(IterateInPlace, RoundedIterate):
 
     def _trial(self, x: wp.array[Any], scale: float) -> float:
         """Move, and return the merit; the system is that of the next step then, for a full step is nearly always taken."""
-        if self._fused is not None:
+        if self._fused:
             move, self._gone = scale - self._gone, scale
             return self._condense(x, move) if math.isfinite(move) else math.inf
         self._go(x, scale)

@@ -92,7 +92,7 @@ class GradientWorkspace(IterateInPlace):
         self.residual = residual or NaturalResidual(problem)
         self.x = problem.layout.zeros(wp.float64) if residual is None else wp.empty(0, dtype=wp.float64, device=problem.device)
         self._from = problem.layout.zeros(wp.float64)
-        self._map = NonsmoothMap(problem, self.residual, Reformulation(settings.map), settings.share, wp.float64)
+        self._map = NonsmoothMap(problem, self.residual, Reformulation(settings.map), settings.share)
         self._search = NonmonotoneSearch(memory=settings.memory, least=1e-18)
         self._rounded = problem.layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
         self.floating: Any = None

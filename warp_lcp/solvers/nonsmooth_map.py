@@ -9,10 +9,12 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.layout import PaddedLayout
+from warp_lcp.multigrid.hierarchy import Level
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
-from warp_lcp.solvers.nonsmooth_map_kernels import Form, Map, kernels
-from warp_lcp.vectors import Reduction, launch_spans
+from warp_lcp.rows import Bound, RowPass, Rows
+from warp_lcp.solvers import nonsmooth_map_kernels as kernels
+from warp_lcp.vectors import Reduction
 
 KINK = 1e-14  # times the size of b: a point this near to both sides of a kink is on it
 
@@ -52,46 +54,38 @@ class NonsmoothMap:
         residual: whose y is used.
         map: which of the three.
         share: lambda of the penalized map.
-        real: type of corrections.
         kink: what stands for the derivative at a kink.
 
     Attributes:
-        form: what of the maps is computed.
-        data: numbers that the kernels take.
-        drops: whether unknowns at a kink do not move.
+        norm: of the right-hand side that `step` wrote, as its system measures it.
     """
 
-    def __init__(
-        self, problem: LCP, residual: NaturalResidual, map: Reformulation, share: float, real: Any, kink: Kink = Kink.PERTURBATION
-    ) -> None:
+    def __init__(self, problem: LCP, residual: NaturalResidual, map: Reformulation, share: float, kink: Kink = Kink.PERTURBATION) -> None:
         self.problem, self.residual, self.map = problem, residual, map
         layout, self._share = problem.layout, share if map is Reformulation.PENALIZED else 1.0
-        natural, penalized = map is Reformulation.NATURAL, self._share < 1
-        form = self.form = Form(natural, problem.bounds.may_bind[1], penalized, kink is Kink.RANDOM and not natural)
-        self._kernels = kernels(residual.diagonal.dtype, real, form)
-        self._double = kernels(residual.diagonal.dtype, wp.float64, form)
-        self._sums = wp.zeros(2, dtype=wp.float64, device=problem.device)
-        self._reduction = Reduction(layout.size, problem.device, self._sums, columns=2)
-        self.data = Map()
-        self._gradients: list[wp.array[Any]] = []  # this one and the last, the product, the weights: made when first asked for
-        self.drops = kink in (Kink.ZERO, Kink.APPROXIMATION)
+        natural, self._rows, self._random = map is Reformulation.NATURAL, Rows.flat(layout.size, problem.device), kink is Kink.RANDOM
+        self._form = {"NATURAL": natural, "UPPER": problem.bounds.may_bind[1], "PENALIZED": self._share < 1}
+        self._form["RANDOM"] = self._random and not natural
+        self._sums, self.norm = wp.zeros(3, dtype=wp.float64, device=problem.device), 0.0
+        self._reduction = Reduction(layout.size, problem.device, self._sums, columns=2, threads=self._rows.places)
+        self._by_rows: Reduction | None = None  # made when first asked for, as is this one and the last gradient, the product, the weights
+        self._gradients: list[wp.array[Any]] = []
+        self._drops = kink in (Kink.ZERO, Kink.APPROXIMATION)
         self.begin()
 
     def begin(self) -> None:
         """Take the scale of b as it is now."""
-        p, data = self.problem, self.data
-        count = max(int(np.count_nonzero(p.unknown.numpy() == 1)), 1)
+        count = max(int(np.count_nonzero(self.problem.unknown.numpy() == 1)), 1)
         scale = self.residual.norm_of_b() / np.sqrt(count) or 1.0
-        data.unit, data.share, data.over, data.kinks = self.residual.unit, self._share, 1 / scale, KINK * scale
-        data.seed = 0
+        self._numbers = {"share": self._share, "over": float(1 / scale), "kinks": float(KINK * scale), "seed": 0}
 
     def merit(self, x: wp.array[Any]) -> float:
         """Return f.f / 2."""
-        return self._half_sum(self._kernels.merit, x, [])
+        return self._half_sum(kernels.MERIT, x)
 
     def values(self, x: wp.array[Any], out: wp.array[Any]) -> None:
         """Write f to a stored field."""
-        launch_spans(self._kernels.values, self._reduction.spans, [*self._operands(x), out], [], self.problem.device)
+        self._bind(kernels.VALUES, x, values=out).launch()
 
     def condense(self, x: wp.array[Any], shift: wp.array[Any], r: wp.array[Any], free: wp.array[Any], scale: float, turn: int) -> float:
         """Write Newton's system divided by q: (A + D) dx = -f / q with D = d p / q, q at least 1e-6; return the merit.
@@ -104,12 +98,38 @@ class NonsmoothMap:
             scale: of the right-hand side.
             turn: number of the step, so that random elements differ from step to step.
         """
-        self.turn(turn)
-        return self._half_sum(self._kernels.condense, x, [shift, r, free, wp.float64(scale), wp.float64(self.drops)])
+        return self._half_sum(kernels.CONDENSE, x, D=shift, r=r, free=free, **self._condensing(scale, turn))
 
-    def turn(self, number: int) -> None:
-        """Draw other random elements than in the last step."""
-        self.data.seed = number * self.problem.layout.size
+    def _condensing(self, scale: float, turn: int) -> dict[str, Any]:
+        self._numbers["seed"] = turn * self.problem.layout.size  # other random elements than in the last step
+        return {"scale": scale, "least": kernels.LEAST_Q, "drop": self._drops}
+
+    def step(self, x: wp.array[Any], e: wp.array[Any], length: float, finest: Level, scale: float, turn: int) -> float:
+        """Move x by length e, set the residual's norm, and condense the next system there, for one CPU thread and no periodic axes.
+
+        Args:
+            x: the iterate, stored.
+            e: the direction, stored.
+            length: how far; 0: only condense.
+            finest: level with a shift; receives the system, D on top of A's diagonal.
+            scale: of the right-hand side.
+            turn: number of the step.
+
+        Returns:
+            The merit.
+        """
+        p, stencil = self.problem, self.problem.A.stencil  # type: ignore[attr-defined]
+        if self._by_rows is None:
+            self._by_rows = Reduction(p.layout.size, p.device, self._sums, columns=3, threads=stencil.rows.places)
+        moving = kernels.MOVE.bind(stencil.rows, e=e, x=x, step=length) if length else None
+        fields = {"x": x, "b": p.b, "unknown": p.unknown, "D": finest.stencil.d, "r": finest.b, "out": self._by_rows.partials}
+        numbers = self._condensing(scale, turn) | self._numbers | self._form
+        condensing = kernels.CONDENSE_AT_ROWS.bind(stencil.rows, stencil=stencil, bounds=p.bounds.operands, **fields, **numbers)
+        kernels.STEP.launch(moving, condensing)
+        self._by_rows.add_up(0, columns=3)
+        square, merit, weighted = self._sums.numpy()
+        self.residual.norm, self.residual.current, self.norm = float(np.sqrt(square)), True, float(np.sqrt(weighted))
+        return 0.5 * float(merit) / scale**2
 
     def descend(self, x: wp.array[Any]) -> tuple[float, float]:
         """Write the gradient J'f, scaled by d^-2, to `direction`.
@@ -122,14 +142,13 @@ class NonsmoothMap:
             self._gradients = [p.layout.zeros(wp.float64) for _ in range(4)]
         last, new, product, weights = self._gradients
         self._gradients = [new, last, product, weights]
-        self._half_sum(self._kernels.weighted, x, [new, weights])
+        self._half_sum(kernels.WEIGHTED, x, by_x=new, by_y=weights)
         shape = (p.layout.size,) if isinstance(p.layout, PaddedLayout) else p.layout.stored_shape  # grids take stored fields flat
         p.A.apply_transpose(weights.reshape(shape), product.reshape(shape))
-        r, reduction = self.residual, self._reduction
-        before = [new, product, last, r.diagonal, wp.float64(r.unit), p.unknown]
-        launch_spans(self._kernels.gradient, reduction.spans, before, [reduction.threads, reduction.partials], p.device)
-        reduction.add_up(0, columns=2)
-        square, inner = self._sums.numpy()
+        r, fields = self.residual, {"gradient": new, "product": product, "last": last, "unknown": p.unknown}
+        kernels.GRADIENT.bind(self._rows, **fields, d=r.diagonal, unit=r.unit, out=self._reduction.partials).launch()
+        self._reduction.add_up(0, columns=2)
+        square, inner = self._sums.numpy()[:2]
         return float(square), float(inner)
 
     @property
@@ -140,15 +159,15 @@ class NonsmoothMap:
     def advance(self, base: wp.array[Any], e: wp.array[Any], scale: float, x: wp.array[Any], *, projected: bool) -> None:
         """Set x = base + scale e, projected onto the bounds or not; base and x may be one field."""
         p = self.problem
-        before = [base, e, p.lower, p.upper, p.unknown, x, wp.float64(scale), projected]
-        launch_spans((self._kernels if e.dtype is not wp.float64 else self._double).advance, self._reduction.spans, before, [], p.device)
+        fields = {"base": base, "e": e, "unknown": p.unknown, "x": x}
+        kernels.ADVANCE.bind(self._rows, bounds=p.bounds.operands, **fields, scale=scale, projected=projected).launch()
 
-    def _half_sum(self, kernel: wp.Kernel, x: wp.array[Any], after: list[Any]) -> float:
-        reduction = self._reduction
-        launch_spans(kernel, reduction.spans, [*self._operands(x), *after], [reduction.partials], self.problem.device)
-        reduction.add_up(0)
+    def _half_sum(self, declared: RowPass, x: wp.array[Any], **given: Any) -> float:
+        self._bind(declared, x, **given, out=self._reduction.partials).launch()
+        self._reduction.add_up(0)
         return 0.5 * float(self._sums.numpy()[0])
 
-    def _operands(self, x: wp.array[Any]) -> list[Any]:
+    def _bind(self, declared: RowPass, x: wp.array[Any], **given: Any) -> Bound:
         p, r = self.problem, self.residual
-        return [self.data, x, r.y, r.diagonal, p.lower, p.upper, p.unknown]
+        fields = {"x": x, "y": r.y, "d": r.diagonal, "unknown": p.unknown, "unit": r.unit}
+        return declared.bind(self._rows, bounds=p.bounds.operands, **fields, **given, **self._numbers, **self._form)
