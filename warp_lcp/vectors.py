@@ -12,6 +12,7 @@ import warp as wp
 
 from warp_lcp.native import CUDA_BLOCK, CUDA_SEGMENTS, Spans
 from warp_lcp.program import Launch, perform
+from warp_lcp.rows import Rows
 from warp_lcp.vector_kernels import add_up_kernel, kernels
 
 
@@ -86,6 +87,11 @@ def _add_across(across: Across, scalars: wp.array[wp.float64], slots: slice) -> 
         sums[...] = across.sum(sums)
     else:
         scalars[slots].assign(across.sum(scalars[slots].numpy()))
+
+
+def rows_of(field: wp.array[Any]) -> Rows:
+    """Return the rows of passes over flat fields like this one."""
+    return Rows.flat(field.size, field.device)
 
 
 def launch_spans(

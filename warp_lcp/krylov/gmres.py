@@ -10,11 +10,13 @@ import warp as wp
 
 from warp_lcp.deadline import check_time
 from warp_lcp.field_set import FieldSet
-from warp_lcp.krylov.conjugate_gradient import LinearMap, Preconditioner
-from warp_lcp.krylov.gmres_kernels import kernels
-from warp_lcp.native import Spans
-from warp_lcp.vectors import launch_spans
+from warp_lcp.krylov.conjugate_gradient import HEADERS, LinearMap, Preconditioner
+from warp_lcp.rows import RowPass
+from warp_lcp.vectors import rows_of
 
+RESIDUAL = RowPass("gmres.residual", HEADERS / "residual.h", "S", reads={"b": "S", "w": "S"}, writes={"q": "S"}, optional=("w",))
+WEIGH = RowPass("gmres.weigh", HEADERS / "weigh.h", "S", reads={"w": "S"}, writes={"q": "S"}, numbers={"inverse": bool})
+INCREASE = RowPass("gmres.increase", HEADERS / "increase.h", "S", reads={"z": "S"}, writes={"x": "S"})
 STALLED = 0.99  # a restart that leaves more than this share of the residual gains nothing that another one would not
 
 
@@ -38,10 +40,11 @@ class GMRES:
         self._product, self._preconditioner, self._restart = product, preconditioner, restart
         self.device, self.x = r.device, wp.zeros_like(r)
         self._b, self._q = wp.zeros_like(r), wp.zeros_like(r)
-        self._weight = wp.empty(0, dtype=r.dtype, device=r.device) if weight is None else weight
+        self._weight = weight
         self._basis = FieldSet(restart + 1, r.size, r.dtype, r.device)
         self._factors = wp.zeros(restart + 1, dtype=wp.float64, device=r.device)
-        self._kernels, self._spans = kernels(r.dtype), Spans.of(r.size, r.device)
+        self._residual = RESIDUAL.bind(rows_of(r), b=self._b, w=weight, q=self._q)
+        self._increase = INCREASE.bind(rows_of(r), z=preconditioner.z, x=self.x)
         self._H, self._rotations, self._g = np.zeros((restart + 1, restart)), np.zeros((restart, 2)), np.zeros(restart + 1)
 
     def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
@@ -66,8 +69,7 @@ class GMRES:
 
     def _start(self) -> float:
         """Make the residual the first vector; return its norm. `_q` is A x."""
-        inputs = [self._b, self._q, self._weight, self._q]
-        launch_spans(self._kernels.residual, self._spans, inputs, [], self.device)
+        self._residual.launch()
         self._basis.add(self._factors, self._q, count=0, norm=True)
         self._basis.store(self._q, 0)
         return float(np.sqrt(self._basis.sums.numpy()[-1]))
@@ -92,8 +94,8 @@ class GMRES:
 
     def _weigh(self, q: wp.array[Any], *, inverse: bool = False) -> None:
         """Take a residual to the vectors of the basis, or back."""
-        if self._weight.size:
-            launch_spans(self._kernels.weigh, self._spans, [self._weight, inverse, q], [], self.device)
+        if self._weight is not None:
+            WEIGH.bind(rows_of(q), w=self._weight, q=q, inverse=inverse).launch()
 
     def _orthogonalize(self, count: int) -> np.ndarray:
         """Take the first vectors out of `_q`, twice, and store the rest as the next one; return the column of H."""
@@ -131,4 +133,4 @@ class GMRES:
         self._basis.add(self._factors, r, count=columns)
         self._weigh(r, inverse=True)
         self._preconditioner.apply()
-        launch_spans(self._kernels.increase, self._spans, [self._preconditioner.z, self.x], [], self.device)
+        self._increase.launch()
