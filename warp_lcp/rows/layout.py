@@ -130,7 +130,7 @@ class Rows:
     @staticmethod
     def of(padding: Padding, device: wp.Device, spans: Any = None) -> "Rows":
         """Return the rows of a padded grid, or what their spans have of them."""
-        return Rows._make(padding.size, device, (padding.plane + padding.row + 1, padding.plane, padding.row), padding.counts, spans)
+        return Rows.strided(padding.size, device, (padding.plane + padding.row + 1, padding.plane, padding.row), padding.counts, spans)
 
     @staticmethod
     def beyond(padding: Padding, device: wp.Device, axis: int, end: int) -> "Rows":
@@ -139,7 +139,7 @@ class Rows:
         counts = [1 if 2 - axis == a else n for a, n in enumerate(padding.counts)]
         starts = [end * (padding.counts[a] + 1) if 2 - axis == a else 1 for a in range(3)]
         first = sum(start * stride for start, stride in zip(starts, strides, strict=True))
-        return Rows._make(padding.size, device, (first, padding.plane, padding.row), tuple(counts), None)
+        return Rows.strided(padding.size, device, (first, padding.plane, padding.row), tuple(counts))
 
     @staticmethod
     def flat(size: int, device: wp.Device, *, serial: bool = False) -> "Rows":
@@ -147,12 +147,13 @@ class Rows:
         return _flat(size, device.alias, serial)
 
     @staticmethod
-    def _make(
-        size: int, device: wp.Device, strides: Any, counts: Any, spans: Any, cells: int | None = None, slab: int | None = None
+    def strided(
+        size: int, device: wp.Device, first: Any, counts: Any, spans: Any = None, cells: int | None = None, slab: int | None = None
     ) -> "Rows":
+        """Return rows by the first cell's element and the steps from plane to plane and row to row, and counts of planes, rows, cells."""
         slab, cells = slab or PLANES_A_THREAD["cuda" if device.is_cuda else "cpu"], cells or grain(counts[2], device)
         names = ("base", "s1", "s2", "planes", "rows", "nx")
-        shared = dict(zip(names, (*strides, *counts), strict=True)) | {"grain": cells, "chunks": -(-counts[2] // cells), "spans": spans}
+        shared = dict(zip(names, (*first, *counts), strict=True)) | {"grain": cells, "chunks": -(-counts[2] // cells), "spans": spans}
         single = put(copy_of(BLANK), shared | {"slab": 1})
         return Rows(single if slab == 1 else put(copy_of(single), {"slab": slab}), single, size, 0, device)
 
@@ -188,17 +189,17 @@ class Rows:
 def _flat(size: int, name: str, serial: bool) -> Rows:
     device = wp.get_device(name)
     if serial or not device.is_cuda:
-        return Rows._make(size, device, (0, 0, 0), (1, 1, size), None, cells=max(size, 1) if serial else CPU_CHUNK)
-    return strided(size, device, min(size, CUDA_THREADS))
+        return Rows.strided(size, device, (0, 0, 0), (1, 1, size), cells=max(size, 1) if serial else CPU_CHUNK)
+    return by_turns(size, device, min(size, CUDA_THREADS))
 
 
-def strided(size: int, device: wp.Device, width: int) -> Rows:
+def by_turns(size: int, device: wp.Device, width: int) -> Rows:
     """Return a flat field as rows of a width: a thread of a pass that sums takes the same place of each, its neighbor the next."""
     planes = -(-size // width)
     ends = np.full((planes, 1, 2), (0, width))
     ends[-1, 0, 1] -= planes * width - size
     spans = wp.array(ends, dtype=wp.vec2i, device=device)
-    return Rows._make(size, device, (0, width, 0), (planes, 1, width), spans, cells=1, slab=planes)
+    return Rows.strided(size, device, (0, width, 0), (planes, 1, width), spans, cells=1, slab=planes)
 
 
 @functools.cache
