@@ -69,7 +69,7 @@ def test_a_product_that_is_known_stands_for_a_stencil(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "rows", [Rows.flat(1000, wp.get_device("cpu"), serial=True), layout.by_turns(1000, wp.get_device("cpu"), 64)], ids=str
+    "rows", [Rows.flat(1000, wp.get_device("cpu"), serial=True), Rows.by_turns(1000, wp.get_device("cpu"), 64)], ids=str
 )
 def test_a_flat_field_goes_to_one_thread_or_by_turns_to_many(tmp_path, rows):
     """The second is what CUDA has: thread t sums elements t, t + 64, ...; 1000 is no multiple of 64."""

@@ -147,6 +147,15 @@ class Rows:
         return _flat(size, device.alias, serial)
 
     @staticmethod
+    def by_turns(size: int, device: wp.Device, width: int) -> "Rows":
+        """Return a flat field as rows of a width: a thread of a pass that sums takes the same place of each, its neighbor the next."""
+        planes = -(-size // width)
+        ends = np.full((planes, 1, 2), (0, width))
+        ends[-1, 0, 1] -= planes * width - size
+        spans = wp.array(ends, dtype=wp.vec2i, device=device)
+        return Rows.strided(size, device, (0, width, 0), (planes, 1, width), spans, cells=1, slab=planes)
+
+    @staticmethod
     def strided(
         size: int, device: wp.Device, first: Any, counts: Any, spans: Any = None, cells: int | None = None, slab: int | None = None
     ) -> "Rows":
@@ -190,16 +199,7 @@ def _flat(size: int, name: str, serial: bool) -> Rows:
     device = wp.get_device(name)
     if serial or not device.is_cuda:
         return Rows.strided(size, device, (0, 0, 0), (1, 1, size), cells=max(size, 1) if serial else CPU_CHUNK)
-    return by_turns(size, device, min(size, CUDA_THREADS))
-
-
-def by_turns(size: int, device: wp.Device, width: int) -> Rows:
-    """Return a flat field as rows of a width: a thread of a pass that sums takes the same place of each, its neighbor the next."""
-    planes = -(-size // width)
-    ends = np.full((planes, 1, 2), (0, width))
-    ends[-1, 0, 1] -= planes * width - size
-    spans = wp.array(ends, dtype=wp.vec2i, device=device)
-    return Rows.strided(size, device, (0, width, 0), (planes, 1, width), spans, cells=1, slab=planes)
+    return Rows.by_turns(size, device, min(size, CUDA_THREADS))
 
 
 @functools.cache
