@@ -164,7 +164,7 @@ def wrong_launches():
     yield {"out": wp.zeros(7, dtype=wp.float64, device="cpu")}, ValueError, "product: out has 7 elements, fewer than 30"
     yield {"out": short}, TypeError, "product: out is float32, not an array of float64"
     yield {"stencil": None}, TypeError, "product: needs stencil"
-    yield {"bounds": []}, TypeError, "product: takes no bounds"
+    yield {"bounds": []}, TypeError, "product: needs stencil, takes no bounds"
 
 
 @pytest.mark.parametrize(("change", "error", "message"), [*wrong_launches()], ids=lambda v: next(iter(v)) if isinstance(v, dict) else "")
@@ -208,14 +208,13 @@ def test_a_changed_header_is_compiled_anew(tmp_path):
     assert hashes[0] != hashes[1]
 
 
-def test_the_example_of_a_new_pass_runs_and_compiles_for_cuda(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("example", "header", "form"), [(0, "energy", "uint8_float32_float32"), (1, "relax", "uint8_float32")])
+def test_the_examples_of_a_new_pass_and_a_new_method_run_and_compile_for_cuda(tmp_path, monkeypatch, example, header, form):
     page = Path(__file__).parents[2] / "CONTRIBUTING.md"
-    (header,), (code,) = blocks(page, "cpp"), blocks(page, "python")
-    assert header.count("\n") + code.count("\n") < 40
-    (tmp_path / "energy.h").write_text(header)
+    source, code = blocks(page, "cpp")[example], blocks(page, "python")[example]
+    assert source.count("\n") + code.count("\n") < 40
+    (tmp_path / f"{header}.h").write_text(source)
     monkeypatch.chdir(tmp_path)
     run(code, page)
     for arch in (80, 90):
-        wp.compile_aot_module(
-            "warp_lcp.mine.energy.uniform_uint8_float32_float32", device=None, arch=arch, module_dir=tmp_path, use_ptx=True
-        )
+        wp.compile_aot_module(f"warp_lcp.mine.{header}.uniform_{form}", device=None, arch=arch, module_dir=tmp_path, use_ptx=True)

@@ -1,5 +1,6 @@
 """Where rows lie, and the structs that hand stencils and bounds to kernels."""
 
+import ctypes
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -44,22 +45,28 @@ class Bounds:
     """Bounds of x as `warp_lcp.bounds.Bounds.operands` has them."""
 
     lower: wp.array(dtype=wp.float64)
-    least: wp.float64
     upper: wp.array(dtype=wp.float64)
-    most: wp.float64
     code: wp.array(dtype=wp.uint8)
+    least: wp.float64
+    most: wp.float64
 
 
 BLANK = RowLayout()
+NO_ARRAY = bytes(wp.array(dtype=wp.uint8).__ctype__())
 
 
 def put(struct: Any, members: Mapping[str, Any]) -> Any:
     """Set members of a Warp struct whose types have been checked, and return it: in a third of the time that attributes take."""
-    native, known = struct.__ctype__(), struct.__dict__
+    native = struct.__ctype__()
     for name, value in members.items():
-        if value is not None:
+        kind = type(value)
+        if kind is wp.array:
+            setattr(native, name, value.ctype or value.__ctype__())
+        elif kind is float or kind is int or kind is bool:
+            setattr(native, name, value)
+        elif value is not None:
             setattr(native, name, value.__ctype__() if hasattr(value, "__ctype__") else getattr(value, "value", value))
-            known[name] = value  # keeps the memory
+    struct.__dict__.update(members)  # keeps the memory
     return struct
 
 
@@ -68,6 +75,17 @@ def copy_of(struct: Any) -> Any:
     native = struct.__ctype__()
     made = object.__new__(type(struct))
     made.__dict__.update(struct.__dict__, _ctype=type(native).from_buffer_copy(native))
+    return made
+
+
+def joined(blank: Any, members: dict[str, Any], numbers: bytes = b"") -> Any:
+    """Return a Warp struct like `blank` of the memory of its members, in a tenth of the time of setting them.
+
+    Members lie as in C: those that fill whole eight bytes (structs, arrays, None for no array) side by side, then packed numbers.
+    """
+    memory = b"".join([NO_ARRAY if v is None else v.__ctype__() for v in members.values()]) + numbers
+    made, native = object.__new__(type(blank)), type(blank.__ctype__())
+    made.__dict__.update(blank.__dict__, **members, _ctype=native.from_buffer_copy(memory.ljust(ctypes.sizeof(native), b"\0")))
     return made
 
 
@@ -173,6 +191,17 @@ class Rows:
             other: the rows of that level.
             factors: cells of it along x, y, z that one of ours stands for; below 0: of ours that one of its stands for.
         """
+        made = self._pairs.get(id(other))
+        if made is None:
+            made = self._pairs[id(other)] = other, self._beside(other, factors)
+        return made[1]
+
+    @functools.cached_property
+    def _pairs(self) -> dict[int, tuple["Rows", "Rows"]]:
+        """Rows with another level's beside them: of each level that has been asked for, and which that is."""
+        return {}
+
+    def _beside(self, other: "Rows", factors: tuple[int, int, int]) -> "Rows":
         L, theirs = self.single, other.single
         members = {"o0": theirs.base, "o1": theirs.s1, "o2": theirs.s2, "n1": theirs.planes, "n2": theirs.rows}
         members |= dict(zip(("fx", "fy", "fz"), factors, strict=True))

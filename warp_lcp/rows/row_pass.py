@@ -6,22 +6,23 @@ A row function sees a piece: pointers to its first cell, the number n of its cel
 
 import functools
 import re
+import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import warp as wp
 
 from warp_lcp.native import C_TYPES
-from warp_lcp.rows.layout import Bounds, Known, RowLayout, Rows, copy_of, make_struct, no_rows, put, stencil_struct, threads
+from warp_lcp.rows.layout import Bounds, Known, RowLayout, Rows, joined, make_struct, no_rows, stencil_struct, threads
 
 HEADERS = Path(__file__).parent / "headers"
 C = {**C_TYPES, wp.int8: "signed char", wp.int32: "int", wp.bool: "bool"}
+PACKED = {wp.float32: "f", wp.float64: "d", wp.int32: "i", int: "i", wp.bool: "?", bool: "?"}  # numbers, as `struct` calls them
+NO_BOUNDS, SIDES = Bounds(), struct.Struct("dd")
 LARGEST = 4  # passes of a wave
-
-
-NO_BOUNDS = Bounds()
+STAGES = ("L1", "F1", "L2", "F2", "L3", "F3", "L4", "F4")  # their layouts and fields
 NUMBERS = "numbers"  # that are the same everywhere, infinite ones too; else "coded", "fields"
 UNIFORM, VARIABLE, KNOWN = "uniform", "variable", "known"  # stencils: with a weight an axis, with arrays of them, with a product in place
 
@@ -39,7 +40,9 @@ def text(path: Path) -> str:
 
 @wp.struct
 class Nothing:
-    """Fields of a pass that a wave does not have."""
+    """Fields of a pass that a wave does not have; of eight bytes, as `joined` asks for."""
+
+    unused: wp.int64
 
 
 NOTHING = Nothing()
@@ -108,9 +111,9 @@ class RowPass:
             TypeError: one is missing, unknown, or of the wrong type.
             ValueError: an array has the wrong length.
         """
-        for name, wanted, value in (("stencil", self.stencil, stencil), ("bounds", self.bounds, bounds)):
-            if bool(wanted) != (value is not None):
-                raise TypeError(f"{self.name}: {'needs' if wanted else 'takes no'} {name}")
+        if (self.stencil is None) != (stencil is None) or self.bounds == (bounds is None):
+            verb = {True: "needs", False: "takes no"}
+            raise TypeError(f"{self.name}: {verb[self.stencil is not None]} stencil, {verb[self.bounds]} bounds")
         constants = tuple([int(given.pop(n, usual)) for n, usual in self.constants.items()]) if self.constants else ()
         if given.keys() != self._wanted:
             missing, unknown = sorted(self._wanted - given.keys()), sorted(given.keys() - self._wanted)
@@ -157,16 +160,20 @@ class RowPass:
         used = {kind for kind in (*self.arrays.values(), *(self.stencil or ())) if isinstance(kind, str)}
         return letters | dict.fromkeys(used - letters.keys(), wp.float32)  # of what is absent
 
+    @functools.cached_property
+    def _lengths(self) -> list[tuple[str, str]]:
+        """Names of the arrays whose lengths are known, each with the attribute of rows that it is."""
+        groups = (({**self.reads, **self.writes}, "size"), (self.other, "other_size"), (self.by_row, "count"))
+        return [(name, length) for names, length in groups for name in names]
+
     def _check_lengths(self, rows: Rows, given: dict[str, Any]) -> None:
-        lengths = ((self.reads, rows.size), (self.writes, rows.size), (self.other, rows.other_size), (self.by_row, rows.count))
-        for names, length in lengths:
-            for name in names:
-                found = 0 if given[name] is None else given[name].size
-                if found != length and (found or name not in self.optional):
-                    raise ValueError(f"{self.name}: {name} has {found} elements, not {length}")
-        least = len(self.sums) * rows.places
-        if self.sums and given["out"].size < least:
-            raise ValueError(f"{self.name}: out has {given['out'].size} elements, fewer than {least}: {rows.places} threads for each sum")
+        for name, length in self._lengths:
+            found, expected = 0 if given[name] is None else given[name].size, getattr(rows, length)
+            if found != expected and (found or name not in self.optional):
+                raise ValueError(f"{self.name}: {name} has {found} elements, not {expected}")
+        if self.sums and given["out"].size < len(self.sums) * rows.places:
+            least = f"fewer than {len(self.sums) * rows.places}: {rows.places} threads for each sum"
+            raise ValueError(f"{self.name}: out has {given['out'].size} elements, {least}")
 
 
 def _kind(bounds: list[Any]) -> str:
@@ -200,6 +207,7 @@ class Form:
         parts |= {"bounds": Bounds} if d.bounds else {}
         self.types = {name: of(kind) for name, kind in d.arrays.items()}
         members = {n: wp.array(dtype=t) for n, t in self.types.items()} | {n: of(t) for n, t in d.numbers.items()}
+        self._numbers = struct.Struct("".join(PACKED[of(t)] for t in d.numbers.values()))
         self.fields = Fields = make_struct(f"{d.name.replace('.', '_')}_{'_'.join(self.words)}", parts | members)
 
         def run(L: RowLayout, given: Fields, k_: int, end_: int, j_: int, last_: int, c_: int): ...
@@ -246,12 +254,12 @@ class Form:
 
     def fill(self, stencil: Any, bounds: Any, given: dict[str, Any]) -> Any:
         """Return the struct of arguments."""
-        F = copy_of(self.blank)
-        if stencil is not None:
-            put(F, {"stencil": stencil.struct})
+        parts = {} if stencil is None else {"stencil": stencil.struct}
         if bounds is not None:
-            put(F, {"bounds": put(copy_of(NO_BOUNDS), dict(zip(("lower", "least", "upper", "most", "code"), bounds, strict=True)))})
-        return put(F, given)
+            lower, least, upper, most, code = bounds
+            parts["bounds"] = joined(NO_BOUNDS, {"lower": lower, "upper": upper, "code": code}, SIDES.pack(least.value, most.value))
+        arrays = {name: given[name] for name in self.types}
+        return joined(self.blank, parts | arrays, self._numbers.pack(*[given[name] for name in self.declared.numbers]))
 
     @functools.cached_property
     def kernel(self) -> Any:
@@ -265,8 +273,7 @@ class Form:
         return _make_kernel(alone, self.declared.name, run.module.name)
 
 
-@dataclass(frozen=True)
-class Bound:
+class Bound(NamedTuple):
     """A pass with its arguments."""
 
     form: Form
@@ -305,12 +312,10 @@ class Wave:
                 bound.launch(launch)
             return
         forms = tuple(b.form if b else given[0].form.alike(stage) for b, stage in zip(passes, declared, strict=True))
-        inputs: list[Any] = []
-        for b, form in zip(passes, forms, strict=True):
-            inputs += [b.layout, b.fields] if b else [no_rows(), form.blank]
-        inputs += [no_rows(), NOTHING] * (LARGEST - len(passes))
-        kernel = _wave_kernel(self.name, forms, tuple(lag for _, lag in self.stages))
-        launch(kernel, 1, inputs, device=given[0].rows.device)
+        kernel, Stages = _wave_kernel(self.name, forms, tuple(lag for _, lag in self.stages))
+        parts = [part for b, form in zip(passes, forms, strict=True) for part in ((b.layout, b.fields) if b else (no_rows(), form.blank))]
+        parts += [no_rows(), NOTHING] * (LARGEST - len(passes))
+        launch(kernel, 1, [joined(Stages, dict(zip(STAGES, parts, strict=True)))], device=given[0].rows.device)
 
 
 @wp.func
@@ -345,17 +350,22 @@ def _wave_kernel(name: str, forms: tuple[Form, ...], lags: tuple[int, ...]) -> A
     shape = [word for word in words if word in (UNIFORM, VARIABLE, KNOWN, "coded", "fields")]
     variant = "_".join([*shape, *types, *(word for word in words if word not in shape)])
 
-    def wave(L1: RowLayout, F1: One, L2: RowLayout, F2: Two, L3: RowLayout, F3: Three, L4: RowLayout, F4: Four):
-        for s in range(wp.max(L1.planes, L2.planes) + most):
-            first(L1, F1, s, s + 1, 0, L1.rows, 0)
-            k = plane_after(L2, s - two)
-            second(L2, F2, k, k + 1, 0, L2.rows, 0)
-            k = plane_after(L3, s - three)
-            third(L3, F3, k, k + 1, 0, L3.rows, 0)
-            k = plane_after(L4, s - four)
-            fourth(L4, F4, k, k + 1, 0, L4.rows, 0)
+    types = (RowLayout, One, RowLayout, Two, RowLayout, Three, RowLayout, Four)
+    Stages = make_struct(
+        f"{name.replace('.', '_')}_{variant}", dict(zip(STAGES, types, strict=True))
+    )  # one argument, which takes a fraction of the time of eight
 
-    return _make_kernel(wave, name, f"warp_lcp.{name}.{variant}")
+    def wave(W: Stages):
+        for s in range(wp.max(W.L1.planes, W.L2.planes) + most):
+            first(W.L1, W.F1, s, s + 1, 0, W.L1.rows, 0)
+            k = plane_after(W.L2, s - two)
+            second(W.L2, W.F2, k, k + 1, 0, W.L2.rows, 0)
+            k = plane_after(W.L3, s - three)
+            third(W.L3, W.F3, k, k + 1, 0, W.L3.rows, 0)
+            k = plane_after(W.L4, s - four)
+            fourth(W.L4, W.F4, k, k + 1, 0, W.L4.rows, 0)
+
+    return _make_kernel(wave, name, f"warp_lcp.{name}.{variant}"), Stages()
 
 
 def _make_kernel(function: Any, name: str, module: str) -> Any:
