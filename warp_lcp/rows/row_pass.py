@@ -19,7 +19,15 @@ from warp_lcp.rows.layout import Bounds, Known, RowLayout, Rows, joined, make_st
 
 HEADERS = Path(__file__).parent / "headers"
 C = {**C_TYPES, wp.int8: "signed char", wp.int32: "int", wp.bool: "bool"}
-PACKED = {wp.float32: "f", wp.float64: "d", wp.int32: "i", int: "i", wp.int64: "q", wp.bool: "?", bool: "?"}  # numbers, as `struct` calls them
+PACKED = {
+    wp.float32: "f",
+    wp.float64: "d",
+    wp.int32: "i",
+    int: "i",
+    wp.int64: "q",
+    wp.bool: "?",
+    bool: "?",
+}  # numbers, as `struct` calls them
 NO_BOUNDS, SIDES = Bounds(), struct.Struct("dd")
 LARGEST = 4  # passes of a wave
 STAGES = ("L1", "F1", "L2", "F2", "L3", "F3", "L4", "F4")  # their layouts and fields
