@@ -18,6 +18,7 @@ from warp_lcp.vector_kernels import add_up_kernel
 
 HEADERS = Path(__file__).parent / "headers"
 DOT = RowPass("vectors.dot", HEADERS / "dot.h", wp.float64, reads={"a": "A", "b": "B"}, sums=("ab",))
+ADD = RowPass("vectors.add", HEADERS / "add.h", "S", reads={"z": "S"}, writes={"x": "S"})  # x += z
 CONVERT = RowPass("vectors.convert", HEADERS / "convert.h", "B", reads={"a": "A"}, writes={"b": "B"})
 
 

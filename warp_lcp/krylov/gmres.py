@@ -11,11 +11,10 @@ import warp as wp
 from warp_lcp.deadline import check_time
 from warp_lcp.krylov.conjugate_gradient import HEADERS, LinearMap, Preconditioner
 from warp_lcp.rows import RowPass
-from warp_lcp.vectors import Reduction, rows_of
+from warp_lcp.vectors import ADD, Reduction, rows_of
 
 RESIDUAL = RowPass("gmres.residual", HEADERS / "residual.h", "S", reads={"b": "S", "w": "S"}, writes={"q": "S"}, optional=("w",))
 WEIGH = RowPass("gmres.weigh", HEADERS / "weigh.h", "S", reads={"w": "S"}, writes={"q": "S"}, numbers={"inverse": bool})
-INCREASE = RowPass("gmres.increase", HEADERS / "increase.h", "S", reads={"z": "S"}, writes={"x": "S"})
 NUMBERS = {"size": wp.int64, "count": int}
 DOTS = RowPass("gmres.dots", HEADERS / "dots.h", "S", whole={"basis": "S"}, reads={"x": "S"}, numbers=NUMBERS, sums=("first",))
 COMBINE = RowPass(
@@ -55,7 +54,7 @@ class GMRES:
         self._reduction = Reduction(r.size, r.device, self._sums, columns=restart + 1)
         self._factors = wp.zeros(restart + 1, dtype=wp.float64, device=r.device)
         self._residual = RESIDUAL.bind(rows_of(r), b=self._b, w=weight, q=self._q)
-        self._increase = INCREASE.bind(rows_of(r), z=preconditioner.z, x=self.x)
+        self._increase = ADD.bind(rows_of(r), z=preconditioner.z, x=self.x)
         self._H, self._rotations, self._g = np.zeros((restart + 1, restart)), np.zeros((restart, 2)), np.zeros(restart + 1)
 
     def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:

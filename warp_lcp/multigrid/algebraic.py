@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 import warp as wp
-from pyamg.aggregation.aggregate import standard_aggregation
 from pyamg.aggregation.smooth import jacobi_prolongation_smoother
 from pyamg.aggregation.tentative import fit_candidates
 from pyamg.strength import symmetric_strength_of_connection
 
+from warp_lcp.multigrid.aggregates import aggregated, symmetric_part
 from warp_lcp.multigrid.algebraic_kernels import densify_kernel, factor_kernel, invert_kernel, places_kernel, solve_kernel
 from warp_lcp.operators.sparse import GATHER, PRODUCT, ROWS, SparseOperator
 from warp_lcp.program import Launch, Program
@@ -119,15 +119,6 @@ def product_pass(left: DeviceMatrix, right: DeviceMatrix, out: DeviceMatrix, hos
     return MULTIPLY.bind(left.rows, **left.operands, **given, begins=begins)
 
 
-@dataclass(frozen=True)
-class Step:
-    """From one level to the next: prolongation P, R = P', and the pattern of A P, on the host."""
-
-    P: Matrix
-    R: Matrix
-    AP: Matrix
-
-
 class AlgebraicLevel:
     """One level: its matrix, iterate x, right-hand side b, a second buffer t, the smoother's scale, and the way to the next level."""
 
@@ -137,9 +128,9 @@ class AlgebraicLevel:
         self.x, self.b, self.t, self.inverse = (wp.zeros(self.size, dtype=real, device=device) for _ in range(4))
         self.P: DeviceMatrix | None = None
 
-    def connect(self, host: Matrix, step: Step, coarse: AlgebraicLevel, coarse_host: Matrix, real: Any) -> None:
-        """Take the prolongation from a coarser level; `host` and `coarse_host` are both matrices' patterns."""
-        device, P, R, AP = self.device, step.P, step.R, step.AP
+    def connect(self, hosts: tuple[Matrix, ...], coarse: AlgebraicLevel, real: Any) -> None:
+        """Take the prolongation from a coarser level; `hosts` are A, P, R = P', the patterns of A P and of the coarse matrix."""
+        device, (host, P, R, AP, coarse_host) = self.device, hosts
         turn = scipy.sparse.csr_array((np.arange(P.nnz), P.indices, P.indptr), shape=P.shape).T.tocsr().data
         self.P, self.R = DeviceMatrix(P, real, device), DeviceMatrix(R, real, device)
         self.plain = wp.clone(self.P.values)  # P's entries before its rows are scaled
@@ -286,17 +277,15 @@ def _coarsen(A: Matrix, pattern: Matrix, real: Any, device: wp.Device, settings:
     levels = [AlgebraicLevel(current, real, device)]
     while current.shape[0] > most:
         fine = levels[-1]
-        turned = current.T.tocsr()
-        entries = scipy.sparse.csr_matrix((current + turned) * 0.5)
-        entries.eliminate_zeros()
+        entries = symmetric_part(current)
         C = symmetric_strength_of_connection(entries, theta=settings.strength)
-        aggregates, _ = standard_aggregation(C)
-        if aggregates.nnz == 0 or aggregates.shape[1] > settings.stall * current.shape[0]:
+        aggregates = aggregated(C, settings.stall)
+        if aggregates is None:
             break
         T, candidates = fit_candidates(aggregates, candidates)
         # local weights are sums of magnitudes; spectral ones start from random vectors, so runs would differ
         P = T
-        if _skewness(current, turned, entries) <= settings.skew:
+        if _skewness(current, entries) <= settings.skew:
             P = jacobi_prolongation_smoother(entries, T, C, candidates, omega=4 / 3, weighting="local")
         P = scipy.sparse.csr_array(P)
         P.sort_indices()
@@ -306,7 +295,7 @@ def _coarsen(A: Matrix, pattern: Matrix, real: Any, device: wp.Device, settings:
         if coarse.nnz > current.nnz or np.diff(AP.indptr).max() > WIDEST:  # wide rows, which coarsening fills
             break
         levels.append(AlgebraicLevel(coarse, real, device))
-        fine.connect(current, Step(P, R, AP), levels[-1], coarse, real)
+        fine.connect((current, P, R, AP, coarse), levels[-1], real)
         for product in fine.products:
             product.launch()
         values = levels[-1].A.values.numpy().astype(np.float64)
@@ -321,10 +310,10 @@ def _pattern_product(A: Matrix, B: Matrix) -> Matrix:
     return product
 
 
-def _skewness(A: Matrix, turned: Matrix, symmetric: Matrix) -> float:
+def _skewness(A: Matrix, symmetric: Matrix) -> float:
     """Return the sum of |A - A'| / 2 over that of the off-diagonal |A + A'| / 2."""
     off = float(np.abs(symmetric.data).sum() - np.abs(symmetric.diagonal()).sum())
-    return 0.5 * float(np.abs((A - turned).data).sum()) / off if off > 0 else 0.0
+    return 0.5 * float(np.abs((A - A.T).data).sum()) / off if off > 0 else 0.0
 
 
 def _alike(A: Matrix, B: Matrix) -> bool:
@@ -356,6 +345,3 @@ def _with_diagonal(matrix: Matrix) -> Matrix:
     pattern = (pattern + scipy.sparse.eye_array(matrix.shape[0], dtype=np.float32)).tocsr()
     pattern.sort_indices()
     return pattern
-
-
-__all__ = ["AlgebraicHierarchy", "AlgebraicSettings"]

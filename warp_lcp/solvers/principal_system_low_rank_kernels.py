@@ -32,13 +32,6 @@ def join_kernel(S: F64, columns: I32, u: F64, m: int, kept: F64, t: F64):
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.low_rank_correction")
-def copy_kernel(a: F64, b: F64):
-    """B = a."""
-    i = wp.tid()
-    b[i] = a[i]
-
-
-@wp.kernel(enable_backward=False, module="warp_lcp.low_rank_correction")
 def add_products_kernel(W: F64, uz: F64, up: F64, n: int, scalars: F64):
     """Make z'Kz and z'Kp of K = A + U W U' from those of A."""
     zz = wp.float64(0.0)

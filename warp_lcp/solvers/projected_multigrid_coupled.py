@@ -17,6 +17,7 @@ from warp_lcp.solvers import projected_multigrid_kernels as kernels
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
 from warp_lcp.solvers.principal_system_low_rank import LowRankCorrection
 from warp_lcp.solvers.projected_multigrid_workspace import AssessedResidual, MultigridWorkspace
+from warp_lcp.vectors import CONVERT, rows_of
 
 if TYPE_CHECKING:
     from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
@@ -171,6 +172,6 @@ class CoupledWorkspace(MultigridWorkspace):
         finest.stencil.wrap(finest.x, launch=launch)
         kernels.measuring(finest, self._p, residual.sums.partials).launch(launch)
         residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=launch)
-        launch(coupling.copy_kernel, self._low.rank, [columns.gather(self._p, launch=launch), self._along], device=device)
+        CONVERT.bind(rows_of(self._along), a=columns.gather(self._p, launch=launch), b=self._along).launch(launch)
         inputs = [self._low.weights.flatten(), columns.gather(finest.x, launch=launch), self._along, self._low.rank, residual.scalars]
         launch(coupling.add_products_kernel, 1, inputs, device=device)
