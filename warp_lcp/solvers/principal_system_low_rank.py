@@ -114,8 +114,8 @@ class LowRankCorrection:
         """Before a cycle: take U S'^-1 Z'r off the hierarchy's finest right-hand side r."""
         if self._dots is None:
             return
-        low, finest, m = self._low, self._hierarchy.finest, self.slots
-        DOTS.bind(finest.stencil.rows, Z=self._Z, r=finest.b, slots=m, size=self._size, out=self._dots.partials).launch(launch)
+        low, m = self._low, self.slots
+        self._multiply.launch(launch)
         self._dots.add_up(0, columns=m, launch=launch)
         inputs = [self._S, self._E, self._of_slot, self._sums, m, self._force, self._kept]
         launch(kernels.split_kernel, m, inputs, device=low.device)
@@ -129,8 +129,7 @@ class LowRankCorrection:
         self._spread(1.0, launch)
         u = self._columns.gather(finest.x, launch=launch)
         launch(kernels.join_kernel, m, [self._S, self._of_slot, u, m, self._kept, self._t], device=low.device)
-        given = {"Z": self._Z, "factors": self._t, "z": finest.x, "d": finest.stencil.d, "slots": m, "size": self._size}
-        SUBTRACT.bind(finest.stencil.rows, **given).launch(launch)
+        self._subtract.launch(launch)
 
     def _choose(self, strong: list[int]) -> None:
         """Give these columns slots; those that have one keep their potentials, the others' must be made."""
@@ -148,6 +147,14 @@ class LowRankCorrection:
             if strong
             else None
         )
+        if self._dots is not None:
+            given, rows, finest = (
+                {"Z": self._Z, "slots": len(strong), "size": n},
+                self._hierarchy.finest.stencil.rows,
+                self._hierarchy.finest,
+            )
+            self._multiply = DOTS.bind(rows, r=finest.b, out=self._dots.partials, **given)
+            self._subtract = SUBTRACT.bind(rows, factors=self._t, z=finest.x, d=finest.stencil.d, **given)
         for q in kept:
             wp.copy(self._Z, before, dest_offset=strong.index(q) * n, src_offset=old[q] * n, count=n)
         self._seen[[q for q in range(low.rank) if q not in kept]] = 0.0
