@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from warp_lcp.grid.staggered import CellRange
+from warp_lcp.grid.cell_kernel import F32, F64, I8, U8, cell_kernel
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.contact import HELD, LETS_GO, RELEASED, TOUCHES
 from warp_lcp.native import BLOCK, simd
@@ -149,7 +149,6 @@ COUNT = """
 """
 
 _CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR, "TOUCHES": TOUCHES, "LETS_GO": LETS_GO, "RELEASED": RELEASED, "HELD": HELD}
-_F32, _F64, _I8, _U8 = (wp.array3d(dtype=t) for t in (wp.float32, wp.float64, wp.int8, wp.uint8))
 
 
 def _source(body: str, *, cut: bool = False, moving: bool = False, ghost: bool = False, bounded: bool = True) -> str:
@@ -175,92 +174,82 @@ def pressure_kernels(cut: bool, moving: bool, ghost: bool, bounded: bool = True)
 
     @wp.func_native(_source(ROW + FACE + PREPARE, **flags))
     def prepare_row(
-        u_: _F32, v_: _F32, w_: _F32, kind_: _I8, touch_: _U8, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32, solid_y: _F32,
-        solid_z: _F32, phi_: _F32, planes: int, last_: _F64, ratio: wp.float64, b_: _F64, lower_: _F64, start_: _F64, shift_: _F32,
+        u_: F32, v_: F32, w_: F32, kind_: I8, touch_: U8, open_x: F32, open_y: F32, open_z: F32, solid_x: F32, solid_y: F32,
+        solid_z: F32, phi_: F32, planes: int, last_: F64, ratio: wp.float64, b_: F64, lower_: F64, start_: F64, shift_: F32,
         k: int, j: int, first: int, last_cell: int,
     ): ...  # fmt: skip
 
     @wp.func_native(_source(ROW + FACE + SUBTRACT, **flags))
     def subtract_row(
-        axis: int, x_: _F64, kind_: _I8, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32, solid_y: _F32, solid_z: _F32, phi_: _F32,
-        planes: int, field_: _F32, known_: _I8, k: int, j: int, first: int, last: int,
+        axis: int, x_: F64, kind_: I8, open_x: F32, open_y: F32, open_z: F32, solid_x: F32, solid_y: F32, solid_z: F32, phi_: F32,
+        planes: int, field_: F32, known_: I8, k: int, j: int, first: int, last: int,
     ): ...  # fmt: skip
 
     @wp.func_native(_source(ROW + FACE + SUPPORT, **flags))
     def support_row(
-        axis: int, x_: _F64, kind_: _I8, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32, solid_y: _F32, solid_z: _F32, phi_: _F32,
-        planes: int, weight_: _F32, limit: float, field_: _F32, known_: _I8, k: int, j: int, first: int, last: int,
+        axis: int, x_: F64, kind_: I8, open_x: F32, open_y: F32, open_z: F32, solid_x: F32, solid_y: F32, solid_z: F32, phi_: F32,
+        planes: int, weight_: F32, limit: float, field_: F32, known_: I8, k: int, j: int, first: int, last: int,
     ): ...  # fmt: skip
 
     @wp.func_native(_source(ROW + FACE + CONTACT, **flags))
     def contact_row(
-        u_: _F32, v_: _F32, w_: _F32, kind_: _I8, touch_: _U8, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32, solid_y: _F32,
-        solid_z: _F32, phi_: _F32, planes: int, x_: _F64, threshold: wp.float64, contact_: _U8, sums_: _F64,
+        u_: F32, v_: F32, w_: F32, kind_: I8, touch_: U8, open_x: F32, open_y: F32, open_z: F32, solid_x: F32, solid_y: F32,
+        solid_z: F32, phi_: F32, planes: int, x_: F64, threshold: wp.float64, contact_: U8, sums_: F64,
         k: int, j: int, first: int, last: int,
     ): ...  # fmt: skip
 
-    @wp.kernel(enable_backward=False, module=module)
+    @cell_kernel(module)
     def prepare(
-        cells: CellRange, u: _F32, v: _F32, w: _F32, kind: _I8, touch: _U8, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32,
-        solid_y: _F32, solid_z: _F32, phi: _F32, planes: int, last: _F64, ratio: wp.float64, b: _F64, lower: _F64, start: _F64, shift: _F32,
+        k, j, first, end, u: F32, v: F32, w: F32, kind: I8, touch: U8, open_x: F32, open_y: F32, open_z: F32, solid_x: F32,
+        solid_y: F32, solid_z: F32, phi: F32, planes: int, last: F64, ratio: wp.float64, b: F64, lower: F64, start: F64, shift: F32,
     ):  # fmt: skip
         """Right-hand side b, lower bound, first guess and what the free surface adds to the diagonal of every cell."""
-        plane, row, chunk = wp.tid()
-        first = cells.i + chunk * cells.grain
         prepare_row(
             u, v, w, kind, touch, open_x, open_y, open_z, solid_x, solid_y, solid_z, phi, planes, last, ratio, b, lower, start, shift,
-            cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end),
+            k, j, first, end,
         )  # fmt: skip
 
-    @wp.kernel(enable_backward=False, module=module)
+    @cell_kernel(module)
     def subtract_gradient(
-        cells: CellRange, axis: int, x: _F64, kind: _I8, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32, solid_y: _F32,
-        solid_z: _F32, phi: _F32, planes: int, field: _F32, known: _I8,
+        k, j, first, end, axis: int, x: F64, kind: I8, open_x: F32, open_y: F32, open_z: F32, solid_x: F32, solid_y: F32,
+        solid_z: F32, phi: F32, planes: int, field: F32, known: I8,
     ):  # fmt: skip
         """Project the open faces that touch FLUID and mark them 1; other faces become 0, or -1 inside solids of whole cells."""
-        plane, row, chunk = wp.tid()
-        first = cells.i + chunk * cells.grain
         subtract_row(
             axis, x, kind, open_x, open_y, open_z, solid_x, solid_y, solid_z, phi, planes, field, known,
-            cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end),
+            k, j, first, end,
         )  # fmt: skip
 
-    @wp.kernel(enable_backward=False, module=module)
+    @cell_kernel(module)
     def support(
-        cells: CellRange, axis: int, x: _F64, kind: _I8, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32, solid_y: _F32,
-        solid_z: _F32, phi: _F32, planes: int, weight: _F32, limit: float, field: _F32, known: _I8,
+        k, j, first, end, axis: int, x: F64, kind: I8, open_x: F32, open_y: F32, open_z: F32, solid_x: F32, solid_y: F32,
+        solid_z: F32, phi: F32, planes: int, weight: F32, limit: float, field: F32, known: I8,
     ):  # fmt: skip
         """Give faces with weight beside projected ones their change, up to `limit` [m/s] and not beyond them; they become 2."""
-        plane, row, chunk = wp.tid()
-        first = cells.i + chunk * cells.grain
         support_row(
             axis, x, kind, open_x, open_y, open_z, solid_x, solid_y, solid_z, phi, planes, weight, limit, field, known,
-            cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end),
+            k, j, first, end,
         )  # fmt: skip
 
-    @wp.kernel(enable_backward=False, module=module)
+    @cell_kernel(module)
     def contact(
-        cells: CellRange, u: _F32, v: _F32, w: _F32, kind: _I8, touch: _U8, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32,
-        solid_y: _F32, solid_z: _F32, phi: _F32, planes: int, x: _F64, threshold: wp.float64, contact_: _U8, sums: _F64,
+        k, j, first, end, u: F32, v: F32, w: F32, kind: I8, touch: U8, open_x: F32, open_y: F32, open_z: F32, solid_x: F32,
+        solid_y: F32, solid_z: F32, phi: F32, planes: int, x: F64, threshold: wp.float64, contact_: U8, sums: F64,
     ):  # fmt: skip
         """Find the released cells; a row's sums are [0] their number and [1] the largest |outflow| of the other FLUID cells [m/s]."""
-        plane, row = wp.tid()
         contact_row(
             u, v, w, kind, touch, open_x, open_y, open_z, solid_x, solid_y, solid_z, phi, planes, x, threshold, contact_, sums,
-            cells.k + plane, cells.j + row, cells.i, cells.end,
+            k, j, first, end,
         )  # fmt: skip
 
     return SimpleNamespace(prepare=prepare, subtract_gradient=subtract_gradient, support=support, contact=contact)
 
 
 @wp.func_native(_source(COUNT))
-def count_row(kind_: _I8, k: int, j: int, first: int, last: int) -> int: ...
+def count_row(kind_: I8, k: int, j: int, first: int, last: int) -> int: ...
 
 
-@wp.kernel(enable_backward=False, module="fluids.pressure")
-def count_kernel(cells: CellRange, kind: _I8, sums: _F64):
+@cell_kernel("fluids.pressure")
+def count_kernel(k, j, first, end, kind: I8, sums: F64):
     """Count the FLUID cells of a row."""
-    plane, row = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    sums[k, j, 0] = wp.float64(count_row(kind, k, j, cells.i, cells.end))
+    sums[k, j, 0] = wp.float64(count_row(kind, k, j, first, end))

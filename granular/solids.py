@@ -10,7 +10,8 @@ import warp as wp
 
 from granular.cut_walls import CutWalls
 from granular.stress import Walls
-from warp_lcp.grid.staggered import CellRange, StaggeredGrid
+from warp_lcp.grid.cell_kernel import F32, I8, I32, cell_kernel
+from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid, voxelize
 from warp_lcp.material.boundary import Boundary, Faces
 from warp_lcp.material.cut_boundary import CutBoundary
@@ -20,47 +21,37 @@ _SOLID = wp.constant(wp.int8(SOLID))
 _AIR = wp.constant(wp.int8(AIR))
 
 
-@wp.kernel(enable_backward=False, module="granular.solids")
+@cell_kernel("granular.solids")
 @typing.no_type_check
-def base_kernel(cells: CellRange, index: wp.array3d(dtype=wp.int32), base: wp.array3d(dtype=wp.int8)):
+def base_kernel(k, j, i, index: I32, base: I8):
     """SOLID in walls, AIR elsewhere."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        if index[k, j, i] >= 0:
-            base[k, j, i] = _SOLID
-        else:
-            base[k, j, i] = _AIR
+    if index[k, j, i] >= 0:
+        base[k, j, i] = _SOLID
+    else:
+        base[k, j, i] = _AIR
 
 
-@wp.kernel(enable_backward=False, module="granular.solids")
+@cell_kernel("granular.solids")
 @typing.no_type_check
 def rigid_velocity_kernel(
-    cells: CellRange, axis: int, planes: int, spacing: float, index: wp.array3d(dtype=wp.int32), turn: wp.array(dtype=wp.mat33),
-    shift: wp.array(dtype=wp.vec3), field: wp.array3d(dtype=wp.float32),
+    k, j, i, axis: int, planes: int, spacing: float, index: I32, turn: wp.array(dtype=wp.mat33),
+    shift: wp.array(dtype=wp.vec3), field: F32,
 ):  # fmt: skip
     """Velocity of the solids on the faces of one component that they touch, 0 elsewhere."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
     c = wp.max(k - wp.where(axis == 2, 1, 0), 0)
     b = wp.max(j - wp.where(axis == 1, 1, 0), 0)
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        a = wp.max(i - wp.where(axis == 0, 1, 0), 0)
-        wall = wp.max(index[k, j, i], index[c, b, a])
-        u = float(0.0)
-        if wall > 0:
-            x = (float(i) - wp.where(axis == 0, 1.0, 0.5)) * spacing
-            y = (float(j) - wp.where(axis == 1, 1.0, 0.5)) * spacing
-            z = float(0.0)
-            if planes == 2:
-                z = (float(k) - wp.where(axis == 2, 1.0, 0.5)) * spacing
-            v = turn[wall] * wp.vec3(x, y, z) + shift[wall]
-            u = v[axis]
-        field[k, j, i] = u
+    a = wp.max(i - wp.where(axis == 0, 1, 0), 0)
+    wall = wp.max(index[k, j, i], index[c, b, a])
+    u = float(0.0)
+    if wall > 0:
+        x = (float(i) - wp.where(axis == 0, 1.0, 0.5)) * spacing
+        y = (float(j) - wp.where(axis == 1, 1.0, 0.5)) * spacing
+        z = float(0.0)
+        if planes == 2:
+            z = (float(k) - wp.where(axis == 2, 1.0, 0.5)) * spacing
+        v = turn[wall] * wp.vec3(x, y, z) + shift[wall]
+        u = v[axis]
+    field[k, j, i] = u
 
 
 class SandSolids:

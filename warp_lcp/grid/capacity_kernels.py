@@ -2,18 +2,16 @@
 """The quadratic B-spline kernel of each cell integrated over what solids leave open."""
 
 import itertools
-import typing
 
 import warp as wp
 
+from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
 from warp_lcp.grid.cut_cells_kernels import CUT
 from warp_lcp.grid.staggered import CellRange, Window
 from warp_lcp.native import BLOCK, simd
 
 options = {"enable_backward": False, "module": "warp_lcp.grid.capacity"}
 COLORS = 3  # along an axis: as many cells as a kernel reaches over
-_F32 = wp.array3d(dtype=wp.float32)
-_I8 = wp.array3d(dtype=wp.int8)
 
 # Over its own cell the kernel's integral is 2/3 along an axis, over either neighbor 1/6. Open cells only: cut ones follow.
 OPEN_ROW = """
@@ -41,17 +39,13 @@ OPEN_ROW = """
 
 
 @wp.func_native(simd(BLOCK + OPEN_ROW))
-@typing.no_type_check
-def open_row(state_: _I8, out_: _F32, planes: int, k: int, j: int, first: int, last: int): ...
+def open_row(state_: I8, out_: F32, planes: int, k: int, j: int, first: int, last: int): ...
 
 
-@wp.kernel(**options)
-@typing.no_type_check
-def open_kernel(cells: CellRange, planes: int, state: _I8, capacity: _F32):
+@cell_kernel("warp_lcp.grid.capacity")
+def open_kernel(k, j, first, end, planes: int, state: I8, capacity: F32):
     """Integrate over the open cells."""
-    plane, row, chunk = wp.tid()
-    first = cells.i + chunk * cells.grain
-    open_row(state, capacity, planes, cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end))
+    open_row(state, capacity, planes, k, j, first, end)
 
 
 # A cut cell adds to the kernels of the cells around it what is open of it: along the axis in which the distance changes most the open
@@ -104,13 +98,11 @@ CUT_CELL = """
 
 
 @wp.func_native(CUT_CELL)
-@typing.no_type_check
-def cut_cell(near_: _F32, out_: _F32, planes: int, k: int, j: int, i: int): ...
+def cut_cell(near_: F32, out_: F32, planes: int, k: int, j: int, i: int): ...
 
 
 @wp.kernel(**options)
-@typing.no_type_check
-def cut_kernel(cells: CellRange, color: wp.vec3i, planes: int, near: _F32, state: _I8, capacity: _F32):
+def cut_kernel(cells: CellRange, color: wp.vec3i, planes: int, near: F32, state: I8, capacity: F32):
     """Integrate over every third cut cell along each axis, from cell (color[2], color[1], color[0]) of the box on.
 
     Cells add to their neighbors: those of one color have none in common, so nothing races and sums keep their order.

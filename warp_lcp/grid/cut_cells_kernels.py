@@ -1,22 +1,15 @@
 # mypy: ignore-errors
 """What solids leave open of faces and cells, and how fast they move, from their distances at the nodes (`node_distance`)."""
 
-import typing
-
 import warp as wp
 
+from warp_lcp.grid.cell_kernel import F32, I8, I16, cell_kernel
 from warp_lcp.grid.node_distance_kernels import HOLLOW
-from warp_lcp.grid.staggered import CellRange
 from warp_lcp.native import BLOCK, simd
 from warp_lcp.operators.grid_poisson import AIR, SOLID
 
 DROP = 1.0e-3  # open fractions below become 0: raised, they would lift a flow along the wall; kept, they spoil the condition number
 CLOSED, OPEN, CUT = 0, 1, 2  # states of cells
-
-options = {"enable_backward": False, "module": "warp_lcp.grid.cut_cells"}
-_F32 = wp.array3d(dtype=wp.float32)
-_I16 = wp.array3d(dtype=wp.int16)
-_I8 = wp.array3d(dtype=wp.int8)
 
 
 # The area {d > 0} of a face from its corners v, in order around it: that of the polygon whose vertices lie where d, linear along the edges,
@@ -111,35 +104,17 @@ FRACTIONS_ROW = """
 
 @wp.func_native(simd(BLOCK + AREA + FRACTIONS_ROW.replace("DROP", f"{DROP}f").replace("HOLLOW", str(HOLLOW))))
 def fractions_row(
-    near_: _F32, owner_: _I16, next_near_: _F32, next_owner_: _I16, marks_: _I8, ax_: _F32, ay_: _F32, az_: _F32,
-    wx_: _I16, wy_: _I16, wz_: _I16, planes: int, k: int, j: int, first: int, last: int,
+    near_: F32, owner_: I16, next_near_: F32, next_owner_: I16, marks_: I8, ax_: F32, ay_: F32, az_: F32,
+    wx_: I16, wy_: I16, wz_: I16, planes: int, k: int, j: int, first: int, last: int,
 ) -> int: ...  # fmt: skip
 
 
-@wp.kernel(**options)
-@typing.no_type_check
+@cell_kernel("warp_lcp.grid.cut_cells")
 def fractions_kernel(
-    cells: CellRange,
-    planes: int,
-    near: _F32,
-    owner: _I16,
-    next_near: _F32,
-    next_owner: _I16,
-    marks: _I8,
-    ax: _F32,
-    ay: _F32,
-    az: _F32,
-    wx: _I16,
-    wy: _I16,
-    wz: _I16,
-    counts: wp.array(dtype=wp.int32),
-):
+    k, j, first, end, planes: int, near: F32, owner: I16, next_near: F32, next_owner: I16, marks: I8, ax: F32,
+    ay: F32, az: F32, wx: I16, wy: I16, wz: I16, counts: wp.array(dtype=wp.int32),
+):  # fmt: skip
     """Fill open fractions and wall numbers of all faces inside the domain; count the dropped and the partial ones."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    end = wp.min(first + cells.grain, cells.end)
     found = fractions_row(near, owner, next_near, next_owner, marks, ax, ay, az, wx, wy, wz, planes, k, j, first, end)
     if found != 0:
         wp.atomic_add(counts, 0, found & 0xFFFF)
@@ -170,21 +145,16 @@ STATES_ROW = """
 
 
 @wp.func_native(simd(STATES_ROW))
-@typing.no_type_check
 def states_row(
-    near_: _F32, ax_: _F32, ay_: _F32, az_: _F32, base_: _I8, state_: _I8,
+    near_: F32, ax_: F32, ay_: F32, az_: F32, base_: I8, state_: I8,
     planes: int, air: int, solid: int, k: int, j: int, first: int, last: int,
 ): ...  # fmt: skip
 
 
-@wp.kernel(**options)
-@typing.no_type_check
-def states_kernel(cells: CellRange, planes: int, near: _F32, ax: _F32, ay: _F32, az: _F32, base: _I8, state: _I8):
+@cell_kernel("warp_lcp.grid.cut_cells")
+def states_kernel(k, j, first, end, planes: int, near: F32, ax: F32, ay: F32, az: F32, base: I8, state: I8):
     """Mark SOLID cells, and which are open, closed and cut."""
-    plane, row, chunk = wp.tid()
-    first = cells.i + chunk * cells.grain
-    end = wp.min(first + cells.grain, cells.end)
-    states_row(near, ax, ay, az, base, state, planes, AIR, SOLID, cells.k + plane, cells.j + row, first, end)
+    states_row(near, ax, ay, az, base, state, planes, AIR, SOLID, k, j, first, end)
 
 
 @wp.func_native(
@@ -200,44 +170,35 @@ def states_kernel(cells: CellRange, planes: int, near: _F32, ax: _F32, ay: _F32,
 def open_area(a: float, b: float, c: float, d: float) -> float: ...
 
 
-@wp.kernel(**options)
-@typing.no_type_check
-def side_kernel(
-    cells: CellRange, planes: int, axis: int, near: _F32, owner: _I16, open: _F32, wall: _I16, counts: wp.array(dtype=wp.int32)
-):
+@cell_kernel("warp_lcp.grid.cut_cells")
+def side_kernel(k, j, i, planes: int, axis: int, near: F32, owner: I16, open: F32, wall: I16, counts: wp.array(dtype=wp.int32)):
     """Fill open fractions and wall numbers of the faces on an open side of the domain; count the dropped and the partial ones."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
     dj = wp.where(axis == 0, 1, 0)
     di = 1 - dj
     dk = wp.where(axis == 2, 0, planes - 1)
     ej = wp.where(axis == 2, 1, 0)
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        free = open_area(near[k, j, i], near[k, j + dj, i + di], near[k + dk, j + dj + ej, i + di], near[k + dk, j + ej, i])
-        if free > 0.0 and free < DROP:
-            free = float(0.0)
-            wp.atomic_add(counts, 0, 1)
-        if free > 0.0 and free < 1.0:
-            wp.atomic_add(counts, 1, 1)
-        number = int(-1)
-        if free < 1.0:  # the solid that is nearest to a corner: (0), along (di, dj, 0), and along (0, ej, dk)
-            least = float(1.0e30)
-            for n in range(4):
-                a = n & 1
-                b = n >> 1
-                d = near[k + b * dk, j + a * dj + b * ej, i + a * di]
-                if d < least:
-                    least = d
-                    number = int(owner[k + b * dk, j + a * dj + b * ej, i + a * di])
-        open[k, j, i] = free
-        wall[k, j, i] = wp.int16(number)
+    free = open_area(near[k, j, i], near[k, j + dj, i + di], near[k + dk, j + dj + ej, i + di], near[k + dk, j + ej, i])
+    if free > 0.0 and free < DROP:
+        free = float(0.0)
+        wp.atomic_add(counts, 0, 1)
+    if free > 0.0 and free < 1.0:
+        wp.atomic_add(counts, 1, 1)
+    number = int(-1)
+    if free < 1.0:  # the solid that is nearest to a corner: (0), along (di, dj, 0), and along (0, ej, dk)
+        least = float(1.0e30)
+        for n in range(4):
+            a = n & 1
+            b = n >> 1
+            d = near[k + b * dk, j + a * dj + b * ej, i + a * di]
+            if d < least:
+                least = d
+                number = int(owner[k + b * dk, j + a * dj + b * ej, i + a * di])
+    open[k, j, i] = free
+    wall[k, j, i] = wp.int16(number)
 
 
 @wp.func
-@typing.no_type_check
-def least_moving(k: int, j: int, i: int, near: _F32, owner: _I16, next_near: _F32, next_owner: _I16, moving: wp.array(dtype=wp.uint8)):
+def least_moving(k: int, j: int, i: int, near: F32, owner: I16, next_near: F32, next_owner: I16, moving: wp.array(dtype=wp.uint8)):
     """Return the moving solid among a node's two nearest, 0 if neither moves, and its distance [cells]."""
     solid = int(owner[k, j, i])
     d = near[k, j, i]
@@ -250,20 +211,19 @@ def least_moving(k: int, j: int, i: int, near: _F32, owner: _I16, next_near: _F3
 
 
 @wp.func
-@typing.no_type_check
 def moving_part(
     axis: int,
     planes: int,
     k: int,
     j: int,
     i: int,
-    near: _F32,
-    owner: _I16,
-    next_near: _F32,
-    next_owner: _I16,
-    standing: _F32,
-    open: _F32,
-    wall: _I16,
+    near: F32,
+    owner: I16,
+    next_near: F32,
+    next_owner: I16,
+    standing: F32,
+    open: F32,
+    wall: I16,
     moving: wp.array(dtype=wp.uint8),
 ):
     """Return the moving solid that covers a face, 0 if none does, and its part of what is not open.
@@ -308,37 +268,19 @@ def moving_part(
     return wp.max(solid, 0), part
 
 
-@wp.kernel(**options)
-@typing.no_type_check
+@cell_kernel("warp_lcp.grid.cut_cells")
 def velocity_kernel(
-    cells: CellRange,
-    planes: int,
-    axis: int,
-    spacing: float,
-    near: _F32,
-    owner: _I16,
-    next_near: _F32,
-    next_owner: _I16,
-    standing: _F32,
-    open: _F32,
-    wall: _I16,
-    moving: wp.array(dtype=wp.uint8),
-    turn: wp.array(dtype=wp.mat33),
-    shift: wp.array(dtype=wp.vec3),
-    velocity: _F32,
-):
+    k, j, i, planes: int, axis: int, spacing: float, near: F32, owner: I16, next_near: F32, next_owner: I16,
+    standing: F32, open: F32, wall: I16, moving: wp.array(dtype=wp.uint8), turn: wp.array(dtype=wp.mat33),
+    shift: wp.array(dtype=wp.vec3), velocity: F32,
+):  # fmt: skip
     """Fill the mean velocity of what is not open of each face [m/s], at its center turn x + shift of a solid that moves."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        value = float(0.0)
-        solid, part = moving_part(axis, planes, k, j, i, near, owner, next_near, next_owner, standing, open, wall, moving)
-        if solid > 0:
-            x = wp.vec3(float(i) - 0.5, float(j) - 0.5, float(k) - 0.5) * spacing
-            x[axis] = x[axis] - 0.5 * spacing
-            if planes == 1:
-                x[2] = 0.0
-            value = part * (wp.dot(turn[solid][axis], x) + shift[solid][axis])
-        velocity[k, j, i] = value
+    value = float(0.0)
+    solid, part = moving_part(axis, planes, k, j, i, near, owner, next_near, next_owner, standing, open, wall, moving)
+    if solid > 0:
+        x = wp.vec3(float(i) - 0.5, float(j) - 0.5, float(k) - 0.5) * spacing
+        x[axis] = x[axis] - 0.5 * spacing
+        if planes == 1:
+            x[2] = 0.0
+        value = part * (wp.dot(turn[solid][axis], x) + shift[solid][axis])
+    velocity[k, j, i] = value

@@ -5,7 +5,8 @@ from collections.abc import Callable, Sequence
 
 import warp as wp
 
-from warp_lcp.grid.staggered import CellRange, Window
+from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
+from warp_lcp.grid.staggered import Window
 from warp_lcp.grid.transfer_kernels import TINY_WEIGHT
 from warp_lcp.native import BLOCK, simd
 
@@ -63,32 +64,25 @@ FILL_ROW = """
 @wp.func_native(simd(BLOCK + FILL_ROW))
 @typing.no_type_check
 def fill_row(  # noqa: D103
-    known_: wp.array3d(dtype=wp.int8), field_: wp.array3d(dtype=wp.float32), layer: int, fill: int, k: int, j: int, first: int, last: int
+    known_: I8, field_: F32, layer: int, fill: int, k: int, j: int, first: int, last: int
 ): ...
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.extrapolate")
+@cell_kernel("warp_lcp.grid.extrapolate")
 @typing.no_type_check
-def layer_kernel(cells: CellRange, known: wp.array3d(dtype=wp.int8), field: wp.array3d(dtype=wp.float32), layer: int, fill: int):
+def layer_kernel(k, j, first, end, known: I8, field: F32, layer: int, fill: int):
     """Fill faces marked `fill` from neighbors known up to `layer`, and mark them layer + 1.
 
     In place without a race: a face that another thread fills in this launch is marked `fill` or layer + 1 and is not read either way.
     """
-    plane, row, chunk = wp.tid()
-    first = cells.i + chunk * cells.grain
-    fill_row(known, field, layer, fill, cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end))
+    fill_row(known, field, layer, fill, k, j, first, end)
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.extrapolate")
+@cell_kernel("warp_lcp.grid.extrapolate")
 @typing.no_type_check
-def weighted_kernel(cells: CellRange, weight: wp.array3d(dtype=wp.float32), known: wp.array3d(dtype=wp.int8)):
+def weighted_kernel(k, j, i, weight: F32, known: I8):
     """Mark the faces that particles gave weight."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        known[k, j, i] = wp.where(weight[k, j, i] > TINY_WEIGHT, wp.int8(1), wp.int8(0))
+    known[k, j, i] = wp.where(weight[k, j, i] > TINY_WEIGHT, wp.int8(1), wp.int8(0))
 
 
 def complete(

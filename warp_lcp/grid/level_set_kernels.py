@@ -6,12 +6,10 @@ filled up to s cells from its center holds, is a cubic in pieces: (s + 3/2)^3 / 
 G(-s) = 1 - G(s).
 """
 
-import typing
-
 import warp as wp
 
+from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
 from warp_lcp.grid.particle_loops import particle_loop
-from warp_lcp.grid.staggered import CellRange
 from warp_lcp.native import BLOCK, simd
 from warp_lcp.operators.grid_poisson import SOLID
 
@@ -233,7 +231,7 @@ def _filled(source: str) -> str:
 
 @wp.func_native(particle_loop(_filled(SCATTER)))
 def scatter_some(
-    planes: int, inverse_dx: float, origin: wp.vec3i, each: float, x_: wp.array(dtype=wp.vec3), density_: wp.array3d(dtype=wp.float32),
+    planes: int, inverse_dx: float, origin: wp.vec3i, each: float, x_: wp.array(dtype=wp.vec3), density_: F32,
     first: int, last: int,
 ): ...  # fmt: skip
 
@@ -241,76 +239,65 @@ def scatter_some(
 @wp.func_native(particle_loop(GATHER))
 def gather_cell(
     planes: int, inverse_dx: float, origin: wp.vec3i, each: float, offsets: wp.array(dtype=wp.int32), x_: wp.array(dtype=wp.vec3),
-    density_: wp.array3d(dtype=wp.float32), k: int, j: int, i: int,
+    density_: F32, k: int, j: int, i: int,
 ): ...  # fmt: skip
 
 
 @wp.func_native(simd(BLOCK + BINOMIAL))
-def binomial_row(
-    planes: int, source_: wp.array3d(dtype=wp.float32), out_: wp.array3d(dtype=wp.float32), k: int, j: int, first: int, last: int
-): ...
+def binomial_row(planes: int, source_: F32, out_: F32, k: int, j: int, first: int, last: int): ...
 
 
 @wp.func_native(simd(BLOCK + _filled(DISTANCE)))
 def distance_row(
-    density_: wp.array3d(dtype=wp.float32), capacity_: wp.array3d(dtype=wp.float32), smooth_: wp.array3d(dtype=wp.float32),
-    base_: wp.array3d(dtype=wp.int8), spread: float, limit: float, phi_: wp.array3d(dtype=wp.float32), known_: wp.array3d(dtype=wp.int8),
+    density_: F32, capacity_: F32, smooth_: F32,
+    base_: I8, spread: float, limit: float, phi_: F32, known_: I8,
     k: int, j: int, first: int, last: int,
 ): ...  # fmt: skip
 
 
 @wp.func_native(simd(BLOCK + VOLUME))
 def volume_row(
-    planes: int, parts: int, phi_: wp.array3d(dtype=wp.float32), known_: wp.array3d(dtype=wp.int8),
-    distance_: wp.array3d(dtype=wp.float32), sums_: wp.array2d(dtype=wp.float64), k: int, j: int, first: int, last: int,
+    planes: int, parts: int, phi_: F32, known_: I8,
+    distance_: F32, sums_: wp.array2d(dtype=wp.float64), k: int, j: int, first: int, last: int,
 ): ...  # fmt: skip
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.density")
 def scatter_kernel(
     count: int, grain: int, planes: int, inverse_dx: float, origin: wp.vec3i, each: float, position: wp.array(dtype=wp.vec3),
-    density: wp.array3d(dtype=wp.float32),
+    density: F32,
 ):  # fmt: skip
     """Add the share of some particles to the cells around them."""
     first = wp.tid() * grain
     scatter_some(planes, inverse_dx, origin, each, position, density, first, wp.min(first + grain, count))
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.density")
+@cell_kernel("warp_lcp.grid.density")
 def gather_kernel(
-    cells: CellRange, planes: int, inverse_dx: float, origin: wp.vec3i, each: float, offsets: wp.array(dtype=wp.int32),
-    position: wp.array(dtype=wp.vec3), density: wp.array3d(dtype=wp.float32),
+    k, j, i, planes: int, inverse_dx: float, origin: wp.vec3i, each: float, offsets: wp.array(dtype=wp.int32),
+    position: wp.array(dtype=wp.vec3), density: F32,
 ):  # fmt: skip
     """Let each cell add up the particles around it."""
-    plane, row, chunk = wp.tid()
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        gather_cell(planes, inverse_dx, origin, each, offsets, position, density, cells.k + plane, cells.j + row, i)
+    gather_cell(planes, inverse_dx, origin, each, offsets, position, density, k, j, i)
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.level_set")
-def binomial_kernel(cells: CellRange, planes: int, source: wp.array3d(dtype=wp.float32), out: wp.array3d(dtype=wp.float32)):
+@cell_kernel("warp_lcp.grid.level_set")
+def binomial_kernel(k, j, first, end, planes: int, source: F32, out: F32):
     """Smooth a field once."""
-    plane, row, chunk = wp.tid()
-    first = cells.i + chunk * cells.grain
-    binomial_row(planes, source, out, cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end))
+    binomial_row(planes, source, out, k, j, first, end)
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.level_set")
+@cell_kernel("warp_lcp.grid.level_set")
 def distance_kernel(
-    cells: CellRange, density: wp.array3d(dtype=wp.float32), capacity: wp.array3d(dtype=wp.float32),
-    smooth: wp.array3d(dtype=wp.float32), base: wp.array3d(dtype=wp.int8), spread: float, limit: float,
-    phi: wp.array3d(dtype=wp.float32), known: wp.array3d(dtype=wp.int8),
+    k, j, first, end, density: F32, capacity: F32,
+    smooth: F32, base: I8, spread: float, limit: float,
+    phi: F32, known: I8,
 ):  # fmt: skip
     """Turn filled shares into distances."""
-    plane, row, chunk = wp.tid()
-    first = cells.i + chunk * cells.grain
-    last = wp.min(first + cells.grain, cells.end)
-    distance_row(density, capacity, smooth, base, spread, limit, phi, known, cells.k + plane, cells.j + row, first, last)
+    distance_row(density, capacity, smooth, base, spread, limit, phi, known, k, j, first, end)
 
 
 @wp.func
-@typing.no_type_check
 def slope_beside(here: float, below: float, above: float, has_below: bool, has_above: bool):
     """Return the central difference, or the one-sided one where only one neighbor has a value."""
     if has_below and has_above:
@@ -322,98 +309,73 @@ def slope_beside(here: float, below: float, above: float, has_below: bool, has_a
     return 0.0
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.level_set")
-@typing.no_type_check
+@cell_kernel("warp_lcp.grid.level_set")
 def wall_shift_kernel(
-    cells: CellRange, variance: float, limit: float, capacity: wp.array3d(dtype=wp.float32), phi: wp.array3d(dtype=wp.float32),
-    known: wp.array3d(dtype=wp.int8), out: wp.array3d(dtype=wp.float32),
+    k, j, i, variance: float, limit: float, capacity: F32, phi: F32,
+    known: I8, out: F32,
 ):  # fmt: skip
     """Bring phi from the mean place of the open part of a cell's kernel back to the cell's center.
 
     A wall cuts a part off the kernel, so that what remains measures the liquid at c + s, s = integral of (x - c) K over the open part by
     its capacity. For a Gaussian of that variance s = variance grad(capacity) / capacity; hence phi - s . grad(phi).
     """
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
     one = wp.int8(1)
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        here = phi[k, j, i]
-        value = here
-        c = capacity[k, j, i]
-        inside = k > 0 and j > 0 and i > 0 and k + 1 < phi.shape[0] and j + 1 < phi.shape[1] and i + 1 < phi.shape[2]
-        if inside and known[k, j, i] == one and c < 0.999 and wp.abs(here) < 0.98 * limit:
-            gx = slope_beside(here, phi[k, j, i - 1], phi[k, j, i + 1], known[k, j, i - 1] == one, known[k, j, i + 1] == one)
-            gy = slope_beside(here, phi[k, j - 1, i], phi[k, j + 1, i], known[k, j - 1, i] == one, known[k, j + 1, i] == one)
-            gz = slope_beside(here, phi[k - 1, j, i], phi[k + 1, j, i], known[k - 1, j, i] == one, known[k + 1, j, i] == one)
-            grad = wp.vec3(gx, gy, gz) / wp.max(wp.length(wp.vec3(gx, gy, gz)), 1.0)
-            s = 0.5 * wp.vec3(
-                capacity[k, j, i + 1] - capacity[k, j, i - 1],
-                capacity[k, j + 1, i] - capacity[k, j - 1, i],
-                capacity[k + 1, j, i] - capacity[k - 1, j, i],
-            )
-            if phi.shape[0] == 3:
-                s[2] = 0.0
-            s = s * (variance / wp.max(c, 1e-3))
-            s = s / wp.max(wp.length(s), 1.0)
-            value = wp.clamp(here - wp.dot(s, grad), -limit, limit)
-        out[k, j, i] = value
+    here = phi[k, j, i]
+    value = here
+    c = capacity[k, j, i]
+    inside = k > 0 and j > 0 and i > 0 and k + 1 < phi.shape[0] and j + 1 < phi.shape[1] and i + 1 < phi.shape[2]
+    if inside and known[k, j, i] == one and c < 0.999 and wp.abs(here) < 0.98 * limit:
+        gx = slope_beside(here, phi[k, j, i - 1], phi[k, j, i + 1], known[k, j, i - 1] == one, known[k, j, i + 1] == one)
+        gy = slope_beside(here, phi[k, j - 1, i], phi[k, j + 1, i], known[k, j - 1, i] == one, known[k, j + 1, i] == one)
+        gz = slope_beside(here, phi[k - 1, j, i], phi[k + 1, j, i], known[k - 1, j, i] == one, known[k + 1, j, i] == one)
+        grad = wp.vec3(gx, gy, gz) / wp.max(wp.length(wp.vec3(gx, gy, gz)), 1.0)
+        s = 0.5 * wp.vec3(
+            capacity[k, j, i + 1] - capacity[k, j, i - 1],
+            capacity[k, j + 1, i] - capacity[k, j - 1, i],
+            capacity[k + 1, j, i] - capacity[k - 1, j, i],
+        )
+        if phi.shape[0] == 3:
+            s[2] = 0.0
+        s = s * (variance / wp.max(c, 1e-3))
+        s = s / wp.max(wp.length(s), 1.0)
+        value = wp.clamp(here - wp.dot(s, grad), -limit, limit)
+    out[k, j, i] = value
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.level_set")
-@typing.no_type_check
-def copy_kernel(cells: CellRange, source: wp.array3d(dtype=wp.float32), out: wp.array3d(dtype=wp.float32)):
+@cell_kernel("warp_lcp.grid.level_set")
+def copy_kernel(k, j, i, source: F32, out: F32):
     """Copy a field."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        out[k, j, i] = source[k, j, i]
+    out[k, j, i] = source[k, j, i]
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.level_set")
-@typing.no_type_check
-def clear_kernel(cells: CellRange, limit: float, phi: wp.array3d(dtype=wp.float32), known: wp.array3d(dtype=wp.int8)):
+@cell_kernel("warp_lcp.grid.level_set")
+def clear_kernel(k, j, i, limit: float, phi: F32, known: I8):
     """Forget what an earlier update left: air."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        phi[k, j, i] = limit
-        known[k, j, i] = wp.int8(0)
+    phi[k, j, i] = limit
+    known[k, j, i] = wp.int8(0)
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.level_set")
-@typing.no_type_check
-def whole_cell_capacity_kernel(cells: CellRange, planes: int, base: wp.array3d(dtype=wp.int8), capacity: wp.array3d(dtype=wp.float32)):
+@cell_kernel("warp_lcp.grid.level_set")
+def whole_cell_capacity_kernel(k, j, i, planes: int, base: I8, capacity: F32):
     """Add up the shares 1/6, 2/3, 1/6 of a cell's kernel that lie in the open cells around it."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        total = float(0.0)
-        for c in range(wp.max(k - planes + 1, 0), wp.min(k + planes, base.shape[0])):
-            for b in range(wp.max(j - 1, 0), wp.min(j + 2, base.shape[1])):
-                for a in range(wp.max(i - 1, 0), wp.min(i + 2, base.shape[2])):
-                    if base[c, b, a] != wp.int8(SOLID):
-                        w = float(1.0)
-                        w *= wp.where(a == i, 2.0 / 3.0, 1.0 / 6.0)
-                        w *= wp.where(b == j, 2.0 / 3.0, 1.0 / 6.0)
-                        if planes == 2:
-                            w *= wp.where(c == k, 2.0 / 3.0, 1.0 / 6.0)
-                        total += w
-        capacity[k, j, i] = total
+    total = float(0.0)
+    for c in range(wp.max(k - planes + 1, 0), wp.min(k + planes, base.shape[0])):
+        for b in range(wp.max(j - 1, 0), wp.min(j + 2, base.shape[1])):
+            for a in range(wp.max(i - 1, 0), wp.min(i + 2, base.shape[2])):
+                if base[c, b, a] != wp.int8(SOLID):
+                    w = float(1.0)
+                    w *= wp.where(a == i, 2.0 / 3.0, 1.0 / 6.0)
+                    w *= wp.where(b == j, 2.0 / 3.0, 1.0 / 6.0)
+                    if planes == 2:
+                        w *= wp.where(c == k, 2.0 / 3.0, 1.0 / 6.0)
+                    total += w
+    capacity[k, j, i] = total
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.volume")
+@cell_kernel("warp_lcp.grid.volume")
 def volume_kernel(
-    cells: CellRange, planes: int, parts: int, phi: wp.array3d(dtype=wp.float32), known: wp.array3d(dtype=wp.int8),
-    distance: wp.array3d(dtype=wp.float32), sums: wp.array2d(dtype=wp.float64),
+    k, j, first, end, planes: int, parts: int, phi: F32, known: I8,
+    distance: F32, sums: wp.array2d(dtype=wp.float64),
 ):  # fmt: skip
     """Add up a row of cells [cells]; one thread a row."""
-    plane, row = wp.tid()
-    volume_row(planes, parts, phi, known, distance, sums, cells.k + plane, cells.j + row, cells.i, cells.end)
+    volume_row(planes, parts, phi, known, distance, sums, k, j, first, end)

@@ -4,11 +4,9 @@
 A point belongs to the node at the low end of its edge; a node's points are numbered x, y, z from the number that the node keeps.
 """
 
-import typing
-
 import warp as wp
 
-from warp_lcp.grid.staggered import CellRange
+from warp_lcp.grid.cell_kernel import F32, cell_kernel
 from warp_lcp.native import BLOCK, simd
 
 CLOSEST = 0.01  # of an edge: how near to its end a point may come, so that no triangle shrinks to nothing
@@ -97,8 +95,7 @@ CORNER = """
     });
 """
 
-_F32, _I32, _I8 = wp.array3d(dtype=wp.float32), wp.array2d(dtype=wp.int32), wp.array2d(dtype=wp.int8)
-_options = {"enable_backward": False, "module": "warp_lcp.grid.marching_cubes"}
+_I32, _I8 = wp.array2d(dtype=wp.int32), wp.array2d(dtype=wp.int8)
 
 
 def _filled(source: str) -> str:
@@ -106,52 +103,55 @@ def _filled(source: str) -> str:
 
 
 @wp.func_native(_filled(COUNT))
-@typing.no_type_check
 def count_row(
-    planes: int, phi_: _F32, table_: _I8, points_: _I32, elements_: _I32, k_row: int, j_row: int, k: int, j: int, first: int, last: int
+    planes: int, phi_: F32, table_: _I8, points_: _I32, elements_: _I32, k_row: int, j_row: int, k: int, j: int, first: int, last: int
 ): ...
 
 
 @wp.func_native(_filled(POINT))
-@typing.no_type_check
 def point_row(
-    planes: int, dx: float, phi_: _F32, counts_: _I32, ends_: _I32, number_: wp.array3d(dtype=wp.int32), out_: wp.array(dtype=wp.vec3),
+    planes: int, dx: float, phi_: F32, counts_: _I32, ends_: _I32, number_: wp.array3d(dtype=wp.int32), out_: wp.array(dtype=wp.vec3),
     k_row: int, j_row: int, k: int, j: int, first: int, last: int,
 ): ...  # fmt: skip
 
 
 @wp.func_native(_filled(CORNER))
-@typing.no_type_check
 def corner_row(
-    planes: int, phi_: _F32, table_: _I8, counts_: _I32, ends_: _I32, number_: wp.array3d(dtype=wp.int32), out_: _I32,
+    planes: int, phi_: F32, table_: _I8, counts_: _I32, ends_: _I32, number_: wp.array3d(dtype=wp.int32), out_: _I32,
     k_row: int, j_row: int, k: int, j: int, first: int, last: int,
 ): ...  # fmt: skip
 
 
-@wp.kernel(**_options)
-@typing.no_type_check
-def count_kernel(cells: CellRange, planes: int, phi: _F32, table: _I8, points: _I32, elements: _I32):
+@cell_kernel("warp_lcp.grid.marching_cubes")
+def count_kernel(plane, row, k, j, first, end, planes: int, phi: F32, table: _I8, points: _I32, elements: _I32):
     """Count the points that a row's nodes own and the triangles of its cells."""
-    plane, row = wp.tid()
-    count_row(planes, phi, table, points, elements, plane, row, cells.k + plane, cells.j + row, cells.i, cells.end)
+    count_row(planes, phi, table, points, elements, plane, row, k, j, first, end)
 
 
-@wp.kernel(**_options)
-@typing.no_type_check
+@cell_kernel("warp_lcp.grid.marching_cubes")
 def point_kernel(
-    cells: CellRange, planes: int, dx: float, phi: _F32, counts: _I32, ends: _I32, number: wp.array3d(dtype=wp.int32),
+    plane, row, k, j, first, end, planes: int, dx: float, phi: F32, counts: _I32, ends: _I32, number: wp.array3d(dtype=wp.int32),
     out: wp.array(dtype=wp.vec3),
 ):  # fmt: skip
     """Place the points of a row's nodes, and number the nodes that have any."""
-    plane, row = wp.tid()
-    point_row(planes, dx, phi, counts, ends, number, out, plane, row, cells.k + plane, cells.j + row, cells.i, cells.end)
+    point_row(planes, dx, phi, counts, ends, number, out, plane, row, k, j, first, end)
 
 
-@wp.kernel(**_options)
-@typing.no_type_check
+@cell_kernel("warp_lcp.grid.marching_cubes")
 def corner_kernel(
-    cells: CellRange, planes: int, phi: _F32, table: _I8, counts: _I32, ends: _I32, number: wp.array3d(dtype=wp.int32), out: _I32
+    plane,
+    row,
+    k,
+    j,
+    first,
+    end,
+    planes: int,
+    phi: F32,
+    table: _I8,
+    counts: _I32,
+    ends: _I32,
+    number: wp.array3d(dtype=wp.int32),
+    out: _I32,
 ):
     """Write the triangles of a row's cells."""
-    plane, row = wp.tid()
-    corner_row(planes, phi, table, counts, ends, number, out, plane, row, cells.k + plane, cells.j + row, cells.i, cells.end)
+    corner_row(planes, phi, table, counts, ends, number, out, plane, row, k, j, first, end)

@@ -65,10 +65,12 @@ class Window:
     @cached_property
     def cells(self) -> typing.Any:
         """The CellRange that kernels take as their first argument."""
+        return self._cells(grain(self.high[2] - self.low[2], self.device))
+
+    def _cells(self, each: int) -> typing.Any:
         box = CellRange()
         box.k, box.j, box.i = self.low
-        box.end = self.high[2]
-        box.grain = grain(self.high[2] - self.low[2], self.device)
+        box.end, box.grain = self.high[2], each
         return box
 
     @property
@@ -86,8 +88,8 @@ class Window:
         (launch or wp.launch)(kernel, (*self.rows, self.chunks), [self.cells, *inputs], device=self.device)
 
     def launch_rows(self, kernel: wp.Kernel, inputs: list[typing.Any]) -> None:
-        """Launch kernel(cells, *inputs) with one thread a row (plane, row), for sums that are the same on every run."""
-        wp.launch(kernel, self.rows, [self.cells, *inputs], device=self.device)
+        """Launch kernel(cells, *inputs) with one thread a row (plane, row, 0), for sums that are the same on every run."""
+        wp.launch(kernel, (*self.rows, 1), [self._cells(self.high[2] - self.low[2]), *inputs], device=self.device)
 
 
 @dataclass(frozen=True)

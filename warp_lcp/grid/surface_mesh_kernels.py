@@ -1,13 +1,11 @@
 # mypy: ignore-errors
 """Kernels of the surface that a picture shows: its field on a lattice, what solids take away of it, and how fast it moves."""
 
-import typing
-
 import warp as wp
 
+from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
 from warp_lcp.grid.level_set_kernels import WEIGHTS
 from warp_lcp.grid.particle_loops import particle_loop
-from warp_lcp.grid.staggered import CellRange
 from warp_lcp.native import BLOCK, simd
 from warp_lcp.operators.grid_poisson import SOLID
 
@@ -17,13 +15,12 @@ LEAST_OPEN = 0.25  # of a kernel: where less of it is open the distance is conti
 # outermost particles have about 0.63, by most in a drop of one particle, by about 1/2 in a sheet of one layer, which keeps its thickness.
 THIN, POWER = 0.6, 0.4
 
-_F32 = wp.array3d(dtype=wp.float32)
+
 _options = {"enable_backward": False, "module": "warp_lcp.grid.surface_mesh"}
 
 
 @wp.kernel(**_options)
-@typing.no_type_check
-def mirror_kernel(axis: int, fold: bool, field: _F32):
+def mirror_kernel(axis: int, fold: bool, field: F32):
     """Give the ring at both ends of an axis the values beside it, after adding to those what the ring holds; a thread a line."""
     a, b = wp.tid()
     last = field.shape[2 - axis] - 1
@@ -143,146 +140,103 @@ def _filled(source: str) -> str:
 
 
 @wp.func_native(particle_loop(_filled(BOOST)))
-@typing.no_type_check
 def boost_some(
-    planes: int, inverse_dx: float, each: float, gain: float, most: float, x_: wp.array(dtype=wp.vec3), smooth_: _F32, capacity_: _F32,
-    out_: _F32, first: int, last: int,
+    planes: int, inverse_dx: float, each: float, gain: float, most: float, x_: wp.array(dtype=wp.vec3), smooth_: F32, capacity_: F32,
+    out_: F32, first: int, last: int,
 ): ...  # fmt: skip
 
 
 @wp.func_native(simd(BLOCK + _filled(DISTANCE)))
-@typing.no_type_check
 def distance_row(
-    planes: int, spread: float, smooth_: _F32, thin_: _F32, capacity_: _F32, phi_: _F32, known_: wp.array3d(dtype=wp.int8),
+    planes: int, spread: float, smooth_: F32, thin_: F32, capacity_: F32, phi_: F32, known_: I8,
     k: int, j: int, first: int, last: int,
 ): ...  # fmt: skip
 
 
 @wp.func_native(simd(ROOM))
-@typing.no_type_check
-def room_row(planes: int, parts: int, distance_: _F32, out_: _F32, k: int, j: int, first: int, last: int): ...
+def room_row(planes: int, parts: int, distance_: F32, out_: F32, k: int, j: int, first: int, last: int): ...
 
 
 @wp.func_native(simd(CARVE))
-@typing.no_type_check
-def carve_row(room_: _F32, phi_: _F32, k: int, j: int, first: int, last: int): ...
+def carve_row(room_: F32, phi_: F32, k: int, j: int, first: int, last: int): ...
 
 
 @wp.kernel(**_options)
-@typing.no_type_check
 def boost_kernel(
     count: int, grain: int, planes: int, inverse_dx: float, each: float, gain: float, most: float, position: wp.array(dtype=wp.vec3),
-    smooth: _F32, capacity: _F32, out: _F32,
+    smooth: F32, capacity: F32, out: F32,
 ):  # fmt: skip
     """Add the kernels of particles that have few others around them, the more the fewer these are."""
     first = wp.tid() * grain
     boost_some(planes, inverse_dx, each, gain, most, position, smooth, capacity, out, first, wp.min(first + grain, count))
 
 
-@wp.kernel(**_options)
-@typing.no_type_check
-def distance_kernel(
-    cells: CellRange, planes: int, spread: float, smooth: _F32, thin: _F32, capacity: _F32, phi: _F32, known: wp.array3d(dtype=wp.int8)
-):
+@cell_kernel("warp_lcp.grid.surface_mesh")
+def distance_kernel(k, j, first, end, planes: int, spread: float, smooth: F32, thin: F32, capacity: F32, phi: F32, known: I8):
     """Turn filled shares into distances [lattice cells]."""
-    plane, row, chunk = wp.tid()
-    first = cells.i + chunk * cells.grain
-    last = wp.min(first + cells.grain, cells.end)
-    distance_row(planes, spread, smooth, thin, capacity, phi, known, cells.k + plane, cells.j + row, first, last)
+    distance_row(planes, spread, smooth, thin, capacity, phi, known, k, j, first, end)
 
 
-@wp.kernel(**_options)
-@typing.no_type_check
-def room_kernel(cells: CellRange, planes: int, parts: int, distance: _F32, out: _F32):
+@cell_kernel("warp_lcp.grid.surface_mesh")
+def room_kernel(k, j, first, end, planes: int, parts: int, distance: F32, out: F32):
     """Interpolate the distance to solids that cut cells."""
-    plane, row, chunk = wp.tid()
-    first = cells.i + chunk * cells.grain
-    room_row(planes, parts, distance, out, cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end))
+    room_row(planes, parts, distance, out, k, j, first, end)
 
 
 @wp.func
-@typing.no_type_check
-def is_solid(base: wp.array3d(dtype=wp.int8), planes: int, parts: int, k: int, j: int, i: int):
+def is_solid(base: I8, planes: int, parts: int, k: int, j: int, i: int):
     """Tell whether a lattice cell lies in a cell that is SOLID; cells of the ring are not."""
     c = wp.where(planes == 2, (k - 1) // parts + 1, 1)
     return base[c, (j - 1) // parts + 1, (i - 1) // parts + 1] == wp.int8(SOLID)
 
 
-@wp.kernel(**_options)
-@typing.no_type_check
-def whole_cell_room_kernel(cells: CellRange, planes: int, parts: int, base: wp.array3d(dtype=wp.int8), out: _F32):
+@cell_kernel("warp_lcp.grid.surface_mesh")
+def whole_cell_room_kernel(k, j, i, planes: int, parts: int, base: I8, out: F32):
     """Say half a lattice cell on both sides of the faces of whole solid cells, far elsewhere."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        d = float(FAR)
-        if is_solid(base, planes, parts, k, j, i):
-            d = float(-0.5)
-        else:
-            for a in range(2):
-                s = 2 * a - 1
-                if is_solid(base, planes, parts, k, j, wp.clamp(i + s, 1, out.shape[2] - 2)):
-                    d = float(0.5)
-                if is_solid(base, planes, parts, k, wp.clamp(j + s, 1, out.shape[1] - 2), i):
-                    d = float(0.5)
-                if planes == 2 and is_solid(base, planes, parts, wp.clamp(k + s, 1, out.shape[0] - 2), j, i):
-                    d = float(0.5)
-        out[k, j, i] = d
+    d = float(FAR)
+    if is_solid(base, planes, parts, k, j, i):
+        d = float(-0.5)
+    else:
+        for a in range(2):
+            s = 2 * a - 1
+            if is_solid(base, planes, parts, k, j, wp.clamp(i + s, 1, out.shape[2] - 2)):
+                d = float(0.5)
+            if is_solid(base, planes, parts, k, wp.clamp(j + s, 1, out.shape[1] - 2), i):
+                d = float(0.5)
+            if planes == 2 and is_solid(base, planes, parts, wp.clamp(k + s, 1, out.shape[0] - 2), j, i):
+                d = float(0.5)
+    out[k, j, i] = d
 
 
-@wp.kernel(**_options)
-@typing.no_type_check
-def fill_kernel(cells: CellRange, planes: int, parts: int, least: float, depth: _F32, base: wp.array3d(dtype=wp.int8), density: _F32):
+@cell_kernel("warp_lcp.grid.surface_mesh")
+def fill_kernel(k, j, i, planes: int, parts: int, least: float, depth: F32, base: I8, density: F32):
     """Make lattice cells full that lie in open cells deeper than `least`."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
     c = wp.where(planes == 2, (k - 1) // parts + 1, 1)
     b = (j - 1) // parts + 1
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        a = (i - 1) // parts + 1
-        if depth[c, b, a] >= least and base[c, b, a] != wp.int8(SOLID):
-            density[k, j, i] = 1.0
+    a = (i - 1) // parts + 1
+    if depth[c, b, a] >= least and base[c, b, a] != wp.int8(SOLID):
+        density[k, j, i] = 1.0
 
 
-@wp.kernel(**_options)
-@typing.no_type_check
-def open_share_kernel(cells: CellRange, room: _F32, out: _F32):
+@cell_kernel("warp_lcp.grid.surface_mesh")
+def open_share_kernel(k, j, i, room: F32, out: F32):
     """Estimate which share of each lattice cell is open."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        out[k, j, i] = wp.clamp(room[k, j, i] + 0.5, 0.0, 1.0)
+    out[k, j, i] = wp.clamp(room[k, j, i] + 0.5, 0.0, 1.0)
 
 
-@wp.kernel(**_options)
-@typing.no_type_check
-def carve_kernel(cells: CellRange, room: _F32, phi: _F32):
+@cell_kernel("warp_lcp.grid.surface_mesh")
+def carve_kernel(k, j, first, end, room: F32, phi: F32):
     """Take what lies inside solids away from the liquid."""
-    plane, row, chunk = wp.tid()
-    first = cells.i + chunk * cells.grain
-    carve_row(room, phi, cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end))
+    carve_row(room, phi, k, j, first, end)
 
 
-@wp.kernel(**_options)
-@typing.no_type_check
-def known_kernel(cells: CellRange, weight: _F32, known: wp.array3d(dtype=wp.int8)):
+@cell_kernel("warp_lcp.grid.surface_mesh")
+def known_kernel(k, j, i, weight: F32, known: I8):
     """Mark the faces that particles gave a velocity."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        known[k, j, i] = wp.where(weight[k, j, i] > 0.0, wp.int8(1), wp.int8(0))
+    known[k, j, i] = wp.where(weight[k, j, i] > 0.0, wp.int8(1), wp.int8(0))
 
 
 @wp.kernel(**_options)
-@typing.no_type_check
 def clamp_kernel(points: wp.array(dtype=wp.vec3), size: wp.vec3, out: wp.array(dtype=wp.vec3)):
     """Bring points that are beyond the far sides back to them."""
     p = wp.tid()

@@ -17,9 +17,10 @@ from collections.abc import Sequence
 
 import warp as wp
 
+from warp_lcp.grid.cell_kernel import F32, I8, I16, U8, cell_kernel
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.extrapolate import extrapolate
-from warp_lcp.grid.staggered import CellRange, Window
+from warp_lcp.grid.staggered import Window
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.contact import HELD, RELEASED, TOUCHES_NOTHING
 from warp_lcp.material.wall import Join, keep_released_kernel
@@ -164,7 +165,7 @@ def _named(source: str) -> str:
 @wp.func_native(_named(SPRAY_ROW))
 @typing.no_type_check
 def spray_row(  # noqa: D103
-    known_: wp.array3d(dtype=wp.int8), weight_: wp.array3d(dtype=wp.float32), open_: wp.array3d(dtype=wp.float32),
+    known_: I8, weight_: F32, open_: F32,
     k: int, j: int, first: int, last: int,
 ): ...  # fmt: skip
 
@@ -172,69 +173,60 @@ def spray_row(  # noqa: D103
 @wp.func_native(_named(NEAR_WALLS + CONSTRAIN_ROW))
 @typing.no_type_check
 def constrain_row(  # noqa: D103
-    axis: int, planes: int, dx: float, u_: wp.array3d(dtype=wp.float32), v_: wp.array3d(dtype=wp.float32), w_: wp.array3d(dtype=wp.float32),
-    ku_: wp.array3d(dtype=wp.int8), kv_: wp.array3d(dtype=wp.int8), kw_: wp.array3d(dtype=wp.int8), kind_: wp.array3d(dtype=wp.int8),
-    contact_: wp.array3d(dtype=wp.uint8), known_: wp.array3d(dtype=wp.int8), open_: wp.array3d(dtype=wp.float32),
-    au_: wp.array3d(dtype=wp.int16), av_: wp.array3d(dtype=wp.int16), aw_: wp.array3d(dtype=wp.int16), su_: wp.array3d(dtype=wp.float32),
-    sv_: wp.array3d(dtype=wp.float32), sw_: wp.array3d(dtype=wp.float32), distance_: wp.array3d(dtype=wp.float32),
-    owner_: wp.array3d(dtype=wp.int16), next_: wp.array3d(dtype=wp.float32), next_owner_: wp.array3d(dtype=wp.int16),
+    axis: int, planes: int, dx: float, u_: F32, v_: F32, w_: F32,
+    ku_: I8, kv_: I8, kw_: I8, kind_: I8,
+    contact_: U8, known_: I8, open_: F32,
+    au_: I16, av_: I16, aw_: I16, su_: F32,
+    sv_: F32, sw_: F32, distance_: F32,
+    owner_: I16, next_: F32, next_owner_: I16,
     turn_: wp.array(dtype=wp.mat33), shift_: wp.array(dtype=wp.vec3), separating_: wp.array(dtype=wp.uint8),
-    result_: wp.array3d(dtype=wp.float32), k: int, j: int, first: int, last: int,
+    result_: F32, k: int, j: int, first: int, last: int,
 ): ...  # fmt: skip
 
 
 @wp.func_native(_named(NEAR_WALLS + "each([&](int i) { field_.data[row + i] = result_.data[row + i]; });"))
 @typing.no_type_check
 def take_row(  # noqa: D103
-    axis: int, planes: int, known_: wp.array3d(dtype=wp.int8), open_: wp.array3d(dtype=wp.float32), result_: wp.array3d(dtype=wp.float32),
-    field_: wp.array3d(dtype=wp.float32), k: int, j: int, first: int, last: int,
+    axis: int, planes: int, known_: I8, open_: F32, result_: F32,
+    field_: F32, k: int, j: int, first: int, last: int,
 ): ...  # fmt: skip
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.material.cut_wall")
+@cell_kernel("warp_lcp.material.cut_wall")
 @typing.no_type_check
-def keep_spray_kernel(
-    cells: CellRange, known: wp.array3d(dtype=wp.int8), weight: wp.array3d(dtype=wp.float32), open: wp.array3d(dtype=wp.float32)
-):
+def keep_spray_kernel(k, j, first, end, known: I8, weight: F32, open: F32):
     """Open faces that are still unknown but carry weight become known, and so do the extrapolated ones."""
-    plane, row, chunk = wp.tid()
-    first = cells.i + chunk * cells.grain
-    spray_row(known, weight, open, cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end))
+    spray_row(known, weight, open, k, j, first, end)
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.material.cut_wall")
+@cell_kernel("warp_lcp.material.cut_wall")
 @typing.no_type_check
 def constrain_kernel(
-    cells: CellRange, axis: int, planes: int, dx: float, u: wp.array3d(dtype=wp.float32), v: wp.array3d(dtype=wp.float32),
-    w: wp.array3d(dtype=wp.float32), ku: wp.array3d(dtype=wp.int8), kv: wp.array3d(dtype=wp.int8), kw: wp.array3d(dtype=wp.int8),
-    kind: wp.array3d(dtype=wp.int8), contact: wp.array3d(dtype=wp.uint8), known: wp.array3d(dtype=wp.int8),
-    open: wp.array3d(dtype=wp.float32), wall_u: wp.array3d(dtype=wp.int16), wall_v: wp.array3d(dtype=wp.int16),
-    wall_w: wp.array3d(dtype=wp.int16), moving_u: wp.array3d(dtype=wp.float32), moving_v: wp.array3d(dtype=wp.float32),
-    moving_w: wp.array3d(dtype=wp.float32), distance: wp.array3d(dtype=wp.float32), owner: wp.array3d(dtype=wp.int16),
-    next_near: wp.array3d(dtype=wp.float32), next_owner: wp.array3d(dtype=wp.int16), turn: wp.array(dtype=wp.mat33),
-    shift: wp.array(dtype=wp.vec3), separating: wp.array(dtype=wp.uint8), result: wp.array3d(dtype=wp.float32),
+    k, j, first, end, axis: int, planes: int, dx: float, u: F32, v: F32,
+    w: F32, ku: I8, kv: I8, kw: I8,
+    kind: I8, contact: U8, known: I8,
+    open: F32, wall_u: I16, wall_v: I16,
+    wall_w: I16, moving_u: F32, moving_v: F32,
+    moving_w: F32, distance: F32, owner: I16,
+    next_near: F32, next_owner: I16, turn: wp.array(dtype=wp.mat33),
+    shift: wp.array(dtype=wp.vec3), separating: wp.array(dtype=wp.uint8), result: F32,
 ):  # fmt: skip
     """Write what a component's closed faces become; old values alone are read, so that the order of faces does not matter."""
-    plane, row, chunk = wp.tid()
-    first = cells.i + chunk * cells.grain
     constrain_row(
         axis, planes, dx, u, v, w, ku, kv, kw, kind, contact, known, open, wall_u, wall_v, wall_w, moving_u, moving_v, moving_w, distance,
         owner, next_near, next_owner, turn, shift, separating, result,
-        cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end),
+        k, j, first, end,
     )  # fmt: skip
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.material.cut_wall")
+@cell_kernel("warp_lcp.material.cut_wall")
 @typing.no_type_check
 def take_kernel(
-    cells: CellRange, axis: int, planes: int, known: wp.array3d(dtype=wp.int8), open: wp.array3d(dtype=wp.float32),
-    result: wp.array3d(dtype=wp.float32), field: wp.array3d(dtype=wp.float32),
+    k, j, first, end, axis: int, planes: int, known: I8, open: F32,
+    result: F32, field: F32,
 ):  # fmt: skip
     """Take the results of `constrain_kernel`."""
-    plane, row, chunk = wp.tid()
-    first = cells.i + chunk * cells.grain
-    end = wp.min(first + cells.grain, cells.end)
-    take_row(axis, planes, known, open, result, field, cells.k + plane, cells.j + row, first, end)
+    take_row(axis, planes, known, open, result, field, k, j, first, end)
 
 
 def extend_velocity_cut(

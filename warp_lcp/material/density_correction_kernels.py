@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from warp_lcp.grid.staggered import CellRange
+from warp_lcp.grid.cell_kernel import F32, F64, I8, U8, cell_kernel
 from warp_lcp.material.contact import RELEASED
 from warp_lcp.native import BLOCK, simd
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
@@ -111,7 +111,6 @@ DISPLACE = """
 """
 
 _CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR, "COLUMNS": COLUMNS, "RELEASED": RELEASED}
-_F32, _F64, _I8, _U8 = (wp.array3d(dtype=t) for t in (wp.float32, wp.float64, wp.int8, wp.uint8))
 
 
 def _source(body: str, **more: int) -> str:
@@ -123,49 +122,46 @@ def _source(body: str, **more: int) -> str:
 
 @wp.func_native(_source(PREPARE))
 def prepare_row(
-    base_: _I8, density_: _F32, capacity_: _F32, most: float, gain: float, kind_: _I8, b_: _F64, x_: _F64, contact_: _U8,
-    inside_: _U8, sums_: _F64, k: int, j: int, first: int, last: int,
+    base_: I8, density_: F32, capacity_: F32, most: float, gain: float, kind_: I8, b_: F64, x_: F64, contact_: U8,
+    inside_: U8, sums_: F64, k: int, j: int, first: int, last: int,
 ): ...  # fmt: skip
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.material.density_correction")
+@cell_kernel("warp_lcp.material.density_correction")
 def prepare_kernel(
-    cells: CellRange, base: _I8, density: _F32, capacity: _F32, most: float, gain: float, kind: _I8, b: _F64, x: _F64, contact: _U8,
-    inside: _U8, sums: _F64,
+    k, j, first, end, base: I8, density: F32, capacity: F32, most: float, gain: float, kind: I8, b: F64, x: F64, contact: U8,
+    inside: U8, sums: F64,
 ):  # fmt: skip
     """Unknowns, right-hand side and guess; a row's sums: [0] over-full cells, [1] 1 and the most above what fits, [2] 0."""
-    plane, row = wp.tid()
-    prepare_row(base, density, capacity, most, gain, kind, b, x, contact, inside, sums, cells.k + plane, cells.j + row, cells.i, cells.end)
+    prepare_row(base, density, capacity, most, gain, kind, b, x, contact, inside, sums, k, j, first, end)
 
 
 @wp.func_native(_source(EVEN))
 def even_row(
-    planes: int, density_: _F32, capacity_: _F32, least: float, inside_: _U8, kind_: _I8, b_: _F64, x_: _F64, lower_: _F64, sums_: _F64,
+    planes: int, density_: F32, capacity_: F32, least: float, inside_: U8, kind_: I8, b_: F64, x_: F64, lower_: F64, sums_: F64,
     k: int, j: int, first: int, last: int,
 ): ...  # fmt: skip
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.material.density_correction")
+@cell_kernel("warp_lcp.material.density_correction")
 def even_kernel(
-    cells: CellRange, planes: int, density: _F32, capacity: _F32, least: float, inside: _U8, kind: _I8, b: _F64, x: _F64, lower: _F64,
-    sums: _F64,
+    k, j, first, end, planes: int, density: F32, capacity: F32, least: float, inside: U8, kind: I8, b: F64, x: F64, lower: F64,
+    sums: F64,
 ):  # fmt: skip
     """Equations instead of bounds for cells with material all around them; a row's sums: [2] such cells that hold too little."""
-    plane, row = wp.tid()
-    even_row(planes, density, capacity, least, inside, kind, b, x, lower, sums, cells.k + plane, cells.j + row, cells.i, cells.end)
+    even_row(planes, density, capacity, least, inside, kind, b, x, lower, sums, k, j, first, end)
 
 
 @wp.func_native(_source(CROWD))
 def crowd_row(
-    base_: _I8, density_: _F32, capacity_: _F32, most: float, sums_: _F64, k: int, j: int, first: int, last: int,
+    base_: I8, density_: F32, capacity_: F32, most: float, sums_: F64, k: int, j: int, first: int, last: int,
 ): ...  # fmt: skip
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.material.crowding")
-def crowd_kernel(cells: CellRange, base: _I8, density: _F32, capacity: _F32, most: float, sums: _F64):
+@cell_kernel("warp_lcp.material.crowding")
+def crowd_kernel(k, j, first, end, base: I8, density: F32, capacity: F32, most: float, sums: F64):
     """Write a row's sums: [0] of what cells hold too much, [1] 1 and the most above what fits, [2] of all that they hold."""
-    plane, row = wp.tid()
-    crowd_row(base, density, capacity, most, sums, cells.k + plane, cells.j + row, cells.i, cells.end)
+    crowd_row(base, density, capacity, most, sums, k, j, first, end)
 
 
 @functools.cache
@@ -178,18 +174,16 @@ def displacement_kernel(cut: bool) -> SimpleNamespace:
 
     @wp.func_native(_source(DISPLACE, CUT=int(cut)))
     def displace_row(
-        axis: int, x_: _F64, kind_: _I8, open_: _F32, density_: _F32, capacity_: _F32, most: float, dx: float, d_: _F32,
+        axis: int, x_: F64, kind_: I8, open_: F32, density_: F32, capacity_: F32, most: float, dx: float, d_: F32,
         k: int, j: int, first: int, last: int,
     ): ...  # fmt: skip
 
-    @wp.kernel(enable_backward=False, module="warp_lcp.material.density_correction" + "_cut" * cut)
+    @cell_kernel("warp_lcp.material.density_correction" + "_cut" * cut)
     def displace(
-        cells: CellRange, axis: int, x: _F64, kind: _I8, open_: _F32, density: _F32, capacity: _F32, most: float, dx: float, d: _F32
-    ):
+        k, j, first, end, axis: int, x: F64, kind: I8, open_: F32, density: F32, capacity: F32, most: float,
+        dx: float, d: F32,
+    ):  # fmt: skip
         """Displacement [m] on the lower faces of one axis."""
-        plane, row, chunk = wp.tid()
-        first = cells.i + chunk * cells.grain
-        last = wp.min(first + cells.grain, cells.end)
-        displace_row(axis, x, kind, open_, density, capacity, most, dx, d, cells.k + plane, cells.j + row, first, last)
+        displace_row(axis, x, kind, open_, density, capacity, most, dx, d, k, j, first, end)
 
     return SimpleNamespace(displace=displace)

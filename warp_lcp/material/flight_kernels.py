@@ -6,7 +6,7 @@ Sums are of int64, in fixed point: whole numbers add up to the same in any order
 
 import warp as wp
 
-from warp_lcp.grid.staggered import CellRange
+from warp_lcp.grid.cell_kernel import F32, I8, U8, cell_kernel
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.contact import TOUCHES
 from warp_lcp.native import simd
@@ -19,11 +19,12 @@ MOST_STRIDES = 1024  # of a way, a cell each, as far as particles go in a step
 _TOUCHES = wp.constant(wp.uint8(TOUCHES))
 _SOLID = wp.constant(wp.int8(SOLID))
 
+
 options = {"enable_backward": False, "module": "warp_lcp.material.flight"}
 Integers, Bytes = wp.array(dtype=wp.int32), wp.array(dtype=wp.uint8)
-Kinds = wp.array3d(dtype=wp.int8)
+Kinds = I8
 Motions = wp.array2d(dtype=wp.vec3)
-Vectors, Field = wp.array(dtype=wp.vec3), wp.array3d(dtype=wp.float32)
+Vectors, Field = wp.array(dtype=wp.vec3), F32
 
 
 @wp.struct
@@ -100,7 +101,7 @@ def unite_row(u_: Field, v_: Field, w_: Field, parent: Integers, s1: int, s2: in
 
 @wp.func_native(_native(HOLD))
 def hold_row(
-    kind_: Kinds, touch_: wp.array3d(dtype=wp.uint8), parent: Integers, held: Bytes, several: Bytes, s1: int, s2: int, k: int, j: int,
+    kind_: Kinds, touch_: U8, parent: Integers, held: Bytes, several: Bytes, s1: int, s2: int, k: int, j: int,
     first: int, last: int,
 ): ...  # fmt: skip
 
@@ -123,24 +124,20 @@ def alone_kernel(parent: Integers, held: Bytes, several: Bytes):
     several[c] = wp.uint8(0)
 
 
-@wp.kernel(**options)
-def unite_kernel(cells: CellRange, u: Field, v: Field, w: Field, parent: Integers):
+@cell_kernel("warp_lcp.material.flight")
+def unite_kernel(k, j, first, end, u: Field, v: Field, w: Field, parent: Integers):
     """Cells with a face between them that particles gave weight belong together."""
-    plane, row, chunk = wp.tid()
-    first = cells.i + chunk * cells.grain
     s2 = u.shape[2]
     s1 = s2 * u.shape[1]
-    unite_row(u, v, w, parent, s1, s2, cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end))
+    unite_row(u, v, w, parent, s1, s2, k, j, first, end)
 
 
-@wp.kernel(**options)
-def hold_kernel(cells: CellRange, kind: Kinds, touch: wp.array3d(dtype=wp.uint8), parent: Integers, held: Bytes, several: Bytes):
+@cell_kernel("warp_lcp.material.flight")
+def hold_kernel(k, j, first, end, kind: Kinds, touch: U8, parent: Integers, held: Bytes, several: Bytes):
     """Tell which trees reach a wall, and which have several cells: those without weight stay alone."""
-    plane, row, chunk = wp.tid()
-    first = cells.i + chunk * cells.grain
     s2 = kind.shape[2]
     s1 = s2 * kind.shape[1]
-    hold_row(kind, touch, parent, held, several, s1, s2, cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end))
+    hold_row(kind, touch, parent, held, several, s1, s2, k, j, first, end)
 
 
 @wp.kernel(**options)
@@ -245,7 +242,7 @@ def turned(angle: wp.vec3, a: wp.vec3):
 
 
 @wp.func
-def is_near(base: Kinds, touch: wp.array3d(dtype=wp.uint8), planes: int, x: wp.vec3):
+def is_near(base: Kinds, touch: U8, planes: int, x: wp.vec3):
     """Tell whether x [cells] is in a cell that a wall touches, or near the domain's end."""
     i = int(wp.floor(x[0])) + 1
     j = int(wp.floor(x[1])) + 1
@@ -260,7 +257,7 @@ def is_near(base: Kinds, touch: wp.array3d(dtype=wp.uint8), planes: int, x: wp.v
 
 @wp.kernel(**options)
 def fly_kernel(
-    flight: Flight, u: Field, v: Field, w: Field, motion: Motions, base: Kinds, touch: wp.array3d(dtype=wp.uint8), start: Vectors,
+    flight: Flight, u: Field, v: Field, w: Field, motion: Motions, base: Kinds, touch: U8, start: Vectors,
     end: Vectors,
 ):  # fmt: skip
     """Carry particles through the velocity that moves along with their body, a third-order Runge-Kutta step, and add them up.
