@@ -6,7 +6,7 @@ import typing
 import warp as wp
 
 from granular.yield_set import FIRM, HOLDS, PARTLY, SHEARS_HERE
-from warp_lcp.grid.cell_kernel import F32, I8, I32, U8, cell_kernel
+from warp_lcp.grid.cell_kernel import F32, I8, I32, U8, cell_below, cell_kernel
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 
 _FLUID = wp.constant(wp.int8(FLUID))
@@ -126,9 +126,7 @@ def face_kernel(
     and thus the friction below would be too small by what lies in it, and the uppermost row would slide off slopes that it should rest
     on. Of a face that a solid cuts the open part has mass, at least a least one.
     """
-    c = wp.max(k - wp.where(axis == 2, 1, 0), 0)
-    b = wp.max(j - wp.where(axis == 1, 1, 0), 0)
-    a = wp.max(i - wp.where(axis == 0, 1, 0), 0)
+    c, b, a = cell_below(axis, k, j, i)
     m = float(0.0)
     light = float(0.0)
     u = float(0.0)

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from granular.yield_set import FLUX, OPENINGS, RATE_BOUND, SHAPE, native
-from warp_lcp.grid.cell_kernel import F32, F64, I8, U8, cell_kernel
+from warp_lcp.grid.cell_kernel import F32, F64, I8, U8, cell_below, cell_kernel
 from warp_lcp.grid.extrapolate import BLOCKED
 from warp_lcp.operators.grid_poisson import SOLID
 
@@ -97,9 +97,7 @@ def report_kernels(dimension: int, rate: bool = False, cut: bool = False) -> Sim
         k, j, i, axis: int, base: I8, inverse: F32, found: F64, velocity: F32,
         known: I8,
     ):  # fmt: skip
-        c = wp.max(k - wp.where(axis == 2, 1, 0), 0)
-        b = wp.max(j - wp.where(axis == 1, 1, 0), 0)
-        a = wp.max(i - wp.where(axis == 0, 1, 0), 0)
+        c, b, a = cell_below(axis, k, j, i)
         mark = wp.int8(0)
         if inverse[k, j, i] > 0.0:
             velocity[k, j, i] = wp.float32(found[k, j, i])

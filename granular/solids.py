@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import typing
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,48 +9,11 @@ import warp as wp
 
 from granular.cut_walls import CutWalls
 from granular.stress import Walls
-from warp_lcp.grid.cell_kernel import F32, I8, I32, cell_kernel
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid, voxelize
+from warp_lcp.material import boundary_kernels as kernels
 from warp_lcp.material.boundary import Boundary, Faces
 from warp_lcp.material.cut_boundary import CutBoundary
-from warp_lcp.operators.grid_poisson import AIR, SOLID
-
-_SOLID = wp.constant(wp.int8(SOLID))
-_AIR = wp.constant(wp.int8(AIR))
-
-
-@cell_kernel("granular.solids")
-@typing.no_type_check
-def base_kernel(k, j, i, index: I32, base: I8):
-    """SOLID in walls, AIR elsewhere."""
-    if index[k, j, i] >= 0:
-        base[k, j, i] = _SOLID
-    else:
-        base[k, j, i] = _AIR
-
-
-@cell_kernel("granular.solids")
-@typing.no_type_check
-def rigid_velocity_kernel(
-    k, j, i, axis: int, planes: int, spacing: float, index: I32, turn: wp.array(dtype=wp.mat33),
-    shift: wp.array(dtype=wp.vec3), field: F32,
-):  # fmt: skip
-    """Velocity of the solids on the faces of one component that they touch, 0 elsewhere."""
-    c = wp.max(k - wp.where(axis == 2, 1, 0), 0)
-    b = wp.max(j - wp.where(axis == 1, 1, 0), 0)
-    a = wp.max(i - wp.where(axis == 0, 1, 0), 0)
-    wall = wp.max(index[k, j, i], index[c, b, a])
-    u = float(0.0)
-    if wall > 0:
-        x = (float(i) - wp.where(axis == 0, 1.0, 0.5)) * spacing
-        y = (float(j) - wp.where(axis == 1, 1.0, 0.5)) * spacing
-        z = float(0.0)
-        if planes == 2:
-            z = (float(k) - wp.where(axis == 2, 1.0, 0.5)) * spacing
-        v = turn[wall] * wp.vec3(x, y, z) + shift[wall]
-        u = v[axis]
-    field[k, j, i] = u
 
 
 class SandSolids:
@@ -114,7 +76,7 @@ class SandSolids:
         self.index, self._covered = found.index, found.covered
         if self._boundary.sides is not None:
             self._boundary.sides.wrap(self.index)
-        grid.everywhere.launch(base_kernel, [self.index, self.base])
+        grid.everywhere.launch(kernels.base_kernel, [self.index, self.base])
         cells = self.index.numpy()
         if self.cut is not None:  # the domain's walls alone are whole cells
             wp.copy(self.base, self._boundary.base)
@@ -147,7 +109,7 @@ class SandSolids:
             cut = boundary.cut
             for axis, field in enumerate(self.velocity):
                 inputs = [axis, grid.planes, grid.spacing, self.index, cut.turn, cut.shift, field]
-                grid.everywhere.launch(rigid_velocity_kernel, inputs)
+                grid.everywhere.launch(kernels.wall_velocity_kernel, inputs)
         else:
             for field in self.velocity:  # a source that has stopped has left its own
                 field.zero_()

@@ -22,6 +22,16 @@ end = wp.min(first + cells.grain, cells.end)
 LOOP = "for i in range(first, end): pass"
 
 
+@wp.func
+def cell_below(axis: int, k: int, j: int, i: int):
+    """Return the cell on the other side of a cell's lower face; at the array's edge the cell itself."""
+    return (
+        wp.max(k - wp.where(axis == 2, 1, 0), 0),
+        wp.max(j - wp.where(axis == 1, 1, 0), 0),
+        wp.max(i - wp.where(axis == 0, 1, 0), 0),
+    )
+
+
 def cell_kernel(module: str) -> Callable[[Callable], wp.Kernel]:
     """Return a decorator that makes a kernel(cells, ...) for `Window.launch`, in a Warp module, of what is done to a cell or a piece.
 

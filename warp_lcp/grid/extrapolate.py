@@ -80,9 +80,9 @@ def layer_kernel(k, j, first, end, known: I8, field: F32, layer: int, fill: int)
 
 @cell_kernel("warp_lcp.grid.extrapolate")
 @typing.no_type_check
-def weighted_kernel(k, j, i, weight: F32, known: I8):
-    """Mark the faces that particles gave weight."""
-    known[k, j, i] = wp.where(weight[k, j, i] > TINY_WEIGHT, wp.int8(1), wp.int8(0))
+def weighted_kernel(k, j, i, least: float, weight: F32, known: I8):
+    """Mark the faces that particles gave more weight than `least`."""
+    known[k, j, i] = wp.where(weight[k, j, i] > least, wp.int8(1), wp.int8(0))
 
 
 def complete(
@@ -100,7 +100,7 @@ def complete(
     """
     for field, weight, marks in zip(velocity, weights, known, strict=True):
         marks.zero_()
-        window.launch(weighted_kernel, [weight, marks])
+        window.launch(weighted_kernel, [TINY_WEIGHT, weight, marks])
         extrapolate(window, marks, field, REACH, join=join)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import warp as wp
 
 from warp_lcp.grid import surface_mesh_kernels as kernels
-from warp_lcp.grid.extrapolate import extrapolate
+from warp_lcp.grid.extrapolate import extrapolate, weighted_kernel
 from warp_lcp.grid.level_set_kernels import binomial_kernel, scatter_kernel
 from warp_lcp.grid.marching_cubes import MarchingCubes, Mesh
 from warp_lcp.grid.mesh_smoothing import smooth as smooth_mesh
@@ -188,7 +188,7 @@ def faces_from_particles(
     particles_to_faces(grid, position, velocity, [], fields, weights)
     known = grid.field(wp.int8)
     for field, weight in zip(fields, weights, strict=True):
-        grid.everywhere.launch(kernels.known_kernel, [weight, known])
+        grid.everywhere.launch(weighted_kernel, [0.0, weight, known])
         extrapolate(grid.everywhere, known, field, EXTENDED)
 
 

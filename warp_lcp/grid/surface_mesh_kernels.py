@@ -230,12 +230,6 @@ def carve_kernel(k, j, first, end, room: F32, phi: F32):
     carve_row(room, phi, k, j, first, end)
 
 
-@cell_kernel("warp_lcp.grid.surface_mesh")
-def known_kernel(k, j, i, weight: F32, known: I8):
-    """Mark the faces that particles gave a velocity."""
-    known[k, j, i] = wp.where(weight[k, j, i] > 0.0, wp.int8(1), wp.int8(0))
-
-
 @wp.kernel(**_options)
 def clamp_kernel(points: wp.array(dtype=wp.vec3), size: wp.vec3, out: wp.array(dtype=wp.vec3)):
     """Bring points that are beyond the far sides back to them."""

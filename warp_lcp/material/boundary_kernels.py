@@ -5,7 +5,7 @@ import typing
 
 import warp as wp
 
-from warp_lcp.grid.cell_kernel import F32, I8, I16, I32, U8, cell_kernel
+from warp_lcp.grid.cell_kernel import F32, I8, I16, I32, U8, cell_below, cell_kernel
 from warp_lcp.material.contact import LETS_GO, TOUCHES
 from warp_lcp.operators.grid_poisson import AIR, SOLID
 
@@ -22,6 +22,12 @@ def base_kernel(k, j, i, index: I32, base: I8):
     base[k, j, i] = wp.where(index[k, j, i] >= 0, _SOLID, _AIR)
 
 
+@wp.func
+def touch_of(separates: wp.uint8):
+    """Return what a wall adds to the touch of the cells beside it."""
+    return wp.where(separates != wp.uint8(0), TOUCHES | LETS_GO, TOUCHES)
+
+
 @cell_kernel("warp_lcp.material.boundary")
 def touch_kernel(k, j, i, index: I32, separating: wp.array(dtype=wp.uint8), planes: int, touch: U8):
     """Find the walls on the faces of each cell."""
@@ -31,9 +37,7 @@ def touch_kernel(k, j, i, index: I32, separating: wp.array(dtype=wp.uint8), plan
         axis = n >> 1
         wall = index[k + wp.where(axis == 2, side, 0), j + wp.where(axis == 1, side, 0), i + wp.where(axis == 0, side, 0)]
         if wall >= 0:
-            found = found | TOUCHES
-            if separating[wall] != wp.uint8(0):  # nested: `and` would read both operands
-                found = found | LETS_GO
+            found = found | touch_of(separating[wall])
     touch[k, j, i] = wp.uint8(found)
 
 
@@ -44,21 +48,27 @@ def touch_cut_kernel(k, j, i, axis: int, wall: I16, separating: wp.array(dtype=w
     for side in range(2):
         owner = int(wall[k + wp.where(axis == 2, side, 0), j + wp.where(axis == 1, side, 0), i + wp.where(axis == 0, side, 0)])
         if owner >= 0:
-            found = found | TOUCHES
-            if separating[owner] != wp.uint8(0):
-                found = found | LETS_GO
+            found = found | touch_of(separating[owner])
     touch[k, j, i] = wp.uint8(found)
 
 
 @cell_kernel("warp_lcp.material.boundary")
-def wall_velocity_kernel(k, j, i, axis: int, index: I32, walls: wp.array(dtype=wp.vec3), field: F32):
-    """Give every closed face the velocity of its wall [m/s]."""
-    c = wp.max(k - wp.where(axis == 2, 1, 0), 0)
-    b = wp.max(j - wp.where(axis == 1, 1, 0), 0)
-    a = wp.max(i - wp.where(axis == 0, 1, 0), 0)
+def wall_velocity_kernel(
+    k, j, i, axis: int, planes: int, spacing: float, index: I32, turn: wp.array(dtype=wp.mat33), shift: wp.array(dtype=wp.vec3), field: F32,
+):  # fmt: skip
+    """Velocity turn x + shift [m/s] of the wall on the faces of one component that it closes, 0 elsewhere."""
+    c, b, a = cell_below(axis, k, j, i)
     wall = wp.max(index[k, j, i], index[c, b, a])
+    u = float(0.0)
     if wall >= 0:
-        field[k, j, i] = walls[wall][axis]
+        x = (float(i) - wp.where(axis == 0, 1.0, 0.5)) * spacing
+        y = (float(j) - wp.where(axis == 1, 1.0, 0.5)) * spacing
+        z = float(0.0)
+        if planes == 2:
+            z = (float(k) - wp.where(axis == 2, 1.0, 0.5)) * spacing
+        v = turn[wall] * wp.vec3(x, y, z) + shift[wall]
+        u = v[axis]
+    field[k, j, i] = u
 
 
 @wp.kernel(**options)

@@ -5,7 +5,7 @@ import typing
 
 import warp as wp
 
-from warp_lcp.grid.cell_kernel import F32, I8, I32, cell_kernel
+from warp_lcp.grid.cell_kernel import F32, I8, I32, cell_below, cell_kernel
 from warp_lcp.grid.staggered import cell_index
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 
@@ -37,9 +37,7 @@ def impose_kernel(
     Where the flow would enter a source nothing passes as far as the pressure is concerned (`supply`): its material comes from nowhere, not
     from the material behind it.
     """
-    c = wp.max(k - wp.where(axis == 2, 1, 0), 0)
-    b = wp.max(j - wp.where(axis == 1, 1, 0), 0)
-    a = wp.max(i - wp.where(axis == 0, 1, 0), 0)
+    c, b, a = cell_below(axis, k, j, i)
     if slots[k, j, i] > 0 or slots[c, b, a] > 0:
         here = source_of(slots[k, j, i], sources, running)
         below = source_of(slots[c, b, a], sources, running)

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 
 import warp as wp
 
-from warp_lcp.grid.cell_kernel import F32, I8, I32, U8, cell_kernel
+from warp_lcp.grid.cell_kernel import F32, I8, I32, U8, cell_below, cell_kernel
 from warp_lcp.grid.extrapolate import BLOCKED, extrapolate
 from warp_lcp.grid.staggered import Window
 from warp_lcp.grid.transfer import TINY_WEIGHT
@@ -77,9 +77,7 @@ def keep_spray_kernel(k, j, i, axis: int, kind: I8, weight: F32, known: I8):
 @typing.no_type_check
 def closed_face_kernel(k, j, i, axis: int, kind: I8, contact: U8, index: I32, separating: wp.array(dtype=wp.uint8), solid: F32, field: F32):
     """Closed faces take the wall's normal velocity, or lose only the velocity into the wall."""
-    c = wp.max(k - wp.where(axis == 2, 1, 0), 0)
-    b = wp.max(j - wp.where(axis == 1, 1, 0), 0)
-    a = wp.max(i - wp.where(axis == 0, 1, 0), 0)
+    c, b, a = cell_below(axis, k, j, i)
     here = index[k, j, i]
     below = index[c, b, a]
     if (here >= 0) != (below >= 0):
