@@ -54,9 +54,17 @@ OTHER_SETTINGS: dict[str, tuple[dict[str, Any], ...]] = {  # that take other pat
 SCENES = {"dam-break": (24, 0.1), "floating-bodies": (20, 0.1), "column-collapse": (16, 0.02)}  # resolution, seconds
 
 
+SEED = 0  # added to those of all problems
+
+
+def generator(seed: int) -> np.random.Generator:
+    """Return a generator of a problem's numbers."""
+    return np.random.default_rng(seed + SEED)
+
+
 def bounds_of(shape: tuple[int, ...]) -> dict[str, tuple[Any, Any]]:
     """Return lower and upper bounds of each kind that kernels tell apart."""
-    rng = np.random.default_rng(2718)
+    rng = generator(2718)
     low, high, some = -rng.random(shape), rng.random(shape), rng.random(shape) < 0.3
     return {
         "none": (-np.inf, np.inf),
@@ -73,7 +81,7 @@ def bounds_of(shape: tuple[int, ...]) -> dict[str, tuple[Any, Any]]:
 
 def faces_of(shape: tuple[int, ...]) -> dict[str, dict[str, Any]]:
     """Return coefficients of each form: one, a number an axis, arrays."""
-    rng, names = np.random.default_rng(31), "xyz"[: len(shape)]
+    rng, names = generator(31), "xyz"[: len(shape)]
     axes = enumerate(reversed(names))
     arrays = {f"face_{a}": 0.2 + rng.random([n + (i == j) for j, n in enumerate(shape)]) for i, a in axes}
     return {"unit": {}, "number": {"face_y": 3.0}, "arrays": arrays}
@@ -82,7 +90,7 @@ def faces_of(shape: tuple[int, ...]) -> dict[str, dict[str, Any]]:
 def small_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
     """Yield name, problem, method and start on small random sets of cells: all forms of storage, sides and bounds."""
     for (name, shape), form, real in itertools.product(SHAPES.items(), ("unit", "number", "arrays"), (wp.float32, wp.float64)):
-        rng = np.random.default_rng(97)
+        rng = generator(97)
         cells = rng.choice([wl.AIR, wl.FLUID, wl.SOLID], size=shape, p=[0.1, 0.8, 0.1])
         b, faces, bounds = rng.standard_normal(shape), faces_of(shape)[form], bounds_of(shape)
         start = rng.standard_normal(shape)
@@ -104,9 +112,9 @@ def small_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
 def other_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
     """Yield solves of what lies around those: splashes, closed boxes, low rank, other methods on the same kernels."""
     box, shape = np.full((8, 9, 20), wl.FLUID), (8, 9, 20)
-    b = np.random.default_rng(5).standard_normal(shape)
+    b = generator(5).standard_normal(shape)
     columns = np.zeros((*shape, 2))
-    columns[2, 2:5, 3:7] = np.random.default_rng(7).standard_normal((3, 4, 2))
+    columns[2, 2:5, 3:7] = generator(7).standard_normal((3, 4, 2))
     for precision in PRECISIONS[:2]:
         for method in (wl.ProjectedMultigrid, wl.MinimumMapNewton, MPRGP, wl.InteriorPoint, wl.FischerNewton):
             made = method(precision=precision)
@@ -125,7 +133,7 @@ def other_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
 def method_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
     """Yield every method on grids, matrices and user-made operators that are small enough for it, with bounds of each kind."""
     for (what, make, shape), kind in itertools.product(_operators(), ("none", "number", "coded", "fields")):
-        rng = np.random.default_rng(577)
+        rng = generator(577)
         b, start = rng.standard_normal(shape), rng.standard_normal(shape)
         sides = bounds_of(shape)[kind]
         for name, method in METHODS.items():
@@ -138,7 +146,7 @@ def method_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
 
 
 def _operators() -> Iterator[tuple[str, Any, tuple[int, ...]]]:
-    rng = np.random.default_rng(1618)
+    rng = generator(1618)
     factor = rng.standard_normal((40, 40))
     matrix = factor @ factor.T + 4 * np.eye(40)
     cells = rng.choice([wl.AIR, wl.FLUID, wl.SOLID], size=(7, 9, 13), p=[0.1, 0.8, 0.1])
@@ -194,7 +202,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.bits", description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--part", choices=PARTS, action="append")
+    parser.add_argument("--seed", type=int, default=0, help="of other problems of the same kinds (but scenes and splashes)")
     args = parser.parse_args()
+    globals()["SEED"] = args.seed
     parts, lines = args.part or PARTS, list[str]()
     for part, solves in (("small", small_solves), ("other", other_solves), ("methods", method_solves)):
         if part in parts:

@@ -68,6 +68,22 @@ def test_a_product_that_is_known_stands_for_a_stencil(tmp_path):
     assert rows.places == 3 and out.numpy().sum() == pytest.approx((2 * d * product).sum(), rel=1e-12)
 
 
+@pytest.mark.parametrize(
+    "rows", [Rows.flat(1000, wp.get_device("cpu"), serial=True), layout.strided(1000, wp.get_device("cpu"), 64)], ids=str
+)
+def test_a_flat_field_goes_to_one_thread_or_by_turns_to_many(tmp_path, rows):
+    """The second is what CUDA has: thread t sums elements t, t + 64, ...; 1000 is no multiple of 64."""
+    squares = row_pass(tmp_path, "squares", "T xx = 0;\nfor (int k = 0; k < n; ++k) { y[k] = p + k; xx += x[k]*x[k]; }\n",
+                       reads={"x": "S"}, writes={"y": "S"}, sums=("xx",))  # fmt: skip
+    host = RNG.standard_normal(1000)
+    x, y, out = (wp.array(v, dtype=wp.float64, device="cpu") for v in (host, host, np.full(rows.places + 1, 9.0)))
+    squares.bind(rows, x=x, y=y, out=out).launch()
+    np.testing.assert_array_equal(y.numpy(), np.arange(1000))
+    expected = (host**2).sum() if rows.places == 1 else [(host[t::64] ** 2).sum() for t in range(64)]
+    np.testing.assert_allclose(out.numpy()[:-1], expected, rtol=1e-13)
+    assert out.numpy()[-1] == 9.0
+
+
 def test_slabs_chunks_and_spans_share_the_same_cells_out(product, monkeypatch):
     """As on CUDA: a cell a thread, several planes a place for sums; cells outside the spans are not visited."""
     A, _, x, _ = scene(wp.float64, {})
@@ -192,14 +208,13 @@ def test_a_changed_header_is_compiled_anew(tmp_path):
     assert hashes[0] != hashes[1]
 
 
-def test_the_example_of_a_new_pass_runs_and_compiles_for_cuda(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("example", "header", "form"), [(0, "energy", "uint8_float32_float32"), (1, "relax", "uint8_float32")])
+def test_the_examples_of_a_new_pass_and_a_new_method_run_and_compile_for_cuda(tmp_path, monkeypatch, example, header, form):
     page = Path(__file__).parents[2] / "CONTRIBUTING.md"
-    (header,), (code,) = blocks(page, "cpp"), blocks(page, "python")
-    assert header.count("\n") + code.count("\n") < 40
-    (tmp_path / "energy.h").write_text(header)
+    source, code = blocks(page, "cpp")[example], blocks(page, "python")[example]
+    assert source.count("\n") + code.count("\n") < 40
+    (tmp_path / f"{header}.h").write_text(source)
     monkeypatch.chdir(tmp_path)
     run(code, page)
     for arch in (80, 90):
-        wp.compile_aot_module(
-            "warp_lcp.mine.energy.uniform_uint8_float32_float32", device=None, arch=arch, module_dir=tmp_path, use_ptx=True
-        )
+        wp.compile_aot_module(f"warp_lcp.mine.{header}.uniform_{form}", device=None, arch=arch, module_dir=tmp_path, use_ptx=True)

@@ -6,10 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from warp_lcp.layout import Padding
-from warp_lcp.native import CPU_CHUNK, grain
+from warp_lcp.native import CPU_CHUNK, CUDA_THREADS, grain
 
 # planes that a thread sums over: on CUDA, a place for the sums of every cell would cost more memory than the rest of a method
 PLANES_A_THREAD = {"cpu": 1, "cuda": 16}
@@ -159,13 +160,15 @@ class Rows:
         return Rows._make(padding.size, device, (first, padding.plane, padding.row), tuple(counts), None)
 
     @staticmethod
-    def flat(size: int, device: wp.Device) -> "Rows":
-        """Return a flat field as one row."""
-        return Rows._make(size, device, (0, 0, 0), (1, 1, size), None, cells=1 if device.is_cuda else CPU_CHUNK)
+    def flat(size: int, device: wp.Device, *, serial: bool = False) -> "Rows":
+        """Return a flat field as one row, on CUDA as rows as long as there are threads that sum; `serial`: one row for one thread."""
+        return _flat(size, device.alias, serial)
 
     @staticmethod
-    def _make(size: int, device: wp.Device, strides: Any, counts: Any, spans: Any, cells: int | None = None) -> "Rows":
-        slab, cells = PLANES_A_THREAD["cuda" if device.is_cuda else "cpu"], cells or grain(counts[2], device)
+    def _make(
+        size: int, device: wp.Device, strides: Any, counts: Any, spans: Any, cells: int | None = None, slab: int | None = None
+    ) -> "Rows":
+        slab, cells = slab or PLANES_A_THREAD["cuda" if device.is_cuda else "cpu"], cells or grain(counts[2], device)
         names = ("base", "s1", "s2", "planes", "rows", "nx")
         shared = dict(zip(names, (*strides, *counts), strict=True)) | {"grain": cells, "chunks": -(-counts[2] // cells), "spans": spans}
         single = put(copy_of(BLANK), shared | {"slab": 1})
@@ -208,6 +211,23 @@ class Rows:
         """How many sums a pass makes of each kind, one a thread."""
         planes, rows, chunks = threads(self.summed)
         return planes * rows * chunks
+
+
+@functools.lru_cache(maxsize=1024)
+def _flat(size: int, name: str, serial: bool) -> Rows:
+    device = wp.get_device(name)
+    if serial or not device.is_cuda:
+        return Rows._make(size, device, (0, 0, 0), (1, 1, size), None, cells=max(size, 1) if serial else CPU_CHUNK)
+    return strided(size, device, min(size, CUDA_THREADS))
+
+
+def strided(size: int, device: wp.Device, width: int) -> Rows:
+    """Return a flat field as rows of a width: a thread of a pass that sums takes the same place of each, so that neighbors read neighbors."""
+    planes = -(-size // width)
+    ends = np.full((planes, 1, 2), (0, width))
+    ends[-1, 0, 1] -= planes * width - size
+    spans = wp.array(ends, dtype=wp.vec2i, device=device)
+    return Rows._make(size, device, (0, width, 0), (planes, 1, width), spans, cells=1, slab=planes)
 
 
 @functools.cache

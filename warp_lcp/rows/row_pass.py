@@ -29,11 +29,12 @@ UNIFORM, VARIABLE, KNOWN = "uniform", "variable", "known"  # stencils: with a we
 
 @functools.cache
 def text(path: Path) -> str:
-    """Return a header with the headers that it includes. As text, Warp sees changes of it; the compiler still knows file and line."""
+    """Return a header with those that it includes, from beside it or from here. As text, Warp sees changes; errors name file and line."""
     lines = [f'#line 1 "{path.name}"']
     for number, line in enumerate(path.read_text().splitlines(), 1):
         found = re.fullmatch(r'#include "(\w+\.h)"', line)
-        lines += [text(path.with_name(found[1])), f'#line {number + 1} "{path.name}"'] if found else [line]
+        included = [h / found[1] for h in (path.parent, HEADERS) if (h / found[1]).exists()] if found else []
+        lines += [text(included[0]), f'#line {number + 1} "{path.name}"'] if found else [line]
     return "\n".join(lines)
 
 
