@@ -16,6 +16,7 @@ import warp as wp
 
 from warp_lcp.native import grain
 from warp_lcp.program import Launch
+from warp_lcp.rows import RowPass, Rows
 
 
 @wp.struct
@@ -82,6 +83,25 @@ class Window:
     def chunks(self) -> int:
         """Threads that share a row."""
         return -(-(self.high[2] - self.low[2]) // self.cells.grain)
+
+    def run(self, passed: RowPass, *, whole: bool = False, launch: Launch | None = None, **given: typing.Any) -> None:
+        """Launch a pass over the box, or record it with `Program.launch`.
+
+        Args:
+            passed: with fields of a `box`.
+            whole: a thread takes a whole row, for sums that are the same on every run.
+            launch: of a program.
+            given: fields and numbers by name.
+        """
+        passed.bind(self._whole if whole else self._shared, **given).launch(launch or wp.launch)
+
+    @cached_property
+    def _shared(self) -> Rows:
+        return Rows.box(self.low, self.high, self.device)
+
+    @cached_property
+    def _whole(self) -> Rows:
+        return Rows.box(self.low, self.high, self.device, whole=True)
 
     def launch(self, kernel: wp.Kernel, inputs: list[typing.Any], *, launch: Launch | None = None) -> None:
         """Launch kernel(cells, *inputs) with threads (plane, row, chunk of a row), or record it with `Program.launch`."""

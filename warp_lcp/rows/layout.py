@@ -3,7 +3,7 @@
 import ctypes
 import functools
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -137,6 +137,7 @@ class Rows:
         size: elements of a field.
         other_size: elements of a field of the other level of a transfer; 0: there is none.
         device: where the fields are.
+        place: first stored cell of a box.
     """
 
     summed: Any
@@ -144,6 +145,7 @@ class Rows:
     size: int
     other_size: int
     device: wp.Device
+    place: Mapping[str, int] = field(default_factory=dict)
 
     @staticmethod
     def of(padding: Padding, device: wp.Device, spans: Any = None) -> "Rows":
@@ -163,6 +165,13 @@ class Rows:
     def flat(size: int, device: wp.Device, *, serial: bool = False) -> "Rows":
         """Return a flat field as one row, on CUDA as rows as long as there are threads that sum; `serial`: one row for one thread."""
         return _flat(size, device.alias, serial)
+
+    @staticmethod
+    def box(low: tuple[int, int, int], high: tuple[int, int, int], device: wp.Device, *, whole: bool = False) -> "Rows":
+        """Return the rows of stored cells low <= (k, j, i) < high of a grid; a thread takes a `whole` one."""
+        counts = tuple(end - begin for begin, end in zip(low, high, strict=True))
+        made = Rows._make(0, device, (0, 0, 0), counts, None, cells=counts[2] if whole else None)
+        return replace(made, place=dict(zip(("k0", "j0", "i0"), low, strict=True)))
 
     @staticmethod
     def _make(
