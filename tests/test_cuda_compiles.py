@@ -15,7 +15,7 @@ import warp as wp
 import fluids
 import granular
 import warp_lcp as wl
-from fluids.pressure_kernels import pressure_kernels
+from fluids.pressure_kernels import pressure_passes
 from granular.bodies_kernels import body_kernels
 from granular.checkerboard import damping_kernel
 from granular.cut_walls_kernels import traction_kernel
@@ -191,7 +191,7 @@ def test_kernels_compile_for_cuda(reals, archs, tmp_path):
         advection_kernels.advect_kernel(endless)
         distance_advection_kernels.advect_kernel(endless)
     for variant in itertools.product((False, True), repeat=4):
-        pressure_kernels(*variant)
+        pressure_passes(*variant)
     for axis in (0, 1, 2, CENTERS):
         carry_kernels(axis)
     for dtype in (wp.int8, wp.uint8, wp.int32, wp.float32, wp.float64):
