@@ -10,8 +10,8 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from fluids.pressure_kernels import COUNT, FACES, pressure_passes
 from fluids.coupling import BodyCoupling
+from fluids.pressure_kernels import COUNT, FACES, pressure_passes
 from fluids.tolerance import TimeErrorTolerance
 from warp_lcp.gallery import recorded
 from warp_lcp.grid.staggered import StaggeredGrid, Window

@@ -27,7 +27,7 @@ from warp_lcp.grid import advection_kernels, distance_advection_kernels, transfe
 from warp_lcp.grid.periodic import ring_kernels
 from warp_lcp.grid.semi_lagrangian import CENTERS
 from warp_lcp.grid.semi_lagrangian_kernels import carry_kernels
-from warp_lcp.material.density_correction_kernels import displacement_kernel
+from warp_lcp.material.density_correction_kernels import displacement_pass
 from warp_lcp.multigrid import CycleSettings
 from warp_lcp.rows.row_pass import Form
 from warp_lcp.solvers.mprgp import MPRGP
@@ -186,7 +186,7 @@ def test_kernels_compile_for_cuda(reals, archs, tmp_path):
             importlib.import_module(found.name)
     use_every_kernel(reals)
     for cut in (False, True):
-        displacement_kernel(cut)
+        displacement_pass(cut)
     for endless in (0, 1, 4, 5):
         advection_kernels.advect_kernel(endless)
         distance_advection_kernels.advect_kernel(endless)

@@ -239,9 +239,9 @@ class Form:
         """Return the body: a loop over pieces, in it pointers by name, the shared functions, the row function, the sums."""
         d = self.declared
         into = not {*d.ring}.isdisjoint(d.writes)
-        switches = {"RINGS": bool(d.ring), "INTO_RING": into, "LEVELS": bool(d.other), "BOUNDS": ord(self.bounds[0])} | constants
+        known = {"RINGS": bool(d.ring), "INTO_RING": into, "LEVELS": bool(d.other), "BOUNDS": ord(self.bounds[0])} | constants
         head = [f"typedef {C[t]} {n};" for n, t in letters.items()] + [f"typedef {C[of(d.compute)]} T;"] * ("T" not in letters)
-        head += [f"constexpr double {n} = {v!r};" if isinstance(v, float) else f"constexpr int {n} = {int(v)};" for n, v in switches.items()]
+        head += [f"constexpr double {n} = {v!r};" if isinstance(v, float) else f"constexpr int {n} = {int(v)};" for n, v in known.items()]
         at = {n: " + p + P.ring" if n in d.ring else " + p" for n in (*d.reads, *d.writes)} | dict.fromkeys(d.other, " + P.q")
         each = ["const Piece P = piece(k_i, j_i, c_); const int n = P.n; const long long p = P.p;"]
         each += [f"const long long yp = {'L.o2' if d.finer else 'P.yp'}, zp = {'L.o1' if d.finer else 'P.zp'};"]
@@ -268,7 +268,8 @@ class Form:
         shared = [text(HEADERS / h) for h, used in (("stencil.h", d.stencil), ("bounds.h", d.bounds)) if used]
         loops = ["for (int k_i = k_ < 0 ? 0 : k_; k_i < end_ && k_i < L.planes; ++k_i)", "for (int j_i = j_; j_i < last_; ++j_i) {"]
         before = [text(HEADERS / "native.h"), '#line 1 "types"', *head, text(HEADERS / "piece.h"), '#line 1 "fields"', *loops, *each]
-        return "\n".join(["", *before, *shared, *(["{", text(d.header), "}"] if d.box else [text(d.header)]), '#line 1 "sums"', *(sums if d.sums else []), "}", ""])
+        body = ["{", text(d.header), "}"] if d.box else [text(d.header)]  # there names may be those of the pass
+        return "\n".join(["", *before, *shared, *body, '#line 1 "sums"', *(sums if d.sums else []), "}", ""])
 
     def alike(self, declared: RowPass) -> "Form":
         """Return another pass without a stencil in the form that has the same types."""
