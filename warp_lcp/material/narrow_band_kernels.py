@@ -1,12 +1,14 @@
 # mypy: ignore-errors
 """Kernels of the narrow band: how deep cells lie, which of them hold particles, and what the others stand for."""
 
+from pathlib import Path
+
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, F64, I8, I32, U8, cell_kernel
 from warp_lcp.material.contact import RELEASED
-from warp_lcp.native import BLOCK, simd
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
+from warp_lcp.rows import RowPass
 
 NEAR = 1.0  # cells from a solid inside the domain within which particles stay
 INSET = 1e-3  # of a cell: particles are put no nearer to its faces
@@ -16,49 +18,14 @@ _FLUID = wp.constant(wp.int8(FLUID))
 _SOLID = wp.constant(wp.int8(SOLID))
 _RELEASED = wp.constant(wp.uint8(RELEASED))
 
-# One pass of depth_i = min over the 3^dimension - 1 cells around i of depth_n + |i - n|. In place: a value only falls, and ends at the
-# same minimum whatever order the cells come in.
-RELAX = """
-    typedef float T;
-    const int nz = depth_.shape[0], ny = depth_.shape[1], nx = depth_.shape[2];
-    const long long s2 = nx, s1 = s2*ny;
-    T* d = depth_.data + k*s1 + j*s2;
-    T best[M];
-    int changed = 0;
-    for (int start = first; start < last; start += M) {
-        const int n = last - start < M ? last - start : (int)M;
-        T* here = d + start;
-        int deep = 0;
-        SIMD for (int m = 0; m < n; ++m) { best[m] = here[m]; deep |= (int)(here[m] > (T)0.5); }
-        if (!deep) continue;  // nothing but air and its shore
-        const int low = start > 0 ? 0 : 1, high = start + n < nx ? n : n - 1;
-        for (int c = planes == 2 && k > 0 ? -1 : 0; c <= (planes == 2 && k + 1 < nz ? 1 : 0); ++c)
-            for (int b = j > 0 ? -1 : 0; b <= (j + 1 < ny ? 1 : 0); ++b) {
-                const int across = (b != 0) + (c != 0);
-                const T straight = across == 0 ? (T)0 : across == 1 ? (T)1 : (T)1.41421356;
-                const T slant = across == 0 ? (T)1 : across == 1 ? (T)1.41421356 : (T)1.73205081;
-                const T* row = here + c*s1 + b*s2;
-                SIMD for (int m = 0; m < n; ++m) { const T v = row[m] + straight; best[m] = v < best[m] ? v : best[m]; }
-                SIMD for (int m = low; m < n; ++m) { const T v = row[m - 1] + slant; best[m] = v < best[m] ? v : best[m]; }
-                SIMD for (int m = 0; m < high; ++m) { const T v = row[m + 1] + slant; best[m] = v < best[m] ? v : best[m]; }
-            }
-        SIMD for (int m = 0; m < n; ++m) { changed |= (int)(best[m] < here[m]); here[m] = best[m]; }
-    }
-    return changed;
-"""
-
-
-@wp.func_native(simd(BLOCK + RELAX))
-def relax_row(planes: int, depth_: F32, k: int, j: int, first: int, last: int) -> int: ...
-
-
-@cell_kernel("warp_lcp.material.narrow_band_depth")
-def relax_kernel(plane, row, k, j, first, end, planes: int, last_plane: int, last_row: int, depth: F32, changed: wp.array(dtype=wp.int32)):
-    """Shorten the depths of some cells by what their neighbors know; rows are taken from the last on if there is a `last_row`."""
-    k = wp.where(last_row > 0, last_plane - plane, k)
-    j = wp.where(last_row > 0, last_row - row, j)
-    if relax_row(planes, depth, k, j, first, end) > 0:
-        changed[0] = 1
+RELAX = RowPass(
+    "warp_lcp.material.narrow_band.relax",
+    Path(__file__).parent / "headers" / "relax_depth.h",
+    wp.float32,
+    box={"depth": wp.float32},
+    whole={"changed": wp.int32},
+    numbers=dict.fromkeys(("planes", "last_plane", "last_row"), int),
+)
 
 
 @wp.func
