@@ -29,6 +29,7 @@ class RowLayout:
     grain: int  # cells that a thread takes
     chunks: int  # threads of a row
     slab: int  # planes that a thread takes
+    lines: int  # rows of a plane that it takes
     spans: wp.array2d(dtype=wp.vec2i)  # first and one past the last cell of each row (k, j) that may hold unknowns; null: all
     o0: wp.int64  # the other level of a transfer: element of its first cell, elements from plane to plane and from row to row
     o1: wp.int64
@@ -170,16 +171,24 @@ class Rows:
     def box(low: tuple[int, int, int], high: tuple[int, int, int], device: wp.Device, *, whole: bool = False) -> "Rows":
         """Return the rows of stored cells low <= (k, j, i) < high of a grid; a thread takes a `whole` one."""
         counts = tuple(end - begin for begin, end in zip(low, high, strict=True))
-        made = Rows._make(0, device, (0, 0, 0), counts, None, cells=counts[2] if whole else None)
+        made = Rows._make(0, device, (0, 0, 0), counts, None, cells=counts[2] if whole else None, lines=1 if device.is_cuda else counts[1])
         return replace(made, place=dict(zip(("k0", "j0", "i0"), low, strict=True)))
 
     @staticmethod
     def _make(
-        size: int, device: wp.Device, strides: Any, counts: Any, spans: Any, cells: int | None = None, slab: int | None = None
+        size: int,
+        device: wp.Device,
+        strides: Any,
+        counts: Any,
+        spans: Any,
+        cells: int | None = None,
+        slab: int | None = None,
+        lines: int = 1,
     ) -> "Rows":
         slab, cells = slab or PLANES_A_THREAD["cuda" if device.is_cuda else "cpu"], cells or grain(counts[2], device)
         names = ("base", "s1", "s2", "planes", "rows", "nx")
         shared = dict(zip(names, (*strides, *counts), strict=True)) | {"grain": cells, "chunks": -(-counts[2] // cells), "spans": spans}
+        shared["lines"] = lines
         single = put(copy_of(BLANK), shared | {"slab": 1})
         return Rows(single if slab == 1 else put(copy_of(single), {"slab": slab}), single, size, 0, device)
 
@@ -243,10 +252,10 @@ def strided(size: int, device: wp.Device, width: int) -> Rows:
 def no_rows() -> Any:
     """Return the layout of a pass that is left out."""
     L = RowLayout()
-    L.slab = 1
+    L.slab = L.lines = 1
     return L
 
 
 def threads(layout: Any) -> tuple[int, int, int]:
     """Return the threads of a launch."""
-    return -(-layout.planes // layout.slab), layout.rows, layout.chunks
+    return -(-layout.planes // layout.slab), -(-layout.rows // layout.lines), layout.chunks

@@ -292,7 +292,7 @@ class Form:
 
         def alone(L: RowLayout, F: Fields):
             i, j, c = wp.tid()
-            run(L, F, i * L.slab, (i + 1) * L.slab, j, j + 1, c)
+            run(L, F, i * L.slab, (i + 1) * L.slab, j * L.lines, (j + 1) * L.lines, c)
 
         return _make_kernel(alone, self.declared.name, run.module.name)
 
