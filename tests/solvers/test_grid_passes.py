@@ -11,7 +11,6 @@ from oracle import assemble, natural_residual
 from warp_lcp.krylov import ConjugateGradient
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.solvers.interior_point import InteriorPoint
-from warp_lcp.solvers.interior_point_grid import GridPath
 from warp_lcp.solvers.nonsmooth_map import Kink, NonsmoothMap, Reformulation
 from warp_lcp.solvers.nonsmooth_map_grid import GridMap
 from warp_lcp.solvers.principal_system import GridSystem
@@ -119,11 +118,11 @@ def test_a_step_along_the_path_is_mehrotras(form, upper):
     v, t = (np.where(fluid, upper - x, np.inf), np.where(fluid, rng.random(n), 0.0)) if two else (np.full(n, np.inf), np.zeros(n))
     size, tau, length, scale = 1.7, 0.05, 0.4, 0.6
     e, a = (rng.standard_normal(n) * fluid * 0.1 for _ in range(2))
-    system = GridSystem(s.problem.A, wp.float64, bounded=False, shifted=True)
-    residual, predicted = NaturalResidual(s.problem), s.problem.layout.zeros(wp.float64)
-    W, S = stored(s, w), stored(s, sl)
-    pairs = [W, stored(s, v) if two else W, S, stored(s, t) if two else S]
-    path = GridPath(residual, system.hierarchy, pairs, stored(s, fluid, wp.uint8), system.e, predicted)
+    path = InteriorPoint(precision="double").init(s.problem)
+    system, residual, predicted = path.system, path.residual, path._predicted
+    path._w, path._s = stored(s, w), stored(s, sl)
+    path._v, path._t = (stored(s, v), stored(s, t)) if two else (path._w, path._s)
+    path.free, path.count, residual.norm = stored(s, fluid, wp.uint8), 1, 1 / scale
     X = stored(s, x)
 
     def condensed():
@@ -131,24 +130,25 @@ def test_a_step_along_the_path_is_mehrotras(form, upper):
         np.testing.assert_allclose(inner(system.r)[fluid], -scale * y[fluid], rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(inner(system.hierarchy.finest.stencil.d), (np.diag(s.A) + D) * fluid, rtol=1e-12)
         weights = (np.diag(s.A) + D)[fluid]
-        assert path.norm == pytest.approx(np.sqrt(np.sum((scale * y[fluid]) ** 2 / np.where(weights > 0, weights, 1))), rel=1e-6)
+        assert path._norm(1) == pytest.approx(np.sqrt(np.sum((scale * y[fluid]) ** 2 / np.where(weights > 0, weights, 1))), rel=1e-6)
         f = np.ix_(fluid, fluid)
         expected = natural_residual(s.A[f], s.b[fluid], lower[fluid], np.full(fluid.sum(), upper), inner(X)[fluid])
         assert residual.norm == pytest.approx(expected, rel=1e-12)
 
-    path.advance(X, (0.0, 0.0, 0.0, 0.0), 0.0, scale)
+    path._advance(X, 0.0, 0.0)
     condensed()
+    path.size = size
     left = rng.standard_normal(n) * fluid  # of the predictor's residual
     system.r.assign(stored(s, left))
     system.e.assign(stored(s, a))
     da = size * a
     dsa, dta = -sl - sl / w * da, -t + t / v * da
-    longest, products = path.ratios((size, 0.0, 0.0, 0.0))
+    longest, products = path._ratios(0.0, 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
         rates = [-da / w, np.where(sl > 0, -dsa / sl, 0), da / v, np.where(t > 0, -dta / t, 0)]
     assert longest == pytest.approx(max(r[fluid].max() for r in rates), rel=1e-12)
     assert products == pytest.approx(np.sum((da * dsa - da * dta)[fluid]), rel=1e-10)
-    path.center(size, tau)
+    path._correct(tau, y=None, D=system.hierarchy.finest.stencil.d)
     right = (left + ((tau - da * dsa) / w - (tau + da * dta) / v) / size) * fluid
     np.testing.assert_allclose(inner(system.r), right, rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(inner(predicted), a, rtol=1e-12)
@@ -156,14 +156,15 @@ def test_a_step_along_the_path_is_mehrotras(form, upper):
     dx = size * e + da
     ds = (tau - da * dsa) / w - sl - sl / w * dx
     dt = (tau + da * dta) / v - t + t / v * dx
-    assert path.ratios((size, 1.0, 1.0, tau))[1] == pytest.approx(np.sum((dx * ds - dx * dt)[fluid]), rel=1e-10)
-    path.advance(X, (size, 1.0, 1.0, tau), length, scale)
+    assert path._ratios(1.0, tau)[1] == pytest.approx(np.sum((dx * ds - dx * dt)[fluid]), rel=1e-10)
+    residual.norm = 1 / scale
+    path._advance(X, tau, length)
     x, w, sl, v, t = x + length * dx, w + length * dx, sl + length * ds, v - length * dx, t + length * dt
     np.testing.assert_allclose(inner(X)[fluid], x[fluid], rtol=1e-12, atol=1e-12)
-    for field, expected in zip(pairs, (w, v, sl, t) if two else (w, w, sl, sl), strict=True):
+    for field, expected in zip(path._pairs.values(), (w, v, sl, t) if two else (w, w, sl, sl), strict=True):
         np.testing.assert_allclose(inner(field)[fluid], expected[fluid], rtol=1e-10, atol=1e-12)
     bounded = np.where(sl > 0, np.where(np.isfinite(w), w, 0) * sl, 0) + np.where(t > 0, np.where(np.isfinite(v), v, 0) * t, 0)
-    assert path.products == pytest.approx(bounded[fluid].sum(), rel=1e-10)
+    assert path.mu * path.count == pytest.approx(bounded[fluid].sum(), rel=1e-10)
     condensed()
 
 

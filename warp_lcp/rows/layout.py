@@ -240,7 +240,7 @@ def _flat(size: int, name: str, serial: bool) -> Rows:
 
 
 def strided(size: int, device: wp.Device, width: int) -> Rows:
-    """Return a flat field as rows of a width: a thread of a pass that sums takes the same place of each, so that neighbors read neighbors."""
+    """Return a flat field as rows of a width: a thread of a pass that sums takes the same place of each, neighbors read neighbors."""
     planes = -(-size // width)
     ends = np.full((planes, 1, 2), (0, width))
     ends[-1, 0, 1] -= planes * width - size

@@ -13,16 +13,16 @@ from warp_lcp.multigrid.hierarchy import CycleSettings
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
+from warp_lcp.rows import Known, RowPass, Rows
 from warp_lcp.solve import IterateInPlace, Precision, RoundedIterate, Step
+from warp_lcp.solvers import interior_point_kernels as kernels
 from warp_lcp.solvers.equilibrated import EquilibratedWorkspace
-from warp_lcp.solvers.interior_point_grid import GridPath
-from warp_lcp.solvers.interior_point_kernels import kernels
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
 from warp_lcp.solvers.principal_system import GridSystem, principal_system
-from warp_lcp.vectors import Reduction, launch_spans
+from warp_lcp.vectors import Reduction
 
-SUMS, LONGEST = 0, 2  # slots of the device scalars
+SUMS, LONGEST = 0, 3  # slots of the device scalars
 NEAR = 10.0  # a near start has w A_ii and s at least this multiple of the residual's root mean square; 3 to 50 measured
 
 
@@ -143,21 +143,21 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
         elif problem.bounded and settings.crossover > 0:
             self.active_set = NewtonWorkspace(problem, newton)
             self.active_set.residual = self.residual
-        self.system = principal_system(problem, self.precision.correction, bounded=False, settings=settings.cycle, shifted=problem.bounded)
+        self.system: Any = principal_system(
+            problem, self.precision.correction, bounded=False, settings=settings.cycle, shifted=problem.bounded
+        )
         upper = problem.bounds.may_bind[1]
         self._w, self._s = layout.zeros(wp.float64), layout.zeros(wp.float64)
         self._v, self._t = (layout.zeros(wp.float64), layout.zeros(wp.float64)) if upper else (self._w, self._s)
         self._D, self.free = layout.zeros(wp.float64), layout.zeros(wp.uint8)
         self._predicted = wp.zeros_like(self.system.e)
-        self._scalars = wp.zeros(3, dtype=wp.float64, device=device)
-        self._reduction = Reduction(layout.size, device, self._scalars, columns=2)
-        self._kernels = kernels(self.residual.diagonal.dtype, self.system.r.dtype, upper)
+        self._scalars = wp.zeros(4, dtype=wp.float64, device=device)
         self._rounded = layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
         self._carries = isinstance(self.system, GridSystem)  # conjugate gradients leave the residual in r
-        self._passes: GridPath | None = None
+        self._flat, self._upper, self._fusable, self._grid = Rows.flat(layout.size, device), upper, False, Rows.flat(layout.size, device)
         if isinstance(self.system, GridSystem) and self.system.fused and problem.bounded and settings.mehrotra and self._rounded is None:
-            fields = [self._pairs, self.free, self.system.e, self._predicted]
-            self._passes = GridPath(self.residual, self.system.hierarchy, *fields)
+            self._fusable, self._grid = True, problem.A.stencil.rows  # type: ignore[attr-defined]
+        self._sums = [Reduction(layout.size, device, self._scalars, columns=3, threads=r.places) for r in (self._flat, self._grid)]
         self.floating: Any = None
         self.cycles_left = self.steps = self.count = 0
         self.near = self.begun = self.crossed = False
@@ -204,9 +204,9 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
         return isinstance(self.active_set, GridNewtonWorkspace)
 
     @property
-    def _fused(self) -> GridPath | None:
-        """What steps in one pass, where the problem allows that."""
-        return self._passes if self.floating is None and self.count else None
+    def _fused(self) -> bool:
+        """Whether what moves is evaluated and condensed in the same pass over memory: by one CPU thread, without periodic axes."""
+        return self._fusable and self.floating is None and self.count > 0
 
     def begin(self, x: wp.array[Any]) -> None:
         """Move x inside its bounds, and choose multipliers: by b and the residual far from the path, by the residual near it."""
@@ -233,21 +233,19 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
     def path_step(self, x: wp.array[Any]) -> Step:
         """Solve for the direction, and go nearly as far along it as w, v, s and t stay positive."""
         s, self.steps = self.settings, self.steps + 1
-        if self._fused is not None:
-            return self._fused_step(self._fused, x)
+        if self._fused:
+            return self._fused_step(x)
         self.size = max(self.residual.norm, 1e-300)
         tau = 0.0 if s.mehrotra else self.mu / self.steps
         second = 0.0
-        fields = [self.residual.y, *self._pairs, self.free, self.system.r, self._D, wp.float64(1 / self.size), wp.float64(tau)]
-        self._flat(self._kernels.condense, fields)
+        self._launch(kernels.CONDENSE, **self._condensing(x, self._D, tau))
         self.system.restrict(self.free, self._D if self.problem.bounded else None)
         self._project()
         iterations = self._solve(s.predictor_eta if s.mehrotra and self.count else s.eta)
         longest, products = self._ratios(second, tau)
         if s.mehrotra and self.count:
             tau, second = self._center(longest, products), 1.0
-            fields = [self.residual.y, *self._pairs, self.free, self.system.e, self._predicted, self.system.r]
-            self._flat(self._kernels.center, [*fields, wp.float64(self.size), wp.float64(tau), self._carries])
+            self._correct(tau, y=self.residual.y, D=None)
             self._project()
             iterations += self._solve(s.eta)
             longest, _ = self._ratios(second, tau)
@@ -259,23 +257,19 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
         name = "predictor-corrector" if s.mehrotra else "path"
         return Step(name, iterations, None, interim=not s.mehrotra and self.steps <= s.horizon)
 
-    def _fused_step(self, passes: GridPath, x: wp.array[Any]) -> Step:
+    def _fused_step(self, x: wp.array[Any]) -> Step:
         """Do what `path_step` does by Mehrotra's rule in four passes over memory."""
-        s = self.settings
+        s, finest = self.settings, self.system.hierarchy.finest
         if not self.condensed:
-            self.size, self.condensed = max(self.residual.norm, 1e-300), True
-            passes.advance(x, (0.0, 0.0, 0.0, 0.0), 0.0, 1 / self.size)
-        passes.rebuild()
-        iterations = self.system.solve(s.predictor_eta * passes.norm, s.max_linear_iterations)[0]
-        longest, products = passes.ratios((self.size, 0.0, 0.0, 0.0))
-        tau = self._center(longest, products)
-        passes.center(self.size, tau)
-        iterations += self.system.solve(s.eta * passes.norm, s.max_linear_iterations)[0]
-        direction = (self.size, 1.0, 1.0, tau)
-        longest, _ = passes.ratios(direction)
-        self.size = max(self.residual.norm, 1e-300)
-        passes.advance(x, direction, min(1.0, s.backoff / longest) if longest > 0 else 1.0, 1 / self.size)
-        self.mu = passes.products / self.count
+            self.condensed = True
+            self._advance(x, 0.0, 0.0)
+        self.system.hierarchy.rebuild()
+        iterations = self.system.solve(s.predictor_eta * self._norm(1), s.max_linear_iterations)[0]
+        tau = self._center(*self._ratios(0.0, 0.0))
+        self._correct(tau, y=None, D=finest.stencil.d)
+        iterations += self.system.solve(s.eta * self._norm(0), s.max_linear_iterations)[0]
+        longest, _ = self._ratios(1.0, tau)
+        self._advance(x, tau, min(1.0, s.backoff / longest) if longest > 0 else 1.0)
         return Step("predictor-corrector", iterations, None)
 
     def _center(self, longest: float, products: float) -> float:
@@ -287,48 +281,81 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
         return self.mu * min(1.0, max(0.0, after / self.mu)) ** 3
 
     @property
-    def _pairs(self) -> list[wp.array[Any]]:
-        return [self._w, self._v, self._s, self._t]
+    def _pairs(self) -> dict[str, wp.array[Any]]:
+        return {"w": self._w, "v": self._v, "s": self._s, "t": self._t}
 
-    def _direction(self, second: float, tau: float) -> list[Any]:
+    def _launch(self, declared: RowPass, **given: Any) -> None:
+        """Launch a pass over the fields, and add up what it sums."""
+        fused = self._fused and declared in (kernels.RATIOS, kernels.CENTER)
+        rows, sums = (self._grid, self._sums[1]) if fused else (self._flat, self._sums[0])
+        out = {"out": sums.partials} if declared.sums else {}
+        declared.bind(rows, **given, **out, UPPER=self._upper, FUSED=fused).launch()
+        if declared.sums:
+            sums.add_up(SUMS, columns=len(declared.sums))
+
+    def _direction(self, second: float, tau: float) -> dict[str, Any]:
         """What ds and dt are computed from."""
         joined = 1.0 if self._carries else 0.0
-        return [*self._pairs, self._predicted, self.system.e, *(wp.float64(v) for v in (self.size, second, joined, tau))]
+        return {**self._pairs, "a": self._predicted, "e": self.system.e, "scale": self.size, "second": second, "joined": joined, "tau": tau}
+
+    def _condensing(self, x: wp.array[Any], D: wp.array[Any], tau: float) -> dict[str, Any]:
+        p, r = self.problem, self.residual
+        operator = p.A.stencil if self._fused else Known(r.diagonal, r.unit, r.y)  # type: ignore[attr-defined]
+        fields = {"x": x, "b": p.b, "unknown": p.unknown, "free": self.free, **self._pairs, "D": D, "r": self.system.r}
+        return {"stencil": operator, "bounds": p.bounds.operands, **fields, "scale": 1 / self.size, "tau": tau}
+
+    def _moving(self, x: wp.array[Any], second: float, tau: float, length: float) -> dict[str, Any]:
+        return {"bounds": self.problem.bounds.operands, **self._direction(second, tau), "x": x, "length": length}
+
+    def _advance(self, x: wp.array[Any], tau: float, length: float) -> None:
+        """Move, unless the length is 0, and set the residual's norm and the next system there."""
+        sums, rows, form = self._sums[1], self._grid, dict[str, Any](UPPER=self._upper, FUSED=True)
+        move = self._moving(x, 1.0, tau, length)
+        self.size = max(self.residual.norm, 1e-300)
+        moving = kernels.MOVE.bind(rows, **move, **form, out=sums.partials[2 * rows.places :]) if length else None
+        condensing = kernels.CONDENSE.bind(
+            rows, **self._condensing(x, self.system.hierarchy.finest.stencil.d, 0.0), **form, out=sums.partials
+        )
+        kernels.ADVANCE.launch(moving, condensing)
+        sums.add_up(SUMS, columns=3)
+        self.residual.norm, self.residual.current = self._norm(0), True
+        if length:
+            self.mu = float(self._scalars.numpy()[2]) / self.count
+
+    def _norm(self, slot: int) -> float:
+        """Return the norm whose square a pass has summed."""
+        return float(np.sqrt(self._scalars.numpy()[slot]))
 
     def _ratios(self, second: float, tau: float) -> tuple[float, float]:
         """Return the reciprocal of the longest step, 0 if there is none, and the sum of dw ds + dv dt."""
         longest = self._scalars[LONGEST : LONGEST + 1]
         longest.zero_()
-        r = self._reduction
-        launch_spans(self._kernels.ratios, r.spans, self._direction(second, tau), [longest, r.partials], self.problem.device)
-        r.add_up(SUMS)
+        self._launch(kernels.RATIOS, **self._direction(second, tau), longest=longest)
         found = self._scalars.numpy()
         return float(found[LONGEST]), float(found[SUMS])
 
+    def _correct(self, tau: float, **fields: wp.array[Any] | None) -> None:
+        """Write the corrector's right-hand side."""
+        common = {"e": self.system.e, "free": self.free, "a": self._predicted, "r": self.system.r}
+        self._launch(kernels.CENTER, **self._pairs, **common, **fields, scale=self.size, tau=tau, carried=self._carries)
+
     def _move(self, x: wp.array[Any], second: float, tau: float, length: float) -> None:
         """Take the step, and remember mu."""
-        p, r = self.problem, self._reduction
-        w, v, s, t, *rest = self._direction(second, tau)
-        before = [p.lower, p.upper, w, v, s, t, rest[0], rest[1], x, *rest[2:], wp.float64(length)]
-        launch_spans(self._kernels.move, r.spans, before, [r.partials], p.device)
-        r.add_up(SUMS)
+        self._launch(kernels.MOVE, **self._moving(x, second, tau, length))
         self.mu = float(self._scalars.numpy()[SUMS]) / max(self.count, 1)
         if self.floating is not None:
-            self.floating.settle(x, p.lower, p.upper)
+            self.floating.settle(x, self.problem.lower, self.problem.upper)
         self._round(x)
 
     def _inside(self, x: wp.array[Any], width: float) -> None:
         """Set w and v to at least width / d, and x accordingly."""
         p, r = self.problem, self.residual
-        before = [p.lower, p.upper, p.unknown, r.diagonal, r.unit, wp.float64(width), x, self._w, self._v, self.free]
-        self._flat(self._kernels.inside, before)
+        fields = {"x": x, "w": self._w, "v": self._v, "unknown": p.unknown, "free": self.free, "d": r.diagonal}
+        self._launch(kernels.INSIDE, bounds=p.bounds.operands, **fields, unit=r.unit, width=width)
 
     def _multipliers(self, least: float) -> tuple[float, float]:
         """Set s and t to y's sides, at least `least`; return the sum of products and how many bounds are finite."""
-        r = self._reduction
-        before = [self.residual.y, *self._pairs, wp.float64(least)]
-        launch_spans(self._kernels.multipliers, r.spans, before, [r.threads, r.partials], self.problem.device)
-        r.add_up(SUMS, columns=2)
+        self._launch(kernels.MULTIPLIERS, y=self.residual.y, **self._pairs, least=least)
         found = self._scalars.numpy()
         return float(found[0]), float(found[1])
 
@@ -343,6 +370,3 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
         """Take off what a singular component without bounds cannot meet."""
         if self.floating is not None:
             self.floating.project(self.system.r, self._without_bounds)
-
-    def _flat(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
-        launch_spans(kernel, self._reduction.spans, inputs, [], self.problem.device)
