@@ -88,12 +88,14 @@ def extend_velocity_cut(
         window.run(KEEP_SPRAY, known=marks, weight=weight, open=fraction)
         extrapolate(window, marks, field, layers, join=join)
     parts = zip(("", "known_", "wall_", "moving_"), (velocity, known, cut.wall, cut.velocity or ()), strict=True)
-    fields = dict.fromkeys(_COMPONENTS) | {f"{name}{c}": field for name, of in parts for c, field in zip("uvw", of, strict=False)}
+    fields: dict[str, Any] = dict.fromkeys(_COMPONENTS) | {
+        f"{name}{c}": field for name, of in parts for c, field in zip("uvw", of, strict=False)
+    }
     fields |= dict(zip(_NEAREST, cut.nearest or [None] * 3, strict=True)) | {"kind": kind, "contact": contact, "distance": cut.distance}
     fields |= {"turn": cut.turn, "shift": cut.shift, "separating": cut.separating, "dx": cut.grid.spacing}
     faces = [{"known": m, "open": o, "result": r} for m, o, r in zip(known, cut.open, scratch, strict=True)]
-    on = {"planes": len(velocity) - 1}
+    planes = len(velocity) - 1
     for axis, face in enumerate(faces):
-        window.run(CONSTRAIN, axis=axis, **on, **face, **fields)
+        window.run(CONSTRAIN, axis=axis, planes=planes, **face, **fields)
     for axis, (face, field) in enumerate(zip(faces, velocity, strict=True)):
-        window.run(TAKE, axis=axis, **on, **face, field=field)
+        window.run(TAKE, axis=axis, planes=planes, **face, field=field)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -189,11 +188,19 @@ class DensityCorrection:
     def _prepare(self, contact: wp.array | None) -> tuple[int, float]:
         """Set up the problem; return how many cells are over-full, and the largest density."""
         b, most = self.boundary, self.max_density
-        fields = {"kind": self._kind, "b": self._b, "x": self.x, "density": self.density, "capacity": b.capacity, "inside": self._inside}
-        run = functools.partial(self.grid.domain.run, whole=True, **fields, sums=self._sums)
-        run(kernels.PREPARE, base=b.base, contact=contact, most=most, gain=self.gain)
+        fields: dict[str, Any] = {
+            "kind": self._kind,
+            "b": self._b,
+            "x": self.x,
+            "density": self.density,
+            "capacity": b.capacity,
+            "inside": self._inside,
+        }
+        fields["sums"], run = self._sums, self.grid.domain.run
+        run(kernels.PREPARE, whole=True, **fields, base=b.base, contact=contact, most=most, gain=self.gain)
         if self._inside is not None:
-            run(kernels.EVEN, lower=self._lower, least=min(most, 2.0 - most), planes=self.grid.planes - 1)
+            numbers: dict[str, Any] = {"least": min(most, 2.0 - most), "planes": self.grid.planes - 1}
+            run(kernels.EVEN, whole=True, **fields, **numbers, lower=self._lower)
         sums = _inner(self.grid, self._sums)
         return int(sums[..., [0, 2]].sum()), float(sums[..., 1].max())
 

@@ -94,7 +94,7 @@ class RowPass:
     optional: tuple[str, ...] = ()
     numbers: Mapping[str, Any] = field(default_factory=dict)
     sums: tuple[str, ...] = ()
-    constants: Mapping[str, int] = field(default_factory=dict)
+    constants: Mapping[str, float] = field(default_factory=dict)
     box: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
