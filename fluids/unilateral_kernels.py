@@ -1,8 +1,6 @@
 # mypy: ignore-errors
 """Kernels of the pressure that only keeps cells from over-filling."""
 
-import typing
-
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, F64, I8, U8, cell_kernel
@@ -17,8 +15,6 @@ LEAST_DENSITY = 0.1  # of a face: less mass would be thrown about by the pressur
 _AIR = wp.constant(wp.int8(AIR))
 _FLUID = wp.constant(wp.int8(FLUID))
 _SOLID = wp.constant(wp.int8(SOLID))
-
-options: dict[str, typing.Any] = {"enable_backward": False, "module": "fluids.unilateral"}
 
 
 @wp.struct

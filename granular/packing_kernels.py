@@ -1,8 +1,6 @@
 # mypy: ignore-errors
 """Kernels of the packing: masses of faces, shares of edges, what a cell may carry."""
 
-import typing
-
 import warp as wp
 
 from granular.yield_set import FIRM, HOLDS, PARTLY, SHEARS_HERE
@@ -25,7 +23,6 @@ LANES = 16  # cells of a vector
 ROUNDING = 1e-6  # by which a fraction may differ from 1 and count as 1
 
 _F32X = wp.array4d(dtype=wp.float32)
-options: dict[str, typing.Any] = {"enable_backward": False, "module": "granular.packing"}
 
 
 @cell_kernel("granular.packing")

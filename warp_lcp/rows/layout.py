@@ -176,14 +176,7 @@ class Rows:
 
     @staticmethod
     def _make(
-        size: int,
-        device: wp.Device,
-        strides: Any,
-        counts: Any,
-        spans: Any,
-        cells: int | None = None,
-        slab: int | None = None,
-        lines: int = 1,
+        size: int, device: wp.Device, strides: Any, counts: Any, spans: Any, cells: Any = None, slab: Any = None, lines: int = 1
     ) -> "Rows":
         slab, cells = slab or PLANES_A_THREAD["cuda" if device.is_cuda else "cpu"], cells or grain(counts[2], device)
         names = ("base", "s1", "s2", "planes", "rows", "nx")
