@@ -15,7 +15,7 @@ import warp as wp
 import fluids
 import granular
 import warp_lcp as wl
-from fluids.pressure_kernels import pressure_kernels
+from fluids.pressure_kernels import pressure_passes
 from granular.bodies_kernels import body_kernels
 from granular.checkerboard import damping_kernel
 from granular.cut_walls_kernels import traction_kernel
@@ -27,7 +27,7 @@ from warp_lcp.grid import advection_kernels, distance_advection_kernels, transfe
 from warp_lcp.grid.periodic import ring_kernels
 from warp_lcp.grid.semi_lagrangian import CENTERS
 from warp_lcp.grid.semi_lagrangian_kernels import carry_kernels
-from warp_lcp.material.density_correction_kernels import displacement_kernel
+from warp_lcp.material.density_correction_kernels import displacement_pass
 from warp_lcp.multigrid import CycleSettings
 from warp_lcp.rows.row_pass import Form
 from warp_lcp.solvers.mprgp import MPRGP
@@ -186,12 +186,12 @@ def test_kernels_compile_for_cuda(reals, archs, tmp_path):
             importlib.import_module(found.name)
     use_every_kernel(reals)
     for cut in (False, True):
-        displacement_kernel(cut)
+        displacement_pass(cut)
     for endless in (0, 1, 4, 5):
         advection_kernels.advect_kernel(endless)
         distance_advection_kernels.advect_kernel(endless)
     for variant in itertools.product((False, True), repeat=4):
-        pressure_kernels(*variant)
+        pressure_passes(*variant)
     for axis in (0, 1, 2, CENTERS):
         carry_kernels(axis)
     for dtype in (wp.int8, wp.uint8, wp.int32, wp.float32, wp.float64):
