@@ -49,6 +49,11 @@ EXTRAPOLATE = RowPass(
     "active_set.extrapolate", HEADERS / "extrapolate.h", f64, bounds=True, reads={"y": f64, "d": f64, "unknown": i8},
     writes=dict.fromkeys(("x", "x_old", "y_old", "z", "y_z"), f64), numbers={"beta": f64, "lipschitz": f64},
 )  # fmt: skip
+TAKEN = RowPass("active_set.taken", HEADERS / "taken.h", f64, reads={"x": f64, "unknown": i8}, writes={"g": f64}, sums=("square",))
+CARRY_ON = RowPass(
+    "active_set.carry_on", HEADERS / "carry_on.h", f64, bounds=True, reads={"g": f64, "unknown": i8}, writes={"x": f64, "along": f64},
+    whole={"squares": f64},
+)  # fmt: skip
 
 
 def move(

@@ -64,7 +64,7 @@ GAPS = RowPass(
     "projected_multigrid.gaps", HEADERS / "gaps.h", wp.float64, bounds=True, reads={"x": wp.float64, "unknown": wp.int8},
     writes={"lo": "S", "hi": "S"}, optional=("hi",), whole={"scalars": wp.float64}, constants=SLOT,
 )  # fmt: skip
-MASK = RowPass("projected_multigrid.mask", HEADERS / "mask.h", wp.uint8, reads={"free": "F"}, writes={"mask": wp.uint8})
+MASK = RowPass("projected_multigrid.mask", HEADERS / "free_mask.h", wp.uint8, reads={"free": "F"}, writes={"mask": wp.uint8})
 UNDO = RowPass(
     "projected_multigrid.undo", HEADERS / "undo.h", wp.float64, bounds=True, reads={"x": wp.float64, "q": "S", "unknown": wp.int8},
     writes={"before": wp.float64}, whole={"scalars": wp.float64}, constants=SLOT,
