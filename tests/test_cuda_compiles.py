@@ -100,7 +100,9 @@ def use_sweeping_kernels(reals):
             A = wl.GridPoisson(np.array([[0, 1, 1, 1]]), device="cpu", dtype=dtype, **faces)
             for axis in wl.GridLines:
                 assert wl.solve(wl.LCP(A, -np.ones((1, 4))), wl.BlockedGaussSeidel(blocks=axis))
-        assert wl.solve(wl.LCP(wl.DenseOperator(np.eye(2), device="cpu", dtype=dtype), -np.ones(2), *friction), wl.ProjectedSOR())
+        for solver in (wl.ProjectedSOR(), wl.SubspaceMinimization(sweeps=1)):
+            A = wl.DenseOperator(np.array([[3.0, -0.5], [-0.5, 3.0]]), device="cpu", dtype=dtype)
+            assert wl.solve(wl.LCP(A, np.array([-1.0, -2.0]), *friction), solver)
 
 
 def use_gradient_projection_kernels(reals):
@@ -114,6 +116,7 @@ def use_gradient_projection_kernels(reals):
         for A in operators:
             for precision in ("mixed", "double"):
                 assert wl.solve(wl.LCP(A, -np.ones(A.shape)), MPRGP(precision=precision))
+                assert wl.solve(wl.LCP(A, -np.ones(A.shape), 0.0), MPRGP(precision=precision), x0=np.zeros(A.shape))  # releases all
 
 
 def use_newton_kernels(reals):
