@@ -12,7 +12,7 @@ from pathlib import Path
 from benchmarks.compare import comparison
 from warp_lcp.distributed import launch
 from warp_lcp.gallery import recorded
-from warp_lcp.solvers import METHODS
+from warp_lcp.solvers.registry import METHODS
 
 DISTRIBUTED = "distributed"  # group of --engine petsc
 WRONG_INPUT = 2  # exit code of a suite that says what is wrong with its input

@@ -1,21 +1,15 @@
+# mypy: ignore-errors
 """Kernels that find how the motions of rigid bodies displace the liquid of the cells beside them."""
-
-import typing
 
 import warp as wp
 
+from warp_lcp.grid.cell_kernel import F32, I8, I16, cell_kernel
 from warp_lcp.grid.cut_cells_kernels import moving_part
-from warp_lcp.grid.staggered import CellRange
 from warp_lcp.operators.grid_poisson import FLUID
 
 _FLUID = wp.constant(wp.int8(FLUID))
-_F32 = wp.array3d(dtype=wp.float32)
-_I16 = wp.array3d(dtype=wp.int16)
-_I8 = wp.array3d(dtype=wp.int8)
 _I32 = wp.array(dtype=wp.int32)
 _F64 = wp.array(dtype=wp.float64)
-
-options: dict[str, typing.Any] = {"enable_backward": False, "module": "fluids.coupling"}
 
 
 @wp.struct
@@ -25,24 +19,23 @@ class Solids:
     planes: int
     bodies: int
     spacing: wp.float64
-    near: _F32
-    owner: _I16
-    next_near: _F32
-    next_owner: _I16
-    standing: _F32
+    near: F32
+    owner: I16
+    next_near: F32
+    next_owner: I16
+    standing: F32
     moving: wp.array(dtype=wp.uint8)
-    open_x: _F32
-    open_y: _F32
-    open_z: _F32
-    wall_x: _I16
-    wall_y: _I16
-    wall_z: _I16
+    open_x: F32
+    open_y: F32
+    open_z: F32
+    wall_x: I16
+    wall_y: I16
+    wall_z: I16
     body: _I32  # of a wall's number; -1: it is none
     center: wp.array(dtype=wp.vec3d)  # of mass of each body [m]
 
 
 @wp.func
-@typing.no_type_check
 def body_on_face(S: Solids, axis: int, k: int, j: int, i: int):
     """Return the body that covers a face, -1 if none does, and the share of the face that it covers."""
     solid = int(0)
@@ -71,7 +64,6 @@ def body_on_face(S: Solids, axis: int, k: int, j: int, i: int):
 
 
 @wp.func
-@typing.no_type_check
 def beside_a_wall(S: Solids, k: int, j: int, i: int):
     """Return whether a face of a cell is not open."""
     a = wp.min(wp.min(S.open_x[k, j, i], S.open_x[k, j, i + 1]), wp.min(S.open_y[k, j, i], S.open_y[k, j + 1, i]))
@@ -81,7 +73,6 @@ def beside_a_wall(S: Solids, k: int, j: int, i: int):
 
 
 @wp.func
-@typing.no_type_check
 def side(S: Solids, n: int, k: int, j: int, i: int):
     """Return body and share on side n = 2 axis + (0: low, 1: high) of a cell."""
     axis = n >> 1
@@ -90,7 +81,6 @@ def side(S: Solids, n: int, k: int, j: int, i: int):
 
 
 @wp.func
-@typing.no_type_check
 def next_body(S: Solids, last: int, k: int, j: int, i: int):
     """Return the least body after `last` beside a cell; the number of bodies if there is none."""
     least = int(S.bodies)
@@ -101,15 +91,11 @@ def next_body(S: Solids, last: int, k: int, j: int, i: int):
     return least
 
 
-@wp.kernel(**options)
-@typing.no_type_check
-def count_kernel(cells: CellRange, S: Solids, kind: _I8, rows: int, counts: _I32):
+@cell_kernel("fluids.coupling")
+def count_kernel(k, j, first, end, S: Solids, kind: I8, rows: int, counts: _I32):
     """Count the pairs of a FLUID cell and a body beside it in a row."""
-    plane, row = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
     found = int(0)
-    for i in range(cells.i, cells.end):
+    for i in range(first, end):
         if kind[k, j, i] == _FLUID:
             if beside_a_wall(S, k, j, i):
                 last = int(-1)
@@ -122,15 +108,14 @@ def count_kernel(cells: CellRange, S: Solids, kind: _I8, rows: int, counts: _I32
     counts[k * rows + j] = found
 
 
-@wp.kernel(**options)
-@typing.no_type_check
-def fill_kernel(cells: CellRange, S: Solids, kind: _I8, rows: int, columns: int, offsets: _I32, index: _I32, block: _I32, values: _F64):
+@cell_kernel("fluids.coupling")
+def fill_kernel(
+    k, j, first, end, S: Solids, kind: I8, rows: int, columns: int, offsets: _I32, index: _I32, block: _I32,
+    values: _F64,
+):  # fmt: skip
     """Write the entries of a row: what a cell's outflow gains by unit motions of a body, (vx, vy, wz) or (vx, vy, vz, wx, wy, wz)."""
-    plane, row = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
     e = offsets[k * rows + j]
-    for i in range(cells.i, cells.end):
+    for i in range(first, end):
         if kind[k, j, i] == _FLUID:
             if beside_a_wall(S, k, j, i):
                 last = int(-1)
@@ -171,14 +156,8 @@ def fill_kernel(cells: CellRange, S: Solids, kind: _I8, rows: int, columns: int,
                     e += 1
 
 
-@wp.kernel(**options)
-@typing.no_type_check
-def enclosed_kernel(cells: CellRange, open: _F32, solid: _F32, known: _I8, velocity: _F32):
+@cell_kernel("fluids.coupling")
+def enclosed_kernel(k, j, i, open: F32, solid: F32, known: I8, velocity: F32):
     """Give closed faces that nothing has reached the velocity of the solid there [m/s]."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        if known[k, j, i] <= wp.int8(0) and open[k, j, i] == 0.0:
-            velocity[k, j, i] = solid[k, j, i]
+    if known[k, j, i] <= wp.int8(0) and open[k, j, i] == 0.0:
+        velocity[k, j, i] = solid[k, j, i]

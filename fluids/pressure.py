@@ -10,8 +10,8 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from fluids import pressure_kernels as kernels
 from fluids.coupling import BodyCoupling
+from fluids.pressure_kernels import COUNT, FACES, pressure_passes
 from fluids.tolerance import TimeErrorTolerance
 from warp_lcp.gallery import recorded
 from warp_lcp.grid.staggered import StaggeredGrid, Window
@@ -99,7 +99,7 @@ class PressureProjection:
         self._weights, self._gravity = list(weights or ()), gravity
         self.tolerance, self.max_iterations = tolerance, max_iterations
         self.automatic = TimeErrorTolerance(grid.size, grid.device) if tolerance == "auto" else None
-        self._kernels = kernels.pressure_kernels(bool(boundary.open), bool(boundary.velocity), phi is not None, lets_go)
+        self._passes = pressure_passes(bool(boundary.open), bool(boundary.velocity), phi is not None, lets_go)
         self.kind, self.shown, self.contact = grid.field(wp.int8), grid.field(wp.int8), grid.field(wp.uint8)
         self.pressure, self.known = grid.field(wp.float64), grid.faces(wp.int8)
         wp.copy(self.kind, boundary.base)
@@ -129,9 +129,8 @@ class PressureProjection:
         self._begin(kick_dt)
         if self._problem is None:
             return 0
-        fields = [self.pressure, self._ratio, self._b, self._lower, self._start, self._shift]
-        inputs = [*three(velocity), self.kind, self.boundary.touch, *self._faces(), *fields]
-        self._solved.launch(self._kernels.prepare, inputs)
+        problem = {"previous": self.pressure, "b": self._b, "lower": self._lower, "start": self._start, "shift": self._shift}
+        self._solved.run(self._passes.prepare, **self._liquid(velocity), **problem, ratio=self._ratio)
         self._update(self.kind)
         return unknowns
 
@@ -164,9 +163,14 @@ class PressureProjection:
         if self.coupling is not None:
             self.coupling.take(cells)
 
-    def _faces(self) -> list[Any]:
-        """Return what the kernels take of solids and surface."""
-        return [*three(self.boundary.open), *three(self.boundary.velocity), self._phi, self.grid.planes]
+    def _faces(self) -> dict[str, Any]:
+        """Return what passes take of cells, solids and surface."""
+        faces = zip(FACES, [*three(self.boundary.open), *three(self.boundary.velocity)], strict=True)
+        return {"kind": self.kind, "phi": self._phi, "planes": self.grid.planes, **dict(faces)}
+
+    def _liquid(self, velocity: Sequence[wp.array]) -> dict[str, Any]:
+        """Return what passes take of velocities and walls, and what `_faces` has."""
+        return dict(zip("uvw", three(velocity), strict=True)) | {"touch": self.boundary.touch} | self._faces()
 
     def solve(self, speed: float, unknowns: int) -> tuple[wl.SolveResult, wl.StoppingCriteria]:
         """Solve the prepared problem for x without changing velocity or pressure.
@@ -237,14 +241,14 @@ class PressureProjection:
         self._last = self._kick
         for axis, field in enumerate(velocity):
             self.known[axis].zero_()
-            window.launch(self._kernels.subtract_gradient, [axis, self.pressure, self.kind, *self._faces(), field, self.known[axis]])
+            faces = self._faces() | {"x": self.pressure, "field": field, "known": self.known[axis]}
+            window.run(self._passes.subtract_gradient, axis=axis, **faces)
         self._support(velocity, window)
         reference = result.residual / result.relative_residual if result.relative_residual > 0.0 else 0.0
         # the criteria bound a 2-norm; what a cell may carry of it is the root mean square
         threshold = RELEASE_FACTOR * criteria.tolerance(reference) / max(unknowns, 1) ** 0.5
-        fields = [self.pressure, threshold, self.contact, self._sums]
-        inputs = [*three(velocity), self.kind, self.boundary.touch, *self._faces(), *fields]
-        self._solved.launch_rows(self._kernels.contact, inputs)
+        found = {"contact": self.contact, "sums": self._sums}
+        self._solved.run(self._passes.contact, whole=True, **self._liquid(velocity), x=self.pressure, threshold=threshold, **found)
         released, worst = self._found()
         return Projection(result, unknowns, int(released), worst)
 
@@ -288,13 +292,12 @@ class PressureProjection:
     def _support(self, velocity: Sequence[wp.array], window: Window) -> None:
         """Let the pressure act on what rests on the surface; its faces become known after the projected ones."""
         for axis, (field, weight, known) in enumerate(zip(velocity, self._weights, self.known, strict=False)):
-            window.launch(
-                self._kernels.support, [axis, self.pressure, self.kind, *self._faces(), weight, self._gravity * self._last, field, known]
-            )
+            faces = self._faces() | {"x": self.pressure, "field": field, "known": known, "weight": weight}
+            window.run(self._passes.support, axis=axis, limit=self._gravity * self._last, **faces)
 
     def _count(self, kind: wp.array) -> int:
         """Return the number of cells that are FLUID in a field."""
-        self._solved.launch_rows(kernels.count_kernel, [kind, self._sums])
+        self._solved.run(COUNT, whole=True, kind=kind, sums=self._sums)
         return int(self._found()[0])
 
     def _take(self, x: wp.array) -> None:

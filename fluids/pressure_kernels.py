@@ -1,5 +1,4 @@
-# mypy: ignore-errors
-"""Kernels of the pressure problem.
+"""Passes of the pressure problem.
 
 A face is open, closed, or open in part. In whole cells the cells say which: a face with SOLID on a side is closed. Cut cells have the
 open fraction a_f of every face. What passes a face is a_f u_f + (1 - a_f) u_s,f with u_s the solid's velocity, which no array means is 0.
@@ -7,161 +6,29 @@ Where the free surface lies between cells, phi (< 0 in liquid, in cells) says wh
 """
 
 import functools
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
-from warp_lcp.grid.staggered import CellRange
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.contact import HELD, LETS_GO, RELEASED, TOUCHES
-from warp_lcp.native import BLOCK, simd
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
+from warp_lcp.rows import RowPass
 
+HEADERS = Path(__file__).parent / "headers"
+CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR, "TOUCHES": TOUCHES, "LETS_GO": LETS_GO, "RELEASED": RELEASED, "HELD": HELD}
 THETA_MIN = 1e-3  # the nearest that air comes to a FLUID cell's center, in cells
-
-# Row k, j of the fields. In 2-D the third axis repeats the first with a step of 0, so that what enters also leaves.
-ROW = """
-    const long long s2 = kind_.shape[2], s1 = s2*kind_.shape[1], row = k*s1 + j*s2, sz = planes == 2 ? s1 : 0;
-    const signed char* kind = (const signed char*)kind_.data + row;
-    const float* a[3] = {open_x.data + (CUT ? row : 0), open_y.data + (CUT ? row : 0), open_z.data + (CUT ? row : 0)};
-    const float* solid[3] = {solid_x.data + (MOVING ? row : 0), solid_y.data + (MOVING ? row : 0), solid_z.data + (MOVING ? row : 0)};
-    const float* phi = phi_.data + (GHOST ? row : 0);
-    if (planes != 2) { a[2] = a[0]; solid[2] = solid[0]; }
-"""
-
-# The open fraction of a cell's lower face, what the solid adds to what passes it, and the reciprocal of theta between two cells.
-FACE = """
-    auto fraction = [&](int axis, long long i, long long s) {
-        return CUT ? a[axis][CUT ? i : 0] : (((kind[i] == SOLID) | (kind[i - s] == SOLID)) ? 0.0f : 1.0f);
-    };
-    auto passes = [&](const float* u, int axis, long long i, long long s) {
-        const double open = fraction(axis, i, s);
-        return open*u[i] + (MOVING ? (1.0 - open)*solid[axis][MOVING ? i : 0] : 0.0);
-    };
-    auto inverse_theta = [&](long long i, long long n) {  // FLUID i, AIR n
-        const float inverse = GHOST ? 1.0f - phi[GHOST ? n : 0]/phi[GHOST ? i : 0] : 1.0f;
-        const float least = inverse > 1.0f ? inverse : 1.0f;  // beyond an open side there is air whatever phi says
-        return least < (float)(1.0/THETA_MIN) ? least : (float)(1.0/THETA_MIN);
-    };
-    auto outflow = [&](const float* u, const float* v, const float* w, long long i) {
-        return passes(u, 0, i + 1, 1) - passes(u, 0, i, 1) + passes(v, 1, i + s2, s2) - passes(v, 1, i, s2)
-            + passes(w, 2, i + sz, sz) - passes(w, 2, i, sz);
-    };
-"""
-
-PREPARE = """
-    const float* u = u_.data + row; const float* v = v_.data + row; const float* w = planes == 2 ? w_.data + row : u;
-    const unsigned char* touch = touch_.data + row; const double* last = last_.data + row;
-    double* b = b_.data + row; double* lower = lower_.data + (BOUNDED ? row : 0); double* start = start_.data + row;
-    SIMD8 for (int i = first; i < last_cell; ++i) {
-        const int fluid = kind[i] == FLUID;
-        const double y = outflow(u, v, w, i), bound = BOUNDED && (touch[i] & LETS_GO) ? 0.0 : -INFINITY, x = last[i]*ratio;
-        b[i] = fluid ? y : 0.0;
-        if (BOUNDED) lower[i] = fluid ? bound : -INFINITY;
-        start[i] = fluid ? (x < bound ? bound : x) : 0.0;
-    }
-    // What the diagonal of a FLUID cell has more than the operator knows: air nearer than a cell away, and the air beyond open sides.
-    if (shift_.data) {
-        float* shift = shift_.data + row;
-        const int nx = kind_.shape[2] - 2, ny = kind_.shape[1] - 2, nz = kind_.shape[0] - 2;
-        auto nearer = [&](int axis, long long face, long long s, long long i, long long n, bool side) {
-            return kind[n] == AIR ? fraction(axis, face, s)*(inverse_theta(i, n) - (side ? 0.0f : 1.0f)) : 0.0f;
-        };
-        SIMD for (int i = first; i < last_cell; ++i) {
-            const float more = nearer(0, i + 1, 1, i, i + 1, i == nx) + nearer(0, i, 1, i, i - 1, i == 1)
-                + nearer(1, i + s2, s2, i, i + s2, j == ny) + nearer(1, i, s2, i, i - s2, j == 1)
-                + nearer(2, i + sz, sz, i, i + sz, k == nz) + nearer(2, i, sz, i, i - sz, k == 1);
-            shift[i] = kind[i] == FLUID ? more : 0.0f;
-        }
-    }
-"""
-
-SUBTRACT = """
-    const long long s = axis == 0 ? 1 : (axis == 1 ? s2 : s1);
-    const double* x = x_.data + row; float* field = field_.data + row; signed char* known = (signed char*)known_.data + row;
-    const int edge = (axis == 1 && j == 0) || (axis == 2 && k == 0) ? last : (axis == 0 && first == 0 ? 1 : first);
-    for (int i = first; i < edge; ++i) known[i] = -1;  // the ring's own lower faces lie in the wall
-    SIMD8 for (int i = edge; i < last; ++i) {
-        const int here = kind[i], below = kind[i - s], wet = (here == FLUID) | (below == FLUID);
-        const float open = fraction(axis, i, s);
-        const float inverse = !GHOST ? 1.0f : (here == AIR ? inverse_theta(i - s, i) : (below == AIR ? inverse_theta(i, i - s) : 1.0f));
-        const int projected = wet & (open > 0.0f) & (here != SOLID) & (below != SOLID);  // a source's cells are SOLID, their faces open
-        field[i] -= projected ? (float)(x[i] - x[i - s])*inverse : 0.0f;
-        const int hidden = CUT ? 0 : (here == SOLID) & (below == SOLID);
-        known[i] = projected ? 1 : (hidden ? -1 : 0);
-    }
-"""
-
-# Open faces between AIR cells that particles gave weight, beside projected ones. All that a face reads of others is of projected ones,
-# which nobody writes here, so that the order does not matter.
-SUPPORT = """
-    const int nx = kind_.shape[2], ny = kind_.shape[1], nz = kind_.shape[0];
-    const long long s = axis == 0 ? 1 : (axis == 1 ? s2 : s1), steps[6] = {-1, 1, -s2, s2, -s1, s1};
-    const double* x = x_.data + row; float* field = field_.data + row; signed char* known = (signed char*)known_.data + row;
-    const float* weight = weight_.data + row;
-    const bool inside_y = j > 0 && j < (axis == 1 ? ny : ny - 1), inside_z = planes != 2 || (k > 0 && k < (axis == 2 ? nz : nz - 1));
-    const int low = first > 1 ? first : 1, end = axis == 0 ? nx : nx - 1, high = last < end ? last : end;
-    for (int i = low; i < high && inside_y && inside_z; ++i) {
-        if (known[i] != 0 || !(weight[i] > TINY_WEIGHTf)) continue;
-        if (kind[i] == SOLID || kind[i - s] == SOLID || !(fraction(axis, i, s) > 0.0f)) continue;
-        const bool there[6] = {true, i + 1 < nx, true, j + 1 < ny, planes == 2, planes == 2 && k + 1 < nz};
-        float change = 0.0f, velocity = 0.0f; int found = 0;
-        for (int n = 0; n < 6; ++n) {
-            const long long e = there[n] ? i + steps[n] : i;
-            if (known[e] != 1) continue;
-            const float inverse = kind[e] == AIR ? inverse_theta(e - s, e) : (kind[e - s] == AIR ? inverse_theta(e, e - s) : 1.0f);
-            change -= (float)(x[e] - x[e - s])*inverse; velocity += field[e]; ++found;
-        }
-        if (found == 0) continue;
-        change /= (float)found;
-        const float gap = velocity/(float)found - field[i], size = change < 0.0f ? -change : change, most = gap < 0.0f ? -gap : gap;
-        const float nearer = change*gap > 0.0f ? (size < most ? change : gap) : 0.0f, low = nearer > -limit ? nearer : -limit;
-        field[i] += low < limit ? low : limit;
-        known[i] = 2;
-    }
-"""
-
-CONTACT = """
-    const float* u = u_.data + row; const float* v = v_.data + row; const float* w = planes == 2 ? w_.data + row : u;
-    const unsigned char* touch = touch_.data + row; const double* x = x_.data + row; unsigned char* contact = contact_.data + row;
-    int released = 0; double worst = 0.0, rest[M]; unsigned char leaves[M];
-    for (int from = first; from < last; from += M) {
-        const int n = last - from < M ? last - from : M;
-        SIMD8 for (int m = 0; m < n; ++m) {
-            const int i = from + m, fluid = kind[i] == FLUID;
-            const double y = outflow(u, v, w, i), size = y < 0.0 ? -y : y;
-            const int leaving = BOUNDED & fluid & ((touch[i] & LETS_GO) != 0) & (x[i] <= 0.0) & (y > threshold);
-            contact[i] = leaving ? RELEASED : ((fluid & (touch[i] & TOUCHES)) ? HELD : 0);
-            leaves[m] = leaving;
-            rest[m] = (fluid & !leaving) ? size : 0.0;
-        }
-        for (int m = 0; m < n; ++m) { released += leaves[m]; worst = rest[m] > worst ? rest[m] : worst; }
-    }
-    double* sums = sums_.data + 2*(k*kind_.shape[1] + j);
-    sums[0] = released; sums[1] = worst;
-"""
-
-COUNT = """
-    const signed char* kind = (const signed char*)kind_.data + ((long long)k*kind_.shape[1] + j)*kind_.shape[2];
-    int n = 0;
-    SIMD for (int i = first; i < last; ++i) n += kind[i] == FLUID;
-    return n;
-"""
-
-_CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR, "TOUCHES": TOUCHES, "LETS_GO": LETS_GO, "RELEASED": RELEASED, "HELD": HELD}
-_F32, _F64, _I8, _U8 = (wp.array3d(dtype=t) for t in (wp.float32, wp.float64, wp.int8, wp.uint8))
-
-
-def _source(body: str, *, cut: bool = False, moving: bool = False, ghost: bool = False, bounded: bool = True) -> str:
-    """Return a native function's body with its constants."""
-    values = _CONSTANTS | {"CUT": int(cut), "MOVING": int(moving), "GHOST": int(ghost), "BOUNDED": int(bounded)}
-    names = "".join(f"constexpr int {name} = {value}; " for name, value in values.items())
-    body = body.replace("TINY_WEIGHT", repr(TINY_WEIGHT))
-    return simd(BLOCK + names + f"constexpr double THETA_MIN = {THETA_MIN};" + body)
+F32, F64, I8, U8 = wp.float32, wp.float64, wp.int8, wp.uint8
+FACES = {f"{what}_{axis}": F32 for what in ("open", "solid") for axis in "xyz"}
+COUNT = RowPass(
+    "fluids.pressure.count_fluid", HEADERS / "count_fluid.h", F64, box={"kind": I8}, whole={"sums": F64}, constants={"FLUID": FLUID}
+)
 
 
 @functools.cache
-def pressure_kernels(cut: bool, moving: bool, ghost: bool, bounded: bool = True) -> SimpleNamespace:
+def pressure_passes(cut: bool, moving: bool, ghost: bool, bounded: bool = True) -> SimpleNamespace:
     """Return `prepare`, `subtract_gradient`, `support` and `contact`.
 
     Args:
@@ -171,96 +38,18 @@ def pressure_kernels(cut: bool, moving: bool, ghost: bool, bounded: bool = True)
         bounded: whether a wall lets go; else there is no lower bound.
     """
     module = "fluids.pressure" + "_cut" * cut + "_moving" * moving + "_ghost" * ghost + "_equations" * (not bounded)
-    flags = {"cut": cut, "moving": moving, "ghost": ghost, "bounded": bounded}
+    flags = {"CUT": cut, "MOVING": moving, "GHOST": ghost, "BOUNDED": bounded, "THETA_MIN": THETA_MIN, "TINY_WEIGHT": TINY_WEIGHT}
 
-    @wp.func_native(_source(ROW + FACE + PREPARE, **flags))
-    def prepare_row(
-        u_: _F32, v_: _F32, w_: _F32, kind_: _I8, touch_: _U8, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32, solid_y: _F32,
-        solid_z: _F32, phi_: _F32, planes: int, last_: _F64, ratio: wp.float64, b_: _F64, lower_: _F64, start_: _F64, shift_: _F32,
-        k: int, j: int, first: int, last_cell: int,
-    ): ...  # fmt: skip
+    def made(name: str, fields: dict[str, Any], numbers: dict[str, Any], **more: Any) -> RowPass:
+        box, optional = {"kind": I8, **FACES, "phi": F32} | fields, (*FACES, "phi", "w", "lower", "shift")
+        numbers, path = {"planes": int} | numbers, HEADERS / f"{name}.h"
+        return RowPass(f"{module}.{name}", path, F64, box=box, numbers=numbers, constants=CONSTANTS | flags, optional=optional, **more)
 
-    @wp.func_native(_source(ROW + FACE + SUBTRACT, **flags))
-    def subtract_row(
-        axis: int, x_: _F64, kind_: _I8, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32, solid_y: _F32, solid_z: _F32, phi_: _F32,
-        planes: int, field_: _F32, known_: _I8, k: int, j: int, first: int, last: int,
-    ): ...  # fmt: skip
-
-    @wp.func_native(_source(ROW + FACE + SUPPORT, **flags))
-    def support_row(
-        axis: int, x_: _F64, kind_: _I8, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32, solid_y: _F32, solid_z: _F32, phi_: _F32,
-        planes: int, weight_: _F32, limit: float, field_: _F32, known_: _I8, k: int, j: int, first: int, last: int,
-    ): ...  # fmt: skip
-
-    @wp.func_native(_source(ROW + FACE + CONTACT, **flags))
-    def contact_row(
-        u_: _F32, v_: _F32, w_: _F32, kind_: _I8, touch_: _U8, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32, solid_y: _F32,
-        solid_z: _F32, phi_: _F32, planes: int, x_: _F64, threshold: wp.float64, contact_: _U8, sums_: _F64,
-        k: int, j: int, first: int, last: int,
-    ): ...  # fmt: skip
-
-    @wp.kernel(enable_backward=False, module=module)
-    def prepare(
-        cells: CellRange, u: _F32, v: _F32, w: _F32, kind: _I8, touch: _U8, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32,
-        solid_y: _F32, solid_z: _F32, phi: _F32, planes: int, last: _F64, ratio: wp.float64, b: _F64, lower: _F64, start: _F64, shift: _F32,
-    ):  # fmt: skip
-        """Right-hand side b, lower bound, first guess and what the free surface adds to the diagonal of every cell."""
-        plane, row, chunk = wp.tid()
-        first = cells.i + chunk * cells.grain
-        prepare_row(
-            u, v, w, kind, touch, open_x, open_y, open_z, solid_x, solid_y, solid_z, phi, planes, last, ratio, b, lower, start, shift,
-            cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end),
-        )  # fmt: skip
-
-    @wp.kernel(enable_backward=False, module=module)
-    def subtract_gradient(
-        cells: CellRange, axis: int, x: _F64, kind: _I8, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32, solid_y: _F32,
-        solid_z: _F32, phi: _F32, planes: int, field: _F32, known: _I8,
-    ):  # fmt: skip
-        """Project the open faces that touch FLUID and mark them 1; other faces become 0, or -1 inside solids of whole cells."""
-        plane, row, chunk = wp.tid()
-        first = cells.i + chunk * cells.grain
-        subtract_row(
-            axis, x, kind, open_x, open_y, open_z, solid_x, solid_y, solid_z, phi, planes, field, known,
-            cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end),
-        )  # fmt: skip
-
-    @wp.kernel(enable_backward=False, module=module)
-    def support(
-        cells: CellRange, axis: int, x: _F64, kind: _I8, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32, solid_y: _F32,
-        solid_z: _F32, phi: _F32, planes: int, weight: _F32, limit: float, field: _F32, known: _I8,
-    ):  # fmt: skip
-        """Give faces with weight beside projected ones their change, up to `limit` [m/s] and not beyond them; they become 2."""
-        plane, row, chunk = wp.tid()
-        first = cells.i + chunk * cells.grain
-        support_row(
-            axis, x, kind, open_x, open_y, open_z, solid_x, solid_y, solid_z, phi, planes, weight, limit, field, known,
-            cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end),
-        )  # fmt: skip
-
-    @wp.kernel(enable_backward=False, module=module)
-    def contact(
-        cells: CellRange, u: _F32, v: _F32, w: _F32, kind: _I8, touch: _U8, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32,
-        solid_y: _F32, solid_z: _F32, phi: _F32, planes: int, x: _F64, threshold: wp.float64, contact_: _U8, sums: _F64,
-    ):  # fmt: skip
-        """Find the released cells; a row's sums are [0] their number and [1] the largest |outflow| of the other FLUID cells [m/s]."""
-        plane, row = wp.tid()
-        contact_row(
-            u, v, w, kind, touch, open_x, open_y, open_z, solid_x, solid_y, solid_z, phi, planes, x, threshold, contact_, sums,
-            cells.k + plane, cells.j + row, cells.i, cells.end,
-        )  # fmt: skip
-
-    return SimpleNamespace(prepare=prepare, subtract_gradient=subtract_gradient, support=support, contact=contact)
-
-
-@wp.func_native(_source(COUNT))
-def count_row(kind_: _I8, k: int, j: int, first: int, last: int) -> int: ...
-
-
-@wp.kernel(enable_backward=False, module="fluids.pressure")
-def count_kernel(cells: CellRange, kind: _I8, sums: _F64):
-    """Count the FLUID cells of a row."""
-    plane, row = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    sums[k, j, 0] = wp.float64(count_row(kind, k, j, cells.i, cells.end))
+    liquid, faces = {"u": F32, "v": F32, "w": F32, "touch": U8}, {"x": F64, "field": F32, "known": I8}
+    problem = {"previous": F64, "b": F64, "lower": F64, "start": F64, "shift": F32}
+    return SimpleNamespace(
+        prepare=made("prepare", liquid | problem, {"ratio": F64}),
+        subtract_gradient=made("subtract_gradient", faces, {"axis": int}),
+        support=made("support", faces | {"weight": F32}, {"axis": int, "limit": F32}),
+        contact=made("contact", liquid | {"x": F64, "contact": U8}, {"threshold": F64}, whole={"sums": F64}),
+    )

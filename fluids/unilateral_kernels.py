@@ -1,10 +1,9 @@
+# mypy: ignore-errors
 """Kernels of the pressure that only keeps cells from over-filling."""
-
-import typing
 
 import warp as wp
 
-from warp_lcp.grid.staggered import CellRange
+from warp_lcp.grid.cell_kernel import F32, F64, I8, U8, cell_kernel
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.contact import HELD, LETS_GO, RELEASED, TOUCHES
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
@@ -16,9 +15,6 @@ LEAST_DENSITY = 0.1  # of a face: less mass would be thrown about by the pressur
 _AIR = wp.constant(wp.int8(AIR))
 _FLUID = wp.constant(wp.int8(FLUID))
 _SOLID = wp.constant(wp.int8(SOLID))
-_F32, _F64, _I8, _U8 = (wp.array3d(dtype=t) for t in (wp.float32, wp.float64, wp.int8, wp.uint8))
-
-options: dict[str, typing.Any] = {"enable_backward": False, "module": "fluids.unilateral"}
 
 
 @wp.struct
@@ -28,15 +24,14 @@ class Setting:
     planes: int
     rate: wp.float64  # dx / dt [m/s]
     settling: float  # speed at which a full cell comes to the density at rest [m/s], of what it is off by
-    density: wp.array3d(dtype=wp.float32)
-    capacity: wp.array3d(dtype=wp.float32)
-    cells: wp.array3d(dtype=wp.int8)  # FLUID: an unknown
-    base: wp.array3d(dtype=wp.int8)
+    density: F32
+    capacity: F32
+    cells: I8  # FLUID: an unknown
+    base: I8
 
 
 @wp.func
-@typing.no_type_check
-def open_part(s: Setting, open: _F32, k: int, j: int, i: int, c: int, b: int, a: int):
+def open_part(s: Setting, open: F32, k: int, j: int, i: int, c: int, b: int, a: int):
     """Return the open fraction of the lower face of cell (k, j, i), beyond which cell (c, b, a) lies."""
     part = float(1.0)
     if open:
@@ -47,14 +42,12 @@ def open_part(s: Setting, open: _F32, k: int, j: int, i: int, c: int, b: int, a:
 
 
 @wp.func
-@typing.no_type_check
 def filled(s: Setting, k: int, j: int, i: int):
     """Return which share of a cell is filled: never more than all of it, whatever it holds."""
     return wp.min(s.density[k, j, i] / (FULL * wp.max(s.capacity[k, j, i], LEAST_SHARE)), 1.0)
 
 
 @wp.func
-@typing.no_type_check
 def face_density(s: Setting, k: int, j: int, i: int, c: int, b: int, a: int):
     """Return the density on the face between two cells, of a full cell's."""
     total = float(0.0)
@@ -69,8 +62,7 @@ def face_density(s: Setting, k: int, j: int, i: int, c: int, b: int, a: int):
 
 
 @wp.func
-@typing.no_type_check
-def passing(s: Setting, u: _F32, open: _F32, solid: _F32, k: int, j: int, i: int, c: int, b: int, a: int):
+def passing(s: Setting, u: F32, open: F32, solid: F32, k: int, j: int, i: int, c: int, b: int, a: int):
     """Return what passes the lower face of cell (k, j, i) [m/s], in units of what full cells let pass; solids take their place."""
     part = open_part(s, open, k, j, i, c, b, a)
     flow = part * u[k, j, i]
@@ -84,9 +76,8 @@ def passing(s: Setting, u: _F32, open: _F32, solid: _F32, k: int, j: int, i: int
 
 
 @wp.func
-@typing.no_type_check
 def slack(
-    s: Setting, u: _F32, v: _F32, w: _F32, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32, solid_y: _F32, solid_z: _F32,
+    s: Setting, u: F32, v: F32, w: F32, open_x: F32, open_y: F32, open_z: F32, solid_x: F32, solid_y: F32, solid_z: F32,
     k: int, j: int, i: int,
 ):  # fmt: skip
     """Return y of a cell: what it may still take, what it is off the density at rest, and what flows out of it [m/s]."""
@@ -109,86 +100,70 @@ def slack(
     return y
 
 
-@wp.kernel(**options)
-@typing.no_type_check
+@cell_kernel("fluids.unilateral")
 def prepare_kernel(
-    cells: CellRange, s: Setting, kind: _I8, u: _F32, v: _F32, w: _F32, open_x: _F32, open_y: _F32, open_z: _F32, solid_x: _F32,
-    solid_y: _F32, solid_z: _F32, last: _F64, ratio: wp.float64, least: float, b: _F64, start: _F64, shift: _F32,
+    k, j, i, s: Setting, kind: I8, u: F32, v: F32, w: F32, open_x: F32, open_y: F32, open_z: F32, solid_x: F32,
+    solid_y: F32, solid_z: F32, last: F64, ratio: wp.float64, least: float, b: F64, start: F64, shift: F32,
 ):  # fmt: skip
     """Mark the unknowns; fill right-hand side, first guess and what the open sides add to the diagonal."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        unknown = s.base[k, j, i] != _SOLID and kind[k, j, i] != _SOLID
-        value = wp.float64(0.0)
-        guess = wp.float64(0.0)
-        if unknown:
-            value = slack(s, u, v, w, open_x, open_y, open_z, solid_x, solid_y, solid_z, k, j, i)
-            guess = wp.max(last[k, j, i] * ratio, wp.float64(0.0))
-        s.cells[k, j, i] = wp.where(unknown, _FLUID, _SOLID)
-        b[k, j, i] = value
-        start[k, j, i] = guess
-        if shift:
-            more = least
-            if i == 1 and s.base[k, j, 0] == _AIR:
-                more += open_part(s, open_x, k, j, i, k, j, i - 1)
-            if i + 2 == b.shape[2] and s.base[k, j, i + 1] == _AIR:
-                more += open_part(s, open_x, k, j, i + 1, k, j, i)
-            if j == 1 and s.base[k, 0, i] == _AIR:
-                more += open_part(s, open_y, k, j, i, k, j - 1, i)
-            if j + 2 == b.shape[1] and s.base[k, j + 1, i] == _AIR:
-                more += open_part(s, open_y, k, j + 1, i, k, j, i)
-            if s.planes == 2:
-                if k == 1 and s.base[0, j, i] == _AIR:
-                    more += open_part(s, open_z, k, j, i, k - 1, j, i)
-                if k + 2 == b.shape[0] and s.base[k + 1, j, i] == _AIR:
-                    more += open_part(s, open_z, k + 1, j, i, k, j, i)
-            shift[k, j, i] = more
+    unknown = s.base[k, j, i] != _SOLID and kind[k, j, i] != _SOLID
+    value = wp.float64(0.0)
+    guess = wp.float64(0.0)
+    if unknown:
+        value = slack(s, u, v, w, open_x, open_y, open_z, solid_x, solid_y, solid_z, k, j, i)
+        guess = wp.max(last[k, j, i] * ratio, wp.float64(0.0))
+    s.cells[k, j, i] = wp.where(unknown, _FLUID, _SOLID)
+    b[k, j, i] = value
+    start[k, j, i] = guess
+    if shift:
+        more = least
+        if i == 1 and s.base[k, j, 0] == _AIR:
+            more += open_part(s, open_x, k, j, i, k, j, i - 1)
+        if i + 2 == b.shape[2] and s.base[k, j, i + 1] == _AIR:
+            more += open_part(s, open_x, k, j, i + 1, k, j, i)
+        if j == 1 and s.base[k, 0, i] == _AIR:
+            more += open_part(s, open_y, k, j, i, k, j - 1, i)
+        if j + 2 == b.shape[1] and s.base[k, j + 1, i] == _AIR:
+            more += open_part(s, open_y, k, j + 1, i, k, j, i)
+        if s.planes == 2:
+            if k == 1 and s.base[0, j, i] == _AIR:
+                more += open_part(s, open_z, k, j, i, k - 1, j, i)
+            if k + 2 == b.shape[0] and s.base[k + 1, j, i] == _AIR:
+                more += open_part(s, open_z, k + 1, j, i, k, j, i)
+        shift[k, j, i] = more
 
 
-@wp.kernel(**options)
-@typing.no_type_check
-def push_kernel(cells: CellRange, s: Setting, axis: int, x: _F64, open: _F32, weight: _F32, field: _F32, known: _I8):
+@cell_kernel("fluids.unilateral")
+def push_kernel(k, j, i, s: Setting, axis: int, x: F64, open: F32, weight: F32, field: F32, known: I8):
     """Let the pressure act on the open faces that particles gave weight, and mark them 1; others 0, or -1 inside solids of whole cells."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
     c = k - wp.where(axis == 2, 1, 0)
     b = j - wp.where(axis == 1, 1, 0)
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        a = i - wp.where(axis == 0, 1, 0)
-        mark = int(0)
-        if a < 0 or b < 0 or c < 0:  # the ring's own lower faces lie in the wall
+    a = i - wp.where(axis == 0, 1, 0)
+    mark = int(0)
+    if a < 0 or b < 0 or c < 0:  # the ring's own lower faces lie in the wall
+        mark = -1
+    elif open_part(s, open, k, j, i, c, b, a) > 0.0:
+        if weight[k, j, i] > TINY_WEIGHT:
+            mark = 1
+            # a source's cells are no unknowns, and their faces' velocities are given
+            if s.cells[k, j, i] != _SOLID and s.cells[c, b, a] != _SOLID:
+                change = x[k, j, i] - x[c, b, a]
+                field[k, j, i] -= wp.float32(change) / face_density(s, k, j, i, c, b, a)
+    elif not open:
+        if s.base[k, j, i] == _SOLID and s.base[c, b, a] == _SOLID:
             mark = -1
-        elif open_part(s, open, k, j, i, c, b, a) > 0.0:
-            if weight[k, j, i] > TINY_WEIGHT:
-                mark = 1
-                # a source's cells are no unknowns, and their faces' velocities are given
-                if s.cells[k, j, i] != _SOLID and s.cells[c, b, a] != _SOLID:
-                    change = x[k, j, i] - x[c, b, a]
-                    field[k, j, i] -= wp.float32(change) / face_density(s, k, j, i, c, b, a)
-        elif not open:
-            if s.base[k, j, i] == _SOLID and s.base[c, b, a] == _SOLID:
-                mark = -1
-        known[k, j, i] = wp.int8(mark)
+    known[k, j, i] = wp.int8(mark)
 
 
-@wp.kernel(**options)
-@typing.no_type_check
+@cell_kernel("fluids.unilateral")
 def contact_kernel(
-    cells: CellRange, s: Setting, kind: _I8, touch: _U8, u: _F32, v: _F32, w: _F32, open_x: _F32, open_y: _F32, open_z: _F32,
-    solid_x: _F32, solid_y: _F32, solid_z: _F32, x: _F64, contact: _U8, sums: _F64,
+    k, j, first, end, s: Setting, kind: I8, touch: U8, u: F32, v: F32, w: F32, open_x: F32, open_y: F32, open_z: F32,
+    solid_x: F32, solid_y: F32, solid_z: F32, x: F64, contact: U8, sums: F64,
 ):  # fmt: skip
     """Find the wall cells that hold liquid and those that let go, [0] their number in a row, and [1] the largest |y| of full cells."""
-    plane, row = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
     released = int(0)
     worst = wp.float64(0.0)
-    for i in range(cells.i, cells.end):
+    for i in range(first, end):
         state = int(0)
         walls = int(touch[k, j, i])
         full = x[k, j, i] > wp.float64(0.0)

@@ -12,7 +12,7 @@ import functools
 import warp as wp
 
 from granular.yield_set import SHAPE, native
-from warp_lcp.grid.staggered import CellRange
+from warp_lcp.grid.cell_kernel import F32, U8, cell_kernel
 
 DAMPED = 0.15  # of the pattern in a step
 
@@ -41,7 +41,7 @@ DAMP = (
 """
 )
 
-_F32, _U8, _STRESS = wp.array3d(dtype=wp.float32), wp.array3d(dtype=wp.uint8), wp.array4d(dtype=wp.float32)
+_STRESS = wp.array4d(dtype=wp.float32)
 
 
 @functools.cache
@@ -50,15 +50,12 @@ def damping_kernel(dimension: int) -> wp.Kernel:
 
     @wp.func_native(native(DAMP, dimension, wp.float32, box=False, DAMPED=DAMPED))
     def damp_row(
-        flags_: _U8, share_x: _F32, share_y: _F32, share_z: _F32, from_: _STRESS, now_: _STRESS, k: int, j: int, first: int, last: int
+        flags_: U8, share_x: F32, share_y: F32, share_z: F32, from_: _STRESS, now_: _STRESS, k: int, j: int, first: int, last: int
     ): ...  # fmt: skip
 
-    @wp.kernel(enable_backward=False, module=f"granular.checkerboard_{dimension}d")
-    def damp(cells: CellRange, flags: _U8, share_x: _F32, share_y: _F32, share_z: _F32, source: _STRESS, now: _STRESS):
+    @cell_kernel(f"granular.checkerboard_{dimension}d")
+    def damp(k, j, first, end, flags: U8, share_x: F32, share_y: F32, share_z: F32, source: _STRESS, now: _STRESS):
         """Take a part of the pattern from `now`, found in `source`, which holds the same."""
-        plane, row, chunk = wp.tid()
-        first = cells.i + chunk * cells.grain
-        last = wp.min(first + cells.grain, cells.end)
-        damp_row(flags, share_x, share_y, share_z, source, now, cells.k + plane, cells.j + row, first, last)
+        damp_row(flags, share_x, share_y, share_z, source, now, k, j, first, end)
 
     return damp

@@ -83,7 +83,7 @@ class Packing:
         rate = grid.spacing / dt
         openings, volume, around = (None, None, [None] * 3) if self.cut is None else (self.cut.openings, self.cut.volume, self.cut.around)
         inputs = [self.base, self._capacity, self.fraction, grid.planes, rate, volume, self.kind, self.flags, self.drive]
-        domain.launch(kernels.cell_kernel, inputs)
+        domain.launch(kernels.contents_kernel, inputs)
         if self.sides is not None:
             self.sides.wrap(self.flags, self.kind)
         for axis in range(dimension):

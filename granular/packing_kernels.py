@@ -1,11 +1,10 @@
+# mypy: ignore-errors
 """Kernels of the packing: masses of faces, shares of edges, what a cell may carry."""
-
-import typing
 
 import warp as wp
 
 from granular.yield_set import FIRM, HOLDS, PARTLY, SHEARS_HERE
-from warp_lcp.grid.staggered import CellRange
+from warp_lcp.grid.cell_kernel import F32, I8, I32, U8, cell_below, cell_kernel
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 
 _FLUID = wp.constant(wp.int8(FLUID))
@@ -23,34 +22,23 @@ LEAST_OPEN = 5e-4  # of a cell, below which it bears nothing: its faces are slit
 LANES = 16  # cells of a vector
 ROUNDING = 1e-6  # by which a fraction may differ from 1 and count as 1
 
-_F32 = wp.array3d(dtype=wp.float32)
 _F32X = wp.array4d(dtype=wp.float32)
-_I8 = wp.array3d(dtype=wp.int8)
-_U8 = wp.array3d(dtype=wp.uint8)
-options: dict[str, typing.Any] = {"enable_backward": False, "module": "granular.packing"}
 
 
-@wp.kernel(**options)
-@typing.no_type_check
-def fraction_kernel(cells: CellRange, base: _I8, capacity: _F32, splatted: _F32, fraction: _F32):
-    """Fraction of a cell from the particles' density. More than 1 is mass, but never a velocity, see `cell_kernel`."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        phi = float(0.0)
-        if base[k, j, i] != _SOLID:
-            phi = splatted[k, j, i] / wp.max(capacity[k, j, i], 0.1)
-            if wp.abs(phi - 1.0) <= ROUNDING:
-                phi = 1.0
-        fraction[k, j, i] = phi
+@cell_kernel("granular.packing")
+def fraction_kernel(k, j, i, base: I8, capacity: F32, splatted: F32, fraction: F32):
+    """Fraction of a cell from the particles' density. More than 1 is mass, but never a velocity, see `contents_kernel`."""
+    phi = float(0.0)
+    if base[k, j, i] != _SOLID:
+        phi = splatted[k, j, i] / wp.max(capacity[k, j, i], 0.1)
+        if wp.abs(phi - 1.0) <= ROUNDING:
+            phi = 1.0
+    fraction[k, j, i] = phi
 
 
-@wp.kernel(**options)
-@typing.no_type_check
-def cell_kernel(
-    cells: CellRange, base: _I8, capacity: _F32, fraction: _F32, planes: int, rate: float, volume: _F32, kind: _I8, flags: _U8, drive: _F32,
+@cell_kernel("granular.packing")
+def contents_kernel(
+    k, j, i, base: I8, capacity: F32, fraction: F32, planes: int, rate: float, volume: F32, kind: I8, flags: U8, drive: F32,
 ):  # fmt: skip
     """Which cells hold sand, and what of them is still free: drive = max(FULL - saturation, 0) dx / dt [m/s].
 
@@ -60,63 +48,57 @@ def cell_kernel(
     would be a velocity, which friction works against (a silo's walls would pull its sand down), and the larger the shorter the step. Where
     solids cut cells, `volume` is what they leave open of each.
     """
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        solid = base[k, j, i] == _SOLID
-        phi = fraction[k, j, i]
-        mark = int(0)
-        full = phi
-        if not solid and phi > LEAST_FRACTION:
-            mark = HOLDS
-            if phi > DENSE:
-                mark = mark | SHEARS_HERE
-            if phi > FIRM_FRACTION:
-                mark = mark | FIRM
-            if phi >= SURFACE:
-                air = bool(False)
-                for axis in range(planes + 1):
-                    for side in range(2):
-                        step = 2 * side - 1
-                        n = k + wp.where(axis == 2, step, 0)
-                        m = j + wp.where(axis == 1, step, 0)
-                        l = i + wp.where(axis == 0, step, 0)
-                        if base[n, m, l] != _SOLID and fraction[n, m, l] < SURFACE:
-                            air = True
-                if air:
-                    full = wp.max(phi, 1.0)
-        open = float(1.0)
-        if volume:
-            open = volume[k, j, i]
-            if mark != 0:
-                least = float(1.0)
-                for c in range(-planes + 1, planes):
-                    for b in range(-1, 2):
-                        for a in range(-1, 2):
-                            least = wp.min(least, volume[k + c, j + b, i + a])
-                if least < 1.0:
-                    mark = mark | PARTLY
-        bears = mark
-        if open < LEAST_OPEN:
-            bears = 0
-        flags[k, j, i] = wp.uint8(bears)
-        free = FULL - WALL_NOISE * (1.0 - open) - full
-        if mark != 0 and free > 0.0:
-            free = wp.min(free, _free_around(base, capacity, fraction, planes, k, j, i))
-        drive[k, j, i] = wp.max(free, 0.0) * rate * open
-        if solid:
-            kind[k, j, i] = _SOLID
-        elif mark != 0:
-            kind[k, j, i] = _FLUID
-        else:
-            kind[k, j, i] = _AIR
+    solid = base[k, j, i] == _SOLID
+    phi = fraction[k, j, i]
+    mark = int(0)
+    full = phi
+    if not solid and phi > LEAST_FRACTION:
+        mark = HOLDS
+        if phi > DENSE:
+            mark = mark | SHEARS_HERE
+        if phi > FIRM_FRACTION:
+            mark = mark | FIRM
+        if phi >= SURFACE:
+            air = bool(False)
+            for axis in range(planes + 1):
+                for side in range(2):
+                    step = 2 * side - 1
+                    n = k + wp.where(axis == 2, step, 0)
+                    m = j + wp.where(axis == 1, step, 0)
+                    l = i + wp.where(axis == 0, step, 0)
+                    if base[n, m, l] != _SOLID and fraction[n, m, l] < SURFACE:
+                        air = True
+            if air:
+                full = wp.max(phi, 1.0)
+    open = float(1.0)
+    if volume:
+        open = volume[k, j, i]
+        if mark != 0:
+            least = float(1.0)
+            for c in range(-planes + 1, planes):
+                for b in range(-1, 2):
+                    for a in range(-1, 2):
+                        least = wp.min(least, volume[k + c, j + b, i + a])
+            if least < 1.0:
+                mark = mark | PARTLY
+    bears = mark
+    if open < LEAST_OPEN:
+        bears = 0
+    flags[k, j, i] = wp.uint8(bears)
+    free = FULL - WALL_NOISE * (1.0 - open) - full
+    if mark != 0 and free > 0.0:
+        free = wp.min(free, _free_around(base, capacity, fraction, planes, k, j, i))
+    drive[k, j, i] = wp.max(free, 0.0) * rate * open
+    if solid:
+        kind[k, j, i] = _SOLID
+    elif mark != 0:
+        kind[k, j, i] = _FLUID
+    else:
+        kind[k, j, i] = _AIR
 
 
 @wp.func
-@typing.no_type_check
-def _free_around(base: _I8, capacity: _F32, fraction: _F32, planes: int, k: int, j: int, i: int):
+def _free_around(base: I8, capacity: F32, fraction: F32, planes: int, k: int, j: int, i: int):
     """What of a cell would be free if all that is free around it, weighed by (1, 2, 1)/4 along each axis, were in it."""
     free = float(0.0)
     for c in range(1 - planes, planes):
@@ -128,11 +110,10 @@ def _free_around(base: _I8, capacity: _F32, fraction: _F32, planes: int, k: int,
     return free / wp.max(capacity[k, j, i], 0.1)
 
 
-@wp.kernel(**options)
-@typing.no_type_check
+@cell_kernel("granular.packing")
 def face_kernel(
-    cells: CellRange, axis: int, base: _I8, fraction: _F32, velocity: _F32, solid: _F32, openings: _F32X,
-    start: _F32, mass: _F32, inverse: _F32,
+    k, j, i, axis: int, base: I8, fraction: F32, velocity: F32, solid: F32, openings: _F32X,
+    start: F32, mass: F32, inverse: F32,
 ):  # fmt: skip
     """Mass of a face in units of a full one, its inverse, and the velocity that the stress acts on.
 
@@ -142,62 +123,50 @@ def face_kernel(
     and thus the friction below would be too small by what lies in it, and the uppermost row would slide off slopes that it should rest
     on. Of a face that a solid cuts the open part has mass, at least a least one.
     """
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    c = wp.max(k - wp.where(axis == 2, 1, 0), 0)
-    b = wp.max(j - wp.where(axis == 1, 1, 0), 0)
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        a = wp.max(i - wp.where(axis == 0, 1, 0), 0)
-        m = float(0.0)
-        light = float(0.0)
-        u = float(0.0)
-        if base[k, j, i] == _SOLID or base[c, b, a] == _SOLID:
-            if solid:
-                u = solid[k, j, i]
-                m = fraction[k, j, i] + fraction[c, b, a]  # one is 0, or both
-        else:
-            mean = 0.5 * (fraction[k, j, i] + fraction[c, b, a])
-            less = wp.min(fraction[k, j, i], fraction[c, b, a])
-            if less < SURFACE and wp.max(fraction[k, j, i], fraction[c, b, a]) >= SURFACE:
-                mean += 0.5 * less
-            if mean > LEAST_FRACTION:
-                m = wp.max(mean, LEAST_MASS)
-                light = 1.0 / m
-                u = velocity[k, j, i]
-                if openings:
-                    open = openings[axis, k, j, i]
-                    light = 1.0 / wp.max(open * m, LEAST_MASS)
-                    if open == 0.0:
-                        m = 0.0
-                        light = 0.0
-                        u = 0.0
-        mass[k, j, i] = m
-        inverse[k, j, i] = light
-        start[k, j, i] = u
+    c, b, a = cell_below(axis, k, j, i)
+    m = float(0.0)
+    light = float(0.0)
+    u = float(0.0)
+    if base[k, j, i] == _SOLID or base[c, b, a] == _SOLID:
+        if solid:
+            u = solid[k, j, i]
+            m = fraction[k, j, i] + fraction[c, b, a]  # one is 0, or both
+    else:
+        mean = 0.5 * (fraction[k, j, i] + fraction[c, b, a])
+        less = wp.min(fraction[k, j, i], fraction[c, b, a])
+        if less < SURFACE and wp.max(fraction[k, j, i], fraction[c, b, a]) >= SURFACE:
+            mean += 0.5 * less
+        if mean > LEAST_FRACTION:
+            m = wp.max(mean, LEAST_MASS)
+            light = 1.0 / m
+            u = velocity[k, j, i]
+            if openings:
+                open = openings[axis, k, j, i]
+                light = 1.0 / wp.max(open * m, LEAST_MASS)
+                if open == 0.0:
+                    m = 0.0
+                    light = 0.0
+                    u = 0.0
+    mass[k, j, i] = m
+    inverse[k, j, i] = light
+    start[k, j, i] = u
 
 
-@wp.kernel(**options)
-@typing.no_type_check
+@cell_kernel("granular.packing")
 def edge_kernel(
-    cells: CellRange, alpha: int, beta: int, base: _I8, flags: _U8, inverse_alpha: _F32, inverse_beta: _F32,
-    around: _F32, share: _F32,
+    k, j, first, end, alpha: int, beta: int, base: I8, flags: U8, inverse_alpha: F32, inverse_beta: F32,
+    around: F32, share: F32,
 ):  # fmt: skip
     """The weight of a copy on an edge: 1 / dense cells around it, or -1 / cells with a wall face that ends there, or 0.
 
     Where solids cut cells, times what is open around it.
     """
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
     ka = wp.where(alpha == 2, 1, 0)
     ja = wp.where(alpha == 1, 1, 0)
     ia = wp.where(alpha == 0, 1, 0)
     kb = wp.where(beta == 2, 1, 0)
     jb = wp.where(beta == 1, 1, 0)
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
+    for i in range(first, end):
         f0 = inverse_alpha[k, j, i]
         f1 = inverse_alpha[k - kb, j - jb, i]
         g0 = inverse_beta[k, j, i]
@@ -235,62 +204,51 @@ def edge_kernel(
         share[k, j, i] = weight
 
 
-@wp.kernel(**options)
-@typing.no_type_check
+@cell_kernel("granular.packing")
 def stiffness_kernel(
-    cells: CellRange, dimension: int, flags: _U8, inverse_x: _F32, inverse_y: _F32, inverse_z: _F32,
-    share_x: _F32, share_y: _F32, share_z: _F32, openings: _F32X, stiff: _F32,
+    k, j, i, dimension: int, flags: U8, inverse_x: F32, inverse_y: F32, inverse_z: F32,
+    share_x: F32, share_y: F32, share_z: F32, openings: _F32X, stiff: F32,
 ):  # fmt: skip
     """What bounds the friction's part of a step in a cell: the largest diagonal in the metric of its yield set. 0: it carries no shear."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        most = float(0.0)
-        if int(flags[k, j, i]) & SHEARS_HERE:
-            x = inverse_x[k, j, i] + inverse_x[k, j, i + 1]
-            y = inverse_y[k, j, i] + inverse_y[k, j + 1, i]
-            can = x > 0.0 and y > 0.0
+    most = float(0.0)
+    if int(flags[k, j, i]) & SHEARS_HERE:
+        x = inverse_x[k, j, i] + inverse_x[k, j, i + 1]
+        y = inverse_y[k, j, i] + inverse_y[k, j + 1, i]
+        can = x > 0.0 and y > 0.0
+        if openings:
+            x = x * wp.pow(openings[dimension, k, j, i], 2.0)
+            y = y * wp.pow(openings[dimension + 1, k, j, i], 2.0)
+        most = 2.0 * wp.max(x, y)
+        if dimension == 3:
+            z = inverse_z[k, j, i] + inverse_z[k + 1, j, i]
+            can = can and z > 0.0
             if openings:
-                x = x * wp.pow(openings[dimension, k, j, i], 2.0)
-                y = y * wp.pow(openings[dimension + 1, k, j, i], 2.0)
-            most = 2.0 * wp.max(x, y)
-            if dimension == 3:
-                z = inverse_z[k, j, i] + inverse_z[k + 1, j, i]
-                can = can and z > 0.0
-                if openings:
-                    z = z * wp.pow(openings[dimension + 2, k, j, i], 2.0)
-                most = wp.max(most, 2.0 * z)
-            for b in range(2):
-                for a in range(2):
-                    most = wp.max(most, _edge(share_x, inverse_x, inverse_y, k, j + b, i + a, 0, 1, 0, 0, 0, 1))
-                    if dimension == 3:
-                        most = wp.max(most, _edge(share_y, inverse_x, inverse_z, k + b, j, i + a, 1, 0, 0, 0, 0, 1))
-                        most = wp.max(most, _edge(share_z, inverse_y, inverse_z, k + b, j + a, i, 1, 0, 0, 0, 1, 0))
-            if not can:
-                most = 0.0
-        stiff[k, j, i] = most
+                z = z * wp.pow(openings[dimension + 2, k, j, i], 2.0)
+            most = wp.max(most, 2.0 * z)
+        for b in range(2):
+            for a in range(2):
+                most = wp.max(most, _edge(share_x, inverse_x, inverse_y, k, j + b, i + a, 0, 1, 0, 0, 0, 1))
+                if dimension == 3:
+                    most = wp.max(most, _edge(share_y, inverse_x, inverse_z, k + b, j, i + a, 1, 0, 0, 0, 0, 1))
+                    most = wp.max(most, _edge(share_z, inverse_y, inverse_z, k + b, j + a, i, 1, 0, 0, 0, 1, 0))
+        if not can:
+            most = 0.0
+    stiff[k, j, i] = most
 
 
 @wp.func
-@typing.no_type_check
-def _edge(share: _F32, first: _F32, second: _F32, k: int, j: int, i: int, bk: int, bj: int, bi: int, ak: int, aj: int, ai: int):
+def _edge(share: F32, first: F32, second: F32, k: int, j: int, i: int, bk: int, bj: int, bi: int, ak: int, aj: int, ai: int):
     """4 share times the sum of the inverse masses around an edge between cells; 0 on walls."""
     around = first[k, j, i] + first[k - bk, j - bj, i - bi] + second[k, j, i] + second[k - ak, j - aj, i - ai]
     return 4.0 * wp.max(share[k, j, i], 0.0) * around
 
 
-@wp.kernel(**options)
-@typing.no_type_check
-def span_kernel(cells: CellRange, flags: _U8, own: wp.array3d(dtype=wp.int32)):
+@cell_kernel("granular.packing")
+def span_kernel(k, j, first, end, flags: U8, own: I32):
     """First and one past the last cell of a row that holds sand."""
-    plane, row = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    low = int(cells.end)
+    low = int(end)
     high = int(0)
-    for i in range(cells.i, cells.end):
+    for i in range(first, end):
         if int(flags[k, j, i]) != 0:
             low = wp.min(low, i)
             high = i + 1
@@ -298,14 +256,10 @@ def span_kernel(cells: CellRange, flags: _U8, own: wp.array3d(dtype=wp.int32)):
     own[k, j, 1] = high
 
 
-@wp.kernel(**options)
-@typing.no_type_check
-def widen_kernel(cells: CellRange, own: wp.array3d(dtype=wp.int32), wide: wp.array3d(dtype=wp.int32)):
+@cell_kernel("granular.packing")
+def widen_kernel(k, j, first, end, own: I32, wide: I32):
     """The span of a row and the rows around it, a cell wider on both sides, rounded up to whole vectors, within the range."""
-    plane, row = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    low = int(cells.end)
+    low = int(end)
     high = int(0)
     for c in range(wp.max(k - 1, 0), wp.min(k + 2, own.shape[0])):
         for b in range(wp.max(j - 1, 0), wp.min(j + 2, own.shape[1])):
@@ -316,10 +270,10 @@ def widen_kernel(cells: CellRange, own: wp.array3d(dtype=wp.int32), wide: wp.arr
         wide[k, j, 0] = 0
         wide[k, j, 1] = 0
     else:
-        low = wp.max(low - 1, cells.i)
-        high = wp.min(high + 1, cells.end)
+        low = wp.max(low - 1, first)
+        high = wp.min(high + 1, end)
         # whole vectors of cells, which may lie on either side; what is left of a row takes as long as a vector
         more = (high - low + LANES - 1) / LANES * LANES - (high - low)
-        right = wp.min(more, wp.max(cells.end - 1 - high, 0))
-        wide[k, j, 0] = wp.max(low - (more - right), cells.i)
+        right = wp.min(more, wp.max(end - 1 - high, 0))
+        wide[k, j, 0] = wp.max(low - (more - right), first)
         wide[k, j, 1] = high + right

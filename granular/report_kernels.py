@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import warp as wp
 
 from granular.yield_set import FLUX, OPENINGS, RATE_BOUND, SHAPE, native
+from warp_lcp.grid.cell_kernel import F32, F64, I8, U8, cell_below, cell_kernel
 from warp_lcp.grid.extrapolate import BLOCKED
-from warp_lcp.grid.staggered import CellRange
 from warp_lcp.operators.grid_poisson import SOLID
 
 RATIO_YIELDS = 0.99  # of the bound, from which a cell counts as yielded
@@ -65,7 +65,6 @@ REPORT = (
 """
 )
 
-_F32, _F64, _U8 = (wp.array3d(dtype=t) for t in (wp.float32, wp.float64, wp.uint8))
 _STRESS = wp.array4d(dtype=wp.float32)
 
 
@@ -77,56 +76,43 @@ def report_kernels(dimension: int, rate: bool = False, cut: bool = False) -> Sim
 
     @wp.func_native(native(REPORT, dimension, wp.float64, rate=rate, cut=cut, **words))
     def report_row(
-        flags_: _U8, now_: _STRESS, drive_: _F32, share_x: _F32, share_y: _F32, share_z: _F32, b_x: _F64, b_y: _F64, b_z: _F64,
-        u_x: _F64, u_y: _F64, u_z: _F64, mass_x: _F32, mass_y: _F32, mass_z: _F32, cut_: _STRESS, numbers: wp.array(dtype=wp.float32),
-        ratio_: _F32, sums_: wp.array(dtype=wp.float64), k: int, j: int, first: int, last: int,
+        flags_: U8, now_: _STRESS, drive_: F32, share_x: F32, share_y: F32, share_z: F32, b_x: F64, b_y: F64, b_z: F64,
+        u_x: F64, u_y: F64, u_z: F64, mass_x: F32, mass_y: F32, mass_z: F32, cut_: _STRESS, numbers: wp.array(dtype=wp.float32),
+        ratio_: F32, sums_: wp.array(dtype=wp.float64), k: int, j: int, first: int, last: int,
     ): ...  # fmt: skip
 
-    @wp.kernel(enable_backward=False, module=name)
+    @cell_kernel(name)
     def report(
-        cells: CellRange, flags: _U8, now: _STRESS, drive: _F32, share_x: _F32, share_y: _F32, share_z: _F32,
-        b_x: _F64, b_y: _F64, b_z: _F64, u_x: _F64, u_y: _F64, u_z: _F64, mass_x: _F32, mass_y: _F32, mass_z: _F32,
-        openings: _STRESS, numbers: wp.array(dtype=wp.float32), ratio: _F32, sums: wp.array(dtype=wp.float64),
+        k, j, first, end, flags: U8, now: _STRESS, drive: F32, share_x: F32, share_y: F32, share_z: F32,
+        b_x: F64, b_y: F64, b_z: F64, u_x: F64, u_y: F64, u_z: F64, mass_x: F32, mass_y: F32, mass_z: F32,
+        openings: _STRESS, numbers: wp.array(dtype=wp.float32), ratio: F32, sums: wp.array(dtype=wp.float64),
     ):  # fmt: skip
-        plane, row = wp.tid()
         report_row(
             flags, now, drive, share_x, share_y, share_z, b_x, b_y, b_z, u_x, u_y, u_z, mass_x, mass_y, mass_z, openings, numbers,
-            ratio, sums, cells.k + plane, cells.j + row, cells.i, cells.end,
+            ratio, sums, k, j, first, end,
         )  # fmt: skip
 
-    @wp.kernel(enable_backward=False, module=name)
+    @cell_kernel(name)
     def take(
-        cells: CellRange, axis: int, base: wp.array3d(dtype=wp.int8), inverse: _F32, found: _F64, velocity: _F32,
-        known: wp.array3d(dtype=wp.int8),
+        k, j, i, axis: int, base: I8, inverse: F32, found: F64, velocity: F32,
+        known: I8,
     ):  # fmt: skip
-        plane, row, chunk = wp.tid()
-        k = cells.k + plane
-        j = cells.j + row
-        first = cells.i + chunk * cells.grain
-        c = wp.max(k - wp.where(axis == 2, 1, 0), 0)
-        b = wp.max(j - wp.where(axis == 1, 1, 0), 0)
-        for i in range(first, wp.min(first + cells.grain, cells.end)):
-            a = wp.max(i - wp.where(axis == 0, 1, 0), 0)
-            mark = wp.int8(0)
-            if inverse[k, j, i] > 0.0:
-                velocity[k, j, i] = wp.float32(found[k, j, i])
-                mark = wp.int8(1)
-            elif base[k, j, i] == wp.int8(SOLID) and base[c, b, a] == wp.int8(SOLID):
-                mark = wp.int8(BLOCKED)
-            known[k, j, i] = mark
+        c, b, a = cell_below(axis, k, j, i)
+        mark = wp.int8(0)
+        if inverse[k, j, i] > 0.0:
+            velocity[k, j, i] = wp.float32(found[k, j, i])
+            mark = wp.int8(1)
+        elif base[k, j, i] == wp.int8(SOLID) and base[c, b, a] == wp.int8(SOLID):
+            mark = wp.int8(BLOCKED)
+        known[k, j, i] = mark
 
-    @wp.kernel(enable_backward=False, module=name)
-    def contact(cells: CellRange, held: wp.uint8, released: wp.uint8, flags: _U8, now: _STRESS, out: _U8):
-        plane, row, chunk = wp.tid()
-        k = cells.k + plane
-        j = cells.j + row
-        first = cells.i + chunk * cells.grain
-        for i in range(first, wp.min(first + cells.grain, cells.end)):
-            mark = wp.uint8(0)
-            if flags[k, j, i] != wp.uint8(0):
-                mark = released
-                if now[0, k, j, i] > 0.0:
-                    mark = held
-            out[k, j, i] = mark
+    @cell_kernel(name)
+    def contact(k, j, i, held: wp.uint8, released: wp.uint8, flags: U8, now: _STRESS, out: U8):
+        mark = wp.uint8(0)
+        if flags[k, j, i] != wp.uint8(0):
+            mark = released
+            if now[0, k, j, i] > 0.0:
+                mark = held
+        out[k, j, i] = mark
 
     return SimpleNamespace(report=report, take=take, contact=contact)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import typing
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,57 +9,11 @@ import warp as wp
 
 from granular.cut_walls import CutWalls
 from granular.stress import Walls
-from warp_lcp.grid.staggered import CellRange, StaggeredGrid
+from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid, voxelize
+from warp_lcp.material import boundary_kernels as kernels
 from warp_lcp.material.boundary import Boundary, Faces
 from warp_lcp.material.cut_boundary import CutBoundary
-from warp_lcp.operators.grid_poisson import AIR, SOLID
-
-_SOLID = wp.constant(wp.int8(SOLID))
-_AIR = wp.constant(wp.int8(AIR))
-
-
-@wp.kernel(enable_backward=False, module="granular.solids")
-@typing.no_type_check
-def base_kernel(cells: CellRange, index: wp.array3d(dtype=wp.int32), base: wp.array3d(dtype=wp.int8)):
-    """SOLID in walls, AIR elsewhere."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        if index[k, j, i] >= 0:
-            base[k, j, i] = _SOLID
-        else:
-            base[k, j, i] = _AIR
-
-
-@wp.kernel(enable_backward=False, module="granular.solids")
-@typing.no_type_check
-def rigid_velocity_kernel(
-    cells: CellRange, axis: int, planes: int, spacing: float, index: wp.array3d(dtype=wp.int32), turn: wp.array(dtype=wp.mat33),
-    shift: wp.array(dtype=wp.vec3), field: wp.array3d(dtype=wp.float32),
-):  # fmt: skip
-    """Velocity of the solids on the faces of one component that they touch, 0 elsewhere."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    c = wp.max(k - wp.where(axis == 2, 1, 0), 0)
-    b = wp.max(j - wp.where(axis == 1, 1, 0), 0)
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        a = wp.max(i - wp.where(axis == 0, 1, 0), 0)
-        wall = wp.max(index[k, j, i], index[c, b, a])
-        u = float(0.0)
-        if wall > 0:
-            x = (float(i) - wp.where(axis == 0, 1.0, 0.5)) * spacing
-            y = (float(j) - wp.where(axis == 1, 1.0, 0.5)) * spacing
-            z = float(0.0)
-            if planes == 2:
-                z = (float(k) - wp.where(axis == 2, 1.0, 0.5)) * spacing
-            v = turn[wall] * wp.vec3(x, y, z) + shift[wall]
-            u = v[axis]
-        field[k, j, i] = u
 
 
 class SandSolids:
@@ -123,7 +76,7 @@ class SandSolids:
         self.index, self._covered = found.index, found.covered
         if self._boundary.sides is not None:
             self._boundary.sides.wrap(self.index)
-        grid.everywhere.launch(base_kernel, [self.index, self.base])
+        grid.everywhere.launch(kernels.base_kernel, [self.index, self.base])
         cells = self.index.numpy()
         if self.cut is not None:  # the domain's walls alone are whole cells
             wp.copy(self.base, self._boundary.base)
@@ -156,7 +109,7 @@ class SandSolids:
             cut = boundary.cut
             for axis, field in enumerate(self.velocity):
                 inputs = [axis, grid.planes, grid.spacing, self.index, cut.turn, cut.shift, field]
-                grid.everywhere.launch(rigid_velocity_kernel, inputs)
+                grid.everywhere.launch(kernels.wall_velocity_kernel, inputs)
         else:
             for field in self.velocity:  # a source that has stopped has left its own
                 field.zero_()

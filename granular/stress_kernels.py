@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from granular.yield_set import COLUMNS, FLUX, OPENINGS, RATE_BOUND, SHAPE, WALL_FACE, YIELD, native
-from warp_lcp.grid.staggered import CellRange
+from warp_lcp.grid.cell_kernel import F32, I32, U8, cell_kernel
 
 # The momentum's state: steps done; the most of it for pressure and friction; that of this step; that of the next; estimates of the natural
 # residuals over the last PERIOD steps; sums over these; 1 less the most that the momentum may grow to.
@@ -270,8 +270,7 @@ ADMIT = (
 """
 )
 
-_F32, _F64, _U8 = (wp.array3d(dtype=t) for t in (wp.float32, wp.float64, wp.uint8))
-_STRESS, _SPANS = wp.array4d(dtype=wp.float32), wp.array3d(dtype=wp.int32)
+_STRESS, _SPANS = wp.array4d(dtype=wp.float32), I32
 
 
 def step_source(
@@ -294,113 +293,102 @@ def stress_kernels(dimension: int, real, residual: bool, box: bool, rate: bool =
 
     @wp.func_native(source(EDGE_STRESS))
     def edge_stress_row(
-        spans_: _SPANS, y_: _STRESS, share_x: _F32, share_y: _F32, share_z: _F32, b_x: field, b_y: field, b_z: field,
+        spans_: _SPANS, y_: _STRESS, share_x: F32, share_y: F32, share_z: F32, b_x: field, b_y: field, b_z: field,
         k: int, j: int, first: int, last: int,
     ): ...  # fmt: skip
 
-    @wp.kernel(enable_backward=False, module=name)
+    @cell_kernel(name)
     def edge_stress(
-        cells: CellRange, spans: _SPANS, y: _STRESS, share_x: _F32, share_y: _F32, share_z: _F32, b_x: field, b_y: field, b_z: field
-    ):
-        plane, row, chunk = wp.tid()
-        first = cells.i + chunk * cells.grain
-        last = wp.min(first + cells.grain, cells.end)
-        edge_stress_row(spans, y, share_x, share_y, share_z, b_x, b_y, b_z, cells.k + plane, cells.j + row, first, last)
+        k, j, first, end, spans: _SPANS, y: _STRESS, share_x: F32, share_y: F32, share_z: F32, b_x: field,
+        b_y: field, b_z: field,
+    ):  # fmt: skip
+        edge_stress_row(spans, y, share_x, share_y, share_z, b_x, b_y, b_z, k, j, first, end)
 
     @wp.func_native(source(FACE_VELOCITY))
     def face_velocity_row(
-        spans_: _SPANS, y_: _STRESS, share_x: _F32, b_x: field, b_y: field, b_z: field, start_x: _F32, start_y: _F32, start_z: _F32,
-        inverse_x: _F32, inverse_y: _F32, inverse_z: _F32, u_x: field, u_y: field, u_z: field, cut_: _STRESS,
+        spans_: _SPANS, y_: _STRESS, share_x: F32, b_x: field, b_y: field, b_z: field, start_x: F32, start_y: F32, start_z: F32,
+        inverse_x: F32, inverse_y: F32, inverse_z: F32, u_x: field, u_y: field, u_z: field, cut_: _STRESS,
         k: int, j: int, first: int, last: int,
     ): ...  # fmt: skip
 
-    @wp.kernel(enable_backward=False, module=name)
+    @cell_kernel(name)
     def face_velocity(
-        cells: CellRange, spans: _SPANS, y: _STRESS, share_x: _F32, b_x: field, b_y: field, b_z: field,
-        start_x: _F32, start_y: _F32, start_z: _F32, inverse_x: _F32, inverse_y: _F32, inverse_z: _F32,
+        k, j, first, end, spans: _SPANS, y: _STRESS, share_x: F32, b_x: field, b_y: field, b_z: field,
+        start_x: F32, start_y: F32, start_z: F32, inverse_x: F32, inverse_y: F32, inverse_z: F32,
         u_x: field, u_y: field, u_z: field, openings: _STRESS,
     ):  # fmt: skip
-        plane, row, chunk = wp.tid()
-        first = cells.i + chunk * cells.grain
-        last = wp.min(first + cells.grain, cells.end)
         face_velocity_row(
             spans, y, share_x, b_x, b_y, b_z, start_x, start_y, start_z, inverse_x, inverse_y, inverse_z, u_x, u_y, u_z, openings,
-            cells.k + plane, cells.j + row, first, last,
+            k, j, first, end,
         )  # fmt: skip
 
     @wp.func_native(source(EDGE_STRAIN))
     def edge_strain_row(
-        spans_: _SPANS, share_x: _F32, u_x: field, u_y: field, u_z: field, b_x: field, b_y: field, b_z: field,
+        spans_: _SPANS, share_x: F32, u_x: field, u_y: field, u_z: field, b_x: field, b_y: field, b_z: field,
         k: int, j: int, first: int, last: int,
     ): ...  # fmt: skip
 
-    @wp.kernel(enable_backward=False, module=name)
-    def edge_strain(cells: CellRange, spans: _SPANS, share_x: _F32, u_x: field, u_y: field, u_z: field, b_x: field, b_y: field, b_z: field):
-        plane, row, chunk = wp.tid()
-        first = cells.i + chunk * cells.grain
-        last = wp.min(first + cells.grain, cells.end)
-        edge_strain_row(spans, share_x, u_x, u_y, u_z, b_x, b_y, b_z, cells.k + plane, cells.j + row, first, last)
+    @cell_kernel(name)
+    def edge_strain(
+        k, j, first, end, spans: _SPANS, share_x: F32, u_x: field, u_y: field, u_z: field, b_x: field, b_y: field,
+        b_z: field,
+    ):  # fmt: skip
+        edge_strain_row(spans, share_x, u_x, u_y, u_z, b_x, b_y, b_z, k, j, first, end)
 
     @wp.func_native(source(CELLS))
     def step_row(
-        spans_: _SPANS, flags_: _U8, now_: _STRESS, before_: _STRESS, point_: _STRESS, drive_: _F32, stiff_: _F32,
-        share_x: _F32, share_y: _F32, share_z: _F32, b_x: field, b_y: field, b_z: field, mass_x: _F32, mass_y: _F32, mass_z: _F32,
-        inverse_x: _F32, inverse_y: _F32, inverse_z: _F32, u_x: field, u_y: field, u_z: field, cut_: _STRESS,
+        spans_: _SPANS, flags_: U8, now_: _STRESS, before_: _STRESS, point_: _STRESS, drive_: F32, stiff_: F32,
+        share_x: F32, share_y: F32, share_z: F32, b_x: field, b_y: field, b_z: field, mass_x: F32, mass_y: F32, mass_z: F32,
+        inverse_x: F32, inverse_y: F32, inverse_z: F32, u_x: field, u_y: field, u_z: field, cut_: _STRESS,
         momentum: wp.array(dtype=wp.float64), numbers: wp.array(dtype=wp.float32),
         partials: wp.array(dtype=wp.float64), chunks: int, chunk: int, k: int, j: int, first: int, last: int,
     ): ...  # fmt: skip
 
-    @wp.kernel(enable_backward=False, module=name)
+    @cell_kernel(name)
     def step(
-        cells: CellRange, spans: _SPANS, flags: _U8, now: _STRESS, before: _STRESS, point: _STRESS, drive: _F32, stiff: _F32,
-        share_x: _F32, share_y: _F32, share_z: _F32, b_x: field, b_y: field, b_z: field, mass_x: _F32, mass_y: _F32, mass_z: _F32,
-        inverse_x: _F32, inverse_y: _F32, inverse_z: _F32, u_x: field, u_y: field, u_z: field, openings: _STRESS,
+        chunk, k, j, first, end, spans: _SPANS, flags: U8, now: _STRESS, before: _STRESS, point: _STRESS, drive: F32, stiff: F32,
+        share_x: F32, share_y: F32, share_z: F32, b_x: field, b_y: field, b_z: field, mass_x: F32, mass_y: F32, mass_z: F32,
+        inverse_x: F32, inverse_y: F32, inverse_z: F32, u_x: field, u_y: field, u_z: field, openings: _STRESS,
         momentum: wp.array(dtype=wp.float64), numbers: wp.array(dtype=wp.float32),
         partials: wp.array(dtype=wp.float64), chunks: int,
     ):  # fmt: skip
-        plane, row, chunk = wp.tid()
-        first = cells.i + chunk * cells.grain
-        last = wp.min(first + cells.grain, cells.end)
         step_row(
             spans, flags, now, before, point, drive, stiff, share_x, share_y, share_z, b_x, b_y, b_z, mass_x, mass_y, mass_z,
             inverse_x, inverse_y, inverse_z, u_x, u_y, u_z, openings, momentum, numbers, partials, chunks, chunk,
-            cells.k + plane, cells.j + row, first, last,
+            k, j, first, end,
         )  # fmt: skip
 
     @wp.func_native(source(ADMIT))
     def admit_row(
-        flags_: _U8, stiff_: _F32, share_x: _F32, share_y: _F32, share_z: _F32, ratio: float,
+        flags_: U8, stiff_: F32, share_x: F32, share_y: F32, share_z: F32, ratio: float,
         now_: _STRESS, before_: _STRESS, point_: _STRESS,
         k: int, j: int, first: int, last: int,
     ): ...  # fmt: skip
 
-    @wp.kernel(enable_backward=False, module=name)
+    @cell_kernel(name)
     def admit(
-        cells: CellRange, flags: _U8, stiff: _F32, share_x: _F32, share_y: _F32, share_z: _F32, ratio: float,
+        k, j, first, end, flags: U8, stiff: F32, share_x: F32, share_y: F32, share_z: F32, ratio: float,
         now: _STRESS, before: _STRESS, point: _STRESS,
     ):  # fmt: skip
-        plane, row, chunk = wp.tid()
-        first = cells.i + chunk * cells.grain
-        last = wp.min(first + cells.grain, cells.end)
-        admit_row(flags, stiff, share_x, share_y, share_z, ratio, now, before, point, cells.k + plane, cells.j + row, first, last)
+        admit_row(flags, stiff, share_x, share_y, share_z, ratio, now, before, point, k, j, first, end)
 
     @wp.func_native(source(WALLS))
     def wall_entries(
         cells: wp.array(dtype=wp.int32), sides: wp.array(dtype=wp.uint8), walls: wp.array(dtype=wp.int32),
-        friction: wp.array(dtype=wp.float32), active: wp.array(dtype=wp.int32), fraction_: _F32,
+        friction: wp.array(dtype=wp.float32), active: wp.array(dtype=wp.int32), fraction_: F32,
         now_: _STRESS, before_: _STRESS, point_: _STRESS,
-        share_x: _F32, share_y: _F32, share_z: _F32, b_x: field, b_y: field, b_z: field,
-        inverse_x: _F32, inverse_y: _F32, inverse_z: _F32, momentum: wp.array(dtype=wp.float64), numbers: wp.array(dtype=wp.float32),
+        share_x: F32, share_y: F32, share_z: F32, b_x: field, b_y: field, b_z: field,
+        inverse_x: F32, inverse_y: F32, inverse_z: F32, momentum: wp.array(dtype=wp.float64), numbers: wp.array(dtype=wp.float32),
         partials: wp.array(dtype=wp.float64), chunk: int, first: int, last: int,
     ): ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module=name)
     def wall(
         grain: int, cells: wp.array(dtype=wp.int32), sides: wp.array(dtype=wp.uint8), walls: wp.array(dtype=wp.int32),
-        friction: wp.array(dtype=wp.float32), active: wp.array(dtype=wp.int32), fraction: _F32,
+        friction: wp.array(dtype=wp.float32), active: wp.array(dtype=wp.int32), fraction: F32,
         now: _STRESS, before: _STRESS, point: _STRESS,
-        share_x: _F32, share_y: _F32, share_z: _F32, b_x: field, b_y: field, b_z: field,
-        inverse_x: _F32, inverse_y: _F32, inverse_z: _F32, momentum: wp.array(dtype=wp.float64), numbers: wp.array(dtype=wp.float32),
+        share_x: F32, share_y: F32, share_z: F32, b_x: field, b_y: field, b_z: field,
+        inverse_x: F32, inverse_y: F32, inverse_z: F32, momentum: wp.array(dtype=wp.float64), numbers: wp.array(dtype=wp.float32),
         partials: wp.array(dtype=wp.float64),
     ):  # fmt: skip
         chunk = wp.tid()

@@ -15,7 +15,7 @@ import warp as wp
 import fluids
 import granular
 import warp_lcp as wl
-from fluids.pressure_kernels import pressure_kernels
+from fluids.pressure_kernels import pressure_passes
 from granular.bodies_kernels import body_kernels
 from granular.checkerboard import damping_kernel
 from granular.cut_walls_kernels import traction_kernel
@@ -27,7 +27,7 @@ from warp_lcp.grid import advection_kernels, distance_advection_kernels, transfe
 from warp_lcp.grid.periodic import ring_kernels
 from warp_lcp.grid.semi_lagrangian import CENTERS
 from warp_lcp.grid.semi_lagrangian_kernels import carry_kernels
-from warp_lcp.material.density_correction_kernels import displacement_kernel
+from warp_lcp.material.density_correction_kernels import displacement_pass
 from warp_lcp.multigrid import CycleSettings
 from warp_lcp.rows.row_pass import Form
 from warp_lcp.solvers.mprgp import MPRGP
@@ -100,7 +100,9 @@ def use_sweeping_kernels(reals):
             A = wl.GridPoisson(np.array([[0, 1, 1, 1]]), device="cpu", dtype=dtype, **faces)
             for axis in wl.GridLines:
                 assert wl.solve(wl.LCP(A, -np.ones((1, 4))), wl.BlockedGaussSeidel(blocks=axis))
-        assert wl.solve(wl.LCP(wl.DenseOperator(np.eye(2), device="cpu", dtype=dtype), -np.ones(2), *friction), wl.ProjectedSOR())
+        for solver in (wl.ProjectedSOR(), wl.SubspaceMinimization(sweeps=1)):
+            A = wl.DenseOperator(np.array([[3.0, -0.5], [-0.5, 3.0]]), device="cpu", dtype=dtype)
+            assert wl.solve(wl.LCP(A, np.array([-1.0, -2.0]), *friction), solver)
 
 
 def use_gradient_projection_kernels(reals):
@@ -114,6 +116,7 @@ def use_gradient_projection_kernels(reals):
         for A in operators:
             for precision in ("mixed", "double"):
                 assert wl.solve(wl.LCP(A, -np.ones(A.shape)), MPRGP(precision=precision))
+                assert wl.solve(wl.LCP(A, -np.ones(A.shape), 0.0), MPRGP(precision=precision), x0=np.zeros(A.shape))  # releases all
 
 
 def use_newton_kernels(reals):
@@ -186,12 +189,12 @@ def test_kernels_compile_for_cuda(reals, archs, tmp_path):
             importlib.import_module(found.name)
     use_every_kernel(reals)
     for cut in (False, True):
-        displacement_kernel(cut)
+        displacement_pass(cut)
     for endless in (0, 1, 4, 5):
         advection_kernels.advect_kernel(endless)
         distance_advection_kernels.advect_kernel(endless)
     for variant in itertools.product((False, True), repeat=4):
-        pressure_kernels(*variant)
+        pressure_passes(*variant)
     for axis in (0, 1, 2, CENTERS):
         carry_kernels(axis)
     for dtype in (wp.int8, wp.uint8, wp.int32, wp.float32, wp.float64):

@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.affine_bounds import affine_fields
-from warp_lcp.bounds_kernels import LOWER_IS_FINITE, UPPER_IS_FINITE, decode_kernel, encode_kernel, encode_rows_kernel
 from warp_lcp.layout import Array, Layout, real_array
-from warp_lcp.native import Spans
 from warp_lcp.pickling import OnHost
+from warp_lcp.rows import RowPass, Rows
 
 NAMES, INFINITE = ("lower", "upper"), (-np.inf, np.inf)
 LAUNCHED = 4096  # elements from which a kernel looks at fields on the CPU: below, NumPy takes less than the launch
-BITS = (int(LOWER_IS_FINITE), int(UPPER_IS_FINITE))
+BITS = (1, 2)  # of a code: the lower bound is finite, the upper one is
+HEADERS, SIDES = Path(__file__).parent / "headers", {"lower": wp.float64, "upper": wp.float64}
+ENCODE = RowPass(
+    "bounds.encode", HEADERS / "encode.h", wp.float64, reads=SIDES, optional=("lower", "upper"), writes={"code": wp.uint8},
+    numbers={"least": wp.float64, "most": wp.float64}, sums=("others",),
+)  # fmt: skip
+FINITE = {"value": wp.float64, "infinite": wp.float64, "bit": int}
+CODE_ROWS = RowPass(
+    "bounds.code_rows", HEADERS / "code_rows.h", wp.float64, whole={"source": wp.float64}, writes={"code": wp.uint8}, numbers=FINITE,
+    sums=("others",),
+)  # fmt: skip
+DECODE = RowPass("bounds.decode", HEADERS / "decode.h", wp.float64, reads={"code": wp.uint8}, writes={"field": wp.float64}, numbers=FINITE)
 
 
 class Bounds:
@@ -99,11 +110,10 @@ class Bounds:
             return
         if self._memory is None:
             self._memory = self.layout.zeros(wp.uint8)
-            self._others = wp.zeros(Spans.of(self.layout.size, self.device).threads, dtype=wp.float64, device=self.device)
-        spans = Spans.of(self.layout.size, self.device)
-        numbers = [wp.float64(0.0 if field.size else v) for field, v in zip(self.fields, self.values, strict=True)]
-        inputs = [self.fields[0], numbers[0], self.fields[1], numbers[1], self._memory, spans.n, spans.chunk, spans.stride, self._others]
-        wp.launch(encode_kernel, spans.threads, inputs, device=self.device)
+            self._others = wp.zeros(self._rows.places, dtype=wp.float64, device=self.device)
+        least, most = (0.0 if field.size else v for field, v in zip(self.fields, self.values, strict=True))
+        given = {"lower": self.fields[0], "upper": self.fields[1], "least": least, "most": most, "code": self._memory}
+        ENCODE.bind(self._rows, **given, out=self._others).launch()
         self.code = self._no_code if self._others.numpy().any() else self._memory
 
     def as_field(self, side: int) -> wp.array[Any]:
@@ -112,8 +122,8 @@ class Bounds:
             return self.fields[side]
         field = wp.full(self.layout.size, self.values[side], dtype=wp.float64, device=self.device)
         if self.code.size and not self.in_place:
-            inputs = [self.code, BITS[side], wp.float64(self.values[side]), wp.float64(INFINITE[side]), field]
-            wp.launch(decode_kernel, self.layout.size, inputs, device=self.device)
+            given: dict[str, Any] = {"bit": BITS[side], "value": self.values[side], "infinite": INFINITE[side]}
+            DECODE.bind(self._rows, code=self.code, field=field, **given).launch()
         return field
 
     def host(self, side: int) -> np.ndarray:
@@ -124,6 +134,10 @@ class Bounds:
         if self.code.size and not self.in_place:
             field[self.code.numpy() & BITS[side] == 0] = INFINITE[side]
         return field
+
+    @property
+    def _rows(self) -> Rows:
+        return Rows.flat(self.layout.size, self.device)
 
     def _code_from_host(self, sides: tuple[Array, Array]) -> bool:
         """Code fields that are not stored yet; returns False, with nothing done, if their finite values differ or one is a NaN."""
@@ -151,11 +165,9 @@ class Bounds:
             target += (BITS[side] * finite).astype(np.uint8).reshape(target.shape)
             return not (finite & (host != value)).any()
         target = target if target.ndim == 3 else target.reshape(1, 1, -1)
-        source = np.ascontiguousarray(host, dtype=np.float64).ravel()
         first = target.__array_interface__["data"][0] - code.__array_interface__["data"][0]
-        others = np.zeros(target.shape[:2])
-        given, bits, out = (wp.array(a, device="cpu", copy=False) for a in (source, code.ravel(), others))
-        numbers = [wp.float64(value), wp.float64(INFINITE[side]), BITS[side]]
-        inputs = [given, *numbers, bits, first, *target.strides[:2], target.shape[2], out]
-        wp.launch(encode_rows_kernel, target.shape[:2], inputs, device="cpu")
-        return not others.any()
+        rows = Rows.strided(code.size, wp.get_device("cpu"), (first, *target.strides[:2]), target.shape)
+        arrays = (np.ascontiguousarray(host, dtype=np.float64).ravel(), code.ravel(), np.zeros(rows.places))
+        source, bits, out = (wp.array(a, device="cpu", copy=False) for a in arrays)
+        CODE_ROWS.bind(rows, source=source, code=bits, value=value, infinite=INFINITE[side], bit=BITS[side], out=out).launch()
+        return not out.numpy().any()

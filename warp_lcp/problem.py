@@ -10,14 +10,18 @@ import warp as wp
 
 from warp_lcp.bounds import INFINITE, LAUNCHED, Bounds
 from warp_lcp.layout import Array, layout_of, real_array
-from warp_lcp.native import Spans
 from warp_lcp.pickling import OnHost, Pickled
-from warp_lcp.problem_kernels import check_kernel
+from warp_lcp.rows import RowPass, Rows
+from warp_lcp.vectors import HEADERS
 
 if TYPE_CHECKING:
     from warp_lcp.operators.protocol import Operator
 
 
+CHECK = RowPass(
+    "problem.check", HEADERS / "check.h", wp.float64, bounds=True, reads={"b": wp.float64, "unknown": wp.int8},
+    sums=("bad", "nan_lower", "nan_upper", "crossed", "no_lower", "no_upper"),
+)  # fmt: skip
 MEMBERS = ("shape", "dtype", "device", "symmetric", "apply", "apply_transpose", "diagonal", "masked")  # of `wl.Operator`
 
 
@@ -120,11 +124,10 @@ class LCP(Pickled):
             b, lower, upper = field.numpy()[inside], bounds.host(0)[inside], bounds.host(1)[inside]
             faults = (~np.isfinite(b), np.isnan(lower), np.isnan(upper), lower > upper, lower == np.inf, upper == -np.inf)
             return self._totals(np.array([np.count_nonzero(fault) for fault in faults]))
-        spans = Spans.of(self.layout.size, self.device)
-        counts = wp.zeros((6, spans.threads), dtype=wp.float64, device=self.device)
-        inputs = [field, *bounds.operands, self.unknown, spans.n, spans.chunk, spans.stride, spans.threads, counts.flatten()]
-        wp.launch(check_kernel, spans.threads, inputs, device=self.device)
-        return self._totals(counts.numpy().sum(axis=1))
+        rows = Rows.flat(self.layout.size, self.device)
+        counts = wp.zeros(len(CHECK.sums) * rows.places, dtype=wp.float64, device=self.device)
+        CHECK.bind(rows, bounds=bounds.operands, b=field, unknown=self.unknown, out=counts).launch()
+        return self._totals(counts.numpy().reshape(-1, rows.places).sum(axis=1))
 
     def _totals(self, found: np.ndarray) -> list[int]:
         return [int(n) for n in (found if self.layout.across is None else self.layout.across.sum(found))]

@@ -1,10 +1,6 @@
 # mypy: ignore-errors
 """Kernels on flat fields, and how their native loops are written."""
 
-import functools
-from types import SimpleNamespace
-from typing import Any
-
 import warp as wp
 
 from warp_lcp.native import simd
@@ -85,28 +81,3 @@ def add_up_kernel(partials: wp.array(dtype=wp.float64), n: int, threads: int, se
     total = wp.tile_sum(wp.tile(s))
     if t == block * threads:
         out[slot + block] = total[0]
-
-
-@functools.cache
-def kernels(a_type: Any, b_type: Any) -> SimpleNamespace:
-    """Return the kernels for fields a and b of these types."""
-    name = f"warp_lcp.vectors.{a_type.__name__}_{b_type.__name__}"
-    a_array, b_array = wp.array(dtype=a_type), wp.array(dtype=b_type)
-
-    @wp.func_native(flat("double s = 0; EACH { s += (double)a.data[i] * (double)b.data[i]; } return s;"))
-    def dot_span(a: a_array, b: b_array, start: wp.int64, end: wp.int64, stride: wp.int64) -> wp.float64: ...
-
-    @wp.func_native(flat("EACH { b.data[i] = a.data[i]; }"))
-    def convert_span(a: a_array, b: b_array, start: wp.int64, end: wp.int64, stride: wp.int64): ...
-
-    @wp.kernel(enable_backward=False, module=name)
-    def dot(a: a_array, b: b_array, n: int, chunk: int, stride: wp.int64, partials: wp.array(dtype=wp.float64)):
-        t = wp.tid()
-        partials[t] = dot_span(a, b, span_start(t, chunk), span_end(t, chunk, n), stride)
-
-    @wp.kernel(enable_backward=False, module=name)
-    def convert(a: a_array, b: b_array, n: int, chunk: int, stride: wp.int64):
-        t = wp.tid()
-        convert_span(a, b, span_start(t, chunk), span_end(t, chunk, n), stride)
-
-    return SimpleNamespace(dot=dot, convert=convert)

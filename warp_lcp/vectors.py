@@ -6,13 +6,20 @@ Every operator stores its fields as flat arrays (see `warp_lcp.layout`), so that
 from __future__ import annotations
 
 from functools import partial
+from pathlib import Path
 from typing import Any, Protocol
 
 import warp as wp
 
 from warp_lcp.native import CUDA_BLOCK, CUDA_SEGMENTS, Spans
 from warp_lcp.program import Launch, perform
-from warp_lcp.vector_kernels import add_up_kernel, kernels
+from warp_lcp.rows import RowPass, Rows
+from warp_lcp.vector_kernels import add_up_kernel
+
+HEADERS = Path(__file__).parent / "headers"
+DOT = RowPass("vectors.dot", HEADERS / "dot.h", wp.float64, reads={"a": "A", "b": "B"}, sums=("ab",))
+ADD = RowPass("vectors.add", HEADERS / "add.h", "S", reads={"z": "S"}, writes={"x": "S"})  # x += z
+CONVERT = RowPass("vectors.convert", HEADERS / "convert.h", "B", reads={"a": "A"}, writes={"b": "B"})
 
 
 class Across(Protocol):
@@ -75,7 +82,7 @@ class Reduction:
 
     def dot(self, a: wp.array[Any], b: wp.array[Any], slot: int, *, launch: Launch = wp.launch) -> None:
         """Write a.b to scalars[slot]."""
-        launch_spans(kernels(a.dtype, b.dtype).dot, self.spans, [a, b], [self.partials], a.device, launch=launch)
+        DOT.bind(rows_of(a), a=a, b=b, out=self.partials).launch(launch)
         self.add_up(slot, launch=launch)
 
 
@@ -86,6 +93,11 @@ def _add_across(across: Across, scalars: wp.array[wp.float64], slots: slice) -> 
         sums[...] = across.sum(sums)
     else:
         scalars[slots].assign(across.sum(scalars[slots].numpy()))
+
+
+def rows_of(field: wp.array[Any]) -> Rows:
+    """Return the rows of passes over flat fields like this one."""
+    return Rows.flat(field.size, field.device)
 
 
 def launch_spans(
@@ -100,4 +112,4 @@ def convert(a: wp.array[Any], b: wp.array[Any]) -> None:
     if a.dtype is b.dtype:
         wp.copy(b, a)
     else:
-        launch_spans(kernels(a.dtype, b.dtype).convert, Spans.of(a.size, a.device), [a, b], [], a.device)
+        CONVERT.bind(rows_of(a), a=a, b=b).launch()

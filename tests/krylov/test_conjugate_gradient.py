@@ -10,7 +10,8 @@ from warp_lcp import program
 from warp_lcp.krylov import ConjugateGradient
 from warp_lcp.krylov.conjugate_gradient_kernels import BEST, ITERATIONS, LIMIT, RR, RZ, RZ_OLD, SLOTS, TOLERANCE, end_kernel
 from warp_lcp.operators.grid_poisson import GridPoisson
-from warp_lcp.solvers.principal_system_kernels import divide_kernel
+from warp_lcp.solvers.principal_system import DIVIDE
+from warp_lcp.vectors import rows_of
 
 SHAPE = (5, 6, 7)
 
@@ -22,13 +23,13 @@ class Jacobi:
         stencil = A.stencil
         self.r, self.z = (wp.zeros(stencil.d.size, dtype=wp.float64, device=A.device) for _ in range(2))
         d = np.maximum(stencil.d.numpy().astype(float) * stencil.unit, 1.0)
-        self._inputs = [self.r, wp.array(d, dtype=wp.float64, device=A.device), self.z]
+        self._divide = DIVIDE.bind(rows_of(self.r), r=self.r, d=wp.array(d, dtype=wp.float64, device=A.device), z=self.z)
         if recorded:
             self.program = program.Program(A.device)
-            self.program.launch(divide_kernel, self.r.size, self._inputs, device=A.device)
+            self._divide.launch(self.program.launch)
 
     def apply(self):
-        wp.launch(divide_kernel, self.r.size, self._inputs, device=self.r.device)
+        self._divide.launch()
 
 
 @pytest.fixture

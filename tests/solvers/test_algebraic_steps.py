@@ -7,7 +7,7 @@ import warp as wp
 import warp_lcp as wl
 from oracle import assemble
 from warp_lcp.operators.grid_matrix import grid_matrix
-from warp_lcp.solvers.algebraic_steps import FIRST, Pace
+from warp_lcp.solvers.phases import FIRST, Pace
 
 
 def spiral(n):

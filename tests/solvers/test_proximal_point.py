@@ -8,7 +8,7 @@ import warp as wp
 import warp_lcp as wl
 from oracle import lemke, natural_residual
 from warp_lcp.gallery import semidefinite
-from warp_lcp.solvers.proximal_point import ProximalPoint
+from warp_lcp.solvers.phases import ProximalPoint
 
 METHODS = [wl.MinimumMapNewton(), wl.PrimalDualActiveSet()]
 NAMES = ["newton", "active-set"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar
 
 import warp as wp
@@ -72,15 +72,7 @@ class PetscActiveSet:
 
     def as_newton(self) -> MinimumMapNewton:
         """Return the method with these settings whose linear solves are our own."""
-        return MinimumMapNewton(
-            precision=self.precision,
-            monotone_cycles=self.monotone_cycles,
-            eta=self.eta,
-            max_linear_iterations=self.max_linear_iterations,
-            backtracks=self.backtracks,
-            memory=self.memory,
-            cycle=self.cycle,
-        )
+        return MinimumMapNewton(**{f.name: getattr(self, f.name) for f in fields(self) if f.name != "prefix"})
 
     def init(self, problem: LCP) -> KSPWorkspace:
         """Return a workspace.
@@ -95,10 +87,7 @@ class PetscActiveSet:
 
     def step(self, problem: LCP, work: KSPWorkspace, x: wp.array[Any]) -> Step:
         """Take a monotone cycle while the start is cold, else a safeguarded Newton step."""
-        if work.cycles_left > 0:
-            work.cycles_left -= 1
-            return work.monotone_cycle(x)
-        return work.newton_step(x)
+        return work.step(x)
 
 
 class KSPWorkspace(NewtonWorkspace):

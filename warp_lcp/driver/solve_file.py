@@ -18,7 +18,7 @@ from warp_lcp.nearest import nearest
 from warp_lcp.operators import DenseOperator, SparseOperator
 from warp_lcp.problem import LCP
 from warp_lcp.result import SolveResult
-from warp_lcp.solvers import default_method, solve
+from warp_lcp.solvers.default import default_method, solve
 from warp_lcp.solvers.registry import METHODS
 from warp_lcp.stopping import StoppingCriteria
 

@@ -16,7 +16,8 @@ from warp_lcp.gallery.recorded_part import cell_counts, load_part
 from warp_lcp.nearest import nearest
 from warp_lcp.operators import GridPoisson
 from warp_lcp.problem import LCP
-from warp_lcp.solvers import ProjectedMultigrid, solve
+from warp_lcp.solvers.default import solve
+from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 from warp_lcp.solvers.registry import METHODS
 
 if TYPE_CHECKING:

@@ -2,57 +2,25 @@
 """The quadratic B-spline kernel of each cell integrated over what solids leave open."""
 
 import itertools
-import typing
+from pathlib import Path
 
 import warp as wp
 
+from warp_lcp.grid.cell_kernel import F32, I8
 from warp_lcp.grid.cut_cells_kernels import CUT
 from warp_lcp.grid.staggered import CellRange, Window
-from warp_lcp.native import BLOCK, simd
+from warp_lcp.rows import RowPass
 
 options = {"enable_backward": False, "module": "warp_lcp.grid.capacity"}
 COLORS = 3  # along an axis: as many cells as a kernel reaches over
-_F32 = wp.array3d(dtype=wp.float32)
-_I8 = wp.array3d(dtype=wp.int8)
 
-# Over its own cell the kernel's integral is 2/3 along an axis, over either neighbor 1/6. Open cells only: cut ones follow.
-OPEN_ROW = """
-    const int nz = state_.shape[0], ny = state_.shape[1], nx = state_.shape[2];
-    const long long s2 = nx, s1 = s2*ny, row = k*s1 + j*s2;
-    const signed char* state = (const signed char*)state_.data; float* out = out_.data + row;
-    const float side = 1.0f/6.0f, middle = 2.0f/3.0f;
-    for (int start = first; start < last; start += M) {
-        const int n = last - start < M ? last - start : M;
-        float sum[M + 2];
-        const int from = start > 0 ? start - 1 : 0, end = start + n < nx ? start + n + 1 : nx;
-        for (int m = 0; m < n + 2; ++m) sum[m] = 0.0f;
-        for (int dk = planes == 2 ? -1 : 0; dk < planes; ++dk) {
-            if (k + dk < 0 || k + dk >= nz) continue;
-            for (int dj = -1; dj <= 1; ++dj) {
-                if (j + dj < 0 || j + dj >= ny) continue;
-                const float weight = (dj == 0 ? middle : side)*(planes == 1 ? 1.0f : (dk == 0 ? middle : side));
-                const signed char* line = state + row + dk*s1 + dj*s2;
-                SIMD for (int i = from; i < end; ++i) sum[i - start + 1] += line[i] == 1 ? weight : 0.0f;
-            }
-        }
-        SIMD for (int m = 0; m < n; ++m) out[start + m] = side*(sum[m] + sum[m + 2]) + middle*sum[m + 1];
-    }
-"""
-
-
-@wp.func_native(simd(BLOCK + OPEN_ROW))
-@typing.no_type_check
-def open_row(state_: _I8, out_: _F32, planes: int, k: int, j: int, first: int, last: int): ...
-
-
-@wp.kernel(**options)
-@typing.no_type_check
-def open_kernel(cells: CellRange, planes: int, state: _I8, capacity: _F32):
-    """Integrate over the open cells."""
-    plane, row, chunk = wp.tid()
-    first = cells.i + chunk * cells.grain
-    open_row(state, capacity, planes, cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end))
-
+OPEN_CELLS = RowPass(
+    "warp_lcp.grid.capacity.open_cells",
+    Path(__file__).parent / "headers" / "open_cells.h",
+    wp.float32,
+    box={"state": wp.int8, "capacity": wp.float32},
+    numbers={"planes": int},
+)
 
 # A cut cell adds to the kernels of the cells around it what is open of it: along the axis in which the distance changes most the open
 # interval of a line is known and so is the kernel's integral, cubic in the ends; across, three Gauss points (error for planes < 2e-4).
@@ -104,13 +72,11 @@ CUT_CELL = """
 
 
 @wp.func_native(CUT_CELL)
-@typing.no_type_check
-def cut_cell(near_: _F32, out_: _F32, planes: int, k: int, j: int, i: int): ...
+def cut_cell(near_: F32, out_: F32, planes: int, k: int, j: int, i: int): ...
 
 
 @wp.kernel(**options)
-@typing.no_type_check
-def cut_kernel(cells: CellRange, color: wp.vec3i, planes: int, near: _F32, state: _I8, capacity: _F32):
+def cut_kernel(cells: CellRange, color: wp.vec3i, planes: int, near: F32, state: I8, capacity: F32):
     """Integrate over every third cut cell along each axis, from cell (color[2], color[1], color[0]) of the box on.
 
     Cells add to their neighbors: those of one color have none in common, so nothing races and sums keep their order.
@@ -138,7 +104,7 @@ def integrate_kernel(
         origin: of a part of a grid, in which sums then keep the order that they have in all of it.
     """
     everywhere = Window((1, 0, 0) if planes == 1 else (0, 0, 0), (2 if planes == 1 else state.shape[0], *state.shape[1:]), window.device)
-    everywhere.launch(open_kernel, [planes, state, capacity])
+    everywhere.run(OPEN_CELLS, planes=planes, state=state, capacity=capacity)
     chunks = -(-(window.high[2] - window.low[2]) // window.cells.grain)
     for color in itertools.product(range(COLORS if planes == 2 else 1), range(COLORS), range(COLORS)):
         z, y, x = ((c - before) % COLORS for c, before in zip(color, reversed(origin), strict=True))

@@ -212,15 +212,16 @@ class CutCells:
         """Fill everything that follows from the distances."""
         grid, nodes = self.grid, self._nodes
         planes = grid.planes
-        faces = [*self.open, *self.open[1:2]][:3]
-        walls = [*self.wall, *self.wall[1:2]][:3]
+        faces = dict(zip(("ax", "ay", "az"), [*self.open, *self.open[1:2]], strict=False))  # in 2-D nothing is done to the third
+        walls = dict(zip(("wx", "wy", "wz"), [*self.wall, *self.wall[1:2]], strict=False))
+        nearest = dict(zip(("d", "o", "d2", "o2"), nodes.arrays, strict=True))
         self._counts.zero_()
         # the marks are in `base`, until the next kernel fills it
-        grid.domain.launch(kernels.fractions_kernel, [planes, *nodes.arrays, self.base, *faces, *walls, self._counts])
+        grid.domain.run(kernels.FRACTIONS, planes=planes, marks=self.base, counts=self._counts, **nearest, **faces, **walls)
         for number in range(2 * grid.dimension):
             if self.open_sides >> number & 1:
                 self._open_side(number >> 1, SIDES[number])
-        grid.domain.launch(kernels.states_kernel, [planes, nodes.near, *faces, self.base, self._state])
+        grid.domain.run(kernels.STATES, planes=planes, d=nodes.near, base=self.base, state=self._state, **faces)
         if self.capacity is not None:
             integrate_kernel(grid.domain, planes, nodes.near, self._state, self.capacity, grid.origin)
             continue_beyond(grid, self.open_sides, self.capacity)

@@ -89,8 +89,8 @@ class LevelSet:
         if self._filled is not None and (self._filled.low, self._filled.high) != (window.low, window.high):
             self._filled.launch(kernels.clear_kernel, [self.limit, self.phi, self._known])
         self._filled = window
-        inputs = [density, capacity, smooth, base, self._spread, self.limit, self.phi, self._known]
-        window.launch(kernels.distance_kernel, inputs)
+        found = {"phi": self.phi, "known": self._known, "spread": self._spread, "limit": self.limit}
+        window.run(kernels.DISTANCE, density=density, capacity=capacity, smooth=smooth, base=base, **found)
         if smooth is not None:
             shifted = next(field for field in self._scratch if field is not smooth)
             window.launch(kernels.wall_shift_kernel, [self._spread**2, self.limit, smooth, self.phi, self._known, shifted])
@@ -111,15 +111,15 @@ class LevelSet:
         if any(a >= b for a, b in zip(low, high, strict=True)):
             return 0.0
         box = Window((low[0], low[1], low[2]), (high[0], high[1], high[2]), grid.device)
-        inputs = [grid.planes, PARTS[grid.dimension], self.phi, self._known, distance, self._sums]
-        box.launch_rows(kernels.volume_kernel, inputs)
+        found = {"phi": self.phi, "known": self._known, "distance": distance, "sums": self._sums}
+        box.run(kernels.VOLUME, whole=True, **found, planes=grid.planes, parts=PARTS[grid.dimension])
         rows = self._sums.numpy()[low[0] : high[0], low[1] : high[1]]
         return float(np.sum(rows)) * grid.cell_volume
 
     def _smoothed(self, window: Window, source: wp.array, first: wp.array, second: wp.array) -> wp.array:
         """Return the source after the binomial passes; in one of two scratch fields."""
         for _ in range(self.smoothing):
-            window.launch(kernels.binomial_kernel, [self.grid.planes, source, first])
+            window.run(kernels.BINOMIAL, planes=self.grid.planes, source=source, out=first)
             source, first, second = first, second, first
         return source
 

@@ -6,14 +6,14 @@ filled up to s cells from its center holds, is a cubic in pieces: (s + 3/2)^3 / 
 G(-s) = 1 - G(s).
 """
 
-import typing
+from pathlib import Path
 
 import warp as wp
 
+from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
 from warp_lcp.grid.particle_loops import particle_loop
-from warp_lcp.grid.staggered import CellRange
-from warp_lcp.native import BLOCK, simd
 from warp_lcp.operators.grid_poisson import SOLID
+from warp_lcp.rows import RowPass
 
 # Of a cell's kernel: where less is open, too few particles fit to tell (one, of four a cell), and an empty wedge deep in the liquid would
 # count as air, into which the liquid falls. Such a cell is given its neighbors' distance.
@@ -96,144 +96,35 @@ GATHER = """
     density_.data[k*s1 + j*s2 + i] = each*total;
 """
 
-# One binomial pass (1, 2, 1)/4 along every axis; there is nothing outside the array.
-BINOMIAL = """
-    typedef float T;
-    const int nz = source_.shape[0], ny = source_.shape[1], nx = source_.shape[2];
-    const long long s2 = nx, s1 = s2*ny, at = k*s1 + j*s2;
-    const T* source = source_.data + at; T* out = out_.data + at;
-    const T wy[3] = {j > 0 ? (T)0.25 : (T)0, (T)0.5, j + 1 < ny ? (T)0.25 : (T)0};
-    const T wz[3] = {planes == 2 && k > 0 ? (T)0.25 : (T)0, planes == 2 ? (T)0.5 : (T)1, planes == 2 && k + 1 < nz ? (T)0.25 : (T)0};
-    T sum[M + 2];
-    for (int start = first; start < last; start += M) {
-        const int n = last - start < M ? last - start : (int)M;
-        const int low = start > 0 ? -1 : 0, high = start + n < nx ? n + 1 : n;
-        sum[0] = 0; sum[n + 1] = 0;
-        SIMD for (int m = low; m < high; ++m) sum[m + 1] = 0;
-        for (int c = 0; c < 3; ++c) for (int b = 0; b < 3; ++b) {
-            const T w = wz[c]*wy[b];
-            if (w == 0) continue;
-            const T* row = source + ((c - 1)*s1 + (b - 1)*s2 + start);
-            SIMD for (int m = low; m < high; ++m) sum[m + 1] += w*row[m];
-        }
-        SIMD for (int m = 0; m < n; ++m) out[start + m] = (T)0.5*sum[m + 1] + (T)0.25*(sum[m] + sum[m + 2]);
-    }
-"""
-
-# phi = -G^-1(filled), or the normal distribution's quantile after smoothing; a cell without a share of its own is marked to be filled
-DISTANCE = """
-    typedef float T;
-    const long long s2 = phi_.shape[2], s1 = s2*phi_.shape[1], at = k*s1 + j*s2;
-    T ones[M], share[M];
-    for (int m = 0; m < M; ++m) ones[m] = 1;
-    // the cube root of 0 <= v <= 1: a third of the exponent, then Newton
-    auto root = [](T v) {
-        union { float f; int i; } bits; bits.f = v;
-        bits.i = bits.i/3 + 709921077;
-        T y = bits.f;
-        for (int n = 0; n < 3; ++n) y = ((T)2*y + v/(y*y))*(T)(1.0/3);
-        return y;
-    };
-    auto outer = [&](T q) { return root((T)6*q) - (T)1.5; };  // G^-1 up to 1/6
-    auto inner = [](T q) {  // and up to 1/2
-        T s = (q - (T)0.5)*(T)(4.0/3);
-        for (int n = 0; n < 3; ++n) s -= ((T)0.5 + s*((T)0.75 - s*s*(T)(1.0/3)) - q)/((T)0.75 - s*s);
-        return s;
-    };
-    for (int start = first; start < last; start += M) {
-        const int n = last - start < M ? last - start : (int)M;
-        const T* density = density_.data + at + start; const signed char* base = (const signed char*)base_.data + at + start;
-        const T* raw = capacity_.data ? capacity_.data + at + start : ones; const T* full = smooth_.data ? smooth_.data + at + start : raw;
-        T* phi = phi_.data + at + start; signed char* known = (signed char*)known_.data + at + start;
-        SIMD for (int m = 0; m < n; ++m) {
-            const int has = (base[m] != SOLID) & (raw[m] > (T)MIN_CAPACITY);
-            const T c = full[m] > (T)1e-3 ? full[m] : (T)1e-3, f = density[m]/c;
-            share[m] = has ? (f < 1 ? f : (T)1) : (T)0;
-            known[m] = has ? 1 : 0;
-        }
-        if (spread > 0) {
-            for (int m = 0; m < n; ++m) {
-                const T f = share[m];
-                phi[m] = f < (T)TAIL ? limit : (f > (T)(1 - TAIL) ? -limit : -spread*(T)1.41421356*erfinvf(2*f - 1));
-            }
-            continue;
-        }
-        SIMD for (int m = 0; m < n; ++m) {
-            const T f = share[m], q = f < (T)0.5 ? f : 1 - f, a = outer(q), b = inner(q);
-            const T s = q < (T)(1.0/6) ? a : b;
-            const T air = -s < limit ? -s : limit, wet = s > -limit ? s : -limit;
-            phi[m] = f < (T)0.5 ? air : wet;
-        }
-    }
-"""
+_LEVEL_SET, _HEADERS = "warp_lcp.grid.level_set", Path(__file__).parent / "headers"
+_CONSTANTS = {"MIN_CAPACITY": MIN_CAPACITY, "TAIL": TAIL, "SOLID": SOLID}
+_PHI = {"phi": wp.float32, "known": wp.int8}
+BINOMIAL = RowPass(
+    f"{_LEVEL_SET}.binomial", _HEADERS / "binomial.h", wp.float32, box={"source": wp.float32, "out": wp.float32}, numbers={"planes": int}
+)
+DISTANCE = RowPass(
+    f"{_LEVEL_SET}.distance",
+    _HEADERS / "level_set_distance.h",
+    wp.float32,
+    box=_PHI | {"density": wp.float32, "capacity": wp.float32, "smooth": wp.float32, "base": wp.int8},
+    numbers={"spread": wp.float32, "limit": wp.float32},
+    optional=("capacity", "smooth"),
+    constants=_CONSTANTS,
+)
+VOLUME = RowPass(
+    f"{_LEVEL_SET}.volume",
+    _HEADERS / "volume.h",
+    wp.float32,
+    box=_PHI | {"distance": wp.float32},
+    whole={"sums": wp.float64},
+    numbers={"planes": int, "parts": int},
+    optional=("distance",),
+)
 
 
-# Cells that neither surface can cross are counted whole. In the others phi between cell centers and the distance between nodes are
-# multilinear, and each of `parts` points an axis stands for its part of the cell, filled as far as a plane at that distance fills it.
-VOLUME = """
-    typedef float T;
-    const long long s2 = phi_.shape[2], s1 = s2*phi_.shape[1], at = k*s1 + j*s2;
-    const T* phi = phi_.data + at; const signed char* known = (const signed char*)known_.data + at;
-    const T* node = distance_.data ? distance_.data + at : phi;
-    const bool walls = distance_.data != nullptr, deep = planes == 2;
-    auto smaller = [](T a, T b) { return a < b ? a : b; };
-    auto larger = [](T a, T b) { return a < b ? b : a; };
-    T low[M + 2], high[M + 2], near[M + 1], far[M + 1];
-    double total = 0;
-    for (int start = first; start < last; start += M) {
-        const int n = last - start < M ? last - start : (int)M;
-        SIMD for (int m = 0; m < n + 2; ++m) { low[m] = phi[start + m - 1]; high[m] = phi[start + m - 1]; }
-        for (int c = deep ? -1 : 0; c <= (deep ? 1 : 0); ++c) for (int b = -1; b <= 1; ++b) {
-            const T* row = phi + (c*s1 + b*s2 + start - 1);
-            SIMD for (int m = 0; m < n + 2; ++m) { low[m] = smaller(low[m], row[m]); high[m] = larger(high[m], row[m]); }
-        }
-        SIMD for (int m = 0; m < n + 1; ++m) { near[m] = walls ? node[start + m] : (T)1; far[m] = near[m]; }
-        for (int c = 0; walls && c <= (deep ? 1 : 0); ++c) for (int b = 0; b <= 1; ++b) {
-            const T* row = node + (c*s1 + b*s2 + start);
-            SIMD for (int m = 0; m < n + 1; ++m) { near[m] = smaller(near[m], row[m]); far[m] = larger(far[m], row[m]); }
-        }
-        for (int m = 0; m < n; ++m) {
-            const int i = start + m;
-            const T least = smaller(low[m], smaller(low[m + 1], low[m + 2])), most = larger(high[m], larger(high[m + 1], high[m + 2]));
-            const bool shut = walls ? larger(far[m], far[m + 1]) <= 0 : known[i] != 1;
-            if (least >= 0 || shut) continue;
-            const bool clear = smaller(near[m], near[m + 1]) >= 0;
-            if (most < 0 && clear) { total += 1; continue; }
-            const T step = (T)1/(T)parts;
-            T sum = 0;
-            for (int c = 0; c < (deep ? parts : 1); ++c) for (int b = 0; b < parts; ++b) for (int a = 0; a < parts; ++a) {
-                const T x = ((T)a + (T)0.5)*step, y = ((T)b + (T)0.5)*step, z = deep ? ((T)c + (T)0.5)*step : (T)0.5;
-                auto between = [&](const T* f, T tx, T ty, T tz) {
-                    const long long up = deep ? s1 : 0;
-                    const T p = f[0] + tx*(f[1] - f[0]), q = f[s2] + tx*(f[s2 + 1] - f[s2]);
-                    const T r = f[up] + tx*(f[up + 1] - f[up]), s = f[up + s2] + tx*(f[up + s2 + 1] - f[up + s2]);
-                    const T l = p + ty*(q - p), h = r + ty*(s - r);
-                    return l + tz*(h - l);
-                };
-                const T hx = x < (T)0.5 ? x + (T)0.5 : x - (T)0.5, hy = y < (T)0.5 ? y + (T)0.5 : y - (T)0.5;
-                const T hz = z < (T)0.5 ? z + (T)0.5 : z - (T)0.5;
-                const long long corner = i - (x < (T)0.5 ? 1 : 0) - (y < (T)0.5 ? s2 : 0) - (deep && z < (T)0.5 ? s1 : 0);
-                const T wet = (T)0.5 - between(phi + corner, hx, hy, hz)*(T)parts;
-                const T open = clear ? (T)1 : (T)0.5 + between(node + i, x, y, z)*(T)parts;
-                sum += smaller(larger(wet, 0), 1)*smaller(larger(open, 0), 1);
-            }
-            total += (double)(sum*step*step*(deep ? step : (T)1));
-        }
-    }
-    sums_.data[k*phi_.shape[1] + j] = total;
-"""
-
-
-def _filled(source: str) -> str:
-    """Return a source with its constants and lambdas."""
-    for name, value in (("MIN_CAPACITY", repr(MIN_CAPACITY)), ("TAIL", repr(TAIL)), ("SOLID", str(SOLID)), ("WEIGHTS", WEIGHTS)):
-        source = source.replace(name, value)
-    return source
-
-
-@wp.func_native(particle_loop(_filled(SCATTER)))
+@wp.func_native(particle_loop(SCATTER.replace("WEIGHTS", WEIGHTS)))
 def scatter_some(
-    planes: int, inverse_dx: float, origin: wp.vec3i, each: float, x_: wp.array(dtype=wp.vec3), density_: wp.array3d(dtype=wp.float32),
+    planes: int, inverse_dx: float, origin: wp.vec3i, each: float, x_: wp.array(dtype=wp.vec3), density_: F32,
     first: int, last: int,
 ): ...  # fmt: skip
 
@@ -241,76 +132,30 @@ def scatter_some(
 @wp.func_native(particle_loop(GATHER))
 def gather_cell(
     planes: int, inverse_dx: float, origin: wp.vec3i, each: float, offsets: wp.array(dtype=wp.int32), x_: wp.array(dtype=wp.vec3),
-    density_: wp.array3d(dtype=wp.float32), k: int, j: int, i: int,
-): ...  # fmt: skip
-
-
-@wp.func_native(simd(BLOCK + BINOMIAL))
-def binomial_row(
-    planes: int, source_: wp.array3d(dtype=wp.float32), out_: wp.array3d(dtype=wp.float32), k: int, j: int, first: int, last: int
-): ...
-
-
-@wp.func_native(simd(BLOCK + _filled(DISTANCE)))
-def distance_row(
-    density_: wp.array3d(dtype=wp.float32), capacity_: wp.array3d(dtype=wp.float32), smooth_: wp.array3d(dtype=wp.float32),
-    base_: wp.array3d(dtype=wp.int8), spread: float, limit: float, phi_: wp.array3d(dtype=wp.float32), known_: wp.array3d(dtype=wp.int8),
-    k: int, j: int, first: int, last: int,
-): ...  # fmt: skip
-
-
-@wp.func_native(simd(BLOCK + VOLUME))
-def volume_row(
-    planes: int, parts: int, phi_: wp.array3d(dtype=wp.float32), known_: wp.array3d(dtype=wp.int8),
-    distance_: wp.array3d(dtype=wp.float32), sums_: wp.array2d(dtype=wp.float64), k: int, j: int, first: int, last: int,
+    density_: F32, k: int, j: int, i: int,
 ): ...  # fmt: skip
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.density")
 def scatter_kernel(
     count: int, grain: int, planes: int, inverse_dx: float, origin: wp.vec3i, each: float, position: wp.array(dtype=wp.vec3),
-    density: wp.array3d(dtype=wp.float32),
+    density: F32,
 ):  # fmt: skip
     """Add the share of some particles to the cells around them."""
     first = wp.tid() * grain
     scatter_some(planes, inverse_dx, origin, each, position, density, first, wp.min(first + grain, count))
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.density")
+@cell_kernel("warp_lcp.grid.density")
 def gather_kernel(
-    cells: CellRange, planes: int, inverse_dx: float, origin: wp.vec3i, each: float, offsets: wp.array(dtype=wp.int32),
-    position: wp.array(dtype=wp.vec3), density: wp.array3d(dtype=wp.float32),
+    k, j, i, planes: int, inverse_dx: float, origin: wp.vec3i, each: float, offsets: wp.array(dtype=wp.int32),
+    position: wp.array(dtype=wp.vec3), density: F32,
 ):  # fmt: skip
     """Let each cell add up the particles around it."""
-    plane, row, chunk = wp.tid()
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        gather_cell(planes, inverse_dx, origin, each, offsets, position, density, cells.k + plane, cells.j + row, i)
-
-
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.level_set")
-def binomial_kernel(cells: CellRange, planes: int, source: wp.array3d(dtype=wp.float32), out: wp.array3d(dtype=wp.float32)):
-    """Smooth a field once."""
-    plane, row, chunk = wp.tid()
-    first = cells.i + chunk * cells.grain
-    binomial_row(planes, source, out, cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end))
-
-
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.level_set")
-def distance_kernel(
-    cells: CellRange, density: wp.array3d(dtype=wp.float32), capacity: wp.array3d(dtype=wp.float32),
-    smooth: wp.array3d(dtype=wp.float32), base: wp.array3d(dtype=wp.int8), spread: float, limit: float,
-    phi: wp.array3d(dtype=wp.float32), known: wp.array3d(dtype=wp.int8),
-):  # fmt: skip
-    """Turn filled shares into distances."""
-    plane, row, chunk = wp.tid()
-    first = cells.i + chunk * cells.grain
-    last = wp.min(first + cells.grain, cells.end)
-    distance_row(density, capacity, smooth, base, spread, limit, phi, known, cells.k + plane, cells.j + row, first, last)
+    gather_cell(planes, inverse_dx, origin, each, offsets, position, density, k, j, i)
 
 
 @wp.func
-@typing.no_type_check
 def slope_beside(here: float, below: float, above: float, has_below: bool, has_above: bool):
     """Return the central difference, or the one-sided one where only one neighbor has a value."""
     if has_below and has_above:
@@ -322,98 +167,64 @@ def slope_beside(here: float, below: float, above: float, has_below: bool, has_a
     return 0.0
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.level_set")
-@typing.no_type_check
+@cell_kernel("warp_lcp.grid.level_set")
 def wall_shift_kernel(
-    cells: CellRange, variance: float, limit: float, capacity: wp.array3d(dtype=wp.float32), phi: wp.array3d(dtype=wp.float32),
-    known: wp.array3d(dtype=wp.int8), out: wp.array3d(dtype=wp.float32),
+    k, j, i, variance: float, limit: float, capacity: F32, phi: F32,
+    known: I8, out: F32,
 ):  # fmt: skip
     """Bring phi from the mean place of the open part of a cell's kernel back to the cell's center.
 
     A wall cuts a part off the kernel, so that what remains measures the liquid at c + s, s = integral of (x - c) K over the open part by
     its capacity. For a Gaussian of that variance s = variance grad(capacity) / capacity; hence phi - s . grad(phi).
     """
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
     one = wp.int8(1)
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        here = phi[k, j, i]
-        value = here
-        c = capacity[k, j, i]
-        inside = k > 0 and j > 0 and i > 0 and k + 1 < phi.shape[0] and j + 1 < phi.shape[1] and i + 1 < phi.shape[2]
-        if inside and known[k, j, i] == one and c < 0.999 and wp.abs(here) < 0.98 * limit:
-            gx = slope_beside(here, phi[k, j, i - 1], phi[k, j, i + 1], known[k, j, i - 1] == one, known[k, j, i + 1] == one)
-            gy = slope_beside(here, phi[k, j - 1, i], phi[k, j + 1, i], known[k, j - 1, i] == one, known[k, j + 1, i] == one)
-            gz = slope_beside(here, phi[k - 1, j, i], phi[k + 1, j, i], known[k - 1, j, i] == one, known[k + 1, j, i] == one)
-            grad = wp.vec3(gx, gy, gz) / wp.max(wp.length(wp.vec3(gx, gy, gz)), 1.0)
-            s = 0.5 * wp.vec3(
-                capacity[k, j, i + 1] - capacity[k, j, i - 1],
-                capacity[k, j + 1, i] - capacity[k, j - 1, i],
-                capacity[k + 1, j, i] - capacity[k - 1, j, i],
-            )
-            if phi.shape[0] == 3:
-                s[2] = 0.0
-            s = s * (variance / wp.max(c, 1e-3))
-            s = s / wp.max(wp.length(s), 1.0)
-            value = wp.clamp(here - wp.dot(s, grad), -limit, limit)
-        out[k, j, i] = value
+    here = phi[k, j, i]
+    value = here
+    c = capacity[k, j, i]
+    inside = k > 0 and j > 0 and i > 0 and k + 1 < phi.shape[0] and j + 1 < phi.shape[1] and i + 1 < phi.shape[2]
+    if inside and known[k, j, i] == one and c < 0.999 and wp.abs(here) < 0.98 * limit:
+        gx = slope_beside(here, phi[k, j, i - 1], phi[k, j, i + 1], known[k, j, i - 1] == one, known[k, j, i + 1] == one)
+        gy = slope_beside(here, phi[k, j - 1, i], phi[k, j + 1, i], known[k, j - 1, i] == one, known[k, j + 1, i] == one)
+        gz = slope_beside(here, phi[k - 1, j, i], phi[k + 1, j, i], known[k - 1, j, i] == one, known[k + 1, j, i] == one)
+        grad = wp.vec3(gx, gy, gz) / wp.max(wp.length(wp.vec3(gx, gy, gz)), 1.0)
+        s = 0.5 * wp.vec3(
+            capacity[k, j, i + 1] - capacity[k, j, i - 1],
+            capacity[k, j + 1, i] - capacity[k, j - 1, i],
+            capacity[k + 1, j, i] - capacity[k - 1, j, i],
+        )
+        if phi.shape[0] == 3:
+            s[2] = 0.0
+        s = s * (variance / wp.max(c, 1e-3))
+        s = s / wp.max(wp.length(s), 1.0)
+        value = wp.clamp(here - wp.dot(s, grad), -limit, limit)
+    out[k, j, i] = value
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.level_set")
-@typing.no_type_check
-def copy_kernel(cells: CellRange, source: wp.array3d(dtype=wp.float32), out: wp.array3d(dtype=wp.float32)):
+@cell_kernel("warp_lcp.grid.level_set")
+def copy_kernel(k, j, i, source: F32, out: F32):
     """Copy a field."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        out[k, j, i] = source[k, j, i]
+    out[k, j, i] = source[k, j, i]
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.level_set")
-@typing.no_type_check
-def clear_kernel(cells: CellRange, limit: float, phi: wp.array3d(dtype=wp.float32), known: wp.array3d(dtype=wp.int8)):
+@cell_kernel("warp_lcp.grid.level_set")
+def clear_kernel(k, j, i, limit: float, phi: F32, known: I8):
     """Forget what an earlier update left: air."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        phi[k, j, i] = limit
-        known[k, j, i] = wp.int8(0)
+    phi[k, j, i] = limit
+    known[k, j, i] = wp.int8(0)
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.level_set")
-@typing.no_type_check
-def whole_cell_capacity_kernel(cells: CellRange, planes: int, base: wp.array3d(dtype=wp.int8), capacity: wp.array3d(dtype=wp.float32)):
+@cell_kernel("warp_lcp.grid.level_set")
+def whole_cell_capacity_kernel(k, j, i, planes: int, base: I8, capacity: F32):
     """Add up the shares 1/6, 2/3, 1/6 of a cell's kernel that lie in the open cells around it."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        total = float(0.0)
-        for c in range(wp.max(k - planes + 1, 0), wp.min(k + planes, base.shape[0])):
-            for b in range(wp.max(j - 1, 0), wp.min(j + 2, base.shape[1])):
-                for a in range(wp.max(i - 1, 0), wp.min(i + 2, base.shape[2])):
-                    if base[c, b, a] != wp.int8(SOLID):
-                        w = float(1.0)
-                        w *= wp.where(a == i, 2.0 / 3.0, 1.0 / 6.0)
-                        w *= wp.where(b == j, 2.0 / 3.0, 1.0 / 6.0)
-                        if planes == 2:
-                            w *= wp.where(c == k, 2.0 / 3.0, 1.0 / 6.0)
-                        total += w
-        capacity[k, j, i] = total
-
-
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.volume")
-def volume_kernel(
-    cells: CellRange, planes: int, parts: int, phi: wp.array3d(dtype=wp.float32), known: wp.array3d(dtype=wp.int8),
-    distance: wp.array3d(dtype=wp.float32), sums: wp.array2d(dtype=wp.float64),
-):  # fmt: skip
-    """Add up a row of cells [cells]; one thread a row."""
-    plane, row = wp.tid()
-    volume_row(planes, parts, phi, known, distance, sums, cells.k + plane, cells.j + row, cells.i, cells.end)
+    total = float(0.0)
+    for c in range(wp.max(k - planes + 1, 0), wp.min(k + planes, base.shape[0])):
+        for b in range(wp.max(j - 1, 0), wp.min(j + 2, base.shape[1])):
+            for a in range(wp.max(i - 1, 0), wp.min(i + 2, base.shape[2])):
+                if base[c, b, a] != wp.int8(SOLID):
+                    w = float(1.0)
+                    w *= wp.where(a == i, 2.0 / 3.0, 1.0 / 6.0)
+                    w *= wp.where(b == j, 2.0 / 3.0, 1.0 / 6.0)
+                    if planes == 2:
+                        w *= wp.where(c == k, 2.0 / 3.0, 1.0 / 6.0)
+                    total += w
+    capacity[k, j, i] = total

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import warp as wp
@@ -51,13 +52,13 @@ class MarchingCubes:
         high = (2 if grid.dimension == 2 else grid.shape[0] - 1, grid.shape[1] - 1, grid.shape[2] - 1)
         cells = Window(low, high, device)  # between the centers of cells and of their upper neighbors
         counts = [wp.empty(cells.rows, dtype=wp.int32, device=device) for _ in range(2)]
-        cells.launch_rows(kernels.count_kernel, [grid.planes, phi, self._table, *counts])
+        run = functools.partial(cells.run, whole=True, phi=phi, planes=grid.planes)
+        run(kernels.COUNT, table=self._table, owned=counts[0], made=counts[1])
         ends = [wp.empty(count.size, dtype=wp.int32, device=device) for count in counts]
         for count, end in zip(counts, ends, strict=True):
             wp.utils.array_scan(count.flatten(), end, inclusive=True)
         points, corners = (int(end[-1:].numpy()[0]) for end in ends)
         mesh = Mesh(wp.empty(points, dtype=wp.vec3, device=device), wp.empty((corners, grid.dimension), dtype=wp.int32, device=device))
-        behind = [end.reshape(cells.rows) for end in ends]
-        cells.launch_rows(kernels.point_kernel, [grid.planes, grid.spacing, phi, counts[0], behind[0], number, mesh.points])
-        cells.launch_rows(kernels.corner_kernel, [grid.planes, phi, self._table, counts[1], behind[1], number, mesh.corners])
+        run(kernels.POINTS, dx=grid.spacing, number=number, counts=counts[0], ends=ends[0], into=mesh.points)
+        run(kernels.CORNERS, table=self._table, number=number, counts=counts[1], ends=ends[1], into=mesh.corners)
         return mesh

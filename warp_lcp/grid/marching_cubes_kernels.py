@@ -4,154 +4,24 @@
 A point belongs to the node at the low end of its edge; a node's points are numbered x, y, z from the number that the node keeps.
 """
 
-import typing
+from pathlib import Path
+from typing import Any
 
 import warp as wp
 
-from warp_lcp.grid.staggered import CellRange
-from warp_lcp.native import BLOCK, simd
+from warp_lcp.rows import RowPass
 
 CLOSEST = 0.01  # of an edge: how near to its end a point may come, so that no triangle shrinks to nothing
 
-# The cases of the cells of a block, and whether any of them has a surface; `visit` gets each that has one. In 2-D the nodes above are
-# those below: no edge along z is cut.
-CASES = """
-    const long long s2 = phi_.shape[2], s1 = s2*phi_.shape[1], at = k*s1 + j*s2, up = planes == 2 ? s1 : 0;
-    auto each = [&](auto visit) {
-        unsigned char cases[M];
-        for (int start = first; start < last; start += M) {
-            const int n = last - start < M ? last - start : (int)M;
-            const float* a = phi_.data + at + start; const float* b = a + s2; const float* c = a + up; const float* d = b + up;
-            unsigned char any = 0;
-            SIMD for (int m = 0; m < n; ++m) {
-                const unsigned char code = (unsigned char)((a[m] < 0) | (a[m + 1] < 0) << 1 | (b[m] < 0) << 2 | (b[m + 1] < 0) << 3
-                    | (c[m] < 0) << 4 | (c[m + 1] < 0) << 5 | (d[m] < 0) << 6 | (d[m + 1] < 0) << 7);
-                cases[m] = code;
-                any |= (unsigned char)((code != 0) & (code != 255));
-            }
-            if (!any) continue;
-            for (int m = 0; m < n; ++m) if (cases[m] != 0 && cases[m] != 255) visit(start + m, (int)cases[m]);
-        }
-    };
-    const long long wide = planes == 2 ? 16 : 5;
-    const int mask = planes == 2 ? 255 : 15;
-"""
-
-COUNT = """
-    int points = 0, elements = 0;
-    each([&](int i, int code) {
-        const int here = code & 1;
-        points += (here ^ (code >> 1 & 1)) + (here ^ (code >> 2 & 1)) + (here ^ (code >> 4 & 1));
-        elements += ((const signed char*)table_.data)[(code & mask)*wide];
-    });
-    points_.data[k_row*points_.shape[1] + j_row] = points;
-    elements_.data[k_row*points_.shape[1] + j_row] = elements;
-"""
-
-# Edges along a side of the domain, half a cell from it, count as if they were on it: the surface meets a wall on the wall, in a sharp edge.
-# What closes it there, the points between the nodes beside a side and the ring, lies on the side too, just off the sides' common edges.
-POINT = """
-    float* out = (float*)out_.data;
-    int next = ends_.data[k_row*ends_.shape[1] + j_row] - counts_.data[k_row*ends_.shape[1] + j_row];
-    const int most[3] = {(int)phi_.shape[2] - 2, (int)phi_.shape[1] - 2, (int)phi_.shape[0] - 2};
-    auto place = [&](int axis, int c, float inset) {
-        const int n = most[axis];
-        if (n == 1 || (c > 1 && c < n)) return (float)c - 0.5f;
-        return c <= 1 ? inset : (float)n - inset;
-    };
-    each([&](int i, int code) {
-        const int here = code & 1;
-        const int cut[3] = {here ^ (code >> 1 & 1), here ^ (code >> 2 & 1), here ^ (code >> 4 & 1)}, at_node[3] = {i, j, k};
-        const long long step[3] = {1, s2, up}, node = at + i;
-        number_.data[node] = next;
-        for (int axis = 0; axis < 3; ++axis) {
-            if (!cut[axis]) continue;
-            const int c = at_node[axis], n = most[axis];
-            const bool side = c == 0 || c == n;
-            const float a = phi_.data[node], b = phi_.data[node + step[axis]];
-            float t = a/(a - b), x[3];
-            t = t > (float)CLOSEST ? (t < (float)(1 - CLOSEST) ? t : (float)(1 - CLOSEST)) : (float)CLOSEST;
-            for (int d = 0; d < 3; ++d) x[d] = place(d, at_node[d], side ? (float)CLOSEST : 0.0f);
-            x[axis] = side ? (c == 0 ? 0.0f : (float)n) : (float)c - 0.5f + t;
-            for (int d = 0; d < 3; ++d) out[3*next + d] = d == 2 && planes == 1 ? 0.0f : dx*x[d];
-            ++next;
-        }
-    });
-"""
-
-CORNER = """
-    const int size = planes + 1;
-    int* out = out_.data;
-    long long next = (long long)size*(ends_.data[k_row*ends_.shape[1] + j_row] - counts_.data[k_row*ends_.shape[1] + j_row]);
-    each([&](int i, int code) {
-        const signed char* row = (const signed char*)table_.data + (code & mask)*wide;
-        for (int n = 0; n < size*row[0]; ++n) {
-            const int edge = row[1 + n], axis = edge/4, b = edge%4;
-            // the low end of the edge: b's two bits are the other two axes, the lower first
-            const int x = axis == 0 ? 0 : b & 1, y = axis == 0 ? b & 1 : (axis == 1 ? 0 : b >> 1), z = axis == 2 ? 0 : b >> 1;
-            const long long node = at + i + x + y*s2 + z*up;
-            const float* phi = phi_.data + node;
-            const bool here = phi[0] < 0;
-            out[next++] = number_.data[node] + (axis > 0 && here != (phi[1] < 0)) + (axis > 1 && here != (phi[s2] < 0));
-        }
-    });
-"""
-
-_F32, _I32, _I8 = wp.array3d(dtype=wp.float32), wp.array2d(dtype=wp.int32), wp.array2d(dtype=wp.int8)
-_options = {"enable_backward": False, "module": "warp_lcp.grid.marching_cubes"}
+_I32, _ROWS = wp.int32, {"ends": wp.int32, "counts": wp.int32}
 
 
-def _filled(source: str) -> str:
-    return simd(BLOCK + CASES + source.replace("CLOSEST", repr(CLOSEST)))
+def _made(name: str, box: dict[str, Any], numbers: dict[str, Any], by_row: dict[str, Any], **whole: Any) -> RowPass:
+    box, numbers, constants = {"phi": wp.float32} | box, {"planes": int} | numbers, {"CLOSEST": CLOSEST}
+    area, path = "warp_lcp.grid.marching_cubes", Path(__file__).parent / "headers" / f"cube_{name}.h"
+    return RowPass(f"{area}.{name}", path, wp.float32, box=box, numbers=numbers, by_row=by_row, whole=whole, constants=constants)
 
 
-@wp.func_native(_filled(COUNT))
-@typing.no_type_check
-def count_row(
-    planes: int, phi_: _F32, table_: _I8, points_: _I32, elements_: _I32, k_row: int, j_row: int, k: int, j: int, first: int, last: int
-): ...
-
-
-@wp.func_native(_filled(POINT))
-@typing.no_type_check
-def point_row(
-    planes: int, dx: float, phi_: _F32, counts_: _I32, ends_: _I32, number_: wp.array3d(dtype=wp.int32), out_: wp.array(dtype=wp.vec3),
-    k_row: int, j_row: int, k: int, j: int, first: int, last: int,
-): ...  # fmt: skip
-
-
-@wp.func_native(_filled(CORNER))
-@typing.no_type_check
-def corner_row(
-    planes: int, phi_: _F32, table_: _I8, counts_: _I32, ends_: _I32, number_: wp.array3d(dtype=wp.int32), out_: _I32,
-    k_row: int, j_row: int, k: int, j: int, first: int, last: int,
-): ...  # fmt: skip
-
-
-@wp.kernel(**_options)
-@typing.no_type_check
-def count_kernel(cells: CellRange, planes: int, phi: _F32, table: _I8, points: _I32, elements: _I32):
-    """Count the points that a row's nodes own and the triangles of its cells."""
-    plane, row = wp.tid()
-    count_row(planes, phi, table, points, elements, plane, row, cells.k + plane, cells.j + row, cells.i, cells.end)
-
-
-@wp.kernel(**_options)
-@typing.no_type_check
-def point_kernel(
-    cells: CellRange, planes: int, dx: float, phi: _F32, counts: _I32, ends: _I32, number: wp.array3d(dtype=wp.int32),
-    out: wp.array(dtype=wp.vec3),
-):  # fmt: skip
-    """Place the points of a row's nodes, and number the nodes that have any."""
-    plane, row = wp.tid()
-    point_row(planes, dx, phi, counts, ends, number, out, plane, row, cells.k + plane, cells.j + row, cells.i, cells.end)
-
-
-@wp.kernel(**_options)
-@typing.no_type_check
-def corner_kernel(
-    cells: CellRange, planes: int, phi: _F32, table: _I8, counts: _I32, ends: _I32, number: wp.array3d(dtype=wp.int32), out: _I32
-):
-    """Write the triangles of a row's cells."""
-    plane, row = wp.tid()
-    corner_row(planes, phi, table, counts, ends, number, out, plane, row, cells.k + plane, cells.j + row, cells.i, cells.end)
+COUNT = _made("count", {}, {}, {"owned": _I32, "made": _I32}, table=wp.int8)
+POINTS = _made("points", {"number": _I32}, {"dx": wp.float32}, _ROWS, into=wp.vec3)
+CORNERS = _made("corners", {"number": _I32}, {}, _ROWS, table=wp.int8, into=_I32)

@@ -1,11 +1,9 @@
 # mypy: ignore-errors
 """Distances of solids at nodes, and the cells that only their centers tell about."""
 
-import typing
-
 import warp as wp
 
-from warp_lcp.grid.staggered import CellRange
+from warp_lcp.grid.cell_kernel import F32, I8, I16, cell_kernel
 
 FAR = 4.0  # cells: distances below it are exact, others at least this large
 COARSE = 3  # nodes along an axis of a block in which one distance may stand for all
@@ -13,9 +11,6 @@ ROUNDING = 1.0e-3  # cells: signs this near to 0 are not relied on
 HOLLOW = 1  # a mark of cells with distance 0 at all corners whose center is open: one cell wide gaps
 
 options = {"enable_backward": False, "module": "warp_lcp.grid.node_distance"}
-_F32 = wp.array3d(dtype=wp.float32)
-_I16 = wp.array3d(dtype=wp.int16)
-_I8 = wp.array3d(dtype=wp.int8)
 
 
 @wp.struct
@@ -32,7 +27,6 @@ class NodeBlock:
 
 
 @wp.func
-@typing.no_type_check
 def first_node(block: NodeBlock, item: int):
     """Return the low node (x, y, z) of an item of a block."""
     across = block.counts[0]
@@ -43,7 +37,6 @@ def first_node(block: NodeBlock, item: int):
 
 
 @wp.func
-@typing.no_type_check
 def node_position(block: NodeBlock, node: wp.vec3i, offset: float):
     """Return the place [m] of a node, moved by `offset` cells along each axis; 2-D has z = 0."""
     z = (float(block.origin[2] + node[2] - 1) + offset) * block.spacing
@@ -54,8 +47,7 @@ def node_position(block: NodeBlock, node: wp.vec3i, offset: float):
 
 
 @wp.func
-@typing.no_type_check
-def enter(node: wp.vec3i, d: float, solid: int, near: _F32, owner: _I16, next_near: _F32, next_owner: _I16):
+def enter(node: wp.vec3i, d: float, solid: int, near: F32, owner: I16, next_near: F32, next_owner: I16):
     """Enter a solid's distance d [cells] at a node among the two nearest; of solids equally near the first stays."""
     k = node[2]
     j = node[1]
@@ -71,7 +63,6 @@ def enter(node: wp.vec3i, d: float, solid: int, near: _F32, owner: _I16, next_ne
 
 
 @wp.func
-@typing.no_type_check
 def snapped(meters: float, spacing: float, snap: float):
     """Return a distance in cells; within `snap` of 0 it is 0, so that walls on faces stay there."""
     d = meters / spacing
@@ -81,7 +72,6 @@ def snapped(meters: float, spacing: float, snap: float):
 
 
 @wp.kernel(**options)
-@typing.no_type_check
 def item_points(block: NodeBlock, out: wp.array(dtype=wp.vec3)):
     """Fill the places [m] of the items of a block: nodes, or the middles of groups of nodes."""
     c = wp.tid()
@@ -89,16 +79,15 @@ def item_points(block: NodeBlock, out: wp.array(dtype=wp.vec3)):
 
 
 @wp.kernel(**options)
-@typing.no_type_check
 def claim_nodes(
     block: NodeBlock,
     distance: wp.array(dtype=wp.float32),
     snap: float,
     solid: int,
-    near: _F32,
-    owner: _I16,
-    next_near: _F32,
-    next_owner: _I16,
+    near: F32,
+    owner: I16,
+    next_near: F32,
+    next_owner: I16,
 ):
     """Enter the distances [m] of a solid at a block of nodes."""
     c = wp.tid()
@@ -106,15 +95,14 @@ def claim_nodes(
 
 
 @wp.kernel(**options)
-@typing.no_type_check
 def claim_groups(
     block: NodeBlock,
     distance: wp.array(dtype=wp.float32),
     solid: int,
-    near: _F32,
-    owner: _I16,
-    next_near: _F32,
-    next_owner: _I16,
+    near: F32,
+    owner: I16,
+    next_near: F32,
+    next_owner: I16,
     unsure: wp.array(dtype=wp.vec4i),
     sure: wp.array(dtype=wp.vec4i),
     listed: wp.array(dtype=wp.int32),
@@ -146,7 +134,6 @@ def claim_groups(
 
 
 @wp.kernel(**options)
-@typing.no_type_check
 def listed_points(block: NodeBlock, list: wp.array(dtype=wp.vec4i), offset: float, out: wp.array(dtype=wp.vec3)):
     """Fill the places [m] of listed nodes (offset 0) or of the centers of listed cells (0.5)."""
     c = wp.tid()
@@ -154,17 +141,16 @@ def listed_points(block: NodeBlock, list: wp.array(dtype=wp.vec4i), offset: floa
 
 
 @wp.kernel(**options)
-@typing.no_type_check
 def claim_listed(
     block: NodeBlock,
     list: wp.array(dtype=wp.vec4i),
     distance: wp.array(dtype=wp.float32),
     snap: float,
     solid: int,
-    near: _F32,
-    owner: _I16,
-    next_near: _F32,
-    next_owner: _I16,
+    near: F32,
+    owner: I16,
+    next_near: F32,
+    next_owner: I16,
 ):
     """Enter the distances [m] of a solid at listed nodes; where the list has a sign, it is that of the distance."""
     c = wp.tid()
@@ -175,29 +161,22 @@ def claim_listed(
     enter(wp.vec3i(node[0], node[1], node[2]), d, solid, near, owner, next_near, next_owner)
 
 
-@wp.kernel(**options)
-@typing.no_type_check
-def find_flat_cells(cells: CellRange, planes: int, near: _F32, list: wp.array(dtype=wp.vec4i), count: wp.array(dtype=wp.int32)):
+@cell_kernel("warp_lcp.grid.node_distance")
+def find_flat_cells(k, j, i, planes: int, near: F32, list: wp.array(dtype=wp.vec4i), count: wp.array(dtype=wp.int32)):
     """List the cells with distance 0 at all corners: a gap or a plate, one cell wide; only their centers tell which."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        if near[k, j, i] == 0.0:
-            most = wp.abs(near[k, j, i + 1]) + wp.abs(near[k, j + 1, i]) + wp.abs(near[k, j + 1, i + 1])
-            if planes == 2:
-                most = most + wp.abs(near[k + 1, j, i]) + wp.abs(near[k + 1, j, i + 1])
-                most = most + wp.abs(near[k + 1, j + 1, i]) + wp.abs(near[k + 1, j + 1, i + 1])
-            if most == 0.0:
-                slot = wp.atomic_add(count, 0, 1)
-                if slot < list.shape[0]:
-                    list[slot] = wp.vec4i(i, j, k, 0)
+    if near[k, j, i] == 0.0:
+        most = wp.abs(near[k, j, i + 1]) + wp.abs(near[k, j + 1, i]) + wp.abs(near[k, j + 1, i + 1])
+        if planes == 2:
+            most = most + wp.abs(near[k + 1, j, i]) + wp.abs(near[k + 1, j, i + 1])
+            most = most + wp.abs(near[k + 1, j + 1, i]) + wp.abs(near[k + 1, j + 1, i + 1])
+        if most == 0.0:
+            slot = wp.atomic_add(count, 0, 1)
+            if slot < list.shape[0]:
+                list[slot] = wp.vec4i(i, j, k, 0)
 
 
 @wp.kernel(**options)
-@typing.no_type_check
-def mark_listed(list: wp.array(dtype=wp.vec4i), distance: wp.array(dtype=wp.float32), begin: bool, marks: _I8):
+def mark_listed(list: wp.array(dtype=wp.vec4i), distance: wp.array(dtype=wp.float32), begin: bool, marks: I8):
     """Mark the listed cells HOLLOW that no solid so far covers at their center."""
     c = wp.tid()
     i = list[c][0]

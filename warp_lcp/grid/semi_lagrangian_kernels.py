@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from warp_lcp.grid.cell_kernel import F32, cell_kernel
 from warp_lcp.grid.runge_kutta import SAMPLE
-from warp_lcp.grid.staggered import CellRange
 from warp_lcp.native import BLOCK, simd
 
 CENTERS = 3  # the `axis` of a field at cell centers
@@ -121,27 +121,21 @@ def _source(axis: int) -> str:
     return simd(BLOCK + CARRY.replace("SAMPLE", SAMPLE).replace("ENDLESS", "0").replace("VALUE", value).replace("AXIS", str(axis)))
 
 
-_F32 = wp.array3d(dtype=wp.float32)
-
-
 @functools.cache
 def carry_kernels(axis: int) -> SimpleNamespace:
     """Return `carry`, for the faces of an axis or `CENTERS`."""
 
     @wp.func_native(_source(axis))
     def carry_row(
-        planes: int, h: float, least: float, u_: _F32, v_: _F32, w_: _F32, level_: _F32, field_: _F32,
-        out_: _F32, k: int, j: int, first: int, last: int,
+        planes: int, h: float, least: float, u_: F32, v_: F32, w_: F32, level_: F32, field_: F32,
+        out_: F32, k: int, j: int, first: int, last: int,
     ): ...  # fmt: skip
 
-    @wp.kernel(enable_backward=False, module=f"warp_lcp.grid.semi_lagrangian_{axis}")
+    @cell_kernel(f"warp_lcp.grid.semi_lagrangian_{axis}")
     def carry(
-        cells: CellRange, planes: int, h: float, least: float, u: _F32, v: _F32, w: _F32, level: _F32,
-        field: _F32, out: _F32,
+        k, j, first, end, planes: int, h: float, least: float, u: F32, v: F32, w: F32, level: F32,
+        field: F32, out: F32,
     ):  # fmt: skip
-        plane, row, chunk = wp.tid()
-        first = cells.i + chunk * cells.grain
-        last = wp.min(first + cells.grain, cells.end)
-        carry_row(planes, h, least, u, v, w, level, field, out, cells.k + plane, cells.j + row, first, last)
+        carry_row(planes, h, least, u, v, w, level, field, out, k, j, first, end)
 
     return SimpleNamespace(carry=carry)

@@ -6,8 +6,9 @@ from collections.abc import Iterable
 import numpy as np
 import warp as wp
 
+from warp_lcp.grid.cell_kernel import F32, cell_kernel
 from warp_lcp.grid.runge_kutta import MARGIN
-from warp_lcp.grid.staggered import CellRange, StaggeredGrid
+from warp_lcp.grid.staggered import StaggeredGrid
 
 SIDES = ("left", "right", "bottom", "top", "back", "front")  # at low x, high x, low y, high y, low z, high z; bit n is side n
 GONE = 0.75 * MARGIN  # cells from an open side at which a particle has left: nearer than particles keep from walls
@@ -45,27 +46,22 @@ def open_ring(shape: tuple[int, int, int], bits: int) -> np.ndarray:
     return outside & ~closed
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.sides")
+@cell_kernel("warp_lcp.grid.sides")
 @typing.no_type_check
-def continue_kernel(cells: CellRange, bits: int, nx: int, ny: int, nz: int, field: wp.array3d(dtype=wp.float32)):
+def continue_kernel(k, j, i, bits: int, nx: int, ny: int, nz: int, field: F32):
     """Copy a field from the cells beside open sides to those beyond."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
     c = wp.clamp(k, 1, nz)
     b = wp.clamp(j, 1, ny)
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        a = wp.clamp(i, 1, nx)
-        beyond = int(0)
-        if i != a:
-            beyond = beyond | wp.where(i < a, 1, 2)
-        if j != b:
-            beyond = beyond | wp.where(j < b, 4, 8)
-        if k != c:
-            beyond = beyond | wp.where(k < c, 16, 32)
-        if beyond != 0 and (beyond & bits) == beyond:
-            field[k, j, i] = field[c, b, a]
+    a = wp.clamp(i, 1, nx)
+    beyond = int(0)
+    if i != a:
+        beyond = beyond | wp.where(i < a, 1, 2)
+    if j != b:
+        beyond = beyond | wp.where(j < b, 4, 8)
+    if k != c:
+        beyond = beyond | wp.where(k < c, 16, 32)
+    if beyond != 0 and (beyond & bits) == beyond:
+        field[k, j, i] = field[c, b, a]
 
 
 def continue_beyond(grid: StaggeredGrid, bits: int, field: wp.array) -> None:

@@ -16,6 +16,7 @@ import warp as wp
 
 from warp_lcp.native import grain
 from warp_lcp.program import Launch
+from warp_lcp.rows import RowPass, Rows
 
 
 @wp.struct
@@ -65,10 +66,12 @@ class Window:
     @cached_property
     def cells(self) -> typing.Any:
         """The CellRange that kernels take as their first argument."""
+        return self._cells(grain(self.high[2] - self.low[2], self.device))
+
+    def _cells(self, each: int) -> typing.Any:
         box = CellRange()
         box.k, box.j, box.i = self.low
-        box.end = self.high[2]
-        box.grain = grain(self.high[2] - self.low[2], self.device)
+        box.end, box.grain = self.high[2], each
         return box
 
     @property
@@ -81,13 +84,32 @@ class Window:
         """Threads that share a row."""
         return -(-(self.high[2] - self.low[2]) // self.cells.grain)
 
+    def run(self, passed: RowPass, *, whole: bool = False, launch: Launch | None = None, **given: typing.Any) -> None:
+        """Launch a pass over the box, or record it with `Program.launch`.
+
+        Args:
+            passed: with fields of a `box`.
+            whole: a thread takes a whole row, for sums that are the same on every run.
+            launch: of a program.
+            given: fields and numbers by name.
+        """
+        passed.bind(self._whole if whole else self._shared, **given).launch(launch or wp.launch)
+
+    @cached_property
+    def _shared(self) -> Rows:
+        return Rows.box(self.low, self.high, self.device)
+
+    @cached_property
+    def _whole(self) -> Rows:
+        return Rows.box(self.low, self.high, self.device, whole=True)
+
     def launch(self, kernel: wp.Kernel, inputs: list[typing.Any], *, launch: Launch | None = None) -> None:
         """Launch kernel(cells, *inputs) with threads (plane, row, chunk of a row), or record it with `Program.launch`."""
         (launch or wp.launch)(kernel, (*self.rows, self.chunks), [self.cells, *inputs], device=self.device)
 
     def launch_rows(self, kernel: wp.Kernel, inputs: list[typing.Any]) -> None:
-        """Launch kernel(cells, *inputs) with one thread a row (plane, row), for sums that are the same on every run."""
-        wp.launch(kernel, self.rows, [self.cells, *inputs], device=self.device)
+        """Launch kernel(cells, *inputs) with one thread a row (plane, row, 0), for sums that are the same on every run."""
+        wp.launch(kernel, (*self.rows, 1), [self._cells(self.high[2] - self.low[2]), *inputs], device=self.device)
 
 
 @dataclass(frozen=True)

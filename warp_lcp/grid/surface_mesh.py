@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import warp as wp
 
 from warp_lcp.grid import surface_mesh_kernels as kernels
-from warp_lcp.grid.extrapolate import extrapolate
-from warp_lcp.grid.level_set_kernels import binomial_kernel, scatter_kernel
+from warp_lcp.grid.extrapolate import extrapolate, weighted_kernel
+from warp_lcp.grid.level_set_kernels import BINOMIAL, scatter_kernel
 from warp_lcp.grid.marching_cubes import MarchingCubes, Mesh
 from warp_lcp.grid.mesh_smoothing import smooth as smooth_mesh
 from warp_lcp.grid.particle_loops import launch
@@ -135,10 +135,11 @@ class SurfaceMesh:
             done = self._smoothed(thin, phi, thin, self._thin_passes)
             thin, phi = done, phi if done is thin else thin
         window = lattice.everywhere
-        window.launch(kernels.distance_kernel, [lattice.planes, self._spread, smooth, thin, self._capacity, phi, self._known])
+        shares = {"smooth": smooth, "thin": thin, "capacity": self._capacity, "planes": lattice.planes, "spread": self._spread}
+        window.run(kernels.DISTANCE, phi=phi, known=self._known, **shares)
         if self._room is not None:
             extrapolate(window, self._known, phi, EXTENDED)
-            window.launch(kernels.carve_kernel, [self._room, phi])
+            window.run(kernels.CARVE, room=self._room, phi=phi)
         mesh = self._cubes.contour(phi, smooth.view(wp.int32))
         smooth_mesh(mesh, lattice, self._room, ROUNDS)
         return mesh
@@ -148,7 +149,7 @@ class SurfaceMesh:
         lattice, domain = self.lattice, self.lattice.domain
         room, capacity = self._room, self._capacity
         if obstacles.distance is not None:
-            domain.launch(kernels.room_kernel, [lattice.planes, self._parts, obstacles.distance, room])
+            domain.run(kernels.ROOM, distance=obstacles.distance, out=room, planes=lattice.planes, parts=self._parts)
         else:
             domain.launch(kernels.whole_cell_room_kernel, [lattice.planes, self._parts, obstacles.base, room])
         self._mirror(room)
@@ -160,7 +161,7 @@ class SurfaceMesh:
     def _smoothed(self, source: wp.array, first: wp.array, second: wp.array, passes: int) -> wp.array:
         """Return the source after binomial passes (1, 2, 1)/4, mirrored at the domain's sides; in one of the two other fields."""
         for _ in range(passes):
-            self.lattice.everywhere.launch(binomial_kernel, [self.lattice.planes, source, first])
+            self.lattice.everywhere.run(BINOMIAL, planes=self.lattice.planes, source=source, out=first)
             self._mirror(first)
             source, first, second = first, second, first
         return source
@@ -188,7 +189,7 @@ def faces_from_particles(
     particles_to_faces(grid, position, velocity, [], fields, weights)
     known = grid.field(wp.int8)
     for field, weight in zip(fields, weights, strict=True):
-        grid.everywhere.launch(kernels.known_kernel, [weight, known])
+        grid.everywhere.launch(weighted_kernel, [0.0, weight, known])
         extrapolate(grid.everywhere, known, field, EXTENDED)
 
 

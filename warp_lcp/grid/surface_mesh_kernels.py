@@ -1,15 +1,16 @@
 # mypy: ignore-errors
 """Kernels of the surface that a picture shows: its field on a lattice, what solids take away of it, and how fast it moves."""
 
-import typing
+from pathlib import Path
+from typing import Any
 
 import warp as wp
 
+from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
 from warp_lcp.grid.level_set_kernels import WEIGHTS
 from warp_lcp.grid.particle_loops import particle_loop
-from warp_lcp.grid.staggered import CellRange
-from warp_lcp.native import BLOCK, simd
 from warp_lcp.operators.grid_poisson import SOLID
+from warp_lcp.rows import RowPass
 
 FAR = 2.0  # lattice cells: a distance to solids that takes nothing from the liquid
 LEAST_OPEN = 0.25  # of a kernel: where less of it is open the distance is continued from outside the solid
@@ -17,13 +18,29 @@ LEAST_OPEN = 0.25  # of a kernel: where less of it is open the distance is conti
 # outermost particles have about 0.63, by most in a drop of one particle, by about 1/2 in a sheet of one layer, which keeps its thickness.
 THIN, POWER = 0.6, 0.4
 
-_F32 = wp.array3d(dtype=wp.float32)
+
 _options = {"enable_backward": False, "module": "warp_lcp.grid.surface_mesh"}
 
 
+def _made(name: str, header: str, fields: str, **more: Any) -> RowPass:
+    box = {n: wp.int8 if n == "known" else wp.float32 for n in fields.split()}
+    return RowPass(f"warp_lcp.grid.surface_mesh.{name}", Path(__file__).parent / "headers" / header, wp.float32, box=box, **more)
+
+
+DISTANCE = _made(
+    "distance",
+    "surface_distance.h",
+    "phi smooth thin capacity known",
+    numbers={"planes": int, "spread": wp.float32},
+    optional=("capacity", "known"),
+    constants={"LEAST_OPEN": LEAST_OPEN},
+)
+ROOM = _made("room", "room.h", "out", whole={"distance": wp.float32}, numbers={"planes": int, "parts": int})
+CARVE = _made("carve", "carve.h", "room phi")
+
+
 @wp.kernel(**_options)
-@typing.no_type_check
-def mirror_kernel(axis: int, fold: bool, field: _F32):
+def mirror_kernel(axis: int, fold: bool, field: F32):
     """Give the ring at both ends of an axis the values beside it, after adding to those what the ring holds; a thread a line."""
     a, b = wp.tid()
     last = field.shape[2 - axis] - 1
@@ -78,63 +95,6 @@ BOOST = """
     }
 """
 
-# phi = -spread sqrt(2) erfinv(2 share - 1), what a half space would be away, by the series up to the seventh power (0.2 % off at the nodes
-# beside the surface); beyond the domain's sides there is air
-DISTANCE = """
-    const int nx = phi_.shape[2] - 2, ny = phi_.shape[1] - 2, nz = phi_.shape[0] - 2;
-    const long long s2 = nx + 2, s1 = s2*(ny + 2), at = k*s1 + j*s2;
-    const float* smooth = smooth_.data + at; const float* thin = thin_.data + at;
-    const float* capacity = capacity_.data ? capacity_.data + at : nullptr;
-    float* phi = phi_.data + at; signed char* known = known_.data ? (signed char*)known_.data + at : nullptr;
-    const float scale = -1.2533141f*spread;  // sqrt(pi / 2)
-    const bool beyond = j == 0 || j > ny || (planes == 2 && (k == 0 || k > nz));
-    float share[M];
-    for (int start = first; start < last; start += M) {
-        const int n = last - start < M ? last - start : (int)M;
-        SIMD for (int m = 0; m < n; ++m) share[m] = smooth[start + m] + thin[start + m];
-        if (capacity) {
-            SIMD for (int m = 0; m < n; ++m) {
-                const float c = capacity[start + m] > (float)LEAST_OPEN ? capacity[start + m] : (float)LEAST_OPEN;
-                known[start + m] = capacity[start + m] > (float)LEAST_OPEN;
-                share[m] /= c;
-            }
-        }
-        SIMD for (int m = 0; m < n; ++m) {
-            const float f = share[m] < 1 ? share[m] : 1.0f, z = 2*f - 1, q = z*z;
-            const float d = scale*z*(1 + q*(0.26179939f + q*(0.14393173f + q*0.097663620f)));
-            phi[start + m] = (beyond | (start + m == 0) | (start + m > nx)) ? 1.0f : d;
-        }
-    }
-"""
-
-CARVE = """
-    const long long at = ((long long)k*phi_.shape[1] + j)*phi_.shape[2];
-    float* phi = phi_.data + at; const float* room = room_.data + at;
-    SIMD for (int i = first; i < last; ++i) phi[i] = phi[i] > -room[i] ? phi[i] : -room[i];
-"""
-
-# Distance to the solids at a row of lattice cells from that at the grid's nodes, in lattice cells
-ROOM = """
-    const int ny = distance_.shape[1], nx = distance_.shape[2];
-    const long long s2 = nx, s1 = s2*ny;
-    const float scale = (float)parts, step = 1.0f/scale;
-    auto cell = [&](int fine, float& f) {  // the stored cell that a lattice cell's center lies in, and where in it
-        const float x = ((float)fine - 0.5f)*step + 1.0f; const int c = (int)x;
-        f = x - (float)c;
-        return c;
-    };
-    float fx, fy, fz = 0;
-    const int cy = cell(j, fy), cz = planes == 2 ? cell(k, fz) : 1;
-    const float* d = distance_.data + cz*s1 + cy*s2; const long long up = planes == 2 ? s1 : 0;
-    float* out = out_.data + (long long)k*out_.shape[1]*out_.shape[2] + (long long)j*out_.shape[2];
-    for (int i = first; i < last; ++i) {
-        const int c = cell(i, fx);
-        auto along = [&](const float* row) { return row[c] + fx*(row[c + 1] - row[c]); };
-        const float low = along(d) + fy*(along(d + s2) - along(d)), high = along(d + up) + fy*(along(d + up + s2) - along(d + up));
-        out[i] = scale*(low + fz*(high - low));
-    }
-"""
-
 
 def _filled(source: str) -> str:
     for name, value in (("LEAST_OPEN", LEAST_OPEN), ("THIN", THIN), ("POWER", POWER), ("WEIGHTS", WEIGHTS)):
@@ -143,146 +103,64 @@ def _filled(source: str) -> str:
 
 
 @wp.func_native(particle_loop(_filled(BOOST)))
-@typing.no_type_check
 def boost_some(
-    planes: int, inverse_dx: float, each: float, gain: float, most: float, x_: wp.array(dtype=wp.vec3), smooth_: _F32, capacity_: _F32,
-    out_: _F32, first: int, last: int,
+    planes: int, inverse_dx: float, each: float, gain: float, most: float, x_: wp.array(dtype=wp.vec3), smooth_: F32, capacity_: F32,
+    out_: F32, first: int, last: int,
 ): ...  # fmt: skip
-
-
-@wp.func_native(simd(BLOCK + _filled(DISTANCE)))
-@typing.no_type_check
-def distance_row(
-    planes: int, spread: float, smooth_: _F32, thin_: _F32, capacity_: _F32, phi_: _F32, known_: wp.array3d(dtype=wp.int8),
-    k: int, j: int, first: int, last: int,
-): ...  # fmt: skip
-
-
-@wp.func_native(simd(ROOM))
-@typing.no_type_check
-def room_row(planes: int, parts: int, distance_: _F32, out_: _F32, k: int, j: int, first: int, last: int): ...
-
-
-@wp.func_native(simd(CARVE))
-@typing.no_type_check
-def carve_row(room_: _F32, phi_: _F32, k: int, j: int, first: int, last: int): ...
 
 
 @wp.kernel(**_options)
-@typing.no_type_check
 def boost_kernel(
     count: int, grain: int, planes: int, inverse_dx: float, each: float, gain: float, most: float, position: wp.array(dtype=wp.vec3),
-    smooth: _F32, capacity: _F32, out: _F32,
+    smooth: F32, capacity: F32, out: F32,
 ):  # fmt: skip
     """Add the kernels of particles that have few others around them, the more the fewer these are."""
     first = wp.tid() * grain
     boost_some(planes, inverse_dx, each, gain, most, position, smooth, capacity, out, first, wp.min(first + grain, count))
 
 
-@wp.kernel(**_options)
-@typing.no_type_check
-def distance_kernel(
-    cells: CellRange, planes: int, spread: float, smooth: _F32, thin: _F32, capacity: _F32, phi: _F32, known: wp.array3d(dtype=wp.int8)
-):
-    """Turn filled shares into distances [lattice cells]."""
-    plane, row, chunk = wp.tid()
-    first = cells.i + chunk * cells.grain
-    last = wp.min(first + cells.grain, cells.end)
-    distance_row(planes, spread, smooth, thin, capacity, phi, known, cells.k + plane, cells.j + row, first, last)
-
-
-@wp.kernel(**_options)
-@typing.no_type_check
-def room_kernel(cells: CellRange, planes: int, parts: int, distance: _F32, out: _F32):
-    """Interpolate the distance to solids that cut cells."""
-    plane, row, chunk = wp.tid()
-    first = cells.i + chunk * cells.grain
-    room_row(planes, parts, distance, out, cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end))
-
-
 @wp.func
-@typing.no_type_check
-def is_solid(base: wp.array3d(dtype=wp.int8), planes: int, parts: int, k: int, j: int, i: int):
+def is_solid(base: I8, planes: int, parts: int, k: int, j: int, i: int):
     """Tell whether a lattice cell lies in a cell that is SOLID; cells of the ring are not."""
     c = wp.where(planes == 2, (k - 1) // parts + 1, 1)
     return base[c, (j - 1) // parts + 1, (i - 1) // parts + 1] == wp.int8(SOLID)
 
 
-@wp.kernel(**_options)
-@typing.no_type_check
-def whole_cell_room_kernel(cells: CellRange, planes: int, parts: int, base: wp.array3d(dtype=wp.int8), out: _F32):
+@cell_kernel("warp_lcp.grid.surface_mesh")
+def whole_cell_room_kernel(k, j, i, planes: int, parts: int, base: I8, out: F32):
     """Say half a lattice cell on both sides of the faces of whole solid cells, far elsewhere."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        d = float(FAR)
-        if is_solid(base, planes, parts, k, j, i):
-            d = float(-0.5)
-        else:
-            for a in range(2):
-                s = 2 * a - 1
-                if is_solid(base, planes, parts, k, j, wp.clamp(i + s, 1, out.shape[2] - 2)):
-                    d = float(0.5)
-                if is_solid(base, planes, parts, k, wp.clamp(j + s, 1, out.shape[1] - 2), i):
-                    d = float(0.5)
-                if planes == 2 and is_solid(base, planes, parts, wp.clamp(k + s, 1, out.shape[0] - 2), j, i):
-                    d = float(0.5)
-        out[k, j, i] = d
+    d = float(FAR)
+    if is_solid(base, planes, parts, k, j, i):
+        d = float(-0.5)
+    else:
+        for a in range(2):
+            s = 2 * a - 1
+            if is_solid(base, planes, parts, k, j, wp.clamp(i + s, 1, out.shape[2] - 2)):
+                d = float(0.5)
+            if is_solid(base, planes, parts, k, wp.clamp(j + s, 1, out.shape[1] - 2), i):
+                d = float(0.5)
+            if planes == 2 and is_solid(base, planes, parts, wp.clamp(k + s, 1, out.shape[0] - 2), j, i):
+                d = float(0.5)
+    out[k, j, i] = d
 
 
-@wp.kernel(**_options)
-@typing.no_type_check
-def fill_kernel(cells: CellRange, planes: int, parts: int, least: float, depth: _F32, base: wp.array3d(dtype=wp.int8), density: _F32):
+@cell_kernel("warp_lcp.grid.surface_mesh")
+def fill_kernel(k, j, i, planes: int, parts: int, least: float, depth: F32, base: I8, density: F32):
     """Make lattice cells full that lie in open cells deeper than `least`."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
     c = wp.where(planes == 2, (k - 1) // parts + 1, 1)
     b = (j - 1) // parts + 1
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        a = (i - 1) // parts + 1
-        if depth[c, b, a] >= least and base[c, b, a] != wp.int8(SOLID):
-            density[k, j, i] = 1.0
+    a = (i - 1) // parts + 1
+    if depth[c, b, a] >= least and base[c, b, a] != wp.int8(SOLID):
+        density[k, j, i] = 1.0
 
 
-@wp.kernel(**_options)
-@typing.no_type_check
-def open_share_kernel(cells: CellRange, room: _F32, out: _F32):
+@cell_kernel("warp_lcp.grid.surface_mesh")
+def open_share_kernel(k, j, i, room: F32, out: F32):
     """Estimate which share of each lattice cell is open."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        out[k, j, i] = wp.clamp(room[k, j, i] + 0.5, 0.0, 1.0)
+    out[k, j, i] = wp.clamp(room[k, j, i] + 0.5, 0.0, 1.0)
 
 
 @wp.kernel(**_options)
-@typing.no_type_check
-def carve_kernel(cells: CellRange, room: _F32, phi: _F32):
-    """Take what lies inside solids away from the liquid."""
-    plane, row, chunk = wp.tid()
-    first = cells.i + chunk * cells.grain
-    carve_row(room, phi, cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end))
-
-
-@wp.kernel(**_options)
-@typing.no_type_check
-def known_kernel(cells: CellRange, weight: _F32, known: wp.array3d(dtype=wp.int8)):
-    """Mark the faces that particles gave a velocity."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        known[k, j, i] = wp.where(weight[k, j, i] > 0.0, wp.int8(1), wp.int8(0))
-
-
-@wp.kernel(**_options)
-@typing.no_type_check
 def clamp_kernel(points: wp.array(dtype=wp.vec3), size: wp.vec3, out: wp.array(dtype=wp.vec3)):
     """Bring points that are beyond the far sides back to them."""
     p = wp.tid()

@@ -12,8 +12,8 @@ from typing import Any
 
 import warp as wp
 
+from warp_lcp.grid.cell_kernel import cell_kernel
 from warp_lcp.grid.particle_loops import particle_loop
-from warp_lcp.grid.staggered import CellRange
 from warp_lcp.native import BLOCK, C_TYPES
 
 TINY_WEIGHT = 1e-9  # below it a face counts as untouched
@@ -194,31 +194,23 @@ def kernels(real: Any) -> SimpleNamespace:
             position, field, saved, velocity, gradient, first, wp.min(first + grain, count),
         )  # fmt: skip
 
-    @wp.kernel(enable_backward=False, module=name)
+    @cell_kernel(name)
     def gather_weights(
-        cells: CellRange, axis: int, planes: int, dx: real, inverse_dx: real, origin: wp.vec3i, offsets: wp.array(dtype=wp.int32),
+        k, j, i, axis: int, planes: int, dx: real, inverse_dx: real, origin: wp.vec3i, offsets: wp.array(dtype=wp.int32),
         position: vectors, velocity: vectors, gradient: vectors, field: values, weight: values,
     ):  # fmt: skip
-        plane, row, chunk = wp.tid()
-        first = cells.i + chunk * cells.grain
         nz, ny, nx = field.shape[0], field.shape[1], field.shape[2]
-        for i in range(first, wp.min(first + cells.grain, cells.end)):
-            gather_face(
-                axis, planes, dx, inverse_dx, origin, nx, ny, nz, wp.int64(ny) * wp.int64(nx), wp.int64(nx), offsets,
-                position, velocity, gradient, field, weight, cells.k + plane, cells.j + row, i,
-            )  # fmt: skip
+        gather_face(
+            axis, planes, dx, inverse_dx, origin, nx, ny, nz, wp.int64(ny) * wp.int64(nx), wp.int64(nx), offsets,
+            position, velocity, gradient, field, weight, k, j, i,
+        )  # fmt: skip
 
-    @wp.kernel(enable_backward=False, module=name)
-    def normalize(cells: CellRange, weight: values, field: values):
-        plane, row, chunk = wp.tid()
-        k = cells.k + plane
-        j = cells.j + row
-        first = cells.i + chunk * cells.grain
-        for i in range(first, wp.min(first + cells.grain, cells.end)):
-            w = weight[k, j, i]
-            if w > real(TINY_WEIGHT):
-                field[k, j, i] = field[k, j, i] / w
-            else:
-                field[k, j, i] = real(0.0)
+    @cell_kernel(name)
+    def normalize(k, j, i, weight: values, field: values):
+        w = weight[k, j, i]
+        if w > real(TINY_WEIGHT):
+            field[k, j, i] = field[k, j, i] / w
+        else:
+            field[k, j, i] = real(0.0)
 
     return SimpleNamespace(scatter=scatter, interpolate=interpolate, gather_weights=gather_weights, normalize=normalize)

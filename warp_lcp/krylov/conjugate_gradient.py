@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.deadline import check_time
-from warp_lcp.krylov.conjugate_gradient_kernels import ITERATIONS, PQ, RR, RZ, SLOTS, begin_kernel, end_kernel, kernels
+from warp_lcp.krylov.conjugate_gradient_kernels import ITERATIONS, PQ, RR, RZ, RZ_OLD, SLOTS, begin_kernel, end_kernel
 from warp_lcp.program import Launch, Program
-from warp_lcp.vectors import Reduction, launch_spans
+from warp_lcp.rows import RowPass
+from warp_lcp.vectors import Reduction, rows_of
+
+HEADERS, PLACES = Path(__file__).parent / "headers", {"RZ": int(RZ), "RZ_OLD": int(RZ_OLD), "PQ": int(PQ)}
+DIRECTION = RowPass(
+    "conjugate_gradient.direction", HEADERS / "direction.h", "S", reads={"z": "S"}, writes={"direction": "S"},
+    whole={"scalars": wp.float64}, constants=PLACES,
+)  # fmt: skip
+UPDATE = RowPass(
+    "conjugate_gradient.update", HEADERS / "update.h", "S", reads={"direction": "S", "q": "S", "w": "S"}, writes={"x": "S", "r": "S"},
+    optional=("w",), whole={"scalars": wp.float64}, sums=("rr",), constants=PLACES,
+)  # fmt: skip
 
 
 class LinearMap(Protocol):
@@ -44,14 +56,15 @@ class ConjugateGradient:
     """
 
     def __init__(self, product: LinearMap, preconditioner: Preconditioner, *, weight: wp.array[Any] | None = None) -> None:
-        self._product, self._preconditioner, self._weight = product, preconditioner, weight
-        r = preconditioner.r
+        self._product, self._preconditioner, r = product, preconditioner, preconditioner.r
         self.device, self.x, self._p, self._q = r.device, wp.zeros_like(r), wp.zeros_like(r), wp.zeros_like(r)
         self._scalars = wp.zeros(SLOTS, dtype=wp.float64, device=r.device)
         self._going = wp.zeros(1, dtype=wp.int32, device=r.device)
         self._reduction = Reduction(r.size, r.device, self._scalars)
-        self._kernels = kernels(r.dtype)
         self._program: Program | None = None
+        rows, given = rows_of(r), {"direction": self._p, "scalars": self._scalars}
+        self._direction = DIRECTION.bind(rows, z=preconditioner.z, **given)
+        self._update = UPDATE.bind(rows, q=self._q, w=weight, x=self.x, r=r, out=self._reduction.partials, **given)
 
     def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
         """Iterate from x = 0 until ||r|| <= tolerance, ||r|| is no number, or it has grown by GROWTH over its least.
@@ -83,14 +96,10 @@ class ConjugateGradient:
 
     def _advance(self, launch: Launch) -> None:
         """Launch what follows the preconditioner."""
-        spans, partials, r, z = self._reduction.spans, self._reduction.partials, self._preconditioner.r, self._preconditioner.z
-        self._reduction.dot(r, z, int(RZ), launch=launch)
-        launch_spans(self._kernels.direction, spans, [z, self._p, self._scalars], [], self.device, launch=launch)
+        self._reduction.dot(self._preconditioner.r, self._preconditioner.z, int(RZ), launch=launch)
+        self._direction.launch(launch)
         self._product(self._p, self._q, launch=launch)
         self._reduction.dot(self._p, self._q, int(PQ), launch=launch)
-        update, kernel = [self._p, self._q, self.x, r, self._scalars], self._kernels.update
-        if self._weight is not None:
-            update, kernel = [*update, self._weight], self._kernels.update_weighted
-        launch_spans(kernel, spans, update, [partials], self.device, launch=launch)
+        self._update.launch(launch)
         self._reduction.add_up(int(RR), launch=launch)
         launch(end_kernel, 1, [self._scalars, self._going], device=self.device)

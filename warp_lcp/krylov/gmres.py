@@ -9,12 +9,22 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.deadline import check_time
-from warp_lcp.field_set import FieldSet
-from warp_lcp.krylov.conjugate_gradient import LinearMap, Preconditioner
-from warp_lcp.krylov.gmres_kernels import kernels
-from warp_lcp.native import Spans
-from warp_lcp.vectors import launch_spans
+from warp_lcp.krylov.conjugate_gradient import HEADERS, LinearMap, Preconditioner
+from warp_lcp.rows import RowPass
+from warp_lcp.vectors import ADD, Reduction, rows_of
 
+RESIDUAL = RowPass("gmres.residual", HEADERS / "residual.h", "S", reads={"b": "S", "w": "S"}, writes={"q": "S"}, optional=("w",))
+WEIGH = RowPass("gmres.weigh", HEADERS / "weigh.h", "S", reads={"w": "S"}, writes={"q": "S"}, numbers={"inverse": bool})
+NUMBERS = {"size": wp.int64, "count": int}
+DOTS = RowPass("gmres.dots", HEADERS / "dots.h", "S", whole={"basis": "S"}, reads={"x": "S"}, numbers=NUMBERS, sums=("first",))
+COMBINE = RowPass(
+    "gmres.combine", HEADERS / "combine.h", "S", whole={"basis": "S", "factors": wp.float64}, writes={"x": "S"},
+    numbers={**NUMBERS, "sign": wp.float64}, sums=("xx",),
+)  # fmt: skip
+STORE = RowPass(
+    "gmres.store", HEADERS / "store.h", "S", whole={"basis": "S", "sums": wp.float64}, reads={"x": "S"},
+    numbers={"size": wp.int64, "place": wp.int64, "last": int},
+)  # fmt: skip
 STALLED = 0.99  # a restart that leaves more than this share of the residual gains nothing that another one would not
 
 
@@ -38,10 +48,13 @@ class GMRES:
         self._product, self._preconditioner, self._restart = product, preconditioner, restart
         self.device, self.x = r.device, wp.zeros_like(r)
         self._b, self._q = wp.zeros_like(r), wp.zeros_like(r)
-        self._weight = wp.empty(0, dtype=r.dtype, device=r.device) if weight is None else weight
-        self._basis = FieldSet(restart + 1, r.size, r.dtype, r.device)
+        self._weight = weight
+        self._basis = wp.zeros((restart + 1) * r.size, dtype=r.dtype, device=r.device)  # fields, one after another
+        self._sums = wp.zeros(restart + 2, dtype=wp.float64, device=r.device)  # products with them, and a square at last
+        self._reduction = Reduction(r.size, r.device, self._sums, columns=restart + 1)
         self._factors = wp.zeros(restart + 1, dtype=wp.float64, device=r.device)
-        self._kernels, self._spans = kernels(r.dtype), Spans.of(r.size, r.device)
+        self._residual = RESIDUAL.bind(rows_of(r), b=self._b, w=weight, q=self._q)
+        self._increase = ADD.bind(rows_of(r), z=preconditioner.z, x=self.x)
         self._H, self._rotations, self._g = np.zeros((restart + 1, restart)), np.zeros((restart, 2)), np.zeros(restart + 1)
 
     def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
@@ -66,11 +79,9 @@ class GMRES:
 
     def _start(self) -> float:
         """Make the residual the first vector; return its norm. `_q` is A x."""
-        inputs = [self._b, self._q, self._weight, self._q]
-        launch_spans(self._kernels.residual, self._spans, inputs, [], self.device)
-        self._basis.add(self._factors, self._q, count=0, norm=True)
-        self._basis.store(self._q, 0)
-        return float(np.sqrt(self._basis.sums.numpy()[-1]))
+        self._residual.launch()
+        self._combine(self._factors, self._q, 0)
+        return float(np.sqrt(self._stored(0)[-1]))
 
     def _expand(self, norm: float, tolerance: float, most: int) -> int:
         """Add vectors until the residual's estimate is small enough; return their number."""
@@ -79,7 +90,7 @@ class GMRES:
         g[0] = norm
         for k in range(most):
             check_time()
-            self._basis.take(k, self._preconditioner.r)
+            wp.copy(self._preconditioner.r, self._basis, src_offset=k * self._q.size, count=self._q.size)
             self._weigh(self._preconditioner.r, inverse=True)
             self._preconditioner.apply()
             self._product(self._preconditioner.z, self._q)
@@ -92,18 +103,33 @@ class GMRES:
 
     def _weigh(self, q: wp.array[Any], *, inverse: bool = False) -> None:
         """Take a residual to the vectors of the basis, or back."""
-        if self._weight.size:
-            launch_spans(self._kernels.weigh, self._spans, [self._weight, inverse, q], [], self.device)
+        if self._weight is not None:
+            WEIGH.bind(rows_of(q), w=self._weight, q=q, inverse=inverse).launch()
 
     def _orthogonalize(self, count: int) -> np.ndarray:
         """Take the first vectors out of `_q`, twice, and store the rest as the next one; return the column of H."""
-        basis = self._basis
-        basis.add(basis.dots(self._q, count), self._q, sign=-1.0, count=count)
-        first = basis.sums.numpy()[:count].copy()
-        basis.add(basis.dots(self._q, count), self._q, sign=-1.0, count=count, norm=True)
-        basis.store(self._q, count)
-        sums = basis.sums.numpy()
-        return np.r_[first + sums[:count], np.sqrt(sums[-1])]
+        column = np.zeros(count)
+        for _ in range(2):
+            DOTS.bind(rows_of(self._q), **self._fields, count=count, x=self._q, out=self._reduction.partials).launch()
+            self._reduction.add_up(0, columns=count)
+            self._combine(self._sums, self._q, count, sign=-1.0)
+            column += self._sums.numpy()[:count]
+        return np.r_[column, np.sqrt(self._stored(count)[-1])]
+
+    @property
+    def _fields(self) -> dict[str, Any]:
+        return {"basis": self._basis, "size": self._q.size}
+
+    def _combine(self, factors: wp.array[Any], x: wp.array[Any], count: int, *, sign: float = 1.0) -> None:
+        """X += sign times the sum of factors_j v_j over the first `count` vectors; the last of the sums becomes x'x."""
+        given = {"factors": factors, "x": x, "count": count, "sign": sign, "out": self._reduction.partials}
+        COMBINE.bind(rows_of(x), **self._fields, **given).launch()
+        self._reduction.add_up(self._restart + 1)
+
+    def _stored(self, place: int) -> np.ndarray:
+        """Store `_q`, normalized, as a vector; return the sums."""
+        STORE.bind(rows_of(self._q), **self._fields, place=place, sums=self._sums, x=self._q, last=self._restart + 1).launch()
+        return self._sums.numpy()
 
     def _rotate(self, k: int) -> None:
         """Make column k of H upper triangular by the old rotations and a new one."""
@@ -128,7 +154,7 @@ class GMRES:
         self._factors.assign(y)
         r = self._preconditioner.r
         r.zero_()
-        self._basis.add(self._factors, r, count=columns)
+        self._combine(self._factors, r, columns)
         self._weigh(r, inverse=True)
         self._preconditioner.apply()
-        launch_spans(self._kernels.increase, self._spans, [self._preconditioner.z, self.x], [], self.device)
+        self._increase.launch()

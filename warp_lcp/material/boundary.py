@@ -117,9 +117,10 @@ class WholeCells:
         if sides is not None:
             sides.wrap(self.capacity)
         if wall_velocity is not None:
-            walls = wp.array(np.asarray(wall_velocity, dtype=np.float32), dtype=wp.vec3, device=grid.device)
+            shift = wp.array(np.asarray(wall_velocity, dtype=np.float32), dtype=wp.vec3, device=grid.device)
+            walls = [grid.planes, grid.spacing, solids.index, wp.zeros(len(shift), dtype=wp.mat33, device=grid.device), shift]
             for axis, field in enumerate(self.velocity):
-                grid.everywhere.launch(kernels.wall_velocity_kernel, [axis, solids.index, walls, field])
+                grid.everywhere.launch(kernels.wall_velocity_kernel, [axis, *walls, field])
         self._room = clearance(grid, self.base)
         self._stopped = wp.zeros(1, dtype=wp.int32, device=grid.device)
 

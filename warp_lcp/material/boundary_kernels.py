@@ -1,108 +1,77 @@
+# mypy: ignore-errors
 """Kernels that say what solids mean to the cells and faces beside them; they run when solids are placed."""
 
 import typing
 
 import warp as wp
 
-from warp_lcp.grid.staggered import CellRange
+from warp_lcp.grid.cell_kernel import F32, I8, I16, I32, U8, cell_below, cell_kernel
 from warp_lcp.material.contact import LETS_GO, TOUCHES
 from warp_lcp.operators.grid_poisson import AIR, SOLID
 
 _AIR = wp.constant(wp.int8(AIR))
 _SOLID = wp.constant(wp.int8(SOLID))
 
+
 options: dict[str, typing.Any] = {"enable_backward": False, "module": "warp_lcp.material.boundary"}
 
 
-@wp.kernel(**options)
-@typing.no_type_check
-def base_kernel(cells: CellRange, index: wp.array3d(dtype=wp.int32), base: wp.array3d(dtype=wp.int8)):
+@cell_kernel("warp_lcp.material.boundary")
+def base_kernel(k, j, i, index: I32, base: I8):
     """Cells without material: SOLID where there is a wall, AIR elsewhere."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        base[k, j, i] = wp.where(index[k, j, i] >= 0, _SOLID, _AIR)
+    base[k, j, i] = wp.where(index[k, j, i] >= 0, _SOLID, _AIR)
 
 
-@wp.kernel(**options)
-@typing.no_type_check
-def touch_kernel(
-    cells: CellRange,
-    index: wp.array3d(dtype=wp.int32),
-    separating: wp.array(dtype=wp.uint8),
-    planes: int,
-    touch: wp.array3d(dtype=wp.uint8),
-):
+@wp.func
+def touch_of(separates: wp.uint8):
+    """Return what a wall adds to the touch of the cells beside it."""
+    return wp.where(separates != wp.uint8(0), TOUCHES | LETS_GO, TOUCHES)
+
+
+@cell_kernel("warp_lcp.material.boundary")
+def touch_kernel(k, j, i, index: I32, separating: wp.array(dtype=wp.uint8), planes: int, touch: U8):
     """Find the walls on the faces of each cell."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        found = int(0)
-        for n in range(2 * planes + 2):
-            side = 2 * (n & 1) - 1
-            axis = n >> 1
-            wall = index[k + wp.where(axis == 2, side, 0), j + wp.where(axis == 1, side, 0), i + wp.where(axis == 0, side, 0)]
-            if wall >= 0:
-                found = found | TOUCHES
-                if separating[wall] != wp.uint8(0):  # nested: `and` would read both operands
-                    found = found | LETS_GO
-        touch[k, j, i] = wp.uint8(found)
-
-
-@wp.kernel(**options)
-@typing.no_type_check
-def touch_cut_kernel(
-    cells: CellRange,
-    axis: int,
-    wall: wp.array3d(dtype=wp.int16),
-    separating: wp.array(dtype=wp.uint8),
-    touch: wp.array3d(dtype=wp.uint8),
-):
-    """Add the walls on the two faces of each cell along an axis; -1 is a face that is open."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        found = int(touch[k, j, i])
-        for side in range(2):
-            owner = int(wall[k + wp.where(axis == 2, side, 0), j + wp.where(axis == 1, side, 0), i + wp.where(axis == 0, side, 0)])
-            if owner >= 0:
-                found = found | TOUCHES
-                if separating[owner] != wp.uint8(0):
-                    found = found | LETS_GO
-        touch[k, j, i] = wp.uint8(found)
-
-
-@wp.kernel(**options)
-@typing.no_type_check
-def wall_velocity_kernel(
-    cells: CellRange,
-    axis: int,
-    index: wp.array3d(dtype=wp.int32),
-    walls: wp.array(dtype=wp.vec3),
-    field: wp.array3d(dtype=wp.float32),
-):
-    """Give every closed face the velocity of its wall [m/s]."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    c = wp.max(k - wp.where(axis == 2, 1, 0), 0)
-    b = wp.max(j - wp.where(axis == 1, 1, 0), 0)
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        a = wp.max(i - wp.where(axis == 0, 1, 0), 0)
-        wall = wp.max(index[k, j, i], index[c, b, a])
+    found = int(0)
+    for n in range(2 * planes + 2):
+        side = 2 * (n & 1) - 1
+        axis = n >> 1
+        wall = index[k + wp.where(axis == 2, side, 0), j + wp.where(axis == 1, side, 0), i + wp.where(axis == 0, side, 0)]
         if wall >= 0:
-            field[k, j, i] = walls[wall][axis]
+            found = found | touch_of(separating[wall])
+    touch[k, j, i] = wp.uint8(found)
+
+
+@cell_kernel("warp_lcp.material.boundary")
+def touch_cut_kernel(k, j, i, axis: int, wall: I16, separating: wp.array(dtype=wp.uint8), touch: U8):
+    """Add the walls on the two faces of each cell along an axis; -1 is a face that is open."""
+    found = int(touch[k, j, i])
+    for side in range(2):
+        owner = int(wall[k + wp.where(axis == 2, side, 0), j + wp.where(axis == 1, side, 0), i + wp.where(axis == 0, side, 0)])
+        if owner >= 0:
+            found = found | touch_of(separating[owner])
+    touch[k, j, i] = wp.uint8(found)
+
+
+@cell_kernel("warp_lcp.material.boundary")
+def wall_velocity_kernel(
+    k, j, i, axis: int, planes: int, spacing: float, index: I32, turn: wp.array(dtype=wp.mat33), shift: wp.array(dtype=wp.vec3), field: F32,
+):  # fmt: skip
+    """Velocity turn x + shift [m/s] of the wall on the faces of one component that it closes, 0 elsewhere."""
+    c, b, a = cell_below(axis, k, j, i)
+    wall = wp.max(index[k, j, i], index[c, b, a])
+    u = float(0.0)
+    if wall >= 0:
+        x = (float(i) - wp.where(axis == 0, 1.0, 0.5)) * spacing
+        y = (float(j) - wp.where(axis == 1, 1.0, 0.5)) * spacing
+        z = float(0.0)
+        if planes == 2:
+            z = (float(k) - wp.where(axis == 2, 1.0, 0.5)) * spacing
+        v = turn[wall] * wp.vec3(x, y, z) + shift[wall]
+        u = v[axis]
+    field[k, j, i] = u
 
 
 @wp.kernel(**options)
-@typing.no_type_check
 def larger_kernel(a: wp.array(dtype=wp.float32), b: wp.array(dtype=wp.float32)):
     """Set b to the larger of a and b."""
     i = wp.tid()

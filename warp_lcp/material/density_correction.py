@@ -50,7 +50,8 @@ class Crowding:
             density = self._density = self.grid.field() if self._density is None else self._density
             particle_density(self.grid, particles, window, self.particles_a_cell, density)
         b = self.boundary
-        self.grid.domain.launch_rows(kernels.crowd_kernel, [b.base, density, b.capacity, self.max_density, self._sums])
+        filled = {"base": b.base, "density": density, "capacity": b.capacity}
+        self.grid.domain.run(kernels.CROWD, whole=True, **filled, most=self.max_density, sums=self._sums)
         sums = _inner(self.grid, self._sums)
         held = float(sums[..., 2].sum())
         return (float(sums[..., 0].sum()) / held if held > 0.0 else 0.0), float(sums[..., 1].max())
@@ -141,7 +142,7 @@ class DensityCorrection:
         self.x, self._b = grid.field(wp.float64), grid.field(wp.float64)
         self.density, self.displacement, self._kind = grid.field(), grid.faces(), grid.field(wp.int8)
         wp.copy(self._kind, boundary.base)
-        self._displace = kernels.displacement_kernel(bool(boundary.open)).displace
+        self._displace = kernels.displacement_pass(bool(boundary.open))
         self._sums = wp.zeros((*grid.shape[:2], kernels.COLUMNS), dtype=wp.float64, device=grid.device)
         self._inside = self._lower = None
         if even:  # the ring stays as it is
@@ -179,20 +180,27 @@ class DensityCorrection:
         longest = LONGEST / self.grid.dimension**0.5
         for axis, field in enumerate(self.displacement):
             open_ = self.boundary.open[axis] if self.boundary.open else None
-            fields = [self.x, self._kind, open_, self.density, self.boundary.capacity]
-            self.grid.domain.launch(self._displace, [axis, *fields, longest, share * self.grid.spacing, field])
+            fields = {"x": self.x, "kind": self._kind, "open": open_, "density": self.density, "capacity": self.boundary.capacity}
+            self.grid.domain.run(self._displace, **fields, axis=axis, most=longest, dx=share * self.grid.spacing, d=field)
         self.boundary.displace(self.displacement, particles.position)
         return Correction(result, over_full, most)
 
     def _prepare(self, contact: wp.array | None) -> tuple[int, float]:
         """Set up the problem; return how many cells are over-full, and the largest density."""
         b, most = self.boundary, self.max_density
-        problem = [self._kind, self._b, self.x]
-        fields = [b.base, self.density, b.capacity, most, self.gain, *problem, contact, self._inside, self._sums]
-        self.grid.domain.launch_rows(kernels.prepare_kernel, fields)
+        fields: dict[str, Any] = {
+            "kind": self._kind,
+            "b": self._b,
+            "x": self.x,
+            "density": self.density,
+            "capacity": b.capacity,
+            "inside": self._inside,
+        }
+        fields["sums"], run = self._sums, self.grid.domain.run
+        run(kernels.PREPARE, whole=True, **fields, base=b.base, contact=contact, most=most, gain=self.gain)
         if self._inside is not None:
-            fields = [self.density, b.capacity, min(most, 2.0 - most), self._inside, *problem, self._lower, self._sums]
-            self.grid.domain.launch_rows(kernels.even_kernel, [self.grid.planes - 1, *fields])
+            numbers: dict[str, Any] = {"least": min(most, 2.0 - most), "planes": self.grid.planes - 1}
+            run(kernels.EVEN, whole=True, **fields, **numbers, lower=self._lower)
         sums = _inner(self.grid, self._sums)
         return int(sums[..., [0, 2]].sum()), float(sums[..., 1].max())
 

@@ -67,8 +67,9 @@ class Flights:
         """
         trees, device = [self._parent, self._held, self._several], self.grid.device
         wp.launch(kernels.alone_kernel, self.grid.size, trees, device=device)
-        window.launch(kernels.unite_kernel, [*[*weights, None][:3], self._parent])
-        window.launch(kernels.hold_kernel, [kind, self.boundary.touch, *trees])
+        window.run(kernels.UNITE, **dict(zip("uvw", [*weights, None], strict=False)), parent=self._parent)
+        named = dict(zip(("parent", "held", "several"), trees, strict=True))
+        window.run(kernels.HOLD, kind=kind, touch=self.boundary.touch, **named)
         self._count.zero_()
         wp.launch(kernels.number_kernel, self.grid.size, [*trees, self._number, self._count], device=device)
         bodies = int(self._count.numpy()[0])

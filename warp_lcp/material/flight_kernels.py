@@ -4,13 +4,16 @@
 Sums are of int64, in fixed point: whole numbers add up to the same in any order, so that a GPU gives the same bits on every run.
 """
 
+from pathlib import Path
+from typing import Any
+
 import warp as wp
 
-from warp_lcp.grid.staggered import CellRange
+from warp_lcp.grid.cell_kernel import F32, I8, U8
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.contact import TOUCHES
-from warp_lcp.native import simd
 from warp_lcp.operators.grid_poisson import SOLID
+from warp_lcp.rows import RowPass
 
 COLUMNS = 18  # of a body's sums, see `add_up`
 LEAVES = 17  # of them, the particles that come near a wall or an open side
@@ -19,11 +22,12 @@ MOST_STRIDES = 1024  # of a way, a cell each, as far as particles go in a step
 _TOUCHES = wp.constant(wp.uint8(TOUCHES))
 _SOLID = wp.constant(wp.int8(SOLID))
 
+
 options = {"enable_backward": False, "module": "warp_lcp.material.flight"}
 Integers, Bytes = wp.array(dtype=wp.int32), wp.array(dtype=wp.uint8)
-Kinds = wp.array3d(dtype=wp.int8)
+Kinds = I8
 Motions = wp.array2d(dtype=wp.vec3)
-Vectors, Field = wp.array(dtype=wp.vec3), wp.array3d(dtype=wp.float32)
+Vectors, Field = wp.array(dtype=wp.vec3), F32
 
 
 @wp.struct
@@ -44,65 +48,14 @@ class Flight:
     sums: wp.array2d(dtype=wp.int64)
 
 
-# Parents have the smaller numbers, so that trees are the same whatever the order of the threads. A lost race is seen in what the atomic
-# minimum returns, and tried again. Rows in native form take a third of the time: they know most roots from the cell before.
-TREES = """
-    int* P = parent.data; const long long q = ((long long)k*s1 + (long long)j*s2);
-    auto find = [&](int i) { while (P[i] != i) i = P[i]; return i; };
-    auto unite = [&](int i, int j) {
-        int a = find(i), b = find(j);
-        while (a != b) {
-            if (a < b) { const int t = a; a = b; b = t; }
-            const int old = wp::atomic_min(P + a, b);
-            if (old == a) return;
-            a = find(old); b = find(b);
-        }
-    };
-"""
-UNITE = """
-    const float* u = u_.data + q; const float* v = v_.data + q; const float* w = w_.data ? w_.data + q : nullptr;
-    auto weighs = [](float weight) { return weight > TINY_WEIGHTf; };
-    for (int i = first; i < last; ++i) {  // a face with weight is none of the array's edge: the cell below it is there
-        const int c = (int)(q + i), x = weighs(u[i]);
-        if (x) {
-    #ifndef __CUDA_ARCH__
-            if (P[c] == c) P[c] = P[c - 1]; else
-    #endif
-            unite(c, c - 1);
-        }
-        // where the cells to the left of both are joined to them, and to each other, there is no need
-        if (weighs(v[i]) && !(x && weighs(v[i - 1]) && weighs(u[i - s2]))) unite(c, c - s2);
-        if (w && weighs(w[i]) && !(x && weighs(w[i - 1]) && weighs(u[i - s1]))) unite(c, c - s1);
-    }
-"""
-HOLD = """
-    const signed char* kind = (const signed char*)kind_.data + q; const unsigned char* touch = touch_.data + q;
-    int parent_of = -1, root = -1;
-    for (int i = first; i < last; ++i) {
-        const int c = (int)(q + i), joined = P[c] != c, wall = (kind[i] == SOLID) | (touch[i] & TOUCHES);
-        if (!(joined | wall)) continue;
-        if (P[c] != parent_of) { parent_of = P[c]; root = find(c); }
-        if (wall) held.data[root] = 1;
-        if (joined) several.data[root] = 1;
-    }
-"""
+def _made(name: str, box: dict[str, Any], *trees: str) -> RowPass:
+    whole = {"parent": wp.int32} | dict.fromkeys(trees, wp.uint8)
+    constants, path = {"SOLID": SOLID, "TOUCHES": TOUCHES, "TINY_WEIGHT": TINY_WEIGHT}, Path(__file__).parent / "headers" / f"{name}.h"
+    return RowPass(f"warp_lcp.material.flight.{name}", path, wp.float32, box=box, whole=whole, constants=constants, optional=("w",))
 
 
-def _native(source: str) -> str:
-    names = {"SOLID": SOLID, "TOUCHES": TOUCHES}
-    constants = "".join(f"constexpr int {name} = {value}; " for name, value in names.items())
-    return simd(constants + TREES + source.replace("TINY_WEIGHT", repr(TINY_WEIGHT)))
-
-
-@wp.func_native(_native(UNITE))
-def unite_row(u_: Field, v_: Field, w_: Field, parent: Integers, s1: int, s2: int, k: int, j: int, first: int, last: int): ...
-
-
-@wp.func_native(_native(HOLD))
-def hold_row(
-    kind_: Kinds, touch_: wp.array3d(dtype=wp.uint8), parent: Integers, held: Bytes, several: Bytes, s1: int, s2: int, k: int, j: int,
-    first: int, last: int,
-): ...  # fmt: skip
+UNITE = _made("unite", dict.fromkeys("uvw", wp.float32))
+HOLD = _made("hold", {"kind": wp.int8, "touch": wp.uint8}, "held", "several")
 
 
 @wp.func
@@ -121,26 +74,6 @@ def alone_kernel(parent: Integers, held: Bytes, several: Bytes):
     parent[c] = c
     held[c] = wp.uint8(0)
     several[c] = wp.uint8(0)
-
-
-@wp.kernel(**options)
-def unite_kernel(cells: CellRange, u: Field, v: Field, w: Field, parent: Integers):
-    """Cells with a face between them that particles gave weight belong together."""
-    plane, row, chunk = wp.tid()
-    first = cells.i + chunk * cells.grain
-    s2 = u.shape[2]
-    s1 = s2 * u.shape[1]
-    unite_row(u, v, w, parent, s1, s2, cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end))
-
-
-@wp.kernel(**options)
-def hold_kernel(cells: CellRange, kind: Kinds, touch: wp.array3d(dtype=wp.uint8), parent: Integers, held: Bytes, several: Bytes):
-    """Tell which trees reach a wall, and which have several cells: those without weight stay alone."""
-    plane, row, chunk = wp.tid()
-    first = cells.i + chunk * cells.grain
-    s2 = kind.shape[2]
-    s1 = s2 * kind.shape[1]
-    hold_row(kind, touch, parent, held, several, s1, s2, cells.k + plane, cells.j + row, first, wp.min(first + cells.grain, cells.end))
 
 
 @wp.kernel(**options)
@@ -245,7 +178,7 @@ def turned(angle: wp.vec3, a: wp.vec3):
 
 
 @wp.func
-def is_near(base: Kinds, touch: wp.array3d(dtype=wp.uint8), planes: int, x: wp.vec3):
+def is_near(base: Kinds, touch: U8, planes: int, x: wp.vec3):
     """Tell whether x [cells] is in a cell that a wall touches, or near the domain's end."""
     i = int(wp.floor(x[0])) + 1
     j = int(wp.floor(x[1])) + 1
@@ -260,7 +193,7 @@ def is_near(base: Kinds, touch: wp.array3d(dtype=wp.uint8), planes: int, x: wp.v
 
 @wp.kernel(**options)
 def fly_kernel(
-    flight: Flight, u: Field, v: Field, w: Field, motion: Motions, base: Kinds, touch: wp.array3d(dtype=wp.uint8), start: Vectors,
+    flight: Flight, u: Field, v: Field, w: Field, motion: Motions, base: Kinds, touch: U8, start: Vectors,
     end: Vectors,
 ):  # fmt: skip
     """Carry particles through the velocity that moves along with their body, a third-order Runge-Kutta step, and add them up.

@@ -6,21 +6,17 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from warp_lcp.grid.staggered import CellRange, Window
+from warp_lcp.grid.cell_kernel import F32, cell_kernel
+from warp_lcp.grid.staggered import Window
 from warp_lcp.grid.transfer import TINY_WEIGHT
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.material.gravity")
+@cell_kernel("warp_lcp.material.gravity")
 @typing.no_type_check
-def accelerate_kernel(cells: CellRange, change: float, weight: wp.array3d(dtype=wp.float32), field: wp.array3d(dtype=wp.float32)):
+def accelerate_kernel(k, j, i, change: float, weight: F32, field: F32):
     """Add a change of velocity [m/s] to every face with weight."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        if weight[k, j, i] > TINY_WEIGHT:
-            field[k, j, i] = field[k, j, i] + change
+    if weight[k, j, i] > TINY_WEIGHT:
+        field[k, j, i] = field[k, j, i] + change
 
 
 def accelerate(window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], change: np.ndarray) -> None:

@@ -305,7 +305,8 @@ class NarrowBand:
         for number in range(math.ceil(most) + 1):
             if self.grid.device.is_cpu:
                 self._changed.zero_()
-            window.launch(kernels.relax_kernel, [planes, *((0, 0) if number % 2 else last), self._now, self._changed])
+            plane, row = (0, 0) if number % 2 else last
+            window.run(kernels.RELAX, depth=self._now, changed=self._changed, planes=planes, last_plane=plane, last_row=row)
             if self.grid.device.is_cpu and self._changed.numpy()[0] == 0:  # rows one after the other are done in three passes or so
                 break
 

@@ -1,12 +1,14 @@
 # mypy: ignore-errors
 """Kernels of the narrow band: how deep cells lie, which of them hold particles, and what the others stand for."""
 
+from pathlib import Path
+
 import warp as wp
 
-from warp_lcp.grid.staggered import CellRange
+from warp_lcp.grid.cell_kernel import F32, F64, I8, I32, U8, cell_kernel
 from warp_lcp.material.contact import RELEASED
-from warp_lcp.native import BLOCK, simd
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
+from warp_lcp.rows import RowPass
 
 NEAR = 1.0  # cells from a solid inside the domain within which particles stay
 INSET = 1e-3  # of a cell: particles are put no nearer to its faces
@@ -15,57 +17,19 @@ COLUMNS = 15  # of a row's sums, see `sum_kernel`
 _FLUID = wp.constant(wp.int8(FLUID))
 _SOLID = wp.constant(wp.int8(SOLID))
 _RELEASED = wp.constant(wp.uint8(RELEASED))
-_F32, _I8, _U8, _I32 = (wp.array3d(dtype=t) for t in (wp.float32, wp.int8, wp.uint8, wp.int32))
 
-# One pass of depth_i = min over the 3^dimension - 1 cells around i of depth_n + |i - n|. In place: a value only falls, and ends at the
-# same minimum whatever order the cells come in.
-RELAX = """
-    typedef float T;
-    const int nz = depth_.shape[0], ny = depth_.shape[1], nx = depth_.shape[2];
-    const long long s2 = nx, s1 = s2*ny;
-    T* d = depth_.data + k*s1 + j*s2;
-    T best[M];
-    int changed = 0;
-    for (int start = first; start < last; start += M) {
-        const int n = last - start < M ? last - start : (int)M;
-        T* here = d + start;
-        int deep = 0;
-        SIMD for (int m = 0; m < n; ++m) { best[m] = here[m]; deep |= (int)(here[m] > (T)0.5); }
-        if (!deep) continue;  // nothing but air and its shore
-        const int low = start > 0 ? 0 : 1, high = start + n < nx ? n : n - 1;
-        for (int c = planes == 2 && k > 0 ? -1 : 0; c <= (planes == 2 && k + 1 < nz ? 1 : 0); ++c)
-            for (int b = j > 0 ? -1 : 0; b <= (j + 1 < ny ? 1 : 0); ++b) {
-                const int across = (b != 0) + (c != 0);
-                const T straight = across == 0 ? (T)0 : across == 1 ? (T)1 : (T)1.41421356;
-                const T slant = across == 0 ? (T)1 : across == 1 ? (T)1.41421356 : (T)1.73205081;
-                const T* row = here + c*s1 + b*s2;
-                SIMD for (int m = 0; m < n; ++m) { const T v = row[m] + straight; best[m] = v < best[m] ? v : best[m]; }
-                SIMD for (int m = low; m < n; ++m) { const T v = row[m - 1] + slant; best[m] = v < best[m] ? v : best[m]; }
-                SIMD for (int m = 0; m < high; ++m) { const T v = row[m + 1] + slant; best[m] = v < best[m] ? v : best[m]; }
-            }
-        SIMD for (int m = 0; m < n; ++m) { changed |= (int)(best[m] < here[m]); here[m] = best[m]; }
-    }
-    return changed;
-"""
-
-
-@wp.func_native(simd(BLOCK + RELAX))
-def relax_row(planes: int, depth_: _F32, k: int, j: int, first: int, last: int) -> int: ...
-
-
-@wp.kernel(enable_backward=False, module="warp_lcp.material.narrow_band_depth")
-def relax_kernel(cells: CellRange, planes: int, last_plane: int, last_row: int, depth: _F32, changed: wp.array(dtype=wp.int32)):
-    """Shorten the depths of some cells by what their neighbors know; rows are taken from the last on if there is a `last_row`."""
-    plane, row, chunk = wp.tid()
-    k = wp.where(last_row > 0, last_plane - plane, cells.k + plane)
-    j = wp.where(last_row > 0, last_row - row, cells.j + row)
-    first = cells.i + chunk * cells.grain
-    if relax_row(planes, depth, k, j, first, wp.min(first + cells.grain, cells.end)) > 0:
-        changed[0] = 1
+RELAX = RowPass(
+    "warp_lcp.material.narrow_band.relax",
+    Path(__file__).parent / "headers" / "relax_depth.h",
+    wp.float32,
+    box={"depth": wp.float32},
+    whole={"changed": wp.int32},
+    numbers=dict.fromkeys(("planes", "last_plane", "last_row"), int),
+)
 
 
 @wp.func
-def solid_inside(distance: _F32, k: int, j: int, i: int, planes: int):
+def solid_inside(distance: F32, k: int, j: int, i: int, planes: int):
     """Tell whether a solid is near one of a cell's corners; the domain's walls are not in the distance."""
     result = bool(False)
     for c in range(planes):
@@ -76,60 +40,46 @@ def solid_inside(distance: _F32, k: int, j: int, i: int, planes: int):
     return result
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.material.narrow_band")
+@cell_kernel("warp_lcp.material.narrow_band")
 def shore_kernel(
-    cells: CellRange, planes: int, most: float, kind: _I8, phi: _F32, contact: _U8, keep: _I8, distance: _F32, depth: _F32,
+    k, j, i, planes: int, most: float, kind: I8, phi: F32, contact: U8, keep: I8, distance: F32, depth: F32,
 ):  # fmt: skip
     """Depth is -phi in air, 0 where particles stay for another reason, and yet unknown elsewhere, solids included."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        value = most
-        if kind[k, j, i] == _FLUID:
-            if contact[k, j, i] == _RELEASED:
+    value = most
+    if kind[k, j, i] == _FLUID:
+        if contact[k, j, i] == _RELEASED:
+            value = 0.0
+        if keep:
+            if keep[k, j, i] != wp.int8(0):
                 value = 0.0
-            if keep:
-                if keep[k, j, i] != wp.int8(0):
-                    value = 0.0
-            if distance:
-                if solid_inside(distance, k, j, i, planes):
-                    value = 0.0
-        elif kind[k, j, i] != _SOLID:
-            value = -0.5
-            if phi:
-                value = -wp.clamp(phi[k, j, i], 0.0, 1.0)
-        depth[k, j, i] = value
+        if distance:
+            if solid_inside(distance, k, j, i, planes):
+                value = 0.0
+    elif kind[k, j, i] != _SOLID:
+        value = -0.5
+        if phi:
+            value = -wp.clamp(phi[k, j, i], 0.0, 1.0)
+    depth[k, j, i] = value
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.material.narrow_band")
-def fill_kernel(cells: CellRange, least: float, filled: float, depth: _F32, capacity: _F32, density: _F32):
+@cell_kernel("warp_lcp.material.narrow_band")
+def fill_kernel(k, j, i, least: float, filled: float, depth: F32, capacity: F32, density: F32):
     """Give cells deeper than `least` the density `filled` as far as walls leave room."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        if depth[k, j, i] >= least:
-            room = float(1.0)
-            if capacity:
-                room = capacity[k, j, i]
-            density[k, j, i] = filled * room
+    if depth[k, j, i] >= least:
+        room = float(1.0)
+        if capacity:
+            room = capacity[k, j, i]
+        density[k, j, i] = filled * room
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.material.narrow_band")
+@cell_kernel("warp_lcp.material.narrow_band")
 def blend_kernel(
-    cells: CellRange, axis: int, start: float, full_weight: float, depth: _F32, base: _I8, carried: _F32, field: _F32, weight: _F32,
+    k, j, first, end, axis: int, start: float, full_weight: float, depth: F32, base: I8, carried: F32, field: F32, weight: F32,
 ):  # fmt: skip
     """Go over from the particles' velocity to the carried one within a cell from depth `start` on."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
     c = wp.max(k - wp.where(axis == 2, 1, 0), 0)
     b = wp.max(j - wp.where(axis == 1, 1, 0), 0)
-    first = cells.i + chunk * cells.grain
-    for i in range(wp.max(first, 1), wp.min(first + cells.grain, cells.end)):
+    for i in range(wp.max(first, 1), end):
         a = i - wp.where(axis == 0, 1, 0)
         here = base[k, j, i] != _SOLID
         below = base[c, b, a] != _SOLID
@@ -161,22 +111,17 @@ def fraction(x: float):
     return x - wp.floor(x)
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.material.narrow_band")
+@cell_kernel("warp_lcp.material.narrow_band")
 def quota_kernel(
-    cells: CellRange, width: float, particles: float, seed: int, shift: float, base: _I8, depth: _F32, before: _F32,
-    quota: _I32,
+    k, j, i, width: float, particles: float, seed: int, shift: float, base: I8, depth: F32, before: F32,
+    quota: I32,
 ):  # fmt: skip
     """Find how many fresh particles each cell gets: so many on average, over the cells and, as `shift` goes on, over the steps."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        count = int(0)
-        if base[k, j, i] != _SOLID and renewed(depth[k, j, i], before[k, j, i], width):
-            cell = (k * depth.shape[1] + j) * depth.shape[2] + i
-            count = int(particles + 0.9999 * fraction(wp.randf(wp.rand_init(seed, cell)) + shift))
-        quota[k, j, i] = count
+    count = int(0)
+    if base[k, j, i] != _SOLID and renewed(depth[k, j, i], before[k, j, i], width):
+        cell = (k * depth.shape[1] + j) * depth.shape[2] + i
+        count = int(particles + 0.9999 * fraction(wp.randf(wp.rand_init(seed, cell)) + shift))
+    quota[k, j, i] = count
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.material.narrow_band")
@@ -191,46 +136,38 @@ def leave_kernel(
     marks[p] = wp.where(now > width or renewed(now, before[cell], width), 1, 0)
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.material.narrow_band")
+@cell_kernel("warp_lcp.material.narrow_band")
 def seed_kernel(
-    cells: CellRange, planes: int, per_axis: int, jitter: float, seed: int, shift: wp.vec3, dx: float, behind: int, ny: int, nx: int,
+    k, j, i, planes: int, per_axis: int, jitter: float, seed: int, shift: wp.vec3, dx: float, behind: int, ny: int, nx: int,
     total: wp.array(dtype=wp.int32), position: wp.array(dtype=wp.vec3),
 ):  # fmt: skip
     """Put a cell's particles on a jittered lattice that `shift` moves through the cell; `total` counts up to and with each cell."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
     sites = per_axis * per_axis * wp.where(planes == 2, per_axis, 1)
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        cell = (k * ny + j) * nx + i
-        start = total[cell - 1]
-        count = total[cell] - start
-        if count > 0:
-            own = wp.rand_init(seed, cell)
-            way = shift + wp.vec3(wp.randf(own), wp.randf(own), wp.randf(own))
-            skip = int(wp.randf(own) * float(sites)) + int(shift[0] * float(sites))  # where it is left out, or begins again
-            for n in range(count):
-                site = (skip + n) % sites
-                state = wp.rand_init(seed + 1, cell * 64 + n)
-                x = wp.vec3(float(site % per_axis), float((site // per_axis) % per_axis), float(site // (per_axis * per_axis)))
-                x = (x + jitter * wp.vec3(wp.randf(state), wp.randf(state), wp.randf(state))) / float(per_axis) + way
-                x = wp.vec3(fraction(x[0]), fraction(x[1]), fraction(x[2])) * (1.0 - 2.0 * INSET) + wp.vec3(INSET, INSET, INSET)
-                x = (x + wp.vec3(float(i - 1), float(j - 1), float(k - 1))) * dx
-                position[behind + start + n] = wp.vec3(x[0], x[1], wp.where(planes == 2, x[2], 0.0))
+    cell = (k * ny + j) * nx + i
+    start = total[cell - 1]
+    count = total[cell] - start
+    if count > 0:
+        own = wp.rand_init(seed, cell)
+        way = shift + wp.vec3(wp.randf(own), wp.randf(own), wp.randf(own))
+        skip = int(wp.randf(own) * float(sites)) + int(shift[0] * float(sites))  # where it is left out, or begins again
+        for n in range(count):
+            site = (skip + n) % sites
+            state = wp.rand_init(seed + 1, cell * 64 + n)
+            x = wp.vec3(float(site % per_axis), float((site // per_axis) % per_axis), float(site // (per_axis * per_axis)))
+            x = (x + jitter * wp.vec3(wp.randf(state), wp.randf(state), wp.randf(state))) / float(per_axis) + way
+            x = wp.vec3(fraction(x[0]), fraction(x[1]), fraction(x[2])) * (1.0 - 2.0 * INSET) + wp.vec3(INSET, INSET, INSET)
+            x = (x + wp.vec3(float(i - 1), float(j - 1), float(k - 1))) * dx
+            position[behind + start + n] = wp.vec3(x[0], x[1], wp.where(planes == 2, x[2], 0.0))
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.material.narrow_band")
+@cell_kernel("warp_lcp.material.narrow_band")
 def sum_kernel(
-    cells: CellRange, planes: int, width: float, base: _I8, depth: _F32, u: _F32, v: _F32, w: _F32, sums: wp.array3d(dtype=wp.float64),
+    k, j, first, end, planes: int, width: float, base: I8, depth: F32, u: F32, v: F32, w: F32, sums: F64,
 ):  # fmt: skip
     """Add up a row's cells deeper than the band.
 
     [0] cells, [1] |u|^2, [2-4] indices (i, j, k), [5] largest |u|^2, [6-8] lowest, [9-11] highest indices, [12-14] u.
     """
-    plane, row = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
     count = int(0)
     squares = wp.float64(0.0)
     along = int(0)
@@ -238,7 +175,7 @@ def sum_kernel(
     way = wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(0.0))
     low = int(1 << 30)
     high = int(-1)
-    for i in range(cells.i, cells.end):
+    for i in range(first, end):
         if depth[k, j, i] > width and base[k, j, i] != _SOLID:
             count += 1
             along += i

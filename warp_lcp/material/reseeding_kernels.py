@@ -3,7 +3,7 @@
 
 import warp as wp
 
-from warp_lcp.grid.staggered import CellRange
+from warp_lcp.grid.cell_kernel import F32, I8, I32, U8, cell_kernel
 from warp_lcp.material.contact import TOUCHES
 from warp_lcp.operators.grid_poisson import AIR
 
@@ -14,47 +14,37 @@ _AIR = wp.constant(wp.int8(AIR))
 _TOUCHES = wp.constant(wp.uint8(TOUCHES))
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.material.reseeding")
-def count_kernel(cells: CellRange, offsets: wp.array(dtype=wp.int32), count: wp.array3d(dtype=wp.int32)):
+@cell_kernel("warp_lcp.material.reseeding")
+def count_kernel(k, j, i, offsets: wp.array(dtype=wp.int32), count: I32):
     """Count each cell's particles."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        cell = (k * count.shape[1] + j) * count.shape[2] + i
-        count[k, j, i] = offsets[cell + 1] - offsets[cell]
+    cell = (k * count.shape[1] + j) * count.shape[2] + i
+    count[k, j, i] = offsets[cell + 1] - offsets[cell]
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.material.reseeding")
+@cell_kernel("warp_lcp.material.reseeding")
 def find_kernel(
-    cells: CellRange, planes: int, least: int, at_rest: int, most: int, count: wp.array3d(dtype=wp.int32),
-    capacity: wp.array3d(dtype=wp.float32), base: wp.array3d(dtype=wp.int8), touch: wp.array3d(dtype=wp.uint8),
+    k, j, i, planes: int, least: int, at_rest: int, most: int, count: I32,
+    capacity: F32, base: I8, touch: U8,
     takers: wp.array(dtype=wp.int32), numbers: wp.array(dtype=wp.int32),
 ):  # fmt: skip
     """List open cells that no wall touches, that want particles, and whose surroundings, themselves included, are full but for a little.
 
     The order of the list differs from run to run on CUDA, and does not matter.
     """
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        has = count[k, j, i]
-        if has < at_rest and base[k, j, i] == _AIR and (touch[k, j, i] & _TOUCHES) == wp.uint8(0):
-            held = int(0)
-            crowd = int(0)
-            room = float(0.0)
-            for c in range(k - planes + 1, k + planes):
-                for b in range(j - 1, j + 2):
-                    for a in range(i - 1, i + 2):
-                        if base[c, b, a] == _AIR:
-                            held += count[c, b, a]
-                            crowd = wp.max(crowd, count[c, b, a])
-                            room += capacity[c, b, a]
-            if (has < least or crowd > most) and float(held) >= FULL * float(at_rest) * room:
-                takers[wp.atomic_add(numbers, 0, 1)] = (k * count.shape[1] + j) * count.shape[2] + i
+    has = count[k, j, i]
+    if has < at_rest and base[k, j, i] == _AIR and (touch[k, j, i] & _TOUCHES) == wp.uint8(0):
+        held = int(0)
+        crowd = int(0)
+        room = float(0.0)
+        for c in range(k - planes + 1, k + planes):
+            for b in range(j - 1, j + 2):
+                for a in range(i - 1, i + 2):
+                    if base[c, b, a] == _AIR:
+                        held += count[c, b, a]
+                        crowd = wp.max(crowd, count[c, b, a])
+                        room += capacity[c, b, a]
+        if (has < least or crowd > most) and float(held) >= FULL * float(at_rest) * room:
+            takers[wp.atomic_add(numbers, 0, 1)] = (k * count.shape[1] + j) * count.shape[2] + i
 
 
 @wp.func
@@ -80,7 +70,7 @@ def emptiest(planes: int, i: int, j: int, k: int, start: int, here: int, inverse
 @wp.kernel(enable_backward=False, module="warp_lcp.material.reseeding")
 def exchange_kernel(
     planes: int, dk: int, dj: int, di: int, least: int, at_rest: int, most: int, seed: int, dx: float, inverse_dx: float,
-    takers: wp.array(dtype=wp.int32), offsets: wp.array(dtype=wp.int32), count: wp.array3d(dtype=wp.int32),
+    takers: wp.array(dtype=wp.int32), offsets: wp.array(dtype=wp.int32), count: I32,
     position: wp.array(dtype=wp.vec3), numbers: wp.array(dtype=wp.int32),
 ):  # fmt: skip
     """Let each cell that wants particles take some from the neighbor in one direction.

@@ -1,20 +1,22 @@
+# mypy: ignore-errors
 """Kernels of sources: their velocity on faces, their cells, and how many particles those hold."""
 
 import typing
 
 import warp as wp
 
-from warp_lcp.grid.staggered import CellRange, cell_index
+from warp_lcp.grid.cell_kernel import F32, I8, I32, cell_below, cell_kernel
+from warp_lcp.grid.staggered import cell_index
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 
 _FLUID = wp.constant(wp.int8(FLUID))
 _SOLID = wp.constant(wp.int8(SOLID))
 
+
 options: dict[str, typing.Any] = {"enable_backward": False, "module": "warp_lcp.material.sources"}
 
 
 @wp.func
-@typing.no_type_check
 def source_of(slot: int, sources: wp.array(dtype=wp.int32), running: wp.array(dtype=wp.uint8)):
     """Return the source that a slot (0: none) belongs to, -1 if it has none that runs."""
     source = int(-1)
@@ -25,78 +27,48 @@ def source_of(slot: int, sources: wp.array(dtype=wp.int32), running: wp.array(dt
     return source
 
 
-@wp.kernel(**options)
-@typing.no_type_check
+@cell_kernel("warp_lcp.material.sources")
 def impose_kernel(
-    cells: CellRange,
-    axis: int,
-    supply: int,
-    slots: wp.array3d(dtype=wp.int32),
-    sources: wp.array(dtype=wp.int32),
-    running: wp.array(dtype=wp.uint8),
-    velocities: wp.array(dtype=wp.vec3),
-    field: wp.array3d(dtype=wp.float32),
-    solid: wp.array3d(dtype=wp.float32),
-    known: wp.array3d(dtype=wp.int8),
-):
+    k, j, i, axis: int, supply: int, slots: I32, sources: wp.array(dtype=wp.int32), running: wp.array(dtype=wp.uint8),
+    velocities: wp.array(dtype=wp.vec3), field: F32, solid: F32, known: I8,
+):  # fmt: skip
     """Give the faces of the running sources' cells their velocity.
 
     Where the flow would enter a source nothing passes as far as the pressure is concerned (`supply`): its material comes from nowhere, not
     from the material behind it.
     """
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    c = wp.max(k - wp.where(axis == 2, 1, 0), 0)
-    b = wp.max(j - wp.where(axis == 1, 1, 0), 0)
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        a = wp.max(i - wp.where(axis == 0, 1, 0), 0)
-        if slots[k, j, i] > 0 or slots[c, b, a] > 0:
-            here = source_of(slots[k, j, i], sources, running)
-            below = source_of(slots[c, b, a], sources, running)
-            source = wp.where(here >= 0, here, below)
-            if source >= 0:
-                value = velocities[source][axis]
-                if supply != 0 and ((below < 0 and value > 0.0) or (here < 0 and value < 0.0)):
-                    value = float(0.0)
-                field[k, j, i] = value
-                if solid:
-                    solid[k, j, i] = value
-                if known:
-                    known[k, j, i] = wp.int8(1)
-            elif solid:
-                solid[k, j, i] = 0.0
+    c, b, a = cell_below(axis, k, j, i)
+    if slots[k, j, i] > 0 or slots[c, b, a] > 0:
+        here = source_of(slots[k, j, i], sources, running)
+        below = source_of(slots[c, b, a], sources, running)
+        source = wp.where(here >= 0, here, below)
+        if source >= 0:
+            value = velocities[source][axis]
+            if supply != 0 and ((below < 0 and value > 0.0) or (here < 0 and value < 0.0)):
+                value = float(0.0)
+            field[k, j, i] = value
+            if solid:
+                solid[k, j, i] = value
+            if known:
+                known[k, j, i] = wp.int8(1)
+        elif solid:
+            solid[k, j, i] = 0.0
 
 
-@wp.kernel(**options)
-@typing.no_type_check
-def occupy_kernel(
-    cells: CellRange,
-    slots: wp.array3d(dtype=wp.int32),
-    sources: wp.array(dtype=wp.int32),
-    running: wp.array(dtype=wp.uint8),
-    fluid: int,
-    kind: wp.array3d(dtype=wp.int8),
-):
+@cell_kernel("warp_lcp.material.sources")
+def occupy_kernel(k, j, i, slots: I32, sources: wp.array(dtype=wp.int32), running: wp.array(dtype=wp.uint8), fluid: int, kind: I8):
     """Mark the cells of running sources SOLID, since their faces' velocities are given, or (`fluid`) as the material that they hold."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        if source_of(slots[k, j, i], sources, running) >= 0:
-            kind[k, j, i] = wp.where(fluid != 0, _FLUID, _SOLID)
+    if source_of(slots[k, j, i], sources, running) >= 0:
+        kind[k, j, i] = wp.where(fluid != 0, _FLUID, _SOLID)
 
 
 @wp.kernel(**options)
-@typing.no_type_check
 def occupants_kernel(
     inverse_dx: float,
     nx: int,
     ny: int,
     nz: int,
-    slots: wp.array3d(dtype=wp.int32),
+    slots: I32,
     position: wp.array(dtype=wp.vec3),
     counts: wp.array(dtype=wp.int32),
 ):

@@ -15,8 +15,9 @@ from collections.abc import Callable, Sequence
 
 import warp as wp
 
+from warp_lcp.grid.cell_kernel import F32, I8, I32, U8, cell_below, cell_kernel
 from warp_lcp.grid.extrapolate import BLOCKED, extrapolate
-from warp_lcp.grid.staggered import CellRange, Window
+from warp_lcp.grid.staggered import Window
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.contact import RELEASED
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
@@ -27,113 +28,73 @@ _FLUID = wp.constant(wp.int8(FLUID))
 _SOLID = wp.constant(wp.int8(SOLID))
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.material.wall")
+@cell_kernel("warp_lcp.material.wall")
 @typing.no_type_check
-def keep_released_kernel(
-    cells: CellRange,
-    axis: int,
-    kind: wp.array3d(dtype=wp.int8),
-    contact: wp.array3d(dtype=wp.uint8),
-    weight: wp.array3d(dtype=wp.float32),
-    field: wp.array3d(dtype=wp.float32),
-    known: wp.array3d(dtype=wp.int8),
-):
+def keep_released_kernel(k, j, i, axis: int, kind: I8, contact: U8, weight: F32, field: F32, known: I8):
     """Faces of RELEASED cells that are still unknown, closed ones, become known after the first layer if they carry weight.
 
     They move as their own particles do, but no faster than the known faces around them in the mean, nor against those.
     """
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        if known[k, j, i] == wp.int8(0) and weight[k, j, i] > TINY_WEIGHT:  # and so no face of the array's edge, see below
-            c = k - wp.where(axis == 2, 1, 0)
-            b = j - wp.where(axis == 1, 1, 0)
-            a = i - wp.where(axis == 0, 1, 0)
-            here = kind[k, j, i] == _FLUID and int(contact[k, j, i]) == RELEASED
-            if here or (kind[c, b, a] == _FLUID and int(contact[c, b, a]) == RELEASED):
-                total = float(0.0)
-                count = float(0.0)
-                for n in range(6):
-                    side = 1 - 2 * (n & 1)
-                    z = k + wp.where(n // 2 == 2, side, 0)
-                    y = j + wp.where(n // 2 == 1, side, 0)
-                    x = i + wp.where(n // 2 == 0, side, 0)
-                    if z >= 0 and z < known.shape[0] and y < known.shape[1] and x < known.shape[2]:
-                        if known[z, y, x] == wp.int8(1):
-                            total += field[z, y, x]
-                            count += 1.0
-                if count > 0.0:
-                    own = field[k, j, i]
-                    around = total / count
-                    field[k, j, i] = wp.where(own * around > 0.0, wp.sign(own) * wp.min(wp.abs(own), wp.abs(around)), 0.0)
-                known[k, j, i] = wp.int8(2)
+    if known[k, j, i] == wp.int8(0) and weight[k, j, i] > TINY_WEIGHT:  # and so no face of the array's edge, see below
+        c = k - wp.where(axis == 2, 1, 0)
+        b = j - wp.where(axis == 1, 1, 0)
+        a = i - wp.where(axis == 0, 1, 0)
+        here = kind[k, j, i] == _FLUID and int(contact[k, j, i]) == RELEASED
+        if here or (kind[c, b, a] == _FLUID and int(contact[c, b, a]) == RELEASED):
+            total = float(0.0)
+            count = float(0.0)
+            for n in range(6):
+                side = 1 - 2 * (n & 1)
+                z = k + wp.where(n // 2 == 2, side, 0)
+                y = j + wp.where(n // 2 == 1, side, 0)
+                x = i + wp.where(n // 2 == 0, side, 0)
+                if z >= 0 and z < known.shape[0] and y < known.shape[1] and x < known.shape[2]:
+                    if known[z, y, x] == wp.int8(1):
+                        total += field[z, y, x]
+                        count += 1.0
+            if count > 0.0:
+                own = field[k, j, i]
+                around = total / count
+                field[k, j, i] = wp.where(own * around > 0.0, wp.sign(own) * wp.min(wp.abs(own), wp.abs(around)), 0.0)
+            known[k, j, i] = wp.int8(2)
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.material.wall")
+@cell_kernel("warp_lcp.material.wall")
 @typing.no_type_check
-def keep_spray_kernel(
-    cells: CellRange,
-    axis: int,
-    kind: wp.array3d(dtype=wp.int8),
-    weight: wp.array3d(dtype=wp.float32),
-    known: wp.array3d(dtype=wp.int8),
-):
+def keep_spray_kernel(k, j, i, axis: int, kind: I8, weight: F32, known: I8):
     """Open faces that are still unknown but carry weight become known, and so do the extrapolated ones."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        mark = int(known[k, j, i])
-        if mark > 1:
+    mark = int(known[k, j, i])
+    if mark > 1:
+        known[k, j, i] = wp.int8(1)
+    if mark == 0 and weight[k, j, i] > TINY_WEIGHT:
+        # a face with weight is no face of the array's edge: its particles lie in the domain
+        below = kind[k - wp.where(axis == 2, 1, 0), j - wp.where(axis == 1, 1, 0), i - wp.where(axis == 0, 1, 0)]
+        if kind[k, j, i] != _SOLID and below != _SOLID:
             known[k, j, i] = wp.int8(1)
-        if mark == 0 and weight[k, j, i] > TINY_WEIGHT:
-            # a face with weight is no face of the array's edge: its particles lie in the domain
-            below = kind[k - wp.where(axis == 2, 1, 0), j - wp.where(axis == 1, 1, 0), i - wp.where(axis == 0, 1, 0)]
-            if kind[k, j, i] != _SOLID and below != _SOLID:
-                known[k, j, i] = wp.int8(1)
 
 
-@wp.kernel(enable_backward=False, module="warp_lcp.material.wall")
+@cell_kernel("warp_lcp.material.wall")
 @typing.no_type_check
-def closed_face_kernel(
-    cells: CellRange,
-    axis: int,
-    kind: wp.array3d(dtype=wp.int8),
-    contact: wp.array3d(dtype=wp.uint8),
-    index: wp.array3d(dtype=wp.int32),
-    separating: wp.array(dtype=wp.uint8),
-    solid: wp.array3d(dtype=wp.float32),
-    field: wp.array3d(dtype=wp.float32),
-):
+def closed_face_kernel(k, j, i, axis: int, kind: I8, contact: U8, index: I32, separating: wp.array(dtype=wp.uint8), solid: F32, field: F32):
     """Closed faces take the wall's normal velocity, or lose only the velocity into the wall."""
-    plane, row, chunk = wp.tid()
-    k = cells.k + plane
-    j = cells.j + row
-    first = cells.i + chunk * cells.grain
-    c = wp.max(k - wp.where(axis == 2, 1, 0), 0)
-    b = wp.max(j - wp.where(axis == 1, 1, 0), 0)
-    for i in range(first, wp.min(first + cells.grain, cells.end)):
-        a = wp.max(i - wp.where(axis == 0, 1, 0), 0)
-        here = index[k, j, i]
-        below = index[c, b, a]
-        if (here >= 0) != (below >= 0):
-            wall = wp.max(here, below)
-            outward = float(1.0)  # from the wall into the open
-            filled = kind[k, j, i] == _FLUID
-            leaving = int(contact[k, j, i]) == RELEASED
-            if here >= 0:
-                outward = -1.0
-                filled = kind[c, b, a] == _FLUID
-                leaving = int(contact[c, b, a]) == RELEASED
-            target = float(0.0)
-            if solid:
-                target = solid[k, j, i]
-            held = filled and (separating[wall] == wp.uint8(0) or not leaving)
-            if held or outward * (field[k, j, i] - target) < 0.0:
-                field[k, j, i] = target
+    c, b, a = cell_below(axis, k, j, i)
+    here = index[k, j, i]
+    below = index[c, b, a]
+    if (here >= 0) != (below >= 0):
+        wall = wp.max(here, below)
+        outward = float(1.0)  # from the wall into the open
+        filled = kind[k, j, i] == _FLUID
+        leaving = int(contact[k, j, i]) == RELEASED
+        if here >= 0:
+            outward = -1.0
+            filled = kind[c, b, a] == _FLUID
+            leaving = int(contact[c, b, a]) == RELEASED
+        target = float(0.0)
+        if solid:
+            target = solid[k, j, i]
+        held = filled and (separating[wall] == wp.uint8(0) or not leaving)
+        if held or outward * (field[k, j, i] - target) < 0.0:
+            field[k, j, i] = target
 
 
 def extend_velocity(

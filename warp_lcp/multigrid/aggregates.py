@@ -122,10 +122,21 @@ class AggregateCycles:
 
 def _aggregates(host: scipy.sparse.csr_array) -> scipy.sparse.csr_array | None:
     """Return which unknowns belong together, None where too few do."""
-    symmetric = scipy.sparse.csr_matrix((host + host.T) * 0.5)
-    symmetric.eliminate_zeros()
-    found, _ = standard_aggregation(symmetric_strength_of_connection(symmetric, theta=STRENGTH))
-    return None if found.nnz == 0 or found.shape[1] > STALL * host.shape[0] else scipy.sparse.csr_array(found).astype(np.float64)
+    found = aggregated(symmetric_strength_of_connection(symmetric_part(host), theta=STRENGTH), STALL)
+    return None if found is None else scipy.sparse.csr_array(found).astype(np.float64)
+
+
+def symmetric_part(host: scipy.sparse.csr_array) -> scipy.sparse.csr_matrix:
+    """Return (A + A') / 2 without its zeros."""
+    part = scipy.sparse.csr_matrix((host + host.T) * 0.5)
+    part.eliminate_zeros()
+    return part
+
+
+def aggregated(strength: scipy.sparse.csr_matrix, stall: float) -> Any:
+    """Return which unknowns belong together, None where that leaves more than a share `stall` of them."""
+    found, _ = standard_aggregation(strength)
+    return None if found.nnz == 0 or found.shape[1] > stall * strength.shape[0] else found
 
 
 def suits_multigrid(host: scipy.sparse.csr_array) -> bool:

@@ -9,23 +9,41 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import scipy.sparse
 import warp as wp
-from pyamg.aggregation.aggregate import standard_aggregation
 from pyamg.aggregation.smooth import jacobi_prolongation_smoother
 from pyamg.aggregation.tentative import fit_candidates
 from pyamg.strength import symmetric_strength_of_connection
 
-from warp_lcp.multigrid.algebraic_kernels import factor_kernel, fill_kernel, invert_kernel, kernels, places_kernel
-from warp_lcp.native import Spans
-from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.operators.sparse_kernels import kernels as sparse_kernels
+from warp_lcp.multigrid.aggregates import aggregated, symmetric_part
+from warp_lcp.multigrid.algebraic_kernels import densify_kernel, factor_kernel, invert_kernel, places_kernel, solve_kernel
+from warp_lcp.operators.sparse import GATHER, PRODUCT, ROWS, SparseOperator
 from warp_lcp.program import Launch, Program
-from warp_lcp.vectors import launch_spans
+from warp_lcp.rows import Bound, RowPass, Rows
 
+HEADERS = Path(__file__).parent / "headers"
+LEVEL = {**ROWS, "a": "S"}
+FILL = RowPass(
+    "algebraic.fill", HEADERS / "fill.h", "S", whole={**ROWS, "a": "A", "order": wp.int32, "free": wp.uint8, "m": "S"},
+    reads={"d": "A", "shift": wp.float64}, writes=dict.fromkeys(("inverse", "scale", "weight"), "S"), optional=("order", "shift"),
+)  # fmt: skip
+SCALE_ROWS = RowPass(
+    "algebraic.scale_rows", HEADERS / "scale_rows.h", "S", whole={"ptr": wp.int32, "a": "S", "scaled": "S"}, reads={"scale": "S"}
+)
+MULTIPLY = RowPass(
+    "algebraic.multiply", HEADERS / "multiply.h", "S", reads={"begins": wp.int64},
+    whole={**LEVEL, "right": wp.int32, "b": "S", "starts": wp.int32, "place": wp.uint16, "result": "S"},
+)  # fmt: skip
+INVERSE = RowPass("algebraic.inverse", HEADERS / "inverse.h", "S", whole={"ptr": wp.int32, "a": "S"}, writes={"inverse": "S"})
+SMOOTH = RowPass(
+    "algebraic.smooth", HEADERS / "smooth.h", "S", whole={**LEVEL, "x": "S"}, reads={"inverse": "S", "b": "S"}, writes={"y": "S"},
+    numbers={"omega": "S", "from_zero": bool},
+)  # fmt: skip
+REMAINDER = RowPass("algebraic.remainder", HEADERS / "remainder.h", "S", whole={**LEVEL, "x": "S"}, reads={"b": "S"}, writes={"y": "S"})
 PINNED = {wp.float32: 3e-5, wp.float64: 1e-13}  # of a coarsest level's diagonal: what rounding leaves of a singular component's last pivot
 WIDEST = np.iinfo(np.uint16).max  # entries of a row whose places are known
 Matrix = Any  # a scipy.sparse.csr_array
@@ -74,11 +92,15 @@ class DeviceMatrix:
         self.shape, self.device = host.shape, device
         self.indptr, self.indices = (wp.array(v, dtype=wp.int32, device=device) for v in (host.indptr, host.indices))
         self.values = wp.array(host.data, dtype=real, device=device)
-        self.operands = [self.indptr, self.indices, self.values]
+        self.rows, self.operands = Rows.flat(self.shape[0], device), {"ptr": self.indptr, "col": self.indices, "a": self.values}
+
+    def product(self, x: wp.array[Any], y: wp.array[Any], launch: Launch, *, add: bool = False) -> None:
+        """Y = A x, or y + A x."""
+        PRODUCT.bind(self.rows, **self.operands, x=x, plus=y if add else None, y=y).launch(launch)
 
 
-class DeviceProduct:
-    """A B into a known pattern.
+def product_pass(left: DeviceMatrix, right: DeviceMatrix, out: DeviceMatrix, hosts: tuple[Matrix, Matrix, Matrix]) -> Bound:
+    """Return what computes A B into a known pattern.
 
     Args:
         left: A.
@@ -86,31 +108,15 @@ class DeviceProduct:
         out: where the product goes; its pattern holds that of A B.
         hosts: the patterns of A, B and A B.
     """
-
-    def __init__(self, left: DeviceMatrix, right: DeviceMatrix, out: DeviceMatrix, hosts: tuple[Matrix, Matrix, Matrix]) -> None:
-        A, B, C = hosts
-        ends = np.concatenate([[0], np.cumsum(np.diff(B.indptr).astype(np.int64)[A.indices])])
-        place = wp.zeros(int(ends[-1]), dtype=wp.uint16, device="cpu")
-        patterns = [wp.array(v, dtype=wp.int32, device="cpu") for m in hosts for v in (m.indptr, m.indices)]
-        at = wp.zeros(C.shape[1], dtype=wp.int32, device="cpu")
-        wp.launch(places_kernel, 1, [*patterns, at, place, A.shape[0]], device="cpu")
-        self._spans = Spans.of(left.shape[0], left.device)
-        first, place = wp.array(ends[A.indptr], dtype=wp.int64, device=left.device), place.to(left.device)
-        self._inputs = [*left.operands, right.indptr, right.values, out.indptr, first, place, out.values]
-        self.nbytes = first.capacity + place.capacity
-
-    def compute(self, kernel: Any, device: wp.Device, launch: Launch) -> None:
-        """Launch the product."""
-        launch_spans(kernel, self._spans, self._inputs, [], device, launch=launch)
-
-
-@dataclass(frozen=True)
-class Step:
-    """From one level to the next: prolongation P, R = P', and the pattern of A P, on the host."""
-
-    P: Matrix
-    R: Matrix
-    AP: Matrix
+    A, B, C = hosts
+    ends = np.concatenate([[0], np.cumsum(np.diff(B.indptr).astype(np.int64)[A.indices])])
+    place = wp.zeros(int(ends[-1]), dtype=wp.uint16, device="cpu")
+    patterns = [wp.array(v, dtype=wp.int32, device="cpu") for m in hosts for v in (m.indptr, m.indices)]
+    at = wp.zeros(C.shape[1], dtype=wp.int32, device="cpu")
+    wp.launch(places_kernel, 1, [*patterns, at, place, A.shape[0]], device="cpu")
+    begins = wp.array(ends[A.indptr[:-1]], dtype=wp.int64, device=left.device)
+    given = {"right": right.indptr, "b": right.values, "starts": out.indptr, "place": place.to(left.device), "result": out.values}
+    return MULTIPLY.bind(left.rows, **left.operands, **given, begins=begins)
 
 
 class AlgebraicLevel:
@@ -120,27 +126,25 @@ class AlgebraicLevel:
         self.size, self.device = host.shape[0], device
         self.A = DeviceMatrix(host, real, device)
         self.x, self.b, self.t, self.inverse = (wp.zeros(self.size, dtype=real, device=device) for _ in range(4))
-        self.spans = Spans.of(self.size, device)
         self.P: DeviceMatrix | None = None
-        self.kernels = kernels(real)
 
-    def connect(self, host: Matrix, step: Step, coarse: AlgebraicLevel, coarse_host: Matrix, real: Any) -> None:
-        """Take the prolongation from a coarser level; `host` and `coarse_host` are both matrices' patterns."""
-        device, P, R, AP = self.device, step.P, step.R, step.AP
+    def connect(self, hosts: tuple[Matrix, ...], coarse: AlgebraicLevel, real: Any) -> None:
+        """Take the prolongation from a coarser level; `hosts` are A, P, R = P', the patterns of A P and of the coarse matrix."""
+        device, (host, P, R, AP, coarse_host) = self.device, hosts
         turn = scipy.sparse.csr_array((np.arange(P.nnz), P.indices, P.indptr), shape=P.shape).T.tocsr().data
         self.P, self.R = DeviceMatrix(P, real, device), DeviceMatrix(R, real, device)
         self.plain = wp.clone(self.P.values)  # P's entries before its rows are scaled
         self.turn = wp.array(turn, dtype=wp.int32, device=device)
         self.AP = DeviceMatrix(AP, real, device)
         self.products = (
-            DeviceProduct(self.A, self.P, self.AP, (host, P, AP)),
-            DeviceProduct(self.R, self.AP, coarse.A, (R, AP, coarse_host)),
+            product_pass(self.A, self.P, self.AP, (host, P, AP)),
+            product_pass(self.R, self.AP, coarse.A, (R, AP, coarse_host)),
         )
 
     def sweep(self, y: wp.array[Any], x: wp.array[Any], omega: float, launch: Launch, *, from_zero: bool = False) -> None:
         """Y = x + omega (b - A x) over the rows' l1 norms; x is taken for 0 if from_zero."""
-        inputs = [*self.A.operands, self.inverse, x, self.b, omega, from_zero, y]
-        launch_spans(self.kernels.sweep, self.spans, inputs, [], self.device, launch=launch)
+        given = {"inverse": self.inverse, "x": x, "b": self.b, "y": y, "omega": omega, "from_zero": from_zero}
+        SMOOTH.bind(self.A.rows, **self.A.operands, **given).launch(launch)
 
 
 class AlgebraicHierarchy:
@@ -173,7 +177,6 @@ class AlgebraicHierarchy:
         self.inverts = last <= self._most
         shape = (last, last) if self.inverts else (0, 0)
         self._matrix, self._inverse = (wp.zeros(shape, dtype=wp.float64, device=self.device) for _ in range(2))
-        self._no_shift = wp.empty(0, dtype=wp.float64, device=self.device)
         self.r, self.z = self.levels[0].b, self.levels[0].x
 
     @property
@@ -184,16 +187,14 @@ class AlgebraicHierarchy:
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
         """Take a free set (uint8 field) and a shift D >= 0 (float64 field; None: 0), and coarsen."""
         finest, A = self.levels[0], self.source
-        fields = [A.values, A.diagonal(), free, self._no_shift if shift is None else shift, finest.A.values, finest.inverse]
-        inputs = [finest.A.indptr, finest.A.indices, self._order, *fields, self.scale, self.weight]
-        launch_spans(fill_kernel(A.dtype, self.real), finest.spans, inputs, [], self.device)
+        given = {"d": A.diagonal(), "free": free, "shift": shift, "inverse": finest.inverse, "scale": self.scale, "weight": self.weight}
+        pattern = {**finest.A.operands, "a": A.values, "order": self._order, "m": finest.A.values}
+        FILL.bind(finest.A.rows, **pattern, **given).launch()
         self._coarsening.run()
 
     def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
         """Q = M p."""
-        finest = self.levels[0]
-        inputs = [*finest.A.operands, p, p, False, q]
-        launch_spans(sparse_kernels(self.real, self.real).product, finest.spans, inputs, [], self.device, launch=launch)
+        self.levels[0].A.product(p, q, launch)
 
     @cached_property
     def program(self) -> Program:
@@ -209,19 +210,20 @@ class AlgebraicHierarchy:
     @cached_property
     def _coarsening(self) -> Program:
         program = Program(self.device)
-        launch, k = program.launch, self.levels[0].kernels
+        launch = program.launch
         for depth, (fine, coarse) in enumerate(zip(self.levels, self.levels[1:], strict=False)):
             P = fine.P
             assert P is not None
             if depth == 0:
-                launch_spans(k.scale, fine.spans, [P.indptr, fine.plain, self.scale, P.values], [], self.device, launch=launch)
-                launch(k.gather, fine.turn.size, [P.values, fine.turn, fine.R.values], device=self.device)
+                SCALE_ROWS.bind(P.rows, ptr=P.indptr, a=fine.plain, scale=self.scale, scaled=P.values).launch(launch)
+                turned = Rows.flat(fine.turn.size, self.device)
+                GATHER.bind(turned, source=P.values, order=fine.turn, taken=fine.R.values).launch(launch)
             for product in fine.products:
-                product.compute(k.multiply, self.device, launch)
-            launch_spans(k.inverse, coarse.spans, [coarse.A.indptr, coarse.A.values, coarse.inverse], [], self.device, launch=launch)
+                product.launch(launch)
+            INVERSE.bind(coarse.A.rows, ptr=coarse.A.indptr, a=coarse.A.values, inverse=coarse.inverse).launch(launch)
         if self.inverts:
             last = self.levels[-1]
-            launch(k.densify, last.size, [*last.A.operands, self._matrix], device=self.device)
+            launch(densify_kernel, last.size, [*last.A.operands.values(), self._matrix], device=self.device)
             launch(factor_kernel, 1, [self._matrix, wp.float64(PINNED[self.real])], device=self.device)
             launch(invert_kernel, last.size, [self._matrix, self._inverse], device=self.device)
         return program
@@ -236,17 +238,17 @@ class AlgebraicHierarchy:
         assert P is not None
         L.sweep(L.t, L.x, first, launch, from_zero=from_zero)
         L.sweep(L.x, L.t, second, launch)
-        launch_spans(L.kernels.residual, L.spans, [*L.A.operands, L.x, L.b, L.t], [], self.device, launch=launch)
-        launch_spans(L.kernels.transfer, C.spans, [*L.R.operands, L.t, False, C.b], [], self.device, launch=launch)
+        REMAINDER.bind(L.A.rows, **L.A.operands, x=L.x, b=L.b, y=L.t).launch(launch)
+        L.R.product(L.t, C.b, launch)
         for visit in range(self._gamma if depth + 2 < len(self.levels) else 1):
             self._visit(depth + 1, launch, from_zero=visit == 0)
-        launch_spans(L.kernels.transfer, L.spans, [*P.operands, C.x, True, L.x], [], self.device, launch=launch)
+        P.product(C.x, L.x, launch, add=True)
         L.sweep(L.t, L.x, second, launch)
         L.sweep(L.x, L.t, first, launch)
 
     def _solve_coarsest(self, L: AlgebraicLevel, launch: Launch, *, from_zero: bool) -> None:
         if self.inverts:
-            launch(L.kernels.solve, L.size, [self._inverse, L.b, L.x], device=self.device)
+            launch(solve_kernel, L.size, [self._inverse, L.b, L.x], device=self.device)
             return
         first, second = self.settings.weights
         for pair in range(self.settings.last_sweeps):  # forth and back, so that the whole is symmetric
@@ -275,17 +277,15 @@ def _coarsen(A: Matrix, pattern: Matrix, real: Any, device: wp.Device, settings:
     levels = [AlgebraicLevel(current, real, device)]
     while current.shape[0] > most:
         fine = levels[-1]
-        turned = current.T.tocsr()
-        entries = scipy.sparse.csr_matrix((current + turned) * 0.5)
-        entries.eliminate_zeros()
+        entries = symmetric_part(current)
         C = symmetric_strength_of_connection(entries, theta=settings.strength)
-        aggregates, _ = standard_aggregation(C)
-        if aggregates.nnz == 0 or aggregates.shape[1] > settings.stall * current.shape[0]:
+        aggregates = aggregated(C, settings.stall)
+        if aggregates is None:
             break
         T, candidates = fit_candidates(aggregates, candidates)
         # local weights are sums of magnitudes; spectral ones start from random vectors, so runs would differ
         P = T
-        if _skewness(current, turned, entries) <= settings.skew:
+        if _skewness(current, entries) <= settings.skew:
             P = jacobi_prolongation_smoother(entries, T, C, candidates, omega=4 / 3, weighting="local")
         P = scipy.sparse.csr_array(P)
         P.sort_indices()
@@ -295,9 +295,9 @@ def _coarsen(A: Matrix, pattern: Matrix, real: Any, device: wp.Device, settings:
         if coarse.nnz > current.nnz or np.diff(AP.indptr).max() > WIDEST:  # wide rows, which coarsening fills
             break
         levels.append(AlgebraicLevel(coarse, real, device))
-        fine.connect(current, Step(P, R, AP), levels[-1], coarse, real)
+        fine.connect((current, P, R, AP, coarse), levels[-1], real)
         for product in fine.products:
-            product.compute(fine.kernels.multiply, device, wp.launch)
+            product.launch()
         values = levels[-1].A.values.numpy().astype(np.float64)
         current = scipy.sparse.csr_array((values, coarse.indices, coarse.indptr), shape=coarse.shape)
     return levels
@@ -310,10 +310,10 @@ def _pattern_product(A: Matrix, B: Matrix) -> Matrix:
     return product
 
 
-def _skewness(A: Matrix, turned: Matrix, symmetric: Matrix) -> float:
+def _skewness(A: Matrix, symmetric: Matrix) -> float:
     """Return the sum of |A - A'| / 2 over that of the off-diagonal |A + A'| / 2."""
     off = float(np.abs(symmetric.data).sum() - np.abs(symmetric.diagonal()).sum())
-    return 0.5 * float(np.abs((A - turned).data).sum()) / off if off > 0 else 0.0
+    return 0.5 * float(np.abs((A - A.T).data).sum()) / off if off > 0 else 0.0
 
 
 def _alike(A: Matrix, B: Matrix) -> bool:
@@ -345,6 +345,3 @@ def _with_diagonal(matrix: Matrix) -> Matrix:
     pattern = (pattern + scipy.sparse.eye_array(matrix.shape[0], dtype=np.float32)).tocsr()
     pattern.sort_indices()
     return pattern
-
-
-__all__ = ["AlgebraicHierarchy", "AlgebraicSettings"]

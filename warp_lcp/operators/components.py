@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import warp as wp
 
 from warp_lcp.operators import components_kernels as kernels
 from warp_lcp.operators.grid_poisson_kernels import FLUID
-from warp_lcp.operators.stencil_kernels import StencilShape
+from warp_lcp.rows import RowPass
 
 if TYPE_CHECKING:
     from warp_lcp.operators.grid_poisson import GridPoisson
@@ -17,6 +18,21 @@ if TYPE_CHECKING:
 
 
 Scratch = tuple[wp.array[Any], wp.array[Any]]
+HEADERS = Path(__file__).parent / "headers"
+FACES, UNIFORM = dict.fromkeys(("face_x", "face_y", "face_z"), "F"), dict.fromkeys(("cx", "cy", "cz"), wp.float64)
+SINGLETONS = RowPass("components.singletons", HEADERS / "singletons.h", wp.float32, writes={"parent": wp.int32, "grounded": wp.uint8})
+UNITE = RowPass(
+    "components.unite", HEADERS / "unite.h", wp.float32, reads={"cells": wp.int8, **FACES}, optional=tuple(FACES),
+    whole={"parent": wp.int32}, numbers=UNIFORM,
+)  # fmt: skip
+GROUND = RowPass(
+    "components.ground", HEADERS / "ground.h", wp.float32, reads={"cells": wp.int8, **FACES, "shift": "F"}, optional=(*FACES, "shift"),
+    whole={"parent": wp.int32, "grounded": wp.uint8}, numbers=UNIFORM,
+)  # fmt: skip
+COUNT = RowPass(
+    "components.count", HEADERS / "count_floating.h", wp.float32, whole={"count": wp.int32},
+    reads={"cells": wp.int8, "parent": wp.int32, "grounded": wp.uint8},
+)  # fmt: skip
 
 
 class FloatingComponents:
@@ -120,11 +136,6 @@ class ComponentFinder:
         self._A, device = A, A.device
         self._own: Scratch | None = None
         self._count = wp.zeros(1, dtype=wp.int32, device=device)
-        self._shape = StencilShape()
-        self._shape.nx, self._shape.s1, self._shape.s2 = A.stencil.shape.nx, A.stencil.shape.s1, A.stencil.shape.s2
-        self._shape.cx, self._shape.cy, self._shape.cz = A.uniform
-        self._shape.spans = A.stencil.spans
-        self._kernels = kernels.component_kernels(A.dtype)
 
     def find(self, scratch: Scratch | None = None) -> FloatingComponents | None:
         """Return the floating components, or None if there are none; `scratch` as in GridPoisson.floating_components."""
@@ -139,7 +150,7 @@ class ComponentFinder:
             scratch: memory, or None.
             joined: stored cell types, of which FLUID neighbors are one component.
         """
-        A, s = self._A, self._A.stencil
+        A, rows = self._A, self._A.stencil.rows
         if scratch is None:
             if self._own is None:
                 self._own = (
@@ -148,16 +159,13 @@ class ComponentFinder:
                 )
             scratch = self._own
         parent, grounded = scratch[0].view(wp.int32), scratch[1]
-        cells, faces = A.cells_around.flatten(), [f.flatten() for f in A.faces]
         self._count.zero_()
-        sizes = wp.vec3i(*A.layout.padding.counts)
-        for kernel, inputs in (
-            (self._kernels.singletons, [parent, grounded, s.grain]),
-            (self._kernels.unite, [joined.flatten(), *faces, parent, sizes, s.grain]),
-            (self._kernels.ground, [cells, *faces, A.shift.flatten(), parent, grounded, s.grain]),
-            (self._kernels.count_floating, [cells, parent, grounded, s.grain, self._count]),
-        ):
-            wp.launch(kernel, s.threads, [self._shape, *inputs], device=A.device)
+        cells, coefficients = A.cells_around.flatten(), dict(zip(UNIFORM, A.uniform, strict=True))
+        given = coefficients | {name: face.flatten() for name, face in zip(FACES, A.faces, strict=True)}
+        SINGLETONS.bind(rows, parent=parent, grounded=grounded).launch()
+        UNITE.bind(rows, cells=joined.flatten(), parent=parent, **given).launch()
+        GROUND.bind(rows, cells=cells, shift=A.shift.flatten(), parent=parent, grounded=grounded, **given).launch()
+        COUNT.bind(rows, cells=cells, parent=parent, grounded=grounded, count=self._count).launch()
         return parent, grounded
 
     def _label(self, parent: np.ndarray, grounded: np.ndarray) -> FloatingComponents:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,14 +10,22 @@ import scipy.sparse
 import warp as wp
 
 from warp_lcp.layout import Layout, check_kept, check_storable, real_array
-from warp_lcp.operators.dense_kernels import product_kernel, relax_kernel
 from warp_lcp.pickling import Pickled, made_again
 from warp_lcp.problem import as_operator
+from warp_lcp.rows import RowPass, Rows
 from warp_lcp.scale import scale_of_matrix
 
-SYMMETRIC = 64 * float(
-    np.finfo(np.float64).eps
-)  # of the largest entries of two rows: what J M^-1 J' and assembly in float64 leave of symmetry
+HEADERS, FIELDS = Path(__file__).parent / "headers", dict.fromkeys(("b", "lower", "upper"), "S")
+PRODUCT = RowPass(
+    "dense.product", HEADERS / "dense_product.h", "S", whole={"a": "A", "x": "S"}, writes={"y": "S"},
+    numbers={"size": wp.int64, "transposed": bool},
+)  # fmt: skip
+RELAX = RowPass(
+    "dense.relax", HEADERS / "dense_relax.h", "S", whole={"a": "A"}, reads=FIELDS, writes={"x": "S"},
+    numbers={"omega": wp.float64, "forward": bool},
+)  # fmt: skip
+# of the largest entries of two rows: what J M^-1 J' and assembly in float64 leave of symmetry
+SYMMETRIC = 64 * float(np.finfo(np.float64).eps)
 
 
 def is_rounding(difference: np.ndarray, one: np.ndarray, other: np.ndarray) -> bool:
@@ -97,14 +106,15 @@ class DenseOperator(Pickled):
 
     def relax(self, x: Any, b: Any, lower: Any, upper: Any, omega: float, *, forward: bool = True) -> None:
         """Sweep x once in row order (forward) or backwards, each unknown projected onto its bounds."""
-        inputs = [self.matrix, b, lower, upper, wp.float64(omega), forward, x]
-        wp.launch(relax_kernel, 1, inputs, device=self.device)
+        given = {"b": b, "lower": lower, "upper": upper, "x": x, "omega": omega, "forward": forward}
+        RELAX.bind(Rows.flat(x.size, self.device, serial=True), a=self.matrix.flatten(), **given).launch()
 
     def _product(self, x: wp.array[Any], out: wp.array[Any] | None, *, transposed: bool) -> wp.array[Any]:
         if tuple(x.shape) != self.shape:
             raise ValueError(f"x has shape {tuple(x.shape)}: expected {self.shape}")
         out = wp.zeros_like(x) if out is None else out
-        wp.launch(product_kernel, self.shape[0], [self.matrix, x, transposed, out], device=self.device)
+        rows = Rows.flat(self.unknowns, self.device)
+        PRODUCT.bind(rows, a=self.matrix.flatten(), x=x, y=out, size=self.unknowns, transposed=transposed).launch()
         return out
 
 

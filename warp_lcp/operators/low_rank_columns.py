@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from warp_lcp.operators.low_rank_kernels import diagonal_kernel, kernels
 from warp_lcp.program import Launch
+from warp_lcp.rows import RowPass, Rows
 from warp_lcp.vectors import Reduction
 
+HEADERS = Path(__file__).parent / "headers"
+ENTRIES = {"entry_rows": wp.int32, "blocks": wp.int32, "values": "V", "count": wp.int32}
+GATHER = RowPass(
+    "low_rank.gather", HEADERS / "gather_entries.h", wp.float64, whole={**ENTRIES, "x": "S", "mask": "K"}, optional=("mask",),
+    numbers={"width": int, "rank": int}, sums=("first",), constants={"FUSED": 1},
+)  # fmt: skip
+SCATTER = RowPass(
+    "low_rank.scatter", HEADERS / "scatter_entries.h", wp.float64, optional=("mask",), numbers={"width": int, "sign": wp.float64},
+    whole={**ENTRIES, "factors": wp.float64, "mask": "K", "base": "S", "result": "S"}, constants={"FUSED": 1},
+)  # fmt: skip
+DIAGONAL = RowPass(
+    "low_rank.diagonal", HEADERS / "diagonal_entries.h", wp.float64, whole={**ENTRIES, "weights": wp.float64, "result": wp.float64},
+    numbers={"width": int, "rank": int},
+)  # fmt: skip
 CUDA_THREADS = 1024  # of a gather; each keeps sums for all columns
 
 
@@ -39,9 +54,6 @@ class BlockColumns:
         self.size, self.width, self.rank, self.dtype, self.device = size, width, blocks * width, dtype, device
         self.count = wp.zeros(1, dtype=wp.int32, device=device)
         self.sums = wp.zeros(self.rank, dtype=wp.float64, device=device)
-        self._threads = CUDA_THREADS if device.is_cuda else 1
-        self._reduction = Reduction(size, device, self.sums, columns=self.rank, threads=self._threads) if device.is_cuda else None
-        self._no_mask = wp.empty(0, dtype=wp.uint8, device=device)
         self.reserve(0)
 
     def reserve(self, entries: int) -> None:
@@ -50,6 +62,10 @@ class BlockColumns:
         self.rows, self.blocks = (wp.zeros(self.capacity, dtype=wp.int32, device=self.device) for _ in range(2))
         self.values = wp.zeros(self.capacity * self.width, dtype=self.dtype, device=self.device)
         self.count.zero_()
+        on_cuda = self.device.is_cuda
+        self._each = Rows.flat(self.capacity, self.device, serial=not on_cuda)
+        self._all = Rows.by_turns(self.capacity, self.device, min(self.capacity, CUDA_THREADS)) if on_cuda else self._each
+        self._reduction = Reduction(self.size, self.device, self.sums, columns=self.rank, threads=self._all.places) if on_cuda else None
 
     def assign(self, rows: np.ndarray, blocks: np.ndarray, values: np.ndarray) -> None:
         """Take entries from the host.
@@ -73,30 +89,32 @@ class BlockColumns:
         n = int(self.count.numpy()[0])
         return self.rows.numpy()[:n], self.blocks.numpy()[:n], self.values.numpy()[: n * self.width].reshape(n, self.width)
 
-    def gather(self, x: wp.array[Any], *, launch: Launch = wp.launch) -> wp.array[Any]:
-        """Write U'x to `sums`, and return that; x is a flat stored field."""
+    def gather(
+        self, x: wp.array[Any], *, mask: wp.array[Any] | None = None, fused: bool = True, launch: Launch = wp.launch,
+    ) -> wp.array[Any]:  # fmt: skip
+        """Write U'x to `sums`, and return that; x is a flat stored field, taken for 0 where `mask` is; `fused` as of `scatter`."""
         out = self.sums if self._reduction is None else self._reduction.partials
-        inputs = [*self._entries, self.rank, x, self._threads, out]
-        launch(kernels(self.dtype, x.dtype).gather, self._threads, inputs, device=self.device)
+        GATHER.bind(self._all, **self.entry_fields, rank=self.rank, x=x, mask=mask, out=out, FUSED=fused).launch(launch)
         if self._reduction is not None:
             self._reduction.add_up(0, columns=self.rank, launch=launch)
         return self.sums
 
     def scatter(
         self, factors: wp.array[Any], base: wp.array[Any], out: wp.array[Any], *, mask: wp.array[Any] | None = None,
-        launch: Launch = wp.launch,
+        sign: float = 1.0, fused: bool = True, launch: Launch = wp.launch,
     ) -> None:  # fmt: skip
-        """Out = base + U f on U's rows; other rows of `out` stay as they are, and so do those where `mask` (uint8) is 0."""
-        threads = self.capacity if self.device.is_cuda else 1
-        inputs = [*self._entries, factors, self._no_mask if mask is None else mask, base, out, threads]
-        launch(kernels(self.dtype, out.dtype).scatter, threads, inputs, device=self.device)
+        """Out = base + sign U f on U's rows; other rows of `out` stay as they are, and so do those where `mask` is 0.
+
+        `fused`: products are rounded with the sums that they are added to.
+        """
+        given = {"factors": factors, "mask": mask, "base": base, "result": out, "sign": sign, "FUSED": fused}
+        SCATTER.bind(self._each, **self.entry_fields, **given).launch(launch)
 
     def add_diagonal(self, weights: wp.array[Any], out: wp.array[Any]) -> None:
         """Out += the diagonal of U W U', W of shape (rank * rank,)."""
-        threads = self.capacity if self.device.is_cuda else 1
-        inputs = [*self._entries, self.rank, weights, out, threads]
-        wp.launch(diagonal_kernel(self.dtype), threads, inputs, device=self.device)
+        DIAGONAL.bind(self._each, **self.entry_fields, rank=self.rank, weights=weights, result=out).launch()
 
     @property
-    def _entries(self) -> list[Any]:
-        return [self.rows, self.blocks, self.values, self.count, self.width]
+    def entry_fields(self) -> dict[str, Any]:
+        """What passes over the entries take."""
+        return {"entry_rows": self.rows, "blocks": self.blocks, "values": self.values, "count": self.count, "width": self.width}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,14 +11,25 @@ import scipy.sparse
 import warp as wp
 
 from warp_lcp.layout import Layout, check_kept, check_storable, real_array
-from warp_lcp.native import Spans
 from warp_lcp.operators.dense import is_rounding
-from warp_lcp.operators.sparse_kernels import color_kernel, gather_kernel, kernels
+from warp_lcp.operators.sparse_kernels import color_kernel
 from warp_lcp.pickling import Pickled, made_again
 from warp_lcp.problem import as_operator
 from warp_lcp.program import Launch
+from warp_lcp.rows import RowPass, Rows
 from warp_lcp.scale import scale_of_matrix
-from warp_lcp.vectors import launch_spans
+
+HEADERS = Path(__file__).parent / "headers"
+ROWS = {"ptr": wp.int32, "col": wp.int32}  # of a matrix: where each begins, columns of the entries
+PRODUCT = RowPass(
+    "sparse.product", HEADERS / "product.h", "S", whole={**ROWS, "a": "A", "x": "S"}, reads={"plus": "S"}, optional=("plus",),
+    writes={"y": "S"},
+)  # fmt: skip
+RELAX = RowPass(
+    "sparse.relax", HEADERS / "relax.h", "S", optional=("list",), numbers={"omega": wp.float64, "forward": bool, "first": int},
+    whole={**ROWS, "a": "A", "d": "A", "list": wp.int32, **dict.fromkeys(("b", "lower", "upper", "x"), "S")},
+)  # fmt: skip
+GATHER = RowPass("sparse.gather", HEADERS / "gather.h", "S", whole={"source": "S"}, reads={"order": wp.int32}, writes={"taken": "S"})
 
 
 class SparseOperator(Pickled):
@@ -129,8 +141,7 @@ class SparseOperator(Pickled):
         if self._transpose_values is None:
             self._transpose_values = wp.zeros_like(self.values)
             self._gather(order)
-        inputs = [indptr, indices, self._transpose_values, x, x, False, out]
-        launch_spans(kernels(self.dtype, x.dtype).product, Spans.of(x.size, self.device), inputs, [], self.device)
+        PRODUCT.bind(Rows.flat(x.size, self.device), ptr=indptr, col=indices, a=self._transpose_values, x=x, plus=None, y=out).launch()
         return out
 
     def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
@@ -139,8 +150,7 @@ class SparseOperator(Pickled):
 
     def product(self, x: wp.array[Any], out: wp.array[Any], plus: wp.array[Any] | None = None, *, launch: Launch = wp.launch) -> None:
         """Out = A x, or A x + plus; kernel launches only."""
-        inputs = [self.indptr, self.indices, self.values, x, x if plus is None else plus, plus is not None, out]
-        launch_spans(kernels(self.dtype, x.dtype).product, Spans.of(x.size, self.device), inputs, [], self.device, launch=launch)
+        PRODUCT.bind(Rows.flat(x.size, self.device), **self._rows, x=x, plus=plus, y=out).launch(launch)
 
     def diagonal(self) -> wp.array[Any]:
         """Return the diagonal of A, shape (n,): the operator's own memory, which `update` keeps current."""
@@ -184,16 +194,15 @@ class SparseOperator(Pickled):
             colored: color by color, all rows of a color at once, instead of row by row by one thread; on CUDA if None.
             launch: launches or records.
         """
-        found = kernels(self.dtype, x.dtype)
-        before = [self.indptr, self.indices, self.values, self._diagonal, b, lower, upper, wp.float64(omega)]
+        given = {**self._rows, "d": self._diagonal, "b": b, "lower": lower, "upper": upper, "x": x, "omega": omega, "forward": forward}
         if not (self.device.is_cuda if colored is None else colored):
-            launch(found.relax, 1, [*before, forward, self._no_rows, x, x.size], device=self.device)
+            RELAX.bind(Rows.flat(x.size, self.device, serial=True), **given, list=None, first=0).launch(launch)
             return
         rows, starts = self.colors
         colors = range(len(starts) - 1)
         for c in colors if forward else reversed(colors):
-            spans = Spans.of(starts[c + 1] - starts[c], self.device)
-            launch_spans(found.relax_color, spans, [*before, rows, starts[c], x], [], self.device, launch=launch)
+            here = Rows.flat(starts[c + 1] - starts[c], self.device)
+            RELAX.bind(here, **given, list=rows, first=starts[c]).launch(launch)
 
     @cached_property
     def colors(self) -> tuple[wp.array[Any], list[int]]:
@@ -229,7 +238,7 @@ class SparseOperator(Pickled):
         self.version += 1
 
     def _gather(self, order: wp.array[Any]) -> None:
-        wp.launch(gather_kernel(self.dtype), order.size, [self.values, order, self._transpose_values], device=self.device)
+        GATHER.bind(Rows.flat(order.size, self.device), source=self.values, order=order, taken=self._transpose_values).launch()
 
     @cached_property
     def _transpose(self) -> tuple[wp.array[Any], wp.array[Any], wp.array[Any]]:
@@ -239,9 +248,9 @@ class SparseOperator(Pickled):
         parts = [wp.array(v, dtype=wp.int32, device=self.device) for v in (turned.indptr, turned.indices, turned.data)]
         return parts[0], parts[1], parts[2]
 
-    @cached_property
-    def _no_rows(self) -> wp.array[Any]:
-        return wp.empty(0, dtype=wp.int32, device=self.device)
+    @property
+    def _rows(self) -> dict[str, Any]:
+        return {"ptr": self.indptr, "col": self.indices, "a": self.values}
 
     def _matrix_of(self, values: np.ndarray) -> scipy.sparse.csr_array:
         return scipy.sparse.csr_array((values.astype(np.float64), self._indices, self._indptr), shape=self.shape * 2)

@@ -11,10 +11,10 @@ import warp as wp
 from warp_lcp.layout import layout_of
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.operators.low_rank import LowRankOperator
-from warp_lcp.operators.low_rank_kernels import add_kernel
 from warp_lcp.operators.protocol import Operator
 from warp_lcp.pickling import Pickled
 from warp_lcp.problem import as_operator
+from warp_lcp.vectors import ADD, rows_of
 
 FELT = 1e-5  # of the sum of a column's sizes over a component: open fractions are of float32
 
@@ -107,7 +107,7 @@ class SumOperator(Pickled):
             return
         stored = self.layout.stored_shape
         self.apply(x.reshape(stored), out.reshape(stored))
-        wp.launch(add_kernel, out.size, [b, out], device=self.device)
+        ADD.bind(rows_of(out), z=b, x=out).launch()
 
     def floating_components(self, scratch: Any = None) -> Any:
         """Return the components on which the sum is singular; None if there are none, or a term does not know its own.
@@ -148,7 +148,7 @@ class SumOperator(Pickled):
             self._scratch[key] = wp.zeros_like(x)
         other = self._scratch[key]
         (low.apply_transpose if transposed else low.apply)(x, other)
-        wp.launch(add_kernel, out.size, [other.flatten(), out.flatten()], device=self.device)
+        ADD.bind(rows_of(out), z=other.flatten(), x=out.flatten()).launch()
 
 
 def grid_and_low_rank(A: Any) -> tuple[GridPoisson, LowRankOperator] | None:

@@ -3,7 +3,7 @@
 import ctypes
 import functools
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,7 @@ class RowLayout:
     grain: int  # cells that a thread takes
     chunks: int  # threads of a row
     slab: int  # planes that a thread takes
+    lines: int  # rows of a plane that it takes
     spans: wp.array2d(dtype=wp.vec2i)  # first and one past the last cell of each row (k, j) that may hold unknowns; null: all
     o0: wp.int64  # the other level of a transfer: element of its first cell, elements from plane to plane and from row to row
     o1: wp.int64
@@ -137,6 +138,7 @@ class Rows:
         size: elements of a field.
         other_size: elements of a field of the other level of a transfer; 0: there is none.
         device: where the fields are.
+        place: first stored cell of a box.
     """
 
     summed: Any
@@ -144,11 +146,12 @@ class Rows:
     size: int
     other_size: int
     device: wp.Device
+    place: Mapping[str, int] = field(default_factory=dict)
 
     @staticmethod
     def of(padding: Padding, device: wp.Device, spans: Any = None) -> "Rows":
         """Return the rows of a padded grid, or what their spans have of them."""
-        return Rows._make(padding.size, device, (padding.plane + padding.row + 1, padding.plane, padding.row), padding.counts, spans)
+        return Rows.strided(padding.size, device, (padding.plane + padding.row + 1, padding.plane, padding.row), padding.counts, spans)
 
     @staticmethod
     def beyond(padding: Padding, device: wp.Device, axis: int, end: int) -> "Rows":
@@ -157,7 +160,7 @@ class Rows:
         counts = [1 if 2 - axis == a else n for a, n in enumerate(padding.counts)]
         starts = [end * (padding.counts[a] + 1) if 2 - axis == a else 1 for a in range(3)]
         first = sum(start * stride for start, stride in zip(starts, strides, strict=True))
-        return Rows._make(padding.size, device, (first, padding.plane, padding.row), tuple(counts), None)
+        return Rows.strided(padding.size, device, (first, padding.plane, padding.row), tuple(counts))
 
     @staticmethod
     def flat(size: int, device: wp.Device, *, serial: bool = False) -> "Rows":
@@ -165,12 +168,30 @@ class Rows:
         return _flat(size, device.alias, serial)
 
     @staticmethod
-    def _make(
-        size: int, device: wp.Device, strides: Any, counts: Any, spans: Any, cells: int | None = None, slab: int | None = None
+    def box(low: tuple[int, int, int], high: tuple[int, int, int], device: wp.Device, *, whole: bool = False) -> "Rows":
+        """Return the rows of stored cells low <= (k, j, i) < high of a grid; a thread takes a `whole` one."""
+        counts = tuple(end - begin for begin, end in zip(low, high, strict=True))
+        made = Rows.strided(0, device, (0, 0, 0), counts, cells=counts[2] if whole else None, lines=1 if device.is_cuda else counts[1])
+        return replace(made, place=dict(zip(("k0", "j0", "i0"), low, strict=True)))
+
+    @staticmethod
+    def by_turns(size: int, device: wp.Device, width: int) -> "Rows":
+        """Return a flat field as rows of a width: a thread of a pass that sums takes the same place of each, its neighbor the next."""
+        planes = -(-size // width)
+        ends = np.full((planes, 1, 2), (0, width))
+        ends[-1, 0, 1] -= planes * width - size
+        spans = wp.array(ends, dtype=wp.vec2i, device=device)
+        return Rows.strided(size, device, (0, width, 0), (planes, 1, width), spans, cells=1, slab=planes)
+
+    @staticmethod
+    def strided(
+        size: int, device: wp.Device, first: Any, counts: Any, spans: Any = None, cells: Any = None, slab: Any = None, lines: int = 1
     ) -> "Rows":
+        """Return rows by the first cell's element and the steps from plane to plane and row to row, and counts of planes, rows, cells."""
         slab, cells = slab or PLANES_A_THREAD["cuda" if device.is_cuda else "cpu"], cells or grain(counts[2], device)
         names = ("base", "s1", "s2", "planes", "rows", "nx")
-        shared = dict(zip(names, (*strides, *counts), strict=True)) | {"grain": cells, "chunks": -(-counts[2] // cells), "spans": spans}
+        shared = dict(zip(names, (*first, *counts), strict=True)) | {"grain": cells, "chunks": -(-counts[2] // cells), "spans": spans}
+        shared["lines"] = lines
         single = put(copy_of(BLANK), shared | {"slab": 1})
         return Rows(single if slab == 1 else put(copy_of(single), {"slab": slab}), single, size, 0, device)
 
@@ -217,27 +238,18 @@ class Rows:
 def _flat(size: int, name: str, serial: bool) -> Rows:
     device = wp.get_device(name)
     if serial or not device.is_cuda:
-        return Rows._make(size, device, (0, 0, 0), (1, 1, size), None, cells=max(size, 1) if serial else CPU_CHUNK)
-    return strided(size, device, min(size, CUDA_THREADS))
-
-
-def strided(size: int, device: wp.Device, width: int) -> Rows:
-    """Return a flat field as rows of a width: a thread of a pass that sums takes the same place of each, neighbors read neighbors."""
-    planes = -(-size // width)
-    ends = np.full((planes, 1, 2), (0, width))
-    ends[-1, 0, 1] -= planes * width - size
-    spans = wp.array(ends, dtype=wp.vec2i, device=device)
-    return Rows._make(size, device, (0, width, 0), (planes, 1, width), spans, cells=1, slab=planes)
+        return Rows.strided(size, device, (0, 0, 0), (1, 1, size), cells=max(size, 1) if serial else CPU_CHUNK)
+    return Rows.by_turns(size, device, min(size, CUDA_THREADS))
 
 
 @functools.cache
 def no_rows() -> Any:
     """Return the layout of a pass that is left out."""
     L = RowLayout()
-    L.slab = 1
+    L.slab = L.lines = 1
     return L
 
 
 def threads(layout: Any) -> tuple[int, int, int]:
     """Return the threads of a launch."""
-    return -(-layout.planes // layout.slab), layout.rows, layout.chunks
+    return -(-layout.planes // layout.slab), -(-layout.rows // layout.lines), layout.chunks

@@ -19,15 +19,9 @@ from warp_lcp.rows.layout import Bounds, Known, RowLayout, Rows, joined, make_st
 
 HEADERS = Path(__file__).parent / "headers"
 C = {**C_TYPES, wp.int8: "signed char", wp.int32: "int", wp.bool: "bool"}
-PACKED = {
-    wp.float32: "f",
-    wp.float64: "d",
-    wp.int64: "q",
-    wp.int32: "i",
-    int: "i",
-    wp.bool: "?",
-    bool: "?",
-}  # numbers, as `struct` calls them
+PLACE = ("k0", "j0", "i0")  # first stored cell of a box
+INTEGERS = {wp.int32: "i", int: "i", wp.int64: "q", wp.bool: "?", bool: "?"}
+PACKED = {wp.float32: "f", wp.float64: "d", **INTEGERS}  # numbers, as `struct` calls them
 NO_BOUNDS, SIDES = Bounds(), struct.Struct("dd")
 LARGEST = 4  # passes of a wave
 STAGES = ("L1", "F1", "L2", "F2", "L3", "F3", "L4", "F4")  # their layouts and fields
@@ -77,10 +71,13 @@ class RowPass:
         finer: whether the stencil and the offsets are those of the other level, which is finer.
         by_row: one element a row of the grid: pointers to the first row's; `P.row` counts.
         whole: small arrays: pointers to the first element.
+        box: fields of all cells of a grid, of `Rows.box`: pointers to the first stored cell of row j of plane k, null where there is none.
+            The piece is first <= i < last; the planes of the first field are s1 elements apart, its rows s2. Such a pass has no letters,
+            no sums and one form, in the Warp module that its name begins with.
         optional: which arrays may be None, or empty: their pointers are null then.
         numbers: given by the host.
         sums: variables of the row function that are summed over the cells.
-        constants: integers that are known when the kernel is made, macros of the row function, with their usual values.
+        constants: numbers that are known when the kernel is made, with their usual values; those that are given are integers, and macros.
     """
 
     name: str
@@ -98,13 +95,20 @@ class RowPass:
     optional: tuple[str, ...] = ()
     numbers: Mapping[str, Any] = field(default_factory=dict)
     sums: tuple[str, ...] = ()
-    constants: Mapping[str, int] = field(default_factory=dict)
+    constants: Mapping[str, float] = field(default_factory=dict)
+    box: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Make the form of a box at once: a Warp module that has been loaded would be compiled again with it."""
+        if self.box:
+            object.__setattr__(self, "numbers", {**self.numbers, **dict.fromkeys(PLACE, int)})
+            assert _form(self, (), tuple(self.constants.items()), UNIFORM, NUMBERS).kernel
 
     @functools.cached_property
     def arrays(self) -> dict[str, Any]:
         """Types of all arrays by name; `out` receives the sums, a column each."""
         out = {"out": wp.float64} if self.sums else {}
-        return {**self.reads, **self.writes, **self.other, **self.by_row, **self.whole, **out}
+        return {**self.reads, **self.writes, **self.other, **self.by_row, **self.whole, **self.box, **out}
 
     def bind(self, rows: Rows, *, stencil: Any = None, bounds: list[Any] | None = None, **given: Any) -> "Bound":
         """Check and take what a launch needs.
@@ -122,7 +126,11 @@ class RowPass:
         if (self.stencil is None) != (stencil is None) or self.bounds == (bounds is None):
             verb = {True: "needs", False: "takes no"}
             raise TypeError(f"{self.name}: {verb[self.stencil is not None]} stencil, {verb[self.bounds]} bounds")
-        constants = tuple([int(given.pop(n, usual)) for n, usual in self.constants.items()]) if self.constants else ()
+        if self.box:
+            given |= rows.place
+            constants = tuple(self.constants.values())
+        else:
+            constants = tuple([int(given.pop(n, usual)) for n, usual in self.constants.items()]) if self.constants else ()
         if given.keys() != self._wanted:
             missing, unknown = sorted(self._wanted - given.keys()), sorted(given.keys() - self._wanted)
             raise TypeError(f"{self.name}: missing {missing}, unknown {unknown}")
@@ -179,6 +187,8 @@ class RowPass:
             found, expected = 0 if given[name] is None else given[name].size, getattr(rows, length)
             if found != expected and (found or name not in self.optional):
                 raise ValueError(f"{self.name}: {name} has {found} elements, not {expected}")
+        if self.box and len(shapes := {tuple(given[n].shape) for n in self.box if given[n] is not None}) > 1:
+            raise ValueError(f"{self.name}: fields have the shapes {', '.join(map(str, sorted(shapes)))}")
         if self.sums and given["out"].size < len(self.sums) * rows.places:
             least = f"fewer than {len(self.sums) * rows.places}: {rows.places} threads for each sum"
             raise ValueError(f"{self.name}: out has {given['out'].size} elements, {least}")
@@ -221,7 +231,8 @@ class Form:
         def run(L: RowLayout, given: Fields, k_: int, end_: int, j_: int, last_: int, c_: int): ...
 
         self.blank = Fields()
-        run.__module__ = f"warp_lcp.{d.name}.{'_'.join(self.words)}"  # apart from other forms, which Warp would take for overloads
+        variant = f"warp_lcp.{d.name}.{'_'.join(self.words)}"
+        run.__module__ = d.name.rpartition(".")[0] if d.box else variant  # apart from other forms, which Warp would take for overloads
         run.__qualname__ = f"{d.name.rpartition('.')[2]}_rows"
         self.run = wp.func_native(self._source(letters, constants, ord(shape[0]), of))(run)
 
@@ -230,9 +241,10 @@ class Form:
         d = self.declared
         into = not {*d.ring}.isdisjoint(d.writes)
         switches = {"RINGS": bool(d.ring), "INTO_RING": into, "LEVELS": bool(d.other), "BOUNDS": ord(self.bounds[0]), "STENCIL": stencil}
+        macros = {n: v for n, v in constants.items() if not isinstance(v, float)}
         head = [f"typedef {C[t]} {n};" for n, t in letters.items()] + [f"typedef {C[of(d.compute)]} T;"] * ("T" not in letters)
-        head += [f"constexpr int {n} = {int(v)};" for n, v in switches.items()] + [f"#define {n} {v}" for n, v in constants.items()]
-        tail = ['#line 1 "end"', "}", *(f"#undef {n}" for n in constants), ""]
+        head += [f"constexpr int {n} = {int(v)};" for n, v in switches.items()] + [f"#define {n} {int(v)}" for n, v in macros.items()]
+        head += [f"constexpr double {n} = {v!r};" for n, v in constants.items() if n not in macros]
         at = {n: " + p + P.ring" if n in d.ring else " + p" for n in (*d.reads, *d.writes)} | dict.fromkeys(d.other, " + P.q")
         each = ["const Piece P = piece(k_i, j_i, c_); const int n = P.n; const long long p = P.p;"]
         each += [f"const long long yp = {'L.o2' if d.finer else 'P.yp'}, zp = {'L.o1' if d.finer else 'P.zp'};"]
@@ -241,11 +253,16 @@ class Form:
         if d.other:
             each += ["const bool pairs = L.fx > 1 || L.fx < -1; const int deep = L.fz == 1 || 2*P.k + 2 > L.n1 ? 1 : 2;"]
             each += ["const int wide = L.fy == 1 || 2*P.j + 2 > L.n2 ? 1 : 2;"]
-        for n in (n for n in d.arrays if n != "out"):
+        for n in (n for n in d.arrays if n != "out" and n not in d.box):
             pointer = f"given.{n}.data{at.get(n, '')}"
             pointer = f"given.{n}.data ? {pointer} : nullptr" if n in d.optional else pointer
             each += [f"{'const ' * (n in d.reads)}auto* {n} = {pointer};"]
         each += [f"const auto {n} = given.{n};" for n in d.numbers]
+        if d.box:
+            each += ["const int k = P.k + k0, j = P.j + j0, first = P.first + i0, last = first + n;"]
+            each += [f"const long long s2 = given.{next(iter(d.box))}.shape[2], s1 = s2*given.{next(iter(d.box))}.shape[1];"]
+            row = "((long long)k*given.{0}.shape[1] + j)*given.{0}.shape[2]"
+            each += [f"auto* {n} = given.{n}.data ? given.{n}.data + {row.format(n)} : nullptr;" for n in d.box]
         if d.stencil:
             each += [f"const auto* {n} = given.stencil.{n}.data + {'P.q' if d.finer else 'p'};" for n in ("d", "wx", "wy", "wz", "known")]
             each += [f"const T {n} = (T)given.stencil.{n};" for n in ("unit", "cx", "cy", "cz")]
@@ -254,7 +271,9 @@ class Form:
         shared = [text(HEADERS / h) for h, used in (("stencil.h", d.stencil), ("bounds.h", d.bounds)) if used]
         loops = ["for (int k_i = k_ < 0 ? 0 : k_; k_i < end_ && k_i < L.planes; ++k_i)", "for (int j_i = j_; j_i < last_; ++j_i) {"]
         before = [text(HEADERS / "native.h"), '#line 1 "types"', *head, text(HEADERS / "piece.h"), '#line 1 "fields"', *loops, *each]
-        return "\n".join(["", *before, *shared, text(d.header), '#line 1 "sums"', *(sums if d.sums else []), *tail])
+        body = ["{", text(d.header), "}"] if d.box else [text(d.header)]  # there names may be those of the pass
+        tail = ['#line 1 "end"', "}", *(f"#undef {n}" for n in macros), ""]
+        return "\n".join(["", *before, *shared, *body, '#line 1 "sums"', *(sums if d.sums else []), *tail])
 
     def alike(self, declared: RowPass) -> "Form":
         """Return another pass without a stencil in the form that has the same types."""
@@ -277,7 +296,7 @@ class Form:
 
         def alone(L: RowLayout, F: Fields):
             i, j, c = wp.tid()
-            run(L, F, i * L.slab, (i + 1) * L.slab, j, j + 1, c)
+            run(L, F, i * L.slab, (i + 1) * L.slab, j * L.lines, (j + 1) * L.lines, c)
 
         return _make_kernel(alone, self.declared.name, run.module.name)
 

@@ -10,10 +10,11 @@ import warp as wp
 
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
-from warp_lcp.solve import IterateInPlace, Precision, Step
-from warp_lcp.solvers.accelerated_projected_gradient_kernels import advance_kernel, progress_kernel
+from warp_lcp.rows import Rows
+from warp_lcp.solve import IterateInPlace, Precision, RoundedIterate, Step
+from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers.spectrum import positive_diagonal, scaled_spectrum
-from warp_lcp.vectors import Reduction, convert, launch_spans
+from warp_lcp.vectors import Reduction
 
 MARGIN = 1.05  # Lanczos' estimate is from below
 FAR = 1.5  # times L: a step of more curvature is taken back
@@ -70,7 +71,7 @@ class AcceleratedProjectedGradient:
         return Step("gradient")
 
 
-class GradientWorkspace(IterateInPlace):
+class GradientWorkspace(IterateInPlace, RoundedIterate):
     """Memory of the method.
 
     Attributes:
@@ -88,6 +89,7 @@ class GradientWorkspace(IterateInPlace):
         self._d = zeros(wp.float64)
         self._scalars = wp.zeros(4, dtype=wp.float64, device=problem.device)
         self._reduction = Reduction(problem.layout.size, problem.device, self._scalars, columns=4)
+        self._rows = Rows.flat(problem.layout.size, problem.device)
         self._rounded = zeros(wp.float32) if self.precision is Precision.SINGLE else None
 
     def start(self, *, warm: bool, tolerance: float) -> None:
@@ -103,21 +105,17 @@ class GradientWorkspace(IterateInPlace):
 
     def advance(self, x: wp.array[Any]) -> None:
         """Take the step; the residual's y is that of x."""
-        p, y, spans = self.problem, self.residual.y, self._reduction.spans
-        beta = self._beta(x) if self._momentum > 0 else 0.0
+        p, beta = self.problem, self._beta(x) if self._momentum > 0 else 0.0
         if self._momentum == 0:
             self._momentum = 1.0
-        moved = [x, self._x_old, self._y_old, self._z, self._y_z]
-        before = [y, self._d, p.lower, p.upper, p.unknown, beta, self.lipschitz, *moved]
-        launch_spans(advance_kernel, spans, before, [], p.device)
+        fields = {**self._fields(x), "y_old": self._y_old, "beta": beta, "lipschitz": self.lipschitz}
+        passes.EXTRAPOLATE.bind(self._rows, bounds=p.bounds.operands, **fields).launch()
         self.round_iterate()
 
     def _beta(self, x: wp.array[Any]) -> float:
         """Look at the last step, correct L, return the share of it that goes on."""
-        r, spans = self._reduction, self._reduction.spans
-        before = [x, self._x_old, self.residual.y, self._z, self._y_z, self._d, self.problem.unknown]
-        launch_spans(progress_kernel, spans, before, [r.threads, r.partials], self.problem.device)
-        r.add_up(0, columns=4)
+        passes.PROGRESS.bind(self._rows, **self._fields(x), out=self._reduction.partials).launch()
+        self._reduction.add_up(0, columns=4)
         curvature, metric, turned, size = self._scalars.numpy()
         exceeded = metric > NOISE * size and curvature > self.lipschitz * metric
         if exceeded:
@@ -133,8 +131,7 @@ class GradientWorkspace(IterateInPlace):
         self._momentum = (1 + math.sqrt(1 + 4 * t * t)) / 2
         return (t - 1) / self._momentum
 
-    def round_iterate(self) -> None:
-        """Round the iterate to its precision."""
-        if self._rounded is not None:
-            convert(self.x, self._rounded)
-            convert(self._rounded, self.x)
+    def _fields(self, x: wp.array[Any]) -> dict[str, Any]:
+        """Return what both passes take."""
+        fields = {"x": x, "x_old": self._x_old, "y": self.residual.y, "z": self._z, "y_z": self._y_z, "d": self._d}
+        return fields | {"unknown": self.problem.unknown}

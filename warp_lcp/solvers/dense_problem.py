@@ -23,6 +23,7 @@ from warp_lcp.solve import IterateInPlace, Precision, Step
 SEMIDEFINITE = 1e-10  # shift with which an equilibrated semi-definite matrix must have a Cholesky factor
 PROVABLE = 250_000  # entries of A up to which a linear program is asked whether there is a solution: seconds
 EQUILIBRATIONS = 8  # sweeps of Ruiz's iteration, which halves the logarithms of rows that differ
+SINGULAR = 1e-13  # of the matrix's largest row sum: a pivot below it is rounding
 RANK = 1e-12  # singular values below this part of the largest are zero to least-squares solutions (methods.md: all solved with it)
 
 
@@ -155,6 +156,14 @@ def equilibration(A: Any) -> np.ndarray:
         rows, columns = (scaled.max(axis=k).toarray().ravel() if sparse else scaled.max(axis=k) for k in (1, 0))
         S = S * power_of_two(1 / np.sqrt(np.where(np.maximum(rows, columns) > 0, np.maximum(rows, columns), 1.0)))
     return S
+
+
+def factored(block: np.ndarray, r: np.ndarray) -> np.ndarray | None:
+    """Return block^-1 r, None where a pivot is so small that the block looks singular."""
+    factors, pivots, info = scipy.linalg.lapack.dgetrf(block)
+    if info != 0 or np.abs(factors.diagonal()).min() <= SINGULAR * np.abs(block).sum(axis=1).max():
+        return None
+    return scipy.linalg.lapack.dgetrs(factors, pivots, r)[0]
 
 
 def _solved(A: np.ndarray, r: np.ndarray) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,11 +17,16 @@ from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
+from warp_lcp.rows import RowPass
 from warp_lcp.scale import scaled
 from warp_lcp.solve import IterateInPlace, Precision, RoundedIterate, Step
 from warp_lcp.solvers.dense_problem import power_of_two, proved_infeasible, unit_rows_and_columns
-from warp_lcp.solvers.equilibrated_kernels import multiply_kernel
+from warp_lcp.vectors import rows_of
 
+UNITS = RowPass(
+    "equilibrated.units", Path(__file__).parent / "headers" / "units.h", wp.float64, reads={"x": wp.float64, "units": wp.float64},
+    writes={"scaled": wp.float64}, numbers={"inverse": bool},
+)  # fmt: skip
 ALIKE = 4.0  # rows whose units differ by no more stay as they are
 WAIT = 6  # steps without a residual below FALL times the smallest after which it is asked whether there is a solution
 FALL = 0.9
@@ -78,7 +84,7 @@ class EquilibratedWorkspace(IterateInPlace, RoundedIterate):
             else:
                 operator.matrix.assign(self._scaled())
                 self.inner.residual.rescale()
-        wp.launch(multiply_kernel, inner.b.size, [self.problem.b, self._rows, False, inner.b], device=self.problem.device)
+        UNITS.bind(rows_of(inner.b), x=self.problem.b, units=self._rows, inverse=False, scaled=inner.b).launch()
         for k, side in enumerate(self._sides):
             if side is not None:
                 self._multiply(self.problem.bounds.as_field(k), side, inverse=True)
@@ -128,4 +134,4 @@ class EquilibratedWorkspace(IterateInPlace, RoundedIterate):
         return scaled(matrix, R, C)
 
     def _multiply(self, field: wp.array[Any], out: wp.array[Any], *, inverse: bool = False) -> None:
-        wp.launch(multiply_kernel, field.size, [field, self._units, inverse, out], device=self.problem.device)
+        UNITS.bind(rows_of(field), x=field, units=self._units, inverse=inverse, scaled=out).launch()

@@ -8,17 +8,17 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.krylov.gmres import GMRES
+from warp_lcp.krylov.system import KrylovSystem
 from warp_lcp.problem import LCP
 from warp_lcp.program import Launch
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.solvers.nonsmooth_map import Kink, NonsmoothMap, Reformulation
 from warp_lcp.solvers.nonsmooth_map_kernels import difference_kernel, scale_rows_kernel
-from warp_lcp.vectors import Reduction
 
 STEP = 1e-7  # relative to ||x|| / ||p||: half the digits of float64
 
 
-class FiniteDifferenceSystem:
+class FiniteDifferenceSystem(KrylovSystem):
     """Solve J e = -f by GMRES with J p = (f(x + h p) - f(x)) / h, preconditioned by the diagonal of A.
 
     `linearize` takes the point; `r` and `e` are as in a principal system.
@@ -34,10 +34,7 @@ class FiniteDifferenceSystem:
         layout, self._problem, self._residual = problem.layout, problem, residual
         self.r, self.z, self._f, self._moved = (layout.zeros(wp.float64) for _ in range(4))
         self._map = NonsmoothMap(problem, residual, map, share, Kink.APPROXIMATION)
-        self._sums = wp.zeros(1, dtype=wp.float64, device=problem.device)
-        self._reduction = Reduction(layout.size, problem.device, self._sums)
-        self._krylov = GMRES(self._product, self)
-        self.e = self._krylov.x
+        self._iterate_by(GMRES(self._product, self), None)
         self.refresh()
 
     def refresh(self) -> None:
@@ -50,25 +47,17 @@ class FiniteDifferenceSystem:
         """Take the point x, where the residual was evaluated, and make -f / size on the free unknowns the right-hand side."""
         self._x, self._free, self._size = x, free, size
         self._map.values(x, self._f)
-        self._length = 1 + self._norm(x)
+        self._length = 1 + self._norm.of(x)
         self.r.zero_()
         inputs = [free, self._f, wp.float64(1 / size), self.r]
         wp.launch(difference_kernel, self.r.size, inputs, device=self._problem.device)
-
-    def norm(self) -> float:
-        """Return the norm of r."""
-        return self._norm(self.r)
-
-    def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
-        """Iterate."""
-        return self._krylov.solve(tolerance, max_iterations)
 
     def apply(self) -> None:
         """Precondition: z = r / d."""
         wp.launch(scale_rows_kernel, self.r.size, [self.r, self._diagonal, self.z], device=self._problem.device)
 
     def _product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
-        norm = self._norm(p)
+        norm = self._norm.of(p)
         if norm == 0:
             q.zero_()
             return
@@ -77,7 +66,3 @@ class FiniteDifferenceSystem:
         self._residual.affine(self._moved)
         self._map.values(self._moved, q)
         wp.launch(difference_kernel, q.size, [self._free, self._f, wp.float64(1 / h), q], device=self._problem.device)
-
-    def _norm(self, a: wp.array[Any]) -> float:
-        self._reduction.dot(a, a, 0)
-        return float(np.sqrt(self._sums.numpy()[0]))

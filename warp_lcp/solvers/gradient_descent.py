@@ -12,10 +12,9 @@ import warp as wp
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
-from warp_lcp.solve import IterateInPlace, Precision, Step
+from warp_lcp.solve import IterateInPlace, Precision, RoundedIterate, Step
 from warp_lcp.solvers.globalization import NonmonotoneSearch
 from warp_lcp.solvers.nonsmooth_map import NonsmoothMap, Reformulation
-from warp_lcp.vectors import convert
 
 LEAST = 1e-12  # relative decrease of the merit without which a step is none
 LONGEST = 1e6  # length tried
@@ -78,7 +77,7 @@ class GradientDescent:
         return work.descend(x)
 
 
-class GradientWorkspace(IterateInPlace):
+class GradientWorkspace(IterateInPlace, RoundedIterate):
     """Memory of the method for one problem; another method's where it shares that one's residual.
 
     Args:
@@ -128,7 +127,7 @@ class GradientWorkspace(IterateInPlace):
     def _trial(self, x: wp.array[Any], length: float) -> float:
         """Move along the projected path, and return the merit."""
         self._map.advance(self._from, self._map.direction, -length, x, projected=True)
-        self.round(x)
+        self._round(x)
         self.residual.evaluate(x)
         return self._map.merit(x)
 
@@ -139,13 +138,3 @@ class GradientWorkspace(IterateInPlace):
             return SolveStatus.STAGNATED
         moved = float(np.abs(x.numpy() - self._from.numpy()).max())
         return SolveStatus.STAGNATED if moved <= s.stagnation * float(np.abs(x.numpy()).max()) else None
-
-    def round_iterate(self) -> None:
-        """Round x to its precision."""
-        self.round(self.x)
-
-    def round(self, x: wp.array[Any]) -> None:
-        """Round a field to the iterate's precision."""
-        if self._rounded is not None:
-            convert(x, self._rounded)
-            convert(self._rounded, x)

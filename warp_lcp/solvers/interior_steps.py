@@ -11,7 +11,7 @@ from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
 from warp_lcp.solve import Step
-from warp_lcp.solvers.proximal_point import ProximalPoint
+from warp_lcp.solvers.phases import ProximalPoint
 
 FALL = 0.9  # a residual above this part of the smallest so far is no progress
 IDLE = 10  # steps without progress before the proximal-point iteration: a path is joined far from the start

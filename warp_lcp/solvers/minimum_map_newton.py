@@ -17,16 +17,17 @@ from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
+from warp_lcp.rows import Known, Rows
 from warp_lcp.solve import FLOOR_MARGIN, IterateInPlace, Precision, RoundedIterate, Step
+from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers.coarse_problem import CoarseProblem
-from warp_lcp.solvers.gradient_phase import GradientPhase
 from warp_lcp.solvers.interior_steps import InteriorSteps
 from warp_lcp.solvers.minimum_map_newton_direct import DirectNewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
-from warp_lcp.solvers.minimum_map_newton_kernels import all_free_kernel, kernels
+from warp_lcp.solvers.phases import GradientPhase, ProximalPoint, projected_cycle
 from warp_lcp.solvers.principal_system import DenseSystem, GridSystem, PrincipalSystem, principal_system
-from warp_lcp.solvers.proximal_point import ProximalPoint
-from warp_lcp.vectors import Reduction, launch_spans
+from warp_lcp.solvers.projected_multigrid_kernels import SLOTS
+from warp_lcp.vectors import Reduction
 
 MOVED, SQUARE = 0, 3  # slots of the device scalars: cells moved, active, shifted, and the free residual's square
 LARGE = 1000  # unknowns from which a cold start on a sparse matrix takes projected cycles
@@ -101,14 +102,7 @@ class MinimumMapNewton:
 
     def step(self, problem: LCP, work: Any, x: wp.array[Any]) -> Step:
         """Take a monotone cycle while the start is cold, else a safeguarded Newton step."""
-        if isinstance(work, DirectNewtonWorkspace):
-            return work.step(x)
-        if isinstance(work, GridNewtonWorkspace):
-            return work.monotone_step() if work.wants_monotone_cycle() else work.newton_step()
-        if work.cycles_left > 0:
-            work.cycles_left -= 1
-            return work.monotone_cycle(x)
-        return work.newton_step(x)
+        return work.step(x)
 
 
 class NewtonWorkspace(IterateInPlace, RoundedIterate):
@@ -133,10 +127,9 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         self.residual = NaturalResidual(problem)
         self.system = self._principal_system()
         self.free = layout.zeros(wp.uint8)
-        self._scalars = wp.zeros(4, dtype=wp.float64, device=problem.device)
+        self._scalars = wp.zeros(SLOTS, dtype=wp.float64, device=problem.device)
         self._reduction = Reduction(layout.size, problem.device, self._scalars, columns=4, across=layout.across)
-        self._nothing = wp.empty(0, dtype=wp.float64, device=problem.device)
-        self._kernels = kernels(self.residual.diagonal.dtype, self.system.r.dtype)
+        self._rows, self._known = Rows.flat(layout.size, problem.device), Known(self.residual.diagonal, self.residual.unit, self.residual.y)
         self._rounded = layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
         self.floating: Any = None
         cycled = self.bounded and isinstance(problem.A, SparseOperator) and problem.A.unknowns >= LARGE
@@ -164,24 +157,24 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         self.resort, self._smallest, self._waited = None, math.inf, 0
         self.system.refresh()
 
+    def step(self, x: wp.array[Any]) -> Step:
+        """Take a monotone cycle while the start is cold, else a Newton step."""
+        if self.cycles_left > 0:
+            self.cycles_left -= 1
+            return self.monotone_cycle(x)
+        return self.newton_step(x)
+
     def monotone_cycle(self, x: wp.array[Any]) -> Step:
         """Projected cycle on all unknowns from x."""
-        p, system = self.problem, self.system
+        p, system, residual = self.problem, self.system, self.residual
         if self.aggregates is not None:
             self.aggregates.cycle(x, p.b, p.lower, p.upper)
             self._round(x)
             return Step("monotone cycle", 1, None)
         assert isinstance(system, GridSystem)
-        self._flat(all_free_kernel, [p.unknown, self.free])
-        if self.stale:
-            system.restrict(self.free)
+        projected_cycle(p, system, x, residual.y, residual.norm, self.free, self._reduction, restrict=self.stale)
         self.stale = True  # the next Newton step takes cells out again
-        size = self.residual.norm
-        self._right_side(size)
-        finest = system.hierarchy.finest
-        self._flat(self._kernels.gaps, [x, p.lower, p.upper, p.unknown, 1 / size, finest.lower, finest.upper])
-        system.monotone_cycle()
-        self._correct(x, system.z, size, x)
+        self._correct(x, system.z, residual.norm, x)
         if self.cycles_left > 0:
             self.stale = False
         return Step("monotone cycle", 1, None)
@@ -196,12 +189,10 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
             return self._resort(x)
         self.norms = [*self.norms, residual.norm][-self.settings.memory :]
         size = residual.norm
-        before = [x, residual.y, residual.diagonal, residual.unit, *p.bounds.operands, p.unknown, self.free, self.system.r]
-        reduction = self._reduction
-        after = [reduction.threads, reduction.partials]
-        launch_spans(self._kernels.classify, reduction.spans, [*before, wp.float64(1 / size)], after, p.device)
-        reduction.add_up(MOVED, columns=4)
-        moved, active, shifted, square = self._scalars.numpy()
+        fields = {"x": x, "unknown": p.unknown, "free": self.free, "g": self.system.r, "out": self._reduction.partials}
+        passes.CLASSIFY.bind(self._rows, stencil=self._known, bounds=p.bounds.operands, scale=1 / size, **fields).launch()
+        self._reduction.add_up(MOVED, columns=4)
+        moved, active, shifted, square = self._scalars.numpy()[:4]
         if self.coarse is not None and self.coarse.is_due(float(moved)):
             return self._coarse_step(x, int(active))
         if moved or self.stale:
@@ -242,18 +233,15 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         p, residual = self.problem, self.residual
         residual.affine(x)
         self.trial.assign(self.coarse.correction(p, x.numpy(), residual.y.numpy()))
-        correct = kernels(self.residual.diagonal.dtype, wp.float64).correct
-        self._flat(correct, [x, self.trial, *p.bounds.operands, x, self._nothing, wp.float64(1.0)])
-        self._round(x)
+        self._correct(x, self.trial, 1.0, x)
         self.norms, self.stale, self._smallest, self._waited = [], True, math.inf, 0
         return Step("coarse problem", 1, active, interim=True)
 
     def _right_side(self, size: float) -> float:
         """Set the system's right-hand side to -y / size on the free set; return the square of y's norm there."""
-        reduction = self._reduction
-        before = [self.residual.y, self.free, self.system.r, wp.float64(1 / size)]
-        launch_spans(self._kernels.right_side, reduction.spans, before, [reduction.partials], self.problem.device)
-        reduction.add_up(SQUARE)
+        fields = {"y": self.residual.y, "free": self.free, "g": self.system.r, "out": self._reduction.partials}
+        passes.ON_FREE.bind(self._rows, scale=1 / size, **fields).launch()
+        self._reduction.add_up(SQUARE)
         return float(self._scalars.numpy()[SQUARE])
 
     def _solve(self, norm: float, size: float, *, settled: bool) -> int:
@@ -344,9 +332,5 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
 
     def _correct(self, base: wp.array[Any], e: wp.array[Any], scale: float, x: wp.array[Any], kept: wp.array[Any] | None = None) -> None:
         """Set x = clip(base + scale e), rounded, where e is not 0; remember base if `kept` is given."""
-        kept = self._nothing if kept is None else kept
-        self._flat(self._kernels.correct, [base, e, *self.problem.bounds.operands, x, kept, wp.float64(scale)])
+        passes.move(self._rows, self.problem.bounds.operands, base, e, scale, x, kept=kept, guarded=False)
         self._round(x)
-
-    def _flat(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
-        launch_spans(kernel, self._reduction.spans, inputs, [], self.problem.device)

@@ -16,13 +16,13 @@ from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.solve import Precision, RoundedIterate, Step
+from warp_lcp.solvers.dense_problem import SINGULAR, factored
 
 if TYPE_CHECKING:
     from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
 
 MOST, WIDEST = 200, 3  # unknowns, or bandwidth whatever their number, up to which LAPACK on the host costs less than launches
 FEW = 30  # unknowns up to which dense factors cost no more than banded ones, whatever the bandwidth
-SINGULAR = 1e-13  # of the matrix's largest row sum: a pivot below it is rounding, the free block singular
 IDLE = 30  # steps without a smaller residual, the loop's patience, after which safeguarded steps take over
 PAUSE = 4  # steps without reaching out after a set has come again, doubled each time
 
@@ -51,11 +51,10 @@ class SmallMatrix:
         if not len(rows):
             return np.zeros(len(r))
         block = self._host if len(rows) == len(r) else self._host[rows[:, None], rows]
-        factors, pivots, info = scipy.linalg.lapack.dgetrf(block)
-        if info != 0 or _singular(factors.diagonal(), np.abs(block).sum(axis=1).max()):
+        e, found = np.zeros(len(r)), factored(block, r[rows])
+        if found is None:
             return None
-        e = np.zeros(len(r))
-        e[rows] = scipy.linalg.lapack.dgetrs(factors, pivots, r[rows])[0]
+        e[rows] = found
         return e
 
 
@@ -111,11 +110,7 @@ class BandedMatrix:
         else:
             factors, _, e, info = scipy.linalg.lapack.dgbsv(k, k, np.vstack([np.zeros((k, n)), masked]), right)
             pivots = factors[2 * k]
-        return None if info != 0 or _singular(pivots, self._size) else e
-
-
-def _singular(pivots: np.ndarray, size: float) -> bool:
-    return bool(np.abs(pivots).min() <= SINGULAR * size)
+        return None if info != 0 or np.abs(pivots).min() <= SINGULAR * self._size else e
 
 
 def suits(A: Any) -> bool:

@@ -84,6 +84,10 @@ class GridNewtonWorkspace(MultigridWorkspace):
         """Return whether the start is still cold, or Newton's steps have failed."""
         return self._cycles_left > 0
 
+    def step(self, x: wp.array[Any] | None = None) -> Step:
+        """Take a monotone cycle while the start is cold, else a safeguarded Newton step; x is the workspace's own."""
+        return self.monotone_step() if self.wants_monotone_cycle() else self.newton_step()
+
     def newton_step(self) -> Step:
         """Solve on the free set, and shorten the step if the residual exceeds the largest of the last ones."""
         residual, s = self.residual, self._newton

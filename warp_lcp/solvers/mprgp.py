@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -16,19 +17,22 @@ from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
+from warp_lcp.rows import Known, Rows
 from warp_lcp.solve import Precision, RoundedIterate, Step
-from warp_lcp.solvers import mprgp_kernels as kernels
+from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers import projected_multigrid_kernels as engine
 from warp_lcp.solvers.descent import Descent
-from warp_lcp.solvers.minimum_map_newton_kernels import all_free_kernel
+from warp_lcp.solvers.phases import projected_cycle
 from warp_lcp.solvers.principal_system import DiagonalSystem, principal_system
 from warp_lcp.solvers.principal_system_sparse import SparseSystem
 from warp_lcp.solvers.sweep import Diagonal
-from warp_lcp.vectors import Reduction, launch_spans
+from warp_lcp.vectors import Reduction
 
 SINGLE_SLACK = 1.2e-7  # a bound that float32 rounds is met within this part of it
-LEAST_REST = 1e-3  # of a correction's energy that must not lie along the last direction; what is left else is cancellation
 ENERGY_ROUNDING = 1e-12  # rises of the energy within this part of it are rounding
+SPLIT_SUMS = len(passes.SPLIT.sums)  # slots of the device scalars; slots of their own have
+GAIN, CURVATURE, SIZE, OVERLAP = 7, 8, int(engine.SIZE), 10
+SLOTS = 11
 NOISE = 1e-14  # of the energy: falls of less, over as many steps as patience lasts, are what rounding its sum may pretend
 
 
@@ -138,19 +142,20 @@ class SplitResidual(NaturalResidual):
 
     def __init__(self, problem: LCP, r: wp.array[Any], chopped_step: wp.array[Any], *, slack: float) -> None:
         super().__init__(problem)
-        device = problem.device
+        device, size = problem.device, problem.layout.size
         self.free, self._r, self._chopped_step, self._slack = problem.layout.zeros(wp.uint8), r, chopped_step, slack
-        self.scalars = wp.zeros(kernels.SLOTS, dtype=wp.float64, device=device)
-        self.sums = Reduction(problem.layout.size, device, self.scalars, columns=2)
-        self.kernels = kernels.kernels(self.diagonal.dtype, r.dtype)
+        self.scalars = wp.zeros(SLOTS, dtype=wp.float64, device=device)
+        self.sums, self.rows = Reduction(size, device, self.scalars, columns=2), Rows.flat(size, device)
         self.size, self.moved, self.chopped, self.reduced, self.release, self.active, self.energy = 1.0, True, 0.0, 0.0, 0.0, 0, 0.0
         self._norm_of_b = 0.0
         self._stencil = problem.A.stencil if isinstance(problem.A, GridPoisson) else None
-        if self._stencil is None:
-            self._split = Reduction(problem.layout.size, device, self.scalars, columns=kernels.COLUMNS)
-            return
-        places = self._stencil.rows.places
-        self._split = Reduction(problem.layout.size, device, self.scalars, columns=kernels.COLUMNS, threads=places)
+        places = self._stencil.rows.places if self._stencil else self.rows.places
+        self._split = Reduction(size, device, self.scalars, columns=SPLIT_SUMS, threads=places)
+
+    @cached_property
+    def known(self) -> Known:
+        """What passes take on matrices."""
+        return Known(self.diagonal, self.unit, self.y)
 
     def start(self, x: wp.array[Any], *, keep: bool) -> None:
         """Set x to clip(x, l, u) or clip(0, l, u)."""
@@ -168,21 +173,16 @@ class SplitResidual(NaturalResidual):
         p = self.problem
         if 0 < self.norm < math.inf:
             self.size = self.norm
+        fields = {"x": x, "b": p.b, "unknown": p.unknown, "free": self.free, "g": self._r, "step": self._chopped_step}
+        fields |= {"bounds": p.bounds.operands, "out": self._split.partials, "inverse": 1 / self.size, "slack": self._slack}
         if self._stencil is None:
-            written = [self.free, self._r, self._chopped_step, wp.float64(1 / self.size), wp.float64(self._slack)]
             self.affine(x)
-            before = [x, self.y, self.diagonal, wp.float64(self.unit), *p.bounds.operands, p.unknown, p.b, *written]
-            launch_spans(self.kernels.split, self._split.spans, before, [self._split.threads, self._split.partials], p.device)
+            passes.SPLIT_KNOWN.bind(self.rows, stencil=self.known, **fields).launch()
         else:
-            s = self._stencil
-            s.wrap(x)
-            fields = {"x": x, "b": p.b, "unknown": p.unknown, "free": self.free, "g": self._r, "step": self._chopped_step}
-            numbers = {"inverse": 1 / self.size, "slack": self._slack}
-            kernels.SPLIT.bind(s.rows, stencil=s, bounds=p.bounds.operands, out=self._split.partials, **fields, **numbers).launch(wp.launch)
-        self._split.add_up(kernels.SQUARE, columns=kernels.COLUMNS)
-        square, self.chopped, self.reduced, self.release, moved, active, self.energy = (
-            float(v) for v in self.scalars.numpy()[: kernels.COLUMNS]
-        )
+            self._stencil.wrap(x)
+            passes.SPLIT.bind(self._stencil.rows, stencil=self._stencil, **fields).launch()
+        self._split.add_up(0, columns=SPLIT_SUMS)
+        square, self.chopped, self.reduced, self.release, moved, active, self.energy = (float(v) for v in self.scalars.numpy()[:SPLIT_SUMS])
         self.norm, self.current, self.active, self.moved = float(np.sqrt(square)), True, int(active), self.moved or moved > 0
         return self.norm
 
@@ -247,17 +247,12 @@ class GradientWorkspace(RoundedIterate):
 
     def monotone_step(self, x: wp.array[Any]) -> Step:
         """Projected cycle on all unknowns."""
-        p, system, residual = self.problem, self.system, self.residual
+        residual = self.residual
         self._cycles_left -= 1
-        self._flat(all_free_kernel, [p.unknown, residual.free])
-        system.restrict(residual.free)
         residual.moved, self._carry = True, False
         residual.affine(x)
-        finest = system.hierarchy.finest
-        scaled = [finest.lower, finest.upper, system.r, wp.float64(1 / residual.size)]
-        self._flat(residual.kernels.gaps, [x, residual.y, *p.bounds.operands, p.unknown, *scaled])
-        system.monotone_cycle()
-        self._move(system.z, residual.size)
+        projected_cycle(self.problem, self.system, x, residual.y, residual.size, residual.free, residual.sums)
+        self._move(self.system.z, residual.size)
         return Step("monotone cycle", 1, None)
 
     def proportion(self) -> bool:
@@ -265,13 +260,14 @@ class GradientWorkspace(RoundedIterate):
         residual, direction = self.residual, self._chopped
         self._carry, self._released = False, True
         self._product(direction)
-        residual.sums.dot(direction, self._q, kernels.CURVATURE)
-        curvature = float(residual.scalars.numpy()[kernels.CURVATURE])
+        residual.sums.dot(direction, self._q, CURVATURE)
+        curvature = float(residual.scalars.numpy()[CURVATURE])
         if not (self.is_grid and curvature > 0):
             return self._projected_step(direction, residual.release, curvature)
-        factor, target, bounds = residual.release / curvature, self._target(), self.problem.bounds.operands
-        inputs = [self.x, direction, self._q, residual.diagonal, wp.float64(residual.unit), *bounds, residual.free, self.preconditioner.r]
-        self._flat(residual.kernels.release, [*inputs, target, wp.float64(factor), wp.float64(factor * residual.size)])
+        factor, target, p = residual.release / curvature, self._target(), self.problem
+        fields = {"x": self.x, "step": direction, "q": self._q, "to": target, "free": residual.free, "g": self.preconditioner.r}
+        numbers, stencil = {"part": factor, "length": factor * residual.size}, p.A.stencil  # type: ignore[attr-defined]
+        passes.RELEASE.bind(residual.rows, stencil=stencil, bounds=p.bounds.operands, **fields, **numbers).launch()
         self._settle(target)
         residual.moved = True
         return True
@@ -295,15 +291,14 @@ class GradientWorkspace(RoundedIterate):
         """Keep q = A p from step to step."""
         residual, M, beta = self.residual, self.preconditioner, 0.0
         if self._carry:
-            residual.sums.dot(M.z, self._q, kernels.OVERLAP)
-            beta = -float(residual.scalars.numpy()[kernels.OVERLAP]) / self._curvature
-        self._flat(residual.kernels.direct, [M.z, self._p, M.z.dtype(beta if math.isfinite(beta) else 0.0)])
+            residual.sums.dot(M.z, self._q, OVERLAP)
+            beta = -float(residual.scalars.numpy()[OVERLAP]) / self._curvature
+        bounds, beta = self.problem.bounds.operands, beta if math.isfinite(beta) else 0.0
+        passes.move(residual.rows, bounds, None, self._p, 0.0, None, z=M.z, beta=beta)
         self._product(self._p)
-        sums = residual.sums
-        after = [sums.threads, sums.partials]
-        launch_spans(residual.kernels.measure, sums.spans, [self._p, self._q, M.r], after, self.problem.device)
-        sums.add_up(kernels.GAIN, columns=2)
-        gain, curvature = (float(v) for v in residual.scalars.numpy()[kernels.GAIN : kernels.GAIN + 2])
+        passes.GAIN.bind(residual.rows, along=self._p, q=self._q, g=M.r, out=residual.sums.partials).launch()
+        residual.sums.add_up(GAIN, columns=2)
+        gain, curvature = (float(v) for v in residual.scalars.numpy()[GAIN : CURVATURE + 1])
         self._carry, self._curvature = curvature > 0, curvature
         return self._projected_step(self._p, gain, curvature)
 
@@ -315,18 +310,14 @@ class GradientWorkspace(RoundedIterate):
         zaz, zap, gz, gp = (float(v) for v in residual.scalars.numpy()[:4])
         beta, curvature, gain = 0.0, zaz, gz
         if self._carry:
-            ratio = -zap / self._curvature
-            rest = zaz + ratio * (2 * zap + ratio * self._curvature)
-            if rest > LEAST_REST * zaz:
-                beta, curvature, gain = ratio, rest, gz + ratio * gp
+            beta, curvature, gain = engine.conjugate.func(zaz, zap, gz, gp, self._curvature, engine.LEAST_REST.value)
         if not curvature > 0:
             wp.copy(self._p, finest.x)
             self._carry = False
             return self._projected_step(self._p, gz, zaz)
         self._carry, self._curvature = True, curvature
-        target, bounds = self._target(), self.problem.bounds.operands
-        numbers = [finest.x.dtype(beta), wp.float64(gain / curvature * residual.size)]
-        self._flat(residual.kernels.direct_advance, [self.x, finest.x, self._p, *bounds, target, *numbers])
+        target, bounds, length = self._target(), self.problem.bounds.operands, gain / curvature * residual.size
+        passes.move(residual.rows, bounds, self.x, self._p, length, target, z=finest.x, beta=beta)
         self._settle(target)
         return True
 
@@ -364,8 +355,7 @@ class GradientWorkspace(RoundedIterate):
 
     def _advance(self, origin: wp.array[Any], direction: wp.array[Any], length: float, target: wp.array[Any]) -> None:
         """X = clip(origin + length direction, l, u)."""
-        bounds = self.problem.bounds.operands
-        self._flat(self.residual.kernels.advance, [origin, direction, *bounds, target, wp.float64(length)])
+        passes.move(self.residual.rows, self.problem.bounds.operands, origin, direction, length, target)
         self._settle(target)
 
     def _settle(self, target: wp.array[Any]) -> None:
@@ -399,9 +389,6 @@ class GradientWorkspace(RoundedIterate):
             A.stencil.product(direction, self._q)
         else:
             A.apply(direction.reshape(shape), self._q.reshape(shape))
-
-    def _flat(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
-        launch_spans(kernel, self.residual.sums.spans, inputs, [], self.problem.device)
 
 
 def _preconditioner(problem: LCP, real: Any, cycle: CycleSettings, system: Any) -> tuple[Any, Any]:

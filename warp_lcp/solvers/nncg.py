@@ -10,8 +10,9 @@ import warp as wp
 
 from warp_lcp.problem import LCP
 from warp_lcp.residual_kernels import start_kernel
+from warp_lcp.rows import Rows
 from warp_lcp.solve import Precision, Step
-from warp_lcp.solvers.nncg_kernels import direction_kernel, gradient_kernel
+from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers.psor import DIRECTIONS, SweepWorkspace
 from warp_lcp.solvers.sweep import sweep_for
 from warp_lcp.vectors import Reduction, launch_spans
@@ -85,13 +86,13 @@ class NNCGWorkspace(SweepWorkspace):
         super().__init__(problem, precision)
         self.g, self.p = problem.layout.zeros(wp.float64), problem.layout.zeros(wp.float64)
         affine = problem.bounds.affine
-        self._bounds = [problem.lower, problem.upper]
+        self._constant = problem.bounds.operands  # where bounds do not depend on x
         if affine is not None:
-            self._bounds = [
-                _where_constant(c, i, side) for c, i, side in zip(affine.constant, affine.index, (-np.inf, np.inf), strict=True)
-            ]
+            sides = zip(affine.constant, affine.index, (-np.inf, np.inf), strict=True)
+            self._constant[0], self._constant[2] = (_where_constant(*side) for side in sides)
         self._scalars = wp.zeros(2, dtype=wp.float64, device=problem.device)
         self._reduction = Reduction(problem.layout.size, problem.device, self._scalars)
+        self._rows = Rows.flat(problem.layout.size, problem.device)
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the direction."""
@@ -101,13 +102,14 @@ class NNCGWorkspace(SweepWorkspace):
 
     def advance(self, x: wp.array[Any]) -> None:
         """Move x, which a sweep has just moved, along p, and turn p."""
-        p, spans = self.problem, self._reduction.spans
-        launch_spans(gradient_kernel, spans, [x, p.unknown, self.g], [self._reduction.partials], p.device)
+        p, fields = self.problem, {"x": x, "g": self.g, "unknown": self.problem.unknown}
+        passes.TAKEN.bind(self._rows, **fields, out=self._reduction.partials).launch()
         self._reduction.add_up(0)
-        launch_spans(direction_kernel, spans, [self._scalars, self.g, *self._bounds, p.unknown, x, self.p], [], p.device)
+        bounds = p.bounds.operands if p.bounds.affine is None else self._constant
+        passes.CARRY_ON.bind(self._rows, bounds=bounds, **fields, along=self.p, squares=self._scalars).launch()
         if p.bounds.affine is not None:
             p.bounds.follow(x)
-            launch_spans(start_kernel, spans, [x, *p.bounds.operands, p.unknown, True], [], p.device)
+            launch_spans(start_kernel, self._reduction.spans, [x, *p.bounds.operands, p.unknown, True], [], p.device)
         wp.copy(self._scalars, self._scalars, dest_offset=1, src_offset=0, count=1)
         self.round_iterate()
 

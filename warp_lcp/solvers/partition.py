@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,14 @@ from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.operators.sparse_kernels import color_kernel
 from warp_lcp.problem import LCP
 from warp_lcp.result import SolveResult
-from warp_lcp.solvers.partition_kernels import outside_kernel, put_kernel, take_kernel
+from warp_lcp.rows import RowPass
+from warp_lcp.vectors import rows_of
 
 Blocks = int | Sequence[Any]
+SELECT = RowPass(
+    "partition.select", Path(__file__).parent / "headers" / "select.h", wp.float64, optional=("less",), numbers={"kept": bool},
+    reads={"x": wp.float64, "less": wp.float64, "member": wp.uint8}, writes={"target": wp.float64},
+)  # fmt: skip
 
 
 def blocks_of_size(problem: LCP, size: int) -> list[np.ndarray]:
@@ -175,12 +181,12 @@ class GridBlock:
 
     def couple(self) -> None:
         """Write what A x + b leaves of b when the block's own part is taken out."""
-        whole, n = self._whole, self._x.size
+        whole, of_block = self._whole, {"member": self._member, "kept": False}
         whole.bounds.follow(self._x)
         whole.A.apply_plus(self._x, whole.b, self._y)  # type: ignore[attr-defined]
-        wp.launch(take_kernel, n, [self._x, self._member, self._guess], device=whole.device)
+        SELECT.bind(rows_of(self._x), x=self._x, less=None, target=self._guess, **of_block).launch()
         self.problem.A.apply(self._guess, self._z)
-        wp.launch(outside_kernel, n, [self._y, self._z, self._member, self._b], device=whole.device)
+        SELECT.bind(rows_of(self._x), x=self._y, less=self._z, target=self._b, **of_block).launch()
 
     def guess(self) -> wp.array[Any]:
         """Return x_B as `couple` found it."""
@@ -188,7 +194,7 @@ class GridBlock:
 
     def accept(self, result: SolveResult) -> None:
         """Write x_B."""
-        wp.launch(put_kernel, self._x.size, [result.x.flatten(), self._member, self._x], device=self._whole.device)
+        SELECT.bind(rows_of(self._x), x=result.x.flatten(), less=None, member=self._member, target=self._x, kept=True).launch()
 
     def _cells(self) -> np.ndarray:
         """Return the padded cell types with AIR in place of the other unknowns."""

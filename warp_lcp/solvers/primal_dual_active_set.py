@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar
 
 import numpy as np
@@ -15,10 +15,10 @@ from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem import LCP
 from warp_lcp.result import SolveStatus
 from warp_lcp.solve import Step
-from warp_lcp.solvers import mprgp_kernels
+from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers.dense_problem import DenseProblem, pivots_of
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
-from warp_lcp.solvers.proximal_point import ProximalPoint
+from warp_lcp.solvers.phases import ProximalPoint
 
 LOWER, FREE, UPPER = -1, 0, 1  # where least-index pivoting has an unknown
 STUCK = 2  # steps on one set that leave the residual where it is: its free block is singular
@@ -68,13 +68,7 @@ class PrimalDualActiveSet:
 
     def as_newton(self) -> MinimumMapNewton:
         """Return the method whose steps take over on operators that are not dense."""
-        return MinimumMapNewton(
-            precision=self.precision,
-            monotone_cycles=self.monotone_cycles,
-            eta=self.eta,
-            max_linear_iterations=self.max_linear_iterations,
-            cycle=self.cycle,
-        )
+        return MinimumMapNewton(**{f.name: getattr(self, f.name) for f in fields(self)})
 
     def init(self, problem: LCP) -> ActiveSetWorkspace:
         """Return a workspace.
@@ -86,10 +80,7 @@ class PrimalDualActiveSet:
 
     def step(self, problem: LCP, work: ActiveSetWorkspace, x: wp.array[Any]) -> Step:
         """Take a monotone cycle while the start is cold, else a full step; after a cycle what is safe."""
-        if work.cycles_left > 0:
-            work.cycles_left -= 1
-            return work.monotone_cycle(x)
-        return work.least_index_step(x) if work.places is not None else work.newton_step(x)
+        return work.step(x)
 
 
 class ActiveSetWorkspace(NewtonWorkspace):
@@ -111,10 +102,11 @@ class ActiveSetWorkspace(NewtonWorkspace):
         self.cycled, self.places, self.first = False, None, 0.0
         nothing, none = wp.empty(0, dtype=wp.float64, device=self.problem.device), wp.empty(0, dtype=wp.uint8, device=self.problem.device)
         self._unbounded = [nothing, wp.float64(-np.inf), nothing, wp.float64(np.inf), none]
-        self._plain = mprgp_kernels.kernels(self.residual.diagonal.dtype, self.system.r.dtype)
 
     def newton_step(self, x: wp.array[Any]) -> Step:
-        """Classify, solve on the free set, take the whole step."""
+        """Classify, solve on the free set, take the whole step; a least-index one after a cycle."""
+        if self.places is not None:
+            return self.least_index_step(x)
         step = super().newton_step(x)
         if step.linear_iterations == 0 and self.resort is None and self._cycles(x) and isinstance(self.problem.A, DenseOperator):
             return self.least_index_step(x)  # every unknown is held
@@ -136,7 +128,7 @@ class ActiveSetWorkspace(NewtonWorkspace):
         if watched:
             wp.copy(self.trial, x)
         bounds = self._unbounded if self._moved else p.bounds.operands  # within rounding of the bounds at the end
-        self._flat(self._plain.advance, [x, self.system.e, *bounds, x, wp.float64(size)])
+        passes.move(self._rows, bounds, x, self.system.e, size, x)
         if self.floating is not None:
             self.floating.settle(x, p.lower, p.upper)
         self._round(x)

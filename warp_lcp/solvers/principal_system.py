@@ -6,14 +6,15 @@ factors, other operators Krylov methods preconditioned by the diagonal: conjugat
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-import scipy.linalg
 import warp as wp
 
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.krylov.gmres import GMRES
+from warp_lcp.krylov.system import KrylovSystem
 from warp_lcp.multigrid.hierarchy import CycleSettings
 from warp_lcp.multigrid.turning import make_hierarchy
 from warp_lcp.operators.dense import DenseOperator
@@ -23,13 +24,25 @@ from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.operators.sum import SumOperator, grid_and_low_rank
 from warp_lcp.problem import LCP
 from warp_lcp.program import Launch, Program
-from warp_lcp.solvers.dense_problem import equilibration
+from warp_lcp.rows import RowPass
+from warp_lcp.solvers.dense_problem import equilibration, factored
 from warp_lcp.solvers.grid_conjugate_gradient import GridConjugateGradient
-from warp_lcp.solvers.principal_system_kernels import divide_kernel, mask_kernel, shift_kernel
 from warp_lcp.solvers.principal_system_low_rank import LowRankCorrection
-from warp_lcp.solvers.principal_system_norm import WeightedNorm
 from warp_lcp.solvers.principal_system_sparse import SparseSystem
-from warp_lcp.vectors import launch_spans
+from warp_lcp.vectors import rows_of
+
+HEADERS = Path(__file__).parent / "headers"
+SHIFT = RowPass(
+    "principal_system.shift", HEADERS / "shift.h", "S", reads={"d": "D", "free": wp.uint8, "shift": wp.float64}, optional=("shift",),
+    writes={"diagonal": "S", "weight": "S"}, numbers={"unit": wp.float64},
+)  # fmt: skip
+MASK = RowPass(
+    "principal_system.mask", HEADERS / "mask.h", wp.float64, reads={"direction": wp.float64, "free": wp.uint8, "shift": wp.float64},
+    optional=("shift",), writes={"q": wp.float64},
+)  # fmt: skip
+DIVIDE = RowPass(
+    "principal_system.divide", HEADERS / "divide.h", wp.float64, reads={"r": wp.float64, "d": wp.float64}, writes={"z": wp.float64}
+)
 
 
 class PrincipalSystem(Protocol):
@@ -59,7 +72,7 @@ class PrincipalSystem(Protocol):
         """Solve until the residual's norm is at most `tolerance`; return iterations and the norm reached."""
 
 
-class GridSystem:
+class GridSystem(KrylovSystem):
     """Conjugate gradients on a grid, preconditioned by a linear multigrid cycle on the free set."""
 
     def __init__(self, A: GridPoisson, real: Any, *, bounded: bool, settings: CycleSettings | None = None, shifted: bool = False) -> None:
@@ -68,17 +81,11 @@ class GridSystem:
         self.hierarchy = make_hierarchy(A.stencil, real, bounded=bounded, settings=settings, shifted=shifted)
         self.r, self.z = self.hierarchy.finest.b, self.hierarchy.finest.x
         self._weight = wp.zeros_like(self.r) if shifted else None
-        self._norm = WeightedNorm(self.r, self._weight)
-        self._no_shift = wp.empty(0, dtype=wp.float64, device=A.device)
         self.fused = self.hierarchy.open_cycle is not None  # one CPU thread, no ghost cells to fill
-        self._krylov = self._krylov_method()
-        self.e = self._krylov.x
-
-    def _krylov_method(self) -> Any:
-        """Return what iterates: it has `solve`, and the solution in `x`."""
         if self.fused:
-            return GridConjugateGradient(self._A.stencil, self.hierarchy, weighted=self._weight is not None)
-        return ConjugateGradient(self.hierarchy.finest.stencil.product, self, weight=self._weight)
+            self._iterate_by(GridConjugateGradient(A.stencil, self.hierarchy, weighted=shifted), self._weight)
+        else:
+            self._iterate_by(ConjugateGradient(self.hierarchy.finest.stencil.product, self, weight=self._weight), self._weight)
 
     def refresh(self) -> None:
         """Take the rows and the weights again if the operator has changed."""
@@ -101,17 +108,9 @@ class GridSystem:
             self.hierarchy.hold(source.d, free)
             self.hierarchy.rebuild_changed()
         else:
-            inputs = [source.d, wp.float64(source.unit), free, self._no_shift if shift is None else shift, target, self._weight]
-            launch_spans(shift_kernel(source.d.dtype, target.dtype), self._norm.spans, inputs, [], target.device)
+            given = {"d": source.d, "unit": source.unit, "diagonal": target, "weight": self._weight}
+            SHIFT.bind(rows_of(target), free=free, shift=shift, **given).launch()
             self.hierarchy.rebuild()
-
-    def norm(self) -> float:
-        """Return the norm of r."""
-        return self._norm.of(self.r)
-
-    def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
-        """Iterate."""
-        return self._krylov.solve(tolerance, max_iterations)
 
     @property
     def program(self) -> Program:
@@ -127,7 +126,7 @@ class GridSystem:
         self.hierarchy.monotone_cycle.run()
 
 
-class CoupledGridSystem:
+class CoupledGridSystem(KrylovSystem):
     """Conjugate gradients on a grid operator plus one of low rank, preconditioned by the grid's multigrid, corrected for the columns."""
 
     def __init__(
@@ -139,10 +138,7 @@ class CoupledGridSystem:
         self._extra = wp.zeros_like(self.r)
         self._free: wp.array[Any] | None = None
         self._weight = wp.zeros_like(self.r) if shifted else None
-        self._norm = WeightedNorm(self.r, self._weight)
-        self._no_shift = wp.empty(0, dtype=wp.float64, device=self.r.device)
-        self._krylov = ConjugateGradient(self._product, self, weight=self._weight)
-        self.e = self._krylov.x
+        self._iterate_by(ConjugateGradient(self._product, self, weight=self._weight), self._weight)
         self._take_diagonal()
 
     def refresh(self) -> None:
@@ -156,20 +152,12 @@ class CoupledGridSystem:
         self._free = free
         self._grid.restrict(free, shift)
         if self._weight is not None:
-            inputs = [self._own, wp.float64(1.0), free, self._no_shift if shift is None else shift, self._extra, self._weight]
-            launch_spans(shift_kernel(wp.float64, self.r.dtype), self._norm.spans, inputs, [], self.r.device)
+            given = {"d": self._own, "unit": 1.0, "diagonal": self._extra, "weight": self._weight}
+            SHIFT.bind(rows_of(self.r), free=free, shift=shift, **given).launch()
         wp.copy(self._extra, self.r)
         self._correction.renew(begins=self._begins)
         wp.copy(self.r, self._extra)
         self._begins = False
-
-    def norm(self) -> float:
-        """Return the norm of r."""
-        return self._norm.of(self.r)
-
-    def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
-        """Iterate."""
-        return self._krylov.solve(tolerance, max_iterations)
 
     def apply(self) -> None:
         """Precondition: one cycle of the grid's multigrid, corrected."""
@@ -225,23 +213,16 @@ class DenseSystem:
 
 def _solve_or_least_squares(block: np.ndarray, r: np.ndarray) -> np.ndarray:
     """Return block^-1 r; where the block looks singular even in units in which its rows are alike, the least-squares solution there."""
-    solution = _factored(block, r)
+    solution = factored(block, r)
     if solution is None:
         S = equilibration(block)
         block, r = S[:, None] * block * S, S * r
-        solution = _factored(block, r)
+        solution = factored(block, r)
         solution = S * (np.linalg.lstsq(block, r, rcond=1e-12)[0] if solution is None else solution)
     return solution
 
 
-def _factored(block: np.ndarray, r: np.ndarray) -> np.ndarray | None:
-    factors, pivots, info = scipy.linalg.lapack.dgetrf(block)
-    if info != 0 or np.abs(np.diag(factors)).min() <= 1e-13 * np.abs(block).sum(axis=1).max():
-        return None
-    return scipy.linalg.lapack.dgetrs(factors, pivots, r)[0]
-
-
-class DiagonalSystem:
+class DiagonalSystem(KrylovSystem):
     """A Krylov method preconditioned by the diagonal, for any operator, in float64: conjugate gradients if A is symmetric, else GMRES."""
 
     def __init__(self, problem: LCP, *, shifted: bool = False) -> None:
@@ -249,11 +230,9 @@ class DiagonalSystem:
         self.r, self.z = self._layout.zeros(wp.float64), self._layout.zeros(wp.float64)
         self._diagonal, self._inverse = self._layout.zeros(wp.float64), self._layout.zeros(wp.float64)
         weight = self._inverse if shifted else None
-        self._norm = WeightedNorm(self.r, weight)
-        self._no_shift = self._shift = wp.empty(0, dtype=wp.float64, device=self._layout.device)
+        self._shift: wp.array[Any] | None = None
         method = ConjugateGradient if self._A.symmetric else GMRES
-        self._krylov = method(self._product, self, weight=weight)
-        self.e = self._krylov.x
+        self._iterate_by(method(self._product, self, weight=weight), weight)
         self.refresh()
 
     def refresh(self) -> None:
@@ -262,26 +241,18 @@ class DiagonalSystem:
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
         """Remember the free set and the shift, and shift the diagonal."""
-        self._free, self._shift = free, self._no_shift if shift is None else shift
-        inputs = [self._own, wp.float64(1.0), free, self._shift, self._diagonal, self._inverse]
-        launch_spans(shift_kernel(wp.float64, wp.float64), self._norm.spans, inputs, [], self._layout.device)
-
-    def norm(self) -> float:
-        """Return the norm of r."""
-        return self._norm.of(self.r)
-
-    def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
-        """Iterate."""
-        return self._krylov.solve(tolerance, max_iterations)
+        self._free, self._shift = free, shift
+        given = {"d": self._own, "unit": 1.0, "diagonal": self._diagonal, "weight": self._inverse}
+        SHIFT.bind(rows_of(self.r), free=free, shift=shift, **given).launch()
 
     def apply(self) -> None:
         """Precondition: z = r / d."""
-        wp.launch(divide_kernel, self.r.size, [self.r, self._diagonal, self.z], device=self._layout.device)
+        DIVIDE.bind(rows_of(self.r), r=self.r, d=self._diagonal, z=self.z).launch()
 
     def _product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
         shape = self._layout.stored_shape
         self._A.apply(p.reshape(shape), q.reshape(shape))
-        wp.launch(mask_kernel, q.size, [self._free, self._shift, p, q], device=self._layout.device)
+        MASK.bind(rows_of(q), free=self._free, shift=self._shift, direction=p, q=q).launch()
 
 
 def principal_system(

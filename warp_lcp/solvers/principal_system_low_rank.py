@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
-import math
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.low_rank import LowRankOperator
+from warp_lcp.operators.low_rank_columns import ENTRIES
 from warp_lcp.program import Launch
+from warp_lcp.rows import RowPass, Rows
 from warp_lcp.solvers import principal_system_low_rank_kernels as kernels
 from warp_lcp.vectors import Reduction
 
+HEADERS = Path(__file__).parent / "headers"
+SQUARES = RowPass(
+    "low_rank_correction.squares", HEADERS / "square_entries.h", wp.float64, whole={**ENTRIES, "d": "D", "squares": wp.float64},
+    numbers={"width": int, "rank": int},
+)  # fmt: skip
+SLOTS = {"slots": int, "size": wp.int64}
+DOTS = RowPass("low_rank_correction.dots", HEADERS / "slot_dots.h", "S", whole={"Z": "S"}, reads={"r": "S"}, numbers=SLOTS, sums=("first",))
+SUBTRACT = RowPass(
+    "low_rank_correction.subtract", HEADERS / "slot_subtract.h", "S", whole={"Z": "S", "factors": wp.float64}, reads={"d": "D"},
+    writes={"z": "S"}, numbers=SLOTS,
+)  # fmt: skip
 STRONG = 2.0  # added over own inertia, as estimated, from which a column is corrected for: others move eigenvalues by a small factor
 SPREAD = 0.115  # U_q' A^-1 U_q / (U_q' U_q) over rows^(1 / (dimension - 1)): of a disc and of a sphere
 FELT = 0.3  # added over own inertia of a mode of the columns corrected for, from which it counts
@@ -48,13 +60,12 @@ class LowRankCorrection:
     def __init__(self, low: LowRankOperator, hierarchy: Hierarchy) -> None:
         self._low, self._hierarchy, self._columns = low, hierarchy, low.columns
         n, device = low.rank, hierarchy.device
-        self._G, self._S, self._E = (wp.zeros(n * n, dtype=wp.float64, device=device) for _ in range(3))
+        self._S, self._E = (wp.zeros(n * n, dtype=wp.float64, device=device) for _ in range(2))
         self._sums, self._kept, self._force, self._t = (wp.zeros(n, dtype=wp.float64, device=device) for _ in range(4))
         self._squares = wp.zeros(n + n // low.columns.width, dtype=wp.float64, device=device)
         self._of_slot = wp.zeros(n, dtype=wp.int32, device=device)
         self._size = hierarchy.finest.x.size
         self._Z = wp.zeros(0, dtype=hierarchy.real, device=device)
-        self._threads = math.prod(hierarchy.finest.stencil.threads)
         self._dots: Reduction | None = None
         self._slot_columns = list[int]()
         self._seen = np.zeros(n)  # U_q' U_q when a potential was made
@@ -79,8 +90,8 @@ class LowRankCorrection:
             Whether the finest right-hand side was lost.
         """
         low, finest, W = self._low, self._hierarchy.finest, self._low.weights.numpy()
-        inputs = [*self._entries, low.rank, finest.stencil.d, self._squares]
-        wp.launch(self._kernels.squares, 1, inputs, device=low.device)
+        one = Rows.flat(1, low.device)
+        SQUARES.bind(one, **self._columns.entry_fields, rank=low.rank, d=finest.stencil.d, squares=self._squares).launch()
         found, width = self._squares.numpy().copy(), self._columns.width
         squares, rows = found[: low.rank], np.repeat(found[low.rank :], width)
         power = 1.0 / max(sum(n > 1 for n in self._hierarchy.finest.stencil.padding.counts) - 1, 1)
@@ -103,10 +114,8 @@ class LowRankCorrection:
         """Before a cycle: take U S'^-1 Z'r off the hierarchy's finest right-hand side r."""
         if self._dots is None:
             return
-        low, finest, m, s = self._low, self._hierarchy.finest, self.slots, self._hierarchy.finest.stencil
-        planes, rows, _ = s.threads
-        fields = [self._Z, finest.b, m, wp.int64(self._size), self._threads, self._dots.partials]
-        launch(self._kernels.dots, s.threads, [s.shape, planes, rows, s.grain, *fields], device=low.device)
+        low, m = self._low, self.slots
+        self._multiply.launch(launch)
         self._dots.add_up(0, columns=m, launch=launch)
         inputs = [self._S, self._E, self._of_slot, self._sums, m, self._force, self._kept]
         launch(kernels.split_kernel, m, inputs, device=low.device)
@@ -116,22 +125,11 @@ class LowRankCorrection:
         """After the cycle: correct the finest x, and put back what `begin` took."""
         if self._dots is None:
             return
-        low, finest, m, s = self._low, self._hierarchy.finest, self.slots, self._hierarchy.finest.stencil
+        low, finest, m = self._low, self._hierarchy.finest, self.slots
         self._spread(1.0, launch)
         u = self._columns.gather(finest.x, launch=launch)
         launch(kernels.join_kernel, m, [self._S, self._of_slot, u, m, self._kept, self._t], device=low.device)
-        fields = [self._Z, self._t, finest.x, m, wp.int64(self._size)]
-        launch(self._kernels.subtract, s.threads, [s.shape, s.d, s.grain, *fields], device=low.device)
-
-    @property
-    def _kernels(self) -> Any:
-        finest = self._hierarchy.finest
-        return kernels.kernels(self._columns.dtype, finest.stencil.d.dtype, finest.x.dtype)
-
-    @property
-    def _entries(self) -> list[Any]:
-        u = self._columns
-        return [u.rows, u.blocks, u.values, u.count, u.width]
+        self._subtract.launch(launch)
 
     def _choose(self, strong: list[int]) -> None:
         """Give these columns slots; those that have one keep their potentials, the others' must be made."""
@@ -144,7 +142,19 @@ class LowRankCorrection:
         order[: len(strong)] = strong
         self._of_slot.assign(order)
         self._slot_columns = strong
-        self._dots = Reduction(n, low.device, self._sums, columns=len(strong), threads=self._threads) if strong else None
+        self._dots = (
+            Reduction(n, low.device, self._sums, columns=len(strong), threads=self._hierarchy.finest.stencil.rows.places)
+            if strong
+            else None
+        )
+        if self._dots is not None:
+            given, rows, finest = (
+                {"Z": self._Z, "slots": len(strong), "size": n},
+                self._hierarchy.finest.stencil.rows,
+                self._hierarchy.finest,
+            )
+            self._multiply = DOTS.bind(rows, r=finest.b, out=self._dots.partials, **given)
+            self._subtract = SUBTRACT.bind(rows, factors=self._t, z=finest.x, d=finest.stencil.d, **given)
         for q in kept:
             wp.copy(self._Z, before, dest_offset=strong.index(q) * n, src_offset=old[q] * n, count=n)
         self._seen[[q for q in range(low.rank) if q not in kept]] = 0.0
@@ -164,10 +174,8 @@ class LowRankCorrection:
 
     def _invert(self, W: np.ndarray) -> bool:
         """Write the inverses of S and E on the modes that are felt; return whether S is as symmetric as it should be."""
-        low, finest, m = self._low, self._hierarchy.finest, self.slots
-        inputs = [*self._entries, low.rank, finest.stencil.d, self._Z, wp.int64(self._size), m, self._G]
-        wp.launch(self._kernels.reduce, m, inputs, device=low.device)
-        G = self._G.numpy()[: low.rank * m].reshape(low.rank, m)
+        d, m, n = self._hierarchy.finest.stencil.d, self.slots, self._size
+        G = np.stack([self._columns.gather(self._Z[s * n : (s + 1) * n], mask=d, fused=False).numpy().copy() for s in range(m)], axis=1)
         S = G[self._slot_columns]
         even, odd = 0.5 * (S + S.T), 0.5 * (S - S.T)
         values, vectors = np.linalg.eigh(W[np.ix_(self._slot_columns, self._slot_columns)])
@@ -186,6 +194,5 @@ class LowRankCorrection:
 
     def _spread(self, sign: float, launch: Launch) -> None:
         """Add U f to the finest right-hand side."""
-        finest, threads = self._hierarchy.finest, self._columns.capacity if self._low.device.is_cuda else 1
-        inputs = [*self._entries, finest.stencil.d, self._force, wp.float64(sign), finest.b, threads]
-        launch(self._kernels.spread, threads, inputs, device=self._low.device)
+        finest = self._hierarchy.finest
+        self._columns.scatter(self._force, finest.b, finest.b, mask=finest.stencil.d, sign=sign, fused=False, launch=launch)

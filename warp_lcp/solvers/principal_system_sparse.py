@@ -11,11 +11,11 @@ import warp as wp
 
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.krylov.gmres import GMRES
+from warp_lcp.krylov.system import KrylovSystem
 from warp_lcp.multigrid.aggregates import suits_multigrid
 from warp_lcp.multigrid.algebraic import AlgebraicHierarchy, AlgebraicSettings
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.program import Launch
-from warp_lcp.solvers.principal_system_norm import WeightedNorm
 
 # symmetric matrices far from M-matrices: on plates of 60^2 and 120^2 0.55 times the iterations of the usual settings, .8 on elastic blocks
 FAR_FROM_M = AlgebraicSettings(strength=0.08, interval=(0.05, 1.0))
@@ -39,7 +39,7 @@ class SparsePreconditioner(Protocol):
         """Write z."""
 
 
-class SparseSystem:
+class SparseSystem(KrylovSystem):
     """(P A P + P D P) e = r with a sparse A.
 
     Symmetric matrices whose diagonal is not negative take conjugate gradients with algebraic multigrid, which falls back on sweeps where
@@ -48,28 +48,22 @@ class SparseSystem:
     """
 
     def __init__(self, A: SparseOperator, real: Any, *, shifted: bool = False, settings: AlgebraicSettings | None = None) -> None:
-        self._A, self._real, self._shifted, self._settings = A, real, shifted, settings
-        self._build()
-
-    def _build(self) -> None:
-        A, real = self._A, self._real
         host = A.matrix()
-        self._version, self._symmetric = A.version, A.symmetric
+        self._A, self._version, self._symmetric = A, A.version, A.symmetric
         positive = bool((host.diagonal() >= 0).all())
         self.preconditioner: SparsePreconditioner
         if (A.symmetric and positive) or suits_multigrid(host):
             usual = AlgebraicSettings() if suits_multigrid(host) else FAR_FROM_M
-            self.preconditioner = AlgebraicHierarchy(A, real, self._settings or usual)
+            self.preconditioner = AlgebraicHierarchy(A, real, settings or usual)
         elif A.device.is_cpu:
             self.preconditioner = IncompleteFactors(A, real)
         else:
             self.preconditioner = AlgebraicHierarchy(A, real, AlgebraicSettings(coarsest_cpu=0, coarsest_cuda=0, stall=0.0, last_sweeps=1))
         M = self.preconditioner
-        weight = M.weight if self._shifted else None
+        weight = M.weight if shifted else None
         method = ConjugateGradient if A.symmetric and positive else GMRES
-        self._krylov = method(M.product, M, weight=weight)
-        self.r, self.e = M.r, self._krylov.x
-        self._norm = WeightedNorm(self.r, weight)
+        self.r = M.r
+        self._iterate_by(method(M.product, M, weight=weight), weight)
 
     def refresh(self) -> None:
         """Choose again where an update of A has changed whether it is symmetric; `restrict` takes the entries.
@@ -86,14 +80,6 @@ class SparseSystem:
         """Take another free set and shift, and compute the preconditioner anew."""
         self.preconditioner.restrict(free, shift)
 
-    def norm(self) -> float:
-        """Return the norm of r."""
-        return self._norm.of(self.r)
-
-    def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
-        """Iterate."""
-        return self._krylov.solve(tolerance, max_iterations)
-
 
 class IncompleteFactors:
     """L U factors of the free block by SciPy, on the CPU; incomplete ones of more than `DIRECT` unknowns.
@@ -108,7 +94,7 @@ class IncompleteFactors:
     def __init__(self, A: SparseOperator, real: Any, *, drop: float = 1e-4, fill: float = 10.0) -> None:
         self._A, self._drop, self._fill = A, drop, fill
         self.r, self.z, self.weight = (wp.zeros(A.unknowns, dtype=real, device="cpu") for _ in range(3))
-        self._factors: Any = None
+        self._solve: Any = None
         self._free = np.zeros(0, dtype=np.intp)
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:
@@ -122,7 +108,7 @@ class IncompleteFactors:
         diagonal = np.abs(self._M.diagonal())
         self.weight.assign(np.where(free.numpy() != 0, 1 / np.where(diagonal > 0, diagonal, 1.0), 0.0))
         self.z.zero_()
-        self._factors = self._factor(matrix[self._free][:, self._free].tocsc()) if self._free.size else None
+        self._solve = self._factor(matrix[self._free][:, self._free].tocsc()) if self._free.size else None
 
     def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
         """Q = M p, on the host."""
@@ -130,25 +116,19 @@ class IncompleteFactors:
 
     def apply(self) -> None:
         """Precondition."""
-        if self._factors is not None:
+        if self._solve is not None:
             with np.errstate(over="ignore"):  # the method sees that its iterate is not finite
-                self.z.numpy()[self._free] = self._factors.solve(self.r.numpy()[self._free].astype(np.float64))
+                self.z.numpy()[self._free] = self._solve(self.r.numpy()[self._free].astype(np.float64))
 
     def _factor(self, block: Any) -> Any:
+        """Return what applies the factors' inverse; nothing is done where they cannot be had."""
         size = float(np.abs(block.data).max(initial=0.0)) or 1.0
         for nudge in (0.0, 1e-10, 1e-6):
             try:
                 nudged = block if nudge == 0 else (block + nudge * size * scipy.sparse.eye_array(block.shape[0])).tocsc()
                 if block.shape[0] <= DIRECT:
-                    return scipy.sparse.linalg.splu(nudged)
-                return scipy.sparse.linalg.spilu(nudged, drop_tol=self._drop, fill_factor=self._fill)
+                    return scipy.sparse.linalg.splu(nudged).solve
+                return scipy.sparse.linalg.spilu(nudged, drop_tol=self._drop, fill_factor=self._fill).solve
             except RuntimeError:  # a factor is exactly singular
                 continue
-        return _Identity()
-
-
-class _Identity:
-    """Stands for factors that cannot be had."""
-
-    def solve(self, r: np.ndarray) -> np.ndarray:
-        return r
+        return np.asarray

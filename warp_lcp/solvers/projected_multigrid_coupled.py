@@ -14,9 +14,11 @@ from warp_lcp.program import Launch, Program
 from warp_lcp.solve import Precision, Step
 from warp_lcp.solvers import principal_system_low_rank_kernels as coupling
 from warp_lcp.solvers import projected_multigrid_kernels as kernels
-from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
+from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
+from warp_lcp.solvers.phases import Inner
 from warp_lcp.solvers.principal_system_low_rank import LowRankCorrection
 from warp_lcp.solvers.projected_multigrid_workspace import AssessedResidual, MultigridWorkspace
+from warp_lcp.vectors import CONVERT, rows_of
 
 if TYPE_CHECKING:
     from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
@@ -75,7 +77,7 @@ class CoupledWorkspace(MultigridWorkspace):
         self.correction = LowRankCorrection(low, self.hierarchy)
         self._along = wp.zeros(low.rank, dtype=wp.float64, device=problem.device)  # U'p
         self._fresh = True  # whether the correction is still that of the last solve
-        self._newton: NewtonWorkspace | None = None
+        self._newton: Inner | None = None
         self._searches = False  # whether steps are Newton's
 
     def start(self, *, warm: bool, tolerance: float) -> None:
@@ -112,24 +114,15 @@ class CoupledWorkspace(MultigridWorkspace):
     def _newton_step(self) -> Step:
         """Take a step of Newton's method on the minimum map, whose memory is made when the first solve needs it."""
         p, settings = self.problem, MinimumMapNewton(precision=self.precision.value, cycle=self.settings.cycle)
-        if self._newton is None:
-            made = settings.init(p)
-            assert isinstance(made, NewtonWorkspace)
-            self._newton = made
-        newton = self._newton
+        newton = self._newton = self._newton or Inner(settings, p)
         if not self._searches:
             self.restore()
-            self._searches, newton.floating = True, self.floating
-            wp.copy(newton.x, self.x)
-            newton.residual.evaluate(newton.x)
-            newton.start(warm=True, tolerance=self._tolerance)
+            self._searches, newton.work.floating = True, self.floating
+            newton.begin(self.x, self._tolerance)
         self._store()
         self._past += 1
-        newton.residual.current = False
-        done = settings.step(p, newton, newton.x)
-        if not newton.residual.current:
-            newton.residual.evaluate(newton.x)
-        wp.copy(self.x, newton.x)
+        done = newton.step()
+        wp.copy(self.x, newton.work.x)
         self.residual.evaluate(self.x)
         return done
 
@@ -171,6 +164,6 @@ class CoupledWorkspace(MultigridWorkspace):
         finest.stencil.wrap(finest.x, launch=launch)
         kernels.measuring(finest, self._p, residual.sums.partials).launch(launch)
         residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=launch)
-        launch(coupling.copy_kernel, self._low.rank, [columns.gather(self._p, launch=launch), self._along], device=device)
+        CONVERT.bind(rows_of(self._along), a=columns.gather(self._p, launch=launch), b=self._along).launch(launch)
         inputs = [self._low.weights.flatten(), columns.gather(finest.x, launch=launch), self._along, self._low.rank, residual.scalars]
         launch(coupling.add_products_kernel, 1, inputs, device=device)

@@ -27,6 +27,7 @@ BETA = wp.constant(10)
 STEP = wp.constant(11)  # x moved by this multiple of the direction
 CARRY = wp.constant(12)  # 0: forget the search direction
 SLOTS = 13
+LEAST_REST = wp.constant(wp.float64(1e-3))  # of a correction's energy that must not lie along the last direction: else cancellation
 
 f64 = wp.array(dtype=wp.float64)
 
@@ -63,6 +64,7 @@ GAPS = RowPass(
     "projected_multigrid.gaps", HEADERS / "gaps.h", wp.float64, bounds=True, reads={"x": wp.float64, "unknown": wp.int8},
     writes={"lo": "S", "hi": "S"}, optional=("hi",), whole={"scalars": wp.float64}, constants=SLOT,
 )  # fmt: skip
+MASK = RowPass("projected_multigrid.mask", HEADERS / "free_mask.h", wp.uint8, reads={"free": "F"}, writes={"mask": wp.uint8})
 UNDO = RowPass(
     "projected_multigrid.undo", HEADERS / "undo.h", wp.float64, bounds=True, reads={"x": wp.float64, "q": "S", "unknown": wp.int8},
     writes={"before": wp.float64}, whole={"scalars": wp.float64}, constants=SLOT,
@@ -130,6 +132,16 @@ def add_side_kernel(variable: bool, free_type: Any, real: Any) -> Any:
     return add_side
 
 
+@wp.func
+def conjugate(zaz: wp.float64, zap: wp.float64, gz: wp.float64, gp: wp.float64, pap: wp.float64, least: wp.float64):
+    """Beta that makes z + beta p conjugate to p, 0 where z is nearly p, and of the sum the curvature and the gain; the host's too."""
+    ratio = -zap / pap
+    rest = zaz + ratio * (zap + zap + ratio * pap)
+    if rest > least * zaz:
+        return ratio, rest, gz + ratio * gp
+    return least - least, zaz, gz
+
+
 @wp.kernel(enable_backward=False, module="warp_lcp.projected_multigrid")
 def plan_step_kernel(scalars: f64):
     """Beta and the step length from the measured products: the new direction is conjugate to the last one, the step minimizes along it."""
@@ -138,12 +150,7 @@ def plan_step_kernel(scalars: f64):
     curvature = scalars[ZAZ]
     gain = scalars[GZ]
     if scalars[CARRY] != zero and scalars[PAP] > zero:  # without a direction to carry, p and its products are meaningless
-        ratio = -scalars[ZAP] / scalars[PAP]
-        rest = curvature + ratio * (wp.float64(2.0) * scalars[ZAP] + ratio * scalars[PAP])
-        if rest > wp.float64(1.0e-3) * curvature:  # else z is nearly the last direction, and what is left of it cancellation
-            beta = ratio
-            curvature = rest
-            gain += beta * scalars[GP]
+        beta, curvature, gain = conjugate(curvature, scalars[ZAP], gain, scalars[GP], scalars[PAP], LEAST_REST)
     length = zero
     if curvature > zero or not wp.isfinite(curvature):  # a step that is not finite is not taken, and is reported
         length = gain / curvature
@@ -168,16 +175,3 @@ def plan_whole_step_kernel(scalars: f64):
     scalars[STEP] = scalars[SIZE]
     scalars[CARRY] = wp.float64(0.0)
     rescale(scalars)
-
-
-@wp.kernel(enable_backward=False, module="warp_lcp.projected_multigrid")
-def free_mask_kernel(free: wp.array(dtype=Any), mask: wp.array(dtype=wp.uint8)):
-    """1 where the masked diagonal is not 0."""
-    i = wp.tid()
-    mask[i] = wp.uint8(0)
-    if free[i] != free.dtype(0):
-        mask[i] = wp.uint8(1)
-
-
-for _T in (wp.uint8, wp.float32, wp.float64):
-    wp.overload(free_mask_kernel, [wp.array(dtype=_T), wp.array(dtype=wp.uint8)])

@@ -19,8 +19,8 @@ from warp_lcp.residual import NaturalResidual
 from warp_lcp.rows import Bound, Rows
 from warp_lcp.solve import FLOOR_MARGIN, Precision, RoundedIterate, Step
 from warp_lcp.solvers import projected_multigrid_kernels as kernels
-from warp_lcp.solvers.algebraic_steps import AlgebraicSteps, Pace
 from warp_lcp.solvers.descent import Descent
+from warp_lcp.solvers.phases import AlgebraicSteps, Pace
 from warp_lcp.vectors import Reduction
 
 if TYPE_CHECKING:
@@ -405,5 +405,5 @@ class MultigridWorkspace(RoundedIterate):
         free = self.hierarchy.finest.stencil.d
         if self._mask is None:
             self._mask = self.problem.layout.zeros(wp.uint8)
-        wp.launch(kernels.free_mask_kernel, free.size, [free, self._mask], device=self.A.device)
+        kernels.MASK.bind(self._flat, free=free, mask=self._mask).launch()
         self.floating.project(self.hierarchy.finest.b, self._mask)

@@ -9,10 +9,9 @@ import warp as wp
 
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
-from warp_lcp.solve import IterateInPlace, Precision, Step
+from warp_lcp.solve import IterateInPlace, Precision, RoundedIterate, Step
 from warp_lcp.solvers.spectrum import scaled_spectrum
 from warp_lcp.solvers.sweep import Contraction, Diagonal, Sweep, SweepOrder, sweep_for
-from warp_lcp.vectors import convert
 
 DIRECTIONS = {"forward": (True,), "backward": (False,), "symmetric": (True, False)}
 
@@ -94,7 +93,7 @@ class ProjectedSOR:
         return Step("sweep", len(directions), failure=work.contraction.test(x))
 
 
-class SweepWorkspace(IterateInPlace):
+class SweepWorkspace(IterateInPlace, RoundedIterate):
     """Memory of a method that sweeps.
 
     Attributes:
@@ -118,12 +117,6 @@ class SweepWorkspace(IterateInPlace):
         """Look at the operator again; nothing else is carried from solve to solve."""
         self.sweep.start()
         self.contraction.start(self.x)
-
-    def round_iterate(self) -> None:
-        """Round the iterate to its precision."""
-        if self._rounded is not None:
-            convert(self.x, self._rounded)
-            convert(self._rounded, self.x)
 
 
 def advised_omega(problem: LCP, steps: int = 60, free: Any = None) -> float:

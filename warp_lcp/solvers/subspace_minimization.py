@@ -11,12 +11,13 @@ import warp as wp
 from warp_lcp.deadline import check_time
 from warp_lcp.multigrid.hierarchy import CycleSettings
 from warp_lcp.problem import LCP
+from warp_lcp.rows import Rows
 from warp_lcp.solve import Precision, Step
+from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers.principal_system import principal_system
 from warp_lcp.solvers.psor import SweepWorkspace
-from warp_lcp.solvers.subspace_minimization_kernels import classify_kernel, follow_kernel, free_square_kernel, kernels
 from warp_lcp.solvers.sweep import sweep_for
-from warp_lcp.vectors import Reduction, launch_spans
+from warp_lcp.vectors import Reduction
 
 MOVED, HELD, FREE_NORM, XY, XB = range(5)  # slots of the device scalars; HELD follows MOVED
 ROUNDING = 1e-14  # relative change of the energy that is none
@@ -113,7 +114,7 @@ class SubspaceWorkspace(SweepWorkspace):
         self._old_bounds = [layout.zeros(wp.float64) for _ in range(2)] if affine else []
         self._scalars = wp.zeros(5, dtype=wp.float64, device=problem.device)
         self._reduction = Reduction(layout.size, problem.device, self._scalars, columns=2)
-        self._kernels = kernels(self.system.r.dtype)
+        self._rows = Rows.flat(layout.size, problem.device)
         self._stale, self._target = True, 0.0
 
     def start(self, *, warm: bool, tolerance: float) -> None:
@@ -126,8 +127,8 @@ class SubspaceWorkspace(SweepWorkspace):
         """Find the free set; return how many unknowns entered or left it, and how many are held."""
         p, r = self.problem, self._reduction
         p.bounds.follow(x)
-        before = [x, p.lower, p.upper, p.unknown, self.free]
-        launch_spans(classify_kernel, r.spans, before, [r.threads, r.partials], p.device)
+        fields = {"x": x, "unknown": p.unknown, "free": self.free, "out": r.partials}
+        passes.BETWEEN.bind(self._rows, bounds=p.bounds.operands, **fields).launch()
         r.add_up(MOVED, columns=2)
         moved, held = (int(v) for v in self._scalars.numpy()[:2])
         if moved or self._stale:
@@ -139,10 +140,10 @@ class SubspaceWorkspace(SweepWorkspace):
         """Solve on the free set and move x along the projected correction; returns linear iterations."""
         s, residual = self.settings, self.residual
         norm, energy = residual.evaluate(x), self._energy(x)
-        size = self._free_norm()
+        size = self._right_side(1.0)
         if size == 0 or norm <= self._target:
             return 0
-        self._flat(self._kernels.right_side, [residual.y, self.free, 1 / size, self.system.r])
+        self._right_side(1 / size)
         if self.floating is not None:
             self.floating.project(self.system.r, self.free)
         iterations = self.system.solve(max(s.eta, 0.3 * self._target / size), s.max_linear_iterations)[0]
@@ -160,12 +161,13 @@ class SubspaceWorkspace(SweepWorkspace):
     def _correct(self, x: wp.array[Any], scale: float) -> None:
         p = self.problem
         p.bounds.follow(self._before)
-        self._flat(self._kernels.correct, [self._before, self.system.e, p.lower, p.upper, scale, x])
+        passes.move(self._rows, p.bounds.operands, self._before, self.system.e, scale, x, guarded=False)
         if self._old_bounds:
             for old, bound in zip(self._old_bounds, (p.lower, p.upper), strict=True):
                 wp.copy(old, bound)
             p.bounds.follow(x)
-            wp.launch(follow_kernel, x.size, [*self._old_bounds, p.lower, p.upper, x], device=x.device)
+            old = dict(zip(("old_lower", "old_upper"), self._old_bounds, strict=True))
+            passes.FOLLOW.bind(self._rows, bounds=p.bounds.operands, x=x, **old).launch()
         if self.floating is not None:
             self.floating.settle(x, p.lower, p.upper)
         self.round_iterate()
@@ -178,11 +180,9 @@ class SubspaceWorkspace(SweepWorkspace):
         self._reduction.dot(x, self.problem.b, XB)
         return 0.5 * float(self._scalars.numpy()[XY:].sum())
 
-    def _free_norm(self) -> float:
-        r = self._reduction
-        launch_spans(free_square_kernel, r.spans, [self.residual.y, self.free], [r.partials], self.problem.device)
-        r.add_up(FREE_NORM)
+    def _right_side(self, scale: float) -> float:
+        """Set the system's right-hand side to -scale y on the free set; return y's norm there."""
+        fields = {"y": self.residual.y, "free": self.free, "g": self.system.r, "out": self._reduction.partials}
+        passes.ON_FREE.bind(self._rows, scale=scale, **fields).launch()
+        self._reduction.add_up(FREE_NORM)
         return float(np.sqrt(self._scalars.numpy()[FREE_NORM]))
-
-    def _flat(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
-        launch_spans(kernel, self._reduction.spans, inputs, [], self.problem.device)

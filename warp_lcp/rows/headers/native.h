@@ -13,6 +13,12 @@
 #define BUFFERED 128
 #endif
 #define SIMD VECTORS(16)
+// MASKED: what is left of a row after its last whole vector as a vector with a mask, where the processor has masks
+#if !defined(__CUDA_ARCH__) && defined(__AVX512BW__) && defined(__AVX512VL__)
+#define MASKED PRAGMA(clang loop vectorize_predicate(enable)) SIMD
+#else
+#define MASKED SIMD
+#endif
 #define SIMD8 VECTORS(8)
 #define SIMD64 VECTORS(64)
 FAST_MATH  // comes before the first declaration

@@ -1,0 +1,18 @@
+// Find the released cells; a row's sums are [0] their number and [1] the largest |outflow| of the other FLUID cells [m/s].
+#include "pressure_face.h"
+if (planes != 2) w = u;
+int released = 0; double worst = 0.0, rest[M]; unsigned char leaves[M];
+for (int from = first; from < last; from += M) {
+    const int n = last - from < M ? last - from : M;
+    SIMD8 for (int m = 0; m < n; ++m) {
+        const int i = from + m, fluid = kind[i] == FLUID;
+        const double y = outflow(u, v, w, i), size = y < 0.0 ? -y : y;
+        const int leaving = BOUNDED & fluid & ((touch[i] & LETS_GO) != 0) & (x[i] <= 0.0) & (y > threshold);
+        contact[i] = leaving ? RELEASED : ((fluid & (touch[i] & TOUCHES)) ? HELD : 0);
+        leaves[m] = leaving;
+        rest[m] = (fluid & !leaving) ? size : 0.0;
+    }
+    for (int m = 0; m < n; ++m) { released += leaves[m]; worst = rest[m] > worst ? rest[m] : worst; }
+}
+double* out = sums + 2*((long long)k*given.kind.shape[1] + j);
+out[0] = released; out[1] = worst;

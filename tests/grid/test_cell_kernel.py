@@ -1,0 +1,119 @@
+# mypy: ignore-errors
+"""Kernels of cells and pieces, and passes over boxes of stored cells, against NumPy."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import warp as wp
+
+from warp_lcp.grid.cell_kernel import F32, cell_below, cell_kernel
+from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.rows import RowPass, Rows
+
+GRID = StaggeredGrid((5, 4, 3), 1.0, 3)
+WINDOW = GRID.window((2, 1, 2), (4, 3, 3))  # stored cells 2 <= k < 4, 1 <= j < 4, 2 <= i < 5
+
+
+@cell_kernel("tests.cell_kernel")
+def mark_kernel(k, j, i, factor: float, out: F32):
+    """Write where a cell is."""
+    if i != 3:  # a comment
+        out[k, j, i] = factor * float(100 * k + 10 * j + i)
+
+
+@cell_kernel("tests.cell_kernel")
+def sum_kernel(row, chunk, k, j, first, end, field: F32, out: F32):
+    """Add up a row, and say which."""
+    total = float(0.0)
+    for i in range(first, end):
+        total += field[k, j, i]
+    out[k, j, 0] = total + 1000.0 * float(row) + 1.0e6 * float(chunk)
+
+
+@cell_kernel("tests.cell_kernel")
+def below_kernel(k, j, i, axis: int, out: F32):
+    c, b, a = cell_below(axis, k, j, i)
+    out[k, j, i] = float(100 * c + 10 * b + a)
+
+
+def places(factor: float = 1.0) -> np.ndarray:
+    k, j, i = np.indices(GRID.shape)
+    return factor * (100 * k + 10 * j + i)
+
+
+def inside(of: np.ndarray) -> np.ndarray:
+    return of[2:4, 1:4, 2:5]
+
+
+def test_a_kernel_of_a_cell_visits_those_of_a_window_and_no_other() -> None:
+    out = GRID.field()
+    WINDOW.launch(mark_kernel, [0.5, out])
+    expected = np.zeros(GRID.shape)
+    inside(expected)[...] = inside(places(0.5))
+    expected[..., 3] = 0.0
+    np.testing.assert_array_equal(out.numpy(), expected)
+
+
+def test_a_kernel_of_a_piece_has_a_whole_row() -> None:
+    field, out = wp.array(places(), dtype=wp.float32, device="cpu"), GRID.field()
+    WINDOW.launch_rows(sum_kernel, [field, out])
+    np.testing.assert_array_equal(out.numpy()[2:4, 1:4, 0], inside(places()).sum(axis=2) + 1000 * np.arange(3))
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_the_cell_below_stays_in_the_array(axis: int) -> None:
+    out = GRID.field()
+    GRID.everywhere.launch(below_kernel, [axis, out])
+    step = np.zeros(3, dtype=int)
+    step[2 - axis] = 1
+    below = np.maximum(np.indices(GRID.shape) - step[:, None, None, None], 0)
+    np.testing.assert_array_equal(out.numpy(), np.tensordot([100, 10, 1], below, axes=1))
+
+
+@pytest.fixture(scope="module")
+def box_pass(tmp_path_factory) -> RowPass:
+    header = tmp_path_factory.mktemp("headers") / "box.h"
+    header.write_text(
+        "double total = 0; const int n = 7;\n"  # a name of the pass itself
+        "for (int i = first; i < last; ++i) { y[i] = (T)(SCALE*(x[i] + (z ? z[i - s1 - s2] : (T)n))); total += y[i]; }\n"
+        "sums[P.row] = total;\n"
+    )
+    real = wp.float32
+    fields, sums = {"x": real, "y": real, "z": real}, {"sums": wp.float64}
+    return RowPass("tests.boxes.scaled", header, real, box=fields, by_row=sums, optional=("z",), constants={"SCALE": 0.5})
+
+
+@pytest.mark.parametrize("whole", [False, True])
+@pytest.mark.parametrize("given", [False, True])
+def test_a_pass_over_a_box(box_pass: RowPass, whole: bool, given: bool) -> None:
+    x, y = wp.array(places(), dtype=wp.float32, device="cpu"), GRID.field()
+    sums = wp.zeros(6, dtype=wp.float64, device="cpu")
+    WINDOW.run(box_pass, whole=whole, x=x, y=y, z=x if given else None, sums=sums)
+    expected = np.zeros(GRID.shape)
+    inside(expected)[...] = 0.5 * inside(places() + (places() - 110 if given else 7))
+    np.testing.assert_array_equal(y.numpy(), expected)
+    np.testing.assert_array_equal(sums.numpy(), inside(expected).sum(axis=2).ravel())
+
+
+def test_threads_share_a_row_of_a_box_unless_it_is_whole(box_pass: RowPass) -> None:
+    rows, fields = Rows.box(WINDOW.low, WINDOW.high, GRID.device), {"x": GRID.field(), "y": GRID.field(), "z": None}
+    assert Rows.box(WINDOW.low, WINDOW.high, GRID.device, whole=True).single.chunks == rows.single.chunks == 1
+    chunks = Rows._make(0, GRID.device, (0, 0, 0), (2, 3, 3), None, cells=2)
+    chunks = replace(chunks, place=rows.place)
+    fields["x"].fill_(1.0)
+    box_pass.bind(chunks, **fields, sums=wp.zeros(6, dtype=wp.float64, device="cpu")).launch()
+    assert (inside(fields["y"].numpy()) == 4.0).all()
+    assert fields["y"].numpy().sum() == 4.0 * 18
+
+
+def test_what_is_said_of_a_box_that_is_wrong(box_pass: RowPass) -> None:
+    x, sums = GRID.field(), wp.zeros(6, dtype=wp.float64, device="cpu")
+    with pytest.raises(ValueError, match=r"tests.boxes.scaled: fields have the shapes \(5, 6, 6\), \(5, 6, 7\)"):
+        WINDOW.run(box_pass, x=x, y=wp.zeros((5, 6, 6), dtype=wp.float32, device="cpu"), z=None, sums=sums)
+    with pytest.raises(TypeError, match="y is NoneType, not an array of float32"):
+        WINDOW.run(box_pass, x=x, y=None, z=None, sums=sums)
+    with pytest.raises(TypeError, match=r"missing \['sums'\], unknown \['SCALE'\]"):
+        WINDOW.run(box_pass, x=x, y=x, z=x, SCALE=1)
+    with pytest.raises(ValueError, match="sums has 5 elements, not 6"):
+        WINDOW.run(box_pass, x=x, y=x, z=x, sums=sums[:5])

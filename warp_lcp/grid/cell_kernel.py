@@ -1,0 +1,58 @@
+# mypy: ignore-errors
+"""Kernels that are written for a cell, or for a piece of a row: how threads share the cells of a `CellRange` stands here alone."""
+
+import ast
+import inspect
+import textwrap
+from collections.abc import Callable
+
+import warp as wp
+
+from warp_lcp.grid.staggered import CellRange
+
+F32, F64, I8, U8 = (wp.array3d(dtype=t) for t in (wp.float32, wp.float64, wp.int8, wp.uint8))  # fields
+I16, I32 = wp.array3d(dtype=wp.int16), wp.array3d(dtype=wp.int32)
+PIECE = """
+plane, row, chunk = wp.tid()
+k = cells.k + plane
+j = cells.j + row
+first = cells.i + chunk * cells.grain
+end = wp.min(first + cells.grain, cells.end)
+"""
+LOOP = "for i in range(first, end): pass"
+
+
+@wp.func
+def cell_below(axis: int, k: int, j: int, i: int):
+    """Return the cell on the other side of a cell's lower face; at the array's edge the cell itself."""
+    return (
+        wp.max(k - wp.where(axis == 2, 1, 0), 0),
+        wp.max(j - wp.where(axis == 1, 1, 0), 0),
+        wp.max(i - wp.where(axis == 0, 1, 0), 0),
+    )
+
+
+def cell_kernel(module: str) -> Callable[[Callable], wp.Kernel]:
+    """Return a decorator that makes a kernel(cells, ...) for `Window.launch`, in a Warp module, of what is done to a cell or a piece.
+
+    The function's parameters without a type are the kernel's own: the cell `k, j, i`, or the piece `k, j, first, end` of a row, the cells
+    first <= i < end, and how many planes, rows and pieces are before it, `plane, row, chunk`. A function of a cell cannot return early.
+    """
+    return lambda function: _kernel(function, module)
+
+
+def _kernel(function: Callable, module: str) -> wp.Kernel:
+    """Put the function's body behind what opens a piece. Warp is given the text that results, which it hashes."""
+    tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
+    made, parameters = tree.body[0], inspect.signature(function).parameters.values()
+    typed = [p for p in parameters if p.annotation is not p.empty]
+    if "i" in function.__code__.co_varnames[: len(parameters) - len(typed)]:
+        opened = ast.parse(PIECE + LOOP).body
+        opened[-1].body = made.body
+    else:
+        opened = ast.parse(PIECE).body + made.body
+    made.body, made.decorator_list, made.args.args = opened, [], [ast.arg("cells"), *(ast.arg(p.name) for p in typed)]
+    function.__signature__ = inspect.Signature([inspect.Parameter("cells", inspect.Parameter.POSITIONAL_OR_KEYWORD), *typed])
+    function.__annotations__ = {"cells": CellRange} | {p.name: p.annotation for p in typed}
+    key = function.__qualname__.replace("<locals>.", "").replace(".", "__")
+    return wp.Kernel(function, key, wp.get_module(module), {"enable_backward": False}, source=ast.unparse(tree))

@@ -1,0 +1,90 @@
+// Write what a component's closed faces become; old values alone are read, so that the order of faces does not matter.
+#include "near_walls.h"
+const float* field[3] = {given.u.data, given.v.data, given.w.data};
+const signed char* marks[3] = {given.known_u.data, given.known_v.data, given.known_w.data};
+const short* wall[3] = {given.wall_u.data, given.wall_v.data, given.wall_w.data};
+const float* moving[3] = {given.moving_u.data, given.moving_v.data, given.moving_w.data}; const float* turn = (const float*)given.turn.data;
+const float* shift = (const float*)given.shift.data;
+const float* distance = given.distance.data; const float* next = given.next_near.data; float* result = given.result.data;
+const short* owner = given.owner.data; const short* next_owner = given.next_owner.data;
+const signed char* kind = given.kind.data; const unsigned char* contact = given.contact.data;
+const unsigned char* separating = given.separating.data;
+const long long stride[3] = {1, s2, s1}; const int counts[3] = {nx, ny, nz};
+// does the material beside the wall stay on it: asked of the nearest open cell along the normal, from where the wall is
+auto holds = [&](const float* center, const float* n, float depth, int number) {
+    int cell[3] = {1, 1, 1}; long long e = -1;
+    for (int step = 0; step < 6; ++step) {
+        for (int d = 0; d <= planes; ++d) {
+            const int at = (int)(center[d] + (depth + 0.05f + 0.25f*(float)step)*n[d]);
+            cell[d] = at < 1 ? 1 : (at < counts[d] ? at : counts[d]);
+        }
+        e = cell[2]*s1 + cell[1]*s2 + cell[0];
+        if (kind[e] != SOLID) break;
+    }
+    if (kind[e] != FLUID) return false;
+    if (!separating[number]) return true;
+    if (contact[e] != TOUCHES_NOTHING) return contact[e] != RELEASED;
+    bool released = false;  // it touches the wall with an edge or a corner: its neighbors on the side of the wall know
+    for (int d = 0; d <= planes; ++d) {
+        const long long beside = e - (n[d] > 0 ? stride[d] : -stride[d]);
+        if (kind[beside] == FLUID && contact[beside] == HELD) return true;
+        released = released || (kind[beside] == FLUID && contact[beside] == RELEASED);
+    }
+    return !released;
+};
+auto constrain = [&](int i) {
+    int at[3] = {i, j, k};
+    if (at[axis] == 0) { result[row + i] = field[axis][row + i]; return; }  // behind the domain's wall: no tent reaches it
+    for (int d = 0; d <= planes; ++d) {  // the ring follows what lies beside it
+        const int most = counts[d] + (d == axis ? 1 : 0);
+        at[d] = at[d] < 1 ? 1 : (at[d] < most ? at[d] : most);
+    }
+    const long long e = at[2]*s1 + at[1]*s2 + at[0], here = row + i;
+    const float own = field[axis][e];
+    if (known[e] <= 0) { result[here] = field[axis][here]; return; }
+    result[here] = own;
+    if (open[e] > 0) return;
+    const int number = wall[axis][e] > 0 ? wall[axis][e] : 0;
+    auto distance_to = [&](long long node) {  // that wall; of other nodes than its own, to the nearest
+        return owner && owner[node] != number && next_owner[node] == number ? next[node] : distance[node];
+    };
+    // the distance at the face's nodes (b along the first tangential axis, c along the second), and its gradient at the center
+    const int p = axis == 0 ? 1 : 0, q = axis == 2 ? 1 : 2, nodes = planes == 2 ? 2 : 1;
+    const long long back = -stride[axis], ahead = at[axis] <= counts[axis] ? stride[axis] : 0;
+    float s = 0, n[3] = {0, 0, 0};
+    for (int c = 0; c < nodes; ++c) {
+        for (int b = 0; b < 2; ++b) {
+            const long long a = e + b*stride[p] + c*stride[q]; const float d = distance_to(a);
+            s += distance[a];
+            n[axis] += (distance_to(a + ahead) - distance_to(a + back))/(ahead ? 2.0f : 1.0f);
+            n[p] += b ? 2*d : -2*d;
+            n[q] += nodes == 1 ? 0.0f : (c ? 2*d : -2*d);
+        }
+    }
+    if (number == 0) { n[0] = 0; n[1] = 0; n[2] = 0; n[axis] = (at[axis] == 1 ? 2.0f : -2.0f)*(float)nodes; }  // the domain's wall
+    const float share = 0.5f/(float)nodes, size = share*sqrt(n[0]*n[0] + n[1]*n[1] + n[2]*n[2]);
+    s *= share;
+    if (s < -(float)DEPTH || !(size > 0.1f)) return;  // within a thin plate the normal means nothing
+    for (int d = 0; d < 3; ++d) n[d] *= share/size;
+    float center[3];
+    for (int d = 0; d < 3; ++d) center[d] = (float)at[d] + (d == axis ? 0.0f : 0.5f);
+    auto of_wall = [&](int d) {  // its velocity at the center; on the domain's faces that of a solid that covers them
+        if (!moving[0]) return 0.0f;
+        if (number == 0) return d == axis ? moving[axis][e] : 0.0f;
+        float v = shift[3*number + d];
+        for (int c = 0; c <= planes; ++c) v += turn[9*number + 3*d + c]*(center[c] - 1.0f)*dx;
+        return v;
+    };
+    float relative = n[axis]*(own - of_wall(axis));
+    for (int d = 0; d <= planes; ++d) {
+        if (d == axis) continue;
+        float total = 0; int found = 0;
+        for (int b = 0; b < 4; ++b) {
+            const long long f = e + (b & 1 ? back : 0) + (b & 2 ? stride[d] : 0);
+            if (marks[d][f] > 0) { total += field[d][f]; ++found; }
+        }
+        relative += n[d]*((found ? total/(float)found : 0.0f) - of_wall(d));
+    }
+    if (relative < 0 || holds(center, n, s < 0 ? -s : 0.0f, number)) result[here] = own - relative*n[axis];
+};
+each(constrain);

@@ -1,0 +1,3 @@
+#include "entries.h"
+// y = b - A x
+ROWS { T s = b[k]; ENTRIES s -= a[e]*x[col[e]]; y[k] = s; }

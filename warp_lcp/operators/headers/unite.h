@@ -1,0 +1,45 @@
+#include "joined.h"
+// Join cells to their lower neighbors. Parents have smaller numbers, so that trees do not depend on the order of threads; a lost race is
+// seen in what the atomic minimum returns, and tried again
+const bool first = P.first == 0;  // from there a periodic axis leads to the last cell, from other rows to the one below
+const long long wrap_x = L.nx - 1, wrap_y = P.j == 0 ? (L.rows - 1)*L.s2 : -L.s2, wrap_z = P.k == 0 ? (L.planes - 1)*L.s1 : -L.s1;
+const auto unite = [&](int i, int j) {
+    int a = find(i), b = find(j);
+    while (a != b) {
+        if (a < b) { const int t = a; a = b; b = t; }
+        const int old = wp::atomic_min(P_ + a, b);
+        if (old == a) return;
+        a = find(old); b = find(b); } };
+// what to join is found in bytes, many cells at a time: 1 the cell to the left, 2 the one below along y, 4 along z; the cell to the
+// left has been joined to its own lower neighbors, and those joined to ours need no more
+const unsigned char ax = cx > 0, ay = cy > 0, az = cz > 0;
+unsigned char join[M];
+for (int begin = 0; begin < n; begin += M) {
+    const int m = n - begin < M ? n - begin : (int)M; const signed char* e = c + begin;
+    if (uniform) {
+        SIMD for (int k = 0; k < m; ++k) {
+            const unsigned char in = e[k] == 1, left = ax & (e[k-1] == 1), y = ay & (e[k-s2] == 1), z = az & (e[k-s1] == 1);
+            const unsigned char y_done = left & (e[k-1-s2] == 1), z_done = left & (e[k-1-s1] == 1);
+            join[k] = in ? (unsigned char)(left | (y & !y_done) << 1 | (z & !z_done) << 2) : (unsigned char)0; }
+    } else {
+        for (int k = begin; k < begin + m; ++k) {
+            const bool in = c[k] == 1, left = c[k-1] == 1 && x(k);
+            const bool y_done = left && c[k-1-s2] == 1 && y(k-1) && x(k-s2), z_done = left && c[k-1-s1] == 1 && z(k-1) && x(k-s1);
+            const bool y_here = c[k-s2] == 1 && y(k) && !y_done, z_here = c[k-s1] == 1 && z(k) && !z_done;
+            join[k - begin] = in ? (unsigned char)(left | y_here << 1 | z_here << 2) : (unsigned char)0; }
+    }
+    if (first && begin == 0 && join[0] & 1) {  // the neighbor to the left of a first cell is the last one: no chain to rely on
+        const int k = 0; join[0] = 1 | (c[k-s2] == 1 && y(k)) << 1 | (c[k-s1] == 1 && z(k)) << 2; }
+    for (int k = 0; k < m; ++k) {
+        const unsigned char j = join[k]; const int i = (int)(p + begin + k);
+        if (!j) continue;
+        if (j & 1) {
+            const bool edge = first && begin + k == 0;
+#ifdef __CUDA_ARCH__
+            unite(i, edge ? i + (int)wrap_x : i - 1);
+#else
+            if (!edge && P_[i] == i) P_[i] = P_[i-1]; else unite(i, edge ? i + (int)wrap_x : i - 1);
+#endif
+        }
+        if (j & 2) unite(i, i + (int)wrap_y);
+        if (j & 4) unite(i, i + (int)wrap_z); } }

@@ -1,0 +1,295 @@
+"""Phases of a solve in which another method is at work: cold starts, and what goes on where a method's own steps lead nowhere."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.sparse
+import warp as wp
+
+from warp_lcp.operators.dense import DenseOperator
+from warp_lcp.operators.grid_matrix import grid_matrix
+from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.problem import LCP
+from warp_lcp.residual import NaturalResidual
+from warp_lcp.result import SolveStatus
+from warp_lcp.rows import Rows
+from warp_lcp.solve import EPS, FLOOR_MARGIN, Step
+from warp_lcp.solvers import active_set_passes as passes
+from warp_lcp.solvers.dense_problem import proved_infeasible
+from warp_lcp.solvers.principal_system import GridSystem
+from warp_lcp.solvers.projected_multigrid_kernels import GAPS, SIZE
+from warp_lcp.stopping import StoppingCriteria
+from warp_lcp.vectors import Reduction
+
+if TYPE_CHECKING:
+    from warp_lcp.operators.grid_poisson import GridPoisson
+    from warp_lcp.solvers.principal_system_sparse import SparseSystem
+
+# of steps on a grid's matrix
+WINDOW = 10  # steps over which the residual's fall is measured
+FIRST = 20  # steps before which nothing is concluded: residuals of conjugate gradients rise and fall
+MOST = 30  # steps that a solve may still need at that pace: assembly and set-up cost about as much
+# of the proximal-point iteration
+CENTER, FACTOR, LEAST = 1e-4, 0.1, 1e-10  # eps of the first center, its factor from center to center, and the smallest
+RAISED, LARGEST = 100.0, 1.0  # factor of eps where a regularized problem is not solved, and the largest eps: larger ones are easier
+NEAR = 1e-3  # of a center's residual: what the regularized problem's may be when the next center is taken
+TRIED, FEWER = 30, 15  # steps for one center, before and after eps had to be raised
+SMALL = 1000  # unknowns up to which a sparse matrix is taken as a dense one, for which least-index pivoting is there
+FALL = 0.9  # a center whose residual is above this part of the smallest so far is no progress
+IDLE = 4  # centers without progress before the end
+PATIENCE = StoppingCriteria().patience  # gradient steps that neither lower the energy nor the residual before the end
+
+
+def projected_cycle(
+    problem: LCP, system: GridSystem, x: wp.array[Any], y: wp.array[Any], size: float, free: wp.array[Any], sums: Reduction, *,
+    restrict: bool = True,
+) -> None:  # fmt: skip
+    """Run one from x: the correction is `system.z` times `size`.
+
+    Args:
+        problem: a grid's.
+        system: of its corrections.
+        x: where to begin, a stored field like y and free.
+        y: A x + b.
+        size: what the right-hand side is divided by.
+        free: every unknown's, when this is done.
+        sums: memory; `SIZE` of its scalars is written.
+        restrict: whether the system does not have all unknowns yet.
+    """
+    rows, finest = Rows.flat(problem.layout.size, problem.device), system.hierarchy.finest
+    passes.ALL_FREE.bind(rows, unknown=problem.unknown, free=free).launch()
+    if restrict:
+        system.restrict(free)
+    passes.ON_FREE.bind(rows, y=y, free=free, g=system.r, scale=1 / size, out=sums.partials).launch()
+    sums.scalars[int(SIZE) : int(SIZE) + 1].fill_(size)
+    gaps = {"lo": finest.lower, "hi": finest.upper, "scalars": sums.scalars}
+    GAPS.bind(rows, bounds=problem.bounds.operands, x=x, unknown=problem.unknown, **gaps).launch()
+    system.monotone_cycle()
+
+
+class Inner:
+    """Another method at work inside one, on a problem of its own or the same.
+
+    Args:
+        method: it.
+        problem: what it is to solve.
+        work: its memory; None: made by the method.
+    """
+
+    def __init__(self, method: Any, problem: LCP, work: Any = None) -> None:
+        self.method, self.problem, self.work = method, problem, method.init(problem) if work is None else work
+
+    def begin(self, x: Any, tolerance: float, *, warm: bool = True) -> None:
+        """Start from a stored field."""
+        work = self.work
+        work.x.assign(x)
+        work.residual.evaluate(work.x)
+        work.start(warm=warm, tolerance=tolerance)
+
+    def step(self, x: wp.array[Any] | None = None) -> Step:
+        """Take a step, from another iterate than the last one if x is given; the residual is that of its end."""
+        work = self.work
+        work.residual.current = False
+        done = self.method.step(self.problem, work, work.x if x is None else x)
+        if not work.residual.current:
+            work.residual.evaluate(work.x if x is None else x)
+        return done
+
+
+class Pace:
+    """How fast the least residual of a solve falls.
+
+    Args:
+        tolerance: the residual norm that is asked for.
+    """
+
+    def __init__(self, tolerance: float) -> None:
+        self._tolerance, self._least = tolerance, list[float]()
+
+    def record(self, norm: float) -> None:
+        """Take note of the residual before a step."""
+        self._least.append(min(self._least[-1], norm) if self._least else norm)
+
+    @property
+    def crawls(self) -> bool:
+        """Whether the tolerance, or what float64 can tell from 0, is more than MOST steps away at the pace of the last ones."""
+        if len(self._least) <= FIRST:
+            return False
+        least, target = self._least[-1], max(self._tolerance, EPS * self._least[0])
+        return least > target and math.log(least / target) > MOST / WINDOW * math.log(self._least[-1 - WINDOW] / least)
+
+
+class AlgebraicSteps:
+    """Steps of MinimumMapNewton on the matrix of a grid, in double precision: its aggregates follow the grid's coefficients.
+
+    For domains on which aggregates of whole blocks fail. Channels and walls a cell wide, spirals and mazes, share blocks that are not
+    joined inside; so do cells whose coefficients are random over many decades. Cycles of a geometric hierarchy are slow there, without
+    bounds too.
+
+    Args:
+        problem: a grid's, in one process.
+        A: its operator.
+        x: the iterate, stored, to begin with.
+        tolerance: the residual norm that is asked for.
+    """
+
+    def __init__(self, problem: LCP, A: GridPoisson, x: wp.array[Any], tolerance: float) -> None:
+        from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton  # which needs this module
+
+        self._rows = np.flatnonzero(problem.unknown.numpy() == 1)
+        b, lower, upper, start = (field.numpy()[self._rows] for field in (problem.b, problem.lower, problem.upper, x))
+        matrix = SparseOperator(grid_matrix(A), device=problem.device, dtype=wp.float64)
+        self._inner = Inner(MinimumMapNewton(precision="double"), LCP(matrix, b, lower, upper))
+        self._inner.begin(start, tolerance, warm=False)
+
+    def step(self, x: wp.array[Any]) -> Step:
+        """Take a step, and write the iterate to x."""
+        done, stored = self._inner.step(), x.numpy()
+        stored[self._rows] = self._inner.work.x.numpy()
+        x.assign(stored)
+        return done
+
+
+class GradientPhase:
+    """Minimizes the energy by conjugate gradients that know the bounds, a batch a step.
+
+    Newton's method solves a linear system for each set that it tries, and its safeguard is a residual that says little where A is badly
+    conditioned: a plate's rises by a factor of 1000 on the way. MPRGP as a whole costs about as much as one or two such linear solves.
+
+    Args:
+        problem: with a symmetric sparse operator whose diagonal is not negative.
+        system: the preconditioner's.
+        precision: as MPRGP takes it.
+    """
+
+    def __init__(self, problem: LCP, system: SparseSystem, precision: str) -> None:
+        from warp_lcp.solvers.mprgp import MPRGP, GradientWorkspace  # which needs this module
+
+        method = MPRGP(precision=precision)
+        self._inner = Inner(method, problem, GradientWorkspace(problem, method, system))
+
+    def start(self, x: wp.array[Any], floating: Any, tolerance: float) -> None:
+        """Begin at x."""
+        work, self._tolerance = self._inner.work, tolerance
+        work.floating = floating
+        work.residual.start(work.x, keep=False)
+        self._inner.begin(x, tolerance)
+
+    def step(self, x: wp.array[Any], factor: float, most: int) -> Step | None:
+        """Iterate until the residual is `factor` times what it was, at most so often; move x there.
+
+        Returns:
+            None: the energy has no minimum, or neither it nor the residual falls any more.
+        """
+        inner, residual, linear, idle, sank = self._inner, self._inner.work.residual, 0, 0, False
+        least, target = residual.norm, max(self._tolerance, factor * residual.norm)
+        while linear < most and idle < PATIENCE and residual.norm > target:
+            step = inner.step()
+            if step.failure is not None:
+                return None
+            linear += step.linear_iterations
+            idle = 0 if step.interim or residual.norm < least else idle + 1
+            least, sank = min(least, residual.norm), sank or step.interim
+        wp.copy(x, inner.work.x)
+        if idle == PATIENCE:
+            return None
+        return Step("conjugate gradients", linear, residual.active, interim=sank)
+
+
+class ProximalPoint:
+    """Solve A x + b + eps D (x - c) = y with the same bounds, take x for the center c, lower eps, repeat (Martinet 1970, Rockafellar 1976).
+
+    D is the natural residual's d. A + eps D is a P-matrix wherever A is a
+    P0-matrix (positive semi-definite ones, skew ones), so that free blocks are regular and least-index pivoting is finite. Its solutions
+    tend to one of the problem's own if A is monotone and there is one. The regularized problems are solved by PrimalDualActiveSet; where
+    it fails, eps is raised, and does not fall again. Failure with eps = 1 ends the iteration with NON_DESCENT.
+
+    Made for a singular block here and there. Linear programs (A skew) of more than some dozens of unknowns come to residuals of 1e-2 or end
+    with NON_DESCENT: they are InteriorPoint's.
+
+    Args:
+        problem: with a dense or sparse operator.
+        residual: the problem's own.
+        tolerance: the norm of it that is asked for.
+    """
+
+    def __init__(self, problem: LCP, residual: NaturalResidual, tolerance: float) -> None:
+        from warp_lcp.solvers.primal_dual_active_set import PrimalDualActiveSet  # whose last resort this is
+
+        self._problem, self._residual, self._tolerance = problem, residual, tolerance
+        A = problem.A
+        self._matrix: Any = A.matrix() if isinstance(A, SparseOperator) else A.matrix.numpy().astype(np.float64)  # type: ignore[attr-defined]
+        self._D = A.scale()  # type: ignore[attr-defined]
+        self._b, self._eps = problem.b.numpy(), CENTER
+        if scipy.sparse.issparse(self._matrix) and A.unknowns <= SMALL:  # type: ignore[attr-defined]
+            self._matrix = self._matrix.toarray()
+        made: Any = SparseOperator if scipy.sparse.issparse(self._matrix) else DenseOperator
+        operator = made(self._regularized(), device=problem.device, dtype=wp.float64)
+        regularized = LCP(operator, self._b, problem.lower.numpy(), problem.upper.numpy())
+        self._inner = Inner(PrimalDualActiveSet(precision="double"), regularized)
+        self._inner.work.last_resort = False
+        self._smallest, self._idle, self._steps, self._near, self._least = residual.norm, 0, 0, 0.0, LEAST
+
+    @staticmethod
+    def suits(problem: LCP) -> bool:
+        """Return whether the iteration can be had: A + eps D must be assembled."""
+        return isinstance(problem.A, (DenseOperator, SparseOperator))
+
+    def step(self, x: wp.array[Any]) -> Step:
+        """Take one step for the regularized problem, from a new center if the last one's has been solved."""
+        if self._steps == 0:
+            self._take_center(x)
+        residual, self._steps = self._inner.work.residual, self._steps + 1
+        residual.evaluate(x)
+        step, failure = self._inner.step(x), None
+        if residual.norm <= self._near or step.failure is not None or self._steps >= (TRIED if self._least == LEAST else FEWER):
+            failure = self._assess(x)
+        self._residual.current = False
+        return Step("proximal point", step.linear_iterations, step.active, failure, interim=failure is None)
+
+    def _take_center(self, x: wp.array[Any]) -> None:
+        """Write the regularized problem around clip(x, l, u)."""
+        inner = self._inner.problem
+        center = np.clip(x.numpy(), inner.lower.numpy(), inner.upper.numpy())
+        x.assign(center)
+        operator: Any = inner.A
+        if isinstance(operator, SparseOperator):
+            operator.update(self._regularized())
+        else:
+            operator.matrix.assign(self._regularized())
+        inner.b.assign(self._b - self._eps * self._D * center)
+        self._center = center
+        size = self._residual.evaluate(x)
+        self._near = max(NEAR * size, 0.3 * self._tolerance)
+        self._inner.work.start(warm=True, tolerance=self._near)
+
+    def _assess(self, x: wp.array[Any]) -> SolveStatus | None:
+        """Prepare for the next center; return how the iteration ends if it has come no nearer to a solution for some."""
+        solved, self._steps = self._inner.work.residual.norm <= self._near, 0
+        x.assign(np.clip(x.numpy(), self._inner.problem.lower.numpy(), self._inner.problem.upper.numpy()))
+        norm = self._residual.evaluate(x)
+        if norm <= FALL * self._smallest:
+            self._smallest, self._idle, self._eps = norm, 0, max(self._least, FACTOR * self._eps)
+            return None
+        if not solved and self._eps < LARGEST:
+            if self._least == LEAST and proved_infeasible(self._problem):
+                return SolveStatus.INFEASIBLE
+            self._eps = self._least = min(LARGEST, RAISED * self._eps)
+            x.assign(self._center)
+            return None
+        self._eps, self._idle = max(self._least, FACTOR * self._eps), self._idle + 1
+        if solved and self._idle < IDLE:
+            return None
+        floor = FLOOR_MARGIN * self._residual.rounding_floor(x, EPS)
+        if norm > floor and proved_infeasible(self._problem):
+            return SolveStatus.INFEASIBLE
+        return SolveStatus.STAGNATED if solved else SolveStatus.NON_DESCENT
+
+    def _regularized(self) -> Any:
+        """Return A + eps D."""
+        if not scipy.sparse.issparse(self._matrix):
+            return self._matrix + np.diag(self._eps * self._D)
+        return scipy.sparse.csr_array(self._matrix + scipy.sparse.diags_array(self._eps * self._D))
