@@ -16,6 +16,7 @@ import warp as wp
 
 from warp_lcp.problem import LCP
 from warp_lcp.residual_kernels import add_kernel, kernels, masked_square_kernel, settle_isolated_kernel, start_kernel
+from warp_lcp.rows import Known
 from warp_lcp.scale import scale_by_products
 from warp_lcp.vectors import Reduction, launch_spans
 
@@ -47,6 +48,11 @@ class NaturalResidual:
     def y(self) -> wp.array[Any]:
         """Memory of y, made when it is first asked for."""
         return self.problem.layout.zeros(wp.float64)
+
+    @cached_property
+    def known(self) -> Known:
+        """What passes take of y in place of a stencil."""
+        return Known(self.diagonal, self.unit, self.y)
 
     def evaluate(self, x: wp.array[Any]) -> float:
         """Compute y and return the norm of the natural residual at x (stored, float64)."""

@@ -17,7 +17,7 @@ from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
-from warp_lcp.rows import Known, Rows
+from warp_lcp.rows import Rows
 from warp_lcp.solve import FLOOR_MARGIN, IterateInPlace, Precision, RoundedIterate, Step
 from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers.coarse_problem import CoarseProblem
@@ -129,7 +129,7 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         self.free = layout.zeros(wp.uint8)
         self._scalars = wp.zeros(SLOTS, dtype=wp.float64, device=problem.device)
         self._reduction = Reduction(layout.size, problem.device, self._scalars, columns=4, across=layout.across)
-        self._rows, self._known = Rows.flat(layout.size, problem.device), Known(self.residual.diagonal, self.residual.unit, self.residual.y)
+        self._rows = Rows.flat(layout.size, problem.device)
         self._rounded = layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
         self.floating: Any = None
         cycled = self.bounded and isinstance(problem.A, SparseOperator) and problem.A.unknowns >= LARGE
@@ -190,7 +190,7 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         self.norms = [*self.norms, residual.norm][-self.settings.memory :]
         size = residual.norm
         fields = {"x": x, "unknown": p.unknown, "free": self.free, "g": self.system.r, "out": self._reduction.partials}
-        passes.CLASSIFY.bind(self._rows, stencil=self._known, bounds=p.bounds.operands, scale=1 / size, **fields).launch()
+        passes.CLASSIFY.bind(self._rows, stencil=residual.known, bounds=p.bounds.operands, scale=1 / size, **fields).launch()
         self._reduction.add_up(MOVED, columns=4)
         moved, active, shifted, square = self._scalars.numpy()[:4]
         if self.coarse is not None and self.coarse.is_due(float(moved)):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -17,7 +16,7 @@ from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
-from warp_lcp.rows import Known, Rows
+from warp_lcp.rows import Rows
 from warp_lcp.solve import Precision, RoundedIterate, Step
 from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers import projected_multigrid_kernels as engine
@@ -151,11 +150,6 @@ class SplitResidual(NaturalResidual):
         self._stencil = problem.A.stencil if isinstance(problem.A, GridPoisson) else None
         places = self._stencil.rows.places if self._stencil else self.rows.places
         self._split = Reduction(size, device, self.scalars, columns=SPLIT_SUMS, threads=places)
-
-    @cached_property
-    def known(self) -> Known:
-        """What passes take on matrices."""
-        return Known(self.diagonal, self.unit, self.y)
 
     def start(self, x: wp.array[Any], *, keep: bool) -> None:
         """Set x to clip(x, l, u) or clip(0, l, u)."""
