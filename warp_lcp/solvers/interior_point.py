@@ -192,11 +192,8 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
 
     def newton_step(self, x: wp.array[Any]) -> Step:
         """Take a step of the active-set method."""
-        if isinstance(self.active_set, GridNewtonWorkspace):
-            work = self.active_set
-            return work.monotone_step() if work.wants_monotone_cycle() else work.newton_step()
         assert self.active_set is not None
-        return self.active_set.newton_step(x)
+        return self.active_set.step(x)
 
     @property
     def is_grid(self) -> bool:

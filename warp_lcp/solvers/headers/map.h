@@ -9,7 +9,7 @@ const R w = (R)(scale*value), a = low ? (R)(scale*below_) : (R)0, c = high ? (R)
 #else
 const double at_ = unit*(double)d[i], above_ = at_ < 0 ? -at_ : at_, size = above_ == 0 ? 1.0 : above_, low_ = lower(i), high_ = upper(i);
 const bool inside = unknown[i] == 1, low = low_ > -(double)INFINITY, high = high_ < (double)INFINITY;
-const R w = y[i], a = low ? size*(x[i] - low_) : 0.0, c = high ? size*(high_ - x[i]) : 0.0;
+const R a = low ? size*(x[i] - low_) : 0.0, c = high ? size*(high_ - x[i]) : 0.0, w = y[i];
 #endif
 #if RANDOM  // an element of the unit disc's first quadrant for each kink, a hash of its index
 const unsigned long long z0 = ((unsigned long long)(p + i) + seed)*0x9E3779B97F4A7C15ull, z1 = (z0 ^ (z0 >> 29))*0xBF58476D1CE4E5B9ull;
