@@ -82,10 +82,13 @@ class GridSystem(KrylovSystem):
         self.r, self.z = self.hierarchy.finest.b, self.hierarchy.finest.x
         self._weight = wp.zeros_like(self.r) if shifted else None
         self.fused = self.hierarchy.open_cycle is not None  # one CPU thread, no ghost cells to fill
+        self._iterate_by(self._krylov_method(), self._weight)
+
+    def _krylov_method(self) -> Any:
+        """Return what iterates: it has `solve`, and the solution in `x`."""
         if self.fused:
-            self._iterate_by(GridConjugateGradient(A.stencil, self.hierarchy, weighted=shifted), self._weight)
-        else:
-            self._iterate_by(ConjugateGradient(self.hierarchy.finest.stencil.product, self, weight=self._weight), self._weight)
+            return GridConjugateGradient(self._A.stencil, self.hierarchy, weighted=self._weight is not None)
+        return ConjugateGradient(self.hierarchy.finest.stencil.product, self, weight=self._weight)
 
     def refresh(self) -> None:
         """Take the rows and the weights again if the operator has changed."""
