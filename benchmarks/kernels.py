@@ -27,7 +27,7 @@ PRODUCT = "stencil.product, float32"
 # kernels that run once in a while: for a new operator, problem or set of cells
 SET_UP = (
     "grid_poisson.copy_cells", "grid_poisson.count_faces", "grid_poisson.diagonal", "grid_poisson.weights", "components", "problem",
-    "residual.start", "residual.masked_square", "residual.settle",
+    "residual.within", "residual.unknown_square", "residual.settle",
 )  # fmt: skip
 SERIAL = ("stencil.relax",)  # in place and in two colors: bound by store forwarding, not by memory
 FORMS = ("unit", "faces")

@@ -9,16 +9,31 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.problem import LCP
-from warp_lcp.residual_kernels import add_kernel, kernels, masked_square_kernel, settle_isolated_kernel, start_kernel
-from warp_lcp.rows import Known
+from warp_lcp.rows import Known, RowPass
 from warp_lcp.scale import scale_by_products
-from warp_lcp.vectors import Reduction, launch_spans
+from warp_lcp.vectors import ADD, Reduction, rows_of
+
+HEADERS = Path(__file__).parent / "headers"
+f64, i8 = wp.float64, wp.int8
+NATURAL = RowPass(
+    "residual.natural", HEADERS / "natural.h", f64, bounds=True, reads={"x": f64, "y": f64, "d": "D", "unknown": i8},
+    numbers={"unit": f64}, sums=("square",),
+)  # fmt: skip
+UNKNOWN_SQUARE = RowPass("residual.unknown_square", HEADERS / "unknown_square.h", f64, reads={"b": f64, "unknown": i8}, sums=("square",))
+WITHIN = RowPass(
+    "residual.within", HEADERS / "within.h", f64, bounds=True, reads={"unknown": i8}, writes={"x": f64}, numbers={"keep": bool}
+)
+SETTLE_ISOLATED = RowPass(
+    "residual.settle_isolated", HEADERS / "settle_isolated.h", f64, bounds=True, reads={"d": "D", "b": f64, "unknown": i8},
+    writes={"x": f64},
+)  # fmt: skip
 
 
 class NaturalResidual:
@@ -59,9 +74,8 @@ class NaturalResidual:
         p = self.problem
         p.bounds.follow(x)
         self.affine(x)
-        before = [x, self.y, self.diagonal, self.unit, *p.bounds.operands, p.unknown]
-        spans, partials = self._reduction.spans, self._reduction.partials
-        launch_spans(kernels(self.diagonal.dtype).natural, spans, before, [partials], p.device)
+        fields = {"x": x, "y": self.y, "d": self.diagonal, "unknown": p.unknown, "unit": self.unit}
+        NATURAL.bind(rows_of(x), bounds=p.bounds.operands, **fields, out=self._reduction.partials).launch()
         self._reduction.add_up(0)
         self.norm, self.current = float(np.sqrt(self._sums.numpy()[0])), True
         return self.norm
@@ -74,7 +88,7 @@ class NaturalResidual:
             apply_plus(x, p.b, self.y)
             return
         A.apply(x.reshape(p.layout.stored_shape), self.y.reshape(p.layout.stored_shape))
-        wp.launch(add_kernel, x.size, [p.b, self.y], device=p.device)
+        ADD.bind(rows_of(x), z=p.b, x=self.y).launch()
 
     def start(self, x: wp.array[Any], *, keep: bool) -> None:
         """Set x to clip(x, l, u), or to clip(0, l, u), and to 0 where there is no unknown."""
@@ -84,7 +98,7 @@ class NaturalResidual:
             self.rescale()
         for _ in range(1 if p.bounds.affine is None else 2):  # bounds that depend on x: at x as it is, then at x within its bounds
             p.bounds.follow(x)
-            launch_spans(start_kernel, self._reduction.spans, [x, *p.bounds.operands, p.unknown, keep], [], p.device)
+            WITHIN.bind(rows_of(x), bounds=p.bounds.operands, x=x, unknown=p.unknown, keep=keep).launch()
         self.current = False
 
     def rescale(self) -> None:
@@ -113,7 +127,8 @@ class NaturalResidual:
         """Set x where A's row is empty, so that y = b, to the bound that b's sign asks for; methods move coupled unknowns only."""
         p, sizes = self.problem, getattr(self.problem.A, "row_sizes", None)  # of grids, only an empty row has a zero diagonal
         zero_if_empty = self.diagonal if sizes is None else sizes
-        wp.launch(settle_isolated_kernel, x.size, [zero_if_empty, p.b, p.lower, p.upper, p.unknown, x], device=p.device)
+        fields = {"d": zero_if_empty, "b": p.b, "unknown": p.unknown, "x": x}
+        SETTLE_ISOLATED.bind(rows_of(x), bounds=p.bounds.operands, **fields).launch()
         self.current = False
 
     def unattainable(self) -> float:
@@ -126,8 +141,8 @@ class NaturalResidual:
 
     def norm_of_b(self) -> float:
         """Return ||b|| over the unknowns."""
-        p, s = self.problem, self._reduction.spans
-        launch_spans(masked_square_kernel, s, [p.b, p.unknown], [self._reduction.partials], p.device)
+        p = self.problem
+        UNKNOWN_SQUARE.bind(rows_of(p.b), b=p.b, unknown=p.unknown, out=self._reduction.partials).launch()
         self._reduction.add_up(1)
         return float(np.sqrt(self._sums.numpy()[1]))
 

@@ -8,7 +8,8 @@ import warp as wp
 import warp_lcp as wl
 from oracle import assemble, lemke
 from warp_lcp.solvers.subspace_minimization import SubspaceMinimization
-from warp_lcp.solvers.sweep_kernels import change_kernel
+from warp_lcp.solvers.sweep_kernels import CHANGE
+from warp_lcp.vectors import rows_of
 
 TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=500)
 
@@ -101,9 +102,6 @@ def test_change_is_the_largest(device):
     x[[3, 9000, 19_999]] = 1.0, -7.0, 2.0
     arrays = [wp.array(v, dtype=wp.float64, device=device) for v in (x, old)]
     out = wp.zeros(1, dtype=wp.float64, device=device)
-    from warp_lcp.native import Spans
-    from warp_lcp.vectors import launch_spans
-
-    launch_spans(change_kernel, Spans.of(n, wp.get_device(device)), arrays, [out], wp.get_device(device))
+    CHANGE.bind(rows_of(arrays[0]), x=arrays[0], old=arrays[1], out_of=out).launch()
     assert out.numpy()[0] == 7.0
     np.testing.assert_array_equal(arrays[1].numpy(), x)

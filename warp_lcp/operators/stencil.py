@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_lcp.layout import Padding
 from warp_lcp.native import grain
-from warp_lcp.operators.stencil_kernels import StencilShape, product_kernels, wrap_kernel
+from warp_lcp.operators.stencil_kernels import PRODUCT, RELAX, StencilShape, wrap_kernel
 from warp_lcp.program import Launch, perform
 from warp_lcp.rows import Rows
 from warp_lcp.rows.layout import put, stencil_struct
@@ -129,18 +129,15 @@ class Stencil:
     def product(self, x: wp.array[Any], out: wp.array[Any], plus: wp.array[Any] | None = None, *, launch: Launch = wp.launch) -> None:
         """Out = A x, or A x + plus. All of one float type; rows that are no unknowns give 0 (or plus)."""
         self.wrap(x, launch=launch)
-        kernel = product_kernels(*self.storage, x.dtype).product
-        inputs = [*self.operands, x, x if plus is None else plus, plus is not None, out]
-        launch(kernel, self.threads, inputs, device=self.device)
+        PRODUCT.bind(self.rows, stencil=self, x=x, b=plus, y=out).launch(launch)
 
     def relax(
         self, x: wp.array[Any], b: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any], omega: float, *, forward: bool = True
     ) -> None:
         """Sweep x once, red cells then black ones (forward) or black then red, each cell projected onto its bounds."""
-        kernel = product_kernels(*self.storage, x.dtype).relax
         for color in (0, 1) if forward else (1, 0):
             self.wrap(x)
-            wp.launch(kernel, self.threads, [*self.operands, x, b, lower, upper, omega, color], device=self.device)
+            RELAX.bind(self.rows, stencil=self, x=x, b=b, lower=lower, upper=upper, omega=omega, color=color).launch()
 
 
 def wrap(field: wp.array[Any], periodic: tuple[bool, ...], counts: tuple[int, int, int], *, launch: Launch = wp.launch) -> None:

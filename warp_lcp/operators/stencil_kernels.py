@@ -7,25 +7,33 @@ byte, d_scale its unit), `variable` has an array of lower faces an axis.
 """
 
 import functools
-from types import SimpleNamespace
+from pathlib import Path
 from typing import Any
 
 import warp as wp
 
-from warp_lcp.native import C_TYPES, simd
+from warp_lcp.rows import RowPass
+from warp_lcp.rows.row_pass import HEADERS as ROWS
+from warp_lcp.rows.row_pass import text
 
-NEIGHBORS = {
-    False: "(cx*(x[k-1] + x[k+1]) + cy*(x[k-s2] + x[k+s2]) + cz*(x[k-s1] + x[k+s1]))",
-    True: "(wx[k]*x[k-1] + wx[k+1]*x[k+1] + wy[k]*x[k-s2] + wy[k+s2]*x[k+s2] + wz[k]*x[k-s1] + wz[k+s1]*x[k+s1])",
-}
+HEADERS = Path(__file__).parent / "headers"
+PRODUCT = RowPass(
+    "stencil.product", HEADERS / "stencil_product.h", "S", stencil=("D", "W"), reads={"x": "S", "b": "S"}, optional=("b",),
+    writes={"y": "S"},
+)  # fmt: skip
+RELAX = RowPass(
+    "stencil.relax", HEADERS / "stencil_relax.h", "S", stencil=("D", "W"), reads={"b": "S", "lower": "S", "upper": "S"},
+    writes={"x": "S"}, numbers={"omega": "S", "color": int},
+)  # fmt: skip
 
 
 def stencil_head(variable: bool, real: str) -> str:
-    """Return declarations of d, the weights, the strides s1 and s2 for a row that begins at element p."""
-    head = f"typedef {real} T; const long long s1 = A.s1, s2 = A.s2; const T unit = (T)A.unit; const auto* d = d_.data + p;"
-    if variable:
-        return head + "const auto* wx = wx_.data + p; const auto* wy = wy_.data + p; const auto* wz = wz_.data + p;"
-    return head + "const T cx = (T)A.cx, cy = (T)A.cy, cz = (T)A.cz;"
+    """Return what opens a native function for cells k from element p on: d, the weights, `diagonal` and `neighbors` of `stencil.h`."""
+    types = f"typedef {real} T; constexpr int STENCIL = {ord('v' if variable else 'u')}; const double* known = nullptr;"
+    at = " ".join(f"const auto* {w} = {w}_.data + p;" for w in ("d", "wx", "wy", "wz"))
+    numbers = " ".join(f"const T {c} = (T)A.{c};" for c in ("unit", "cx", "cy", "cz"))
+    strides = "const long long s1 = A.s1, s2 = A.s2, ym = -s2, yp = s2, zm = -s1, zp = s1;"
+    return "\n".join([types, at, strides, numbers, text(ROWS / "stencil.h"), ""])
 
 
 @wp.struct
@@ -64,69 +72,6 @@ def row_count(A: StencilShape, k: int, j: int, c: int, grain: int):
 def row_start(A: StencilShape, k: int, j: int, c: int, grain: int):
     """Element at which chunk c of row (k, j) begins; k, j count interior cells from 0."""
     return wp.int64(k + 1) * A.s1 + wp.int64(j + 1) * A.s2 + wp.int64(1 + row_first(A, k, j, c, grain))
-
-
-@functools.cache
-def product_kernels(variable: bool, d_type: Any, w_type: Any, x_type: Any) -> SimpleNamespace:
-    """Return `product` (y = A x + b or A x) and `relax` (one color of projected SOR)."""
-    form = "variable" if variable else "uniform"
-    name = f"warp_lcp.stencil.{form}_{d_type.__name__}_{w_type.__name__}_{x_type.__name__}"
-    d_array, w_array, x_array = wp.array(dtype=d_type), wp.array(dtype=w_type), wp.array(dtype=x_type)
-    head, neighbors = stencil_head(variable, C_TYPES[x_type]), NEIGHBORS[variable]
-
-    @wp.func_native(
-        simd(
-            head
-            + f"""const T* x = x_.data + p; T* y = y_.data + p;
-        if (shifted) {{
-            const T* b = b_.data + p;
-            SIMD for (int k = 0; k < n; ++k) {{ const T e = unit*(T)d[k], v = e*x[k] - {neighbors}; y[k] = (e != 0 ? v : (T)0) + b[k]; }}
-        }} else {{
-            SIMD for (int k = 0; k < n; ++k) {{ const T e = unit*(T)d[k], v = e*x[k] - {neighbors}; y[k] = e != 0 ? v : (T)0; }}
-        }}"""
-        )
-    )
-    def product_row(
-        A: StencilShape, d_: d_array, wx_: w_array, wy_: w_array, wz_: w_array, x_: x_array, b_: x_array, y_: x_array, p: wp.int64, n: int,
-        shifted: bool,
-    ): ...  # fmt: skip
-
-    @wp.func_native(
-        simd(
-            head
-            + f"""T* x = x_.data + p; const T* b = b_.data + p; const T* lower = l_.data + p; const T* upper = u_.data + p;
-        for (int k = first; k < n; k += 2) {{
-            const T e = unit*(T)d[k];
-            if (e != 0) {{
-                T v = x[k] - omega*(b[k] + e*x[k] - {neighbors}) / e;
-                v = v > lower[k] ? v : lower[k]; x[k] = v < upper[k] ? v : upper[k]; }}
-        }}"""
-        )
-    )
-    def relax_row(
-        A: StencilShape, d_: d_array, wx_: w_array, wy_: w_array, wz_: w_array, x_: x_array, b_: x_array, l_: x_array, u_: x_array,
-        p: wp.int64, n: int, first: int, omega: x_type,
-    ): ...  # fmt: skip
-
-    @wp.kernel(enable_backward=False, module=name)
-    def product(
-        A: StencilShape, d: d_array, wx: w_array, wy: w_array, wz: w_array, grain: int, x: x_array, b: x_array, shifted: bool, y: x_array
-    ):
-        k, j, c = wp.tid()
-        n = row_count(A, k, j, c, grain)
-        product_row(A, d, wx, wy, wz, x, b, y, row_start(A, k, j, c, grain), n, shifted)
-
-    @wp.kernel(enable_backward=False, module=name)
-    def relax(
-        A: StencilShape, d: d_array, wx: w_array, wy: w_array, wz: w_array, grain: int, x: x_array, b: x_array, lower: x_array,
-        upper: x_array, omega: x_type, color: int,
-    ):  # fmt: skip
-        k, j, c = wp.tid()
-        n = row_count(A, k, j, c, grain)
-        first = (k + j + row_first(A, k, j, c, grain) + color) % 2
-        relax_row(A, d, wx, wy, wz, x, b, lower, upper, row_start(A, k, j, c, grain), n, first, omega)
-
-    return SimpleNamespace(product=product, relax=relax)
 
 
 @functools.cache

@@ -4,6 +4,8 @@ import ctypes
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from struct import Struct
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -53,6 +55,7 @@ class Bounds:
 
 
 BLANK = RowLayout()
+NOTHING, EMPTY = Struct(""), MappingProxyType[str, Any]({})
 NO_ARRAY = bytes(wp.array(dtype=wp.uint8).__ctype__())
 
 
@@ -79,14 +82,14 @@ def copy_of(struct: Any) -> Any:
     return made
 
 
-def joined(blank: Any, members: dict[str, Any], numbers: bytes = b"") -> Any:
+def joined(blank: Any, members: dict[str, Any], packing: Struct = NOTHING, numbers: Mapping[str, Any] = EMPTY) -> Any:
     """Return a Warp struct like `blank` of the memory of its members, in a tenth of the time of setting them.
 
-    Members lie as in C: those that fill whole eight bytes (structs, arrays, None for no array) side by side, then packed numbers.
+    Members lie as in C: those that fill whole eight bytes (structs, arrays, None for no array) side by side, then numbers.
     """
-    memory = b"".join([NO_ARRAY if v is None else v.__ctype__() for v in members.values()]) + numbers
+    memory = b"".join([NO_ARRAY if v is None else v.__ctype__() for v in members.values()]) + packing.pack(*numbers.values())
     made, native = object.__new__(type(blank)), type(blank.__ctype__())
-    made.__dict__.update(blank.__dict__, **members, _ctype=native.from_buffer_copy(memory.ljust(ctypes.sizeof(native), b"\0")))
+    made.__dict__.update(blank.__dict__, **members, **numbers, _ctype=native.from_buffer_copy(memory.ljust(ctypes.sizeof(native), b"\0")))
     return made
 
 

@@ -285,9 +285,10 @@ class Form:
         parts = {} if stencil is None else {"stencil": stencil.struct}
         if bounds is not None:
             lower, least, upper, most, code = bounds
-            parts["bounds"] = joined(NO_BOUNDS, {"lower": lower, "upper": upper, "code": code}, SIDES.pack(least.value, most.value))
+            numbers = {"least": least.value, "most": most.value}
+            parts["bounds"] = joined(NO_BOUNDS, {"lower": lower, "upper": upper, "code": code}, SIDES, numbers)
         arrays = {name: given[name] for name in self.types}
-        return joined(self.blank, parts | arrays, self._numbers.pack(*[given[name] for name in self.declared.numbers]))
+        return joined(self.blank, parts | arrays, self._numbers, {name: given[name] for name in self.declared.numbers})
 
     @functools.cached_property
     def kernel(self) -> Any:

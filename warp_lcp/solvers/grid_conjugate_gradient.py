@@ -29,7 +29,6 @@ class GridConjugateGradient:
         finest, device = hierarchy.finest, hierarchy.device
         r, s = finest.b, finest.stencil
         self.device, self.x, self._p = device, wp.zeros_like(r), wp.zeros_like(r)
-        planes, rows, _ = s.padding.counts
         self._scalars = wp.zeros(kernels.SLOTS, dtype=wp.float64, device=device)
         self._going = wp.zeros(1, dtype=wp.int32, device=device)
         sums = Reduction(r.size, device, self._scalars, columns=4, threads=s.rows.places)
@@ -39,9 +38,9 @@ class GridConjugateGradient:
         engine.CLIMB.launch(*hierarchy.last_leg(), engine.measuring(finest, self._p, sums.partials), launch=program.launch)
         sums.add_up(int(engine.ZAZ), columns=4, launch=program.launch)
         program.launch(engine.plan_step_kernel, 1, [self._scalars], device=device)
-        fields = [finest.x, self._p, self.x, r, self._scalars, weighted, sums.partials]
-        advance = kernels.advance_kernel(s.weights is not None, s.d.dtype, r.dtype)
-        program.launch(advance, 1, [*finest.operands, planes, rows, *fields], device=device)
+        direct = kernels.DIRECT.bind(s.rows, z=finest.x, q=self._p, scalars=self._scalars)
+        fields = {"q": self._p, "x": self.x, "r": r, "scalars": self._scalars, "weighted": weighted, "out": sums.partials}
+        kernels.ADVANCE.launch(direct, kernels.STEP_ALONG.bind(s.rows, stencil=s, **fields), launch=program.launch)
         sums.add_up(int(kernels.SQUARE), launch=program.launch)
         program.launch(kernels.end_kernel, 1, [self._scalars, self._going], device=device)
 

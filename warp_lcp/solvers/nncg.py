@@ -9,13 +9,13 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.problem import LCP
-from warp_lcp.residual_kernels import start_kernel
+from warp_lcp.residual import WITHIN
 from warp_lcp.rows import Rows
 from warp_lcp.solve import Precision, Step
 from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers.psor import DIRECTIONS, SweepWorkspace
 from warp_lcp.solvers.sweep import sweep_for
-from warp_lcp.vectors import Reduction, launch_spans
+from warp_lcp.vectors import Reduction
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +109,7 @@ class NNCGWorkspace(SweepWorkspace):
         passes.CARRY_ON.bind(self._rows, bounds=bounds, **fields, along=self.p, squares=self._scalars).launch()
         if p.bounds.affine is not None:
             p.bounds.follow(x)
-            launch_spans(start_kernel, self._reduction.spans, [x, *p.bounds.operands, p.unknown, True], [], p.device)
+            WITHIN.bind(self._rows, bounds=p.bounds.operands, x=x, unknown=p.unknown, keep=True).launch()
         wp.copy(self._scalars, self._scalars, dest_offset=1, src_offset=0, count=1)
         self.round_iterate()
 

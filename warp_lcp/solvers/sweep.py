@@ -9,15 +9,13 @@ from typing import Any, Protocol
 import numpy as np
 import warp as wp
 
-from warp_lcp.native import Spans
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
-from warp_lcp.residual_kernels import add_kernel
 from warp_lcp.result import SolveStatus
-from warp_lcp.solvers.sweep_kernels import change_kernel, row_kernels
-from warp_lcp.vectors import launch_spans
+from warp_lcp.solvers.sweep_kernels import CHANGE, row_kernels
+from warp_lcp.vectors import ADD, rows_of
 
 
 class SweepOrder(Enum):
@@ -122,7 +120,7 @@ class RowSweep:
         p = self.problem
         if self._y is not None:
             p.A.apply(x, self._y)
-            wp.launch(add_kernel, x.size, [p.b, self._y], device=p.device)
+            ADD.bind(rows_of(x), z=p.b, x=self._y).launch()
             inputs = [*self._operands, p.A.diagonal(), p.b, *self._bounds, self._omega, x.size, self._y, x]
             wp.launch(self._kernels.greedy, 1, inputs, device=p.device)
             return
@@ -255,7 +253,6 @@ class Contraction:
     def __init__(self, problem: LCP) -> None:
         self._old = problem.layout.zeros(wp.float64)
         self._out = wp.zeros(1, dtype=wp.float64, device=problem.device)
-        self._spans = Spans.of(problem.layout.size, problem.device)
         self.factor = np.nan
 
     def start(self, x: wp.array[Any]) -> None:
@@ -266,7 +263,7 @@ class Contraction:
     def test(self, x: wp.array[Any]) -> SolveStatus | None:
         """Compare x with the x of the last call; return DIVERGED, NON_DESCENT where nothing changed, or None."""
         self._out.zero_()
-        launch_spans(change_kernel, self._spans, [x, self._old], [self._out], x.device)
+        CHANGE.bind(rows_of(x), x=x, old=self._old, out_of=self._out).launch()
         delta = float(self._out.numpy()[0])
         if delta == 0:
             return SolveStatus.NON_DESCENT

@@ -2,14 +2,14 @@
 """Kernels of sweeps: the scalar problem of one unknown, rows one after the other in any order, Jacobi's pass, the size of a change."""
 
 import functools
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
 from warp_lcp.affine_bounds_kernels import bound_at
-from warp_lcp.native import simd
-from warp_lcp.vector_kernels import EACH, span_end, span_start
+from warp_lcp.rows import RowPass
 
 f64, i32, i8 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32), wp.array(dtype=wp.int8)
 ZERO = wp.constant(wp.float64(0.0))
@@ -143,16 +143,7 @@ def jacobi_kernel(d_type: Any) -> Any:
     return jacobi
 
 
-# clang vectorizes no largest value of doubles, as one may be NaN: asked to, it only warns
-@wp.func_native(
-    simd(f"""const double* x = x_.data; double* o = old_.data; double s = 0; {EACH.replace("SIMD ", "")}
-    {{ const double e = x[i] - o[i], v = e < 0 ? -e : e; s = v > s ? v : s; o[i] = x[i]; }} return s;""")
-)
-def change_span(x_: f64, old_: f64, start: wp.int64, end: wp.int64, stride: wp.int64) -> wp.float64: ...
-
-
-@wp.kernel(enable_backward=False, module="warp_lcp.sweep")
-def change_kernel(x: f64, old: f64, n: int, chunk: int, stride: wp.int64, out: f64):
-    """Set out[0] to the largest |x - old| and old to x; out is 0 before."""
-    t = wp.tid()
-    wp.atomic_max(out, 0, change_span(x, old, span_start(t, chunk), span_end(t, chunk, n), stride))
+CHANGE = RowPass(  # out_of[0] is 0 before
+    "sweep.change", Path(__file__).parent / "headers" / "change.h", wp.float64, reads={"x": wp.float64}, writes={"old": wp.float64},
+    whole={"out_of": wp.float64},
+)  # fmt: skip
