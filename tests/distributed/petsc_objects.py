@@ -163,8 +163,7 @@ class Sums:
     def __init__(self, fine, coarse, factor):
         self.shapes = [level.stencil.padding.counts for level in (fine, coarse)]
         self.unknown = [inner(level.stencil, level.stencil.d) != 0 for level in (fine, coarse)]
-        G = coarse.aggregates
-        self.factor, self.by = factor, (G.fz, G.fy, G.fx)
+        self.factor, self.by = factor, coarse.factors[::-1]
 
     def mult(self, matrix, x, y):
         field = np.where(self.unknown[0], x.getArray(readonly=True).reshape(self.shapes[0]), 0.0)

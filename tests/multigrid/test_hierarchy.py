@@ -86,7 +86,7 @@ def test_only_strong_axes_are_coarsened_until_the_others_have_caught_up(strength
     cells = np.full((16, 16, 16), wl.FLUID)
     A = wl.GridPoisson(cells, **{f"face_{a}": c for a, c in zip("xyz", strength, strict=True)}, device=device)
     hierarchy = Hierarchy(A.stencil, wp.float32, bounded=False)
-    factors = [(lv.aggregates.fx, lv.aggregates.fy, lv.aggregates.fz) for lv in hierarchy.levels[1:]]
+    factors = [lv.factors for lv in hierarchy.levels[1:]]
     strong = max(strength)
     assert factors[0] == tuple(2 if s == strong else 1 for s in strength)
     assert np.prod(hierarchy.levels[-1].stencil.padding.counts) <= 64

@@ -1,7 +1,5 @@
 """All small levels in one launch against one launch a stage, and the inverse of the coarsest one against dense algebra."""
 
-import re
-
 import numpy as np
 import pytest
 import warp as wp
@@ -9,9 +7,11 @@ import warp as wp
 import warp_lcp as wl
 from multigrid.test_hierarchy import level_matrix, masked_hierarchy
 from warp_lcp.multigrid import CycleSettings, Hierarchy
+from warp_lcp.multigrid.coarsest_kernels import coarsest_kernels
 from warp_lcp.multigrid.small_levels import SmallLevels
-from warp_lcp.multigrid.small_levels_kernels import CUDA_THREADS, small_levels_kernels
 from warp_lcp.operators.grid_poisson import mask_diagonal
+from warp_lcp.rows import Rows, Sequence
+from warp_lcp.rows.sequence import CUDA_THREADS
 
 TOGETHER = {"one_launch_cpu": 4096, "one_launch_cuda": 4096}
 APART = {"one_launch_cpu": 0, "one_launch_cuda": 0}
@@ -84,19 +84,35 @@ def test_threads_of_a_block_share_a_stage_in_any_number(shape, periodic, project
     expected = first.x.numpy() * inside
     assert np.abs(expected).max() > 0.1
 
+    made = [a.numpy() for level in rows.levels[1:] for a in (level.stencil.d, *level.stencil.weights)]
     for level in rows.levels:
-        level.stencil.grain, level.stencil.threads = 1, level.stencil.padding.counts
-    single = SmallLevels(rows.levels, rows.settings, hierarchy._inverse, hierarchy._matrix)
-    single.rebuild(1e-13, wp.launch)
+        L = level.stencil.rows.single
+        counts = level.stencil.padding.counts
+        level.stencil.__dict__["rows"] = Rows.strided(level.stencil.d.size, first.x.device, (L.base, L.s1, L.s2), counts, cells=1)
+    pairs = list(zip(rows.levels, rows.levels[1:], strict=False))
+    stages = [fine.coarsening(coarse, rows.settings.over_correction, rows.settings.excess) for fine, coarse in pairs]
+    stages = [(stage, [c.stencil.filling(w, a) for w in c.stencil.weights for a in range(3) if c.stencil.periodic[a]])
+              for stage, (_, c) in zip(stages, pairs, strict=True)]  # fmt: skip
+    coarsening = Sequence("small_levels.coarsen", [stage for made, fillings in stages for stage in (made, *fillings)])
+    kernels, s, m = coarsest_kernels(*rows.levels[-1].form), rows.levels[-1].stencil, len(inverse)
+    inputs = [s.struct, s.rows.single, wp.vec3i(*map(int, s.periodic)), wp.float64(1e-13), 1, hierarchy._matrix, hierarchy._inverse]
+    wp.launch(kernels.invert, 1, inputs, device="cpu")
     np.testing.assert_allclose(hierarchy._inverse.numpy(), inverse, rtol=1e-12)
-    stages = single.stages(2, projected=projected)
+    solve = hierarchy._solving._replace(rows=Rows.by_turns(m, first.x.device, m))
+    cycles = SmallLevels(rows.levels, rows.settings, solve).sequence(2, projected, True)
     for threads in (1, 7, 64):
         for level in rows.levels:
             level.x.zero_()
             level.t.zero_()
-        for i in range(len(stages)):
-            inputs = [single.table, stages[i : i + 1], 1, threads, rows.settings.over_correction, projected, hierarchy._inverse]
-            wp.launch(single.kernels.cycle, threads, inputs, device="cpu")
+            level.changed.fill_(1)
+            for w in (level.stencil.d, *level.stencil.weights) if level is not first else ():
+                w.zero_()
+        for sequence in (coarsening, cycles):
+            for i in range(len(sequence.order)):
+                wp.launch(sequence.kernel, threads, [sequence.tables, i, i + 1, threads], device="cpu")
+        found = [a.numpy() for level in rows.levels[1:] for a in (level.stencil.d, *level.stencil.weights)]
+        for a, expected_field in zip(found, made, strict=True):
+            np.testing.assert_array_equal(a, expected_field)
         np.testing.assert_allclose(first.x.numpy() * inside, expected, rtol=0, atol=1e-13)
 
 
@@ -165,14 +181,16 @@ def test_levels_follow_when_the_cells_change(device):
 @pytest.mark.parametrize("real", [wp.float32, wp.float64])
 def test_the_gpu_waits_after_every_stage_and_reads_what_others_wrote(real, tmp_path):
     """Barriers are in the GPU's source only, and no load goes past the cache that sees a block's own writes."""
-    small_levels_kernels(True, real, real)
-    module = f"warp_lcp.small_levels.variable_{real.__name__}_{real.__name__}"
-    (path,) = wp.compile_aot_module(module, device=None, arch=[80], module_dir=tmp_path, use_ptx=True)
-    kernels = path.read_text().split(".visible .entry")[1:]
-    barriers = {re.search("(cycle|rebuild)_", text)[1]: text.count("bar.sync") for text in kernels}
-    assert barriers == {"cycle": 1, "rebuild": 5}  # coarsened, wrapped, assembled, eliminated to and fro
-    assert not any("ld.global.nc" in text for text in kernels)
-    assert all(f".maxntid {CUDA_THREADS}" in text for text in kernels)  # else there may be too few registers for such a block
+    cells, free, keywords = problem((8, 12, 10), "arrays")
+    hierarchy = masked_hierarchy(cells, free, (True, False, True), "cpu", CycleSettings(**TOGETHER), real, True, **keywords)[1]
+    modules = {hierarchy._small.sequence(1, projected, True).kernel.module.name: 1 for projected in (False, True)}
+    modules[coarsest_kernels(True, real, real).invert.module.name] = 3  # assembled, eliminated to and fro
+    for module, barriers in modules.items():
+        (path,) = wp.compile_aot_module(module, device=None, arch=[80], module_dir=tmp_path, use_ptx=True)
+        (text,) = path.read_text().split(".visible .entry")[1:]
+        assert text.count("bar.sync") == barriers, module
+        assert "ld.global.nc" not in text
+        assert f".maxntid {CUDA_THREADS}" in text  # else there may be too few registers for such a block
 
 
 def test_levels_of_at_most_so_many_cells_are_taken(device):

@@ -5,16 +5,18 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import cached_property, partial
+from itertools import product
 from typing import Any
 
 import warp as wp
 
 from warp_lcp.distributed.halo import Halo
 from warp_lcp.layout import Padding
+from warp_lcp.multigrid import cycle_passes as passes
 from warp_lcp.multigrid.hierarchy import Hierarchy, Level
-from warp_lcp.multigrid.shared_cycle_kernels import shared_cycle_kernels
 from warp_lcp.operators.stencil import Stencil
 from warp_lcp.program import Launch, Program, perform
+from warp_lcp.rows import Rows
 
 GATHERED = 32_768  # cells from which on a level is gathered: exchanges between ranks would take as long as its cells
 
@@ -77,9 +79,11 @@ class DistributedHierarchy(Hierarchy):
             super()._go_down(level, launch, projected=projected, from_zero=from_zero)
             return
         L.stencil.wrap(L.b, launch=launch)
-        planes, rows, _ = L.stencil.padding.counts
-        inputs = [*L.operands, planes, rows, L.x, L.b, L.t, L.lower, L.upper, *self.settings.weights]
-        launch(shared_cycle_kernels(*L.form).descend, 1, inputs, device=self.device)
+        s, (first, second) = L.stencil, self.settings.weights
+        everywhere, inside = Rows.stored(s.padding, s.device), s.rows.after_ghosts()
+        into_ring = L.sweeping(L.t, L.x, first, projected=False, from_zero=True, kind=passes.SWEEP_INTO_RING, rows=everywhere)
+        out_of_ring = L.sweeping(L.x, L.t, second, projected=False, kind=passes.SWEEP_OUT_OF_RING, rows=inside)
+        passes.SWEEP_TWICE.launch(into_ring, out_of_ring, launch=launch)
         self._restrict(level, launch)
 
     @cached_property
@@ -105,10 +109,14 @@ class DistributedHierarchy(Hierarchy):
         L, C = self.levels[level], self.levels[level + 1]
         if level + 2 < len(self.levels):  # those of L.x are filled since its restriction, those of a gathered level since it was solved
             C.stencil.wrap(C.x, launch=launch)
-        planes, rows, _ = C.stencil.padding.counts
-        fields = [L.x, L.b, L.t, L.lower, L.upper, C.x, self.settings.weights[1], self.settings.over_correction]
-        inputs = [*L.operands, C.stencil.shape, C.aggregates, planes, rows, *fields]
-        launch(shared_cycle_kernels(*L.form).ascend, 1, inputs, device=self.device)
+        scale = self.settings.over_correction
+        for axis, end in product(range(3), range(2)):
+            ours, theirs = (Rows.beyond(v.stencil.padding, self.device, axis, end) for v in (L, C))
+            factors = [1 if a == axis else f for a, f in enumerate(C.factors)]
+            beyond = ours.beside(theirs, (-factors[0], -factors[1], -factors[2]))
+            L.correcting(C, scale, projected=False, rows=beyond).launch(launch)
+        sweep = L.sweeping(L.t, L.x, self.settings.weights[1], projected=False)
+        passes.CLIMB.launch(L.correcting(C, scale, projected=False), sweep, launch=launch)
 
     def _streams(self, L: Level) -> bool:
         """Whether legs of the cycle go through memory once for several sweeps: by one CPU thread, in three planes at a time."""

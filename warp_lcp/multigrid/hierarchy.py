@@ -11,19 +11,17 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.layout import Padding, zeros
-from warp_lcp.multigrid import coarsen_kernels as kernels
 from warp_lcp.multigrid import cycle_passes as passes
-from warp_lcp.multigrid.coarsen_kernels import UNBOUNDED
-from warp_lcp.multigrid.cycle_kernels import Aggregates, cycle_kernels
-from warp_lcp.multigrid.renew_kernels import renew_kernels
+from warp_lcp.multigrid.coarsest_kernels import coarsest_kernels
+from warp_lcp.multigrid.cycle_passes import UNBOUNDED
 from warp_lcp.multigrid.shared_levels import share_changes, whole_counts
 from warp_lcp.multigrid.small_levels import SmallLevels, first_small
-from warp_lcp.native import Spans, grain
 from warp_lcp.operators.stencil import Stencil
 from warp_lcp.operators.stencil_kernels import coarsen_spans_kernel
 from warp_lcp.program import Launch, Program
-from warp_lcp.rows import Bound, RowPass
-from warp_lcp.vectors import convert, launch_spans
+from warp_lcp.rows import Bound, RowPass, Rows, Sequence
+from warp_lcp.rows.sequence import CUDA_THREADS
+from warp_lcp.vectors import convert
 
 # of a coarsest level's diagonal: what rounding leaves of a singular component's last pivot, with a margin
 PINNED = {wp.float32: 3e-5, wp.float64: 1e-13}
@@ -79,47 +77,73 @@ class Level:
         self.x, self.b, self.t = field(), field(), field()
         nothing = wp.empty(0, dtype=real, device=stencil.device)
         self.lower, self.upper = (bounds or (field(), field() if upper else nothing)) if bounded else (self.x, self.x)
-        self.form = (stencil.weights is not None, stencil.d.dtype, real)
-        self.kernels = cycle_kernels(*self.form)
-        self.aggregates: Aggregates | None = None  # how the finer level's cells make up this one's
+        self.form = stencil.weights is not None, stencil.d.dtype, real
+        self.factors = 1, 1, 1  # cells of the finer level along x, y and z that one of this level stands for
         self.visits, self.shrunk = 1, 1.0  # by a cycle of the next finer level; by how much since a level that was visited more
-        self.operands = [stencil.shape, stencil.d, *(stencil.weights or (nothing,) * 3)]
         rows = stencil.padding.counts[:2]
         self.changed = wp.ones(rows, dtype=wp.uint8, device=stencil.device)  # rows, since the last rebuild
         self._spans = None if stencil.spans is None else wp.zeros(rows, dtype=wp.vec2i, device=stencil.device)  # of the fields' contents
 
-    def renew(self, *, keeps_weights: bool, launch: Launch) -> None:
-        """Clear the fields outside the rows' new spans and mark rows whose span has changed.
+    def renewing(self, *, keeps_weights: bool) -> Bound:
+        """Return the pass that clears the fields outside the rows' new spans and marks rows whose span has changed.
 
         Args:
             keeps_weights: whether the weights are not the level's own to clear.
-            launch: launches or records.
         """
         s = self.stencil
-        weights = () if keeps_weights or s.weights is None else s.weights
-        nothing = wp.empty(0, dtype=self.real, device=s.device)
-        inputs = [s.shape, self._spans, self.changed, self.x, self.b, self.t, s.d, *(weights or (nothing,) * 3)]
-        launch(renew_kernels(s.d.dtype, self.real).renew, s.padding.counts[:2], inputs, device=s.device)
+        weights = dict(zip(passes.LOWER, (None if keeps_weights else s.weights) or (None,) * 3, strict=True))
+        fields = {"x": self.x, "b": self.b, "t": self.t, "diagonals": s.d, **weights}
+        rows = Rows.of(s.padding, s.device, whole=True)
+        return passes.RENEW.bind(rows, **fields, spans=s.spans, known=self._spans, changed=self.changed)
 
-    @property
-    def factors(self) -> tuple[int, int, int]:
-        """Cells of the finer level along x, y and z that one of this level stands for."""
-        assert self.aggregates is not None
-        return self.aggregates.fx, self.aggregates.fy, self.aggregates.fz
+    def signing(self, signs: wp.array[Any]) -> Bound:
+        """Return the pass that marks rows whose weights hash to other 64 bits than before."""
+        s = self.stencil
+        weights = dict(zip(("weight_x", "weight_y", "weight_z"), s.weights or (), strict=True))
+        return passes.SIGN.bind(Rows.of(s.padding, s.device, s.spans, whole=True), **weights, signs=signs, changed=self.changed)
 
-    @property
-    def grids(self) -> list[wp.array[Any]]:
-        """The diagonal and the weights as three-dimensional arrays; empty ones for uniform weights."""
-        shape, s = self.stencil.padding.shape, self.stencil
-        empty = wp.empty((0, 0, 0), dtype=self.real, device=s.device)
-        return [s.d.reshape(shape), *((w.reshape(shape) for w in s.weights) if s.weights else (empty,) * 3)]
+    def coarsening(self, coarse: Level, stiffen: float, held: float) -> Bound:
+        """Return the pass that makes those of the coarser level's rows that depend on rows of this level that have changed."""
+        s, c = self.stencil, coarse.stencil
+        names = ("coarse_d", "coarse_wx", "coarse_wy", "coarse_wz")
+        fields = dict(zip(names, (c.d, *(c.weights or ())), strict=True)) | {"changed": self.changed, "coarse_changed": coarse.changed}
+        fields |= dict(zip(("periodic_x", "periodic_y", "periodic_z"), s.periodic, strict=True))
+        rows, cells = self._coarser_rows(coarse), s.padding.counts[2]
+        return passes.COARSEN.bind(rows, stencil=s, **fields, cells=cells, stiffen=stiffen, held=held)
+
+    def restricting(self, coarse: Level) -> Bound:
+        """Return the pass that sums the residual over aggregates."""
+        return passes.RESTRICT.bind(self._coarser_rows(coarse), stencil=self.stencil, x=self.x, b=self.b, coarse=coarse.b)
+
+    def bounding(self, coarse: Level, scale: float) -> Bound:
+        """Return the pass that finds the bounds of a coarse correction."""
+        fields = {"x": self.x, "lower": self.lower, "upper": self.upper, "coarse_lower": coarse.lower, "coarse_upper": coarse.upper}
+        return passes.COARSE_BOUNDS.bind(self._coarser_rows(coarse), stencil=self.stencil, scale=scale, **fields)
+
+    def correcting(self, coarse: Level, scale: float, *, projected: bool, rows: Rows | None = None) -> Bound:
+        """Return the pass that adds `scale` times the coarse correction to x, clipped if projected."""
+        fx, fy, fz = coarse.factors
+        rows = rows or self.stencil.rows.beside(coarse.stencil.rows, (-fx, -fy, -fz))
+        fields = {"x": self.x, "coarse": coarse.x, "lower": self.lower, "upper": self.upper}
+        return passes.CORRECT.bind(rows, stencil=self.stencil, scale=scale, projected=projected, **fields)
+
+    def _coarser_rows(self, coarse: Level) -> Rows:
+        return coarse.stencil.rows.beside(self.stencil.rows, coarse.factors)
 
     def sweeping(
-        self, y: wp.array[Any], x: wp.array[Any], omega: float, *, projected: bool, from_zero: bool = False, kind: RowPass = passes.SWEEP
+        self,
+        y: wp.array[Any],
+        x: wp.array[Any],
+        omega: float,
+        *,
+        projected: bool,
+        from_zero: bool = False,
+        kind: RowPass = passes.SWEEP,
+        rows: Rows | None = None,
     ) -> Bound:
-        """Return the pass that `sweep` launches, or one of its kind that goes into or out of a ring."""
+        """Return the pass that `sweep` launches, or one of its kind that goes into or out of a ring; of all rows unless told."""
         fields = {"x": x, "y": y, "b": self.b, "lower": self.lower, "upper": self.upper}
-        return kind.bind(self.stencil.rows, stencil=self.stencil, omega=omega, projected=projected, from_zero=from_zero, **fields)
+        return kind.bind(rows or self.stencil.rows, stencil=self.stencil, omega=omega, projected=projected, from_zero=from_zero, **fields)
 
     def sweep(
         self, y: wp.array[Any], x: wp.array[Any], omega: float, *, projected: bool, from_zero: bool = False, launch: Launch = wp.launch
@@ -190,8 +214,12 @@ class Hierarchy:
         self._matrix, self._inverse = (wp.zeros((m, m), dtype=wp.float64, device=self.device) for _ in range(2))
         cells = self.settings.one_launch_cuda if self.device.is_cuda else self.settings.one_launch_cpu
         self._first_small = first_small(self.levels, cells)  # its index; none is small: len(levels)
+        last, names = self.levels[-1], ("nz", "ny", "nx")
+        fields = {"inverse": self._inverse, "b": last.b, "x": last.x, **dict(zip(names, last.stencil.padding.counts, strict=True))}
+        self._solving = passes.SOLVE.bind(Rows.flat(m, self.device), **fields)
         small = self.levels[self._first_small :]
-        self._small = SmallLevels(small, self.settings, self._inverse, self._matrix) if small else None
+        self._small = SmallLevels(small, self.settings, self._solving) if small else None
+        self._last = SmallLevels(self.levels[-1:], self.settings, self._solving)
 
     @property
     def finest(self) -> Level:
@@ -221,23 +249,20 @@ class Hierarchy:
     def _renewal(self) -> Program:
         program = Program(self.device)
         for fine, coarse in zip(self.levels, self.levels[1:], strict=False):
-            f, c, G = fine.stencil, coarse.stencil, coarse.aggregates
-            if f.spans is not None and G is not None:
-                inputs = [f.spans, wp.vec3i(G.fz, G.fy, G.fx), c.padding.counts[2], c.spans]
+            f, c, (fx, fy, fz) = fine.stencil, coarse.stencil, coarse.factors
+            if f.spans is not None:
+                inputs = [f.spans, wp.vec3i(fz, fy, fx), c.padding.counts[2], c.spans]
                 program.launch(coarsen_spans_kernel, c.padding.counts[:2], inputs, device=self.device)
         for level in self.levels if self.finest.stencil.spans is not None else []:
-            level.renew(keeps_weights=level is self.finest, launch=program.launch)
-        s = self.finest.stencil
-        if s.weights is not None and self._signs is not None:
-            inputs = [s.shape, *s.weights, self._signs, self.finest.changed]
-            program.launch(renew_kernels(s.d.dtype, self.real).sign, s.padding.counts[:2], inputs, device=self.device)
+            level.renewing(keeps_weights=level is self.finest).launch(program.launch)
+        if self._signs is not None:
+            self.finest.signing(self._signs).launch(program.launch)
         return program
 
     def hold(self, d: wp.array[Any], free: wp.array[Any]) -> None:
         """Fill the finest diagonal: d where the stored uint8 field `free` is not 0, else 0; the rows that change are marked."""
-        s, rows = self.finest.stencil, self.finest.stencil.padding.counts[1]
-        inputs = [s.shape, d, free, s.grain, rows, s.d, self.finest.changed.flatten()]
-        wp.launch(kernels.hold_kernel(d.dtype, s.d.dtype), s.threads, inputs, device=self.device)
+        s = self.finest.stencil
+        passes.HOLD.bind(s.rows, d=d, free=free, out_d=s.d, changed=self.finest.changed).launch()
 
     def rebuild(self) -> None:
         """Coarsen from the finest diagonal down, and factor the coarsest level."""
@@ -254,38 +279,40 @@ class Hierarchy:
     @cached_property
     def _coarsening(self) -> Program:
         program = Program(self.device)
-        alone = len(self.levels) if self.device.is_cpu else self._first_small  # rows that have not changed are left out then
-        for fine, coarse in zip(self.levels[:alone], self.levels[1:], strict=False):
-            s, c = fine.stencil, coarse.stencil
-            if s.ghosts is not None:
+        weights = self.settings.over_correction, self.settings.excess
+        together: list[Bound] = []
+        alone = len(self.levels) if self.device.is_cpu else self._first_small
+        for index, (fine, coarse) in enumerate(zip(self.levels, self.levels[1:], strict=False)):
+            c = coarse.stencil
+            if index >= alone:
+                together += [fine.coarsening(coarse, *weights)]
+                together += [c.filling(w, axis) for w in c.weights or () for axis in range(3) if c.periodic[axis]]
+                continue
+            if fine.stencil.ghosts is not None:
                 program.record(partial(share_changes, fine))
-            sizes = [wp.vec3i(*s.padding.counts), wp.vec3i(*map(int, s.periodic)), c.shape, coarse.aggregates, c.grain]
-            sizes += [self.settings.over_correction, self.settings.excess]
-            kernel = kernels.coarsen_kernels(s.weights is not None, s.d.dtype, self.real)
-            outputs = [c.d, *(c.weights or ()), coarse.changed]
-            program.launch(kernel, c.threads, [*fine.operands, *sizes, fine.changed, *outputs], device=self.device)
+            fine.coarsening(coarse, *weights).launch(program.launch)
             for w in c.weights or ():
                 c.wrap(w, launch=program.launch)
+        if together:
+            Sequence("small_levels.coarsen", together).launch(program.launch)
         if len(self.levels) > 1:
-            flags = self.finest.changed.flatten()
-            spans = Spans.of(flags.size, self.device)
-            launch_spans(kernels.mark_kernel, spans, [flags, wp.uint8(0)], [], self.device, launch=program.launch)
+            flags = self.finest.changed
+            passes.UNMARK.bind(Rows.flat(flags.size, self.device), changed=flags).launch(program.launch)
         self._factor_coarsest(program)
         return program
 
     def _factor_coarsest(self, program: Program) -> None:
-        """Record the preparation of solves on the coarsest levels."""
-        if self._small is not None and self.device.is_cuda:
-            self._small.rebuild(PINNED[self.real], program.launch)
+        """Record the preparation of solves on the coarsest level."""
+        last, m = self.levels[-1], self._matrix.shape[0]
+        s, kernels = last.stencil, coarsest_kernels(*last.form)
+        inputs = [s.struct, s.rows.single, wp.vec3i(*map(int, s.periodic)), wp.float64(PINNED[self.real])]
+        if self.device.is_cuda and self._small is not None:
+            inputs += [CUDA_THREADS, self._matrix, self._inverse]
+            program.launch(kernels.invert, CUDA_THREADS, inputs, device=self.device, block_dim=CUDA_THREADS)
             return
-        last, s = self.levels[-1], self.levels[-1].stencil
-        sizes = [wp.vec3i(*s.padding.counts), wp.vec3i(*map(int, s.periodic))]
-        inputs = [s.shape, *last.grids, *sizes, wp.float64(PINNED[self.real]), last.changed, self._matrix]
-        program.launch(kernels.factor_kernel(s.d.dtype, self.real), 1, inputs, device=self.device)
-        m = self._matrix.shape[0]
-        columns = grain(m, self.device)
-        inputs = [last.changed, self._matrix, columns, self._inverse]
-        program.launch(kernels.invert_kernel, m // columns, inputs, device=self.device)
+        program.launch(kernels.factor, 1, [*inputs, last.changed, self._matrix], device=self.device)
+        fields = {"changed": last.changed, "matrix": self._matrix, "inverse": self._inverse}
+        passes.INVERT.bind(Rows.flat(m, self.device), **fields, m=m, flags=last.changed.size).launch(program.launch)
 
     @cached_property
     def cycle(self) -> Program:
@@ -359,7 +386,7 @@ class Hierarchy:
         launch = program.launch
         self._go_down(level, launch, projected=projected, from_zero=from_zero)
         if projected:
-            self._restrict_bounds(level, launch)
+            self._bounding(level).launch(launch)
         self._visit(level + 1, self._visits(level + 1), program, projected=projected)
         if whole:
             self._go_up(level, launch, projected=projected)
@@ -395,7 +422,7 @@ class Hierarchy:
         L, (first, second) = self.levels[level], self.settings.weights
         into_ring = L.sweeping(L.t, L.x, first, projected=projected, from_zero=from_zero, kind=passes.SWEEP_INTO_RING)
         out_of_ring = L.sweeping(L.x, L.t, second, projected=projected, kind=passes.SWEEP_OUT_OF_RING)
-        passes.DESCEND.launch(into_ring, out_of_ring, self._restricting(level), launch=launch)
+        passes.DESCEND.launch(into_ring, out_of_ring, L.restricting(self.levels[level + 1]), launch=launch)
 
     def _ascent(self, level: int, *, projected: bool) -> tuple[Bound, ...]:
         """Return the passes of a leg up: correction and sweeps."""
@@ -407,22 +434,14 @@ class Hierarchy:
     def _solve_coarsest(self, launch: Launch, *, projected: bool, from_zero: bool) -> None:
         """Multiply by the inverse; projected sweeps stand for that where there are bounds."""
         L = self.levels[-1]
-        if projected and self._fuses(L):
-            planes, rows, _ = L.stencil.padding.counts
-            fields = [L.x, L.b, L.t, L.lower, L.upper, *self.settings.weights]
-            inputs = [*L.operands, planes, rows, self.settings.projected_sweeps, from_zero, *fields]
-            launch(L.kernels.relax, 1, inputs, device=self.device)
-            return
-        if projected:
+        if not projected:
+            self._solving.launch(launch)
+        elif self._fuses(L):
+            self._last.cycle(1, launch, projected=True, from_zero=from_zero)
+        else:
             for sweep in range(self.settings.projected_sweeps):
                 self._pair(L, launch, from_zero=from_zero and sweep == 0, projected=True)
                 self._pair(L, launch, reverse=True, projected=True)
-            return
-        counts, shape = L.stencil.padding.counts, L.stencil.padding.shape
-        m = math.prod(counts)
-        rows = grain(m, self.device)
-        inputs = [self._inverse, wp.vec3i(*counts), rows, L.b.reshape(shape), L.x.reshape(shape)]
-        launch(kernels.solve_coarsest_kernel, m // rows, inputs, device=self.device)
 
     def _pair(self, L: Level, launch: Launch, *, projected: bool, from_zero: bool = False, reverse: bool = False) -> None:
         """Two Chebyshev-Jacobi sweeps; the reverse pair after the correction keeps the cycle symmetric."""
@@ -432,25 +451,13 @@ class Hierarchy:
 
     def _restrict(self, level: int, launch: Launch) -> None:
         self.levels[level].stencil.wrap(self.levels[level].x, launch=launch)
-        self._restricting(level).launch(launch)
+        self.levels[level].restricting(self.levels[level + 1]).launch(launch)
 
-    def _restrict_bounds(self, level: int, launch: Launch) -> None:
-        L, C = self.levels[level], self.levels[level + 1]
-        rows, scale = C.stencil.rows.beside(L.stencil.rows, C.factors), self.settings.over_correction
-        fields = {"x": L.x, "lower": L.lower, "upper": L.upper, "coarse_lower": C.lower, "coarse_upper": C.upper}
-        passes.COARSE_BOUNDS.bind(rows, stencil=L.stencil, scale=scale, **fields).launch(launch)
-
-    def _restricting(self, level: int) -> Bound:
-        L, C = self.levels[level], self.levels[level + 1]
-        rows = C.stencil.rows.beside(L.stencil.rows, C.factors)
-        return passes.RESTRICT.bind(rows, stencil=L.stencil, x=L.x, b=L.b, coarse=C.b)
+    def _bounding(self, level: int) -> Bound:
+        return self.levels[level].bounding(self.levels[level + 1], self.settings.over_correction)
 
     def _correcting(self, level: int, *, projected: bool) -> Bound:
-        L, C = self.levels[level], self.levels[level + 1]
-        fx, fy, fz = C.factors
-        rows, scale = L.stencil.rows.beside(C.stencil.rows, (-fx, -fy, -fz)), self.settings.over_correction
-        fields = {"x": L.x, "coarse": C.x, "lower": L.lower, "upper": L.upper}
-        return passes.CORRECT.bind(rows, stencil=L.stencil, scale=scale, projected=projected, **fields)
+        return self.levels[level].correcting(self.levels[level + 1], self.settings.over_correction, projected=projected)
 
     def _coarser(self, fine: Level, *, bounded: bool) -> Level:
         """Return the next level: aggregates of two cells along every axis, or along the strong ones only where axes differ much."""
@@ -467,8 +474,7 @@ class Hierarchy:
         ghosts = None if s.ghosts is None else s.ghosts.coarser(factors)
         stencil = Stencil(padding, new[0], weights, (0.0, 0.0, 0.0), 1.0, periodic, spans, ghosts=ghosts)  # type: ignore[arg-type]
         level = Level(stencil, self.real, bounded=bounded, upper=fine.upper.size > 0)
-        G = level.aggregates = Aggregates()
-        G.fx, G.fy, G.fz, G.ny, G.nz = *factors, counts[1], counts[0]
+        level.factors = factors
         # visiting levels of half the cells twice would cost as much on each of them: only every second one is
         level.shrunk = fine.shrunk * math.prod(whole) / math.prod(whole_counts(stencil))
         if level.shrunk >= 3:

@@ -11,9 +11,9 @@ import warp as wp
 
 from warp_lcp.layout import Padding
 from warp_lcp.native import grain
-from warp_lcp.operators.stencil_kernels import PRODUCT, RELAX, StencilShape, wrap_kernel
+from warp_lcp.operators.stencil_kernels import PRODUCT, RELAX, WRAP, StencilShape
 from warp_lcp.program import Launch, perform
-from warp_lcp.rows import Rows
+from warp_lcp.rows import Bound, Rows
 from warp_lcp.rows.layout import put, stencil_struct
 
 
@@ -121,10 +121,21 @@ class Stencil:
 
     def wrap(self, x: wp.array[Any], *, launch: Launch = wp.launch) -> None:
         """Fill x's ghost cells along periodic axes, and those that stand for cells of others."""
-        if any(self.periodic):
-            wrap(x.reshape(self.padding.shape), self.periodic, self.padding.counts, launch=launch)
+        for axis, periodic in enumerate(self.periodic):
+            if periodic:
+                self.filling(x, axis).launch(launch)
         if self.ghosts is not None:
             perform(partial(self.ghosts.fill, x), launch)
+
+    def filling(self, x: wp.array[Any], axis: int) -> Bound:
+        """Return the pass that fills x's ghost cells along a periodic axis, 0, 1, 2 for x, y, z."""
+        step = (1, self.padding.row, self.padding.plane)[axis]
+        return WRAP.bind(self._edges[axis], x=x, cells=self.padding.counts[2 - axis], step=step)
+
+    @cached_property
+    def _edges(self) -> list[Rows]:
+        """The ghost cells before the first of each axis."""
+        return [Rows.edge(self.padding, self.device, axis) for axis in range(3)]
 
     def product(self, x: wp.array[Any], out: wp.array[Any], plus: wp.array[Any] | None = None, *, launch: Launch = wp.launch) -> None:
         """Out = A x, or A x + plus. All of one float type; rows that are no unknowns give 0 (or plus)."""
@@ -138,11 +149,3 @@ class Stencil:
         for color in (0, 1) if forward else (1, 0):
             self.wrap(x)
             RELAX.bind(self.rows, stencil=self, x=x, b=b, lower=lower, upper=upper, omega=omega, color=color).launch()
-
-
-def wrap(field: wp.array[Any], periodic: tuple[bool, ...], counts: tuple[int, int, int], *, launch: Launch = wp.launch) -> None:
-    """Fill the ghost cells of a padded field (nz + 2, ny + 2, nx + 2) along its periodic axes x, y, z."""
-    for axis, n in enumerate(reversed(counts)):
-        if periodic[axis]:
-            others = [field.shape[a] for a in range(3) if a != 2 - axis]
-            launch(wrap_kernel(field.dtype), others, [field, axis, n], device=field.device)

@@ -6,9 +6,7 @@ unknowns, so a neighbor needs no test. Two forms of one source: `uniform` has a 
 byte, d_scale its unit), `variable` has an array of lower faces an axis.
 """
 
-import functools
 from pathlib import Path
-from typing import Any
 
 import warp as wp
 
@@ -25,6 +23,7 @@ RELAX = RowPass(
     "stencil.relax", HEADERS / "stencil_relax.h", "S", stencil=("D", "W"), reads={"b": "S", "lower": "S", "upper": "S"},
     writes={"x": "S"}, numbers={"omega": "S", "color": int},
 )  # fmt: skip
+WRAP = RowPass("stencil.wrap", HEADERS / "wrap.h", "S", writes={"x": "S"}, numbers={"cells": int, "step": wp.int64})
 
 
 def stencil_head(variable: bool, real: str) -> str:
@@ -72,30 +71,6 @@ def row_count(A: StencilShape, k: int, j: int, c: int, grain: int):
 def row_start(A: StencilShape, k: int, j: int, c: int, grain: int):
     """Element at which chunk c of row (k, j) begins; k, j count interior cells from 0."""
     return wp.int64(k + 1) * A.s1 + wp.int64(j + 1) * A.s2 + wp.int64(1 + row_first(A, k, j, c, grain))
-
-
-@functools.cache
-def wrap_kernel(dtype: Any) -> Any:
-    """Return the kernel that fills ghost cells of a periodic axis with the values of the cells at the other end.
-
-    One kernel a type, each in a module of its own: a captured CPU graph confuses overloads of one generic kernel.
-    """
-    field = wp.array3d(dtype=dtype)
-
-    @wp.kernel(enable_backward=False, module=f"warp_lcp.stencil.wrap_{dtype.__name__}")
-    def wrap(x: field, axis: int, n: int):
-        a, b = wp.tid()
-        if axis == 0:
-            x[a, b, 0] = x[a, b, n]
-            x[a, b, n + 1] = x[a, b, 1]
-        elif axis == 1:
-            x[a, 0, b] = x[a, n, b]
-            x[a, n + 1, b] = x[a, 1, b]
-        else:
-            x[0, a, b] = x[n, a, b]
-            x[n + 1, a, b] = x[1, a, b]
-
-    return wrap
 
 
 SPAN_CELLS = wp.constant(16)  # spans begin at multiples of this, so that rows stay whole vectors and aggregates whole

@@ -2,5 +2,6 @@
 
 from warp_lcp.rows.layout import Known, Rows
 from warp_lcp.rows.row_pass import Bound, RowPass, Wave
+from warp_lcp.rows.sequence import Sequence
 
-__all__ = ["Bound", "Known", "RowPass", "Rows", "Wave"]
+__all__ = ["Bound", "Known", "RowPass", "Rows", "Sequence", "Wave"]

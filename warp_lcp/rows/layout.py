@@ -32,6 +32,7 @@ class RowLayout:
     chunks: int  # threads of a row
     slab: int  # planes that a thread takes
     lines: int  # rows of a plane that it takes
+    turn: int  # planes before the first that fields of three planes keep, too: that of ghosts, or none
     spans: wp.array2d(dtype=wp.vec2i)  # first and one past the last cell of each row (k, j) that may hold unknowns; null: all
     o0: wp.int64  # the other level of a transfer: element of its first cell, elements from plane to plane and from row to row
     o1: wp.int64
@@ -152,18 +153,36 @@ class Rows:
     place: Mapping[str, int] = field(default_factory=dict)
 
     @staticmethod
-    def of(padding: Padding, device: wp.Device, spans: Any = None) -> "Rows":
-        """Return the rows of a padded grid, or what their spans have of them."""
-        return Rows.strided(padding.size, device, (padding.plane + padding.row + 1, padding.plane, padding.row), padding.counts, spans)
+    def of(padding: Padding, device: wp.Device, spans: Any = None, *, whole: bool = False) -> "Rows":
+        """Return the rows of a padded grid, or what their spans have of them; a thread takes a `whole` one."""
+        steps = padding.plane + padding.row + 1, padding.plane, padding.row
+        return Rows.strided(padding.size, device, steps, padding.counts, spans, cells=padding.counts[2] if whole else None)
 
     @staticmethod
-    def beyond(padding: Padding, device: wp.Device, axis: int, end: int) -> "Rows":
-        """Return the ghost cells beside those of a padded grid: beyond the lower (0) or upper (1) side of axis 0, 1, 2 for x, y, z."""
+    def beyond(padding: Padding, device: wp.Device, axis: int, end: int, *, inside: bool = False) -> "Rows":
+        """Return the ghost cells beyond the lower (0) or upper (1) side of axis 0, 1, 2 for x, y, z, or the cells `inside` of them."""
         strides = (padding.plane, padding.row, 1)
         counts = [1 if 2 - axis == a else n for a, n in enumerate(padding.counts)]
-        starts = [end * (padding.counts[a] + 1) if 2 - axis == a else 1 for a in range(3)]
+        starts = [end * (n + 1 - 2 * inside) + inside if 2 - axis == a else 1 for a, n in enumerate(padding.counts)]
         first = sum(start * stride for start, stride in zip(starts, strides, strict=True))
         return Rows.strided(padding.size, device, (first, padding.plane, padding.row), tuple(counts))
+
+    @staticmethod
+    def stored(padding: Padding, device: wp.Device) -> "Rows":
+        """Return all stored cells of a padded grid, ghosts too."""
+        return Rows.strided(padding.size, device, (0, padding.plane, padding.row), tuple(n + 2 for n in padding.counts))
+
+    def after_ghosts(self) -> "Rows":
+        """Return the same rows for passes whose ring begins with a plane of ghosts."""
+        single = put(copy_of(self.single), {"turn": 1})
+        return replace(self, single=single, summed=single if self.summed is self.single else put(copy_of(self.summed), {"turn": 1}))
+
+    @staticmethod
+    def edge(padding: Padding, device: wp.Device, axis: int) -> "Rows":
+        """Return the first stored cells along axis 0, 1, 2 for x, y, z, those of its edges too."""
+        counts = [1 if 2 - axis == a else n + 2 for a, n in enumerate(padding.counts)]
+        lines = 1 if device.is_cuda else counts[1]
+        return Rows.strided(padding.size, device, (0, padding.plane, padding.row), tuple(counts), lines=lines)
 
     @staticmethod
     def flat(size: int, device: wp.Device, *, serial: bool = False) -> "Rows":

@@ -240,7 +240,8 @@ class Form:
         """Return the body: a loop over pieces, in it pointers by name, the shared functions, the row function, the sums."""
         d = self.declared
         into = not {*d.ring}.isdisjoint(d.writes)
-        switches = {"RINGS": bool(d.ring), "INTO_RING": into, "LEVELS": bool(d.other), "BOUNDS": ord(self.bounds[0]), "STENCIL": stencil}
+        levels = d.finer or bool(d.other)
+        switches = {"RINGS": bool(d.ring), "INTO_RING": into, "LEVELS": levels, "BOUNDS": ord(self.bounds[0]), "STENCIL": stencil}
         macros = {n: v for n, v in constants.items() if not isinstance(v, float)}
         head = [f"typedef {C[t]} {n};" for n, t in letters.items()] + [f"typedef {C[of(d.compute)]} T;"] * ("T" not in letters)
         head += [f"constexpr int {n} = {int(v)};" for n, v in switches.items()] + [f"#define {n} {int(v)}" for n, v in macros.items()]
@@ -250,7 +251,7 @@ class Form:
         each += [f"const long long yp = {'L.o2' if d.finer else 'P.yp'}, zp = {'L.o1' if d.finer else 'P.zp'};"]
         each += [f"const long long ym = {'-yp' if d.finer else 'P.ym'}, zm = {'-zp' if d.finer else 'P.zm'};"]
         each += ["const long long down = P.down, up = P.up;" if d.ring and not into else "const long long down = zm, up = zp;"]
-        if d.other:
+        if levels:
             each += ["const bool pairs = L.fx > 1 || L.fx < -1; const int deep = L.fz == 1 || 2*P.k + 2 > L.n1 ? 1 : 2;"]
             each += ["const int wide = L.fy == 1 || 2*P.j + 2 > L.n2 ? 1 : 2;"]
         for n in (n for n in d.arrays if n != "out" and n not in d.box):

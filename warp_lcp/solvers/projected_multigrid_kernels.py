@@ -1,7 +1,6 @@
 # mypy: ignore-errors
 """Passes of the projected multigrid method: a CG step, and the residual, active set and right-hand side after it; plans of the step."""
 
-import functools
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +8,6 @@ import warp as wp
 
 from warp_lcp.multigrid.cycle_passes import ASCEND, SWEEP
 from warp_lcp.multigrid.hierarchy import Level
-from warp_lcp.operators.stencil_kernels import StencilShape
 from warp_lcp.rows import Bound, RowPass, Wave
 
 # Slots of the device scalars. NORM, MOVED and ACTIVE are sums of one pass, and so are ZAZ ... GP.
@@ -49,6 +47,10 @@ ADVANCE = Wave("projected_multigrid.advance", (UPDATE, 0), (ASSESS, 1))  # a pla
 MEASURE = RowPass(
     "projected_multigrid.measure", HEADERS / "measure.h", "S", stencil=("F", "S"), reads={"z": "S", "q": "S", "g": "S"}, sums=PRODUCTS,
 )  # fmt: skip
+SIDE = RowPass(
+    "projected_multigrid.side", HEADERS / "side.h", "S", stencil=("F", "S"), reads={"z": "S", "q": "S"}, whole={"sums": wp.float64},
+    numbers={"axis": int, "end": int, "place": int, "lines": int, "places": int},
+)  # fmt: skip
 CLIMB = Wave("projected_multigrid.climb", *ASCEND.stages, (MEASURE, 3))  # the last leg of a cycle: z is still in the cache
 SWEEP_AND_MEASURE = Wave("projected_multigrid.sweep_and_measure", (SWEEP, 0), (MEASURE, 1))  # z's ghost cells are 0
 HOLD = RowPass(
@@ -74,62 +76,6 @@ UNDO = RowPass(
 def measuring(finest: Level, direction: Any, out: Any) -> Bound:
     """Return the measuring of a cycle's correction along a direction."""
     return MEASURE.bind(finest.stencil.rows, stencil=finest.stencil, z=finest.x, q=direction, g=finest.b, out=out)
-
-
-@functools.cache
-def add_side_kernel(variable: bool, free_type: Any, real: Any) -> Any:
-    """Return the kernel that adds what the faces at a side, whose ghost cells have been filled meanwhile, add to the products."""
-    field, free_array = wp.array(dtype=real), wp.array(dtype=free_type)
-    form = "variable" if variable else "uniform"
-
-    @wp.kernel(enable_backward=False, module=f"warp_lcp.projected_multigrid_side.{form}_{free_type.__name__}_{real.__name__}")
-    def add_side(
-        A: StencilShape, d: free_array, wx: field, wy: field, wz: field, axis: int, end: int, last: int, rows: int, places: int, x: field,
-        p: field, out: f64,
-    ):  # fmt: skip
-        """Take the products with the ghost cells beyond side `end` of an axis off the sums of the rows beside it; a row a thread."""
-        a, b = wp.tid()
-        k = a
-        j = b
-        i = int(0)
-        n = A.nx
-        step = A.s1
-        coefficient = real(A.cz)
-        if axis == 0:
-            i = end * last
-            n = 1
-            step = wp.int64(1)
-            coefficient = real(A.cx)
-        elif axis == 1:
-            j = end * last
-            step = A.s2
-            coefficient = real(A.cy)
-        else:
-            k = end * last
-        o = wp.int64(k + 1) * A.s1 + wp.int64(j + 1) * A.s2 + wp.int64(1 + i)
-        out_of = step * wp.int64(2 * end - 1)
-        zaz = real(0.0)
-        zap = real(0.0)
-        for m in range(n):
-            q = o + wp.int64(m)
-            if d[q] != free_type(0):
-                w = coefficient
-                if wx:
-                    face = q + step * wp.int64(end)
-                    if axis == 0:
-                        w = wx[face]
-                    elif axis == 1:
-                        w = wy[face]
-                    else:
-                        w = wz[face]
-                beyond = w * x[q + out_of]
-                zaz += x[q] * beyond
-                zap += p[q] * beyond
-        t = k * rows + j
-        out[t] = out[t] - wp.float64(zaz)
-        out[places + t] = out[places + t] - wp.float64(zap)
-
-    return add_side
 
 
 @wp.func

@@ -359,11 +359,11 @@ class MultigridWorkspace(RoundedIterate):
         sweep = finest.sweeping(finest.x, finest.t, self.hierarchy.settings.weights[0], projected=False)
         kernels.SWEEP_AND_MEASURE.launch(sweep, kernels.measuring(finest, self._p, residual.sums.partials), launch=launch)
         s.wrap(finest.x, launch=launch)
-        nz, ny, nx = s.padding.counts
+        (nz, ny, _), partials = s.padding.counts, residual.sums.partials
         for axis, end in s.ghosts.cuts:
-            lines, last = [(nz, ny), (nz, 1), (1, ny)][axis], (nx, ny, nz)[axis] - 1
-            inputs = [*finest.operands, axis, end, last, ny, s.rows.places, finest.x, self._p, residual.sums.partials]
-            launch(kernels.add_side_kernel(s.weights is not None, s.d.dtype, finest.real), lines, inputs, device=device)
+            beside = Rows.beyond(s.padding, device, axis, end, inside=True)
+            numbers = {"axis": axis, "end": end, "place": end * (0, ny - 1, (nz - 1) * ny)[axis], "lines": ny, "places": s.rows.places}
+            kernels.SIDE.bind(beside, stencil=s, z=finest.x, q=self._p, sums=partials, **numbers).launch(launch)
         residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=launch)
         launch(kernels.plan_step_kernel, 1, [residual.scalars], device=device)
 

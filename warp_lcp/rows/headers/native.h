@@ -4,12 +4,14 @@
 #define FAST_MATH
 #define EXACT_MATH
 #define VECTORS(WIDTH)
+#define UNROLLED _Pragma("unroll 4")  // so that several loads are under way at a time
 #define BUFFERED 1
 #else
 #define PRAGMA(TEXT) _Pragma(#TEXT)
 #define FAST_MATH PRAGMA(clang fp reassociate(on) contract(fast))
 #define EXACT_MATH PRAGMA(clang fp reassociate(off) contract(off))
 #define VECTORS(WIDTH) PRAGMA(clang loop vectorize(assume_safety) vectorize_width(WIDTH) interleave_count(1))
+#define UNROLLED
 #define BUFFERED 128
 #endif
 #define SIMD VECTORS(16)

@@ -1,0 +1,168 @@
+# mypy: ignore-errors
+"""Kernels that assemble the coarsest level's matrix and factor or invert it.
+
+A pivot below `rounding` times its diagonal is a singular component's rounding: its unknown is pinned at 0. Positive semi-definite matrices
+need no other order of the pivots.
+"""
+
+import functools
+from types import SimpleNamespace
+from typing import Any
+
+import warp as wp
+
+from warp_lcp.rows.layout import RowLayout, stencil_struct
+from warp_lcp.rows.sequence import CUDA_THREADS, meet
+
+square = wp.array2d(dtype=wp.float64)
+
+
+@wp.func
+def none_changed(changed: wp.array2d(dtype=wp.uint8)):
+    """Whether no row has changed."""
+    found = int(0)
+    for k in range(changed.shape[0]):
+        for j in range(changed.shape[1]):
+            if changed[k, j] != wp.uint8(0):
+                found = 1
+    return found == 0
+
+
+@wp.func
+def element(L: RowLayout, r: int):
+    """Element of a stored field that holds cell r."""
+    return L.base + wp.int64(r // (L.rows * L.nx)) * L.s1 + wp.int64((r // L.nx) % L.rows) * L.s2 + wp.int64(r % L.nx)
+
+
+@wp.func
+def beside(L: RowLayout, periodic: wp.vec3i, r: int, axis: int, way: int):
+    """Cell before (way = -1) or after (1) cell r along an axis; -1 where there is none."""
+    step = int(1)
+    n = L.nx
+    if axis == 1:
+        step = L.nx
+        n = L.rows
+    elif axis == 2:
+        step = L.nx * L.rows
+        n = L.planes
+    i = (r // step) % n + way
+    q = int(-1)
+    if i >= 0 and i < n:
+        q = r + way * step
+    elif periodic[axis] != 0:
+        q = r - way * (n - 1) * step
+    return q
+
+
+@functools.cache
+def coarsest_kernels(variable: bool, d_type: Any, real: Any) -> SimpleNamespace:
+    """Return `factor`, L D L' by one thread, and `invert`, by one block, each in a module of its own: they take long to compile."""
+    name = f"{'variable' if variable else 'uniform'}_{d_type.__name__}_{real.__name__}"
+    Stencil = stencil_struct(d_type, real if variable else wp.float32)
+
+    @wp.func
+    def weight(S: Stencil, axis: int, at: wp.int64):
+        """Weight of a cell's lower face."""
+        w = S.cx
+        if axis == 1:
+            w = S.cy
+        elif axis == 2:
+            w = S.cz
+        if S.wx:
+            if axis == 0:
+                w = wp.float64(S.wx[at])
+            elif axis == 1:
+                w = wp.float64(S.wy[at])
+            else:
+                w = wp.float64(S.wz[at])
+        return w
+
+    @wp.func
+    def assemble(S: Stencil, L: RowLayout, periodic: wp.vec3i, r: int, matrix: square):
+        """Write row r; a periodic axis of two cells has two faces between them."""
+        for c in range(matrix.shape[0]):
+            matrix[r, c] = wp.float64(0.0)
+        at = element(L, r)
+        if S.d[at] != d_type(0):
+            matrix[r, r] = S.unit * wp.float64(S.d[at])
+            for axis in range(3):
+                below = beside(L, periodic, r, axis, -1)
+                if below >= 0:
+                    if S.d[element(L, below)] != d_type(0):
+                        matrix[r, below] -= weight(S, axis, at)
+                above = beside(L, periodic, r, axis, 1)
+                if above >= 0:
+                    o = element(L, above)
+                    if S.d[o] != d_type(0):
+                        matrix[r, above] -= weight(S, axis, o)
+
+    @wp.kernel(enable_backward=False, module=f"warp_lcp.coarsest.factor_{name}")
+    def factor(
+        S: Stencil, L: RowLayout, periodic: wp.vec3i, rounding: wp.float64, changed: wp.array2d(dtype=wp.uint8), matrix: square
+    ):  # fmt: skip
+        """Assemble and factor in place; nothing to do if none of the rows of cells has changed."""
+        if none_changed(changed):
+            return
+        m = matrix.shape[0]
+        for r in range(m):
+            assemble(S, L, periodic, r, matrix)
+        for c in range(m):
+            pivot = matrix[c, c]
+            for s in range(c):
+                pivot -= matrix[c, s] * matrix[c, s] * matrix[s, s]
+            if pivot <= rounding * matrix[c, c]:
+                pivot = wp.float64(0.0)
+            matrix[c, c] = pivot
+            for r in range(c + 1, m):
+                v = matrix[r, c]
+                for s in range(c):
+                    v -= matrix[r, s] * matrix[c, s] * matrix[s, s]
+                if pivot > wp.float64(0.0):
+                    matrix[r, c] = v / pivot
+                else:
+                    matrix[r, c] = wp.float64(0.0)
+
+    @wp.func
+    def eliminate(least: wp.float64, c: int, t: int, threads: int, old: square, new: square):
+        """One step of Gauss-Jordan from `old` to `new`, so that no thread reads what another has written since the last barrier."""
+        m = old.shape[0]
+        pivot = old[c, c]
+        pinned = pivot <= least
+        reciprocal = wp.float64(1.0) / pivot  # not used where it is infinite
+        for q in range(t, m * m, threads):
+            i = q // m
+            j = q % m
+            v = old[i, j]
+            if pinned:
+                if i == c or j == c:
+                    v = wp.float64(0.0)
+            elif i == c and j == c:
+                v = reciprocal
+            elif i == c:
+                v = v * reciprocal
+            elif j == c:
+                v = -v * reciprocal
+            else:
+                v -= old[i, c] * (old[c, j] * reciprocal)
+            new[i, j] = v
+        meet()
+
+    @wp.kernel(enable_backward=False, module=f"warp_lcp.coarsest.invert_{name}", launch_bounds=CUDA_THREADS)
+    def invert(S: Stencil, L: RowLayout, periodic: wp.vec3i, rounding: wp.float64, threads: int, other: square, inverse: square):
+        """Assemble and invert; every thread of the block passes every barrier."""
+        t = wp.tid()
+        m = inverse.shape[0]
+        for r in range(t, m, threads):
+            if m % 2 == 0:  # after m steps to and fro the result is to lie in `inverse`
+                assemble(S, L, periodic, r, inverse)
+            else:
+                assemble(S, L, periodic, r, other)
+        meet()
+        for c in range(m):
+            least = rounding * S.unit * wp.float64(S.d[element(L, c)])
+            if (m - c) % 2 == 0:
+                eliminate(least, c, t, threads, inverse, other)
+            else:
+                eliminate(least, c, t, threads, other, inverse)
+
+    return SimpleNamespace(factor=factor, invert=invert)

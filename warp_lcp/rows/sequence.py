@@ -1,0 +1,114 @@
+# mypy: ignore-errors
+"""Passes one after another in one launch: of one block of threads on CUDA, which meet at a barrier after each, of one thread on the CPU."""
+
+import functools
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.rows.layout import RowLayout, make_struct
+from warp_lcp.rows.row_pass import Bound, Form, Nothing, nothing
+
+CUDA_THREADS = 1024  # of the block: latency is all there is to hide, and a block of a GPU holds no more
+MOST = 5  # forms
+
+
+class Sequence:
+    """A table of passes on the device, which one launch works through: grids of 16^3 cells take less time than launches.
+
+    Args:
+        name: of the kernel, as a pass has one.
+        stages: the passes in order, of five forms at most, without sums. Those that are the same object are kept once.
+    """
+
+    def __init__(self, name: str, stages: list[Bound]) -> None:
+        forms = tuple(dict.fromkeys(stage.form for stage in stages))
+        self.device, self._stages = stages[0].rows.device, stages  # which keeps what the tables have the addresses of
+        self.threads = CUDA_THREADS if self.device.is_cuda else 1
+        self.kernel, Tables, structs = _sequence_kernel(name, forms)
+        places = dict[int, tuple[int, int]]()
+        kept: list[list[bytes]] = [[] for _ in forms]
+        for bound in {id(stage): stage for stage in stages}.values():
+            which = forms.index(bound.form)
+            places[id(bound)] = which, len(kept[which])
+            kept[which].append(bytes(bound.layout.__ctype__()) + bytes(bound.fields.__ctype__()))
+        self.tables = Tables()
+        self.order = self.tables.order = wp.array([places[id(stage)] for stage in stages], dtype=wp.vec2i, device=self.device)
+        for table, struct, memory in zip(TABLES, structs, kept, strict=False):
+            stored = np.frombuffer(b"".join(memory), dtype=struct.numpy_dtype())
+            setattr(self.tables, table, wp.array(stored, dtype=struct, device=self.device))
+
+    def launch(self, launch: Any = wp.launch) -> None:
+        """Launch all passes, or record their launch."""
+        inputs = [self.tables, 0, len(self.order), self.threads]
+        launch(self.kernel, self.threads, inputs, device=self.device, block_dim=self.threads)
+
+
+TABLES = tuple(f"pieces{i}" for i in range(MOST))
+
+
+@wp.func_native(
+    """
+#if defined(__CUDA_ARCH__)
+__syncthreads();
+#endif
+"""
+)
+def meet():
+    """Wait for all threads of the block."""
+
+
+@functools.cache
+def _shared(form: Form | None) -> Any:
+    """Return the struct of a pass with its arguments, and the function by which threads share its rows."""
+    run, Fields = (form.run, form.fields) if form else (nothing, Nothing)
+    Piece = make_struct(f"Piece_{Fields.key}", {"L": RowLayout, "F": Fields})
+    pieces = wp.array(dtype=Piece)
+
+    def share(given: pieces, place: int, t: int, threads: int):
+        P = given[place]
+        lines = int(1)
+        if threads == 1:
+            lines = P.L.rows
+        shares = P.L.rows // lines * P.L.chunks
+        for q in range(t, P.L.planes * shares, threads):
+            j = (q % shares) // P.L.chunks * lines
+            run(P.L, P.F, q // shares, q // shares + 1, j, j + lines, q % P.L.chunks)
+
+    share.__module__ = run.module.name if form else __name__
+    share.__qualname__ = f"{run.key}_shared"
+    return Piece, wp.func(share)
+
+
+@functools.cache
+def _sequence_kernel(name: str, forms: tuple[Form, ...]) -> Any:
+    (One, first), (Two, second), (Three, third), (Four, fourth), (Five, fifth) = (
+        _shared(form) for form in (*forms, *(None,) * (MOST - len(forms)))
+    )
+    kinds = [form.declared.name.rpartition(".")[2] for form in forms]
+    variant = f"{'_'.join(kinds)}.{'_'.join(dict.fromkeys(word for form in forms for word in form.words))}"
+    structs = (One, Two, Three, Four, Five)
+    members = {"order": wp.array(dtype=wp.vec2i)} | {n: wp.array(dtype=s) for n, s in zip(TABLES, structs, strict=True)}
+    Tables = make_struct(f"{name.replace('.', '_')}_{variant.replace('.', '_')}", members)
+
+    def sequence(T: Tables, begin: int, end: int, threads: int):
+        """Every thread of the block passes every barrier: the bounds of the loop are the same for all."""
+        t = wp.tid()
+        for s in range(begin, end):
+            at = T.order[s]
+            if at[0] == 0:
+                first(T.pieces0, at[1], t, threads)
+            elif at[0] == 1:
+                second(T.pieces1, at[1], t, threads)
+            elif at[0] == 2:
+                third(T.pieces2, at[1], t, threads)
+            elif at[0] == 3:
+                fourth(T.pieces3, at[1], t, threads)
+            else:
+                fifth(T.pieces4, at[1], t, threads)
+            meet()
+
+    sequence.__name__ = sequence.__qualname__ = name.rpartition(".")[2]
+    kernel = wp.kernel(enable_backward=False, module=f"warp_lcp.{name}.{variant}", launch_bounds=CUDA_THREADS)(sequence)
+    return kernel, Tables, structs
