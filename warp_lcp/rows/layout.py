@@ -32,7 +32,8 @@ class RowLayout:
     chunks: int  # threads of a row
     slab: int  # planes that a thread takes
     lines: int  # rows of a plane that it takes
-    turn: int  # planes before the first that fields of three planes keep, too: that of ghosts, or none
+    turn: int  # fields of three planes: planes before the first that they keep, too, that of ghosts, or none
+    lift: int  # the plane at which they begin, counted from the first
     spans: wp.array2d(dtype=wp.vec2i)  # first and one past the last cell of each row (k, j) that may hold unknowns; null: all
     o0: wp.int64  # the other level of a transfer: element of its first cell, elements from plane to plane and from row to row
     o1: wp.int64
@@ -170,12 +171,16 @@ class Rows:
     @staticmethod
     def stored(padding: Padding, device: wp.Device) -> "Rows":
         """Return all stored cells of a padded grid, ghosts too."""
-        return Rows.strided(padding.size, device, (0, padding.plane, padding.row), tuple(n + 2 for n in padding.counts))
+        made = Rows.strided(padding.size, device, (0, padding.plane, padding.row), tuple(n + 2 for n in padding.counts))
+        return made._changed(lift=1)
 
     def after_ghosts(self) -> "Rows":
-        """Return the same rows for passes whose ring begins with a plane of ghosts."""
-        single = put(copy_of(self.single), {"turn": 1})
-        return replace(self, single=single, summed=single if self.summed is self.single else put(copy_of(self.summed), {"turn": 1}))
+        """Return the same rows for passes whose fields of three planes begin with one of ghosts."""
+        return self._changed(turn=1)
+
+    def _changed(self, **members: int) -> "Rows":
+        single = put(copy_of(self.single), members)
+        return replace(self, single=single, summed=single if self.summed is self.single else put(copy_of(self.summed), members))
 
     @staticmethod
     def edge(padding: Padding, device: wp.Device, axis: int) -> "Rows":

@@ -362,7 +362,13 @@ class MultigridWorkspace(RoundedIterate):
         (nz, ny, _), partials = s.padding.counts, residual.sums.partials
         for axis, end in s.ghosts.cuts:
             beside = Rows.beyond(s.padding, device, axis, end, inside=True)
-            numbers = {"axis": axis, "end": end, "place": end * (0, ny - 1, (nz - 1) * ny)[axis], "lines": ny, "places": s.rows.places}
+            numbers: dict[str, Any] = {
+                "axis": axis,
+                "end": end,
+                "place": end * (0, ny - 1, (nz - 1) * ny)[axis],
+                "lines": ny,
+                "places": s.rows.places,
+            }
             kernels.SIDE.bind(beside, stencil=s, z=finest.x, q=self._p, sums=partials, **numbers).launch(launch)
         residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=launch)
         launch(kernels.plan_step_kernel, 1, [residual.scalars], device=device)

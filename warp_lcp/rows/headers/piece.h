@@ -21,7 +21,7 @@ const auto piece = [&](int k, int j, int c) -> Piece {
     P.ym = -L.s2; P.yp = L.s2; P.zm = -L.s1; P.zp = L.s1;
     if constexpr (RINGS) {  // the plane below the ring stands below the first plane and above the last one, unless those are in turn
         const int at = k + L.turn, slot = at % 3;
-        P.ring = (slot - at)*L.s1;
+        P.ring = (slot - k + L.lift)*L.s1;
         P.down = slot == 0 && at > 0 ? 2*L.s1 : -L.s1;
         P.up = k == L.planes - 1 && !L.turn ? (-1 - slot)*L.s1 : slot == 2 ? -2*L.s1 : L.s1; }
     if constexpr (LEVELS) P.q = L.o0 + over(k, L.fz)*L.o1 + over(j, L.fy)*L.o2 + over(first, L.fx);
