@@ -8,7 +8,6 @@ import warp_lcp as wl
 from oracle import assemble
 from warp_lcp.krylov import ConjugateGradient
 from warp_lcp.multigrid import CycleSettings, Hierarchy
-from warp_lcp.operators.grid_poisson import mask_diagonal
 
 CASES = [
     ((6, 5, 7), (False,) * 3),
@@ -23,7 +22,7 @@ def masked_hierarchy(cells, free, periodic, device, settings=None, real=wp.float
     A = wl.GridPoisson(cells, periodic=periodic, device=device, dtype=wp.float64, **faces)
     hierarchy = Hierarchy(A.stencil, real, bounded=bounded, settings=settings)
     mask = A.layout.load(free.astype(np.uint8) * (cells == wl.FLUID).astype(np.uint8), wp.uint8)
-    mask_diagonal(A.stencil.d, mask, hierarchy.finest.stencil.d)
+    hierarchy.hold(A.stencil.d, mask)
     hierarchy.rebuild()
     return A, hierarchy
 

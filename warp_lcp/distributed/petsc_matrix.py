@@ -9,22 +9,31 @@ from __future__ import annotations
 import math
 import weakref
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.distributed.ranks import petsc
-from warp_lcp.distributed.vector_copies_kernels import copy_kernels
 from warp_lcp.layout import zeros
 from warp_lcp.multigrid.hierarchy import CycleSettings, Hierarchy
 from warp_lcp.multigrid.turning import make_hierarchy
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.operators.stencil import Stencil
+from warp_lcp.rows import RowPass, Rows
 
 if TYPE_CHECKING:
     from petsc4py import PETSc
 
+HEADERS, VECTORS = Path(__file__).parent / "headers", {"v": wp.float64}
+ENTER = RowPass(
+    "vector_copies.enter", HEADERS / "enter.h", "S", reads={"d": "D"}, writes={"x": "S"}, other=VECTORS, numbers={"scale": wp.float64}
+)
+LEAVE = RowPass(
+    "vector_copies.leave", HEADERS / "leave.h", "S", reads={"d": "D", "x": "S"}, other={**VECTORS, "others": wp.float64},
+    optional=("others",), numbers={"scale": wp.float64},
+)  # fmt: skip
 TRUE_RESIDUAL = frozenset({"cg", "cgne", "fcg", "pipefcg", "groppcg", "pipecg", "bcgs", "tfqmr", "fgmres", "richardson"})
 """Methods of KSP that measure b - A x if asked to; others know other norms only."""
 
@@ -44,9 +53,9 @@ class VectorCopies:
         self.stencil, self.comm, self.device = stencil, comm, stencil.device
         self._n = math.prod(stencil.padding.counts)
         self.sizes = self._n, None  # PETSc adds the ranks' up
-        s = stencil.shape
-        self._box = [wp.vec3i(*stencil.padding.counts), s.s1, s.s2, stencil.grain]
-        self._nothing = wp.empty(0, dtype=wp.float64, device=self.device)
+        counts = stencil.padding.counts
+        dense = Rows.strided(self._n, self.device, (0, counts[1] * counts[2], counts[2]), counts)
+        self._rows = Rows.of(stencil.padding, self.device).beside(dense, (1, 1, 1))
         staged = self.device.is_cuda  # PETSc's vectors are the host's
         self._staging = [wp.zeros(self._n, dtype=wp.float64, device=self.device) for _ in range(2)] if staged else []
 
@@ -60,20 +69,15 @@ class VectorCopies:
 
     def enter(self, v: PETSc.Vec, field: wp.array[Any], scale: float = 1.0) -> None:
         """Set the field to scale v on the unknowns and to 0 on the other cells; its ghost cells stay as they are."""
-        s = self.stencil
-        kernel = copy_kernels(s.d.dtype, field.dtype).enter
         values = v.getArray(readonly=True)  # PETSc counts accesses: it ends with the array
-        inputs = [self._seen(values, 0), s.d, wp.float64(scale), *self._box, field]
-        wp.launch(kernel, s.threads, inputs, device=self.device)
+        ENTER.bind(self._rows, v=self._seen(values, 0), d=self.stencil.d, x=field, scale=scale).launch()
 
     def leave(self, field: wp.array[Any], others: PETSc.Vec | None, v: PETSc.Vec, scale: float = 1.0) -> None:
         """Set v to scale times the field on the unknowns and to `others` (0 if None) on the other cells."""
-        s = self.stencil
-        kernel = copy_kernels(s.d.dtype, field.dtype).leave
         given = None if others is None else others.getArray(readonly=True)
         values = v.getArray()
-        seen, target = self._nothing if given is None else self._seen(given, 0), self._seen(values, 1)
-        wp.launch(kernel, s.threads, [field, s.d, seen, wp.float64(scale), *self._box, target], device=self.device)
+        seen, target = None if given is None else self._seen(given, 0), self._seen(values, 1)
+        LEAVE.bind(self._rows, x=field, d=self.stencil.d, others=seen, v=target, scale=scale).launch()
         if self._staging:
             values[:] = target.numpy()
 

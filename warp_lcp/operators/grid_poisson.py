@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import copy
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.layout import PaddedLayout, check_kept, check_storable, real_array
-from warp_lcp.native import Spans
 from warp_lcp.operators import grid_poisson_kernels as kernels
 from warp_lcp.operators.components import ComponentFinder, FloatingComponents, Scratch
 from warp_lcp.operators.grid_poisson_kernels import AIR, FLUID, SOLID
 from warp_lcp.operators.stencil import Ghosts, Stencil
-from warp_lcp.operators.stencil_kernels import StencilShape, find_spans_kernel
+from warp_lcp.operators.stencil_kernels import find_spans_kernel
 from warp_lcp.pickling import OnHost, Pickled, made_again
-from warp_lcp.vectors import Across, launch_spans
+from warp_lcp.rows import Rows
+from warp_lcp.vectors import Across
 
 __all__ = ["AIR", "FLUID", "SOLID", "GridPoisson"]
 
@@ -101,11 +102,6 @@ class GridPoisson(Pickled):
         self._spans = wp.zeros((counts[0], counts[1]), dtype=wp.vec2i, device=self.device)
         self.version = 0
         self.stencil = self._empty_stencil()
-        self._whole_rows = StencilShape()
-        whole, some = self._whole_rows, self.stencil.shape
-        whole.nx, whole.s1, whole.s2 = some.nx, some.s1, some.s2
-        beyond = self._rows_and_ghosts = StencilShape()
-        beyond.nx, beyond.s1, beyond.s2 = some.nx + 1, some.s1, some.s2
         self._mask: wp.array[Any] | None = None
         self._finder: ComponentFinder | None = None
         self._refill(wp.array(np.pad(host.reshape(counts), 1).astype(np.int8), device=self.device))
@@ -184,18 +180,14 @@ class GridPoisson(Pickled):
 
     def masked(self, free: Any, shift: Any = None) -> GridPoisson:
         """Return the principal system P A P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift), shift >= 0."""
-        wanted = self.layout.load(free, wp.uint8, "free").numpy() != 0
-        mask = wp.array((wanted & (self.cells.numpy().ravel() == FLUID)).astype(np.uint8), device=self.device)
+        mask = (self.layout.load(free, wp.uint8, "free").numpy() != 0) & (self.cells.numpy().ravel() == FLUID)
         twin = copy.copy(self)
-        twin._mask, twin._finder = mask, None
-        d = self.stencil.d
-        if shift is None:
-            new = wp.zeros_like(d)
-            mask_diagonal(d, mask, new)
-        else:
-            new = self.layout.zeros(self.dtype)
-            inputs = [d, wp.float64(self.stencil.unit), mask, self.layout.load(shift, self.dtype, "shift"), new]
-            wp.launch(kernels.mask_and_shift_kernel, d.size, inputs, device=self.device)
+        twin._mask, twin._finder = wp.array(mask.astype(np.uint8), device=self.device), None
+        d, kind = self.stencil.d.numpy(), self.stencil.d.dtype
+        if shift is not None:
+            kind = self.dtype
+            d = self.stencil.unit * d.astype(np.float64) + self.layout.load(shift, kind, "shift").numpy()
+        new = wp.array(np.where(mask, d, 0), dtype=kind, device=self.device)
         twin.stencil = self.stencil.with_diagonal(new)
         return twin
 
@@ -308,29 +300,31 @@ class GridPoisson(Pickled):
     def _refill(self, cells: wp.array[Any]) -> None:
         """Take padded cell types and compute diagonal and weights."""
         counts, s = self.layout.padding.counts, self.stencil
+        padding, whole = self.layout.padding, self._whole_rows
         if cells is not self.cells:
-            inputs = [self._whole_rows, cells.flatten(), self.cells.flatten(), s.grain]
-            wp.launch(kernels.copy_cells_kernel, s.threads, inputs, device=self.device)
+            kernels.COPY_CELLS.bind(whole, **{"from": cells.flatten(), "to": self.cells.flatten()}).launch()
         wp.launch(find_spans_kernel, counts[:2], [self.cells, counts[2], self._spans], device=self.device)
         self.version += 1
         if self.cells_around is not self.cells:
             wp.copy(self.cells_around, self.cells)
             s.wrap(self.cells_around)
+        around = {"cells": self.cells_around.flatten()}
         if self._counts_faces:
-            axes = wp.vec3i(*(int(c > 0) for c in self.uniform))
-            inputs = [self._whole_rows, self.cells_around.flatten(), axes, s.d, s.grain]
-            wp.launch(kernels.count_faces_kernel, s.threads, inputs, device=self.device)
+            axes: dict[str, Any] = {f"around_{a}": c > 0 for a, c in zip(AXES, self.uniform, strict=True)}
+            kernels.COUNT_FACES.bind(whole, **around, diagonal=s.d, **axes).launch()
             return
-        arrays = tuple(f.size > 0 for f in self.faces)
-        made = kernels.coefficient_kernels(arrays, self.shift.size > 0, self.dtype)
-        before = [self.cells_around.flatten(), *(f.flatten() for f in self.faces), wp.vec3d(*self.uniform)]
-        inputs = [self._whole_rows, *before, self.shift.flatten(), s.d, s.grain]
-        wp.launch(made.diagonal, s.threads, inputs, device=self.device)
+        faces: dict[str, Any] = {}
+        for axis, field, number in zip(AXES, self.faces, self.uniform, strict=True):
+            faces |= {f"f{axis}": field.flatten() if field.size else None, f"n{axis}": number, f"FIELD_{axis.upper()}": field.size > 0}
+        shift = self.shift.flatten() if self.shift.size else None
+        kernels.DIAGONAL.bind(whole, **around, **faces, shift=shift, SHIFTED=self.shift.size > 0, diagonal=s.d).launch()
         if s.weights is not None:
-            planes, rows, _ = counts
-            beyond = 1 if self.device.is_cuda else 0
-            inputs = [self._rows_and_ghosts, *before, *s.weights, s.grain + (1 - beyond)]
-            wp.launch(made.weights, (planes + 1, rows + 1, s.threads[2] + beyond), inputs, device=self.device)
+            weights = dict(zip(("wx", "wy", "wz"), s.weights, strict=True))
+            kernels.WEIGHTS.bind(Rows.of(padding, self.device, more=1), **around, **faces, **weights).launch()
+
+    @cached_property
+    def _whole_rows(self) -> Rows:
+        return Rows.of(self.layout.padding, self.device)
 
 
 def _checked_cells(cells: Any) -> np.ndarray:
@@ -350,8 +344,3 @@ def _check_coefficients(values: np.ndarray, dtype: Any, name: str) -> None:
     check_kept(values, dtype, name)
     if (values < 0).any():
         raise ValueError(f"{name} holds a negative value ({values.min()}): coefficients must be >= 0")
-
-
-def mask_diagonal(d: wp.array[Any], free: wp.array[Any], out: wp.array[Any]) -> None:
-    """Copy a stored diagonal where the stored uint8 field `free` is not 0, write 0 elsewhere."""
-    launch_spans(kernels.mask_diagonal_kernel(d.dtype, out.dtype), Spans.of(d.size, d.device), [d, free, out], [], d.device)

@@ -10,8 +10,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.layout import Padding
-from warp_lcp.native import grain
-from warp_lcp.operators.stencil_kernels import PRODUCT, RELAX, WRAP, StencilShape
+from warp_lcp.operators.stencil_kernels import PRODUCT, RELAX, WRAP
 from warp_lcp.program import Launch, perform
 from warp_lcp.rows import Bound, Rows
 from warp_lcp.rows.layout import put, stencil_struct
@@ -68,17 +67,8 @@ class Stencil:
     ghosts: Ghosts | None = None
 
     def __post_init__(self) -> None:
-        """Lay out the kernel's view of the sizes."""
-        nz, ny, nx = self.padding.counts
+        """Take the device of the diagonal."""
         self.device = self.d.device
-        self.shape = StencilShape()
-        self.shape.nx, self.shape.s1, self.shape.s2, self.shape.unit = nx, self.padding.plane, self.padding.row, self.unit
-        self.shape.cx, self.shape.cy, self.shape.cz = self.coefficients
-        if self.spans is not None:
-            self.shape.spans = self.spans
-        self.grain = grain(nx, self.device)
-        self.threads = (nz, ny, -(-nx // self.grain))
-        self.operands = [self.shape, self.d, *(self.weights or [wp.empty(0, dtype=wp.float32, device=self.device)] * 3), self.grain]
 
     @cached_property
     def rows(self) -> Rows:

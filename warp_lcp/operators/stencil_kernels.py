@@ -11,8 +11,6 @@ from pathlib import Path
 import warp as wp
 
 from warp_lcp.rows import RowPass
-from warp_lcp.rows.row_pass import HEADERS as ROWS
-from warp_lcp.rows.row_pass import text
 
 HEADERS = Path(__file__).parent / "headers"
 PRODUCT = RowPass(
@@ -24,53 +22,6 @@ RELAX = RowPass(
     writes={"x": "S"}, numbers={"omega": "S", "color": int},
 )  # fmt: skip
 WRAP = RowPass("stencil.wrap", HEADERS / "wrap.h", "S", writes={"x": "S"}, numbers={"cells": int, "step": wp.int64})
-
-
-def stencil_head(variable: bool, real: str) -> str:
-    """Return what opens a native function for cells k from element p on: d, the weights, `diagonal` and `neighbors` of `stencil.h`."""
-    types = f"typedef {real} T; constexpr int STENCIL = {ord('v' if variable else 'u')}; const double* known = nullptr;"
-    at = " ".join(f"const auto* {w} = {w}_.data + p;" for w in ("d", "wx", "wy", "wz"))
-    numbers = " ".join(f"const T {c} = (T)A.{c};" for c in ("unit", "cx", "cy", "cz"))
-    strides = "const long long s1 = A.s1, s2 = A.s2, ym = -s2, yp = s2, zm = -s1, zp = s1;"
-    return "\n".join([types, at, strides, numbers, text(ROWS / "stencil.h"), ""])
-
-
-@wp.struct
-class StencilShape:
-    """Sizes and uniform coefficients of a stencil."""
-
-    nx: int
-    s1: wp.int64  # elements from plane to plane
-    s2: wp.int64  # elements from row to row
-    unit: wp.float64  # what one unit of d is worth
-    cx: wp.float64
-    cy: wp.float64
-    cz: wp.float64
-    spans: wp.array2d(dtype=wp.vec2i)  # first and one past the last cell of each row (k, j) that may hold unknowns; null: all
-
-
-@wp.func
-def row_first(A: StencilShape, k: int, j: int, c: int, grain: int):
-    """First cell, from 0, that chunk c of row (k, j) takes: no earlier than the row's span begins."""
-    first = c * grain
-    if A.spans:
-        first = wp.max(first, A.spans[k, j][0])
-    return first
-
-
-@wp.func
-def row_count(A: StencilShape, k: int, j: int, c: int, grain: int):
-    """Cells that chunk c of row (k, j) takes, counted from its first."""
-    last = wp.min(A.nx, (c + 1) * grain)
-    if A.spans:
-        last = wp.min(last, A.spans[k, j][1])
-    return wp.max(last - row_first(A, k, j, c, grain), 0)
-
-
-@wp.func
-def row_start(A: StencilShape, k: int, j: int, c: int, grain: int):
-    """Element at which chunk c of row (k, j) begins; k, j count interior cells from 0."""
-    return wp.int64(k + 1) * A.s1 + wp.int64(j + 1) * A.s2 + wp.int64(1 + row_first(A, k, j, c, grain))
 
 
 SPAN_CELLS = wp.constant(16)  # spans begin at multiples of this, so that rows stay whole vectors and aggregates whole

@@ -154,10 +154,10 @@ class Rows:
     place: Mapping[str, int] = field(default_factory=dict)
 
     @staticmethod
-    def of(padding: Padding, device: wp.Device, spans: Any = None, *, whole: bool = False) -> "Rows":
-        """Return the rows of a padded grid, or what their spans have of them; a thread takes a `whole` one."""
-        steps = padding.plane + padding.row + 1, padding.plane, padding.row
-        return Rows.strided(padding.size, device, steps, padding.counts, spans, cells=padding.counts[2] if whole else None)
+    def of(padding: Padding, device: wp.Device, spans: Any = None, *, whole: bool = False, more: int = 0) -> "Rows":
+        """Return the rows of a padded grid and `more` beyond, or what their spans have of them; a thread takes a `whole` one."""
+        steps, counts = (padding.plane + padding.row + 1, padding.plane, padding.row), tuple(n + more for n in padding.counts)
+        return Rows.strided(padding.size, device, steps, counts, spans, cells=counts[2] if whole else None)
 
     @staticmethod
     def beyond(padding: Padding, device: wp.Device, axis: int, end: int, *, inside: bool = False) -> "Rows":

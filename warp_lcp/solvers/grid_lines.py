@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 from enum import Enum
+from pathlib import Path
 from typing import Any
 
 import warp as wp
 
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
-from warp_lcp.solvers.grid_lines_kernels import line_kernel
+from warp_lcp.rows import RowPass, Rows
 from warp_lcp.solvers.sweep import check_colors
 
 MOST = 60  # changes of a line's set; few are needed, and what is left is projected
+
+f64 = wp.float64
+SOLVE_LINE = RowPass(  # of each line's first cell
+    "grid_lines.solve", Path(__file__).parent / "headers" / "solve_line.h", f64, stencil=("D", "W"),
+    reads=dict.fromkeys(("b", "l", "u"), f64), writes={**dict.fromkeys(("x", "c", "q", "z"), f64), "s": wp.uint8},
+    numbers={"s1": wp.int64, "s2": wp.int64, "cells": int, "most": int, "color": int, "omega": f64}, constants={"AXIS": 0},
+)  # fmt: skip
 
 
 class GridLines(Enum):
@@ -43,23 +51,19 @@ class LineSweep:
         if A.periodic[axis.value]:
             raise ValueError(f"blocks = {axis}: lines along a periodic axis have no ends; take another axis")
         check_colors(problem)
-        self.problem, self._axis, self._omega = problem, axis.value, wp.float64(omega)
-        padding = A.layout.padding
+        self.problem, padding = problem, A.layout.padding
         strides, counts = (1, padding.row, padding.plane), tuple(reversed(padding.counts))
         a, b = (other for other in (2, 1, 0) if other != axis.value)
-        self._lines, self._count = (counts[a], counts[b]), counts[axis.value]
-        self._places = [wp.int64(v) for v in (sum(strides), strides[a], strides[b])]
-        zeros = problem.layout.zeros
-        self._memory = [zeros(wp.float64), zeros(wp.float64), zeros(wp.float64), zeros(wp.uint8)]
+        self._lines = Rows.strided(padding.size, problem.device, (sum(strides), strides[a], strides[b]), (counts[a], counts[b], 1))
+        zeros, numbers = problem.layout.zeros, {"AXIS": axis.value, "cells": counts[axis.value], "most": MOST, "omega": omega}
+        memory = {name: zeros(f64) for name in ("c", "q", "z")} | {"s": zeros(wp.uint8)}
+        self._given: dict[str, Any] = memory | numbers | {"s1": padding.plane, "s2": padding.row}
 
     def run(self, x: wp.array[Any], *, forward: bool) -> None:
         """Sweep."""
         p = self.problem
         stencil = p.A.stencil  # type: ignore[attr-defined]
-        variable, d_type, w_type = stencil.storage
         p.bounds.follow(x)
         for color in (0, 1) if forward else (1, 0):
             stencil.wrap(x)
-            before = [*stencil.operands[:-1], *self._places, x, p.b, p.lower, p.upper, *self._memory]
-            kernel = line_kernel(variable, d_type, w_type, self._axis)
-            wp.launch(kernel, self._lines, [*before, self._count, MOST, self._omega, color], device=p.device)
+            SOLVE_LINE.bind(self._lines, stencil=stencil, x=x, b=p.b, l=p.lower, u=p.upper, color=color, **self._given).launch()

@@ -33,7 +33,7 @@ class MinimumMapResidual(AssessedResidual):
 
     def __init__(self, problem: LCP, A: GridPoisson, hierarchy: Hierarchy, *, rounded: bool) -> None:
         super().__init__(problem, A, hierarchy, rounded=rounded)
-        planes, rows, _ = A.stencil.threads
+        planes, rows, _ = A.stencil.padding.counts
         self._away = wp.zeros(planes * rows, dtype=wp.uint8, device=A.device)  # rows with such unknowns
 
     @property
