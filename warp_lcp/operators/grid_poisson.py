@@ -302,7 +302,7 @@ class GridPoisson(Pickled):
         counts, s = self.layout.padding.counts, self.stencil
         padding, whole = self.layout.padding, self._whole_rows
         if cells is not self.cells:
-            kernels.COPY_CELLS.bind(whole, **{"from": cells.flatten(), "to": self.cells.flatten()}).launch()
+            kernels.COPY_CELLS.bind(whole, source=cells.flatten(), to=self.cells.flatten()).launch()
         wp.launch(find_spans_kernel, counts[:2], [self.cells, counts[2], self._spans], device=self.device)
         self.version += 1
         if self.cells_around is not self.cells:

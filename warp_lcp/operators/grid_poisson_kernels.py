@@ -16,7 +16,7 @@ CELLS = {"cells": wp.int8}
 FIELDS = ("fx", "fy", "fz")
 AROUND = dict.fromkeys(("around_x", "around_y", "around_z"), bool)
 
-COPY_CELLS = RowPass("grid_poisson.copy_cells", HEADERS / "copy.h", wp.int8, reads={"from": wp.int8}, writes={"to": wp.int8})
+COPY_CELLS = RowPass("grid_poisson.copy_cells", HEADERS / "copy.h", wp.int8, reads={"source": wp.int8}, writes={"to": wp.int8})
 COUNT_FACES = RowPass(
     "grid_poisson.count_faces", HEADERS / "count_faces.h", wp.uint8, reads=CELLS, writes={"diagonal": wp.uint8}, numbers=AROUND
 )

@@ -1,1 +1,1 @@
-SIMD for (int k = 0; k < n; ++k) to[k] = from[k];
+SIMD for (int k = 0; k < n; ++k) to[k] = source[k];
