@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from fluids.tolerance_kernels import change_kernel
-from warp_lcp.vectors import Across, Reduction, convert, launch_spans
+from warp_lcp.rows import RowPass
+from warp_lcp.vectors import Across, Reduction, convert, rows_of
 
+f64 = wp.float64
+CHANGE = RowPass("fluids.change", Path(__file__).parent / "headers" / "change.h", f64, reads={"x": f64}, writes={"guess": f64})
 FRACTION = 0.1  # of the time step's error that the solve may leave
 FIRST = 1e-4  # relative residual of the first steps, before which there is no change to measure: a liquid that is at rest shall stay so
 LEAST = 1e-6  # relative residual than which none is asked to be smaller: rounding on the faces is what is left then
@@ -89,7 +92,7 @@ class TimeErrorTolerance:
         if x.dtype is not wp.float64:  # of a method in single precision
             convert(x, product)
             x = product
-        launch_spans(change_kernel, self._reduction.spans, [x, change], [], change.device)
+        CHANGE.bind(rows_of(x), x=x, guess=change).launch()
         A.apply(change, product)
         self._reduction.dot(change, product, 0)
         self.time_error = 0.5 * float(np.sqrt(max(float(self._sum.numpy()[0]), 0.0) / max(unknowns, 1)))

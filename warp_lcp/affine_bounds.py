@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from warp_lcp.affine_bounds_kernels import evaluate_kernel
+from warp_lcp.affine_bounds_kernels import AffineSide, evaluate_kernel
 from warp_lcp.layout import Layout, real_array
 
 SIDES = ("lower", "upper")
@@ -123,9 +124,13 @@ class AffineFields:
 
     def evaluate(self, x: wp.array[Any]) -> None:
         """Compute the bounds at x (stored, float64)."""
-        for side in (0, 1):
-            inputs = [self.constant[side], self.index[side], self.coefficient[side], x, self.values[side]]
-            wp.launch(evaluate_kernel, x.size, inputs, device=x.device)
+        for operands, values in zip(self.operands, self.values, strict=True):
+            wp.launch(evaluate_kernel, x.size, [operands, x, values], device=x.device)
+
+    @cached_property
+    def operands(self) -> list[AffineSide]:
+        """Lower and upper bounds as kernels take them."""
+        return [affine_side(*of) for of in zip(self.constant, self.index, self.coefficient, strict=True)]
 
     def _check(self) -> None:
         """Refuse boxes that are empty where the unknown which decides them is at one of its own bounds; evaluate at clip(0, l, u)."""
@@ -142,6 +147,15 @@ class AffineFields:
         index, coefficient = self.index[side].numpy(), self.coefficient[side].numpy()
         with np.errstate(invalid="ignore"):
             return np.where(index >= 0, self.constant[side].numpy() + coefficient * x[index], self.constant[side].numpy())
+
+
+def affine_side(constant: wp.array[Any], index: Any = None, coefficient: Any = None) -> AffineSide:
+    """Return bounds as kernels take them; constant ones without the rest."""
+    side = AffineSide()
+    side.constant = constant
+    if index is not None:
+        side.index, side.coefficient = index, coefficient
+    return side
 
 
 def affine_fields(layout: Layout, lower: Any, upper: Any) -> AffineFields | None:

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 import warp as wp
 
-from warp_lcp.native import CUDA_BLOCK, CUDA_SEGMENTS, Spans
+from warp_lcp.native import CUDA_BLOCK, CUDA_SEGMENTS
 from warp_lcp.program import Launch, perform
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.vector_kernels import add_up_kernel
@@ -60,8 +60,8 @@ class Reduction:
         threads: int | None = None,
         across: Across | None = None,
     ) -> None:
-        self.spans, self.scalars, self.columns, self._across = Spans.of(n, device), scalars, columns, across
-        self.threads = threads or self.spans.threads
+        self.scalars, self.columns, self._across = scalars, columns, across
+        self.threads = threads or Rows.flat(n, device).places
         self.block = min(CUDA_BLOCK, self.threads) if device.is_cuda else 1
         self.partials = wp.zeros(columns * self.threads, dtype=wp.float64, device=device)
         # one block of a GPU would take long over millions of partial sums: many blocks add them up first
@@ -98,13 +98,6 @@ def _add_across(across: Across, scalars: wp.array[wp.float64], slots: slice) -> 
 def rows_of(field: wp.array[Any]) -> Rows:
     """Return the rows of passes over flat fields like this one."""
     return Rows.flat(field.size, field.device)
-
-
-def launch_spans(
-    kernel: wp.Kernel, spans: Spans, before: list[Any], after: list[Any], device: wp.Device, *, launch: Launch = wp.launch
-) -> None:
-    """Launch a kernel (*before, n, chunk, stride, *after) with one thread a span."""
-    launch(kernel, spans.threads, [*before, spans.n, spans.chunk, spans.stride, *after], device=device)
 
 
 def convert(a: wp.array[Any], b: wp.array[Any]) -> None:

@@ -12,8 +12,9 @@ import warp as wp
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem import LCP
+from warp_lcp.rows.layout import put
 from warp_lcp.solve import Precision, Solver, Step
-from warp_lcp.solvers.blocked_gauss_seidel_kernels import block_kernels
+from warp_lcp.solvers.blocked_gauss_seidel_kernels import Blocks, block_kernels
 from warp_lcp.solvers.grid_lines import GridLines, LineSweep
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.partition import blocks_of_size, color_blocks, given_blocks
@@ -129,9 +130,9 @@ class BlockWorkspace(SweepWorkspace):
             colors = color_blocks(problem.A.matrix(), owner, len(blocks))  # type: ignore[attr-defined]
         self._starts = [0, *np.cumsum([len(color) for color in colors]).tolist()]
         arrays = [np.concatenate([[0], np.cumsum(sizes)]), members, owner, place, np.concatenate(colors)]
-        self._blocks = [wp.array(v, dtype=wp.int32, device=device) for v in arrays]
-        before = [rows.indptr, rows.indices, rows.values, problem.b, *bound_operands(problem)]
-        self._operands = [*before, wp.float64(settings.omega)]
+        names = ("first", "rows", "owner", "place", "order")
+        given = put(Blocks(), {name: wp.array(v, dtype=wp.int32, device=device) for name, v in zip(names, arrays, strict=True)})
+        self._operands = [rows.operand, problem.b, *bound_operands(problem), wp.float64(settings.omega), given]
         self._kernel = block_kernels(rows.values.dtype, max(sizes)).sweep
 
     def start(self, *, warm: bool, tolerance: float) -> None:
@@ -144,7 +145,7 @@ class BlockWorkspace(SweepWorkspace):
         for c in colors if forward else reversed(colors):
             count = self._starts[c + 1] - self._starts[c]
             threads, each = (count, 1) if self._parallel else (1, count)
-            wp.launch(self._kernel, threads, [*self._operands, *self._blocks, self._starts[c], each, forward, x], device=x.device)
+            wp.launch(self._kernel, threads, [*self._operands, self._starts[c], each, forward, x], device=x.device)
 
 
 class LineWorkspace(SweepWorkspace):

@@ -7,8 +7,8 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.affine_bounds_kernels import bound_at
-from warp_lcp.solvers.sweep_kernels import INFINITE, ZERO, scalar_solution
+from warp_lcp.affine_bounds_kernels import AffineSide, bound_at
+from warp_lcp.solvers.sweep_kernels import INFINITE, ZERO, matrix_rows, scalar_solution
 
 f64, i32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
 AT_LOWER, FREE, AT_UPPER = wp.constant(0), wp.constant(1), wp.constant(2)
@@ -16,11 +16,22 @@ ROUNDING = wp.constant(wp.float64(1e-12))  # of the terms of y and of |x|: what 
 SINGULAR = wp.constant(wp.float64(1e-13))  # of the largest entry
 
 
+@wp.struct
+class Blocks:
+    """Blocks: where each begins in `rows`, those, of which block each row is and where in it, and the order of the blocks."""
+
+    first: i32
+    rows: i32
+    owner: i32
+    place: i32
+    order: i32
+
+
 @functools.cache
 def block_kernels(a_type: Any, m: int) -> SimpleNamespace:
     """Return the kernel for entries of type a_type and blocks of at most m unknowns."""
     name = f"warp_lcp.blocked_gauss_seidel.{a_type.__name__}_{m}"
-    entries = wp.array(dtype=a_type)
+    Rows = matrix_rows(a_type)
     vector = wp.types.vector(length=m, dtype=wp.float64)
     places = wp.types.vector(length=m, dtype=wp.int32)
     table = wp.types.matrix(shape=(m, m + 1), dtype=wp.float64)
@@ -216,54 +227,53 @@ def block_kernels(a_type: Any, m: int) -> SimpleNamespace:
 
     @wp.kernel(enable_backward=False, module=name)
     def sweep(
-        ptr: i32, col: i32, entry: entries, b: f64, l: f64, l_index: i32, l_slope: f64, u: f64, u_index: i32, u_slope: f64,
-        omega: wp.float64, first: i32, rows: i32, owner: i32, place: i32, order: i32, begin: int, each: int, forward: bool, x: f64,
-    ):  # fmt: skip
-        """Solve `each` blocks a thread, from place begin of `order`; owner and place say where in which block a row is."""
+        A: Rows, b: f64, lowers: AffineSide, uppers: AffineSide, omega: wp.float64, B: Blocks, begin: int, each: int, forward: bool, x: f64
+    ):
+        """Solve `each` blocks a thread, from place begin of their order."""
         thread = wp.tid()
         for step in range(each):
             at = begin + thread * each + step
             if not forward:
                 at = begin + thread * each + each - 1 - step
-            block = order[at]
-            start = first[block]
-            n = first[block + 1] - start
+            block = B.order[at]
+            start = B.first[block]
+            n = B.first[block + 1] - start
             a = table()
             box = Box()
             old = vector()
             for p in range(n):
-                i = rows[start + p]
+                i = B.rows[start + p]
                 old[p] = x[i]
                 c = b[i]
-                row = ptr[i]
-                for k in range(row, ptr[i + 1]):
+                row = A.ptr[i]
+                for k in range(row, A.ptr[i + 1]):
                     j = k - row
-                    if col.shape[0] > 0:
-                        j = col[k]
-                    v = wp.float64(entry[k])
-                    if owner[j] == block:
-                        q = place[j]
+                    if A.col.shape[0] > 0:
+                        j = A.col[k]
+                    v = wp.float64(A.a[k])
+                    if B.owner[j] == block:
+                        q = B.place[j]
                         a[p, q] += v
                     else:
                         c += v * x[j]
                 a[p, m] = c
-                box.l[p] = bound_at(l, l_index, l_slope, x, i)
-                box.u[p] = bound_at(u, u_index, u_slope, x, i)
+                box.l[p] = bound_at(lowers, x, i)
+                box.u[p] = bound_at(uppers, x, i)
                 box.l_at[p] = -1
                 box.u_at[p] = -1
-                if l_index.shape[0] > 0:
-                    j = l_index[i]
+                if lowers.index.shape[0] > 0:
+                    j = lowers.index[i]
                     if j >= 0:
-                        if owner[j] == block:
-                            box.l[p] = l[i]
-                            box.l_slope[p] = l_slope[i]
-                            box.l_at[p] = place[j]
-                    j = u_index[i]
+                        if B.owner[j] == block:
+                            box.l[p] = lowers.constant[i]
+                            box.l_slope[p] = lowers.coefficient[i]
+                            box.l_at[p] = B.place[j]
+                    j = uppers.index[i]
                     if j >= 0:
-                        if owner[j] == block:
-                            box.u[p] = u[i]
-                            box.u_slope[p] = u_slope[i]
-                            box.u_at[p] = place[j]
+                        if B.owner[j] == block:
+                            box.u[p] = uppers.constant[i]
+                            box.u_slope[p] = uppers.coefficient[i]
+                            box.u_at[p] = B.place[j]
             new = solve_block(a, box, old, n)
             for p in range(n):
                 new[p] = old[p] + omega * (new[p] - old[p])
@@ -271,6 +281,6 @@ def block_kernels(a_type: Any, m: int) -> SimpleNamespace:
                 if box.l_at[p] < 0 and box.u_at[p] < 0:
                     new[p] = wp.clamp(new[p], box.l[p], box.u[p])
             for p in range(n):
-                x[rows[start + p]] = wp.clamp(new[p], lower_at(box, new, p), upper_at(box, new, p))
+                x[B.rows[start + p]] = wp.clamp(new[p], lower_at(box, new, p), upper_at(box, new, p))
 
     return SimpleNamespace(sweep=sweep)

@@ -9,12 +9,13 @@ from typing import Any, Protocol
 import numpy as np
 import warp as wp
 
+from warp_lcp.affine_bounds import affine_side
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
-from warp_lcp.solvers.sweep_kernels import CHANGE, row_kernels
+from warp_lcp.solvers.sweep_kernels import CHANGE, matrix_rows, row_kernels
 from warp_lcp.vectors import ADD, rows_of
 
 
@@ -68,6 +69,13 @@ class Rows:
     indices: wp.array[Any]
     values: wp.array[Any]
 
+    @property
+    def operand(self) -> Any:
+        """What kernels take."""
+        made = matrix_rows(self.values.dtype)()
+        made.ptr, made.col, made.a = self.indptr, self.indices, self.values
+        return made
+
     @classmethod
     def of(cls, A: Any) -> Rows | None:
         """Return the rows of an operator, None if it has none to show."""
@@ -81,13 +89,9 @@ class Rows:
 
 
 def bound_operands(problem: LCP) -> list[Any]:
-    """Return constant, index and slope of the lower and of the upper bounds, as kernels take them; no index where none depends on x."""
+    """Return the lower and the upper bounds, as kernels take them that follow x."""
     affine = problem.bounds.affine
-    if affine is None:
-        empty = [wp.empty(0, dtype=t, device=problem.device) for t in (wp.int32, wp.float64)]
-        return [problem.lower, *empty, problem.upper, *empty]
-    sides = zip(affine.constant, affine.index, affine.coefficient, strict=True)
-    return [operand for side in sides for operand in side]
+    return affine.operands if affine else [affine_side(problem.lower), affine_side(problem.upper)]
 
 
 class RowSweep:
@@ -107,7 +111,7 @@ class RowSweep:
         self._n = n if permutation is None else len(permutation)
         given = np.zeros(n if order is SweepOrder.MAGNITUDE else 0) if permutation is None else permutation
         self._places = wp.array(given, dtype=wp.int32, device=problem.device)
-        self._operands = [rows.indptr, rows.indices, rows.values]
+        self._matrix = rows.operand
         self._bounds = bound_operands(problem)
         self._kernels = row_kernels(rows.values.dtype)
         self._y = problem.layout.zeros(wp.float64) if order is SweepOrder.GREEDY else None
@@ -121,12 +125,12 @@ class RowSweep:
         if self._y is not None:
             p.A.apply(x, self._y)
             ADD.bind(rows_of(x), z=p.b, x=self._y).launch()
-            inputs = [*self._operands, p.A.diagonal(), p.b, *self._bounds, self._omega, x.size, self._y, x]
+            inputs = [self._matrix, p.A.diagonal(), *self._bounds, self._omega, x.size, self._y, x]
             wp.launch(self._kernels.greedy, 1, inputs, device=p.device)
             return
         if self._order is SweepOrder.MAGNITUDE:
             self._places.assign(np.argsort(-np.abs(x.numpy()), kind="stable").astype(np.int32))
-        inputs = [*self._operands, p.b, *self._bounds, self._omega, self._places, forward, self._n, x]
+        inputs = [self._matrix, p.b, *self._bounds, self._omega, self._places, forward, self._n, x]
         wp.launch(self._kernels.sweep, 1, inputs, device=p.device)
 
 

@@ -8,8 +8,9 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.affine_bounds_kernels import bound_at
+from warp_lcp.affine_bounds_kernels import AffineSide, bound_at
 from warp_lcp.rows import RowPass
+from warp_lcp.rows.layout import make_struct
 
 f64, i32, i8 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32), wp.array(dtype=wp.int8)
 ZERO = wp.constant(wp.float64(0.0))
@@ -59,17 +60,20 @@ def scalar_solution(x: wp.float64, y: wp.float64, d: wp.float64, l: wp.float64, 
 
 
 @functools.cache
+def matrix_rows(a_type: Any) -> Any:
+    """Return the struct of a matrix in compressed rows; `col` may be empty: full rows."""
+    return make_struct(f"MatrixRows_{a_type.__name__}", {"ptr": i32, "col": i32, "a": wp.array(dtype=a_type)})
+
+
+@functools.cache
 def row_kernels(a_type: Any) -> SimpleNamespace:
     """Return the kernels for entries of type a_type: `sweep` in a given order, `greedy` by the largest residual."""
     name = f"warp_lcp.sweep.{a_type.__name__}"
-    entries = wp.array(dtype=a_type)
+    entries, Rows = wp.array(dtype=a_type), matrix_rows(a_type)
 
     @wp.kernel(enable_backward=False, module=name)
-    def sweep(
-        ptr: i32, col: i32, a: entries, b: f64, l: f64, l_index: i32, l_slope: f64, u: f64, u_index: i32, u_slope: f64, omega: wp.float64,
-        order: i32, forward: bool, n: int, x: f64,
-    ):  # fmt: skip
-        """Relax the rows of `order` (empty: all, by number) one after the other, by one thread; col may be empty for full rows."""
+    def sweep(A: Rows, b: f64, lowers: AffineSide, uppers: AffineSide, omega: wp.float64, order: i32, forward: bool, n: int, x: f64):
+        """Relax the rows of `order` (empty: all, by number) one after the other, by one thread."""
         for place in range(n):
             r = place
             if not forward:
@@ -77,33 +81,30 @@ def row_kernels(a_type: Any) -> SimpleNamespace:
             i = r
             if order.shape[0] > 0:
                 i = order[r]
-            first = ptr[i]
+            first = A.ptr[i]
             y = b[i]
             d = ZERO
-            for k in range(first, ptr[i + 1]):
+            for k in range(first, A.ptr[i + 1]):
                 j = k - first
-                if col.shape[0] > 0:
-                    j = col[k]
-                v = wp.float64(a[k])
+                if A.col.shape[0] > 0:
+                    j = A.col[k]
+                v = wp.float64(A.a[k])
                 y += v * x[j]
                 if j == i:
                     d += v
-            lower = bound_at(l, l_index, l_slope, x, i)
-            upper = bound_at(u, u_index, u_slope, x, i)
+            lower = bound_at(lowers, x, i)
+            upper = bound_at(uppers, x, i)
             x[i] = scalar_solution(x[i], y, d, lower, upper, omega)
 
     @wp.kernel(enable_backward=False, module=name)
-    def greedy(
-        ptr: i32, col: i32, a: entries, diagonal: entries, b: f64, l: f64, l_index: i32, l_slope: f64, u: f64, u_index: i32, u_slope: f64,
-        omega: wp.float64, n: int, y: f64, x: f64,
-    ):  # fmt: skip
+    def greedy(A: Rows, diagonal: entries, lowers: AffineSide, uppers: AffineSide, omega: wp.float64, n: int, y: f64, x: f64):
         """Relax n times the row whose x would change most, measured by |d| |change|; A is symmetric, so that its column is its row."""
         for _ in range(n):
             chosen = int(-1)
             most = ZERO
             for i in range(n):
-                lower = bound_at(l, l_index, l_slope, x, i)
-                upper = bound_at(u, u_index, u_slope, x, i)
+                lower = bound_at(lowers, x, i)
+                upper = bound_at(uppers, x, i)
                 d = wp.float64(diagonal[i])
                 weight = wp.abs(d)
                 if weight == ZERO:
@@ -114,17 +115,17 @@ def row_kernels(a_type: Any) -> SimpleNamespace:
                     chosen = i
             if chosen >= 0:
                 i = chosen
-                lower = bound_at(l, l_index, l_slope, x, i)
-                upper = bound_at(u, u_index, u_slope, x, i)
+                lower = bound_at(lowers, x, i)
+                upper = bound_at(uppers, x, i)
                 v = scalar_solution(x[i], y[i], wp.float64(diagonal[i]), lower, upper, omega)
                 change = v - x[i]
                 x[i] = v
-                first = ptr[i]
-                for k in range(first, ptr[i + 1]):
+                first = A.ptr[i]
+                for k in range(first, A.ptr[i + 1]):
                     j = k - first
-                    if col.shape[0] > 0:
-                        j = col[k]
-                    y[j] += wp.float64(a[k]) * change
+                    if A.col.shape[0] > 0:
+                        j = A.col[k]
+                    y[j] += wp.float64(A.a[k]) * change
 
     return SimpleNamespace(sweep=sweep, greedy=greedy)
 
