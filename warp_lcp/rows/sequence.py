@@ -20,10 +20,18 @@ class Sequence:
     Args:
         name: of the kernel, as a pass has one.
         stages: the passes in order, of five forms at most, without sums. Those that are the same object are kept once.
+
+    Raises:
+        ValueError: too many forms, or a pass that sums.
     """
 
     def __init__(self, name: str, stages: list[Bound]) -> None:
         forms = tuple(dict.fromkeys(stage.form for stage in stages))
+        names = [form.declared.name for form in forms]
+        if len(forms) > MOST:
+            raise ValueError(f"{name}: {', '.join(names)} are {len(forms)} forms: a sequence takes {MOST}")
+        if summing := [form.declared.name for form in forms if form.declared.sums]:
+            raise ValueError(f"{name}: {summing[0]} sums, which passes of a sequence cannot")
         self.device, self._stages = stages[0].rows.device, stages  # which keeps what the tables have the addresses of
         self.threads = CUDA_THREADS if self.device.is_cuda else 1
         self.kernel, Tables, structs = _sequence_kernel(name, forms)

@@ -1,29 +1,27 @@
 // The line of n cells along an axis that begins at this one, if it has the color: no two of that touch. Its active set is changed until none is
 // wrong. s: 1 free, 0 at l, 2 at u, 3 no unknown. Rows: -before z[k-st] + e z[k] - after z[k+st] + c = 0 where free, z = bound elsewhere.
-#define FACES(W, C, M, P) (STENCIL == 'v' ? W[k]*x[k + M] + W[k + P]*x[k + P] : C*(x[k + M] + x[k + P]))
-#define ALONG_X FACES(wx, cx, -1, 1)
-#define ALONG_Y FACES(wy, cy, -s2, s2)
-#define ALONG_Z FACES(wz, cz, -s1, s1)
+#define FACES(W, S) W[k]*x[k - S] + W[k + S]*x[k + S]
+#define EQUAL(C, S) C*(x[k - S] + x[k + S])
+#define WEIGHT(K) (STENCIL == 'v' ? (T)(AXIS == 0 ? wx[K] : AXIS == 1 ? wy[K] : wz[K]) : AXIS == 0 ? cx : AXIS == 1 ? cy : cz)
 const long long st = AXIS == 0 ? 1 : AXIS == 1 ? s2 : s1, end = cells*st; const T eps = 1e-14;
-const auto weight = [&](long long k) -> T {
-    if constexpr (STENCIL == 'v') return AXIS == 0 ? wx[k] : AXIS == 1 ? wy[k] : wz[k]; else return AXIS == 0 ? cx : AXIS == 1 ? cy : cz; };
 if ((P.k + P.j) % 2 == color) {
     for (long long k = 0; k < end; k += st) {
-        if constexpr (AXIS == 0) c[k] = b[k] - (ALONG_Y + ALONG_Z);
-        else if constexpr (AXIS == 1) c[k] = b[k] - (ALONG_X + ALONG_Z);
-        else c[k] = b[k] - (ALONG_X + ALONG_Y);
+        if constexpr (STENCIL == 'v') c[k] = b[k] - (AXIS == 0 ? FACES(wy, s2) + FACES(wz, s1) : AXIS == 1 ? FACES(wx, 1) + FACES(wz, s1)
+            : FACES(wx, 1) + FACES(wy, s2));
+        else c[k] = b[k] - (AXIS == 0 ? EQUAL(cy, s2) + EQUAL(cz, s1) : AXIS == 1 ? EQUAL(cx, 1) + EQUAL(cz, s1)
+            : EQUAL(cx, 1) + EQUAL(cy, s2));
         s[k] = d[k] == 0 ? 3 : (x[k] <= l[k] ? 0 : (x[k] >= u[k] ? 2 : 1)); }
     for (int pass = 0; pass < most; ++pass) {
         T q0 = 0, z0 = 0; int wrong = 0;
         for (long long k = 0; k < end; k += st) {
-            const T before = weight(k), after = weight(k + st), e = unit*(T)d[k], pivot = e - before*q0;
+            const T before = WEIGHT(k), after = WEIGHT(k + st), e = unit*(T)d[k], pivot = e - before*q0;
             if (s[k] == 1 && pivot > 0) { q0 = after/pivot; z0 = (before*z0 - c[k])/pivot; }
             else { q0 = 0; z0 = s[k] == 0 ? l[k] : (s[k] == 2 ? u[k] : (s[k] == 3 ? (T)0 : x[k])); }
             q[k] = q0; z[k] = z0; }
         for (long long k = end - 2*st; k >= 0; k -= st) z[k] += q[k]*z[k + st];
         for (long long k = 0; k < end; k += st) {
             if (s[k] == 3) continue;
-            const T before = weight(k), after = weight(k + st), e = unit*(T)d[k];
+            const T before = WEIGHT(k), after = WEIGHT(k + st), e = unit*(T)d[k];
             const T low = k > 0 ? before*z[k - st] : (T)0, high = k + st < end ? after*z[k + st] : (T)0, y = e*z[k] - low - high + c[k];
             const T scale = eps*(fabs(e*z[k]) + fabs(low) + fabs(high) + fabs(c[k]));
             if (s[k] == 1) {
@@ -36,6 +34,5 @@ if ((P.k + P.j) % 2 == color) {
         T v = x[k] + omega*(z[k] - x[k]);
         v = v > l[k] ? v : l[k]; x[k] = v < u[k] ? v : u[k]; } }
 #undef FACES
-#undef ALONG_X
-#undef ALONG_Y
-#undef ALONG_Z
+#undef EQUAL
+#undef WEIGHT
