@@ -53,7 +53,7 @@ def test_what_a_sequence_cannot_take(passes, tmp_path):
     rows, x = Rows.flat(8, wp.get_device("cpu")), wp.zeros(8, dtype=wp.float64, device="cpu")
     (tmp_path / "sum.h").write_text("T s = 0; for (int k = 0; k < n; ++k) s += x[k];\n")
     total = RowPass("test_sequence.sum", tmp_path / "sum.h", "S", reads={"x": "S"}, sums=("s",))
-    with pytest.raises(ValueError, match="test_sequence.sum sums, which passes of a sequence cannot"):
+    with pytest.raises(ValueError, match=r"test_sequence\.sum sums, which passes of a sequence cannot"):
         Sequence("test_sequence.wrong", [total.bind(rows, x=x, out=wp.zeros(1, dtype=wp.float64, device="cpu"))])
     (tmp_path / "set.h").write_text("for (int k = 0; k < n; ++k) x[k] = KIND;\n")
     many = RowPass("test_sequence.set", tmp_path / "set.h", "S", writes={"x": "S"}, constants={"KIND": 0})
