@@ -67,9 +67,9 @@ class SmallLevels:
         if not projected:
             yield self._inverse
             return
-        for sweep in range(self.settings.projected_sweeps):
-            yield from self._pair(index, projected=True, from_zero=from_zero and sweep == 0)
-            yield from self._pair(index, projected=True, reverse=True)
+        back = list(self._pair(index, projected=True, reverse=True))
+        yield from (*self._pair(index, projected=True, from_zero=from_zero), *back)
+        yield from (*self._pair(index, projected=True), *back) * (self.settings.projected_sweeps - 1)
 
     def _pair(self, index: int, *, projected: bool, from_zero: bool = False, reverse: bool = False) -> Iterator[Bound]:
         """Yield two sweeps, x to t and back."""

@@ -43,9 +43,11 @@ class Sequence:
             kept[which].append(bytes(bound.layout.__ctype__()) + bytes(bound.fields.__ctype__()))
         self.tables = Tables()
         self.order = self.tables.order = wp.array([places[id(stage)] for stage in stages], dtype=wp.vec2i, device=self.device)
-        for table, struct, memory in zip(TABLES, structs, kept, strict=False):
-            stored = np.frombuffer(b"".join(memory), dtype=struct.numpy_dtype())
-            setattr(self.tables, table, wp.array(stored, dtype=struct, device=self.device))
+        self._memory = []
+        for table, struct, pieces in zip(TABLES, structs, kept, strict=False):
+            stored = wp.array(np.frombuffer(b"".join(pieces), dtype=np.uint8), device=self.device)
+            setattr(self.tables, table, wp.array(ptr=stored.ptr, dtype=struct, shape=len(pieces), device=self.device))
+            self._memory.append(stored)
 
     def launch(self, launch: Any = wp.launch) -> None:
         """Launch all passes, or record their launch."""
