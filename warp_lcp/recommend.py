@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from warp_lcp.problem import LCP
+from warp_lcp.settings import Count, Positive, Settings
 from warp_lcp.solve import Solver, solve
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.registry import METHODS
@@ -42,7 +43,7 @@ LEAN = (0.0, 18.0)  # methods that hold some fields only
 
 
 @dataclass(frozen=True, kw_only=True)
-class Budget:
+class Budget(Settings):
     """What a solve may cost; what is None does not matter.
 
     Args:
@@ -57,23 +58,18 @@ class Budget:
         >>> Budget(iterations=0)
         Traceback (most recent call last):
         ...
-        ValueError: iterations = 0: must be an integer >= 1
+        warp_lcp.settings.SettingError: iterations = 0: must be an integer >= 1 or None
     """
 
-    seconds: float | None = None
-    iterations: int | None = None
-    bytes: int | None = None
+    seconds: Positive | None = None
+    iterations: Count | None = None
+    bytes: Count | None = None
 
     def __post_init__(self) -> None:
         """Check the ranges."""
+        super().__post_init__()
         if self.seconds is None and self.iterations is None and self.bytes is None:
             raise ValueError("budget: give seconds, iterations or bytes")
-        if self.seconds is not None and not (_is_number(self.seconds) and 0 < self.seconds < math.inf):
-            raise ValueError(f"seconds = {self.seconds!r}: must be a finite number > 0")
-        for name in ("iterations", "bytes"):
-            value = getattr(self, name)
-            if value is not None and not (isinstance(value, int) and not isinstance(value, bool) and value >= 1):
-                raise ValueError(f"{name} = {value!r}: must be an integer >= 1")
 
 
 @dataclass(frozen=True)

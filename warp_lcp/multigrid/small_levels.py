@@ -12,7 +12,8 @@ from warp_lcp.multigrid.small_levels_kernels import CORRECT, CUDA_THREADS, RESTR
 from warp_lcp.program import Launch
 
 if TYPE_CHECKING:
-    from warp_lcp.multigrid.hierarchy import CycleSettings, Level
+    from warp_lcp.multigrid.cycle_settings import CycleSettings
+    from warp_lcp.multigrid.hierarchy import Level
 
 
 class SmallLevels:

@@ -19,7 +19,7 @@ from warp_lcp.result import SolveResult
 from warp_lcp.rows import RowPass
 from warp_lcp.vectors import rows_of
 
-Blocks = int | Sequence[Any]
+Blocks = Sequence[Any] | np.ndarray
 SELECT = RowPass(
     "partition.select", Path(__file__).parent / "headers" / "select.h", wp.float64, optional=("less",), numbers={"kept": bool},
     reads={"x": wp.float64, "less": wp.float64, "member": wp.uint8}, writes={"target": wp.float64},
@@ -32,7 +32,7 @@ def blocks_of_size(problem: LCP, size: int) -> list[np.ndarray]:
     return [unknowns[i : i + size] for i in range(0, len(unknowns), size)]
 
 
-def given_blocks(problem: LCP, blocks: Sequence[Any]) -> list[np.ndarray]:
+def given_blocks(problem: LCP, blocks: Blocks) -> list[np.ndarray]:
     """Return stored indices of each block.
 
     Args:
