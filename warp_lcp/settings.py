@@ -118,7 +118,8 @@ def rule(annotation: Any) -> str:
         case None:
             return KINDS.get(annotation) or f"a {getattr(annotation, '__name__', annotation)}"
         case kind if kind is Annotated:
-            return _range(*parts)
+            said = [part for part in parts if isinstance(part, str)]  # words of the annotation's own
+            return said[0] if said else _range(*parts)
         case kind if kind in (Literal, Union, UnionType):
             words = [repr(part) if kind is Literal else rule(part) for part in parts]
             return " or ".join(part for part in (", ".join(words[:-1]), words[-1]) if part)
