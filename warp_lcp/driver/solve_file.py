@@ -18,6 +18,7 @@ from warp_lcp.nearest import nearest
 from warp_lcp.operators import DenseOperator, SparseOperator
 from warp_lcp.problem import LCP
 from warp_lcp.result import SolveResult
+from warp_lcp.settings import SettingError
 from warp_lcp.solvers.default import default_method, solve
 from warp_lcp.solvers.registry import METHODS
 from warp_lcp.stopping import StoppingCriteria
@@ -134,12 +135,11 @@ def criteria(tolerance: float, max_iterations: int, max_seconds: float) -> Stopp
     Raises:
         ProblemError: an option is outside its range; the message names it.
     """
-    if not max_seconds > 0:
-        raise ProblemError(f"--max-seconds {max_seconds}: must be > 0")
     try:
         return StoppingCriteria(rtol=tolerance, max_iterations=max_iterations, max_seconds=max_seconds)
-    except ValueError as error:
-        raise ProblemError(f"--tolerance {tolerance}: {error}") from error
+    except SettingError as error:
+        option = "tolerance" if error.name == "rtol" else error.name.replace("_", "-")
+        raise ProblemError(f"--{option} {error.value}: must be {error.rule}") from error
 
 
 def read_matrix(path: Path) -> Any:
