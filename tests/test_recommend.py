@@ -119,7 +119,7 @@ def test_the_trial_foresees_how_many_sweeps():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"accuracy": "perfect"}, r"accuracy = 'perfect': must be in \(0, 1\), 'rough', 'usual' or 'exact'"),
+        ({"accuracy": "perfect"}, r"accuracy = 'perfect': must be in \(0, 1\) or 'rough', 'usual' or 'exact'"),
         ({"accuracy": 1}, "accuracy = .*: must be in"),
         ({"accuracy": True}, "accuracy = .*: must be in"),
         ({"accuracy": float("nan")}, "accuracy = .*: must be in"),

@@ -94,7 +94,7 @@ def checked(name: str, given: object, annotation: Any) -> Any:
     value: Any = given.item() if isinstance(given, (np.generic, np.ndarray)) and np.ndim(given) == 0 else given
     whole = isinstance(value, float) and value.is_integer()
     try:
-        return _adapter(annotation).validate_python(int(value) if whole else value)
+        return adapter(annotation).validate_python(int(value) if whole else value)
     except ValueError:  # pydantic's words name one end of a range
         raise SettingError(name, value, rule(annotation)) from None
 
@@ -141,7 +141,7 @@ def _range(kind: type, *limits: Any) -> str:
 
 
 @cache
-def _adapter(annotation: Any) -> Any:
+def adapter(annotation: Any) -> Any:
     """Return what validates a value; pydantic is imported here, for the import of the package not to wait for it."""
     from pydantic import ConfigDict, InstanceOf, TypeAdapter
 
