@@ -123,10 +123,8 @@ def rule(annotation: Any) -> str:
         case kind if kind in (Literal, Union, UnionType):
             words = [repr(part) if kind is Literal else rule(part) for part in parts]
             return " or ".join(part for part in (", ".join(words[:-1]), words[-1]) if part)
-        case kind if kind is tuple:
-            return f"a tuple, each {rule(parts[0])}"
         case kind:
-            return f"a {kind.__name__}"
+            return f"a {kind.__name__}, each {rule(parts[0])}"
 
 
 def _range(kind: type, *limits: Any) -> str:
