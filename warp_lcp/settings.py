@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from enum import StrEnum
 from functools import cache
 from reprlib import repr as short
 from types import NoneType, UnionType
@@ -57,8 +58,9 @@ class SettingError(ValueError):
 class Settings:
     """Base of a frozen dataclass that checks its fields by their annotations, once it is made. Numbers are stored as Python's.
 
-    Whole floats are integers, NumPy's numbers are those of their values; a bool or a text is no number. Numbers are finite, unless the
-    range says `OrInfinite`. What several fields must be together is checked in a `__post_init__` that calls this one first.
+    Whole floats are integers, NumPy's numbers are those of their values, members of a `StrEnum` their words; a bool or a text is no number.
+    Numbers are finite, unless the range says `OrInfinite`. What several fields must be together is checked in a `__post_init__` that calls
+    this one first.
 
     Example:
         >>> @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -92,9 +94,9 @@ def checked(name: str, given: object, annotation: Any) -> Any:
         SettingError: it is not.
     """
     value: Any = given.item() if isinstance(given, (np.generic, np.ndarray)) and np.ndim(given) == 0 else given
-    whole = isinstance(value, float) and value.is_integer()
+    plain = str(value) if isinstance(value, StrEnum) else int(value) if isinstance(value, float) and value.is_integer() else value
     try:
-        return adapter(annotation).validate_python(int(value) if whole else value)
+        return adapter(annotation).validate_python(plain)
     except ValueError:  # pydantic's words name one end of a range
         raise SettingError(name, value, rule(annotation)) from None
 
