@@ -121,7 +121,9 @@ def solve_files(
     try:
         operator = SparseOperator(A, device=device) if scipy.sparse.issparse(A) else DenseOperator(A, device=device)
         problem = LCP(operator, b, *sides)
-        solver = default_method(problem) if method is None else _method(method, operator)
+        family = "sparse" if isinstance(operator, SparseOperator) else "dense"
+        takes = f"take {family} matrices", lambda kind: family in kind.supports
+        solver = default_method(problem) if method is None else method_named(method, *takes)
         result = solve(problem, solver, stopping=stopping)
     except ValueError as error:
         raise ProblemError(str(error)) from error
@@ -204,15 +206,20 @@ def _bound(value: str, n: int, option: str) -> float | np.ndarray:
         return read_vector(Path(value), n, infinite=True)
 
 
-def _method(name: str, operator: Any) -> Any:
-    """Return a method by its name."""
+def method_named(name: str, what: str, takes: Callable[[Any], bool]) -> Any:
+    """Return a method by its name.
+
+    Args:
+        name: in `METHODS`.
+        what: those do that may be chosen, such as "take grids".
+        takes: whether a class does.
+
+    Raises:
+        ProblemError: there is no such method, or it does not.
+    """
     if name not in METHODS:
         raise ProblemError(f"--method {name}: no such method; {nearest(name, METHODS)}")
-    family = "sparse" if isinstance(operator, SparseOperator) else "dense"
-    takes = {known for known, kind in METHODS.items() if family in getattr(kind, "supports", {family})}
-    if name not in takes:
-        raise ProblemError(f"--method {name}: does not take {family} matrices; choose from {', '.join(sorted(takes))}")
-    try:
-        return METHODS[name]()
-    except (ImportError, TypeError) as error:
-        raise ProblemError(f"--method {name}: {error}") from error
+    if not takes(METHODS[name]):
+        others = ", ".join(sorted(known for known, kind in METHODS.items() if takes(kind)))
+        raise ProblemError(f"--method {name}: does not {what}; choose from {others}")
+    return METHODS[name]()
