@@ -14,6 +14,7 @@ from granular.interleaved_kernels import APART, interleaved_kernels
 from granular.packing import three
 from granular.stress import Stress
 from granular.stress_kernels import PERIOD
+from warp_lcp.settings import Count, CountOrZero, NonNegative, Part, Positive, Relaxation, Settings, ShareOrZero
 
 BETTER = 0.95  # of the best estimate: progress
 NEAR_BEST = 1.2
@@ -63,7 +64,7 @@ class CoupledMethod(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class AcceleratedProjection:
+class AcceleratedProjection(Settings):
     """Projected gradient steps on pressure and friction together, with momentum (Polyak's heavy ball).
 
     Each step moves all stresses against their gradient, scaled by the problem's diagonal, and projects: x onto x >= 0, the friction onto
@@ -94,17 +95,17 @@ class AcceleratedProjection:
             the height, and friction points down in the uppermost rows.
     """
 
-    pressure_step: float = 1.0 / 1.2
-    shear_step: float = 1.0 / 2.5
-    lookahead: float = 0.15
-    momentum: float = 0.85
-    decay: float = 1.0
-    check_every: int = 2
-    patience: int = 300
-    wait: int = 100
-    calm: tuple[float, ...] = (0.87, 0.8)
-    least: int = 80
-    cold: int = 600
+    pressure_step: Positive = 1.0 / 1.2
+    shear_step: Positive = 1.0 / 2.5
+    lookahead: NonNegative = 0.15
+    momentum: ShareOrZero = 0.85
+    decay: Part = 1.0
+    check_every: Count = 2
+    patience: Count = 300
+    wait: Count = 100
+    calm: tuple[ShareOrZero, ...] = (0.87, 0.8)
+    least: CountOrZero = 80
+    cold: CountOrZero = 600
 
     def solve(self, stress: Stress, *, scale: float, tolerance: float, max_iterations: int) -> CoupledOutcome:
         """Solve from the stresses as they are."""
@@ -141,7 +142,7 @@ class AcceleratedProjection:
 
 
 @dataclass(frozen=True, kw_only=True)
-class InterleavedSweeps:
+class InterleavedSweeps(Settings):
     """One Gauss-Seidel sweep over the pressure and one over the friction in turn ([Book] 2.2.4, staggering with one sweep a block).
 
     Solving either to the end before the other converges far slower: both carry the same load, and each sweep must be able to hand it over.
@@ -153,10 +154,10 @@ class InterleavedSweeps:
         check_every: rounds between two looks at the residual.
     """
 
-    pressure_relaxation: float = 1.5
-    friction_relaxation: float = 1.0
-    decay: float = 1.0
-    check_every: int = 4
+    pressure_relaxation: Relaxation = 1.5
+    friction_relaxation: Relaxation = 1.0
+    decay: Part = 1.0
+    check_every: Count = 4
 
     def solve(self, stress: Stress, *, scale: float, tolerance: float, max_iterations: int) -> CoupledOutcome:
         """Solve from the stresses as they are."""

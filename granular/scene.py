@@ -29,6 +29,7 @@ from warp_lcp.driver.shapes import (
     Sphere,
     WallFriction,
 )
+from warp_lcp.settings import NonNegative, Positive, Share
 
 STRESS_BYTES = {2: 160, 3: 330}  # a cell: the coupled solve's fields
 CUT_STRESS_BYTES = {2: 48, 3: 76}  # and where solids cut cells
@@ -43,7 +44,7 @@ class SandTime(Time):
     """[time], with steps short enough for sand: what moves further than a cell a step packs unevenly."""
 
     cfl: float = Field(default=0.8, ge=1e-3, description="a Courant number, usually 0.5 to 1")
-    dt_max: float = Field(default=5e-3, gt=0, description="the longest step [s]")
+    dt_max: Positive = Field(default=5e-3, description="the longest step [s]")
 
 
 class SandDomain(Domain):
@@ -66,13 +67,13 @@ class MaterialTable(Table):
 
     name: Literal["dry-sand", "gravel", "sugar"] = Field(default="dry-sand", description="gives what the table does not")
     friction_angle: Angle | None = Field(default=None, description="degrees: the slope at which sand that runs stops; see angle_of")
-    density: float | None = Field(default=None, gt=0, description="at the densest, air included [kg/m^3]")
-    max_fraction: float | None = Field(default=None, gt=0, lt=1, description="of space that grains fill at the densest")
+    density: Positive | None = Field(default=None, description="at the densest, air included [kg/m^3]")
+    max_fraction: Share | None = Field(default=None, description="of space that grains fill at the densest")
     wall_friction: WallFriction | None = Field(default=None, description=f"against solids: {FRICTIONS}")
-    cohesion: float = Field(
-        default=0.0, ge=0, description="the shear stress it bears without pressure [Pa]; over cos(friction_angle) unless that is of repose"
+    cohesion: NonNegative = Field(
+        default=0.0, description="the shear stress it bears without pressure [Pa]; over cos(friction_angle) unless that is of repose"
     )
-    tensile_strength: float = Field(default=0.0, ge=0, description="the tension it bears where it is densely packed [Pa]")
+    tensile_strength: NonNegative = Field(default=0.0, description="the tension it bears where it is densely packed [Pa]")
     angle_of: AngleOf = Field(
         default="repose",
         description="what friction_angle is of: repose, the slope at which layers stop (k = tan); sand at rest holds up to asin(k), so"
@@ -98,7 +99,7 @@ class Friction(Table):
     dynamic_angle: Angle | None = Field(
         default=None, description="degrees: friction grows with the rate of shear, mu(I), from material.friction_angle to this"
     )
-    grain_size: float | None = Field(default=None, gt=0, description="diameter of the grains, with dynamic_angle [m]")
+    grain_size: Positive | None = Field(default=None, description="diameter of the grains, with dynamic_angle [m]")
     inertial_number: float | None = Field(
         default=None, ge=1e-9, description=f"at which half of the growth is there, with dynamic_angle; {GLASS:g} of glass beads by itself"
     )
@@ -125,8 +126,8 @@ class SandSolver(Table):
     method: Literal["accelerated-projection", "interleaved-sweeps"] = Field(
         default="accelerated-projection", description="interleaved-sweeps is the textbook's, several times slower"
     )
-    tolerance: Annotated[float, BeforeValidator(_not_automatic)] = Field(
-        default=1e-3, gt=0, lt=1, description="of the stresses, root mean square in units of rho g dx"
+    tolerance: Annotated[Share, BeforeValidator(_not_automatic)] = Field(
+        default=1e-3, description="of the stresses, root mean square in units of rho g dx"
     )
     max_iterations: int = Field(default=600, ge=10, description="iterations after which a step takes the stresses as they are")
     precision: Literal["single"] = Field(default="single", description="of the stresses; residuals are double")
@@ -136,7 +137,7 @@ class SandProperties(MaterialProperties):
     """What a body of sand has besides its shape."""
 
     friction_angle: Angle | None = Field(default=None, description="degrees; material.friction_angle unless given")
-    cohesion: float | None = Field(default=None, ge=0, description="[Pa]; material.cohesion unless given")
+    cohesion: NonNegative | None = Field(default=None, description="[Pa]; material.cohesion unless given")
 
 
 class SandBox(SandProperties, Box):

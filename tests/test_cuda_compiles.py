@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import scipy.sparse
 import warp as wp
+from warp_lcp.distributed.vector_copies_kernels import copy_kernels
 
 import fluids
 import granular
@@ -22,7 +23,6 @@ from granular.cut_walls_kernels import traction_kernel
 from granular.interleaved_kernels import interleaved_kernels
 from granular.report_kernels import report_kernels
 from granular.stress_kernels import stress_kernels
-from warp_lcp.distributed.vector_copies_kernels import copy_kernels
 from warp_lcp.grid import advection_kernels, distance_advection_kernels, transfer_kernels
 from warp_lcp.grid.periodic import ring_kernels
 from warp_lcp.grid.semi_lagrangian import CENTERS

@@ -78,11 +78,12 @@ def test_the_reference_has_every_public_name():
     assert {f"warp_lcp.gallery.{path.stem}" for path in Path(gallery.__file__).parent.glob("[a-z]*.py")} <= set(NAMED)
 
 
-def test_the_page_of_scene_files_is_up_to_date():
-    spec = importlib.util.spec_from_file_location("scene_keys", DOCS / "generate" / "scene_keys.py")
-    scene_keys = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(scene_keys)
-    assert scene_keys.PAGE.read_text() == scene_keys.page(), "run: python docs/generate/scene_keys.py"
+@pytest.mark.parametrize("name", ["scene_keys", "method_settings"])
+def test_generated_pages_are_up_to_date(name):
+    spec = importlib.util.spec_from_file_location(name, DOCS / "generate" / f"{name}.py")
+    generator = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(generator)
+    assert generator.PAGE.read_text() == generator.page(), f"run: python docs/generate/{name}.py"
 
 
 def test_the_page_of_scene_files_has_every_key():

@@ -4,6 +4,7 @@ from importlib.metadata import PackageNotFoundError, version
 
 from warp_lcp.affine_bounds import AffineBounds
 from warp_lcp.kernel_messages import hear_kernels
+from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators import (
     AIR,
     FLUID,
@@ -66,6 +67,7 @@ __all__ = [
     "Budget",
     "CoupledBlock",
     "CoupledResult",
+    "CycleSettings",
     "DenseOperator",
     "DirectEnumeration",
     "FischerNewton",

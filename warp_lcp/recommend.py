@@ -7,8 +7,10 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Literal
 
 from warp_lcp.problem import LCP
+from warp_lcp.settings import Count, Positive, Settings, Share, checked
 from warp_lcp.solve import Solver, solve
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.registry import METHODS
@@ -42,7 +44,7 @@ LEAN = (0.0, 18.0)  # methods that hold some fields only
 
 
 @dataclass(frozen=True, kw_only=True)
-class Budget:
+class Budget(Settings):
     """What a solve may cost; what is None does not matter.
 
     Args:
@@ -57,23 +59,18 @@ class Budget:
         >>> Budget(iterations=0)
         Traceback (most recent call last):
         ...
-        ValueError: iterations = 0: must be an integer >= 1
+        warp_lcp.settings.SettingError: iterations = 0: must be an integer >= 1 or None
     """
 
-    seconds: float | None = None
-    iterations: int | None = None
-    bytes: int | None = None
+    seconds: Positive | None = None
+    iterations: Count | None = None
+    bytes: Count | None = None
 
     def __post_init__(self) -> None:
         """Check the ranges."""
+        super().__post_init__()
         if self.seconds is None and self.iterations is None and self.bytes is None:
             raise ValueError("budget: give seconds, iterations or bytes")
-        if self.seconds is not None and not (_is_number(self.seconds) and 0 < self.seconds < math.inf):
-            raise ValueError(f"seconds = {self.seconds!r}: must be a finite number > 0")
-        for name in ("iterations", "bytes"):
-            value = getattr(self, name)
-            if value is not None and not (isinstance(value, int) and not isinstance(value, bool) and value >= 1):
-                raise ValueError(f"{name} = {value!r}: must be an integer >= 1")
 
 
 @dataclass(frozen=True)
@@ -348,25 +345,11 @@ def recommend(problem: LCP, *, accuracy: float | str = "usual", budget: Budget |
         raise ValueError(f"problem is a {type(problem).__name__}: expected an LCP")
     if not (budget is None or isinstance(budget, Budget)):
         raise ValueError(f"budget = {budget!r}: expected Budget(seconds=...), Budget(iterations=...) or Budget(bytes=...)")
-    rtol = _relative(accuracy)
+    given = checked("accuracy", accuracy, Share | Literal[tuple(ACCURACIES)])
+    rtol = ACCURACIES.get(given, given)
     traits = traits_of(problem, rtol)
     rule = next(rule for rule in RULES if rule.applies(traits))
     return _within(_from_rule(rule, traits, rtol), budget, problem) if budget else _from_rule(rule, traits, rtol)
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
-
-
-def _relative(accuracy: float | str) -> float:
-    """Return a relative residual for a word or a number."""
-    if isinstance(accuracy, str):
-        if accuracy not in ACCURACIES:
-            raise ValueError(f"accuracy = {accuracy!r}: must be one of {', '.join(map(repr, ACCURACIES))} or a number in (0, 1)")
-        return ACCURACIES[accuracy]
-    if not (_is_number(accuracy) and 0 < accuracy < 1):
-        raise ValueError(f"accuracy = {accuracy!r}: must be a relative residual in (0, 1), or one of {', '.join(map(repr, ACCURACIES))}")
-    return float(accuracy)
 
 
 def _from_rule(rule: Rule, t: Traits, rtol: float) -> Recommendation:

@@ -6,9 +6,9 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import Enum
+from enum import StrEnum
 from functools import cache
-from typing import Any, Protocol, get_args, get_type_hints
+from typing import Any, Literal, Protocol, get_args, get_type_hints, runtime_checkable
 
 import numpy as np
 import warp as wp
@@ -26,16 +26,12 @@ SMALLEST = 1e-138  # a norm from which on residuals 16 digits smaller have squar
 FLOOR_MARGIN = 8.0  # a stagnated residual within this multiple of the rounding estimate is called the precision's floor
 
 
-class Precision(Enum):
+class Precision(StrEnum):
     """Types of iterate and corrections: `mixed` keeps the iterate in float64 and computes corrections in float32."""
 
     MIXED = "mixed"
     SINGLE = "single"
     DOUBLE = "double"
-
-    @classmethod
-    def _missing_(cls, value: object) -> Precision:
-        raise ValueError(f"precision = {value!r}: must be 'mixed', 'single' or 'double'")
 
     @property
     def iterate(self) -> Any:
@@ -51,6 +47,9 @@ class Precision(Enum):
     def epsilon(self) -> float:
         """Rounding unit of the iterate."""
         return float(np.finfo(np.float32 if self is Precision.SINGLE else np.float64).eps)
+
+
+PrecisionName = Literal[tuple(map(str, Precision))]
 
 
 @dataclass(frozen=True)
@@ -129,6 +128,7 @@ class RoundedIterate:
             convert(self._rounded, x)
 
 
+@runtime_checkable
 class Solver(Protocol):
     """A method is its settings; its memory is a Workspace."""
 

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
+
+from annotated_types import Gt
+
+from warp_lcp.settings import Count, CountOrZero, NonNegative, OrInfinite, Settings, ShareOrZero
 
 
 @dataclass(frozen=True, kw_only=True)
-class StoppingCriteria:
+class StoppingCriteria(Settings):
     """Say when a solve is done: ||r|| <= max(atol, rtol ||r(clip(0, l, u))||), r the natural residual in float64.
 
     Args:
@@ -29,30 +34,15 @@ class StoppingCriteria:
         >>> StoppingCriteria(rtol=2)
         Traceback (most recent call last):
         ...
-        ValueError: rtol = 2: must be in [0, 1)
+        warp_lcp.settings.SettingError: rtol = 2: must be in [0, 1)
     """
 
-    rtol: float = 1e-6
-    atol: float = 0.0
-    max_iterations: int = 100
-    patience: int = 30
-    divergence: float = 1e8
-    max_seconds: float = math.inf
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        if not 0 <= self.rtol < 1:
-            raise ValueError(f"rtol = {self.rtol}: must be in [0, 1)")
-        if not (self.atol >= 0 and math.isfinite(self.atol)):
-            raise ValueError(f"atol = {self.atol}: must be finite and >= 0, in the units of y")
-        for name, least in (("max_iterations", 0), ("patience", 1)):
-            value = getattr(self, name)
-            if not (value >= least and value == math.floor(value)):
-                raise ValueError(f"{name} = {value}: must be an integer >= {least}")
-        if not self.divergence > 1:
-            raise ValueError(f"divergence = {self.divergence}: must be > 1")
-        if not self.max_seconds > 0:
-            raise ValueError(f"max_seconds = {self.max_seconds}: must be > 0, or inf for no limit")
+    rtol: ShareOrZero = 1e-6
+    atol: NonNegative = 0.0
+    max_iterations: CountOrZero = 100
+    patience: Count = 30
+    divergence: Annotated[float, Gt(1), OrInfinite] = 1e8
+    max_seconds: Annotated[float, Gt(0), OrInfinite] = math.inf
 
     def tolerance(self, reference: float) -> float:
         """Return the absolute tolerance for a reference residual norm."""

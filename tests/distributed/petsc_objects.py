@@ -14,7 +14,7 @@ from petsc_oracles import level_matrix, shared_problem, solve_ours, whole_field
 import warp_lcp as wl
 from warp_lcp.distributed.petsc_matrix import PetscGrid
 from warp_lcp.distributed.ranks import Ranks, petsc
-from warp_lcp.multigrid.hierarchy import CycleSettings
+from warp_lcp.multigrid.cycle_settings import CycleSettings
 
 
 def on_all_cells(problem, free):

@@ -64,9 +64,9 @@ def test_inverse_mass_inverts_what_the_energy_weighs():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Sphere(0.0), "radius"),
+        (lambda: Sphere(0.0), "radius = 0.0: must be a finite number > 0"),
         (lambda: Box((1.0, -1.0, 1.0)), "half"),
-        (lambda: Gear(1.0, 0.1, 0.1, 0), "bar"),
+        (lambda: Gear(1.0, 0.1, 0.1, 0), "bars = 0: must be an integer >= 1"),
         (lambda: RigidBodies([], [], []), "shapes is empty"),
         (lambda: RigidBodies([Sphere(1.0)], [-1.0], [[0, 0, 0]]), "mass holds"),
         (lambda: RigidBodies([Sphere(1.0)], [1.0], [[0, 0]]), "position has shape"),

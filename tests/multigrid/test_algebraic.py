@@ -7,7 +7,8 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.krylov import ConjugateGradient
-from warp_lcp.multigrid.algebraic import AlgebraicHierarchy, AlgebraicSettings
+from warp_lcp.multigrid.algebraic import AlgebraicHierarchy
+from warp_lcp.multigrid.cycle_settings import AlgebraicSettings
 
 
 def poisson(*counts):

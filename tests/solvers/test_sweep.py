@@ -231,7 +231,7 @@ def test_spectrum_is_that_of_the_scaled_matrix():
     [
         ({"omega": 2.0}, r"must be in \(0, 2\)"),
         ({"direction": "up"}, "must be 'forward'"),
-        ({"order": "random"}, "must be one of 'natural', 'multicolor', 'magnitude', 'greedy'"),
+        ({"order": "random"}, "must be 'natural', 'multicolor', 'magnitude' or 'greedy'"),
         ({"order": "greedy", "permutation": (0, 1)}, "cannot be combined"),
         ({"precision": "half"}, "half"),
     ],

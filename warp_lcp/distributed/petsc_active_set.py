@@ -9,10 +9,11 @@ import warp as wp
 
 from warp_lcp.distributed.petsc_matrix import PetscGrid
 from warp_lcp.distributed.ranks import petsc
-from warp_lcp.multigrid.hierarchy import CycleSettings
+from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
-from warp_lcp.solve import Step
+from warp_lcp.settings import Count, CountOrZero, Settings, Share
+from warp_lcp.solve import PrecisionName, Step
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
 from warp_lcp.solvers.principal_system import GridSystem, PrincipalSystem
 
@@ -20,7 +21,7 @@ LEAST = 0.5  # by which a linear solve reduces its residual at least
 
 
 @dataclass(frozen=True, kw_only=True)
-class PetscActiveSet:
+class PetscActiveSet(Settings):
     """The primal-dual active set as the outer loop, PETSc's KSP for what is linear (Hintermueller, Ito, Kunisch 2003; [Book] 2.4.1).
 
     Unknowns with x - y / A_ii outside their bounds are held there; PETSc solves on the others, matrix-free, by conjugate gradients
@@ -57,18 +58,14 @@ class PetscActiveSet:
     needs: ClassVar[str] = "positive definite"
     distributed: ClassVar[bool] = True
 
-    precision: str = "mixed"
-    monotone_cycles: int = 2
-    eta: float = 0.1
-    max_linear_iterations: int = 200
-    backtracks: int = 6
-    memory: int = 4
+    precision: PrecisionName = "mixed"
+    monotone_cycles: CountOrZero = 2
+    eta: Share = 0.1
+    max_linear_iterations: Count = 200
+    backtracks: CountOrZero = 6
+    memory: Count = 4
     prefix: str = ""
     cycle: CycleSettings = field(default_factory=CycleSettings)
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        self.as_newton()
 
     def as_newton(self) -> MinimumMapNewton:
         """Return the method with these settings whose linear solves are our own."""

@@ -17,7 +17,8 @@ import warp as wp
 
 from warp_lcp.distributed.ranks import petsc
 from warp_lcp.layout import zeros
-from warp_lcp.multigrid.hierarchy import CycleSettings, Hierarchy
+from warp_lcp.multigrid.cycle_settings import CycleSettings
+from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.multigrid.turning import make_hierarchy
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.operators.stencil import Stencil

@@ -273,7 +273,7 @@ def solve(
     ] = None,
     method: Annotated[str | None, typer.Option(metavar="NAME", help="The fastest for A unless given.", show_default=False)] = None,
     tolerance: Annotated[float, typer.Option(metavar="T", help="Of the residual, relative to the one at clip(0, lower, upper).")] = 1e-6,
-    max_iterations: Annotated[int, typer.Option(min=0, metavar="N", help="The most steps.")] = 1000,
+    max_iterations: Annotated[int, typer.Option(metavar="N", help="The most steps.")] = 1000,
     max_seconds: Annotated[
         float, typer.Option(metavar="S", help="The most wall time of the solve; no limit unless given.", show_default=False)
     ] = math.inf,

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from warp_lcp.driver.table import Angles, Complaint, Table, Vector, counted
+from warp_lcp.settings import Positive
 
 if TYPE_CHECKING:
     from warp_lcp.grid import motion
@@ -93,7 +94,7 @@ class SinusoidMotion(PrescribedMotion):
     """A swing of sin(360 degrees time / period + phase) times a shift, an angle or both."""
 
     kind: Literal["sinusoid"] = "sinusoid"
-    period: float = Field(gt=0, description="[s]")
+    period: Positive = Field(description="[s]")
     amplitude: Vector | None = Field(default=None, description="of the shift, along each axis [m]")
     phase: float = Field(default=0.0, description="[degrees, not radians]; 0: in the middle at time 0, -90: at rest at one end")
     angle: float | None = Field(default=None, description="amplitude of the turn [degrees]")

@@ -17,6 +17,7 @@ from warp_lcp.driver.scene import Scene
 from warp_lcp.driver.shapes import BODY_FRICTION, STICKS, Drain, MaterialProperties, Source
 from warp_lcp.driver.table import Complaint, Table
 from warp_lcp.grid.surface_mesh import MESH_LATTICE_BYTES, MESH_POINT_BYTES, MESH_SOLID_BYTES
+from warp_lcp.settings import Count, CountOrZero, Part, Share
 
 # Measured at 96^3 as the growth of a process on the CPU, first step included.
 GRID_BYTES = 36  # fields of the grid, a cell
@@ -39,9 +40,9 @@ LATTICE_BYTES = 50  # a point of one plane of cells, while particles are chosen 
 class Reseed(Table):
     """[particles.reseed]: evens out particles deep in the material; off unless the table is there."""
 
-    every: int = Field(default=2, ge=1, description="steps from one time to the next")
-    min: int | None = Field(default=None, ge=1, description="particles in a cell, fewer are filled up; 3/8 of those at rest unless given")
-    max: int | None = Field(default=None, ge=1, description="particles in a cell, more are handed on; twice those at rest unless given")
+    every: Count = Field(default=2, description="steps from one time to the next")
+    min: Count | None = Field(default=None, description="particles in a cell, fewer are filled up; 3/8 of those at rest unless given")
+    max: Count | None = Field(default=None, description="particles in a cell, more are handed on; twice those at rest unless given")
 
 
 class NarrowBandSettings(Table):
@@ -55,9 +56,9 @@ class ParticleSettings(Table):
 
     per_axis: int = Field(default=2, ge=1, le=4, description="particles along the edge of a cell at the start")
     transfer: Literal["apic", "flip", "pic"] = Field(default="apic", description="flip is livelier and noisier, pic damps")
-    flip_ratio: float = Field(default=0.95, ge=0, le=1, description="the share of FLIP when transfer is flip; the rest is PIC")
-    jitter: float = Field(default=0.25, ge=0, le=1, description="random displacement at the start, a fraction of the particles' distance")
-    seed: int = Field(default=2015, ge=0, description="of the random displacements")
+    flip_ratio: Part = Field(default=0.95, description="the share of FLIP when transfer is flip; the rest is PIC")
+    jitter: Part = Field(default=0.25, description="random displacement at the start, a fraction of the particles' distance")
+    seed: CountOrZero = Field(default=2015, description="of the random displacements")
     reseed: Reseed | None = None
     narrow_band: NarrowBandSettings | None = None
 
@@ -70,8 +71,8 @@ class ParticleSettings(Table):
 class DensityCorrectionSettings(Table):
     """[density_correction]: moves particles apart that have come too close; without the table as soon as a thousandth crowds."""
 
-    every: int = Field(default=1, ge=0, description="steps from one correction to the next; 0 switches it off")
-    tolerance: float = Field(default=1e-2, gt=0, lt=1, description="the relative residual to reach")
+    every: CountOrZero = Field(default=1, description="steps from one correction to the next; 0 switches it off")
+    tolerance: Share = Field(default=1e-2, description="the relative residual to reach")
     max_density: float | None = Field(
         default=None, gt=0, le=2, description="of a cell, in units of the density at rest; 1 + 0.1 / particles.per_axis unless given"
     )

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, ClassVar, Literal, Self
 from unicodedata import normalize
 
 import numpy as np
-from pydantic import AfterValidator, Field, WrapValidator, model_validator
-from pydantic_core import PydanticCustomError, PydanticKnownError
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic_core import PydanticCustomError
 
 from warp_lcp.driver.camera import Camera
 from warp_lcp.driver.motions import SinusoidMotion
@@ -18,32 +18,21 @@ from warp_lcp.driver.shapes import Liquid, Shape, Solid, Wall
 from warp_lcp.driver.table import Complaint, Problem, SceneError, Table, Vector, refuse, validate
 from warp_lcp.grid.sides import SIDES
 from warp_lcp.grid.solid_notes import STRAY
+from warp_lcp.settings import Count, CountOrZero, Positive, Share, adapter
+from warp_lcp.solve import PrecisionName
 from warp_lcp.solvers.registry import grid_methods
 
 __all__ = ["Complaint", "Liquid", "Problem", "Scene", "SceneError", "Shape", "Solid", "Table", "Vector", "Wall", "validate"]
 
-Length = Annotated[float, Field(gt=0)]
-
 GridMethod = Literal[grid_methods()]
 
 
-def _tolerance(value: Any, handler: Callable[[Any], float | str]) -> float | str:
+def _tolerance(value: Any) -> Any:
     """Return a number in (0, 1) or "auto"; a wrong one is refused as any other number is, without a word of the alternative's type."""
-    if value == "auto":
-        return "auto"
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if not number:
-        raise PydanticKnownError("float_type")
-    if value >= 1.0:
-        raise PydanticKnownError("less_than", {"lt": 1.0})
-    if value <= 0.0:
-        raise PydanticKnownError("greater_than", {"gt": 0.0})
-    return handler(float(value))
+    return value if value == "auto" else adapter(Share).validate_python(value)
 
 
-Tolerance = Annotated[
-    Annotated[float, Field(gt=0, lt=1)] | Literal["auto"], WrapValidator(_tolerance, json_schema_input_type=float | Literal["auto"])
-]
+Tolerance = Annotated[Share | Literal["auto"], BeforeValidator(_tolerance, json_schema_input_type=Share | Literal["auto"])]
 
 PRESET_KEY = "sets time step, tolerance and more, where the scene does not; none unless given"
 
@@ -77,11 +66,11 @@ class About(Table):
 class Time(Table):
     """[time]: how long, how often to look, how large the steps may be."""
 
-    duration: float = Field(gt=0, description="the simulated time [s]")
-    frames_per_second: float = Field(default=30.0, gt=0, description="frames per simulated second [1/s]")
+    duration: Positive = Field(description="the simulated time [s]")
+    frames_per_second: Positive = Field(default=30.0, description="frames per simulated second [1/s]")
     cfl: float = Field(default=2.0, ge=1e-3, description="a Courant number, usually 1 to 4")
-    dt_max: float = Field(default=0.02, gt=0, description="the longest step [s]")
-    dt_min: float = Field(default=1e-6, gt=0, description="the shortest step that the CFL number or a retry may ask for [s]")
+    dt_max: Positive = Field(default=0.02, description="the longest step [s]")
+    dt_min: Positive = Field(default=1e-6, description="the shortest step that the CFL number or a retry may ask for [s]")
 
     @property
     def frame_count(self) -> int:
@@ -98,7 +87,7 @@ class Domain(Table):
 
     later: ClassVar = {"periodic": frozenset({True})}
     elsewhere: ClassVar = {"friction": "granular", "periodic": "granular"}
-    size: list[Length] = Field(min_length=2, max_length=3, description="the sides of the domain [m], [x, y] or [x, y, z]")
+    size: list[Positive] = Field(min_length=2, max_length=3, description="the sides of the domain [m], [x, y] or [x, y, z]")
     resolution: int = Field(ge=2, le=4096, description="cells along the longest side")
     wall: Wall = Field(default="separating", description="whether material may let go of the domain's walls")
     solids: Literal["cut-cell", "voxel"] = Field(
@@ -114,7 +103,7 @@ class Physics(Table):
     """[physics]: the constants of the world."""
 
     gravity: Vector = Field(description="an acceleration [m/s^2]; 9.81 down along y unless given")
-    density: float = Field(default=1000.0, gt=0, description="of the material [kg/m^3]")
+    density: Positive = Field(default=1000.0, description="of the material [kg/m^3]")
 
 
 class Solver(Table):
@@ -126,8 +115,8 @@ class Solver(Table):
         default=1e-4,
         description='the relative residual to reach; "auto": what leaves a tenth of the error that the time step makes',
     )
-    precision: Literal["mixed", "single", "double"] = Field(default="mixed", description="of the method's arithmetic")
-    max_iterations: int = Field(default=100, ge=1, description="iterations before the step counts as failed")
+    precision: PrecisionName = Field(default="mixed", description="of the method's arithmetic")
+    max_iterations: Count = Field(default=100, description="iterations before the step counts as failed")
 
 
 class Output(Table):
@@ -150,9 +139,9 @@ class Output(Table):
     diagnostics: bool = Field(
         default=True, description="measure what only the log shows: volume and divergence of liquid, yielding and dissipation of sand"
     )
-    checkpoint_every: int = Field(default=50, ge=0, description="steps between checkpoints; 0: not by steps")
-    checkpoint_minutes: float | None = Field(default=None, gt=0, description="the most minutes of real time between checkpoints")
-    checkpoints_kept: int = Field(default=3, ge=1, description="how many of the newest checkpoints stay")
+    checkpoint_every: CountOrZero = Field(default=50, description="steps between checkpoints; 0: not by steps")
+    checkpoint_minutes: Positive | None = Field(default=None, description="the most minutes of real time between checkpoints")
+    checkpoints_kept: Count = Field(default=3, description="how many of the newest checkpoints stay")
 
 
 class Scene(Table):

@@ -13,6 +13,7 @@ from pydantic_core import PydanticCustomError
 
 from warp_lcp.driver.motions import Motion
 from warp_lcp.driver.table import Angles, Complaint, Table, Vector, counted
+from warp_lcp.settings import NonNegative, Part, Positive
 
 if TYPE_CHECKING:
     from warp_lcp.grid.solids import Geometry, Placement
@@ -62,7 +63,7 @@ class Shape(Table):
         default=None,
         description="the point that scale and rotate leave where it is, such as the shape's center [m]; else the origin",
     )
-    scale: float = Field(default=1.0, gt=0, description="a factor, the same along every axis")
+    scale: Positive = Field(default=1.0, description="a factor, the same along every axis")
     invert: bool = Field(default=False, description="true: everything but the shape")
 
     @abstractmethod
@@ -155,7 +156,7 @@ class Sphere(Shape):
 
     shape: Literal["sphere"] = "sphere"
     center: Vector = Field(description="a point [m]")
-    radius: float = Field(gt=0, description="a length [m]")
+    radius: Positive = Field(description="a length [m]")
 
     def to_geometry(self, folder: Path, dimension: int) -> Geometry:
         """Return the ball."""
@@ -170,7 +171,7 @@ class Capsule(Shape):
     shape: Literal["capsule"] = "capsule"
     start: Vector = Field(alias="from", description="one end of the axis [m]")
     end: Vector = Field(alias="to", description="the other end of the axis [m]")
-    radius: float = Field(gt=0, description="a length [m]")
+    radius: Positive = Field(description="a length [m]")
 
     def to_geometry(self, folder: Path, dimension: int) -> Geometry:
         """Return the capsule."""
@@ -242,7 +243,7 @@ class SolidProperties(Shape):
         description=f"of its surface, against sand and between bodies and walls: {FRICTIONS}; domain.friction unless given, "
         f"{BODY_FRICTION:g} for a rigid body in a liquid",
     )
-    restitution: float = Field(default=0.0, ge=0, le=1, description="of a rigid body: the part of the speed of an impact that comes back")
+    restitution: Part = Field(default=0.0, description="of a rigid body: the part of the speed of an impact that comes back")
 
     @property
     def is_body(self) -> bool:
@@ -337,7 +338,7 @@ class LiquidMesh(MaterialProperties, Mesh):
 class Schedule(Table):
     """When something runs."""
 
-    begin: float = Field(alias="start", default=0.0, ge=0, description="when it starts to run [s]")
+    begin: NonNegative = Field(alias="start", default=0.0, description="when it starts to run [s]")
     stop: float | None = Field(default=None, description="when it no longer runs [s]; it goes on unless given")
 
     def schedule_complaints(self) -> list[Complaint]:

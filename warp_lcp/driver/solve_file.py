@@ -18,6 +18,7 @@ from warp_lcp.nearest import nearest
 from warp_lcp.operators import DenseOperator, SparseOperator
 from warp_lcp.problem import LCP
 from warp_lcp.result import SolveResult
+from warp_lcp.settings import SettingError
 from warp_lcp.solvers.default import default_method, solve
 from warp_lcp.solvers.registry import METHODS
 from warp_lcp.stopping import StoppingCriteria
@@ -120,7 +121,9 @@ def solve_files(
     try:
         operator = SparseOperator(A, device=device) if scipy.sparse.issparse(A) else DenseOperator(A, device=device)
         problem = LCP(operator, b, *sides)
-        solver = default_method(problem) if method is None else _method(method, operator)
+        family = "sparse" if isinstance(operator, SparseOperator) else "dense"
+        takes = f"take {family} matrices", lambda kind: family in kind.supports
+        solver = default_method(problem) if method is None else method_named(method, *takes)
         result = solve(problem, solver, stopping=stopping)
     except ValueError as error:
         raise ProblemError(str(error)) from error
@@ -134,12 +137,11 @@ def criteria(tolerance: float, max_iterations: int, max_seconds: float) -> Stopp
     Raises:
         ProblemError: an option is outside its range; the message names it.
     """
-    if not max_seconds > 0:
-        raise ProblemError(f"--max-seconds {max_seconds}: must be > 0")
     try:
         return StoppingCriteria(rtol=tolerance, max_iterations=max_iterations, max_seconds=max_seconds)
-    except ValueError as error:
-        raise ProblemError(f"--tolerance {tolerance}: {error}") from error
+    except SettingError as error:
+        option = "tolerance" if error.name == "rtol" else error.name.replace("_", "-")
+        raise ProblemError(f"--{option} {error.value}: must be {error.rule}") from error
 
 
 def read_matrix(path: Path) -> Any:
@@ -204,15 +206,20 @@ def _bound(value: str, n: int, option: str) -> float | np.ndarray:
         return read_vector(Path(value), n, infinite=True)
 
 
-def _method(name: str, operator: Any) -> Any:
-    """Return a method by its name."""
+def method_named(name: str, what: str, takes: Callable[[Any], bool]) -> Any:
+    """Return a method by its name.
+
+    Args:
+        name: in `METHODS`.
+        what: those do that may be chosen, such as "take grids".
+        takes: whether a class does.
+
+    Raises:
+        ProblemError: there is no such method, or it does not.
+    """
     if name not in METHODS:
         raise ProblemError(f"--method {name}: no such method; {nearest(name, METHODS)}")
-    family = "sparse" if isinstance(operator, SparseOperator) else "dense"
-    takes = {known for known, kind in METHODS.items() if family in getattr(kind, "supports", {family})}
-    if name not in takes:
-        raise ProblemError(f"--method {name}: does not take {family} matrices; choose from {', '.join(sorted(takes))}")
-    try:
-        return METHODS[name]()
-    except (ImportError, TypeError) as error:
-        raise ProblemError(f"--method {name}: {error}") from error
+    if not takes(METHODS[name]):
+        others = ", ".join(sorted(known for known, kind in METHODS.items() if takes(kind)))
+        raise ProblemError(f"--method {name}: does not {what}; choose from {others}")
+    return METHODS[name]()

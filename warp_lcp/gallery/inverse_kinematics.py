@@ -11,6 +11,7 @@ from warp_lcp.gallery.articulated_figure import ArticulatedFigure
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem import LCP
 from warp_lcp.result import SolveStatus
+from warp_lcp.settings import CountOrZero, NonNegative, Positive, Settings
 from warp_lcp.solve import Solver, solve
 from warp_lcp.solvers.incremental_pivoting import IncrementalPivoting
 from warp_lcp.stopping import StoppingCriteria
@@ -103,7 +104,7 @@ class Pose:
 
 
 @dataclass(frozen=True, kw_only=True)
-class InverseKinematics:
+class InverseKinematics(Settings):
     """Minimize 1/2 |g - f(theta)|^2 within joint limits, a boxed LCP a step ([Book] 1.3.4, eqs. 1.130-1.144).
 
     The Gauss-Newton model at theta, (J'J + mu I) d - J'(g - f) = y with max(l - theta, -radius) <= d <= min(u - theta, radius), is solved
@@ -136,23 +137,13 @@ class InverseKinematics:
     """
 
     method: Solver = field(default_factory=IncrementalPivoting)
-    damping: float = 1e-4
-    radius: float = 0.5
-    tolerance: float = 1e-7
-    max_iterations: int = 500
+    damping: NonNegative = 1e-4
+    radius: Positive = 0.5
+    tolerance: Positive = 1e-7
+    max_iterations: CountOrZero = 500
     curvature: bool = False
     multipliers: bool = False
     device: Any = None
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        if not (self.damping >= 0 and np.isfinite(self.damping)):
-            raise ValueError(f"damping = {self.damping}: must be finite and >= 0, in units of reach^2")
-        for name in ("radius", "tolerance"):
-            if not (getattr(self, name) > 0 and np.isfinite(getattr(self, name))):
-                raise ValueError(f"{name} = {getattr(self, name)}: must be finite and > 0, in radians")
-        if self.max_iterations < 0:
-            raise ValueError(f"max_iterations = {self.max_iterations}: must be >= 0")
 
     def solve(self, figure: ArticulatedFigure, goals: Vector, start: Vector | None = None) -> Pose:
         """Return a pose whose end effectors are as near to their goals as they come from the start.

@@ -12,10 +12,11 @@ import warp as wp
 from warp_lcp.gallery.problem import Problem
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID, GridPoisson
+from warp_lcp.settings import Part, Positive, Settings
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plant:
+class Plant(Settings):
     """How a solution is chosen.
 
     Args:
@@ -29,19 +30,11 @@ class Plant:
         ValueError: a share is outside [0, 1], or the size is not positive.
     """
 
-    active: float = 0.3
-    weak: float = 0.0
+    active: Part = 0.3
+    weak: Part = 0.0
     boxed: bool = False
-    mixed: float = 0.0
-    size: float = 1.0
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        for name in ("active", "weak", "mixed"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} = {getattr(self, name)}: must be in [0, 1]")
-        if not self.size > 0:
-            raise ValueError(f"size = {self.size}: must be > 0")
+    mixed: Part = 0.0
+    size: Positive = 1.0
 
 
 def planted(A: Any, rng: np.random.Generator, plant: Plant, *, name: str, facts: frozenset[str]) -> Problem:

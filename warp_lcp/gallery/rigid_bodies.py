@@ -8,23 +8,20 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse
 
+from warp_lcp.settings import Count, Positive, Settings
+
 FIXED = np.inf  # mass [kg] of a body that does not move
 
 
 @dataclass(frozen=True)
-class Sphere:
+class Sphere(Settings):
     """A ball of a radius [m].
 
     Raises:
         ValueError: the radius is not positive.
     """
 
-    radius: float
-
-    def __post_init__(self) -> None:
-        """Check the radius."""
-        if not 0 < self.radius < np.inf:
-            raise ValueError(f"radius = {self.radius}: must be > 0 and finite, in m")
+    radius: Positive
 
     @property
     def reach(self) -> float:
@@ -67,7 +64,7 @@ class Box:
 
 
 @dataclass(frozen=True)
-class Gear:
+class Gear(Settings):
     """Bars that cross in the center, in the body's xy plane: 2 `bars` teeth.
 
     Args:
@@ -80,15 +77,10 @@ class Gear:
         ValueError: a length is not positive, or there is no bar.
     """
 
-    radius: float
-    tooth: float
-    thickness: float
-    bars: int = 3
-
-    def __post_init__(self) -> None:
-        """Check lengths and number."""
-        if self.bars < 1 or not all(0 < v < np.inf for v in (self.radius, self.tooth, self.thickness)):
-            raise ValueError(f"{self}: must have lengths > 0, in m, and at least one bar")
+    radius: Positive
+    tooth: Positive
+    thickness: Positive
+    bars: Count = 3
 
     @property
     def reach(self) -> float:

@@ -25,6 +25,7 @@ from warp_lcp.grid.solids_kernels import (
     sphere_distance,
 )
 from warp_lcp.grid.triangle_mesh import ClosedSurface, load_surface
+from warp_lcp.settings import Positive, checked
 
 if TYPE_CHECKING:
     from warp_lcp.grid.motion import Pose
@@ -54,13 +55,6 @@ def _vector(name: str, value: Vector) -> tuple[float, ...]:
     if not np.isfinite(numbers).all():
         raise ValueError(f"{name} must be finite, not {list(numbers)}")
     return numbers
-
-
-def _positive(name: str, value: float) -> float:
-    """Return `value` as a positive finite number."""
-    if not (np.isfinite(value) and value > 0.0):
-        raise ValueError(f"{name} must be a positive number, not {value}")
-    return float(value)
 
 
 def _in_space(vector: Vector) -> np.ndarray:
@@ -101,7 +95,7 @@ class Placement:
 
     def __post_init__(self) -> None:
         """Check the values and store them as float64."""
-        object.__setattr__(self, "scale", _positive("scale", self.scale))
+        object.__setattr__(self, "scale", checked("scale", self.scale, Positive))
         rotation = np.array(self.rotation, dtype=np.float64)
         translation = np.array(self.translation, dtype=np.float64)
         if rotation.shape != (3, 3):
@@ -293,7 +287,7 @@ class Sphere(_Shape):
     def __post_init__(self) -> None:
         """Check center and radius."""
         object.__setattr__(self, "center", _vector("center", self.center))
-        object.__setattr__(self, "radius", _positive("radius", self.radius))
+        object.__setattr__(self, "radius", checked("radius", self.radius, Positive))
 
     def _origin(self) -> np.ndarray:
         return _in_space(self.center)
@@ -335,7 +329,7 @@ class Capsule(_Shape):
             raise ValueError(f"a capsule's ends coincide at {list(start)}: use a sphere")
         object.__setattr__(self, "start", start)
         object.__setattr__(self, "end", end)
-        object.__setattr__(self, "radius", _positive("radius", self.radius))
+        object.__setattr__(self, "radius", checked("radius", self.radius, Positive))
 
     def _origin(self) -> np.ndarray:
         return _in_space(self.start)

@@ -1,5 +1,6 @@
 """Galerkin multigrid of a grid stencil."""
 
-from warp_lcp.multigrid.hierarchy import CycleSettings, Hierarchy
+from warp_lcp.multigrid.cycle_settings import CycleSettings
+from warp_lcp.multigrid.hierarchy import Hierarchy
 
 __all__ = ["CycleSettings", "Hierarchy"]

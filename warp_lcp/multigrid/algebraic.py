@@ -6,8 +6,6 @@ Galerkin products P' M P go into patterns that are known, by lists of places mad
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -21,6 +19,7 @@ from pyamg.strength import symmetric_strength_of_connection
 
 from warp_lcp.multigrid.aggregates import aggregated, symmetric_part
 from warp_lcp.multigrid.algebraic_kernels import densify_kernel, factor_kernel, invert_kernel, places_kernel, solve_kernel
+from warp_lcp.multigrid.cycle_settings import AlgebraicSettings
 from warp_lcp.operators.sparse import GATHER, PRODUCT, ROWS, SparseOperator
 from warp_lcp.program import Launch, Program
 from warp_lcp.rows import Bound, RowPass, Rows
@@ -47,42 +46,6 @@ REMAINDER = RowPass("algebraic.remainder", HEADERS / "remainder.h", "S", whole={
 PINNED = {wp.float32: 3e-5, wp.float64: 1e-13}  # of a coarsest level's diagonal: what rounding leaves of a singular component's last pivot
 WIDEST = np.iinfo(np.uint16).max  # entries of a row whose places are known
 Matrix = Any  # a scipy.sparse.csr_array
-
-
-@dataclass(frozen=True, kw_only=True)
-class AlgebraicSettings:
-    """How the hierarchy is built and cycled.
-
-    Args:
-        strength: entries below this share of sqrt(a_ii a_jj) do not aggregate. It must be above what rounding leaves of
-            entries that cancel.
-        gamma: coarse cycles a level; 1 is a V-cycle.
-        gamma_unsymmetric: the same on an unsymmetric A.
-        skew: a level whose skew part is larger than this share of its symmetric off-diagonal part takes plain aggregates: Galerkin products
-            of smoothed ones are centered differences, which are unstable where convection rules; those of plain ones stay M-matrices.
-        interval: bounds of the spectrum, in units of its l1 bound, that the two Chebyshev-Jacobi sweeps damp.
-        coarsest_cpu: the most unknowns of the coarsest level, which is inverted densely.
-        coarsest_cuda: the same on a GPU, where one thread factors it.
-        stall: a level that keeps more than this share of its unknowns is not coarsened.
-        last_sweeps: pairs of sweeps on a coarsest level that is too large to invert.
-    """
-
-    strength: float = 1e-3
-    gamma: int = 1
-    gamma_unsymmetric: int = 2
-    skew: float = 0.35
-    interval: tuple[float, float] = (0.25, 1.0)
-    coarsest_cpu: int = 64
-    coarsest_cuda: int = 24
-    stall: float = 0.7
-    last_sweeps: int = 4
-
-    @property
-    def weights(self) -> tuple[float, float]:
-        """Relaxation weights: reciprocals of the Chebyshev points of the interval."""
-        a, b = self.interval
-        points = [0.5 * (a + b) + 0.5 * (b - a) * math.cos(math.pi * (2 * i + 1) / 4) for i in range(2)]
-        return 1 / points[0], 1 / points[1]
 
 
 class DeviceMatrix:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
 
@@ -14,6 +13,7 @@ from warp_lcp.layout import Padding, zeros
 from warp_lcp.multigrid import cycle_passes as passes
 from warp_lcp.multigrid.coarsest_kernels import coarsest_kernels
 from warp_lcp.multigrid.cycle_passes import UNBOUNDED
+from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.shared_levels import share_changes, whole_counts
 from warp_lcp.multigrid.small_levels import SmallLevels, first_small
 from warp_lcp.operators.stencil import Stencil
@@ -27,45 +27,6 @@ from warp_lcp.vectors import convert
 PINNED = {wp.float32: 3e-5, wp.float64: 1e-13}
 
 Pair = tuple[wp.array[Any], wp.array[Any]]
-
-
-@dataclass(frozen=True, kw_only=True)
-class CycleSettings:
-    """How a cycle goes. The defaults are the best measured on 7-point stencils with piecewise-constant aggregates.
-
-    Args:
-        gamma: coarse cycles a level; 1 is a V-cycle, 2 a W-cycle. Where one axis is coarsened at a time, every second level
-            is visited once.
-        over_correction: factor on coarse corrections: piecewise-constant aggregates are too stiff by about two.
-        excess: factor on what AIR and held unknowns add to an aggregate's diagonal: they are nearer than the next aggregate, so the
-            over-correction applies to them in part only.
-        interval: bounds of the spectrum of D^-1 A that the two Chebyshev-Jacobi sweeps damp.
-        coarsest_cpu: the most cells of the coarsest level, which is inverted densely.
-        coarsest_cuda: the same on a GPU; without `one_launch_cuda` one thread factors it, which is quick for 16 cells only.
-        one_launch_cpu: the most cells of levels that run together in one launch of one thread; 0: none do. On the CPU a captured graph's
-            launches cost next to nothing, and its legs that stream through a level are faster.
-        one_launch_cuda: the same on a GPU, in one block of threads: 16^3 cells are few enough for one multiprocessor.
-        semi: axes whose mean weight is below this share of the strongest one's are not coarsened until they have caught up.
-        projected_sweeps: pairs of sweeps that stand for a solve on the coarsest level of a projected cycle.
-    """
-
-    gamma: int = 2
-    over_correction: float = 1.8
-    excess: float = 1.5
-    interval: tuple[float, float] = (0.5, 2.0)
-    coarsest_cpu: int = 64
-    coarsest_cuda: int = 64
-    one_launch_cpu: int = 0
-    one_launch_cuda: int = 4096
-    semi: float = 0.3
-    projected_sweeps: int = 8
-
-    @property
-    def weights(self) -> tuple[float, float]:
-        """Relaxation weights: reciprocals of the Chebyshev points of the interval."""
-        a, b = self.interval
-        points = [0.5 * (a + b) + 0.5 * (b - a) * math.cos(math.pi * (2 * i + 1) / 4) for i in range(2)]
-        return 1 / points[0], 1 / points[1]
 
 
 class Level:
@@ -502,4 +463,4 @@ def _finest_level(stencil: Stencil, real: Any, *, bounded: bool, bounds: Pair | 
     return Level(finest, real, bounded=bounded, bounds=bounds)
 
 
-__all__ = ["UNBOUNDED", "CycleSettings", "Hierarchy", "Level"]
+__all__ = ["UNBOUNDED", "Hierarchy", "Level"]

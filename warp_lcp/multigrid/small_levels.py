@@ -11,7 +11,8 @@ from warp_lcp.program import Launch
 from warp_lcp.rows import Bound, Sequence
 
 if TYPE_CHECKING:
-    from warp_lcp.multigrid.hierarchy import CycleSettings, Level
+    from warp_lcp.multigrid.cycle_settings import CycleSettings
+    from warp_lcp.multigrid.hierarchy import Level
 
 
 class SmallLevels:

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.multigrid.hierarchy import CycleSettings, Hierarchy
+from warp_lcp.multigrid.cycle_settings import CycleSettings
+from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.multigrid.turning_kernels import sample_kernel
 from warp_lcp.operators.stencil import Stencil
 from warp_lcp.program import Program

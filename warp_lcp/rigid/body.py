@@ -9,6 +9,7 @@ import numpy as np
 
 from warp_lcp.grid.motion import Pose
 from warp_lcp.rigid.mass_properties import MassProperties
+from warp_lcp.settings import NonNegative, Part, checked
 
 SAME_TURN = 1e-15  # [rad]: half a step's turn that no longer changes
 SMALL_TURN = 1e-5  # [rad]: its third power is nothing beside 1
@@ -51,11 +52,8 @@ class RigidBody:
         angular_velocity: np.ndarray | None = None,
     ) -> None:
         """Place the body where the scene does."""
-        if not 0.0 <= friction < np.inf:
-            raise ValueError(f"friction = {friction}: must be >= 0 and finite")
-        if not 0.0 <= restitution <= 1.0:
-            raise ValueError(f"restitution = {restitution}: must be in [0, 1]")
-        self.properties, self.name, self.friction, self.restitution = properties, name, friction, restitution
+        self.friction, self.restitution = checked("friction", friction, NonNegative), checked("restitution", restitution, Part)
+        self.properties, self.name = properties, name
         self.position, self.rotation = properties.center.copy(), np.eye(3)
         self.momentum = properties.mass * _three(velocity)
         self.angular_momentum = properties.inertia @ _three(angular_velocity)

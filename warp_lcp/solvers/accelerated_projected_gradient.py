@@ -11,7 +11,8 @@ import warp as wp
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.rows import Rows
-from warp_lcp.solve import IterateInPlace, Precision, RoundedIterate, Step
+from warp_lcp.settings import Count, Positive, Settings
+from warp_lcp.solve import IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
 from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers.spectrum import positive_diagonal, scaled_spectrum
 from warp_lcp.vectors import Reduction
@@ -22,7 +23,7 @@ NOISE = 1e-20  # relative (squared) length of a step below which its curvature i
 
 
 @dataclass(frozen=True, kw_only=True)
-class AcceleratedProjectedGradient:
+class AcceleratedProjectedGradient(Settings):
     """Iterate the proximal map x = prox_K(x - r (A x + b)) of the box K with momentum ([Book] 1.1.4).
 
     With the diagonal D of A as metric and L = lambda_max(D^-1/2 A D^-1/2): x+ = clip(z - D^-1 (A z + b) / L, l, u), where z = x + beta
@@ -42,17 +43,9 @@ class AcceleratedProjectedGradient:
     supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
     needs: ClassVar[str] = "symmetric positive semidefinite A"
 
-    lipschitz: float | None = None
-    estimate_steps: int = 20
-    precision: str = "mixed"
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        if self.lipschitz is not None and not self.lipschitz > 0:
-            raise ValueError(f"lipschitz = {self.lipschitz}: must be > 0")
-        if self.estimate_steps < 1:
-            raise ValueError(f"estimate_steps = {self.estimate_steps}: must be >= 1")
-        Precision(self.precision)
+    lipschitz: Positive | None = None
+    estimate_steps: Count = 20
+    precision: PrecisionName = "mixed"
 
     def init(self, problem: LCP) -> GradientWorkspace:
         """Return a workspace.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -13,12 +12,13 @@ from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem import LCP
 from warp_lcp.rows.layout import put
-from warp_lcp.solve import Precision, Solver, Step
-from warp_lcp.solvers.blocked_gauss_seidel_kernels import Blocks, block_kernels
+from warp_lcp.settings import Count, Relaxation, Settings, Share
+from warp_lcp.solve import Precision, PrecisionName, Solver, Step
+from warp_lcp.solvers.blocked_gauss_seidel_kernels import BlockLists, block_kernels
 from warp_lcp.solvers.grid_lines import GridLines, LineSweep
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
-from warp_lcp.solvers.partition import blocks_of_size, color_blocks, given_blocks
-from warp_lcp.solvers.psor import DIRECTIONS, SweepWorkspace
+from warp_lcp.solvers.partition import Blocks, blocks_of_size, color_blocks, given_blocks
+from warp_lcp.solvers.psor import DIRECTIONS, Direction, SweepWorkspace
 from warp_lcp.solvers.staggering import StaggeringWorkspace
 from warp_lcp.solvers.sweep import Rows, bound_operands
 
@@ -27,7 +27,7 @@ MOST = 6  # unknowns of a block that a thread solves by active sets
 
 
 @dataclass(frozen=True, kw_only=True)
-class BlockedGaussSeidel:
+class BlockedGaussSeidel(Settings):
     """Solve blocks of unknowns in turn, the others held ([Book] 2.2.3).
 
     With blocks of one unknown it is projected Gauss-Seidel, with one block its solver. Strong coupling within a block, as of a contact's
@@ -57,26 +57,18 @@ class BlockedGaussSeidel:
     needs: ClassVar[str] = "symmetric positive definite A for a proof of convergence"
     affine_bounds: ClassVar[bool] = True
 
-    blocks: int | GridLines | Sequence[Any] | None = None
+    blocks: Count | GridLines | Blocks | None = None
     sub_solver: Solver | None = None
-    omega: float = 1.0
-    direction: str = "forward"
-    eta: float = 1e-2
-    precision: str = "mixed"
+    omega: Relaxation = 1.0
+    direction: Direction = "forward"
+    eta: Share = 1e-2
+    precision: PrecisionName = "mixed"
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        if isinstance(self.blocks, int) and self.blocks < 1:
-            raise ValueError(f"blocks = {self.blocks}: must be >= 1")
-        if not 0 < self.omega < 2:
-            raise ValueError(f"omega = {self.omega}: must be in (0, 2)")
-        if not 0 < self.eta < 1:
-            raise ValueError(f"eta = {self.eta}: must be in (0, 1)")
-        if self.direction not in DIRECTIONS:
-            raise ValueError(f"direction = {self.direction!r}: must be 'forward', 'backward' or 'symmetric'")
+        super().__post_init__()
         if self.sub_solver is not None and self.omega != 1:
             raise ValueError(f"omega = {self.omega}: must be 1 with a sub_solver")
-        Precision(self.precision)
 
     def init(self, problem: LCP) -> BlockWorkspace | LineWorkspace | StaggeringWorkspace:
         """Return a workspace.
@@ -131,7 +123,7 @@ class BlockWorkspace(SweepWorkspace):
         self._starts = [0, *np.cumsum([len(color) for color in colors]).tolist()]
         arrays = [np.concatenate([[0], np.cumsum(sizes)]), members, owner, place, np.concatenate(colors)]
         names = ("first", "rows", "owner", "place", "order")
-        given = put(Blocks(), {name: wp.array(v, dtype=wp.int32, device=device) for name, v in zip(names, arrays, strict=True)})
+        given = put(BlockLists(), {name: wp.array(v, dtype=wp.int32, device=device) for name, v in zip(names, arrays, strict=True)})
         self._operands = [rows.operand, problem.b, *bound_operands(problem), wp.float64(settings.omega), given]
         self._kernel = block_kernels(rows.values.dtype, max(sizes)).sweep
 

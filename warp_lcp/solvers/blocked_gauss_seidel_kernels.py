@@ -17,7 +17,7 @@ SINGULAR = wp.constant(wp.float64(1e-13))  # of the largest entry
 
 
 @wp.struct
-class Blocks:
+class BlockLists:
     """Blocks: where each begins in `rows`, those, of which block each row is and where in it, and the order of the blocks."""
 
     first: i32
@@ -227,8 +227,9 @@ def block_kernels(a_type: Any, m: int) -> SimpleNamespace:
 
     @wp.kernel(enable_backward=False, module=name)
     def sweep(
-        A: Rows, b: f64, lowers: AffineSide, uppers: AffineSide, omega: wp.float64, B: Blocks, begin: int, each: int, forward: bool, x: f64
-    ):
+        A: Rows, b: f64, lowers: AffineSide, uppers: AffineSide, omega: wp.float64, B: BlockLists, begin: int, each: int, forward: bool,
+        x: f64,
+    ):  # fmt: skip
         """Solve `each` blocks a thread, from place begin of their order."""
         thread = wp.tid()
         for step in range(each):

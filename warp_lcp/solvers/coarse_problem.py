@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from warp_lcp.stopping import StoppingCriteria
 if TYPE_CHECKING:
     from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 
-TOLERANCE = StoppingCriteria(rtol=1e-2, max_iterations=30)  # of a correction that interpolation blurs by a layer or two anyway
+ROUGH = partial(StoppingCriteria, rtol=1e-2, max_iterations=30)  # of a correction that interpolation blurs by a layer or two anyway
 # a set creeps while more than this share of what the last step moved moves again: at that rate a dozen steps or more are still to
 # come, and a first correction costs as much as those
 CREEP = 0.92
@@ -60,7 +61,7 @@ class CoarseProblem:
         work, fields = self._work, (self._R @ y, (problem.lower.numpy() - x)[self._points], (problem.upper.numpy() - x)[self._points])
         for field, values in zip((work.problem.b, work.problem.lower, work.problem.upper), fields, strict=True):
             field.assign(values)
-        e = solve(work.problem, self._settings, stopping=TOLERANCE, workspace=work).x.numpy()
+        e = solve(work.problem, self._settings, stopping=ROUGH(), workspace=work).x.numpy()
         return self._P @ e
 
     def _refresh(self) -> bool:

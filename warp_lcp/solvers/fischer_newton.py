@@ -9,27 +9,28 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
-from warp_lcp.multigrid.hierarchy import CycleSettings
+from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
-from warp_lcp.solve import IterateInPlace, Precision, RoundedIterate, Step
+from warp_lcp.settings import Count, CountOrZero, Settings, Share, ShareOrAll
+from warp_lcp.solve import IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
 from warp_lcp.solvers.finite_difference import FiniteDifferenceSystem
 from warp_lcp.solvers.fischer_newton_dense import FischerDenseWorkspace
 from warp_lcp.solvers.globalization import NonmonotoneSearch
 from warp_lcp.solvers.gradient_descent import GradientDescent, GradientWorkspace
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
-from warp_lcp.solvers.nonsmooth_map import Kink, NonsmoothMap, Reformulation
+from warp_lcp.solvers.nonsmooth_map import Kink, KinkName, NonsmoothMap, Reformulation
 from warp_lcp.solvers.principal_system import GridSystem, principal_system
 
 SHARE = 0.95  # lambda of the penalized map for dense problems: measured on frictional contacts
 
 
 @dataclass(frozen=True, kw_only=True)
-class FischerNewton:
+class FischerNewton(Settings):
     """Solve f(x) = 0 for the Fischer-Burmeister map, plain or penalized, by a nonsmooth Newton method ([Book] 2.4.2-3, algorithm 12).
 
     f_i = lambda psi(a_i, y_i) + (1 - lambda) a_i+ y_i+ / scale, psi(a, b) = a + b - sqrt(a^2 + b^2), a = d (x - l) with d of the
@@ -73,27 +74,16 @@ class FischerNewton:
     supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
     needs: ClassVar[str] = "a P0-matrix for plain steps; the safeguarded chain also solves copositive contact problems"
 
-    kink: str = "perturbation"
-    share: float | None = None
+    kink: KinkName = "perturbation"
+    share: ShareOrAll | None = None
     safeguard: bool = True
-    precision: str = "mixed"
-    warm_start: int = 0
-    monotone_cycles: int = 2
-    eta: float = 0.1
-    max_linear_iterations: int = 200
-    memory: int = 8
+    precision: PrecisionName = "mixed"
+    warm_start: CountOrZero = 0
+    monotone_cycles: CountOrZero = 2
+    eta: Share = 0.1
+    max_linear_iterations: Count = 200
+    memory: Count = 8
     cycle: CycleSettings = field(default_factory=CycleSettings)
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        Precision(self.precision), Kink(self.kink)
-        if self.share is not None and not 0 < self.share <= 1:
-            raise ValueError(f"share = {self.share}: must be in (0, 1]")
-        if not 0 < self.eta < 1:
-            raise ValueError(f"eta = {self.eta}: must be in (0, 1)")
-        for name, least in (("warm_start", 0), ("monotone_cycles", 0), ("max_linear_iterations", 1), ("memory", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} = {getattr(self, name)}: must be >= {least}")
 
     def descent(self, problem: LCP) -> GradientDescent:
         """Return the gradient descent whose map is this method's for the problem: the only one consistent with it as a warm start."""

@@ -12,16 +12,17 @@ import warp as wp
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
-from warp_lcp.solve import IterateInPlace, Precision, RoundedIterate, Step
+from warp_lcp.settings import Count, NonNegative, Settings, ShareOrAll
+from warp_lcp.solve import IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
 from warp_lcp.solvers.globalization import NonmonotoneSearch
-from warp_lcp.solvers.nonsmooth_map import NonsmoothMap, Reformulation
+from warp_lcp.solvers.nonsmooth_map import MapName, NonsmoothMap, Reformulation
 
 LEAST = 1e-12  # relative decrease of the merit without which a step is none
 LONGEST = 1e6  # length tried
 
 
 @dataclass(frozen=True, kw_only=True)
-class GradientDescent:
+class GradientDescent(Settings):
     """Descend on the merit f.f / 2 of a reformulation ([Book] 2.4.4, eq. 2.199, algorithm 13).
 
     x <- clip(x - t d^-2 J'f, l, u) with an element J = diag(p d) + diag(q) A of the generalized Jacobian and the natural residual's
@@ -49,24 +50,13 @@ class GradientDescent:
     supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
     needs: ClassVar[str] = "products with A'"
 
-    map: str = "fischer"
-    share: float = 0.95
-    relative: float = 1e-12
-    stagnation: float = 1e-14
-    gradient: float = 1e-10
-    memory: int = 10
-    precision: str = "double"
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        Reformulation(self.map), Precision(self.precision)
-        if not 0 < self.share <= 1:
-            raise ValueError(f"share = {self.share}: must be in (0, 1]")
-        if self.memory < 1:
-            raise ValueError(f"memory = {self.memory}: must be >= 1")
-        for name in ("relative", "stagnation", "gradient"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} = {getattr(self, name)}: must be >= 0")
+    map: MapName = "fischer"
+    share: ShareOrAll = 0.95
+    relative: NonNegative = 1e-12
+    stagnation: NonNegative = 1e-14
+    gradient: NonNegative = 1e-10
+    memory: Count = 10
+    precision: PrecisionName = "double"
 
     def init(self, problem: LCP) -> GradientWorkspace:
         """Return a workspace."""

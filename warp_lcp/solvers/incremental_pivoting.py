@@ -11,6 +11,7 @@ import warp as wp
 from warp_lcp.deadline import time_is_up
 from warp_lcp.problem import LCP
 from warp_lcp.result import SolveStatus
+from warp_lcp.settings import Count, Settings
 from warp_lcp.solve import Step
 from warp_lcp.solvers.dense_problem import DenseWorkspace, assemble, check_size, pivots_of, semidefinite
 from warp_lcp.solvers.principal_inverse import PrincipalInverse
@@ -24,7 +25,7 @@ OPEN, FREE, LOW, HIGH = 0, 1, 2, 3  # not held yet; y = 0; x = l and y >= 0; x =
 
 
 @dataclass(frozen=True, kw_only=True)
-class IncrementalPivoting:
+class IncrementalPivoting(Settings):
     """Solve a dense symmetric problem by Baraff's incremental pivoting ([Book] 2.1.2, algorithm 2; eqs. 2.20-2.27).
 
     The most violated row j is driven to y_j = 0 or to its bound while all rows that hold keep holding: dx_F = -A_FF^-1 A_Fj, dy = A dx, and
@@ -46,12 +47,7 @@ class IncrementalPivoting:
     needs: ClassVar[str] = "symmetric, positive semi-definite, n <= 4096"
     most_unknowns: ClassVar[int] = 4096  # three dense n x n float64 arrays of 134 MB each
 
-    pivots_per_step: int | None = None
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        if self.pivots_per_step is not None and self.pivots_per_step < 1:
-            raise ValueError(f"pivots_per_step = {self.pivots_per_step}: must be >= 1")
+    pivots_per_step: Count | None = None
 
     def init(self, problem: LCP) -> PivotingWorkspace:
         """Return a workspace.

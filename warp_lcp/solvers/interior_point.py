@@ -9,12 +9,13 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
-from warp_lcp.multigrid.hierarchy import CycleSettings
+from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.rows import Known, RowPass, Rows
-from warp_lcp.solve import IterateInPlace, Precision, RoundedIterate, Step
+from warp_lcp.settings import Count, CountOrZero, Positive, Settings, Share, ShareOrZero
+from warp_lcp.solve import IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
 from warp_lcp.solvers import interior_point_kernels as kernels
 from warp_lcp.solvers.equilibrated import EquilibratedWorkspace
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
@@ -27,7 +28,7 @@ NEAR = 10.0  # a near start has w A_ii and s at least this multiple of the resid
 
 
 @dataclass(frozen=True, kw_only=True)
-class InteriorPoint:
+class InteriorPoint(Settings):
     """Follow the central path to the solution ([Book] 2.3, eq. 2.105-2.114, algorithm 9; Mehrotra 1992 for the default).
 
     With w = x - l, v = u - x and multipliers s, t >= 0, the solution has A x + b = s - t, W s = 0, V t = 0. A step is Newton's for
@@ -71,31 +72,17 @@ class InteriorPoint:
     supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
     needs: ClassVar[str] = "A positive semi-definite; it need not be symmetric"
 
-    precision: str = "mixed"
+    precision: PrecisionName = "mixed"
     mehrotra: bool = True
-    horizon: int = 100
-    backoff: float = 0.995
-    crossover: float = 0.0
-    start: float = 15.0
-    monotone_cycles: int = 2
-    predictor_eta: float = 0.3
-    eta: float = 0.2
-    max_linear_iterations: int = 200
+    horizon: Count = 100
+    backoff: Share = 0.995
+    crossover: ShareOrZero = 0.0
+    start: Positive = 15.0
+    monotone_cycles: CountOrZero = 2
+    predictor_eta: Share = 0.3
+    eta: Share = 0.2
+    max_linear_iterations: Count = 200
     cycle: CycleSettings = field(default_factory=CycleSettings)
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        Precision(self.precision)
-        for name in ("backoff", "predictor_eta", "eta"):
-            if not 0 < getattr(self, name) < 1:
-                raise ValueError(f"{name} = {getattr(self, name)}: must be in (0, 1)")
-        if not 0 <= self.crossover < 1:
-            raise ValueError(f"crossover = {self.crossover}: must be in [0, 1)")
-        if not (self.start > 0 and math.isfinite(self.start)):
-            raise ValueError(f"start = {self.start}: must be finite and > 0")
-        for name, least in (("monotone_cycles", 0), ("max_linear_iterations", 1), ("horizon", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} = {getattr(self, name)}: must be >= {least}")
 
     def init(self, problem: LCP) -> InteriorPointWorkspace | EquilibratedWorkspace:
         """Return a workspace: for dense and sparse problems one that equilibrates them."""

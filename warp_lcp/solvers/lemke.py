@@ -13,6 +13,7 @@ from scipy.linalg.blas import dger
 from warp_lcp.deadline import time_is_up
 from warp_lcp.problem import LCP
 from warp_lcp.result import SolveStatus
+from warp_lcp.settings import Count, Settings
 from warp_lcp.solve import Step
 from warp_lcp.solvers.dense_problem import DenseProblem, DenseWorkspace, check_size, inconsistent, pivots_of, semidefinite
 from warp_lcp.solvers.lemke_banded import BandedFactors, narrow_problem
@@ -27,7 +28,7 @@ ACCEPTED = 1e-9  # relative error of the entering column after refinement with w
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lemke:
+class Lemke(Settings):
     """Solve a dense problem by Lemke's method with the lexicographic rule ([Book] 2.1, appendix C; LCP of w - M z - d z0 = q).
 
     z0 and the covering vector d > 0 make the start feasible; complements enter until z0 leaves. It processes every problem with a
@@ -51,15 +52,8 @@ class Lemke:
     needs: ClassVar[str] = "n <= 4096; sure of an end for copositive-plus and P-matrices"
     most_unknowns: ClassVar[int] = 4096  # the basis and its inverse take 134 MB each, four times that with boxes everywhere
 
-    pivots_per_step: int | None = None
-    covering_vectors: int = 3
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        if self.pivots_per_step is not None and self.pivots_per_step < 1:
-            raise ValueError(f"pivots_per_step = {self.pivots_per_step}: must be >= 1")
-        if self.covering_vectors < 1:
-            raise ValueError(f"covering_vectors = {self.covering_vectors}: must be >= 1")
+    pivots_per_step: Count | None = None
+    covering_vectors: Count = 3
 
     def init(self, problem: LCP) -> LemkeWorkspace:
         """Return a workspace.

@@ -11,14 +11,15 @@ import warp as wp
 
 from warp_lcp.deadline import check_time
 from warp_lcp.multigrid.aggregates import AggregateCycles, suits_multigrid
-from warp_lcp.multigrid.hierarchy import CycleSettings
+from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
 from warp_lcp.rows import Rows
-from warp_lcp.solve import FLOOR_MARGIN, IterateInPlace, Precision, RoundedIterate, Step
+from warp_lcp.settings import Count, CountOrZero, Settings, Share
+from warp_lcp.solve import FLOOR_MARGIN, IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
 from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers.coarse_problem import CoarseProblem
 from warp_lcp.solvers.interior_steps import InteriorSteps
@@ -37,7 +38,7 @@ REGULARIZATIONS = (1e-8, 1e-4, 1e-2, 0.1, 1.0, 10.0, 100.0)  # of J'J, times its
 
 
 @dataclass(frozen=True, kw_only=True)
-class MinimumMapNewton:
+class MinimumMapNewton(Settings):
     """Solve on the unknowns that the minimum map calls free, hold the others at their bounds ([Book] 2.4.1, Schur-reduced).
 
     Unknown i is held where x_i - y_i / d_i, with the natural residual's d, is outside [l_i, u_i]. Cold, the first steps on a grid are
@@ -72,23 +73,14 @@ class MinimumMapNewton:
     needs: ClassVar[str] = "positive definite or P-matrix"
     distributed: ClassVar[bool] = True
 
-    precision: str = "mixed"
-    monotone_cycles: int = 2
-    eta: float = 0.1
-    max_linear_iterations: int = 200
-    backtracks: int = 6
-    memory: int = 4
+    precision: PrecisionName = "mixed"
+    monotone_cycles: CountOrZero = 2
+    eta: Share = 0.1
+    max_linear_iterations: Count = 200
+    backtracks: CountOrZero = 6
+    memory: Count = 4
     cycle: CycleSettings = field(default_factory=CycleSettings)
     direct: bool = False
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        Precision(self.precision)
-        if not 0 < self.eta < 1:
-            raise ValueError(f"eta = {self.eta}: must be in (0, 1)")
-        for name, least in (("monotone_cycles", 0), ("max_linear_iterations", 1), ("backtracks", 0), ("memory", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} = {getattr(self, name)}: must be >= {least}")
 
     def init(self, problem: LCP) -> NewtonWorkspace | GridNewtonWorkspace | DirectNewtonWorkspace:
         """Return a workspace.

@@ -10,14 +10,16 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.deadline import check_time
-from warp_lcp.multigrid.hierarchy import CycleSettings, Level
+from warp_lcp.multigrid.cycle_settings import CycleSettings
+from warp_lcp.multigrid.hierarchy import Level
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
 from warp_lcp.rows import Rows
-from warp_lcp.solve import Precision, RoundedIterate, Step
+from warp_lcp.settings import Count, CountOrZero, Positive, Settings
+from warp_lcp.solve import Precision, PrecisionName, RoundedIterate, Step
 from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers import projected_multigrid_kernels as engine
 from warp_lcp.solvers.descent import Descent
@@ -36,7 +38,7 @@ NOISE = 1e-14  # of the energy: falls of less, over as many steps as patience la
 
 
 @dataclass(frozen=True, kw_only=True)
-class MPRGP:
+class MPRGP(Settings):
     """Minimize 1/2 x'Ax + b'x on the bounds by projected, preconditioned conjugate gradients (Dostal; Takahashi and Batty 2023).
 
     Unknowns at a bound are held. While the part of the residual on them, the chopped gradient, is small against the free part
@@ -66,20 +68,11 @@ class MPRGP:
     supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
     needs: ClassVar[str] = "A symmetric, positive semi-definite"
 
-    precision: str = "mixed"
-    monotone_cycles: int = 1  # two cost as much as they save on splashes of 64^3 and 128^3
-    gamma: float = 1.0
-    patience: int = 3
+    precision: PrecisionName = "mixed"
+    monotone_cycles: CountOrZero = 1  # two cost as much as they save on splashes of 64^3 and 128^3
+    gamma: Positive = 1.0
+    patience: Count = 3
     cycle: CycleSettings = field(default_factory=CycleSettings)
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        Precision(self.precision)
-        if not (self.gamma > 0 and math.isfinite(self.gamma)):
-            raise ValueError(f"gamma = {self.gamma}: must be finite and > 0")
-        for name, least in (("monotone_cycles", 0), ("patience", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} = {getattr(self, name)}: must be >= {least}")
 
     def init(self, problem: LCP) -> GradientWorkspace:
         """Return a workspace.

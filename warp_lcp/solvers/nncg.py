@@ -11,15 +11,16 @@ import warp as wp
 from warp_lcp.problem import LCP
 from warp_lcp.residual import WITHIN
 from warp_lcp.rows import Rows
-from warp_lcp.solve import Precision, Step
+from warp_lcp.settings import Relaxation, Settings
+from warp_lcp.solve import Precision, PrecisionName, Step
 from warp_lcp.solvers import active_set_passes as passes
-from warp_lcp.solvers.psor import DIRECTIONS, SweepWorkspace
+from warp_lcp.solvers.psor import DIRECTIONS, Direction, SweepWorkspace
 from warp_lcp.solvers.sweep import sweep_for
 from warp_lcp.vectors import Reduction
 
 
 @dataclass(frozen=True, kw_only=True)
-class NNCG:
+class NNCG(Settings):
     """Accelerate projected Gauss-Seidel by nonlinear conjugate gradients ([Book] 2.2.6, algorithm 8; Silcowitz-Hansen et al. 2010).
 
     The change of a sweep is taken for the negative gradient, g = x - PGS(x), of a function whose minimum is the sweep's fixed point. With
@@ -42,17 +43,9 @@ class NNCG:
     needs: ClassVar[str] = "what ProjectedSOR needs"
     affine_bounds: ClassVar[bool] = True
 
-    direction: str = "forward"
-    omega: float = 1.0
-    precision: str = "mixed"
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        if not 0 < self.omega < 2:
-            raise ValueError(f"omega = {self.omega}: must be in (0, 2)")
-        if self.direction not in DIRECTIONS:
-            raise ValueError(f"direction = {self.direction!r}: must be 'forward', 'backward' or 'symmetric'")
-        Precision(self.precision)
+    direction: Direction = "forward"
+    omega: Relaxation = 1.0
+    precision: PrecisionName = "mixed"
 
     def init(self, problem: LCP) -> NNCGWorkspace:
         """Return a workspace.

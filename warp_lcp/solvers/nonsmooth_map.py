@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from enum import Enum
-from typing import Any
+from enum import StrEnum
+from typing import Any, Literal
 
 import numpy as np
 import warp as wp
@@ -19,7 +19,7 @@ from warp_lcp.vectors import Reduction
 KINK = 1e-14  # times the size of b: a point this near to both sides of a kink is on it
 
 
-class Reformulation(Enum):
+class Reformulation(StrEnum):
     """Which map ([Book] 1.1.2-3): the minimum map, Fischer and Burmeister's, or Chen, Chen and Kanzow's penalized one."""
 
     NATURAL = "natural"
@@ -27,7 +27,7 @@ class Reformulation(Enum):
     PENALIZED = "penalized"
 
 
-class Kink(Enum):
+class Kink(StrEnum):
     """What stands for the derivative at a kink ([Book] 2.4.2).
 
     There any (p, q) = (1 - alpha, 1 - beta) with alpha^2 + beta^2 <= 1 is one: a random one; (0, 1), that of a point moved a little off the
@@ -39,6 +39,10 @@ class Kink(Enum):
     ZERO = "zero"
     PERTURBATION = "perturbation"
     APPROXIMATION = "approximation"
+
+
+MapName = Literal[tuple(map(str, Reformulation))]
+KinkName = Literal[tuple(map(str, Kink))]
 
 
 class NonsmoothMap:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import scipy.sparse
@@ -19,7 +19,7 @@ from warp_lcp.result import SolveResult
 from warp_lcp.rows import RowPass
 from warp_lcp.vectors import rows_of
 
-Blocks = int | Sequence[Any]
+Blocks = Annotated[Sequence[Any] | np.ndarray, "for each block a list of indices"]
 SELECT = RowPass(
     "partition.select", Path(__file__).parent / "headers" / "select.h", wp.float64, optional=("less",), numbers={"kept": bool},
     reads={"x": wp.float64, "less": wp.float64, "member": wp.uint8}, writes={"target": wp.float64},
@@ -32,7 +32,7 @@ def blocks_of_size(problem: LCP, size: int) -> list[np.ndarray]:
     return [unknowns[i : i + size] for i in range(0, len(unknowns), size)]
 
 
-def given_blocks(problem: LCP, blocks: Sequence[Any]) -> list[np.ndarray]:
+def given_blocks(problem: LCP, blocks: Blocks) -> list[np.ndarray]:
     """Return stored indices of each block.
 
     Args:

@@ -40,7 +40,7 @@ TRIED, FEWER = 30, 15  # steps for one center, before and after eps had to be ra
 SMALL = 1000  # unknowns up to which a sparse matrix is taken as a dense one, for which least-index pivoting is there
 FALL = 0.9  # a center whose residual is above this part of the smallest so far is no progress
 IDLE = 4  # centers without progress before the end
-PATIENCE = StoppingCriteria().patience  # gradient steps that neither lower the energy nor the residual before the end
+PATIENCE = StoppingCriteria.patience  # gradient steps that neither lower the energy nor the residual before the end
 
 
 def projected_cycle(

@@ -10,11 +10,12 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.deadline import time_is_up
-from warp_lcp.multigrid.hierarchy import CycleSettings
+from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem import LCP
 from warp_lcp.result import SolveStatus
-from warp_lcp.solve import Step
+from warp_lcp.settings import Count, CountOrZero, Settings, Share
+from warp_lcp.solve import PrecisionName, Step
 from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers.dense_problem import DenseProblem, pivots_of
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
@@ -28,7 +29,7 @@ SLACK = 1e-12  # of the largest magnitudes of x and y: violations below it are r
 
 
 @dataclass(frozen=True, kw_only=True)
-class PrimalDualActiveSet:
+class PrimalDualActiveSet(Settings):
     """Guess the active set from x and y, solve for the rest, repeat until the guess stays (Hintermueller, Ito, Kunisch 2003).
 
     With the natural residual's d, unknown i is held at l_i if x_i - y_i / d_i < l_i, at u_i if it is above, else free: y_i = 0 there. This
@@ -56,15 +57,11 @@ class PrimalDualActiveSet:
     supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
     needs: ClassVar[str] = "M-matrix, or P-matrix where dense"
 
-    precision: str = "mixed"
-    monotone_cycles: int = 2
-    eta: float = 0.01
-    max_linear_iterations: int = 200
+    precision: PrecisionName = "mixed"
+    monotone_cycles: CountOrZero = 2
+    eta: Share = 0.01
+    max_linear_iterations: Count = 200
     cycle: CycleSettings = field(default_factory=CycleSettings)
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        self.as_newton()
 
     def as_newton(self) -> MinimumMapNewton:
         """Return the method whose steps take over on operators that are not dense."""

@@ -15,7 +15,7 @@ import warp as wp
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.krylov.gmres import GMRES
 from warp_lcp.krylov.system import KrylovSystem
-from warp_lcp.multigrid.hierarchy import CycleSettings
+from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.turning import make_hierarchy
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.grid_poisson import GridPoisson

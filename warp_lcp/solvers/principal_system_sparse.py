@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,12 +14,13 @@ from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.krylov.gmres import GMRES
 from warp_lcp.krylov.system import KrylovSystem
 from warp_lcp.multigrid.aggregates import suits_multigrid
-from warp_lcp.multigrid.algebraic import AlgebraicHierarchy, AlgebraicSettings
+from warp_lcp.multigrid.algebraic import AlgebraicHierarchy
+from warp_lcp.multigrid.cycle_settings import AlgebraicSettings
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.program import Launch
 
 # symmetric matrices far from M-matrices: on plates of 60^2 and 120^2 0.55 times the iterations of the usual settings, .8 on elastic blocks
-FAR_FROM_M = AlgebraicSettings(strength=0.08, interval=(0.05, 1.0))
+FAR_FROM_M = partial(AlgebraicSettings, strength=0.08, interval=(0.05, 1.0))
 DIRECT = 2000  # unknowns up to which factors are complete: that costs less than the iterations it saves
 
 
@@ -53,8 +55,8 @@ class SparseSystem(KrylovSystem):
         positive = bool((host.diagonal() >= 0).all())
         self.preconditioner: SparsePreconditioner
         if (A.symmetric and positive) or suits_multigrid(host):
-            usual = AlgebraicSettings() if suits_multigrid(host) else FAR_FROM_M
-            self.preconditioner = AlgebraicHierarchy(A, real, settings or usual)
+            usual = AlgebraicSettings if suits_multigrid(host) else FAR_FROM_M
+            self.preconditioner = AlgebraicHierarchy(A, real, settings or usual())
         elif A.device.is_cpu:
             self.preconditioner = IncompleteFactors(A, real)
         else:

@@ -8,7 +8,8 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_lcp.problem import LCP
-from warp_lcp.solve import Precision, Step
+from warp_lcp.settings import Positive, Settings
+from warp_lcp.solve import Precision, PrecisionName, Step
 from warp_lcp.solvers.psor import SweepWorkspace
 from warp_lcp.solvers.spectrum import scaled_spectrum
 from warp_lcp.solvers.sweep_kernels import jacobi_kernel
@@ -18,7 +19,7 @@ SHARE = 1.8  # of the 2 / lambda_max at which Jacobi's method stops converging; 
 
 
 @dataclass(frozen=True, kw_only=True)
-class ProjectedJacobi:
+class ProjectedJacobi(Settings):
     """Solve each scalar problem from the same x ([Book] 2.2.1, table 2.1 and eq. 2.63 with M = D / omega).
 
     x <- clip(x - omega D^-1 (A x + b), l, u). Converges for symmetric positive definite A and 0 < omega < 2 / lambda_max(D^-1 A), which
@@ -39,14 +40,8 @@ class ProjectedJacobi:
     needs: ClassVar[str] = "symmetric positive (semi-)definite A for a proof of convergence; A_ii <= 0 case by case"
     affine_bounds: ClassVar[bool] = True
 
-    omega: float | None = None
-    precision: str = "mixed"
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        if self.omega is not None and not self.omega > 0:
-            raise ValueError(f"omega = {self.omega}: must be > 0")
-        Precision(self.precision)
+    omega: Positive | None = None
+    precision: PrecisionName = "mixed"
 
     def init(self, problem: LCP) -> JacobiWorkspace:
         """Return a workspace.

@@ -7,17 +7,18 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_lcp.multigrid.hierarchy import CycleSettings
+from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.operators.sum import grid_and_low_rank
 from warp_lcp.problem import LCP
-from warp_lcp.solve import Precision, Step
+from warp_lcp.settings import Count, CountOrZero, Settings
+from warp_lcp.solve import PrecisionName, Step
 from warp_lcp.solvers.projected_multigrid_coupled import CoupledWorkspace
 from warp_lcp.solvers.projected_multigrid_workspace import MultigridWorkspace
 
 
 @dataclass(frozen=True, kw_only=True)
-class ProjectedMultigrid:
+class ProjectedMultigrid(Settings):
     """Solve the LCP of a grid in about as many multigrid cycles as the linear system needs.
 
     Cold, the first step is a projected (monotone) cycle, which moves whole aggregates on and off their bounds. Then each step evaluates
@@ -43,18 +44,11 @@ class ProjectedMultigrid:
     needs: ClassVar[str] = ""
     distributed: ClassVar[bool] = True
 
-    precision: str = "mixed"
+    precision: PrecisionName = "mixed"
     # without one the set creeps; nested iteration from the coarsest level saves a step of ten, and takes as long
-    monotone_cycles: int = 1
-    patience: int = 3
+    monotone_cycles: CountOrZero = 1
+    patience: Count = 3
     cycle: CycleSettings = field(default_factory=CycleSettings)
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        Precision(self.precision)
-        for name, least in (("monotone_cycles", 0), ("patience", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} = {getattr(self, name)}: must be >= {least}")
 
     def init(self, problem: LCP) -> MultigridWorkspace | CoupledWorkspace:
         """Return a workspace.

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import warp as wp
 
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
-from warp_lcp.solve import IterateInPlace, Precision, RoundedIterate, Step
+from warp_lcp.settings import Relaxation, Settings
+from warp_lcp.solve import IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
 from warp_lcp.solvers.spectrum import scaled_spectrum
-from warp_lcp.solvers.sweep import Contraction, Diagonal, Sweep, SweepOrder, sweep_for
+from warp_lcp.solvers.sweep import Contraction, Diagonal, OrderName, Sweep, SweepOrder, sweep_for
 
 DIRECTIONS = {"forward": (True,), "backward": (False,), "symmetric": (True, False)}
+Direction = Literal[tuple(DIRECTIONS)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class ProjectedSOR:
+class ProjectedSOR(Settings):
     """Sweep the unknowns, solving each scalar problem in turn ([Book] 2.2.1, eq. 2.52).
 
     x_i <- clip(x_i - omega (A x + b)_i / A_ii, l_i, u_i), red-black order on grids, row order otherwise. Converges for symmetric positive
@@ -52,25 +54,19 @@ class ProjectedSOR:
     needs: ClassVar[str] = "symmetric positive (semi-)definite A for a proof of convergence; A_ii <= 0 case by case"
     affine_bounds: ClassVar[bool] = True
 
-    omega: float = 1.4  # best of the book's parameter study (fig. C.4)
-    direction: str = "forward"
-    order: str = "natural"
+    omega: Relaxation = 1.4  # best of the book's parameter study (fig. C.4)
+    direction: Direction = "forward"
+    order: OrderName = "natural"
     permutation: tuple[int, ...] | None = None
-    precision: str = "mixed"
+    precision: PrecisionName = "mixed"
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        if not 0 < self.omega < 2:
-            raise ValueError(f"omega = {self.omega}: must be in (0, 2)")
-        if self.direction not in DIRECTIONS:
-            raise ValueError(f"direction = {self.direction!r}: must be 'forward', 'backward' or 'symmetric'")
-        if self.order not in [order.value for order in SweepOrder]:
-            raise ValueError(f"order = {self.order!r}: must be one of {', '.join(repr(order.value) for order in SweepOrder)}")
         if self.permutation is not None:
-            if self.order != "natural":
-                raise ValueError(f"permutation: is an order itself, and cannot be combined with order = {self.order!r}")
             object.__setattr__(self, "permutation", tuple(int(i) for i in self.permutation))
-        Precision(self.precision)
+        super().__post_init__()
+        if self.permutation is not None and self.order != "natural":
+            raise ValueError(f"permutation: is an order itself, and cannot be combined with order = {self.order!r}")
 
     def init(self, problem: LCP) -> SweepWorkspace:
         """Return a workspace.

@@ -13,12 +13,13 @@ import warp as wp
 
 from warp_lcp.problem import LCP
 from warp_lcp.result import SolveStatus
+from warp_lcp.settings import Count, Positive, Settings
 from warp_lcp.solve import Step
 from warp_lcp.solvers.dense_problem import SEMIDEFINITE, DenseProblem, DenseWorkspace, check_size, inconsistent, semidefinite, sparse_matrix
 
 
 @dataclass(frozen=True, kw_only=True)
-class QuadraticProgram:
+class QuadraticProgram(Settings):
     """Minimize x'Ax / 2 + b'x over l <= x <= u by PIQP, a proximal interior-point solver ([Book] 2.2.2, eq. 2.56; extra `peers`).
 
     The minimizers are the solutions of the problem, because A is symmetric and positive semi-definite and the gradient is y = A x + b.
@@ -39,15 +40,8 @@ class QuadraticProgram:
     needs: ClassVar[str] = "symmetric, positive semi-definite, n <= 4096 unless sparse; the extra `peers`"
     most_unknowns: ClassVar[int] = 4096  # a dense n x n float64 array of 134 MB, and its factor; sparse operators have no limit
 
-    tolerance: float = 1e-12
-    max_iterations: int = 250
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        if not self.tolerance > 0:
-            raise ValueError(f"tolerance = {self.tolerance}: must be > 0")
-        if self.max_iterations < 1:
-            raise ValueError(f"max_iterations = {self.max_iterations}: must be >= 1")
+    tolerance: Positive = 1e-12
+    max_iterations: Count = 250
 
     def init(self, problem: LCP) -> QuadraticProgramWorkspace:
         """Return a workspace.

@@ -11,15 +11,16 @@ import warp as wp
 
 from warp_lcp.problem import LCP
 from warp_lcp.residual import NaturalResidual
+from warp_lcp.settings import Count, Settings, Share
 from warp_lcp.solve import IterateInPlace, Precision, Solver, Step
 from warp_lcp.solvers.coupled_problem import StaggeredRound
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
-from warp_lcp.solvers.partition import Block, block_problem, given_blocks
+from warp_lcp.solvers.partition import Block, Blocks, block_problem, given_blocks
 from warp_lcp.solvers.sweep import Contraction
 
 
 @dataclass(frozen=True, kw_only=True)
-class Staggering:
+class Staggering(Settings):
     """Solve the blocks of a problem in turn, the others held, each by its own method ([Book] 2.2.4).
 
     Block k solves A_kk x_k + (b_k + sum_{j != k} A_kj x_j) within its bounds: a block Gauss-Seidel method, which converges for symmetric
@@ -41,19 +42,10 @@ class Staggering:
     needs: ClassVar[str] = "symmetric positive definite A for a proof of convergence"
     affine_bounds: ClassVar[bool] = True
 
-    blocks: int | Sequence[Any] = 2
+    blocks: Count | Blocks = 2
     solvers: Solver | Sequence[Solver] = ()
-    eta: float = 1e-2
-    max_block_iterations: int = 100
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        if isinstance(self.blocks, int) and self.blocks < 1:
-            raise ValueError(f"blocks = {self.blocks}: must be >= 1")
-        if not 0 < self.eta < 1:
-            raise ValueError(f"eta = {self.eta}: must be in (0, 1)")
-        if self.max_block_iterations < 1:
-            raise ValueError(f"max_block_iterations = {self.max_block_iterations}: must be >= 1")
+    eta: Share = 1e-2
+    max_block_iterations: Count = 100
 
     def init(self, problem: LCP) -> StaggeringWorkspace:
         """Return a workspace.

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.deadline import check_time
-from warp_lcp.multigrid.hierarchy import CycleSettings
+from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.problem import LCP
 from warp_lcp.rows import Rows
-from warp_lcp.solve import Precision, Step
+from warp_lcp.settings import Count, Ge, Relaxation, Settings, Share
+from warp_lcp.solve import Precision, PrecisionName, Step
 from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers.principal_system import principal_system
 from warp_lcp.solvers.psor import SweepWorkspace
@@ -24,7 +25,7 @@ ROUNDING = 1e-14  # relative change of the energy that is none
 
 
 @dataclass(frozen=True, kw_only=True)
-class SubspaceMinimization:
+class SubspaceMinimization(Settings):
     """Sweep, then solve A_FF x_F = -(b_F + A_FH x_H) on the unknowns off their bounds and project ([Book] 2.2.5, algorithm 7, eq. 2.95).
 
     A step is `sweeps` projected Gauss-Seidel sweeps and up to `solves` such solves, until the free set stays ([Book] eq. 2.98). Each solve
@@ -56,25 +57,14 @@ class SubspaceMinimization:
     needs: ClassVar[str] = "what ProjectedSOR needs; regular principal blocks (dense: least squares otherwise)"
     affine_bounds: ClassVar[bool] = True
 
-    sweeps: int = 5
-    solves: int = 2
-    omega: float = 1.0
-    eta: float = 0.1
-    max_linear_iterations: int = 200
-    backtracks: int = 5
-    precision: str = "mixed"
+    sweeps: Count = 5
+    solves: Count = 2
+    omega: Relaxation = 1.0
+    eta: Share = 0.1
+    max_linear_iterations: Count = 200
+    backtracks: Annotated[int, Ge(-1)] = 5
+    precision: PrecisionName = "mixed"
     cycle: CycleSettings = field(default_factory=CycleSettings)
-
-    def __post_init__(self) -> None:
-        """Check the settings."""
-        Precision(self.precision)
-        if not 0 < self.omega < 2:
-            raise ValueError(f"omega = {self.omega}: must be in (0, 2)")
-        if not 0 < self.eta < 1:
-            raise ValueError(f"eta = {self.eta}: must be in (0, 1)")
-        for name, least in (("sweeps", 1), ("solves", 1), ("max_linear_iterations", 1), ("backtracks", -1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} = {getattr(self, name)}: must be >= {least}")
 
     def init(self, problem: LCP) -> SubspaceWorkspace:
         """Return a workspace.

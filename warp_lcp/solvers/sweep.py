@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
-from typing import Any, Protocol
+from enum import StrEnum
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import warp as wp
@@ -19,13 +19,16 @@ from warp_lcp.solvers.sweep_kernels import CHANGE, matrix_rows, row_kernels
 from warp_lcp.vectors import ADD, rows_of
 
 
-class SweepOrder(Enum):
+class SweepOrder(StrEnum):
     """In which order the unknowns of a sweep are visited ([Book] 2.2.1 and fig. 2.3)."""
 
     NATURAL = "natural"
     MULTICOLOR = "multicolor"
     MAGNITUDE = "magnitude"
     GREEDY = "greedy"
+
+
+OrderName = Literal[tuple(map(str, SweepOrder))]
 
 
 class Sweep(Protocol):

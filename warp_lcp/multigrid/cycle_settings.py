@@ -1,0 +1,88 @@
+"""How multigrid cycles go: those of a Galerkin hierarchy of a grid, and those of an algebraic one."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from warp_lcp.settings import Count, CountOrZero, NonNegative, Part, Positive, SettingError, Settings, ShareOrZero
+
+
+class Smoothing(Settings):
+    """What damps the upper part of a spectrum: two Chebyshev-Jacobi sweeps."""
+
+    interval: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        super().__post_init__()
+        if not self.interval[0] < self.interval[1]:
+            raise SettingError("interval", self.interval, "in order")
+
+    @property
+    def weights(self) -> tuple[float, float]:
+        """Relaxation weights: reciprocals of the Chebyshev points of the interval."""
+        a, b = self.interval
+        points = [0.5 * (a + b) + 0.5 * (b - a) * math.cos(math.pi * (2 * i + 1) / 4) for i in range(2)]
+        return 1 / points[0], 1 / points[1]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CycleSettings(Smoothing):
+    """How a cycle goes. The defaults are the best measured on 7-point stencils with piecewise-constant aggregates.
+
+    Args:
+        gamma: coarse cycles a level; 1 is a V-cycle, 2 a W-cycle. Where one axis is coarsened at a time, every second level
+            is visited once.
+        over_correction: factor on coarse corrections: piecewise-constant aggregates are too stiff by about two.
+        excess: factor on what AIR and held unknowns add to an aggregate's diagonal: they are nearer than the next aggregate, so the
+            over-correction applies to them in part only.
+        interval: bounds of the spectrum of D^-1 A that the two Chebyshev-Jacobi sweeps damp.
+        coarsest_cpu: the most cells of the coarsest level, which is inverted densely.
+        coarsest_cuda: the same on a GPU; without `one_launch_cuda` one thread factors it, which is quick for 16 cells only.
+        one_launch_cpu: the most cells of levels that run together in one launch of one thread; 0: none do. On the CPU a captured graph's
+            launches cost next to nothing, and its legs that stream through a level are faster.
+        one_launch_cuda: the same on a GPU, in one block of threads: 16^3 cells are few enough for one multiprocessor.
+        semi: axes whose mean weight is below this share of the strongest one's are not coarsened until they have caught up.
+        projected_sweeps: pairs of sweeps that stand for a solve on the coarsest level of a projected cycle.
+    """
+
+    gamma: Count = 2
+    over_correction: Positive = 1.8
+    excess: Positive = 1.5
+    interval: tuple[Positive, Positive] = (0.5, 2.0)
+    coarsest_cpu: Count = 64
+    coarsest_cuda: Count = 64
+    one_launch_cpu: CountOrZero = 0
+    one_launch_cuda: CountOrZero = 4096
+    semi: Part = 0.3
+    projected_sweeps: Count = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlgebraicSettings(Smoothing):
+    """How the hierarchy is built and cycled.
+
+    Args:
+        strength: entries below this share of sqrt(a_ii a_jj) do not aggregate. It must be above what rounding leaves of
+            entries that cancel.
+        gamma: coarse cycles a level; 1 is a V-cycle.
+        gamma_unsymmetric: the same on an unsymmetric A.
+        skew: a level whose skew part is larger than this share of its symmetric off-diagonal part takes plain aggregates: Galerkin products
+            of smoothed ones are centered differences, which are unstable where convection rules; those of plain ones stay M-matrices.
+        interval: bounds of the spectrum, in units of its l1 bound, that the two Chebyshev-Jacobi sweeps damp.
+        coarsest_cpu: the most unknowns of the coarsest level, which is inverted densely.
+        coarsest_cuda: the same on a GPU, where one thread factors it.
+        stall: a level that keeps more than this share of its unknowns is not coarsened.
+        last_sweeps: pairs of sweeps on a coarsest level that is too large to invert.
+    """
+
+    strength: ShareOrZero = 1e-3
+    gamma: Count = 1
+    gamma_unsymmetric: Count = 2
+    skew: NonNegative = 0.35
+    interval: tuple[Positive, Positive] = (0.25, 1.0)
+    coarsest_cpu: CountOrZero = 64
+    coarsest_cuda: CountOrZero = 24
+    stall: Part = 0.7
+    last_sweeps: Count = 4

@@ -1,0 +1,150 @@
+"""Settings: dataclasses whose annotations say what a field may hold; checks and the words of a refusal are drawn from there."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from enum import StrEnum
+from functools import cache
+from reprlib import repr as short
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+from annotated_types import Ge, Gt, Le, Lt
+
+
+class _OrInfinite:
+    """Lets a range without an end hold inf."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Callable[[Any], Any]) -> Any:
+        """Return the schema of the range, inf included."""
+        return {**handler(source), "allow_inf_nan": True}
+
+
+OrInfinite = _OrInfinite()
+Count = Annotated[int, Ge(1)]
+CountOrZero = Annotated[int, Ge(0)]
+Positive = Annotated[float, Gt(0)]
+NonNegative = Annotated[float, Ge(0)]
+Share = Annotated[float, Gt(0), Lt(1)]  # neither nothing nor all
+ShareOrZero = Annotated[float, Ge(0), Lt(1)]
+ShareOrAll = Annotated[float, Gt(0), Le(1)]
+Part = Annotated[float, Ge(0), Le(1)]
+Relaxation = Annotated[float, Gt(0), Lt(2)]
+
+KINDS = {int: "an integer", float: "a finite number", bool: "True or False", str: "text", NoneType: "None"}
+ENDS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
+
+
+class SettingError(ValueError):
+    """A setting outside its range.
+
+    Args:
+        name: the setting's.
+        value: what was given.
+        rule: what it must be.
+    """
+
+    def __init__(self, name: str, value: object, rule: str) -> None:
+        super().__init__(name, value, rule)
+        self.name, self.value, self.rule = name, value, rule
+
+    def __str__(self) -> str:
+        """Return one line, such as `gamma = 0: must be an integer >= 1`."""
+        return f"{self.name} = {short(self.value)}: must be {self.rule}"
+
+
+class Settings:
+    """Base of a frozen dataclass that checks its fields by their annotations, once it is made. Numbers are stored as Python's.
+
+    Whole floats are integers, NumPy's numbers are those of their values, members of a `StrEnum` their words; a bool or a text is no number.
+    Numbers are finite, unless the range says `OrInfinite`. What several fields must be together is checked in a `__post_init__` that calls
+    this one first.
+
+    Example:
+        >>> @dataclasses.dataclass(frozen=True, kw_only=True)
+        ... class Damped(Settings):
+        ...     omega: Relaxation = 0.8
+        >>> Damped(omega=2)
+        Traceback (most recent call last):
+        ...
+        warp_lcp.settings.SettingError: omega = 2: must be in (0, 2)
+    """
+
+    def __post_init__(self) -> None:
+        """Check the fields.
+
+        Raises:
+            SettingError: a field is outside its range.
+        """
+        for name, annotation in ranges(type(self)).items():  # type: ignore[arg-type]  # a class has a hash
+            object.__setattr__(self, name, checked(name, getattr(self, name), annotation))
+
+
+def checked(name: str, given: object, annotation: Any) -> Any:
+    """Return a value as the type that its annotation says.
+
+    Args:
+        name: of the value, for the message.
+        given: the value.
+        annotation: what is allowed.
+
+    Raises:
+        SettingError: it is not.
+    """
+    value: Any = given.item() if isinstance(given, (np.generic, np.ndarray)) and np.ndim(given) == 0 else given
+    plain = str(value) if isinstance(value, StrEnum) else int(value) if isinstance(value, float) and value.is_integer() else value
+    try:
+        return adapter(annotation).validate_python(plain)
+    except ValueError:  # pydantic's words name one end of a range
+        raise SettingError(name, value, rule(annotation)) from None
+
+
+@cache
+def ranges(settings: type[Any]) -> dict[str, Any]:
+    """Return the annotation of each field of a dataclass."""
+    hints = get_type_hints(settings, include_extras=True)
+    return {field.name: hints[field.name] for field in dataclasses.fields(settings)}
+
+
+def rule(annotation: Any) -> str:
+    """Return in words what an annotation allows.
+
+    Example:
+        >>> rule(Count), rule(Share), rule(Positive | None), rule(Literal["forward", "backward"])
+        ('an integer >= 1', 'in (0, 1)', 'a finite number > 0 or None', "'forward' or 'backward'")
+    """
+    parts = get_args(annotation)
+    match get_origin(annotation):
+        case None:
+            return KINDS.get(annotation) or f"a {getattr(annotation, '__name__', annotation)}"
+        case kind if kind is Annotated:
+            said = [part for part in parts if isinstance(part, str)]  # words of the annotation's own
+            return said[0] if said else _range(*parts)
+        case kind if kind in (Literal, Union, UnionType):
+            words = [repr(part) if kind is Literal else rule(part) for part in parts]
+            return " or ".join(part for part in (", ".join(words[:-1]), words[-1]) if part)
+        case kind:
+            return f"a {kind.__name__}, each {rule(parts[0])}"
+
+
+def _range(kind: type, *limits: Any) -> str:
+    """Return a range of numbers in words."""
+    found = {name: getattr(limit, name) for limit in limits for name in ENDS if hasattr(limit, name)}
+    if len(found) == 2:
+        (low, a), (high, b) = found.items()
+        ends = f"in {'[' if low == 'ge' else '('}{a:g}, {b:g}{']' if high == 'le' else ')'}"
+        return f"an integer {ends}" if kind is int else ends
+    ends = " ".join(f"{ENDS[name]} {limit:g}" for name, limit in found.items())
+    return f"an integer {ends}" if kind is int else f"{ends} or inf" if OrInfinite in limits else f"a finite number {ends}"
+
+
+@cache
+def adapter(annotation: Any) -> Any:
+    """Return what validates a value; pydantic is imported here, for the import of the package not to wait for it."""
+    from pydantic import ConfigDict, InstanceOf, TypeAdapter
+
+    if dataclasses.is_dataclass(annotation):
+        return TypeAdapter(InstanceOf[annotation])
+    return TypeAdapter(annotation, config=ConfigDict(strict=True, allow_inf_nan=False, arbitrary_types_allowed=True))
