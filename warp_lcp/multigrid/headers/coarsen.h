@@ -29,48 +29,47 @@ if (make) {
     const T sy = whole_y ? (T)0 : L.fy == 2 ? scale : scale*stiffen, sz = whole_z ? (T)0 : L.fz == 2 ? scale : scale*stiffen;
     B excess[2*M], bx[2*M], ax[2*M], by[2*M], ay[2*M], bz[2*M], az[2*M];
     const auto one = [](B v) { return (unsigned char)(v < (B)1 ? v : (B)1); };
+    const auto outer = [](B v, B is) -> B { if constexpr (COUNTS) return (B)((unsigned char)v & (unsigned char)is); else return v*is; };
     const auto face = [&](const auto* w, T c, long long k, long long shift, long long other) -> B {  // stored `shift` after cell k, to `other`
         if constexpr (COUNTS) return (B)(one(d[k]) & one(d[k + other]) & (unsigned char)(c > 0));
         else if constexpr (STENCIL == 'v') return ((d[k] != 0) & (d[k + other] != 0)) ? (B)w[k + shift] : (B)0;
         else return ((d[k] != 0) & (d[k + other] != 0)) ? (B)c : (B)0; };
     for (int begin = 0; begin < n; begin += M) {
         const int m = n - begin < M ? n - begin : (int)M, last = cells - 1 - fx*(P.first + begin); const long long p = fx*begin;
-        const auto rows = [&](auto two_y, auto two_z) {
-            // Cell i of a row in both planes: what it adds to the aggregate's excess and to the outer faces below and above it. Rows go
-            // one after another, for memory is fetched ahead best along them; planes together, which halves the passes.
-            const auto cell = [&](auto second, int i, long long left, long long right) {
-                enum { UY = decltype(second)::value, NY = decltype(two_y)::value, NZ = decltype(two_z)::value };
+        // Cell i of row y in one plane or both: what it adds to the aggregate's excess and to the outer faces below and above it. Rows go one
+        // after another, for memory is fetched ahead best along them; planes together, which halves the passes.
+        const auto row = [&](auto both, auto second, int from, int to, long long left, long long right) {
+            enum { BOTH = decltype(both)::value, SECOND = decltype(second)::value };
+            const long long at = p + (SECOND ? yp : 0), low_y = SECOND ? -yp : below_y, high_y = SECOND || wide == 1 ? above_y : yp;
+            const B only = wide == 1;
+            const auto cell = [&](int i) {
                 B sum = 0, bx_ = 0, ax_ = 0, by_ = 0, ay_ = 0, bz_ = 0, az_ = 0;
-                if (UY) { sum = excess[i]; bx_ = bx[i]; ax_ = ax[i]; by_ = by[i]; ay_ = ay[i]; bz_ = bz[i]; az_ = az[i]; }
+                if (SECOND) { sum = excess[i]; bx_ = bx[i]; ax_ = ax[i]; by_ = by[i]; ay_ = ay[i]; bz_ = bz[i]; az_ = az[i]; }
                 const auto add = [&](auto upper) {
-                    enum { UZ = decltype(upper)::value };
-                    const long long k = p + i + (UY ? yp : 0) + (UZ ? zp : 0);
+                    enum { UPPER = decltype(upper)::value };
+                    const long long k = at + i + (UPPER ? zp : 0);
                     const B f = face(wx, cx, k, 0, left), g = face(wx, cx, k, 1, right);
-                    const B h = face(wy, cy, k, 0, UY ? -yp : below_y), l = face(wy, cy, k, yp, NY && !UY ? yp : above_y);
-                    const B o = face(wz, cz, k, 0, UZ ? -zp : below_z), q = face(wz, cz, k, zp, NZ && !UZ ? zp : above_z);
+                    const B h = face(wy, cy, k, 0, low_y), l = face(wy, cy, k, yp, high_y);
+                    const B o = face(wz, cz, k, 0, UPPER ? -zp : below_z), q = face(wz, cz, k, zp, BOTH && !UPPER ? zp : above_z);
                     if constexpr (COUNTS) sum += (B)(d[k] - f - g - h - l - o - q);
                     else { const B e = unit*(T)d[k], v = e - f - g - h - l - o - q; sum += v > least*e ? v : (B)0; }
-                    bx_ += f; ax_ += g;
-                    if (!UY) by_ += h;
-                    if (UY || !NY) ay_ += l;
-                    if (!UZ) bz_ += o;
-                    if (UZ || !NZ) az_ += q; };
+                    bx_ += f; ax_ += g; ay_ += SECOND ? l : outer(l, only);
+                    if (!SECOND) by_ += h;
+                    if (!UPPER) bz_ += o;
+                    if (UPPER || !BOTH) az_ += q; };
                 add(No());
-                if (NZ) add(Yes());
+                if (BOTH) add(Yes());
                 excess[i] = sum; bx[i] = bx_; ax[i] = ax_; by[i] = by_; ay[i] = ay_; bz[i] = bz_; az[i] = az_; };
-            const auto row = [&](auto second) {
-                const int bytes = COUNTS ? fx*m/64*64 : 0;
-                SIMD64 for (int i = 0; i < bytes; ++i) cell(second, i, -1, 1);
-                SIMD for (int i = bytes; i < fx*m; ++i) cell(second, i, -1, 1); };
-            const auto end = [&](int i, long long left, long long right) {  // a cell whose neighbor is at the other end of the row
-                cell(No(), i, left, right);
-                if (decltype(two_y)::value) cell(Yes(), i, left, right); };
-            row(No());
-            if (decltype(two_y)::value) row(Yes());
-            if (P.first + begin == 0 && below_x != -1) end(0, below_x, 1);
-            if (last < fx*m && above_x != 1) end(last, -1, above_x); };
-        if (wide == 1) { if (deep == 1) rows(No(), No()); else rows(No(), Yes()); }
-        else { if (deep == 1) rows(Yes(), No()); else rows(Yes(), Yes()); }
+            const int bytes = COUNTS ? from + (to - from)/64*64 : from;
+            SIMD64 for (int i = from; i < bytes; ++i) cell(i);
+            SIMD for (int i = bytes; i < to; ++i) cell(i); };
+        for (int part = 0; part < 3; ++part) {  // all; again those whose neighbor is at the other end of the row
+            const int from = part == 2 ? last : 0, to = part == 0 ? fx*m : from + 1;
+            if (part == 1 && (P.first + begin > 0 || below_x == -1)) continue;
+            if (part == 2 && (last >= fx*m || above_x == 1)) continue;
+            const long long left = part == 1 ? below_x : -1, right = part == 2 ? above_x : 1;
+            if (deep == 1) { row(No(), No(), from, to, left, right); if (wide == 2) row(No(), Yes(), from, to, left, right); }
+            else { row(Yes(), No(), from, to, left, right); if (wide == 2) row(Yes(), Yes(), from, to, left, right); } }
         T *dc = coarse_d + begin, *wxc = coarse_wx + begin, *wyc = coarse_wy + begin, *wzc = coarse_wz + begin;
         if (fx == 2) {
             SIMD for (int k = 0; k < m; ++k) {
