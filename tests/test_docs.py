@@ -9,6 +9,7 @@ import warp_lcp as wl
 from benchmarks import sweep_prices
 from code_blocks import blocks, run
 from warp_lcp.driver.scene_file import load_scene
+from warp_lcp.protocol import families
 from warp_lcp.solvers.registry import grid_methods
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -31,7 +32,7 @@ def test_rows_say_what_the_classes_say(row):
     method = wl.METHODS[name]
     assert row["class"] == f"`{method.__name__}`"
     assert getattr(wl, method.__name__) is method
-    assert set(row["takes"].split(", ")) == method.supports
+    assert set(row["takes"].split(", ")) == families(method)
     assert row["affine"] == ("yes" if getattr(method, "affine_bounds", False) else "no")
     assert row["name"].endswith("*") == (name in grid_methods())
     for needs in (row["needs"], method.needs):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 from warp_lcp.problem import LCP
@@ -184,6 +184,14 @@ RULES: tuple[Rule, ...] = (
         ("psor", "blocked-gauss-seidel", "staggering"),
     ),
     Rule(
+        "projected-jacobi",
+        "Bounds that are affine in x, with an operator that can neither be swept nor shows its rows,",
+        "are for the one method that takes both",
+        lambda t: t.bounds == "affine",
+        None,
+        (),
+    ),
+    Rule(
         "minimum-map-newton",
         "An operator that shows no rows",
         "cannot be swept; Newton's method needs the fewest products",
@@ -350,8 +358,8 @@ def recommend(problem: LCP, *, accuracy: float | str = "usual", budget: Budget |
         raise ValueError(f"budget = {budget!r}: expected Budget(seconds=...), Budget(iterations=...) or Budget(bytes=...)")
     rtol = _relative(accuracy)
     traits = traits_of(problem, rtol)
-    rule = next(rule for rule in RULES if rule.applies(traits))
-    return _within(_from_rule(rule, traits, rtol), budget, problem) if budget else _from_rule(rule, traits, rtol)
+    found = _from_rule(next(_rules(traits)), traits, rtol)
+    return _within(found, budget, problem) if budget else found
 
 
 def _is_number(value: object) -> bool:
@@ -386,13 +394,14 @@ def _from_rule(rule: Rule, t: Traits, rtol: float) -> Recommendation:
     return Recommendation(rule.method, method, stopping, reasons, expected, _able(rule.alternatives, t), t)
 
 
+def _rules(t: Traits) -> Iterator[Rule]:
+    """Return the rules that apply, of the methods that take such a problem."""
+    return (rule for rule in RULES if rule.method in t.able and rule.applies(t))
+
+
 def _able(names: tuple[str, ...], t: Traits) -> tuple[str, ...]:
-    """Return the names of the methods that take such a problem."""
-    kind = "grid" if t.kind == "operator" else t.kind
-    fits = [n for n in names if kind in METHODS[n].supports and t.unknowns <= getattr(METHODS[n], "most_unknowns", t.unknowns)]
-    if t.bounds == "affine":
-        fits = [n for n in fits if getattr(METHODS[n], "affine_bounds", False)]
-    return tuple(fits)
+    """Return those of the names that are of methods that take such a problem."""
+    return tuple(n for n in names if n in t.able)
 
 
 def _portrait(t: Traits) -> str:
@@ -426,7 +435,7 @@ def _within(first: Recommendation, budget: Budget, problem: LCP) -> Recommendati
     if budget.iterations is not None:
         sweeps = {"psor": t.sweeps, "nncg": t.sweeps, "blocked-gauss-seidel": t.block_sweeps}.get(found.name)
         if budget.bytes is None and sweeps is not None and sweeps > budget.iterations:
-            others = ((rule, rule.steps[1]) for rule in RULES if rule.steps is not None and rule.applies(t))
+            others = ((rule, rule.steps[1]) for rule in _rules(t) if rule.steps is not None)
             fewer = next(((rule, steps) for rule, steps in others if steps <= budget.iterations), None)
             if fewer is not None:
                 why = f"{found.name} would take {sweeps:.0f} of the {budget.iterations} steps allowed, {fewer[0].method} about {fewer[1]}."

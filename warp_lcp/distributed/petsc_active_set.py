@@ -10,8 +10,8 @@ import warp as wp
 from warp_lcp.distributed.petsc_matrix import PetscGrid
 from warp_lcp.distributed.ranks import petsc
 from warp_lcp.multigrid.hierarchy import CycleSettings
-from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import HasStencil, check_taken, has
 from warp_lcp.solve import Step
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
 from warp_lcp.solvers.principal_system import GridSystem, PrincipalSystem
@@ -53,7 +53,7 @@ class PetscActiveSet:
         ValueError: an argument is outside its range.
     """
 
-    supports: ClassVar[frozenset[str]] = frozenset({"grid"})
+    supports: ClassVar = (HasStencil,)
     needs: ClassVar[str] = "positive definite"
     distributed: ClassVar[bool] = True
 
@@ -79,10 +79,9 @@ class PetscActiveSet:
 
         Raises:
             ImportError: PETSc cannot be imported; the message says how to install it.
-            ValueError: A is no grid operator.
+            ValueError: A has no stencil.
         """
-        if not isinstance(problem.A, GridPoisson):
-            raise ValueError(f"PetscActiveSet takes a GridPoisson, not a {type(problem.A).__name__}: take MinimumMapNewton")
+        check_taken(self, problem.A)
         return KSPWorkspace(problem, self)
 
     def step(self, problem: LCP, work: KSPWorkspace, x: wp.array[Any]) -> Step:
@@ -109,14 +108,14 @@ class KSPWorkspace(NewtonWorkspace):
 
     def _principal_system(self) -> PrincipalSystem:
         A = self.problem.A
-        assert isinstance(A, GridPoisson)
+        assert has(A, HasStencil)
         return KSPSystem(A, self.precision.correction, bounded=self.bounded, settings=self.settings.cycle, prefix=self._prefix)
 
 
 class KSPSystem(GridSystem):
     """The system on a grid's free set, solved by PETSc's KSP."""
 
-    def __init__(self, A: GridPoisson, real: Any, *, bounded: bool, settings: CycleSettings | None = None, prefix: str = "") -> None:
+    def __init__(self, A: HasStencil, real: Any, *, bounded: bool, settings: CycleSettings | None = None, prefix: str = "") -> None:
         self._prefix = prefix
         super().__init__(A, real, bounded=bounded, settings=settings)
 

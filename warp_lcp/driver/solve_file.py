@@ -17,6 +17,7 @@ from warp_lcp.driver.matrix_market import MarketError, read_market
 from warp_lcp.nearest import nearest
 from warp_lcp.operators import DenseOperator, SparseOperator
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import families
 from warp_lcp.result import SolveResult
 from warp_lcp.solvers.default import default_method, solve
 from warp_lcp.solvers.registry import METHODS
@@ -208,10 +209,10 @@ def _method(name: str, operator: Any) -> Any:
     """Return a method by its name."""
     if name not in METHODS:
         raise ProblemError(f"--method {name}: no such method; {nearest(name, METHODS)}")
-    family = "sparse" if isinstance(operator, SparseOperator) else "dense"
-    takes = {known for known, kind in METHODS.items() if family in getattr(kind, "supports", {family})}
-    if name not in takes:
-        raise ProblemError(f"--method {name}: does not take {family} matrices; choose from {', '.join(sorted(takes))}")
+    kind = "sparse" if isinstance(operator, SparseOperator) else "dense"
+    fits = [known for known, method in METHODS.items() if kind in families(method)]
+    if name not in fits:
+        raise ProblemError(f"--method {name}: does not take {kind} matrices; choose from {', '.join(fits)}")
     try:
         return METHODS[name]()
     except (ImportError, TypeError) as error:

@@ -16,6 +16,7 @@ from warp_lcp.gallery.recorded_part import cell_counts, load_part
 from warp_lcp.nearest import nearest
 from warp_lcp.operators import GridPoisson
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import families
 from warp_lcp.solvers.default import solve
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 from warp_lcp.solvers.registry import METHODS
@@ -179,7 +180,7 @@ def _method(name: str, *, shared: bool) -> Any:
     """Return a method by its name."""
     if name not in METHODS:
         raise ProblemError(f"--method {name}: no such method; {nearest(name, METHODS)}")
-    takes = {known for known, kind in METHODS.items() if "grid" in kind.supports and (not shared or getattr(kind, "distributed", False))}
+    takes = {known for known, kind in METHODS.items() if "grid" in families(kind) and (not shared or getattr(kind, "distributed", False))}
     if name not in takes:
         where = "work on several ranks" if shared else "take grids"
         raise ProblemError(f"--method {name}: does not {where}; choose from {', '.join(sorted(takes))}")

@@ -46,7 +46,6 @@ class GradientDescent:
         ValueError: an argument is outside its range.
     """
 
-    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
     needs: ClassVar[str] = "products with A'"
 
     map: str = "fischer"

@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import HasRows, Relaxes, check_taken
 from warp_lcp.residual import WITHIN
 from warp_lcp.rows import Rows
 from warp_lcp.solve import Precision, Step
@@ -38,7 +39,7 @@ class NNCG:
         ValueError: an argument is outside its range.
     """
 
-    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
+    supports: ClassVar = (Relaxes, HasRows)
     needs: ClassVar[str] = "what ProjectedSOR needs"
     affine_bounds: ClassVar[bool] = True
 
@@ -60,6 +61,7 @@ class NNCG:
         Raises:
             ValueError: A cannot be swept; see ProjectedSOR.
         """
+        check_taken(self, problem.A)
         work = NNCGWorkspace(problem, Precision(self.precision))
         work.sweep = sweep_for(problem, work.diagonal, self.omega)
         work.diagonal.check()

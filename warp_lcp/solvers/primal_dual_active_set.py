@@ -53,7 +53,6 @@ class PrimalDualActiveSet:
         ValueError: an argument is outside its range.
     """
 
-    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
     needs: ClassVar[str] = "M-matrix, or P-matrix where dense"
 
     precision: str = "mixed"

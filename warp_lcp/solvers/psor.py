@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import HasRows, Relaxes, check_taken
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.solve import IterateInPlace, Precision, RoundedIterate, Step
 from warp_lcp.solvers.spectrum import scaled_spectrum
@@ -48,7 +49,7 @@ class ProjectedSOR:
         ValueError: an argument is outside its range.
     """
 
-    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
+    supports: ClassVar = (Relaxes, HasRows)
     needs: ClassVar[str] = "symmetric positive (semi-)definite A for a proof of convergence; A_ii <= 0 case by case"
     affine_bounds: ClassVar[bool] = True
 
@@ -79,6 +80,7 @@ class ProjectedSOR:
             ValueError: A cannot be swept (in this order), has a zero or negative diagonal entry with a right-hand side that no bound
                 meets, or an odd periodic side.
         """
+        check_taken(self, problem.A)
         work = SweepWorkspace(problem, Precision(self.precision))
         work.sweep = sweep_for(problem, work.diagonal, self.omega, SweepOrder(self.order), self.permutation)
         work.diagonal.check()
