@@ -122,7 +122,7 @@ class HasStencil(HasCells, HasLayout, Versioned, Protocol):
 
 
 @runtime_checkable
-class HasFaces(HasCells, Versioned, Protocol):
+class HasFaces(HasCells, HasLayout, Versioned, Protocol):
     """What a `wl.GridPoisson` on some of the cells is made from, the others taken as AIR: a block of the unknowns.
 
     Attributes:
