@@ -77,7 +77,7 @@ class LCP(Pickled):
         A = as_operator(A, b.device if isinstance(b, wp.array) else None)
         self.A, self.layout = A, layout_of(A)
         self.unknown = _unknown(A, self.layout)
-        if self._totals(np.array([np.count_nonzero(self.unknown.numpy() == 1)])) == [0]:
+        if has(A, HasCells) and self._totals(np.array([np.count_nonzero(self.unknown.numpy() == 1)])) == [0]:
             raise ValueError("A has no unknowns: the problem is empty")
         self.in_place = isinstance(b, wp.array) and self.layout.holds(b, wp.float64) and tuple(b.shape) != tuple(A.shape)
         self.b = self.layout.load(b, wp.float64, "b")

@@ -1,4 +1,8 @@
-"""What solvers ask of an operator: the members that each has, and capabilities that some methods need and others make use of."""
+"""What solvers ask of an operator: the members that each has, and capabilities that some methods need and others make use of.
+
+An operator has a capability if it has the members; `has` says so, and is the only place that looks for them by name. A method lists in
+`supports` the capabilities of which it needs one.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +51,6 @@ class Operator(Protocol):
         """Return P A P + P D P, with P the restriction to the unknowns where `free` is not 0 and D = diag(shift)."""
 
 
-@runtime_checkable
 class HasRows(Operator, Protocol):
     """The entries of A by rows: for sweeps in any order, blocks, and proofs that there is no solution.
 
@@ -62,7 +65,6 @@ class HasRows(Operator, Protocol):
         """Return the rows of A between the elements of flat stored fields, in the operator's own memory."""
 
 
-@runtime_checkable
 class Relaxes(Operator, Protocol):
     """A sweep in an order of the operator's own."""
 
@@ -73,7 +75,6 @@ class Relaxes(Operator, Protocol):
         """
 
 
-@runtime_checkable
 class HasLayout(Operator, Protocol):
     """Fields that are stored otherwise than as plain arrays.
 
@@ -84,7 +85,6 @@ class HasLayout(Operator, Protocol):
     layout: Layout
 
 
-@runtime_checkable
 class Versioned(Operator, Protocol):
     """Entries that change in place.
 
@@ -95,7 +95,6 @@ class Versioned(Operator, Protocol):
     version: int
 
 
-@runtime_checkable
 class HasCells(Operator, Protocol):
     """Elements of a field that are no unknowns.
 
@@ -106,7 +105,6 @@ class HasCells(Operator, Protocol):
     cells: wp.array[Any]
 
 
-@runtime_checkable
 class HasStencil(HasCells, HasLayout, Versioned, Protocol):
     """The 5- or 7-point stencil of a grid: for multigrid and for passes that compute A x on the way.
 
@@ -121,7 +119,6 @@ class HasStencil(HasCells, HasLayout, Versioned, Protocol):
     layout: PaddedLayout
 
 
-@runtime_checkable
 class HasFaces(HasCells, HasLayout, Versioned, Protocol):
     """What a `wl.GridPoisson` on some of the cells is made from, the others taken as AIR: a block of the unknowns.
 
@@ -138,7 +135,6 @@ class HasFaces(HasCells, HasLayout, Versioned, Protocol):
     periodic: tuple[bool, bool, bool]
 
 
-@runtime_checkable
 class HasColumns(Operator, Protocol):
     """A = G + U W U', with a stencil and a few columns.
 
@@ -151,7 +147,6 @@ class HasColumns(Operator, Protocol):
     low: Any
 
 
-@runtime_checkable
 class AppliesPlus(Operator, Protocol):
     """A x + b in one pass: saves each residual one over memory."""
 
@@ -159,7 +154,6 @@ class AppliesPlus(Operator, Protocol):
         """Out = A x + b; flat stored fields of one type."""
 
 
-@runtime_checkable
 class HasScale(Operator, Protocol):
     """The d of the natural residual, d_i (x_i - clip(x_i - y_i / d_i, l_i, u_i)); without it, d is estimated by 16 products."""
 
@@ -167,7 +161,6 @@ class HasScale(Operator, Protocol):
         """Return d > 0, units of y over those of x, as a flat stored field; None: it is to be estimated."""
 
 
-@runtime_checkable
 class NamesComponents(Operator, Protocol):
     """Sets of unknowns on which A is singular with the constants as null space: they are projected out, or b is INFEASIBLE there."""
 
@@ -204,7 +197,7 @@ def members(capability: type[Operator]) -> tuple[str, ...]:
 
 
 def has(A: object, capability: type[Capability]) -> TypeGuard[Capability]:
-    """Return whether an operator has a capability: what `isinstance` says, a hundred times as fast."""
+    """Return whether an operator has a capability: all of its members. `isinstance` of protocols would take 10 us."""
     return all(hasattr(A, name) for name in members(capability))
 
 
