@@ -88,7 +88,7 @@ class BlockedGaussSeidel:
         A, given, kind = problem.A, self.blocks, type(problem.A).__name__
         rows = A.rows() if has(A, HasRows) else None
         if given is None:
-            given = GridLines.X if rows is None else CONSECUTIVE
+            given = GridLines.X if has(A, HasStencil) else CONSECUTIVE
         if isinstance(given, GridLines):
             if not has(A, HasStencil) or self.sub_solver is not None:
                 raise ValueError(f"blocks = {given}: are for GridPoisson without a sub_solver; A is a {kind}")
