@@ -39,6 +39,7 @@ MEMORY = {
     "projected-multigrid": (0.0, 12.0),
 }
 LEAN = (0.0, 18.0)  # methods that hold some fields only
+LEANEST = ("psor", "accelerated-projected-gradient", "projected-jacobi")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -391,17 +392,12 @@ def _from_rule(rule: Rule, t: Traits, rtol: float) -> Recommendation:
     stopping = StoppingCriteria(rtol=rtol, max_iterations=limit, patience=max(30, limit // 10))
     direct = rule.method == "minimum-map-newton" and t.direct
     method = MinimumMapNewton(direct=True) if direct else METHODS[rule.method]()
-    return Recommendation(rule.method, method, stopping, reasons, expected, _able(rule.alternatives, t), t)
+    return Recommendation(rule.method, method, stopping, reasons, expected, tuple(n for n in rule.alternatives if n in t.able), t)
 
 
 def _rules(t: Traits) -> Iterator[Rule]:
     """Return the rules that apply, of the methods that take such a problem."""
     return (rule for rule in RULES if rule.method in t.able and rule.applies(t))
-
-
-def _able(names: tuple[str, ...], t: Traits) -> tuple[str, ...]:
-    """Return those of the names that are of methods that take such a problem."""
-    return tuple(n for n in names if n in t.able)
 
 
 def _portrait(t: Traits) -> str:
@@ -426,7 +422,7 @@ def _within(first: Recommendation, budget: Budget, problem: LCP) -> Recommendati
     """Return a recommendation that respects a budget, or says that it cannot."""
     found, t = first, first.traits
     if budget.bytes is not None and memory_of(found.name, t) > budget.bytes:
-        lean = next((n for n in _able(("psor", "accelerated-projected-gradient", "projected-jacobi"), t) if _starts(n, problem)), None)
+        lean = next((n for n in LEANEST if n in t.able and _starts(n, problem)), None)
         if lean is None or memory_of(lean, t) > budget.bytes:
             found = _said(found, f"No method fits into {budget.bytes} bytes; this one takes about {memory_of(found.name, t)}.")
         else:
@@ -451,7 +447,7 @@ def _in_time(found: Recommendation, seconds: float, problem: LCP) -> Recommendat
     took = time.perf_counter() - begun
     if solved and took <= seconds:
         return _said(found, f"Its set-up and first step took {took:.2g} s of the {seconds:g} s allowed.")
-    if not _able(("psor",), found.traits) or not _starts("psor", problem):
+    if "psor" not in found.traits.able or not _starts("psor", problem):
         return _said(found, f"Its set-up and first step took {took:.2g} s, more than the {seconds:g} s allowed; no sweep is possible here.")
     begun = time.perf_counter()
     _tried("psor", problem, TRIAL)

@@ -121,7 +121,8 @@ def solve_files(
     try:
         operator = SparseOperator(A, device=device) if scipy.sparse.issparse(A) else DenseOperator(A, device=device)
         problem = LCP(operator, b, *sides)
-        solver = default_method(problem) if method is None else _method(method, operator)
+        family = "sparse" if isinstance(operator, SparseOperator) else "dense"
+        solver = default_method(problem) if method is None else method_named(method, family)
         result = solve(problem, solver, stopping=stopping)
     except ValueError as error:
         raise ProblemError(str(error)) from error
@@ -205,14 +206,14 @@ def _bound(value: str, n: int, option: str) -> float | np.ndarray:
         return read_vector(Path(value), n, infinite=True)
 
 
-def _method(name: str, operator: Any) -> Any:
-    """Return a method by its name."""
+def method_named(name: str, family: str, *, shared: bool = False) -> Any:
+    """Return a method by its name, for a family of operators, perhaps on several ranks."""
     if name not in METHODS:
         raise ProblemError(f"--method {name}: no such method; {nearest(name, METHODS)}")
-    kind = "sparse" if isinstance(operator, SparseOperator) else "dense"
-    fits = [known for known, method in METHODS.items() if kind in families(method)]
+    fits = [known for known, kind in METHODS.items() if family in families(kind) and (not shared or getattr(kind, "distributed", False))]
     if name not in fits:
-        raise ProblemError(f"--method {name}: does not take {kind} matrices; choose from {', '.join(fits)}")
+        what = "work on several ranks" if shared else "take grids" if family == "grid" else f"take {family} matrices"
+        raise ProblemError(f"--method {name}: does not {what}; choose from {', '.join(fits)}")
     try:
         return METHODS[name]()
     except (ImportError, TypeError) as error:

@@ -11,12 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from warp_lcp.driver.atomic import replacing
-from warp_lcp.driver.solve_file import Outcome, ProblemError, criteria
+from warp_lcp.driver.solve_file import Outcome, ProblemError, criteria, method_named
 from warp_lcp.gallery.recorded_part import cell_counts, load_part
-from warp_lcp.nearest import nearest
 from warp_lcp.operators import GridPoisson
 from warp_lcp.problem import LCP
-from warp_lcp.protocol import families
 from warp_lcp.solvers.default import solve
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 from warp_lcp.solvers.registry import METHODS
@@ -94,7 +92,7 @@ def solve_recorded(
         ProblemError: the file or an option is wrong.
     """
     stopping = criteria(tolerance, max_iterations, max_seconds)
-    solver = ProjectedMultigrid() if method is None else _method(method, shared=ranks is not None and ranks.size > 1)
+    solver = ProjectedMultigrid() if method is None else method_named(method, "grid", shared=ranks is not None and ranks.size > 1)
     name = next(name for name, kind in METHODS.items() if type(solver) is kind)
     try:
         shape = cell_counts(path)
@@ -174,17 +172,3 @@ def _write_boxes(path: Path, x: np.ndarray, shape: tuple[int, ...], decompositio
             whole[part] = mine
         whole.flush()
         del whole
-
-
-def _method(name: str, *, shared: bool) -> Any:
-    """Return a method by its name."""
-    if name not in METHODS:
-        raise ProblemError(f"--method {name}: no such method; {nearest(name, METHODS)}")
-    takes = {known for known, kind in METHODS.items() if "grid" in families(kind) and (not shared or getattr(kind, "distributed", False))}
-    if name not in takes:
-        where = "work on several ranks" if shared else "take grids"
-        raise ProblemError(f"--method {name}: does not {where}; choose from {', '.join(sorted(takes))}")
-    try:
-        return METHODS[name]()
-    except (ImportError, TypeError) as error:
-        raise ProblemError(f"--method {name}: {error}") from error

@@ -55,11 +55,13 @@ class SumOperator(Pickled):
         self.shape, self.device = tuple(first.shape), first.device
         self.dtype = wp.float64 if wp.float64 in (first.dtype, second.dtype) else wp.float32
         self._scratch: dict[Any, wp.array[Any]] = {}
-        for A, B in ((first, second), (second, first)):
-            if has(A, HasCells):
-                self.cells = A.cells
-            if has(A, HasStencil) and isinstance(B, LowRankOperator):
-                self.grid, self.low = A, B
+        terms: tuple[Operator, Operator] = (second, first) if isinstance(first, LowRankOperator) else (first, second)
+        self._plain, self._low = terms
+        for term in (second, first):
+            if has(term, HasCells):
+                self.cells = term.cells
+        if has(self._plain, HasStencil) and isinstance(self._low, LowRankOperator):
+            self.grid, self.low = self._plain, self._low
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the terms."""
@@ -94,7 +96,7 @@ class SumOperator(Pickled):
 
     def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
         """Out = A x + B x + b; flat stored fields of one type."""
-        plain, low = (self.second, self.first) if isinstance(self.first, LowRankOperator) else (self.first, self.second)
+        plain, low = self._plain, self._low
         if isinstance(low, LowRankOperator) and has(plain, AppliesPlus):
             plain.apply_plus(x, b, out)
             low.add(x, out, out)
@@ -109,11 +111,11 @@ class SumOperator(Pickled):
         The constants of a component are a null space as long as no column of a LowRankOperator feels them: a body that closes off a
         chamber as a piston does is moved by the pressure in it.
         """
-        for A, B in ((self.first, self.second), (self.second, self.first)):
-            if isinstance(B, LowRankOperator) and has(A, NamesComponents):
-                found = A.floating_components(scratch)
-                return None if found is None else found.without(_felt(found.label, found.count, B))
-        return None
+        plain, low = self._plain, self._low
+        if not (isinstance(low, LowRankOperator) and has(plain, NamesComponents)):
+            return None
+        found = plain.floating_components(scratch)
+        return None if found is None else found.without(_felt(found.label, found.count, low))
 
     def masked(self, free: Any, shift: Any = None) -> SumOperator:
         """Return P (A + B) P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift)."""
@@ -132,7 +134,7 @@ class SumOperator(Pickled):
         return out
 
     def _add_fields(self, x: wp.array[Any], out: wp.array[Any], *, transposed: bool) -> None:
-        plain, low = (self.second, self.first) if isinstance(self.first, LowRankOperator) else (self.first, self.second)
+        plain, low = self._plain, self._low
         (plain.apply_transpose if transposed else plain.apply)(x, out)
         if isinstance(low, LowRankOperator) and x.size == low.layout.size:
             low.add(x.flatten(), out.flatten(), out.flatten(), transposed=transposed)

@@ -7,7 +7,6 @@ problems only has `most_unknowns`; one that takes no upper bounds and no equatio
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 from warp_lcp.nearest import nearest
@@ -66,13 +65,5 @@ METHODS = Methods(
 
 def grid_methods() -> tuple[str, ...]:
     """Return the names of the methods that take a grid of any size and a precision: what a scene may name."""
-    able = [name for name, method in METHODS.items() if "grid" in families(method)]
-    return tuple(name for name in able if _has_precision(METHODS[name]) and not _is_small(METHODS[name]))
-
-
-def _is_small(method: type[Any]) -> bool:
-    return hasattr(method, "most_unknowns")
-
-
-def _has_precision(method: type[Any]) -> bool:
-    return any(field.name == "precision" for field in dataclasses.fields(method))
+    grids = [(name, method) for name, method in METHODS.items() if "grid" in families(method) and not hasattr(method, "most_unknowns")]
+    return tuple(name for name, method in grids if "precision" in method.__dataclass_fields__)
