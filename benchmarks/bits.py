@@ -25,6 +25,7 @@ from benchmarks.problems import cut_cells, splash
 from warp_lcp.driver.progress import Lines
 from warp_lcp.driver.run import run_scene
 from warp_lcp.driver.scene_file import load_scene
+from warp_lcp.protocol import families
 from warp_lcp.solvers.mprgp import MPRGP
 from warp_lcp.solvers.registry import METHODS
 
@@ -137,7 +138,7 @@ def method_solves() -> Iterator[tuple[str, wl.LCP, Any, Any]]:
         b, start = rng.standard_normal(shape), rng.standard_normal(shape)
         sides = bounds_of(shape)[kind]
         for name, method in METHODS.items():
-            if what.split()[0] not in method.supports or math.prod(shape) > getattr(method, "most_unknowns", math.inf):
+            if what.split()[0] not in families(method) or math.prod(shape) > getattr(method, "most_unknowns", math.inf):
                 continue
             for number, made in enumerate(_variants(name, method)):
                 yield f"{what} {kind} {number}", wl.LCP(make(), b, *sides), made, None

@@ -18,6 +18,7 @@ import scipy.optimize
 import warp_lcp as wl
 from warp_lcp.gallery.articulated_figure import ArticulatedFigure, branching_figure, planar_chain, spatial_chain
 from warp_lcp.gallery.inverse_kinematics import InverseKinematics, Pose
+from warp_lcp.protocol import families
 
 SAME = 1e-6  # of reach^2: objectives that differ by less are one optimum
 OUTSIDE = 1e-9  # [rad] beyond the limits
@@ -178,7 +179,7 @@ def _print_damping(count: int) -> None:
 def _print_methods(count: int) -> None:
     reference = [InverseKinematics(device="cpu", curvature=True).solve(t.figure, t.goals, t.start) for t in targets(count)]
     for name, method in wl.METHODS.items():
-        if "dense" not in method.supports or getattr(method, "most_unknowns", 9999) < 13:
+        if "dense" not in families(method) or getattr(method, "most_unknowns", 9999) < 13:
             continue
         solver = InverseKinematics(device="cpu", curvature=True, method=method())
         try:

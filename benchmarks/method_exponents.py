@@ -14,6 +14,7 @@ import warp_lcp as wl
 from warp_lcp import gallery
 from warp_lcp.gallery import Plant, Problem, planted
 from warp_lcp.gallery.psd import spectrum_matrix
+from warp_lcp.protocol import families
 
 SIZES = {"dense": (200, 400), "grid": (32, 64)}  # unknowns; cells along a side of a splash, half of them liquid
 LIMITS = {"max_iterations": 400, "patience": 100}
@@ -81,12 +82,12 @@ def main() -> None:
     slow = ("projected-jacobi", "gradient-descent")  # thousands of steps on grids
     for name, method in wl.METHODS.items():
         if getattr(method, "most_unknowns", 400) >= 400:
-            large = "grid" in method.supports and not hasattr(method, "most_unknowns") and name not in slow
-            dense = exponents(name, "dense") if "dense" in method.supports else "-"
+            large = "grid" in families(method) and not hasattr(method, "most_unknowns") and name not in slow
+            dense = exponents(name, "dense") if "dense" in families(method) else "-"
             print(f"| `{name}` | {dense} | {exponents(name, 'grid') if large else '-'} |", flush=True)
     print("\n| method | " + " | ".join(MATRICES) + " |\n|" + "---|" * (1 + len(MATRICES)))
     for name, method in wl.METHODS.items():
-        if "dense" in method.supports and getattr(method, "most_unknowns", 60) >= 60:
+        if "dense" in families(method) and getattr(method, "most_unknowns", 60) >= 60:
             print(f"| `{name}` | " + " | ".join(outcome(name, make()) for make in MATRICES.values()) + " |", flush=True)
 
 

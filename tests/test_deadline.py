@@ -12,6 +12,7 @@ import scipy.sparse
 import warp_lcp as wl
 from oracle import natural_residual
 from warp_lcp import deadline
+from warp_lcp.protocol import families
 from warp_lcp.solvers.partition import block_problem
 
 S = wl.SolveStatus
@@ -59,7 +60,7 @@ def solve(monkeypatch):
     return by_counting
 
 
-@pytest.mark.parametrize(("name", "family"), [(name, family) for name, cls in wl.METHODS.items() for family in sorted(cls.supports)])
+@pytest.mark.parametrize(("name", "family"), [(name, family) for name, cls in wl.METHODS.items() for family in sorted(families(cls))])
 def test_each_method_ends_in_time_with_its_best_iterate(name, family, solve):
     if name == "quadratic-program":
         pytest.importorskip("piqp")

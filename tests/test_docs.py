@@ -9,6 +9,7 @@ import warp_lcp as wl
 from benchmarks import sweep_prices
 from code_blocks import blocks, run
 from warp_lcp.driver.scene_file import load_scene
+from warp_lcp.protocol import CAPABILITIES, families, members
 from warp_lcp.solvers.registry import grid_methods
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -31,7 +32,7 @@ def test_rows_say_what_the_classes_say(row):
     method = wl.METHODS[name]
     assert row["class"] == f"`{method.__name__}`"
     assert getattr(wl, method.__name__) is method
-    assert set(row["takes"].split(", ")) == method.supports
+    assert set(row["takes"].split(", ")) == families(method)
     assert row["affine"] == ("yes" if getattr(method, "affine_bounds", False) else "no")
     assert row["name"].endswith("*") == (name in grid_methods())
     for needs in (row["needs"], method.needs):
@@ -41,6 +42,17 @@ def test_rows_say_what_the_classes_say(row):
     assert getattr(method, "boxed", True)  # the text says so of all
     section = re.match(r"[\d.]+", row["book"])
     assert section is None or section.group() in method.__doc__
+
+
+def test_capabilities_have_their_rows():
+    """The table of operators is what protocols and methods say, in their order."""
+    rows = re.findall(r"^\| `(\w+)` \| (.*) \| (.*) \| (.*) \|$", (DOCS / "operators.md").read_text(), flags=re.M)
+    expected = []
+    for capability, (_, having) in CAPABILITIES.items():
+        asking = sorted(name for name, method in wl.METHODS.items() if capability in getattr(method, "supports", ()))
+        names, asked = (", ".join(f"`{name}`" for name in listed) for listed in (members(capability), asking))
+        expected.append((capability.__name__, names, ", ".join(having) or "-", asked or "-"))
+    assert rows == expected
 
 
 def test_prices_name_methods():

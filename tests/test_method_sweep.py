@@ -15,6 +15,7 @@ import warp as wp
 import warp_lcp as wl
 from oracle import natural_residual
 from warp_lcp.gallery import FAMILIES
+from warp_lcp.protocol import families
 from warp_lcp.solvers.registry import METHODS
 
 RTOL = {"mixed": 1e-8, "double": 1e-8, "single": 1e-3}
@@ -44,7 +45,7 @@ def as_kind(problem, seed):
 
 def takes(cls, problem, n):
     boxes = {"boxed", "mixed"} & problem.facts
-    return problem.kind in cls.supports and n <= getattr(cls, "most_unknowns", n) and (getattr(cls, "boxed", True) or not boxes)
+    return problem.kind in families(cls) and n <= getattr(cls, "most_unknowns", n) and (getattr(cls, "boxed", True) or not boxes)
 
 
 def allowed(name, facts):
@@ -137,7 +138,7 @@ def test_sweep(name, monkeypatch):
     outcomes, found = sweep(name, cls, [1000 + sum(map(ord, name)), 2000 + sum(map(ord, name))])
     assert not found, "\n".join(found)
     if "most_unknowns" not in vars(cls) or cls.most_unknowns > 100:
-        assert sum(outcomes.values()) >= (1 if cls.supports == {"grid"} else len(FAMILIES))
+        assert sum(outcomes.values()) >= (1 if families(cls) == {"grid"} else len(FAMILIES))
 
 
 @pytest.mark.slow

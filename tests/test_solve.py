@@ -154,7 +154,7 @@ def test_without_a_method_the_fastest_is_taken():
 
 
 def test_methods_refuse_what_they_cannot_take():
-    with pytest.raises(ValueError, match="no method `relax`"):
+    with pytest.raises(ValueError, match="ProjectedSOR needs an operator with a sweep"):
         wl.solve(wl.LCP(Ring(5), -np.ones(5)), wl.ProjectedSOR())
     zero = wl.DenseOperator(np.array([[0.0, 1.0], [1.0, 1.0]]), device="cpu")
     with pytest.raises(ValueError, match="zero on the diagonal"):

@@ -6,7 +6,8 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.problem import MEMBERS
+from warp_lcp.protocol import families
+from warp_lcp.protocol import members as names_of
 
 A, B = np.array([[2.0, -1.0], [-1.0, 2.0]]), np.array([0.5, -2.5])
 X = [0.5, 1.5]  # 2 * 0.5 - 1.5 + 0.5 = 0 and -0.5 + 2 * 1.5 - 2.5 = 0
@@ -87,14 +88,14 @@ def test_workspaces_of_another_method_problem_or_kind_are_refused(name, device):
     method = wl.METHODS[name]()
     if name == "quadratic-program":
         pytest.importorskip("piqp")
-    for family in wl.METHODS[name].supports:
+    for family in families(wl.METHODS[name]):
         problem, twin = (OPERATORS[family](device) for _ in range(2))
         assert wl.solve(problem, method, workspace=method.init(problem), stopping=wl.StoppingCriteria(rtol=0.5))
         with pytest.raises(ValueError, match="workspace was made for another problem"):
             wl.solve(problem, method, workspace=method.init(twin))
         for other, cls in wl.METHODS.items():
             shared = (name, other) == ("blocked-gauss-seidel", "staggering")  # two blocks are staggered
-            if other not in (name, "quadratic-program") and family in cls.supports and not shared:
+            if other not in (name, "quadratic-program") and family in families(cls) and not shared:
                 with pytest.raises(ValueError, match=f"workspace is a .*: expected what {type(method).__name__}"):
                     wl.solve(problem, method, workspace=cls().init(problem))
     for wrong in ({}, 3, "work", type(method.init(problem)), problem, np.zeros(2)):
@@ -244,7 +245,7 @@ def test_bounds_beyond_single_precision(bounds, message):
 
 def test_operators_that_lack_members():
     members = {name for name in vars(wl.Operator) if not name.startswith("_")} | set(wl.Operator.__annotations__)
-    assert set(MEMBERS) == members
+    assert set(names_of(wl.Operator)) == members
 
     class Half:
         shape, dtype, symmetric = (2,), wp.float64, True

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.protocol import HasLayout, Operator, has
+
 Array = Any  # a numpy array or a wp.array
 
 
@@ -184,7 +186,6 @@ class PaddedLayout(Layout):
         return stored[1:-1, 1:-1, 1:-1]
 
 
-def layout_of(operator: Any) -> Layout:
+def layout_of(A: Operator) -> Layout:
     """Return the layout of an operator's fields; plain arrays unless it says otherwise."""
-    found = getattr(operator, "layout", None)
-    return found if isinstance(found, Layout) else Layout(operator.shape, operator.device)
+    return A.layout if has(A, HasLayout) else Layout(A.shape, A.device)

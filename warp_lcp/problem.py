@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 from functools import cached_property, singledispatch
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.bounds import INFINITE, LAUNCHED, Bounds
-from warp_lcp.layout import Array, layout_of, real_array
+from warp_lcp.layout import Array, Layout, layout_of, real_array
 from warp_lcp.pickling import OnHost, Pickled
+from warp_lcp.protocol import AppliesPlus, HasCells, Operator, has, members
 from warp_lcp.rows import RowPass, Rows
-from warp_lcp.vectors import HEADERS
-
-if TYPE_CHECKING:
-    from warp_lcp.operators.protocol import Operator
-
+from warp_lcp.vectors import ADD, HEADERS, rows_of
 
 CHECK = RowPass(
     "problem.check", HEADERS / "check.h", wp.float64, bounds=True, reads={"b": wp.float64, "unknown": wp.int8},
     sums=("bad", "nan_lower", "nan_upper", "crossed", "no_lower", "no_upper"),
 )  # fmt: skip
-MEMBERS = ("shape", "dtype", "device", "symmetric", "apply", "apply_transpose", "diagonal", "masked")  # of `wl.Operator`
 
 
 @singledispatch
@@ -38,7 +34,7 @@ def as_operator(A: Any, device: Any = None) -> Operator:
     Raises:
         ValueError: A is neither, or lacks members of `wl.Operator`; the message names them.
     """
-    missing = [name for name in MEMBERS if not hasattr(A, name)]
+    missing = [name for name in members(Operator) if not hasattr(A, name)]
     if not missing:
         return A
     if hasattr(A, "__array__") or hasattr(A, "to_numpy"):
@@ -80,12 +76,12 @@ class LCP(Pickled):
     def __init__(self, A: Operator | Array, b: Array, lower: Any = 0.0, upper: Any = np.inf) -> None:
         A = as_operator(A, b.device if isinstance(b, wp.array) else None)
         self.A, self.layout = A, layout_of(A)
-        if getattr(A, "unknowns", self.layout.size) == 0:
+        self.unknown = _unknown(A, self.layout)
+        if has(A, HasCells) and self._totals(np.array([np.count_nonzero(self.unknown.numpy() == 1)])) == [0]:
             raise ValueError("A has no unknowns: the problem is empty")
         self.in_place = isinstance(b, wp.array) and self.layout.holds(b, wp.float64) and tuple(b.shape) != tuple(A.shape)
         self.b = self.layout.load(b, wp.float64, "b")
         self.bounds = Bounds(self.layout, lower, upper)
-        self.unknown = _unknown(A, self.layout)
         self._check()
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -112,6 +108,14 @@ class LCP(Pickled):
     def upper(self) -> wp.array[Any]:
         """U as a stored field, float64."""
         return self.bounds.as_field(1)
+
+    def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
+        """Out = A x + b, flat stored fields of one type: in one pass where the operator has it."""
+        if has(self.A, AppliesPlus):
+            self.A.apply_plus(x, b, out)
+            return
+        self.A.apply(x.reshape(self.layout.stored_shape), out.reshape(self.layout.stored_shape))
+        ADD.bind(rows_of(x), z=b, x=out).launch()
 
     def not_finite(self, field: wp.array[Any]) -> int:
         """Return how many unknowns of a stored field are not finite."""
@@ -147,9 +151,8 @@ class LCP(Pickled):
             raise ValueError(f"lower > upper in {crossed} unknowns")
 
 
-def _unknown(A: Any, layout: Any) -> wp.array[Any]:
+def _unknown(A: Operator, layout: Layout) -> wp.array[Any]:
     """Return a stored int8 field that is 1 on unknowns: a grid's cell types serve as they are."""
-    cells = getattr(A, "cells", None)
-    if isinstance(cells, wp.array):
-        return cells.flatten()
+    if has(A, HasCells):
+        return A.cells.flatten()
     return wp.full(layout.size, 1, dtype=wp.int8, device=layout.device)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -41,6 +41,7 @@ MEMORY = {
     "projected-multigrid": (0.0, 12.0),
 }
 LEAN = (0.0, 18.0)  # methods that hold some fields only
+LEANEST = ("psor", "accelerated-projected-gradient", "projected-jacobi")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,6 +180,14 @@ RULES: tuple[Rule, ...] = (
         lambda t: t.bounds == "affine",
         None,
         ("psor", "blocked-gauss-seidel", "staggering"),
+    ),
+    Rule(
+        "projected-jacobi",
+        "Bounds that are affine in x, with an operator that can neither be swept nor shows its rows,",
+        "are for the one method that takes both",
+        lambda t: t.bounds == "affine",
+        None,
+        (),
     ),
     Rule(
         "minimum-map-newton",
@@ -348,8 +357,8 @@ def recommend(problem: LCP, *, accuracy: float | str = "usual", budget: Budget |
     given = checked("accuracy", accuracy, Share | Literal[tuple(ACCURACIES)])
     rtol = ACCURACIES.get(given, given)
     traits = traits_of(problem, rtol)
-    rule = next(rule for rule in RULES if rule.applies(traits))
-    return _within(_from_rule(rule, traits, rtol), budget, problem) if budget else _from_rule(rule, traits, rtol)
+    found = _from_rule(next(_rules(traits)), traits, rtol)
+    return _within(found, budget, problem) if budget else found
 
 
 def _from_rule(rule: Rule, t: Traits, rtol: float) -> Recommendation:
@@ -366,16 +375,12 @@ def _from_rule(rule: Rule, t: Traits, rtol: float) -> Recommendation:
     stopping = StoppingCriteria(rtol=rtol, max_iterations=limit, patience=max(30, limit // 10))
     direct = rule.method == "minimum-map-newton" and t.direct
     method = MinimumMapNewton(direct=True) if direct else METHODS[rule.method]()
-    return Recommendation(rule.method, method, stopping, reasons, expected, _able(rule.alternatives, t), t)
+    return Recommendation(rule.method, method, stopping, reasons, expected, tuple(n for n in rule.alternatives if n in t.able), t)
 
 
-def _able(names: tuple[str, ...], t: Traits) -> tuple[str, ...]:
-    """Return the names of the methods that take such a problem."""
-    kind = "grid" if t.kind == "operator" else t.kind
-    fits = [n for n in names if kind in METHODS[n].supports and t.unknowns <= getattr(METHODS[n], "most_unknowns", t.unknowns)]
-    if t.bounds == "affine":
-        fits = [n for n in fits if getattr(METHODS[n], "affine_bounds", False)]
-    return tuple(fits)
+def _rules(t: Traits) -> Iterator[Rule]:
+    """Return the rules that apply, of the methods that take such a problem."""
+    return (rule for rule in RULES if rule.method in t.able and rule.applies(t))
 
 
 def _portrait(t: Traits) -> str:
@@ -400,7 +405,7 @@ def _within(first: Recommendation, budget: Budget, problem: LCP) -> Recommendati
     """Return a recommendation that respects a budget, or says that it cannot."""
     found, t = first, first.traits
     if budget.bytes is not None and memory_of(found.name, t) > budget.bytes:
-        lean = next((n for n in _able(("psor", "accelerated-projected-gradient", "projected-jacobi"), t) if _starts(n, problem)), None)
+        lean = next((n for n in LEANEST if n in t.able and _starts(n, problem)), None)
         if lean is None or memory_of(lean, t) > budget.bytes:
             found = _said(found, f"No method fits into {budget.bytes} bytes; this one takes about {memory_of(found.name, t)}.")
         else:
@@ -409,7 +414,7 @@ def _within(first: Recommendation, budget: Budget, problem: LCP) -> Recommendati
     if budget.iterations is not None:
         sweeps = {"psor": t.sweeps, "nncg": t.sweeps, "blocked-gauss-seidel": t.block_sweeps}.get(found.name)
         if budget.bytes is None and sweeps is not None and sweeps > budget.iterations:
-            others = ((rule, rule.steps[1]) for rule in RULES if rule.steps is not None and rule.applies(t))
+            others = ((rule, rule.steps[1]) for rule in _rules(t) if rule.steps is not None)
             fewer = next(((rule, steps) for rule, steps in others if steps <= budget.iterations), None)
             if fewer is not None:
                 why = f"{found.name} would take {sweeps:.0f} of the {budget.iterations} steps allowed, {fewer[0].method} about {fewer[1]}."
@@ -425,7 +430,7 @@ def _in_time(found: Recommendation, seconds: float, problem: LCP) -> Recommendat
     took = time.perf_counter() - begun
     if solved and took <= seconds:
         return _said(found, f"Its set-up and first step took {took:.2g} s of the {seconds:g} s allowed.")
-    if not _able(("psor",), found.traits) or not _starts("psor", problem):
+    if "psor" not in found.traits.able or not _starts("psor", problem):
         return _said(found, f"Its set-up and first step took {took:.2g} s, more than the {seconds:g} s allowed; no sweep is possible here.")
     begun = time.perf_counter()
     _tried("psor", problem, TRIAL)

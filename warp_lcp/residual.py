@@ -16,9 +16,10 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import HasRows, HasScale, HasStencil, has, version_of
 from warp_lcp.rows import Known, RowPass
 from warp_lcp.scale import scale_by_products
-from warp_lcp.vectors import ADD, Reduction, rows_of
+from warp_lcp.vectors import Reduction, rows_of
 
 HEADERS = Path(__file__).parent / "headers"
 f64, i8 = wp.float64, wp.int8
@@ -50,10 +51,10 @@ class NaturalResidual:
         self.problem = problem
         layout = problem.layout
         self.norm, self.current = 0.0, False
-        stencil = getattr(problem.A, "stencil", None)
+        stencil = problem.A.stencil if has(problem.A, HasStencil) else None
         self.diagonal = stencil.d if stencil else wp.zeros(layout.size, dtype=problem.A.dtype, device=layout.device)
         self.unit = float(stencil.unit) if stencil else 1.0
-        self._diagonal_of = None if stencil else getattr(problem.A, "version", None)  # of an operator whose scale is a copy
+        self._diagonal_of = None if stencil else version_of(problem.A)  # of an operator whose scale is a copy
         self._sums = wp.zeros(2, dtype=wp.float64, device=layout.device)
         self._reduction = Reduction(layout.size, layout.device, self._sums, across=layout.across)
         if not stencil:
@@ -82,19 +83,13 @@ class NaturalResidual:
 
     def affine(self, x: wp.array[Any]) -> None:
         """Set y = A x + b."""
-        A, p = self.problem.A, self.problem
-        apply_plus = getattr(A, "apply_plus", None)
-        if apply_plus is not None:
-            apply_plus(x, p.b, self.y)
-            return
-        A.apply(x.reshape(p.layout.stored_shape), self.y.reshape(p.layout.stored_shape))
-        ADD.bind(rows_of(x), z=p.b, x=self.y).launch()
+        self.problem.apply_plus(x, self.problem.b, self.y)
 
     def start(self, x: wp.array[Any], *, keep: bool) -> None:
         """Set x to clip(x, l, u), or to clip(0, l, u), and to 0 where there is no unknown."""
         p = self.problem
-        if self._diagonal_of is not None and self._diagonal_of != p.A.version:  # type: ignore[attr-defined]
-            self._diagonal_of = p.A.version  # type: ignore[attr-defined]
+        if self._diagonal_of is not None and self._diagonal_of != version_of(p.A):
+            self._diagonal_of = version_of(p.A)
             self.rescale()
         for _ in range(1 if p.bounds.affine is None else 2):  # bounds that depend on x: at x as it is, then at x within its bounds
             p.bounds.follow(x)
@@ -103,8 +98,9 @@ class NaturalResidual:
 
     def rescale(self) -> None:
         """Take d again from an operator that has changed; grids share theirs."""
-        own = getattr(self.problem.A, "scale", None)
-        d = self._estimated_scale() if own is None else own()
+        A = self.problem.A
+        own = A.scale() if has(A, HasScale) else None
+        d = self._estimated_scale() if own is None else own
         self.diagonal.assign(np.maximum(d, np.finfo(wp.dtype_to_numpy(self.diagonal.dtype)).tiny))
 
     def _estimated_scale(self) -> np.ndarray:
@@ -123,17 +119,22 @@ class NaturalResidual:
         d = layout.load(p.A.diagonal(), wp.float64).numpy() * unknown
         return scale_by_products(d, images(p.A.apply), images(p.A.apply if p.A.symmetric else p.A.apply_transpose))
 
+    @property
+    def row_sizes(self) -> wp.array[Any] | None:
+        """The largest magnitude of each row of a matrix with empty ones, None of others."""
+        return self.problem.A.row_sizes if has(self.problem.A, HasRows) else None
+
     def settle_isolated(self, x: wp.array[Any]) -> None:
         """Set x where A's row is empty, so that y = b, to the bound that b's sign asks for; methods move coupled unknowns only."""
-        p, sizes = self.problem, getattr(self.problem.A, "row_sizes", None)  # of grids, only an empty row has a zero diagonal
-        zero_if_empty = self.diagonal if sizes is None else sizes
+        p, sizes = self.problem, self.row_sizes
+        zero_if_empty = self.diagonal if sizes is None else sizes  # of grids, only an empty row has a zero diagonal
         fields = {"d": zero_if_empty, "b": p.b, "unknown": p.unknown, "x": x}
         SETTLE_ISOLATED.bind(rows_of(x), bounds=p.bounds.operands, **fields).launch()
         self.current = False
 
     def unattainable(self) -> float:
         """Return the norm of b where a matrix has an empty row and b's sign asks for a bound that is infinite: no x will do."""
-        p, sizes = self.problem, getattr(self.problem.A, "row_sizes", None)
+        p, sizes = self.problem, self.row_sizes
         if sizes is None:
             return 0.0
         b = np.where(sizes.numpy() == 0, p.b.numpy(), 0.0)

@@ -16,6 +16,7 @@ import warp as wp
 from warp_lcp.deadline import Deadline, TimeIsUp
 from warp_lcp.layout import Array
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import NamesComponents, has
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import Record, SolveResult, SolveStatus
 from warp_lcp.stopping import StoppingCriteria
@@ -226,13 +227,13 @@ class _Loop:
             self._record(0, Step("start", 0))
             self._keep(0)
             return self._finish(SolveStatus.CONVERGED, 0)
-        find = getattr(self.problem.A, "floating_components", lambda scratch: None)
-        floating = find(getattr(self.work, "scratch", None))
+        A = self.problem.A
+        floating = A.floating_components(getattr(self.work, "scratch", None)) if has(A, NamesComponents) else None
         self.work.floating = floating
         lost = floating.unattainable(self.problem.b, self.problem.lower, self.problem.upper) if floating else residual.unattainable()
         if guess is not None:
             self._take(guess)
-        if floating is not None or getattr(self.problem.A, "row_sizes", None) is not None:
+        if floating is not None or residual.row_sizes is not None:
             residual.settle_isolated(self.work.x)
             residual.evaluate(self.work.x)
         self._record(0, Step("start", 0))

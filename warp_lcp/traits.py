@@ -11,14 +11,13 @@ import scipy.sparse
 import warp as wp
 
 from warp_lcp.layout import layout_of
-from warp_lcp.operators.dense import DenseOperator
-from warp_lcp.operators.grid_poisson import GridPoisson
-from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import HasRows, HasStencil, has, takes
 from warp_lcp.solve import Solver, solve
 from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel
 from warp_lcp.solvers.minimum_map_newton_direct import suits
 from warp_lcp.solvers.psor import ProjectedSOR
+from warp_lcp.solvers.registry import METHODS
 from warp_lcp.stopping import StoppingCriteria
 
 MOST_FACTORED = 1500  # unknowns of a matrix whose Cholesky factorization is tried: it takes 0.1 s there, a Newton step's time
@@ -44,6 +43,7 @@ class Traits:
         block_sweeps: the same of `BlockedGaussSeidel`; 1 or 2 where unknowns are coupled in small blocks alone.
         quiet: share of the unknowns with b_i = 0: of contacts at rest, most.
         direct: whether the matrix is so small or narrow that its systems are solved directly on the host.
+        able: names of the methods that take such an operator, so many unknowns and such bounds.
     """
 
     kind: str
@@ -58,6 +58,7 @@ class Traits:
     block_sweeps: float
     quiet: float = 0.0
     direct: bool = False
+    able: tuple[str, ...] = ()
 
 
 def traits_of(problem: LCP, accuracy: float) -> Traits:
@@ -68,8 +69,9 @@ def traits_of(problem: LCP, accuracy: float) -> Traits:
         accuracy: relative residual that the number of sweeps is for, in (0, 1).
     """
     A = problem.A
-    kinds = {"grid": GridPoisson, "sparse": SparseOperator, "dense": DenseOperator}
-    kind = next((name for name, cls in kinds.items() if isinstance(A, cls)), "operator")
+    matrix: Any = A.rows().matrix() if has(A, HasRows) else None
+    shown = "operator" if matrix is None else "sparse" if scipy.sparse.issparse(matrix) else "dense"
+    kind = "grid" if has(A, HasStencil) else shown
     unknowns = int(np.count_nonzero(problem.unknown.numpy() == 1))
     d = layout_of(A).load(A.diagonal(), wp.float64).numpy()[problem.unknown.numpy() == 1]
     least = float(d.min())
@@ -79,14 +81,14 @@ def traits_of(problem: LCP, accuracy: float) -> Traits:
     elif kind == "operator":
         m_matrix, definiteness = False, "indefinite" if least < 0 else "unknown"
     else:
-        host = A.matrix() if isinstance(A, SparseOperator) else A.matrix.numpy()  # type: ignore[attr-defined]
-        m_matrix, definiteness = _of_matrix(host, A.symmetric, d)
-    entries = {"sparse": getattr(A, "nnz", 0), "dense": unknowns**2}.get(kind, 7 * unknowns)
+        m_matrix, definiteness = _of_matrix(matrix, A.symmetric, d)
+    entries = matrix.nnz if kind == "sparse" else unknowns**2 if kind == "dense" else 7 * unknowns
     b = np.abs(problem.b.numpy().ravel()[problem.unknown.numpy().ravel() == 1])
     quiet = float((b <= 1e-9 * b.max()).mean())
     trials = [sweeps_to(problem, accuracy, method) for method in (ProjectedSOR(), BlockedGaussSeidel())]
-    known = (kind, unknowns, entries, A.symmetric, sign, m_matrix, definiteness)
-    return Traits(*known, bounds_of(problem), trials[0], trials[1], quiet, suits(A))
+    known, bounds = (kind, unknowns, entries, A.symmetric, sign, m_matrix, definiteness), bounds_of(problem)
+    able = tuple(name for name, method in METHODS.items() if takes(method, A) and _suits(method, unknowns, bounds))
+    return Traits(*known, bounds, trials[0], trials[1], quiet, suits(A), able)
 
 
 def bounds_of(problem: LCP) -> str:
@@ -96,6 +98,11 @@ def bounds_of(problem: LCP) -> str:
     known = problem.unknown.numpy() == 1
     sides = [bool(np.isfinite(side.numpy()[known]).any()) for side in (problem.lower, problem.upper)]
     return {0: "none", 1: "one-sided", 2: "box"}[sum(sides)]
+
+
+def _suits(method: Any, unknowns: int, bounds: str) -> bool:
+    """Return whether a method takes so many unknowns and such bounds."""
+    return unknowns <= getattr(method, "most_unknowns", unknowns) and (bounds != "affine" or getattr(method, "affine_bounds", False))
 
 
 def sweeps_to(problem: LCP, accuracy: float, method: Solver) -> float:

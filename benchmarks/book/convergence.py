@@ -15,6 +15,7 @@ from benchmarks.book.traces import RTOL
 from benchmarks.record import Chart, Lines, Record, Results, Sheet, Table
 from benchmarks.timing import Figure
 from warp_lcp.gallery import Plant, Problem, contact, poisson, splash
+from warp_lcp.protocol import families
 
 MOST = 300  # steps
 DEEP = 1e-10  # tolerance of the curves: far enough to see how fast a method is at its end
@@ -77,7 +78,7 @@ def applicable(problem: Problem) -> dict[str, Any]:
     methods: dict[str, Any] = {"psor, omega 1": wl.ProjectedSOR(omega=1.0)}
     for name, method in wl.METHODS.items():
         small = getattr(method, "most_unknowns", None)
-        if problem.kind in method.supports and (small is None or problem.b.size <= min(small, DIRECT)):
+        if problem.kind in families(method) and (small is None or problem.b.size <= min(small, DIRECT)):
             methods[name] = method()
     return methods
 

@@ -11,6 +11,7 @@ import warp_lcp as wl
 from benchmarks.inverse_kinematics import MODELS, OUTSIDE, compare, targets
 from warp_lcp.gallery.articulated_figure import ArticulatedFigure, branching_figure, planar_chain, spatial_chain
 from warp_lcp.gallery.inverse_kinematics import InverseKinematics, StepProblem
+from warp_lcp.protocol import families
 
 FIGURES = {"planar": planar_chain([1.0, 0.8, 0.6, 0.4]), "spatial": spatial_chain([0.3] * 7), "branching": branching_figure()}
 TIGHT = wl.StoppingCriteria(rtol=1e-12, max_iterations=300)
@@ -85,7 +86,7 @@ def test_every_method_finds_the_pose():
         lambda t: (figure.positions(t) - goal).ravel(), start, bounds=(figure.lower, figure.upper), ftol=1e-15, xtol=1e-15, gtol=1e-13
     )
     for name, method in wl.METHODS.items():
-        if "dense" not in method.supports:
+        if "dense" not in families(method):
             continue
         pose = InverseKinematics(device="cpu", method=method(), curvature=True, tolerance=1e-6).solve(figure, goal, start)
         assert pose, (name, pose)

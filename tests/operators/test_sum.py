@@ -147,7 +147,7 @@ def test_what_does_not_fit_is_refused(cells):
         with pytest.raises(ValueError, match=message):
             wl.LowRankOperator(columns, weights, device="cpu")
     summed = wl.SumOperator(sparse, wl.LowRankOperator(np.ones((4, 1)), [1.0], device="cpu"))
-    with pytest.raises(ValueError, match="no method `relax`"):
+    with pytest.raises(ValueError, match="ProjectedSOR needs an operator with a sweep"):
         wl.solve(wl.LCP(summed, -np.ones(4)), wl.ProjectedSOR())
     with pytest.raises(ValueError, match="x has shape"):
         summed.apply(wp.zeros(5, dtype=wp.float64, device="cpu"))

@@ -7,10 +7,11 @@ import warp as wp
 
 import warp_lcp as wl
 from oracle import lemke, natural_residual
+from warp_lcp.protocol import families
 from warp_lcp.residual import NaturalResidual
 
 N, EMPTY = 12, (3, 4, 9)
-NAMES = [name for name, cls in wl.METHODS.items() if "sparse" in cls.supports and name != "direct-enumeration"]
+NAMES = [name for name, cls in wl.METHODS.items() if "sparse" in families(cls) and name != "direct-enumeration"]
 
 
 def chain():

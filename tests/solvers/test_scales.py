@@ -6,6 +6,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
+from warp_lcp.protocol import families
 
 N = 20
 GRID = np.array([[0] * 5] + [[1] * 5] * 3)
@@ -14,7 +15,7 @@ CASES = [
     pytest.param(name, family, id=f"{name}-{family}")
     for name, cls in wl.METHODS.items()
     for family in ("dense", "sparse", "grid")
-    if family in cls.supports and name != "direct-enumeration"
+    if family in families(cls) and name != "direct-enumeration"
 ]
 
 

@@ -10,6 +10,7 @@ import warp as wp
 import warp_lcp as wl
 from oracle import assemble, boxed, lemke, natural_residual
 from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.protocol import families
 from warp_lcp.solvers.registry import METHODS
 
 FAMILIES = ("dense", "sparse", "grid")
@@ -29,7 +30,7 @@ def cases():
         for family in FAMILIES:
             for bounds in BOUNDS:
                 for precision in precisions(cls):
-                    if family in cls.supports and (bounds == "lcp" or getattr(cls, "boxed", True)):
+                    if family in families(cls) and (bounds == "lcp" or getattr(cls, "boxed", True)):
                         yield pytest.param(name, family, bounds, precision, id=f"{name}-{family}-{bounds}-{precision}")
 
 
@@ -101,7 +102,7 @@ def test_method(name, family, bounds, precision, device):
     assert len(result.history) == result.iterations + 1
 
 
-@pytest.mark.parametrize("name", [name for name, cls in METHODS.items() if "dense" in cls.supports])
+@pytest.mark.parametrize("name", [name for name, cls in METHODS.items() if "dense" in families(cls)])
 def test_unsymmetric_matrix(name, device):
     """Strictly diagonally dominant: whatever takes an unsymmetric A solves it; the others refuse it before they start."""
     cls = METHODS[name]
@@ -122,8 +123,8 @@ def test_unsymmetric_matrix(name, device):
 
 def test_every_method_says_where_it_works():
     for name, cls in METHODS.items():
-        assert cls.supports, name
-        assert cls.supports <= set(FAMILIES), name
+        assert families(cls), name
+        assert families(cls) <= set(FAMILIES), name
         assert isinstance(cls.needs, str), name
         assert name == name.lower(), name
         assert not set(name) - set("abcdefghijklmnopqrstuvwxyz-"), name

@@ -6,6 +6,7 @@ import scipy.sparse
 
 import warp_lcp as wl
 from oracle import boxed, lemke
+from warp_lcp.protocol import families
 
 STOPPING = wl.StoppingCriteria(rtol=1e-8, max_iterations=2000, patience=2000)
 
@@ -32,7 +33,7 @@ def problems(most):
 
 
 @pytest.mark.parametrize(
-    ("name", "family"), [(name, family) for name, cls in wl.METHODS.items() for family in ("dense", "sparse") if family in cls.supports]
+    ("name", "family"), [(name, family) for name, cls in wl.METHODS.items() for family in ("dense", "sparse") if family in families(cls)]
 )
 def test_on_matrices(name, family):
     if name == "quadratic-program":
@@ -51,7 +52,7 @@ def test_on_matrices(name, family):
     assert solved >= 8
 
 
-@pytest.mark.parametrize("name", [name for name, cls in wl.METHODS.items() if "grid" in cls.supports and name != "direct-enumeration"])
+@pytest.mark.parametrize("name", [name for name, cls in wl.METHODS.items() if "grid" in families(cls) and name != "direct-enumeration"])
 @pytest.mark.parametrize("lower", [0.3, -0.3])
 def test_on_a_membrane_that_an_obstacle_lifts(name, lower):
     """4 x 5 cells with x = 0 around, x >= lower in the middle; the oracle solves in x - l."""

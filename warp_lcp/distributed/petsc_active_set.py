@@ -10,8 +10,8 @@ import warp as wp
 from warp_lcp.distributed.petsc_matrix import PetscGrid
 from warp_lcp.distributed.ranks import petsc
 from warp_lcp.multigrid.cycle_settings import CycleSettings
-from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import HasStencil, check_taken, has
 from warp_lcp.settings import Count, CountOrZero, Settings, Share
 from warp_lcp.solve import PrecisionName, Step
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
@@ -54,7 +54,7 @@ class PetscActiveSet(Settings):
         ValueError: an argument is outside its range.
     """
 
-    supports: ClassVar[frozenset[str]] = frozenset({"grid"})
+    supports: ClassVar = (HasStencil,)
     needs: ClassVar[str] = "positive definite"
     distributed: ClassVar[bool] = True
 
@@ -76,10 +76,9 @@ class PetscActiveSet(Settings):
 
         Raises:
             ImportError: PETSc cannot be imported; the message says how to install it.
-            ValueError: A is no grid operator.
+            ValueError: A has no stencil.
         """
-        if not isinstance(problem.A, GridPoisson):
-            raise ValueError(f"PetscActiveSet takes a GridPoisson, not a {type(problem.A).__name__}: take MinimumMapNewton")
+        check_taken(self, problem.A)
         return KSPWorkspace(problem, self)
 
     def step(self, problem: LCP, work: KSPWorkspace, x: wp.array[Any]) -> Step:
@@ -106,14 +105,14 @@ class KSPWorkspace(NewtonWorkspace):
 
     def _principal_system(self) -> PrincipalSystem:
         A = self.problem.A
-        assert isinstance(A, GridPoisson)
+        assert has(A, HasStencil)
         return KSPSystem(A, self.precision.correction, bounded=self.bounded, settings=self.settings.cycle, prefix=self._prefix)
 
 
 class KSPSystem(GridSystem):
     """The system on a grid's free set, solved by PETSc's KSP."""
 
-    def __init__(self, A: GridPoisson, real: Any, *, bounded: bool, settings: CycleSettings | None = None, prefix: str = "") -> None:
+    def __init__(self, A: HasStencil, real: Any, *, bounded: bool, settings: CycleSettings | None = None, prefix: str = "") -> None:
         self._prefix = prefix
         super().__init__(A, real, bounded=bounded, settings=settings)
 

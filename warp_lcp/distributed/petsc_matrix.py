@@ -15,13 +15,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
 from warp_lcp.distributed.ranks import petsc
 from warp_lcp.layout import zeros
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.multigrid.turning import make_hierarchy
-from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.operators.stencil import Stencil
+from warp_lcp.protocol import HasStencil
 from warp_lcp.rows import RowPass, Rows
 
 if TYPE_CHECKING:
@@ -188,7 +189,7 @@ class PetscGrid:
     """
 
     def __init__(
-        self, A: GridPoisson, hierarchy: Hierarchy | None = None, *, real: Any = wp.float32, cycle: CycleSettings | None = None
+        self, A: HasStencil, hierarchy: Hierarchy | None = None, *, real: Any = wp.float32, cycle: CycleSettings | None = None
     ) -> None:
         self._A, comm = A, communicator(A)
         petsc().garbage_cleanup(comm)  # what ranks share ends when all have let go of it, and PETSc has time to look
@@ -259,7 +260,6 @@ def _let_go(kept: list[Any]) -> None:
         thing.decRef()
 
 
-def communicator(A: GridPoisson) -> Any:
+def communicator(A: HasStencil) -> Any:
     """Return PETSc's or mpi4py's communicator of the ranks that share an operator."""
-    decomposition = getattr(A, "decomposition", None)
-    return petsc().COMM_SELF if decomposition is None else decomposition.ranks.comm
+    return A.decomposition.ranks.comm if isinstance(A, DistributedGridPoisson) else petsc().COMM_SELF

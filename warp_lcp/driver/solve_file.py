@@ -17,6 +17,7 @@ from warp_lcp.driver.matrix_market import MarketError, read_market
 from warp_lcp.nearest import nearest
 from warp_lcp.operators import DenseOperator, SparseOperator
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import families
 from warp_lcp.result import SolveResult
 from warp_lcp.settings import SettingError
 from warp_lcp.solvers.default import default_method, solve
@@ -122,8 +123,7 @@ def solve_files(
         operator = SparseOperator(A, device=device) if scipy.sparse.issparse(A) else DenseOperator(A, device=device)
         problem = LCP(operator, b, *sides)
         family = "sparse" if isinstance(operator, SparseOperator) else "dense"
-        takes = f"take {family} matrices", lambda kind: family in kind.supports
-        solver = default_method(problem) if method is None else method_named(method, *takes)
+        solver = default_method(problem) if method is None else method_named(method, family)
         result = solve(problem, solver, stopping=stopping)
     except ValueError as error:
         raise ProblemError(str(error)) from error
@@ -206,20 +206,15 @@ def _bound(value: str, n: int, option: str) -> float | np.ndarray:
         return read_vector(Path(value), n, infinite=True)
 
 
-def method_named(name: str, what: str, takes: Callable[[Any], bool]) -> Any:
-    """Return a method by its name.
-
-    Args:
-        name: in `METHODS`.
-        what: those do that may be chosen, such as "take grids".
-        takes: whether a class does.
-
-    Raises:
-        ProblemError: there is no such method, or it does not.
-    """
+def method_named(name: str, family: str, *, shared: bool = False) -> Any:
+    """Return a method by its name, for a family of operators, perhaps on several ranks."""
     if name not in METHODS:
         raise ProblemError(f"--method {name}: no such method; {nearest(name, METHODS)}")
-    if not takes(METHODS[name]):
-        others = ", ".join(sorted(known for known, kind in METHODS.items() if takes(kind)))
-        raise ProblemError(f"--method {name}: does not {what}; choose from {others}")
-    return METHODS[name]()
+    fits = [known for known, kind in METHODS.items() if family in families(kind) and (not shared or getattr(kind, "distributed", False))]
+    if name not in fits:
+        what = "work on several ranks" if shared else "take grids" if family == "grid" else f"take {family} matrices"
+        raise ProblemError(f"--method {name}: does not {what}; choose from {', '.join(fits)}")
+    try:
+        return METHODS[name]()
+    except (ImportError, TypeError) as error:
+        raise ProblemError(f"--method {name}: {error}") from error

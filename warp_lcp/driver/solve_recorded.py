@@ -92,10 +92,7 @@ def solve_recorded(
         ProblemError: the file or an option is wrong.
     """
     stopping = criteria(tolerance, max_iterations, max_seconds)
-    shared = ranks is not None and ranks.size > 1
-    what = "work on several ranks" if shared else "take grids"
-    takes = what, lambda kind: getattr(kind, "distributed", False) if shared else "grid" in kind.supports
-    solver = ProjectedMultigrid() if method is None else method_named(method, *takes)
+    solver = ProjectedMultigrid() if method is None else method_named(method, "grid", shared=ranks is not None and ranks.size > 1)
     name = next(name for name, kind in METHODS.items() if type(solver) is kind)
     try:
         shape = cell_counts(path)

@@ -10,6 +10,7 @@ import scipy.sparse
 import warp as wp
 
 from warp_lcp.layout import Layout, check_kept, check_storable, real_array
+from warp_lcp.operators.compressed_rows import CompressedRows
 from warp_lcp.pickling import Pickled, made_again
 from warp_lcp.problem import as_operator
 from warp_lcp.rows import RowPass, Rows
@@ -91,6 +92,11 @@ class DenseOperator(Pickled):
     def diagonal(self) -> wp.array[Any]:
         """Return the diagonal of A, shape (n,)."""
         return wp.array(np.diag(self.matrix.numpy()).copy(), dtype=self.dtype, device=self.device)
+
+    def rows(self) -> CompressedRows:
+        """Return the entries by rows, the operator's own."""
+        starts = wp.array(np.arange(self.unknowns + 1) * self.unknowns, dtype=wp.int32, device=self.device)
+        return CompressedRows(starts, wp.empty(0, dtype=wp.int32, device=self.device), self.matrix.flatten())
 
     def scale(self) -> np.ndarray:
         """Return the natural residual's d, shape (n,), of the entries as they are now."""

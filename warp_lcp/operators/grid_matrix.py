@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse
 
-from warp_lcp.operators.grid_poisson import FLUID, GridPoisson
+from warp_lcp.operators.grid_poisson import FLUID
+from warp_lcp.protocol import HasStencil
 
 
-def grid_matrix(A: GridPoisson) -> scipy.sparse.csr_array:
+def grid_matrix(A: HasStencil) -> scipy.sparse.csr_array:
     """Assemble a grid operator on its FLUID cells, in their order, from its diagonal and lower-face weights.
 
     Args:

@@ -130,15 +130,15 @@ class GridPoisson(Pickled):
         """Return A x.
 
         Args:
-            x: field of type wp.float32 or wp.float64, of the operator's shape or stored (flat, padded, 0 off the FLUID cells).
+            x: field of type wp.float32 or wp.float64, of the operator's shape or stored (padded, flat or not, 0 off the FLUID cells).
             out: field like x that receives the product; made if None.
         """
-        if tuple(x.shape) == (self.layout.size,):
+        if x.size == self.layout.size:
             if out is None:
                 out = wp.zeros_like(x)
             else:
                 out.zero_()
-            self.stencil.product(x, out)
+            self.stencil.product(x.flatten(), out.flatten())
             return out
         stored = self.layout.load(x, x.dtype, "x")
         inside = self.cells.numpy().ravel() == FLUID if self._mask is None else self._mask.numpy() != 0

@@ -11,6 +11,7 @@ import scipy.sparse
 import warp as wp
 
 from warp_lcp.layout import Layout, check_kept, check_storable, real_array
+from warp_lcp.operators.compressed_rows import CompressedRows
 from warp_lcp.operators.dense import is_rounding
 from warp_lcp.operators.sparse_kernels import color_kernel
 from warp_lcp.pickling import Pickled, made_again
@@ -155,6 +156,10 @@ class SparseOperator(Pickled):
     def diagonal(self) -> wp.array[Any]:
         """Return the diagonal of A, shape (n,): the operator's own memory, which `update` keeps current."""
         return self._diagonal
+
+    def rows(self) -> CompressedRows:
+        """Return the entries by rows, the operator's own."""
+        return CompressedRows(self.indptr, self.indices, self.values)
 
     def scale(self) -> np.ndarray:
         """Return the natural residual's d, shape (n,)."""

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.layout import layout_of
-from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.operators.low_rank import LowRankOperator
-from warp_lcp.operators.protocol import Operator
 from warp_lcp.pickling import Pickled
 from warp_lcp.problem import as_operator
+from warp_lcp.protocol import AppliesPlus, HasCells, HasColumns, HasStencil, NamesComponents, Operator, has, version_of
 from warp_lcp.vectors import ADD, rows_of
 
 FELT = 1e-5  # of the sum of a column's sizes over a component: open fractions are of float32
@@ -22,7 +20,7 @@ FELT = 1e-5  # of the sum of a column's sizes over a component: open fractions a
 class SumOperator(Pickled):
     """(A + B) x = A x + B x.
 
-    It has no `relax`: methods that sweep refuse it, those that take products (Newton types, gradient methods) do not. With a grid
+    It has no sweep: methods that need one refuse it, those that take products (Newton types, gradient methods) do not. With a grid
     operator and a LowRankOperator as its terms, principal systems are preconditioned by the grid's multigrid.
 
     Args:
@@ -57,9 +55,13 @@ class SumOperator(Pickled):
         self.shape, self.device = tuple(first.shape), first.device
         self.dtype = wp.float64 if wp.float64 in (first.dtype, second.dtype) else wp.float32
         self._scratch: dict[Any, wp.array[Any]] = {}
-        grid = next((A for A in (first, second) if hasattr(A, "cells")), None)
-        if grid is not None:
-            self.cells = grid.cells
+        terms: tuple[Operator, Operator] = (second, first) if isinstance(first, LowRankOperator) else (first, second)
+        self._plain, self._low = terms
+        for term in (second, first):
+            if has(term, HasCells):
+                self.cells = term.cells
+        if has(self._plain, HasStencil) and isinstance(self._low, LowRankOperator):
+            self.grid, self.low = self._plain, self._low
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the terms."""
@@ -73,12 +75,7 @@ class SumOperator(Pickled):
     @property
     def version(self) -> int:
         """How often a term has changed."""
-        return sum(int(getattr(A, "version", 0)) for A in (self.first, self.second))
-
-    @property
-    def unknowns(self) -> int:
-        """Number of unknowns."""
-        return min(int(getattr(A, "unknowns", self.layout.size)) for A in (self.first, self.second))
+        return sum(version_of(A) or 0 for A in (self.first, self.second))
 
     def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
         """Return A x + B x."""
@@ -93,15 +90,14 @@ class SumOperator(Pickled):
         d = self.first.diagonal().numpy().astype(np.float64) + self.second.diagonal().numpy()
         return wp.array(d, dtype=self.dtype, device=self.device)
 
-    @property
-    def scale(self) -> Callable[[], np.ndarray] | None:
-        """What returns the natural residual's d: the diagonal of a grid and a symmetric term of low rank; None for other sums."""
-        return None if grid_and_low_rank(self) is None else lambda: self.layout.load(self.diagonal(), self.dtype).numpy()
+    def scale(self) -> np.ndarray | None:
+        """Return the natural residual's d: the diagonal of a grid and a symmetric term of low rank; None for other sums."""
+        return None if grid_and_low_rank(self) is None else self.layout.load(self.diagonal(), self.dtype).numpy()
 
     def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
         """Out = A x + B x + b; flat stored fields of one type."""
-        plain, low = (self.second, self.first) if isinstance(self.first, LowRankOperator) else (self.first, self.second)
-        if isinstance(low, LowRankOperator) and hasattr(plain, "apply_plus"):
+        plain, low = self._plain, self._low
+        if isinstance(low, LowRankOperator) and has(plain, AppliesPlus):
             plain.apply_plus(x, b, out)
             low.add(x, out, out)
             return
@@ -115,11 +111,11 @@ class SumOperator(Pickled):
         The constants of a component are a null space as long as no column of a LowRankOperator feels them: a body that closes off a
         chamber as a piston does is moved by the pressure in it.
         """
-        for A, B in ((self.first, self.second), (self.second, self.first)):
-            if isinstance(B, LowRankOperator) and hasattr(A, "floating_components"):
-                found = A.floating_components(scratch)
-                return None if found is None else found.without(_felt(found.label, found.count, B))
-        return None
+        plain, low = self._plain, self._low
+        if not (isinstance(low, LowRankOperator) and has(plain, NamesComponents)):
+            return None
+        found = plain.floating_components(scratch)
+        return None if found is None else found.without(_felt(found.label, found.count, low))
 
     def masked(self, free: Any, shift: Any = None) -> SumOperator:
         """Return P (A + B) P + P D P, P the restriction to `free` (non-zero entries) and D = diag(shift)."""
@@ -138,7 +134,7 @@ class SumOperator(Pickled):
         return out
 
     def _add_fields(self, x: wp.array[Any], out: wp.array[Any], *, transposed: bool) -> None:
-        plain, low = (self.second, self.first) if isinstance(self.first, LowRankOperator) else (self.first, self.second)
+        plain, low = self._plain, self._low
         (plain.apply_transpose if transposed else plain.apply)(x, out)
         if isinstance(low, LowRankOperator) and x.size == low.layout.size:
             low.add(x.flatten(), out.flatten(), out.flatten(), transposed=transposed)
@@ -151,13 +147,9 @@ class SumOperator(Pickled):
         ADD.bind(rows_of(out), z=other.flatten(), x=out.flatten()).launch()
 
 
-def grid_and_low_rank(A: Any) -> tuple[GridPoisson, LowRankOperator] | None:
-    """Return the terms of a symmetric sum of a grid operator and one of low rank, None if A is something else."""
-    if isinstance(A, SumOperator) and A.symmetric:
-        for grid, low in ((A.first, A.second), (A.second, A.first)):
-            if isinstance(grid, GridPoisson) and isinstance(low, LowRankOperator):
-                return grid, low
-    return None
+def grid_and_low_rank(A: Any) -> tuple[HasStencil, LowRankOperator] | None:
+    """Return the terms of a symmetric sum of an operator with a stencil and one of low rank, None if A is something else."""
+    return (A.grid, A.low) if has(A, HasColumns) and A.symmetric else None
 
 
 def _felt(label: np.ndarray, count: int, low: LowRankOperator) -> np.ndarray:

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import version_of
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.rows import Rows
 from warp_lcp.settings import Count, Positive, Settings
@@ -40,7 +41,6 @@ class AcceleratedProjectedGradient(Settings):
         ValueError: an argument is outside its range.
     """
 
-    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
     needs: ClassVar[str] = "symmetric positive semidefinite A"
 
     lipschitz: Positive | None = None
@@ -88,7 +88,7 @@ class GradientWorkspace(IterateInPlace, RoundedIterate):
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the momentum; look at the operator again if it has changed."""
         self._momentum = 0.0  # Nesterov's t; 0 before the first step, when there is no z
-        version = getattr(self.problem.A, "version", None)
+        version = version_of(self.problem.A)
         if version != self._version:
             self._d.assign(positive_diagonal(self.problem))
             if self.settings.lipschitz is None:

@@ -8,9 +8,10 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
-from warp_lcp.operators.grid_poisson import GridPoisson
+from warp_lcp.operators.compressed_rows import CompressedRows
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import HasRows, HasStencil, check_taken, has
 from warp_lcp.rows.layout import put
 from warp_lcp.settings import Count, Relaxation, Settings, Share
 from warp_lcp.solve import Precision, PrecisionName, Solver, Step
@@ -20,7 +21,7 @@ from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.partition import Blocks, blocks_of_size, color_blocks, given_blocks
 from warp_lcp.solvers.psor import DIRECTIONS, Direction, SweepWorkspace
 from warp_lcp.solvers.staggering import StaggeringWorkspace
-from warp_lcp.solvers.sweep import Rows, bound_operands
+from warp_lcp.solvers.sweep import bound_operands
 
 CONSECUTIVE = 3  # unknowns of a block unless given: a contact in space
 MOST = 6  # unknowns of a block that a thread solves by active sets
@@ -53,7 +54,7 @@ class BlockedGaussSeidel(Settings):
         ValueError: an argument is outside its range.
     """
 
-    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
+    supports: ClassVar = (HasRows, HasStencil)
     needs: ClassVar[str] = "symmetric positive definite A for a proof of convergence"
     affine_bounds: ClassVar[bool] = True
 
@@ -76,11 +77,13 @@ class BlockedGaussSeidel(Settings):
         Raises:
             ValueError: the blocks are no partition of the unknowns, A cannot be taken apart, or the method does not take its blocks.
         """
-        rows, given, kind = Rows.of(problem.A), self.blocks, type(problem.A).__name__
+        check_taken(self, problem.A)
+        A, given, kind = problem.A, self.blocks, type(problem.A).__name__
+        rows = A.rows() if has(A, HasRows) else None
         if given is None:
-            given = GridLines.X if isinstance(problem.A, GridPoisson) else CONSECUTIVE
+            given = GridLines.X if has(A, HasStencil) else CONSECUTIVE
         if isinstance(given, GridLines):
-            if not isinstance(problem.A, GridPoisson) or self.sub_solver is not None:
+            if not has(A, HasStencil) or self.sub_solver is not None:
                 raise ValueError(f"blocks = {given}: are for GridPoisson without a sub_solver; A is a {kind}")
             return LineWorkspace(problem, given, self)
         if rows is None and (isinstance(given, int) or self.sub_solver is None):
@@ -109,7 +112,7 @@ class BlockedGaussSeidel(Settings):
 class BlockWorkspace(SweepWorkspace):
     """Memory of sweeps over small blocks."""
 
-    def __init__(self, problem: LCP, rows: Rows, blocks: list[np.ndarray], settings: BlockedGaussSeidel) -> None:
+    def __init__(self, problem: LCP, rows: CompressedRows, blocks: list[np.ndarray], settings: BlockedGaussSeidel) -> None:
         super().__init__(problem, Precision(settings.precision))
         device, n, sizes = problem.device, problem.layout.size, [len(block) for block in blocks]
         members = np.concatenate(blocks)

@@ -8,7 +8,8 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.affine_bounds_kernels import AffineSide, bound_at
-from warp_lcp.solvers.sweep_kernels import INFINITE, ZERO, matrix_rows, scalar_solution
+from warp_lcp.operators.compressed_rows import matrix_rows
+from warp_lcp.solvers.sweep_kernels import INFINITE, ZERO, scalar_solution
 
 f64, i32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
 AT_LOWER, FREE, AT_UPPER = wp.constant(0), wp.constant(1), wp.constant(2)

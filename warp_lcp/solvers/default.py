@@ -6,13 +6,14 @@ from collections.abc import Callable
 from typing import Never
 
 from warp_lcp.layout import Array
-from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import HasStencil, has, takes
 from warp_lcp.result import Record, SolveResult
 from warp_lcp.solve import Solver, Workspace
 from warp_lcp.solve import solve as solve_by
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.minimum_map_newton_direct import suits
+from warp_lcp.solvers.projected_jacobi import ProjectedJacobi
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 from warp_lcp.solvers.psor import ProjectedSOR
 from warp_lcp.stopping import StoppingCriteria
@@ -22,11 +23,11 @@ def default_method(problem: LCP) -> Solver:
     """Return the fastest method measured for the problem's operator: ProjectedMultigrid on grids, MinimumMapNewton on others.
 
     Its systems are solved directly on the host, on CUDA devices too, where a matrix has at most 200 unknowns or a bandwidth up to 3. Where
-    bounds are affine in x, a method that takes them: ProjectedSOR.
+    bounds are affine in x, a method that takes them: ProjectedSOR, or ProjectedJacobi where A cannot be swept.
     """
     if problem.bounds.affine is not None:
-        return ProjectedSOR()
-    return ProjectedMultigrid() if isinstance(problem.A, GridPoisson) else MinimumMapNewton(direct=suits(problem.A))
+        return ProjectedSOR() if takes(ProjectedSOR, problem.A) else ProjectedJacobi()
+    return ProjectedMultigrid() if has(problem.A, HasStencil) else MinimumMapNewton(direct=suits(problem.A))
 
 
 def solve(

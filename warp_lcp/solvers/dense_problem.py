@@ -13,8 +13,8 @@ import scipy.sparse.linalg
 import warp as wp
 
 from warp_lcp.deadline import check_time, seconds_left
-from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import HasRows, has
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
 from warp_lcp.scale import scale_of_matrix, scaled, sizes_of_matrix
@@ -105,31 +105,24 @@ class DenseProblem:
 
 
 def sparse_matrix(problem: LCP) -> scipy.sparse.csr_array | None:
-    """Return the matrix of a sparse operator, None for other operators."""
-    matrix = getattr(problem.A, "matrix", None)
-    found: Any = matrix() if callable(matrix) else None
-    return found.astype(np.float64) if scipy.sparse.issparse(found) else None
+    """Return the matrix of an operator that has sparse rows, None for other operators."""
+    matrix = problem.A.rows().matrix() if has(problem.A, HasRows) else None
+    return matrix if scipy.sparse.issparse(matrix) else None
 
 
 def assemble(problem: LCP, rows: np.ndarray) -> np.ndarray:
-    """Return A between the unknowns `rows`, shape (n, n), float64: a copy of a dense operator's, else column by column."""
-    if isinstance(problem.A, DenseOperator):
-        return problem.A.matrix.numpy().astype(np.float64)[np.ix_(rows, rows)]
-    sparse = sparse_matrix(problem)
-    if sparse is not None:
-        return sparse.toarray()[np.ix_(rows, rows)]
-    layout, A = problem.layout, problem.A
+    """Return A between the unknowns `rows`, shape (n, n), float64: copied where there are rows, else column by column."""
+    if has(problem.A, HasRows):
+        whole = problem.A.rows().matrix()
+        return (whole.toarray() if scipy.sparse.issparse(whole) else whole)[np.ix_(rows, rows)]
+    layout = problem.layout
     unit, image, zero = (layout.zeros(wp.float64) for _ in range(3))
-    apply_plus = getattr(A, "apply_plus", None)  # takes stored fields, as grids have them
     host, matrix = np.zeros(layout.size), np.empty((len(rows), len(rows)))
     for column, row in enumerate(rows):
         check_time()
         host[row] = 1.0
         unit.assign(host)
-        if apply_plus is not None:
-            apply_plus(unit, zero, image)
-        else:
-            A.apply(unit.reshape(layout.stored_shape), image.reshape(layout.stored_shape))
+        problem.apply_plus(unit, zero, image)
         matrix[:, column] = image.numpy()[rows]
         host[row] = 0.0
     return matrix

@@ -32,7 +32,6 @@ class DirectEnumeration:
     For many problems at once see `enumerate_batch`.
     """
 
-    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
     needs: ClassVar[str] = "n <= 4"
     most_unknowns: ClassVar[int] = MOST
 

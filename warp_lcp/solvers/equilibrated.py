@@ -15,6 +15,7 @@ import warp as wp
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import HasRows, HasScale, has, version_of
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
 from warp_lcp.rows import RowPass
@@ -65,17 +66,17 @@ class EquilibratedWorkspace(IterateInPlace, RoundedIterate):
         limits = [bounds.values[k] if side is None else side for k, side in enumerate(sides)]
         self._inner = LCP(operator, layout.zeros(wp.float64), *limits)
         self.inner = make(self._inner)
-        self._version = getattr(problem.A, "version", None)
+        self._version = version_of(problem.A)
         self._smallest, self._waited, self._steps, self._asked = math.inf, 0, 0, False
 
     @staticmethod
     def suits(problem: LCP) -> bool:
         """Return whether the problem's rows are at hand."""
-        return isinstance(problem.A, (DenseOperator, SparseOperator))
+        return has(problem.A, HasRows) and has(problem.A, HasScale)
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Take A, b and the bounds as they are now."""
-        inner, version = self._inner, getattr(self.problem.A, "version", None)
+        inner, version = self._inner, version_of(self.problem.A)
         if version is None or version != self._version:
             self._version = version
             operator: Any = inner.A
@@ -125,7 +126,7 @@ class EquilibratedWorkspace(IterateInPlace, RoundedIterate):
     def _scaled(self) -> Any:
         """Set R and C, and return R A C on the host."""
         A: Any = self.problem.A
-        matrix = A.matrix() if isinstance(A, SparseOperator) else A.matrix.numpy().astype(np.float64)
+        matrix = A.rows().matrix()
         R, C = (power_of_two(1 / np.sqrt(A.scale())),) * 2 if A.symmetric else unit_rows_and_columns(matrix)
         if max(R.max() / R.min(), C.max() / C.min()) <= ALIKE:
             R = C = np.ones(len(R))

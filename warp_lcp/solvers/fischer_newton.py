@@ -11,8 +11,8 @@ import warp as wp
 
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.dense import DenseOperator
-from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import HasStencil, has
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
 from warp_lcp.settings import Count, CountOrZero, Settings, Share, ShareOrAll
@@ -71,7 +71,6 @@ class FischerNewton(Settings):
         CONVERGED [0.  1.5]
     """
 
-    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
     needs: ClassVar[str] = "a P0-matrix for plain steps; the safeguarded chain also solves copositive contact problems"
 
     kink: KinkName = "perturbation"
@@ -116,7 +115,7 @@ class FischerWorkspace(IterateInPlace, RoundedIterate):
         layout, self.kink = problem.layout, Kink(settings.kink)
         self.active_set: GridNewtonWorkspace | None = None
         self.x, self.residual = layout.zeros(wp.float64), NaturalResidual(problem)
-        if isinstance(problem.A, GridPoisson) and self.kink is not Kink.APPROXIMATION:
+        if has(problem.A, HasStencil) and self.kink is not Kink.APPROXIMATION:
             newton = MinimumMapNewton(precision=settings.precision, monotone_cycles=settings.monotone_cycles, cycle=settings.cycle)
             self.active_set = GridNewtonWorkspace(problem, problem.A, newton, serves=True)
             self.x, self.residual, self.scratch = self.active_set.x, self.active_set.residual, self.active_set.scratch

@@ -47,7 +47,6 @@ class GradientDescent(Settings):
         ValueError: an argument is outside its range.
     """
 
-    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
     needs: ClassVar[str] = "products with A'"
 
     map: MapName = "fischer"

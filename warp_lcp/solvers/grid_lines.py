@@ -8,8 +8,8 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import HasStencil, has
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.solvers.sweep import check_colors
 
@@ -47,7 +47,7 @@ class LineSweep:
 
     def __init__(self, problem: LCP, axis: GridLines, omega: float) -> None:
         A = problem.A
-        assert isinstance(A, GridPoisson)
+        assert has(A, HasStencil)
         if A.periodic[axis.value]:
             raise ValueError(f"blocks = {axis}: lines along a periodic axis have no ends; take another axis")
         check_colors(problem)

@@ -43,7 +43,6 @@ class IncrementalPivoting(Settings):
         ValueError: pivots_per_step < 1.
     """
 
-    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
     needs: ClassVar[str] = "symmetric, positive semi-definite, n <= 4096"
     most_unknowns: ClassVar[int] = 4096  # three dense n x n float64 arrays of 134 MB each
 

@@ -10,8 +10,8 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.multigrid.cycle_settings import CycleSettings
-from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import HasStencil, has
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.rows import Known, RowPass, Rows
 from warp_lcp.settings import Count, CountOrZero, Positive, Settings, Share, ShareOrZero
@@ -69,7 +69,6 @@ class InteriorPoint(Settings):
         CONVERGED [0.  1.5]
     """
 
-    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
     needs: ClassVar[str] = "A positive semi-definite; it need not be symmetric"
 
     precision: PrecisionName = "mixed"
@@ -123,7 +122,7 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
             precision=settings.precision, monotone_cycles=settings.monotone_cycles, max_linear_iterations=settings.max_linear_iterations,
             cycle=settings.cycle,
         )  # fmt: skip
-        if isinstance(problem.A, GridPoisson) and problem.bounded:
+        if has(problem.A, HasStencil) and problem.bounded:
             self.active_set = GridNewtonWorkspace(problem, problem.A, newton, serves=True)
             self.x, self.scratch = self.active_set.x, self.active_set.scratch
             self.residual = self.active_set.residual
@@ -153,7 +152,7 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the path; the operator may have changed."""
         s = self.settings
-        cold_grid = self.problem.bounded and isinstance(self.problem.A, GridPoisson) and not warm
+        cold_grid = self.problem.bounded and self._carries and not warm
         self.cycles_left = s.monotone_cycles if cold_grid else 0
         self.near = warm or self.cycles_left > 0
         self.begun = self.crossed = False

@@ -48,7 +48,6 @@ class Lemke(Settings):
         ValueError: an argument is outside its range.
     """
 
-    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
     needs: ClassVar[str] = "n <= 4096; sure of an end for copositive-plus and P-matrices"
     most_unknowns: ClassVar[int] = 4096  # the basis and its inverse take 134 MB each, four times that with boxes everywhere
 

@@ -12,9 +12,9 @@ import warp as wp
 from warp_lcp.deadline import check_time
 from warp_lcp.multigrid.aggregates import AggregateCycles, suits_multigrid
 from warp_lcp.multigrid.cycle_settings import CycleSettings
-from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import HasStencil, has
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
 from warp_lcp.rows import Rows
@@ -69,7 +69,6 @@ class MinimumMapNewton(Settings):
         ValueError: an argument is outside its range.
     """
 
-    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
     needs: ClassVar[str] = "positive definite or P-matrix"
     distributed: ClassVar[bool] = True
 
@@ -90,7 +89,7 @@ class MinimumMapNewton(Settings):
         """
         if self.direct:
             return DirectNewtonWorkspace(problem, self)
-        return GridNewtonWorkspace(problem, problem.A, self) if isinstance(problem.A, GridPoisson) else NewtonWorkspace(problem, self)
+        return GridNewtonWorkspace(problem, problem.A, self) if has(problem.A, HasStencil) else NewtonWorkspace(problem, self)
 
     def step(self, problem: LCP, work: Any, x: wp.array[Any]) -> Step:
         """Take a monotone cycle while the start is cold, else a safeguarded Newton step."""

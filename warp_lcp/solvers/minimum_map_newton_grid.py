@@ -9,8 +9,8 @@ import warp as wp
 
 from warp_lcp.deadline import time_is_up
 from warp_lcp.multigrid.hierarchy import Hierarchy
-from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import HasStencil
 from warp_lcp.solve import Precision, Step
 from warp_lcp.solvers import projected_multigrid_kernels as engine
 from warp_lcp.solvers.projected_multigrid_workspace import AssessedResidual, MultigridWorkspace
@@ -31,7 +31,7 @@ class MinimumMapResidual(AssessedResidual):
     _away: wp.array[Any]
     _minimum_map = True
 
-    def __init__(self, problem: LCP, A: GridPoisson, hierarchy: Hierarchy, *, rounded: bool) -> None:
+    def __init__(self, problem: LCP, A: HasStencil, hierarchy: Hierarchy, *, rounded: bool) -> None:
         super().__init__(problem, A, hierarchy, rounded=rounded)
         planes, rows, _ = A.stencil.padding.counts
         self._away = wp.zeros(planes * rows, dtype=wp.uint8, device=A.device)  # rows with such unknowns
@@ -70,7 +70,7 @@ class GridNewtonWorkspace(MultigridWorkspace):
         serves: whether another method makes the cold start or ends with this one, on the same x and residual, and keeps the best iterate.
     """
 
-    def __init__(self, problem: LCP, A: GridPoisson, settings: MinimumMapNewton, *, serves: bool = False) -> None:
+    def __init__(self, problem: LCP, A: HasStencil, settings: MinimumMapNewton, *, serves: bool = False) -> None:
         super().__init__(problem, A, settings)  # type: ignore[arg-type]
         self.residual = MinimumMapResidual(problem, A, self.hierarchy, rounded=self.precision is Precision.SINGLE)
         self._newton, self._norms, self._target, self._serves = settings, list[float](), 0.0, serves

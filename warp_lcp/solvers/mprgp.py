@@ -13,8 +13,8 @@ from warp_lcp.deadline import check_time
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Level
 from warp_lcp.operators.dense import DenseOperator
-from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import HasStencil, has
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
 from warp_lcp.rows import Rows
@@ -65,7 +65,6 @@ class MPRGP(Settings):
         ValueError: an argument is outside its range.
     """
 
-    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
     needs: ClassVar[str] = "A symmetric, positive semi-definite"
 
     precision: PrecisionName = "mixed"
@@ -140,7 +139,7 @@ class SplitResidual(NaturalResidual):
         self.sums, self.rows = Reduction(size, device, self.scalars, columns=2), Rows.flat(size, device)
         self.size, self.moved, self.chopped, self.reduced, self.release, self.active, self.energy = 1.0, True, 0.0, 0.0, 0.0, 0, 0.0
         self._norm_of_b = 0.0
-        self._stencil = problem.A.stencil if isinstance(problem.A, GridPoisson) else None
+        self._stencil = problem.A.stencil if has(problem.A, HasStencil) else None
         places = self._stencil.rows.places if self._stencil else self.rows.places
         self._split = Reduction(size, device, self.scalars, columns=SPLIT_SUMS, threads=places)
 
@@ -190,7 +189,7 @@ class GradientWorkspace(RoundedIterate):
 
     def __init__(self, problem: LCP, settings: MPRGP, system: SparseSystem | None = None) -> None:
         self.problem, self.settings, self.precision = problem, settings, Precision(settings.precision)
-        self.bounded, self.is_grid = problem.bounded, isinstance(problem.A, GridPoisson)
+        self.bounded, self.is_grid = problem.bounded, has(problem.A, HasStencil)
         self.system, self.preconditioner = _preconditioner(problem, self.precision.correction, settings.cycle, system)
         z, single = self.preconditioner.z, self.precision is Precision.SINGLE
         self._fields = [problem.layout.zeros(wp.float64) for _ in range(2 if self.is_grid else 3)]
@@ -372,8 +371,8 @@ class GradientWorkspace(RoundedIterate):
     def _product(self, direction: wp.array[Any]) -> None:
         """Q = A times a direction."""
         A, shape = self.problem.A, self.problem.layout.stored_shape
-        if isinstance(A, GridPoisson):
-            A.stencil.product(direction, self._q)
+        if self.is_grid:
+            A.stencil.product(direction, self._q)  # type: ignore[attr-defined]
         else:
             A.apply(direction.reshape(shape), self._q.reshape(shape))
 

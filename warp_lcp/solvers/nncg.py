@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import HasRows, Relaxes, check_taken
 from warp_lcp.residual import WITHIN
 from warp_lcp.rows import Rows
 from warp_lcp.settings import Relaxation, Settings
@@ -39,7 +40,7 @@ class NNCG(Settings):
         ValueError: an argument is outside its range.
     """
 
-    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
+    supports: ClassVar = (Relaxes, HasRows)
     needs: ClassVar[str] = "what ProjectedSOR needs"
     affine_bounds: ClassVar[bool] = True
 
@@ -53,6 +54,7 @@ class NNCG(Settings):
         Raises:
             ValueError: A cannot be swept; see ProjectedSOR.
         """
+        check_taken(self, problem.A)
         work = NNCGWorkspace(problem, Precision(self.precision))
         work.sweep = sweep_for(problem, work.diagonal, self.omega)
         work.diagonal.check()

@@ -15,6 +15,7 @@ from warp_lcp.operators.grid_poisson import AIR, FLUID, GridPoisson
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.operators.sparse_kernels import color_kernel
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import HasFaces, HasRows, described, has, version_of
 from warp_lcp.result import SolveResult
 from warp_lcp.rows import RowPass
 from warp_lcp.vectors import rows_of
@@ -92,16 +93,16 @@ class MatrixBlock:
     def __init__(self, whole: LCP, x: wp.array[Any], rows: np.ndarray) -> None:
         self._whole, self._x, self._rows = whole, x, rows
         inner, self._outer = self._entries()
-        made: Any = DenseOperator if isinstance(whole.A, DenseOperator) else SparseOperator
+        made: Any = DenseOperator if isinstance(inner, np.ndarray) else SparseOperator
         device, size = whole.device, len(rows)
         A = made(inner, device=device, dtype=whole.A.dtype)
         b, low, high = (wp.zeros(size, dtype=wp.float64, device=device) for _ in range(3))
         self.problem = LCP(A, b, low, high)
-        self._version = getattr(whole.A, "version", 0)
+        self._version = version_of(whole.A)
 
     def refresh(self) -> None:
         """Take A's entries again."""
-        A, version = self.problem.A, getattr(self._whole.A, "version", 0)
+        A, version = self.problem.A, version_of(self._whole.A)
         if isinstance(A, SparseOperator) and version == self._version:
             return
         self._version = version
@@ -132,14 +133,13 @@ class MatrixBlock:
     def _entries(self) -> tuple[Any, Any]:
         """Return A_BB, and the block's rows of A with 0 in place of it."""
         A, rows = self._whole.A, self._rows
-        if isinstance(A, DenseOperator):
-            outer = A.matrix.numpy()[rows].astype(np.float64)
-            inner = outer[:, rows].copy()
-            outer[:, rows] = 0.0
-            return inner, outer
-        assert isinstance(A, SparseOperator)
-        slab = scipy.sparse.csr_array(A.matrix()[rows])
-        others = np.ones(A.unknowns)
+        assert has(A, HasRows)
+        slab = A.rows().matrix()[rows]
+        if isinstance(slab, np.ndarray):
+            inner = slab[:, rows]
+            slab[:, rows] = 0.0
+            return inner, slab
+        others = np.ones(slab.shape[1])
         others[rows] = 0.0
         outer = slab @ scipy.sparse.diags_array(others)
         return slab[:, rows], outer
@@ -154,7 +154,7 @@ class GridBlock:
 
     def __init__(self, whole: LCP, x: wp.array[Any], rows: np.ndarray) -> None:
         A = whole.A
-        assert isinstance(A, GridPoisson)
+        assert has(A, HasFaces)
         layout = whole.layout
         self._whole, self._x = whole, x
         member = np.zeros(layout.size, dtype=np.uint8)
@@ -173,7 +173,7 @@ class GridBlock:
     def refresh(self) -> None:
         """Take A's coefficients again; cells that are no longer FLUID leave the block, new ones belong to none."""
         A = self._whole.A
-        assert isinstance(A, GridPoisson)
+        assert has(A, HasFaces)
         if A.version != self._version:
             self._version = A.version
             cells = self._cells().reshape(self._whole.layout.stored_shape)
@@ -183,7 +183,7 @@ class GridBlock:
         """Write what A x + b leaves of b when the block's own part is taken out."""
         whole, of_block = self._whole, {"member": self._member, "kept": False}
         whole.bounds.follow(self._x)
-        whole.A.apply_plus(self._x, whole.b, self._y)  # type: ignore[attr-defined]
+        whole.apply_plus(self._x, whole.b, self._y)
         SELECT.bind(rows_of(self._x), x=self._x, less=None, target=self._guess, **of_block).launch()
         self.problem.A.apply(self._guess, self._z)
         SELECT.bind(rows_of(self._x), x=self._y, less=self._z, target=self._b, **of_block).launch()
@@ -216,8 +216,8 @@ def block_problem(whole: LCP, x: wp.array[Any], rows: np.ndarray) -> Block:
     Raises:
         ValueError: the operator has no principal sub-operators.
     """
-    if isinstance(whole.A, GridPoisson):
+    if has(whole.A, HasFaces):
         return GridBlock(whole, x, rows)
-    if isinstance(whole.A, (DenseOperator, SparseOperator)):
+    if has(whole.A, HasRows):
         return MatrixBlock(whole, x, rows)
-    raise ValueError(f"{type(whole.A).__name__} cannot be taken apart: blocks are for DenseOperator, SparseOperator and GridPoisson")
+    raise ValueError(f"{type(whole.A).__name__} cannot be taken apart: blocks need {described(HasRows, HasFaces)}")

@@ -13,6 +13,7 @@ from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import HasRows, HasScale, HasStencil, has
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
 from warp_lcp.rows import Rows
@@ -25,7 +26,6 @@ from warp_lcp.stopping import StoppingCriteria
 from warp_lcp.vectors import Reduction
 
 if TYPE_CHECKING:
-    from warp_lcp.operators.grid_poisson import GridPoisson
     from warp_lcp.solvers.principal_system_sparse import SparseSystem
 
 # of steps on a grid's matrix
@@ -136,7 +136,7 @@ class AlgebraicSteps:
         tolerance: the residual norm that is asked for.
     """
 
-    def __init__(self, problem: LCP, A: GridPoisson, x: wp.array[Any], tolerance: float) -> None:
+    def __init__(self, problem: LCP, A: HasStencil, x: wp.array[Any], tolerance: float) -> None:
         from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton  # which needs this module
 
         self._rows = np.flatnonzero(problem.unknown.numpy() == 1)
@@ -220,11 +220,10 @@ class ProximalPoint:
         from warp_lcp.solvers.primal_dual_active_set import PrimalDualActiveSet  # whose last resort this is
 
         self._problem, self._residual, self._tolerance = problem, residual, tolerance
-        A = problem.A
-        self._matrix: Any = A.matrix() if isinstance(A, SparseOperator) else A.matrix.numpy().astype(np.float64)  # type: ignore[attr-defined]
-        self._D = A.scale()  # type: ignore[attr-defined]
+        A: Any = problem.A
+        self._matrix, self._D = A.rows().matrix(), A.scale()
         self._b, self._eps = problem.b.numpy(), CENTER
-        if scipy.sparse.issparse(self._matrix) and A.unknowns <= SMALL:  # type: ignore[attr-defined]
+        if scipy.sparse.issparse(self._matrix) and len(self._D) <= SMALL:
             self._matrix = self._matrix.toarray()
         made: Any = SparseOperator if scipy.sparse.issparse(self._matrix) else DenseOperator
         operator = made(self._regularized(), device=problem.device, dtype=wp.float64)
@@ -236,7 +235,7 @@ class ProximalPoint:
     @staticmethod
     def suits(problem: LCP) -> bool:
         """Return whether the iteration can be had: A + eps D must be assembled."""
-        return isinstance(problem.A, (DenseOperator, SparseOperator))
+        return has(problem.A, HasRows) and has(problem.A, HasScale)
 
     def step(self, x: wp.array[Any]) -> Step:
         """Take one step for the regularized problem, from a new center if the last one's has been solved."""

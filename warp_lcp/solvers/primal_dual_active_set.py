@@ -54,7 +54,6 @@ class PrimalDualActiveSet(Settings):
         ValueError: an argument is outside its range.
     """
 
-    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
     needs: ClassVar[str] = "M-matrix, or P-matrix where dense"
 
     precision: PrecisionName = "mixed"

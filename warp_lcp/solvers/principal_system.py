@@ -18,12 +18,12 @@ from warp_lcp.krylov.system import KrylovSystem
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.turning import make_hierarchy
 from warp_lcp.operators.dense import DenseOperator
-from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.operators.sum import SumOperator, grid_and_low_rank
 from warp_lcp.problem import LCP
 from warp_lcp.program import Launch, Program
+from warp_lcp.protocol import HasStencil, has
 from warp_lcp.rows import RowPass
 from warp_lcp.solvers.dense_problem import equilibration, factored
 from warp_lcp.solvers.grid_conjugate_gradient import GridConjugateGradient
@@ -75,7 +75,7 @@ class PrincipalSystem(Protocol):
 class GridSystem(KrylovSystem):
     """Conjugate gradients on a grid, preconditioned by a linear multigrid cycle on the free set."""
 
-    def __init__(self, A: GridPoisson, real: Any, *, bounded: bool, settings: CycleSettings | None = None, shifted: bool = False) -> None:
+    def __init__(self, A: HasStencil, real: Any, *, bounded: bool, settings: CycleSettings | None = None, shifted: bool = False) -> None:
         self._A = A
         self._version = A.version
         self.hierarchy = make_hierarchy(A.stencil, real, bounded=bounded, settings=settings, shifted=shifted)
@@ -133,7 +133,7 @@ class CoupledGridSystem(KrylovSystem):
     """Conjugate gradients on a grid operator plus one of low rank, preconditioned by the grid's multigrid, corrected for the columns."""
 
     def __init__(
-        self, A: SumOperator, grid: GridPoisson, low: LowRankOperator, real: Any, *, settings: CycleSettings | None, shifted: bool
+        self, A: SumOperator, grid: HasStencil, low: LowRankOperator, real: Any, *, settings: CycleSettings | None, shifted: bool
     ) -> None:
         self._grid, self._low, self._A = GridSystem(grid, real, bounded=False, settings=settings, shifted=shifted), low, A
         self.r, self.z = self._grid.r, self._grid.z
@@ -271,7 +271,7 @@ def principal_system(
         shifted: whether `restrict` gets a shift; see `PrincipalSystem` for what it does to norms.
     """
     A = problem.A
-    if isinstance(A, GridPoisson):
+    if has(A, HasStencil):
         return GridSystem(A, real, bounded=bounded, settings=settings, shifted=shifted)
     if isinstance(A, DenseOperator):
         return DenseSystem(A)

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import version_of
 from warp_lcp.settings import Positive, Settings
 from warp_lcp.solve import Precision, PrecisionName, Step
 from warp_lcp.solvers.psor import SweepWorkspace
@@ -36,7 +37,6 @@ class ProjectedJacobi(Settings):
         ValueError: an argument is outside its range.
     """
 
-    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
     needs: ClassVar[str] = "symmetric positive (semi-)definite A for a proof of convergence; A_ii <= 0 case by case"
     affine_bounds: ClassVar[bool] = True
 
@@ -79,7 +79,7 @@ class JacobiWorkspace(SweepWorkspace):
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Estimate the damping where the operator is new."""
-        self.d, version = self.diagonal.field(), getattr(self.problem.A, "version", None)
+        self.d, version = self.diagonal.field(), version_of(self.problem.A)
         if self._given is None and version != self._version:
             self.omega = self._estimate()
             self._version = version  # last: time may be up before

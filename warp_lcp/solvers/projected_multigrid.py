@@ -8,9 +8,9 @@ from typing import Any, ClassVar
 import warp as wp
 
 from warp_lcp.multigrid.cycle_settings import CycleSettings
-from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.operators.sum import grid_and_low_rank
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import HasColumns, HasStencil, check_taken, has
 from warp_lcp.settings import Count, CountOrZero, Settings
 from warp_lcp.solve import PrecisionName, Step
 from warp_lcp.solvers.projected_multigrid_coupled import CoupledWorkspace
@@ -40,7 +40,7 @@ class ProjectedMultigrid(Settings):
         ValueError: an argument is outside its range.
     """
 
-    supports: ClassVar[frozenset[str]] = frozenset({"grid"})
+    supports: ClassVar = (HasStencil, HasColumns)
     needs: ClassVar[str] = ""
     distributed: ClassVar[bool] = True
 
@@ -54,14 +54,15 @@ class ProjectedMultigrid(Settings):
         """Return a workspace.
 
         Raises:
-            ValueError: A is not a grid operator.
+            ValueError: A has no stencil, or columns that are not symmetric.
         """
+        check_taken(self, problem.A)
+        if has(problem.A, HasStencil):
+            return MultigridWorkspace(problem, problem.A, self)
         terms = grid_and_low_rank(problem.A)
-        if terms is not None:
-            return CoupledWorkspace(problem, *terms, self)
-        if not isinstance(problem.A, GridPoisson):
-            raise ValueError(f"{type(problem.A).__name__} is no grid operator: ProjectedMultigrid needs one; MinimumMapNewton takes others")
-        return MultigridWorkspace(problem, problem.A, self)
+        if terms is None:
+            raise ValueError("A is not symmetric: ProjectedMultigrid needs symmetric columns of low rank; take MinimumMapNewton")
+        return CoupledWorkspace(problem, *terms, self)
 
     def step(self, problem: LCP, work: MultigridWorkspace, x: wp.array[Any]) -> Step:
         """Take a monotone cycle while the start is cold or steps do not lead down, else a truncated one; on the matrix if these crawl."""

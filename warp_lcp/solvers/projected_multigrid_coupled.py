@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 import warp as wp
 
 from warp_lcp.multigrid.hierarchy import Hierarchy
-from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.problem import LCP
 from warp_lcp.program import Launch, Program
+from warp_lcp.protocol import HasStencil
 from warp_lcp.solve import Precision, Step
 from warp_lcp.solvers import principal_system_low_rank_kernels as coupling
 from warp_lcp.solvers import projected_multigrid_kernels as kernels
@@ -32,7 +32,7 @@ class CoupledResidual(AssessedResidual):
     Its d_i are the diagonal of A alone, which is no larger.
     """
 
-    def __init__(self, problem: LCP, A: GridPoisson, low: LowRankOperator, hierarchy: Hierarchy, *, rounded: bool) -> None:
+    def __init__(self, problem: LCP, A: HasStencil, low: LowRankOperator, hierarchy: Hierarchy, *, rounded: bool) -> None:
         super().__init__(problem, A, hierarchy, rounded=rounded)
         self.diagonal, self.unit, self._diagonal_of = A.stencil.d, float(A.stencil.unit), None
         self._low, self._b = low, wp.zeros_like(problem.b)  # in the place of the problem's
@@ -69,7 +69,7 @@ class CoupledWorkspace(MultigridWorkspace):
 
     residual: CoupledResidual
 
-    def __init__(self, problem: LCP, A: GridPoisson, low: LowRankOperator, settings: ProjectedMultigrid) -> None:
+    def __init__(self, problem: LCP, A: HasStencil, low: LowRankOperator, settings: ProjectedMultigrid) -> None:
         super().__init__(problem, A, settings)
         self._low = low
         rounded = self.precision is Precision.SINGLE

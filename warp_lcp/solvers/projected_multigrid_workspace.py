@@ -12,9 +12,9 @@ import warp as wp
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.multigrid.shared_levels import clear_ghosts
 from warp_lcp.multigrid.turning import make_hierarchy
-from warp_lcp.operators.grid_poisson import GridPoisson
 from warp_lcp.problem import LCP
 from warp_lcp.program import Launch, Program, perform
+from warp_lcp.protocol import HasStencil
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.rows import Bound, Rows
 from warp_lcp.solve import FLOOR_MARGIN, Precision, RoundedIterate, Step
@@ -39,7 +39,7 @@ class AssessedResidual(NaturalResidual):
 
     _minimum_map = False
 
-    def __init__(self, problem: LCP, A: GridPoisson, hierarchy: Hierarchy, *, rounded: bool) -> None:
+    def __init__(self, problem: LCP, A: HasStencil, hierarchy: Hierarchy, *, rounded: bool) -> None:
         super().__init__(problem)
         self._A, self._finest, self._hierarchy, self._version = A, hierarchy.finest, hierarchy, A.version
         self._rounded, self._b = rounded, problem.b
@@ -134,7 +134,7 @@ class MultigridWorkspace(RoundedIterate):
     is when the residual has risen and goes on from there.
     """
 
-    def __init__(self, problem: LCP, A: GridPoisson, settings: ProjectedMultigrid) -> None:
+    def __init__(self, problem: LCP, A: HasStencil, settings: ProjectedMultigrid) -> None:
         self.problem, self.A, self.settings, self.precision = problem, A, settings, Precision(settings.precision)
         self.bounded = problem.bounded
         real = self.precision.correction

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Literal
 import warp as wp
 
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import HasRows, Relaxes, check_taken
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.settings import Relaxation, Settings
 from warp_lcp.solve import IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
@@ -50,7 +51,7 @@ class ProjectedSOR(Settings):
         ValueError: an argument is outside its range.
     """
 
-    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
+    supports: ClassVar = (Relaxes, HasRows)
     needs: ClassVar[str] = "symmetric positive (semi-)definite A for a proof of convergence; A_ii <= 0 case by case"
     affine_bounds: ClassVar[bool] = True
 
@@ -75,6 +76,7 @@ class ProjectedSOR(Settings):
             ValueError: A cannot be swept (in this order), has a zero or negative diagonal entry with a right-hand side that no bound
                 meets, or an odd periodic side.
         """
+        check_taken(self, problem.A)
         work = SweepWorkspace(problem, Precision(self.precision))
         work.sweep = sweep_for(problem, work.diagonal, self.omega, SweepOrder(self.order), self.permutation)
         work.diagonal.check()

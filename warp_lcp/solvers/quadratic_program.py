@@ -36,7 +36,6 @@ class QuadraticProgram(Settings):
         ValueError: an argument is outside its range.
     """
 
-    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
     needs: ClassVar[str] = "symmetric, positive semi-definite, n <= 4096 unless sparse; the extra `peers`"
     most_unknowns: ClassVar[int] = 4096  # a dense n x n float64 array of 134 MB, and its factor; sparse operators have no limit
 

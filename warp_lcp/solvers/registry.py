@@ -1,16 +1,16 @@
 """The methods by name: the one table that scenes, the command line, the tests and the documentation read.
 
-A new method is one file and one line here. Each class says in `supports` on which families of operators it works ("dense", "sparse",
-"grid") and in `needs` what else it asks of A ("symmetric", ...). A class that takes small problems only has `most_unknowns`; one that takes
-no upper bounds and no equations has `boxed = False`.
+A new method is one file and one line here. Each class says in `supports` which capabilities it asks of an operator, any one of them (see
+`warp_lcp.protocol`; nothing where every operator will do), and in `needs` what must hold of A ("symmetric", ...). A class that takes small
+problems only has `most_unknowns`; one that takes no upper bounds and no equations has `boxed = False`.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 from warp_lcp.nearest import nearest
+from warp_lcp.protocol import families
 from warp_lcp.solvers.accelerated_projected_gradient import AcceleratedProjectedGradient
 from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel
 from warp_lcp.solvers.direct_enumeration import DirectEnumeration
@@ -65,12 +65,5 @@ METHODS = Methods(
 
 def grid_methods() -> tuple[str, ...]:
     """Return the names of the methods that take a grid of any size and a precision: what a scene may name."""
-    return tuple(name for name, method in METHODS.items() if "grid" in method.supports and _has_precision(method) and not _is_small(method))
-
-
-def _is_small(method: type[Any]) -> bool:
-    return hasattr(method, "most_unknowns")
-
-
-def _has_precision(method: type[Any]) -> bool:
-    return any(field.name == "precision" for field in dataclasses.fields(method))
+    grids = [(name, method) for name, method in METHODS.items() if "grid" in families(method) and not hasattr(method, "most_unknowns")]
+    return tuple(name for name, method in grids if "precision" in method.__dataclass_fields__)

@@ -37,14 +37,10 @@ def scaled_spectrum(problem: LCP, steps: int, free: Any = None) -> tuple[float, 
     if not unknown.any():
         raise ValueError("free: holds no unknown")
     field, image, nothing = (layout.zeros(wp.float64) for _ in range(3))
-    plus = getattr(A, "apply_plus", None)
 
     def product(v: np.ndarray) -> np.ndarray:
         field.assign(scale * v)
-        if plus is not None:
-            plus(field, nothing, image)
-        else:
-            A.apply(field.reshape(layout.stored_shape), image.reshape(layout.stored_shape))
+        problem.apply_plus(field, nothing, image)
         if not A.symmetric:
             straight = image.numpy().copy()
             A.apply_transpose(field.reshape(layout.stored_shape), image.reshape(layout.stored_shape))

@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import HasFaces, HasRows, check_taken
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.settings import Count, Settings, Share
 from warp_lcp.solve import IterateInPlace, Precision, Solver, Step
@@ -38,7 +39,7 @@ class Staggering(Settings):
         ValueError: an argument is outside its range.
     """
 
-    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
+    supports: ClassVar = (HasRows, HasFaces)
     needs: ClassVar[str] = "symmetric positive definite A for a proof of convergence"
     affine_bounds: ClassVar[bool] = True
 
@@ -53,6 +54,7 @@ class Staggering(Settings):
         Raises:
             ValueError: the blocks are no partition of the unknowns, A cannot be taken apart, or a method does not take its block.
         """
+        check_taken(self, problem.A)
         if isinstance(self.blocks, int):
             rows = np.array_split(np.flatnonzero(problem.unknown.numpy() == 1), self.blocks)
             rows = [block for block in rows if block.size]

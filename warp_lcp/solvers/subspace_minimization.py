@@ -11,6 +11,7 @@ import warp as wp
 from warp_lcp.deadline import check_time
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import HasRows, Relaxes, check_taken
 from warp_lcp.rows import Rows
 from warp_lcp.settings import Count, Ge, Relaxation, Settings, Share
 from warp_lcp.solve import Precision, PrecisionName, Step
@@ -53,7 +54,7 @@ class SubspaceMinimization(Settings):
         ValueError: an argument is outside its range.
     """
 
-    supports: ClassVar[frozenset[str]] = frozenset({"dense", "sparse", "grid"})
+    supports: ClassVar = (Relaxes, HasRows)
     needs: ClassVar[str] = "what ProjectedSOR needs; regular principal blocks (dense: least squares otherwise)"
     affine_bounds: ClassVar[bool] = True
 
@@ -72,6 +73,7 @@ class SubspaceMinimization(Settings):
         Raises:
             ValueError: A cannot be swept, or its principal systems cannot be solved.
         """
+        check_taken(self, problem.A)
         work = SubspaceWorkspace(problem, self)
         work.diagonal.check()
         return work

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Literal, Protocol
 
@@ -10,12 +9,13 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.affine_bounds import affine_side
-from warp_lcp.operators.dense import DenseOperator
+from warp_lcp.operators.compressed_rows import CompressedRows
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem import LCP
+from warp_lcp.protocol import HasRows, HasStencil, NamesComponents, Relaxes, has
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
-from warp_lcp.solvers.sweep_kernels import CHANGE, matrix_rows, row_kernels
+from warp_lcp.solvers.sweep_kernels import CHANGE, row_kernels
 from warp_lcp.vectors import ADD, rows_of
 
 
@@ -44,8 +44,8 @@ class Sweep(Protocol):
 class OperatorSweep:
     """The operator's own sweep: red-black on grids, by rows or by colors on sparse matrices. Affine bounds are evaluated once a sweep."""
 
-    def __init__(self, problem: LCP, omega: float, *, colored: bool | None = None) -> None:
-        self.problem, self.omega = problem, omega
+    def __init__(self, problem: LCP, A: Relaxes, omega: float, *, colored: bool | None = None) -> None:
+        self.problem, self._A, self.omega = problem, A, omega
         self._options: dict[str, bool] = {} if colored is None else {"colored": colored}
 
     def start(self) -> None:
@@ -55,40 +55,7 @@ class OperatorSweep:
         """Sweep."""
         p = self.problem
         p.bounds.follow(x)
-        p.A.relax(x, p.b, p.lower, p.upper, self.omega, forward=forward, **self._options)  # type: ignore[attr-defined]
-
-
-@dataclass(frozen=True, eq=False)
-class Rows:
-    """The entries of a dense or sparse operator by rows, on its device, shared with it.
-
-    Attributes:
-        indptr: where each row begins, shape (n + 1,), wp.int32.
-        indices: columns, wp.int32; empty if every row is full.
-        values: entries.
-    """
-
-    indptr: wp.array[Any]
-    indices: wp.array[Any]
-    values: wp.array[Any]
-
-    @property
-    def operand(self) -> Any:
-        """What kernels take."""
-        made = matrix_rows(self.values.dtype)()
-        made.ptr, made.col, made.a = self.indptr, self.indices, self.values
-        return made
-
-    @classmethod
-    def of(cls, A: Any) -> Rows | None:
-        """Return the rows of an operator, None if it has none to show."""
-        if isinstance(A, SparseOperator):
-            return cls(A.indptr, A.indices, A.values)
-        if isinstance(A, DenseOperator):
-            n = A.unknowns
-            none = wp.empty(0, dtype=wp.int32, device=A.device)
-            return cls(wp.array(np.arange(n + 1) * n, dtype=wp.int32, device=A.device), none, A.matrix.flatten())
-        return None
+        self._A.relax(x, p.b, p.lower, p.upper, self.omega, forward=forward, **self._options)
 
 
 def bound_operands(problem: LCP) -> list[Any]:
@@ -101,14 +68,14 @@ class RowSweep:
     """Rows one after the other by one thread, in any order; bounds affine in x and zero or negative diagonals are minded row by row.
 
     Args:
-        problem: with a dense or sparse operator.
-        rows: its rows.
+        problem: the problem.
+        rows: its operator's rows.
         omega: relaxation factor.
         order: NATURAL, MAGNITUDE (largest |x| first, sorted anew before each sweep) or GREEDY (always the row that would change most).
         permutation: rows in the order of a sweep; all of them by number if None.
     """
 
-    def __init__(self, problem: LCP, rows: Rows, omega: float, order: SweepOrder, permutation: tuple[int, ...] | None) -> None:
+    def __init__(self, problem: LCP, rows: CompressedRows, omega: float, order: SweepOrder, permutation: tuple[int, ...] | None) -> None:
         self.problem, self._rows, self._omega, self._order = problem, rows, wp.float64(omega), order
         n = problem.layout.size
         self._n = n if permutation is None else len(permutation)
@@ -165,7 +132,7 @@ class Diagonal:
     def field(self) -> wp.array[Any]:
         """Return the diagonal / unit, a stored field; of grids and sparse matrices their own memory."""
         p, r = self.problem, self._residual
-        return r.diagonal if getattr(p.A, "stencil", None) else p.layout.load(p.A.diagonal(), p.A.dtype)
+        return r.diagonal if has(p.A, HasStencil) else p.layout.load(p.A.diagonal(), p.A.dtype)
 
     def positive(self) -> bool:
         """Return whether every unknown's entry is positive."""
@@ -189,7 +156,7 @@ class Diagonal:
                 f"A has {np.count_nonzero(concave)} negative diagonal entries where no bound solves the row (the first is row {row}, "
                 f"b = {b[row]}): no sweep can solve them"
             )
-        if hasattr(p.A, "floating_components"):
+        if has(p.A, NamesComponents):
             return  # a grid's zero diagonals are isolated cells, which the loop settles or calls INFEASIBLE
         stuck = inside & (d == 0) & (((b < 0) & np.isinf(upper)) | ((b > 0) & np.isinf(lower)))
         if stuck.any():
@@ -207,14 +174,15 @@ def sweep_for(
     Raises:
         ValueError: the operator cannot be swept in this order.
     """
-    A, rows = problem.A, Rows.of(problem.A)
+    A = problem.A
+    rows = A.rows() if has(A, HasRows) else None
     kind = type(A).__name__
     if order is SweepOrder.MULTICOLOR:
         if not isinstance(A, SparseOperator):
             raise ValueError(f"order 'multicolor' is for sparse matrices; {kind} has its own order (grids: red-black)")
         if problem.bounds.affine is not None or not diagonal.positive():
             raise ValueError("order 'multicolor' needs constant bounds and a positive diagonal")
-        return OperatorSweep(problem, omega, colored=True)
+        return OperatorSweep(problem, A, omega, colored=True)
     if permutation is not None and rows is not None and sorted(permutation) != list(range(problem.layout.size)):
         raise ValueError(f"permutation: must hold every row from 0 to {problem.layout.size - 1} once")
     special = permutation is not None or order is not SweepOrder.NATURAL
@@ -223,12 +191,11 @@ def sweep_for(
     if order is SweepOrder.GREEDY and not A.symmetric:
         raise ValueError("order 'greedy' updates y by rows of A, which must be symmetric")
     by_rows = None if rows is None else RowSweep(problem, rows, omega, order, permutation)
-    if by_rows is not None and (special or problem.bounds.affine is not None):
+    if by_rows is not None and (special or problem.bounds.affine is not None or not has(A, Relaxes)):
         return by_rows
-    if not hasattr(A, "relax"):
-        raise ValueError(f"{kind} has no method `relax`, which sweeps an operator")
+    assert has(A, Relaxes)
     check_colors(problem)
-    return DiagonalSweep(OperatorSweep(problem, omega), by_rows, diagonal)
+    return DiagonalSweep(OperatorSweep(problem, A, omega), by_rows, diagonal)
 
 
 def check_colors(problem: LCP) -> None:
@@ -237,7 +204,7 @@ def check_colors(problem: LCP) -> None:
     Raises:
         ValueError: a periodic side has an odd number of cells.
     """
-    for axis, periodic in zip("xyz", getattr(problem.A, "periodic", ()), strict=False):
+    for axis, periodic in zip("xyz", problem.A.periodic if has(problem.A, HasStencil) else (), strict=False):
         count = problem.layout.shape["xyz".index(axis) * -1 - 1] if periodic else 0
         if count % 2:
             raise ValueError(f"the periodic {axis} axis has {count} cells: red-black sweeps need an even number")

@@ -9,8 +9,8 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.affine_bounds_kernels import AffineSide, bound_at
+from warp_lcp.operators.compressed_rows import matrix_rows
 from warp_lcp.rows import RowPass
-from warp_lcp.rows.layout import make_struct
 
 f64, i32, i8 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32), wp.array(dtype=wp.int8)
 ZERO = wp.constant(wp.float64(0.0))
@@ -57,12 +57,6 @@ def scalar_solution(x: wp.float64, y: wp.float64, d: wp.float64, l: wp.float64, 
     else:
         v = bound_for_concave(x, y, d, l, u)
     return v
-
-
-@functools.cache
-def matrix_rows(a_type: Any) -> Any:
-    """Return the struct of a matrix in compressed rows; `col` may be empty: full rows."""
-    return make_struct(f"MatrixRows_{a_type.__name__}", {"ptr": i32, "col": i32, "a": wp.array(dtype=a_type)})
 
 
 @functools.cache

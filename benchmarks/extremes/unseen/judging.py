@@ -28,6 +28,7 @@ from benchmarks.extremes.case import (
 from benchmarks.extremes.problem import GridProblem, MatrixProblem
 from benchmarks.extremes.unseen.draw import Unseen, equality
 from benchmarks.record import Table
+from warp_lcp.protocol import families
 
 FAMILY = "unseen"
 METHODS_FAMILY = "unseen, every method"
@@ -175,7 +176,7 @@ def by_method(name: str, problem: GridProblem | MatrixProblem, device: str, solv
     method: Any = wl.METHODS[name]
     lcp = problem.lcp(device, wp.float64)
     operator = "grid" if isinstance(problem, GridProblem) else "sparse" if scipy.sparse.issparse(problem.matrix) else "dense"
-    if operator not in method.supports or unknowns(problem) > getattr(method, "most_unknowns", np.inf):
+    if operator not in families(method) or unknowns(problem) > getattr(method, "most_unknowns", np.inf):
         return "not for it", []
     try:
         with interrupted_after(METHOD_SECONDS):

@@ -1,0 +1,49 @@
+"""The entries of a matrix by rows, on its device."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+import warp as wp
+
+from warp_lcp.rows.layout import make_struct
+
+
+@functools.cache
+def matrix_rows(a_type: Any) -> Any:
+    """Return the struct of a matrix in compressed rows; `col` may be empty: full rows."""
+    members = {"ptr": wp.array(dtype=wp.int32), "col": wp.array(dtype=wp.int32), "a": wp.array(dtype=a_type)}
+    return make_struct(f"MatrixRows_{a_type.__name__}", members)
+
+
+@dataclass(frozen=True, eq=False)
+class CompressedRows:
+    """The entries of a matrix by rows.
+
+    Attributes:
+        indptr: where each row begins, shape (n + 1,), wp.int32.
+        indices: columns, wp.int32, ascending in each row; empty if every row is full.
+        values: entries, wp.float32 or wp.float64.
+    """
+
+    indptr: wp.array[Any]
+    indices: wp.array[Any]
+    values: wp.array[Any]
+
+    @property
+    def operand(self) -> Any:
+        """What kernels take."""
+        made = matrix_rows(self.values.dtype)()
+        made.ptr, made.col, made.a = self.indptr, self.indices, self.values
+        return made
+
+    def matrix(self) -> Any:
+        """Return the matrix on the host, float64: a scipy.sparse.csr_array, or where every row is full numpy, perhaps the same memory."""
+        n, values = self.indptr.size - 1, self.values.numpy()
+        if self.indices.size == 0 and values.size:
+            return values.reshape(n, n).astype(np.float64, copy=False)
+        return scipy.sparse.csr_array((values.astype(np.float64), self.indices.numpy(), self.indptr.numpy()), shape=(n, n))
