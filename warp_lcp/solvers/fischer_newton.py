@@ -126,8 +126,11 @@ class FischerWorkspace(IterateInPlace, RoundedIterate):
         self.system: Any = (
             FiniteDifferenceSystem(problem, self.residual, map_, share)
             if self.kink is Kink.APPROXIMATION
-            else principal_system(problem, self.precision.correction, bounded=False, settings=settings.cycle, shifted=True)
-        )
+            else principal_system(
+                problem, self.precision.correction, bounded=False, settings=settings.cycle, shifted=True,
+                hierarchy=self.active_set.hierarchy if self.active_set else None,
+            )
+        )  # fmt: skip
         self.map = NonsmoothMap(problem, self.residual, map_, share, self.kink)
         grid = isinstance(self.system, GridSystem) and self.system.fused
         self._fusable = grid and settings.safeguard and self.precision is not Precision.SINGLE

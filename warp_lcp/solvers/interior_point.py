@@ -129,8 +129,9 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
         elif problem.bounded and settings.crossover > 0:
             self.active_set = NewtonWorkspace(problem, newton)
             self.active_set.residual = self.residual
+        shared = self.active_set.hierarchy if isinstance(self.active_set, GridNewtonWorkspace) else None
         self.system: Any = principal_system(
-            problem, self.precision.correction, bounded=False, settings=settings.cycle, shifted=problem.bounded
+            problem, self.precision.correction, bounded=False, settings=settings.cycle, shifted=problem.bounded, hierarchy=shared
         )
         upper = problem.bounds.may_bind[1]
         self._w, self._s = layout.zeros(wp.float64), layout.zeros(wp.float64)

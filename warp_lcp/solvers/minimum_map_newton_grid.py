@@ -67,11 +67,12 @@ class GridNewtonWorkspace(MultigridWorkspace):
         problem: the problem.
         A: its operator.
         settings: the method.
-        serves: whether another method makes the cold start or ends with this one, on the same x and residual, and keeps the best iterate.
+        serves: whether another method makes the cold start or ends with this one, on the same x, residual and hierarchy, whose finest
+            diagonal then takes its shifts, and keeps the best iterate.
     """
 
     def __init__(self, problem: LCP, A: HasStencil, settings: MinimumMapNewton, *, serves: bool = False) -> None:
-        super().__init__(problem, A, settings)  # type: ignore[arg-type]
+        super().__init__(problem, A, settings, shifted=serves)  # type: ignore[arg-type]
         self.residual = MinimumMapResidual(problem, A, self.hierarchy, rounded=self.precision is Precision.SINGLE)
         self._newton, self._norms, self._target, self._serves = settings, list[float](), 0.0, serves
 

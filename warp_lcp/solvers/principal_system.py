@@ -16,6 +16,7 @@ from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.krylov.gmres import GMRES
 from warp_lcp.krylov.system import KrylovSystem
 from warp_lcp.multigrid.cycle_settings import CycleSettings
+from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.multigrid.turning import make_hierarchy
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.low_rank import LowRankOperator
@@ -73,12 +74,15 @@ class PrincipalSystem(Protocol):
 
 
 class GridSystem(KrylovSystem):
-    """Conjugate gradients on a grid, preconditioned by a linear multigrid cycle on the free set."""
+    """Conjugate gradients on a grid, preconditioned by a linear multigrid cycle on the free set; of `hierarchy` where there is one."""
 
-    def __init__(self, A: HasStencil, real: Any, *, bounded: bool, settings: CycleSettings | None = None, shifted: bool = False) -> None:
+    def __init__(
+        self, A: HasStencil, real: Any, *, bounded: bool, settings: CycleSettings | None = None, shifted: bool = False,
+        hierarchy: Hierarchy | None = None,
+    ) -> None:  # fmt: skip
         self._A = A
         self._version = A.version
-        self.hierarchy = make_hierarchy(A.stencil, real, bounded=bounded, settings=settings, shifted=shifted)
+        self.hierarchy = hierarchy or make_hierarchy(A.stencil, real, bounded=bounded, settings=settings, shifted=shifted)
         self.r, self.z = self.hierarchy.finest.b, self.hierarchy.finest.x
         self._weight = wp.zeros_like(self.r) if shifted else None
         self.fused = self.hierarchy.open_cycle is not None  # one CPU thread, no ghost cells to fill
@@ -259,8 +263,9 @@ class DiagonalSystem(KrylovSystem):
 
 
 def principal_system(
-    problem: LCP, real: Any, *, bounded: bool, settings: CycleSettings | None = None, shifted: bool = False
-) -> PrincipalSystem:
+    problem: LCP, real: Any, *, bounded: bool, settings: CycleSettings | None = None, shifted: bool = False,
+    hierarchy: Hierarchy | None = None,
+) -> PrincipalSystem:  # fmt: skip
     """Return the system for a problem's operator.
 
     Args:
@@ -269,10 +274,11 @@ def principal_system(
         bounded: whether projected cycles are wanted on grids.
         settings: how a grid's cycles go.
         shifted: whether `restrict` gets a shift; see `PrincipalSystem` for what it does to norms.
+        hierarchy: of a grid's stencil, where another method has made one.
     """
     A = problem.A
     if has(A, HasStencil):
-        return GridSystem(A, real, bounded=bounded, settings=settings, shifted=shifted)
+        return GridSystem(A, real, bounded=bounded, settings=settings, shifted=shifted, hierarchy=hierarchy)
     if isinstance(A, DenseOperator):
         return DenseSystem(A)
     if isinstance(A, SparseOperator):

@@ -134,14 +134,15 @@ class MultigridWorkspace(RoundedIterate):
     is when the residual has risen and goes on from there.
     """
 
-    def __init__(self, problem: LCP, A: HasStencil, settings: ProjectedMultigrid) -> None:
+    def __init__(self, problem: LCP, A: HasStencil, settings: ProjectedMultigrid, *, shifted: bool = False) -> None:
         self.problem, self.A, self.settings, self.precision = problem, A, settings, Precision(settings.precision)
         self.bounded = problem.bounded
         real = self.precision.correction
         self.x, self._p = problem.layout.zeros(wp.float64), problem.layout.zeros(real)
         # a projected cycle forgets the search direction, so its lower bounds may lie in that memory: finite numbers, and 0 off the unknowns
         upper = problem.layout.zeros(real) if problem.bounds.may_bind[1] else wp.empty(0, dtype=real, device=A.device)
-        self.hierarchy = make_hierarchy(A.stencil, real, bounded=self.bounded, settings=settings.cycle, bounds=(self._p, upper))
+        options: dict[str, Any] = {"bounded": self.bounded, "settings": settings.cycle, "bounds": (self._p, upper), "shifted": shifted}
+        self.hierarchy = make_hierarchy(A.stencil, real, **options)
         self.residual = AssessedResidual(problem, A, self.hierarchy, rounded=self.precision is Precision.SINGLE)
         self._flat = Rows.flat(problem.layout.size, A.device)
         self._rounded = problem.layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None

@@ -3,6 +3,7 @@
 // a one is not at its bound yet, g is a mark and its row is flagged in `away`.
 #include "mark.h"
 const auto near = [](T v) -> T { return ROUNDED ? (T)(float)v : v; };  // a bound as x can hold it
+const auto stored = [&](int k) -> F { return sizeof(F) > sizeof(*d) ? (F)diagonal(k) : (F)d[k]; };  // a count of faces, or what it is worth
 const T inverse = reciprocal(scalars[SIZE]);
 T norm = 0, energy = 0; int moved = 0, active = 0, off = 0; unsigned char hold[M];
 for (int begin = 0; begin < n; begin += M) {
@@ -12,7 +13,7 @@ for (int begin = 0; begin < n; begin += M) {
     if (unbounded) {
         SIMD8 for (int k = begin; k < end; ++k) {
             const T v = y[k - begin], r = unknown[k] == 1 ? v : (T)0; norm += r*r; g[k] = d[k] != 0 ? -v*inverse : (T)0; }
-        SIMD for (int k = begin; k < end; ++k) { const F now = (F)d[k]; any |= (unsigned char)(free[k] != now); free[k] = now; }
+        SIMD for (int k = begin; k < end; ++k) { const F now = stored(k); any |= (unsigned char)(free[k] != now); free[k] = now; }
         moved += any;
         continue;
     }
@@ -31,7 +32,7 @@ for (int begin = 0; begin < n; begin += M) {
                 hold[k - begin] = held; g[k] = ((e != 0) & !held) ? -v*inverse : (T)0;
             } } });
     SIMD for (int k = begin; k < end; ++k) {  // bytes only, where the diagonal is one
-        const unsigned char h = hold[k - begin]; const F now = h ? (F)0 : (F)d[k]; const unsigned char one = free[k] != now, two = h & unknown[k];
+        const unsigned char h = hold[k - begin]; const F now = h ? (F)0 : stored(k); const unsigned char one = free[k] != now, two = h & unknown[k];
         any |= one; count += two; free[k] = now; if constexpr (MINIMUM_MAP) far |= h; }
     moved += any; active += count; off |= far & 2; }
 if (moved) changed[P.row] = 1;
