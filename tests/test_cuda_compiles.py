@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import scipy.sparse
 import warp as wp
-from warp_lcp.distributed.vector_copies_kernels import copy_kernels
 
 import fluids
 import granular
@@ -23,12 +22,14 @@ from granular.cut_walls_kernels import traction_kernel
 from granular.interleaved_kernels import interleaved_kernels
 from granular.report_kernels import report_kernels
 from granular.stress_kernels import stress_kernels
+from warp_lcp.distributed.petsc_matrix import ENTER, LEAVE
 from warp_lcp.grid import advection_kernels, distance_advection_kernels, transfer_kernels
 from warp_lcp.grid.periodic import ring_kernels
 from warp_lcp.grid.semi_lagrangian import CENTERS
 from warp_lcp.grid.semi_lagrangian_kernels import carry_kernels
 from warp_lcp.material.density_correction_kernels import displacement_pass
-from warp_lcp.multigrid import CycleSettings
+from warp_lcp.multigrid import CycleSettings, Hierarchy
+from warp_lcp.rows import Rows
 from warp_lcp.rows.row_pass import Form
 from warp_lcp.solvers.mprgp import MPRGP
 from warp_lcp.solvers.principal_system import principal_system
@@ -54,6 +55,7 @@ def use_every_kernel(reals):
             problem = wl.LCP(wl.GridPoisson(cells, device="cpu", dtype=dtype, **faces), -np.ones(cells.shape))
             for solver in METHODS:
                 assert wl.solve(problem, solver, stopping=wl.StoppingCriteria(rtol=1e-4))
+        assert Hierarchy(problem.A.stencil, dtype, bounded=False, settings=ONE_LAUNCH[1])._small.coarsening.kernel
     for real in (wp.float32, wp.float64):
         transfer_kernels.kernels(real)
     wl.solve(wl.LCP(wl.DenseOperator(np.eye(3), device="cpu"), -np.ones(3)), wl.MinimumMapNewton(precision="single"))
@@ -200,7 +202,11 @@ def test_kernels_compile_for_cuda(reals, archs, tmp_path):
     for dtype in (wp.int8, wp.uint8, wp.int32, wp.float32, wp.float64):
         ring_kernels(dtype)
     for d_type, real in itertools.product((wp.uint8, wp.float32, wp.float64), (wp.float32, wp.float64)):
-        copy_kernels(d_type, real)
+        field, vector = wp.zeros(8, dtype=real, device="cpu"), wp.zeros(8, dtype=wp.float64, device="cpu")
+        rows = Rows.flat(8, field.device).beside(Rows.flat(8, field.device), (1, 1, 1))
+        given = {"d": wp.zeros(8, dtype=d_type, device="cpu"), "x": field, "v": vector, "scale": 1.0}
+        ENTER.bind(rows, **given)
+        LEAVE.bind(rows, **given, others=None)
     use_sparse_kernels(reals)
     use_sweeping_kernels(reals)
     use_gradient_projection_kernels(reals)

@@ -9,7 +9,7 @@ from multigrid.test_hierarchy import level_matrix, masked_hierarchy
 from warp_lcp.multigrid import CycleSettings, Hierarchy
 from warp_lcp.multigrid.coarsest_kernels import coarsest_kernels
 from warp_lcp.multigrid.small_levels import SmallLevels
-from warp_lcp.rows import Rows, Sequence
+from warp_lcp.rows import Rows
 from warp_lcp.rows.sequence import CUDA_THREADS
 
 TOGETHER = {"one_launch_cpu": 4096, "one_launch_cuda": 4096}
@@ -88,17 +88,13 @@ def test_threads_of_a_block_share_a_stage_in_any_number(shape, periodic, project
         L = level.stencil.rows.single
         counts = level.stencil.padding.counts
         level.stencil.__dict__["rows"] = Rows.strided(level.stencil.d.size, first.x.device, (L.base, L.s1, L.s2), counts, cells=1)
-    pairs = list(zip(rows.levels, rows.levels[1:], strict=False))
-    stages = [fine.coarsening(coarse, rows.settings.over_correction, rows.settings.excess) for fine, coarse in pairs]
-    stages = [(stage, [c.stencil.filling(w, a) for w in c.stencil.weights for a in range(3) if c.stencil.periodic[a]])
-              for stage, (_, c) in zip(stages, pairs, strict=True)]  # fmt: skip
-    coarsening = Sequence("small_levels.coarsen", [stage for made, fillings in stages for stage in (made, *fillings)])
     kernels, s, m = coarsest_kernels(*rows.levels[-1].form), rows.levels[-1].stencil, len(inverse)
     inputs = [s.struct, s.rows.single, wp.vec3i(*map(int, s.periodic)), wp.float64(1e-13), 1, hierarchy._matrix, hierarchy._inverse]
     wp.launch(kernels.invert, 1, inputs, device="cpu")
     np.testing.assert_allclose(hierarchy._inverse.numpy(), inverse, rtol=1e-12)
     solve = hierarchy._solving._replace(rows=Rows.by_turns(m, first.x.device, m))
-    cycles = SmallLevels(rows.levels, rows.settings, solve).sequence(2, projected, True)
+    small = SmallLevels(rows.levels, rows.settings, solve)
+    cycles = small.sequence(2, projected, True)
     for threads in (1, 7, 64):
         for level in rows.levels:
             level.x.zero_()
@@ -106,7 +102,7 @@ def test_threads_of_a_block_share_a_stage_in_any_number(shape, periodic, project
             level.changed.fill_(1)
             for w in (level.stencil.d, *level.stencil.weights) if level is not first else ():
                 w.zero_()
-        for sequence in (coarsening, cycles):
+        for sequence in (small.coarsening, cycles):
             for i in range(len(sequence.order)):
                 wp.launch(sequence.kernel, threads, [sequence.tables, i, i + 1, threads], device="cpu")
         found = [a.numpy() for level in rows.levels[1:] for a in (level.stencil.d, *level.stencil.weights)]
@@ -183,6 +179,7 @@ def test_the_gpu_waits_after_every_stage_and_reads_what_others_wrote(real, tmp_p
     cells, free, keywords = problem((8, 12, 10), "arrays")
     hierarchy = masked_hierarchy(cells, free, (True, False, True), "cpu", CycleSettings(**TOGETHER), real, True, **keywords)[1]
     modules = {hierarchy._small.sequence(1, projected, True).kernel.module.name: 1 for projected in (False, True)}
+    modules[hierarchy._small.coarsening.kernel.module.name] = 1
     modules[coarsest_kernels(True, real, real).invert.module.name] = 3  # assembled, eliminated to and fro
     for module, barriers in modules.items():
         (path,) = wp.compile_aot_module(module, device=None, arch=[80], module_dir=tmp_path, use_ptx=True)

@@ -19,7 +19,7 @@ from warp_lcp.multigrid.small_levels import SmallLevels, first_small
 from warp_lcp.operators.stencil import Stencil
 from warp_lcp.operators.stencil_kernels import coarsen_spans_kernel
 from warp_lcp.program import Launch, Program
-from warp_lcp.rows import Bound, RowPass, Rows, Sequence
+from warp_lcp.rows import Bound, RowPass, Rows
 from warp_lcp.rows.sequence import CUDA_THREADS
 from warp_lcp.vectors import convert
 
@@ -241,21 +241,15 @@ class Hierarchy:
     def _coarsening(self) -> Program:
         program = Program(self.device)
         weights = self.settings.over_correction, self.settings.excess
-        together: list[Bound] = []
-        alone = len(self.levels) if self.device.is_cpu else self._first_small
-        for index, (fine, coarse) in enumerate(zip(self.levels, self.levels[1:], strict=False)):
-            c = coarse.stencil
-            if index >= alone:
-                together += [fine.coarsening(coarse, *weights)]
-                together += [c.filling(w, axis) for w in c.weights or () for axis in range(3) if c.periodic[axis]]
-                continue
+        alone = len(self.levels) if self.device.is_cpu else self._first_small + 1
+        for fine, coarse in zip(self.levels, self.levels[1:alone], strict=False):
             if fine.stencil.ghosts is not None:
                 program.record(partial(share_changes, fine))
             fine.coarsening(coarse, *weights).launch(program.launch)
-            for w in c.weights or ():
-                c.wrap(w, launch=program.launch)
-        if together:
-            Sequence("small_levels.coarsen", together).launch(program.launch)
+            for w in coarse.stencil.weights or ():
+                coarse.stencil.wrap(w, launch=program.launch)
+        if self._small is not None and alone < len(self.levels):
+            self._small.coarsening.launch(program.launch)
         if len(self.levels) > 1:
             flags = self.finest.changed
             passes.UNMARK.bind(Rows.flat(flags.size, self.device), changed=flags).launch(program.launch)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
@@ -41,6 +42,16 @@ class SmallLevels:
     def cycle(self, visits: int, launch: Launch, *, projected: bool, from_zero: bool = True) -> None:
         """Launch cycles on the first level and those below it, one after another, the first as if x were 0 or not."""
         self.sequence(visits, projected, from_zero).launch(launch)
+
+    @functools.cached_property
+    def coarsening(self) -> Sequence:
+        """The making of all levels from the first one."""
+        stages, weights = list[Bound](), (self.settings.over_correction, self.settings.excess)
+        for fine, coarse in itertools.pairwise(self.levels):
+            c = coarse.stencil
+            stages += [fine.coarsening(coarse, *weights)]
+            stages += [c.filling(w, axis) for w in c.weights or () for axis in range(3) if c.periodic[axis]]
+        return Sequence("small_levels.coarsen", stages)
 
     def _sequence(self, visits: int, projected: bool, from_zero: bool) -> Sequence:
         visiting = [from_zero, *[False] * (visits - 1)]
