@@ -40,6 +40,7 @@ class Level:
         self.lower, self.upper = (bounds or (field(), field() if upper else nothing)) if bounded else (self.x, self.x)
         self.form = stencil.weights is not None, stencil.d.dtype, real
         self.factors = 1, 1, 1  # cells of the finer level along x, y and z that one of this level stands for
+        self._bound: dict[Any, Bound] = {}  # passes by what tells them apart: a W-cycle repeats few of them many times
         self.visits, self.shrunk = 1, 1.0  # by a cycle of the next finer level; by how much since a level that was visited more
         rows = stencil.padding.counts[:2]
         self.changed = wp.ones(rows, dtype=wp.uint8, device=stencil.device)  # rows, since the last rebuild
@@ -74,19 +75,33 @@ class Level:
 
     def restricting(self, coarse: Level) -> Bound:
         """Return the pass that sums the residual over aggregates."""
-        return passes.RESTRICT.bind(self._coarser_rows(coarse), stencil=self.stencil, x=self.x, b=self.b, coarse=coarse.b)
+        fields = {"x": self.x, "b": self.b, "coarse": coarse.b}
+        return self._once(("restrict", coarse), lambda: passes.RESTRICT.bind(self._coarser_rows(coarse), stencil=self.stencil, **fields))
 
     def bounding(self, coarse: Level, scale: float) -> Bound:
         """Return the pass that finds the bounds of a coarse correction."""
         fields = {"x": self.x, "lower": self.lower, "upper": self.upper, "coarse_lower": coarse.lower, "coarse_upper": coarse.upper}
-        return passes.COARSE_BOUNDS.bind(self._coarser_rows(coarse), stencil=self.stencil, scale=scale, **fields)
+        bind: Callable[..., Bound] = passes.COARSE_BOUNDS.bind
+        return self._once(("bounds", coarse), lambda: bind(self._coarser_rows(coarse), stencil=self.stencil, scale=scale, **fields))
 
     def correcting(self, coarse: Level, scale: float, *, projected: bool, rows: Rows | None = None) -> Bound:
         """Return the pass that adds `scale` times the coarse correction to x, clipped if projected."""
         fx, fy, fz = coarse.factors
-        rows = rows or self.stencil.rows.beside(coarse.stencil.rows, (-fx, -fy, -fz))
+        there = rows or self.stencil.rows.beside(coarse.stencil.rows, (-fx, -fy, -fz))
         fields = {"x": self.x, "coarse": coarse.x, "lower": self.lower, "upper": self.upper}
-        return passes.CORRECT.bind(rows, stencil=self.stencil, scale=scale, projected=projected, **fields)
+        bind: Callable[..., Bound] = passes.CORRECT.bind
+        return self._once((coarse, projected, id(rows)), lambda: bind(there, stencil=self.stencil, scale=scale, projected=projected, **fields))
+
+    def filling(self, name: str, axis: int) -> Bound:
+        """Return the pass that fills the ghost cells of a field, x or t, along a periodic axis."""
+        return self._once((name, axis), lambda: self.stencil.filling(getattr(self, name), axis))
+
+    def _once(self, key: Any, make: Callable[[], Bound]) -> Bound:
+        """Return the pass with this key, made at its first use."""
+        made = self._bound.get(key)
+        if made is None:
+            made = self._bound[key] = make()
+        return made
 
     def _coarser_rows(self, coarse: Level) -> Rows:
         return coarse.stencil.rows.beside(self.stencil.rows, coarse.factors)
@@ -104,7 +119,9 @@ class Level:
     ) -> Bound:
         """Return the pass that `sweep` launches, or one of its kind that goes into or out of a ring; of all rows unless told."""
         fields = {"x": x, "y": y, "b": self.b, "lower": self.lower, "upper": self.upper}
-        return kind.bind(rows or self.stencil.rows, stencil=self.stencil, omega=omega, projected=projected, from_zero=from_zero, **fields)
+        numbers: dict[str, Any] = {"omega": omega, "projected": projected, "from_zero": from_zero}
+        key = kind, id(rows), y is self.x, *numbers.values()
+        return self._once(key, lambda: kind.bind(rows or self.stencil.rows, stencil=self.stencil, **numbers, **fields))
 
     def sweep(
         self, y: wp.array[Any], x: wp.array[Any], omega: float, *, projected: bool, from_zero: bool = False, launch: Launch = wp.launch

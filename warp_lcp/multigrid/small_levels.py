@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from warp_lcp.program import Launch
@@ -29,15 +29,7 @@ class SmallLevels:
 
     def __init__(self, levels: list[Level], settings: CycleSettings, solve: Bound) -> None:
         self.levels, self.settings = levels, settings
-        scale = settings.over_correction
-        kept: Callable[[Callable[..., Bound]], Callable[..., Bound]] = functools.cache  # what is launched again is the same object
-        self._sweep = kept(self._sweeping)
-        self._restrict = kept(lambda i: levels[i].restricting(levels[i + 1]))
-        self._bound = kept(lambda i: levels[i].bounding(levels[i + 1], scale))
-        self._correct = kept(lambda i, projected: levels[i].correcting(levels[i + 1], scale, projected=projected))
-        self._fill = kept(lambda i, name, axis: levels[i].stencil.filling(getattr(levels[i], name), axis))
-        self._inverse = solve
-        self.sequence = kept(self._sequence)  # type: ignore[arg-type]
+        self._inverse, self._sequences = solve, dict[tuple[int, bool, bool], Sequence]()
 
     def cycle(self, visits: int, launch: Launch, *, projected: bool, from_zero: bool = True) -> None:
         """Launch cycles on the first level and those below it, one after another, the first as if x were 0 or not."""
@@ -53,10 +45,14 @@ class SmallLevels:
             stages += [c.filling(w, axis) for w in c.weights or () for axis in range(3) if c.periodic[axis]]
         return Sequence("small_levels.coarsen", stages)
 
-    def _sequence(self, visits: int, projected: bool, from_zero: bool) -> Sequence:
-        visiting = [from_zero, *[False] * (visits - 1)]
-        stages = [stage for zero in visiting for stage in self._descend(0, projected=projected, from_zero=zero)]
-        return Sequence("small_levels.projected" if projected else "small_levels.cycle", stages)
+    def sequence(self, visits: int, projected: bool, from_zero: bool) -> Sequence:
+        """Return the stages of `cycle`; made once."""
+        key = visits, projected, from_zero
+        if key not in self._sequences:
+            visiting = [from_zero, *[False] * (visits - 1)]
+            stages = [stage for zero in visiting for stage in self._descend(0, projected=projected, from_zero=zero)]
+            self._sequences[key] = Sequence("small_levels.projected" if projected else "small_levels.cycle", stages)
+        return self._sequences[key]
 
     def _descend(self, index: int, *, projected: bool, from_zero: bool) -> Iterator[Bound]:
         """Yield the stages of a cycle on a level and those below it."""
@@ -65,13 +61,14 @@ class SmallLevels:
             return
         yield from self._pair(index, projected=projected, from_zero=from_zero)
         yield from self._wrap(index, "x")
-        yield self._restrict(index)
+        below, scale = index + 1, self.settings.over_correction
+        fine, coarse = self.levels[index], self.levels[below]
+        yield fine.restricting(coarse)
         if projected:
-            yield self._bound(index)
-        below = index + 1
+            yield fine.bounding(coarse, scale)
         for visit in range(self.levels[below].visits if below + 1 < len(self.levels) else 1):
             yield from self._descend(below, projected=projected, from_zero=visit == 0)
-        yield self._correct(index, projected)
+        yield fine.correcting(coarse, scale, projected=projected)
         yield from self._pair(index, projected=projected, reverse=True)
 
     def _solve(self, index: int, *, projected: bool, from_zero: bool) -> Iterator[Bound]:
@@ -88,19 +85,16 @@ class SmallLevels:
         first, second = reversed(self.settings.weights) if reverse else self.settings.weights
         if not from_zero:
             yield from self._wrap(index, "x")
-        yield self._sweep(index, "t", "x", first, projected, from_zero)
-        yield from self._wrap(index, "t")
-        yield self._sweep(index, "x", "t", second, projected, False)
-
-    def _sweeping(self, index: int, y: str, x: str, omega: float, projected: bool, from_zero: bool) -> Bound:
         L = self.levels[index]
-        return L.sweeping(getattr(L, y), getattr(L, x), omega, projected=projected, from_zero=from_zero)
+        yield L.sweeping(L.t, L.x, first, projected=projected, from_zero=from_zero)
+        yield from self._wrap(index, "t")
+        yield L.sweeping(L.x, L.t, second, projected=projected)
 
     def _wrap(self, index: int, name: str) -> Iterator[Bound]:
         """Yield the filling of ghost cells where an axis is periodic."""
         for axis, periodic in enumerate(self.levels[index].stencil.periodic):
             if periodic:
-                yield self._fill(index, name, axis)
+                yield self.levels[index].filling(name, axis)
 
 
 def first_small(levels: list[Level], cells: int) -> int:
