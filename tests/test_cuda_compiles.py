@@ -26,7 +26,7 @@ from warp_lcp.distributed.vector_copies_kernels import copy_kernels
 from warp_lcp.grid import advection_kernels, distance_advection_kernels, transfer_kernels
 from warp_lcp.grid.periodic import ring_kernels
 from warp_lcp.grid.semi_lagrangian import CENTERS
-from warp_lcp.grid.semi_lagrangian_kernels import carry_kernels
+from warp_lcp.grid.semi_lagrangian_kernels import carry_pass
 from warp_lcp.material.density_correction_kernels import displacement_pass
 from warp_lcp.multigrid import CycleSettings
 from warp_lcp.rows.row_pass import Form
@@ -190,12 +190,12 @@ def test_kernels_compile_for_cuda(reals, archs, tmp_path):
     for cut in (False, True):
         displacement_pass(cut)
     for endless in (0, 1, 4, 5):
-        advection_kernels.advect_kernel(endless)
-        distance_advection_kernels.advect_kernel(endless)
+        advection_kernels.advect_pass(endless)
+        distance_advection_kernels.advect_pass(endless)
     for variant in itertools.product((False, True), repeat=4):
         pressure_passes(*variant)
     for axis in (0, 1, 2, CENTERS):
-        carry_kernels(axis)
+        carry_pass(axis)
     for dtype in (wp.int8, wp.uint8, wp.int32, wp.float32, wp.float64):
         ring_kernels(dtype)
     for d_type, real in itertools.product((wp.uint8, wp.float32, wp.float64), (wp.float32, wp.float64)):
