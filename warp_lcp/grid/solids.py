@@ -17,6 +17,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.grid.solids_kernels import (
+    Frame,
     box_distance,
     capsule_distance,
     mesh_distance,
@@ -177,15 +178,14 @@ class _Shape(ABC):
         """
         if points.shape != out.shape:
             raise ValueError(f"out has shape {out.shape}, points have {points.shape}")
-        sign = -1.0 if self.invert else 1.0
-        common = [points, *self._frame(), sign]
-        wp.launch(self.kernel, dim=points.shape[0], inputs=[*common, *self._parameters(points.device)], outputs=[out], device=points.device)
+        self._measure(self.kernel, points, out)
 
-    def _frame(self) -> list[Any]:
-        """Return what takes points into the shape's coordinates: inverse rotation, translation and scale."""
-        placement = self.placement
+    def _measure(self, kernel: Any, points: wp.array, out: wp.array) -> None:
+        placement, frame, device = self.placement, Frame(), points.device
         translation = placement.translation + placement.scale * placement.rotation @ self._origin()
-        return [wp.mat33(placement.rotation.T), wp.vec3(*translation), placement.scale * self._unit()]
+        frame.inverse_rotation, frame.translation = wp.mat33(placement.rotation.T), wp.vec3(*translation)
+        frame.scale, frame.sign = placement.scale * self._unit(), -1.0 if self.invert else 1.0
+        wp.launch(kernel, points.shape[0], [points, frame, *self._parameters(device), out], device=device)
 
     def bounds(self) -> np.ndarray | None:
         """Return the low and the high corner [m] of a box around the region, shape (2, 3); None when it is unlimited or inverted."""
@@ -431,8 +431,7 @@ class TriangleMesh(_Shape):
             points: [m], shape (m,), on any device.
             out: [m], shape (m,), on the same device.
         """
-        inputs = [points, *self._frame(), *self._parameters(points.device)]
-        wp.launch(mesh_surface_distance, dim=points.shape[0], inputs=inputs, outputs=[out], device=points.device)
+        self._measure(mesh_surface_distance, points, out)
 
     def thin_fraction(self, thickness: float, device: wp.Device) -> float:
         """Return the share of the surface's area behind which the solid is thinner than `thickness` [m]."""
