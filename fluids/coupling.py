@@ -47,8 +47,7 @@ class BodyCoupling:
         body[bodies.numbers] = np.arange(len(bodies.bodies))
         cut, S = boundary.cut, kernels.Solids()
         S.planes, S.bodies, S.spacing = grid.planes, len(bodies.bodies), grid.spacing
-        S.near, S.owner, S.next_near, S.next_owner = cut.near_solids
-        S.standing, S.moving = cut.standing, cut.moving_numbers
+        S.moving = cut.moving
         S.open_x, S.open_y, S.open_z = (*cut.open, *cut.open[:1])[:3]
         S.wall_x, S.wall_y, S.wall_z = (*cut.wall, *cut.wall[:1])[:3]
         S.body = wp.array(body, dtype=wp.int32, device=grid.device)

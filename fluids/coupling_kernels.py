@@ -4,7 +4,7 @@
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, I16, cell_kernel
-from warp_lcp.grid.cut_cells_kernels import moving_part
+from warp_lcp.grid.cut_cells_kernels import Moving, moving_part
 from warp_lcp.operators.grid_poisson import FLUID
 
 _FLUID = wp.constant(wp.int8(FLUID))
@@ -19,12 +19,7 @@ class Solids:
     planes: int
     bodies: int
     spacing: wp.float64
-    near: F32
-    owner: I16
-    next_near: F32
-    next_owner: I16
-    standing: F32
-    moving: wp.array(dtype=wp.uint8)
+    moving: Moving
     open_x: F32
     open_y: F32
     open_z: F32
@@ -43,19 +38,13 @@ def body_on_face(S: Solids, axis: int, k: int, j: int, i: int):
     free = float(1.0)
     if axis == 0:
         free = S.open_x[k, j, i]
-        solid, part = moving_part(
-            0, S.planes, k, j, i, S.near, S.owner, S.next_near, S.next_owner, S.standing, S.open_x, S.wall_x, S.moving
-        )
+        solid, part = moving_part(S.moving, 0, S.planes, k, j, i, S.open_x, S.wall_x)
     elif axis == 1:
         free = S.open_y[k, j, i]
-        solid, part = moving_part(
-            1, S.planes, k, j, i, S.near, S.owner, S.next_near, S.next_owner, S.standing, S.open_y, S.wall_y, S.moving
-        )
+        solid, part = moving_part(S.moving, 1, S.planes, k, j, i, S.open_y, S.wall_y)
     else:
         free = S.open_z[k, j, i]
-        solid, part = moving_part(
-            2, S.planes, k, j, i, S.near, S.owner, S.next_near, S.next_owner, S.standing, S.open_z, S.wall_z, S.moving
-        )
+        solid, part = moving_part(S.moving, 2, S.planes, k, j, i, S.open_z, S.wall_z)
     share = (wp.float64(1.0) - wp.float64(free)) * wp.float64(part)
     body = S.body[solid]
     if share == wp.float64(0.0):
@@ -109,10 +98,7 @@ def count_kernel(k, j, first, end, S: Solids, kind: I8, rows: int, counts: _I32)
 
 
 @cell_kernel("fluids.coupling")
-def fill_kernel(
-    k, j, first, end, S: Solids, kind: I8, rows: int, columns: int, offsets: _I32, index: _I32, block: _I32,
-    values: _F64,
-):  # fmt: skip
+def fill_kernel(k, j, first, end, S: Solids, kind: I8, rows: int, columns: int, offsets: _I32, index: _I32, block: _I32, values: _F64):
     """Write the entries of a row: what a cell's outflow gains by unit motions of a body, (vx, vy, wz) or (vx, vy, vz, wx, wy, wz)."""
     e = offsets[k * rows + j]
     for i in range(first, end):

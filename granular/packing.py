@@ -97,7 +97,10 @@ class Packing:
             nodes.launch(
                 kernels.edge_kernel, [alpha, beta, self.base, self.flags, self.inverse[alpha], self.inverse[beta], part, share]
             )  # fmt: skip
-        domain.launch(kernels.stiffness_kernel, [dimension, self.flags, *three(self.inverse), *three(self.share), openings, self.stiff])
+        inverse, share = kernels.Faces(), kernels.Faces()
+        inverse.x, inverse.y, inverse.z = three(self.inverse)
+        share.x, share.y, share.z = three(self.share)
+        domain.launch(kernels.stiffness_kernel, [dimension, self.flags, inverse, share, openings, self.stiff])
         if self.sides is not None:
             return  # the spans are whole rows
         domain.launch_rows(kernels.span_kernel, [self.flags, self._own])

@@ -136,12 +136,22 @@ def leave_kernel(
     marks[p] = wp.where(now > width or renewed(now, before[cell], width), 1, 0)
 
 
+@wp.struct
+class Sites:
+    """A jittered lattice of so many places along each axis of a cell, that `shift` moves through the cell."""
+
+    planes: int
+    per_axis: int
+    jitter: float
+    seed: int
+    shift: wp.vec3
+    dx: float
+
+
 @cell_kernel("warp_lcp.material.narrow_band")
-def seed_kernel(
-    k, j, i, planes: int, per_axis: int, jitter: float, seed: int, shift: wp.vec3, dx: float, behind: int, ny: int, nx: int,
-    total: wp.array(dtype=wp.int32), position: wp.array(dtype=wp.vec3),
-):  # fmt: skip
-    """Put a cell's particles on a jittered lattice that `shift` moves through the cell; `total` counts up to and with each cell."""
+def seed_kernel(k, j, i, S: Sites, behind: int, ny: int, nx: int, total: wp.array(dtype=wp.int32), position: wp.array(dtype=wp.vec3)):
+    """Put a cell's particles on their sites; `total` counts up to and with each cell."""
+    planes, per_axis, seed, shift = S.planes, S.per_axis, S.seed, S.shift
     sites = per_axis * per_axis * wp.where(planes == 2, per_axis, 1)
     cell = (k * ny + j) * nx + i
     start = total[cell - 1]
@@ -154,9 +164,9 @@ def seed_kernel(
             site = (skip + n) % sites
             state = wp.rand_init(seed + 1, cell * 64 + n)
             x = wp.vec3(float(site % per_axis), float((site // per_axis) % per_axis), float(site // (per_axis * per_axis)))
-            x = (x + jitter * wp.vec3(wp.randf(state), wp.randf(state), wp.randf(state))) / float(per_axis) + way
+            x = (x + S.jitter * wp.vec3(wp.randf(state), wp.randf(state), wp.randf(state))) / float(per_axis) + way
             x = wp.vec3(fraction(x[0]), fraction(x[1]), fraction(x[2])) * (1.0 - 2.0 * INSET) + wp.vec3(INSET, INSET, INSET)
-            x = (x + wp.vec3(float(i - 1), float(j - 1), float(k - 1))) * dx
+            x = (x + wp.vec3(float(i - 1), float(j - 1), float(k - 1))) * S.dx
             position[behind + start + n] = wp.vec3(x[0], x[1], wp.where(planes == 2, x[2], 0.0))
 
 

@@ -10,29 +10,35 @@ from warp_lcp.operators.grid_poisson import AIR
 JITTER = 0.25  # of half a cell: how far from the center of its part of a cell a particle is put at random, as at the start
 FULL = 0.75  # of what the cells around one can hold: less, and it is near a surface (a level one: 2/3), or in a bubble of more than a cell
 
+_INTS = wp.array(dtype=wp.int32)
 _AIR = wp.constant(wp.int8(AIR))
 _TOUCHES = wp.constant(wp.uint8(TOUCHES))
 
 
+@wp.struct
+class Limits:
+    """How many particles a cell should hold."""
+
+    least: int
+    at_rest: int
+    most: int
+
+
 @cell_kernel("warp_lcp.material.reseeding")
-def count_kernel(k, j, i, offsets: wp.array(dtype=wp.int32), count: I32):
+def count_kernel(k, j, i, offsets: _INTS, count: I32):
     """Count each cell's particles."""
     cell = (k * count.shape[1] + j) * count.shape[2] + i
     count[k, j, i] = offsets[cell + 1] - offsets[cell]
 
 
 @cell_kernel("warp_lcp.material.reseeding")
-def find_kernel(
-    k, j, i, planes: int, least: int, at_rest: int, most: int, count: I32,
-    capacity: F32, base: I8, touch: U8,
-    takers: wp.array(dtype=wp.int32), numbers: wp.array(dtype=wp.int32),
-):  # fmt: skip
+def find_kernel(k, j, i, planes: int, limits: Limits, count: I32, capacity: F32, base: I8, touch: U8, takers: _INTS, numbers: _INTS):
     """List open cells that no wall touches, that want particles, and whose surroundings, themselves included, are full but for a little.
 
     The order of the list differs from run to run on CUDA, and does not matter.
     """
     has = count[k, j, i]
-    if has < at_rest and base[k, j, i] == _AIR and (touch[k, j, i] & _TOUCHES) == wp.uint8(0):
+    if has < limits.at_rest and base[k, j, i] == _AIR and (touch[k, j, i] & _TOUCHES) == wp.uint8(0):
         held = int(0)
         crowd = int(0)
         room = float(0.0)
@@ -43,7 +49,7 @@ def find_kernel(
                         held += count[c, b, a]
                         crowd = wp.max(crowd, count[c, b, a])
                         room += capacity[c, b, a]
-        if (has < least or crowd > most) and float(held) >= FULL * float(at_rest) * room:
+        if (has < limits.least or crowd > limits.most) and float(held) >= FULL * float(limits.at_rest) * room:
             takers[wp.atomic_add(numbers, 0, 1)] = (k * count.shape[1] + j) * count.shape[2] + i
 
 
@@ -69,9 +75,8 @@ def emptiest(planes: int, i: int, j: int, k: int, start: int, here: int, inverse
 
 @wp.kernel(enable_backward=False, module="warp_lcp.material.reseeding")
 def exchange_kernel(
-    planes: int, dk: int, dj: int, di: int, least: int, at_rest: int, most: int, seed: int, dx: float, inverse_dx: float,
-    takers: wp.array(dtype=wp.int32), offsets: wp.array(dtype=wp.int32), count: I32,
-    position: wp.array(dtype=wp.vec3), numbers: wp.array(dtype=wp.int32),
+    planes: int, way: wp.vec3i, limits: Limits, seed: int, dx: float, inverse_dx: float, takers: _INTS, offsets: _INTS, count: I32,
+    position: wp.array(dtype=wp.vec3), numbers: _INTS,
 ):  # fmt: skip
     """Let each cell that wants particles take some from the neighbor in one direction.
 
@@ -82,6 +87,8 @@ def exchange_kernel(
     i = cell % count.shape[2]
     j = (cell // count.shape[2]) % count.shape[1]
     k = cell // (count.shape[2] * count.shape[1])
+    dk, dj, di = way[0], way[1], way[2]
+    least, at_rest, most = limits.least, limits.at_rest, limits.most
     has = count[k, j, i]
     gives = count[k + dk, j + dj, i + di]
     if gives <= at_rest or (has >= least and (has >= at_rest or gives <= most)):
