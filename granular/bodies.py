@@ -10,6 +10,8 @@ import numpy as np
 import warp as wp
 
 from granular.bodies_kernels import (
+    Edges,
+    Shape,
     body_kernels,
     flat,
     force_kernel,
@@ -64,7 +66,8 @@ class SandBodies:
         self.velocity, self._force, self._start, self._error = (wp.zeros((count, k), dtype=wp.float64, device=device) for _ in range(4))
         self._response, self._correction = (wp.zeros((count, k, k), dtype=wp.float64, device=device) for _ in range(2))
         _, rows, columns = grid.shape
-        self._strides = wp.vec3i(1, columns, columns * rows)
+        self._shape = Shape()
+        self._shape.dimension, self._shape.layer, self._shape.strides = grid.dimension, grid.size, wp.vec3i(1, columns, columns * rows)
         self._nothing = wp.zeros(1, dtype=wp.float64, device=device)  # sums that trial steps do not make
         self.faces: BodyFaces | None = None
         self._walls: Walls
@@ -103,7 +106,8 @@ class SandBodies:
 
         self._face = [ints(found.face), small(found.face_axis), ints(found.face_body), reals(found.face_row)]
         self._cell, self._cell_row = ints(found.cell), reals(found.cell_row)
-        self._edge, self._edge_shear, self._edge_row = ints(found.edge), small(found.edge_shear), reals(found.edge_row)
+        self._edge_row, self._edges = reals(found.edge_row), Edges()
+        self._edges.at, self._edges.shear, self._edges.row = ints(found.edge), small(found.edge_shear), self._edge_row
         copies, homes = unowned_copies(grid, index, found)
         self._unowned = ints((FIRST[grid.dimension] + copies) * grid.size + homes)
         self._trial = ints(cells)
@@ -165,10 +169,10 @@ class SandBodies:
         assert found is not None
         inverse = flat(packing.inverse)
         cells = wp.zeros(len(found.cell), dtype=wp.vec2d, device=device)
-        inputs = [self._strides, dimension, self._cell, packing.flags.flatten(), packing.drive.flatten(), packing.stiff.flatten()]
+        inputs = [self._shape, self._cell, packing.flags.flatten(), packing.drive.flatten(), packing.stiff.flatten()]
         wp.launch(stiffness_kernel, len(found.cell), [*inputs, flat(packing.mass), inverse, numbers, cells], device=device)
         edges = wp.zeros(len(found.edge), dtype=wp.float64, device=device)
-        inputs = [self._strides, self._edge, self._edge_shear, flat(packing.share), inverse, edges]
+        inputs = [self._shape, self._edges, flat(packing.share), inverse, edges]
         wp.launch(lightness_kernel, len(found.edge), inputs, device=device)
         pressure, shear = (cells.numpy() * found.cell_share[:, None]).T
         along = found.cell_row.sum(axis=1)
@@ -199,9 +203,9 @@ class SandBodies:
 
     def respond(self, packing: Packing, stress: wp.array, launch: Launch, *, implicit: bool) -> None:
         """Find what stresses do to the bodies and the velocity that they leave, or a step towards it."""
-        grid, device = self.grid, self.grid.device
-        rows = [self._cell, self._cell_row, self._edge, self._edge_shear, self._edge_row]
-        inputs = [grid.dimension, grid.size, self._spans, stress.flatten(), *rows, self._strides, flat(packing.share), self._partial]
+        device = self.grid.device
+        rows = [self._cell, self._cell_row, self._edges]
+        inputs = [self._shape, self._spans, stress.flatten(), *rows, flat(packing.share), self._partial]
         if self._spans.shape[0]:
             launch(force_kernel, self._spans.shape[0], inputs, device=device)
         inputs = [int(implicit), self._owned, self._partial, self._start, self._response, self._correction]
@@ -224,15 +228,15 @@ class SandBodies:
         cells = p.cells | velocity.fields | {"cell": self._trial, "spans": p.spans, "openings": None}
         faces = xyz(share=p.share, inverse=p.inverse, edge=velocity.edge) | walls.fields(p) | {"active": self._active}
         trials = [(kernels.trial, len(self._trial), cells), (kernels.trial_wall, len(self._entries), faces)]
-        edges = [self._edge, self._edge_shear, self._strides, flat(velocity.u), flat(velocity.edge)]
+        edges = [self._shape, self._edges, flat(velocity.u), flat(velocity.edge)]
         for _ in range(ROUNDS if len(self._trial) else 0):
             for passed, count, fields in trials:
                 if count:
                     passed.bind(Rows.entries(count, device), **stress, **given, **fields).launch(launch)
             self.respond(packing, stress["point"], launch, implicit=True)
             self.move(velocity, launch)
-            if len(self._edge):
-                launch(kernels.strain, len(self._edge), edges, device=device)
+            if len(self._edges.at):
+                launch(kernels.strain, len(self._edges.at), edges, device=device)
 
     def _parts(self, found: BodyFaces) -> tuple[np.ndarray, np.ndarray]:
         """Return runs of the lists of cells and edges that a thread adds up, first and last of both, and each body's runs."""

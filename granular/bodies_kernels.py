@@ -13,8 +13,8 @@ from granular.yield_set import HOLDS, NEARLY, SHEARS_HERE, STEP_OF_CELL, WALLS, 
 from warp_lcp.rows.layout import make_struct, put
 
 _INTS, _BYTES, _REALS = wp.array(dtype=wp.int32), wp.array(dtype=wp.uint8), wp.array(dtype=wp.float64)
-_ROWS, _SINGLE, _PAIRS = wp.array2d(dtype=wp.float64), wp.array(dtype=wp.float32), wp.array(dtype=wp.vec2d)
-_TABLES, _SPANS = wp.array3d(dtype=wp.float64), wp.array2d(dtype=wp.int32)
+_ROW, _SINGLE, _PAIRS = wp.array2d(dtype=wp.float64), wp.array(dtype=wp.float32), wp.array(dtype=wp.vec2d)
+_MATS, _SPANS = wp.array3d(dtype=wp.float64), wp.array2d(dtype=wp.int32)
 options = {"enable_backward": False, "module": "granular.bodies"}
 
 
@@ -30,6 +30,24 @@ def flat(fields: Sequence[wp.array]) -> Any:
 
 
 Vector = vector_struct(wp.float32)
+
+
+@wp.struct
+class Shape:
+    """Shape of the grid's fields."""
+
+    dimension: int
+    layer: int  # elements of a field
+    strides: wp.vec3i  # elements from cell to cell along x, y, z
+
+
+@wp.struct
+class Edges:
+    """Edges beside bodies: where they are, their shear, and what a unit of its stress does to their bodies."""
+
+    at: _INTS
+    shear: _BYTES
+    row: _ROW
 
 
 @wp.func
@@ -79,41 +97,37 @@ def forget_kernel(slot: _INTS, now: _SINGLE, before: _SINGLE, point: _SINGLE):
 
 
 @wp.kernel(**options)
-def force_kernel(
-    dimension: int, layer: int, spans: _SPANS, stress: _SINGLE, cell: _INTS, cell_row: _TABLES, edge: _INTS, edge_shear: _BYTES,
-    edge_row: _ROWS, strides: wp.vec3i, share: Vector, out: _ROWS,
-):  # fmt: skip
+def force_kernel(grid: Shape, spans: _SPANS, stress: _SINGLE, cell: _INTS, cell_row: _MATS, edges: Edges, share: Vector, out: _ROW):
     """What a part of the cells and edges beside a body does to it: minus their rows times their stresses."""
     part = wp.tid()
     freedoms = out.shape[1]
     for q in range(freedoms):
         out[part, q] = wp.float64(0.0)
     for n in range(spans[part, 0], spans[part, 1]):
-        for axis in range(dimension):
-            normal = stress_part(stress, layer, cell[n], axis, dimension)
+        for axis in range(grid.dimension):
+            normal = stress_part(stress, grid.layer, cell[n], axis, grid.dimension)
             for q in range(freedoms):
                 out[part, q] = out[part, q] - cell_row[n, axis, q] * normal
-    first = wp.where(dimension == 3, 4, 2)
+    first = wp.where(grid.dimension == 3, 4, 2)
     for n in range(spans[part, 2], spans[part, 3]):
-        at = edge[n]
-        d = int(edge_shear[n])
+        at = edges.at[n]
+        d = int(edges.shear[n])
         a, b = axes_of(d)
-        alpha, beta = strides[a], strides[b]
+        alpha, beta = grid.strides[a], grid.strides[b]
         weight = of(share, d, at)
         if weight != 0.0:
-            base = (first + 4 * d) * layer + at
-            low = wp.float64(stress[base]) + wp.float64(stress[base + layer - alpha])
-            high = wp.float64(stress[base + 2 * layer - beta]) + wp.float64(stress[base + 3 * layer - alpha - beta])
+            base = (first + 4 * d) * grid.layer + at
+            low = wp.float64(stress[base]) + wp.float64(stress[base + grid.layer - alpha])
+            high = wp.float64(stress[base + 2 * grid.layer - beta]) + wp.float64(stress[base + 3 * grid.layer - alpha - beta])
             shear = wp.float64(wp.abs(weight)) * (low + high)
             for q in range(freedoms):
-                out[part, q] = out[part, q] - edge_row[n, q] * shear
+                out[part, q] = out[part, q] - edges.row[n, q] * shear
 
 
 @wp.kernel(**options)
 def respond_kernel(
-    implicit: int, parts: _SPANS, partial: _ROWS, start: _ROWS, response: _TABLES, correction: _TABLES, force: _ROWS, error: _ROWS,
-    velocity: _ROWS,
-):  # fmt: skip
+    implicit: int, parts: _SPANS, partial: _ROW, start: _ROW, response: _MATS, correction: _MATS, force: _ROW, error: _ROW, velocity: _ROW
+):
     """The force on a body and the velocity that it leaves; implicit: a step towards the velocity whose stresses leave it."""
     body = wp.tid()
     freedoms = velocity.shape[1]
@@ -149,9 +163,8 @@ def layer_kernel(face: _INTS, axis: _BYTES, mass: Vector, u: Vector, weight: Vec
 
 @wp.kernel(**options)
 def stiffness_kernel(
-    strides: wp.vec3i, dimension: int, cell: _INTS, flags: _BYTES, drive: _SINGLE, stiff: _SINGLE, mass: Vector, inverse: Vector,
-    numbers: _SINGLE, out: _PAIRS,
-):  # fmt: skip
+    grid: Shape, cell: _INTS, flags: _BYTES, drive: _SINGLE, stiff: _SINGLE, mass: Vector, inverse: Vector, numbers: _SINGLE, out: _PAIRS
+):
     """Inverses of what the steps of pressure and friction in a cell are scaled by; 0 where it has none."""
     n = wp.tid()
     at = cell[n]
@@ -160,8 +173,8 @@ def stiffness_kernel(
         full = wp.clamp(1.0 - drive[at] * numbers[STEP_OF_CELL] / NEARLY, 0.0, 1.0)
         diagonal = float(0.0)
         for side in range(2):
-            for axis in range(dimension):
-                o = at + side * strides[axis]
+            for axis in range(grid.dimension):
+                o = at + side * grid.strides[axis]
                 m = of(mass, axis, o)
                 diagonal += (m + full * (1.0 - m)) * of(inverse, axis, o)
         if diagonal > 0.0:
@@ -172,13 +185,13 @@ def stiffness_kernel(
 
 
 @wp.kernel(**options)
-def lightness_kernel(strides: wp.vec3i, edge: _INTS, edge_shear: _BYTES, share: Vector, inverse: Vector, out: _REALS):
+def lightness_kernel(grid: Shape, edges: Edges, share: Vector, inverse: Vector, out: _REALS):
     """1 / sum of the inverse masses around an edge; 0 where it has no shear."""
     n = wp.tid()
-    at = edge[n]
-    d = int(edge_shear[n])
+    at = edges.at[n]
+    d = int(edges.shear[n])
     a, b = axes_of(d)
-    around = of(inverse, a, at) + of(inverse, a, at - strides[b]) + of(inverse, b, at) + of(inverse, b, at - strides[a])
+    around = of(inverse, a, at) + of(inverse, a, at - grid.strides[b]) + of(inverse, b, at) + of(inverse, b, at - grid.strides[a])
     out[n] = wp.float64(0.0)
     if of(share, d, at) != 0.0 and around > 0.0:
         out[n] = wp.float64(1.0) / wp.float64(around)
@@ -191,7 +204,7 @@ def body_kernels(dimension: int, real: Any, box: bool, rate: bool = False) -> Si
     module, Velocity = f"granular.{name}", vector_struct(real)
 
     @wp.kernel(enable_backward=False, module=module)
-    def move(face: _INTS, axis: _BYTES, body: _INTS, row: _ROWS, velocity: _ROWS, moved: Velocity):
+    def move(face: _INTS, axis: _BYTES, body: _INTS, row: _ROW, velocity: _ROW, moved: Velocity):
         """Give the bodies' faces the velocity that they have."""
         n = wp.tid()
         b = body[n]
@@ -201,13 +214,13 @@ def body_kernels(dimension: int, real: Any, box: bool, rate: bool = False) -> Si
         give(moved, int(axis[n]), face[n], real(u))
 
     @wp.kernel(enable_backward=False, module=module)
-    def strain(edge: _INTS, shear: _BYTES, strides: wp.vec3i, u: Velocity, rates: Velocity):
+    def strain(grid: Shape, edges: Edges, u: Velocity, rates: Velocity):
         """Twice the shear rate of the edges beside bodies, times dx."""
         n = wp.tid()
-        i = edge[n]
-        d = int(shear[n])
+        i = edges.at[n]
+        d = int(edges.shear[n])
         a, b = axes_of(d)
-        give(rates, d, i, (of(u, a, i) - of(u, a, i - strides[b])) + (of(u, b, i) - of(u, b, i - strides[a])))
+        give(rates, d, i, (of(u, a, i) - of(u, a, i - grid.strides[b])) + (of(u, b, i) - of(u, b, i - grid.strides[a])))
 
     edges = xyz(edge=[real] * 3)
     made = functools.partial(sand_pass, name, dimension=dimension, real=real, BOX=box, RATE=rate, RESIDUAL=0, TRIAL=1, **MOMENTUM)
@@ -215,6 +228,3 @@ def body_kernels(dimension: int, real: Any, box: bool, rate: bool = False) -> Si
     trial = made("step", box={"flags": wp.uint8, **CELLS, **edges, **xyz(u=[real] * 3)}, whole=cells, listed="cell")
     trial_wall = made("wall_step", box={"active": wp.int32}, whole=entries)
     return SimpleNamespace(move=move, strain=strain, trial=trial, trial_wall=trial_wall)
-
-
-__all__ = ["body_kernels", "force_kernel", "forget_kernel", "layer_kernel", "lightness_kernel", "respond_kernel", "stiffness_kernel"]

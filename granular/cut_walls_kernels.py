@@ -14,7 +14,6 @@ def traction_pass(dimension: int, real: Any) -> RowPass:
     residual = real is F64
     walls = {"walls": F32, "friction": F32, "flags": U8, "fraction": F32, "openings": F32, **STRESSES}
     fields = {**walls, "share_x": F32, **xyz("inverse", u=[real] * 3), **STEP, "partials": F64}
-    return sand_pass(
-        f"cut_walls_{dimension}d_{real.__name__}_{'residual' if residual else 'step'}", "traction", dimension, real,
-        {"cells": I32, "numbers_of": I32}, whole=fields, numbers={"behind": int}, RESIDUAL=residual, **MOMENTUM,
-    )  # fmt: skip
+    words: dict[str, Any] = {"numbers": {"behind": int}, "RESIDUAL": residual} | MOMENTUM
+    module = f"cut_walls_{dimension}d_{real.__name__}_{'residual' if residual else 'step'}"
+    return sand_pass(module, "traction", dimension, real, {"cells": I32, "numbers_of": I32}, whole=fields, **words)

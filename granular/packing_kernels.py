@@ -38,8 +38,8 @@ def fraction_kernel(k, j, i, base: I8, capacity: F32, splatted: F32, fraction: F
 
 @cell_kernel("granular.packing")
 def contents_kernel(
-    k, j, i, base: I8, capacity: F32, fraction: F32, planes: int, rate: float, volume: F32, kind: I8, flags: U8, drive: F32,
-):  # fmt: skip
+    k, j, i, base: I8, capacity: F32, fraction: F32, planes: int, rate: float, volume: F32, kind: I8, flags: U8, drive: F32
+):
     """Which cells hold sand, and what of them is still free: drive = max(FULL - saturation, 0) dx / dt [m/s].
 
     What is free in a cell must be free around it as well: a gap that its neighbors' surplus fills is the particles' sampling, no room.
@@ -112,9 +112,8 @@ def _free_around(base: I8, capacity: F32, fraction: F32, planes: int, k: int, j:
 
 @cell_kernel("granular.packing")
 def face_kernel(
-    k, j, i, axis: int, base: I8, fraction: F32, velocity: F32, solid: F32, openings: _F32X,
-    start: F32, mass: F32, inverse: F32,
-):  # fmt: skip
+    k, j, i, axis: int, base: I8, fraction: F32, velocity: F32, solid: F32, openings: _F32X, start: F32, mass: F32, inverse: F32
+):
     """Mass of a face in units of a full one, its inverse, and the velocity that the stress acts on.
 
     A face beside a solid cannot be moved: inverse 0. Its mass is the fraction of the open cell where the solid moves (it sweeps sand
@@ -154,9 +153,8 @@ def face_kernel(
 
 @cell_kernel("granular.packing")
 def edge_kernel(
-    k, j, first, end, alpha: int, beta: int, base: I8, flags: U8, inverse_alpha: F32, inverse_beta: F32,
-    around: F32, share: F32,
-):  # fmt: skip
+    k, j, first, end, alpha: int, beta: int, base: I8, flags: U8, inverse_alpha: F32, inverse_beta: F32, around: F32, share: F32
+):
     """The weight of a copy on an edge: 1 / dense cells around it, or -1 / cells with a wall face that ends there, or 0.
 
     Where solids cut cells, times what is open around it.

@@ -26,10 +26,8 @@ def stress_passes(dimension: int, real: Any, *, box: bool = False, rate: bool = 
     """Return the passes for 2 or 3 dimensions: with velocities of float32 of a step, of float64 of what the natural residual would move."""
     residual = real is F64
     kind = ("residual" if residual else "step") + "_box" * box + "_rate" * rate + "_cut" * cut
-    made = functools.partial(
-        sand_pass, f"stress_{dimension}d_{real.__name__}_{kind}", dimension=dimension, real=real,
-        BOX=box, RATE=rate, CUT=cut, RESIDUAL=residual, TRIAL=0, **MOMENTUM,
-    )  # fmt: skip
+    words = {"BOX": box, "RATE": rate, "CUT": cut, "RESIDUAL": residual, "TRIAL": 0} | MOMENTUM
+    made = functools.partial(sand_pass, f"stress_{dimension}d_{real.__name__}_{kind}", dimension=dimension, real=real, **words)
     u, edge, spans = xyz(u=[real] * 3), xyz(edge=[real] * 3), {"spans": I32}
     faces, sums = xyz("start", "inverse") | {"openings": F32}, STEP | {"partials": F64}
     entries = {**WALLS, **STRESSES, **edge, **xyz("share", "inverse"), **sums}

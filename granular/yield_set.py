@@ -50,9 +50,17 @@ def xyz(*names: str, **fields: Any) -> dict[str, Any]:
 
 
 def sand_pass(
-    module: str, name: str, dimension: int, real: Any, box: Mapping[str, Any], *, numbers: Mapping[str, Any] | None = None,
-    whole: Mapping[str, Any] | None = None, listed: str = "", **words: Any,
-) -> RowPass:  # fmt: skip
+    module: str,
+    name: str,
+    dimension: int,
+    real: Any,
+    box: Mapping[str, Any],
+    *,
+    numbers: Mapping[str, Any] | None = None,
+    whole: Mapping[str, Any] | None = None,
+    listed: str = "",
+    **words: Any,
+) -> RowPass:
     """Return a pass over stresses.
 
     Args:

@@ -50,9 +50,7 @@ def copy_kernels(d_type: Any, real: Any) -> SimpleNamespace:
         enter_row(v, d, x, scale, q, p, wp.min(grain, counts[2] - first))
 
     @wp.kernel(enable_backward=False, module=name)
-    def leave(
-        x: field, d: d_array, others: f64, scale: wp.float64, counts: wp.vec3i, s1: wp.int64, s2: wp.int64, grain: int, v: f64
-    ):  # fmt: skip
+    def leave(x: field, d: d_array, others: f64, scale: wp.float64, counts: wp.vec3i, s1: wp.int64, s2: wp.int64, grain: int, v: f64):
         k, j, c = wp.tid()
         first = c * grain
         q = (wp.int64(k) * wp.int64(counts[1]) + wp.int64(j)) * wp.int64(counts[2]) + wp.int64(first)

@@ -64,10 +64,7 @@ def slope_beside(here: float, below: float, above: float, has_below: bool, has_a
 
 
 @cell_kernel("warp_lcp.grid.level_set")
-def wall_shift_kernel(
-    k, j, i, variance: float, limit: float, capacity: F32, phi: F32,
-    known: I8, out: F32,
-):  # fmt: skip
+def wall_shift_kernel(k, j, i, variance: float, limit: float, capacity: F32, phi: F32, known: I8, out: F32):
     """Bring phi from the mean place of the open part of a cell's kernel back to the cell's center.
 
     A wall cuts a part off the kernel, so that what remains measures the liquid at c + s, s = integral of (x - c) K over the open part by

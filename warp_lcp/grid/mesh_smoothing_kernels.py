@@ -1,16 +1,17 @@
 # mypy: ignore-errors
 """Kernels that smooth a closed surface."""
 
-import typing
 from pathlib import Path
 
 import warp as wp
 
+from warp_lcp.grid.cell_kernel import F32, POINTS
 from warp_lcp.rows import RowPass
 
 TOUCHING = 0.015  # lattice cells from the domain's side: points that close the surface there are 0.01 off its other sides
 NEAR = 0.25  # lattice cells: a point on a solid, as accurately as a distance that is linear between nodes can tell
 
+_SUMS, _BYTES = wp.array2d(dtype=wp.float32), wp.array(dtype=wp.uint8)
 _options = {"enable_backward": False, "module": "warp_lcp.grid.mesh_smoothing"}
 
 SEE_NEIGHBORS = RowPass(
@@ -23,15 +24,7 @@ SEE_NEIGHBORS = RowPass(
 
 
 @wp.kernel(**_options)
-@typing.no_type_check
-def hold_kernel(
-    planes: int,
-    dx: float,
-    points: wp.array(dtype=wp.vec3),
-    room: wp.array3d(dtype=wp.float32),
-    counts: wp.vec3,
-    held: wp.array(dtype=wp.uint8),
-):
+def hold_kernel(planes: int, dx: float, points: POINTS, room: F32, counts: wp.vec3, held: _BYTES):
     """Mark points that stay: those on the domain's sides, so that these end in an edge, and on solids."""
     p = wp.tid()
     x = points[p] / dx
@@ -61,11 +54,7 @@ def hold_kernel(
 
 
 @wp.kernel(**_options)
-@typing.no_type_check
-def move_kernel(
-    share: float, most: float, sums: wp.array2d(dtype=wp.float32), held: wp.array(dtype=wp.uint8), size: wp.vec3,
-    start: wp.array(dtype=wp.vec3), points: wp.array(dtype=wp.vec3),
-):  # fmt: skip
+def move_kernel(share: float, most: float, sums: _SUMS, held: _BYTES, size: wp.vec3, start: POINTS, points: POINTS):
     """Move a point a share of the way to the mean of its neighbors, within the domain and not too far from where it started."""
     p = wp.tid()
     if held[p] != wp.uint8(0):
