@@ -11,11 +11,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, runtime_checkable
+from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 
 import numpy as np
 import warp as wp
 
+from warp_lcp.grid.motion import Pose, keep_checked
 from warp_lcp.grid.solids_kernels import (
     Frame,
     box_distance,
@@ -26,9 +27,6 @@ from warp_lcp.grid.solids_kernels import (
     sphere_distance,
 )
 from warp_lcp.grid.triangle_mesh import ClosedSurface, load_surface
-
-if TYPE_CHECKING:
-    from warp_lcp.grid.motion import Pose
 
 Vector = Sequence[float] | np.ndarray
 
@@ -103,17 +101,7 @@ class Placement:
     def __post_init__(self) -> None:
         """Check the values and store them as float64."""
         object.__setattr__(self, "scale", _positive("scale", self.scale))
-        rotation = np.array(self.rotation, dtype=np.float64)
-        translation = np.array(self.translation, dtype=np.float64)
-        if rotation.shape != (3, 3):
-            raise ValueError(f"rotation must be a 3 x 3 matrix, not of shape {rotation.shape}")
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0.0:
-            raise ValueError("rotation must be a proper rotation matrix (orthogonal, determinant 1)")
-        if translation.shape != (3,) or not np.isfinite(translation).all():
-            raise ValueError(f"translation must be 3 finite numbers, not {translation.tolist()}")
-        for name, array in (("rotation", rotation), ("translation", translation)):
-            array.flags.writeable = False
-            object.__setattr__(self, name, array)
+        keep_checked(self, 1e-5)
 
     @classmethod
     def from_degrees(cls, scale: float, rotate: float | Vector, translate: Vector, dimension: int) -> Placement:
