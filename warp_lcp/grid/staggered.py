@@ -93,7 +93,7 @@ class Window:
             launch: of a program.
             given: fields and numbers by name.
         """
-        passed.bind(self._whole if whole else self._shared, **given).launch(launch or wp.launch)
+        passed.bind(self._whole if whole else self._shared, **given).launch(launch)
 
     @cached_property
     def _shared(self) -> Rows:

@@ -317,9 +317,9 @@ class Bound(NamedTuple):
         """Where the rows are."""
         return self.rows.summed if self.form.declared.sums else self.rows.single
 
-    def launch(self, launch: Any = wp.launch) -> None:
+    def launch(self, launch: Any = None) -> None:
         """Launch the pass, or record it."""
-        launch(self.form.kernel, threads(self.layout), [self.layout, self.fields], device=self.rows.device)
+        (launch or wp.launch)(self.form.kernel, threads(self.layout), [self.layout, self.fields], device=self.rows.device)
 
 
 class Wave:
