@@ -16,7 +16,7 @@ from warp_lcp.rows import RowPass, Rows
 if TYPE_CHECKING:
     from warp_lcp.grid.staggered import StaggeredGrid
 
-CPU_GRAIN = 1024  # particles that a CPU thread takes: the launch then costs nothing, the arrays stay in the L2 cache
+CPU_GRAIN = 4096  # particles that a CPU thread takes: the launch then costs nothing, the arrays stay in the L2 cache
 HEADERS = Path(__file__).parent / "headers"
 NONE: Mapping[str, Any] = {}
 
@@ -44,9 +44,9 @@ def on_grid(grid: "StaggeredGrid") -> dict[str, Any]:
     return {"planes": grid.planes, "dx": grid.spacing, "inverse_dx": 1.0 / grid.spacing, **before}
 
 
-def chunks(count: int, device: wp.Device, grain: int = CPU_GRAIN) -> Rows:
-    """Return how a list's entries are shared out: a CPU thread takes `grain`."""
-    return Rows.entries(count, device, 1 if device.is_cuda else grain)
+def chunks(count: int, device: wp.Device) -> Rows:
+    """Return how a list's entries are shared out."""
+    return Rows.entries(count, device, 1 if device.is_cuda else CPU_GRAIN)
 
 
 def launch(passed: RowPass, count: int, grid: "StaggeredGrid", **given: Any) -> None:
