@@ -15,7 +15,6 @@ from granular.interleaved_kernels import APART, interleaved_passes
 from granular.stress import Stress
 from granular.stress_kernels import PERIOD
 from granular.yield_set import xyz
-from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.rows import RowPass, Rows
 
 BETTER = 0.95  # of the best estimate: progress
@@ -192,17 +191,16 @@ def _sweep(stress: Stress, passed: RowPass, **given: Any) -> None:
     if not grid.device.is_cuda:
         grid.domain.run(passed, **given)
         return
-    for cells in _colors(grid):
+    for cells in colors(grid.shape, grid.domain.low, grid.domain.high, grid.device.alias):
         passed.bind(Rows.entries(cells.size, grid.device), cells=cells, **given).launch()
 
 
 @functools.lru_cache(maxsize=2)
-def _colors(grid: StaggeredGrid) -> list[wp.array]:
-    """Return the flat indices of the cells of each color."""
-    box = tuple(slice(a, b) for a, b in zip(grid.domain.low, grid.domain.high, strict=True))
-    cells = np.arange(grid.size, dtype=np.int32).reshape(grid.shape)[box]
+def colors(shape: tuple[int, int, int], low: tuple[int, int, int], high: tuple[int, int, int], device: str) -> list[wp.array]:
+    """Return the flat indices of a box's cells low <= (k, j, i) < high in fields of a shape, a list a color: `APART` along each axis."""
+    cells = np.arange(np.prod(shape), dtype=np.int32).reshape(shape)[tuple(map(slice, low, high))]
     starts = np.ndindex(*(min(APART, n) for n in cells.shape))
-    return [wp.array(cells[k::APART, j::APART, i::APART].ravel(), dtype=wp.int32, device=grid.device) for k, j, i in starts]
+    return [wp.array(cells[k::APART, j::APART, i::APART].ravel(), dtype=wp.int32, device=device) for k, j, i in starts]
 
 
 def _status(history: list[tuple[int, float]], tolerance: float, most: int, done: int) -> wl.SolveStatus | None:
