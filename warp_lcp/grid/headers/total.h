@@ -4,7 +4,8 @@ enum { LANES = 1 };
 #else
 enum { LANES = 16 };
 #endif
-const T* position = (const T*)given.position.data; const T* velocity = (const T*)given.velocity.data; double* sums = given.sums.data + 16*c_;
+const T* position = (const T*)given.position.data; const T* velocity = (const T*)given.velocity.data;
+double* sums = given.sums.data + 16*c_;
 double squares[LANES], sum[3][LANES], way[3][LANES]; T low[3][LANES], high[3][LANES], fastest[LANES]; int bad_x[LANES], bad_v[LANES];
 for (int m = 0; m < LANES; ++m) {
     squares[m] = 0; fastest[m] = 0; bad_x[m] = 0; bad_v[m] = 0;
