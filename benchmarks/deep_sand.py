@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import argparse
 import math
+import shutil
+import tempfile
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -25,6 +28,7 @@ from granular.simulator import SandSimulation
 from granular.stress import Stress
 from granular.yield_set import HOLDS
 from warp_lcp import SolveStatus
+from warp_lcp.rows import RowPass
 
 SILO_WIDTH = 0.2  # [m]
 SETTLED = 20  # steps before those that count
@@ -153,6 +157,14 @@ def _waves(stress: Stress) -> list[float]:
     return [float(power[(waves >= a) & (waves < b)].sum() / power.sum()) for a, b in pairwise(edges)][::-1]
 
 
+def held_step(passed: RowPass) -> RowPass:
+    """Return a step with the friction's bound held at the pressure that inverse_z has, which 2-D has no use for."""
+    with tempfile.TemporaryDirectory() as folder:
+        copy = shutil.copytree(passed.header.parent, Path(folder) / "headers")
+        (copy / "step.h").write_text(passed.header.read_text().replace("k_yield*x +", "k_yield*(T)inverse_z[i] +"))
+        return replace(passed, name="granular.deep_sand.step", header=copy / "step.h")
+
+
 def stall(make: Callable[..., SandSimulation], settle: int) -> list[list[str]]:
     """Return rows of a table: a step in deep sand that goes on and on, for several k, and with the bound of the friction held."""
     simulation = make()
@@ -161,14 +173,10 @@ def stall(make: Callable[..., SandSimulation], settle: int) -> list[list[str]]:
     state, rows = simulation.state(), []
     trials = [(k, False) for k in SLOPES] + [(SLOPES[-1], True)]
     for k, frozen in trials:
-        if frozen:  # inverse_z, which 2-D has no use for, becomes the pressure that the friction's bound is held at
-            text = stress_kernels.CELLS
-            stress_kernels.CELLS = text.replace("k_yield*x +", "k_yield*(T)inverse_z.data[row + i] +")
-            stress_kernels.stress_kernels.cache_clear()
         trial = make(material={"friction_angle": math.degrees(math.atan(k))})
         if frozen:
-            stress_kernels.CELLS = text
-            stress_kernels.stress_kernels.cache_clear()
+            velocity = trial.stress.velocity
+            velocity.passes = SimpleNamespace(**vars(velocity.passes) | {"step": held_step(velocity.passes.step)})
             trial.packing.inverse.append(wp.zeros_like(trial.packing.fraction))
         trial.restore(state)
         trial.method = watch = Stalled(frozen)

@@ -47,8 +47,7 @@ class BodyCoupling:
         body[bodies.numbers] = np.arange(len(bodies.bodies))
         cut, S = boundary.cut, kernels.Solids()
         S.planes, S.bodies, S.spacing = grid.planes, len(bodies.bodies), grid.spacing
-        S.near, S.owner, S.next_near, S.next_owner = cut.near_solids
-        S.standing, S.moving = cut.standing, cut.moving_numbers
+        S.moving = cut.moving
         S.open_x, S.open_y, S.open_z = (*cut.open, *cut.open[:1])[:3]
         S.wall_x, S.wall_y, S.wall_z = (*cut.wall, *cut.wall[:1])[:3]
         S.body = wp.array(body, dtype=wp.int32, device=grid.device)
@@ -69,21 +68,21 @@ class BodyCoupling:
         Args:
             kind: int8 of AIR, FLUID, SOLID.
         """
-        grid, S, rows = self.grid, self._solids, self.grid.shape[1]
+        grid, S = self.grid, self._solids
         S.center.assign(np.array([body.position for body in self.bodies.bodies]))
         block = self.boundary.cut.moving_block()
         self._counts.zero_()
         total = 0
         if block is not None:
             window = grid.window(*block)
-            window.launch_rows(kernels.count_kernel, [S, kind, rows, self._counts])
+            window.launch_rows(kernels.enter_kernel, [S, kind, self._counts, None, None, None, None])
             wp.utils.array_scan(self._counts, self._offsets, inclusive=False)
             total = int(self._offsets.numpy()[-1]) + int(self._counts.numpy()[-1])
         if total > self.columns.capacity:
             self.columns.reserve(round(SPARE * total))
         if total:
             entries = [self.columns.rows, self.columns.blocks, self.columns.values]
-            window.launch_rows(kernels.fill_kernel, [S, kind, rows, self.width, self._offsets, *entries])
+            window.launch_rows(kernels.enter_kernel, [S, kind, self._counts, self._offsets, *entries])
         self.columns.count.fill_(total)
         if self._low is not None:
             self._low.update(self._weights())

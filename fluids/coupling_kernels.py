@@ -4,7 +4,7 @@
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, I16, cell_kernel
-from warp_lcp.grid.cut_cells_kernels import moving_part
+from warp_lcp.grid.cut_cells_kernels import Moving, moving_part
 from warp_lcp.operators.grid_poisson import FLUID
 
 _FLUID = wp.constant(wp.int8(FLUID))
@@ -19,12 +19,7 @@ class Solids:
     planes: int
     bodies: int
     spacing: wp.float64
-    near: F32
-    owner: I16
-    next_near: F32
-    next_owner: I16
-    standing: F32
-    moving: wp.array(dtype=wp.uint8)
+    moving: Moving
     open_x: F32
     open_y: F32
     open_z: F32
@@ -43,19 +38,13 @@ def body_on_face(S: Solids, axis: int, k: int, j: int, i: int):
     free = float(1.0)
     if axis == 0:
         free = S.open_x[k, j, i]
-        solid, part = moving_part(
-            0, S.planes, k, j, i, S.near, S.owner, S.next_near, S.next_owner, S.standing, S.open_x, S.wall_x, S.moving
-        )
+        solid, part = moving_part(S.moving, 0, S.planes, k, j, i, S.open_x, S.wall_x)
     elif axis == 1:
         free = S.open_y[k, j, i]
-        solid, part = moving_part(
-            1, S.planes, k, j, i, S.near, S.owner, S.next_near, S.next_owner, S.standing, S.open_y, S.wall_y, S.moving
-        )
+        solid, part = moving_part(S.moving, 1, S.planes, k, j, i, S.open_y, S.wall_y)
     else:
         free = S.open_z[k, j, i]
-        solid, part = moving_part(
-            2, S.planes, k, j, i, S.near, S.owner, S.next_near, S.next_owner, S.standing, S.open_z, S.wall_z, S.moving
-        )
+        solid, part = moving_part(S.moving, 2, S.planes, k, j, i, S.open_z, S.wall_z)
     share = (wp.float64(1.0) - wp.float64(free)) * wp.float64(part)
     body = S.body[solid]
     if share == wp.float64(0.0):
@@ -92,29 +81,16 @@ def next_body(S: Solids, last: int, k: int, j: int, i: int):
 
 
 @cell_kernel("fluids.coupling")
-def count_kernel(k, j, first, end, S: Solids, kind: I8, rows: int, counts: _I32):
-    """Count the pairs of a FLUID cell and a body beside it in a row."""
-    found = int(0)
-    for i in range(first, end):
-        if kind[k, j, i] == _FLUID:
-            if beside_a_wall(S, k, j, i):
-                last = int(-1)
-                for _ in range(S.bodies):
-                    least = next_body(S, last, k, j, i)
-                    if least == S.bodies:
-                        break
-                    found += 1
-                    last = least
-    counts[k * rows + j] = found
+def enter_kernel(k, j, first, end, S: Solids, kind: I8, counts: _I32, offsets: _I32, index: _I32, block: _I32, values: _F64):
+    """Count the pairs of a FLUID cell and a body beside it in a row, or with `values` write their entries.
 
-
-@cell_kernel("fluids.coupling")
-def fill_kernel(
-    k, j, first, end, S: Solids, kind: I8, rows: int, columns: int, offsets: _I32, index: _I32, block: _I32,
-    values: _F64,
-):  # fmt: skip
-    """Write the entries of a row: what a cell's outflow gains by unit motions of a body, (vx, vy, wz) or (vx, vy, vz, wx, wy, wz)."""
-    e = offsets[k * rows + j]
+    An entry is what a cell's outflow gains by unit motions of a body, (vx, vy, wz) or (vx, vy, vz, wx, wy, wz).
+    """
+    row = k * kind.shape[1] + j
+    begin = int(0)
+    if values:
+        begin = offsets[row]
+    e = int(begin)
     for i in range(first, end):
         if kind[k, j, i] == _FLUID:
             if beside_a_wall(S, k, j, i):
@@ -124,36 +100,38 @@ def fill_kernel(
                     if least == S.bodies:
                         break
                     last = least
-                    move = wp.vec3d()
-                    turn = wp.vec3d()
-                    for n in range(2 * (S.planes + 1)):
-                        body, share = side(S, n, k, j, i)
-                        if body == least:
-                            axis = n >> 1
-                            high = n & 1
-                            half = wp.float64(0.5)
-                            x = wp.vec3d(wp.float64(i) - half, wp.float64(j) - half, wp.float64(k) - half)
-                            x[axis] = x[axis] + wp.float64(high) - half
-                            r = x * S.spacing - S.center[least]
-                            if S.planes == 1:
-                                r[2] = wp.float64(0.0)
-                            normal = wp.vec3d()
-                            normal[axis] = share * wp.float64(2 * high - 1)
-                            move += normal
-                            turn += wp.cross(r, normal)
-                    index[e] = (k * rows + j) * kind.shape[2] + i
-                    block[e] = least
-                    at = e * columns
-                    values[at] = move[0]
-                    values[at + 1] = move[1]
-                    if S.planes == 1:
-                        values[at + 2] = turn[2]
-                    else:
-                        values[at + 2] = move[2]
-                        values[at + 3] = turn[0]
-                        values[at + 4] = turn[1]
-                        values[at + 5] = turn[2]
+                    if values:
+                        move = wp.vec3d()
+                        turn = wp.vec3d()
+                        for n in range(2 * (S.planes + 1)):
+                            body, share = side(S, n, k, j, i)
+                            if body == least:
+                                axis = n >> 1
+                                high = n & 1
+                                half = wp.float64(0.5)
+                                x = wp.vec3d(wp.float64(i) - half, wp.float64(j) - half, wp.float64(k) - half)
+                                x[axis] = x[axis] + wp.float64(high) - half
+                                r = x * S.spacing - S.center[least]
+                                if S.planes == 1:
+                                    r[2] = wp.float64(0.0)
+                                normal = wp.vec3d()
+                                normal[axis] = share * wp.float64(2 * high - 1)
+                                move += normal
+                                turn += wp.cross(r, normal)
+                        index[e] = (k * kind.shape[1] + j) * kind.shape[2] + i
+                        block[e] = least
+                        at = e * wp.where(S.planes == 1, 3, 6)
+                        values[at] = move[0]
+                        values[at + 1] = move[1]
+                        if S.planes == 1:
+                            values[at + 2] = turn[2]
+                        else:
+                            values[at + 2] = move[2]
+                            values[at + 3] = turn[0]
+                            values[at + 4] = turn[1]
+                            values[at + 5] = turn[2]
                     e += 1
+    counts[row] = e - begin
 
 
 @cell_kernel("fluids.coupling")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -30,45 +30,18 @@ class DistributedPressure(PressureProjection):
         part: where this rank works.
         boundary: solids and walls.
         solver: settings of the method.
-        tolerance: relative residual at which a solve is done; "auto": see `fluids.tolerance`.
-        max_iterations: of the method a solve may take.
-        phi: as of `PressureProjection`.
-        lets_go: whether a wall separates.
-        weights: as of `PressureProjection`.
-        gravity: as of `PressureProjection`.
+        settings: others, as of `PressureProjection`.
     """
 
-    def __init__(
-        self,
-        part: Subdomain,
-        boundary: Boundary,
-        solver: Any,
-        *,
-        tolerance: float | Literal["auto"],
-        max_iterations: int,
-        phi: wp.array | None = None,
-        lets_go: bool = True,
-        weights: Sequence[wp.array] | None = None,
-        gravity: float = 0.0,
-    ) -> None:
+    def __init__(self, part: Subdomain, boundary: Boundary, solver: Any, **settings: Any) -> None:
         """Allocate the fields."""
-        super().__init__(
-            part.grid,
-            boundary,
-            solver,
-            tolerance=tolerance,
-            max_iterations=max_iterations,
-            phi=phi,
-            lets_go=lets_go,
-            weights=weights,
-            gravity=gravity,
-        )
+        super().__init__(part.grid, boundary, solver, **settings)
         self.part, self._solved = part, part.owned
-        if phi is None:
+        if self._phi is None:
             self._shift = None  # the part's sides at cuts are open, the domain's are not
         self._box_kind, self._rhs, self._guess = (self._box_like(field) for field in (self.kind, self._b, self._start))
         self._box_lower, self._box_shift = (None if field is None else self._box_like(field) for field in (self._lower, self._shift))
-        if tolerance == "auto":
+        if settings["tolerance"] == "auto":
             self.automatic = TimeErrorTolerance(self._rhs.size, part.grid.device, part.ranks)
 
     def project(

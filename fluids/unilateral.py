@@ -108,7 +108,7 @@ class UnilateralPressure(PressureProjection):
         self._setting.settling = min(math.sqrt(self._gravity * self.grid.spacing), self.grid.spacing / dt)
         least = SHIFT if self.boundary.open else 0.0
         fields = [self.pressure, self._ratio, least, self._b, self._start, self._shift]
-        self.grid.domain.launch(kernels.prepare_kernel, [self._setting, self.kind, *self._sides(velocity), *fields])
+        self.grid.domain.launch(kernels.prepare_kernel, [self._at(velocity), self.kind, *fields])
         unknowns = self.unknowns()
         if unknowns and self._problem is None:
             self._make_problem()
@@ -140,10 +140,8 @@ class UnilateralPressure(PressureProjection):
             open_ = self.boundary.open[axis] if self.boundary.open else None
             inputs = [self._setting, axis, self.pressure, open_, self._weights[axis], field, self.known[axis]]
             window.launch(kernels.push_kernel, inputs)
-        fields = [self.pressure, self.contact, self._sums]
-        self.grid.domain.launch_rows(
-            kernels.contact_kernel, [self._setting, self.kind, self.boundary.touch, *self._sides(velocity), *fields]
-        )
+        inputs = [self._at(velocity), self.kind, self.boundary.touch, self.pressure, self.contact, self._sums]
+        self.grid.domain.launch_rows(kernels.contact_kernel, inputs)
         released, worst = self._found()
         return Projection(result, unknowns, int(released), worst)
 
@@ -158,6 +156,10 @@ class UnilateralPressure(PressureProjection):
         self._problem = wl.LCP(self._joined(), self._b, 0.0, np.inf)
         self._work = self.solver.init(self._problem)
 
-    def _sides(self, velocity: Sequence[wp.array]) -> list[Any]:
-        """Return velocities, open fractions and solids' velocities as the kernels take them."""
-        return [*three(velocity), *three(self.boundary.open), *three(self.boundary.velocity)]
+    def _at(self, velocity: Sequence[wp.array]) -> Any:
+        """Return the setting with velocities, open fractions and solids' velocities as they are."""
+        s = self._setting
+        s.u, s.v, s.w = three(velocity)
+        s.open_x, s.open_y, s.open_z = three(self.boundary.open)
+        s.solid_x, s.solid_y, s.solid_z = three(self.boundary.velocity)
+        return s

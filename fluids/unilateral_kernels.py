@@ -28,6 +28,15 @@ class Setting:
     capacity: F32
     cells: I8  # FLUID: an unknown
     base: I8
+    u: F32  # u* of each component [m/s]
+    v: F32
+    w: F32
+    open_x: F32  # fractions of faces
+    open_y: F32
+    open_z: F32
+    solid_x: F32  # what solids let pass [m/s]
+    solid_y: F32
+    solid_z: F32
 
 
 @wp.func
@@ -76,21 +85,18 @@ def passing(s: Setting, u: F32, open: F32, solid: F32, k: int, j: int, i: int, c
 
 
 @wp.func
-def slack(
-    s: Setting, u: F32, v: F32, w: F32, open_x: F32, open_y: F32, open_z: F32, solid_x: F32, solid_y: F32, solid_z: F32,
-    k: int, j: int, i: int,
-):  # fmt: skip
+def slack(s: Setting, k: int, j: int, i: int):
     """Return y of a cell: what it may still take, what it is off the density at rest, and what flows out of it [m/s]."""
-    left = passing(s, u, open_x, solid_x, k, j, i, k, j, i - 1)
-    right = passing(s, u, open_x, solid_x, k, j, i + 1, k, j, i)
-    low = passing(s, v, open_y, solid_y, k, j, i, k, j - 1, i)
-    high = passing(s, v, open_y, solid_y, k, j + 1, i, k, j, i)
+    left = passing(s, s.u, s.open_x, s.solid_x, k, j, i, k, j, i - 1)
+    right = passing(s, s.u, s.open_x, s.solid_x, k, j, i + 1, k, j, i)
+    low = passing(s, s.v, s.open_y, s.solid_y, k, j, i, k, j - 1, i)
+    high = passing(s, s.v, s.open_y, s.solid_y, k, j + 1, i, k, j, i)
     zero = wp.float64(0.0)
     inward = wp.max(left, zero) - wp.min(right, zero) + wp.max(low, zero) - wp.min(high, zero)
     y = right - left + high - low
     if s.planes == 2:
-        back = passing(s, w, open_z, solid_z, k, j, i, k - 1, j, i)
-        front = passing(s, w, open_z, solid_z, k + 1, j, i, k, j, i)
+        back = passing(s, s.w, s.open_z, s.solid_z, k, j, i, k - 1, j, i)
+        front = passing(s, s.w, s.open_z, s.solid_z, k + 1, j, i, k, j, i)
         inward += wp.max(back, zero) - wp.min(front, zero)
         y += front - back
     capacity = s.capacity[k, j, i]
@@ -101,16 +107,13 @@ def slack(
 
 
 @cell_kernel("fluids.unilateral")
-def prepare_kernel(
-    k, j, i, s: Setting, kind: I8, u: F32, v: F32, w: F32, open_x: F32, open_y: F32, open_z: F32, solid_x: F32,
-    solid_y: F32, solid_z: F32, last: F64, ratio: wp.float64, least: float, b: F64, start: F64, shift: F32,
-):  # fmt: skip
+def prepare_kernel(k, j, i, s: Setting, kind: I8, last: F64, ratio: wp.float64, least: float, b: F64, start: F64, shift: F32):
     """Mark the unknowns; fill right-hand side, first guess and what the open sides add to the diagonal."""
     unknown = s.base[k, j, i] != _SOLID and kind[k, j, i] != _SOLID
     value = wp.float64(0.0)
     guess = wp.float64(0.0)
     if unknown:
-        value = slack(s, u, v, w, open_x, open_y, open_z, solid_x, solid_y, solid_z, k, j, i)
+        value = slack(s, k, j, i)
         guess = wp.max(last[k, j, i] * ratio, wp.float64(0.0))
     s.cells[k, j, i] = wp.where(unknown, _FLUID, _SOLID)
     b[k, j, i] = value
@@ -118,18 +121,18 @@ def prepare_kernel(
     if shift:
         more = least
         if i == 1 and s.base[k, j, 0] == _AIR:
-            more += open_part(s, open_x, k, j, i, k, j, i - 1)
+            more += open_part(s, s.open_x, k, j, i, k, j, i - 1)
         if i + 2 == b.shape[2] and s.base[k, j, i + 1] == _AIR:
-            more += open_part(s, open_x, k, j, i + 1, k, j, i)
+            more += open_part(s, s.open_x, k, j, i + 1, k, j, i)
         if j == 1 and s.base[k, 0, i] == _AIR:
-            more += open_part(s, open_y, k, j, i, k, j - 1, i)
+            more += open_part(s, s.open_y, k, j, i, k, j - 1, i)
         if j + 2 == b.shape[1] and s.base[k, j + 1, i] == _AIR:
-            more += open_part(s, open_y, k, j + 1, i, k, j, i)
+            more += open_part(s, s.open_y, k, j + 1, i, k, j, i)
         if s.planes == 2:
             if k == 1 and s.base[0, j, i] == _AIR:
-                more += open_part(s, open_z, k, j, i, k - 1, j, i)
+                more += open_part(s, s.open_z, k, j, i, k - 1, j, i)
             if k + 2 == b.shape[0] and s.base[k + 1, j, i] == _AIR:
-                more += open_part(s, open_z, k + 1, j, i, k, j, i)
+                more += open_part(s, s.open_z, k + 1, j, i, k, j, i)
         shift[k, j, i] = more
 
 
@@ -156,10 +159,7 @@ def push_kernel(k, j, i, s: Setting, axis: int, x: F64, open: F32, weight: F32, 
 
 
 @cell_kernel("fluids.unilateral")
-def contact_kernel(
-    k, j, first, end, s: Setting, kind: I8, touch: U8, u: F32, v: F32, w: F32, open_x: F32, open_y: F32, open_z: F32,
-    solid_x: F32, solid_y: F32, solid_z: F32, x: F64, contact: U8, sums: F64,
-):  # fmt: skip
+def contact_kernel(k, j, first, end, s: Setting, kind: I8, touch: U8, x: F64, contact: U8, sums: F64):
     """Find the wall cells that hold liquid and those that let go, [0] their number in a row, and [1] the largest |y| of full cells."""
     released = int(0)
     worst = wp.float64(0.0)
@@ -175,7 +175,7 @@ def contact_kernel(
                     released += 1
         contact[k, j, i] = wp.uint8(state)
         if full:
-            y = slack(s, u, v, w, open_x, open_y, open_z, solid_x, solid_y, solid_z, k, j, i)
+            y = slack(s, k, j, i)
             worst = wp.max(worst, wp.abs(y))
     sums[k, j, 0] = wp.float64(released)
     sums[k, j, 1] = worst

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import typing
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
 import warp as wp
 
 from granular.bodies_kernels import (
+    Edges,
+    Shape,
     body_kernels,
+    flat,
     force_kernel,
     forget_kernel,
     layer_kernel,
@@ -19,9 +22,11 @@ from granular.bodies_kernels import (
     stiffness_kernel,
 )
 from granular.body_faces import BodyFaces, entries_near, find_body_faces, unowned_copies
-from granular.packing import Packing, three
+from granular.packing import Packing
+from granular.yield_set import xyz
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.program import Launch
+from warp_lcp.rows import Rows
 
 if typing.TYPE_CHECKING:
     from granular.stress import Velocity, Walls
@@ -61,7 +66,8 @@ class SandBodies:
         self.velocity, self._force, self._start, self._error = (wp.zeros((count, k), dtype=wp.float64, device=device) for _ in range(4))
         self._response, self._correction = (wp.zeros((count, k, k), dtype=wp.float64, device=device) for _ in range(2))
         _, rows, columns = grid.shape
-        self._strides = wp.vec3i(1, columns, columns * rows)
+        self._shape = Shape()
+        self._shape.dimension, self._shape.layer, self._shape.strides = grid.dimension, grid.size, wp.vec3i(1, columns, columns * rows)
         self._nothing = wp.zeros(1, dtype=wp.float64, device=device)  # sums that trial steps do not make
         self.faces: BodyFaces | None = None
         self._walls: Walls
@@ -100,7 +106,8 @@ class SandBodies:
 
         self._face = [ints(found.face), small(found.face_axis), ints(found.face_body), reals(found.face_row)]
         self._cell, self._cell_row = ints(found.cell), reals(found.cell_row)
-        self._edge, self._edge_shear, self._edge_row = ints(found.edge), small(found.edge_shear), reals(found.edge_row)
+        self._edge_row, self._edges = reals(found.edge_row), Edges()
+        self._edges.at, self._edges.shear, self._edges.row = ints(found.edge), small(found.edge_shear), self._edge_row
         copies, homes = unowned_copies(grid, index, found)
         self._unowned = ints((FIRST[grid.dimension] + copies) * grid.size + homes)
         self._trial = ints(cells)
@@ -126,8 +133,8 @@ class SandBodies:
         assert self.faces is not None
         self._scale, rows, owner = density * self.grid.cell_volume, self.faces.face_row, self.faces.face_body
         layer = wp.zeros(len(rows), dtype=wp.vec2d, device=self.grid.device)
-        fields = [*_flat(packing.mass), *_flat(sand), *_flat(weights)]
-        wp.launch(layer_kernel, len(rows), [*self._face[:2], *fields, layer], device=self.grid.device)
+        inputs = [*self._face[:2], flat(packing.mass), flat(sand), flat(weights), layer]
+        wp.launch(layer_kernel, len(rows), inputs, device=self.grid.device)
         mass, speed = layer.numpy().T
         count = len(self.numbers)
         self._layer_mass = _products(mass, rows[:, None], owner, count)
@@ -144,10 +151,10 @@ class SandBodies:
         active[0], active[1 : 1 + len(held)] = len(held), held
         self._active.assign(active)
 
-    def forget(self, stress: Sequence[wp.array]) -> None:
-        """Take stresses from where only the edge of a body is near: now, before, point."""
+    def forget(self, stress: Mapping[str, wp.array]) -> None:
+        """Take stresses from where only the edge of a body is near."""
         if len(self._unowned):
-            wp.launch(forget_kernel, len(self._unowned), [self._unowned, *(s.flatten() for s in stress)], device=self.grid.device)
+            wp.launch(forget_kernel, len(self._unowned), [self._unowned, *(s.flatten() for s in stress.values())], device=self.grid.device)
 
     def prepare(self, packing: Packing, numbers: wp.array, *, pressure_step: float, shear_step: float) -> None:
         """Find how much of a mismatch of the velocity a trial step corrects.
@@ -160,12 +167,12 @@ class SandBodies:
         """
         found, device, dimension = self.faces, self.grid.device, self.grid.dimension
         assert found is not None
-        fields = [*_flat(packing.mass), *_flat(packing.inverse)]
+        inverse = flat(packing.inverse)
         cells = wp.zeros(len(found.cell), dtype=wp.vec2d, device=device)
-        inputs = [self._strides, dimension, self._cell, packing.flags.flatten(), packing.drive.flatten(), packing.stiff.flatten()]
-        wp.launch(stiffness_kernel, len(found.cell), [*inputs, *fields, numbers, cells], device=device)
+        inputs = [self._shape, self._cell, packing.flags.flatten(), packing.drive.flatten(), packing.stiff.flatten()]
+        wp.launch(stiffness_kernel, len(found.cell), [*inputs, flat(packing.mass), inverse, numbers, cells], device=device)
         edges = wp.zeros(len(found.edge), dtype=wp.float64, device=device)
-        inputs = [self._strides, self._edge, self._edge_shear, *_flat(packing.share), *fields[3:], edges]
+        inputs = [self._shape, self._edges, flat(packing.share), inverse, edges]
         wp.launch(lightness_kernel, len(found.edge), inputs, device=device)
         pressure, shear = (cells.numpy() * found.cell_share[:, None]).T
         along = found.cell_row.sum(axis=1)
@@ -192,21 +199,20 @@ class SandBodies:
         """Give the bodies' faces their velocity."""
         kernel = body_kernels(self.grid.dimension, velocity.real, velocity.box, velocity.rate).move
         if len(self._face[0]):
-            launch(kernel, len(self._face[0]), [*self._face, self.velocity, *_flat(velocity.u)], device=self.grid.device)
+            launch(kernel, len(self._face[0]), [*self._face, self.velocity, flat(velocity.u)], device=self.grid.device)
 
     def respond(self, packing: Packing, stress: wp.array, launch: Launch, *, implicit: bool) -> None:
         """Find what stresses do to the bodies and the velocity that they leave, or a step towards it."""
-        grid, device, k = self.grid, self.grid.device, self.freedoms
-        shares = _flat(packing.share)
-        rows = [self._cell, self._cell_row, self._edge, self._edge_shear, self._edge_row]
-        inputs = [grid.dimension, grid.size, k, self._spans, stress.flatten(), *rows, self._strides, *shares, self._partial]
+        device = self.grid.device
+        rows = [self._cell, self._cell_row, self._edges]
+        inputs = [self._shape, self._spans, stress.flatten(), *rows, flat(packing.share), self._partial]
         if self._spans.shape[0]:
             launch(force_kernel, self._spans.shape[0], inputs, device=device)
-        inputs = [int(implicit), k, self._owned, self._partial, self._start, self._response, self._correction]
+        inputs = [int(implicit), self._owned, self._partial, self._start, self._response, self._correction]
         launch(respond_kernel, len(self.numbers), [*inputs, self._force, self._error, self.velocity], device=device)
 
     def search(
-        self, packing: Packing, velocity: Velocity, stress: list[wp.array], momentum: wp.array, numbers: wp.array, launch: Launch
+        self, packing: Packing, velocity: Velocity, stress: Mapping[str, typing.Any], given: Mapping[str, typing.Any], launch: Launch
     ) -> None:
         """Find the velocity with which a step of the stresses is implicit; faces and edges beside the bodies get it.
 
@@ -214,26 +220,23 @@ class SandBodies:
             packing: where sand is.
             velocity: what a step is taken with, at the bodies' last velocity.
             stress: now, before, point; the last is overwritten beside bodies.
-            momentum: of the steps.
-            numbers: of the stresses.
+            given: the steps' momentum, numbers of the stresses.
             launch: records.
         """
         p, device, walls = packing, self.grid.device, self._walls
         kernels = body_kernels(self.grid.dimension, velocity.real, velocity.box, velocity.rate)
-        share, edge, inverse, u = three(p.share), three(velocity.edge), three(p.inverse), three(velocity.u)
-        cells = [self._trial, p.spans, p.flags, *stress, p.drive, p.stiff, *share, *edge, *three(p.mass), *inverse, *u]
-        faces = [walls.cells, walls.sides, walls.walls, walls.friction, self._active, p.fraction]
-        entries = [*faces, *stress, *share, *edge, *inverse]
-        scalars = [momentum, numbers, self._nothing]
-        edges = [self._edge, self._edge_shear, self._strides, *_flat(velocity.u), *_flat(velocity.edge)]
+        cells = p.cells | velocity.fields | {"cell": self._trial, "spans": p.spans, "openings": None}
+        faces = xyz(share=p.share, inverse=p.inverse, edge=velocity.edge) | walls.fields(p) | {"active": self._active}
+        trials = [(kernels.trial, len(self._trial), cells), (kernels.trial_wall, len(self._entries), faces)]
+        edges = [self._shape, self._edges, flat(velocity.u), flat(velocity.edge)]
         for _ in range(ROUNDS if len(self._trial) else 0):
-            launch(kernels.trial, len(self._trial), [*cells, *scalars], device=device)
-            if len(self._entries):
-                launch(kernels.trial_wall, len(self._entries), [*entries, *scalars], device=device)
-            self.respond(packing, stress[2], launch, implicit=True)
+            for passed, count, fields in trials:
+                if count:
+                    passed.bind(Rows.entries(count, device), **stress, **given, **fields).launch(launch)
+            self.respond(packing, stress["point"], launch, implicit=True)
             self.move(velocity, launch)
-            if len(self._edge):
-                launch(kernels.strain, len(self._edge), edges, device=device)
+            if len(self._edges.at):
+                launch(kernels.strain, len(self._edges.at), edges, device=device)
 
     def _parts(self, found: BodyFaces) -> tuple[np.ndarray, np.ndarray]:
         """Return runs of the lists of cells and edges that a thread adds up, first and last of both, and each body's runs."""
@@ -267,8 +270,3 @@ def _products(weight: np.ndarray, rows: np.ndarray, owner: np.ndarray, count: in
         part = rows[low:high]
         found[body] = np.tensordot(weight[low:high, None, None] * part, part, axes=((0, 1), (0, 1)))
     return found
-
-
-def _flat(fields: Sequence[wp.array]) -> list[wp.array | None]:
-    """Return three flat views, None where there are fewer."""
-    return three([field.flatten() for field in fields])

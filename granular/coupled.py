@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -10,10 +11,11 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from granular.interleaved_kernels import APART, interleaved_kernels
-from granular.packing import three
+from granular.interleaved_kernels import APART, interleaved_passes
 from granular.stress import Stress
 from granular.stress_kernels import PERIOD
+from granular.yield_set import xyz
+from warp_lcp.rows import RowPass, Rows
 from warp_lcp.settings import Count, CountOrZero, NonNegative, Part, Positive, Relaxation, Settings, ShareOrZero
 
 BETTER = 0.95  # of the best estimate: progress
@@ -172,32 +174,34 @@ class InterleavedSweeps(Settings):
         return CoupledOutcome(status, done, pressure / scale, friction / scale, history)
 
     def _round(self, stress: Stress) -> None:
-        p, u = stress.packing, three(stress.velocity.u)
-        kernels = interleaved_kernels(p.grid.dimension, stress.box, stress.rate)
-        share, mass, inverse, numbers = three(p.share), three(p.mass), three(p.inverse), stress.numbers
-        pressure = [p.flags, stress.now, p.drive, share[0], *mass, *inverse, *u, numbers, self.pressure_relaxation]
-        friction = [p.flags, stress.now, p.stiff, *share, *inverse, *u, numbers, self.friction_relaxation]
-        for kernel, inputs in ((kernels.pressure, pressure), (kernels.friction, friction)):
-            _sweep(stress, kernel, inputs)
-        walls = stress.walls
-        faces = [walls.cells, walls.sides, walls.walls, walls.friction, p.flags, p.fraction]
-        inputs = [*faces, stress.now, *share, *inverse, *u, numbers, self.friction_relaxation]
+        p, walls, device = stress.packing, stress.walls, stress.packing.grid.device
+        passes = interleaved_passes(p.grid.dimension, stress.box, stress.rate, device.is_cuda)
+        cells = {"flags": p.flags, "now": stress.now, "numbers": stress.numbers, **xyz(inverse=p.inverse, u=stress.velocity.u)}
+        share, omega = xyz(share=p.share), self.friction_relaxation
+        mass = {"drive": p.drive, "share_x": p.share[0], **xyz(mass=p.mass)}
+        _sweep(stress, passes.pressure, omega=self.pressure_relaxation, **cells, **mass)
+        _sweep(stress, passes.friction, omega=omega, **cells, **share, stiff=p.stiff)
         if walls.count:
-            wp.launch(kernels.wall, 1, inputs, device=p.grid.device)
+            rows = Rows.entries(walls.count, device, walls.count)
+            passes.wall.bind(rows, omega=omega, **cells, **share, **walls.fields(p)).launch()
 
 
-def _sweep(stress: Stress, kernel: wp.Kernel, inputs: list[Any]) -> None:
+def _sweep(stress: Stress, passed: RowPass, **given: Any) -> None:
     """Launch a sweep over all cells: in order on the CPU, in colors on CUDA."""
     grid = stress.packing.grid
-    low, high = grid.domain.low, grid.domain.high
     if not grid.device.is_cuda:
-        rows = (high[0] - low[0], high[1] - low[1], 1)
-        wp.launch(kernel, rows, [wp.vec3i(*low), wp.vec3i(*high), 1, high[2] - low[2], *inputs], device=grid.device)
+        grid.domain.run(passed, **given)
         return
-    for color in np.ndindex(*(min(APART, b - a) for a, b in zip(low, high, strict=True))):
-        first = tuple(a + c for a, c in zip(low, color, strict=True))
-        threads = tuple(-(-(b - a) // APART) for a, b in zip(first, high, strict=True))
-        wp.launch(kernel, threads, [wp.vec3i(*first), wp.vec3i(*high), APART, 1, *inputs], device=grid.device)
+    for cells in colors(grid.shape, grid.domain.low, grid.domain.high, grid.device.alias):
+        passed.bind(Rows.entries(cells.size, grid.device), cells=cells, **given).launch()
+
+
+@functools.lru_cache(maxsize=2)
+def colors(shape: tuple[int, int, int], low: tuple[int, int, int], high: tuple[int, int, int], device: str) -> list[wp.array]:
+    """Return the flat indices of a box's cells low <= (k, j, i) < high in fields of a shape, a list a color: `APART` along each axis."""
+    cells = np.arange(np.prod(shape), dtype=np.int32).reshape(shape)[tuple(map(slice, low, high))]
+    starts = np.ndindex(*(min(APART, n) for n in cells.shape))
+    return [wp.array(cells[k::APART, j::APART, i::APART].ravel(), dtype=wp.int32, device=device) for k, j, i in starts]
 
 
 def _status(history: list[tuple[int, float]], tolerance: float, most: int, done: int) -> wl.SolveStatus | None:

@@ -9,19 +9,20 @@ load, and its friction is a traction of its own.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
-from granular.cut_walls_kernels import traction_kernel
-from granular.packing import SHEARS, Packing, three
-from granular.yield_set import COLUMNS
+from granular.cut_walls_kernels import traction_pass
+from granular.packing import SHEARS, Packing
+from granular.yield_set import COLUMNS, xyz
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
 from warp_lcp.program import Launch
+from warp_lcp.rows import Rows
 
 if TYPE_CHECKING:
     from granular.stress import Velocity
@@ -93,27 +94,22 @@ class CutWalls:
         self._numbers = wp.array(numbers, dtype=wp.int32, device=device)
         self._entries = wp.array(entries.ravel(), dtype=wp.float32, device=device)
 
-    def project(
-        self, packing: Packing, velocity: Velocity, stress: Sequence[wp.array], scalars: Sequence[wp.array], partials: wp.array,
-        grain: int, threads: int, launch: Launch,
-    ) -> None:  # fmt: skip
+    def project(self, packing: Packing, velocity: Velocity, given: Mapping[str, Any], grain: int, launch: Launch) -> None:
         """Take a projected step of the tractions, or find what the natural residual would move.
 
         Args:
             packing: where sand is.
             velocity: that the stresses leave.
-            stress: now, before, point.
-            scalars: state of the momentum, numbers.
-            partials: sums; the last `threads` of each column are these.
+            given: stresses, numbers and `partials`, sums; the last of each column are these.
             grain: cells a thread takes.
-            threads: of the launch.
             launch: launches or records.
         """
-        kernel = traction_kernel(self.grid.dimension, velocity.real, velocity.real is wp.float64)
-        behind = partials.shape[0] // COLUMNS - threads
-        walls = [self.cells, self._numbers, self._entries, self._friction, packing.flags, packing.fraction, self.openings]
-        fields = [packing.share[0], *three(velocity.u), *three(packing.inverse)]
-        launch(kernel, threads, [grain, behind, *walls, *stress, *fields, *scalars, partials], device=self.grid.device)
+        rows = Rows.entries(self.count, self.grid.device, grain)
+        behind = given["partials"].shape[0] // COLUMNS - rows.places
+        walls = {"cells": self.cells, "numbers_of": self._numbers, "walls": self._entries, "friction": self._friction}
+        fields = {"flags": packing.flags, "fraction": packing.fraction, "openings": self.openings, "share_x": packing.share[0]}
+        fields |= xyz(inverse=packing.inverse, u=velocity.u)
+        traction_pass(self.grid.dimension, velocity.real).bind(rows, behind=behind, **walls, **fields, **given).launch(launch)
 
 
 def _corners(distance: np.ndarray, axes: Sequence[int]) -> np.ndarray:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
 from granular import packing_kernels as kernels
+from granular.yield_set import xyz
 from warp_lcp.grid.periodic import PeriodicSides
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.operators.grid_poisson import SOLID
@@ -96,11 +97,20 @@ class Packing:
             nodes.launch(
                 kernels.edge_kernel, [alpha, beta, self.base, self.flags, self.inverse[alpha], self.inverse[beta], part, share]
             )  # fmt: skip
-        domain.launch(kernels.stiffness_kernel, [dimension, self.flags, *three(self.inverse), *three(self.share), openings, self.stiff])
+        inverse, share = kernels.Faces(), kernels.Faces()
+        inverse.x, inverse.y, inverse.z = three(self.inverse)
+        share.x, share.y, share.z = three(self.share)
+        domain.launch(kernels.stiffness_kernel, [dimension, self.flags, inverse, share, openings, self.stiff])
         if self.sides is not None:
             return  # the spans are whole rows
         domain.launch_rows(kernels.span_kernel, [self.flags, self._own])
         nodes.launch_rows(kernels.widen_kernel, [self._own, self.spans])
+
+    @property
+    def cells(self) -> dict[str, Any]:
+        """What a step of the stresses takes, by name."""
+        fields = {"flags": self.flags, "drive": self.drive, "stiff": self.stiff}
+        return fields | xyz(share=self.share, mass=self.mass, inverse=self.inverse)
 
 
 def three(fields: Sequence[wp.array]) -> list[wp.array | None]:

@@ -38,8 +38,8 @@ def fraction_kernel(k, j, i, base: I8, capacity: F32, splatted: F32, fraction: F
 
 @cell_kernel("granular.packing")
 def contents_kernel(
-    k, j, i, base: I8, capacity: F32, fraction: F32, planes: int, rate: float, volume: F32, kind: I8, flags: U8, drive: F32,
-):  # fmt: skip
+    k, j, i, base: I8, capacity: F32, fraction: F32, planes: int, rate: float, volume: F32, kind: I8, flags: U8, drive: F32
+):
     """Which cells hold sand, and what of them is still free: drive = max(FULL - saturation, 0) dx / dt [m/s].
 
     What is free in a cell must be free around it as well: a gap that its neighbors' surplus fills is the particles' sampling, no room.
@@ -112,9 +112,8 @@ def _free_around(base: I8, capacity: F32, fraction: F32, planes: int, k: int, j:
 
 @cell_kernel("granular.packing")
 def face_kernel(
-    k, j, i, axis: int, base: I8, fraction: F32, velocity: F32, solid: F32, openings: _F32X,
-    start: F32, mass: F32, inverse: F32,
-):  # fmt: skip
+    k, j, i, axis: int, base: I8, fraction: F32, velocity: F32, solid: F32, openings: _F32X, start: F32, mass: F32, inverse: F32
+):
     """Mass of a face in units of a full one, its inverse, and the velocity that the stress acts on.
 
     A face beside a solid cannot be moved: inverse 0. Its mass is the fraction of the open cell where the solid moves (it sweeps sand
@@ -154,9 +153,8 @@ def face_kernel(
 
 @cell_kernel("granular.packing")
 def edge_kernel(
-    k, j, first, end, alpha: int, beta: int, base: I8, flags: U8, inverse_alpha: F32, inverse_beta: F32,
-    around: F32, share: F32,
-):  # fmt: skip
+    k, j, first, end, alpha: int, beta: int, base: I8, flags: U8, inverse_alpha: F32, inverse_beta: F32, around: F32, share: F32
+):
     """The weight of a copy on an edge: 1 / dense cells around it, or -1 / cells with a wall face that ends there, or 0.
 
     Where solids cut cells, times what is open around it.
@@ -204,33 +202,39 @@ def edge_kernel(
         share[k, j, i] = weight
 
 
+@wp.struct
+class Faces:
+    """The components of a vector, or shears."""
+
+    x: F32
+    y: F32
+    z: F32
+
+
 @cell_kernel("granular.packing")
-def stiffness_kernel(
-    k, j, i, dimension: int, flags: U8, inverse_x: F32, inverse_y: F32, inverse_z: F32,
-    share_x: F32, share_y: F32, share_z: F32, openings: _F32X, stiff: F32,
-):  # fmt: skip
+def stiffness_kernel(k, j, i, dimension: int, flags: U8, inverse: Faces, share: Faces, openings: _F32X, stiff: F32):
     """What bounds the friction's part of a step in a cell: the largest diagonal in the metric of its yield set. 0: it carries no shear."""
     most = float(0.0)
     if int(flags[k, j, i]) & SHEARS_HERE:
-        x = inverse_x[k, j, i] + inverse_x[k, j, i + 1]
-        y = inverse_y[k, j, i] + inverse_y[k, j + 1, i]
+        x = inverse.x[k, j, i] + inverse.x[k, j, i + 1]
+        y = inverse.y[k, j, i] + inverse.y[k, j + 1, i]
         can = x > 0.0 and y > 0.0
         if openings:
             x = x * wp.pow(openings[dimension, k, j, i], 2.0)
             y = y * wp.pow(openings[dimension + 1, k, j, i], 2.0)
         most = 2.0 * wp.max(x, y)
         if dimension == 3:
-            z = inverse_z[k, j, i] + inverse_z[k + 1, j, i]
+            z = inverse.z[k, j, i] + inverse.z[k + 1, j, i]
             can = can and z > 0.0
             if openings:
                 z = z * wp.pow(openings[dimension + 2, k, j, i], 2.0)
             most = wp.max(most, 2.0 * z)
         for b in range(2):
             for a in range(2):
-                most = wp.max(most, _edge(share_x, inverse_x, inverse_y, k, j + b, i + a, 0, 1, 0, 0, 0, 1))
+                most = wp.max(most, _edge(share.x, inverse.x, inverse.y, k, j + b, i + a, 0, 1, 0, 0, 0, 1))
                 if dimension == 3:
-                    most = wp.max(most, _edge(share_y, inverse_x, inverse_z, k + b, j, i + a, 1, 0, 0, 0, 0, 1))
-                    most = wp.max(most, _edge(share_z, inverse_y, inverse_z, k + b, j + a, i, 1, 0, 0, 0, 1, 0))
+                    most = wp.max(most, _edge(share.y, inverse.x, inverse.z, k + b, j, i + a, 1, 0, 0, 0, 0, 1))
+                    most = wp.max(most, _edge(share.z, inverse.y, inverse.z, k + b, j + a, i, 1, 0, 0, 0, 1, 0))
         if not can:
             most = 0.0
     stiff[k, j, i] = most

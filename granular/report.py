@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from granular.packing import three
-from granular.report_kernels import REPORT_COLUMNS, report_kernels
+from granular.report_kernels import REPORT_COLUMNS, contact_kernel, report_pass, take_kernel
 from granular.stress import Stress
+from granular.yield_set import xyz
 from warp_lcp.material.contact import HELD, RELEASED
 
 
@@ -49,7 +49,7 @@ class Outcome:
         self._sums = wp.zeros(REPORT_COLUMNS * self._rows, dtype=wp.float64, device=grid.device)
         cut = stress.packing.cut
         self._openings = None if cut is None else cut.openings
-        self._kernels = report_kernels(grid.dimension, stress.rate, cut is not None)
+        self._report = report_pass(grid.dimension, stress.rate, cut is not None)
         self._base = stress.packing.base if cut is None else grid.field(wp.int8)  # no face inside a solid that cuts cells is left unknown
 
     def take(self, velocity: Sequence[wp.array]) -> None:
@@ -57,15 +57,15 @@ class Outcome:
         stress, packing = self.stress, self.stress.packing
         for axis, field in enumerate(velocity):
             fields = [self._base, packing.inverse[axis], stress.checked.u[axis], field, self.known[axis]]
-            packing.grid.everywhere.launch(self._kernels.take, [axis, *fields])
+            packing.grid.everywhere.launch(take_kernel, [axis, *fields])
         inputs = [wp.uint8(HELD), wp.uint8(RELEASED), packing.flags, stress.now, self.contact]
-        packing.grid.domain.launch(self._kernels.contact, inputs)
+        packing.grid.domain.launch(contact_kernel, inputs)
 
     def report(self) -> Report:
         """Return the figures of the last solve."""
         stress, p = self.stress, self.stress.packing
-        fields = [*three(p.share), *three(stress.checked.edge), *three(stress.checked.u), *three(p.mass), self._openings]
-        inputs = [p.flags, stress.now, p.drive, *fields, stress.numbers, self.ratio, self._sums]
-        p.grid.domain.launch_rows(self._kernels.report, inputs)
+        fields = stress.checked.fields | xyz(share=p.share, mass=p.mass) | {"openings": self._openings, "ratio": self.ratio}
+        fields |= {"flags": p.flags, "drive": p.drive, "now": stress.now}
+        p.grid.domain.run(self._report, whole=True, numbers=stress.numbers, sums=self._sums, **fields)
         cells, yielded, taken, most = self._sums.numpy().reshape(REPORT_COLUMNS, self._rows)
         return Report(float(yielded.sum() / max(cells.sum(), 1.0)), float(taken.sum()), float(most.max()))

@@ -5,17 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from granular.bodies import SandBodies
-from granular.checkerboard import damping_kernel
-from granular.packing import SHEARS, Packing, three, wall_faces
-from granular.stress_kernels import BETA_X, NEXT_X, PERIOD, RESIDUAL_X, REST, STATE, momentum_kernel, stress_kernels
-from granular.yield_set import COLUMNS, LOOKAHEAD, NUMBERS, PRESSURE_STEP, SHEAR_STEP
+from granular.checkerboard import damping_pass
+from granular.packing import SHEARS, Packing, wall_faces
+from granular.stress_kernels import BETA_X, NEXT_X, PERIOD, RESIDUAL_X, REST, STATE, STRESSES, momentum_kernel, stress_passes
+from granular.yield_set import COLUMNS, LOOKAHEAD, NUMBERS, PRESSURE_STEP, SHEAR_STEP, xyz
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.program import Launch, Program
+from warp_lcp.rows import Rows
 from warp_lcp.vectors import Reduction
 
 WALL_GRAIN = 256  # wall faces a CPU thread takes
@@ -80,6 +82,11 @@ class Walls:
         self._host = cells
         self.active = wp.zeros(1 + self.count, dtype=wp.int32, device=device)
 
+    def fields(self, packing: Packing) -> dict[str, Any]:
+        """Return what passes over faces take, by name."""
+        faces = {"cells": self.cells, "sides": self.sides, "walls": self.walls, "friction": self.friction}
+        return {**faces, "fraction": packing.fraction}
+
     def activate(self, flags: np.ndarray) -> None:
         """Find the faces whose cells hold sand: their number and their entries go to `active`."""
         found = np.flatnonzero(flags.ravel()[self._host])
@@ -102,9 +109,13 @@ class Velocity:
         self.packing, self.real, self.box, self.rate = packing, real, box, rate
         self.u = grid.faces(real)
         self.edge = [grid.field(real) for _ in SHEARS[grid.dimension]]
-        cut, residual = packing.cut, real is wp.float64
-        self.openings = None if cut is None else cut.openings
-        self.kernels = stress_kernels(grid.dimension, real, residual=residual, box=box, rate=rate, cut=cut is not None)
+        self.openings = None if packing.cut is None else packing.cut.openings
+        self.passes = stress_passes(grid.dimension, real, box=box, rate=rate, cut=packing.cut is not None)
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """The fields by name."""
+        return xyz(u=self.u, edge=self.edge)
 
     def find(self, stress: wp.array, *, launch: Launch = wp.launch, bodies: SandBodies | None = None, respond: bool = False) -> None:
         """Find velocity and rates of strain under a field of stresses.
@@ -115,20 +126,19 @@ class Velocity:
             bodies: whose faces get the velocity that they have.
             respond: first give the bodies the velocity that the stresses leave.
         """
-        p, edge, u, kernels = self.packing, three(self.edge), three(self.u), self.kernels
-        share, window = three(p.share), p.nodes
+        p, passes, share = self.packing, self.passes, {"share_x": self.packing.share[0]}
         if p.sides is not None:
             p.sides.wrap(stress, launch=launch)
-        window.launch(kernels.edge_stress, [p.spans, stress, *share, *edge], launch=launch)
-        faces = [*three(p.start), *three(p.inverse), *u, self.openings]
-        window.launch(kernels.face_velocity, [p.spans, stress, share[0], *edge, *faces], launch=launch)
+        p.nodes.run(passes.edge_stress, launch=launch, spans=p.spans, y=stress, **xyz(share=p.share, edge=self.edge))
+        faces = share | self.fields | xyz(start=p.start, inverse=p.inverse)
+        p.nodes.run(passes.face_velocity, launch=launch, spans=p.spans, y=stress, openings=self.openings, **faces)
         if bodies is not None:
             if respond:
                 bodies.respond(p, stress, launch, implicit=False)
             bodies.move(self, launch)
         if p.sides is not None:
             p.sides.wrap(*self.u, launch=launch)
-        window.launch(kernels.edge_strain, [p.spans, share[0], *u, *edge], launch=launch)
+        p.nodes.run(passes.edge_strain, launch=launch, spans=p.spans, **share, **self.fields)
 
 
 class Stress:
@@ -187,8 +197,7 @@ class Stress:
         self.walls, self._program, self._check = walls, None, None
         self._grain = 1 if device.is_cuda else WALL_GRAIN
         cut = self.packing.cut
-        self._cut_threads = 0 if cut is None else -(-cut.count // self._grain)
-        threads = -(-walls.count // self._grain) + self._cut_threads
+        threads = sum(-(-count // self._grain) for count in (walls.count, cut.count if cut is not None else 0))
         self._wall_sums = Reduction(max(threads, 1), device, self._sums, columns=COLUMNS, threads=threads) if threads else None
 
     def begin(self, bound: YieldSet, gravity: np.ndarray, dt: float, kick_dt: float, *, decay: float = 1.0) -> None:
@@ -214,14 +223,13 @@ class Stress:
         self.walls.activate(flags)
         self.cold = kick_dt > GROWN * self.kick_dt
         ratio = decay * (kick_dt / self.kick_dt if self.kick_dt > 0.0 else 1.0)
-        inputs = [p.flags, p.stiff, *three(p.share), ratio, self.now, self._before, self._point]
-        p.grid.domain.launch(self.velocity.kernels.admit, inputs)
+        share = xyz(share=p.share)
+        p.grid.domain.run(self.velocity.passes.admit, ratio=ratio, flags=p.flags, stiff=p.stiff, **share, **self._stresses)
         if self.bodies is not None:
-            self.bodies.forget([self.now, self._before, self._point])
+            self.bodies.forget(self._stresses)
         if p.sides is not None:
             p.sides.wrap(self._point)
-        inputs = [p.flags, *three(p.share), self._point, self.now]
-        p.grid.domain.launch(damping_kernel(p.grid.dimension), inputs)
+        p.grid.domain.run(damping_pass(p.grid.dimension), flags=p.flags, source=self._point, now=self.now, **share)
         self.kick_dt = kick_dt
 
     def take_back(self) -> None:
@@ -272,8 +280,7 @@ class Stress:
     def _record(self, launch: Launch) -> None:
         self.velocity.find(self._point, launch=launch, bodies=self.bodies)
         if self.bodies is not None:
-            stress = [self.now, self._before, self._point]
-            self.bodies.search(self.packing, self.velocity, stress, self._momentum, self.numbers, launch)
+            self.bodies.search(self.packing, self.velocity, self._stresses, self._step, launch)
         self._project(self.velocity, launch)
         self._add_up(launch)
         launch(momentum_kernel, 1, [self._sums, self._momentum], device=self.packing.grid.device)
@@ -291,20 +298,26 @@ class Stress:
         return self.last_residual
 
     def _project(self, velocity: Velocity, launch: Launch) -> None:
-        p, walls, kernels = self.packing, self.walls, velocity.kernels
-        grid, share, edge, inverse = p.grid, three(p.share), three(velocity.edge), three(p.inverse)
-        stress = [self.now, self._before, self._point]
-        fields = [p.drive, p.stiff, *share, *edge, *three(p.mass), *inverse, *three(velocity.u), velocity.openings]
-        scalars = [self._momentum, self.numbers]
-        inputs = [p.spans, p.flags, *stress, *fields, *scalars, self._cell_sums.partials, grid.domain.chunks]
-        grid.domain.launch(kernels.step, inputs, launch=launch)
+        p, walls, passes = self.packing, self.walls, velocity.passes
+        given = self._stresses | self._step
+        cells = p.cells | velocity.fields | {"spans": p.spans, "openings": velocity.openings}
+        p.grid.domain.run(passes.step, launch=launch, partials=self._cell_sums.partials, **given, **cells)
         if self._wall_sums is not None:
-            faces = [walls.cells, walls.sides, walls.walls, walls.friction, walls.active, p.fraction]
-            inputs = [self._grain, *faces, *stress, *share, *edge, *inverse, *scalars, self._wall_sums.partials]
+            given["partials"] = self._wall_sums.partials
             if walls.count:
-                launch(kernels.wall, self._wall_sums.threads - self._cut_threads, inputs, device=grid.device)
+                fields = xyz(share=p.share, inverse=p.inverse, edge=velocity.edge) | walls.fields(p)
+                rows = Rows.entries(walls.count, p.grid.device, self._grain)
+                passes.wall.bind(rows, active=walls.active, behind=0, **fields, **given).launch(launch)
             if p.cut is not None:
-                p.cut.project(p, velocity, stress, scalars, self._wall_sums.partials, self._grain, self._cut_threads, launch)
+                p.cut.project(p, velocity, given, self._grain, launch)
+
+    @property
+    def _stresses(self) -> dict[str, Any]:
+        return dict(zip(STRESSES, (self.now, self._before, self._point), strict=True))
+
+    @property
+    def _step(self) -> dict[str, Any]:
+        return {"momentum": self._momentum, "numbers": self.numbers}
 
     def _add_up(self, launch: Launch) -> None:
         self._cell_sums.add_up(0, COLUMNS, launch=launch)

@@ -17,16 +17,16 @@ import granular
 import warp_lcp as wl
 from fluids.pressure_kernels import pressure_passes
 from granular.bodies_kernels import body_kernels
-from granular.checkerboard import damping_kernel
-from granular.cut_walls_kernels import traction_kernel
-from granular.interleaved_kernels import interleaved_kernels
-from granular.report_kernels import report_kernels
-from granular.stress_kernels import stress_kernels
+from granular.checkerboard import damping_pass
+from granular.cut_walls_kernels import traction_pass
+from granular.interleaved_kernels import interleaved_passes
+from granular.report_kernels import report_pass
+from granular.stress_kernels import stress_passes
 from warp_lcp.distributed.petsc_matrix import ENTER, LEAVE
 from warp_lcp.grid import advection_kernels, distance_advection_kernels, transfer_kernels
 from warp_lcp.grid.periodic import ring_kernels
 from warp_lcp.grid.semi_lagrangian import CENTERS
-from warp_lcp.grid.semi_lagrangian_kernels import carry_kernels
+from warp_lcp.grid.semi_lagrangian_kernels import carry_pass
 from warp_lcp.material.density_correction_kernels import displacement_pass
 from warp_lcp.multigrid import CycleSettings, Hierarchy
 from warp_lcp.rows import Rows
@@ -157,18 +157,17 @@ def use_coupled_kernels(reals):
 def use_sand_kernels():
     """Instantiate the kernels of sand in 2-D and 3-D, with both yield sets."""
     for dimension in (2, 3):
-        damping_kernel(dimension)
-        traction_kernel(dimension, wp.float32, residual=False)
-        traction_kernel(dimension, wp.float64, residual=True)
+        damping_pass(dimension)
+        for real in (wp.float32, wp.float64):
+            traction_pass(dimension, real)
         for rate, cut in itertools.product((False, True), repeat=2):
-            report_kernels(dimension, rate, cut)
+            report_pass(dimension, rate, cut)
         for box, rate in ((False, False), (True, False), (False, True)):
-            interleaved_kernels(dimension, box, rate)
-            for cut in (False, True):
-                stress_kernels(dimension, wp.float32, residual=False, box=box, rate=rate, cut=cut)
-                stress_kernels(dimension, wp.float64, residual=True, box=box, rate=rate, cut=cut)
+            interleaved_passes(dimension, box, rate, listed=True)
             for real in (wp.float32, wp.float64):
                 body_kernels(dimension, real, box, rate)
+                for cut in (False, True):
+                    stress_passes(dimension, real, box=box, rate=rate, cut=cut)
 
 
 def family(name):
@@ -193,12 +192,12 @@ def test_kernels_compile_for_cuda(reals, archs, tmp_path):
     for cut in (False, True):
         displacement_pass(cut)
     for endless in (0, 1, 4, 5):
-        advection_kernels.advect_kernel(endless)
-        distance_advection_kernels.advect_kernel(endless)
+        advection_kernels.advect_pass(endless)
+        distance_advection_kernels.advect_pass(endless)
     for variant in itertools.product((False, True), repeat=4):
         pressure_passes(*variant)
     for axis in (0, 1, 2, CENTERS):
-        carry_kernels(axis)
+        carry_pass(axis)
     for dtype in (wp.int8, wp.uint8, wp.int32, wp.float32, wp.float64):
         ring_kernels(dtype)
     for d_type, real in itertools.product((wp.uint8, wp.float32, wp.float64), (wp.float32, wp.float64)):

@@ -5,10 +5,11 @@ import pytest
 import warp as wp
 from test_sand_stress import Case, make, velocity
 
-from granular.checkerboard import DAMPED, damping_kernel
+from granular.checkerboard import DAMPED, damping_pass
 from granular.packing import Packing
 from granular.report import Outcome
 from granular.stress import Stress, Walls, YieldSet
+from granular.yield_set import xyz
 from small_sands import advance, box, create, scene
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
@@ -64,8 +65,8 @@ def test_the_checkerboard_that_is_damped_moves_nothing(dimension: int) -> None:
     stress.now.assign(start)
     stress.residual()
     before = [field.numpy().copy() for field in stress.checked.u]
-    shares = [*packing.share, None, None][:3]
-    grid.domain.launch(damping_kernel(dimension), [packing.flags, *shares, wp.clone(stress.now), stress.now])
+    given = {"flags": packing.flags, "source": wp.clone(stress.now), "now": stress.now} | xyz(share=packing.share)
+    grid.domain.run(damping_pass(dimension), **given)
     stress.residual()
     deep = (slice(5, 7) if dimension == 3 else slice(1, 2), slice(5, 7), slice(5, 7))
     taken = start[0][deep] - stress.now.numpy()[0][deep]

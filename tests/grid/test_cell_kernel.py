@@ -1,7 +1,7 @@
 # mypy: ignore-errors
 """Kernels of cells and pieces, and passes over boxes of stored cells, against NumPy."""
 
-from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -98,9 +98,8 @@ def test_a_pass_over_a_box(box_pass: RowPass, whole: bool, given: bool) -> None:
 
 def test_threads_share_a_row_of_a_box_unless_it_is_whole(box_pass: RowPass) -> None:
     rows, fields = Rows.box(WINDOW.low, WINDOW.high, GRID.device), {"x": GRID.field(), "y": GRID.field(), "z": None}
-    assert Rows.box(WINDOW.low, WINDOW.high, GRID.device, whole=True).single.chunks == rows.single.chunks == 1
-    chunks = Rows._make(0, GRID.device, (0, 0, 0), (2, 3, 3), None, cells=2)
-    chunks = replace(chunks, place=rows.place)
+    assert Rows.box(WINDOW.low, WINDOW.high, GRID.device, cells=10**6).single.chunks == rows.single.chunks == 1
+    chunks = Rows.box(WINDOW.low, WINDOW.high, GRID.device, cells=2)
     fields["x"].fill_(1.0)
     box_pass.bind(chunks, **fields, sums=wp.zeros(6, dtype=wp.float64, device="cpu")).launch()
     assert (inside(fields["y"].numpy()) == 4.0).all()
@@ -117,3 +116,32 @@ def test_what_is_said_of_a_box_that_is_wrong(box_pass: RowPass) -> None:
         WINDOW.run(box_pass, x=x, y=x, z=x, SCALE=1)
     with pytest.raises(ValueError, match="sums has 5 elements, not 6"):
         WINDOW.run(box_pass, x=x, y=x, z=x, sums=sums[:5])
+
+
+def test_a_pass_over_listed_cells_sees_them_as_in_their_rows(tmp_path: Path) -> None:
+    """Pointers are those of a box, into the first layer of a field that has several; cells that are not listed keep their value."""
+    header = tmp_path / "mark.h"
+    header.write_text("for (int i = first; i < last; ++i) y[i + s1*given.x.shape[0]] = x[i] + (T)(10000*k + 1000*j);\n")
+    fields, layers = {"x": wp.float32, "y": wp.float32}, wp.zeros((2, *GRID.shape), dtype=wp.float32, device="cpu")
+    listed = RowPass("tests.lists.mark", header, wp.float32, box=fields, whole={"cells": wp.int32}, listed="cells")
+    cells = [(0, 0, 0), (1, 2, 3), (2, 3, 1)]
+    flat = wp.array([int(np.ravel_multi_index(cell, GRID.shape)) for cell in cells], dtype=wp.int32, device="cpu")
+    listed.bind(Rows.entries(len(cells), GRID.device), cells=flat, x=wp.array(places(), dtype=wp.float32, device="cpu"), y=layers).launch()
+    expected = np.zeros((2, *GRID.shape))
+    for k, j, i in cells:
+        expected[1, k, j, i] = places()[k, j, i] + 10000 * k + 1000 * j
+    np.testing.assert_array_equal(layers.numpy(), expected)
+
+
+@pytest.mark.parametrize("grain", [None, 4])
+def test_a_pass_over_entries(grain: int | None, tmp_path: Path) -> None:
+    """A list is the row of a box; a thread takes some of it."""
+    header = tmp_path / "double.h"
+    header.write_text("for (int n = first; n < last; ++n) { y[n] = 2*x[n]; z[n] = last - first; }\n")
+    passed = RowPass("tests.lists.double", header, wp.float32, box=dict.fromkeys("xyz", wp.float32))
+    x, y, z = (wp.array(np.arange(10.0), dtype=wp.float32, device="cpu") for _ in range(3))
+    passed.bind(Rows.entries(10, GRID.device, grain), x=x, y=y, z=z).launch()
+    np.testing.assert_array_equal(y.numpy(), 2.0 * np.arange(10))
+    np.testing.assert_array_equal(z.numpy(), 10 if grain is None else [4] * 8 + [2] * 2)
+    with pytest.raises(ValueError, match="fields have the shapes"):
+        passed.bind(Rows.entries(10, GRID.device), x=x, y=y, z=z[:9])

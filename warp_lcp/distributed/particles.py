@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.distributed.decomposition import Box
-from warp_lcp.distributed.particles_kernels import INNER, OUTSIDE, where_kernel
+from warp_lcp.distributed.particles_kernels import INNER, OUTSIDE, WHERE
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.grid import particles_kernels as kernels
 from warp_lcp.grid.particle_loops import launch
@@ -189,9 +189,9 @@ class SharedParticles(Particles):
         bits = [[part.cuts >> 2 * axis + side & 1 for axis in range(3)] for side in range(2)]
         low = [box + 1 if cut else -ENDLESS for box, cut in zip(part.box.low, bits[0], strict=True)]
         high = [box + 1 if cut else ENDLESS for box, cut in zip(part.box.high, bits[1], strict=True)]
+        ends = dict(zip((f"{end}_{axis}" for end in ("low", "high") for axis in "xyz"), map(float, low + high), strict=True))
         found = wp.empty(self.count, dtype=wp.uint8, device=grid.device)
-        inputs = [1.0 / grid.spacing, wp.vec3(*low), wp.vec3(*high), float(REACH), self.position, found]
-        launch(where_kernel, self.count, inputs, grid.device)
+        launch(WHERE, self.count, grid, position=self.position, where=found, reach=float(REACH), **ends)
         return np.asarray(found.numpy())
 
     def _cells(self, which: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ particles nothing can stop; only the others walk.
 
 import warp as wp
 
-from warp_lcp.grid.advection_kernels import MAX_CLEARANCE, advect_kernel, clearance_kernel
+from warp_lcp.grid.advection_kernels import MAX_CLEARANCE, advect_pass, clearance_kernel
 from warp_lcp.grid.particle_loops import launch
 from warp_lcp.grid.runge_kutta import MARGIN
 from warp_lcp.grid.staggered import StaggeredGrid
@@ -48,6 +48,5 @@ def advect(
             end up there.
     """
     u, v, w = [*fields, None][:3]
-    inverse = 1.0 / grid.spacing
-    inputs = [grid.planes, grid.spacing, inverse, grid.first, dt * inverse, position, u, v, w, room, stopped]
-    launch(advect_kernel(endless), len(position), inputs, grid.device)
+    given = {"u": u, "v": v, "w": w, "room": room, "stopped": stopped, "h": dt * (1.0 / grid.spacing)}
+    launch(advect_pass(endless), len(position), grid, position=position, **given)

@@ -12,6 +12,7 @@ from warp_lcp.grid.staggered import CellRange
 
 F32, F64, I8, U8 = (wp.array3d(dtype=t) for t in (wp.float32, wp.float64, wp.int8, wp.uint8))  # fields
 I16, I32 = wp.array3d(dtype=wp.int16), wp.array3d(dtype=wp.int32)
+INTS, POINTS = wp.array(dtype=wp.int32), wp.array(dtype=wp.vec3)  # lists
 PIECE = """
 plane, row, chunk = wp.tid()
 k = cells.k + plane

@@ -55,6 +55,7 @@ class CutCells:
         notes: warnings worth a line at the start of a run.
         whole_cells: whether every face is open or closed, no solid reaches into a cell with an open face and nothing moves.
         moves: whether a solid moves.
+        moving: what tells kernels which solids that move cover a face.
 
     Raises:
         ValueError: a solid that stands still lies wholly outside the domain, or the solids leave no open cell.
@@ -92,9 +93,11 @@ class CutCells:
         self._moved_from: list[tuple[np.ndarray, np.ndarray]] = []  # nodes near the solids that move, where the velocity was filled last
         self._moved_to: list[tuple[np.ndarray, np.ndarray]] = []  # and where they are
         if self.moves:
-            self._moving_numbers = wp.array([False, *(s.motion is not None for s in solids)], dtype=wp.uint8, device=grid.device)
             self._standing = NodeDistances(grid, second=len(solids) > 1)
             self._standing.copy_from(self._nodes)
+            self.moving = kernels.Moving()
+            self.moving.nodes, self.moving.standing = self._nodes.struct, self._standing.near
+            self.moving.moves = wp.array([False, *(s.motion is not None for s in solids)], dtype=wp.uint8, device=grid.device)
             self._enter_moving(0.0)
         self._refresh()
         dropped, partial = self._counts.numpy().tolist()
@@ -153,7 +156,7 @@ class CutCells:
             turn[number], shift[number] = (way.rotation - np.eye(3)) / dt, way.translation / dt
         self.turn.assign(turn.astype(np.float32))
         self.shift.assign(shift.astype(np.float32))
-        grid, nodes = self.grid, self._nodes
+        grid = self.grid
         near = [*self._moved_from, *self._moved_to]
         if not near:
             return
@@ -164,25 +167,9 @@ class CutCells:
             if any(a > b for a, b in zip(first, last, strict=True)):
                 continue  # only the ring is near
             window = grid.window(first, last)
-            solids = [*nodes.arrays, self._standing.near, open_, wall, self._moving_numbers, self.turn, self.shift]
-            inputs = [grid.planes, axis, grid.spacing, *solids, field]
+            inputs = [self.moving, grid.planes, axis, grid.spacing, open_, wall, self.turn, self.shift, field]
             window.launch(kernels.velocity_kernel, inputs)
         self._moved_from = self._moved_to
-
-    @property
-    def standing(self) -> wp.array:
-        """Float32 distance to the nearest solid that stands still, at nodes [cells]."""
-        return self._standing.near
-
-    @property
-    def near_solids(self) -> list[wp.array]:
-        """Distances to a node's two nearest solids and their numbers: near, owner, next_near, next_owner."""
-        return self._nodes.arrays
-
-    @property
-    def moving_numbers(self) -> wp.array:
-        """Uint8 of shape (1 + solids,): whether each moves."""
-        return self._moving_numbers
 
     def moving_block(self) -> tuple[list[int], list[int]] | None:
         """Return the low and high cell (x, y, z), both included, of a block with all cells beside solids that move, if there are any."""

@@ -6,7 +6,7 @@ from pathlib import Path
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I16, cell_kernel
-from warp_lcp.grid.node_distance_kernels import HOLLOW
+from warp_lcp.grid.node_distance_kernels import HOLLOW, Nearest
 from warp_lcp.operators.grid_poisson import AIR, SOLID
 from warp_lcp.rows import RowPass
 from warp_lcp.rows.row_pass import text
@@ -76,35 +76,33 @@ def side_kernel(k, j, i, planes: int, axis: int, near: F32, owner: I16, open: F3
     wall[k, j, i] = wp.int16(number)
 
 
+_TURNS, _SHIFTS = wp.array(dtype=wp.mat33), wp.array(dtype=wp.vec3)
+
+
+@wp.struct
+class Moving:
+    """What tells which solids that move cover a face."""
+
+    nodes: Nearest
+    standing: F32  # distance to the nearest solid that stands still, at nodes [cells]
+    moves: wp.array(dtype=wp.uint8)  # whether a solid does
+
+
 @wp.func
-def least_moving(k: int, j: int, i: int, near: F32, owner: I16, next_near: F32, next_owner: I16, moving: wp.array(dtype=wp.uint8)):
+def least_moving(S: Moving, k: int, j: int, i: int):
     """Return the moving solid among a node's two nearest, 0 if neither moves, and its distance [cells]."""
-    solid = int(owner[k, j, i])
-    d = near[k, j, i]
-    if moving[solid] == wp.uint8(0):
-        solid = int(next_owner[k, j, i])
-        d = next_near[k, j, i]
-    if moving[solid] == wp.uint8(0):
+    solid = int(S.nodes.owner[k, j, i])
+    d = S.nodes.near[k, j, i]
+    if S.moves[solid] == wp.uint8(0):
+        solid = int(S.nodes.next_owner[k, j, i])
+        d = S.nodes.next_near[k, j, i]
+    if S.moves[solid] == wp.uint8(0):
         solid = 0
     return solid, d
 
 
 @wp.func
-def moving_part(
-    axis: int,
-    planes: int,
-    k: int,
-    j: int,
-    i: int,
-    near: F32,
-    owner: I16,
-    next_near: F32,
-    next_owner: I16,
-    standing: F32,
-    open: F32,
-    wall: I16,
-    moving: wp.array(dtype=wp.uint8),
-):
+def moving_part(S: Moving, axis: int, planes: int, k: int, j: int, i: int, open: F32, wall: I16):
     """Return the moving solid that covers a face, 0 if none does, and its part of what is not open.
 
     What the solids that stand still cover rests, and so does a face of the domain but for the part that a moving solid covers: of a
@@ -122,40 +120,35 @@ def moving_part(
             dk = 0
         solid = int(wall[k, j, i])
         least = float(1.0e30)
-        if moving[wp.max(solid, 0)] == wp.uint8(0):  # the corners are (0), along (di, dj, 0), and along (0, ej, dk)
+        if S.moves[wp.max(solid, 0)] == wp.uint8(0):  # the corners are (0), along (di, dj, 0), and along (0, ej, dk)
             solid = 0
             for n in range(4):
                 a = n & 1
                 b = n >> 1
-                found, d = least_moving(k + b * dk, j + a * dj + b * ej, i + a * di, near, owner, next_near, next_owner, moving)
+                found, d = least_moving(S, k + b * dk, j + a * dj + b * ej, i + a * di)
                 if found > 0 and d < least:
                     least = d
                     solid = found
         if solid > 0:
             if wall[k, j, i] == wp.int16(0):
+                near = S.nodes.near
                 free = open_area(near[k, j, i], near[k, j + dj, i + di], near[k + dk, j + dj + ej, i + di], near[k + dk, j + ej, i])
                 closed = float(1.0)
             else:
                 closed = 1.0 - free
-            at_rest = 1.0 - open_area(
-                standing[k, j, i],
-                standing[k, j + dj, i + di],
-                standing[k + dk, j + dj + ej, i + di],
-                standing[k + dk, j + ej, i],
-            )
+            rest = S.standing
+            at_rest = 1.0 - open_area(rest[k, j, i], rest[k, j + dj, i + di], rest[k + dk, j + dj + ej, i + di], rest[k + dk, j + ej, i])
             part = wp.clamp((1.0 - free - at_rest) / closed, 0.0, 1.0)
     return wp.max(solid, 0), part
 
 
 @cell_kernel("warp_lcp.grid.cut_cells")
 def velocity_kernel(
-    k, j, i, planes: int, axis: int, spacing: float, near: F32, owner: I16, next_near: F32, next_owner: I16,
-    standing: F32, open: F32, wall: I16, moving: wp.array(dtype=wp.uint8), turn: wp.array(dtype=wp.mat33),
-    shift: wp.array(dtype=wp.vec3), velocity: F32,
-):  # fmt: skip
+    k, j, i, S: Moving, planes: int, axis: int, spacing: float, open: F32, wall: I16, turn: _TURNS, shift: _SHIFTS, velocity: F32
+):
     """Fill the mean velocity of what is not open of each face [m/s], at its center turn x + shift of a solid that moves."""
     value = float(0.0)
-    solid, part = moving_part(axis, planes, k, j, i, near, owner, next_near, next_owner, standing, open, wall, moving)
+    solid, part = moving_part(S, axis, planes, k, j, i, open, wall)
     if solid > 0:
         x = wp.vec3(float(i) - 0.5, float(j) - 0.5, float(k) - 0.5) * spacing
         x[axis] = x[axis] - 0.5 * spacing

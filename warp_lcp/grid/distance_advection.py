@@ -12,7 +12,7 @@ walls.
 
 import warp as wp
 
-from warp_lcp.grid.distance_advection_kernels import PUSH, advect_kernel, push_kernel
+from warp_lcp.grid.distance_advection_kernels import PUSH, PUSH_OUT, advect_pass
 from warp_lcp.grid.particle_loops import launch
 from warp_lcp.grid.runge_kutta import MARGIN
 from warp_lcp.grid.staggered import StaggeredGrid
@@ -48,9 +48,8 @@ def advect_with_distance(
         endless: has bit n set if axis n has no end, see `warp_lcp.grid.advection.advect`; its sides are open, and alike.
     """
     u, v, w = [*fields, None][:3]
-    inverse = 1.0 / grid.spacing
-    inputs = [grid.planes, grid.spacing, inverse, grid.first, dt * inverse, position, u, v, w, distance, open_sides, stopped]
-    launch(advect_kernel(endless), len(position), inputs, grid.device)
+    given = {"u": u, "v": v, "w": w, "distance": distance, "stopped": stopped, "h": dt * (1.0 / grid.spacing)}
+    launch(advect_pass(endless), len(position), grid, position=position, open_sides=open_sides, **given)
 
 
 def push_out(grid: StaggeredGrid, distance: wp.array, position: wp.array, moved: wp.array, left: wp.array, *, open_sides: int = 0) -> None:
@@ -64,5 +63,4 @@ def push_out(grid: StaggeredGrid, distance: wp.array, position: wp.array, moved:
         left: int32, shape (1,): raised by the number of those for which no way out was found; they stay where they were.
         open_sides: of `warp_lcp.grid.sides.side_bits`: particles beyond stay there.
     """
-    inputs = [grid.planes, grid.spacing, 1.0 / grid.spacing, position, distance, open_sides, moved, left]
-    launch(push_kernel, len(position), inputs, grid.device)
+    launch(PUSH_OUT, len(position), grid, position=position, distance=distance, open_sides=open_sides, moved=moved, left=left)

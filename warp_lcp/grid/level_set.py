@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_lcp.grid import level_set_kernels as kernels
 from warp_lcp.grid.extrapolate import extrapolate
-from warp_lcp.grid.particle_loops import launch
+from warp_lcp.grid.particle_loops import launch, on_grid
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 
@@ -134,12 +134,12 @@ def particle_density(grid: StaggeredGrid, particles: Particles, window: Window, 
         particles_a_cell: particles in a full cell at rest.
         density: float32 (written, 0 away from particles).
     """
-    numbers = [grid.planes, 1.0 / grid.spacing, grid.first, 1.0 / particles_a_cell]
+    given = {"position": particles.position, "density": density, "each": 1.0 / particles_a_cell}
     density.zero_()
     if particles.offsets is not None:
-        window.launch(kernels.gather_kernel, [*numbers, particles.offsets, particles.position, density])
+        window.run(kernels.GATHER, offsets=particles.offsets, **given, **on_grid(grid))
     else:
-        launch(kernels.scatter_kernel, particles.count, [*numbers, particles.position, density], grid.device)
+        launch(kernels.SCATTER, particles.count, grid, **given)
 
 
 def whole_cell_capacity(grid: StaggeredGrid, base: wp.array, capacity: wp.array) -> None:

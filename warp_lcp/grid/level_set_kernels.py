@@ -11,7 +11,7 @@ from pathlib import Path
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
-from warp_lcp.grid.particle_loops import particle_loop
+from warp_lcp.grid.particle_loops import particle_pass
 from warp_lcp.operators.grid_poisson import SOLID
 from warp_lcp.rows import RowPass
 
@@ -21,82 +21,7 @@ MIN_CAPACITY = 0.25
 TAIL = 1e-4  # the least filled share whose quantile is taken after smoothing
 EXTENDED = 2  # layers of cells without a distance of their own that are given one
 
-# The cell c of a coordinate and the weights of cells c - 1, c, c + 1.
-WEIGHTS = """
-    auto weigh = [](T x, int count, T* w) {
-        const T from = x > 1 ? x : (T)1, e = count; const int c = (int)(from < e ? from : e);
-        const T f = from - (T)c - (T)0.5, a = (T)0.5 - f, b = (T)0.5 + f;
-        w[0] = (T)0.5*a*a; w[1] = (T)0.75 - f*f; w[2] = (T)0.5*b*b;
-        return c;
-    };
-"""
-
-SCATTER = """
-    typedef float T;
-    const T* position = (const T*)x_.data; T* density = density_.data;
-    const int nx = density_.shape[2] - 2, ny = density_.shape[1] - 2, nz = density_.shape[0] - 2;
-    const long long s2 = nx + 2, s1 = s2*(ny + 2);
-    auto add = [](T& element, T value) {
-    #ifdef __CUDA_ARCH__
-        atomicAdd(&element, value);
-    #else
-        element += value;
-    #endif
-    };
-    GRID_COORDINATE WEIGHTS
-    for (long long p = first; p < last; ++p) {
-        T wx[3], wy[3], wz[3] = {0, 1, 0};
-        const int i = weigh(grid_coordinate(position[3*p], origin[0]), nx, wx);
-        const int j = weigh(grid_coordinate(position[3*p + 1], origin[1]), ny, wy);
-        const int k = planes == 2 ? weigh(grid_coordinate(position[3*p + 2], origin[2]), nz, wz) : 1;
-        #ifndef __CUDA_ARCH__
-        typedef T Four __attribute__((vector_size(4*sizeof(T))));
-        const Four along = {wx[0], wx[1], wx[2], 0};
-        #endif
-        for (int c = 2 - planes; c <= planes; ++c) for (int b = 0; b < 3; ++b) {
-            const T share = each*wz[c]*wy[b];
-            T* row = density + ((k + c - 1)*s1 + (j + b - 1)*s2 + i);
-            #ifndef __CUDA_ARCH__
-            if (i < nx) {  // four at once, of which the last gets nothing: a third of the stores, 9 ns a particle in 3-D instead of 15
-                Four sum;
-                __builtin_memcpy(&sum, row - 1, sizeof(Four));
-                sum += share*along;
-                __builtin_memcpy(row - 1, &sum, sizeof(Four));
-                continue;
-            }
-            #endif
-            add(row[-1], share*wx[0]); add(row[0], share*wx[1]); add(row[1], share*wx[2]);
-        }
-    }
-"""
-
-GATHER = """
-    typedef float T;
-    const T* position = (const T*)x_.data; const int* first_of = offsets.data;
-    const int nx = density_.shape[2], ny = density_.shape[1], nz = density_.shape[0];
-    const long long s2 = nx, s1 = s2*ny;
-    GRID_COORDINATE
-    auto weight = [&](int axis, T x, int cell) {
-        T d = grid_coordinate(x, origin[axis]) - ((T)cell + (T)0.5);
-        d = d < 0 ? -d : d;
-        const T outer = d < (T)1.5 ? (T)1.5 - d : (T)0;
-        return d < (T)0.5 ? (T)0.75 - d*d : (T)0.5*outer*outer;
-    };
-    const int x0 = i > 0 ? i - 1 : 0, x1 = i + 1 < nx ? i + 1 : i, y0 = j > 0 ? j - 1 : 0, y1 = j + 1 < ny ? j + 1 : j;
-    const int z0 = planes == 2 && k > 0 ? k - 1 : k, z1 = planes == 2 && k + 1 < nz ? k + 1 : k;
-    T total = 0;
-    for (int c = z0; c <= z1; ++c) for (int b = y0; b <= y1; ++b) {
-        const long long row = c*s1 + b*s2;
-        const int last = first_of[row + x1 + 1];
-        for (long long p = first_of[row + x0]; p < last; ++p) {
-            const T z = planes == 2 ? weight(2, position[3*p + 2], k) : (T)1;
-            total += weight(0, position[3*p], i)*weight(1, position[3*p + 1], j)*z;
-        }
-    }
-    density_.data[k*s1 + j*s2 + i] = each*total;
-"""
-
-_LEVEL_SET, _HEADERS = "warp_lcp.grid.level_set", Path(__file__).parent / "headers"
+_LEVEL_SET, _DENSITY, _HEADERS = "warp_lcp.grid.level_set", "warp_lcp.grid.density", Path(__file__).parent / "headers"
 _CONSTANTS = {"MIN_CAPACITY": MIN_CAPACITY, "TAIL": TAIL, "SOLID": SOLID}
 _PHI = {"phi": wp.float32, "known": wp.int8}
 BINOMIAL = RowPass(
@@ -120,39 +45,10 @@ VOLUME = RowPass(
     numbers={"planes": int, "parts": int},
     optional=("distance",),
 )
-
-
-@wp.func_native(particle_loop(SCATTER.replace("WEIGHTS", WEIGHTS)))
-def scatter_some(
-    planes: int, inverse_dx: float, origin: wp.vec3i, each: float, x_: wp.array(dtype=wp.vec3), density_: F32,
-    first: int, last: int,
-): ...  # fmt: skip
-
-
-@wp.func_native(particle_loop(GATHER))
-def gather_cell(
-    planes: int, inverse_dx: float, origin: wp.vec3i, each: float, offsets: wp.array(dtype=wp.int32), x_: wp.array(dtype=wp.vec3),
-    density_: F32, k: int, j: int, i: int,
-): ...  # fmt: skip
-
-
-@wp.kernel(enable_backward=False, module="warp_lcp.grid.density")
-def scatter_kernel(
-    count: int, grain: int, planes: int, inverse_dx: float, origin: wp.vec3i, each: float, position: wp.array(dtype=wp.vec3),
-    density: F32,
-):  # fmt: skip
-    """Add the share of some particles to the cells around them."""
-    first = wp.tid() * grain
-    scatter_some(planes, inverse_dx, origin, each, position, density, first, wp.min(first + grain, count))
-
-
-@cell_kernel("warp_lcp.grid.density")
-def gather_kernel(
-    k, j, i, planes: int, inverse_dx: float, origin: wp.vec3i, each: float, offsets: wp.array(dtype=wp.int32),
-    position: wp.array(dtype=wp.vec3), density: F32,
-):  # fmt: skip
-    """Let each cell add up the particles around it."""
-    gather_cell(planes, inverse_dx, origin, each, offsets, position, density, k, j, i)
+SCATTER = particle_pass(f"{_DENSITY}.scatter_density", {"position": wp.vec3}, whole={"density": wp.float32}, numbers={"each": wp.float32})
+GATHER = particle_pass(
+    f"{_DENSITY}.gather_density", {"density": wp.float32}, whole={"offsets": wp.int32, "position": wp.vec3}, numbers={"each": wp.float32}
+)
 
 
 @wp.func
@@ -168,10 +64,7 @@ def slope_beside(here: float, below: float, above: float, has_below: bool, has_a
 
 
 @cell_kernel("warp_lcp.grid.level_set")
-def wall_shift_kernel(
-    k, j, i, variance: float, limit: float, capacity: F32, phi: F32,
-    known: I8, out: F32,
-):  # fmt: skip
+def wall_shift_kernel(k, j, i, variance: float, limit: float, capacity: F32, phi: F32, known: I8, out: F32):
     """Bring phi from the mean place of the open part of a cell's kernel back to the cell's center.
 
     A wall cuts a part off the kernel, so that what remains measures the liquid at c + s, s = integral of (x - c) K over the open part by

@@ -39,6 +39,16 @@ class Crossings:
     inverted: float = 0.0
 
 
+Points, Corners = wp.array(dtype=wp.vec3d), wp.array2d(dtype=wp.int32)
+
+
+@wp.func
+@typing.no_type_check
+def triangle(points: Points, corners: Corners, t: int):
+    """Return the corners of a triangle."""
+    return points[corners[t, 0]], points[corners[t, 1]], points[corners[t, 2]]
+
+
 @wp.func
 @typing.no_type_check
 def side_of(mesh: wp.uint64, point: wp.vec3d) -> int:
@@ -87,17 +97,10 @@ def height(x: wp.vec3d, origin: wp.vec3d, normal: wp.vec3d, shared: bool) -> wp.
 
 @wp.kernel(enable_backward=False, module=MODULE)
 @typing.no_type_check
-def find_crossings(
-    mesh: wp.uint64,
-    points: wp.array(dtype=wp.vec3d),
-    corners: wp.array2d(dtype=wp.int32),
-    crosses: wp.array(dtype=wp.uint8),
-):
+def find_crossings(mesh: wp.uint64, points: Points, corners: Corners, crosses: wp.array(dtype=wp.uint8)):
     """Mark the triangles that cross another one."""
     t = wp.tid()
-    a = points[corners[t, 0]]
-    b = points[corners[t, 1]]
-    c = points[corners[t, 2]]
+    a, b, c = triangle(points, corners, t)
     n = wp.normalize(wp.cross(b - a, c - a))
     margin = wp.vec3d(wp.float64(1.0e-6))
     low = wp.vec3(wp.min(wp.min(a, b), c) - margin)
@@ -118,9 +121,7 @@ def find_crossings(
                     theirs[j] = 1
         if shared >= 2:  # neighbors
             continue
-        d = points[corners[other, 0]]
-        e = points[corners[other, 1]]
-        f = points[corners[other, 2]]
+        d, e, f = triangle(points, corners, other)
         m = wp.normalize(wp.cross(e - d, f - d))
         line = wp.cross(n, m)
         if wp.length(line) < wp.float64(1.0e-6):  # in parallel planes
@@ -153,19 +154,11 @@ def find_crossings(
 @wp.kernel(enable_backward=False, module=MODULE)
 @typing.no_type_check
 def look_beside(
-    mesh: wp.uint64,
-    points: wp.array(dtype=wp.vec3d),
-    corners: wp.array2d(dtype=wp.int32),
-    which: wp.array(dtype=wp.int32),
-    at: wp.array(dtype=wp.vec3d),
-    kind: wp.array(dtype=wp.uint8),
+    mesh: wp.uint64, points: Points, corners: Corners, which: wp.array(dtype=wp.int32), at: Points, kind: wp.array(dtype=wp.uint8)
 ):
     """Tell at which points of triangles `which` one side is surrounded twice, DOUBLED, or less than never, INVERTED."""
     i = wp.tid()
-    t = which[i]
-    a = points[corners[t, 0]]
-    b = points[corners[t, 1]]
-    c = points[corners[t, 2]]
+    a, b, c = triangle(points, corners, which[i])
     n = wp.normalize(wp.cross(b - a, c - a)) * wp.float64(ASIDE)
     outside = side_of(mesh, at[i] + n)
     inside = side_of(mesh, at[i] - n)

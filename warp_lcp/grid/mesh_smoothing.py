@@ -6,7 +6,7 @@ import warp as wp
 
 from warp_lcp.grid import mesh_smoothing_kernels as kernels
 from warp_lcp.grid.marching_cubes import Mesh
-from warp_lcp.grid.particle_loops import launch
+from warp_lcp.grid.particle_loops import chunks
 from warp_lcp.grid.staggered import StaggeredGrid
 
 FORTH, BACK = 0.5, -0.53  # shares of the way to the neighbors' mean: waves longer than about 9 points keep their height, short ones lose it
@@ -32,7 +32,8 @@ def smooth(mesh: Mesh, lattice: StaggeredGrid, room: wp.array | None, rounds: in
     start, most = wp.clone(mesh.points), MOST * lattice.spacing
     sums = wp.empty((count, 4), dtype=wp.float32, device=device)  # of the neighbors' coordinates, and how many they are
     size = wp.vec3(*(n * lattice.spacing for n in lattice.counts))
+    rows = chunks(len(mesh.corners), device)
     for share in (FORTH, BACK) * rounds:
         sums.zero_()
-        launch(kernels.neighbor_kernel, len(mesh.corners), [mesh.corners, mesh.points, sums], device)
+        kernels.SEE_NEIGHBORS.bind(rows, corners=mesh.corners, points=mesh.points, sums=sums).launch()
         wp.launch(kernels.move_kernel, count, [share, most, sums, held, size, start, mesh.points], device=device)

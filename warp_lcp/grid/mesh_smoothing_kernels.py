@@ -1,69 +1,30 @@
 # mypy: ignore-errors
 """Kernels that smooth a closed surface."""
 
-import typing
+from pathlib import Path
 
 import warp as wp
 
-from warp_lcp.grid.particle_loops import particle_loop
+from warp_lcp.grid.cell_kernel import F32, POINTS
+from warp_lcp.rows import RowPass
 
 TOUCHING = 0.015  # lattice cells from the domain's side: points that close the surface there are 0.01 off its other sides
 NEAR = 0.25  # lattice cells: a point on a solid, as accurately as a distance that is linear between nodes can tell
 
+_SUMS, _BYTES = wp.array2d(dtype=wp.float32), wp.array(dtype=wp.uint8)
 _options = {"enable_backward": False, "module": "warp_lcp.grid.mesh_smoothing"}
 
-# A closed surface has each edge once in either direction, so that each neighbor is added once; an outline's points have two neighbors
-NEIGHBORS = """
-    const int size = corners_.shape[1];
-    const int* corners = corners_.data; const float* points = (const float*)points_.data; float* sums = sums_.data;
-    auto add = [](float& element, float value) {
-    #ifdef __CUDA_ARCH__
-        atomicAdd(&element, value);
-    #else
-        element += value;
-    #endif
-    };
-    auto see = [&](long long here, long long there) {
-        for (int a = 0; a < 3; ++a) add(sums[4*here + a], points[3*there + a]);
-        add(sums[4*here + 3], 1.0f);
-    };
-    for (long long t = first; t < last; ++t) {
-        const int* c = corners + size*t;
-        see(c[0], c[1]);
-        if (size == 2) { see(c[1], c[0]); continue; }
-        see(c[1], c[2]);
-        see(c[2], c[0]);
-    }
-"""
-
-
-@wp.func_native(particle_loop(NEIGHBORS))
-@typing.no_type_check
-def see_neighbors(
-    corners_: wp.array2d(dtype=wp.int32), points_: wp.array(dtype=wp.vec3), sums_: wp.array2d(dtype=wp.float32), first: int, last: int
-): ...
+SEE_NEIGHBORS = RowPass(
+    "warp_lcp.grid.mesh_smoothing.see_neighbors",
+    Path(__file__).parent / "headers" / "see_neighbors.h",
+    wp.float32,
+    box={"corners": wp.int32},
+    whole={"points": wp.vec3, "sums": wp.float32},
+)
 
 
 @wp.kernel(**_options)
-@typing.no_type_check
-def neighbor_kernel(
-    count: int, grain: int, corners: wp.array2d(dtype=wp.int32), points: wp.array(dtype=wp.vec3), sums: wp.array2d(dtype=wp.float32)
-):
-    """Add up the neighbors of each point."""
-    first = wp.tid() * grain
-    see_neighbors(corners, points, sums, first, wp.min(first + grain, count))
-
-
-@wp.kernel(**_options)
-@typing.no_type_check
-def hold_kernel(
-    planes: int,
-    dx: float,
-    points: wp.array(dtype=wp.vec3),
-    room: wp.array3d(dtype=wp.float32),
-    counts: wp.vec3,
-    held: wp.array(dtype=wp.uint8),
-):
+def hold_kernel(planes: int, dx: float, points: POINTS, room: F32, counts: wp.vec3, held: _BYTES):
     """Mark points that stay: those on the domain's sides, so that these end in an edge, and on solids."""
     p = wp.tid()
     x = points[p] / dx
@@ -93,11 +54,7 @@ def hold_kernel(
 
 
 @wp.kernel(**_options)
-@typing.no_type_check
-def move_kernel(
-    share: float, most: float, sums: wp.array2d(dtype=wp.float32), held: wp.array(dtype=wp.uint8), size: wp.vec3,
-    start: wp.array(dtype=wp.vec3), points: wp.array(dtype=wp.vec3),
-):  # fmt: skip
+def move_kernel(share: float, most: float, sums: _SUMS, held: _BYTES, size: wp.vec3, start: POINTS, points: POINTS):
     """Move a point a share of the way to the mean of its neighbors, within the domain and not too far from where it started."""
     p = wp.tid()
     if held[p] != wp.uint8(0):

@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Protocol, cast, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
@@ -22,6 +22,28 @@ ROTATION_ERROR = 1e-9  # of a pose's R R' - 1; products of a few rotations stay 
 FASTEST = 1e18  # [m/s] or [degrees/s], between keyframes of a smooth motion: cubics have its square and more
 SPEED_SAMPLES = 4  # of a span in which the top speed is looked for
 SAME_AXIS = 1e-9  # 1 - cosine of the angle between two axes that count as one
+
+
+def keep_checked(frozen: Any, error: float) -> None:
+    """Check the `rotation` and `translation` of a frozen dataclass, and store them as float64.
+
+    Args:
+        frozen: the dataclass.
+        error: that R R' - 1 may have.
+
+    Raises:
+        ValueError: a value is not finite, or the matrix is not a rotation.
+    """
+    rotation, translation = (np.array(of, dtype=np.float64) for of in (frozen.rotation, frozen.translation))
+    if rotation.shape != (3, 3):
+        raise ValueError(f"rotation must be a 3 x 3 matrix, not of shape {rotation.shape}")
+    if not np.abs(rotation @ rotation.T - np.eye(3)).max() < error or np.linalg.det(rotation) < 0.0:
+        raise ValueError("rotation must be a proper rotation matrix (orthogonal, determinant 1)")
+    if translation.shape != (3,) or not np.isfinite(translation).all():
+        raise ValueError(f"translation must be 3 finite numbers, not {translation.tolist()}")
+    for name, array in (("rotation", rotation), ("translation", translation)):
+        array.flags.writeable = False
+        object.__setattr__(frozen, name, array)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,17 +63,7 @@ class Pose:
 
     def __post_init__(self) -> None:
         """Check the values and store them as float64."""
-        rotation = np.array(self.rotation, dtype=np.float64)
-        translation = np.array(self.translation, dtype=np.float64)
-        if rotation.shape != (3, 3):
-            raise ValueError(f"rotation must be a 3 x 3 matrix, not of shape {rotation.shape}")
-        if not np.abs(rotation @ rotation.T - np.eye(3)).max() < ROTATION_ERROR or np.linalg.det(rotation) < 0.0:
-            raise ValueError("rotation must be a proper rotation matrix (orthogonal, determinant 1)")
-        if translation.shape != (3,) or not np.isfinite(translation).all():
-            raise ValueError(f"translation must be 3 finite numbers, not {translation.tolist()}")
-        for name, array in (("rotation", rotation), ("translation", translation)):
-            array.flags.writeable = False
-            object.__setattr__(self, name, array)
+        keep_checked(self, ROTATION_ERROR)
 
     @classmethod
     def identity(cls) -> Pose:

@@ -13,8 +13,9 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.grid import node_distance_kernels as kernels
-from warp_lcp.grid.node_distance_kernels import COARSE, FAR, NodeBlock
+from warp_lcp.grid.node_distance_kernels import COARSE, FAR, Nearest
 from warp_lcp.grid.solids import Geometry, TriangleMesh
+from warp_lcp.grid.solids_kernels import block_of, item_points
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 
 CHUNK = 1 << 18  # points at a time: 8 MB of positions, distances and nodes
@@ -33,6 +34,7 @@ class NodeDistances:
         owner: int16 its number; 0: none is near.
         next_near: float32 distance to the second nearest [cells].
         next_owner: int16 its number.
+        struct: what kernels take.
     """
 
     def __init__(self, grid: StaggeredGrid, *, second: bool) -> None:
@@ -42,10 +44,13 @@ class NodeDistances:
         self.next_near, self.next_owner = (grid.field(), grid.field(wp.int16)) if second else (self.near, self.owner)
         self.near.fill_(FAR)
         self.next_near.fill_(FAR)
+        self.struct = Nearest()
+        for name in ("near", "owner", "next_near", "next_owner"):
+            setattr(self.struct, name, getattr(self, name))
 
     @property
     def arrays(self) -> list[wp.array]:
-        """What kernels take."""
+        """All fields."""
         return [self.near, self.owner, self.next_near, self.next_owner]
 
     def copy_from(self, other: NodeDistances) -> None:
@@ -99,21 +104,21 @@ class NodeSampler:
         # others matter, and the sign of many.
         stride = COARSE if isinstance(geometry, TriangleMesh) else 1
         for block in self._parts(*near, stride):
-            counts: Any = block.counts
-            distances = self._measure(geometry, counts[0] * counts[1] * counts[2], kernels.item_points, [block])
+            counts = block.counts
+            distances = self._measure(geometry, counts[0] * counts[1] * counts[2], item_points, [block])
             if stride == 1:
-                wp.launch(
-                    kernels.claim_nodes, len(distances), [block, distances, self.snap, number, *nodes.arrays], device=self.grid.device
-                )
+                inputs = [block, distances, self.snap, number, nodes.struct]
+                wp.launch(kernels.claim_nodes, len(distances), inputs, device=self.grid.device)
                 continue
             self._listed.zero_()
-            inputs = [block, distances, number, *nodes.arrays, self._list, self._sure, self._listed]
+            inputs = [block, distances, number, nodes.struct, self._list, self._sure, self._listed]
             wp.launch(kernels.claim_groups, len(distances), inputs, device=self.grid.device)
+            block.offset = 0.0
             for listed, count in zip((self._list, self._sure), self._listed.numpy().tolist(), strict=True):
                 if count:
                     known = listed is self._sure
-                    distances = self._measure(geometry, count, kernels.listed_points, [block, listed, 0.0], unsigned=known)
-                    inputs = [block, listed, distances, self.snap, number, *nodes.arrays]
+                    distances = self._measure(geometry, count, kernels.listed_points, [block, listed], unsigned=known)
+                    inputs = [block, listed, distances, self.snap, number, nodes.struct]
                     wp.launch(kernels.claim_listed, count, inputs, device=self.grid.device)
 
     def look_at_centers(self, nodes: NodeDistances, solids: Sequence[Geometry], low: np.ndarray, high: np.ndarray, marks: wp.array) -> None:
@@ -141,9 +146,9 @@ class NodeSampler:
                 begin[longest], end[longest] = part.start or begin[longest], part.stop or end[longest]
                 self.look_at_centers(nodes, solids, begin, end, marks)
         elif found:
-            block, listed = self._block(low, high, 1), self._list[:found]
+            block, listed = self._block(low, high, offset=0.5), self._list[:found]
             for order, geometry in enumerate(solids):
-                distances = self._measure(geometry, found, kernels.listed_points, [block, listed, 0.5])
+                distances = self._measure(geometry, found, kernels.listed_points, [block, listed])
                 wp.launch(kernels.mark_listed, found, [listed, distances, order == 0, marks], device=self.grid.device)
 
     def _measure(self, geometry: Geometry, count: int, fill: wp.Kernel, inputs: list[Any], *, unsigned: bool = False) -> wp.array:
@@ -156,15 +161,10 @@ class NodeSampler:
             geometry.signed_distance(points, distances)
         return distances
 
-    def _block(self, low: np.ndarray, high: np.ndarray, stride: int) -> NodeBlock:
-        """Return the nodes low <= (x, y, z) < high in groups of `stride` along each axis."""
-        block = NodeBlock()
-        block.low, block.high = wp.vec3i(*(int(v) for v in low)), wp.vec3i(*(int(v) for v in high))
-        block.counts = wp.vec3i(*(int(v) for v in -(-(high - low) // stride)))
-        block.stride, block.flat, block.spacing, block.origin = stride, self.grid.dimension == 2, self.grid.spacing, self.grid.first
-        return block
+    def _block(self, low: np.ndarray, high: np.ndarray, **more: Any) -> Any:
+        return block_of(low, high, self.grid.spacing, self.grid.dimension, self.grid.origin, **more)
 
-    def _parts(self, low: np.ndarray, high: np.ndarray, stride: int) -> Iterator[NodeBlock]:
+    def _parts(self, low: np.ndarray, high: np.ndarray, stride: int) -> Iterator[Any]:
         """Cut a box of nodes into blocks that fit: planes, or else rows."""
         room = len(self._points) // stride**3
         across, rows, _ = (int(v) for v in -(-(high - low) // stride))
@@ -173,7 +173,7 @@ class NodeSampler:
             for front in range(int(low[1]), int(high[1]), height * stride):
                 begin = np.array([low[0], front, bottom])
                 end = np.minimum(begin + np.array([high[0] - low[0], height * stride, depth * stride]), high)
-                yield self._block(begin, end, stride)
+                yield self._block(begin, end, stride=stride, offset=0.5 * (stride - 1))
 
 
 def _kji(corner: np.ndarray) -> tuple[int, int, int]:

@@ -4,62 +4,41 @@
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, I16, cell_kernel
+from warp_lcp.grid.solids_kernels import Block, Distances, Points, first_node, node_position
 
 FAR = 4.0  # cells: distances below it are exact, others at least this large
 COARSE = 3  # nodes along an axis of a block in which one distance may stand for all
 ROUNDING = 1.0e-3  # cells: signs this near to 0 are not relied on
 HOLLOW = 1  # a mark of cells with distance 0 at all corners whose center is open: one cell wide gaps
 
+Listed = wp.array(dtype=wp.vec4i)
 options = {"enable_backward": False, "module": "warp_lcp.grid.node_distance"}
 
 
 @wp.struct
-class NodeBlock:
-    """A box of nodes, x fastest, as kernels see it; `stride` 1, or COARSE and each item stands for so many nodes along every axis."""
+class Nearest:
+    """The two nearest solids of each node, see `warp_lcp.grid.node_distance.NodeDistances`."""
 
-    low: wp.vec3i
-    high: wp.vec3i  # one past the last
-    counts: wp.vec3i  # of items
-    origin: wp.vec3i  # cells of a larger grid before the first
-    stride: int
-    flat: bool  # 2-D: z does not count
-    spacing: float  # [m]
+    near: F32
+    owner: I16
+    next_near: F32
+    next_owner: I16
 
 
 @wp.func
-def first_node(block: NodeBlock, item: int):
-    """Return the low node (x, y, z) of an item of a block."""
-    across = block.counts[0]
-    i = item % across
-    j = (item // across) % block.counts[1]
-    k = item // (across * block.counts[1])
-    return block.low + block.stride * wp.vec3i(i, j, k)
-
-
-@wp.func
-def node_position(block: NodeBlock, node: wp.vec3i, offset: float):
-    """Return the place [m] of a node, moved by `offset` cells along each axis; 2-D has z = 0."""
-    z = (float(block.origin[2] + node[2] - 1) + offset) * block.spacing
-    if block.flat:
-        z = 0.0
-    x = (float(block.origin[0] + node[0] - 1) + offset) * block.spacing
-    return wp.vec3(x, (float(block.origin[1] + node[1] - 1) + offset) * block.spacing, z)
-
-
-@wp.func
-def enter(node: wp.vec3i, d: float, solid: int, near: F32, owner: I16, next_near: F32, next_owner: I16):
+def enter(node: wp.vec3i, d: float, solid: int, nodes: Nearest):
     """Enter a solid's distance d [cells] at a node among the two nearest; of solids equally near the first stays."""
     k = node[2]
     j = node[1]
     i = node[0]
-    if d < near[k, j, i]:
-        next_near[k, j, i] = near[k, j, i]
-        next_owner[k, j, i] = owner[k, j, i]
-        near[k, j, i] = d
-        owner[k, j, i] = wp.int16(solid)
-    elif d < next_near[k, j, i]:
-        next_near[k, j, i] = d
-        next_owner[k, j, i] = wp.int16(solid)
+    if d < nodes.near[k, j, i]:
+        nodes.next_near[k, j, i] = nodes.near[k, j, i]
+        nodes.next_owner[k, j, i] = nodes.owner[k, j, i]
+        nodes.near[k, j, i] = d
+        nodes.owner[k, j, i] = wp.int16(solid)
+    elif d < nodes.next_near[k, j, i]:
+        nodes.next_near[k, j, i] = d
+        nodes.next_owner[k, j, i] = wp.int16(solid)
 
 
 @wp.func
@@ -72,40 +51,15 @@ def snapped(meters: float, spacing: float, snap: float):
 
 
 @wp.kernel(**options)
-def item_points(block: NodeBlock, out: wp.array(dtype=wp.vec3)):
-    """Fill the places [m] of the items of a block: nodes, or the middles of groups of nodes."""
-    c = wp.tid()
-    out[c] = node_position(block, first_node(block, c), 0.5 * float(block.stride - 1))
-
-
-@wp.kernel(**options)
-def claim_nodes(
-    block: NodeBlock,
-    distance: wp.array(dtype=wp.float32),
-    snap: float,
-    solid: int,
-    near: F32,
-    owner: I16,
-    next_near: F32,
-    next_owner: I16,
-):
+def claim_nodes(block: Block, distance: Distances, snap: float, solid: int, nodes: Nearest):
     """Enter the distances [m] of a solid at a block of nodes."""
     c = wp.tid()
-    enter(first_node(block, c), snapped(distance[c], block.spacing, snap), solid, near, owner, next_near, next_owner)
+    enter(first_node(block, c), snapped(distance[c], block.spacing, snap), solid, nodes)
 
 
 @wp.kernel(**options)
 def claim_groups(
-    block: NodeBlock,
-    distance: wp.array(dtype=wp.float32),
-    solid: int,
-    near: F32,
-    owner: I16,
-    next_near: F32,
-    next_owner: I16,
-    unsure: wp.array(dtype=wp.vec4i),
-    sure: wp.array(dtype=wp.vec4i),
-    listed: wp.array(dtype=wp.int32),
+    block: Block, distance: Distances, solid: int, nodes: Nearest, unsure: Listed, sure: Listed, listed: wp.array(dtype=wp.int32)
 ):
     """Bound the distances of groups of nodes by that of their middles; list the nodes that may be nearer than FAR.
 
@@ -115,7 +69,7 @@ def claim_groups(
     low = first_node(block, c)
     high = wp.min(low + wp.vec3i(block.stride), block.high)
     center = distance[c] / block.spacing
-    middle = 0.5 * float(block.stride - 1)
+    middle = block.offset
     for k in range(low[2], high[2]):
         for j in range(low[1], high[1]):
             for i in range(low[0], high[0]):
@@ -126,7 +80,7 @@ def claim_groups(
                     z = 0.0
                 d = wp.abs(center) - wp.length(wp.vec3(x, y, z))
                 if d >= FAR:
-                    enter(wp.vec3i(i, j, k), wp.sign(center) * d, solid, near, owner, next_near, next_owner)
+                    enter(wp.vec3i(i, j, k), wp.sign(center) * d, solid, nodes)
                 elif d > ROUNDING:
                     sure[wp.atomic_add(listed, 1, 1)] = wp.vec4i(i, j, k, int(wp.sign(center)))
                 else:
@@ -134,35 +88,25 @@ def claim_groups(
 
 
 @wp.kernel(**options)
-def listed_points(block: NodeBlock, list: wp.array(dtype=wp.vec4i), offset: float, out: wp.array(dtype=wp.vec3)):
-    """Fill the places [m] of listed nodes (offset 0) or of the centers of listed cells (0.5)."""
+def listed_points(block: Block, list: Listed, out: Points):
+    """Fill the places [m] of listed nodes, or with the block's offset of the centers of listed cells."""
     c = wp.tid()
-    out[c] = node_position(block, wp.vec3i(list[c][0], list[c][1], list[c][2]), offset)
+    out[c] = node_position(block, wp.vec3i(list[c][0], list[c][1], list[c][2]), block.offset)
 
 
 @wp.kernel(**options)
-def claim_listed(
-    block: NodeBlock,
-    list: wp.array(dtype=wp.vec4i),
-    distance: wp.array(dtype=wp.float32),
-    snap: float,
-    solid: int,
-    near: F32,
-    owner: I16,
-    next_near: F32,
-    next_owner: I16,
-):
+def claim_listed(block: Block, list: Listed, distance: Distances, snap: float, solid: int, nodes: Nearest):
     """Enter the distances [m] of a solid at listed nodes; where the list has a sign, it is that of the distance."""
     c = wp.tid()
     node = list[c]
     d = snapped(distance[c], block.spacing, snap)
     if node[3] < 0:
         d = -d
-    enter(wp.vec3i(node[0], node[1], node[2]), d, solid, near, owner, next_near, next_owner)
+    enter(wp.vec3i(node[0], node[1], node[2]), d, solid, nodes)
 
 
 @cell_kernel("warp_lcp.grid.node_distance")
-def find_flat_cells(k, j, i, planes: int, near: F32, list: wp.array(dtype=wp.vec4i), count: wp.array(dtype=wp.int32)):
+def find_flat_cells(k, j, i, planes: int, near: F32, list: Listed, count: wp.array(dtype=wp.int32)):
     """List the cells with distance 0 at all corners: a gap or a plate, one cell wide; only their centers tell which."""
     if near[k, j, i] == 0.0:
         most = wp.abs(near[k, j, i + 1]) + wp.abs(near[k, j + 1, i]) + wp.abs(near[k, j + 1, i + 1])
@@ -176,7 +120,7 @@ def find_flat_cells(k, j, i, planes: int, near: F32, list: wp.array(dtype=wp.vec
 
 
 @wp.kernel(**options)
-def mark_listed(list: wp.array(dtype=wp.vec4i), distance: wp.array(dtype=wp.float32), begin: bool, marks: I8):
+def mark_listed(list: Listed, distance: Distances, begin: bool, marks: I8):
     """Mark the listed cells HOLLOW that no solid so far covers at their center."""
     c = wp.tid()
     i = list[c][0]

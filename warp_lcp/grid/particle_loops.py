@@ -1,46 +1,55 @@
-"""Native loops over particles: how they are shared out, and the one formula for a particle's grid coordinate.
+"""Passes over particles: how these are shared out, and what they are told of the grid.
 
 Written plainly, one thread a particle, the transfers take 71 and 74 ns a particle in 3-D and the advection 129 (one core, 8 particles a
 cell, sorted); as native loops over a grain of particles they take 25, 12 and 34. clang vectorizes a loop whose arrays it is told not to
 alias, gathers from the fields included.
 """
 
-import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from warp_lcp.native import simd
+from warp_lcp.rows import RowPass, Rows
 
-CPU_GRAIN = 1024  # particles that a CPU thread takes: the launch then costs nothing, the arrays stay in the L2 cache
+if TYPE_CHECKING:
+    from warp_lcp.grid.staggered import StaggeredGrid
 
-# Coordinates are rounded after each operation, unlike the rest, so that every kernel finds a particle in the same cell. Taking off the
-# cells before a part of a grid is exact, as they are a whole number below the coordinate.
-GRID_COORDINATE = """
-    auto grid_coordinate = [=](T x, int before = 0) -> T {
-    #ifdef __CUDA_ARCH__
-        if (sizeof(T) == 4) return (T)__fsub_rn(__fadd_rn(__fmul_rn((float)x, (float)inverse_dx), 1.0f), (float)before);
-        return (T)__dsub_rn(__dadd_rn(__dmul_rn((double)x, (double)inverse_dx), 1.0), (double)before);
-    #else
-        #pragma clang fp contract(off) reassociate(off)
-        const T scaled = x*inverse_dx;
-        const T coordinate = scaled + (T)1;
-        return coordinate - (T)before;
-    #endif
-    };
-"""
+CPU_GRAIN = 4096  # particles that a CPU thread takes: the launch then costs nothing, the arrays stay in the L2 cache
+HEADERS = Path(__file__).parent / "headers"
+NONE: Mapping[str, Any] = {}
 
 
-def particle_loop(source: str) -> str:
-    """Return the body of a native function over particles first <= p < last, with `grid_coordinate(x, cells before)` if wanted."""
-    return simd(source.replace("GRID_COORDINATE", GRID_COORDINATE))
+def particle_pass(
+    name: str, box: Mapping[str, Any], *, real: Any = wp.float32, numbers: Mapping[str, Any] = NONE, headers: Path = HEADERS, **more: Any
+) -> RowPass:
+    """Return a pass that also takes `on_grid`, in the header that its name ends in.
+
+    Args:
+        name: of the pass, with its Warp module.
+        box: lists with an entry a particle, or fields of cells.
+        real: of coordinates.
+        numbers: others that it takes.
+        headers: where the header is.
+        more: of the pass.
+    """
+    grid = {"planes": int, "dx": real, "inverse_dx": real, "before_x": int, "before_y": int, "before_z": int}
+    return RowPass(name, headers / f"{name.rpartition('.')[2]}.h", real, box=box, numbers={**grid, **numbers}, **more)
 
 
-def grain(device: wp.Device) -> int:
-    """Return how many particles one thread takes."""
-    return 1 if device.is_cuda else CPU_GRAIN
+def on_grid(grid: "StaggeredGrid") -> dict[str, Any]:
+    """Return what passes are told of a grid: its spacing [m], and the cells of a larger one before it."""
+    before = dict(zip(("before_x", "before_y", "before_z"), grid.origin, strict=True))
+    return {"planes": grid.planes, "dx": grid.spacing, "inverse_dx": 1.0 / grid.spacing, **before}
 
 
-def launch(kernel: wp.Kernel, count: int, inputs: list[typing.Any], device: wp.Device) -> None:
-    """Launch kernel(count, grain, *inputs), whose thread t takes the particles from t * grain on."""
-    each = grain(device)
-    wp.launch(kernel, -(-count // each), [count, each, *inputs], device=device)
+def chunks(count: int, device: wp.Device) -> Rows:
+    """Return how a list's entries are shared out."""
+    return Rows.entries(count, device, 1 if device.is_cuda else CPU_GRAIN)
+
+
+def launch(passed: RowPass, count: int, grid: "StaggeredGrid", **given: Any) -> None:
+    """Launch a pass over the first particles of a list."""
+    if count:
+        passed.bind(chunks(count, grid.device), **on_grid(grid), **given).launch()

@@ -7,10 +7,11 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.grid import particles_kernels as kernels
-from warp_lcp.grid.particle_loops import launch
+from warp_lcp.grid.particle_loops import launch, on_grid
 from warp_lcp.grid.runge_kutta import MARGIN
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.layout import zeros
+from warp_lcp.rows import Rows
 
 CHUNK = 256  # the fewest particles that one thread adds up
 THREADS = 1024  # the most threads of a sum, each a partial result that the host reads
@@ -226,8 +227,8 @@ class Particles:
     def number(self) -> None:
         """Find the cell of each particle."""
         grid = self.grid
-        inputs = [1.0 / grid.spacing, grid.planes, *grid.counts, grid.first, self.position, self.key]
-        launch(kernels.number_kernel, self.count, inputs, grid.device)
+        counts = dict(zip(("nx", "ny", "nz"), grid.counts, strict=True))
+        launch(kernels.NUMBER, self.count, grid, position=self.position, key=self.key, **counts)
 
     def sort(self) -> None:
         """Bring the particles into the order of their cells; equal cells keep their order, so that a run is repeatable."""
@@ -250,10 +251,10 @@ class Particles:
         if self.count == 0:
             return ParticleTotals(0, 0.0, np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), 0.0, 0, 0)
         chunk = max(CHUNK, -(-self.count // THREADS))
-        rows = -(-self.count // chunk)
-        inputs = [self.count, chunk, self.position, self.velocity, self._partials]
-        wp.launch(kernels.total_kernel, rows, inputs, device=self.grid.device)
-        part = self._partials.numpy()[:rows]
+        rows = Rows.entries(self.count, self.grid.device, chunk)
+        given = {"position": self.position, "velocity": self.velocity, "sums": self._partials}
+        kernels.TOTAL.bind(rows, **given, **on_grid(self.grid)).launch()
+        part = self._partials.numpy()[: rows.places]
         with np.errstate(invalid="ignore"):  # sums of values that are not finite: counted in the last two columns
             total = part.sum(axis=0)
         return ParticleTotals(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from warp_lcp.grid.semi_lagrangian_kernels import CENTERS, carry_kernels
+from warp_lcp.grid.semi_lagrangian_kernels import CENTERS, carry_pass
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 
 __all__ = ["CENTERS", "carry_field"]
@@ -36,4 +36,5 @@ def carry_field(
     u, v, w = [*velocity, None][:3]
     low = tuple(max(start, 1) for start in window.low)
     inner = Window((low[0], low[1], low[2]), window.high, window.device)
-    inner.launch(carry_kernels(axis).carry, [grid.planes, dt / grid.spacing, least, u, v, w, level, field, out])
+    given = {"u": u, "v": v, "w": w, "level": level, "field": field, "out": out}
+    inner.run(carry_pass(axis), planes=grid.planes, h=dt / grid.spacing, least=least, **given)

@@ -11,12 +11,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, runtime_checkable
+from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 
 import numpy as np
 import warp as wp
 
+from warp_lcp.grid.motion import Pose, keep_checked
 from warp_lcp.grid.solids_kernels import (
+    Frame,
     box_distance,
     capsule_distance,
     mesh_distance,
@@ -26,9 +28,6 @@ from warp_lcp.grid.solids_kernels import (
 )
 from warp_lcp.grid.triangle_mesh import ClosedSurface, load_surface
 from warp_lcp.settings import Positive, checked
-
-if TYPE_CHECKING:
-    from warp_lcp.grid.motion import Pose
 
 Vector = Sequence[float] | np.ndarray
 
@@ -96,17 +95,7 @@ class Placement:
     def __post_init__(self) -> None:
         """Check the values and store them as float64."""
         object.__setattr__(self, "scale", checked("scale", self.scale, Positive))
-        rotation = np.array(self.rotation, dtype=np.float64)
-        translation = np.array(self.translation, dtype=np.float64)
-        if rotation.shape != (3, 3):
-            raise ValueError(f"rotation must be a 3 x 3 matrix, not of shape {rotation.shape}")
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0.0:
-            raise ValueError("rotation must be a proper rotation matrix (orthogonal, determinant 1)")
-        if translation.shape != (3,) or not np.isfinite(translation).all():
-            raise ValueError(f"translation must be 3 finite numbers, not {translation.tolist()}")
-        for name, array in (("rotation", rotation), ("translation", translation)):
-            array.flags.writeable = False
-            object.__setattr__(self, name, array)
+        keep_checked(self, 1e-5)
 
     @classmethod
     def from_degrees(cls, scale: float, rotate: float | Vector, translate: Vector, dimension: int) -> Placement:
@@ -171,15 +160,14 @@ class _Shape(ABC):
         """
         if points.shape != out.shape:
             raise ValueError(f"out has shape {out.shape}, points have {points.shape}")
-        sign = -1.0 if self.invert else 1.0
-        common = [points, *self._frame(), sign]
-        wp.launch(self.kernel, dim=points.shape[0], inputs=[*common, *self._parameters(points.device)], outputs=[out], device=points.device)
+        self._measure(self.kernel, points, out)
 
-    def _frame(self) -> list[Any]:
-        """Return what takes points into the shape's coordinates: inverse rotation, translation and scale."""
-        placement = self.placement
+    def _measure(self, kernel: Any, points: wp.array, out: wp.array) -> None:
+        placement, frame, device = self.placement, Frame(), points.device
         translation = placement.translation + placement.scale * placement.rotation @ self._origin()
-        return [wp.mat33(placement.rotation.T), wp.vec3(*translation), placement.scale * self._unit()]
+        frame.inverse_rotation, frame.translation = wp.mat33(placement.rotation.T), wp.vec3(*translation)
+        frame.scale, frame.sign = placement.scale * self._unit(), -1.0 if self.invert else 1.0
+        wp.launch(kernel, points.shape[0], [points, frame, *self._parameters(device), out], device=device)
 
     def bounds(self) -> np.ndarray | None:
         """Return the low and the high corner [m] of a box around the region, shape (2, 3); None when it is unlimited or inverted."""
@@ -425,8 +413,7 @@ class TriangleMesh(_Shape):
             points: [m], shape (m,), on any device.
             out: [m], shape (m,), on the same device.
         """
-        inputs = [points, *self._frame(), *self._parameters(points.device)]
-        wp.launch(mesh_surface_distance, dim=points.shape[0], inputs=inputs, outputs=[out], device=points.device)
+        self._measure(mesh_surface_distance, points, out)
 
     def thin_fraction(self, thickness: float, device: wp.Device) -> float:
         """Return the share of the surface's area behind which the solid is thinner than `thickness` [m]."""

@@ -1,142 +1,94 @@
-"""Signed distances as Warp kernels, one a shape, and the claim of cells by solids.
+# mypy: ignore-errors
+"""Signed distances as Warp kernels, one a shape, the points at which they are asked for, and the claim of cells by solids."""
 
-A shape lives in its own coordinates q, counted from its center or another point of it. A point p of the domain is q = R' (p - t) / s there,
-and a distance comes back times s. `sign` is 1, or -1 for an inverted shape.
-"""
-
-import typing
+from typing import Any
 
 import warp as wp
 
 MODULE = "warp_lcp.solids"
+Points, Distances = wp.array(dtype=wp.vec3), wp.array(dtype=wp.float32)
 FAR = 1.0e10  # a mesh query's reach, in half diagonals of the mesh; its square is still finite in float32
 
 
+@wp.struct
+class Frame:
+    """Where a shape stands, whose own coordinates q are counted from its center or another point of it: q = R' (p - t) / s of a point p."""
+
+    inverse_rotation: wp.mat33
+    translation: wp.vec3
+    scale: float  # that distances come back times
+    sign: float  # -1: the shape is inverted
+
+
 @wp.func
-@typing.no_type_check
-def to_shape(p: wp.vec3, inverse_rotation: wp.mat33, translation: wp.vec3, scale: float) -> wp.vec3:
+def to_shape(p: wp.vec3, frame: Frame) -> wp.vec3:
     """Return q of a point p."""
-    return inverse_rotation * (p - translation) / scale
+    return frame.inverse_rotation * (p - frame.translation) / frame.scale
 
 
 @wp.kernel(enable_backward=False, module=MODULE)
-@typing.no_type_check
-def box_distance(
-    points: wp.array(dtype=wp.vec3),
-    inverse_rotation: wp.mat33,
-    translation: wp.vec3,
-    scale: float,
-    sign: float,
-    half: wp.vec3,
-    out: wp.array(dtype=wp.float32),
-):
+def box_distance(points: Points, frame: Frame, half: wp.vec3, out: Distances):
     """Measure a box of half extents `half` (infinite in z in 2-D) about the origin."""
     i = wp.tid()
-    q = to_shape(points[i], inverse_rotation, translation, scale)
+    q = to_shape(points[i], frame)
     x = wp.abs(q[0]) - half[0]
     y = wp.abs(q[1]) - half[1]
     z = wp.abs(q[2]) - half[2]
     outside = wp.length(wp.vec3(wp.max(x, 0.0), wp.max(y, 0.0), wp.max(z, 0.0)))
-    out[i] = sign * scale * (outside + wp.min(wp.max(x, wp.max(y, z)), 0.0))
+    out[i] = frame.sign * frame.scale * (outside + wp.min(wp.max(x, wp.max(y, z)), 0.0))
 
 
 @wp.kernel(enable_backward=False, module=MODULE)
-@typing.no_type_check
-def sphere_distance(
-    points: wp.array(dtype=wp.vec3),
-    inverse_rotation: wp.mat33,
-    translation: wp.vec3,
-    scale: float,
-    sign: float,
-    radius: float,
-    out: wp.array(dtype=wp.float32),
-):
+def sphere_distance(points: Points, frame: Frame, radius: float, out: Distances):
     """Measure a sphere about the origin."""
     i = wp.tid()
-    q = to_shape(points[i], inverse_rotation, translation, scale)
-    out[i] = sign * scale * (wp.length(q) - radius)
+    q = to_shape(points[i], frame)
+    out[i] = frame.sign * frame.scale * (wp.length(q) - radius)
 
 
 @wp.kernel(enable_backward=False, module=MODULE)
-@typing.no_type_check
-def capsule_distance(
-    points: wp.array(dtype=wp.vec3),
-    inverse_rotation: wp.mat33,
-    translation: wp.vec3,
-    scale: float,
-    sign: float,
-    axis: wp.vec3,
-    radius: float,
-    out: wp.array(dtype=wp.float32),
-):
+def capsule_distance(points: Points, frame: Frame, axis: wp.vec3, radius: float, out: Distances):
     """Measure all within `radius` of the segment from the origin along `axis`."""
     i = wp.tid()
-    q = to_shape(points[i], inverse_rotation, translation, scale)
+    q = to_shape(points[i], frame)
     along = wp.clamp(wp.dot(q, axis) / wp.dot(axis, axis), 0.0, 1.0)
-    out[i] = sign * scale * (wp.length(q - along * axis) - radius)
+    out[i] = frame.sign * frame.scale * (wp.length(q - along * axis) - radius)
 
 
 @wp.kernel(enable_backward=False, module=MODULE)
-@typing.no_type_check
-def plane_distance(
-    points: wp.array(dtype=wp.vec3),
-    inverse_rotation: wp.mat33,
-    translation: wp.vec3,
-    scale: float,
-    sign: float,
-    normal: wp.vec3,
-    out: wp.array(dtype=wp.float32),
-):
+def plane_distance(points: Points, frame: Frame, normal: wp.vec3, out: Distances):
     """Measure the half-space below the plane through the origin with a unit `normal`."""
     i = wp.tid()
-    q = to_shape(points[i], inverse_rotation, translation, scale)
-    out[i] = sign * scale * wp.dot(q, normal)
+    q = to_shape(points[i], frame)
+    out[i] = frame.sign * frame.scale * wp.dot(q, normal)
 
 
 @wp.kernel(enable_backward=False, module=MODULE)
-@typing.no_type_check
-def mesh_distance(
-    points: wp.array(dtype=wp.vec3),
-    inverse_rotation: wp.mat33,
-    translation: wp.vec3,
-    scale: float,
-    sign: float,
-    mesh: wp.uint64,
-    out: wp.array(dtype=wp.float32),
-):
+def mesh_distance(points: Points, frame: Frame, mesh: wp.uint64, out: Distances):
     """Measure the inside of a closed mesh: distance to the closest triangle, sign from the winding number."""
     i = wp.tid()
-    q = to_shape(points[i], inverse_rotation, translation, scale)
+    q = to_shape(points[i], frame)
     # 2: groups of triangles farther than twice their radius count as one dipole; a closed surface has whole numbers, so 0.5 has room.
     query = wp.mesh_query_point_sign_winding_number(mesh, q, FAR, 2.0, 0.5)
     distance = FAR
     if query.result:
         distance = wp.length(wp.mesh_eval_position(mesh, query.face, query.u, query.v) - q)
-    out[i] = sign * scale * query.sign * distance
+    out[i] = frame.sign * frame.scale * query.sign * distance
 
 
 @wp.kernel(enable_backward=False, module=MODULE)
-@typing.no_type_check
-def mesh_surface_distance(
-    points: wp.array(dtype=wp.vec3),
-    inverse_rotation: wp.mat33,
-    translation: wp.vec3,
-    scale: float,
-    mesh: wp.uint64,
-    out: wp.array(dtype=wp.float32),
-):
+def mesh_surface_distance(points: Points, frame: Frame, mesh: wp.uint64, out: Distances):
     """Measure the distance to the closest triangle, without the sign, which takes most of the time."""
     i = wp.tid()
-    q = to_shape(points[i], inverse_rotation, translation, scale)
+    q = to_shape(points[i], frame)
     query = wp.mesh_query_point_no_sign(mesh, q, FAR)
     distance = FAR
     if query.result:
         distance = wp.length(wp.mesh_eval_position(mesh, query.face, query.u, query.v) - q)
-    out[i] = scale * distance
+    out[i] = frame.scale * distance
 
 
 @wp.kernel(enable_backward=False, module=MODULE)
-@typing.no_type_check
 def mesh_thickness(mesh: wp.uint64, reach: float, out: wp.array(dtype=wp.float32)):
     """Measure from each triangle's center straight inward to the other side; `reach` when it is farther or another part begins."""
     face = wp.tid()
@@ -151,49 +103,62 @@ def mesh_thickness(mesh: wp.uint64, reach: float, out: wp.array(dtype=wp.float32
         out[face] = query.t + skip
 
 
-@wp.kernel(enable_backward=False, module=MODULE)
-@typing.no_type_check
-def cell_centers(
-    low_x: int,
-    low_y: int,
-    low_z: int,
-    count_x: int,
-    count_y: int,
-    origin: wp.vec3i,
-    spacing: float,
-    flat: bool,
-    out: wp.array(dtype=wp.vec3),
-):
-    """Fill a block of cell centers [m], x fastest; cell 1 of the padded grid begins `origin` cells from 0, `flat` puts them at z = 0."""
-    c = wp.tid()
-    i = origin[0] + low_x + c % count_x
-    j = origin[1] + low_y + (c // count_x) % count_y
-    k = origin[2] + low_z + c // (count_x * count_y)
-    z = (float(k) - 0.5) * spacing
-    if flat:
+@wp.struct
+class Block:
+    """A box of nodes or cells, x fastest, as kernels see it; each item stands for `stride` of them along every axis."""
+
+    low: wp.vec3i
+    high: wp.vec3i  # one past the last
+    counts: wp.vec3i  # of items
+    origin: wp.vec3i  # cells of a larger grid before the first
+    stride: int
+    flat: bool  # 2-D: z does not count
+    spacing: float  # [m]
+    offset: float  # of an item's point from its low node, in cells
+
+
+@wp.func
+def first_node(block: Block, item: int):
+    """Return the low node (x, y, z) of an item of a block."""
+    across = block.counts[0]
+    i = item % across
+    j = (item // across) % block.counts[1]
+    k = item // (across * block.counts[1])
+    return block.low + block.stride * wp.vec3i(i, j, k)
+
+
+@wp.func
+def node_position(block: Block, node: wp.vec3i, offset: float):
+    """Return the place [m] of a node, moved by `offset` cells along each axis; 2-D has z = 0."""
+    z = (float(block.origin[2] + node[2] - 1) + offset) * block.spacing
+    if block.flat:
         z = 0.0
-    out[c] = wp.vec3((float(i) - 0.5) * spacing, (float(j) - 0.5) * spacing, z)
+    x = (float(block.origin[0] + node[0] - 1) + offset) * block.spacing
+    return wp.vec3(x, (float(block.origin[1] + node[1] - 1) + offset) * block.spacing, z)
 
 
 @wp.kernel(enable_backward=False, module=MODULE)
-@typing.no_type_check
-def claim_cells(
-    low_x: int,
-    low_y: int,
-    low_z: int,
-    count_x: int,
-    count_y: int,
-    distance: wp.array(dtype=wp.float32),
-    solid: int,
-    index: wp.array3d(dtype=wp.int32),
-    covered: wp.array(dtype=wp.int32),
-):
+def item_points(block: Block, out: Points):
+    """Fill the places [m] of the items of a block: nodes, the middles of groups of nodes, or the centers of cells."""
+    c = wp.tid()
+    out[c] = node_position(block, first_node(block, c), block.offset)
+
+
+@wp.kernel(enable_backward=False, module=MODULE)
+def claim_cells(block: Block, distance: Distances, solid: int, index: wp.array3d(dtype=wp.int32), covered: wp.array(dtype=wp.int32)):
     """Give the open cells of a block whose center lies inside to `solid`, and count those that lie inside, claimed or not."""
     c = wp.tid()
     if distance[c] < 0.0:
-        i = low_x + c % count_x
-        j = low_y + (c // count_x) % count_y
-        k = low_z + c // (count_x * count_y)
-        if index[k, j, i] < 0:
-            index[k, j, i] = solid
+        at = first_node(block, c)
+        if index[at[2], at[1], at[0]] < 0:
+            index[at[2], at[1], at[0]] = solid
         wp.atomic_add(covered, solid, 1)
+
+
+def block_of(low: Any, high: Any, spacing: float, dimension: int, origin: Any, *, stride: int = 1, offset: float = 0.0) -> Any:
+    """Return the nodes or cells low <= (x, y, z) < high in groups of `stride` along each axis, their points moved by `offset` cells."""
+    block = Block()
+    block.low, block.high = wp.vec3i(*(int(v) for v in low)), wp.vec3i(*(int(v) for v in high))
+    block.counts = wp.vec3i(*(-(-int(b - a) // stride) for a, b in zip(low, high, strict=True)))
+    block.stride, block.flat, block.spacing, block.origin, block.offset = stride, dimension == 2, spacing, wp.vec3i(*origin), offset
+    return block

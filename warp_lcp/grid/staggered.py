@@ -93,7 +93,7 @@ class Window:
             launch: of a program.
             given: fields and numbers by name.
         """
-        passed.bind(self._whole if whole else self._shared, **given).launch(launch or wp.launch)
+        passed.bind(self._whole if whole else self._shared, **given).launch(launch)
 
     @cached_property
     def _shared(self) -> Rows:
@@ -101,7 +101,7 @@ class Window:
 
     @cached_property
     def _whole(self) -> Rows:
-        return Rows.box(self.low, self.high, self.device, whole=True)
+        return Rows.box(self.low, self.high, self.device, cells=self.high[2] - self.low[2])
 
     def launch(self, kernel: wp.Kernel, inputs: list[typing.Any], *, launch: Launch | None = None) -> None:
         """Launch kernel(cells, *inputs) with threads (plane, row, chunk of a row), or record it with `Program.launch`."""

@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_lcp.grid import surface_mesh_kernels as kernels
 from warp_lcp.grid.extrapolate import extrapolate, weighted_kernel
-from warp_lcp.grid.level_set_kernels import BINOMIAL, scatter_kernel
+from warp_lcp.grid.level_set_kernels import BINOMIAL, SCATTER
 from warp_lcp.grid.marching_cubes import MarchingCubes, Mesh
 from warp_lcp.grid.mesh_smoothing import smooth as smooth_mesh
 from warp_lcp.grid.particle_loops import launch
@@ -117,8 +117,7 @@ class SurfaceMesh:
             self._place(self.obstacles)
         raw, first, second = self._fields
         raw.zero_()
-        numbers = [lattice.planes, 1.0 / lattice.spacing, self._each]
-        launch(scatter_kernel, len(position), [*numbers[:2], lattice.first, self._each, position, raw], lattice.device)
+        launch(SCATTER, len(position), lattice, each=self._each, position=position, density=raw)
         self._mirror(raw, fold=True)
         if interior is not None:
             inputs = [lattice.planes, self._parts, interior.least, interior.depth, interior.base, raw]
@@ -127,9 +126,8 @@ class SurfaceMesh:
         smooth = self._smoothed(raw, first, second, self._passes)
         thin, phi = (field for field in self._fields if field is not smooth)
         thin.zero_()
-        launch(
-            kernels.boost_kernel, len(position), [*numbers, self._gain, self._most, position, smooth, self._capacity, thin], lattice.device
-        )
+        given = {"smooth": smooth, "capacity": self._capacity, "thin": thin, "gain": self._gain, "most": self._most}
+        launch(kernels.BOOST, len(position), lattice, each=self._each, position=position, **given)
         self._mirror(thin, fold=True)
         if self._thin_passes:
             done = self._smoothed(thin, phi, thin, self._thin_passes)

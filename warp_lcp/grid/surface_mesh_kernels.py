@@ -7,8 +7,7 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
-from warp_lcp.grid.level_set_kernels import WEIGHTS
-from warp_lcp.grid.particle_loops import particle_loop
+from warp_lcp.grid.particle_loops import particle_pass
 from warp_lcp.operators.grid_poisson import SOLID
 from warp_lcp.rows import RowPass
 
@@ -37,6 +36,14 @@ DISTANCE = _made(
 )
 ROOM = _made("room", "room.h", "out", whole={"distance": wp.float32}, numbers={"planes": int, "parts": int})
 CARVE = _made("carve", "carve.h", "room phi")
+BOOST = particle_pass(
+    "warp_lcp.grid.surface_mesh.boost",
+    {"position": wp.vec3},
+    whole=dict.fromkeys(("smooth", "capacity", "thin"), wp.float32),
+    numbers=dict.fromkeys(("each", "gain", "most"), wp.float32),
+    constants={"LEAST_OPEN": LEAST_OPEN, "THIN": THIN, "POWER": POWER},
+    optional=("capacity",),
+)
 
 
 @wp.kernel(**_options)
@@ -59,64 +66,6 @@ def mirror_kernel(axis: int, fold: bool, field: F32):
             if fold:
                 field[beside, a, b] += field[ring, a, b]
             field[ring, a, b] = field[beside, a, b]
-
-
-# A particle looks at the share in its own lattice cell; few have to go on
-BOOST = """
-    typedef float T;
-    const T* position = (const T*)x_.data; const T* smooth = smooth_.data; const T* capacity = capacity_.data; T* out = out_.data;
-    const int nx = out_.shape[2] - 2, ny = out_.shape[1] - 2, nz = out_.shape[0] - 2;
-    const long long s2 = nx + 2, s1 = s2*(ny + 2);
-    auto add = [](T& element, T value) {
-    #ifdef __CUDA_ARCH__
-        atomicAdd(&element, value);
-    #else
-        element += value;
-    #endif
-    };
-    GRID_COORDINATE WEIGHTS
-    for (long long p = first; p < last; ++p) {
-        auto cell = [&](int axis, int n) {
-            const T x = grid_coordinate(position[3*p + axis]), from = x > 1 ? x : (T)1, e = n; return (int)(from < e ? from : e);
-        };
-        const int i = cell(0, nx), j = cell(1, ny), k = planes == 2 ? cell(2, nz) : 1;
-        const long long at = k*s1 + j*s2 + i;
-        T share = smooth[at];
-        if (capacity) share /= capacity[at] > (T)LEAST_OPEN ? capacity[at] : (T)LEAST_OPEN;
-        if (share >= (T)THIN) continue;
-        const T wanted = gain*((T)pow((T)THIN/(share > (T)1e-3 ? share : (T)1e-3), (T)POWER) - 1);
-        const T boost = each*(wanted < most ? wanted : most);
-        T wx[3], wy[3], wz[3] = {0, 1, 0};
-        weigh(grid_coordinate(position[3*p]), nx, wx);
-        weigh(grid_coordinate(position[3*p + 1]), ny, wy);
-        if (planes == 2) weigh(grid_coordinate(position[3*p + 2]), nz, wz);
-        for (int c = 2 - planes; c <= planes; ++c) for (int b = 0; b < 3; ++b) for (int a = 0; a < 3; ++a)
-            add(out[at + (c - 1)*s1 + (b - 1)*s2 + a - 1], boost*wz[c]*wy[b]*wx[a]);
-    }
-"""
-
-
-def _filled(source: str) -> str:
-    for name, value in (("LEAST_OPEN", LEAST_OPEN), ("THIN", THIN), ("POWER", POWER), ("WEIGHTS", WEIGHTS)):
-        source = source.replace(name, value if isinstance(value, str) else repr(value))
-    return source
-
-
-@wp.func_native(particle_loop(_filled(BOOST)))
-def boost_some(
-    planes: int, inverse_dx: float, each: float, gain: float, most: float, x_: wp.array(dtype=wp.vec3), smooth_: F32, capacity_: F32,
-    out_: F32, first: int, last: int,
-): ...  # fmt: skip
-
-
-@wp.kernel(**_options)
-def boost_kernel(
-    count: int, grain: int, planes: int, inverse_dx: float, each: float, gain: float, most: float, position: wp.array(dtype=wp.vec3),
-    smooth: F32, capacity: F32, out: F32,
-):  # fmt: skip
-    """Add the kernels of particles that have few others around them, the more the fewer these are."""
-    first = wp.tid() * grain
-    boost_some(planes, inverse_dx, each, gain, most, position, smooth, capacity, out, first, wp.min(first + grain, count))
 
 
 @wp.func

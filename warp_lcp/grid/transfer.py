@@ -11,7 +11,7 @@ the first particle of each cell: no two threads write one face, so that a GPU to
 
 import warp as wp
 
-from warp_lcp.grid.particle_loops import launch
+from warp_lcp.grid.particle_loops import launch, on_grid
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.transfer_kernels import TINY_WEIGHT, kernels
 
@@ -48,11 +48,11 @@ def particles_to_faces(
         field.zero_()
         weight.zero_()
         gradient = affine[axis] if affine else None
-        numbers = [axis, grid.planes, grid.spacing, 1.0 / grid.spacing, grid.first]
+        particles = {"position": position, "velocity": velocity, "gradient": gradient, "axis": axis}
         if offsets is not None:
-            window.launch(kernel.gather_weights, [*numbers, offsets, position, velocity, gradient, field, weight])
+            window.run(kernel.gather_weights, offsets=offsets, field=field, weight=weight, **particles, **on_grid(grid))
             continue
-        launch(kernel.scatter, len(position), [*numbers, position, velocity, gradient, field, weight], grid.device)
+        launch(kernel.scatter, len(position), grid, momentum=field, weight=weight, **particles)
         window.launch(kernel.normalize, [weight, field])
 
 
@@ -81,5 +81,5 @@ def faces_to_particles(
     for axis, field in enumerate(fields):
         gradient = affine[axis] if affine else None
         old = saved[axis] if saved and flip > 0.0 else None
-        inputs = [axis, grid.planes, 1.0 / grid.spacing, grid.first, flip, position, field, old, velocity, gradient]
-        launch(kernel.interpolate, len(position), inputs, grid.device)
+        particles = {"position": position, "velocity": velocity, "gradient": gradient}
+        launch(kernel.interpolate, len(position), grid, axis=axis, flip=flip, field=field, saved=old, **particles)

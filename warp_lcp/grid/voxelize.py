@@ -12,7 +12,7 @@ from warp_lcp.grid.motion import Motion
 from warp_lcp.grid.sides import open_ring
 from warp_lcp.grid.solid_notes import placement_notes, thin_notes
 from warp_lcp.grid.solids import Geometry
-from warp_lcp.grid.solids_kernels import cell_centers, claim_cells
+from warp_lcp.grid.solids_kernels import block_of, claim_cells, item_points
 
 OPEN = -1
 DOMAIN_WALL = 0
@@ -172,14 +172,12 @@ def _claim(
     for bottom in range(int(low[2]), int(high[2]), layers):
         top = min(bottom + layers, int(high[2]))
         size = int(across.prod()) * (top - bottom)
-        block = [int(low[0]), int(low[1]), bottom, int(across[0]), int(across[1])]
+        block = block_of([*low[:2], bottom], [*high[:2], top], spacing, dimension, origin, offset=0.5)
         points = wp.empty(size, dtype=wp.vec3, device=index.device)
         distance = wp.empty(size, dtype=wp.float32, device=index.device)
-        wp.launch(
-            cell_centers, dim=size, inputs=[*block, wp.vec3i(*origin), spacing, dimension == 2], outputs=[points], device=index.device
-        )
+        wp.launch(item_points, size, [block, points], device=index.device)
         geometry.signed_distance(points, distance)
-        wp.launch(claim_cells, dim=size, inputs=[*block, distance, number, index, covered], device=index.device)
+        wp.launch(claim_cells, size, [block, distance, number, index, covered], device=index.device)
 
 
 def _cell_range(

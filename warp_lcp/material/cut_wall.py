@@ -23,7 +23,7 @@ from warp_lcp.grid.extrapolate import extrapolate
 from warp_lcp.grid.staggered import Window
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.contact import HELD, RELEASED, TOUCHES_NOTHING
-from warp_lcp.material.wall import Join, keep_released_kernel
+from warp_lcp.material.wall import KEEP_SPRAY, Join, keep_released_kernel
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 from warp_lcp.rows import RowPass
 
@@ -45,7 +45,6 @@ def _made(name: str, box: dict[str, Any], **more: Any) -> RowPass:
     return RowPass(f"warp_lcp.material.cut_wall.{name}", path, F32, box=box, constants=_CONSTANTS, optional=absent, **more)
 
 
-KEEP_SPRAY = _made("keep_spray", {"known": I8, "weight": F32, "open": F32})
 CONSTRAIN = _made(
     "constrain",
     _FACE | _COMPONENTS | _NEAREST | {"kind": I8, "contact": wp.uint8, "distance": F32},
@@ -85,7 +84,7 @@ def extend_velocity_cut(
     for axis, (field, weight, marks, fraction) in enumerate(zip(velocity, weights, known, cut.open, strict=True)):
         window.launch(keep_released_kernel, [axis, kind, contact, weight, field, marks])
         extrapolate(window, marks, field, 1, join=join)
-        window.run(KEEP_SPRAY, known=marks, weight=weight, open=fraction)
+        window.run(KEEP_SPRAY, axis=axis, known=marks, weight=weight, kind=kind, open=fraction)
         extrapolate(window, marks, field, layers, join=join)
     parts = zip(("", "known_", "wall_", "moving_"), (velocity, known, cut.wall, cut.velocity or ()), strict=True)
     fields: dict[str, Any] = dict.fromkeys(_COMPONENTS) | {

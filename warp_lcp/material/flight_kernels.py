@@ -192,10 +192,7 @@ def is_near(base: Kinds, touch: U8, planes: int, x: wp.vec3):
 
 
 @wp.kernel(**options)
-def fly_kernel(
-    flight: Flight, u: Field, v: Field, w: Field, motion: Motions, base: Kinds, touch: U8, start: Vectors,
-    end: Vectors,
-):  # fmt: skip
+def fly_kernel(flight: Flight, u: Field, v: Field, w: Field, motion: Motions, base: Kinds, touch: U8, start: Vectors, end: Vectors):
     """Carry particles through the velocity that moves along with their body, a third-order Runge-Kutta step, and add them up.
 
     What they have of the body's spin turns with it. A motion is the body's [0] velocity, [1] spin, [2] center.

@@ -313,8 +313,10 @@ class NarrowBand:
     def _seed(self, particles: Particles, window: Window, shift: np.ndarray, saved: Sequence[wp.array]) -> None:
         """Put fresh particles behind the others."""
         grid, first = self.grid, particles.make_room(self.fresh)
-        numbers = [grid.planes, self.per_axis, self.jitter, self._seeds, wp.vec3(*shift), grid.spacing, first, *grid.shape[1:]]
-        window.launch(kernels.seed_kernel, [*numbers, self._total, particles.position])
+        sites = kernels.Sites()
+        sites.planes, sites.per_axis, sites.jitter, sites.seed = grid.planes, self.per_axis, self.jitter, self._seeds
+        sites.shift, sites.dx = wp.vec3(*shift), grid.spacing
+        window.launch(kernels.seed_kernel, [sites, first, *grid.shape[1:], self._total, particles.position])
         if saved:
             tail = particles.position[first:], particles.velocity[first:]
             faces_to_particles(grid, list(saved), *tail, [])

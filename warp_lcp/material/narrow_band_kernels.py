@@ -5,7 +5,7 @@ from pathlib import Path
 
 import warp as wp
 
-from warp_lcp.grid.cell_kernel import F32, F64, I8, I32, U8, cell_kernel
+from warp_lcp.grid.cell_kernel import F32, F64, I8, I32, INTS, POINTS, U8, cell_kernel
 from warp_lcp.material.contact import RELEASED
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 from warp_lcp.rows import RowPass
@@ -41,9 +41,7 @@ def solid_inside(distance: F32, k: int, j: int, i: int, planes: int):
 
 
 @cell_kernel("warp_lcp.material.narrow_band")
-def shore_kernel(
-    k, j, i, planes: int, most: float, kind: I8, phi: F32, contact: U8, keep: I8, distance: F32, depth: F32,
-):  # fmt: skip
+def shore_kernel(k, j, i, planes: int, most: float, kind: I8, phi: F32, contact: U8, keep: I8, distance: F32, depth: F32):
     """Depth is -phi in air, 0 where particles stay for another reason, and yet unknown elsewhere, solids included."""
     value = most
     if kind[k, j, i] == _FLUID:
@@ -74,8 +72,8 @@ def fill_kernel(k, j, i, least: float, filled: float, depth: F32, capacity: F32,
 
 @cell_kernel("warp_lcp.material.narrow_band")
 def blend_kernel(
-    k, j, first, end, axis: int, start: float, full_weight: float, depth: F32, base: I8, carried: F32, field: F32, weight: F32,
-):  # fmt: skip
+    k, j, first, end, axis: int, start: float, full_weight: float, depth: F32, base: I8, carried: F32, field: F32, weight: F32
+):
     """Go over from the particles' velocity to the carried one within a cell from depth `start` on."""
     c = wp.max(k - wp.where(axis == 2, 1, 0), 0)
     b = wp.max(j - wp.where(axis == 1, 1, 0), 0)
@@ -112,10 +110,7 @@ def fraction(x: float):
 
 
 @cell_kernel("warp_lcp.material.narrow_band")
-def quota_kernel(
-    k, j, i, width: float, particles: float, seed: int, shift: float, base: I8, depth: F32, before: F32,
-    quota: I32,
-):  # fmt: skip
+def quota_kernel(k, j, i, width: float, particles: float, seed: int, shift: float, base: I8, depth: F32, before: F32, quota: I32):
     """Find how many fresh particles each cell gets: so many on average, over the cells and, as `shift` goes on, over the steps."""
     count = int(0)
     if base[k, j, i] != _SOLID and renewed(depth[k, j, i], before[k, j, i], width):
@@ -125,10 +120,7 @@ def quota_kernel(
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.material.narrow_band")
-def leave_kernel(
-    width: float, key: wp.array(dtype=wp.int32), depth: wp.array(dtype=wp.float32), before: wp.array(dtype=wp.float32),
-    marks: wp.array(dtype=wp.int32),
-):  # fmt: skip
+def leave_kernel(width: float, key: INTS, depth: wp.array(dtype=wp.float32), before: wp.array(dtype=wp.float32), marks: INTS):
     """Mark the particles of cells deeper than the band, and of those that get fresh ones."""
     p = wp.tid()
     cell = key[p]
@@ -136,12 +128,22 @@ def leave_kernel(
     marks[p] = wp.where(now > width or renewed(now, before[cell], width), 1, 0)
 
 
+@wp.struct
+class Sites:
+    """A jittered lattice of so many places along each axis of a cell, that `shift` moves through the cell."""
+
+    planes: int
+    per_axis: int
+    jitter: float
+    seed: int
+    shift: wp.vec3
+    dx: float
+
+
 @cell_kernel("warp_lcp.material.narrow_band")
-def seed_kernel(
-    k, j, i, planes: int, per_axis: int, jitter: float, seed: int, shift: wp.vec3, dx: float, behind: int, ny: int, nx: int,
-    total: wp.array(dtype=wp.int32), position: wp.array(dtype=wp.vec3),
-):  # fmt: skip
-    """Put a cell's particles on a jittered lattice that `shift` moves through the cell; `total` counts up to and with each cell."""
+def seed_kernel(k, j, i, S: Sites, behind: int, ny: int, nx: int, total: INTS, position: POINTS):
+    """Put a cell's particles on their sites; `total` counts up to and with each cell."""
+    planes, per_axis, seed, shift = S.planes, S.per_axis, S.seed, S.shift
     sites = per_axis * per_axis * wp.where(planes == 2, per_axis, 1)
     cell = (k * ny + j) * nx + i
     start = total[cell - 1]
@@ -154,16 +156,14 @@ def seed_kernel(
             site = (skip + n) % sites
             state = wp.rand_init(seed + 1, cell * 64 + n)
             x = wp.vec3(float(site % per_axis), float((site // per_axis) % per_axis), float(site // (per_axis * per_axis)))
-            x = (x + jitter * wp.vec3(wp.randf(state), wp.randf(state), wp.randf(state))) / float(per_axis) + way
+            x = (x + S.jitter * wp.vec3(wp.randf(state), wp.randf(state), wp.randf(state))) / float(per_axis) + way
             x = wp.vec3(fraction(x[0]), fraction(x[1]), fraction(x[2])) * (1.0 - 2.0 * INSET) + wp.vec3(INSET, INSET, INSET)
-            x = (x + wp.vec3(float(i - 1), float(j - 1), float(k - 1))) * dx
+            x = (x + wp.vec3(float(i - 1), float(j - 1), float(k - 1))) * S.dx
             position[behind + start + n] = wp.vec3(x[0], x[1], wp.where(planes == 2, x[2], 0.0))
 
 
 @cell_kernel("warp_lcp.material.narrow_band")
-def sum_kernel(
-    k, j, first, end, planes: int, width: float, base: I8, depth: F32, u: F32, v: F32, w: F32, sums: F64,
-):  # fmt: skip
+def sum_kernel(k, j, first, end, planes: int, width: float, base: I8, depth: F32, u: F32, v: F32, w: F32, sums: F64):
     """Add up a row's cells deeper than the band.
 
     [0] cells, [1] |u|^2, [2-4] indices (i, j, k), [5] largest |u|^2, [6-8] lowest, [9-11] highest indices, [12-14] u.

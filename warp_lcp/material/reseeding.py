@@ -62,7 +62,7 @@ class Reseeding:
         """
         if particles.count == 0:
             return 0
-        grid, planes = self.grid, self.grid.planes
+        grid = self.grid
         particles.sort()
         offsets = particles.offsets
         if offsets is None:
@@ -70,12 +70,14 @@ class Reseeding:
             wp.launch(offset_kernel, grid.size + 1, [particles.key, particles.count, offsets], device=grid.device)
         self._numbers.zero_()
         window.launch(kernels.count_kernel, [offsets, self._count])
-        b, limits = self.boundary, [self.least, self.particles_a_cell, self.most]
-        window.launch(kernels.find_kernel, [planes, *limits, self._count, b.capacity, b.base, b.touch, self._takers, self._numbers])
+        b, s = self.boundary, kernels.Setting()
+        s.planes, s.seed, s.dx, s.inverse_dx = grid.planes, step, grid.spacing, 1.0 / grid.spacing
+        s.least, s.at_rest, s.most = self.least, self.particles_a_cell, self.most
+        window.launch(kernels.find_kernel, [s, self._count, b.capacity, b.base, b.touch, self._takers, self._numbers])
         takers = int(self._numbers.numpy()[0])
         if takers == 0:
             return 0
-        inputs = [*limits, step, grid.spacing, 1.0 / grid.spacing, self._takers, offsets, self._count, particles.position, self._numbers]
+        inputs = [s, self._takers, offsets, self._count, particles.position, self._numbers]
         for direction in self._directions:
-            wp.launch(kernels.exchange_kernel, takers, [planes, *direction, *inputs], device=grid.device)
+            wp.launch(kernels.exchange_kernel, takers, [wp.vec3i(*direction), *inputs], device=grid.device)
         return int(self._numbers.numpy()[1])

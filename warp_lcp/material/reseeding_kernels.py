@@ -3,7 +3,7 @@
 
 import warp as wp
 
-from warp_lcp.grid.cell_kernel import F32, I8, I32, U8, cell_kernel
+from warp_lcp.grid.cell_kernel import F32, I8, I32, INTS, POINTS, U8, cell_kernel
 from warp_lcp.material.contact import TOUCHES
 from warp_lcp.operators.grid_poisson import AIR
 
@@ -14,36 +14,45 @@ _AIR = wp.constant(wp.int8(AIR))
 _TOUCHES = wp.constant(wp.uint8(TOUCHES))
 
 
+@wp.struct
+class Setting:
+    """How many particles a cell should hold, and what else is the same for all cells of a step."""
+
+    planes: int
+    seed: int
+    dx: float
+    inverse_dx: float
+    least: int
+    at_rest: int
+    most: int
+
+
 @cell_kernel("warp_lcp.material.reseeding")
-def count_kernel(k, j, i, offsets: wp.array(dtype=wp.int32), count: I32):
+def count_kernel(k, j, i, offsets: INTS, count: I32):
     """Count each cell's particles."""
     cell = (k * count.shape[1] + j) * count.shape[2] + i
     count[k, j, i] = offsets[cell + 1] - offsets[cell]
 
 
 @cell_kernel("warp_lcp.material.reseeding")
-def find_kernel(
-    k, j, i, planes: int, least: int, at_rest: int, most: int, count: I32,
-    capacity: F32, base: I8, touch: U8,
-    takers: wp.array(dtype=wp.int32), numbers: wp.array(dtype=wp.int32),
-):  # fmt: skip
+def find_kernel(k, j, i, s: Setting, count: I32, capacity: F32, base: I8, touch: U8, takers: INTS, numbers: INTS):
     """List open cells that no wall touches, that want particles, and whose surroundings, themselves included, are full but for a little.
 
     The order of the list differs from run to run on CUDA, and does not matter.
     """
     has = count[k, j, i]
-    if has < at_rest and base[k, j, i] == _AIR and (touch[k, j, i] & _TOUCHES) == wp.uint8(0):
+    if has < s.at_rest and base[k, j, i] == _AIR and (touch[k, j, i] & _TOUCHES) == wp.uint8(0):
         held = int(0)
         crowd = int(0)
         room = float(0.0)
-        for c in range(k - planes + 1, k + planes):
+        for c in range(k - s.planes + 1, k + s.planes):
             for b in range(j - 1, j + 2):
                 for a in range(i - 1, i + 2):
                     if base[c, b, a] == _AIR:
                         held += count[c, b, a]
                         crowd = wp.max(crowd, count[c, b, a])
                         room += capacity[c, b, a]
-        if (has < least or crowd > most) and float(held) >= FULL * float(at_rest) * room:
+        if (has < s.least or crowd > s.most) and float(held) >= FULL * float(s.at_rest) * room:
             takers[wp.atomic_add(numbers, 0, 1)] = (k * count.shape[1] + j) * count.shape[2] + i
 
 
@@ -68,11 +77,7 @@ def emptiest(planes: int, i: int, j: int, k: int, start: int, here: int, inverse
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.material.reseeding")
-def exchange_kernel(
-    planes: int, dk: int, dj: int, di: int, least: int, at_rest: int, most: int, seed: int, dx: float, inverse_dx: float,
-    takers: wp.array(dtype=wp.int32), offsets: wp.array(dtype=wp.int32), count: I32,
-    position: wp.array(dtype=wp.vec3), numbers: wp.array(dtype=wp.int32),
-):  # fmt: skip
+def exchange_kernel(way: wp.vec3i, s: Setting, takers: INTS, offsets: INTS, count: I32, position: POINTS, numbers: INTS):
     """Let each cell that wants particles take some from the neighbor in one direction.
 
     No race, though a cell may be the neighbor of another that takes: whoever gives holds more than `at_rest` before and no less after,
@@ -82,6 +87,8 @@ def exchange_kernel(
     i = cell % count.shape[2]
     j = (cell // count.shape[2]) % count.shape[1]
     k = cell // (count.shape[2] * count.shape[1])
+    dk, dj, di = way[0], way[1], way[2]
+    planes, dx, least, at_rest, most = s.planes, s.dx, s.least, s.at_rest, s.most
     has = count[k, j, i]
     gives = count[k + dk, j + dj, i + di]
     if gives <= at_rest or (has >= least and (has >= at_rest or gives <= most)):
@@ -89,11 +96,11 @@ def exchange_kernel(
     start = offsets[cell]
     here = offsets[cell + 1] - start
     donor = offsets[cell + (dk * count.shape[1] + dj) * count.shape[2] + di]
-    first_part = emptiest(planes, i, j, k, start, here, inverse_dx, position)
+    first_part = emptiest(planes, i, j, k, start, here, s.inverse_dx, position)
     taken = int(0)
     while gives > at_rest and (has < least or (has < at_rest and gives > most)):
         part = (first_part + has - here) % (2 << planes)
-        state = wp.rand_init(seed, cell * 64 + has)
+        state = wp.rand_init(s.seed, cell * 64 + has)
         x = float(i - 1) + 0.25 + 0.5 * float(part % 2) + 0.5 * JITTER * (wp.randf(state) - 0.5)
         y = float(j - 1) + 0.25 + 0.5 * float((part // 2) % 2) + 0.5 * JITTER * (wp.randf(state) - 0.5)
         z = float(k - 1) + 0.25 + 0.5 * float(part // 4) + 0.5 * JITTER * (wp.randf(state) - 0.5)

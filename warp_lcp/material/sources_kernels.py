@@ -5,19 +5,19 @@ import typing
 
 import warp as wp
 
-from warp_lcp.grid.cell_kernel import F32, I8, I32, cell_below, cell_kernel
+from warp_lcp.grid.cell_kernel import F32, I8, I32, INTS, POINTS, cell_below, cell_kernel
 from warp_lcp.grid.staggered import cell_index
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 
 _FLUID = wp.constant(wp.int8(FLUID))
 _SOLID = wp.constant(wp.int8(SOLID))
-
+_BYTES = wp.array(dtype=wp.uint8)
 
 options: dict[str, typing.Any] = {"enable_backward": False, "module": "warp_lcp.material.sources"}
 
 
 @wp.func
-def source_of(slot: int, sources: wp.array(dtype=wp.int32), running: wp.array(dtype=wp.uint8)):
+def source_of(slot: int, sources: INTS, running: _BYTES):
     """Return the source that a slot (0: none) belongs to, -1 if it has none that runs."""
     source = int(-1)
     if slot > 0:
@@ -29,9 +29,8 @@ def source_of(slot: int, sources: wp.array(dtype=wp.int32), running: wp.array(dt
 
 @cell_kernel("warp_lcp.material.sources")
 def impose_kernel(
-    k, j, i, axis: int, supply: int, slots: I32, sources: wp.array(dtype=wp.int32), running: wp.array(dtype=wp.uint8),
-    velocities: wp.array(dtype=wp.vec3), field: F32, solid: F32, known: I8,
-):  # fmt: skip
+    k, j, i, axis: int, supply: int, slots: I32, sources: INTS, running: _BYTES, velocities: POINTS, field: F32, solid: F32, known: I8
+):
     """Give the faces of the running sources' cells their velocity.
 
     Where the flow would enter a source nothing passes as far as the pressure is concerned (`supply`): its material comes from nowhere, not

@@ -12,6 +12,7 @@ tangential flow is not slowed by a wall.
 
 import typing
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import warp as wp
 
@@ -21,11 +22,20 @@ from warp_lcp.grid.staggered import Window
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.contact import RELEASED
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
+from warp_lcp.rows import RowPass
 
 Join = Callable[[wp.array, wp.array], None]  # takes the marks and the velocity of a component
 
+KEEP_SPRAY = RowPass(
+    "warp_lcp.material.wall.keep_spray",
+    Path(__file__).parent / "headers" / "keep_spray.h",
+    wp.float32,
+    box={"known": wp.int8, "weight": wp.float32, "kind": wp.int8, "open": wp.float32},
+    numbers={"axis": int},
+    constants={"TINY_WEIGHT": TINY_WEIGHT, "SOLID": SOLID},
+    optional=("open",),
+)
 _FLUID = wp.constant(wp.int8(FLUID))
-_SOLID = wp.constant(wp.int8(SOLID))
 
 
 @cell_kernel("warp_lcp.material.wall")
@@ -57,20 +67,6 @@ def keep_released_kernel(k, j, i, axis: int, kind: I8, contact: U8, weight: F32,
                 around = total / count
                 field[k, j, i] = wp.where(own * around > 0.0, wp.sign(own) * wp.min(wp.abs(own), wp.abs(around)), 0.0)
             known[k, j, i] = wp.int8(2)
-
-
-@cell_kernel("warp_lcp.material.wall")
-@typing.no_type_check
-def keep_spray_kernel(k, j, i, axis: int, kind: I8, weight: F32, known: I8):
-    """Open faces that are still unknown but carry weight become known, and so do the extrapolated ones."""
-    mark = int(known[k, j, i])
-    if mark > 1:
-        known[k, j, i] = wp.int8(1)
-    if mark == 0 and weight[k, j, i] > TINY_WEIGHT:
-        # a face with weight is no face of the array's edge: its particles lie in the domain
-        below = kind[k - wp.where(axis == 2, 1, 0), j - wp.where(axis == 1, 1, 0), i - wp.where(axis == 0, 1, 0)]
-        if kind[k, j, i] != _SOLID and below != _SOLID:
-            known[k, j, i] = wp.int8(1)
 
 
 @cell_kernel("warp_lcp.material.wall")
@@ -129,7 +125,7 @@ def extend_velocity(
     for axis, (field, weight, marks) in enumerate(zip(velocity, weights, known, strict=True)):
         window.launch(keep_released_kernel, [axis, kind, contact, weight, field, marks])
         extrapolate(window, marks, field, 1, join=join)
-        window.launch(keep_spray_kernel, [axis, kind, weight, marks])
+        window.run(KEEP_SPRAY, axis=axis, known=marks, weight=weight, kind=kind, open=None)
         if join is not None:
             join(marks, field)
         extrapolate(window, marks, field, layers, join=join)

@@ -90,7 +90,9 @@ class Level:
         there = rows or self.stencil.rows.beside(coarse.stencil.rows, (-fx, -fy, -fz))
         fields = {"x": self.x, "coarse": coarse.x, "lower": self.lower, "upper": self.upper}
         bind: Callable[..., Bound] = passes.CORRECT.bind
-        return self._once((coarse, projected, id(rows)), lambda: bind(there, stencil=self.stencil, scale=scale, projected=projected, **fields))
+        return self._once(
+            (coarse, projected, id(rows)), lambda: bind(there, stencil=self.stencil, scale=scale, projected=projected, **fields)
+        )
 
     def filling(self, name: str, axis: int) -> Bound:
         """Return the pass that fills the ghost cells of a field, x or t, along a periodic axis."""

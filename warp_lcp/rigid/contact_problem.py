@@ -13,7 +13,8 @@ from scipy.sparse.csgraph import connected_components
 from warp_lcp.affine_bounds import AffineBounds
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem import LCP
-from warp_lcp.rigid.contact_kernels import solve_islands
+from warp_lcp.rigid.contact_kernels import NNCG
+from warp_lcp.rows import Rows
 from warp_lcp.stopping import StoppingCriteria
 
 YIELDS = 1e-6  # of B, along tangents: how friction is shared between contacts then is unique, and rest creeps by 1e-7 m/s at most
@@ -92,12 +93,11 @@ class ContactProblem:
         x = np.zeros(k * rows) if start is None else start[order].ravel()
         residual, J = np.zeros(len(starts) - 1), np.concatenate([self.one[order], self.other[order]], axis=2)
         w = np.zeros((self.bodies + 1) * q)
-        fields = [J, self.b[order], more, diagonal, self.friction[order]]
-        inputs: list[Any] = [_real(field) for field in fields]
-        inputs += [_index(self.first[order]), _index(self.second[order]), q, rows, _index(starts)]
-        inputs += [wp.float64(stopping.rtol), stopping.max_iterations, _real(w), *(_real(np.zeros(k * rows)) for _ in range(3))]
-        out = [_real(x), _real(residual)]
-        wp.launch(solve_islands, len(residual), [*inputs, *out], device="cpu")
+        fields = {"J": J, "b": self.b[order], "e": more, "d": diagonal, "mu": self.friction[order], "w": w, "x": x, "residual": residual}
+        given = {name: _real(field) for name, field in fields.items()} | {name: _real(np.zeros(k * rows)) for name in ("g", "way", "best")}
+        given |= {"one": _index(self.first[order]), "other": _index(self.second[order]), "starts": _index(starts)}
+        islands = Rows.entries(len(residual), wp.get_device("cpu"))
+        NNCG.bind(islands, q=q, dim=rows, rtol=stopping.rtol, most=stopping.max_iterations, **given).launch()
         result = np.empty((k, rows))
         result[order] = x.reshape(k, rows)
         return result, float(residual.max(initial=0.0))

@@ -195,11 +195,16 @@ class Rows:
         return _flat(size, device.alias, serial)
 
     @staticmethod
-    def box(low: tuple[int, int, int], high: tuple[int, int, int], device: wp.Device, *, whole: bool = False) -> "Rows":
-        """Return the rows of stored cells low <= (k, j, i) < high of a grid; a thread takes a `whole` one."""
+    def box(low: tuple[int, int, int], high: tuple[int, int, int], device: wp.Device, *, cells: int | None = None) -> "Rows":
+        """Return the rows of stored cells low <= (k, j, i) < high of a grid; a thread takes some `cells` of one."""
         counts = tuple(end - begin for begin, end in zip(low, high, strict=True))
-        made = Rows.strided(0, device, (0, 0, 0), counts, cells=counts[2] if whole else None, lines=1 if device.is_cuda else counts[1])
+        made = Rows.strided(0, device, (0, 0, 0), counts, cells=cells, lines=1 if device.is_cuda else counts[1])
         return replace(made, place=dict(zip(("k0", "j0", "i0"), low, strict=True)))
+
+    @staticmethod
+    def entries(count: int, device: wp.Device, cells: int | None = None) -> "Rows":
+        """Return a list's entries as the row of a box; a thread takes some `cells` of them."""
+        return Rows.box((0, 0, 0), (1, 1, count), device, cells=cells)
 
     @staticmethod
     def by_turns(size: int, device: wp.Device, width: int) -> "Rows":

@@ -71,9 +71,10 @@ class RowPass:
         finer: whether the stencil and the offsets are those of the other level, which is finer.
         by_row: one element a row of the grid: pointers to the first row's; `P.row` counts.
         whole: small arrays: pointers to the first element.
-        box: fields of all cells of a grid, of `Rows.box`: pointers to the first stored cell of row j of plane k, null where there is none.
-            The piece is first <= i < last; the planes of the first field are s1 elements apart, its rows s2. Such a pass has no letters,
-            no sums and one form, in the Warp module that its name begins with.
+        box: fields of all cells of a grid, of `Rows.box`: pointers to the first stored cell of row j of plane k, null where there is none;
+            of one that has layers, in its first. The piece is first <= i < last; the planes of the first field are s1 elements apart, its
+            rows s2. Such a pass has no letters, no sums and one form, in the Warp module that its name begins with. Lists, too, are fields.
+        listed: int32 array of `whole` with the flat indices of the cells that are visited; the box is then that of the list's entries.
         optional: which arrays may be None, or empty: their pointers are null then.
         numbers: given by the host.
         sums: variables of the row function that are summed over the cells.
@@ -97,6 +98,7 @@ class RowPass:
     sums: tuple[str, ...] = ()
     constants: Mapping[str, float] = field(default_factory=dict)
     box: Mapping[str, Any] = field(default_factory=dict)
+    listed: str = ""
 
     def __post_init__(self) -> None:
         """Make the form of a box at once: a Warp module that has been loaded would be compiled again with it."""
@@ -187,7 +189,7 @@ class RowPass:
             found, expected = 0 if given[name] is None else given[name].size, getattr(rows, length)
             if found != expected and (found or name not in self.optional):
                 raise ValueError(f"{self.name}: {name} has {found} elements, not {expected}")
-        if self.box and len(shapes := {tuple(given[n].shape) for n in self.box if given[n] is not None}) > 1:
+        if self.box and len(shapes := {tuple(given[n].shape[-3:]) for n in self.box if given[n] is not None}) > 1:
             raise ValueError(f"{self.name}: fields have the shapes {', '.join(map(str, sorted(shapes)))}")
         if self.sums and given["out"].size < len(self.sums) * rows.places:
             least = f"fewer than {len(self.sums) * rows.places}: {rows.places} threads for each sum"
@@ -260,10 +262,11 @@ class Form:
             each += [f"{'const ' * (n in d.reads)}auto* {n} = {pointer};"]
         each += [f"const auto {n} = given.{n};" for n in d.numbers]
         if d.box:
-            each += ["const int k = P.k + k0, j = P.j + j0, first = P.first + i0, last = first + n;"]
             each += [f"const long long s2 = given.{next(iter(d.box))}.shape[2], s1 = s2*given.{next(iter(d.box))}.shape[1];"]
-            row = "((long long)k*given.{0}.shape[1] + j)*given.{0}.shape[2]"
-            each += [f"auto* {n} = given.{n}.data ? given.{n}.data + {row.format(n)} : nullptr;" for n in d.box]
+            listed = [f"for (int m_ = P.first; m_ < P.first + n; ++m_) {{ const int at_ = {d.listed}[m_], k = at_ / (int)s1;"]
+            listed += ["const int j = (at_ - k*(int)s1) / (int)s2, first = at_ % (int)s2, last = first + 1;"]
+            each += listed if d.listed else ["const int k = P.k + k0, j = P.j + j0, first = P.first + i0, last = first + n;"]
+            each += [f"auto* {n} = given.{n}.data ? given.{n}.data + k*s1 + j*s2 : nullptr;" for n in d.box]
         if d.stencil:
             each += [f"const auto* {n} = given.stencil.{n}.data + {'P.q' if d.finer else 'p'};" for n in ("d", "wx", "wy", "wz", "known")]
             each += [f"const T {n} = (T)given.stencil.{n};" for n in ("unit", "cx", "cy", "cz")]
@@ -273,7 +276,7 @@ class Form:
         loops = ["for (int k_i = k_ < 0 ? 0 : k_; k_i < end_ && k_i < L.planes; ++k_i)", "for (int j_i = j_; j_i < last_; ++j_i) {"]
         before = [text(HEADERS / "native.h"), '#line 1 "types"', *head, text(HEADERS / "piece.h"), '#line 1 "fields"', *loops, *each]
         body = ["{", text(d.header), "}"] if d.box else [text(d.header)]  # there names may be those of the pass
-        tail = ['#line 1 "end"', "}", *(f"#undef {n}" for n in macros), ""]
+        tail = ['#line 1 "end"', "}", *["}"] * bool(d.listed), *(f"#undef {n}" for n in macros), ""]
         return "\n".join(["", *before, *shared, *body, '#line 1 "sums"', *(sums if d.sums else []), *tail])
 
     def alike(self, declared: RowPass) -> "Form":
@@ -315,9 +318,9 @@ class Bound(NamedTuple):
         """Where the rows are."""
         return self.rows.summed if self.form.declared.sums else self.rows.single
 
-    def launch(self, launch: Any = wp.launch) -> None:
+    def launch(self, launch: Any = None) -> None:
         """Launch the pass, or record it."""
-        launch(self.form.kernel, threads(self.layout), [self.layout, self.fields], device=self.rows.device)
+        (launch or wp.launch)(self.form.kernel, threads(self.layout), [self.layout, self.fields], device=self.rows.device)
 
 
 class Wave:

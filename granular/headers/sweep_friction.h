@@ -1,0 +1,51 @@
+// A sweep over the friction, the velocity kept up to date.
+#include "shape.h"
+#include "rate_bound.h"
+#include "yield.h"
+#include "edges.h"
+for (int i = first; i < last; ++i) {
+    if (!(flags[i] & SHEARS_HERE) || !(stiff[i] > 0.0f)) continue;
+    float* stress = now + i;
+    const T x = (T)stress[0], radius = larger((T)numbers[FRICTION]*x + (T)numbers[COHESION], (T)0);
+    const T r = larger(radius, (T)LEAST_RADIUS);
+    T e[3] = {0, 0, 0}, mean = 0, diagonal = 0;
+    for (int axis = 0; axis < DIM; ++axis) {
+        e[axis] = u[axis][i + s[axis]] - u[axis][i]; mean += e[axis]/(T)DIM;
+        diagonal += (T)(inverse[axis][i + s[axis]] + inverse[axis][i]);
+    }
+    T b[SHEARS][4], largest[SHEARS][4], cap[SHEARS], part[SHEARS][4]; long long at[SHEARS][4];
+    for (int d = 0; d < SHEARS; ++d) for (int q = 0; q < 4; ++q) {
+        at[d][q] = i + (q & 1)*s[ALPHA[d]] + (q >> 1)*s[BETA[d]];
+        part[d][q] = share[d][at[d][q]] > 0.0f ? (T)share[d][at[d][q]] : (T)0;
+        diagonal += (T)4*part[d][q]*part[d][q]*light(d, at[d][q]);
+    }
+    const T soft = (T)omega/((T)0.6*diagonal);  // more than half the norm of a cell's own block: stable
+    T n[NORMALS], normal2 = 0;
+    if (DIM == 2) { n[0] = (T)stress[layer] + soft*(e[0] - e[1]); normal2 = n[0]*n[0]; }
+    else for (int m = 0; m < NORMALS; ++m) { n[m] = (T)stress[(1 + m)*layer] + (T)2*soft*(e[m] - mean); normal2 += (T)0.5*n[m]*n[m]; }
+    for (int d = 0; d < SHEARS; ++d) {
+        for (int q = 0; q < 4; ++q) b[d][q] = (T)stress[(FIRST + 4*d + q)*layer] + (T)4*soft*part[d][q]*rate(d, at[d][q]);
+        T m[4];
+        for (int q = 0; q < 4; ++q) m[q] = part[d][q] > (T)0 ? magnitude(b[d][q]) : (T)0;
+        sums(m[0], m[1], m[2], m[3], largest[d]);
+    }
+    const T shrink = yield(normal2, largest, r, gain_at(x), half_at(x), soft, cap), keep = radius > (T)LEAST_RADIUS ? shrink : (T)0;
+    for (int m = 0; m < NORMALS; ++m) {
+        const float fresh = (float)(n[m]*keep); const T by = (T)fresh - (T)stress[(1 + m)*layer];
+        stress[(1 + m)*layer] = fresh;
+        for (int axis = 0; axis < DIM; ++axis) {
+            if (DIM == 3 && axis != m) continue;
+            const T sign = DIM == 2 && axis == 1 ? (T)-1 : (T)1;
+            u[axis][i + s[axis]] -= sign*(T)inverse[axis][i + s[axis]]*by;
+            u[axis][i] += sign*(T)inverse[axis][i]*by;
+        }
+    }
+    for (int d = 0; d < SHEARS; ++d) for (int q = 0; q < 4; ++q) {
+        if (!(part[d][q] > (T)0)) continue;
+        const T limit = radius > (T)LEAST_RADIUS ? cap[d] : (T)0, cut = larger(smaller(b[d][q], limit), -limit);
+        float* slot = stress + (FIRST + 4*d + q)*layer;
+        const float fresh = (float)cut; const T by = part[d][q]*((T)fresh - (T)slot[0]);
+        slot[0] = fresh;
+        shear(d, at[d][q], by);
+    }
+}
