@@ -11,33 +11,10 @@ import warp as wp
 
 CPU_CHUNK = 8192  # elements of a flat field a CPU thread takes: its operands stay in the L2 cache between fused loops
 CUDA_THREADS = 1 << 16  # threads of a flat reduction, several waves of a large GPU
-BLOCK = "\n#ifdef __CUDA_ARCH__\nenum { M = 1 };\n#else\nenum { M = 128 };\n#endif\n"  # cells that a row function buffers at a time
 CUDA_BLOCK = 256  # threads that add up partial sums
 CUDA_SEGMENTS = 256  # blocks that do so first where there are very many
 
-# pragmas of a loop add up
-MASKS = """
-#if defined(__AVX512BW__) && defined(__AVX512VL__)
-#pragma clang loop vectorize_predicate(enable)
-#endif
-"""
-
 C_TYPES = {wp.uint8: "unsigned char", wp.float32: "float", wp.float64: "double"}
-
-
-def simd(source: str) -> str:
-    """Return the body of a native function: `SIMD for` becomes a vectorized loop, sums may be taken in any order.
-
-    `SIMD8 for` takes half as many elements at a time, which is faster where most of them are doubles; `SIMD64 for` is for bytes.
-    `MASKED for` takes what is left of a row after its last whole vector as a vector with a mask, where the processor has masks, instead
-    of element by element: for short rows with much work an element.
-    """
-    pragma = "\n#ifndef __CUDA_ARCH__\n#pragma clang loop vectorize(assume_safety) vectorize_width({}) interleave_count(1)\n#endif\n"
-    head = "\n#ifndef __CUDA_ARCH__\n#pragma clang fp reassociate(on) contract(fast)\n#endif\n"
-    source = source.replace("MASKED ", MASKS + "SIMD ")
-    for word, width in (("SIMD64 ", 64), ("SIMD8 ", 8), ("SIMD ", 16)):
-        source = source.replace(word, pragma.format(width))
-    return head + source + "\n"
 
 
 def grain(n: int, device: wp.Device) -> int:

@@ -1,17 +1,16 @@
 # mypy: ignore-errors
 """Kernel that adds up partial sums."""
 
+from pathlib import Path
+
 import warp as wp
 
-from warp_lcp.native import simd
+from warp_lcp.rows.row_pass import HEADERS, text
 
-ADD_UP = """const double* v = partials.data + offset; double s = 0;
-if (stride == 1) { SIMD8 for (int i = start; i < n; ++i) s += v[i]; }
-else for (int i = start; i < n; i += stride) s += v[i];
-return s;"""
+SOURCE = "\n".join(["", text(HEADERS / "native.h"), text(Path(__file__).parent / "headers" / "add_up.h"), ""])
 
 
-@wp.func_native(simd(ADD_UP))
+@wp.func_native(SOURCE)
 def add_up_span(partials: wp.array(dtype=wp.float64), offset: int, start: int, n: int, stride: int) -> wp.float64: ...
 
 

@@ -81,18 +81,16 @@ class Level:
     def bounding(self, coarse: Level, scale: float) -> Bound:
         """Return the pass that finds the bounds of a coarse correction."""
         fields = {"x": self.x, "lower": self.lower, "upper": self.upper, "coarse_lower": coarse.lower, "coarse_upper": coarse.upper}
-        bind: Callable[..., Bound] = passes.COARSE_BOUNDS.bind
-        return self._once(("bounds", coarse), lambda: bind(self._coarser_rows(coarse), stencil=self.stencil, scale=scale, **fields))
+        given: dict[str, Any] = {"stencil": self.stencil, "scale": scale, **fields}
+        return self._once(("bounds", coarse), lambda: passes.COARSE_BOUNDS.bind(self._coarser_rows(coarse), **given))
 
     def correcting(self, coarse: Level, scale: float, *, projected: bool, rows: Rows | None = None) -> Bound:
         """Return the pass that adds `scale` times the coarse correction to x, clipped if projected."""
         fx, fy, fz = coarse.factors
         there = rows or self.stencil.rows.beside(coarse.stencil.rows, (-fx, -fy, -fz))
         fields = {"x": self.x, "coarse": coarse.x, "lower": self.lower, "upper": self.upper}
-        bind: Callable[..., Bound] = passes.CORRECT.bind
-        return self._once(
-            (coarse, projected, id(rows)), lambda: bind(there, stencil=self.stencil, scale=scale, projected=projected, **fields)
-        )
+        given: dict[str, Any] = {"stencil": self.stencil, "scale": scale, "projected": projected, **fields}
+        return self._once((coarse, projected, id(rows)), lambda: passes.CORRECT.bind(there, **given))  # which keeps the rows
 
     def filling(self, name: str, axis: int) -> Bound:
         """Return the pass that fills the ghost cells of a field, x or t, along a periodic axis."""
