@@ -1,4 +1,4 @@
-"""What is changed: cosmic-ray's operators that leave code plausible, calls left out, and operators within native C++ snippets."""
+"""What is changed: cosmic-ray's operators that leave code plausible, calls left out, and operators in headers of C++."""
 
 from __future__ import annotations
 
@@ -31,6 +31,7 @@ NAMES = (
 )
 SWAPS = {"+": "-", "-": "+", "*": "/", "/": "*", "<": "<=", "<=": "<", ">": ">=", ">=": ">", "==": "!=", "!=": "==", "&&": "||", "||": "&&"}
 SWAPS |= {"&": "|", "|": "&"}
+NATIVE_SWAP = "NativeSwap"  # one of them for its neighbor
 NATIVE = re.compile(r"(?<=[\w\])] )(?:[<>=!]=|&&|\|\||[-+*/<>&|])(?= [\w(!-])|(?<=[\w\])])[*/](?=[\w(])")
 
 
@@ -55,31 +56,6 @@ class LeaveOut(Operator):
         return ()
 
 
-class NativeSwap(LeaveOut):
-    """Swap one operator in the text of a native function."""
-
-    def mutation_positions(self, node: Any) -> Iterator[tuple[Any, Any]]:
-        """Yield where the operators of a string that reads like C++ stand."""
-        if node.type != "string" or node.parent.type == "simple_stmt" or ";" not in node.value:
-            return
-        line, column = node.start_pos
-        for match in self._matches(node.value):
-            before = node.value[: match.start()]
-            start = (line + before.count("\n"), match.start() - before.rfind("\n") - 1 if "\n" in before else column + match.start())
-            yield start, (start[0], start[1] + len(match[0]))
-
-    @staticmethod
-    def _matches(text: str) -> list[re.Match[str]]:
-        """Return the operators outside of comments and of the preprocessor's lines."""
-        return [m for m in NATIVE.finditer(text) if not re.search(r"//|^\s*#", text[text.rfind("\n", 0, m.start()) + 1 : m.start()])]
-
-    def mutate(self, node: Any, index: int) -> Any:
-        """Return the string with that operator swapped."""
-        match = self._matches(node.value)[index]
-        text = node.value[: match.start()] + SWAPS[match[0]] + node.value[match.end() :]
-        return parso.python.tree.String(text, node.start_pos, node.prefix)
-
-
 class Mutant(NamedTuple):
     """One change: file, line, operator's name, which of the operator's places in the file, and the lines before and after."""
 
@@ -93,12 +69,19 @@ class Mutant(NamedTuple):
 
 def operator(name: str) -> Operator:
     """Return a mutation operator by name."""
-    own = {"LeaveOut": LeaveOut, "NativeSwap": NativeSwap}
-    return own[name]() if name in own else get_operator(name)()
+    return LeaveOut() if name == "LeaveOut" else get_operator(name)()
+
+
+def native_places(source: str) -> list[re.Match[str]]:
+    """Return the operators of a header outside of comments and of the preprocessor's lines."""
+    return [m for m in NATIVE.finditer(source) if not re.search(r"//|^\s*#", source[source.rfind("\n", 0, m.start()) + 1 : m.start()])]
 
 
 def mutated(source: str, name: str, occurrence: int) -> str:
     """Return the source with one change."""
+    if name == NATIVE_SWAP:
+        match = native_places(source)[occurrence]
+        return source[: match.start()] + SWAPS[match[0]] + source[match.end() :]
     return str(mutate_code(source, operator(name), occurrence))
 
 
@@ -111,12 +94,12 @@ def draw(root: Path, count: int, seed: int) -> list[Mutant]:
         seed: of the first line and of the operators.
     """
     rng = random.Random(seed)
-    files = sorted(str(f.relative_to(root)) for package in PACKAGES for f in (root / package).rglob("*.py"))
+    files = sorted(str(f.relative_to(root)) for package in PACKAGES for f in (root / package).rglob("*") if f.suffix in (".py", ".h"))
     lines = [(f, n + 1) for f in files if not APART.search(f) for n, text in enumerate((root / f).read_text().splitlines()) if text.strip()]
     start = rng.random()
     wanted = [lines[int((start + i) * len(lines) / count)] for i in range(count)]
     sources = {module: (root / module).read_text() for module in {module for module, _ in wanted}}
-    places = {module: _places(source) for module, source in sources.items()}
+    places = {module: _places(module, source) for module, source in sources.items()}
     found = []
     for module, line in wanted:
         if places[module]:
@@ -127,11 +110,13 @@ def draw(root: Path, count: int, seed: int) -> list[Mutant]:
     return found
 
 
-def _places(source: str) -> list[tuple[int, str, int]]:
-    """Return line, operator's name and occurrence of a module's changes but those in annotations, in what is raised and on UNSEEN lines."""
+def _places(module: str, source: str) -> list[tuple[int, str, int]]:
+    """Return line, operator's name and occurrence of a file's changes but those in annotations, in what is raised and on UNSEEN lines."""
+    if module.endswith(".h"):
+        return [(source.count("\n", 0, match.start()) + 1, NATIVE_SWAP, n) for n, match in enumerate(native_places(source))]
     nodes = [(node, _inert(node)) for node in ast_nodes(parso.parse(source))]
     places, lines = [], source.splitlines()
-    for name in (*NAMES, "LeaveOut", "NativeSwap"):
+    for name in (*NAMES, "LeaveOut"):
         change, occurrence = operator(name), 0
         for node, inert in nodes:
             for begin, _ in change.mutation_positions(node):

@@ -23,9 +23,15 @@ def _tests(root: Path) -> dict[str, set[str]]:
 
 @cache
 def _users(root: Path) -> dict[str, set[str]]:
-    """Return the modules that import each module, by its last name and its package's."""
+    """Return the modules that import each module, by its last name and its package's, and who names each header."""
     users = defaultdict(set)
     for package in ("warp_lcp", "fluids", "granular"):
+        for file in (root / package).rglob("*"):
+            if file.suffix in (".py", ".h"):
+                places = [file.parent, file.parent / "headers", root / "warp_lcp/rows/headers"]
+                for header in re.findall(r"\w+\.h(?=\")", file.read_text()):
+                    found = [place / header for place in places if (place / header).exists()]
+                    users[str(found[0].relative_to(root)) if found else header].add(str(file.relative_to(root)))
         for file in (root / package).rglob("*.py"):
             for whole, names in re.findall(r"^\s*from ([\w.]+) import (.+)$", file.read_text(), re.MULTILINE):
                 for name in [whole, *(f"{whole}.{word}" for word in WORD.findall(names))]:
@@ -38,6 +44,8 @@ def tests_of(root: Path, module: str) -> list[str]:
     """Return test files, the likeliest to notice a change of a module first."""
     score: dict[str, float] = defaultdict(float)
     front, weight, seen = {module}, 1.0, set[str]()
+    while any(file.endswith(".h") for file in front):
+        front = {user for file in front for user in (_users(root).get(file, ()) if file.endswith(".h") else (file,))}
     for _ in range(3):
         for file in front:
             name = Path(file).stem.removesuffix("_kernels")
