@@ -29,7 +29,6 @@ if (make) {
     const T sy = whole_y ? (T)0 : L.fy == 2 ? scale : scale*stiffen, sz = whole_z ? (T)0 : L.fz == 2 ? scale : scale*stiffen;
     B excess[2*M], bx[2*M], ax[2*M], by[2*M], ay[2*M], bz[2*M], az[2*M];
     const auto one = [](B v) { return (unsigned char)(v < (B)1 ? v : (B)1); };
-    const auto outer = [](B v, B is) -> B { if constexpr (COUNTS) return (B)((unsigned char)v & (unsigned char)is); else return v*is; };
     const auto face = [&](const auto* w, T c, long long k, long long shift, long long other) -> B {  // stored `shift` after cell k, to `other`
         if constexpr (COUNTS) return (B)(one(d[k]) & one(d[k + other]) & (unsigned char)(c > 0));
         else if constexpr (STENCIL == 'v') return ((d[k] != 0) & (d[k + other] != 0)) ? (B)w[k + shift] : (B)0;
@@ -41,10 +40,9 @@ if (make) {
         const auto row = [&](auto both, auto second, int from, int to, long long left, long long right) {
             enum { BOTH = decltype(both)::value, SECOND = decltype(second)::value };
             const long long at = p + (SECOND ? yp : 0), low_y = SECOND ? -yp : below_y, high_y = SECOND || wide == 1 ? above_y : yp;
-            const B only = wide == 1;
             const auto cell = [&](int i) {
                 B sum = 0, bx_ = 0, ax_ = 0, by_ = 0, ay_ = 0, bz_ = 0, az_ = 0;
-                if (SECOND) { sum = excess[i]; bx_ = bx[i]; ax_ = ax[i]; by_ = by[i]; ay_ = ay[i]; bz_ = bz[i]; az_ = az[i]; }
+                if (SECOND) { sum = excess[i]; bx_ = bx[i]; ax_ = ax[i]; bz_ = bz[i]; az_ = az[i]; }
                 const auto add = [&](auto upper) {
                     enum { UPPER = decltype(upper)::value };
                     const long long k = at + i + (UPPER ? zp : 0);
@@ -53,13 +51,13 @@ if (make) {
                     const B o = face(wz, cz, k, 0, UPPER ? -zp : below_z), q = face(wz, cz, k, zp, BOTH && !UPPER ? zp : above_z);
                     if constexpr (COUNTS) sum += (B)(d[k] - f - g - h - l - o - q);
                     else { const B e = unit*(T)d[k], v = e - f - g - h - l - o - q; sum += v > least*e ? v : (B)0; }
-                    bx_ += f; ax_ += g; ay_ += SECOND ? l : outer(l, only);
-                    if (!SECOND) by_ += h;
+                    bx_ += f; ax_ += g; by_ += h; ay_ += l;  // the last row's l counts
                     if (!UPPER) bz_ += o;
                     if (UPPER || !BOTH) az_ += q; };
                 add(No());
                 if (BOTH) add(Yes());
-                excess[i] = sum; bx[i] = bx_; ax[i] = ax_; by[i] = by_; ay[i] = ay_; bz[i] = bz_; az[i] = az_; };
+                excess[i] = sum; bx[i] = bx_; ax[i] = ax_; ay[i] = ay_; bz[i] = bz_; az[i] = az_;
+                if (!SECOND) by[i] = by_; };
             const int bytes = COUNTS ? from + (to - from)/64*64 : from;
             SIMD64 for (int i = from; i < bytes; ++i) cell(i);
             SIMD for (int i = bytes; i < to; ++i) cell(i); };
