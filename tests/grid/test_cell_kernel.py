@@ -99,7 +99,7 @@ def test_a_pass_over_a_box(box_pass: RowPass, whole: bool, given: bool) -> None:
 def test_threads_share_a_row_of_a_box_unless_it_is_whole(box_pass: RowPass) -> None:
     rows, fields = Rows.box(WINDOW.low, WINDOW.high, GRID.device), {"x": GRID.field(), "y": GRID.field(), "z": None}
     assert Rows.box(WINDOW.low, WINDOW.high, GRID.device, whole=True).single.chunks == rows.single.chunks == 1
-    chunks = Rows._make(0, GRID.device, (0, 0, 0), (2, 3, 3), None, cells=2)
+    chunks = Rows.strided(0, GRID.device, (0, 0, 0), (2, 3, 3), None, cells=2)
     chunks = replace(chunks, place=rows.place)
     fields["x"].fill_(1.0)
     box_pass.bind(chunks, **fields, sums=wp.zeros(6, dtype=wp.float64, device="cpu")).launch()

@@ -22,17 +22,19 @@ class Sequence:
         stages: the passes in order, of five forms at most, without sums. Those that are the same object are kept once.
 
     Raises:
-        ValueError: too many forms, or a pass that sums.
+        ValueError: no pass, too many forms, a pass that sums, or passes on several devices.
     """
 
     def __init__(self, name: str, stages: list[Bound]) -> None:
         forms = tuple(dict.fromkeys(stage.form for stage in stages))
         names = [form.declared.name for form in forms]
+        if not stages or any(stage.rows.device is not stages[0].rows.device for stage in stages):
+            raise ValueError(f"{name}: takes passes, all on one device")
         if len(forms) > MOST:
             raise ValueError(f"{name}: {', '.join(names)} are {len(forms)} forms: a sequence takes {MOST}")
         if summing := [form.declared.name for form in forms if form.declared.sums]:
             raise ValueError(f"{name}: {summing[0]} sums, which passes of a sequence cannot")
-        self.device, self._stages = stages[0].rows.device, stages  # which keeps what the tables have the addresses of
+        self.device, self._stages = stages[0].rows.device, tuple(stages)  # which keeps what the tables have the addresses of
         self.threads = CUDA_THREADS if self.device.is_cuda else 1
         self.kernel, Tables, structs = _sequence_kernel(name, forms)
         places = dict[int, tuple[int, int]]()
@@ -80,7 +82,7 @@ def _shared(form: Form | None) -> Any:
         P = given[place]
         lines = int(1)
         if threads == 1:
-            lines = P.L.rows
+            lines = wp.max(P.L.rows, 1)
         shares = P.L.rows // lines * P.L.chunks
         for q in range(t, P.L.planes * shares, threads):
             j = (q % shares) // P.L.chunks * lines
