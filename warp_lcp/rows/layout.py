@@ -247,9 +247,10 @@ class Rows:
             TypeError: spans are of another type.
             ValueError: a count is negative or too large, lines do not share the rows of a plane out, or spans have another shape.
         """
-        slab, cells, lines = slab or PLANES_A_THREAD["cuda" if device.is_cuda else "cpu"], cells or grain(counts[2], device) or 1, lines or 1
+        slab, cells = slab or PLANES_A_THREAD["cuda" if device.is_cuda else "cpu"], cells or grain(counts[2], device) or 1
+        lines = lines or 1
         if not 0 <= min(counts) <= max(counts) < 1 << 31 or counts[1] % lines:
-            raise ValueError(f"rows: counts {tuple(counts)}, {lines} rows a thread: expected below 2^31, and a multiple of the rows a thread")
+            raise ValueError(f"rows: counts {tuple(counts)} with {lines} rows a thread: expected below 2^31, a multiple of those")
         if spans is not None:
             check_memory("spans", spans, wp.vec2i, tuple(counts[:2]))
         names = ("base", "s1", "s2", "planes", "rows", "nx")

@@ -127,7 +127,8 @@ class RowPass:
         known = {*self.arrays.values(), *(self.stencil or ())}
         wrong |= {kind for kind in (self.compute, *numbers.values()) if isinstance(kind, str) and kind not in known}
         if wrong:
-            raise ValueError(f"{self.name}: {sorted(wrong)}: expected names that are free, rings of fields, letters of arrays, a first field of a box that is there")
+            expected = "names that are free, rings of fields, letters of arrays, a first field of a box that is not optional"
+            raise ValueError(f"{self.name}: {sorted(wrong)}: expected {expected}")
         if others := {name for name, kind in numbers.items() if not isinstance(kind, str) and kind not in PACKED}:
             raise TypeError(f"{self.name}: {sorted(others)}: expected numbers of the types {', '.join(t.__name__ for t in PACKED)}")
 
@@ -237,7 +238,8 @@ class RowPass:
                 if found != expected is not None and (found or name not in self.optional):
                     raise ValueError(f"{self.name}: {name} has {found} elements, not {expected}")
                 if found and not (value.is_contiguous and value.device is device):
-                    raise ValueError(f"{self.name}: {name} {f'is on {value.device}, not {device}' if value.is_contiguous else 'is strided'}")
+                    why = f"on {value.device}, not {device}" if value.is_contiguous else "strided"
+                    raise ValueError(f"{self.name}: {name} is {why}")
         if self.box:
             self._check_box(rows, {tuple(given[n].shape) for n in self.box if given[n] is not None})
         if self.sums and given["out"].size < len(self.sums) * rows.places:
