@@ -127,6 +127,8 @@ def test_constants_keep_their_fractions_and_numbers_their_range(row_pass):
     y, rows = zeros(3), Rows.flat(3, CPU)
     half.bind(rows, y=y, v=-(1 << 40)).launch()
     assert (y.numpy() == 0.5 - 2.0**40).all()
+    replace(half, name="test_misuse.quarter", constants={"HALF": np.float32(0.25)}).bind(rows, y=y, v=0).launch()
+    assert (y.numpy() == 0.25).all()
     half.bind(rows, y=y, v=0, HALF=-3).launch()
     assert (y.numpy() == -3).all()
     with pytest.raises(TypeError, match=r"misuse\.half: HALF are integers where given"):

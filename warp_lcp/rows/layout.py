@@ -34,7 +34,7 @@ class RowLayout:
     lines: int  # rows of a plane that it takes
     turn: int  # fields of three planes: planes before the first that they keep, too, that of ghosts, or none
     lift: int  # the plane at which they begin, counted from the first
-    spans: wp.array2d(dtype=wp.vec2i)  # first and one past the last cell of each row (k, j) that may hold unknowns; null: all
+    spans: wp.array2d(dtype=wp.vec2i)  # first (even, for `pairs`) and one past the last cell of each row (k, j) with unknowns; null: all
     o0: wp.int64  # the other level of a transfer: element of its first cell, elements from plane to plane and from row to row
     o1: wp.int64
     o2: wp.int64

@@ -297,10 +297,10 @@ class Form:
         into = not {*d.ring}.isdisjoint(d.writes)
         levels = d.finer or bool(d.other)
         switches = {"RINGS": bool(d.ring), "INTO_RING": into, "LEVELS": levels, "BOUNDS": ord(self.bounds[0]), "STENCIL": stencil}
-        macros = {n: v for n, v in constants.items() if not isinstance(v, float)}
+        macros = {n: v for n, v in constants.items() if hasattr(v, "__index__")}
         head = [f"typedef {C[t]} {n};" for n, t in letters.items()] + [f"typedef {C[of(d.compute)]} T;"] * ("T" not in letters)
         head += [f"constexpr int {n} = {int(v)};" for n, v in switches.items()] + [f"#define {n} {int(v)}" for n, v in macros.items()]
-        head += [f"constexpr double {n} = {v!r};" for n, v in constants.items() if n not in macros]
+        head += [f"constexpr double {n} = {float(v)!r};" for n, v in constants.items() if n not in macros]
         at = {n: " + p + P.ring" if n in d.ring else " + p" for n in (*d.reads, *d.writes)} | dict.fromkeys(d.other, " + P.q")
         each = ["const Piece P = piece(k_i, j_i, c_); const int n = P.n; const long long p = P.p;"]
         each += [f"const long long yp = {'L.o2' if d.finer else 'P.yp'}, zp = {'L.o1' if d.finer else 'P.zp'};"]
