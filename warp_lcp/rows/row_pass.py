@@ -250,8 +250,8 @@ class RowPass:
         if len(shapes) > 1:
             raise ValueError(f"{self.name}: fields have the shapes {', '.join(map(str, sorted(shapes)))}")
         for shape in shapes:
-            k, j, i = rows.ends
-            if len(shape) != 3 or k > shape[0] or j > shape[1] or i > shape[2]:
+            k, j, i = (1, 1, *shape) if len(shape) == 1 else shape if len(shape) == 3 else (0, 0, 0)
+            if rows.ends[0] > k or rows.ends[1] > j or rows.ends[2] > i:
                 raise ValueError(f"{self.name}: fields have the shape {shape}, the box ends at {rows.ends}")
 
 
