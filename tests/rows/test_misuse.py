@@ -155,7 +155,9 @@ def test_a_header_that_is_written_anew_is_read_anew(row_pass):
         assert (y.numpy() == value).all()
 
 
-def test_grids_without_cells_are_left_alone(add):
+def test_grids_without_cells_are_left_alone(add, row_pass):
+    total = row_pass("total", "T s = 0; " + EACH + "s += x[k];", reads={"x": "S"}, sums=("s",))
+    total.bind(Rows.flat(0, CPU), x=zeros(0), out=zeros(0)).launch()
     grids = [Rows.of(Padding(counts), CPU) for counts in ((0, 2, 2), (2, 0, 2), (2, 2, 0))]
     for rows in (*grids, Rows.flat(0, CPU), Rows.flat(0, CPU, serial=True), Rows.by_turns(0, CPU, 64)):
         y = zeros(rows.size)

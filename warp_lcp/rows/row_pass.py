@@ -233,7 +233,7 @@ class RowPass:
             for name in names:
                 value = given[name]
                 found = 0 if value is None else value.size
-                if not found:
+                if not found and name in self.optional:
                     given[name] = None  # a slice of nothing has an address
                 if found != expected is not None and (found or name not in self.optional):
                     raise ValueError(f"{self.name}: {name} has {found} elements, not {expected}")
