@@ -119,7 +119,7 @@ class RowPass:
     def _check_names(self) -> None:
         """Check the declaration, in whose place a compiler would complain, or nobody."""
         numbers = {n: kind for n, kind in self.numbers.items() if not (self.box and n in PLACE)}
-        groups = (self.reads, self.writes, self.other, self.by_row, self.whole, self.box, numbers, self.constants, self.sums and ("out",))
+        groups = (self.reads, self.writes, self.other, self.by_row, {**self.whole, **self.box}, numbers, self.constants, self.sums and ("out",))
         names = [name for group in groups for name in group]
         wrong = {name for name in names if names.count(name) > 1 or not name.isidentifier() or name in OWN}
         wrong |= {*self.ring} - {*self.reads, *self.writes} | {*self.optional} & {*[*self.box][:1]}
@@ -250,7 +250,7 @@ class RowPass:
         if len(shapes) > 1:
             raise ValueError(f"{self.name}: fields have the shapes {', '.join(map(str, sorted(shapes)))}")
         for shape in shapes:
-            k, j, i = (1, 1, *shape) if len(shape) == 1 else shape if len(shape) == 3 else (0, 0, 0)
+            k, j, i = shape if len(shape) == 3 else (1, 1, shape[0])  # else a list
             if rows.ends[0] > k or rows.ends[1] > j or rows.ends[2] > i:
                 raise ValueError(f"{self.name}: fields have the shape {shape}, the box ends at {rows.ends}")
 
