@@ -119,7 +119,8 @@ class RowPass:
     def _check_names(self) -> None:
         """Check the declaration, in whose place a compiler would complain, or nobody."""
         numbers = {n: kind for n, kind in self.numbers.items() if not (self.box and n in PLACE)}
-        groups = (self.reads, self.writes, self.other, self.by_row, {**self.whole, **self.box}, numbers, self.constants, self.sums and ("out",))
+        fields = (self.reads, self.writes, self.other, self.by_row, {**self.whole, **self.box})
+        groups = (*fields, numbers, self.constants, self.sums and ("out",))
         names = [name for group in groups for name in group]
         wrong = {name for name in names if names.count(name) > 1 or not name.isidentifier() or name in OWN}
         wrong |= {*self.ring} - {*self.reads, *self.writes} | {*self.optional} & {*[*self.box][:1]}
