@@ -13,7 +13,7 @@ from warp_lcp.layout import Padding
 from warp_lcp.operators.stencil_kernels import PRODUCT, RELAX, WRAP
 from warp_lcp.program import Launch, perform
 from warp_lcp.rows import Bound, Rows
-from warp_lcp.rows.layout import put, stencil_struct
+from warp_lcp.rows.layout import check_memory, put, stencil_struct
 
 
 class Ghosts(Protocol):
@@ -81,6 +81,8 @@ class Stencil:
         variable, d, w = self.storage
         numbers = {"unit": self.unit, **dict(zip(("cx", "cy", "cz"), self.coefficients, strict=True))}
         weights = dict(zip(("wx", "wy", "wz"), self.weights or (), strict=False)) if variable else {}
+        for name, array in weights.items():
+            check_memory(f"the stencil's {name}", array, w, (self.d.size,))
         return put(stencil_struct(d, w)(), numbers | {"d": self.d} | weights)
 
     @property

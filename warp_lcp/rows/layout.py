@@ -34,7 +34,7 @@ class RowLayout:
     lines: int  # rows of a plane that it takes
     turn: int  # fields of three planes: planes before the first that they keep, too, that of ghosts, or none
     lift: int  # the plane at which they begin, counted from the first
-    spans: wp.array2d(dtype=wp.vec2i)  # first and one past the last cell of each row (k, j) that may hold unknowns; null: all
+    spans: wp.array2d(dtype=wp.vec2i)  # first (even, for `pairs`) and one past the last cell of each row (k, j) with unknowns; null: all
     o0: wp.int64  # the other level of a transfer: element of its first cell, elements from plane to plane and from row to row
     o1: wp.int64
     o2: wp.int64
@@ -61,6 +61,20 @@ NOTHING, EMPTY = Struct(""), MappingProxyType[str, Any]({})
 NO_ARRAY = bytes(wp.array(dtype=wp.uint8).__ctype__())
 
 
+def check_memory(name: str, array: Any, dtype: Any, shape: tuple[int, ...]) -> None:
+    """Check what kernels are to have the address of.
+
+    Raises:
+        TypeError: it is no array of this type.
+        ValueError: it has another shape, or elements that do not lie side by side.
+    """
+    if not isinstance(array, wp.array) or array.dtype is not dtype:
+        found = array.dtype if isinstance(array, wp.array) else type(array)
+        raise TypeError(f"{name} is {found.__name__}, not an array of {dtype.__name__}")
+    if tuple(array.shape) != shape or not array.is_contiguous:
+        raise ValueError(f"{name} has shape {array.shape}{', strided' * (not array.is_contiguous)}: expected {shape}, contiguous")
+
+
 def put(struct: Any, members: Mapping[str, Any]) -> Any:
     """Set members of a Warp struct whose types have been checked, and return it: in a third of the time that attributes take."""
     native = struct.__ctype__()
@@ -85,13 +99,13 @@ def copy_of(struct: Any) -> Any:
 
 
 def joined(blank: Any, members: dict[str, Any], packing: Struct = NOTHING, numbers: Mapping[str, Any] = EMPTY) -> Any:
-    """Return a Warp struct like `blank` of the memory of its members, in a tenth of the time of setting them.
+    """Return a Warp struct like `blank` of the memory of all its members, in a tenth of the time of setting them.
 
     Members lie as in C: those that fill whole eight bytes (structs, arrays, None for no array) side by side, then numbers.
     """
     memory = b"".join([NO_ARRAY if v is None else v.__ctype__() for v in members.values()]) + packing.pack(*numbers.values())
     made, native = object.__new__(type(blank)), type(blank.__ctype__())
-    made.__dict__.update(blank.__dict__, **members, **numbers, _ctype=native.from_buffer_copy(memory.ljust(ctypes.sizeof(native), b"\0")))
+    made.__dict__.update(members, **numbers, _ctype=native.from_buffer_copy(memory.ljust(ctypes.sizeof(native), b"\0")))
     return made
 
 
@@ -120,6 +134,7 @@ class Known:
     @functools.cached_property
     def struct(self) -> Any:
         """What passes take of it."""
+        check_memory("a known product", self.y, wp.float64, (self.d.size,))
         return put(copy_of(_blank_stencil(self.d.dtype)), {"unit": float(self.unit), "d": self.d, "known": self.y})
 
 
@@ -175,7 +190,13 @@ class Rows:
         return made._changed(lift=1)
 
     def after_ghosts(self) -> "Rows":
-        """Return the same rows for passes whose fields of three planes begin with one of ghosts."""
+        """Return the same rows for passes whose fields of three planes begin with one of ghosts.
+
+        Raises:
+            ValueError: there are fewer than two: with ghost cells, a field has no room for three planes and what is below them.
+        """
+        if self.single.planes < 2:
+            raise ValueError(f"planes: {self.single.planes}: expected at least 2 after one of ghosts")
         return self._changed(turn=1)
 
     def _changed(self, **members: int) -> "Rows":
@@ -196,7 +217,13 @@ class Rows:
 
     @staticmethod
     def box(low: tuple[int, int, int], high: tuple[int, int, int], device: wp.Device, *, cells: int | None = None) -> "Rows":
-        """Return the rows of stored cells low <= (k, j, i) < high of a grid; a thread takes some `cells` of one."""
+        """Return the rows of stored cells low <= (k, j, i) < high of a grid; a thread takes some `cells` of one.
+
+        Raises:
+            ValueError: low is not between 0 and high.
+        """
+        if not all(0 <= begin <= end for begin, end in zip(low, high, strict=True)):
+            raise ValueError(f"box: from {low} to {high}: expected 0 <= low <= high")
         counts = tuple(end - begin for begin, end in zip(low, high, strict=True))
         made = Rows.strided(0, device, (0, 0, 0), counts, cells=cells, lines=1 if device.is_cuda else counts[1])
         return replace(made, place=dict(zip(("k0", "j0", "i0"), low, strict=True)))
@@ -211,7 +238,7 @@ class Rows:
         """Return a flat field as rows of a width: a thread of a pass that sums takes the same place of each, its neighbor the next."""
         planes = -(-size // width)
         ends = np.full((planes, 1, 2), (0, width))
-        ends[-1, 0, 1] -= planes * width - size
+        ends[-1:, 0, 1] -= planes * width - size
         spans = wp.array(ends, dtype=wp.vec2i, device=device)
         return Rows.strided(size, device, (0, width, 0), (planes, 1, width), spans, cells=1, slab=planes)
 
@@ -219,8 +246,18 @@ class Rows:
     def strided(
         size: int, device: wp.Device, first: Any, counts: Any, spans: Any = None, cells: Any = None, slab: Any = None, lines: int = 1
     ) -> "Rows":
-        """Return rows by the first cell's element and the steps from plane to plane and row to row, and counts of planes, rows, cells."""
-        slab, cells = slab or PLANES_A_THREAD["cuda" if device.is_cuda else "cpu"], cells or grain(counts[2], device)
+        """Return rows by the first cell's element and the steps from plane to plane and row to row, and counts of planes, rows, cells.
+
+        Raises:
+            TypeError: spans are of another type.
+            ValueError: a count is negative or too large, lines do not share the rows of a plane out, or spans have another shape.
+        """
+        slab, cells = slab or PLANES_A_THREAD["cuda" if device.is_cuda else "cpu"], cells or grain(counts[2], device) or 1
+        lines = lines or 1
+        if not 0 <= min(counts) <= max(counts) < 1 << 31 or counts[1] % lines:
+            raise ValueError(f"rows: counts {tuple(counts)} with {lines} rows a thread: expected below 2^31, a multiple of those")
+        if spans is not None:
+            check_memory("spans", spans, wp.vec2i, tuple(counts[:2]))
         names = ("base", "s1", "s2", "planes", "rows", "nx")
         shared = dict(zip(names, (*first, *counts), strict=True)) | {"grain": cells, "chunks": -(-counts[2] // cells), "spans": spans}
         shared["lines"] = lines
@@ -234,14 +271,14 @@ class Rows:
             other: the rows of that level.
             factors: cells of it along x, y, z that one of ours stands for; below 0: of ours that one of its stands for.
         """
-        made = self._pairs.get(id(other))
+        made = self._pairs.get((id(other), factors))
         if made is None:
-            made = self._pairs[id(other)] = other, self._beside(other, factors)
+            made = self._pairs[id(other), factors] = other, self._beside(other, factors)
         return made[1]
 
     @functools.cached_property
-    def _pairs(self) -> dict[int, tuple["Rows", "Rows"]]:
-        """Rows with another level's beside them: of each level that has been asked for, and which that is."""
+    def _pairs(self) -> dict[tuple[int, Any], tuple["Rows", "Rows"]]:
+        """Rows with another level's beside them: of each level and factors that have been asked for, and which that is."""
         return {}
 
     def _beside(self, other: "Rows", factors: tuple[int, int, int]) -> "Rows":
@@ -260,6 +297,12 @@ class Rows:
         return int(self.single.planes * self.single.rows)
 
     @functools.cached_property
+    def ends(self) -> tuple[int, ...]:
+        """One past the last stored cell (k, j, i) of a box."""
+        L = self.single
+        return tuple(first + n for first, n in zip(self.place.values(), (L.planes, L.rows, L.nx), strict=True))
+
+    @functools.cached_property
     def places(self) -> int:
         """How many sums a pass makes of each kind, one a thread."""
         planes, rows, chunks = threads(self.summed)
@@ -269,7 +312,7 @@ class Rows:
 @functools.lru_cache(maxsize=1024)
 def _flat(size: int, name: str, serial: bool) -> Rows:
     device = wp.get_device(name)
-    if serial or not device.is_cuda:
+    if serial or not device.is_cuda or not size:
         return Rows.strided(size, device, (0, 0, 0), (1, 1, size), cells=max(size, 1) if serial else CPU_CHUNK)
     return Rows.by_turns(size, device, min(size, CUDA_THREADS))
 

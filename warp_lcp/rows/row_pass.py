@@ -9,6 +9,7 @@ import re
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from operator import index
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,7 +30,6 @@ NUMBERS = "numbers"  # that are the same everywhere, infinite ones too; else "co
 UNIFORM, VARIABLE, KNOWN = "uniform", "variable", "known"  # stencils: with a weight an axis, with arrays of them, with a product in place
 
 
-@functools.cache
 def text(path: Path) -> str:
     """Return a header with those that it includes, from beside it or from here. As text, Warp sees changes; errors name file and line."""
     lines = [f'#line 1 "{path.name}"']
@@ -40,6 +40,12 @@ def text(path: Path) -> str:
     return "\n".join(lines)
 
 
+@functools.cache
+def shared(name: str) -> str:
+    """Return a header of the layer's own."""
+    return text(HEADERS / name)
+
+
 @wp.struct
 class Nothing:
     """Fields of a pass that a wave does not have; of eight bytes, as `joined` asks for."""
@@ -48,6 +54,7 @@ class Nothing:
 
 
 NOTHING = Nothing()
+OWN = frozenset(("self", "rows", "stencil", "bounds", "given", "P", "n", "p", "ym", "yp", "zm", "zp", "down", "up", "_ctype"))  # names
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +86,10 @@ class RowPass:
         numbers: given by the host.
         sums: variables of the row function that are summed over the cells.
         constants: numbers that are known when the kernel is made, with their usual values; those that are given are integers, and macros.
+
+    Raises:
+        ValueError: a name cannot be one in C++, is the layer's own, or stands for two things; a role or a letter is of no array.
+        TypeError: a number is of a type that cannot be given.
     """
 
     name: str
@@ -101,10 +112,28 @@ class RowPass:
     listed: str = ""
 
     def __post_init__(self) -> None:
-        """Make the form of a box at once: a Warp module that has been loaded would be compiled again with it."""
+        """Check names, and make the form of a box at once: a Warp module that has been loaded would be compiled again with it."""
+        self._check_names()
         if self.box:
             object.__setattr__(self, "numbers", {**self.numbers, **dict.fromkeys(PLACE, int)})
             assert _form(self, (), tuple(self.constants.items()), UNIFORM, NUMBERS).kernel
+
+    def _check_names(self) -> None:
+        """Check the declaration, in whose place a compiler would complain, or nobody."""
+        numbers = {n: kind for n, kind in self.numbers.items() if not (self.box and n in PLACE)}
+        fields = (self.reads, self.writes, self.other, self.by_row, {**self.whole, **self.box})
+        groups = (*fields, numbers, self.constants, self.sums and ("out",))
+        names = [name for group in groups for name in group]
+        wrong = {name for name in names if names.count(name) > 1 or not name.isidentifier() or name in OWN}
+        wrong |= {*self.ring} - {*self.reads, *self.writes} | {*self.optional} & {*[*self.box][:1]}
+        wrong |= {part for part in self.name.split(".") if not part.isidentifier()}
+        known = {*self.arrays.values(), *(self.stencil or ())}
+        wrong |= {kind for kind in (self.compute, *numbers.values()) if isinstance(kind, str) and kind not in known}
+        if wrong:
+            expected = "names that are free, rings of fields, letters of arrays, a first field of a box that is not optional"
+            raise ValueError(f"{self.name}: {sorted(wrong)}: expected {expected}")
+        if others := {name for name, kind in numbers.items() if not isinstance(kind, str) and kind not in PACKED}:
+            raise TypeError(f"{self.name}: {sorted(others)}: expected numbers of the types {', '.join(t.__name__ for t in PACKED)}")
 
     @functools.cached_property
     def arrays(self) -> dict[str, Any]:
@@ -123,7 +152,7 @@ class RowPass:
 
         Raises:
             TypeError: one is missing, unknown, or of the wrong type.
-            ValueError: an array has the wrong length.
+            ValueError: an array has the wrong length, lies on another device, or its elements do not lie side by side.
         """
         if (self.stencil is None) != (stencil is None) or self.bounds == (bounds is None):
             verb = {True: "needs", False: "takes no"}
@@ -132,13 +161,26 @@ class RowPass:
             given |= rows.place
             constants = tuple(self.constants.values())
         else:
-            constants = tuple([int(given.pop(n, usual)) for n, usual in self.constants.items()]) if self.constants else ()
+            try:
+                constants = tuple([index(given.pop(n)) if n in given else v for n, v in self.constants.items()]) if self.constants else ()
+            except TypeError as error:
+                raise TypeError(f"{self.name}: {', '.join(self.constants)} are integers where given: {error}") from None
         if given.keys() != self._wanted:
             missing, unknown = sorted(self._wanted - given.keys()), sorted(given.keys() - self._wanted)
             raise TypeError(f"{self.name}: missing {missing}, unknown {unknown}")
         types = [getattr(given[n], "dtype", None) for n in self.arrays]
-        weights, kind = stencil.weights if stencil is not None else None, _kind(bounds) if bounds else NUMBERS
-        stored = (type(stencil), stencil.d.dtype, weights[0].dtype if weights else None) if stencil is not None else ()
+        kind, weights, stored = NUMBERS, None, ()
+        if bounds:
+            lower, _, upper, _, code = bounds
+            if length := code.size or lower.size or upper.size:
+                kind = "coded" if code.size else "fields"
+                if length != rows.size:
+                    raise ValueError(f"{self.name}: bounds have {length} elements, not {rows.size}")
+        if stencil is not None:
+            d, weights = stencil.d, stencil.weights
+            stored = (type(stencil), d.dtype, weights[0].dtype if weights else None)
+            if d.size != (rows.other_size if self.finer else rows.size):
+                raise ValueError(f"{self.name}: the stencil has {d.size} elements, not {rows.other_size if self.finer else rows.size}")
         key = (constants, kind, *stored, *types)
         made = self._forms.get(key)
         if made is None:
@@ -146,7 +188,7 @@ class RowPass:
             numbers = tuple(zip(self.constants, constants, strict=True))
             shape = KNOWN if isinstance(stencil, Known) else VARIABLE if weights else UNIFORM
             made = self._forms[key] = _form(self, letters, numbers, shape, kind)
-        self._check_lengths(rows, given)
+        self._check_memory(rows, given)
         return Bound(made, rows, made.fill(stencil, bounds, given))
 
     @functools.cached_property
@@ -176,30 +218,44 @@ class RowPass:
                 raise TypeError(f"{self.name}: {name} is {found.__name__}, not an array of {expected.__name__}{why}")
             seen.setdefault(kind, name)
         used = {kind for kind in (*self.arrays.values(), *(self.stencil or ())) if isinstance(kind, str)}
+        if others := [f"{seen[kind]} is {found.__name__}" for kind, found in letters.items() if found not in C]:
+            raise TypeError(f"{self.name}: {others[0]}: a letter stands for {', '.join(t.__name__ for t in C)}")
         return letters | dict.fromkeys(used - letters.keys(), wp.float32)  # of what is absent
 
     @functools.cached_property
-    def _lengths(self) -> list[tuple[str, str]]:
-        """Names of the arrays whose lengths are known, each with the attribute of rows that it is."""
-        groups = (({**self.reads, **self.writes}, "size"), (self.other, "other_size"), (self.by_row, "count"))
-        return [(name, length) for names, length in groups for name in names]
+    def _lengths(self) -> list[tuple[str | None, tuple[str, ...]]]:
+        """Names of the arrays of each length, with the attribute of rows that it is; None: of any."""
+        sized = (("size", {**self.reads, **self.writes}), ("other_size", self.other), ("count", self.by_row))
+        groups = (*sized, (None, {**self.whole, **self.box, **dict.fromkeys(("out",) * bool(self.sums))}))
+        return [(length, tuple(names)) for length, names in groups if names]
 
-    def _check_lengths(self, rows: Rows, given: dict[str, Any]) -> None:
-        for name, length in self._lengths:
-            found, expected = 0 if given[name] is None else given[name].size, getattr(rows, length)
-            if found != expected and (found or name not in self.optional):
-                raise ValueError(f"{self.name}: {name} has {found} elements, not {expected}")
-        if self.box and len(shapes := {tuple(given[n].shape[-3:]) for n in self.box if given[n] is not None}) > 1:
-            raise ValueError(f"{self.name}: fields have the shapes {', '.join(map(str, sorted(shapes)))}")
+    def _check_memory(self, rows: Rows, given: dict[str, Any]) -> None:
+        device = rows.device
+        for length, names in self._lengths:
+            expected = length and getattr(rows, length)
+            for name in names:
+                value = given[name]
+                found = 0 if value is None else value.size
+                if not found and name in self.optional:
+                    given[name] = None  # a slice of nothing has an address
+                if found != expected is not None and (found or name not in self.optional):
+                    raise ValueError(f"{self.name}: {name} has {found} elements, not {expected}")
+                if found and not (value.is_contiguous and value.device is device):
+                    why = f"on {value.device}, not {device}" if value.is_contiguous else "strided"
+                    raise ValueError(f"{self.name}: {name} is {why}")
+        if self.box:
+            self._check_box(rows, {tuple(given[n].shape[-3:]) for n in self.box if given[n] is not None})
         if self.sums and given["out"].size < len(self.sums) * rows.places:
             least = f"fewer than {len(self.sums) * rows.places}: {rows.places} threads for each sum"
             raise ValueError(f"{self.name}: out has {given['out'].size} elements, {least}")
 
-
-def _kind(bounds: list[Any]) -> str:
-    """Return which of the operands of bounds count."""
-    lower, _, upper, _, code = bounds
-    return "coded" if code.size else "fields" if lower.size or upper.size else NUMBERS
+    def _check_box(self, rows: Rows, shapes: set[tuple[int, ...]]) -> None:
+        if len(shapes) > 1:
+            raise ValueError(f"{self.name}: fields have the shapes {', '.join(map(str, sorted(shapes)))}")
+        for shape in shapes:
+            k, j, i = shape if len(shape) == 3 else (1, 1, shape[0])  # else a list
+            if not self.listed and (rows.ends[0] > k or rows.ends[1] > j or rows.ends[2] > i):
+                raise ValueError(f"{self.name}: fields have the shape {shape}, the box ends at {rows.ends}")
 
 
 @functools.cache
@@ -244,10 +300,10 @@ class Form:
         into = not {*d.ring}.isdisjoint(d.writes)
         levels = d.finer or bool(d.other)
         switches = {"RINGS": bool(d.ring), "INTO_RING": into, "LEVELS": levels, "BOUNDS": ord(self.bounds[0]), "STENCIL": stencil}
-        macros = {n: v for n, v in constants.items() if not isinstance(v, float)}
+        macros = {n: v for n, v in constants.items() if hasattr(v, "__index__")}
         head = [f"typedef {C[t]} {n};" for n, t in letters.items()] + [f"typedef {C[of(d.compute)]} T;"] * ("T" not in letters)
         head += [f"constexpr int {n} = {int(v)};" for n, v in switches.items()] + [f"#define {n} {int(v)}" for n, v in macros.items()]
-        head += [f"constexpr double {n} = {v!r};" for n, v in constants.items() if n not in macros]
+        head += [f"constexpr double {n} = {float(v)!r};" for n, v in constants.items() if n not in macros]
         at = {n: " + p + P.ring" if n in d.ring else " + p" for n in (*d.reads, *d.writes)} | dict.fromkeys(d.other, " + P.q")
         each = ["const Piece P = piece(k_i, j_i, c_); const int n = P.n; const long long p = P.p;"]
         each += [f"const long long yp = {'L.o2' if d.finer else 'P.yp'}, zp = {'L.o1' if d.finer else 'P.zp'};"]
@@ -256,7 +312,7 @@ class Form:
         if levels:
             each += ["const bool pairs = L.fx > 1 || L.fx < -1; const int deep = L.fz == 1 || 2*P.k + 2 > L.n1 ? 1 : 2;"]
             each += ["const int wide = L.fy == 1 || 2*P.j + 2 > L.n2 ? 1 : 2;"]
-        for n in (n for n in d.arrays if n != "out" and n not in d.box):
+        for n in (n for n in d.arrays if n not in d.box and not (d.sums and n == "out")):
             pointer = f"given.{n}.data{at.get(n, '')}"
             pointer = f"given.{n}.data ? {pointer} : nullptr" if n in d.optional else pointer
             each += [f"{'const ' * (n in d.reads)}auto* {n} = {pointer};"]
@@ -271,17 +327,24 @@ class Form:
             each += [f"const auto* {n} = given.stencil.{n}.data + {'P.q' if d.finer else 'p'};" for n in ("d", "wx", "wy", "wz", "known")]
             each += [f"const T {n} = (T)given.stencil.{n};" for n in ("unit", "cx", "cy", "cz")]
         sums = [f"const double all_[] = {{{', '.join(f'(double){s}' for s in d.sums)}}}; double* sums_ = given.out.data + P.t;"]
-        sums += [f"for (int s = 0; s < {len(d.sums)}; ++s, sums_ += places) *sums_ = P.more ? all_[s] + *sums_ : all_[s];"]
-        shared = [text(HEADERS / h) for h, used in (("stencil.h", d.stencil), ("bounds.h", d.bounds)) if used]
+        sums += [f"for (int s = 0; s < {len(d.sums)}; ++s, sums_ += places_) *sums_ = P.more ? all_[s] + *sums_ : all_[s];"]
+        common = [shared(h) for h, used in (("stencil.h", d.stencil), ("bounds.h", d.bounds)) if used]
         loops = ["for (int k_i = k_ < 0 ? 0 : k_; k_i < end_ && k_i < L.planes; ++k_i)", "for (int j_i = j_; j_i < last_; ++j_i) {"]
-        before = [text(HEADERS / "native.h"), '#line 1 "types"', *head, text(HEADERS / "piece.h"), '#line 1 "fields"', *loops, *each]
+        before = [shared("native.h"), '#line 1 "types"', *head, shared("piece.h"), '#line 1 "fields"', *loops, *each]
         body = ["{", text(d.header), "}"] if d.box else [text(d.header)]  # there names may be those of the pass
         tail = ['#line 1 "end"', "}", *["}"] * bool(d.listed), *(f"#undef {n}" for n in macros), ""]
-        return "\n".join(["", *before, *shared, *body, '#line 1 "sums"', *(sums if d.sums else []), *tail])
+        return "\n".join(["", *before, *common, *body, '#line 1 "sums"', *(sums if d.sums else []), *tail])
 
     def alike(self, declared: RowPass) -> "Form":
-        """Return another pass without a stencil in the form that has the same types."""
-        letters = {kind: self.letters[kind] for kind in declared.arrays.values() if isinstance(kind, str)}
+        """Return another pass without a stencil in the form that has the same types.
+
+        Raises:
+            TypeError: it has a stencil, or letters that are not known here.
+        """
+        used = {kind for kind in declared.arrays.values() if isinstance(kind, str)}
+        if declared.stencil or not used <= self.letters.keys():
+            raise TypeError(f"{declared.name}: cannot be left out beside {self.declared.name}, which does not tell its types")
+        letters = {kind: self.letters[kind] for kind in used}
         return _form(declared, tuple(sorted(letters.items())), tuple(declared.constants.items()), UNIFORM, self.bounds)
 
     def fill(self, stencil: Any, bounds: Any, given: dict[str, Any]) -> Any:
@@ -291,8 +354,13 @@ class Form:
             lower, least, upper, most, code = bounds
             numbers = {"least": least.value, "most": most.value}
             parts["bounds"] = joined(NO_BOUNDS, {"lower": lower, "upper": upper, "code": code}, SIDES, numbers)
-        arrays = {name: given[name] for name in self.types}
-        return joined(self.blank, parts | arrays, self._numbers, {name: given[name] for name in self.declared.numbers})
+        for name in self.types:
+            parts[name] = given[name]
+        values = {name: given[name] for name in self.declared.numbers}
+        try:
+            return joined(self.blank, parts, self._numbers, values)
+        except struct.error as error:
+            raise TypeError(f"{self.declared.name}: {', '.join(f'{n} = {v!r}' for n, v in values.items())}: {error}") from None
 
     @functools.cached_property
     def kernel(self) -> Any:
@@ -328,22 +396,36 @@ class Wave:
 
     Args:
         name: of the kernel, as a pass has one.
-        stages: passes, each with how many planes it is behind the first.
+        stages: at most four passes, each with how many planes it is behind the first.
+
+    Raises:
+        ValueError: there are too many, or the first is behind.
     """
 
     def __init__(self, name: str, *stages: tuple[RowPass, int]) -> None:
+        if not 0 < len(stages) <= LARGEST or stages[0][1] or min(lag for _, lag in stages) < 0:
+            raise ValueError(f"{name}: expected 1 to {LARGEST} passes, 0 and more planes behind the first")
         self.name, self.stages = name, stages
 
     def launch(self, *passes: Bound | None, launch: Any = wp.launch) -> None:
-        """Launch the passes, or record them; None leaves one out, and no other kernel is needed for the rest."""
+        """Launch the passes, or record them; None leaves one out, and no other kernel is needed for the rest.
+
+        Raises:
+            TypeError: passes are others, or in another order, than declared, or left out though nothing else tells their types.
+            ValueError: threads share the rows of one out, as those of a flat field.
+        """
         declared = tuple(stage for stage, _ in self.stages)
         given = [b for b in passes if b is not None]
         if len(passes) != len(declared) or any(b and b.form.declared is not stage for b, stage in zip(passes, declared, strict=True)):
             raise TypeError(f"{self.name}: takes {', '.join(stage.name for stage in declared)}, in this order")
+        if not given:
+            return
         if given[0].rows.device.is_cuda:
             for bound in given:
                 bound.launch(launch)
             return
+        if max([b.rows.single.chunks for b in given]) > 1:
+            raise ValueError(f"{self.name}: takes whole rows, not chunks of them")
         forms = tuple(b.form if b else given[0].form.alike(stage) for b, stage in zip(passes, declared, strict=True))
         kernel, Stages = _wave_kernel(self.name, forms, tuple(lag for _, lag in self.stages))
         parts = [part for b, form in zip(passes, forms, strict=True) for part in ((b.layout, b.fields) if b else (no_rows(), form.blank))]
@@ -353,11 +435,11 @@ class Wave:
 
 @wp.func
 def plane_after(L: RowLayout, i: int):
-    """Plane whose turn it is once plane i of the wave is done; on a coarser level, when its last finer one is; -1: none."""
+    """Plane whose turn it is once plane i of the wave is done; on a coarser level, once, when its last finer one is; -1: none."""
     k = i
     if L.fz > 1:
         k = i // L.fz
-        if (i + 1) % L.fz != 0 and i != L.n1 - 1:
+        if i >= L.n1 or ((i + 1) % L.fz != 0 and i != L.n1 - 1):
             k = -1
     return k
 
@@ -389,7 +471,7 @@ def _wave_kernel(name: str, forms: tuple[Form, ...], lags: tuple[int, ...]) -> A
     )  # one argument, which takes a fraction of the time of eight
 
     def wave(W: Stages):
-        for s in range(wp.max(W.L1.planes, W.L2.planes) + most):
+        for s in range(wp.max(wp.max(W.L1.planes, W.L2.planes), wp.max(W.L3.planes, W.L4.planes)) + most):
             first(W.L1, W.F1, s, s + 1, 0, W.L1.rows, 0)
             k = plane_after(W.L2, s - two)
             second(W.L2, W.F2, k, k + 1, 0, W.L2.rows, 0)

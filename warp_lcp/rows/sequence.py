@@ -22,17 +22,19 @@ class Sequence:
         stages: the passes in order, of five forms at most, without sums. Those that are the same object are kept once.
 
     Raises:
-        ValueError: too many forms, or a pass that sums.
+        ValueError: no pass, too many forms, a pass that sums, or passes on several devices.
     """
 
     def __init__(self, name: str, stages: list[Bound]) -> None:
         forms = tuple(dict.fromkeys(stage.form for stage in stages))
         names = [form.declared.name for form in forms]
+        if not stages or any(stage.rows.device is not stages[0].rows.device for stage in stages):
+            raise ValueError(f"{name}: takes passes, all on one device")
         if len(forms) > MOST:
             raise ValueError(f"{name}: {', '.join(names)} are {len(forms)} forms: a sequence takes {MOST}")
         if summing := [form.declared.name for form in forms if form.declared.sums]:
             raise ValueError(f"{name}: {summing[0]} sums, which passes of a sequence cannot")
-        self.device, self._stages = stages[0].rows.device, stages  # which keeps what the tables have the addresses of
+        self.device, stages = stages[0].rows.device, tuple(stages)
         self.threads = CUDA_THREADS if self.device.is_cuda else 1
         self.kernel, Tables, structs = _sequence_kernel(name, forms)
         places = dict[int, tuple[int, int]]()
@@ -43,11 +45,11 @@ class Sequence:
             kept[which].append(bytes(bound.layout.__ctype__()) + bytes(bound.fields.__ctype__()))
         self.tables = Tables()
         self.order = self.tables.order = wp.array([places[id(stage)] for stage in stages], dtype=wp.vec2i, device=self.device)
-        self._memory = []
         for table, struct, pieces in zip(TABLES, structs, kept, strict=False):
             stored = wp.array(np.frombuffer(b"".join(pieces), dtype=np.uint8), device=self.device)
-            setattr(self.tables, table, wp.array(ptr=stored.ptr, dtype=struct, shape=len(pieces), device=self.device))
-            self._memory.append(stored)
+            typed = wp.array(ptr=stored.ptr, dtype=struct, shape=len(pieces), device=self.device)
+            typed.kept = stored, stages  # a recorded launch keeps the tables alone, and they what they have the addresses of
+            setattr(self.tables, table, typed)
 
     def launch(self, launch: Any = wp.launch) -> None:
         """Launch all passes, or record their launch."""
@@ -80,7 +82,7 @@ def _shared(form: Form | None) -> Any:
         P = given[place]
         lines = int(1)
         if threads == 1:
-            lines = P.L.rows
+            lines = wp.max(P.L.rows, 1)
         shares = P.L.rows // lines * P.L.chunks
         for q in range(t, P.L.planes * shares, threads):
             j = (q % shares) // P.L.chunks * lines

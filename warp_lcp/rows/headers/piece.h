@@ -8,10 +8,10 @@ struct Piece {
     int k, j, first, row;       // plane, row in it, first cell, counted from 0; row of all
     int t; bool more;           // place of the thread's sums, and whether something is there already
 };
-const long long places = (L.planes + L.slab - 1)/L.slab*L.rows*L.chunks;  // of the sums of all threads
+const long long places_ = (L.planes + L.slab - 1)/L.slab*L.rows*L.chunks, places = places_;  // of the sums of all threads; a number may hide the name
 const auto over = [](int i, int f) -> long long { return f > 0 ? (long long)i*f : i / -f; };  // along an axis, from level to level
 const auto piece = [&](int k, int j, int c) -> Piece {
-    Piece P; int first = c*L.grain, last = L.nx < first + L.grain ? L.nx : first + L.grain;
+    Piece P; int first = c*L.grain, last = L.nx - first < L.grain ? L.nx : first + L.grain;  // not above 2^31
     P.k = k; P.j = j; P.row = k*L.rows + j;
     if (L.spans.data) {
         const auto span = L.spans.data[P.row];
