@@ -21,11 +21,9 @@ from warp_lcp.rows import Rows
 from warp_lcp.settings import Count, CountOrZero, Settings, Share
 from warp_lcp.solve import FLOOR_MARGIN, IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
 from warp_lcp.solvers import active_set_passes as passes
-from warp_lcp.solvers.coarse_problem import CoarseProblem
-from warp_lcp.solvers.interior_steps import InteriorSteps
 from warp_lcp.solvers.minimum_map_newton_direct import DirectNewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
-from warp_lcp.solvers.phases import GradientPhase, ProximalPoint, projected_cycle
+from warp_lcp.solvers.phases import CoarseProblem, GradientPhase, InteriorSteps, ProximalPoint, projected_cycle
 from warp_lcp.solvers.principal_system import DenseSystem, GridSystem, PrincipalSystem, principal_system
 from warp_lcp.solvers.projected_multigrid_kernels import SLOTS
 from warp_lcp.vectors import Reduction

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse
 import warp as wp
 
+from warp_lcp.multigrid.aggregates import suits_multigrid
+from warp_lcp.multigrid.coarse_points import coarse_points
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.sparse import SparseOperator
@@ -17,7 +21,7 @@ from warp_lcp.protocol import HasRows, HasScale, HasStencil, has
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import SolveStatus
 from warp_lcp.rows import Rows
-from warp_lcp.solve import EPS, FLOOR_MARGIN, Step
+from warp_lcp.solve import EPS, FLOOR_MARGIN, Step, solve
 from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers.dense_problem import proved_infeasible
 from warp_lcp.solvers.principal_system import GridSystem
@@ -26,6 +30,7 @@ from warp_lcp.stopping import StoppingCriteria
 from warp_lcp.vectors import Reduction
 
 if TYPE_CHECKING:
+    from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
     from warp_lcp.solvers.principal_system_sparse import SparseSystem
 
 # of steps on a grid's matrix
@@ -38,9 +43,17 @@ RAISED, LARGEST = 100.0, 1.0  # factor of eps where a regularized problem is not
 NEAR = 1e-3  # of a center's residual: what the regularized problem's may be when the next center is taken
 TRIED, FEWER = 30, 15  # steps for one center, before and after eps had to be raised
 SMALL = 1000  # unknowns up to which a sparse matrix is taken as a dense one, for which least-index pivoting is there
-FALL = 0.9  # a center whose residual is above this part of the smallest so far is no progress
+FALL = 0.9  # a center, or a step of another method, whose residual is above this part of the smallest so far is no progress
 IDLE = 4  # centers without progress before the end
 PATIENCE = StoppingCriteria.patience  # gradient steps that neither lower the energy nor the residual before the end
+# of interior-point steps
+PATH_IDLE = 10  # steps without progress before the proximal-point iteration: a path is joined far from the start
+# of problems on coarse points
+ROUGH = partial(StoppingCriteria, rtol=1e-2, max_iterations=30)  # of a correction that interpolation blurs by a layer or two anyway
+# a set creeps while more than this share of what the last step moved moves again: at that rate a dozen steps or more are still to
+# come, and a first correction costs as much as those
+CREEP = 0.92
+STEPS = 3  # of creeping before the correction
 
 
 def projected_cycle(
@@ -292,3 +305,104 @@ class ProximalPoint:
         if not scipy.sparse.issparse(self._matrix):
             return self._matrix + np.diag(self._eps * self._D)
         return scipy.sparse.csr_array(self._matrix + scipy.sparse.diags_array(self._eps * self._D))
+
+
+class InteriorSteps:
+    """Follow the central path from its own start; where that leads nowhere, iterate by ProximalPoint from where the method was.
+
+    Linear programs and other saddle points, A skew but for a block or a small shift, have free blocks that are singular or nearly so
+    on the way to the solution's own. The central path exists for every positive semi-definite A, and asks for none.
+
+    Args:
+        problem: with a dense or sparse operator.
+        residual: the problem's own.
+        tolerance: the norm of it that is asked for.
+    """
+
+    def __init__(self, problem: LCP, residual: NaturalResidual, tolerance: float) -> None:
+        from warp_lcp.solvers.interior_point import InteriorPoint  # which knows the active-set methods
+
+        self._problem, self._residual, self._tolerance = problem, residual, tolerance
+        self._method = InteriorPoint(precision="double")
+        self._work = work = self._method.init(problem)
+        work.residual.start(work.x, keep=False)
+        work.residual.evaluate(work.x)
+        work.start(warm=False, tolerance=tolerance)
+        self._smallest, self._idle = math.inf, 0
+        self._begun: wp.array[Any] | None = None
+        self._next: ProximalPoint | None = None
+
+    def step(self, x: wp.array[Any]) -> Step:
+        """Take one step."""
+        if self._next is not None:
+            return self._next.step(x)
+        if self._begun is None:
+            self._begun = wp.clone(x)
+        step = self._method.step(self._problem, self._work, self._work.x)
+        if step.failure is SolveStatus.INFEASIBLE:
+            return step
+        norm = self._work.residual.norm
+        self._idle = 0 if norm <= FALL * self._smallest else self._idle + 1
+        self._smallest = min(norm, self._smallest)
+        over = step.failure is not None or self._idle >= PATH_IDLE
+        wp.copy(x, self._begun if over else self._work.x)
+        if over:
+            self._residual.evaluate(x)
+            self._next = ProximalPoint(self._problem, self._residual, self._tolerance)
+        self._residual.current = False
+        return Step("interior point", step.linear_iterations, interim=True)
+
+
+class CoarseProblem:
+    """Solves for the correction P e of an x: P'A P e + P'(A x + b), with the bounds that x leaves to the coarse points.
+
+    Those are unknowns of the fine problem, so that an obstacle's corners stay where they are, and unknowns at their bounds stay there until
+    the correction says otherwise: the contact's boundary moves as far as it must at once, where Newton's own step moves it by a layer of
+    unknowns. The coarse problem is solved by Newton's method too, which begins with a coarse problem of its own.
+
+    Args:
+        A: the matrix.
+        coarse: whether A is a coarse problem's.
+    """
+
+    def __init__(self, A: SparseOperator, settings: MinimumMapNewton, *, coarse: bool = False) -> None:
+        self._A, self._settings, self._coarse, self._version = A, replace(settings, monotone_cycles=0), coarse, -1
+        self._work: Any = None
+        self.start()
+
+    def start(self) -> None:
+        """Forget how the set has moved."""
+        self._moved, self._crept, self._wait = 0.0, STEPS if self._coarse else 0, STEPS
+
+    def is_due(self, moved: float) -> bool:
+        """Return whether a correction should come now that another part of the unknowns has moved on or off the active set."""
+        creeps = self._coarse or moved > CREEP * self._moved > 0
+        self._moved, self._crept = moved, self._crept + 1 if creeps else 0
+        if self._crept < self._wait or not self._refresh():
+            return False
+        self._moved, self._crept, self._wait = 0.0, 0, 2 * self._wait
+        return True
+
+    def correction(self, problem: LCP, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return P e for the problem at x, where A x + b = y."""
+        work, fields = self._work, (self._R @ y, (problem.lower.numpy() - x)[self._points], (problem.upper.numpy() - x)[self._points])
+        for field, values in zip((work.problem.b, work.problem.lower, work.problem.upper), fields, strict=True):
+            field.assign(values)
+        e = solve(work.problem, self._settings, stopping=ROUGH(), workspace=work).x.numpy()
+        return self._P @ e
+
+    def _refresh(self) -> bool:
+        """Choose points of A as it is now, if it has changed since; return whether there are any."""
+        if self._version == self._A.version:
+            return self._work is not None
+        self._version, self._work, host = self._A.version, None, self._A.matrix()
+        found = coarse_points(host) if self._coarse or suits_multigrid(host) else None
+        if found is not None:
+            self._P, matrix, self._points = found
+            self._R = self._P.T.tocsr()
+            A = SparseOperator(matrix, device=self._A.device, dtype=wp.float64)
+            b, lower, upper = (A.layout.zeros(wp.float64) for _ in range(3))
+            self._work = self._settings.init(LCP(A, b, lower, upper))
+            if self._work.coarse is not None:
+                self._work.coarse = CoarseProblem(A, self._settings, coarse=True)
+        return self._work is not None
