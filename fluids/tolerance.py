@@ -13,7 +13,7 @@ from warp_lcp.rows import RowPass
 from warp_lcp.vectors import Across, Reduction, convert, rows_of
 
 f64 = wp.float64
-CHANGE = RowPass("fluids.change", Path(__file__).parent / "headers" / "change.h", f64, reads={"x": f64}, writes={"guess": f64})
+CHANGE = RowPass("tolerance.change", Path(__file__).parent / "headers" / "change.h", f64, reads={"x": f64}, writes={"guess": f64})
 FRACTION = 0.1  # of the time step's error that the solve may leave
 FIRST = 1e-4  # relative residual of the first steps, before which there is no change to measure: a liquid that is at rest shall stay so
 LEAST = 1e-6  # relative residual than which none is asked to be smaller: rounding on the faces is what is left then

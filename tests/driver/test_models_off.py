@@ -167,7 +167,7 @@ CASES = {
         {"pressure": {}, "output": {}}, {"pressure": {}}, modules=("warp_lcp.grid.volume",), columns=("volume", "max_divergence")
     ),
     "automatic tolerance": Case(
-        {"solver": {"tolerance": "auto"}}, modules=("fluids.tolerance",), files=("fluids/tolerance.py",),
+        {"solver": {"tolerance": "auto"}}, modules=("warp_lcp.tolerance",), files=("fluids/tolerance.py",),
         columns=("tolerance", "time_error"),
     ),
     "rigid bodies in sand": Case(

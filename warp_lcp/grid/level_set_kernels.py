@@ -36,8 +36,8 @@ DISTANCE = RowPass(
     optional=("capacity", "smooth"),
     constants=_CONSTANTS,
 )
-VOLUME = RowPass(
-    f"{_LEVEL_SET}.volume",
+VOLUME = RowPass(  # in a module of its own: few runs ask for it
+    "warp_lcp.grid.volume.enclosed",
     _HEADERS / "volume.h",
     wp.float32,
     box=_PHI | {"distance": wp.float32},

@@ -79,6 +79,9 @@ class GridNewtonWorkspace(MultigridWorkspace):
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the search direction and the residuals; the operator may have changed."""
         self._norms, self._target = [], tolerance
+        if self._serves:  # who shares the hierarchy may have written its finest diagonal since it was coarsened
+            self.hierarchy.finest.changed.fill_(1)
+            self.residual.stale = True
         super().start(warm=warm, tolerance=tolerance)
 
     def wants_monotone_cycle(self) -> bool:
