@@ -29,9 +29,10 @@ def _users(root: Path) -> dict[str, set[str]]:
         for file in (root / package).rglob("*"):
             if file.suffix in (".py", ".h"):
                 places = [file.parent, file.parent / "headers", root / "warp_lcp/rows/headers"]
-                for header in re.findall(r"\w+\.h(?=\")", file.read_text()):
-                    found = [place / header for place in places if (place / header).exists()]
-                    users[str(found[0].relative_to(root)) if found else header].add(str(file.relative_to(root)))
+                for header in re.findall(r"[\".](\w+?)(?:\.h)?\"", file.read_text()):  # some are named as their passes are, without the end
+                    found = [place / f"{header}.h" for place in places if (place / f"{header}.h").exists()]
+                    if found and found[0] != file:
+                        users[str(found[0].relative_to(root))].add(str(file.relative_to(root)))
         for file in (root / package).rglob("*.py"):
             for whole, names in re.findall(r"^\s*from ([\w.]+) import (.+)$", file.read_text(), re.MULTILINE):
                 for name in [whole, *(f"{whole}.{word}" for word in WORD.findall(names))]:
@@ -44,8 +45,10 @@ def tests_of(root: Path, module: str) -> list[str]:
     """Return test files, the likeliest to notice a change of a module first."""
     score: dict[str, float] = defaultdict(float)
     front, weight, seen = {module}, 1.0, set[str]()
-    while any(file.endswith(".h") for file in front):
+    for _ in range(3):  # headers in headers
         front = {user for file in front for user in (_users(root).get(file, ()) if file.endswith(".h") else (file,))}
+    if not front:  # its name is put together
+        front = {str(file.relative_to(root)) for file in (root / module).parents[1].glob("*_kernels.py")}
     for _ in range(3):
         for file in front:
             name = Path(file).stem.removesuffix("_kernels")
