@@ -273,7 +273,7 @@ class SandSimulation(ParticleSimulation):
             max(float(np.abs(component.numpy()[at]).max(initial=0.0)) for component, at in zip(velocity, moving, strict=True))
             for velocity in (self.stress.checked.u, packing.start)
         )
-        others = max(float(np.abs(component.numpy()).max()) for component in self.solids.velocity)
+        others = max((float(np.abs(component.numpy()).max()) for component in self.solids.velocity), default=0.0)
         return after > before + scale + others + (self.bodies.top_speed(0.0) if self.bodies is not None else 0.0)
 
     def _solve(self, window: Window, dt: float) -> CoupledOutcome:

@@ -9,6 +9,7 @@ import warp as wp
 
 from granular.simulator import SandSimulation
 from small_sands import GRAVITY, advance, box, create, scene
+from warp_lcp.driver.simulator import StepFailed
 
 SPEED = 0.5  # of a paddle [m/s]
 FEW = {"max_iterations": 60}  # of a solve: enough where nothing depends on its accuracy
@@ -106,3 +107,12 @@ def test_solids_that_close_the_domain_end_no_run() -> None:
     rows = advance(simulation, 0.4)  # the press passes the floor at 0.3 s
     assert rows[-1]["stuck"] > 0
     assert math.isfinite(rows[-1]["kinetic_energy"])
+
+
+def test_sand_without_solids_that_finds_no_stresses_says_so() -> None:
+    """At 1e6 m/s for a second a step nothing converges; there is no velocity of solids to compare with."""
+    sand = [box([0.0, 0.0], [0.375, 0.375], velocity=[1e6, 0.0])]
+    simulation = create(scene(size=[1.0, 0.5], resolution=16, sand=sand))
+    with pytest.raises(StepFailed, match="would make the sand faster"):
+        for _ in range(3):
+            simulation.step(1.0)
