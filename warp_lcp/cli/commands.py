@@ -32,7 +32,7 @@ from warp_lcp.run.loop import RunRequest
 from warp_lcp.run.problem_folder import ProblemError
 from warp_lcp.run.profile import Profile
 from warp_lcp.run.progress import Bar, Lines
-from warp_lcp.run.terminal import Commands, Terminal, say, tell
+from warp_lcp.run.terminal import Commands, Terminal, say, table_lines, tell
 from warp_lcp.run.trial import step_seconds
 from warp_lcp.run.tune import FRAMES, Tuning, tune, write_tuned
 from warp_lcp.scene.presets import PresetName
@@ -134,7 +134,7 @@ def run(
     if not launcher.is_root:
         raise typer.Exit(0 if record.status == "finished" else FAILED)
     if watch:
-        tell("\n".join(watch.table(record.steps - (record.resumed_from_step or 0), record.seconds)))
+        tell(watch.table(record.steps - (record.resumed_from_step or 0), record.seconds))
     _report(record, folder)
 
 
@@ -398,9 +398,7 @@ def info() -> None:
 def _print_tuning(tuning: Tuning, accuracy: str, device: str) -> None:
     """Say what was measured, and which settings are the fastest."""
     rows = tuning.rows()
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    for row in rows:
-        tell("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    tell(table_lines(rows[0], rows[1:], left=range(len(rows[0]))))
     tell(f"{tuning.frames} frames on {device}; distance: share of the mass elsewhere than in a run of {tuning.reference.steps} steps")
     for line in tuning.verdict(accuracy):
         tell(line)
