@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse
+from scipy.sparse import csr_array
 
-from warp_lcp.gallery.rigid_bodies import RigidBodies
+from warp_lcp.rigid.body import RigidBody
+from warp_lcp.rigid.touching import jacobian
 
 WORLD = -1  # in the place of a body: the hinge is fixed in space
 NEAR_LIMIT = 0.2  # [rad]: a limit that is farther away has no row
@@ -54,7 +56,7 @@ class Hinge:
 
     @staticmethod
     def between(
-        bodies: RigidBodies,
+        bodies: Sequence[RigidBody],
         first: int,
         second: int,
         anchor: np.ndarray,
@@ -68,7 +70,7 @@ class Hinge:
         axis = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
         zero = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
         zero /= np.linalg.norm(zero)
-        frames = [(np.zeros(3), np.eye(3)) if i == WORLD else (bodies.position[i], bodies.rotation[i]) for i in (first, second)]
+        frames = [(np.zeros(3), np.eye(3)) if i == WORLD else (bodies[i].position, bodies[i].rotation) for i in (first, second)]
         anchors, axes, zeros = ([R.T @ v for _, R in frames] for v in (np.zeros(3), axis, zero))
         anchors = [R.T @ (np.asarray(anchor, dtype=np.float64) - x) for x, R in frames]
         a, d, z = ((v[0], v[1]) for v in (anchors, axes, zeros))
@@ -79,21 +81,20 @@ class Hinge:
         """The bodies, the smaller index first."""
         return min(self.first, self.second), max(self.first, self.second)
 
-    def _world(self, bodies: RigidBodies, which: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def _world(self, bodies: Sequence[RigidBody], which: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return the arm, the anchor, the axis and the zero direction of a side in the world's frame."""
         body = (self.first, self.second)[which]
-        R = np.eye(3) if body == WORLD else bodies.rotation[body]
-        x = np.zeros(3) if body == WORLD else bodies.position[body]
+        x, R = (np.zeros(3), np.eye(3)) if body == WORLD else (bodies[body].position, bodies[body].rotation)
         arm = R @ self.anchors[which]
         return arm, x + arm, R @ self.axes[which], R @ self.zeros[which]
 
-    def angle(self, bodies: RigidBodies) -> float:
+    def angle(self, bodies: Sequence[RigidBody]) -> float:
         """Return the angle of first relative to second [rad], in (-pi, pi]."""
         _, _, axis, mine = self._world(bodies, 0)
         other = self._world(bodies, 1)[3]
         return float(np.arctan2(np.cross(other, mine) @ axis, other @ mine))
 
-    def rows(self, bodies: RigidBodies, dt: float, rate: float) -> HingeRows:
+    def rows(self, bodies: Sequence[RigidBody], dt: float, rate: float) -> HingeRows:
         """Return its rows for a time step [s] in which `rate` of its error is removed.
 
         y = J v' + c: anchors' relative velocity and the angular velocity across the axis are equations (y = 0, x free); the angle's rate
@@ -123,31 +124,17 @@ class Hinge:
             bias.append(-self.motor_speed)
             low.append(-self.motor_torque * dt)
             high.append(self.motor_torque * dt)
-        return HingeRows(np.array(rows), np.array(bias), np.array(low), np.array(high))
+        m, n, each = len(rows), len(bodies), np.array(rows)[:, None]
+        second = np.full(m, n if self.second == WORLD else self.second)
+        J = jacobian(np.full(m, self.first), second, each[..., :6], each[..., 6:], n)
+        return HingeRows(J, np.array(bias), np.array(low), np.array(high))
 
 
 @dataclass(frozen=True, eq=False)
 class HingeRows:
-    """A hinge's rows: J for (first's, second's) velocities, shape (m, 12); c, and bounds of the impulses, shape (m,)."""
+    """A hinge's m rows: J for the velocities of all bodies, shape (m, 6n); c, and bounds of the impulses, shape (m,)."""
 
-    J: np.ndarray
+    J: csr_array
     bias: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
-
-
-def hinge_jacobian(hinges: tuple[Hinge, ...], rows: list[HingeRows], bodies: int) -> scipy.sparse.csr_array:
-    """Return the rows of all hinges for the velocities of all bodies, shape (m, 6 bodies)."""
-    i, j, entries, start = [], [], [], 0
-    for hinge, r in zip(hinges, rows, strict=True):
-        for side, body in enumerate((hinge.first, hinge.second)):
-            if body != WORLD:
-                block = r.J[:, 6 * side : 6 * side + 6]
-                i.append(np.broadcast_to(start + np.arange(len(block))[:, None], block.shape).ravel())
-                j.append(np.broadcast_to(6 * body + np.arange(6), block.shape).ravel())
-                entries.append(block.ravel())
-        start += len(r.bias)
-    if not entries:
-        return scipy.sparse.csr_array((start, 6 * bodies))
-    triplets = (np.concatenate(entries), (np.concatenate(i), np.concatenate(j)))
-    return scipy.sparse.coo_array(triplets, shape=(start, 6 * bodies)).tocsr()

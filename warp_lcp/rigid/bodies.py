@@ -11,8 +11,8 @@ from warp_lcp.grid.solids import Geometry
 from warp_lcp.rigid.body import BodyMotion, RigidBody
 from warp_lcp.rigid.contact_shape import ContactShape
 from warp_lcp.rigid.contact_solve import ContactSolve, Touching
+from warp_lcp.rigid.obstacles import Obstacle
 from warp_lcp.rigid.outline import BodySurface, body_surface
-from warp_lcp.rigid.surroundings import Surroundings
 
 STATE = 20  # numbers of a body's state
 IN_PLANE = ("x", "y", "vx", "vy", "angle", "spin")
@@ -47,7 +47,7 @@ class RigidBodies:
         bodies: in the order of their solids.
         geometries: the shape of each as the scene places it.
         numbers: the wall number of each, 1 + the index of its solid.
-        surroundings: what else they may touch.
+        obstacles: what else they may touch.
         dimension: 2 or 3.
 
     Attributes:
@@ -65,15 +65,15 @@ class RigidBodies:
         bodies: Sequence[RigidBody],
         geometries: Sequence[Geometry],
         numbers: Sequence[int],
-        surroundings: Surroundings,
+        obstacles: Sequence[Obstacle],
         dimension: int,
     ) -> None:
         """Prepare the shapes for contact, and check that bodies start apart."""
         self.bodies, self.numbers, self.dimension = list(bodies), list(numbers), dimension
         self.motions = [BodyMotion(body) for body in bodies]
-        self.surroundings, self._geometries = surroundings, list(geometries)
+        self._geometries = list(geometries)
         self.shapes = [ContactShape.of(geometry, dimension) for geometry in geometries]
-        self._solve = ContactSolve(self.bodies, self.shapes, surroundings, dimension)
+        self._solve = ContactSolve(self.bodies, self.shapes, obstacles, dimension)
         self._surfaces: list[BodySurface] | None = None
         self._begun: _Begun | None = None
         self.contacts, self.contact_residual = 0, 0.0
@@ -175,7 +175,7 @@ class RigidBodies:
 
     def potential_energy(self, gravity: np.ndarray) -> float:
         """Return the energy of height [J; J/m in 2-D], 0 at the origin."""
-        return -sum(body.properties.mass * float(body.position @ gravity) for body in self.bodies)
+        return sum(body.potential_energy(gravity) for body in self.bodies)
 
     def state(self) -> dict[str, np.ndarray]:
         """Return what `restore` needs to continue bit for bit."""

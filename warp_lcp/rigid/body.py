@@ -81,6 +81,10 @@ class RigidBody:
         """Energy of motion and spin [J]."""
         return 0.5 * float(self.momentum @ self.velocity + self.angular_momentum @ self.angular_velocity)
 
+    def potential_energy(self, gravity: np.ndarray) -> float:
+        """Return the energy of height [J], 0 at the origin; gravity [m/s^2], shape (3,)."""
+        return -self.properties.mass * float(self.position @ gravity)
+
     def free_inverse_mass(self, dimension: int) -> np.ndarray:
         """Return block diag(1/m, I^-1), shape (k, k): k = 3 in 2-D (vx, vy, wz), 6 in 3-D (vx, vy, vz, wx, wy, wz)."""
         result, R = np.zeros((6, 6)), self.rotation

@@ -8,11 +8,11 @@ import numpy as np
 
 from warp_lcp.grid.motion import Motion
 from warp_lcp.rigid.body import AXES, PLANAR, RigidBody
+from warp_lcp.rigid.contact_detection import ContactDetection, Found
 from warp_lcp.rigid.contact_problem import ContactProblem
 from warp_lcp.rigid.contact_shape import ContactShape
 from warp_lcp.rigid.firm import SINGULAR, Firm
-from warp_lcp.rigid.near import Found, Neighborhood
-from warp_lcp.rigid.surroundings import Surroundings
+from warp_lcp.rigid.obstacles import Obstacle
 from warp_lcp.rigid.touching import ContactMemory, Touching
 from warp_lcp.stopping import StoppingCriteria
 
@@ -34,18 +34,26 @@ class ContactSolve:
     Args:
         bodies: all.
         shapes: of the bodies as placed.
-        surroundings: what else there is.
+        obstacles: what else there is.
         dimension: 2 or 3.
+        every: see `ContactDetection`.
 
     Attributes:
         residual: of the last problem, relative to that of no impulses; 0 without contacts.
         memory: impulses of the last step.
     """
 
-    def __init__(self, bodies: Sequence[RigidBody], shapes: Sequence[ContactShape], surroundings: Surroundings, dimension: int) -> None:
-        self.bodies, self.shapes, self.surroundings, self.dimension = list(bodies), list(shapes), surroundings, dimension
+    def __init__(
+        self,
+        bodies: Sequence[RigidBody],
+        shapes: Sequence[ContactShape],
+        obstacles: Sequence[Obstacle],
+        dimension: int,
+        every: bool = False,
+    ) -> None:
+        self.bodies, self.dimension = list(bodies), dimension
         self.residual, self.memory = 0.0, ContactMemory(len(self.bodies))
-        self._near = Neighborhood(self.bodies, self.shapes, surroundings, dimension)
+        self.detection = ContactDetection(self.bodies, shapes, obstacles, dimension, every)
         self._reach = np.array([shape.reach(body.properties.center) for body, shape in zip(bodies, shapes, strict=True)])
         self._size = np.array([shape.size for shape in shapes])
         self._friction = np.array([body.friction for body in bodies])
@@ -61,7 +69,7 @@ class ContactSolve:
             ValueError: which, and with what.
         """
         nothing = np.zeros(len(self.bodies))
-        for found in self._near.find(time, nothing, np.zeros(len(self.surroundings.obstacles))):
+        for found in self.detection.find(time, nothing, np.zeros(len(self.detection.obstacles))):
             name, deep = self.bodies[found.first].name, -float(found.touch.gap.min())
             if deep <= START_OVERLAP * self._size[found.first]:
                 continue
@@ -81,10 +89,10 @@ class ContactSolve:
         six = self._six()
         speeds, spins = np.linalg.norm(six[:, :3], axis=1), np.linalg.norm(six[:, 3:], axis=1)
         ways = AHEAD * dt * (speeds + spins * self._reach + falls)
-        brought = [AHEAD * self._obstacle_way(obstacle.motion, time, dt) for obstacle in self.surroundings.obstacles]
+        brought = [AHEAD * self._obstacle_way(obstacle.motion, time, dt) for obstacle in self.detection.obstacles]
         near = NEAR * float(self._size.min())
-        found = self._near.find(time, ways, near + np.array(brought), near)
-        return self._assembled(found, time, dt, gravity) if found else Touching.none(self.dimension)
+        found = self.detection.find(time, ways, near + np.array(brought), near)
+        return self.assembled(found, time, dt, gravity)
 
     def push_apart(self, touching: Touching, start: np.ndarray | None = None) -> np.ndarray:
         """Solve for the impulses of contacts and give them to the bodies; return them [N s], shape (k, dimension).
@@ -149,9 +157,11 @@ class ContactSolve:
         first, second = touching.first, touching.second
         return ContactProblem(first, second, one @ roots[first], other @ roots[second], b, friction, len(self.bodies))
 
-    def _assembled(self, found: Sequence[Found], time: float, dt: float, gravity: np.ndarray) -> Touching:
-        """Return the contacts with their rows."""
-        falls, n, dim = float(np.linalg.norm(gravity)) * dt, len(self.bodies), self.dimension
+    def assembled(self, found: Sequence[Found], time: float, dt: float, gravity: np.ndarray | None) -> Touching:
+        """Return the contacts with their rows; tangents are along the slip, or along gravity, if that is given."""
+        if not found:
+            return Touching.none(self.dimension)
+        falls, n, dim = 0.0 if gravity is None else float(np.linalg.norm(gravity)) * dt, len(self.bodies), self.dimension
         counts = [len(entry.touch) for entry in found]
         first = np.repeat(np.array([entry.first for entry in found], dtype=int), counts)
         second = np.repeat(np.array([entry.second for entry in found], dtype=int), counts)
@@ -220,7 +230,7 @@ def _carried(motion: Motion | None, points: np.ndarray, time: float, dt: float) 
     return np.asarray((way.apply(points) - points) / dt)
 
 
-def _frames(normal: np.ndarray, slip: np.ndarray, dimension: int, slow: float, gravity: np.ndarray) -> np.ndarray:
+def _frames(normal: np.ndarray, slip: np.ndarray, dimension: int, slow: float, gravity: np.ndarray | None) -> np.ndarray:
     """Return normal and tangents of contacts, shape (k, dimension, 3).
 
     In space the first tangent is along the slip, where there is none along what gravity would make slip: boxes of friction then are as wide
@@ -229,7 +239,7 @@ def _frames(normal: np.ndarray, slip: np.ndarray, dimension: int, slow: float, g
     if dimension == 2:
         return np.stack([normal, np.stack([-normal[:, 1], normal[:, 0], np.zeros(len(normal))], axis=1)], axis=1)
     u = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
-    for way, least in ((gravity, SIDEWAYS * float(np.linalg.norm(gravity))), (slip, slow)):
+    for way, least in () if gravity is None else ((gravity, SIDEWAYS * float(np.linalg.norm(gravity))), (slip, slow)):
         along = way - (way * normal).sum(axis=1)[:, None] * normal
         u = np.where((np.linalg.norm(along, axis=1) > least)[:, None], along, u)
     u /= np.linalg.norm(u, axis=1, keepdims=True)

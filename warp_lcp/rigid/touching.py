@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import bsr_array, csr_array
 
 from warp_lcp.rigid.body import RigidBody
 
@@ -53,6 +54,10 @@ class Touching:
     def __len__(self) -> int:
         """Return the number of contacts."""
         return len(self.gap)
+
+    def jacobian(self, bodies: int) -> csr_array:
+        """Return J: what velocities of all bodies make at contacts, shape (k dimension, bodies q)."""
+        return jacobian(self.first, self.second, self.one, self.other, bodies)
 
     def velocities(self, of_bodies: np.ndarray) -> np.ndarray:
         """Return relative velocities at contacts [m/s], shape (k, dimension), from those of the bodies, shape (n, q)."""
@@ -112,3 +117,18 @@ def _places(touching: Touching, bodies: Sequence[RigidBody]) -> np.ndarray:
     """Return contacts in the axes of their first bodies [m], shape (k, 3)."""
     at, turned = (np.array([getattr(body, name) for body in bodies]) for name in ("position", "rotation"))
     return np.asarray(((touching.point - at[touching.first])[:, None] @ turned[touching.first])[:, 0])
+
+
+def jacobian(first: np.ndarray, second: np.ndarray, one: np.ndarray, other: np.ndarray, bodies: int) -> csr_array:
+    """Return J: what velocities of bodies make along the rows of pairs, shape (k rows, q bodies).
+
+    Args:
+        first: of each pair, shape (k,).
+        second: the other one, `bodies` where it is none.
+        one: rows for the first body, shape (k, rows, q).
+        other: for the second.
+        bodies: their number.
+    """
+    k, rows, q = one.shape
+    blocks, places = np.stack([one, other], axis=1).reshape(2 * k, rows, q), np.stack([first, second], axis=1).ravel()
+    return csr_array(bsr_array((blocks, places, 2 * np.arange(k + 1)), shape=(k * rows, (bodies + 1) * q)).tocsr()[:, : bodies * q])

@@ -1,4 +1,4 @@
-"""Where bodies touch each other and what surrounds them: points, normals and gaps, a few for each pair."""
+"""Which bodies touch each other and what surrounds them, and where: points, normals and gaps, a few for each pair."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from warp_lcp.grid.motion import Pose
+from warp_lcp.grid.motion import Motion, Pose
+from warp_lcp.rigid.body import RigidBody
 from warp_lcp.rigid.box_contacts import OrientedBox, box_box
 from warp_lcp.rigid.contact_shape import ContactShape
+from warp_lcp.rigid.obstacles import Obstacle
 
 FLAT = {2: 2, 3: 4}  # contacts of a pair with about one normal: a flat rest needs no more
 MOST = {2: 4, 3: 8}  # contacts of a pair
@@ -67,27 +69,21 @@ class Place(NamedTuple):
         return np.asarray(points @ self.rotation.T + self.translation)
 
 
-def on_planes(shape: ContactShape, pose: Pose | Place, points: np.ndarray, normals: np.ndarray, margin: float, dimension: int) -> Touch:
-    """Return where a shape touches planes.
+def on_plane(shape: ContactShape, pose: Pose | Place, point: np.ndarray, normal: np.ndarray, margin: float) -> Touch:
+    """Return where a shape touches a plane.
 
     Args:
         shape: of the body, as placed.
         pose: of the body.
-        points: of the planes [m], shape (m, 3).
-        normals: unit vectors into the open, shape (m, 3).
+        point: of the plane [m], shape (3,).
+        normal: unit vector into the open, shape (3,).
         margin: gap [m] up to which there is a contact.
-        dimension: 2 or 3.
     """
     centers = pose.apply(shape.points)
-    found = []
-    for point, normal in zip(points, normals, strict=True):
-        gap = (centers - point) @ normal - shape.radius
-        near = gap <= margin
-        if near.any():
-            places = centers[near] - (shape.radius + 0.5 * gap[near])[:, None] * normal
-            touch = Touch(places, np.broadcast_to(normal, places.shape), gap[near])
-            found.append(spread(touch, shape.size, dimension))
-    return Touch.joined(found)
+    gap = (centers - point) @ normal - shape.radius
+    near = gap <= margin
+    places = centers[near] - (shape.radius + 0.5 * gap[near])[:, None] * normal
+    return Touch(places, np.broadcast_to(normal, places.shape), gap[near])
 
 
 def between(one: ContactShape, at: Pose | Place, other: ContactShape, there: Pose | Place, margin: float, dimension: int) -> Touch:
@@ -103,16 +99,15 @@ def between(one: ContactShape, at: Pose | Place, other: ContactShape, there: Pos
         margin: gap [m] up to which there is a contact.
         dimension: 2 or 3.
     """
-    size = min(one.size, other.size)
-    if one.box is not None and other.box is not None:
-        return spread(_boxes(_moved(one.box, at), _moved(other.box, there), margin, dimension), size, dimension)
+    if one.boxes and other.boxes:
+        return Touch.joined([_boxes(_moved(a, at), _moved(b, there), margin, dimension) for a in one.boxes for b in other.boxes])
     single = [len(shape.points) == 1 for shape in (one, other)]  # the center of a ball says all
     found = []
     if not single[1] or single[0]:
         found.append(_points_of(one, at, other, there, margin))
     if not single[0] and len(other.points):
         found.append(_points_of(other, there, one, at, margin).turned())
-    return spread(Touch.joined(found), size, dimension)
+    return Touch.joined(found)
 
 
 def _points_of(one: ContactShape, at: Pose | Place, other: ContactShape, there: Pose | Place, margin: float) -> Touch:
@@ -178,3 +173,101 @@ def spread(touch: Touch, size: float, dimension: int) -> Touch:
             way = np.minimum(way, np.linalg.norm(touch.point - touch.point[following], axis=1))
             side = np.minimum(side, np.linalg.norm(touch.normal - touch.normal[following], axis=1))
     return touch.where(np.array(chosen))
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Contacts of two.
+
+    Args:
+        first: body that normals point into.
+        second: body that they come from; the number of bodies where that is none.
+        touch: the points, one at least.
+        obstacle: what they come from if it is no body.
+    """
+
+    first: int
+    second: int
+    touch: Touch
+    obstacle: Obstacle | None = None
+
+    @property
+    def motion(self) -> Motion | None:
+        """How the obstacle moves, if there is one and it does."""
+        return None if self.obstacle is None else self.obstacle.motion
+
+
+class ContactDetection:
+    """Finds contacts of bodies with each other and with their surroundings.
+
+    Args:
+        bodies: all.
+        shapes: of the bodies as placed.
+        obstacles: what else there is.
+        dimension: 2 or 3.
+        every: keep every point of a pair, not a few that hold a body.
+    """
+
+    def __init__(
+        self,
+        bodies: Sequence[RigidBody],
+        shapes: Sequence[ContactShape],
+        obstacles: Sequence[Obstacle],
+        dimension: int,
+        every: bool = False,
+    ) -> None:
+        self.obstacles, self._bodies, self._shapes = obstacles, bodies, shapes
+        self._center = np.array([body.properties.center for body in bodies])
+        self._dimension, self._every = dimension, every
+        self._middle = np.array([0.5 * (shape.low + shape.high) for shape in shapes])
+        self._half = np.array([0.5 * (shape.high - shape.low) - shape.radius for shape in shapes])
+        self._radius = np.array([shape.radius for shape in shapes])
+
+    def find(self, time: float, ways: np.ndarray, brought: np.ndarray, near: float = 0.0) -> list[Found]:
+        """Return where bodies touch.
+
+        Args:
+            time: of the state [s].
+            ways: how far each body may come [m], shape (n,).
+            brought: gap up to which a body that rests touches each obstacle [m].
+            near: gap up to which bodies that rest touch each other [m].
+        """
+        turns, at = (np.array([getattr(body, name) for body in self._bodies]) for name in ("rotation", "position"))
+        shifts = at - (turns @ self._center[:, :, None])[:, :, 0]
+        poses = [Place(turn, shift) for turn, shift in zip(turns, shifts, strict=True)]
+        middle = (turns @ self._middle[:, :, None])[:, :, 0] + shifts
+        half = (np.abs(turns) @ self._half[:, :, None])[:, :, 0] + self._radius[:, None]
+        found = []
+        for obstacle, more in zip(self.obstacles, brought, strict=True):
+            found += self._with_obstacle(obstacle, obstacle.pose(time), poses, middle, half, ways + more)
+        margins = near + ways[:, None] + ways
+        apart = (np.abs(middle[:, None] - middle) - half[:, None] - half).max(axis=2)
+        for i, j in np.argwhere(np.tril(apart <= margins, -1)).tolist():
+            touch = between(self._shapes[i], poses[i], self._shapes[j], poses[j], float(margins[i, j]), self._dimension)
+            found.append(Found(i, j, self._kept(touch, min(self._shapes[i].size, self._shapes[j].size))))
+        return [entry for entry in found if len(entry.touch)]
+
+    def _kept(self, touch: Touch, size: float) -> Touch:
+        return touch if self._every else spread(touch, size, self._dimension)
+
+    def _with_obstacle(
+        self, obstacle: Obstacle, there: Pose, poses: list[Place], middle: np.ndarray, half: np.ndarray, margins: np.ndarray
+    ) -> list[Found]:
+        """Return where bodies touch an obstacle."""
+        shape, n, touches = obstacle.shape, len(poses), []
+        if shape is None:
+            points, normals = there.apply(obstacle.points), obstacle.normals @ there.rotation.T
+            heights = middle @ normals.T - (points * normals).sum(axis=1) - half @ np.abs(normals).T
+            for i in np.flatnonzero((heights <= margins[:, None]).any(axis=1)).tolist():
+                mine, chosen = self._shapes[i], np.flatnonzero(heights[i] <= margins[i])
+                each = [self._kept(on_plane(mine, poses[i], points[m], normals[m], margins[i]), mine.size) for m in chosen]
+                touches.append(Found(i, n, Touch.joined(each), obstacle))
+        else:
+            near = np.ones(n, dtype=bool)
+            if shape.closed:
+                center, reach = there.apply(0.5 * (shape.low + shape.high)), np.abs(there.rotation) @ (0.5 * (shape.high - shape.low))
+                near = (np.abs(middle - center) - half - reach).max(axis=1) <= margins
+            for i in np.flatnonzero(near).tolist():
+                touch = between(self._shapes[i], poses[i], shape, there, float(margins[i]), self._dimension)
+                touches.append(Found(i, n, self._kept(touch, min(self._shapes[i].size, shape.size)), obstacle))
+        return touches
