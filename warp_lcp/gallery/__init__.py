@@ -1,9 +1,8 @@
 """Problems to try methods on, each deterministic by its seed; most with a known solution."""
 
 from warp_lcp.gallery.banded import banded
-from warp_lcp.gallery.contact import contact
 from warp_lcp.gallery.contact_models import BoxedModel, ContactSystem, FrozenBoxModel, StewartTrinkleModel, proximal_sweeps
-from warp_lcp.gallery.contact_scenes import SCENES, contact_scene
+from warp_lcp.gallery.contact_scenes import SCENES, contact, contact_scene
 from warp_lcp.gallery.contact_stepper import ContactStepper
 from warp_lcp.gallery.families import FAMILIES
 from warp_lcp.gallery.fclib import FclibProblem, read_fclib

@@ -196,7 +196,7 @@ class StewartTrinkleModel:
     cos(pi / K). In the plane the vectors are +-t, K = 2, whatever `directions` is.
 
     Args:
-        directions: K, even and >= 4.
+        directions: K, even; 2 are opposite, and friction acts along one tangent alone.
 
     Raises:
         ValueError: it is not.
@@ -206,8 +206,8 @@ class StewartTrinkleModel:
 
     def __post_init__(self) -> None:
         """Check K."""
-        if self.directions < 4 or self.directions % 2:
-            raise ValueError(f"directions = {self.directions}: must be an even number >= 4")
+        if self.directions < 2 or self.directions % 2:
+            raise ValueError(f"directions = {self.directions}: must be an even number >= 2")
 
     def spread(self, dim: int) -> np.ndarray:
         """Return normal and the K vectors as rows in a contact's frame, shape (1 + K, dim)."""
@@ -249,7 +249,7 @@ class StewartTrinkleModel:
         x = np.zeros((k, 1 + len(spread)))
         x[:, 0] = own[:, 0]
         K = len(spread) - 1
-        if dim == 2:
+        if K == 2:
             x[:, 1], x[:, 2] = np.maximum(own[:, 1], 0.0), np.maximum(-own[:, 1], 0.0)
         else:
             turn = np.arctan2(own[:, 2], own[:, 1]) % (2 * np.pi) * K / (2 * np.pi)

@@ -6,17 +6,21 @@ Each makes a `World`, deterministic by its seed, in meters and kilograms; `conta
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
+from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
-from warp_lcp.gallery.contact_models import BoxedModel, ContactModel
+from warp_lcp.gallery.contact_models import BoxedModel, ContactModel, ContactSystem, StewartTrinkleModel
 from warp_lcp.gallery.contact_stepper import ContactStepper
 from warp_lcp.gallery.hinges import WORLD, Hinge
 from warp_lcp.gallery.problem import Problem
 from warp_lcp.gallery.rigid_world import FIXED, GRAVITY, Parts, World
 from warp_lcp.grid.solids import Box, Placement, Sphere
+from warp_lcp.rigid.contact_solve import contact_frames
 from warp_lcp.rigid.obstacles import Obstacle
+from warp_lcp.rigid.touching import jacobian
 from warp_lcp.solvers.nncg import NNCG
 
 DENSITY = 1000.0  # [kg/m^3]
@@ -275,6 +279,45 @@ def driven_gears(count: int = 3, *, seed: int = 2015) -> World:
         Hinge.between(world.bodies, i, WORLD, body.position, Y_AXIS, motor_speed=1.0, motor_torque=torque) for i, (body, torque) in axles
     )
     return world
+
+
+def contact(contacts: int, *, directions: int = 4, bodies: int | None = None, friction: float = 0.5, seed: int = 2015) -> Problem:
+    """Return the impulse problem of random bodies that touch, in the model of Stewart and Trinkle ([Book] 1.3.5).
+
+    Bodies are balls of radius 1 with velocities v; each contact joins one to another or to the ground at a random point of its surface, the
+    tangents turned at random. Whatever v is there is a solution (Anitescu, Potra), which Lemke's method finds; impulses need not be unique.
+
+    Args:
+        contacts: how many; a problem has (2 + directions) contacts unknowns.
+        directions: tangents of a contact, an even number >= 2.
+        bodies: how many; half as many as contacts if None.
+        friction: coefficient mu >= 0.
+        seed: of all choices.
+
+    Raises:
+        ValueError: an argument is out of range.
+    """
+    model = StewartTrinkleModel(directions)
+    if contacts < 1 or not friction >= 0:
+        raise ValueError(f"contacts = {contacts}, friction = {friction}: at least one contact, friction >= 0")
+    bodies = bodies or max(1, contacts // 2)
+    rng, first = np.random.default_rng(seed), np.arange(contacts) % bodies  # every body has a contact
+    second, one, other = np.full(contacts, bodies), np.zeros((contacts, 3, 6)), np.zeros((contacts, 3, 6))
+    for k in range(contacts):
+        j, normal = int(rng.integers(-1, bodies)), rng.standard_normal(3)
+        normal /= np.linalg.norm(normal)
+        frame = about(normal, rng.uniform(0, 2 * np.pi)).apply(contact_frames(normal[None], 3)[0])
+        arm = -frame[0] + 0.1 * rng.standard_normal(3)
+        one[k] = np.hstack([frame, np.cross(arm, frame)])
+        if j not in (-1, first[k]):
+            second[k], other[k] = j, -np.hstack([frame, np.cross(-arm, frame)])
+    J = jacobian(first, second, one, other, bodies)
+    mass = rng.uniform(0.5, 2.0, bodies)
+    inverse_mass = np.repeat(1 / mass, 6) * np.tile([1.0, 1.0, 1.0, 2.5, 2.5, 2.5], bodies)  # a solid sphere's inertia is 2/5 m r^2
+    B = csr_array(J @ (inverse_mass[:, None] * J.toarray().T))
+    system = ContactSystem("", B, J @ rng.standard_normal(6 * bodies), np.full(contacts, friction))
+    facts = frozenset({"copositive", "solvable"})
+    return replace(model.problem(system).dense(), name=f"contact {contacts} x {directions} directions", facts=facts)
 
 
 SCENES: dict[str, Callable[..., World]] = {

@@ -163,18 +163,15 @@ class ContactSolve:
             return Touching.none(self.dimension)
         falls, n, dim = 0.0 if gravity is None else float(np.linalg.norm(gravity)) * dt, len(self.bodies), self.dimension
         counts = [len(entry.touch) for entry in found]
-        first = np.repeat(np.array([entry.first for entry in found], dtype=int), counts)
-        second = np.repeat(np.array([entry.second for entry in found], dtype=int), counts)
-        point, normal = (
-            np.concatenate([np.zeros((0, 3)), *(getattr(entry.touch, name) for entry in found)]) for name in ("point", "normal")
-        )
-        gap = np.concatenate([np.zeros(0), *(entry.touch.gap for entry in found)])
-        moved = np.concatenate([np.zeros((0, 3)), *(_carried(entry.motion, entry.touch.point, time, dt) for entry in found)])
+        first, second = (np.repeat([getattr(entry, name) for entry in found], counts) for name in ("first", "second"))
+        point, normal, gap = (np.concatenate([getattr(entry.touch, name) for entry in found]) for name in ("point", "normal", "gap"))
+        moved = np.concatenate([_carried(entry.motion, entry.touch.point, time, dt) for entry in found])
         six = np.concatenate([self._six(), np.zeros((1, 6))])
         at = np.array([body.position for body in self.bodies] + [np.zeros(3)])
         mine, others = point - at[first], point - at[second]
         slip = six[first, :3] + np.cross(six[first, 3:], mine) - six[second, :3] - np.cross(six[second, 3:], others) - moved
-        frames = _frames(normal, slip, dim, ALONG_SLIP * falls, gravity)
+        ways = () if gravity is None else ((gravity, SIDEWAYS * float(np.linalg.norm(gravity))), (slip, ALONG_SLIP * falls))
+        frames = contact_frames(normal, dim, ways)
         one, other = _rows(mine, frames, dim), -_rows(others, frames, dim)
         standing = second == n
         other[standing] = 0.0
@@ -230,16 +227,16 @@ def _carried(motion: Motion | None, points: np.ndarray, time: float, dt: float) 
     return np.asarray((way.apply(points) - points) / dt)
 
 
-def _frames(normal: np.ndarray, slip: np.ndarray, dimension: int, slow: float, gravity: np.ndarray | None) -> np.ndarray:
-    """Return normal and tangents of contacts, shape (k, dimension, 3).
+def contact_frames(normal: np.ndarray, dimension: int, ways: Sequence[tuple[np.ndarray, float]] = ()) -> np.ndarray:
+    """Return normal and tangents of contacts, shape (k, dimension, 3), right-handed in space.
 
-    In space the first tangent is along the slip, where there is none along what gravity would make slip: boxes of friction then are as wide
-    as the cone where it counts.
+    There the first tangent is along the last of some ways that is longer than its least: boxes of friction then are as wide as the cone
+    where it counts.
     """
     if dimension == 2:
         return np.stack([normal, np.stack([-normal[:, 1], normal[:, 0], np.zeros(len(normal))], axis=1)], axis=1)
     u = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
-    for way, least in () if gravity is None else ((gravity, SIDEWAYS * float(np.linalg.norm(gravity))), (slip, slow)):
+    for way, least in ways:
         along = way - (way * normal).sum(axis=1)[:, None] * normal
         u = np.where((np.linalg.norm(along, axis=1) > least)[:, None], along, u)
     u /= np.linalg.norm(u, axis=1, keepdims=True)
