@@ -29,7 +29,7 @@ from warp_lcp.material.sources import Source, Sources
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import BodyMotion, RigidBody
 from warp_lcp.rigid.mass_properties import mass_properties
-from warp_lcp.rigid.surroundings import Surroundings, domain_walls, obstacle
+from warp_lcp.rigid.obstacles import domain_walls, obstacle
 from warp_lcp.scene.shapes import SolidProperties
 
 
