@@ -101,7 +101,7 @@ def test_an_arch_presses_on_its_feet_and_closes():
     assert set(feet.first.tolist()) == {0, 6}
     assert (feet.second == 7).all()
     for hinge in world.hinges:
-        (_, a, _, _), (_, b, _, _) = hinge._world(world.bodies, 0), hinge._world(world.bodies, 1)
+        a, b = (hinge.side(world.bodies, number)[1] for number in (hinge.first, hinge.second))
         np.testing.assert_allclose(a, b, atol=1e-12)
         assert hinge.angle(world.bodies) == pytest.approx(0.0, abs=1e-12)
 

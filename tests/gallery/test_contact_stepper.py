@@ -51,10 +51,10 @@ def collision():
     position = [[0, 0, 0], [1.05, 0.2, 0.1], [0.3, 1.1, -0.2], [-1.2, 0.1, 0.3]]
     halves = [(0.4, 0.4, 0.4), (0.5, 0.3, 0.4), None, (0.4, 0.5, 0.3)]
     solids = [box(x, half) if half else Sphere(center=x, radius=0.5) for x, half in zip(position, halves, strict=True)]
-    world = World("collision", solids, [1.0, 2.0, 0.5, 3.0], obstacles=(), gravity=(0.0, 0.0, 0.0))
+    hinge = Hinge(0, 1, np.array([0.5, 0.1, 0.05]), AXIS)
+    world = World("collision", solids, [1.0, 2.0, 0.5, 3.0], obstacles=(), hinges=(hinge,), gravity=(0.0, 0.0, 0.0))
     for body, spin in zip(world.bodies, rng.standard_normal((4, 3)), strict=True):
         body.momentum, body.angular_momentum = -2 * body.properties.mass * body.position, body.properties.inertia @ spin
-    world.hinges = (Hinge.between(world.bodies, 0, 1, np.array([0.5, 0.1, 0.05]), AXIS),)
     return world
 
 
@@ -119,8 +119,8 @@ def test_overlaps_are_removed_as_asked(stabilization):
 
 
 def test_a_pendulum_keeps_its_length_and_its_period():
-    world = World("pendulum", [Sphere(center=[np.sin(0.1), 0, -np.cos(0.1)], radius=0.1)], [1.0], obstacles=())
-    world.hinges = (Hinge.between(world.bodies, 0, WORLD, np.zeros(3), AXIS),)
+    bob = Sphere(center=[np.sin(0.1), 0, -np.cos(0.1)], radius=0.1)
+    world = World("pendulum", [bob], [1.0], obstacles=(), hinges=(Hinge(0, WORLD, np.zeros(3), AXIS),))
     stepper, crossings, last = ContactStepper(world, wl.Lemke(), model=StewartTrinkleModel(4), dt=DT), [], 1.0
     while stepper.time < 1.7:
         stepper.step()

@@ -130,10 +130,10 @@ def _arch(links: int) -> tuple[list[Box], list[np.ndarray], np.ndarray]:
     return boxes, points, at(radius, angles[links // 2])
 
 
-def _chain(world: World, points: list[np.ndarray], limits: np.ndarray) -> tuple[Hinge, ...]:
+def _chain(points: Sequence[Vector], limits: np.ndarray) -> tuple[Hinge, ...]:
     """Return hinges between bodies that follow each other, which turn by up to a limit [rad] each either way."""
-    pairs = zip(points, limits.tolist(), strict=True)
-    return tuple(Hinge.between(world.bodies, i + 1, i, at, Y_AXIS, limits=(-a, a)) for i, (at, a) in enumerate(pairs))
+    pairs = enumerate(zip(points, limits.tolist(), strict=True))
+    return tuple(Hinge(i + 1, i, np.array(at), Y_AXIS, (-limit, limit)) for i, (at, limit) in pairs)
 
 
 def _next_but_one(links: int) -> frozenset[tuple[int, int]]:
@@ -162,9 +162,8 @@ def arched_snake(links: int = 9, *, heavy: float = 0.0, seed: int = 2015) -> Wor
     if heavy > 0:
         boxes, mass = [*boxes, box(top + np.array([0.0, 0.0, 0.08 + 0.25]), (0.25, 0.25, 0.25))], [*mass, heavy * mass[0]]
         name += f" under a box of {heavy:g} links"
-    world = World(name, boxes, mass, friction=0.8, ignored=_next_but_one(links))
-    world.hinges = _chain(world, points, np.random.default_rng(seed).uniform(0.02, 0.04, links - 1))
-    return world
+    hinges = _chain(points, np.random.default_rng(seed).uniform(0.02, 0.04, links - 1))
+    return World(name, boxes, mass, hinges=hinges, friction=0.8, ignored=_next_but_one(links))
 
 
 def hanging_snake(links: int = 8, *, seed: int = 2015) -> World:
@@ -175,10 +174,9 @@ def hanging_snake(links: int = 8, *, seed: int = 2015) -> World:
     """
     _check("links", links, 2)
     boxes, mass = [box([0.42 * i, 0.0, 2.0], LINK) for i in range(links)], [FIXED, *([box_mass(LINK)] * (links - 1))]
-    world = World(f"hanging snake of {links} links", boxes, mass, ignored=_next_but_one(links))
-    points = [np.array([0.42 * i + 0.21, 0.0, 2.0]) for i in range(links - 1)]
-    world.hinges = _chain(world, points, np.random.default_rng(seed).uniform(0.02, 0.05, links - 1))
-    return world
+    points = [(0.42 * i + 0.21, 0.0, 2.0) for i in range(links - 1)]
+    hinges = _chain(points, np.random.default_rng(seed).uniform(0.02, 0.05, links - 1))
+    return World(f"hanging snake of {links} links", boxes, mass, hinges=hinges, ignored=_next_but_one(links))
 
 
 def incline(count: int = 1, *, angle: float = 0.3, friction: float = 0.5, seed: int = 2015) -> World:
@@ -252,15 +250,11 @@ def motor_arm(links: int = 4, *, torque: float = 400.0, seed: int = 2015) -> Wor
     _check("links", links, 1)
     _check("torque", torque, 0.0)
     half, rng = (0.2, 0.08, 0.08), np.random.default_rng(seed)
-    boxes = [box([0.42 * i, 0.0, 1.0], half) for i in range(links + 1)]
-    world = World(f"arm of {links} motors", boxes, [FIXED, *([box_mass(half)] * links)])
-    hinges = []
+    boxes, hinges = [box([0.42 * i, 0.0, 1.0], half) for i in range(links + 1)], []
     for i in range(links):
-        anchor = np.array([0.42 * i + 0.21, 0.0, 1.0])
-        most, speed = torque * ((links - i) / links) ** 2, float(rng.uniform(-0.5, 0.5))
-        hinges.append(Hinge.between(world.bodies, i + 1, i, anchor, Y_AXIS, limits=(-1.0, 1.0), motor_speed=speed, motor_torque=most))
-    world.hinges = tuple(hinges)
-    return world
+        anchor, most = np.array([0.42 * i + 0.21, 0.0, 1.0]), torque * ((links - i) / links) ** 2
+        hinges.append(Hinge(i + 1, i, anchor, Y_AXIS, (-1.0, 1.0), motor_speed=float(rng.uniform(-0.5, 0.5)), motor_torque=most))
+    return World(f"arm of {links} motors", boxes, [FIXED, *([box_mass(half)] * links)], hinges=tuple(hinges))
 
 
 def driven_gears(count: int = 3, *, seed: int = 2015) -> World:
@@ -272,13 +266,9 @@ def driven_gears(count: int = 3, *, seed: int = 2015) -> World:
     _check("count", count, 1)
     half, phase = (0.3, 0.04, 0.1), float(np.random.default_rng(seed).uniform(-0.05, 0.05))
     gears = [gear([0.5 * i, 0.0, 1.0], half, np.pi / 6 * (i % 2) + phase * (-1) ** i) for i in range(count)]
-    world = World(f"{count} driven gears", gears, [BARS * box_mass(half)] * count, friction=0.2)
     torques = [50.0] + [0.0] * (count - 1)
-    axles = enumerate(zip(world.bodies, torques, strict=True))
-    world.hinges = tuple(
-        Hinge.between(world.bodies, i, WORLD, body.position, Y_AXIS, motor_speed=1.0, motor_torque=torque) for i, (body, torque) in axles
-    )
-    return world
+    axles = [Hinge(i, WORLD, np.array([0.5 * i, 0.0, 1.0]), Y_AXIS, motor_speed=1.0, motor_torque=t) for i, t in enumerate(torques)]
+    return World(f"{count} driven gears", gears, [BARS * box_mass(half)] * count, hinges=tuple(axles), friction=0.2)
 
 
 def contact(contacts: int, *, directions: int = 4, bodies: int | None = None, friction: float = 0.5, seed: int = 2015) -> Problem:

@@ -19,15 +19,13 @@ NEAR_LIMIT = 0.2  # [rad]: a limit that is farther away has no row
 class Hinge:
     """Two bodies that turn about a common axis.
 
-    Anchor and axis are given in the frames of the bodies, or in the world's for WORLD; `between` takes them from where bodies are. The
-    angle is that of `first` relative to `second`, 0 where the bodies' `zero` directions agree.
+    The angle is that of `first` relative to `second`, 0 as the scene places them.
 
     Args:
         first: a body.
         second: another one, or WORLD.
-        anchors: point of the axis in each frame [m].
-        axes: unit vector along it in each frame.
-        zeros: unit vectors normal to the axis, in each frame.
+        anchor: point of the axis as the scene places it [m].
+        axis: along it, of any length.
         limits: least and largest angle [rad]; infinite for none.
         motor_speed: angular velocity that the motor wants [rad/s].
         motor_torque: the most that it can do [N m]; 0 for no motor.
@@ -38,61 +36,40 @@ class Hinge:
 
     first: int
     second: int
-    anchors: tuple[np.ndarray, np.ndarray]
-    axes: tuple[np.ndarray, np.ndarray]
-    zeros: tuple[np.ndarray, np.ndarray]
+    anchor: np.ndarray
+    axis: np.ndarray
     limits: tuple[float, float] = (-np.inf, np.inf)
     motor_speed: float = 0.0
     motor_torque: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check."""
+        """Check, and give the axis unit length."""
         if self.first == self.second or self.first < 0:
             raise ValueError(f"first = {self.first}, second = {self.second}: must be two bodies, or a body and WORLD")
         if not self.limits[0] <= self.limits[1]:
             raise ValueError(f"limits = {self.limits}: must be in order, in rad")
         if not self.motor_torque >= 0:
             raise ValueError(f"motor_torque = {self.motor_torque}: must be >= 0, in N m")
-
-    @staticmethod
-    def between(
-        bodies: Sequence[RigidBody],
-        first: int,
-        second: int,
-        anchor: np.ndarray,
-        axis: np.ndarray,
-        *,
-        limits: tuple[float, float] = (-np.inf, np.inf),
-        motor_speed: float = 0.0,
-        motor_torque: float = 0.0,
-    ) -> Hinge:
-        """Return a hinge of bodies as they stand now, at angle 0; anchor [m] and axis are in the world's frame."""
-        axis = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
-        zero = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-        zero /= np.linalg.norm(zero)
-        frames = [(np.zeros(3), np.eye(3)) if i == WORLD else (bodies[i].position, bodies[i].rotation) for i in (first, second)]
-        anchors, axes, zeros = ([R.T @ v for _, R in frames] for v in (np.zeros(3), axis, zero))
-        anchors = [R.T @ (np.asarray(anchor, dtype=np.float64) - x) for x, R in frames]
-        a, d, z = ((v[0], v[1]) for v in (anchors, axes, zeros))
-        return Hinge(first, second, a, d, z, limits, motor_speed, motor_torque)
+        object.__setattr__(self, "axis", np.asarray(self.axis, dtype=np.float64) / np.linalg.norm(self.axis))
 
     @property
     def pair(self) -> tuple[int, int]:
         """The bodies, the smaller index first."""
         return min(self.first, self.second), max(self.first, self.second)
 
-    def _world(self, bodies: Sequence[RigidBody], which: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return the arm, the anchor, the axis and the zero direction of a side in the world's frame."""
-        body = (self.first, self.second)[which]
-        x, R = (np.zeros(3), np.eye(3)) if body == WORLD else (bodies[body].position, bodies[body].rotation)
-        arm = R @ self.anchors[which]
-        return arm, x + arm, R @ self.axes[which], R @ self.zeros[which]
+    def side(self, bodies: Sequence[RigidBody], number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return how a body, or WORLD, carries the hinge now: the arm of the anchor [m], the anchor [m], and the rotation."""
+        if number == WORLD:
+            return self.anchor, self.anchor, np.eye(3)
+        body = bodies[number]
+        arm = body.rotation @ (self.anchor - body.properties.center)
+        return arm, body.position + arm, body.rotation
 
     def angle(self, bodies: Sequence[RigidBody]) -> float:
         """Return the angle of first relative to second [rad], in (-pi, pi]."""
-        _, _, axis, mine = self._world(bodies, 0)
-        other = self._world(bodies, 1)[3]
-        return float(np.arctan2(np.cross(other, mine) @ axis, other @ mine))
+        R, S = (self.side(bodies, number)[2] for number in (self.first, self.second))
+        mine, other = R @ _across(self.axis), S @ _across(self.axis)
+        return float(np.arctan2(np.cross(other, mine) @ (R @ self.axis), other @ mine))
 
     def rows(self, bodies: Sequence[RigidBody], dt: float, rate: float) -> HingeRows:
         """Return its rows for a time step [s] in which `rate` of its error is removed.
@@ -100,11 +77,10 @@ class Hinge:
         y = J v' + c: anchors' relative velocity and the angular velocity across the axis are equations (y = 0, x free); the angle's rate
         plus its distance to a limit over dt is >= 0 where x > 0; the motor's y is the rate less the wanted one, |x| <= torque dt.
         """
-        (arm, anchor, axis, _), (other_arm, other_anchor, other_axis, _) = self._world(bodies, 0), self._world(bodies, 1)
-        apart = anchor - other_anchor
+        (arm, anchor, R), (other_arm, other_anchor, S) = (self.side(bodies, number) for number in (self.first, self.second))
+        apart, axis, other_axis = anchor - other_anchor, R @ self.axis, S @ self.axis
         arm, other_arm = arm - 0.5 * apart, other_arm + 0.5 * apart  # one point for both impulses: they keep the angular momentum
-        u = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-        u /= np.linalg.norm(u)
+        u = _across(axis)
         linear = [np.concatenate([e, np.cross(arm, e), -e, -np.cross(other_arm, e)]) for e in np.eye(3)]
         across = np.array([u, np.cross(axis, u)])
         turn = np.array([np.concatenate([np.zeros(3), d, np.zeros(3), -d]) for d in (*across, axis)])
@@ -138,3 +114,9 @@ class HingeRows:
     bias: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
+
+
+def _across(axis: np.ndarray) -> np.ndarray:
+    """Return a unit vector normal to a direction."""
+    u = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    return np.asarray(u / np.linalg.norm(u))

@@ -8,7 +8,7 @@ import numpy as np
 
 from warp_lcp.grid.motion import Motion
 from warp_lcp.rigid.body import AXES, PLANAR, RigidBody
-from warp_lcp.rigid.contact_detection import ContactDetection, Found
+from warp_lcp.rigid.contact_detection import ContactDetection, Found, Touch
 from warp_lcp.rigid.contact_problem import ContactProblem
 from warp_lcp.rigid.contact_shape import ContactShape
 from warp_lcp.rigid.firm import SINGULAR, Firm
@@ -159,13 +159,12 @@ class ContactSolve:
 
     def assembled(self, found: Sequence[Found], time: float, dt: float, gravity: np.ndarray | None) -> Touching:
         """Return the contacts with their rows; tangents are along the slip, or along gravity, if that is given."""
-        if not found:
-            return Touching.none(self.dimension)
         falls, n, dim = 0.0 if gravity is None else float(np.linalg.norm(gravity)) * dt, len(self.bodies), self.dimension
-        counts = [len(entry.touch) for entry in found]
-        first, second = (np.repeat([getattr(entry, name) for entry in found], counts) for name in ("first", "second"))
-        point, normal, gap = (np.concatenate([getattr(entry.touch, name) for entry in found]) for name in ("point", "normal", "gap"))
-        moved = np.concatenate([_carried(entry.motion, entry.touch.point, time, dt) for entry in found])
+        counts = np.array([len(entry.touch) for entry in found], dtype=int)
+        first, second = (np.repeat(np.array([getattr(entry, name) for entry in found], dtype=int), counts) for name in ("first", "second"))
+        touch = Touch.joined([entry.touch for entry in found])
+        point, normal, gap = touch.point, touch.normal, touch.gap
+        moved = np.concatenate([np.zeros((0, 3)), *(_carried(entry.motion, entry.touch.point, time, dt) for entry in found)])
         six = np.concatenate([self._six(), np.zeros((1, 6))])
         at = np.array([body.position for body in self.bodies] + [np.zeros(3)])
         mine, others = point - at[first], point - at[second]

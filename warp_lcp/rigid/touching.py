@@ -44,13 +44,6 @@ class Touching:
     wall: np.ndarray
     target: np.ndarray
 
-    @classmethod
-    def none(cls, dimension: int) -> Touching:
-        """Return no contacts."""
-        ints, reals, rows = np.zeros(0, dtype=int), np.zeros(0), np.zeros((0, dimension, 3 * dimension - 3))
-        frames, wall = np.zeros((0, dimension, 3)), np.zeros((0, dimension))
-        return cls(ints, ints, np.zeros((0, 3)), frames, reals, reals, reals, rows, rows, wall, reals)
-
     def __len__(self) -> int:
         """Return the number of contacts."""
         return len(self.gap)
