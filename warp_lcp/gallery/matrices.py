@@ -7,7 +7,7 @@ import scipy.linalg
 import scipy.sparse
 
 from warp_lcp.gallery.planted import Plant, planted
-from warp_lcp.gallery.problem import Problem
+from warp_lcp.gallery.problem import M_MATRIX, Problem
 
 
 def spectrum_matrix(eigenvalues: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -34,8 +34,7 @@ def definite(n: int, *, condition: float = 100.0, plant: Plant | None = None, se
         raise ValueError(f"condition = {condition}: must be >= 1")
     rng = np.random.default_rng(seed)
     A = spectrum_matrix(np.geomspace(1 / condition, 1, n), rng)
-    facts = frozenset({"symmetric", "positive-definite", "p-matrix", "positive-diagonal"})
-    return planted(A, rng, plant or Plant(), name=f"definite {n}, condition {condition:g}", facts=facts)
+    return planted(A, rng, plant or Plant(), name=f"definite {n}, condition {condition:g}", facts=M_MATRIX - {"m-matrix"})
 
 
 def semidefinite(n: int, *, zeros: float = 0.5, plant: Plant | None = None, seed: int = 2015) -> Problem:
@@ -134,5 +133,4 @@ def banded(n: int, *, bands: int = 3, plant: Plant | None = None, seed: int = 20
     if not 0 <= bands < n:
         raise ValueError(f"bands = {bands}: must be in [0, n - 1] with n = {n}")
     rng = np.random.default_rng(seed)
-    facts = frozenset({"symmetric", "positive-definite", "p-matrix", "m-matrix", "positive-diagonal"})
-    return planted(banded_matrix(n, bands, rng), rng, plant or Plant(), name=f"banded {n}, {bands} bands", facts=facts)
+    return planted(banded_matrix(n, bands, rng), rng, plant or Plant(), name=f"banded {n}, {bands} bands", facts=M_MATRIX)

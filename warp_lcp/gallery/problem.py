@@ -33,6 +33,7 @@ FACTS = frozenset(
         "solvable",  # there is one at least
     }
 )
+M_MATRIX = frozenset({"symmetric", "positive-definite", "p-matrix", "m-matrix", "positive-diagonal"})  # facts of Laplacians
 
 
 @dataclass(frozen=True, eq=False)

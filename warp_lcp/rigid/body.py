@@ -216,7 +216,7 @@ def in_space(values: np.ndarray) -> np.ndarray:
 
 
 def _turn(vector: np.ndarray) -> np.ndarray:
-    """Return the matrix of a turn by |vector| [rad] about it (Rodrigues' formula)."""
+    """Return the matrix of a turn by |vector| [rad] about it: SciPy's `Rotation.from_rotvec`, whose last bits runs would show."""
     x, y, z = vector.tolist()
     angle = math.sqrt(x * x + y * y + z * z)
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
