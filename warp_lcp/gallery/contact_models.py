@@ -142,7 +142,7 @@ class BoxedModel:
     """
 
     def problem(self, system: ContactSystem) -> Problem:
-        """Return the boxed problem."""
+        """Return the boxed problem: its x are the impulses r."""
         n, normal, mu = len(system.q), np.full(len(system.q), -1), np.zeros(len(system.q))
         normal[system.tangents] = system.normals[:, None]
         mu[system.tangents] = system.friction[:, None]
@@ -153,11 +153,11 @@ class BoxedModel:
         return Problem(f"{system.name}: boxed", system.B, system.q, lower, upper, None, frozenset(facts))
 
     def impulses(self, system: ContactSystem, x: np.ndarray) -> np.ndarray:
-        """Return x: it is r."""
+        """Return x, which are the impulses themselves."""
         return x
 
     def guess(self, system: ContactSystem, r: np.ndarray) -> np.ndarray:
-        """Return r within its bounds."""
+        """Return r clipped to the bounds that it makes."""
         x = r.copy()
         x[system.joints] = np.clip(x[system.joints], system.lower, system.upper)
         x[system.normals] = np.maximum(x[system.normals], 0.0)
@@ -205,7 +205,7 @@ class StewartTrinkleModel:
     directions: int = 4
 
     def __post_init__(self) -> None:
-        """Check K."""
+        """Check that K is even and there are two at least."""
         if self.directions < 2 or self.directions % 2:
             raise ValueError(f"directions = {self.directions}: must be an even number >= 2")
 

@@ -102,7 +102,7 @@ class ContactStepper:
         self._joints: np.ndarray | None = None  # impulses of the last step; those of contacts are in the world's memory
 
     def step(self) -> StepReport:
-        """Advance by dt."""
+        """Advance the world by dt, and return what the solve did."""
         world, dt = self.world, self.dt
         assembly = world.assemble(dt, rate=self.rate if self.stabilization == "baumgarte" else 0.0)
         system = assembly.system

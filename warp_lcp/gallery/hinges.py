@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from warp_lcp.rigid.body import RigidBody
-from warp_lcp.rigid.touching import jacobian
+from warp_lcp.rigid.contacts import jacobian
 
 WORLD = -1  # in the place of a body: the hinge is fixed in space
 NEAR_LIMIT = 0.2  # [rad]: a limit that is farther away has no row

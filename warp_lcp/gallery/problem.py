@@ -62,7 +62,7 @@ class Problem:
     facts: frozenset[str]
 
     def __post_init__(self) -> None:
-        """Check the facts."""
+        """Check that all facts are known ones."""
         unknown = sorted(self.facts - FACTS)
         if unknown:
             raise ValueError(f"facts holds {unknown}: allowed are {sorted(FACTS)}")

@@ -14,9 +14,9 @@ from warp_lcp.grid.solids import Box, Sphere
 from warp_lcp.rigid.body import RigidBody
 from warp_lcp.rigid.contact_shape import ContactShape
 from warp_lcp.rigid.contact_solve import ContactSolve
+from warp_lcp.rigid.contacts import Contacts
 from warp_lcp.rigid.mass_properties import MassProperties, mass_properties
 from warp_lcp.rigid.obstacles import Obstacle
-from warp_lcp.rigid.touching import Touching
 
 Parts = Sphere | Box | Sequence[Box]  # a ball, a box, or boxes that share their center
 
@@ -81,7 +81,7 @@ class World:
         """Return velocities, linear and angular, of the bodies [m/s, rad/s], shape (n, 6)."""
         return np.array([body.velocities(3) for body in self.bodies])
 
-    def contacts(self, dt: float = 0.0, *, margin: float | None = None) -> Touching:
+    def contacts(self, dt: float = 0.0, *, margin: float | None = None) -> Contacts:
         """Return where bodies touch now, or may within dt [s] if two of them meet at the largest speed of all.
 
         Args:
@@ -154,7 +154,7 @@ class Assembly:
     """
 
     system: ContactSystem
-    contacts: Touching
+    contacts: Contacts
     J: scipy.sparse.csr_array
     response: scipy.sparse.csr_array
     falling: np.ndarray
@@ -166,7 +166,7 @@ class Assembly:
 
 
 def _made(solid: Parts, mass: float) -> tuple[MassProperties, ContactShape]:
-    """Return what a body is of."""
+    """Return mass properties and surface of a body; bars and boxes share the mass evenly."""
     if isinstance(solid, Sphere):
         return mass_properties(solid, 3, mass=mass), ContactShape.of(solid, 3)
     boxes = [solid] if isinstance(solid, Box) else solid

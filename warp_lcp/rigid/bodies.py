@@ -10,7 +10,7 @@ import numpy as np
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.rigid.body import BodyMotion, RigidBody
 from warp_lcp.rigid.contact_shape import ContactShape
-from warp_lcp.rigid.contact_solve import ContactSolve, Touching
+from warp_lcp.rigid.contact_solve import Contacts, ContactSolve
 from warp_lcp.rigid.obstacles import Obstacle
 from warp_lcp.rigid.outline import BodySurface, body_surface
 
@@ -26,13 +26,13 @@ class _Begun:
     Args:
         states: of the bodies before it.
         free: momenta without contacts, shape (n, 6).
-        touching: where bodies touch.
+        contacts: where bodies touch.
         impulses: of the contacts if no material pushes.
     """
 
     states: np.ndarray
     free: np.ndarray
-    touching: Touching
+    contacts: Contacts
     impulses: np.ndarray
 
 
@@ -101,14 +101,14 @@ class RigidBodies:
         for body in self.bodies:
             body.time = time
         states = self._states()
-        touching = self._solve.find(time, dt, gravity)
+        contacts = self._solve.find(time, dt, gravity)
         for body in self.bodies:
             body.release()
             body.accelerate(gravity, kick_dt)
         free = self._momenta()
-        impulses = self._solve.push_apart(touching)
-        self._solve.hold(touching, impulses)
-        self._begun = _Begun(states, free, touching, impulses)
+        impulses = self._solve.push_apart(contacts)
+        self._solve.hold(contacts, impulses)
+        self._begun = _Begun(states, free, contacts, impulses)
 
     def end_step(self, dt: float) -> None:
         """Solve for the contacts with what the material gave, then move and turn the bodies.
@@ -126,10 +126,10 @@ class RigidBodies:
         if any(body.given.any() for body in self.bodies):
             for body, momenta in zip(self.bodies, begun.free, strict=True):
                 body.momentum, body.angular_momentum = momenta[:3] + body.given[:3], momenta[3:] + body.given[3:]
-            impulses = self._solve.push_apart(begun.touching, begun.impulses)
-        self._solve.memory.keep(begun.touching, impulses, self.bodies)
-        self.contacts, self.contact_residual = len(begun.touching), self._solve.residual
-        ways = self._solve.separation(begun.touching, dt)
+            impulses = self._solve.push_apart(begun.contacts, begun.impulses)
+        self._solve.memory.keep(begun.contacts, impulses, self.bodies)
+        self.contacts, self.contact_residual = len(begun.contacts), self._solve.residual
+        ways = self._solve.separation(begun.contacts, dt)
         for number, body in enumerate(self.bodies):
             body.release()
             body.advance(dt)

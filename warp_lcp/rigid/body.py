@@ -162,7 +162,7 @@ class RigidBody:
         )  # fmt: skip
 
     def restore(self, state: np.ndarray) -> None:
-        """Continue from `state`."""
+        """Continue from what `state` returned, held by nothing."""
         self.position, self.rotation = state[:3].copy(), state[3:12].reshape(3, 3).copy()
         self.momentum, self.angular_momentum = state[12:15].copy(), state[15:18].copy()
         self.angle, self.time = float(state[18]), float(state[19])
@@ -185,7 +185,6 @@ class BodyMotion:
     """
 
     def __init__(self, body: RigidBody) -> None:
-        """Follow a body."""
         self.body = body
 
     def pose(self, time: float) -> Pose:

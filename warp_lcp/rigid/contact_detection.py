@@ -25,7 +25,7 @@ LEVEL = 1e-4  # of the smaller shape's size: gaps that differ by less are of one
 
 
 @dataclass(frozen=True, eq=False)
-class Touch:
+class ContactPoints:
     """Points where one thing touches another.
 
     Args:
@@ -42,20 +42,19 @@ class Touch:
         """Return the number of points."""
         return len(self.gap)
 
-    def turned(self) -> Touch:
+    def turned(self) -> ContactPoints:
         """Return the same points as the other sees them."""
-        return Touch(self.point, -self.normal, self.gap)
+        return ContactPoints(self.point, -self.normal, self.gap)
 
-    def where(self, chosen: np.ndarray) -> Touch:
-        """Return some of the points."""
-        return Touch(self.point[chosen], self.normal[chosen], self.gap[chosen])
+    def where(self, chosen: np.ndarray) -> ContactPoints:
+        """Return the points that are chosen, by a mask or their places."""
+        return ContactPoints(self.point[chosen], self.normal[chosen], self.gap[chosen])
 
     @classmethod
-    def joined(cls, touches: Sequence[Touch]) -> Touch:
-        """Return the points of several."""
-        if not touches:
-            return cls(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-        return cls(*(np.concatenate([getattr(touch, name) for touch in touches]) for name in ("point", "normal", "gap")))
+    def joined(cls, several: Sequence[ContactPoints]) -> ContactPoints:
+        """Return the points of several pairs as one."""
+        none = cls(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+        return cls(*(np.concatenate([getattr(points, name) for points in (none, *several)]) for name in ("point", "normal", "gap")))
 
 
 class Place(NamedTuple):
@@ -69,7 +68,7 @@ class Place(NamedTuple):
         return np.asarray(points @ self.rotation.T + self.translation)
 
 
-def on_plane(shape: ContactShape, pose: Pose | Place, point: np.ndarray, normal: np.ndarray, margin: float) -> Touch:
+def on_plane(shape: ContactShape, pose: Pose | Place, point: np.ndarray, normal: np.ndarray, margin: float) -> ContactPoints:
     """Return where a shape touches a plane.
 
     Args:
@@ -83,10 +82,10 @@ def on_plane(shape: ContactShape, pose: Pose | Place, point: np.ndarray, normal:
     gap = (centers - point) @ normal - shape.radius
     near = gap <= margin
     places = centers[near] - (shape.radius + 0.5 * gap[near])[:, None] * normal
-    return Touch(places, np.broadcast_to(normal, places.shape), gap[near])
+    return ContactPoints(places, np.broadcast_to(normal, places.shape), gap[near])
 
 
-def between(one: ContactShape, at: Pose | Place, other: ContactShape, there: Pose | Place, margin: float, dimension: int) -> Touch:
+def between(one: ContactShape, at: Pose | Place, other: ContactShape, there: Pose | Place, margin: float, dimension: int) -> ContactPoints:
     """Return where two shapes touch, normals from the other to the one.
 
     Boxes by the axis along which they overlap least; others by points of either surface and the distance to the other one.
@@ -100,17 +99,17 @@ def between(one: ContactShape, at: Pose | Place, other: ContactShape, there: Pos
         dimension: 2 or 3.
     """
     if one.boxes and other.boxes:
-        return Touch.joined([_boxes(_moved(a, at), _moved(b, there), margin, dimension) for a in one.boxes for b in other.boxes])
+        return ContactPoints.joined([_boxes(_moved(a, at), _moved(b, there), margin, dimension) for a in one.boxes for b in other.boxes])
     single = [len(shape.points) == 1 for shape in (one, other)]  # the center of a ball says all
     found = []
     if not single[1] or single[0]:
         found.append(_points_of(one, at, other, there, margin))
     if not single[0] and len(other.points):
         found.append(_points_of(other, there, one, at, margin).turned())
-    return Touch.joined(found)
+    return ContactPoints.joined(found)
 
 
-def _points_of(one: ContactShape, at: Pose | Place, other: ContactShape, there: Pose | Place, margin: float) -> Touch:
+def _points_of(one: ContactShape, at: Pose | Place, other: ContactShape, there: Pose | Place, margin: float) -> ContactPoints:
     """Return the points of one shape that are near the other."""
     centers = at.apply(one.points)
     local = (centers - there.translation) @ there.rotation
@@ -119,49 +118,49 @@ def _points_of(one: ContactShape, at: Pose | Place, other: ContactShape, there: 
         near = ((local >= other.low - reach) & (local <= other.high + reach)).all(axis=1)
         centers, local = centers[near], local[near]
     if not len(local):
-        return Touch.joined([])
+        return ContactPoints.joined([])
     distance, direction = other.distance(local)
     gap = distance - one.radius
     near = gap <= margin
     normal = direction[near] @ there.rotation.T
-    return Touch(centers[near] - (one.radius + 0.5 * gap[near])[:, None] * normal, normal, gap[near])
+    return ContactPoints(centers[near] - (one.radius + 0.5 * gap[near])[:, None] * normal, normal, gap[near])
 
 
 def _moved(box: OrientedBox, pose: Pose | Place) -> OrientedBox:
     return OrientedBox(pose.apply(box.center[None])[0], pose.rotation @ box.rotation, box.half)
 
 
-def _boxes(a: OrientedBox, b: OrientedBox, margin: float, dimension: int) -> Touch:
+def _boxes(a: OrientedBox, b: OrientedBox, margin: float, dimension: int) -> ContactPoints:
     """Return where two boxes touch; in 2-D they are thick, and of their contacts those of one face count."""
     if dimension == 2:
         deep = max(a.half[2], b.half[2])
         a, b = (OrientedBox(box.center, box.rotation, np.array([*box.half[:2], deep])) for box in (a, b))
     hit = box_box(a, b, margin)
     if hit is None:
-        return Touch.joined([])
+        return ContactPoints.joined([])
     points, normal, gaps = hit
     if dimension == 2:
         points, gaps = points[points[:, 2] > 0.0], gaps[points[:, 2] > 0.0]
         points[:, 2] = 0.0
-    return Touch(points, np.broadcast_to(normal, points.shape), gaps)
+    return ContactPoints(points, np.broadcast_to(normal, points.shape), gaps)
 
 
-def spread(touch: Touch, size: float, dimension: int) -> Touch:
+def spread(points: ContactPoints, size: float, dimension: int) -> ContactPoints:
     """Return the deepest of a pair's points and others that are low and far from each other, as many as hold a body.
 
     Where all have about one normal that is two points in 2-D and four in 3-D, and up to two more if some of these are higher than others.
 
     Args:
-        touch: the points.
+        points: the points.
         size: of the smaller shape [m].
         dimension: 2 or 3.
     """
-    if len(touch) < 2:
-        return touch
-    above = touch.gap - touch.gap.min()
-    chosen = [int(touch.gap.argmin())]
-    way = np.linalg.norm(touch.point - touch.point[chosen[0]], axis=1)
-    side = np.linalg.norm(touch.normal - touch.normal[chosen[0]], axis=1)
+    if len(points) < 2:
+        return points
+    above = points.gap - points.gap.min()
+    chosen = [int(points.gap.argmin())]
+    way = np.linalg.norm(points.point - points.point[chosen[0]], axis=1)
+    side = np.linalg.norm(points.normal - points.normal[chosen[0]], axis=1)
     for lower, flat in ((LOWER, FLAT[dimension]), (MUCH_LOWER, FLAT[dimension] + MORE)):
         allowed = above < (above[chosen].max() - LEVEL * size if lower == MUCH_LOWER else np.inf)
         while len(chosen) < MOST[dimension]:
@@ -170,25 +169,25 @@ def spread(touch: Touch, size: float, dimension: int) -> Touch:
                 break
             following = int(np.where(usable, way + size * side - lower * above, -np.inf).argmax())
             chosen.append(following)
-            way = np.minimum(way, np.linalg.norm(touch.point - touch.point[following], axis=1))
-            side = np.minimum(side, np.linalg.norm(touch.normal - touch.normal[following], axis=1))
-    return touch.where(np.array(chosen))
+            way = np.minimum(way, np.linalg.norm(points.point - points.point[following], axis=1))
+            side = np.minimum(side, np.linalg.norm(points.normal - points.normal[following], axis=1))
+    return points.where(np.array(chosen))
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class ContactPair:
     """Contacts of two.
 
     Args:
         first: body that normals point into.
         second: body that they come from; the number of bodies where that is none.
-        touch: the points, one at least.
+        points: one at least.
         obstacle: what they come from if it is no body.
     """
 
     first: int
     second: int
-    touch: Touch
+    points: ContactPoints
     obstacle: Obstacle | None = None
 
     @property
@@ -223,7 +222,7 @@ class ContactDetection:
         self._half = np.array([0.5 * (shape.high - shape.low) - shape.radius for shape in shapes])
         self._radius = np.array([shape.radius for shape in shapes])
 
-    def find(self, time: float, ways: np.ndarray, brought: np.ndarray, near: float = 0.0) -> list[Found]:
+    def find(self, time: float, ways: np.ndarray, brought: np.ndarray, near: float = 0.0) -> list[ContactPair]:
         """Return where bodies touch.
 
         Args:
@@ -243,25 +242,25 @@ class ContactDetection:
         margins = near + ways[:, None] + ways
         apart = (np.abs(middle[:, None] - middle) - half[:, None] - half).max(axis=2)
         for i, j in np.argwhere(np.tril(apart <= margins, -1)).tolist():
-            touch = between(self._shapes[i], poses[i], self._shapes[j], poses[j], float(margins[i, j]), self._dimension)
-            found.append(Found(i, j, self._kept(touch, min(self._shapes[i].size, self._shapes[j].size))))
-        return [entry for entry in found if len(entry.touch)]
+            points = between(self._shapes[i], poses[i], self._shapes[j], poses[j], float(margins[i, j]), self._dimension)
+            found.append(ContactPair(i, j, self._kept(points, min(self._shapes[i].size, self._shapes[j].size))))
+        return [entry for entry in found if len(entry.points)]
 
-    def _kept(self, touch: Touch, size: float) -> Touch:
-        return touch if self._every else spread(touch, size, self._dimension)
+    def _kept(self, points: ContactPoints, size: float) -> ContactPoints:
+        return points if self._every else spread(points, size, self._dimension)
 
     def _with_obstacle(
         self, obstacle: Obstacle, there: Pose, poses: list[Place], middle: np.ndarray, half: np.ndarray, margins: np.ndarray
-    ) -> list[Found]:
+    ) -> list[ContactPair]:
         """Return where bodies touch an obstacle."""
-        shape, n, touches = obstacle.shape, len(poses), []
+        shape, n, pairs = obstacle.shape, len(poses), []
         if shape is None:
             points, normals = there.apply(obstacle.points), obstacle.normals @ there.rotation.T
             heights = middle @ normals.T - (points * normals).sum(axis=1) - half @ np.abs(normals).T
             for i in np.flatnonzero((heights <= margins[:, None]).any(axis=1)).tolist():
                 mine, chosen = self._shapes[i], np.flatnonzero(heights[i] <= margins[i])
                 each = [self._kept(on_plane(mine, poses[i], points[m], normals[m], margins[i]), mine.size) for m in chosen]
-                touches.append(Found(i, n, Touch.joined(each), obstacle))
+                pairs.append(ContactPair(i, n, ContactPoints.joined(each), obstacle))
         else:
             near = np.ones(n, dtype=bool)
             if shape.closed:
@@ -269,5 +268,5 @@ class ContactDetection:
                 near = (np.abs(middle - center) - half - reach).max(axis=1) <= margins
             for i in np.flatnonzero(near).tolist():
                 touch = between(self._shapes[i], poses[i], shape, there, float(margins[i]), self._dimension)
-                touches.append(Found(i, n, self._kept(touch, min(self._shapes[i].size, shape.size)), obstacle))
-        return touches
+                pairs.append(ContactPair(i, n, self._kept(touch, min(self._shapes[i].size, shape.size)), obstacle))
+        return pairs

@@ -16,7 +16,7 @@ import warp as wp
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from warp_lcp.rigid.touching import jacobian
+from warp_lcp.rigid.contacts import jacobian
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.stopping import StoppingCriteria
 

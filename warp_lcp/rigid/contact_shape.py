@@ -48,7 +48,7 @@ class ContactShape:
     high: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
-        """Find the bounds."""
+        """Find the bounds of what is within the radius of the points."""
         points = self.points if len(self.points) else np.zeros((1, 3))
         object.__setattr__(self, "low", points.min(axis=0) - self.radius)
         object.__setattr__(self, "high", points.max(axis=0) + self.radius)

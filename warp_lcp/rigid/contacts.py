@@ -15,7 +15,7 @@ KEPT = 32  # contacts remembered for each body, at most
 
 
 @dataclass(frozen=True, eq=False)
-class Touching:
+class Contacts:
     """The contacts of a step, k of them; a contact's rows are its normal and `dimension` - 1 tangents. q: velocities of a body.
 
     Args:
@@ -75,7 +75,6 @@ class ContactMemory:
     """
 
     def __init__(self, bodies: int) -> None:
-        """Remember nothing."""
         self.values, self._most = np.zeros((0, 8)), KEPT * bodies
 
     def state(self) -> np.ndarray:
@@ -87,29 +86,29 @@ class ContactMemory:
         values = np.array(state, dtype=np.float64).reshape(-1, 8)
         self.values = values[values[:, 0] >= 0.0]
 
-    def keep(self, touching: Touching, impulses: np.ndarray, bodies: Sequence[RigidBody]) -> None:
+    def keep(self, contacts: Contacts, impulses: np.ndarray, bodies: Sequence[RigidBody]) -> None:
         """Remember impulses, shape (k, dimension)."""
-        world = (impulses[:, None] @ touching.frames)[:, 0]
-        self.values = np.column_stack([touching.first, touching.second, _places(touching, bodies), world])[: self._most]
+        world = (impulses[:, None] @ contacts.frames)[:, 0]
+        self.values = np.column_stack([contacts.first, contacts.second, _places(contacts, bodies), world])[: self._most]
 
-    def recall(self, touching: Touching, bodies: Sequence[RigidBody]) -> np.ndarray:
+    def recall(self, contacts: Contacts, bodies: Sequence[RigidBody]) -> np.ndarray:
         """Return impulses to start from, shape (k, dimension): those of the nearest contact of the same two, once each."""
-        start, old = np.zeros(touching.wall.shape), self.values
-        if not len(old) or not len(touching):
+        start, old = np.zeros(contacts.wall.shape), self.values
+        if not len(old) or not len(contacts):
             return start
-        places = _places(touching, bodies)
-        same = (touching.first[:, None] == old[:, 0]) & (touching.second[:, None] == old[:, 1])
+        places = _places(contacts, bodies)
+        same = (contacts.first[:, None] == old[:, 0]) & (contacts.second[:, None] == old[:, 1])
         way = np.where(same, np.linalg.norm(places[:, None] - old[:, 2:5], axis=2), np.inf)
         nearest, each = way.argmin(axis=1), np.arange(len(places))
-        known = (way[each, nearest] < SAME_PLACE * touching.size) & (way.argmin(axis=0)[nearest] == each)
-        start[known] = (touching.frames[known] @ old[nearest[known], 5:, None])[:, :, 0]
+        known = (way[each, nearest] < SAME_PLACE * contacts.size) & (way.argmin(axis=0)[nearest] == each)
+        start[known] = (contacts.frames[known] @ old[nearest[known], 5:, None])[:, :, 0]
         return start
 
 
-def _places(touching: Touching, bodies: Sequence[RigidBody]) -> np.ndarray:
+def _places(contacts: Contacts, bodies: Sequence[RigidBody]) -> np.ndarray:
     """Return contacts in the axes of their first bodies [m], shape (k, 3)."""
     at, turned = (np.array([getattr(body, name) for body in bodies]) for name in ("position", "rotation"))
-    return np.asarray(((touching.point - at[touching.first])[:, None] @ turned[touching.first])[:, 0])
+    return np.asarray(((contacts.point - at[contacts.first])[:, None] @ turned[contacts.first])[:, 0])
 
 
 def jacobian(first: np.ndarray, second: np.ndarray, one: np.ndarray, other: np.ndarray, bodies: int) -> csr_array:
