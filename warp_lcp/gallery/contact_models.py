@@ -6,6 +6,7 @@ All start from a `ContactSystem`: relative velocities at the contacts after impu
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import groupby
 from typing import Protocol
 
 import numpy as np
@@ -76,16 +77,10 @@ class ContactSystem:
         """Return the rows of each contact, then joints' rows: equations that follow each other, at most `most`, bounded ones alone."""
         blocks = list(np.arange(self.dim * self.contacts).reshape(self.contacts, self.dim))
         free = np.isinf(self.lower) & np.isinf(self.upper)
-        current: list[int] = []
-        for row, equation in zip(self.joints, free, strict=True):
-            if current and (not equation or len(current) == most):
-                blocks.append(np.array(current))
-                current = []
-            if equation:
-                current.append(int(row))
-            else:
-                blocks.append(np.array([row]))
-        return [*blocks, np.array(current)] if current else blocks
+        for equations, group in groupby(zip(self.joints, free, strict=True), key=lambda entry: entry[1]):
+            rows = np.array([row for row, _ in group])
+            blocks += np.split(rows, range(most if equations else 1, len(rows), most if equations else 1))
+        return blocks
 
     def staggered(self) -> list[np.ndarray]:
         """Return the rows of normal impulses and joints, and those of friction: two blocks, or one where there is no contact."""
@@ -199,7 +194,7 @@ class StewartTrinkleModel:
         directions: K, even; 2 are opposite, and friction acts along one tangent alone.
 
     Raises:
-        ValueError: it is not.
+        ValueError: K is odd, or less than 2.
     """
 
     directions: int = 4
@@ -216,12 +211,16 @@ class StewartTrinkleModel:
         around = np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, : dim - 1]
         return np.block([[np.ones((1, 1)), np.zeros((1, dim - 1))], [np.zeros((K, 1)), around]])
 
+    def unfold(self, system: ContactSystem) -> scipy.sparse.csr_array:
+        """Return T: impulses are r = T'x of the unknowns x, velocities along the vectors T u; shape (unknowns, rows of B)."""
+        each = np.vstack([self.spread(system.dim), np.zeros(system.dim)])
+        blocks = [scipy.sparse.kron(scipy.sparse.eye_array(system.contacts), each), scipy.sparse.eye_array(len(system.lower))]
+        return scipy.sparse.csr_array(scipy.sparse.block_diag(blocks))
+
     def problem(self, system: ContactSystem) -> Problem:
         """Return the LCP, mixed where joints have equations."""
-        k, m, spread = system.contacts, len(system.lower), self.spread(system.dim)
-        K = len(spread) - 1
-        joint = scipy.sparse.eye_array(m)
-        T = scipy.sparse.block_diag([scipy.sparse.kron(scipy.sparse.eye_array(k), np.vstack([spread, np.zeros(system.dim)])), joint])
+        k, m, T = system.contacts, len(system.lower), self.unfold(system)
+        K = len(self.spread(system.dim)) - 1
         beta = np.zeros((2 + K, 2 + K))
         beta[1:-1, -1], beta[-1, 1:-1] = 1.0, -1.0
         slope = np.zeros((2 + K, 2 + K))
@@ -237,9 +236,7 @@ class StewartTrinkleModel:
 
     def impulses(self, system: ContactSystem, x: np.ndarray) -> np.ndarray:
         """Return r: friction is summed over the vectors."""
-        k, spread = system.contacts, self.spread(system.dim)
-        own = x[: k * (1 + len(spread))].reshape(k, 1 + len(spread))[:, :-1] @ spread
-        return np.concatenate([own.ravel(), x[k * (1 + len(spread)) :]])
+        return np.asarray(self.unfold(system).T @ x)
 
     def guess(self, system: ContactSystem, r: np.ndarray) -> np.ndarray:
         """Return unknowns whose impulses are near r: friction split onto the two nearest vectors, beta from the slip at r."""

@@ -196,8 +196,7 @@ class BodyMotion:
 
     def velocity_field(self) -> tuple[np.ndarray, np.ndarray]:
         """Return turn, shape (3, 3) [1/s], and shift, shape (3,) [m/s]: the body's point x moves at turn x + shift now."""
-        x, y, z = self.body.angular_velocity
-        turn = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        turn = _cross(*self.body.angular_velocity)
         return turn, self.body.velocity - turn @ self.body.position
 
 
@@ -218,10 +217,15 @@ def _turn(vector: np.ndarray) -> np.ndarray:
     """Return the matrix of a turn by |vector| [rad] about it: SciPy's `Rotation.from_rotvec`, whose last bits runs would show."""
     x, y, z = vector.tolist()
     angle = math.sqrt(x * x + y * y + z * z)
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    K = _cross(x, y, z)
     if angle < SMALL_TURN:
         return cast(np.ndarray, np.eye(3) + K + 0.5 * K @ K)
     return cast(np.ndarray, np.eye(3) + math.sin(angle) / angle * K + 0.5 * (math.sin(0.5 * angle) / (0.5 * angle)) ** 2 * K @ K)
+
+
+def _cross(x: float, y: float, z: float) -> np.ndarray:
+    """Return the matrix of the cross product with a vector."""
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def _three(vector: np.ndarray | None) -> np.ndarray:
