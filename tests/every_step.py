@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.run.loop import take_step
+from warp_lcp.run.stepping import take_step
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import Part, Simulation, simulators
 

@@ -55,6 +55,10 @@ class NoStopwatch:
         """Do nothing."""
 
 
+class InputError(ValueError):
+    """What the user gave is wrong. The message names it and says what is allowed; the command line ends with exit code 2."""
+
+
 class StepFailed(RuntimeError):
     """The step's solve missed its criteria. The state is as before the step, so a smaller dt may be tried."""
 
