@@ -11,7 +11,7 @@ import warp as wp
 
 import warp_lcp as wl
 from granular.bodies import SandBodies
-from granular.coupled import METHODS, CoupledMethod, CoupledOutcome
+from granular.coupled import METHODS
 from granular.packing import Packing
 from granular.report import Outcome
 from granular.scene import SandScene
@@ -92,7 +92,7 @@ class SandSimulation(ParticleSimulation):
         super().__init__(scene, grid, boundary, particles, sources=sources, outlets=outlets, bodies=bodies, notes=notes)
         self.solids, self.sides = solids, boundary.sides
         self._join = None if self.sides is None else self.sides.wrap
-        self.method: CoupledMethod = METHODS[scene.solver.method]()
+        self.method = METHODS[scene.solver.method]()
         self._base, self.density = grid.field(wp.int8), grid.field()
         self.packing = Packing(grid, self._base, boundary.capacity, sides=self.sides, cut=solids.cut)
         self.carried = None if bodies is None else SandBodies(grid, bodies.numbers)
@@ -152,22 +152,9 @@ class SandSimulation(ParticleSimulation):
         row = self.move(dt)
         self._place_solids()
         runout, height = self._front()
-        first = solved.history[0][1]
+        rate = self._flow_rate(below, row, dt)
         return self.logged(
-            row
-            | {
-                "solver": self.scene.solver.method,
-                "solve_status": solved.status.name,
-                "solve_iterations": solved.iterations,
-                "solve_residual": solved.residual / first if first > 0.0 else 0.0,
-                "coupled_residual": solved.residual,
-                "staggering_iterations": solved.iterations,
-                "max_fraction": most,
-                "runout": runout - self._start,
-                "height": height,
-                "flow_rate": self._flow_rate(below, row, dt),
-            }
-            | measured
+            row | solved | measured | {"max_fraction": most, "runout": runout - self._start, "height": height, "flow_rate": rate}
         )
 
     def _measured(self) -> Row:
@@ -276,8 +263,14 @@ class SandSimulation(ParticleSimulation):
         others = max((float(np.abs(component.numpy()).max()) for component in self.solids.velocity), default=0.0)
         return after > before + scale + others + (self.bodies.top_speed(0.0) if self.bodies is not None else 0.0)
 
-    def _solve(self, window: Window, dt: float) -> CoupledOutcome:
-        """Solve for the stresses and take over the velocity that they leave."""
+    def solve_stress(self, scale: float) -> wl.SolveResult:
+        """Solve for the stresses, to the scene's tolerance in units of `scale` [m/s]: g dt is a pressure of rho g dx."""
+        solver = self.scene.solver
+        stopping = wl.StoppingCriteria(rtol=0.0, atol=solver.tolerance * scale, max_iterations=solver.max_iterations)
+        return wl.solve(self.stress, self.method, stopping=stopping)
+
+    def _solve(self, window: Window, dt: float) -> Row:
+        """Solve for the stresses and take over the velocity that they leave; return what the log wants to know of the solve."""
         packing, stress, solids, scene = self.packing, self.stress, self.solids, self.scene
         with self.watch.stage("packing", self.density, packing.fraction, *self.velocity):
             self._find_density(window)
@@ -295,21 +288,27 @@ class SandSimulation(ParticleSimulation):
         scale = g * self.kick_dt if g > 0.0 else STANDING * math.sqrt(self.grid.spacing)
         with self.watch.stage("stress", stress.now, *packing.mass, *packing.inverse, *packing.start):
             stress.begin(bound, self.gravity, dt, self.kick_dt, decay=self.method.decay)
-            solved = self.method.solve(
-                stress, scale=scale, tolerance=scene.solver.tolerance, max_iterations=scene.solver.max_iterations
-            )  # fmt: skip
+            solved = self.solve_stress(scale)
+        residual, first = math.hypot(*(part / scale for part in stress.last_residual)), solved.history[0].residual / scale
         if solved.status is wl.SolveStatus.NON_FINITE:
             self.restore_bodies()
             raise SimulationFailed(f"step {self.step_count}: the stresses are not finite after {solved.iterations} iterations")
-        if solved.status is not wl.SolveStatus.CONVERGED and solved.residual > FAR and self._gains(scale):
+        if solved.status is not wl.SolveStatus.CONVERGED and residual > FAR and self._gains(scale):
             self.restore_bodies()
             stress.take_back()
-            residual = f"residual of {solved.residual:.2e} rho g dx (tolerance {scene.solver.tolerance}) and would make the sand faster"
-            raise missed_by_far("stress", solved.status, solved.iterations, residual, JAMMED)
+            left = f"residual of {residual:.2e} rho g dx (tolerance {scene.solver.tolerance}) and would make the sand faster"
+            raise missed_by_far("stress", solved.status, solved.iterations, left, JAMMED)
         with self.watch.stage("projection", *self.velocity):
             self.outcome.take(self.velocity)
             self._push_bodies(dt)
-        return solved
+        return {
+            "solver": scene.solver.method,
+            "solve_status": solved.status.name,
+            "solve_iterations": solved.iterations,
+            "solve_residual": residual / first if first > 0.0 else 0.0,
+            "coupled_residual": residual,
+            "staggering_iterations": solved.iterations,
+        }
 
     def _begin_bodies(self) -> None:
         """Tell the stresses how the bodies move and how easily."""

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+import warp_lcp as wl
 from granular.bodies import SandBodies
 from granular.checkerboard import damping_pass
 from granular.packing import SHEARS, Packing, wall_faces
@@ -141,7 +142,7 @@ class Velocity:
         p.nodes.run(passes.edge_strain, launch=launch, spans=p.spans, **share, **self.fields)
 
 
-class Stress:
+class Stress(wl.ConvexSetProblem):
     """Pressure and friction of sand under a packing.
 
     With x = kick_dt p / (rho dx) and s alike, u = u* + (1/m) (-grad x + div s) on faces of mass m, the stress is the solution of
@@ -152,6 +153,12 @@ class Stress:
     for any r > 0, m' = m in loose cells and 1 in full ones [Narain, Golas & Lin 2010; Daviet & Bertails-Descoubes 2016]: sand is never
     denser than 1, and friction takes as much energy as it can. In a cell |n|^2 / 2 + sum over shears of max_q b_q^2 <= (k x + cohesion)^2.
     On a face of a solid the shear stress is within mu times the normal load (Coulomb).
+
+    So it is a quasi-variational inequality, over the product of x >= 0 and of the slices of the cones that hold each cell's s at its x; its
+    natural residual is how far (x, s) - P((x, s) - y/d) lies from 0, y = (w, -E u), P onto x >= 0 first and then onto the slice at that x.
+    It is not the projection onto the cones themselves, which would let sand push itself apart as it shears (an associated flow rule, whose
+    normal velocity is k times the slip). `wl.solve` solves it, by the methods of `granular.coupled`. Gradient, projection and momentum of
+    a cell are one pass over memory (`headers/step.h`): that is why neither y nor P stand here alone.
 
     Args:
         packing: where sand is.

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import scipy.sparse
 import warp as wp
+from granular.interleaved_kernels import interleaved_passes
 
 import fluids
 import granular
@@ -19,7 +20,6 @@ from fluids.pressure_kernels import pressure_passes
 from granular.bodies_kernels import body_kernels
 from granular.checkerboard import damping_pass
 from granular.cut_walls_kernels import traction_pass
-from granular.interleaved_kernels import interleaved_passes
 from granular.report_kernels import report_pass
 from granular.stress_kernels import stress_passes
 from warp_lcp.distributed.petsc_matrix import ENTER, LEAVE

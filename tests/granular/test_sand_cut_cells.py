@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+import warp_lcp as wl
 from benchmarks.validation import sand_oblique
 from granular.coupled import AcceleratedProjection
 from granular.cut_walls import CutWalls
@@ -55,7 +56,8 @@ class Case:
         self.stress.kick_dt = DT
 
     def solve(self, tolerance: float = 1e-4) -> None:
-        AcceleratedProjection().solve(self.stress, scale=G * DT, tolerance=tolerance, max_iterations=4000)
+        stopping = wl.StoppingCriteria(rtol=0.0, atol=tolerance * G * DT, max_iterations=4000)
+        wl.solve(self.stress, AcceleratedProjection(), stopping=stopping)
 
 
 def along(values: np.ndarray, axis: int, by: int) -> np.ndarray:
