@@ -162,9 +162,7 @@ class SandSimulation(ParticleSimulation):
         if not self.scene.output.diagnostics:
             return {}
         with self.watch.stage("diagnostics", self.packing.flags, self.stress.now):
-            report = self.outcome.report()
-        scale = self.scene.physics.density * self.grid.cell_volume
-        return {"yielded": report.yielded, "dissipation": report.dissipation * scale, "predicted_excess": report.predicted}
+            return self.outcome.report(self.scene.physics.density * self.grid.cell_volume)
 
     def known_density(self) -> wp.array | None:
         """Return the density that the packing is made of."""

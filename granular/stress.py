@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,11 +11,10 @@ import warp as wp
 
 import warp_lcp as wl
 from granular.bodies import SandBodies
-from granular.checkerboard import damping_pass
-from granular.packing import SHEARS, Packing, wall_faces
+from granular.packing import SHEARS, Packing
+from granular.solids import Walls
 from granular.stress_kernels import BETA_X, NEXT_X, PERIOD, RESIDUAL_X, REST, STATE, STRESSES, momentum_kernel, stress_passes
 from granular.yield_set import COLUMNS, LOOKAHEAD, NUMBERS, PRESSURE_STEP, SHEAR_STEP, xyz
-from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.program import Launch, Program
 from warp_lcp.rows import Rows
 from warp_lcp.vectors import Reduction
@@ -47,53 +45,6 @@ class YieldSet:
     tension: float = 0.0
     gain: float = 0.0
     halfway: float = 0.0
-
-
-class Walls:
-    """Friction on the faces between sand and solids.
-
-    Args:
-        grid: the grid.
-        index: int, -1 in open cells, the wall's number elsewhere, shape of the grid's fields.
-        friction: Coulomb's coefficient of each wall, >= 0; inf sticks.
-        rubbing_only: leave out the faces of walls without friction. Their stresses are 0 from the start as long as no wall moves; what
-            moves may come where other cells of sand had theirs, which its faces then take away.
-
-    Attributes:
-        count: faces.
-        cells: int32, flat index of each face's open cell.
-        sides: uint8, 2 axis + side.
-        walls: int32, the wall's number.
-        friction: float32, of each wall.
-        active: int32: how many faces sand touches, and which.
-    """
-
-    def __init__(self, grid: StaggeredGrid, index: np.ndarray, friction: Sequence[float], *, rubbing_only: bool = False) -> None:
-        """Find the faces."""
-        device = grid.device
-        self.friction = wp.array(np.minimum(friction, 1e6), dtype=wp.float32, device=device)
-        cells, sides, walls = wall_faces(index, grid.dimension)
-        if rubbing_only:
-            rubs = np.asarray(friction)[walls] > 0.0
-            cells, sides, walls = cells[rubs], sides[rubs], walls[rubs]
-        self.count = len(cells)
-        self.cells = wp.array(cells, dtype=wp.int32, device=device)
-        self.sides = wp.array(sides, dtype=wp.uint8, device=device)
-        self.walls = wp.array(walls, dtype=wp.int32, device=device)
-        self._host = cells
-        self.active = wp.zeros(1 + self.count, dtype=wp.int32, device=device)
-
-    def fields(self, packing: Packing) -> dict[str, Any]:
-        """Return what passes over faces take, by name."""
-        faces = {"cells": self.cells, "sides": self.sides, "walls": self.walls, "friction": self.friction}
-        return {**faces, "fraction": packing.fraction}
-
-    def activate(self, flags: np.ndarray) -> None:
-        """Find the faces whose cells hold sand: their number and their entries go to `active`."""
-        found = np.flatnonzero(flags.ravel()[self._host])
-        active = np.zeros(1 + self.count, dtype=np.int32)
-        active[0], active[1 : 1 + len(found)] = len(found), found
-        self.active.assign(active)
 
 
 class Velocity:
@@ -236,7 +187,7 @@ class Stress(wl.ConvexSetProblem):
             self.bodies.forget(self._stresses)
         if p.sides is not None:
             p.sides.wrap(self._point)
-        p.grid.domain.run(damping_pass(p.grid.dimension), flags=p.flags, source=self._point, now=self.now, **share)
+        p.grid.domain.run(self.velocity.passes.damp, flags=p.flags, source=self._point, now=self.now, **share)
         self.kick_dt = kick_dt
 
     def take_back(self) -> None:

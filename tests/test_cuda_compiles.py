@@ -11,15 +11,13 @@ import numpy as np
 import pytest
 import scipy.sparse
 import warp as wp
-from granular.interleaved_kernels import interleaved_passes
 
 import fluids
 import granular
 import warp_lcp as wl
 from fluids.pressure_kernels import pressure_passes
 from granular.bodies_kernels import body_kernels
-from granular.checkerboard import damping_pass
-from granular.cut_walls_kernels import traction_pass
+from granular.coupled import interleaved_passes
 from granular.report_kernels import report_pass
 from granular.stress_kernels import stress_passes
 from warp_lcp.distributed.petsc_matrix import ENTER, LEAVE
@@ -157,9 +155,6 @@ def use_coupled_kernels(reals):
 def use_sand_kernels():
     """Instantiate the kernels of sand in 2-D and 3-D, with both yield sets."""
     for dimension in (2, 3):
-        damping_pass(dimension)
-        for real in (wp.float32, wp.float64):
-            traction_pass(dimension, real)
         for rate, cut in itertools.product((False, True), repeat=2):
             report_pass(dimension, rate, cut)
         for box, rate in ((False, False), (True, False), (False, True)):

@@ -10,7 +10,8 @@ import warp_lcp as wl
 from granular.bodies import SandBodies
 from granular.coupled import AcceleratedProjection
 from granular.packing import Packing
-from granular.stress import Stress, Walls, YieldSet
+from granular.solids import Walls
+from granular.stress import Stress, YieldSet
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
 

@@ -15,8 +15,8 @@ from granular.cut_walls import CutWalls
 from granular.packing import SHEARS, Packing
 from granular.scene import SandScene
 from granular.simulator import GranularSimulator, SandSimulation
-from granular.solids import SandSolids
-from granular.stress import Stress, Walls, YieldSet
+from granular.solids import SandSolids, Walls
+from granular.stress import Stress, YieldSet
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.solids import Plane
 from warp_lcp.grid.staggered import StaggeredGrid

@@ -10,7 +10,8 @@ import scipy.optimize
 import warp as wp
 
 from granular.packing import Packing
-from granular.stress import Stress, Walls, YieldSet
+from granular.solids import Walls
+from granular.stress import Stress, YieldSet
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
 
