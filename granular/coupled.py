@@ -12,9 +12,9 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from granular.stress import Stress
-from granular.stress_kernels import PERIOD
-from granular.yield_set import F32, I32, U8, WALLS, sand_pass, xyz
+from warp_lcp.granular.stress import Stress
+from warp_lcp.granular.stress_kernels import PERIOD
+from warp_lcp.granular.yield_set import F32, I32, U8, WALLS, sand_pass, xyz
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.settings import Count, CountOrZero, NonNegative, Part, Positive, Relaxation, Settings, ShareOrZero
 

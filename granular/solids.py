@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from granular.cut_walls import CutWalls
-from granular.packing import Packing
+from warp_lcp.granular.cut_walls import CutWalls
+from warp_lcp.granular.packing import Packing
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid, voxelize
 from warp_lcp.material import boundary_kernels as kernels

@@ -10,11 +10,11 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from granular.bodies import SandBodies
-from granular.packing import SHEARS, Packing
-from granular.solids import Walls
-from granular.stress_kernels import BETA_X, NEXT_X, PERIOD, RESIDUAL_X, REST, STATE, STRESSES, momentum_kernel, stress_passes
-from granular.yield_set import COLUMNS, LOOKAHEAD, NUMBERS, PRESSURE_STEP, SHEAR_STEP, xyz
+from warp_lcp.granular.bodies import SandBodies
+from warp_lcp.granular.packing import SHEARS, Packing
+from warp_lcp.granular.solids import Walls
+from warp_lcp.granular.stress_kernels import BETA_X, NEXT_X, PERIOD, RESIDUAL_X, REST, STATE, STRESSES, momentum_kernel, stress_passes
+from warp_lcp.granular.yield_set import COLUMNS, LOOKAHEAD, NUMBERS, PRESSURE_STEP, SHEAR_STEP, xyz
 from warp_lcp.program import Launch, Program
 from warp_lcp.rows import Rows
 from warp_lcp.vectors import Reduction

@@ -5,8 +5,8 @@ import pytest
 import warp as wp
 from test_sand_stress import make
 
-from granular.coupled import APART, colors, interleaved_passes
-from granular.yield_set import xyz
+from warp_lcp.granular.coupled import APART, colors, interleaved_passes
+from warp_lcp.granular.yield_set import xyz
 from warp_lcp.rows import Rows
 
 

@@ -9,9 +9,9 @@ import pytest
 import scipy.optimize
 import warp as wp
 
-from granular.packing import Packing
-from granular.solids import Walls
-from granular.stress import Stress, YieldSet
+from warp_lcp.granular.packing import Packing
+from warp_lcp.granular.solids import Walls
+from warp_lcp.granular.stress import Stress, YieldSet
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
 
