@@ -12,15 +12,14 @@ import pytest
 import scipy.sparse
 import warp as wp
 
-from warp_lcp import fluids
-from warp_lcp import granular
 import warp_lcp as wl
+from warp_lcp import fluids, granular
+from warp_lcp.distributed.petsc_matrix import ENTER, LEAVE
 from warp_lcp.fluids.pressure_kernels import pressure_passes
 from warp_lcp.granular.bodies_kernels import body_kernels
 from warp_lcp.granular.coupled import interleaved_passes
 from warp_lcp.granular.report_kernels import report_pass
 from warp_lcp.granular.stress_kernels import stress_passes
-from warp_lcp.distributed.petsc_matrix import ENTER, LEAVE
 from warp_lcp.grid import advection_kernels, distance_advection_kernels, transfer_kernels
 from warp_lcp.grid.periodic import ring_kernels
 from warp_lcp.grid.semi_lagrangian import CENTERS

@@ -5,13 +5,13 @@ import pytest
 import warp as wp
 from test_sand_stress import Case, make, velocity
 
+from small_sands import advance, box, create, scene
 from warp_lcp.granular.packing import Packing
 from warp_lcp.granular.report import Outcome
 from warp_lcp.granular.solids import Walls
 from warp_lcp.granular.stress import Stress, YieldSet
 from warp_lcp.granular.stress_kernels import DAMPED
 from warp_lcp.granular.yield_set import xyz
-from small_sands import advance, box, create, scene
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
 
