@@ -23,7 +23,7 @@ from warp_lcp.granular.bodies_kernels import (
 )
 from warp_lcp.granular.body_faces import BodyFaces, entries_near, find_body_faces, unowned_copies
 from warp_lcp.granular.packing import Packing
-from warp_lcp.granular.yield_set import xyz
+from warp_lcp.granular.yield_set import F64, I32, U8, xyz
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.program import Launch
 from warp_lcp.rows import Rows
@@ -68,7 +68,6 @@ class SandBodies:
         _, rows, columns = grid.shape
         self._shape = Shape()
         self._shape.dimension, self._shape.layer, self._shape.strides = grid.dimension, grid.size, wp.vec3i(1, columns, columns * rows)
-        self._nothing = wp.zeros(1, dtype=wp.float64, device=device)  # sums that trial steps do not make
         self.faces: BodyFaces | None = None
         self._walls: Walls
         self._face: list[wp.array] = []
@@ -95,25 +94,19 @@ class SandBodies:
         self._walls = walls
         self._entries, cells = entries_near(grid, found, walls.cells.numpy(), walls.sides.numpy())
 
-        def ints(values: np.ndarray) -> wp.array:
-            return wp.array(values.astype(np.int32), dtype=wp.int32, device=device)
+        def put(values: np.ndarray, dtype: type) -> wp.array:
+            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
-        def small(values: np.ndarray) -> wp.array:
-            return wp.array(values.astype(np.uint8), dtype=wp.uint8, device=device)
-
-        def reals(values: np.ndarray) -> wp.array:
-            return wp.array(np.ascontiguousarray(values), dtype=wp.float64, device=device)
-
-        self._face = [ints(found.face), small(found.face_axis), ints(found.face_body), reals(found.face_row)]
-        self._cell, self._cell_row = ints(found.cell), reals(found.cell_row)
-        self._edge_row, self._edges = reals(found.edge_row), Edges()
-        self._edges.at, self._edges.shear, self._edges.row = ints(found.edge), small(found.edge_shear), self._edge_row
+        self._face = [put(found.face, I32), put(found.face_axis, U8), put(found.face_body, I32), put(found.face_row, F64)]
+        self._cell, self._cell_row = put(found.cell, I32), put(found.cell_row, F64)
+        self._edge_row, self._edges = put(found.edge_row, F64), Edges()
+        self._edges.at, self._edges.shear, self._edges.row = put(found.edge, I32), put(found.edge_shear, U8), self._edge_row
         copies, homes = unowned_copies(grid, index, found)
-        self._unowned = ints((FIRST[grid.dimension] + copies) * grid.size + homes)
-        self._trial = ints(cells)
+        self._unowned = put((FIRST[grid.dimension] + copies) * grid.size + homes, I32)
+        self._trial = put(cells, I32)
         self._active = wp.zeros(1 + len(self._entries), dtype=wp.int32, device=device)
         spans, parts = self._parts(found)
-        self._spans, self._owned = (wp.array(table.astype(np.int32), dtype=wp.int32, device=device) for table in (spans, parts))
+        self._spans, self._owned = put(spans, I32), put(parts, I32)
         self._partial = wp.zeros((len(spans), self.freedoms), dtype=wp.float64, device=device)
 
     def begin(

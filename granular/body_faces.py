@@ -9,11 +9,11 @@ their torques, since the rates of strain of a rigid motion are.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import ndimage
 
 from warp_lcp.granular.packing import SHEARS
 from warp_lcp.grid.staggered import StaggeredGrid
@@ -126,25 +126,20 @@ def _faces(grid: StaggeredGrid, index: np.ndarray, axis: int, numbers: np.ndarra
     held = owner[index + 1] >= 0
     if not held.any():
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-    box = []  # around all bodies, so that the rest of the grid costs nothing
-    for place, size in enumerate(index.shape):
-        along = np.flatnonzero(held.any(axis=tuple(a for a in range(3) if a != place)))
-        box.append(slice(max(along[0] - 2, 0), min(along[-1] + 4, size)))
+    found = ndimage.find_objects(held.astype(np.int8))[0]  # the box around all bodies, so that the rest of the grid costs nothing
+    box = [slice(max(along.start - 2, 0), min(along.stop + 3, size)) for along, size in zip(found, index.shape, strict=True)]
     if grid.dimension == 2:
         box[0] = slice(1, 2)
     part, place = index[tuple(box)], 2 - axis
-    open_ = np.pad(part < 0, [(0, 0) if grid.dimension == 2 and a == 0 else (1, 1) for a in range(3)])
-    near = np.zeros(part.shape, dtype=bool)
-    for shift in itertools.product(*(range(1) if grid.dimension == 2 and a == 0 else range(3) for a in range(3))):
-        near |= open_[tuple(slice(s, s + n) for s, n in zip(shift, part.shape, strict=True))]
+    near = ndimage.binary_dilation(part < 0, np.ones((1 if grid.dimension == 2 else 3, 3, 3)))
     here = tuple(slice(1, None) if a == place else slice(None) for a in range(3))
     before = tuple(slice(None, -1) if a == place else slice(None) for a in range(3))
     body = owner[np.maximum(part[here], part[before]) + 1]
     at = np.argwhere((body >= 0) & (near[here] | near[before]))
-    found = body[tuple(at.T)]
+    bodies = body[tuple(at.T)]
     at += np.array([b.start for b in box]) + np.eye(3, dtype=int)[place]
     flat = np.asarray(np.ravel_multi_index(tuple(at.T), index.shape), dtype=np.int64)
-    return flat, np.asarray(found, dtype=np.int64)
+    return flat, np.asarray(bodies, dtype=np.int64)
 
 
 def _face_rows(grid: StaggeredGrid, flat: np.ndarray, axis: int, centers: np.ndarray) -> np.ndarray:

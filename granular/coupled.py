@@ -16,7 +16,7 @@ from warp_lcp.granular.stress import Stress
 from warp_lcp.granular.stress_kernels import PERIOD
 from warp_lcp.granular.yield_set import F32, I32, U8, WALLS, sand_pass, xyz
 from warp_lcp.rows import RowPass, Rows
-from warp_lcp.settings import Count, CountOrZero, NonNegative, Part, Positive, Relaxation, Settings, ShareOrZero
+from warp_lcp.settings import Count, CountOrZero, NonNegative, Positive, Relaxation, Settings, ShareOrZero
 
 BETTER = 0.95  # of the best estimate: progress
 NEAR_BEST = 1.2
@@ -73,7 +73,6 @@ class AcceleratedProjection(Settings):
         shear_step: relative to the diagonal; in 3-D it is halved.
         lookahead: the gradient is taken at x + lookahead beta (x - x_before), steps start from x + beta (x - x_before).
         momentum: beta at the start of a solve.
-        decay: of the stresses that a time step starts from.
         check_every: periods of steps between two looks at the estimate of the residual.
         patience: steps without a better estimate after which the next that is nearly as good as the best is taken.
         wait: steps without a better estimate after which the momentum is limited, unless the estimate is within the tolerance.
@@ -92,7 +91,6 @@ class AcceleratedProjection(Settings):
     shear_step: Positive = 1.0 / 2.5
     lookahead: NonNegative = 0.15
     momentum: ShareOrZero = 0.85
-    decay: Part = 1.0
     check_every: Count = 2
     patience: Count = 300
     wait: Count = 100
@@ -169,7 +167,6 @@ class InterleavedSweeps(Settings):
     Args:
         pressure_relaxation: of the sweeps for the pressure.
         friction_relaxation: of the sweeps for the friction, which 1.3 or more stalls.
-        decay: of the stresses that a time step starts from.
         check_every: rounds between two looks at the residual.
     """
 
@@ -177,7 +174,6 @@ class InterleavedSweeps(Settings):
 
     pressure_relaxation: Relaxation = 1.5
     friction_relaxation: Relaxation = 1.0
-    decay: Part = 1.0
     check_every: Count = 4
 
     def init(self, problem: Stress) -> SweepWorkspace:

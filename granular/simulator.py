@@ -36,17 +36,8 @@ FRONT = 99.0  # percentile of the particles that runout and height are of
 FAR = 1.0  # rho g dx: cells are left with a velocity that is off by as much as gravity makes in the step
 JAMMED = "solids or a source may leave sand no way out: let them move less or slower; deep sand may need more solver.max_iterations"
 STANDING = 0.05  # of sqrt(g dx): a scale for the residual where there is no gravity
-COLUMNS = (
-    "coupled_residual",
-    "staggering_iterations",
-    "yielded",
-    "dissipation",
-    "predicted_excess",
-    "max_fraction",
-    "runout",
-    "height",
-)  # fmt: skip
-DIAGNOSTICS = ("yielded", "dissipation", "predicted_excess")  # of them, those that nothing else needs
+DIAGNOSTICS = ("yielded", "dissipation", "predicted_excess")  # columns that nothing else needs
+COLUMNS = ("coupled_residual", "staggering_iterations", *DIAGNOSTICS, "max_fraction", "runout", "height")
 
 
 class SandSimulation(ParticleSimulation):
@@ -172,11 +163,10 @@ class SandSimulation(ParticleSimulation):
         """Return the names of the columns of the stresses and of the sand's shape.
 
         coupled_residual: natural residual of pressure and friction together, root mean square over the cells with sand, in units of
-        rho g dx; solve_residual: relative to that at the start of the solve; staggering_iterations: of the coupled method; yielded: share
-        of the cells that carry shear whose friction is at its bound; dissipation [J; J/m in 2-D]: what friction took in the step;
-        predicted_excess: by how much the pressure's solution would pack a cell too densely; max_fraction: of a cell at the start of the
-        step, in units of the densest packing; runout [m]: 99th percentile of x less that at the start; height [m]: 99th percentile of y;
-        flow_rate [kg/s; kg/(s m) in 2-D]: what fell below the gauge, or without one what left through drains and open sides.
+        rho g dx; solve_residual: relative to that at the start of the solve; staggering_iterations: of the coupled method; yielded,
+        dissipation, predicted_excess: see `granular.report.Outcome.report`; max_fraction: of a cell at the start of the step, in units of
+        the densest packing; runout [m]: 99th percentile of x less that at the start; height [m]: 99th percentile of y; flow_rate [kg/s;
+        kg/(s m) in 2-D]: what fell below the gauge, or without one what left through drains and open sides.
         """
         columns = tuple(name for name in COLUMNS if self.scene.output.diagnostics or name not in DIAGNOSTICS)
         return (*columns, "flow_rate") if self.scene.gauge or self.scene.drain or self.scene.domain.open else columns
@@ -285,7 +275,7 @@ class SandSimulation(ParticleSimulation):
         g = float(np.linalg.norm(self.gravity))
         scale = g * self.kick_dt if g > 0.0 else STANDING * math.sqrt(self.grid.spacing)
         with self.watch.stage("stress", stress.now, *packing.mass, *packing.inverse, *packing.start):
-            stress.begin(bound, self.gravity, dt, self.kick_dt, decay=self.method.decay)
+            stress.begin(bound, self.gravity, dt, self.kick_dt)
             solved = self.solve_stress(scale)
         residual, first = math.hypot(*(part / scale for part in stress.last_residual)), solved.history[0].residual / scale
         if solved.status is wl.SolveStatus.NON_FINITE:

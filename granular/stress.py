@@ -158,7 +158,7 @@ class Stress(wl.ConvexSetProblem):
         threads = sum(-(-count // self._grain) for count in (walls.count, cut.count if cut is not None else 0))
         self._wall_sums = Reduction(max(threads, 1), device, self._sums, columns=COLUMNS, threads=threads) if threads else None
 
-    def begin(self, bound: YieldSet, gravity: np.ndarray, dt: float, kick_dt: float, *, decay: float = 1.0) -> None:
+    def begin(self, bound: YieldSet, gravity: np.ndarray, dt: float, kick_dt: float) -> None:
         """Start from the last stresses, as far as they have a place in the packing now.
 
         Args:
@@ -166,7 +166,6 @@ class Stress(wl.ConvexSetProblem):
             gravity: [m/s^2], three entries.
             dt: time step [s].
             kick_dt: how long forces act in it [s]; stresses are impulses, and it is the last step's pressure that goes on.
-            decay: factor of the last stresses; less than 1 damps patterns that exert no force.
         """
         wp.copy(self._last, self.now)
         self._last_kick = self.kick_dt
@@ -180,7 +179,7 @@ class Stress(wl.ConvexSetProblem):
         self._cells = max(int(np.count_nonzero(p.grid.interior(flags))), 1)
         self.walls.activate(flags)
         self.cold = kick_dt > GROWN * self.kick_dt
-        ratio = decay * (kick_dt / self.kick_dt if self.kick_dt > 0.0 else 1.0)
+        ratio = kick_dt / self.kick_dt if self.kick_dt > 0.0 else 1.0
         share = xyz(share=p.share)
         p.grid.domain.run(self.velocity.passes.admit, ratio=ratio, flags=p.flags, stiff=p.stiff, **share, **self._stresses)
         if self.bodies is not None:
