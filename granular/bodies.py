@@ -13,7 +13,7 @@ from warp_lcp.granular.bodies_kernels import (
     Edges,
     Shape,
     body_kernels,
-    flat,
+    flat_vector,
     force_kernel,
     forget_kernel,
     layer_kernel,
@@ -126,7 +126,7 @@ class SandBodies:
         assert self.faces is not None
         self._scale, rows, owner = density * self.grid.cell_volume, self.faces.face_row, self.faces.face_body
         layer = wp.zeros(len(rows), dtype=wp.vec2d, device=self.grid.device)
-        inputs = [*self._face[:2], flat(packing.mass), flat(sand), flat(weights), layer]
+        inputs = [*self._face[:2], flat_vector(packing.mass), flat_vector(sand), flat_vector(weights), layer]
         wp.launch(layer_kernel, len(rows), inputs, device=self.grid.device)
         mass, speed = layer.numpy().T
         count = len(self.numbers)
@@ -160,12 +160,12 @@ class SandBodies:
         """
         found, device, dimension = self.faces, self.grid.device, self.grid.dimension
         assert found is not None
-        inverse = flat(packing.inverse)
+        inverse = flat_vector(packing.inverse)
         cells = wp.zeros(len(found.cell), dtype=wp.vec2d, device=device)
         inputs = [self._shape, self._cell, packing.flags.flatten(), packing.drive.flatten(), packing.stiff.flatten()]
-        wp.launch(stiffness_kernel, len(found.cell), [*inputs, flat(packing.mass), inverse, numbers, cells], device=device)
+        wp.launch(stiffness_kernel, len(found.cell), [*inputs, flat_vector(packing.mass), inverse, numbers, cells], device=device)
         edges = wp.zeros(len(found.edge), dtype=wp.float64, device=device)
-        inputs = [self._shape, self._edges, flat(packing.share), inverse, edges]
+        inputs = [self._shape, self._edges, flat_vector(packing.share), inverse, edges]
         wp.launch(lightness_kernel, len(found.edge), inputs, device=device)
         pressure, shear = (cells.numpy() * found.cell_share[:, None]).T
         along = found.cell_row.sum(axis=1)
@@ -192,13 +192,13 @@ class SandBodies:
         """Give the bodies' faces their velocity."""
         kernel = body_kernels(self.grid.dimension, velocity.real, velocity.box, velocity.rate).move
         if len(self._face[0]):
-            launch(kernel, len(self._face[0]), [*self._face, self.velocity, flat(velocity.u)], device=self.grid.device)
+            launch(kernel, len(self._face[0]), [*self._face, self.velocity, flat_vector(velocity.u)], device=self.grid.device)
 
     def respond(self, packing: Packing, stress: wp.array, launch: Launch, *, implicit: bool) -> None:
         """Find what stresses do to the bodies and the velocity that they leave, or a step towards it."""
         device = self.grid.device
         rows = [self._cell, self._cell_row, self._edges]
-        inputs = [self._shape, self._spans, stress.flatten(), *rows, flat(packing.share), self._partial]
+        inputs = [self._shape, self._spans, stress.flatten(), *rows, flat_vector(packing.share), self._partial]
         if self._spans.shape[0]:
             launch(force_kernel, self._spans.shape[0], inputs, device=device)
         inputs = [int(implicit), self._owned, self._partial, self._start, self._response, self._correction]
@@ -221,7 +221,7 @@ class SandBodies:
         cells = p.cells | velocity.fields | {"cell": self._trial, "spans": p.spans, "openings": None}
         faces = xyz(share=p.share, inverse=p.inverse, edge=velocity.edge) | walls.fields(p) | {"active": self._active}
         trials = [(kernels.trial, len(self._trial), cells), (kernels.trial_wall, len(self._entries), faces)]
-        edges = [self._shape, self._edges, flat(velocity.u), flat(velocity.edge)]
+        edges = [self._shape, self._edges, flat_vector(velocity.u), flat_vector(velocity.edge)]
         for _ in range(ROUNDS if len(self._trial) else 0):
             for passed, count, fields in trials:
                 if count:

@@ -24,7 +24,7 @@ def vector_struct(real: Any) -> Any:
     return make_struct(f"Vector_{real.__name__}", dict.fromkeys("xyz", wp.array(dtype=real)))
 
 
-def flat(fields: Sequence[wp.array]) -> Any:
+def flat_vector(fields: Sequence[wp.array]) -> Any:
     """Return the components of a vector as kernels take them: flat, none where there are fewer."""
     return put(vector_struct(fields[0].dtype)(), dict(zip("xyz", [field.flatten() for field in fields], strict=False)))
 
@@ -51,7 +51,7 @@ class Edges:
 
 
 @wp.func
-def of(v: Any, axis: int, n: int):
+def entry(v: Any, axis: int, n: int):
     """Element n of the component along an axis."""
     if axis == 0:
         return v.x[n]
@@ -61,8 +61,8 @@ def of(v: Any, axis: int, n: int):
 
 
 @wp.func
-def give(v: Any, axis: int, n: int, value: Any):
-    """Set that element."""
+def set_entry(v: Any, axis: int, n: int, value: Any):
+    """Set element n of the component along an axis."""
     if axis == 0:
         v.x[n] = value
     elif axis == 1:
@@ -114,7 +114,7 @@ def force_kernel(grid: Shape, spans: _SPANS, stress: _SINGLE, cell: _INTS, cell_
         d = int(edges.shear[n])
         a, b = axes_of(d)
         alpha, beta = grid.strides[a], grid.strides[b]
-        weight = of(share, d, at)
+        weight = entry(share, d, at)
         if weight != 0.0:
             base = (first + 4 * d) * grid.layer + at
             low = wp.float64(stress[base]) + wp.float64(stress[base + grid.layer - alpha])
@@ -157,8 +157,8 @@ def layer_kernel(face: _INTS, axis: _BYTES, mass: Vector, u: Vector, weight: Vec
     a = int(axis[n])
     at = face[n]
     out[n] = wp.vec2d()
-    if of(weight, a, at) > 0.0:
-        out[n] = wp.vec2d(wp.float64(0.5) * wp.float64(of(mass, a, at)), wp.float64(of(u, a, at)))
+    if entry(weight, a, at) > 0.0:
+        out[n] = wp.vec2d(wp.float64(0.5) * wp.float64(entry(mass, a, at)), wp.float64(entry(u, a, at)))
 
 
 @wp.kernel(**options)
@@ -175,8 +175,8 @@ def stiffness_kernel(
         for side in range(2):
             for axis in range(grid.dimension):
                 o = at + side * grid.strides[axis]
-                m = of(mass, axis, o)
-                diagonal += (m + full * (1.0 - m)) * of(inverse, axis, o)
+                m = entry(mass, axis, o)
+                diagonal += (m + full * (1.0 - m)) * entry(inverse, axis, o)
         if diagonal > 0.0:
             found[0] = wp.float64(1.0) / wp.float64(diagonal)
     if (int(flags[at]) & SHEARS_HERE) != 0 and stiff[at] > 0.0:
@@ -191,9 +191,11 @@ def lightness_kernel(grid: Shape, edges: Edges, share: Vector, inverse: Vector, 
     at = edges.at[n]
     d = int(edges.shear[n])
     a, b = axes_of(d)
-    around = of(inverse, a, at) + of(inverse, a, at - grid.strides[b]) + of(inverse, b, at) + of(inverse, b, at - grid.strides[a])
+    around = (
+        entry(inverse, a, at) + entry(inverse, a, at - grid.strides[b]) + entry(inverse, b, at) + entry(inverse, b, at - grid.strides[a])
+    )
     out[n] = wp.float64(0.0)
-    if of(share, d, at) != 0.0 and around > 0.0:
+    if entry(share, d, at) != 0.0 and around > 0.0:
         out[n] = wp.float64(1.0) / wp.float64(around)
 
 
@@ -211,7 +213,7 @@ def body_kernels(dimension: int, real: Any, box: bool, rate: bool = False) -> Si
         u = wp.float64(0.0)
         for q in range(row.shape[1]):
             u += row[n, q] * velocity[b, q]
-        give(moved, int(axis[n]), face[n], real(u))
+        set_entry(moved, int(axis[n]), face[n], real(u))
 
     @wp.kernel(enable_backward=False, module=module)
     def strain(grid: Shape, edges: Edges, u: Velocity, rates: Velocity):
@@ -220,7 +222,7 @@ def body_kernels(dimension: int, real: Any, box: bool, rate: bool = False) -> Si
         i = edges.at[n]
         d = int(edges.shear[n])
         a, b = axes_of(d)
-        give(rates, d, i, (of(u, a, i) - of(u, a, i - grid.strides[b])) + (of(u, b, i) - of(u, b, i - grid.strides[a])))
+        set_entry(rates, d, i, (entry(u, a, i) - entry(u, a, i - grid.strides[b])) + (entry(u, b, i) - entry(u, b, i - grid.strides[a])))
 
     edges = xyz(edge=[real] * 3)
     made = functools.partial(sand_pass, name, dimension=dimension, real=real, BOX=box, RATE=rate, RESIDUAL=0, TRIAL=1, **MOMENTUM)

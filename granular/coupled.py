@@ -99,7 +99,7 @@ class AcceleratedProjection(Settings):
     cold: CountOrZero = 600
 
     def init(self, problem: Stress) -> MomentumWorkspace:
-        """Return a workspace."""
+        """Return what solves of these stresses keep beside them."""
         return MomentumWorkspace(problem, self)
 
     def step(self, problem: Stress, work: MomentumWorkspace, x: wp.array) -> wl.Step:
@@ -177,7 +177,7 @@ class InterleavedSweeps(Settings):
     check_every: Count = 4
 
     def init(self, problem: Stress) -> SweepWorkspace:
-        """Return a workspace."""
+        """Return what solves of these stresses keep beside them."""
         return SweepWorkspace(problem)
 
     def step(self, problem: Stress, work: SweepWorkspace, x: wp.array) -> wl.Step:
@@ -203,7 +203,7 @@ class SweepWorkspace(StressWorkspace):
     """The stresses under sweeps, which keep the velocity up to date."""
 
     def start(self, *, warm: bool, tolerance: float) -> None:
-        """Find the velocity."""
+        """Find the velocity that sweeps then keep up to date."""
         self.problem.velocity.find(self.problem.now)
 
 

@@ -52,7 +52,6 @@ class Packing:
     def __init__(
         self, grid: StaggeredGrid, base: wp.array, capacity: wp.array, *, sides: PeriodicSides | None = None, cut: CutWalls | None = None
     ) -> None:
-        """Allocate the fields."""
         self.grid, self.base, self._capacity, self.sides, self.cut = grid, base, capacity, sides, cut
         self.fraction, self.kind, self.flags, self.drive = grid.field(), grid.field(wp.int8), grid.field(wp.uint8), grid.field()
         wp.copy(self.kind, base)

@@ -27,7 +27,6 @@ class Outcome:
     """
 
     def __init__(self, stress: Stress) -> None:
-        """Allocate the fields."""
         grid, self.stress = stress.packing.grid, stress
         self.ratio, self.contact, self.known = grid.field(), grid.field(wp.uint8), grid.faces(wp.int8)
         self._rows = int(np.prod(grid.shape[:2]))

@@ -248,7 +248,7 @@ class SandScene(ParticleScene):
 
     @property
     def cohesion(self) -> float:
-        """Return the cohesion [Pa]."""
+        """Return the cohesion of all sand, its own or the material's [Pa]."""
         own = next((sand.cohesion for sand in self.sand if sand.cohesion is not None), None)
         return self.material.cohesion if own is None else own
 

@@ -37,7 +37,6 @@ class Walls:
     """
 
     def __init__(self, grid: StaggeredGrid, index: np.ndarray, friction: Sequence[float], *, rubbing_only: bool = False) -> None:
-        """Find the faces."""
         device = grid.device
         self.friction = wp.array(np.minimum(friction, 1e6), dtype=wp.float32, device=device)
         cells, sides, walls = wall_faces(index, grid.dimension)
@@ -91,7 +90,6 @@ class SandSolids:
         self, grid: StaggeredGrid, placed: Sequence[PlacedSolid], boundary: Boundary, friction: Sequence[float], *,
         prescribed: bool = False, cuts: bool = False,
     ) -> None:  # fmt: skip
-        """Find the cells."""
         self.grid, self._placed, self._boundary, self._friction = grid, tuple(placed), boundary, list(friction)
         self.base = grid.field(wp.int8)
         self.separating = wp.full(1 + len(placed), 1, dtype=wp.uint8, device=grid.device)

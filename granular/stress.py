@@ -56,7 +56,6 @@ class Velocity:
     """
 
     def __init__(self, packing: Packing, real: type, *, box: bool, rate: bool) -> None:
-        """Allocate the fields."""
         grid = packing.grid
         self.packing, self.real, self.box, self.rate = packing, real, box, rate
         self.u = grid.faces(real)
@@ -66,7 +65,7 @@ class Velocity:
 
     @property
     def fields(self) -> dict[str, Any]:
-        """The fields by name."""
+        """Return `u` and `edge` by the names that passes have for them."""
         return xyz(u=self.u, edge=self.edge)
 
     def find(self, stress: wp.array, *, launch: Launch = wp.launch, bodies: SandBodies | None = None, respond: bool = False) -> None:
@@ -127,7 +126,6 @@ class Stress(wl.ConvexSetProblem):
     """
 
     def __init__(self, packing: Packing, walls: Walls, *, box: bool = False, rate: bool = False, bodies: SandBodies | None = None) -> None:
-        """Allocate the fields."""
         grid, self.packing, self.walls, self.box, self.rate, self.bodies = packing.grid, packing, walls, box, rate, bodies
         normals, shears = (3, 3) if grid.dimension == 3 else (1, 1)
         tractions = 0 if packing.cut is None else grid.dimension
