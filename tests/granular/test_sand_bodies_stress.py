@@ -113,7 +113,7 @@ def beside_bodies(case: Case, axis: int) -> np.ndarray:
     """Return which faces of an axis are bodies', shape of the grid's fields."""
     assert case.bodies is not None and case.bodies.faces is not None
     found, faces = np.zeros(case.packing.grid.size, dtype=bool), case.bodies.faces
-    found[faces.face[faces.face_axis == axis]] = True
+    found[faces.face.at[faces.face.axis == axis]] = True
     return found.reshape(case.packing.grid.shape)
 
 
@@ -236,7 +236,7 @@ def test_bodies_far_from_sand_and_outside_change_nothing() -> None:
     index = np.where(case.packing.base.numpy() == SOLID, 0, -1)
     case.bodies = case.stress.bodies = gone = SandBodies(case.packing.grid, [1])
     gone.place(index, np.zeros((1, 3)), case.stress.walls)
-    assert gone.faces is not None and len(gone.faces.face) == 0
+    assert gone.faces is not None and len(gone.faces.face.at) == 0
     case.begin(np.array([[0.1, 0.2, 0.3]]), np.eye(3)[None])
     case.stress.face(case.stress.walls)
     case.solve()
