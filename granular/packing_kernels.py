@@ -6,6 +6,7 @@ import warp as wp
 from warp_lcp.granular.yield_set import FIRM, HOLDS, PARTLY, SHEARS_HERE
 from warp_lcp.grid.cell_kernel import F32, I8, I32, U8, cell_below, cell_kernel
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
+from warp_lcp.rows.layout import make_struct
 
 _FLUID = wp.constant(wp.int8(FLUID))
 _AIR = wp.constant(wp.int8(AIR))
@@ -23,6 +24,7 @@ LANES = 16  # cells of a vector
 ROUNDING = 1e-6  # by which a fraction may differ from 1 and count as 1
 
 _F32X = wp.array4d(dtype=wp.float32)
+Faces = make_struct("Faces", dict.fromkeys("xyz", F32))  # the components of a vector, or shears
 
 
 @cell_kernel("granular.packing")
@@ -193,15 +195,6 @@ def edge_kernel(
         if around:
             weight = weight * around[k, j, i]
         share[k, j, i] = weight
-
-
-@wp.struct
-class Faces:
-    """The components of a vector, or shears."""
-
-    x: F32
-    y: F32
-    z: F32
 
 
 @cell_kernel("granular.packing")
