@@ -31,6 +31,7 @@ class StressWorkspace:
     """The stresses under a method, and their natural residual [m/s]: the iterate is the problem's own field, in place.
 
     The last stresses are the result, also of a solve that fails: `AcceleratedProjection.least` says why the residual is no judge of them.
+    What steps keep beside them (earlier ones, the momentum) is memory of the problem, whose `begin` uses it between solves.
     """
 
     precision = wl.Precision.SINGLE
