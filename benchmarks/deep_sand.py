@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp import SolveStatus
+import warp_lcp as wl
 from warp_lcp.benchmarks.validation import sand_hourglass, sand_pit, tank
 from warp_lcp.granular import stress_kernels
-from warp_lcp.granular.coupled import AcceleratedProjection, CoupledOutcome
+from warp_lcp.granular.coupled import AcceleratedProjection
 from warp_lcp.granular.simulator import SandSimulation
 from warp_lcp.granular.stress import Stress
 from warp_lcp.granular.yield_set import HOLDS
@@ -88,17 +88,16 @@ def cases(seed: int | None) -> dict[str, Make]:
 
 @dataclass
 class Watched:
-    """A method, and what its solves came to: residual, iterations, thread seconds."""
+    """A simulation's solves, and what they came to: residual, iterations, thread seconds."""
 
-    method: AcceleratedProjection
+    solve: Callable[[float], wl.SolveResult]
     rows: list[tuple[float, int, float]]
-    decay: float = 1.0
 
-    def solve(self, stress: Stress, **limits: Any) -> CoupledOutcome:
+    def __call__(self, scale: float) -> wl.SolveResult:
         """Solve, and look at the clock."""
         begun = time.thread_time()
-        found = self.method.solve(stress, **limits)
-        self.rows.append((found.residual, found.iterations, time.thread_time() - begun))
+        found = self.solve(scale)
+        self.rows.append((found.residual / scale, found.iterations, time.thread_time() - begun))
         return found
 
 
@@ -107,14 +106,15 @@ def compare(make: Make, methods: Iterable[AcceleratedProjection], steps: int) ->
     pairs = []
     for method in methods:
         simulation = make()
-        simulation.method = Watched(method, [])
+        simulation.method = method
+        simulation.solve_stress = Watched(simulation.solve_stress, [])  # type: ignore[method-assign]
         pairs.append(simulation)
     for _ in range(SETTLED + steps):
         for simulation in pairs:
             simulation.step(min(simulation.stable_dt(), simulation.scene.time.dt_max))
     found = []
     for simulation in pairs:
-        residual, iterations, seconds = np.array(simulation.method.rows[SETTLED:]).T  # type: ignore[attr-defined]
+        residual, iterations, seconds = np.array(simulation.solve_stress.rows[SETTLED:]).T  # type: ignore[attr-defined]
         within = 100.0 * np.mean(residual <= sand_pit.TOLERANCE)
         low, high = 1e3 * np.quantile(residual, (0.5, 0.95))
         found += [f"{within:.0f} %", f"{low:.2f}, {high:.2f}", f"{iterations.mean():.0f}", f"{1e3 * seconds.mean():.0f} ms"]
@@ -123,13 +123,14 @@ def compare(make: Make, methods: Iterable[AcceleratedProjection], steps: int) ->
 
 @dataclass
 class Stalled:
-    """In the place of a method: a solve that goes on, its residual at MARKS and the waves in what it leaves of the divergence."""
+    """In the place of a simulation's solve: one that goes on, its residual at MARKS and the waves in what it leaves of the divergence."""
 
+    stress: Stress
     frozen: bool = False
-    decay: float = 1.0
 
-    def solve(self, stress: Stress, *, scale: float, **_: Any) -> CoupledOutcome:
+    def __call__(self, scale: float) -> wl.SolveResult:
         """Solve to the last of MARKS."""
+        stress = self.stress
         method = replace(AcceleratedProjection(), calm=())
         if self.frozen:
             stress.packing.inverse[2].assign(stress.now.numpy()[0])
@@ -141,7 +142,8 @@ class Stalled:
             self.found.append(estimate if self.frozen else math.hypot(*stress.residual()) / scale)
             done = mark
         self.waves = _waves(stress)
-        return CoupledOutcome(SolveStatus.MAX_ITERATIONS, done, start[0] / scale, start[1] / scale, [(0, math.hypot(*start) / scale)])
+        stress.last_residual, norm = start, math.hypot(*start)
+        return wl.SolveResult(stress.now, wl.SolveStatus.MAX_ITERATIONS, done, done, norm, 1.0, [wl.Record(0, norm, 0, None, "start", 0.0)])
 
 
 def _waves(stress: Stress) -> list[float]:
@@ -179,7 +181,8 @@ def stall(make: Callable[..., SandSimulation], settle: int) -> list[list[str]]:
             velocity.passes = SimpleNamespace(**vars(velocity.passes) | {"step": held_step(velocity.passes.step)})
             trial.packing.inverse.append(wp.zeros_like(trial.packing.fraction))
         trial.restore(state)
-        trial.method = watch = Stalled(frozen)
+        watch = Stalled(trial.stress, frozen)
+        trial.solve_stress = watch  # type: ignore[method-assign]
         trial.step(min(trial.stable_dt(), trial.scene.time.dt_max))
         name = f"k = {k:.3f}" + (", bound held at the last step's pressure" if frozen else "")
         rows.append([name, *(f"{1e3 * r:.3g}" for r in watch.found), *(f"{100.0 * w:.0f}" for w in watch.waves)])

@@ -17,7 +17,7 @@ import scipy.optimize
 
 import warp_lcp as wl
 from warp_lcp.gallery.articulated_figure import ArticulatedFigure, branching_figure, planar_chain, spatial_chain
-from warp_lcp.gallery.inverse_kinematics import InverseKinematics, Pose
+from warp_lcp.gallery.inverse_kinematics import InverseKinematics, ReachedPose
 from warp_lcp.protocol import families
 
 SAME = 1e-6  # of reach^2: objectives that differ by less are one optimum
@@ -116,7 +116,7 @@ class Comparison:
     evaluations: int = 0
     worst: float = 0.0
 
-    def add(self, target: Target, pose: Pose, other: scipy.optimize.OptimizeResult, solver: InverseKinematics) -> None:
+    def add(self, target: Target, pose: ReachedPose, other: scipy.optimize.OptimizeResult, solver: InverseKinematics) -> None:
         """Count a target."""
         figure, scale = target.figure, target.figure.reach**2
         self.targets += 1

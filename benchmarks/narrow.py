@@ -15,7 +15,7 @@ from warp_lcp.benchmarks.machine import machine
 from warp_lcp.benchmarks.record import Record, Results, Table
 from warp_lcp.benchmarks.small_problems import SmallProblem, option, plain_active_set, stepped, string
 from warp_lcp.benchmarks.timing import Figure, Options, in_turns, ratios
-from warp_lcp.gallery.banded import banded_matrix
+from warp_lcp.gallery.matrices import banded_matrix
 
 TITLE = "Small and narrow problems"
 STEPS, NODES = 50, 2000  # of the American put

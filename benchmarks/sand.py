@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
+import warp_lcp as wl
 from warp_lcp.benchmarks.machine import machine
 from warp_lcp.benchmarks.record import Lines, Record, Results, Table
 from warp_lcp.benchmarks.timing import Figure, Options
 from warp_lcp.granular import SIMULATOR
-from warp_lcp.granular.coupled import METHODS, CoupledOutcome
+from warp_lcp.granular.coupled import METHODS
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import SandSimulation
 
@@ -72,28 +73,29 @@ def _step(simulation: SandSimulation) -> dict[str, Any]:
 
 
 class _Taken:
-    """In the place of a simulation's method: another one, its outcome and its seconds kept."""
+    """In the place of a simulation's solve: one by another method, its residual [rho g dx] and its seconds kept."""
 
-    def __init__(self, name: str, tolerance: float, most: int) -> None:
-        self.method, self.tolerance, self.most = METHODS[name](), tolerance, most
-        self.decay = self.method.decay
-        self.outcome: CoupledOutcome | None = None
-        self.seconds = 0.0
+    def __init__(self, stress: Any, name: str, tolerance: float, most: int) -> None:
+        self.stress, self.method, self.tolerance, self.most = stress, METHODS[name](), tolerance, most
+        self.seconds = self.residual = 0.0
+        self.outcome: wl.SolveResult | None = None
 
-    def solve(self, stress: Any, *, scale: float, tolerance: float, max_iterations: int) -> CoupledOutcome:
+    def __call__(self, scale: float) -> wl.SolveResult:
         """Solve, and look at the clock."""
         begun = time.perf_counter()
-        self.outcome = self.method.solve(stress, scale=scale, tolerance=self.tolerance, max_iterations=self.most)
-        self.seconds = time.perf_counter() - begun
+        stopping = wl.StoppingCriteria(rtol=0.0, atol=self.tolerance * scale, max_iterations=self.most)
+        self.outcome = wl.solve(self.stress, self.method, stopping=stopping)
+        self.seconds, self.residual = time.perf_counter() - begun, self.outcome.residual / scale
         return self.outcome
 
 
 def _solve(simulation: SandSimulation, state: dict[str, np.ndarray], name: str, tolerance: float, most: int) -> _Taken:
     """Solve the step that follows a state."""
     simulation.restore(state)
-    taken = _Taken(name, tolerance, most)
-    simulation.method = taken
+    taken, usual = _Taken(simulation.stress, name, tolerance, most), simulation.solve_stress
+    simulation.solve_stress = taken  # type: ignore[method-assign]
     _step(simulation)
+    simulation.solve_stress = usual  # type: ignore[method-assign]
     return taken
 
 
@@ -101,32 +103,30 @@ def _methods(size: int, options: Options) -> tuple[list[Record], dict[str, tuple
     """Return each method's iterations and seconds from each state, and their curves from the one mid-flow."""
     records, curves = [], dict[str, tuple[list[float], list[float]]]()
     simulation = _simulation(collapse(size), options.device)
-    usual = simulation.method
     for label, moment in STATES.items():
         options.say(f"methods: {label}")
-        simulation.method = usual
         while simulation.time < moment:
             _step(simulation)
         state = simulation.state()
         seconds: dict[str, list[float]] = {name: [] for name in METHODS}
-        found: dict[str, CoupledOutcome] = {}
+        found: dict[str, _Taken] = {}
         for turn in range(options.repeat + 1):  # the first loads kernels
             for name in METHODS:
                 taken = _solve(simulation, state, name, TOLERANCE, MOST)
-                assert taken.outcome is not None
-                found[name] = taken.outcome
+                found[name] = taken
                 if turn > 0:
                     seconds[name].append(taken.seconds)
         base = seconds["interleaved-sweeps"]
-        for name, outcome in found.items():
+        for name, taken in found.items():
+            assert taken.outcome is not None
             ratios = [a / b for a, b in zip(seconds[name], base, strict=True)]
             figures = {
                 "seconds": Figure.of(seconds[name], "s"),
                 "ratio": Figure.of(ratios),
-                "iterations": Figure(outcome.iterations),
-                "residual": Figure(outcome.residual),
+                "iterations": Figure(taken.outcome.iterations),
+                "residual": Figure(taken.residual),
             }
-            records.append(Record(f"{label}: {name}", figures, {"status": outcome.status.name}))
+            records.append(Record(f"{label}: {name}", figures, {"status": taken.outcome.status.name}))
             if label == "mid-flow":
                 curves[name] = _curve(simulation, state, name)
         simulation.restore(state)
@@ -136,7 +136,7 @@ def _methods(size: int, options: Options) -> tuple[list[Record], dict[str, tuple
 def _curve(simulation: SandSimulation, state: dict[str, np.ndarray], name: str) -> tuple[list[float], list[float]]:
     """Return seconds and residuals of solves that stop after some iterations."""
     taken = [_solve(simulation, state, name, 1e-12, most) for most in ROUNDS]
-    return [t.seconds for t in taken], [t.outcome.residual for t in taken if t.outcome is not None]
+    return [t.seconds for t in taken], [t.residual for t in taken]
 
 
 def _collapse(size: int, model: str, options: Options) -> Record:

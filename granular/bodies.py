@@ -10,10 +10,10 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.granular.bodies_kernels import (
-    Edges,
+    Places,
     Shape,
     body_kernels,
-    flat,
+    flat_vector,
     force_kernel,
     forget_kernel,
     layer_kernel,
@@ -23,7 +23,7 @@ from warp_lcp.granular.bodies_kernels import (
 )
 from warp_lcp.granular.body_faces import BodyFaces, entries_near, find_body_faces, unowned_copies
 from warp_lcp.granular.packing import Packing
-from warp_lcp.granular.yield_set import xyz
+from warp_lcp.granular.yield_set import F64, I32, U8, xyz
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.program import Launch
 from warp_lcp.rows import Rows
@@ -68,12 +68,9 @@ class SandBodies:
         _, rows, columns = grid.shape
         self._shape = Shape()
         self._shape.dimension, self._shape.layer, self._shape.strides = grid.dimension, grid.size, wp.vec3i(1, columns, columns * rows)
-        self._nothing = wp.zeros(1, dtype=wp.float64, device=device)  # sums that trial steps do not make
         self.faces: BodyFaces | None = None
         self._walls: Walls
-        self._face: list[wp.array] = []
-        self._cell_row: wp.array | None = None
-        self._edge_row: wp.array | None = None
+        self._faces, self._cells, self._edges = Places(), Places(), Places()
 
     def place(self, index: np.ndarray, centers: np.ndarray, walls: Walls) -> None:
         """Find where the bodies meet sand.
@@ -87,33 +84,25 @@ class SandBodies:
         found = find_body_faces(grid, index, self.numbers, centers)
         if self.faces is not None and walls is self._walls:  # the same cells: what is recorded stays valid
             self.faces = found
-            arrays = (self._face[3], self._cell_row, self._edge_row)
-            for array, rows in zip(arrays, (found.face_row, found.cell_row, found.edge_row), strict=True):
-                array.assign(rows)
+            for places, rows in ((self._faces, found.face.row), (self._cells, found.cell.row), (self._edges, found.edge.row)):
+                places.row.assign(rows)  # type: ignore[attr-defined]  # an array of the struct
             return
         self.faces = found
         self._walls = walls
         self._entries, cells = entries_near(grid, found, walls.cells.numpy(), walls.sides.numpy())
 
-        def ints(values: np.ndarray) -> wp.array:
-            return wp.array(values.astype(np.int32), dtype=wp.int32, device=device)
+        def put(values: np.ndarray, dtype: type) -> wp.array:
+            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
-        def small(values: np.ndarray) -> wp.array:
-            return wp.array(values.astype(np.uint8), dtype=wp.uint8, device=device)
-
-        def reals(values: np.ndarray) -> wp.array:
-            return wp.array(np.ascontiguousarray(values), dtype=wp.float64, device=device)
-
-        self._face = [ints(found.face), small(found.face_axis), ints(found.face_body), reals(found.face_row)]
-        self._cell, self._cell_row = ints(found.cell), reals(found.cell_row)
-        self._edge_row, self._edges = reals(found.edge_row), Edges()
-        self._edges.at, self._edges.shear, self._edges.row = ints(found.edge), small(found.edge_shear), self._edge_row
+        for places, part in ((self._faces, found.face), (self._cells, found.cell), (self._edges, found.edge)):
+            places.at, places.axis, places.body = put(part.at, I32), put(part.axis, U8), put(part.body, I32)
+            places.row = put(part.row, F64)
         copies, homes = unowned_copies(grid, index, found)
-        self._unowned = ints((FIRST[grid.dimension] + copies) * grid.size + homes)
-        self._trial = ints(cells)
+        self._unowned = put((FIRST[grid.dimension] + copies) * grid.size + homes, I32)
+        self._trial = put(cells, I32)
         self._active = wp.zeros(1 + len(self._entries), dtype=wp.int32, device=device)
         spans, parts = self._parts(found)
-        self._spans, self._owned = (wp.array(table.astype(np.int32), dtype=wp.int32, device=device) for table in (spans, parts))
+        self._spans, self._owned = put(spans, I32), put(parts, I32)
         self._partial = wp.zeros((len(spans), self.freedoms), dtype=wp.float64, device=device)
 
     def begin(
@@ -131,14 +120,14 @@ class SandBodies:
             density: of sand at its densest [kg/m^3].
         """
         assert self.faces is not None
-        self._scale, rows, owner = density * self.grid.cell_volume, self.faces.face_row, self.faces.face_body
+        self._scale, rows, owner = density * self.grid.cell_volume, self.faces.face.row, self.faces.face.body
         layer = wp.zeros(len(rows), dtype=wp.vec2d, device=self.grid.device)
-        inputs = [*self._face[:2], flat(packing.mass), flat(sand), flat(weights), layer]
+        inputs = [self._faces, flat_vector(packing.mass), flat_vector(sand), flat_vector(weights), layer]
         wp.launch(layer_kernel, len(rows), inputs, device=self.grid.device)
         mass, speed = layer.numpy().T
         count = len(self.numbers)
-        self._layer_mass = _products(mass, rows[:, None], owner, count)
-        self._layer_momentum = np.stack([np.bincount(owner, mass * speed * row, count) for row in rows.T], axis=1)
+        self._layer_mass = _products(mass, rows, owner, count)
+        self._layer_momentum = np.stack([np.bincount(owner, mass * speed * row, count) for row in rows[:, 0].T], axis=1)
         alone = inverse_mass * self._scale
         heavier = np.linalg.inv(np.eye(self.freedoms) + alone @ self._layer_mass)
         self._host_response = heavier @ alone
@@ -167,23 +156,23 @@ class SandBodies:
         """
         found, device, dimension = self.faces, self.grid.device, self.grid.dimension
         assert found is not None
-        inverse = flat(packing.inverse)
-        cells = wp.zeros(len(found.cell), dtype=wp.vec2d, device=device)
-        inputs = [self._shape, self._cell, packing.flags.flatten(), packing.drive.flatten(), packing.stiff.flatten()]
-        wp.launch(stiffness_kernel, len(found.cell), [*inputs, flat(packing.mass), inverse, numbers, cells], device=device)
-        edges = wp.zeros(len(found.edge), dtype=wp.float64, device=device)
-        inputs = [self._shape, self._edges, flat(packing.share), inverse, edges]
-        wp.launch(lightness_kernel, len(found.edge), inputs, device=device)
-        pressure, shear = (cells.numpy() * found.cell_share[:, None]).T
-        along = found.cell_row.sum(axis=1)
+        inverse, cell, edge = flat_vector(packing.inverse), found.cell, found.edge
+        cells = wp.zeros(len(cell.at), dtype=wp.vec2d, device=device)
+        inputs = [self._shape, self._cells, packing.flags.flatten(), packing.drive.flatten(), packing.stiff.flatten()]
+        wp.launch(stiffness_kernel, len(cell.at), [*inputs, flat_vector(packing.mass), inverse, numbers, cells], device=device)
+        edges = wp.zeros(len(edge.at), dtype=wp.float64, device=device)
+        inputs = [self._shape, self._edges, flat_vector(packing.share), inverse, edges]
+        wp.launch(lightness_kernel, len(edge.at), inputs, device=device)
+        pressure, shear = (cells.numpy() * cell.share[:, None]).T
+        along = cell.row.sum(axis=1)
         if dimension == 2:
-            deviator, factor = (found.cell_row[:, 0] - found.cell_row[:, 1])[:, None], 1.0
+            deviator, factor = (cell.row[:, 0] - cell.row[:, 1])[:, None], 1.0
         else:
-            deviator, factor = found.cell_row - along[:, None] / 3.0, 2.0
+            deviator, factor = cell.row - along[:, None] / 3.0, 2.0
         count = len(self.numbers)
-        steepest = _products(pressure_step * pressure, along[:, None], found.cell_body, count)
-        steepest += _products(factor * shear_step * shear, deviator, found.cell_body, count)
-        steepest += _products(shear_step * edges.numpy() * found.edge_share, found.edge_row[:, None], found.edge_body, count)
+        steepest = _products(pressure_step * pressure, along[:, None], cell.body, count)
+        steepest += _products(factor * shear_step * shear, deviator, cell.body, count)
+        steepest += _products(shear_step * edges.numpy() * edge.share, edge.row, edge.body, count)
         identity = np.eye(self.freedoms)
         self._correction.assign(np.linalg.inv(identity + self._host_response @ steepest))
 
@@ -198,14 +187,13 @@ class SandBodies:
     def move(self, velocity: Velocity, launch: Launch) -> None:
         """Give the bodies' faces their velocity."""
         kernel = body_kernels(self.grid.dimension, velocity.real, velocity.box, velocity.rate).move
-        if len(self._face[0]):
-            launch(kernel, len(self._face[0]), [*self._face, self.velocity, flat(velocity.u)], device=self.grid.device)
+        if len(self._faces.at):
+            launch(kernel, len(self._faces.at), [self._faces, self.velocity, flat_vector(velocity.u)], device=self.grid.device)
 
     def respond(self, packing: Packing, stress: wp.array, launch: Launch, *, implicit: bool) -> None:
         """Find what stresses do to the bodies and the velocity that they leave, or a step towards it."""
         device = self.grid.device
-        rows = [self._cell, self._cell_row, self._edges]
-        inputs = [self._shape, self._spans, stress.flatten(), *rows, flat(packing.share), self._partial]
+        inputs = [self._shape, self._spans, stress.flatten(), self._cells, self._edges, flat_vector(packing.share), self._partial]
         if self._spans.shape[0]:
             launch(force_kernel, self._spans.shape[0], inputs, device=device)
         inputs = [int(implicit), self._owned, self._partial, self._start, self._response, self._correction]
@@ -228,7 +216,7 @@ class SandBodies:
         cells = p.cells | velocity.fields | {"cell": self._trial, "spans": p.spans, "openings": None}
         faces = xyz(share=p.share, inverse=p.inverse, edge=velocity.edge) | walls.fields(p) | {"active": self._active}
         trials = [(kernels.trial, len(self._trial), cells), (kernels.trial_wall, len(self._entries), faces)]
-        edges = [self._shape, self._edges, flat(velocity.u), flat(velocity.edge)]
+        edges = [self._shape, self._edges, flat_vector(velocity.u), flat_vector(velocity.edge)]
         for _ in range(ROUNDS if len(self._trial) else 0):
             for passed, count, fields in trials:
                 if count:
@@ -245,7 +233,7 @@ class SandBodies:
         parts: list[list[int]] = []
         for body in range(len(self.numbers)):
             first = len(spans)
-            for column, owner in ((0, found.cell_body), (2, found.edge_body)):
+            for column, owner in ((0, found.cell.body), (2, found.edge.body)):
                 low, high = np.searchsorted(owner, [body, body + 1])
                 for start in range(low, high, grain):
                     run = [0, 0, 0, 0]

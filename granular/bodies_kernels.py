@@ -24,7 +24,7 @@ def vector_struct(real: Any) -> Any:
     return make_struct(f"Vector_{real.__name__}", dict.fromkeys("xyz", wp.array(dtype=real)))
 
 
-def flat(fields: Sequence[wp.array]) -> Any:
+def flat_vector(fields: Sequence[wp.array]) -> Any:
     """Return the components of a vector as kernels take them: flat, none where there are fewer."""
     return put(vector_struct(fields[0].dtype)(), dict(zip("xyz", [field.flatten() for field in fields], strict=False)))
 
@@ -42,16 +42,17 @@ class Shape:
 
 
 @wp.struct
-class Edges:
-    """Edges beside bodies: where they are, their shear, and what a unit of its stress does to their bodies."""
+class Places:
+    """Faces, cells or edges beside bodies, see `granular.body_faces.Incidence`."""
 
     at: _INTS
-    shear: _BYTES
-    row: _ROW
+    axis: _BYTES
+    body: _INTS
+    row: _MATS
 
 
 @wp.func
-def of(v: Any, axis: int, n: int):
+def entry(v: Any, axis: int, n: int):
     """Element n of the component along an axis."""
     if axis == 0:
         return v.x[n]
@@ -61,8 +62,8 @@ def of(v: Any, axis: int, n: int):
 
 
 @wp.func
-def give(v: Any, axis: int, n: int, value: Any):
-    """Set that element."""
+def set_entry(v: Any, axis: int, n: int, value: Any):
+    """Set element n of the component along an axis."""
     if axis == 0:
         v.x[n] = value
     elif axis == 1:
@@ -97,7 +98,7 @@ def forget_kernel(slot: _INTS, now: _SINGLE, before: _SINGLE, point: _SINGLE):
 
 
 @wp.kernel(**options)
-def force_kernel(grid: Shape, spans: _SPANS, stress: _SINGLE, cell: _INTS, cell_row: _MATS, edges: Edges, share: Vector, out: _ROW):
+def force_kernel(grid: Shape, spans: _SPANS, stress: _SINGLE, cells: Places, edges: Places, share: Vector, out: _ROW):
     """What a part of the cells and edges beside a body does to it: minus their rows times their stresses."""
     part = wp.tid()
     freedoms = out.shape[1]
@@ -105,23 +106,23 @@ def force_kernel(grid: Shape, spans: _SPANS, stress: _SINGLE, cell: _INTS, cell_
         out[part, q] = wp.float64(0.0)
     for n in range(spans[part, 0], spans[part, 1]):
         for axis in range(grid.dimension):
-            normal = stress_part(stress, grid.layer, cell[n], axis, grid.dimension)
+            normal = stress_part(stress, grid.layer, cells.at[n], axis, grid.dimension)
             for q in range(freedoms):
-                out[part, q] = out[part, q] - cell_row[n, axis, q] * normal
+                out[part, q] = out[part, q] - cells.row[n, axis, q] * normal
     first = wp.where(grid.dimension == 3, 4, 2)
     for n in range(spans[part, 2], spans[part, 3]):
         at = edges.at[n]
-        d = int(edges.shear[n])
+        d = int(edges.axis[n])
         a, b = axes_of(d)
         alpha, beta = grid.strides[a], grid.strides[b]
-        weight = of(share, d, at)
+        weight = entry(share, d, at)
         if weight != 0.0:
             base = (first + 4 * d) * grid.layer + at
             low = wp.float64(stress[base]) + wp.float64(stress[base + grid.layer - alpha])
             high = wp.float64(stress[base + 2 * grid.layer - beta]) + wp.float64(stress[base + 3 * grid.layer - alpha - beta])
             shear = wp.float64(wp.abs(weight)) * (low + high)
             for q in range(freedoms):
-                out[part, q] = out[part, q] - edges.row[n, q] * shear
+                out[part, q] = out[part, q] - edges.row[n, 0, q] * shear
 
 
 @wp.kernel(**options)
@@ -151,23 +152,23 @@ def respond_kernel(
 
 
 @wp.kernel(**options)
-def layer_kernel(face: _INTS, axis: _BYTES, mass: Vector, u: Vector, weight: Vector, out: _PAIRS):
+def layer_kernel(faces: Places, mass: Vector, u: Vector, weight: Vector, out: _PAIRS):
     """Mass of the sand that moves with a body's face, half a cell, and the velocity that it had."""
     n = wp.tid()
-    a = int(axis[n])
-    at = face[n]
+    a = int(faces.axis[n])
+    at = faces.at[n]
     out[n] = wp.vec2d()
-    if of(weight, a, at) > 0.0:
-        out[n] = wp.vec2d(wp.float64(0.5) * wp.float64(of(mass, a, at)), wp.float64(of(u, a, at)))
+    if entry(weight, a, at) > 0.0:
+        out[n] = wp.vec2d(wp.float64(0.5) * wp.float64(entry(mass, a, at)), wp.float64(entry(u, a, at)))
 
 
 @wp.kernel(**options)
 def stiffness_kernel(
-    grid: Shape, cell: _INTS, flags: _BYTES, drive: _SINGLE, stiff: _SINGLE, mass: Vector, inverse: Vector, numbers: _SINGLE, out: _PAIRS
+    grid: Shape, cells: Places, flags: _BYTES, drive: _SINGLE, stiff: _SINGLE, mass: Vector, inverse: Vector, numbers: _SINGLE, out: _PAIRS
 ):
     """Inverses of what the steps of pressure and friction in a cell are scaled by; 0 where it has none."""
     n = wp.tid()
-    at = cell[n]
+    at = cells.at[n]
     found = wp.vec2d()
     if (int(flags[at]) & HOLDS) != 0:
         full = wp.clamp(1.0 - drive[at] * numbers[STEP_OF_CELL] / NEARLY, 0.0, 1.0)
@@ -175,8 +176,8 @@ def stiffness_kernel(
         for side in range(2):
             for axis in range(grid.dimension):
                 o = at + side * grid.strides[axis]
-                m = of(mass, axis, o)
-                diagonal += (m + full * (1.0 - m)) * of(inverse, axis, o)
+                m = entry(mass, axis, o)
+                diagonal += (m + full * (1.0 - m)) * entry(inverse, axis, o)
         if diagonal > 0.0:
             found[0] = wp.float64(1.0) / wp.float64(diagonal)
     if (int(flags[at]) & SHEARS_HERE) != 0 and stiff[at] > 0.0:
@@ -185,15 +186,17 @@ def stiffness_kernel(
 
 
 @wp.kernel(**options)
-def lightness_kernel(grid: Shape, edges: Edges, share: Vector, inverse: Vector, out: _REALS):
+def lightness_kernel(grid: Shape, edges: Places, share: Vector, inverse: Vector, out: _REALS):
     """1 / sum of the inverse masses around an edge; 0 where it has no shear."""
     n = wp.tid()
     at = edges.at[n]
-    d = int(edges.shear[n])
+    d = int(edges.axis[n])
     a, b = axes_of(d)
-    around = of(inverse, a, at) + of(inverse, a, at - grid.strides[b]) + of(inverse, b, at) + of(inverse, b, at - grid.strides[a])
+    around = (
+        entry(inverse, a, at) + entry(inverse, a, at - grid.strides[b]) + entry(inverse, b, at) + entry(inverse, b, at - grid.strides[a])
+    )
     out[n] = wp.float64(0.0)
-    if of(share, d, at) != 0.0 and around > 0.0:
+    if entry(share, d, at) != 0.0 and around > 0.0:
         out[n] = wp.float64(1.0) / wp.float64(around)
 
 
@@ -204,23 +207,24 @@ def body_kernels(dimension: int, real: Any, box: bool, rate: bool = False) -> Si
     module, Velocity = f"granular.{name}", vector_struct(real)
 
     @wp.kernel(enable_backward=False, module=module)
-    def move(face: _INTS, axis: _BYTES, body: _INTS, row: _ROW, velocity: _ROW, moved: Velocity):
+    def move(faces: Places, velocity: _ROW, moved: Velocity):
         """Give the bodies' faces the velocity that they have."""
         n = wp.tid()
-        b = body[n]
+        b = faces.body[n]
         u = wp.float64(0.0)
-        for q in range(row.shape[1]):
-            u += row[n, q] * velocity[b, q]
-        give(moved, int(axis[n]), face[n], real(u))
+        for q in range(velocity.shape[1]):
+            u += faces.row[n, 0, q] * velocity[b, q]
+        set_entry(moved, int(faces.axis[n]), faces.at[n], real(u))
 
     @wp.kernel(enable_backward=False, module=module)
-    def strain(grid: Shape, edges: Edges, u: Velocity, rates: Velocity):
+    def strain(grid: Shape, edges: Places, u: Velocity, rates: Velocity):
         """Twice the shear rate of the edges beside bodies, times dx."""
         n = wp.tid()
         i = edges.at[n]
-        d = int(edges.shear[n])
+        d = int(edges.axis[n])
         a, b = axes_of(d)
-        give(rates, d, i, (of(u, a, i) - of(u, a, i - grid.strides[b])) + (of(u, b, i) - of(u, b, i - grid.strides[a])))
+        along, across = entry(u, a, i) - entry(u, a, i - grid.strides[b]), entry(u, b, i) - entry(u, b, i - grid.strides[a])
+        set_entry(rates, d, i, along + across)
 
     edges = xyz(edge=[real] * 3)
     made = functools.partial(sand_pass, name, dimension=dimension, real=real, BOX=box, RATE=rate, RESIDUAL=0, TRIAL=1, **MOMENTUM)

@@ -9,46 +9,43 @@ their torques, since the rates of strain of a rigid motion are.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import ndimage
 
 from warp_lcp.granular.packing import SHEARS
 from warp_lcp.grid.staggered import StaggeredGrid
 
-Rows = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # places, bodies, rows of each pair, bodies of the place
+
+@dataclass(frozen=True)
+class Incidence:
+    """Places beside bodies: faces, cells or edges, each with a body, ordered by body.
+
+    Attributes:
+        at: flat index of the place, shape (n,).
+        body: of each, shape (n,).
+        row: what a unit of V makes there, shape (n, m, k): the face's velocity, [1] and [m], the differences of velocity along each axis
+            across the cell, high less low, or the rate of shear of the edge.
+        axis: the axis of a face, the shear of an edge, 0 of a cell.
+        share: bodies beside the place.
+    """
+
+    at: np.ndarray
+    body: np.ndarray
+    row: np.ndarray
+    axis: np.ndarray
+    share: np.ndarray
 
 
 @dataclass(frozen=True)
 class BodyFaces:
-    """The bodies' faces near open cells, and the rows of the cells and edges that they touch, each ordered by body.
+    """The bodies' faces near open cells, and the open cells and the edges that they touch."""
 
-    Attributes:
-        face, face_axis, face_body: flat index, axis and body of each face, shape (f,).
-        face_row: J of each face, [1] and [m], shape (f, k).
-        cell, cell_body: flat index and body of each pair of an open cell and a body beside it, shape (c,).
-        cell_row: difference of velocity along each axis across the cell, high less low, in units of V, shape (c, dimension, k).
-        cell_share: bodies beside the cell, shape (c,).
-        edge, edge_shear, edge_body: flat index, shear and body of each pair of an edge and a body beside it, shape (e,).
-        edge_row: rate of shear in units of V, shape (e, k).
-        edge_share: bodies beside the edge, shape (e,).
-    """
-
-    face: np.ndarray
-    face_axis: np.ndarray
-    face_body: np.ndarray
-    face_row: np.ndarray
-    cell: np.ndarray
-    cell_body: np.ndarray
-    cell_row: np.ndarray
-    cell_share: np.ndarray
-    edge: np.ndarray
-    edge_shear: np.ndarray
-    edge_body: np.ndarray
-    edge_row: np.ndarray
-    edge_share: np.ndarray
+    face: Incidence
+    cell: Incidence
+    edge: Incidence
 
 
 def find_body_faces(grid: StaggeredGrid, index: np.ndarray, numbers: Sequence[int], centers: np.ndarray) -> BodyFaces:
@@ -62,16 +59,13 @@ def find_body_faces(grid: StaggeredGrid, index: np.ndarray, numbers: Sequence[in
         numbers: the wall's number of each body.
         centers: of mass of each body [m], shape (bodies, 3).
     """
-    strides = _strides(grid)
     faces = [_faces(grid, index, axis, np.asarray(numbers, dtype=int)) for axis in range(grid.dimension)]
     rows = [_face_rows(grid, flat, axis, np.asarray(centers, dtype=float)[body]) for axis, (flat, body) in enumerate(faces)]
     axis_of = np.repeat(np.arange(grid.dimension), [len(flat) for flat, _ in faces])
-    face, body, row = (np.concatenate(parts) for parts in zip(*((f, b, r) for (f, b), r in zip(faces, rows, strict=True)), strict=True))
-    order = np.lexsort((face, axis_of, body))
-    face, body, row, axis_of = face[order], body[order], row[order], axis_of[order]
-    cells = _cells(grid, index, face, axis_of, body, row, strides)
-    edges = _edges(grid, face, axis_of, body, row, strides)
-    return BodyFaces(face, axis_of, body, row, *cells, *edges)
+    at, body, row = (np.concatenate(parts) for parts in zip(*((f, b, r) for (f, b), r in zip(faces, rows, strict=True)), strict=True))
+    order = np.lexsort((at, axis_of, body))
+    face = Incidence(at[order], body[order], row[order][:, None], axis_of[order], np.ones(len(at), dtype=int))
+    return BodyFaces(face, _cells(grid, index, face), _edges(grid, face))
 
 
 def entries_near(grid: StaggeredGrid, faces: BodyFaces, cells: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -86,13 +80,13 @@ def entries_near(grid: StaggeredGrid, faces: BodyFaces, cells: np.ndarray, sides
     strides, near = _strides(grid), np.zeros(len(cells), dtype=bool)
     for d, (alpha, beta) in enumerate(SHEARS[grid.dimension]):
         touched = np.zeros(grid.size, dtype=bool)
-        touched[faces.edge[faces.edge_shear == d]] = True
+        touched[faces.edge.at[faces.edge.axis == d]] = True
         for axis, other in ((alpha, beta), (beta, alpha)):
             own = np.flatnonzero(sides >> 1 == axis)
             first = cells[own].astype(np.int64) + (sides[own] & 1).astype(np.int64) * strides[axis]
             near[own] |= touched[first] | touched[first + strides[other]]
     entries = np.flatnonzero(near)
-    return entries, np.unique(np.concatenate([faces.cell, cells[entries]]))
+    return entries, np.unique(np.concatenate([faces.cell.at, cells[entries]]))
 
 
 def unowned_copies(grid: StaggeredGrid, index: np.ndarray, faces: BodyFaces) -> tuple[np.ndarray, np.ndarray]:
@@ -103,7 +97,7 @@ def unowned_copies(grid: StaggeredGrid, index: np.ndarray, faces: BodyFaces) -> 
     strides, solid = _strides(grid), index.ravel() >= 0
     copies, cells = [], []
     for d, (alpha, beta) in enumerate(SHEARS[grid.dimension]):
-        edges = np.unique(faces.edge[faces.edge_shear == d])
+        edges = np.unique(faces.edge.at[faces.edge.axis == d])
         for q in range(4):
             cell = edges - (q & 1) * strides[alpha] - (q >> 1) * strides[beta]
             along_alpha = cell + (strides[alpha] if q & 1 else -strides[alpha])
@@ -126,25 +120,20 @@ def _faces(grid: StaggeredGrid, index: np.ndarray, axis: int, numbers: np.ndarra
     held = owner[index + 1] >= 0
     if not held.any():
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-    box = []  # around all bodies, so that the rest of the grid costs nothing
-    for place, size in enumerate(index.shape):
-        along = np.flatnonzero(held.any(axis=tuple(a for a in range(3) if a != place)))
-        box.append(slice(max(along[0] - 2, 0), min(along[-1] + 4, size)))
+    found = ndimage.find_objects(held.astype(np.int8))[0]  # the box around all bodies, so that the rest of the grid costs nothing
+    box = [slice(max(along.start - 2, 0), min(along.stop + 3, size)) for along, size in zip(found, index.shape, strict=True)]
     if grid.dimension == 2:
         box[0] = slice(1, 2)
     part, place = index[tuple(box)], 2 - axis
-    open_ = np.pad(part < 0, [(0, 0) if grid.dimension == 2 and a == 0 else (1, 1) for a in range(3)])
-    near = np.zeros(part.shape, dtype=bool)
-    for shift in itertools.product(*(range(1) if grid.dimension == 2 and a == 0 else range(3) for a in range(3))):
-        near |= open_[tuple(slice(s, s + n) for s, n in zip(shift, part.shape, strict=True))]
+    near = ndimage.binary_dilation(part < 0, np.ones((1 if grid.dimension == 2 else 3, 3, 3)))
     here = tuple(slice(1, None) if a == place else slice(None) for a in range(3))
     before = tuple(slice(None, -1) if a == place else slice(None) for a in range(3))
     body = owner[np.maximum(part[here], part[before]) + 1]
     at = np.argwhere((body >= 0) & (near[here] | near[before]))
-    found = body[tuple(at.T)]
+    bodies = body[tuple(at.T)]
     at += np.array([b.start for b in box]) + np.eye(3, dtype=int)[place]
     flat = np.asarray(np.ravel_multi_index(tuple(at.T), index.shape), dtype=np.int64)
-    return flat, np.asarray(found, dtype=np.int64)
+    return flat, np.asarray(bodies, dtype=np.int64)
 
 
 def _face_rows(grid: StaggeredGrid, flat: np.ndarray, axis: int, centers: np.ndarray) -> np.ndarray:
@@ -159,48 +148,43 @@ def _face_rows(grid: StaggeredGrid, flat: np.ndarray, axis: int, centers: np.nda
     return np.concatenate([linear, turn[:, 2:] if grid.dimension == 2 else turn], axis=1)
 
 
-def _cells(
-    grid: StaggeredGrid, index: np.ndarray, face: np.ndarray, axis_of: np.ndarray, body: np.ndarray, row: np.ndarray, strides: Sequence[int]
-) -> Rows:
-    """Return pairs of open cells and bodies beside them, their rows, and how many bodies a cell has."""
+def _cells(grid: StaggeredGrid, index: np.ndarray, face: Incidence) -> Incidence:
+    """Return the open cells beside bodies."""
     inner = np.zeros(index.shape, dtype=bool)
     inner[1:-1, 1:-1, 1:-1] = index[1:-1, 1:-1, 1:-1] < 0
-    open_, step = inner.ravel(), np.array(strides)[axis_of]
+    open_, step = inner.ravel(), np.array(_strides(grid))[face.axis]
     parts = []
-    for cell, sign in ((face, -1.0), (face - step, 1.0)):  # a face is the low one of a cell and the high one of that before
+    for cell, sign in ((face.at, -1.0), (face.at - step, 1.0)):  # a face is the low one of a cell and the high one of that before
         at = np.flatnonzero(open_[cell])
-        rows = np.zeros((len(at), grid.dimension, row.shape[1]))
-        rows[np.arange(len(at)), axis_of[at]] = sign * row[at]
-        parts.append((cell[at], body[at], rows))
-    return _summed(grid, *(np.concatenate(part) for part in zip(*parts, strict=True)))
+        rows = np.zeros((len(at), grid.dimension, face.row.shape[2]))
+        rows[np.arange(len(at)), face.axis[at]] = sign * face.row[at, 0]
+        parts.append((cell[at], face.body[at], rows))
+    return _summed(grid, parts, 0)
 
 
-def _edges(
-    grid: StaggeredGrid, face: np.ndarray, axis_of: np.ndarray, body: np.ndarray, row: np.ndarray, strides: Sequence[int]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return pairs of edges and bodies beside them, their rows, and how many bodies an edge has.
+def _edges(grid: StaggeredGrid, face: Incidence) -> Incidence:
+    """Return the edges beside bodies.
 
     The rate of shear of an edge is u_a - u_a(one cell back along b) + u_b - u_b(one cell back along a).
     """
-    shears, found = [], []
+    strides, found = _strides(grid), []
     for d, (alpha, beta) in enumerate(SHEARS[grid.dimension]):
         parts = []
         for axis, other in ((alpha, beta), (beta, alpha)):
-            own = np.flatnonzero(axis_of == axis)
-            parts += [(face[own], body[own], row[own]), (face[own] + strides[other], body[own], -row[own])]
-        summed = _summed(grid, *(np.concatenate(part) for part in zip(*parts, strict=True)))
-        found.append(summed)
-        shears.append(np.full(len(summed[0]), d))
-    edge, owner, rows, share = (np.concatenate(part) for part in zip(*found, strict=True))
-    order = np.argsort(owner, kind="stable")
-    return edge[order], np.concatenate(shears)[order], owner[order], rows[order], share[order]
+            own = np.flatnonzero(face.axis == axis)
+            parts += [(face.at[own], face.body[own], face.row[own]), (face.at[own] + strides[other], face.body[own], -face.row[own])]
+        found.append(_summed(grid, parts, d))
+    order = np.argsort(np.concatenate([part.body for part in found]), kind="stable")
+    return Incidence(*(np.concatenate([getattr(part, name) for part in found])[order] for name in Incidence.__dataclass_fields__))
 
 
-def _summed(grid: StaggeredGrid, place: np.ndarray, body: np.ndarray, rows: np.ndarray) -> Rows:
-    """Return places, bodies and the sums of the rows of each pair, by body, and how many bodies a place has."""
+def _summed(grid: StaggeredGrid, parts: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], axis: int) -> Incidence:
+    """Return the places that parts name, by body, each once, with the sums of their rows."""
+    place, body, rows = (np.concatenate(part) for part in zip(*parts, strict=True))
     pairs, which = np.unique(body * grid.size + place, return_inverse=True)
     total = np.zeros((len(pairs), *rows.shape[1:]))
     np.add.at(total, which.ravel(), rows)
     places = pairs % grid.size
     _, same, share = np.unique(places, return_inverse=True, return_counts=True)
-    return places, pairs // grid.size, total, share[same.ravel()] if len(pairs) else np.zeros(0, dtype=np.int64)
+    beside = share[same.ravel()] if len(pairs) else np.zeros(0, dtype=np.int64)
+    return Incidence(places, pairs // grid.size, total, np.full(len(pairs), axis), beside)

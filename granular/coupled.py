@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.granular.interleaved_kernels import APART, interleaved_passes
 from warp_lcp.granular.stress import Stress
 from warp_lcp.granular.stress_kernels import PERIOD
-from warp_lcp.granular.yield_set import xyz
+from warp_lcp.granular.yield_set import F32, I32, U8, WALLS, sand_pass, xyz
 from warp_lcp.rows import RowPass, Rows
-from warp_lcp.settings import Count, CountOrZero, NonNegative, Part, Positive, Relaxation, Settings, ShareOrZero
+from warp_lcp.settings import Count, CountOrZero, NonNegative, Positive, Relaxation, Settings, ShareOrZero
 
 BETTER = 0.95  # of the best estimate: progress
 NEAR_BEST = 1.2
@@ -24,45 +24,35 @@ NOTHING = 1e-3  # of the tolerance: nothing to solve, as in free fall
 SWING = 1.9  # 1 - momentum, times the cells of a side, of cold solves: with less than 2 sqrt(pressure_step / 4) pi / 2 = 1.4 the longest
 # wave, a quarter of which fits into a column's depth, swings back, and walls hold down what they have let rise; friction asks for more
 STILL = 1e-2  # of the tolerance, which leaves sand at rest
+APART = 3  # cells along an axis, so that two threads change no velocity in common: what a cell changes reaches two cells far
 
 
-@dataclass(frozen=True)
-class CoupledOutcome:
-    """How a coupled solve ended.
+class StressWorkspace:
+    """The stresses under a method, and their natural residual [m/s]: the iterate is the problem's own field, in place.
 
-    Attributes:
-        status: CONVERGED, STAGNATED, MAX_ITERATIONS or NON_FINITE.
-        iterations: steps of the method: all stresses once.
-        pressure, friction: natural residual of either, root mean square over the cells that hold sand, in units of the scale.
-        history: (iterations, residual) at each check.
+    The last stresses are the result, also of a solve that fails: `AcceleratedProjection.least` says why the residual is no judge of them.
+    What steps keep beside them (earlier ones, the momentum) is memory of the problem, whose `begin` uses it between solves.
     """
 
-    status: wl.SolveStatus
-    iterations: int
-    pressure: float
-    friction: float
-    history: list[tuple[int, float]] = field(repr=False, default_factory=list)
+    precision = wl.Precision.SINGLE
 
-    @property
-    def residual(self) -> float:
-        """Return the residual of both, in units of the scale."""
-        return math.hypot(self.pressure, self.friction)
+    def __init__(self, stress: Stress) -> None:
+        self.problem, self.x, self.residual = stress, stress.now, self
+        self.norm, self.current = math.inf, False
 
+    def evaluate(self, x: wp.array) -> float:
+        """Return the norm of pressure's and friction's natural residual; `stress.checked` is then the velocity that the stresses leave."""
+        self.norm, self.current = math.hypot(*self.problem.residual()), True
+        return self.norm
 
-class CoupledMethod(Protocol):
-    """A method for the coupled problem."""
+    def rounding_floor(self, x: wp.array, epsilon: float) -> float:
+        """Return 0: what rounding leaves of sand's residual is not known."""
+        return 0.0
 
-    decay: float  # of the stresses that a time step starts from
+    def keep(self) -> None:
+        """Let the stresses be the result, as the last ones always are."""
 
-    def solve(self, stress: Stress, *, scale: float, tolerance: float, max_iterations: int) -> CoupledOutcome:
-        """Solve from the stresses as they are; `stress.checked` is then the velocity that the solution leaves.
-
-        Args:
-            stress: begun.
-            scale: unit of the residual [m/s]: g dt is a pressure of rho g dx.
-            tolerance: residual to reach, in that unit.
-            max_iterations: the most steps.
-        """
+    restore = keep
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +74,6 @@ class AcceleratedProjection(Settings):
         shear_step: relative to the diagonal; in 3-D it is halved.
         lookahead: the gradient is taken at x + lookahead beta (x - x_before), steps start from x + beta (x - x_before).
         momentum: beta at the start of a solve.
-        decay: of the stresses that a time step starts from.
         check_every: periods of steps between two looks at the estimate of the residual.
         patience: steps without a better estimate after which the next that is nearly as good as the best is taken.
         wait: steps without a better estimate after which the momentum is limited, unless the estimate is within the tolerance.
@@ -97,11 +86,12 @@ class AcceleratedProjection(Settings):
             the height, and friction points down in the uppermost rows.
     """
 
+    problems: ClassVar = Stress
+
     pressure_step: Positive = 1.0 / 1.2
     shear_step: Positive = 1.0 / 2.5
     lookahead: NonNegative = 0.15
     momentum: ShareOrZero = 0.85
-    decay: Part = 1.0
     check_every: Count = 2
     patience: Count = 300
     wait: Count = 100
@@ -109,38 +99,64 @@ class AcceleratedProjection(Settings):
     least: CountOrZero = 80
     cold: CountOrZero = 600
 
-    def solve(self, stress: Stress, *, scale: float, tolerance: float, max_iterations: int) -> CoupledOutcome:
-        """Solve from the stresses as they are."""
-        history, done = [(0, math.hypot(*stress.residual()) / scale)], 0
+    def init(self, problem: Stress) -> MomentumWorkspace:
+        """Return what solves of these stresses keep beside them."""
+        return MomentumWorkspace(problem, self)
+
+    def step(self, problem: Stress, work: MomentumWorkspace, x: wp.array) -> wl.Step:
+        """Take `check_every` periods of steps; the residual is due where their estimate of it says so."""
+        estimate, taken = problem.advance(self.check_every), self.check_every * PERIOD
+        due, stagnates = work.judge(estimate, taken)
+        failure = wl.SolveStatus.STAGNATED if stagnates else None
+        return wl.Step("projection", taken, failure=failure, interim=True, iterations=taken, due=due, final=True)
+
+
+class MomentumWorkspace(StressWorkspace):
+    """What a solve with momentum has come to.
+
+    Args:
+        stress: the problem.
+        method: the method.
+    """
+
+    def __init__(self, stress: Stress, method: AcceleratedProjection) -> None:
+        super().__init__(stress)
+        self.method = method
+
+    def start(self, *, warm: bool, tolerance: float) -> bool:
+        """Begin a sequence of steps; return whether a least number of them is wanted whatever the residual."""
+        stress, method = self.problem, self.method
         flat = stress.packing.grid.dimension == 2
         stress.restart(
-            pressure_step=self.pressure_step, shear_step=self.shear_step * (1.0 if flat else 0.5), lookahead=self.lookahead,
-            momentum=self.momentum,
+            pressure_step=method.pressure_step, shear_step=method.shear_step * (1.0 if flat else 0.5), lookahead=method.lookahead,
+            momentum=method.momentum,
         )  # fmt: skip
-        aim, best, best_at, moved, limits = tolerance * scale, math.inf, 0, 0, list(self.calm)
-        least, still = self.least, 0.0
+        self._aim, self._best, self._limits = tolerance, math.inf, list(method.calm)
+        self._done, self._best_at, self._moved = 0, 0, 0  # steps: taken, when the estimate was best, when it or the momentum last changed
+        self._least, self._still = method.least, 0.0
         if stress.cold:
-            least, still = self.cold, STILL * aim
+            self._least, self._still = method.cold, STILL * tolerance
             stress.calm(1.0 - SWING / max(stress.packing.grid.counts))
-        least = min(least, max_iterations) if history[0][1] > NOTHING * tolerance else 0
-        status = None if least > 0 and math.isfinite(history[0][1]) else _status(history, tolerance, max_iterations, done)
-        while status is None:
-            estimate, stagnates = math.inf, False
-            while (estimate > aim or (done < least and estimate > still)) and done < max_iterations and not stagnates:
-                estimate = stress.advance(self.check_every)
-                done += self.check_every * PERIOD
-                if not estimate < BETTER * best:
-                    stagnates = not math.isfinite(estimate) or (done - best_at >= self.patience and estimate < NEAR_BEST * best)
-                    if limits and done - moved >= self.wait and estimate > aim:
-                        stress.calm(limits.pop(0))
-                        moved = done
-                else:
-                    best, best_at, moved = estimate, done, done
-            history.append((done, math.hypot(*stress.residual()) / scale))
-            status = _status(history, tolerance, max_iterations, done) or (wl.SolveStatus.STAGNATED if stagnates else None)
-            aim *= 0.8  # should the estimate have been too good
-        pressure, friction = stress.last_residual
-        return CoupledOutcome(status, done, pressure / scale, friction / scale, history)
+        if self.norm <= NOTHING * tolerance:
+            self._least = 0
+        return self._least > 0
+
+    def judge(self, estimate: float, taken: int) -> tuple[bool, bool]:
+        """Return whether the residual is due, and whether no better one is in sight; limit the momentum in between."""
+        method, stagnates = self.method, False
+        self._done += taken
+        if not estimate < BETTER * self._best:
+            late = self._done - self._best_at >= method.patience and estimate < NEAR_BEST * self._best
+            stagnates = not math.isfinite(estimate) or late
+            if self._limits and self._done - self._moved >= method.wait and estimate > self._aim:
+                self.problem.calm(self._limits.pop(0))
+                self._moved = self._done
+        else:
+            self._best, self._best_at, self._moved = estimate, self._done, self._done
+        due = stagnates or not (estimate > self._aim or (self._done < self._least and estimate > self._still))
+        if due:
+            self._aim *= 0.8  # should the estimate have been too good
+        return due, stagnates
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,26 +168,24 @@ class InterleavedSweeps(Settings):
     Args:
         pressure_relaxation: of the sweeps for the pressure.
         friction_relaxation: of the sweeps for the friction, which 1.3 or more stalls.
-        decay: of the stresses that a time step starts from.
         check_every: rounds between two looks at the residual.
     """
 
+    problems: ClassVar = Stress
+
     pressure_relaxation: Relaxation = 1.5
     friction_relaxation: Relaxation = 1.0
-    decay: Part = 1.0
     check_every: Count = 4
 
-    def solve(self, stress: Stress, *, scale: float, tolerance: float, max_iterations: int) -> CoupledOutcome:
-        """Solve from the stresses as they are."""
-        history, done = [(0, math.hypot(*stress.residual()) / scale)], 0
-        stress.velocity.find(stress.now)
-        while (status := _status(history, tolerance, max_iterations, done)) is None:
-            for _ in range(self.check_every):
-                self._round(stress)
-            done += self.check_every
-            history.append((done, math.hypot(*stress.residual()) / scale))
-        pressure, friction = stress.last_residual
-        return CoupledOutcome(status, done, pressure / scale, friction / scale, history)
+    def init(self, problem: Stress) -> SweepWorkspace:
+        """Return what solves of these stresses keep beside them."""
+        return SweepWorkspace(problem)
+
+    def step(self, problem: Stress, work: SweepWorkspace, x: wp.array) -> wl.Step:
+        """Sweep `check_every` times over either."""
+        for _ in range(self.check_every):
+            self._round(problem)
+        return wl.Step("round", self.check_every, interim=True, iterations=self.check_every, final=True)
 
     def _round(self, stress: Stress) -> None:
         p, walls, device = stress.packing, stress.walls, stress.packing.grid.device
@@ -186,6 +200,14 @@ class InterleavedSweeps(Settings):
             passes.wall.bind(rows, omega=omega, **cells, **share, **walls.fields(p)).launch()
 
 
+class SweepWorkspace(StressWorkspace):
+    """The stresses under sweeps, which keep the velocity up to date."""
+
+    def start(self, *, warm: bool, tolerance: float) -> None:
+        """Find the velocity that sweeps then keep up to date."""
+        self.problem.velocity.find(self.problem.now)
+
+
 def _sweep(stress: Stress, passed: RowPass, **given: Any) -> None:
     """Launch a sweep over all cells: in order on the CPU, in colors on CUDA."""
     grid = stress.packing.grid
@@ -196,6 +218,20 @@ def _sweep(stress: Stress, passed: RowPass, **given: Any) -> None:
         passed.bind(Rows.entries(cells.size, grid.device), cells=cells, **given).launch()
 
 
+@functools.cache
+def interleaved_passes(dimension: int, box: bool = False, rate: bool = False, listed: bool = False) -> SimpleNamespace:
+    """Return the passes of sweeps in 2 or 3 dimensions; `listed`: over `cells` with a list of them."""
+    module = f"interleaved_{dimension}d{'_box' * box}{'_rate' * rate}{'_listed' * listed}"
+    made = functools.partial(sand_pass, module, dimension=dimension, real=F32, numbers={"omega": F32}, BOX=box, RATE=rate)
+    cells, moved = {"flags": U8, "now": F32}, xyz("inverse", "u")
+    lists: dict[str, Any] = {"whole": {"numbers": F32} | ({"cells": I32} if listed else {}), "listed": "cells" if listed else ""}
+    return SimpleNamespace(
+        pressure=made("sweep_pressure", box={**cells, "drive": F32, "share_x": F32, **xyz("mass"), **moved}, **lists),
+        friction=made("sweep_friction", box={**cells, "stiff": F32, **xyz("share"), **moved}, **lists),
+        wall=made("sweep_walls", box={"cells": I32}, whole={**WALLS, **cells, **xyz("share"), **moved, "numbers": F32}),
+    )
+
+
 @functools.lru_cache(maxsize=2)
 def colors(shape: tuple[int, int, int], low: tuple[int, int, int], high: tuple[int, int, int], device: str) -> list[wp.array]:
     """Return the flat indices of a box's cells low <= (k, j, i) < high in fields of a shape, a list a color: `APART` along each axis."""
@@ -204,16 +240,7 @@ def colors(shape: tuple[int, int, int], low: tuple[int, int, int], high: tuple[i
     return [wp.array(cells[k::APART, j::APART, i::APART].ravel(), dtype=wp.int32, device=device) for k, j, i in starts]
 
 
-def _status(history: list[tuple[int, float]], tolerance: float, most: int, done: int) -> wl.SolveStatus | None:
-    """Return how a solve ends now, None if it goes on."""
-    norm = history[-1][1]
-    if not math.isfinite(norm):
-        return wl.SolveStatus.NON_FINITE
-    if norm <= tolerance:
-        return wl.SolveStatus.CONVERGED
-    return wl.SolveStatus.MAX_ITERATIONS if done >= most else None
-
-
-METHODS = {"accelerated-projection": AcceleratedProjection, "interleaved-sweeps": InterleavedSweeps}
-
-__all__ = ["METHODS", "AcceleratedProjection", "CoupledMethod", "CoupledOutcome", "InterleavedSweeps"]
+METHODS: dict[str, type[AcceleratedProjection | InterleavedSweeps]] = {
+    "accelerated-projection": AcceleratedProjection,
+    "interleaved-sweeps": InterleavedSweeps,
+}

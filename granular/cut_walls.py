@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.granular.cut_walls_kernels import traction_pass
 from warp_lcp.granular.packing import SHEARS, Packing
 from warp_lcp.granular.yield_set import COLUMNS, xyz
 from warp_lcp.grid.cut_cells import CutCells
@@ -109,7 +108,7 @@ class CutWalls:
         walls = {"cells": self.cells, "numbers_of": self._numbers, "walls": self._entries, "friction": self._friction}
         fields = {"flags": packing.flags, "fraction": packing.fraction, "openings": self.openings, "share_x": packing.share[0]}
         fields |= xyz(inverse=packing.inverse, u=velocity.u)
-        traction_pass(self.grid.dimension, velocity.real).bind(rows, behind=behind, **walls, **fields, **given).launch(launch)
+        velocity.passes.traction.bind(rows, behind=behind, **walls, **fields, **given).launch(launch)
 
 
 def _corners(distance: np.ndarray, axes: Sequence[int]) -> np.ndarray:

@@ -40,44 +40,21 @@ MATERIALS = {
 }
 
 
-def repose_slope(angle: float) -> float:
-    """Return k of the yield set |s|_F / sqrt(2) <= k p whose layers stop at an angle [degrees], k = tan(angle).
-
-    What slides along a slope shears alone, under equal normal stresses: its shear stress over its pressure is the slope's tangent. Sand
-    that rests and has pushed against itself along the slope holds up to asin(k), 35.3 degrees where k = tan(30 degrees): heaps that are
-    poured slowly lie between both.
-
-    >>> round(repose_slope(26.565), 3)
-    0.5
-    """
-    return math.tan(math.radians(angle))
-
-
-def plane_strain_slope(angle: float) -> float:
-    """Return k of the yield set that has a friction angle [degrees] in plane strain (Mohr and Coulomb's), k = sin(angle).
-
-    In 3-D the same cone is flatter where a sample is compressed along one axis: 30 degrees become 22.2, see `compression_slope`.
-
-    >>> round(plane_strain_slope(30.0), 3)
-    0.5
-    """
-    return math.sin(math.radians(angle))
-
-
-def compression_slope(angle: float) -> float:
-    """Return k of the yield set that has a friction angle [degrees] in triaxial compression, k = 2 sqrt(3) sin / (3 - sin).
-
-    Derived from |s|_F = sqrt(2/3) q and q = 6 sin / (3 - sin) p, where q is the difference of the principal stresses.
-
-    >>> round(compression_slope(22.23), 3)
-    0.5
-    """
-    sine = math.sin(math.radians(angle))
-    return 2.0 * math.sqrt(3.0) * sine / (3.0 - sine)
-
-
 def slope(angle: float, test: AngleOf, dimension: int) -> float:
-    """Return k of an angle [degrees] by the test that it is of; in 2-D there is no other compression than plane strain's."""
+    """Return k of the yield set |s|_F / sqrt(2) <= k p of an angle [degrees] by the test that it is of.
+
+    Repose: layers stop at it, k = tan. What slides along a slope shears alone, under equal normal stresses: its shear stress over its
+    pressure is the slope's tangent. Sand that rests and has pushed against itself along the slope holds up to asin(k), 35.3 degrees where
+    k = tan(30 degrees): heaps that are poured slowly lie between both.
+
+    Plane strain: Mohr and Coulomb's, k = sin. In 3-D that cone is flatter where a sample is compressed along one axis: 30 degrees become
+    22.2. So triaxial compression has k = 2 sqrt(3) sin / (3 - sin), from |s|_F = sqrt(2/3) q and q = 6 sin / (3 - sin) p, where q is the
+    difference of the principal stresses. In 2-D there is no other compression than plane strain's.
+
+    >>> [round(slope(angle, test, 3), 3) for angle, test in ((26.565, "repose"), (30.0, "plane-strain"), (22.23, "triaxial-compression"))]
+    [0.5, 0.5, 0.5]
+    """
     if test == "repose":
-        return repose_slope(angle)
-    return compression_slope(angle) if test == "triaxial-compression" and dimension == 3 else plane_strain_slope(angle)
+        return math.tan(math.radians(angle))
+    sine = math.sin(math.radians(angle))
+    return 2.0 * math.sqrt(3.0) * sine / (3.0 - sine) if test == "triaxial-compression" and dimension == 3 else sine

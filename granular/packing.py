@@ -12,7 +12,7 @@ from warp_lcp.granular import packing_kernels as kernels
 from warp_lcp.granular.yield_set import xyz
 from warp_lcp.grid.periodic import PeriodicSides
 from warp_lcp.grid.staggered import StaggeredGrid, Window
-from warp_lcp.operators.grid_poisson import SOLID
+from warp_lcp.rows.layout import put
 
 if TYPE_CHECKING:
     from warp_lcp.granular.cut_walls import CutWalls
@@ -52,7 +52,6 @@ class Packing:
     def __init__(
         self, grid: StaggeredGrid, base: wp.array, capacity: wp.array, *, sides: PeriodicSides | None = None, cut: CutWalls | None = None
     ) -> None:
-        """Allocate the fields."""
         self.grid, self.base, self._capacity, self.sides, self.cut = grid, base, capacity, sides, cut
         self.fraction, self.kind, self.flags, self.drive = grid.field(), grid.field(wp.int8), grid.field(wp.uint8), grid.field()
         wp.copy(self.kind, base)
@@ -97,9 +96,7 @@ class Packing:
             nodes.launch(
                 kernels.edge_kernel, [alpha, beta, self.base, self.flags, self.inverse[alpha], self.inverse[beta], part, share]
             )  # fmt: skip
-        inverse, share = kernels.Faces(), kernels.Faces()
-        inverse.x, inverse.y, inverse.z = three(self.inverse)
-        share.x, share.y, share.z = three(self.share)
+        inverse, share = (put(kernels.Faces(), dict(zip("xyz", fields, strict=False))) for fields in (self.inverse, self.share))
         domain.launch(kernels.stiffness_kernel, [dimension, self.flags, inverse, share, openings, self.stiff])
         if self.sides is not None:
             return  # the spans are whole rows
@@ -111,36 +108,3 @@ class Packing:
         """What a step of the stresses takes, by name."""
         fields = {"flags": self.flags, "drive": self.drive, "stiff": self.stiff}
         return fields | xyz(share=self.share, mass=self.mass, inverse=self.inverse)
-
-
-def three(fields: Sequence[wp.array]) -> list[wp.array | None]:
-    """Return three fields, None where there are fewer."""
-    return [*fields, None, None, None][:3]
-
-
-def wall_faces(index: np.ndarray, dimension: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the faces between open cells and solids, by cell.
-
-    Args:
-        index: int, -1 in open cells, the wall's number elsewhere; shape of the grid's fields.
-        dimension: 2 or 3.
-
-    Returns:
-        For each face its open cell's flat index (int32), 2 axis + side (uint8) and its wall's number (int32).
-    """
-    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-    inner = np.zeros(index.shape, dtype=bool)
-    inner[1:-1, 1:-1, 1:-1] = True
-    flat, open_ = index.ravel(), np.flatnonzero((index.ravel() < 0) & inner.ravel())
-    for axis, stride in zip(range(dimension), (1, index.shape[2], index.shape[1] * index.shape[2]), strict=False):
-        for side in range(2):
-            beyond = open_ + (stride if side else -stride)
-            wall = flat[beyond]
-            at = wall >= 0
-            found.append((open_[at], np.full(int(at.sum()), 2 * axis + side), wall[at]))
-    cells, sides, walls = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    order = np.argsort(cells, kind="stable")
-    return cells[order].astype(np.int32), sides[order].astype(np.uint8), walls[order].astype(np.int32)
-
-
-__all__ = ["SHEARS", "SOLID", "Packing", "three", "wall_faces"]

@@ -6,6 +6,7 @@ import warp as wp
 from warp_lcp.granular.yield_set import FIRM, HOLDS, PARTLY, SHEARS_HERE
 from warp_lcp.grid.cell_kernel import F32, I8, I32, U8, cell_below, cell_kernel
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
+from warp_lcp.rows.layout import make_struct
 
 _FLUID = wp.constant(wp.int8(FLUID))
 _AIR = wp.constant(wp.int8(AIR))
@@ -23,6 +24,7 @@ LANES = 16  # cells of a vector
 ROUNDING = 1e-6  # by which a fraction may differ from 1 and count as 1
 
 _F32X = wp.array4d(dtype=wp.float32)
+Faces = make_struct("Faces", dict.fromkeys("xyz", F32))  # the components of a vector, or shears
 
 
 @cell_kernel("granular.packing")
@@ -172,43 +174,27 @@ def edge_kernel(
         if f0 + f1 + g0 + g1 == 0.0:  # most edges: nothing to move
             share[k, j, i] = 0.0
             continue
-        s00 = base[k, j, i] == _SOLID
-        s10 = base[k - ka, j - ja, i - ia] == _SOLID
-        s01 = base[k - kb, j - jb, i] == _SOLID
-        s11 = base[k - ka - kb, j - ja - jb, i - ia] == _SOLID
-        p00 = int(flags[k, j, i])
-        p10 = int(flags[k - ka, j - ja, i - ia])
-        p01 = int(flags[k - kb, j - jb, i])
-        p11 = int(flags[k - ka - kb, j - ja - jb, i - ia])
+        solids, dense, held = int(0), int(0), int(0)
+        for q in range(4):
+            a, b = q & 1, q >> 1  # the cells around the edge: one back along alpha, along beta
+            flag = int(flags[k - a * ka - b * kb, j - a * ja - b * jb, i - a * ia])
+            dense += flag & SHEARS_HERE
+            if base[k - a * ka - b * kb, j - a * ja - b * jb, i - a * ia] == _SOLID:
+                solids += 1
+            else:
+                across_alpha = base[k - (1 - a) * ka - b * kb, j - (1 - a) * ja - b * jb, i - (1 - a) * ia] == _SOLID
+                across_beta = base[k - a * ka - (1 - b) * kb, j - a * ja - (1 - b) * jb, i - a * ia] == _SOLID
+                if across_alpha != across_beta:
+                    held += flag & HOLDS
         weight = float(0.0)
-        if not (s00 or s10 or s01 or s11):
-            dense = (p00 & SHEARS_HERE) + (p10 & SHEARS_HERE) + (p01 & SHEARS_HERE) + (p11 & SHEARS_HERE)
+        if solids == 0:
             if dense > 0 and f0 > 0.0 and f1 > 0.0 and g0 > 0.0 and g1 > 0.0:
                 weight = float(SHEARS_HERE) / float(dense)
-        else:
-            count = int(0)
-            if not s00 and (s10 != s01):
-                count += p00 & HOLDS
-            if not s10 and (s00 != s11):
-                count += p10 & HOLDS
-            if not s01 and (s00 != s11):
-                count += p01 & HOLDS
-            if not s11 and (s10 != s01):
-                count += p11 & HOLDS
-            if count > 0:
-                weight = -1.0 / float(count)
+        elif held > 0:
+            weight = -1.0 / float(held)
         if around:
             weight = weight * around[k, j, i]
         share[k, j, i] = weight
-
-
-@wp.struct
-class Faces:
-    """The components of a vector, or shears."""
-
-    x: F32
-    y: F32
-    z: F32
 
 
 @cell_kernel("granular.packing")

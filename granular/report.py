@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
@@ -12,21 +11,7 @@ from warp_lcp.granular.report_kernels import REPORT_COLUMNS, contact_kernel, rep
 from warp_lcp.granular.stress import Stress
 from warp_lcp.granular.yield_set import xyz
 from warp_lcp.material.contact import HELD, RELEASED
-
-
-@dataclass(frozen=True)
-class Report:
-    """Figures of a step.
-
-    Attributes:
-        yielded: share of the cells that carry shear whose friction is at its bound.
-        dissipation: what friction takes, over mass of a full cell [m^2/s^2]; never negative but for the solve's residual.
-        predicted: by how much the fraction of a cell would exceed 1 after the step, at most.
-    """
-
-    yielded: float
-    dissipation: float
-    predicted: float
+from warp_lcp.material.particle_simulation import Row
 
 
 class Outcome:
@@ -42,7 +27,6 @@ class Outcome:
     """
 
     def __init__(self, stress: Stress) -> None:
-        """Allocate the fields."""
         grid, self.stress = stress.packing.grid, stress
         self.ratio, self.contact, self.known = grid.field(), grid.field(wp.uint8), grid.faces(wp.int8)
         self._rows = int(np.prod(grid.shape[:2]))
@@ -61,11 +45,19 @@ class Outcome:
         inputs = [wp.uint8(HELD), wp.uint8(RELEASED), packing.flags, stress.now, self.contact]
         packing.grid.domain.launch(contact_kernel, inputs)
 
-    def report(self) -> Report:
-        """Return the figures of the last solve."""
+    def report(self, mass: float) -> Row:
+        """Return figures of the last solve.
+
+        yielded: share of the cells that carry shear whose friction is at its bound; dissipation: what friction takes, never negative but
+        for the solve's residual [J; J/m in 2-D]; predicted_excess: by how much a cell's fraction would exceed 1 after the step, at most.
+
+        Args:
+            mass: of a full cell [kg; kg/m in 2-D].
+        """
         stress, p = self.stress, self.stress.packing
         fields = stress.checked.fields | xyz(share=p.share, mass=p.mass) | {"openings": self._openings, "ratio": self.ratio}
         fields |= {"flags": p.flags, "drive": p.drive, "now": stress.now}
         p.grid.domain.run(self._report, whole=True, numbers=stress.numbers, sums=self._sums, **fields)
         cells, yielded, taken, most = self._sums.numpy().reshape(REPORT_COLUMNS, self._rows)
-        return Report(float(yielded.sum() / max(cells.sum(), 1.0)), float(taken.sum()), float(most.max()))
+        share = float(yielded.sum() / max(cells.sum(), 1.0))
+        return {"yielded": share, "dissipation": float(taken.sum()) * mass, "predicted_excess": float(most.max())}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
@@ -190,6 +190,11 @@ Sand = Annotated[SandBox | SandSphere | SandCapsule | SandPlane | SandMesh, Fiel
 Solid = Annotated[RoughBox | RoughSphere | RoughCapsule | RoughPlane | RoughMesh, Field(discriminator="shape")]
 
 
+def _found(rules: Iterable[tuple[object, str, object, str]]) -> list[Complaint]:
+    """Return the complaints whose case there is: each a case, the key that it is about, its value and the message."""
+    return [Complaint(tuple(key.split(".")), value, message) for case, key, value, message in rules if case]
+
+
 class SandScene(ParticleScene):
     """A scene of sand."""
 
@@ -243,7 +248,7 @@ class SandScene(ParticleScene):
 
     @property
     def cohesion(self) -> float:
-        """Return the cohesion [Pa]."""
+        """Return the cohesion of all sand, its own or the material's [Pa]."""
         own = next((sand.cohesion for sand in self.sand if sand.cohesion is not None), None)
         return self.material.cohesion if own is None else own
 
@@ -297,10 +302,9 @@ class SandScene(ParticleScene):
         for key, first in (("friction_angle", self.friction_angle), ("cohesion", self.cohesion)):
             for number, sand in enumerate(self.sand):
                 value = getattr(sand, key)
-                if (first if value is None else value) != first:
-                    found.append(
-                        Complaint(("sand", number, key), value, f"must be {first:g} as in the other [[sand]]: a scene has one material")
-                    )
+                if value is not None and value != first:
+                    message = f"must be {first:g} as in the other [[sand]]: a scene has one material"
+                    found.append(Complaint(("sand", number, key), value, message))
         return found + self._strength_complaints() + self._rate_complaints() + self._domain_complaints()
 
     def _strength_complaints(self) -> list[Complaint]:
@@ -317,13 +321,11 @@ class SandScene(ParticleScene):
 
     def _too_steep(self) -> Complaint:
         """Return the complaint about a friction angle, at the key that gives it."""
+        angle, message = self.friction_angle, self._at_most()
         number = next((number for number, sand in enumerate(self.sand) if sand.friction_angle is not None), None)
-        if number is not None:
-            return Complaint(("sand", number, "friction_angle"), self.friction_angle, self._at_most())
-        if self.material.friction_angle is not None:
-            return Complaint(("material", "friction_angle"), self.friction_angle, self._at_most())
-        message = f"has a friction angle of {self.friction_angle:g} degrees, which {self._at_most()}"
-        return Complaint(("material", "name"), self.material.name, message)
+        if number is None and self.material.friction_angle is None:
+            return Complaint(("material", "name"), self.material.name, f"has a friction angle of {angle:g} degrees, which {message}")
+        return Complaint(("material", "friction_angle") if number is None else ("sand", number, "friction_angle"), angle, message)
 
     def _at_most(self) -> str:
         """Return what is said of an angle that is too steep."""
@@ -336,52 +338,45 @@ class SandScene(ParticleScene):
         if dynamic is None:
             given = {"grain_size": table.grain_size, "inertial_number": table.inertial_number}
             message = "goes with friction.dynamic_angle, which is missing"
-            return [Complaint(("friction", key), value, message) for key, value in given.items() if value is not None]
-        found = []
-        if dynamic <= self.friction_angle:
-            message = f"must be above the friction angle, {self.friction_angle:g} degrees: friction grows with the rate of shear"
-            found.append(Complaint(("friction", "dynamic_angle"), dynamic, message))
-        elif self._slope_of(dynamic) > STEEPEST[self.dimension]:
-            found.append(Complaint(("friction", "dynamic_angle"), dynamic, self._at_most()))
-        if table.grain_size is None:
-            found.append(Complaint(("friction", "grain_size"), None, "must be given with friction.dynamic_angle: a length > 0 [m]"))
-        if table.model == "box":
-            found.append(Complaint(("friction", "model"), table.model, 'must be "cone" with friction.dynamic_angle'))
-        return found
+            return _found((value is not None, f"friction.{key}", value, message) for key, value in given.items())
+        above = f"must be above the friction angle, {self.friction_angle:g} degrees: friction grows with the rate of shear"
+        small, steep = dynamic <= self.friction_angle, self._slope_of(dynamic) > STEEPEST[self.dimension]
+        missing = "must be given with friction.dynamic_angle: a length > 0 [m]"
+        return _found(
+            [
+                (small, "friction.dynamic_angle", dynamic, above),
+                (steep and not small, "friction.dynamic_angle", dynamic, self._at_most() if steep else ""),
+                (table.grain_size is None, "friction.grain_size", None, missing),
+                (table.model == "box", "friction.model", table.model, 'must be "cone" with friction.dynamic_angle'),
+            ]
+        )
 
     def _domain_complaints(self) -> list[Complaint]:
-        found, periodic, wall = [], self.domain.periodic or [], self.domain.wall
-        if len(periodic) > 1 and periodic[1]:
-            found.append(Complaint(("domain", "periodic"), periodic, "may be true along x and z only: sand falls along y"))
-        closed = {axis for axis, ends in zip((0, 1, 2), periodic, strict=False) if ends}
-        if any(side in self.domain.open for axis in closed for side in (("left", "right"), (), ("back", "front"))[axis]):
-            found.append(Complaint(("domain", "open"), self.domain.open, "names a side of a periodic axis"))
-        if closed and (self.density_correction or self.particles.reseed or self.source or self.drain):
-            found.append(Complaint(("domain", "periodic"), periodic, "goes without density_correction, reseed, source and drain"))
-        if closed and self.solver.method == "interleaved-sweeps":
-            found.append(Complaint(("solver", "method"), self.solver.method, "knows no axis without an end: take accelerated-projection"))
-        if any(solid.is_body for solid in self.solid):
-            found += self._body_complaints(bool(closed))
-        if wall != "separating" or any(solid.wall == "free-slip" for solid in self.solid):
-            found.append(
-                Complaint(
-                    ("domain", "wall"), wall, 'must be "separating", of solids too: walls do not pull at sand; friction = 0 lets it slip'
-                )
-            )
-        if self.gauge is not None and not 0.0 < self.gauge.height < self.domain.size[1]:
-            found.append(
-                Complaint(("gauge", "height"), self.gauge.height, f"must lie in the domain, between 0 and {self.domain.size[1]:g} m")
-            )
-        return found
-
-    def _body_complaints(self, closed: bool) -> list[Complaint]:
-        """Return what does not go with rigid bodies; closed: an axis has no end."""
-        found = []
-        if self.solver.method == "interleaved-sweeps":
-            found.append(Complaint(("solver", "method"), self.solver.method, "moves no rigid bodies: take accelerated-projection"))
-        if closed:
-            found.append(Complaint(("domain", "periodic"), self.domain.periodic, "goes without rigid bodies"))
-        return found
+        """Return what does not go with an axis without an end, with rigid bodies, or with sand at all."""
+        domain, method, closed, periodic = self.domain, self.solver.method, self.endless, self.domain.periodic or []
+        opened = any(side in domain.open for axis in closed for side in (("left", "right"), (), ("back", "front"))[axis])
+        ends = closed and (self.density_correction or self.particles.reseed or self.source or self.drain)
+        sweeps, bodies = method == "interleaved-sweeps", any(solid.is_body for solid in self.solid)
+        holds = domain.wall != "separating" or any(solid.wall == "free-slip" for solid in self.solid)
+        pulls = 'must be "separating", of solids too: walls do not pull at sand; friction = 0 lets it slip'
+        height, top = None if self.gauge is None else self.gauge.height, domain.size[1]
+        return _found(
+            [
+                (1 in closed, "domain.periodic", periodic, "may be true along x and z only: sand falls along y"),
+                (opened, "domain.open", domain.open, "names a side of a periodic axis"),
+                (ends, "domain.periodic", periodic, "goes without density_correction, reseed, source and drain"),
+                (closed and sweeps, "solver.method", method, "knows no axis without an end: take accelerated-projection"),
+                (bodies and sweeps, "solver.method", method, "moves no rigid bodies: take accelerated-projection"),
+                (bodies and closed, "domain.periodic", domain.periodic, "goes without rigid bodies"),
+                (holds, "domain.wall", domain.wall, pulls),
+                (
+                    height is not None and not 0.0 < height < top,
+                    "gauge.height",
+                    height,
+                    f"must lie in the domain, between 0 and {top:g} m",
+                ),
+            ]
+        )
 
     def plan(self) -> list[tuple[str, str]]:
         """Return what a run would do."""
@@ -389,14 +384,8 @@ class SandScene(ParticleScene):
         cohesion = f", cohesion {self.cohesion:g} Pa" if self.cohesion else ""
         dynamic, grain = self.friction.dynamic_angle, self.friction.grain_size
         growing = f", growing to {dynamic:g} degrees with the rate of shear of grains of {grain:g} m" if dynamic else ""
-        return [
-            *super().plan(),
-            (
-                "material",
-                f"{self.material.name}, friction angle {self.friction_angle:g} degrees{cohesion}, {self.physics.density:g} kg/m^3",
-            ),
-            ("friction", f"{self.friction.model}{growing}, on walls {frictions}"),
-        ]
+        material = f"{self.material.name}, friction angle {self.friction_angle:g} degrees{cohesion}, {self.physics.density:g} kg/m^3"
+        return [*super().plan(), ("material", material), ("friction", f"{self.friction.model}{growing}, on walls {frictions}")]
 
     def own_memory_parts(self) -> dict[str, int]:
         """Return what the stresses take at most on the device [bytes]."""

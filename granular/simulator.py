@@ -11,7 +11,7 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.granular.bodies import SandBodies
-from warp_lcp.granular.coupled import METHODS, CoupledMethod, CoupledOutcome
+from warp_lcp.granular.coupled import METHODS
 from warp_lcp.granular.packing import Packing
 from warp_lcp.granular.report import Outcome
 from warp_lcp.granular.scene import SandScene
@@ -36,17 +36,8 @@ FRONT = 99.0  # percentile of the particles that runout and height are of
 FAR = 1.0  # rho g dx: cells are left with a velocity that is off by as much as gravity makes in the step
 JAMMED = "solids or a source may leave sand no way out: let them move less or slower; deep sand may need more solver.max_iterations"
 STANDING = 0.05  # of sqrt(g dx): a scale for the residual where there is no gravity
-COLUMNS = (
-    "coupled_residual",
-    "staggering_iterations",
-    "yielded",
-    "dissipation",
-    "predicted_excess",
-    "max_fraction",
-    "runout",
-    "height",
-)  # fmt: skip
-DIAGNOSTICS = ("yielded", "dissipation", "predicted_excess")  # of them, those that nothing else needs
+DIAGNOSTICS = ("yielded", "dissipation", "predicted_excess")  # columns that nothing else needs
+COLUMNS = ("coupled_residual", "staggering_iterations", *DIAGNOSTICS, "max_fraction", "runout", "height")
 
 
 class SandSimulation(ParticleSimulation):
@@ -92,7 +83,7 @@ class SandSimulation(ParticleSimulation):
         super().__init__(scene, grid, boundary, particles, sources=sources, outlets=outlets, bodies=bodies, notes=notes)
         self.solids, self.sides = solids, boundary.sides
         self._join = None if self.sides is None else self.sides.wrap
-        self.method: CoupledMethod = METHODS[scene.solver.method]()
+        self.method = METHODS[scene.solver.method]()
         self._base, self.density = grid.field(wp.int8), grid.field()
         self.packing = Packing(grid, self._base, boundary.capacity, sides=self.sides, cut=solids.cut)
         self.carried = None if bodies is None else SandBodies(grid, bodies.numbers)
@@ -152,22 +143,9 @@ class SandSimulation(ParticleSimulation):
         row = self.move(dt)
         self._place_solids()
         runout, height = self._front()
-        first = solved.history[0][1]
+        rate = self._flow_rate(below, row, dt)
         return self.logged(
-            row
-            | {
-                "solver": self.scene.solver.method,
-                "solve_status": solved.status.name,
-                "solve_iterations": solved.iterations,
-                "solve_residual": solved.residual / first if first > 0.0 else 0.0,
-                "coupled_residual": solved.residual,
-                "staggering_iterations": solved.iterations,
-                "max_fraction": most,
-                "runout": runout - self._start,
-                "height": height,
-                "flow_rate": self._flow_rate(below, row, dt),
-            }
-            | measured
+            row | solved | measured | {"max_fraction": most, "runout": runout - self._start, "height": height, "flow_rate": rate}
         )
 
     def _measured(self) -> Row:
@@ -175,9 +153,7 @@ class SandSimulation(ParticleSimulation):
         if not self.scene.output.diagnostics:
             return {}
         with self.watch.stage("diagnostics", self.packing.flags, self.stress.now):
-            report = self.outcome.report()
-        scale = self.scene.physics.density * self.grid.cell_volume
-        return {"yielded": report.yielded, "dissipation": report.dissipation * scale, "predicted_excess": report.predicted}
+            return self.outcome.report(self.scene.physics.density * self.grid.cell_volume)
 
     def known_density(self) -> wp.array | None:
         """Return the density that the packing is made of."""
@@ -187,11 +163,10 @@ class SandSimulation(ParticleSimulation):
         """Return the names of the columns of the stresses and of the sand's shape.
 
         coupled_residual: natural residual of pressure and friction together, root mean square over the cells with sand, in units of
-        rho g dx; solve_residual: relative to that at the start of the solve; staggering_iterations: of the coupled method; yielded: share
-        of the cells that carry shear whose friction is at its bound; dissipation [J; J/m in 2-D]: what friction took in the step;
-        predicted_excess: by how much the pressure's solution would pack a cell too densely; max_fraction: of a cell at the start of the
-        step, in units of the densest packing; runout [m]: 99th percentile of x less that at the start; height [m]: 99th percentile of y;
-        flow_rate [kg/s; kg/(s m) in 2-D]: what fell below the gauge, or without one what left through drains and open sides.
+        rho g dx; solve_residual: relative to that at the start of the solve; staggering_iterations: of the coupled method; yielded,
+        dissipation, predicted_excess: see `granular.report.Outcome.report`; max_fraction: of a cell at the start of the step, in units of
+        the densest packing; runout [m]: 99th percentile of x less that at the start; height [m]: 99th percentile of y; flow_rate [kg/s;
+        kg/(s m) in 2-D]: what fell below the gauge, or without one what left through drains and open sides.
         """
         columns = tuple(name for name in COLUMNS if self.scene.output.diagnostics or name not in DIAGNOSTICS)
         return (*columns, "flow_rate") if self.scene.gauge or self.scene.drain or self.scene.domain.open else columns
@@ -276,8 +251,14 @@ class SandSimulation(ParticleSimulation):
         others = max((float(np.abs(component.numpy()).max()) for component in self.solids.velocity), default=0.0)
         return after > before + scale + others + (self.bodies.top_speed(0.0) if self.bodies is not None else 0.0)
 
-    def _solve(self, window: Window, dt: float) -> CoupledOutcome:
-        """Solve for the stresses and take over the velocity that they leave."""
+    def solve_stress(self, scale: float) -> wl.SolveResult:
+        """Solve for the stresses, to the scene's tolerance in units of `scale` [m/s]: g dt is a pressure of rho g dx."""
+        solver = self.scene.solver
+        stopping = wl.StoppingCriteria(rtol=0.0, atol=solver.tolerance * scale, max_iterations=solver.max_iterations)
+        return wl.solve(self.stress, self.method, stopping=stopping)
+
+    def _solve(self, window: Window, dt: float) -> Row:
+        """Solve for the stresses and take over the velocity that they leave; return what the log wants to know of the solve."""
         packing, stress, solids, scene = self.packing, self.stress, self.solids, self.scene
         with self.watch.stage("packing", self.density, packing.fraction, *self.velocity):
             self._find_density(window)
@@ -294,22 +275,28 @@ class SandSimulation(ParticleSimulation):
         g = float(np.linalg.norm(self.gravity))
         scale = g * self.kick_dt if g > 0.0 else STANDING * math.sqrt(self.grid.spacing)
         with self.watch.stage("stress", stress.now, *packing.mass, *packing.inverse, *packing.start):
-            stress.begin(bound, self.gravity, dt, self.kick_dt, decay=self.method.decay)
-            solved = self.method.solve(
-                stress, scale=scale, tolerance=scene.solver.tolerance, max_iterations=scene.solver.max_iterations
-            )  # fmt: skip
+            stress.begin(bound, self.gravity, dt, self.kick_dt)
+            solved = self.solve_stress(scale)
+        residual, first = math.hypot(*(part / scale for part in stress.last_residual)), solved.history[0].residual / scale
         if solved.status is wl.SolveStatus.NON_FINITE:
             self.restore_bodies()
             raise SimulationFailed(f"step {self.step_count}: the stresses are not finite after {solved.iterations} iterations")
-        if solved.status is not wl.SolveStatus.CONVERGED and solved.residual > FAR and self._gains(scale):
+        if solved.status is not wl.SolveStatus.CONVERGED and residual > FAR and self._gains(scale):
             self.restore_bodies()
             stress.take_back()
-            residual = f"residual of {solved.residual:.2e} rho g dx (tolerance {scene.solver.tolerance}) and would make the sand faster"
-            raise missed_by_far("stress", solved.status, solved.iterations, residual, JAMMED)
+            left = f"residual of {residual:.2e} rho g dx (tolerance {scene.solver.tolerance}) and would make the sand faster"
+            raise missed_by_far("stress", solved.status, solved.iterations, left, JAMMED)
         with self.watch.stage("projection", *self.velocity):
             self.outcome.take(self.velocity)
             self._push_bodies(dt)
-        return solved
+        return {
+            "solver": scene.solver.method,
+            "solve_status": solved.status.name,
+            "solve_iterations": solved.iterations,
+            "solve_residual": residual / first if first > 0.0 else 0.0,
+            "coupled_residual": residual,
+            "staggering_iterations": solved.iterations,
+        }
 
     def _begin_bodies(self) -> None:
         """Tell the stresses how the bodies move and how easily."""

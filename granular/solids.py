@@ -3,17 +3,64 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.granular.cut_walls import CutWalls
-from warp_lcp.granular.stress import Walls
+from warp_lcp.granular.packing import Packing
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid, voxelize
 from warp_lcp.material import boundary_kernels as kernels
 from warp_lcp.material.boundary import Boundary, Faces
 from warp_lcp.material.cut_boundary import CutBoundary
+
+
+class Walls:
+    """Friction on the faces between sand and solids.
+
+    Args:
+        grid: the grid.
+        index: int, -1 in open cells, the wall's number elsewhere, shape of the grid's fields.
+        friction: Coulomb's coefficient of each wall, >= 0; inf sticks.
+        rubbing_only: leave out the faces of walls without friction. Their stresses are 0 from the start as long as no wall moves; what
+            moves may come where other cells of sand had theirs, which its faces then take away.
+
+    Attributes:
+        count: faces.
+        cells: int32, flat index of each face's open cell.
+        sides: uint8, 2 axis + side.
+        walls: int32, the wall's number.
+        friction: float32, of each wall.
+        active: int32: how many faces sand touches, and which.
+    """
+
+    def __init__(self, grid: StaggeredGrid, index: np.ndarray, friction: Sequence[float], *, rubbing_only: bool = False) -> None:
+        device = grid.device
+        self.friction = wp.array(np.minimum(friction, 1e6), dtype=wp.float32, device=device)
+        cells, sides, walls = wall_faces(index, grid.dimension)
+        if rubbing_only:
+            rubs = np.asarray(friction)[walls] > 0.0
+            cells, sides, walls = cells[rubs], sides[rubs], walls[rubs]
+        self.count = len(cells)
+        self.cells = wp.array(cells, dtype=wp.int32, device=device)
+        self.sides = wp.array(sides, dtype=wp.uint8, device=device)
+        self.walls = wp.array(walls, dtype=wp.int32, device=device)
+        self._host = cells
+        self.active = wp.zeros(1 + self.count, dtype=wp.int32, device=device)
+
+    def fields(self, packing: Packing) -> dict[str, Any]:
+        """Return what passes over faces take, by name."""
+        faces = {"cells": self.cells, "sides": self.sides, "walls": self.walls, "friction": self.friction}
+        return {**faces, "fraction": packing.fraction}
+
+    def activate(self, flags: np.ndarray) -> None:
+        """Find the faces whose cells hold sand: their number and their entries go to `active`."""
+        found = np.flatnonzero(flags.ravel()[self._host])
+        active = np.zeros(1 + self.count, dtype=np.int32)
+        active[0], active[1 : 1 + len(found)] = len(found), found
+        self.active.assign(active)
 
 
 class SandSolids:
@@ -43,7 +90,6 @@ class SandSolids:
         self, grid: StaggeredGrid, placed: Sequence[PlacedSolid], boundary: Boundary, friction: Sequence[float], *,
         prescribed: bool = False, cuts: bool = False,
     ) -> None:  # fmt: skip
-        """Find the cells."""
         self.grid, self._placed, self._boundary, self._friction = grid, tuple(placed), boundary, list(friction)
         self.base = grid.field(wp.int8)
         self.separating = wp.full(1 + len(placed), 1, dtype=wp.uint8, device=grid.device)
@@ -113,3 +159,28 @@ class SandSolids:
         else:
             for field in self.velocity:  # a source that has stopped has left its own
                 field.zero_()
+
+
+def wall_faces(index: np.ndarray, dimension: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the faces between open cells and solids, by cell.
+
+    Args:
+        index: int, -1 in open cells, the wall's number elsewhere; shape of the grid's fields.
+        dimension: 2 or 3.
+
+    Returns:
+        For each face its open cell's flat index (int32), 2 axis + side (uint8) and its wall's number (int32).
+    """
+    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    inner = np.zeros(index.shape, dtype=bool)
+    inner[1:-1, 1:-1, 1:-1] = True
+    flat, open_ = index.ravel(), np.flatnonzero((index.ravel() < 0) & inner.ravel())
+    for axis, stride in zip(range(dimension), (1, index.shape[2], index.shape[1] * index.shape[2]), strict=False):
+        for side in range(2):
+            beyond = open_ + (stride if side else -stride)
+            wall = flat[beyond]
+            at = wall >= 0
+            found.append((open_[at], np.full(int(at.sum()), 2 * axis + side), wall[at]))
+    cells, sides, walls = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    order = np.argsort(cells, kind="stable")
+    return cells[order].astype(np.int32), sides[order].astype(np.uint8), walls[order].astype(np.int32)

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+import warp_lcp as wl
 from warp_lcp.granular.bodies import SandBodies
-from warp_lcp.granular.checkerboard import damping_pass
-from warp_lcp.granular.packing import SHEARS, Packing, wall_faces
+from warp_lcp.granular.packing import SHEARS, Packing
+from warp_lcp.granular.solids import Walls
 from warp_lcp.granular.stress_kernels import BETA_X, NEXT_X, PERIOD, RESIDUAL_X, REST, STATE, STRESSES, momentum_kernel, stress_passes
 from warp_lcp.granular.yield_set import COLUMNS, LOOKAHEAD, NUMBERS, PRESSURE_STEP, SHEAR_STEP, xyz
-from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.program import Launch, Program
 from warp_lcp.rows import Rows
 from warp_lcp.vectors import Reduction
@@ -48,53 +47,6 @@ class YieldSet:
     halfway: float = 0.0
 
 
-class Walls:
-    """Friction on the faces between sand and solids.
-
-    Args:
-        grid: the grid.
-        index: int, -1 in open cells, the wall's number elsewhere, shape of the grid's fields.
-        friction: Coulomb's coefficient of each wall, >= 0; inf sticks.
-        rubbing_only: leave out the faces of walls without friction. Their stresses are 0 from the start as long as no wall moves; what
-            moves may come where other cells of sand had theirs, which its faces then take away.
-
-    Attributes:
-        count: faces.
-        cells: int32, flat index of each face's open cell.
-        sides: uint8, 2 axis + side.
-        walls: int32, the wall's number.
-        friction: float32, of each wall.
-        active: int32: how many faces sand touches, and which.
-    """
-
-    def __init__(self, grid: StaggeredGrid, index: np.ndarray, friction: Sequence[float], *, rubbing_only: bool = False) -> None:
-        """Find the faces."""
-        device = grid.device
-        self.friction = wp.array(np.minimum(friction, 1e6), dtype=wp.float32, device=device)
-        cells, sides, walls = wall_faces(index, grid.dimension)
-        if rubbing_only:
-            rubs = np.asarray(friction)[walls] > 0.0
-            cells, sides, walls = cells[rubs], sides[rubs], walls[rubs]
-        self.count = len(cells)
-        self.cells = wp.array(cells, dtype=wp.int32, device=device)
-        self.sides = wp.array(sides, dtype=wp.uint8, device=device)
-        self.walls = wp.array(walls, dtype=wp.int32, device=device)
-        self._host = cells
-        self.active = wp.zeros(1 + self.count, dtype=wp.int32, device=device)
-
-    def fields(self, packing: Packing) -> dict[str, Any]:
-        """Return what passes over faces take, by name."""
-        faces = {"cells": self.cells, "sides": self.sides, "walls": self.walls, "friction": self.friction}
-        return {**faces, "fraction": packing.fraction}
-
-    def activate(self, flags: np.ndarray) -> None:
-        """Find the faces whose cells hold sand: their number and their entries go to `active`."""
-        found = np.flatnonzero(flags.ravel()[self._host])
-        active = np.zeros(1 + self.count, dtype=np.int32)
-        active[0], active[1 : 1 + len(found)] = len(found), found
-        self.active.assign(active)
-
-
 class Velocity:
     """The velocity that a stress leaves, in one precision, and the rates of strain.
 
@@ -104,7 +56,6 @@ class Velocity:
     """
 
     def __init__(self, packing: Packing, real: type, *, box: bool, rate: bool) -> None:
-        """Allocate the fields."""
         grid = packing.grid
         self.packing, self.real, self.box, self.rate = packing, real, box, rate
         self.u = grid.faces(real)
@@ -114,7 +65,7 @@ class Velocity:
 
     @property
     def fields(self) -> dict[str, Any]:
-        """The fields by name."""
+        """Return `u` and `edge` by the names that passes have for them."""
         return xyz(u=self.u, edge=self.edge)
 
     def find(self, stress: wp.array, *, launch: Launch = wp.launch, bodies: SandBodies | None = None, respond: bool = False) -> None:
@@ -141,7 +92,7 @@ class Velocity:
         p.nodes.run(passes.edge_strain, launch=launch, spans=p.spans, **share, **self.fields)
 
 
-class Stress:
+class Stress(wl.ConvexSetProblem):
     """Pressure and friction of sand under a packing.
 
     With x = kick_dt p / (rho dx) and s alike, u = u* + (1/m) (-grad x + div s) on faces of mass m, the stress is the solution of
@@ -152,6 +103,12 @@ class Stress:
     for any r > 0, m' = m in loose cells and 1 in full ones [Narain, Golas & Lin 2010; Daviet & Bertails-Descoubes 2016]: sand is never
     denser than 1, and friction takes as much energy as it can. In a cell |n|^2 / 2 + sum over shears of max_q b_q^2 <= (k x + cohesion)^2.
     On a face of a solid the shear stress is within mu times the normal load (Coulomb).
+
+    So it is a quasi-variational inequality, over the product of x >= 0 and of the slices of the cones that hold each cell's s at its x; its
+    natural residual is how far (x, s) - P((x, s) - y/d) lies from 0, y = (w, -E u), P onto x >= 0 first and then onto the slice at that x.
+    It is not the projection onto the cones themselves, which would let sand push itself apart as it shears (an associated flow rule, whose
+    normal velocity is k times the slip). `wl.solve` solves it, by the methods of `granular.coupled`. Gradient, projection and momentum of
+    a cell are one pass over memory (`headers/step.h`): that is why neither y nor P stand here alone.
 
     Args:
         packing: where sand is.
@@ -169,7 +126,6 @@ class Stress:
     """
 
     def __init__(self, packing: Packing, walls: Walls, *, box: bool = False, rate: bool = False, bodies: SandBodies | None = None) -> None:
-        """Allocate the fields."""
         grid, self.packing, self.walls, self.box, self.rate, self.bodies = packing.grid, packing, walls, box, rate, bodies
         normals, shears = (3, 3) if grid.dimension == 3 else (1, 1)
         tractions = 0 if packing.cut is None else grid.dimension
@@ -200,7 +156,7 @@ class Stress:
         threads = sum(-(-count // self._grain) for count in (walls.count, cut.count if cut is not None else 0))
         self._wall_sums = Reduction(max(threads, 1), device, self._sums, columns=COLUMNS, threads=threads) if threads else None
 
-    def begin(self, bound: YieldSet, gravity: np.ndarray, dt: float, kick_dt: float, *, decay: float = 1.0) -> None:
+    def begin(self, bound: YieldSet, gravity: np.ndarray, dt: float, kick_dt: float) -> None:
         """Start from the last stresses, as far as they have a place in the packing now.
 
         Args:
@@ -208,7 +164,6 @@ class Stress:
             gravity: [m/s^2], three entries.
             dt: time step [s].
             kick_dt: how long forces act in it [s]; stresses are impulses, and it is the last step's pressure that goes on.
-            decay: factor of the last stresses; less than 1 damps patterns that exert no force.
         """
         wp.copy(self._last, self.now)
         self._last_kick = self.kick_dt
@@ -222,14 +177,14 @@ class Stress:
         self._cells = max(int(np.count_nonzero(p.grid.interior(flags))), 1)
         self.walls.activate(flags)
         self.cold = kick_dt > GROWN * self.kick_dt
-        ratio = decay * (kick_dt / self.kick_dt if self.kick_dt > 0.0 else 1.0)
+        ratio = kick_dt / self.kick_dt if self.kick_dt > 0.0 else 1.0
         share = xyz(share=p.share)
         p.grid.domain.run(self.velocity.passes.admit, ratio=ratio, flags=p.flags, stiff=p.stiff, **share, **self._stresses)
         if self.bodies is not None:
             self.bodies.forget(self._stresses)
         if p.sides is not None:
             p.sides.wrap(self._point)
-        p.grid.domain.run(damping_pass(p.grid.dimension), flags=p.flags, source=self._point, now=self.now, **share)
+        p.grid.domain.run(self.velocity.passes.damp, flags=p.flags, source=self._point, now=self.now, **share)
         self.kick_dt = kick_dt
 
     def take_back(self) -> None:

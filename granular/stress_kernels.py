@@ -1,5 +1,12 @@
 # mypy: ignore-errors
-"""Passes of the coupled pressure and friction of sand: projected steps on the stresses of `granular.yield_set`, 2-D and 3-D."""
+"""Passes of the coupled pressure and friction of sand: projected steps on the stresses of `granular.yield_set`, 2-D and 3-D.
+
+And what damps the pattern that exerts no force: a checkerboard in the pressure and one in the shear balance each other on every face. Noise
+in the fraction feeds it and no equation takes it away. Where p = (-1)^(i + j), the shear stress with -p at a cell's low-low corner, +p at
+the two mixed ones and -p at high-high cancels grad p; in 3-D half of that on the edges of each shear does. So a part of what alternates of
+the pressure in all directions, (-1, 2, -1)/4 along each axis, can be taken from p and added to the copies with those signs, and no velocity
+changes. Only cells deep in dense sand take part, away from solids that cut cells.
+"""
 
 import functools
 from types import SimpleNamespace
@@ -13,6 +20,7 @@ from warp_lcp.granular.yield_set import COLUMNS, F32, F64, I32, U8, WALLS, sand_
 # residuals over the last PERIOD steps; sums over these; 1 less the most that the momentum may grow to.
 COUNT, BETA_X, NOW_X, NOW_S, NEXT_X, NEXT_S, RESIDUAL_X, SUMS, REST, STATE = 0, 1, 3, 4, 5, 6, 7, 9, 17, 18
 PERIOD = 5
+DAMPED = 0.15  # of the checkerboard, in a step
 HIGH, LOW = 0.85, 0.5  # cosines above and below which the momentum grows and falls
 
 MOMENTUM: dict[str, Any] = {"NOW_X": NOW_X, "NOW_S": NOW_S, "NEXT_X": NEXT_X, "NEXT_S": NEXT_S}
@@ -31,13 +39,17 @@ def stress_passes(dimension: int, real: Any, *, box: bool = False, rate: bool = 
     u, edge, spans = xyz(u=[real] * 3), xyz(edge=[real] * 3), {"spans": I32}
     faces, sums = xyz("start", "inverse") | {"openings": F32}, STEP | {"partials": F64}
     entries = {**WALLS, **STRESSES, **edge, **xyz("share", "inverse"), **sums}
+    walls = {"walls": F32, "friction": F32, "flags": U8, "fraction": F32, "openings": F32, **STRESSES}
+    tractions = {**walls, "share_x": F32, **xyz("inverse"), **u, **sums}
     return SimpleNamespace(
         edge_stress=made("edge_stress", box=xyz("share") | {"y": F32} | edge, whole=spans),
         face_velocity=made("face_velocity", box={"share_x": F32, "y": F32, **edge, **faces, **u}, whole=spans),
         edge_strain=made("edge_strain", box={"share_x": F32, **u, **edge}, whole=spans),
         step=made("step", box={"flags": U8, **CELLS, **edge, **u}, whole=spans | sums),
         wall=made("wall_step", box={"active": I32}, whole=entries, numbers={"behind": int}),
+        traction=made("traction", box={"cells": I32, "numbers_of": I32}, whole=tractions, numbers={"behind": int}),
         admit=made("admit", box={"flags": U8, "stiff": F32, **xyz("share"), **STRESSES}, numbers={"ratio": F32}),
+        damp=made("damp", box={"flags": U8, **xyz("share"), "source": F32, "now": F32}, DAMPED=DAMPED),
     )
 
 

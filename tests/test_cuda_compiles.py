@@ -16,9 +16,7 @@ import warp_lcp as wl
 from warp_lcp.distributed.petsc_matrix import ENTER, LEAVE
 from warp_lcp.fluids.pressure_kernels import pressure_passes
 from warp_lcp.granular.bodies_kernels import body_kernels
-from warp_lcp.granular.checkerboard import damping_pass
-from warp_lcp.granular.cut_walls_kernels import traction_pass
-from warp_lcp.granular.interleaved_kernels import interleaved_passes
+from warp_lcp.granular.coupled import interleaved_passes
 from warp_lcp.granular.report_kernels import report_pass
 from warp_lcp.granular.stress_kernels import stress_passes
 from warp_lcp.grid import advection_kernels, distance_advection_kernels, transfer_kernels
@@ -155,9 +153,6 @@ def use_coupled_kernels(reals):
 def use_sand_kernels():
     """Instantiate the kernels of sand in 2-D and 3-D, with both yield sets."""
     for dimension in (2, 3):
-        damping_pass(dimension)
-        for real in (wp.float32, wp.float64):
-            traction_pass(dimension, real)
         for rate, cut in itertools.product((False, True), repeat=2):
             report_pass(dimension, rate, cut)
         for box, rate in ((False, False), (True, False), (False, True)):

@@ -20,7 +20,7 @@ from warp_lcp.problem import LCP
 from warp_lcp.recommend import Budget, Recommendation, recommend
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.result import Record, SolveResult, SolveStatus
-from warp_lcp.solve import Precision, Step
+from warp_lcp.solve import ConvexSetProblem, Precision, Step
 from warp_lcp.solvers.accelerated_projected_gradient import AcceleratedProjectedGradient
 from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel
 from warp_lcp.solvers.coupled_problem import CoupledBlock, CoupledResult, StaggeredRound, solve_coupled
@@ -65,6 +65,7 @@ __all__ = [
     "BatchResult",
     "BlockedGaussSeidel",
     "Budget",
+    "ConvexSetProblem",
     "CoupledBlock",
     "CoupledResult",
     "CycleSettings",

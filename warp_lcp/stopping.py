@@ -18,7 +18,7 @@ class StoppingCriteria(Settings):
     Args:
         rtol: relative tolerance, in [0, 1).
         atol: absolute tolerance >= 0, in the units of y.
-        max_iterations: the most steps of the method, >= 0; the limit is honored exactly.
+        max_iterations: the most steps of the method, >= 0; the limit is honored exactly, by sand's after the ten it takes at once.
         patience: steps without a new smallest residual after which the solve has stagnated, >= 1.
         divergence: the solve has diverged when the residual exceeds this multiple of the first one, > 1.
         max_seconds: wall time after which the solve ends with TIME_LIMIT, > 0; inf: never. A method's set-up counts. What cannot be cut

@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_lcp.benchmarks.timing import Options
 from warp_lcp.gallery import Plant, Problem, contact, planted, poisson
-from warp_lcp.gallery.banded import banded_matrix
+from warp_lcp.gallery.matrices import banded_matrix
 
 BLOCK = 6  # unknowns of a contact: normal, four tangents, slip speed
 ZEROS = 0.25  # share of zeros in x, of all experiments of Num4LCP

@@ -1,7 +1,6 @@
 // How near each cell is to yielding; a row's sums: cells that carry shear, yielded ones, dissipation, the most of a fraction predicted.
 #include "shape.h"
 #include "openings.h"
-#include "flux.h"
 #include "rate_bound.h"
 const float* share[3] = XYZ(share); const float* mass[3] = XYZ(mass); const double* rate[3] = XYZ(edge); const double* u[3] = XYZ(u);
 double cells = 0, yielded = 0, taken = 0, most = 0;

@@ -12,7 +12,6 @@ for (int c = 0; c < COLUMNS; ++c) partial[c*columns] = 0;
 #include "shape.h"
 #include "span.h"
 #include "openings.h"
-#include "flux.h"
 #include "rate_bound.h"
 #include "yield.h"
 const float* share[3] = XYZ(share); const float* mass[3] = XYZ(mass); const float* inverse[3] = XYZ(inverse);

@@ -1,6 +1,6 @@
 // A sweep over the pressure, the velocity kept up to date.
 #include "shape.h"
-#include "flux.h"
+#include "openings.h"
 const float* mass[3] = XYZ(mass); const float* inverse[3] = XYZ(inverse); T* u[3] = XYZ(u);
 for (int i = first; i < last; ++i) {
     float* x = now + i;

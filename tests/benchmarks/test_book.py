@@ -17,7 +17,7 @@ from warp_lcp.benchmarks.book.sizes import exponent
 from warp_lcp.benchmarks.book.traces import Merit, Trace, follow, judge, spread
 from warp_lcp.benchmarks.timing import Options
 from warp_lcp.cli import commands as cli
-from warp_lcp.gallery.banded import banded_matrix
+from warp_lcp.gallery.matrices import banded_matrix
 
 STATUS = wl.SolveStatus
 

@@ -69,7 +69,8 @@ def test_the_polyhedral_cone_converges_to_the_circular_one():
 def test_in_a_stack_velocities_converge_to_those_of_the_circular_cone():
     """Impulses of face contacts are not unique; velocities of what slides are. Boxes thrown along the ground in odd directions."""
     world = incline(3, angle=0.0, friction=0.3)
-    world.bodies.velocity[:, :2] = [[2.0, 0.7], [0.3, 1.1], [-1.3, 0.4]]
+    for body, thrown in zip(world.bodies, ([2.0, 0.7, 0.0], [0.3, 1.1, 0.0], [-1.3, 0.4, 0.0]), strict=True):
+        body.momentum = body.properties.mass * np.array(thrown)
     assembly = world.assemble(0.01)
     system = assembly.system
     r, residual, _ = proximal_sweeps(system, tolerance=1e-10, most=3000)

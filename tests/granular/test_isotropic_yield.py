@@ -7,7 +7,8 @@ import pytest
 import warp as wp
 
 from warp_lcp.granular.packing import Packing
-from warp_lcp.granular.stress import Stress, Walls, YieldSet
+from warp_lcp.granular.solids import Walls
+from warp_lcp.granular.stress import Stress, YieldSet
 from warp_lcp.grid.staggered import StaggeredGrid
 
 CELLS, PRESSURE, SLOPE, RATE = 6, 1.0, 0.5, 300.0  # cells an edge; p and k of the yield set [m/s]; shear of the flow, times dx [m/s]

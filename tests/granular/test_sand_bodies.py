@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from warp_lcp.granular.coupled import CoupledOutcome
+import warp_lcp as wl
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import FAR, GranularSimulator, SandSimulation
 from warp_lcp.granular.stress import Stress
-from warp_lcp.result import SolveStatus
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.simulation import SimulationFailed, StepFailed, Surface
 
@@ -217,17 +216,17 @@ def test_a_failed_solve_leaves_the_bodies_where_they_were(monkeypatch: pytest.Mo
 
 
 class Misses:
-    """A method for the stresses that leaves a residual."""
+    """In the place of a solve: stresses that leave a residual."""
 
-    decay = 1.0
+    def __init__(self, stress: Stress, residual: float) -> None:
+        self.stress, self.residual = stress, residual
 
-    def __init__(self, residual: float) -> None:
-        self.residual = residual
-
-    def solve(self, stress: Stress, **_: Any) -> CoupledOutcome:
-        stress.now.fill_(7.0)
-        stress.residual()
-        return CoupledOutcome(SolveStatus.STAGNATED, 310, self.residual, 0.0, [(0, 5.0), (310, self.residual)])
+    def __call__(self, scale: float) -> wl.SolveResult:
+        self.stress.now.fill_(7.0)
+        self.stress.residual()
+        self.stress.last_residual = self.residual * scale, 0.0
+        history = [wl.Record(0, 5.0 * scale, 0, None, "start", 0.0)]
+        return wl.SolveResult(self.stress.now, wl.SolveStatus.STAGNATED, 310, 310, self.residual * scale, self.residual / 5.0, history)
 
 
 def test_stresses_that_are_far_off_fail_a_step_that_can_be_taken_again(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -236,7 +235,7 @@ def test_stresses_that_are_far_off_fail_a_step_that_can_be_taken_again(monkeypat
     for simulation in twins:
         simulation.step(0.004)
     with monkeypatch.context() as patch:
-        patch.setattr(twins[0], "method", Misses(1.5 * FAR))
+        patch.setattr(twins[0], "solve_stress", Misses(twins[0].stress, 1.5 * FAR))
         with pytest.raises(StepFailed, match=r"STAGNATED after 310 iterations at a residual of 1.50e\+00 rho g dx .*no way out"):
             twins[0].step(0.004)
     for simulation in twins:
@@ -244,7 +243,7 @@ def test_stresses_that_are_far_off_fail_a_step_that_can_be_taken_again(monkeypat
     first, second = (simulation.state() for simulation in twins)
     for name, value in first.items():
         assert np.array_equal(value, second[name]), name
-    monkeypatch.setattr(twins[0], "method", Misses(0.9 * FAR))
+    monkeypatch.setattr(twins[0], "solve_stress", Misses(twins[0].stress, 0.9 * FAR))
     assert twins[0].step(0.001)["solve_status"] == "STAGNATED"
 
 

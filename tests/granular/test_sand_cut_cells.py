@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 import warp as wp
 
+import warp_lcp as wl
 from warp_lcp.benchmarks.validation import sand_oblique
 from warp_lcp.granular.coupled import AcceleratedProjection
 from warp_lcp.granular.cut_walls import CutWalls
 from warp_lcp.granular.packing import SHEARS, Packing
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import GranularSimulator, SandSimulation
-from warp_lcp.granular.solids import SandSolids
-from warp_lcp.granular.stress import Stress, Walls, YieldSet
+from warp_lcp.granular.solids import SandSolids, Walls
+from warp_lcp.granular.stress import Stress, YieldSet
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.solids import Plane
 from warp_lcp.grid.staggered import StaggeredGrid
@@ -55,7 +56,8 @@ class Case:
         self.stress.kick_dt = DT
 
     def solve(self, tolerance: float = 1e-4) -> None:
-        AcceleratedProjection().solve(self.stress, scale=G * DT, tolerance=tolerance, max_iterations=4000)
+        stopping = wl.StoppingCriteria(rtol=0.0, atol=tolerance * G * DT, max_iterations=4000)
+        wl.solve(self.stress, AcceleratedProjection(), stopping=stopping)
 
 
 def along(values: np.ndarray, axis: int, by: int) -> np.ndarray:

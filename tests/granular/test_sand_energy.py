@@ -6,10 +6,11 @@ import warp as wp
 from test_sand_stress import Case, make, velocity
 
 from small_sands import advance, box, create, scene
-from warp_lcp.granular.checkerboard import DAMPED, damping_pass
 from warp_lcp.granular.packing import Packing
 from warp_lcp.granular.report import Outcome
-from warp_lcp.granular.stress import Stress, Walls, YieldSet
+from warp_lcp.granular.solids import Walls
+from warp_lcp.granular.stress import Stress, YieldSet
+from warp_lcp.granular.stress_kernels import DAMPED
 from warp_lcp.granular.yield_set import xyz
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
@@ -31,7 +32,7 @@ def test_dissipation_is_the_power_of_friction(dimension: int, seed: int) -> None
     now = without_trace(case)
     case.stress.now.assign(now)
     case.stress.residual()
-    found = Outcome(case.stress).report().dissipation
+    found = Outcome(case.stress).report(1.0)["dissipation"]
     u = velocity(case)
     friction = now.copy()
     friction[0] = 0.0
@@ -66,7 +67,7 @@ def test_the_checkerboard_that_is_damped_moves_nothing(dimension: int) -> None:
     stress.residual()
     before = [field.numpy().copy() for field in stress.checked.u]
     given = {"flags": packing.flags, "source": wp.clone(stress.now), "now": stress.now} | xyz(share=packing.share)
-    grid.domain.run(damping_pass(dimension), **given)
+    grid.domain.run(stress.velocity.passes.damp, **given)
     stress.residual()
     deep = (slice(5, 7) if dimension == 3 else slice(1, 2), slice(5, 7), slice(5, 7))
     taken = start[0][deep] - stress.now.numpy()[0][deep]

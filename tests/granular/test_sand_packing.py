@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_lcp.granular.packing import Packing, wall_faces
+from warp_lcp.granular.packing import Packing
+from warp_lcp.granular.solids import wall_faces
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
 

@@ -5,7 +5,7 @@ import numpy as np
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import RigidBody
 from warp_lcp.rigid.mass_properties import mass_properties
-from warp_lcp.rigid.surroundings import Surroundings, domain_walls, obstacle
+from warp_lcp.rigid.obstacles import domain_walls, obstacle
 
 GRAVITY = np.array([0.0, -9.81, 0.0])
 SIDES = 0b111111
@@ -18,7 +18,7 @@ def bodies_of(geometries, dimension, *, solids=(), open_sides=0, density=500.0, 
         for n, shape in enumerate(geometries)
     ]
     walls = domain_walls([1.0] * dimension, open_sides=open_sides)
-    around = Surroundings((walls, *(obstacle(solid, dimension) for solid in solids)))
+    around = (walls, *(obstacle(solid, dimension) for solid in solids))
     return RigidBodies(bodies, geometries, [1 + n for n in range(len(geometries))], around, dimension)
 
 

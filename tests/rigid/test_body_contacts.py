@@ -8,9 +8,9 @@ from warp_lcp.grid.motion import Pose, Rotation, Translation
 from warp_lcp.grid.solids import Box, Capsule, Placement, Plane, Sphere, TriangleMesh
 from warp_lcp.grid.triangle_mesh import builtin_mesh
 from warp_lcp.grid.voxelize import PlacedSolid
+from warp_lcp.rigid.contact_detection import between, on_plane
 from warp_lcp.rigid.contact_shape import ContactShape
-from warp_lcp.rigid.contacts import between, on_planes
-from warp_lcp.rigid.surroundings import Obstacle
+from warp_lcp.rigid.obstacles import Obstacle
 
 G = 9.81
 
@@ -298,7 +298,7 @@ def test_contacts_point_from_the_other_to_the_one():
 @pytest.mark.parametrize("gap", [0.06, -0.02])
 def test_a_contact_lies_halfway_between_the_surfaces(gap):
     shape, pose = ContactShape.of(Sphere(center=[0.0, 0.0, 0.0], radius=0.1), 3), Pose(np.eye(3), np.array([0.5, 0.1 + gap, 0.5]))
-    touch = on_planes(shape, pose, np.zeros((1, 3)), np.array([[0.0, 1.0, 0.0]]), 0.1, 3)
+    touch = on_plane(shape, pose, np.zeros(3), np.array([0.0, 1.0, 0.0]), 0.1)
     np.testing.assert_allclose(touch.point, [[0.5, 0.5 * gap, 0.5]], atol=1e-12)
     np.testing.assert_allclose(touch.gap, gap)
 

@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+import scipy.sparse
 import warp as wp
 from bodies_at_hand import GRAVITY, bodies_of, run
 
 import warp_lcp as wl
+from warp_lcp.gallery.contact_models import BoxedModel, ContactSystem
 from warp_lcp.grid.solids import Box, Sphere
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.rigid.contact_problem import ContactProblem
@@ -36,7 +38,8 @@ def test_impulses_solve_the_lcp_with_affine_bounds(dimension, seed):
     """The residual is recomputed by the package from the matrix, and its own NNCG finds the same impulses."""
     made = problem_of(dimension, seed)
     x, relative = made.solve(EXACT)
-    problem = made.lcp()
+    system = ContactSystem("", scipy.sparse.csr_array(made.matrix()), made.b.ravel(), made.friction, dim=dimension)
+    problem = BoxedModel().problem(system).dense().lcp(device="cpu")
     residual, field = NaturalResidual(problem), problem.layout.load(x.ravel(), wp.float64, "x")
     problem.bounds.refresh()
     norm, none = (residual.evaluate(values) for values in (field, problem.layout.zeros(wp.float64)))

@@ -121,6 +121,15 @@ def test_the_inverse_mass_of_a_turned_body_is_exactly_symmetric(spread):
         np.testing.assert_allclose(W[3:, 3:], axes @ np.diag(1.0 / moments) @ axes.T, rtol=0.0, atol=1e-15 * spread * np.abs(W).max())
 
 
+def test_turns_are_scipys():
+    rng = np.random.default_rng(77)
+    for size in (0.0, 1e-9, 0.3, np.pi, 9.0):
+        vector, top = rng.standard_normal(3), body()
+        vector *= size / np.linalg.norm(vector)
+        top.shift(np.concatenate([np.zeros(3), vector]))
+        np.testing.assert_allclose(top.rotation, Rotation.from_rotvec(vector).as_matrix(), atol=1e-14)
+
+
 def test_gravity_gives_the_velocity_of_fall():
     ball = body(velocity=np.array([1.0, 0.0, 0.0]))
     ball.accelerate(np.array([0.0, -9.81, 0.0]), 0.1)

@@ -5,7 +5,7 @@ import pytest
 
 import warp_lcp as wl
 from oracle import natural_residual
-from warp_lcp.gallery.contact import contact
+from warp_lcp.gallery.contact_scenes import contact
 
 
 def dense(problem, scale=1.0):

@@ -7,9 +7,9 @@ import warp as wp
 
 import warp_lcp as wl
 from oracle import assemble, boxed, lemke, natural_residual
-from warp_lcp.gallery.contact import contact
+from warp_lcp.gallery.contact_scenes import contact
+from warp_lcp.gallery.matrices import semidefinite
 from warp_lcp.gallery.obstacle import ball_obstacle
-from warp_lcp.gallery.psd import semidefinite
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.solvers.fischer_newton import FischerNewton
 from warp_lcp.solvers.globalization import NonmonotoneSearch

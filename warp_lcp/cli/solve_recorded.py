@@ -12,7 +12,7 @@ import numpy as np
 
 from warp_lcp.cli.solve_file import Outcome, criteria, method_named
 from warp_lcp.frames.atomic import replacing
-from warp_lcp.gallery.recorded_part import cell_counts, load_part
+from warp_lcp.gallery.recorded import cell_counts, load_part
 from warp_lcp.operators import GridPoisson
 from warp_lcp.problem import LCP
 from warp_lcp.run.problem_folder import ProblemError

@@ -1,17 +1,15 @@
 """Problems to try methods on, each deterministic by its seed; most with a known solution."""
 
-from warp_lcp.gallery.banded import banded
-from warp_lcp.gallery.contact import contact
 from warp_lcp.gallery.contact_models import BoxedModel, ContactSystem, FrozenBoxModel, StewartTrinkleModel, proximal_sweeps
-from warp_lcp.gallery.contact_scenes import SCENES, contact_scene
+from warp_lcp.gallery.contact_scenes import SCENES, contact, contact_scene
 from warp_lcp.gallery.contact_stepper import ContactStepper
 from warp_lcp.gallery.families import FAMILIES
 from warp_lcp.gallery.fclib import FclibProblem, read_fclib
 from warp_lcp.gallery.fluid import Splash, basin, splash
+from warp_lcp.gallery.matrices import banded, definite, period_three, semidefinite, skewed
 from warp_lcp.gallery.obstacle import ball_obstacle, dam, torsion
 from warp_lcp.gallery.planted import Plant, planted, poisson
 from warp_lcp.gallery.problem import FACTS, Problem
-from warp_lcp.gallery.psd import definite, period_three, semidefinite, skewed
 from warp_lcp.gallery.rigid_world import World
 
 __all__ = [

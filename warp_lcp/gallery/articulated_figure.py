@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 Vector = np.ndarray
 Z = (0.0, 0.0, 1.0)
@@ -87,16 +88,9 @@ class ArticulatedFigure:
         links = np.linalg.norm(self.offsets, axis=1) * (np.array(self.parents) >= 0)
         return float((self.ancestors @ links + np.linalg.norm(self.tips, axis=1)).max())
 
-    @cached_property
-    def _generators(self) -> tuple[Vector, Vector]:
-        """K with K v = axis x v, and K K, shape (n, 3, 3) each."""
-        K = np.cross(self.axes[:, None], np.eye(3)).transpose(0, 2, 1)
-        return K, K @ K
-
     def _frames(self, theta: Vector) -> tuple[Vector, Vector, Vector]:
         """Return the hinges' places (n, 3), their axes (n, 3) and the end effectors (e, 3), in the world."""
-        K, square = self._generators
-        own = np.eye(3) + np.sin(theta)[:, None, None] * K + (1 - np.cos(theta))[:, None, None] * square  # Rodrigues
+        own = Rotation.from_rotvec(theta[:, None] * self.axes).as_matrix()
         places, turns = self.offsets.copy(), own.copy()
         for j, parent in enumerate(self.parents):
             if parent >= 0:

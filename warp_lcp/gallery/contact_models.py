@@ -6,6 +6,7 @@ All start from a `ContactSystem`: relative velocities at the contacts after impu
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import groupby
 from typing import Protocol
 
 import numpy as np
@@ -76,16 +77,10 @@ class ContactSystem:
         """Return the rows of each contact, then joints' rows: equations that follow each other, at most `most`, bounded ones alone."""
         blocks = list(np.arange(self.dim * self.contacts).reshape(self.contacts, self.dim))
         free = np.isinf(self.lower) & np.isinf(self.upper)
-        current: list[int] = []
-        for row, equation in zip(self.joints, free, strict=True):
-            if current and (not equation or len(current) == most):
-                blocks.append(np.array(current))
-                current = []
-            if equation:
-                current.append(int(row))
-            else:
-                blocks.append(np.array([row]))
-        return [*blocks, np.array(current)] if current else blocks
+        for equations, group in groupby(zip(self.joints, free, strict=True), key=lambda entry: entry[1]):
+            rows = np.array([row for row, _ in group])
+            blocks += np.split(rows, range(most if equations else 1, len(rows), most if equations else 1))
+        return blocks
 
     def staggered(self) -> list[np.ndarray]:
         """Return the rows of normal impulses and joints, and those of friction: two blocks, or one where there is no contact."""
@@ -142,7 +137,7 @@ class BoxedModel:
     """
 
     def problem(self, system: ContactSystem) -> Problem:
-        """Return the boxed problem."""
+        """Return the boxed problem: its x are the impulses r."""
         n, normal, mu = len(system.q), np.full(len(system.q), -1), np.zeros(len(system.q))
         normal[system.tangents] = system.normals[:, None]
         mu[system.tangents] = system.friction[:, None]
@@ -153,11 +148,11 @@ class BoxedModel:
         return Problem(f"{system.name}: boxed", system.B, system.q, lower, upper, None, frozenset(facts))
 
     def impulses(self, system: ContactSystem, x: np.ndarray) -> np.ndarray:
-        """Return x: it is r."""
+        """Return x, which are the impulses themselves."""
         return x
 
     def guess(self, system: ContactSystem, r: np.ndarray) -> np.ndarray:
-        """Return r within its bounds."""
+        """Return r clipped to the bounds that it makes."""
         x = r.copy()
         x[system.joints] = np.clip(x[system.joints], system.lower, system.upper)
         x[system.normals] = np.maximum(x[system.normals], 0.0)
@@ -196,18 +191,18 @@ class StewartTrinkleModel:
     cos(pi / K). In the plane the vectors are +-t, K = 2, whatever `directions` is.
 
     Args:
-        directions: K, even and >= 4.
+        directions: K, even; 2 are opposite, and friction acts along one tangent alone.
 
     Raises:
-        ValueError: it is not.
+        ValueError: K is odd, or less than 2.
     """
 
     directions: int = 4
 
     def __post_init__(self) -> None:
-        """Check K."""
-        if self.directions < 4 or self.directions % 2:
-            raise ValueError(f"directions = {self.directions}: must be an even number >= 4")
+        """Check that K is even and there are two at least."""
+        if self.directions < 2 or self.directions % 2:
+            raise ValueError(f"directions = {self.directions}: must be an even number >= 2")
 
     def spread(self, dim: int) -> np.ndarray:
         """Return normal and the K vectors as rows in a contact's frame, shape (1 + K, dim)."""
@@ -216,12 +211,16 @@ class StewartTrinkleModel:
         around = np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, : dim - 1]
         return np.block([[np.ones((1, 1)), np.zeros((1, dim - 1))], [np.zeros((K, 1)), around]])
 
+    def unfold(self, system: ContactSystem) -> scipy.sparse.csr_array:
+        """Return T: impulses are r = T'x of the unknowns x, velocities along the vectors T u; shape (unknowns, rows of B)."""
+        each = np.vstack([self.spread(system.dim), np.zeros(system.dim)])
+        blocks = [scipy.sparse.kron(scipy.sparse.eye_array(system.contacts), each), scipy.sparse.eye_array(len(system.lower))]
+        return scipy.sparse.csr_array(scipy.sparse.block_diag(blocks))
+
     def problem(self, system: ContactSystem) -> Problem:
         """Return the LCP, mixed where joints have equations."""
-        k, m, spread = system.contacts, len(system.lower), self.spread(system.dim)
-        K = len(spread) - 1
-        joint = scipy.sparse.eye_array(m)
-        T = scipy.sparse.block_diag([scipy.sparse.kron(scipy.sparse.eye_array(k), np.vstack([spread, np.zeros(system.dim)])), joint])
+        k, m, T = system.contacts, len(system.lower), self.unfold(system)
+        K = len(self.spread(system.dim)) - 1
         beta = np.zeros((2 + K, 2 + K))
         beta[1:-1, -1], beta[-1, 1:-1] = 1.0, -1.0
         slope = np.zeros((2 + K, 2 + K))
@@ -237,9 +236,7 @@ class StewartTrinkleModel:
 
     def impulses(self, system: ContactSystem, x: np.ndarray) -> np.ndarray:
         """Return r: friction is summed over the vectors."""
-        k, spread = system.contacts, self.spread(system.dim)
-        own = x[: k * (1 + len(spread))].reshape(k, 1 + len(spread))[:, :-1] @ spread
-        return np.concatenate([own.ravel(), x[k * (1 + len(spread)) :]])
+        return np.asarray(self.unfold(system).T @ x)
 
     def guess(self, system: ContactSystem, r: np.ndarray) -> np.ndarray:
         """Return unknowns whose impulses are near r: friction split onto the two nearest vectors, beta from the slip at r."""
@@ -249,7 +246,7 @@ class StewartTrinkleModel:
         x = np.zeros((k, 1 + len(spread)))
         x[:, 0] = own[:, 0]
         K = len(spread) - 1
-        if dim == 2:
+        if K == 2:
             x[:, 1], x[:, 2] = np.maximum(own[:, 1], 0.0), np.maximum(-own[:, 1], 0.0)
         else:
             turn = np.arctan2(own[:, 2], own[:, 1]) % (2 * np.pi) * K / (2 * np.pi)

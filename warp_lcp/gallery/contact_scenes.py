@@ -5,24 +5,48 @@ Each makes a `World`, deterministic by its seed, in meters and kilograms; `conta
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.spatial.transform import Rotation
 
-from warp_lcp.gallery.contact_detection import Plane
-from warp_lcp.gallery.contact_models import BoxedModel, ContactModel
+from warp_lcp.gallery.contact_models import BoxedModel, ContactModel, ContactSystem, StewartTrinkleModel
 from warp_lcp.gallery.contact_stepper import ContactStepper
-from warp_lcp.gallery.hinges import Hinge
+from warp_lcp.gallery.hinges import WORLD, Hinge
 from warp_lcp.gallery.problem import Problem
-from warp_lcp.gallery.rigid_bodies import FIXED, Box, Gear, RigidBodies, Shape, Sphere, rotation
-from warp_lcp.gallery.rigid_world import GRAVITY, World
+from warp_lcp.gallery.rigid_world import FIXED, GRAVITY, Parts, World
+from warp_lcp.grid.solids import Box, Placement, Sphere
+from warp_lcp.rigid.contact_solve import contact_frames
+from warp_lcp.rigid.contacts import jacobian
+from warp_lcp.rigid.obstacles import Obstacle
 from warp_lcp.solvers.nncg import NNCG
 
 DENSITY = 1000.0  # [kg/m^3]
 Y_AXIS = np.array([0.0, 1.0, 0.0])
+BARS = 3  # of a gear, which has twice as many teeth
+LINK = (0.2, 0.12, 0.08)  # half sides of a snake's [m]
+Vector = Sequence[float] | np.ndarray
 
 
-def box_mass(half: tuple[float, float, float]) -> float:
+def box(center: Vector, half: Vector, turn: Rotation | None = None) -> Box:
+    """Return a box by its center and half sides [m], turned about the center."""
+    place = Placement(rotation=(turn or Rotation.identity()).as_matrix(), translation=np.array(center))
+    return Box(lower=tuple(-h for h in half), upper=tuple(half), placement=place)
+
+
+def gear(center: Vector, half: Vector, phase: float) -> list[Box]:
+    """Return BARS bars of half sides [m] that cross in the center, in the xz plane, the first at an angle [rad]."""
+    return [box(center, half, about((1.0, 0.0, 0.0), np.pi / 2) * about((0.0, 0.0, 1.0), phase + np.pi * k / BARS)) for k in range(BARS)]
+
+
+def about(axis: Vector, angle: float) -> Rotation:
+    """Return the rotation about a unit vector by an angle [rad]."""
+    return Rotation.from_rotvec(angle * np.array(axis))
+
+
+def box_mass(half: Vector) -> float:
     """Return the mass of a box of water [kg]."""
     return DENSITY * 8 * float(np.prod(half))
 
@@ -41,8 +65,8 @@ def sphere_stack(count: int = 6, *, seed: int = 2015) -> World:
     _check("count", count, 1)
     radius = 0.25
     mass = DENSITY * 4 / 3 * np.pi * radius**3 * np.random.default_rng(seed).uniform(0.9, 1.1, count)
-    position = [[0.0, 0.0, radius * (2 * i + 1)] for i in range(count)]
-    return World(f"stack of {count} spheres", RigidBodies([Sphere(radius)] * count, mass, position))
+    balls = [Sphere(center=[0.0, 0.0, radius * (2 * i + 1)], radius=radius) for i in range(count)]
+    return World(f"stack of {count} spheres", balls, mass)
 
 
 def box_stack(count: int = 10, *, seed: int = 2015) -> World:
@@ -54,8 +78,8 @@ def box_stack(count: int = 10, *, seed: int = 2015) -> World:
     _check("count", count, 1)
     half, rng = (0.25, 0.25, 0.25), np.random.default_rng(seed)
     position = [[*rng.uniform(-0.02, 0.02, 2), 0.25 + 0.5 * i] for i in range(count)]
-    turned = [rotation(np.array([0.0, 0.0, a])) for a in rng.uniform(-0.1, 0.1, count)]
-    return World(f"stack of {count} boxes", RigidBodies([Box(half)] * count, [box_mass(half)] * count, position, turned))
+    boxes = [box(x, half, about((0.0, 0.0, 1.0), a)) for x, a in zip(position, rng.uniform(-0.1, 0.1, count), strict=True)]
+    return World(f"stack of {count} boxes", boxes, [box_mass(half)] * count)
 
 
 def wall(rows: int = 4, *, columns: int = 4, seed: int = 2015) -> World:
@@ -66,17 +90,14 @@ def wall(rows: int = 4, *, columns: int = 4, seed: int = 2015) -> World:
     """
     _check("rows", rows, 1)
     _check("columns", columns, 1)
-    whole, half = Box((0.25, 0.125, 0.125)), Box((0.12375, 0.125, 0.125))
-    shapes: list[Shape] = []
-    position = []
+    whole, half = (0.25, 0.125, 0.125), (0.12375, 0.125, 0.125)
+    bricks = []
     for i in range(rows):
-        ends = [-0.12625, 0.505 * (columns - 1) + 0.12625] if i % 2 else []
-        centers = [*ends, *(0.505 * (j + 0.5 * (i % 2)) for j in range(columns - i % 2))]
-        shapes += [*([half] * len(ends)), *([whole] * (len(centers) - len(ends)))]
-        position += [[x, 0.0, 0.125 + 0.25 * i] for x in centers]
-    density = np.random.default_rng(seed).uniform(0.9, 1.1, len(position))
-    mass = [d * box_mass(s.half) for d, s in zip(density, shapes, strict=True) if isinstance(s, Box)]
-    return World(f"wall of {rows} x {columns} bricks", RigidBodies(shapes, mass, position))
+        bricks += [(x, i, half) for x in ([-0.12625, 0.505 * (columns - 1) + 0.12625] if i % 2 else [])]
+        bricks += [(0.505 * (j + 0.5 * (i % 2)), i, whole) for j in range(columns - i % 2)]
+    density = np.random.default_rng(seed).uniform(0.9, 1.1, len(bricks))
+    mass = [d * box_mass(sides) for d, (_, _, sides) in zip(density, bricks, strict=True)]
+    return World(f"wall of {rows} x {columns} bricks", [box((x, 0.0, 0.125 + 0.25 * i), sides) for x, i, sides in bricks], mass)
 
 
 def heavy_on_light(layers: int = 2, *, ratio: float = 1000.0, seed: int = 2015) -> World:
@@ -90,25 +111,34 @@ def heavy_on_light(layers: int = 2, *, ratio: float = 1000.0, seed: int = 2015) 
     small, large, rng = (0.125, 0.125, 0.125), (0.3, 0.3, 0.3), np.random.default_rng(seed)
     position = [[0.3 * i - 0.15, 0.3 * j - 0.15, 0.125 + 0.25 * k] for k in range(layers) for i in (0, 1) for j in (0, 1)]
     position = [[x + a, y + b, z] for (x, y, z), (a, b) in zip(position, rng.uniform(-0.01, 0.01, (len(position), 2)), strict=True)]
-    shapes: list[Shape] = [*([Box(small)] * len(position)), Box(large)]
-    light = box_mass(small)
-    bodies = RigidBodies(shapes, [*([light] * len(position)), ratio * light], [*position, [0.0, 0.0, 0.25 * layers + 0.3]])
-    return World(f"heavy box on {layers} layers, mass ratio {ratio:g}", bodies)
+    boxes, light = [*(box(x, small) for x in position), box([0.0, 0.0, 0.25 * layers + 0.3], large)], box_mass(small)
+    return World(f"heavy box on {layers} layers, mass ratio {ratio:g}", boxes, [*([light] * len(position)), ratio * light])
 
 
-def _arch(links: int) -> tuple[list[Shape], list[float], list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
-    """Return shapes, masses, centers, rotations and the points between links of half a regular polygon of links that stands on z = 0."""
-    half = (0.2, 0.12, 0.08)
+def _arch(links: int) -> tuple[list[Box], list[np.ndarray], np.ndarray]:
+    """Return half a regular polygon of links that stands on z = 0, the points between them, and the center of the one on top."""
     step = np.pi / links
-    radius = half[0] / np.tan(step / 2)
+    radius = LINK[0] / np.tan(step / 2)
+    up = np.array([0.0, 0.0, LINK[2] * np.sin(step / 2)])  # the first link leans by step / 2: its lowest corner is that far below its end
+
+    def at(distance: float, angle: float) -> np.ndarray:
+        return distance * np.array([np.cos(angle), 0.0, np.sin(angle)]) + up
+
     angles = np.pi - step * (np.arange(links) + 0.5)
-    lift = half[2] * np.sin(step / 2)  # the first link leans by step / 2 from the vertical: its lowest corner is that far below its end
-    up = np.array([0.0, 0.0, lift])
-    centers = [radius * np.array([np.cos(a), 0.0, np.sin(a)]) + up for a in angles]
-    turned = [rotation(-Y_AXIS * (a - np.pi / 2)) for a in angles]
-    outer = radius / np.cos(step / 2)
-    points = [outer * np.array([np.cos(a), 0.0, np.sin(a)]) + up for a in np.pi - step * np.arange(1, links)]
-    return [Box(half)] * links, [box_mass(half)] * links, centers, turned, points
+    boxes = [box(at(radius, a), LINK, about(-Y_AXIS, a - np.pi / 2)) for a in angles]
+    points = [at(radius / np.cos(step / 2), a) for a in np.pi - step * np.arange(1, links)]
+    return boxes, points, at(radius, angles[links // 2])
+
+
+def _chain(points: Sequence[Vector], limits: np.ndarray) -> tuple[Hinge, ...]:
+    """Return hinges between bodies that follow each other, which turn by up to a limit [rad] each either way."""
+    pairs = enumerate(zip(points, limits.tolist(), strict=True))
+    return tuple(Hinge(i + 1, i, np.array(at), Y_AXIS, (-limit, limit)) for i, (at, limit) in pairs)
+
+
+def _next_but_one(links: int) -> frozenset[tuple[int, int]]:
+    """Return the pairs of a chain's links with one between them, which hinges keep apart."""
+    return frozenset((i, i + 2) for i in range(links - 2))
 
 
 def arched_snake(links: int = 9, *, heavy: float = 0.0, seed: int = 2015) -> World:
@@ -128,19 +158,12 @@ def arched_snake(links: int = 9, *, heavy: float = 0.0, seed: int = 2015) -> Wor
     _check("heavy", heavy, 0.0)
     if links % 2 == 0:
         raise ValueError(f"links = {links}: must be odd, so that one is on top")
-    shapes, mass, centers, turned, points = _arch(links)
+    (boxes, points, top), mass, name = _arch(links), [box_mass(LINK)] * links, f"arched snake of {links} links"
     if heavy > 0:
-        top = centers[links // 2]
-        shapes, mass = [*shapes, Box((0.25, 0.25, 0.25))], [*mass, heavy * mass[0]]
-        centers, turned = [*centers, top + np.array([0.0, 0.0, 0.08 + 0.25])], [*turned, np.eye(3)]
-    bodies = RigidBodies(shapes, mass, centers, turned)
-    rng = np.random.default_rng(seed)
-    hinges = []
-    for i, point in enumerate(points):
-        limit = float(rng.uniform(0.02, 0.04))
-        hinges.append(Hinge.between(bodies, i + 1, i, point, Y_AXIS, limits=(-limit, limit)))
-    name = f"arched snake of {links} links" + (f" under a box of {heavy:g} links" if heavy > 0 else "")
-    return World(name, bodies, hinges=tuple(hinges), friction=0.8, ignored=frozenset((i, i + 2) for i in range(links - 2)))
+        boxes, mass = [*boxes, box(top + np.array([0.0, 0.0, 0.08 + 0.25]), (0.25, 0.25, 0.25))], [*mass, heavy * mass[0]]
+        name += f" under a box of {heavy:g} links"
+    hinges = _chain(points, np.random.default_rng(seed).uniform(0.02, 0.04, links - 1))
+    return World(name, boxes, mass, hinges=hinges, friction=0.8, ignored=_next_but_one(links))
 
 
 def hanging_snake(links: int = 8, *, seed: int = 2015) -> World:
@@ -150,15 +173,10 @@ def hanging_snake(links: int = 8, *, seed: int = 2015) -> World:
         ValueError: there are less than two links.
     """
     _check("links", links, 2)
-    half = (0.2, 0.12, 0.08)
-    position = [[0.42 * i, 0.0, 2.0] for i in range(links)]
-    bodies = RigidBodies([Box(half)] * links, [FIXED, *([box_mass(half)] * (links - 1))], position)
-    limits = np.random.default_rng(seed).uniform(0.02, 0.05, links - 1)
-    hinges = [
-        Hinge.between(bodies, i + 1, i, np.array([0.42 * i + 0.21, 0.0, 2.0]), Y_AXIS, limits=(-float(a), float(a)))
-        for i, a in enumerate(limits)
-    ]
-    return World(f"hanging snake of {links} links", bodies, hinges=tuple(hinges), ignored=frozenset((i, i + 2) for i in range(links - 2)))
+    boxes, mass = [box([0.42 * i, 0.0, 2.0], LINK) for i in range(links)], [FIXED, *([box_mass(LINK)] * (links - 1))]
+    points = [(0.42 * i + 0.21, 0.0, 2.0) for i in range(links - 1)]
+    hinges = _chain(points, np.random.default_rng(seed).uniform(0.02, 0.05, links - 1))
+    return World(f"hanging snake of {links} links", boxes, mass, hinges=hinges, ignored=_next_but_one(links))
 
 
 def incline(count: int = 1, *, angle: float = 0.3, friction: float = 0.5, seed: int = 2015) -> World:
@@ -178,13 +196,11 @@ def incline(count: int = 1, *, angle: float = 0.3, friction: float = 0.5, seed: 
     _check("count", count, 1)
     if not 0 <= angle < np.pi / 2:
         raise ValueError(f"angle = {angle}: must be in [0, pi / 2), in rad")
-    half = (0.25, 0.25, 0.125)
-    R = rotation(Y_AXIS * angle)
-    position = [R @ np.array([0.8 * i, 0.0, half[2]]) for i in range(count)]
+    half, turn = (0.25, 0.25, 0.125), about(Y_AXIS, angle)
+    boxes = [box(turn.apply([0.8 * i, 0.0, half[2]]), half, turn) for i in range(count)]
     mass = box_mass(half) * np.random.default_rng(seed).uniform(0.9, 1.1, count)
-    bodies = RigidBodies([Box(half)] * count, mass, position, [R] * count)
-    normal = (float(R[0, 2]), 0.0, float(R[2, 2]))
-    return World(f"{count} boxes on a slope of {angle:g} rad", bodies, planes=(Plane(normal),), friction=friction)
+    slope = Obstacle(name="slope", points=np.zeros((1, 3)), normals=turn.apply([[0.0, 0.0, 1.0]]))
+    return World(f"{count} boxes on a slope of {angle:g} rad", boxes, mass, (slope,), friction=friction)
 
 
 def leaning_wall(rows: int = 4, *, columns: int = 3, angle: float = 0.25, seed: int = 2015) -> World:
@@ -196,8 +212,8 @@ def leaning_wall(rows: int = 4, *, columns: int = 3, angle: float = 0.25, seed: 
     flat = wall(rows, columns=columns, seed=seed)
     if not 0 <= angle < np.pi / 2:
         raise ValueError(f"angle = {angle}: must be in [0, pi / 2), in rad")
-    gravity = tuple(float(v) for v in rotation(-Y_AXIS * angle) @ np.array(GRAVITY))
-    return World(f"wall of {rows} x {columns} bricks leaning by {angle:g} rad", flat.bodies, gravity=(gravity[0], gravity[1], gravity[2]))
+    x, y, z = about(-Y_AXIS, angle).apply(GRAVITY).tolist()
+    return World(f"wall of {rows} x {columns} bricks leaning by {angle:g} rad", flat.solids, flat.mass, gravity=(x, y, z))
 
 
 def gear_pyramid(rows: int = 3, *, seed: int = 2015) -> World:
@@ -209,22 +225,18 @@ def gear_pyramid(rows: int = 3, *, seed: int = 2015) -> World:
         ValueError: there is no row.
     """
     _check("rows", rows, 1)
-    gear, pitch = Gear(0.3, 0.05, 0.1, 3), 0.62
-    upright = rotation(np.array([np.pi / 2, 0.0, 0.0]))  # the gears' plane is xz
-    rng = np.random.default_rng(seed)
-    position, turned = [], []
+    half, pitch, rng = (0.3, 0.05, 0.1), 0.62, np.random.default_rng(seed)
+    solids: list[Parts] = []
     for row in range(rows):
         for i in range(rows - row):
-            position.append([pitch * (i + 0.5 * row), 0.0, 0.31 + 0.62 * row])
-            turned.append(upright @ rotation(np.array([0.0, 0.0, float(rng.uniform(-0.02, 0.02)) + np.pi / 6 * (row % 2)])))
-    mass = DENSITY * 8 * gear.radius * gear.tooth * gear.thickness * gear.bars
-    post = Box((0.05, 0.3, 0.3))
-    sides = [[-0.37, 0.0, 0.3], [pitch * (rows - 1) + 0.37, 0.0, 0.3]]
-    shapes: list[Shape] = [*([gear] * len(position)), post, post]
-    masses = [*([mass] * len(position)), FIXED, FIXED]
-    bodies = RigidBodies(shapes, masses, [*position, *sides], [*turned, np.eye(3), np.eye(3)])
-    planes = (Plane((0.0, 0.0, 1.0)), Plane((0.0, 1.0, 0.0), -0.101), Plane((0.0, -1.0, 0.0), -0.101))
-    return World(f"pyramid of {len(position)} gears", bodies, planes=planes, friction=0.4)
+            phase = float(rng.uniform(-0.02, 0.02)) + np.pi / 6 * (row % 2)
+            solids.append(gear([pitch * (i + 0.5 * row), 0.0, 0.31 + 0.62 * row], half, phase))
+    gears = len(solids)
+    solids += [box([x, 0.0, 0.3], (0.05, 0.3, 0.3)) for x in (-0.37, pitch * (rows - 1) + 0.37)]
+    points, normals = [[0.0, 0.0, 0.0], [0.0, -0.101, 0.0], [0.0, 0.101, 0.0]], [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]]
+    frame = Obstacle(name="ground and panes", points=np.array(points), normals=np.array(normals))
+    mass = [*([BARS * box_mass(half)] * gears), FIXED, FIXED]
+    return World(f"pyramid of {gears} gears", solids, mass, (frame,), friction=0.4)
 
 
 def motor_arm(links: int = 4, *, torque: float = 400.0, seed: int = 2015) -> World:
@@ -238,14 +250,11 @@ def motor_arm(links: int = 4, *, torque: float = 400.0, seed: int = 2015) -> Wor
     _check("links", links, 1)
     _check("torque", torque, 0.0)
     half, rng = (0.2, 0.08, 0.08), np.random.default_rng(seed)
-    position = [[0.0, 0.0, 1.0], *([0.42 * i, 0.0, 1.0] for i in range(1, links + 1))]
-    bodies = RigidBodies([Box(half)] * (links + 1), [FIXED, *([box_mass(half)] * links)], position)
-    hinges = []
+    boxes, hinges = [box([0.42 * i, 0.0, 1.0], half) for i in range(links + 1)], []
     for i in range(links):
-        anchor = np.array([0.42 * i + 0.21, 0.0, 1.0])
-        most, speed = torque * ((links - i) / links) ** 2, float(rng.uniform(-0.5, 0.5))
-        hinges.append(Hinge.between(bodies, i + 1, i, anchor, Y_AXIS, limits=(-1.0, 1.0), motor_speed=speed, motor_torque=most))
-    return World(f"arm of {links} motors", bodies, hinges=tuple(hinges))
+        anchor, most = np.array([0.42 * i + 0.21, 0.0, 1.0]), torque * ((links - i) / links) ** 2
+        hinges.append(Hinge(i + 1, i, anchor, Y_AXIS, (-1.0, 1.0), motor_speed=float(rng.uniform(-0.5, 0.5)), motor_torque=most))
+    return World(f"arm of {links} motors", boxes, [FIXED, *([box_mass(half)] * links)], hinges=tuple(hinges))
 
 
 def driven_gears(count: int = 3, *, seed: int = 2015) -> World:
@@ -255,16 +264,50 @@ def driven_gears(count: int = 3, *, seed: int = 2015) -> World:
         ValueError: there is no gear.
     """
     _check("count", count, 1)
-    gear, pitch = Gear(0.3, 0.04, 0.1, 3), 0.5
-    upright = rotation(np.array([np.pi / 2, 0.0, 0.0]))
-    phase = float(np.random.default_rng(seed).uniform(-0.05, 0.05))
-    turned = [upright @ rotation(np.array([0.0, 0.0, (np.pi / 6) * (i % 2) + phase * (-1) ** i])) for i in range(count)]
-    position = np.array([[pitch * i, 0.0, 1.0] for i in range(count)])
-    mass = DENSITY * 8 * gear.radius * gear.tooth * gear.thickness * gear.bars
-    bodies = RigidBodies([gear] * count, [mass] * count, position, turned)
-    hinges = [Hinge.between(bodies, 0, -1, position[0], Y_AXIS, motor_speed=1.0, motor_torque=50.0)]
-    hinges += [Hinge.between(bodies, i, -1, position[i], Y_AXIS) for i in range(1, count)]
-    return World(f"{count} driven gears", bodies, hinges=tuple(hinges), friction=0.2)
+    half, phase = (0.3, 0.04, 0.1), float(np.random.default_rng(seed).uniform(-0.05, 0.05))
+    gears = [gear([0.5 * i, 0.0, 1.0], half, np.pi / 6 * (i % 2) + phase * (-1) ** i) for i in range(count)]
+    torques = [50.0] + [0.0] * (count - 1)
+    axles = [Hinge(i, WORLD, np.array([0.5 * i, 0.0, 1.0]), Y_AXIS, motor_speed=1.0, motor_torque=t) for i, t in enumerate(torques)]
+    return World(f"{count} driven gears", gears, [BARS * box_mass(half)] * count, hinges=tuple(axles), friction=0.2)
+
+
+def contact(contacts: int, *, directions: int = 4, bodies: int | None = None, friction: float = 0.5, seed: int = 2015) -> Problem:
+    """Return the impulse problem of random bodies that touch, in the model of Stewart and Trinkle ([Book] 1.3.5).
+
+    Bodies are balls of radius 1 with velocities v; each contact joins one to another or to the ground at a random point of its surface, the
+    tangents turned at random. Whatever v is there is a solution (Anitescu, Potra), which Lemke's method finds; impulses need not be unique.
+
+    Args:
+        contacts: how many; a problem has (2 + directions) contacts unknowns.
+        directions: tangents of a contact, an even number >= 2.
+        bodies: how many; half as many as contacts if None.
+        friction: coefficient mu >= 0.
+        seed: of all choices.
+
+    Raises:
+        ValueError: an argument is out of range.
+    """
+    model = StewartTrinkleModel(directions)
+    if contacts < 1 or not friction >= 0:
+        raise ValueError(f"contacts = {contacts}, friction = {friction}: at least one contact, friction >= 0")
+    bodies = bodies or max(1, contacts // 2)
+    rng, first = np.random.default_rng(seed), np.arange(contacts) % bodies  # every body has a contact
+    second, one, other = np.full(contacts, bodies), np.zeros((contacts, 3, 6)), np.zeros((contacts, 3, 6))
+    for k in range(contacts):
+        j, normal = int(rng.integers(-1, bodies)), rng.standard_normal(3)
+        normal /= np.linalg.norm(normal)
+        frame = about(normal, rng.uniform(0, 2 * np.pi)).apply(contact_frames(normal[None], 3)[0])
+        arm = -frame[0] + 0.1 * rng.standard_normal(3)
+        one[k] = np.hstack([frame, np.cross(arm, frame)])
+        if j not in (-1, first[k]):
+            second[k], other[k] = j, -np.hstack([frame, np.cross(-arm, frame)])
+    J = jacobian(first, second, one, other, bodies)
+    mass = rng.uniform(0.5, 2.0, bodies)
+    inverse_mass = np.repeat(1 / mass, 6) * np.tile([1.0, 1.0, 1.0, 2.5, 2.5, 2.5], bodies)  # a solid sphere's inertia is 2/5 m r^2
+    B = csr_array(J @ (inverse_mass[:, None] * J.toarray().T))
+    system = ContactSystem("", B, J @ rng.standard_normal(6 * bodies), np.full(contacts, friction))
+    facts = frozenset({"copositive", "solvable"})
+    return replace(model.problem(system).dense(), name=f"contact {contacts} x {directions} directions", facts=facts)
 
 
 SCENES: dict[str, Callable[..., World]] = {

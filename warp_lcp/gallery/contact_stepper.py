@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.gallery.contact_detection import Contacts
 from warp_lcp.gallery.contact_models import BoxedModel, ContactModel, ContactSystem
 from warp_lcp.gallery.rigid_world import Assembly, World
 from warp_lcp.operators.sparse import SparseOperator
@@ -22,7 +21,6 @@ from warp_lcp.solvers.psor import ProjectedSOR
 from warp_lcp.stopping import StoppingCriteria
 
 STABILIZATIONS = ("baumgarte", "split", "none")
-SAME_POINT = 0.2  # of the smallest body's reach: how far a contact may have moved to be known again
 
 
 @dataclass(frozen=True)
@@ -52,7 +50,7 @@ class ContactStepper:
     v' = v + dt g + M^-1 J'r, x' = x + dt v'. Overlaps are removed by what is added to the normal velocity: "baumgarte" adds a part of
     the overlap over dt in the problem itself, which bodies keep as velocity; "split" moves bodies by a second, frictionless problem's
     velocities, which are forgotten (50 sweeps of projected Gauss-Seidel); "none" leaves them. Impulses start from those of the step
-    before at the same contacts, known by the bodies and the place.
+    before at the same contacts, as `ContactMemory` knows them.
 
     Args:
         world: what moves; its state is written.
@@ -73,7 +71,7 @@ class ContactStepper:
         >>> from warp_lcp.gallery.contact_scenes import box_stack
         >>> world = box_stack(1)
         >>> report = ContactStepper(world, dt=0.01).step()
-        >>> weight = float(world.bodies.mass[0]) * 9.81 * 0.01
+        >>> weight = world.bodies[0].properties.mass * 9.81 * 0.01
         >>> print(report.contacts, abs(report.impulses[::3].sum() - weight) < 1e-4 * weight)
         4 True
     """
@@ -101,24 +99,28 @@ class ContactStepper:
         self.stabilization, self.device = stabilization, device or "cpu"
         self.stopping = stopping or StoppingCriteria(rtol=1e-6, max_iterations=500, patience=500)
         self.time = 0.0
-        self._last: tuple[Contacts, np.ndarray, np.ndarray] | None = None
+        self._joints: np.ndarray | None = None  # impulses of the last step; those of contacts are in the world's memory
 
     def step(self) -> StepReport:
-        """Advance by dt."""
-        bodies, dt = self.world.bodies, self.dt
-        assembly = self.world.assemble(dt, rate=self.rate if self.stabilization == "baumgarte" else 0.0)
+        """Advance the world by dt, and return what the solve did."""
+        world, dt = self.world, self.dt
+        assembly = world.assemble(dt, rate=self.rate if self.stabilization == "baumgarte" else 0.0)
         system = assembly.system
         r, iterations, residual, status = np.zeros(len(system.q)), 0, 0.0, SolveStatus.CONVERGED
         if r.size:
             r, iterations, residual, status = self._solve(assembly)
-        before = bodies.velocity
-        bodies.velocity = np.where(bodies.free[:, None], assembly.velocity(r), before)
-        self._last = (assembly.contacts, self._forces(assembly.contacts, r), r[system.joints])
-        shift = self._separation() if self.stabilization == "split" and r.size else None
-        bodies.move(dt)
-        if shift is not None:
-            bodies.position += dt * shift[:, :3]
-            bodies.turn(dt * shift[:, 3:])
+        moving = np.flatnonzero(~world.fixed)
+        impulses = (assembly.J.T @ r).reshape(-1, 6)
+        for i in moving:
+            world.bodies[i].accelerate(np.array(world.gravity), dt)
+            world.bodies[i].push(impulses[i])
+        world.contact_solve.memory.keep(assembly.contacts, r[: 3 * system.contacts].reshape(-1, 3), world.bodies)
+        self._joints = r[system.joints]
+        ways = dt * self._separation() if self.stabilization == "split" and r.size else None
+        for i in moving:
+            world.bodies[i].advance(dt)
+            if ways is not None:
+                world.bodies[i].shift(ways[i])
         self.time += dt
         return StepReport(self.time, system.contacts, iterations, residual, status, r)
 
@@ -129,47 +131,27 @@ class ContactStepper:
         if not hasattr(method, "step"):
             method = method(system)
         problem = self.model.problem(system).lcp(device=self.device)
-        x0 = self.model.guess(system, self._guess(assembly)) if self.warm and self._last is not None else None
+        x0 = self.model.guess(system, self._guess(assembly)) if self.warm and self._joints is not None else None
         result = solve(problem, method, stopping=self.stopping, x0=x0)
         return self.model.impulses(system, result.x.numpy()), result.iterations, result.relative_residual, result.status
 
-    def _forces(self, contacts: Contacts, r: np.ndarray) -> np.ndarray:
-        """Return the impulse of each contact as a vector in the world [N s], shape (k, 3)."""
-        return np.einsum("kij,ki->kj", contacts.frames(), r[: 3 * len(contacts)].reshape(-1, 3)) if len(contacts) else np.zeros((0, 3))
-
     def _guess(self, assembly: Assembly) -> np.ndarray:
-        """Return impulses of the step before where a contact of the same bodies was nearest, 0 for new ones."""
-        assert self._last is not None
-        old, forces, joints = self._last
-        contacts, system, r = assembly.contacts, assembly.system, np.zeros(len(assembly.system.q))
-        by_pair: dict[tuple[int, int], list[int]] = {}
-        for i, pair in enumerate(zip(old.first.tolist(), old.second.tolist(), strict=True)):
-            by_pair.setdefault(pair, []).append(i)
-        reach, frames = SAME_POINT * self.world.size, contacts.frames() if len(contacts) else np.zeros((0, 3, 3))
-        for i, pair in enumerate(zip(contacts.first.tolist(), contacts.second.tolist(), strict=True)):
-            candidates = by_pair.get(pair)
-            if candidates:
-                distance = np.linalg.norm(old.point[candidates] - contacts.point[i], axis=1)
-                nearest = int(distance.argmin())
-                if distance[nearest] <= reach:
-                    r[3 * i : 3 * i + 3] = frames[i] @ forces[candidates[nearest]]
-        if len(joints) == len(system.joints):
-            r[system.joints] = joints
-        return r
+        """Return impulses of the step before where they are known, 0 elsewhere."""
+        joints = assembly.system.joints
+        known = self._joints if self._joints is not None and len(self._joints) == len(joints) else np.zeros(len(joints))
+        return np.concatenate([self.world.contact_solve.memory.recall(assembly.contacts, self.world.bodies).ravel(), known])
 
     def _separation(self) -> np.ndarray:
         """Return velocities that remove overlaps and errors of joints, of a frictionless problem of bodies at rest, shape (n, 6)."""
-        bodies = self.world.bodies
         assembly = self.world.assemble(self.dt, rate=self.rate)
         system = assembly.system
         keep = np.concatenate([system.normals, system.joints])
         bias = assembly.bias[keep]
         if not (bias < 0).any() and not system.joints.size:
-            return np.zeros_like(bodies.velocity)
+            return np.zeros_like(assembly.falling)
         lower = np.concatenate([np.zeros(system.contacts), system.lower])
         upper = np.concatenate([np.full(system.contacts, np.inf), system.upper])
         problem = LCP(SparseOperator(system.B[keep][:, keep], device=self.device), bias, lower, upper)
         stopping = StoppingCriteria(rtol=1e-3, max_iterations=50, patience=50)
         x = solve(problem, ProjectedSOR(omega=1.0), stopping=stopping).x.numpy()
-        shift = (assembly.response[:, keep] @ x).reshape(bodies.velocity.shape)
-        return np.where(bodies.free[:, None], shift, 0.0)
+        return np.asarray(assembly.response[:, keep] @ x).reshape(-1, 6)

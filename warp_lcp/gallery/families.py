@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.gallery.banded import banded
-from warp_lcp.gallery.contact import contact
+from warp_lcp.gallery.contact_scenes import contact
+from warp_lcp.gallery.matrices import banded, definite, period_three, semidefinite, skewed
 from warp_lcp.gallery.planted import Plant, poisson
 from warp_lcp.gallery.problem import Problem
-from warp_lcp.gallery.psd import definite, period_three, semidefinite, skewed
 
 
 def _some(seed: int) -> Any:

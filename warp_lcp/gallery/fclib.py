@@ -192,7 +192,7 @@ def _text(group: Any, name: str, path: Path) -> str:
 
 
 def _solution(file: Any, rows: int, joints: int, path: Path) -> np.ndarray | None:
-    """Return (r, l) of /solution."""
+    """Return the impulses (r, l) of /solution, if there are any."""
     if "solution/r" not in file:
         return None
     r = _values(file, "solution/r", path)

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse
 import warp as wp
 
-from warp_lcp.gallery.problem import Problem
+from warp_lcp.gallery.problem import M_MATRIX, Problem
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID, GridPoisson
 from warp_lcp.problem import LCP
@@ -60,9 +60,8 @@ class Splash:
         """
         A = GridPoisson(self.cells, device=device, dtype=dtype, **self.faces)
         lower = np.broadcast_to(np.asarray(self.lower(bounds), dtype=np.float64), self.b.shape).copy()
-        facts = {"symmetric", "positive-definite", "p-matrix", "m-matrix", "positive-diagonal", "unique", "solvable"}
-        facts |= {"mixed"} if np.isinf(lower).any() else set()
-        return Problem(f"splash {self.n}^3, {bounds}", A, self.b, lower, np.full(self.b.shape, np.inf), None, frozenset(facts))
+        facts = M_MATRIX | {"unique", "solvable"} | ({"mixed"} if np.isinf(lower).any() else set())
+        return Problem(f"splash {self.n}^3, {bounds}", A, self.b, lower, np.full(self.b.shape, np.inf), None, facts)
 
 
 @dataclass(frozen=True)

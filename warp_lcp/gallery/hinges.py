@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse
+from scipy.sparse import csr_array
 
-from warp_lcp.gallery.rigid_bodies import RigidBodies
+from warp_lcp.rigid.body import RigidBody
+from warp_lcp.rigid.contacts import jacobian
 
 WORLD = -1  # in the place of a body: the hinge is fixed in space
 NEAR_LIMIT = 0.2  # [rad]: a limit that is farther away has no row
@@ -17,15 +19,13 @@ NEAR_LIMIT = 0.2  # [rad]: a limit that is farther away has no row
 class Hinge:
     """Two bodies that turn about a common axis.
 
-    Anchor and axis are given in the frames of the bodies, or in the world's for WORLD; `between` takes them from where bodies are. The
-    angle is that of `first` relative to `second`, 0 where the bodies' `zero` directions agree.
+    The angle is that of `first` relative to `second`, 0 as the scene places them.
 
     Args:
         first: a body.
         second: another one, or WORLD.
-        anchors: point of the axis in each frame [m].
-        axes: unit vector along it in each frame.
-        zeros: unit vectors normal to the axis, in each frame.
+        anchor: point of the axis as the scene places it [m].
+        axis: along it, of any length.
         limits: least and largest angle [rad]; infinite for none.
         motor_speed: angular velocity that the motor wants [rad/s].
         motor_torque: the most that it can do [N m]; 0 for no motor.
@@ -36,74 +36,51 @@ class Hinge:
 
     first: int
     second: int
-    anchors: tuple[np.ndarray, np.ndarray]
-    axes: tuple[np.ndarray, np.ndarray]
-    zeros: tuple[np.ndarray, np.ndarray]
+    anchor: np.ndarray
+    axis: np.ndarray
     limits: tuple[float, float] = (-np.inf, np.inf)
     motor_speed: float = 0.0
     motor_torque: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check."""
+        """Check, and give the axis unit length."""
         if self.first == self.second or self.first < 0:
             raise ValueError(f"first = {self.first}, second = {self.second}: must be two bodies, or a body and WORLD")
         if not self.limits[0] <= self.limits[1]:
             raise ValueError(f"limits = {self.limits}: must be in order, in rad")
         if not self.motor_torque >= 0:
             raise ValueError(f"motor_torque = {self.motor_torque}: must be >= 0, in N m")
-
-    @staticmethod
-    def between(
-        bodies: RigidBodies,
-        first: int,
-        second: int,
-        anchor: np.ndarray,
-        axis: np.ndarray,
-        *,
-        limits: tuple[float, float] = (-np.inf, np.inf),
-        motor_speed: float = 0.0,
-        motor_torque: float = 0.0,
-    ) -> Hinge:
-        """Return a hinge of bodies as they stand now, at angle 0; anchor [m] and axis are in the world's frame."""
-        axis = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
-        zero = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-        zero /= np.linalg.norm(zero)
-        frames = [(np.zeros(3), np.eye(3)) if i == WORLD else (bodies.position[i], bodies.rotation[i]) for i in (first, second)]
-        anchors, axes, zeros = ([R.T @ v for _, R in frames] for v in (np.zeros(3), axis, zero))
-        anchors = [R.T @ (np.asarray(anchor, dtype=np.float64) - x) for x, R in frames]
-        a, d, z = ((v[0], v[1]) for v in (anchors, axes, zeros))
-        return Hinge(first, second, a, d, z, limits, motor_speed, motor_torque)
+        object.__setattr__(self, "axis", np.asarray(self.axis, dtype=np.float64) / np.linalg.norm(self.axis))
 
     @property
     def pair(self) -> tuple[int, int]:
         """The bodies, the smaller index first."""
         return min(self.first, self.second), max(self.first, self.second)
 
-    def _world(self, bodies: RigidBodies, which: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return the arm, the anchor, the axis and the zero direction of a side in the world's frame."""
-        body = (self.first, self.second)[which]
-        R = np.eye(3) if body == WORLD else bodies.rotation[body]
-        x = np.zeros(3) if body == WORLD else bodies.position[body]
-        arm = R @ self.anchors[which]
-        return arm, x + arm, R @ self.axes[which], R @ self.zeros[which]
+    def side(self, bodies: Sequence[RigidBody], number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return how a body, or WORLD, carries the hinge now: the arm of the anchor [m], the anchor [m], and the rotation."""
+        if number == WORLD:
+            return self.anchor, self.anchor, np.eye(3)
+        body = bodies[number]
+        arm = body.rotation @ (self.anchor - body.properties.center)
+        return arm, body.position + arm, body.rotation
 
-    def angle(self, bodies: RigidBodies) -> float:
+    def angle(self, bodies: Sequence[RigidBody]) -> float:
         """Return the angle of first relative to second [rad], in (-pi, pi]."""
-        _, _, axis, mine = self._world(bodies, 0)
-        other = self._world(bodies, 1)[3]
-        return float(np.arctan2(np.cross(other, mine) @ axis, other @ mine))
+        R, S = (self.side(bodies, number)[2] for number in (self.first, self.second))
+        mine, other = R @ _across(self.axis), S @ _across(self.axis)
+        return float(np.arctan2(np.cross(other, mine) @ (R @ self.axis), other @ mine))
 
-    def rows(self, bodies: RigidBodies, dt: float, rate: float) -> HingeRows:
+    def rows(self, bodies: Sequence[RigidBody], dt: float, rate: float) -> HingeRows:
         """Return its rows for a time step [s] in which `rate` of its error is removed.
 
         y = J v' + c: anchors' relative velocity and the angular velocity across the axis are equations (y = 0, x free); the angle's rate
         plus its distance to a limit over dt is >= 0 where x > 0; the motor's y is the rate less the wanted one, |x| <= torque dt.
         """
-        (arm, anchor, axis, _), (other_arm, other_anchor, other_axis, _) = self._world(bodies, 0), self._world(bodies, 1)
-        apart = anchor - other_anchor
+        (arm, anchor, R), (other_arm, other_anchor, S) = (self.side(bodies, number) for number in (self.first, self.second))
+        apart, axis, other_axis = anchor - other_anchor, R @ self.axis, S @ self.axis
         arm, other_arm = arm - 0.5 * apart, other_arm + 0.5 * apart  # one point for both impulses: they keep the angular momentum
-        u = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-        u /= np.linalg.norm(u)
+        u = _across(axis)
         linear = [np.concatenate([e, np.cross(arm, e), -e, -np.cross(other_arm, e)]) for e in np.eye(3)]
         across = np.array([u, np.cross(axis, u)])
         turn = np.array([np.concatenate([np.zeros(3), d, np.zeros(3), -d]) for d in (*across, axis)])
@@ -123,31 +100,23 @@ class Hinge:
             bias.append(-self.motor_speed)
             low.append(-self.motor_torque * dt)
             high.append(self.motor_torque * dt)
-        return HingeRows(np.array(rows), np.array(bias), np.array(low), np.array(high))
+        m, n, each = len(rows), len(bodies), np.array(rows)[:, None]
+        second = np.full(m, n if self.second == WORLD else self.second)
+        J = jacobian(np.full(m, self.first), second, each[..., :6], each[..., 6:], n)
+        return HingeRows(J, np.array(bias), np.array(low), np.array(high))
 
 
 @dataclass(frozen=True, eq=False)
 class HingeRows:
-    """A hinge's rows: J for (first's, second's) velocities, shape (m, 12); c, and bounds of the impulses, shape (m,)."""
+    """A hinge's m rows: J for the velocities of all bodies, shape (m, 6n); c, and bounds of the impulses, shape (m,)."""
 
-    J: np.ndarray
+    J: csr_array
     bias: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
 
 
-def hinge_jacobian(hinges: tuple[Hinge, ...], rows: list[HingeRows], bodies: int) -> scipy.sparse.csr_array:
-    """Return the rows of all hinges for the velocities of all bodies, shape (m, 6 bodies)."""
-    i, j, entries, start = [], [], [], 0
-    for hinge, r in zip(hinges, rows, strict=True):
-        for side, body in enumerate((hinge.first, hinge.second)):
-            if body != WORLD:
-                block = r.J[:, 6 * side : 6 * side + 6]
-                i.append(np.broadcast_to(start + np.arange(len(block))[:, None], block.shape).ravel())
-                j.append(np.broadcast_to(6 * body + np.arange(6), block.shape).ravel())
-                entries.append(block.ravel())
-        start += len(r.bias)
-    if not entries:
-        return scipy.sparse.csr_array((start, 6 * bodies))
-    triplets = (np.concatenate(entries), (np.concatenate(i), np.concatenate(j)))
-    return scipy.sparse.coo_array(triplets, shape=(start, 6 * bodies)).tocsr()
+def _across(axis: np.ndarray) -> np.ndarray:
+    """Return a unit vector normal to a direction."""
+    u = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    return np.asarray(u / np.linalg.norm(u))

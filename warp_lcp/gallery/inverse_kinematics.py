@@ -73,7 +73,7 @@ class StepProblem:
 
 
 @dataclass(frozen=True, eq=False)
-class Pose:
+class ReachedPose:
     """What `InverseKinematics.solve` returns.
 
     Args:
@@ -145,7 +145,7 @@ class InverseKinematics(Settings):
     multipliers: bool = False
     device: Any = None
 
-    def solve(self, figure: ArticulatedFigure, goals: Vector, start: Vector | None = None) -> Pose:
+    def solve(self, figure: ArticulatedFigure, goals: Vector, start: Vector | None = None) -> ReachedPose:
         """Return a pose whose end effectors are as near to their goals as they come from the start.
 
         Args:
@@ -179,7 +179,7 @@ class InverseKinematics(Settings):
                 rejected += 1
             history.append(0.5 * float(error @ error))
             radius = self._radius(radius, fall, foretold, float(np.abs(d).max()))
-        return Pose(theta, history[-1], measure, status, len(history) - 1, rejected, unsolved, overshoot, history)
+        return ReachedPose(theta, history[-1], measure, status, len(history) - 1, rejected, unsolved, overshoot, history)
 
     def _status(self, measure: float, radius: float, iterations: int) -> SolveStatus | None:
         """Return how the iteration ends now, None if it goes on."""

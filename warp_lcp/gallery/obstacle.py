@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.gallery.problem import Problem
+from warp_lcp.gallery.problem import M_MATRIX, Problem
 from warp_lcp.operators.grid_poisson import AIR, FLUID, GridPoisson
 
 RADIUS = 0.697965148223374  # a, where the membrane leaves the ball: a^2 (log 2 - log a) = 1 - a^2
 EDGE = 0.9  # beyond it the ball is continued by its tangent cone, so that psi is defined on the square
-FACTS = frozenset({"symmetric", "positive-definite", "p-matrix", "m-matrix", "positive-diagonal", "unique", "solvable"})
+UNIQUE = M_MATRIX | {"unique", "solvable"}
 SLOPE = RADIUS**2 / np.sqrt(1 - RADIUS**2)  # of the membrane against -log r
 
 
@@ -54,7 +54,7 @@ def ball_obstacle(n: int, *, device: Any = None, dtype: Any = wp.float32) -> Pro
     b, lower, u = (np.zeros((n, n)) for _ in range(3))
     b[inner] = -(border[2:, 1:-1] + border[:-2, 1:-1] + border[1:-1, 2:] + border[1:-1, :-2])
     lower[inner], u[inner] = ball_height(r)[inner], exact[inner]
-    return Problem(f"ball obstacle {n}x{n}", GridPoisson(cells, device=device, dtype=dtype), b, lower, np.full((n, n), np.inf), u, FACTS)
+    return Problem(f"ball obstacle {n}x{n}", GridPoisson(cells, device=device, dtype=dtype), b, lower, np.full((n, n), np.inf), u, UNIQUE)
 
 
 def torsion(n: int, load: float = 5.0, *, device: Any = None, dtype: Any = wp.float32) -> Problem:
@@ -79,7 +79,7 @@ def torsion(n: int, load: float = 5.0, *, device: Any = None, dtype: Any = wp.fl
     distance = np.minimum(np.minimum(X, 1 - X), np.minimum(Y, 1 - Y))
     b = np.where(cells == FLUID, -load / (n + 1) ** 2, 0.0)
     A = GridPoisson(cells, device=device, dtype=dtype)
-    return Problem(f"torsion {n}x{n}", A, b, -distance, distance, None, FACTS | {"boxed"})
+    return Problem(f"torsion {n}x{n}", A, b, -distance, distance, None, UNIQUE | {"boxed"})
 
 
 def dam(nx: int, ny: int, *, device: Any = None, dtype: Any = wp.float32) -> Problem:
@@ -111,4 +111,4 @@ def dam(nx: int, ny: int, *, device: Any = None, dtype: Any = wp.float32) -> Pro
     b = np.zeros((ny, nx))
     b[inner] = x[1] * y[1] - faces[0] * (w[1:-1, 2:] + w[1:-1, :-2]) - faces[1] * (w[2:, 1:-1] + w[:-2, 1:-1])
     A = GridPoisson(cells, face_x=faces[0], face_y=faces[1], device=device, dtype=dtype)
-    return Problem(f"dam {nx}x{ny}", A, b, np.zeros_like(b), np.full_like(b, np.inf), None, FACTS)
+    return Problem(f"dam {nx}x{ny}", A, b, np.zeros_like(b), np.full_like(b, np.inf), None, UNIQUE)

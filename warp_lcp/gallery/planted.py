@@ -9,7 +9,7 @@ import numpy as np
 import scipy.ndimage
 import warp as wp
 
-from warp_lcp.gallery.problem import Problem
+from warp_lcp.gallery.problem import M_MATRIX, Problem
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID, GridPoisson
 from warp_lcp.settings import Part, Positive, Settings
@@ -127,8 +127,7 @@ def poisson(
         counts = [n + (k == cells.ndim - 1 - axis) for k, n in enumerate(cells.shape)]
         faces[face] = rng.uniform(0.2, 1.0, counts).astype(np.float32).astype(np.float64)
     A = GridPoisson(cells, device=device, dtype=dtype, **faces)  # type: ignore[arg-type]
-    facts = frozenset({"symmetric", "positive-definite", "p-matrix", "m-matrix", "positive-diagonal"})
-    flat = planted(grid_matrix(A), rng, plant, name=f"poisson {'x'.join(map(str, cells.shape))}", facts=facts)
+    flat = planted(grid_matrix(A), rng, plant, name=f"poisson {'x'.join(map(str, cells.shape))}", facts=M_MATRIX)
     fluid = cells == FLUID
 
     def field(values: np.ndarray) -> np.ndarray:

@@ -33,6 +33,7 @@ FACTS = frozenset(
         "solvable",  # there is one at least
     }
 )
+M_MATRIX = frozenset({"symmetric", "positive-definite", "p-matrix", "m-matrix", "positive-diagonal"})  # facts of Laplacians
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +62,7 @@ class Problem:
     facts: frozenset[str]
 
     def __post_init__(self) -> None:
-        """Check the facts."""
+        """Check that all facts are known ones."""
         unknown = sorted(self.facts - FACTS)
         if unknown:
             raise ValueError(f"facts holds {unknown}: allowed are {sorted(FACTS)}")

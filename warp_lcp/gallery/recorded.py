@@ -24,6 +24,7 @@ PROBLEM_FILE = re.compile(r"problem_(?P<step>\d{6,})\.npz")
 NUMBERS = ("step", "time", "dt", "spacing", "tolerance", "absolute_tolerance")
 REQUIRED = frozenset({"format", "cells", "b", "lower", "upper", "x0", *NUMBERS})
 FIELDS = frozenset({"cells", "b", "lower", "upper", "x0", "face_x", "face_y", "face_z", "shift"})
+PLACED = ("cells", "b", "lower", "upper", "shift")  # of the shape of `cells`, or a number
 KNOWN = REQUIRED | FIELDS  # of a file that holds more the rest is not read
 DESCRIPTION = """\
 # Complementarity problems of a simulation
@@ -187,3 +188,34 @@ def _check(archive: Archive) -> None:
             raise ValueError(f"{name} is {header}: must be numbers of shape {' or '.join(map(str, allowed))}")
     values = prod(shape) * len(FIELDS & headers.keys())
     check_claim(f"fields of {' x '.join(map(str, reversed(shape)))} cells", values * np.dtype(np.float64).itemsize)
+
+
+def cell_counts(path: Path) -> tuple[int, ...]:
+    """Return the shape of a recorded problem's cells, (nz, ny, nx) or (ny, nx).
+
+    Raises:
+        ValueError: the file is none of a problem, or is damaged or of a later version; the message names it.
+    """
+    with opened(path) as archive:
+        return archive.headers["cells"].shape
+
+
+def load_part(path: Path, part: tuple[slice, ...]) -> dict[str, np.ndarray]:
+    """Return the arrays of a recorded problem in a box of cells: `cells`, `b`, bounds, coefficients of its faces (upper ones too), shift.
+
+    The file is read from its start to the box's end, one plane of cells (in 2-D one row) at a time.
+
+    Args:
+        path: the file.
+        part: which cells, a slice of each axis of `cells`.
+
+    Raises:
+        ValueError: the file is none of a problem, or is damaged or of a later version; the message names it.
+    """
+    faces = {f"face_{AXES[axis]}": len(part) - 1 - axis for axis in range(len(part))}
+    with opened(path) as archive:
+        return {
+            name: archive.read_box(name, tuple(slice(s.start, s.stop + (faces.get(name) == axis)) for axis, s in enumerate(part)))
+            for name in (*PLACED, *faces)
+            if name in archive.headers
+        }

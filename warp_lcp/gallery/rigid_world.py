@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.sparse
 
-from warp_lcp.gallery.contact_detection import Contacts, Plane, detect
 from warp_lcp.gallery.contact_models import ContactSystem
-from warp_lcp.gallery.hinges import Hinge, hinge_jacobian
-from warp_lcp.gallery.rigid_bodies import RigidBodies
+from warp_lcp.gallery.hinges import Hinge
+from warp_lcp.grid.solids import Box, Sphere
+from warp_lcp.rigid.body import RigidBody
+from warp_lcp.rigid.contact_shape import ContactShape
+from warp_lcp.rigid.contact_solve import ContactSolve
+from warp_lcp.rigid.contacts import Contacts
+from warp_lcp.rigid.mass_properties import MassProperties, mass_properties
+from warp_lcp.rigid.obstacles import Obstacle
 
+Parts = Sphere | Box | Sequence[Box]  # a ball, a box, or boxes that share their center
+
+FIXED = np.inf  # mass [kg] of a body that does not move
+GROUND = Obstacle(name="ground", points=np.zeros((1, 3)), normals=np.array([[0.0, 0.0, 1.0]]))
 GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2]
 MARGIN = 0.02  # of the smallest body's reach: gaps up to it are contacts, besides those that the fastest bodies may close in a step
 SLOP = 0.002  # of the smallest body's reach: overlap that is left alone, so that resting contacts stay
@@ -23,44 +33,71 @@ class World:
 
     Args:
         name: the scene, with its parameters.
-        bodies: their state; steps write it.
-        planes: the ground.
+        solids: the shape of each body, as it is placed: a ball, a box, or boxes that share their center and the body's mass evenly.
+        mass: of each [kg]; FIXED for one that does not move.
+        obstacles: the ground.
         hinges: joints; the bodies of one do not collide.
         friction: coefficient mu >= 0 of all contacts.
         gravity: [m/s^2].
         ignored: further pairs of bodies that do not collide, the smaller index first.
 
+    Attributes:
+        bodies: their state; steps write it.
+        fixed: which do not move, shape (n,).
+        contact_solve: what finds contacts, and remembers their impulses.
+
     Raises:
-        ValueError: friction is negative, or gravity is not finite.
+        ValueError: there is no body, a mass is not positive, friction is negative, or gravity is not finite.
     """
 
     name: str
-    bodies: RigidBodies
-    planes: tuple[Plane, ...] = (Plane((0.0, 0.0, 1.0)),)
+    solids: Sequence[Parts]
+    mass: Sequence[float] | np.ndarray
+    obstacles: tuple[Obstacle, ...] = (GROUND,)
     hinges: tuple[Hinge, ...] = ()
     friction: float = 0.5
     gravity: tuple[float, float, float] = GRAVITY
     ignored: frozenset[tuple[int, int]] = frozenset()
+    bodies: list[RigidBody] = field(init=False)
+    fixed: np.ndarray = field(init=False)
+    contact_solve: ContactSolve = field(init=False)
 
     def __post_init__(self) -> None:
-        """Check friction and gravity."""
+        """Check friction and gravity, and make the bodies."""
         if not 0 <= self.friction < np.inf:
             raise ValueError(f"friction = {self.friction}: must be >= 0 and finite")
         if not np.isfinite(self.gravity).all():
             raise ValueError(f"gravity = {self.gravity}: must be finite, in m/s^2")
+        if not len(self.solids):
+            raise ValueError("solids is empty: there must be a body")
+        self.fixed = np.isposinf(self.mass)
+        made = [_made(solid, 1.0 if m == FIXED else m) for solid, m in zip(self.solids, self.mass, strict=True)]
+        self.bodies = [RigidBody(properties, name=f"body {i}", friction=self.friction) for i, (properties, _) in enumerate(made)]
+        shapes = [shape for _, shape in made]
+        self.contact_solve = ContactSolve(self.bodies, shapes, self.obstacles, 3, every=True)
+        self.size = min(shape.reach(properties.center) for properties, shape in made)  # reach of the smallest body [m]
 
-    @property
-    def size(self) -> float:
-        """Reach of the smallest body [m]."""
-        return min(shape.reach for shape in self.bodies.shapes)
+    def velocities(self) -> np.ndarray:
+        """Return velocities, linear and angular, of the bodies [m/s, rad/s], shape (n, 6)."""
+        return np.array([body.velocities(3) for body in self.bodies])
 
-    def contacts(self, dt: float = 0.0) -> Contacts:
-        """Return where bodies touch now, or may within dt [s] if two of them meet at the largest speed of all."""
-        ignored = self.ignored | {hinge.pair for hinge in self.hinges}
-        fastest = float(np.linalg.norm(self.bodies.velocity[:, :3], axis=1).max())
-        return detect(self.bodies, self.planes, MARGIN * self.size + 2 * dt * fastest, ignored)
+    def contacts(self, dt: float = 0.0, *, margin: float | None = None) -> Contacts:
+        """Return where bodies touch now, or may within dt [s] if two of them meet at the largest speed of all.
 
-    def assemble(self, dt: float, *, rate: float = 0.2, contacts: Contacts | None = None) -> Assembly:
+        Args:
+            dt: time step [s].
+            margin: gap [m] up to which there is a contact; what bodies and their speeds ask for if None.
+        """
+        fastest, near = float(np.linalg.norm(self.velocities()[:, :3], axis=1).max()), MARGIN * self.size
+        near, way = (near, dt * fastest) if margin is None else (margin, 0.0)
+        n, ignored = len(self.bodies), self.ignored | {hinge.pair for hinge in self.hinges}
+        still = np.append(self.fixed, True)
+        found = self.contact_solve.detection.find(0.0, np.full(n, way), np.full(len(self.obstacles), near + way), near)
+        found = [f for f in found if (f.second, f.first) not in ignored and not (still[f.first] and still[f.second])]
+        found.sort(key=lambda f: (f.obstacle is None, f.second, f.first))
+        return self.contact_solve.assembled(found, 0.0, 1.0, None)
+
+    def assemble(self, dt: float, *, rate: float = 0.2) -> Assembly:
         """Return the velocity problem of a step.
 
         u = J v' + c with v' = v + dt g + M^-1 J'r. For a contact's normal row c = gap / dt where there is a gap, so that what approaches
@@ -69,39 +106,38 @@ class World:
         Args:
             dt: time step [s].
             rate: part of an overlap or of a joint's error that the step removes, in [0, 1].
-            contacts: where bodies touch; detected if None.
 
         Raises:
             ValueError: dt or rate is out of range.
         """
         if not (dt > 0 and 0 <= rate <= 1):
             raise ValueError(f"dt = {dt}, rate = {rate}: must be > 0 and in [0, 1]")
-        bodies, contacts = self.bodies, self.contacts(dt) if contacts is None else contacts
-        rows = [hinge.rows(bodies, dt, rate) for hinge in self.hinges]
-        J = scipy.sparse.csr_array(scipy.sparse.vstack([contacts.jacobian(bodies), hinge_jacobian(self.hinges, rows, len(bodies))]).tocsr())
-        M = bodies.inverse_mass()
-        falling = bodies.velocity.copy()
-        falling[bodies.free, :3] += dt * np.array(self.gravity)
-        bias = np.zeros(J.shape[0])
-        gap = contacts.gap
-        bias[0 : 3 * len(contacts) : 3] = np.where(gap > 0, gap, rate * np.minimum(gap + SLOP * self.size, 0.0)) / dt
-        joints = [np.concatenate([getattr(r, name) for r in rows]) if rows else np.zeros(0) for name in ("bias", "lower", "upper")]
-        bias[3 * len(contacts) :] = joints[0]
-        response = scipy.sparse.csr_array(M @ J.T)
-        q = J @ falling.ravel() + bias
+        n, contacts, dim = len(self.bodies), self.contacts(dt), 3
+        joints = [hinge.rows(self.bodies, dt, rate) for hinge in self.hinges]
+        J = scipy.sparse.csr_array(scipy.sparse.vstack([contacts.jacobian(n), *(rows.J for rows in joints)]))
+        masses = [np.zeros((6, 6)) if still else body.free_inverse_mass(3) for body, still in zip(self.bodies, self.fixed, strict=True)]
+        response = scipy.sparse.csr_array(scipy.sparse.bsr_array((np.array(masses), np.arange(n), np.arange(n + 1))) @ J.T)
+        falling = self.velocities()
+        falling[~self.fixed, :3] += dt * np.array(self.gravity)
+        bias, gap = np.zeros((len(contacts), dim)), contacts.gap
+        bias[:, 0] = np.where(gap > 0, gap, rate * np.minimum(gap + SLOP * self.size, 0.0)) / dt
+        bias, low, high = (
+            np.concatenate([own, *(getattr(rows, name) for rows in joints)])
+            for name, own in (("bias", bias.ravel()), ("lower", np.zeros(0)), ("upper", np.zeros(0)))
+        )
         B = scipy.sparse.csr_array(J @ response)
         B = scipy.sparse.csr_array(0.5 * (B + B.T))  # rounding must not make it unsymmetric
-        system = ContactSystem(self.name, B, q, np.full(len(contacts), self.friction), joints[1], joints[2])
-        return Assembly(system, contacts, response, falling, bias)
+        system = ContactSystem(self.name, B, J @ falling.ravel() + bias, np.full(len(contacts), self.friction), low, high)
+        return Assembly(system, contacts, J, response, falling, bias)
 
     def energy(self) -> float:
-        """Return kinetic and potential energy [J]."""
-        return self.bodies.kinetic_energy() + self.bodies.potential_energy(np.array(self.gravity))
+        """Return kinetic and potential energy of the bodies that move [J]."""
+        moving = [body for body, still in zip(self.bodies, self.fixed, strict=True) if not still]
+        return sum(body.kinetic_energy + body.potential_energy(np.array(self.gravity)) for body in moving)
 
     def deepest(self) -> float:
         """Return the largest overlap of bodies [m], 0 where there is none."""
-        gaps = self.contacts().gap
-        return max(0.0, -float(gaps.min())) if gaps.size else 0.0
+        return max(0.0, -float(self.contacts().gap.min(initial=0.0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +147,7 @@ class Assembly:
     Args:
         system: B, q, friction, bounds of joints.
         contacts: the points of its contacts.
+        J: velocities at contacts and joints from those of the bodies, shape (rows, 6n).
         response: M^-1 J', velocities of the bodies from impulses, shape (6n, rows).
         falling: velocities of the bodies without impulses, shape (n, 6).
         bias: c, the part of q that removes errors of position [m/s], shape (rows,).
@@ -118,6 +155,7 @@ class Assembly:
 
     system: ContactSystem
     contacts: Contacts
+    J: scipy.sparse.csr_array
     response: scipy.sparse.csr_array
     falling: np.ndarray
     bias: np.ndarray
@@ -125,3 +163,13 @@ class Assembly:
     def velocity(self, r: np.ndarray) -> np.ndarray:
         """Return v' of the bodies after impulses r, shape (n, 6)."""
         return self.falling + (self.response @ r).reshape(self.falling.shape)
+
+
+def _made(solid: Parts, mass: float) -> tuple[MassProperties, ContactShape]:
+    """Return mass properties and surface of a body; bars and boxes share the mass evenly."""
+    if isinstance(solid, Sphere):
+        return mass_properties(solid, 3, mass=mass), ContactShape.of(solid, 3)
+    boxes = [solid] if isinstance(solid, Box) else solid
+    parts = [mass_properties(box, 3, mass=mass / len(boxes)) for box in boxes]
+    inertia = np.sum([part.inertia for part in parts], axis=0)
+    return MassProperties(mass=mass, center=parts[0].center, inertia=inertia), ContactShape.united(boxes)

@@ -29,7 +29,7 @@ from warp_lcp.material.sources import Source, Sources
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import BodyMotion, RigidBody
 from warp_lcp.rigid.mass_properties import mass_properties
-from warp_lcp.rigid.surroundings import Surroundings, domain_walls, obstacle
+from warp_lcp.rigid.obstacles import domain_walls, obstacle
 from warp_lcp.scene.shapes import SolidProperties
 
 
@@ -70,7 +70,7 @@ def make_bodies(scene: ParticleScene, placed: Sequence[PlacedSolid]) -> RigidBod
         if not ((body.position >= 0.0) & (body.position <= np.array(_vector(scene.domain.size)))).all():
             raise ValueError(f"{body.name} has its center of mass at {body.position.round(6).tolist()} m, outside the domain")
     shapes = [placed[number - 1].geometry for number in motions]
-    return RigidBodies(bodies, shapes, list(motions), Surroundings((walls, *others)), scene.dimension)
+    return RigidBodies(bodies, shapes, list(motions), (walls, *others), scene.dimension)
 
 
 def make_boundary(

@@ -10,9 +10,9 @@ import numpy as np
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.rigid.body import BodyMotion, RigidBody
 from warp_lcp.rigid.contact_shape import ContactShape
-from warp_lcp.rigid.contact_solve import ContactSolve, Touching
+from warp_lcp.rigid.contact_solve import Contacts, ContactSolve
+from warp_lcp.rigid.obstacles import Obstacle
 from warp_lcp.rigid.outline import BodySurface, body_surface
-from warp_lcp.rigid.surroundings import Surroundings
 
 STATE = 20  # numbers of a body's state
 IN_PLANE = ("x", "y", "vx", "vy", "angle", "spin")
@@ -26,13 +26,13 @@ class _Begun:
     Args:
         states: of the bodies before it.
         free: momenta without contacts, shape (n, 6).
-        touching: where bodies touch.
+        contacts: where bodies touch.
         impulses: of the contacts if no material pushes.
     """
 
     states: np.ndarray
     free: np.ndarray
-    touching: Touching
+    contacts: Contacts
     impulses: np.ndarray
 
 
@@ -47,7 +47,7 @@ class RigidBodies:
         bodies: in the order of their solids.
         geometries: the shape of each as the scene places it.
         numbers: the wall number of each, 1 + the index of its solid.
-        surroundings: what else they may touch.
+        obstacles: what else they may touch.
         dimension: 2 or 3.
 
     Attributes:
@@ -65,15 +65,15 @@ class RigidBodies:
         bodies: Sequence[RigidBody],
         geometries: Sequence[Geometry],
         numbers: Sequence[int],
-        surroundings: Surroundings,
+        obstacles: Sequence[Obstacle],
         dimension: int,
     ) -> None:
         """Prepare the shapes for contact, and check that bodies start apart."""
         self.bodies, self.numbers, self.dimension = list(bodies), list(numbers), dimension
         self.motions = [BodyMotion(body) for body in bodies]
-        self.surroundings, self._geometries = surroundings, list(geometries)
+        self._geometries = list(geometries)
         self.shapes = [ContactShape.of(geometry, dimension) for geometry in geometries]
-        self._solve = ContactSolve(self.bodies, self.shapes, surroundings, dimension)
+        self._solve = ContactSolve(self.bodies, self.shapes, obstacles, dimension)
         self._surfaces: list[BodySurface] | None = None
         self._begun: _Begun | None = None
         self.contacts, self.contact_residual = 0, 0.0
@@ -101,14 +101,14 @@ class RigidBodies:
         for body in self.bodies:
             body.time = time
         states = self._states()
-        touching = self._solve.find(time, dt, gravity)
+        contacts = self._solve.find(time, dt, gravity)
         for body in self.bodies:
             body.release()
             body.accelerate(gravity, kick_dt)
         free = self._momenta()
-        impulses = self._solve.push_apart(touching)
-        self._solve.hold(touching, impulses)
-        self._begun = _Begun(states, free, touching, impulses)
+        impulses = self._solve.push_apart(contacts)
+        self._solve.hold(contacts, impulses)
+        self._begun = _Begun(states, free, contacts, impulses)
 
     def end_step(self, dt: float) -> None:
         """Solve for the contacts with what the material gave, then move and turn the bodies.
@@ -126,10 +126,10 @@ class RigidBodies:
         if any(body.given.any() for body in self.bodies):
             for body, momenta in zip(self.bodies, begun.free, strict=True):
                 body.momentum, body.angular_momentum = momenta[:3] + body.given[:3], momenta[3:] + body.given[3:]
-            impulses = self._solve.push_apart(begun.touching, begun.impulses)
-        self._solve.memory.keep(begun.touching, impulses, self.bodies)
-        self.contacts, self.contact_residual = len(begun.touching), self._solve.residual
-        ways = self._solve.separation(begun.touching, dt)
+            impulses = self._solve.push_apart(begun.contacts, begun.impulses)
+        self._solve.memory.keep(begun.contacts, impulses, self.bodies)
+        self.contacts, self.contact_residual = len(begun.contacts), self._solve.residual
+        ways = self._solve.separation(begun.contacts, dt)
         for number, body in enumerate(self.bodies):
             body.release()
             body.advance(dt)
@@ -175,7 +175,7 @@ class RigidBodies:
 
     def potential_energy(self, gravity: np.ndarray) -> float:
         """Return the energy of height [J; J/m in 2-D], 0 at the origin."""
-        return -sum(body.properties.mass * float(body.position @ gravity) for body in self.bodies)
+        return sum(body.potential_energy(gravity) for body in self.bodies)
 
     def state(self) -> dict[str, np.ndarray]:
         """Return what `restore` needs to continue bit for bit."""

@@ -81,6 +81,10 @@ class RigidBody:
         """Energy of motion and spin [J]."""
         return 0.5 * float(self.momentum @ self.velocity + self.angular_momentum @ self.angular_velocity)
 
+    def potential_energy(self, gravity: np.ndarray) -> float:
+        """Return the energy of height [J], 0 at the origin; gravity [m/s^2], shape (3,)."""
+        return -self.properties.mass * float(self.position @ gravity)
+
     def free_inverse_mass(self, dimension: int) -> np.ndarray:
         """Return block diag(1/m, I^-1), shape (k, k): k = 3 in 2-D (vx, vy, wz), 6 in 3-D (vx, vy, vz, wx, wy, wz)."""
         result, R = np.zeros((6, 6)), self.rotation
@@ -158,7 +162,7 @@ class RigidBody:
         )  # fmt: skip
 
     def restore(self, state: np.ndarray) -> None:
-        """Continue from `state`."""
+        """Continue from what `state` returned, held by nothing."""
         self.position, self.rotation = state[:3].copy(), state[3:12].reshape(3, 3).copy()
         self.momentum, self.angular_momentum = state[12:15].copy(), state[15:18].copy()
         self.angle, self.time = float(state[18]), float(state[19])
@@ -181,7 +185,6 @@ class BodyMotion:
     """
 
     def __init__(self, body: RigidBody) -> None:
-        """Follow a body."""
         self.body = body
 
     def pose(self, time: float) -> Pose:
@@ -193,8 +196,7 @@ class BodyMotion:
 
     def velocity_field(self) -> tuple[np.ndarray, np.ndarray]:
         """Return turn, shape (3, 3) [1/s], and shift, shape (3,) [m/s]: the body's point x moves at turn x + shift now."""
-        x, y, z = self.body.angular_velocity
-        turn = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        turn = _cross(*self.body.angular_velocity)
         return turn, self.body.velocity - turn @ self.body.position
 
 
@@ -212,13 +214,18 @@ def in_space(values: np.ndarray) -> np.ndarray:
 
 
 def _turn(vector: np.ndarray) -> np.ndarray:
-    """Return the matrix of a turn by |vector| [rad] about it (Rodrigues' formula)."""
+    """Return the matrix of a turn by |vector| [rad] about it: SciPy's `Rotation.from_rotvec`, whose last bits runs would show."""
     x, y, z = vector.tolist()
     angle = math.sqrt(x * x + y * y + z * z)
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    K = _cross(x, y, z)
     if angle < SMALL_TURN:
         return cast(np.ndarray, np.eye(3) + K + 0.5 * K @ K)
     return cast(np.ndarray, np.eye(3) + math.sin(angle) / angle * K + 0.5 * (math.sin(0.5 * angle) / (0.5 * angle)) ** 2 * K @ K)
+
+
+def _cross(x: float, y: float, z: float) -> np.ndarray:
+    """Return the matrix of the cross product with a vector."""
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def _three(vector: np.ndarray | None) -> np.ndarray:

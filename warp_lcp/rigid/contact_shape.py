@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -30,7 +30,7 @@ class ContactShape:
         points: the surface is `radius` away from them: shape (n, 3) [m].
         radius: [m].
         distance: signed distance and its gradient.
-        box: the shape if it is a box; in 2-D a thick one.
+        boxes: what the shape consists of if that is boxes; in 2-D a thick one.
         size: about half its extent [m].
         closed: whether the inside has an end; contacts with others than such need points of theirs.
 
@@ -42,13 +42,13 @@ class ContactShape:
     radius: float
     distance: Distance
     size: float
-    box: OrientedBox | None = None
+    boxes: tuple[OrientedBox, ...] = ()
     closed: bool = True
     low: np.ndarray = field(init=False)
     high: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
-        """Find the bounds."""
+        """Find the bounds of what is within the radius of the points."""
         points = self.points if len(self.points) else np.zeros((1, 3))
         object.__setattr__(self, "low", points.min(axis=0) - self.radius)
         object.__setattr__(self, "high", points.max(axis=0) + self.radius)
@@ -78,6 +78,20 @@ class ContactShape:
             return -distance, -direction
 
         return cls(points=np.zeros((0, 3)), radius=0.0, distance=outside, size=shape.size, closed=False)
+
+    @classmethod
+    def united(cls, boxes: Sequence[Box]) -> ContactShape:
+        """Return boxes in space as one shape. Its points are their corners alone: what is flat touches a plane nowhere else first."""
+        parts = [_box(box, 3) for box in boxes]
+
+        def nearest(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            distances, directions = (np.array(of) for of in zip(*(part.distance(points) for part in parts), strict=True))
+            which, each = distances.argmin(axis=0), np.arange(len(points))
+            return distances[which, each], directions[which, each]
+
+        made = tuple(box for part in parts for box in part.boxes)
+        corners = np.concatenate([box.corners() for box in made])
+        return cls(points=corners, radius=0.0, distance=nearest, size=max(part.size for part in parts), boxes=made)
 
     def reach(self, center: np.ndarray) -> float:
         """Return the largest distance of a point of the shape from a center [m]."""
@@ -113,7 +127,7 @@ def _box(shape: Box, dimension: int) -> ContactShape:
     thick = np.array([*flat, THICK * flat.max()][:3])
     return ContactShape(
         points=center + np.concatenate(points) @ R.T, radius=0.0, distance=distance, size=float(flat.max()),
-        box=OrientedBox(center, R.copy(), thick),
+        boxes=(OrientedBox(center, R.copy(), thick),),
     )  # fmt: skip
 
 

@@ -8,12 +8,12 @@ import numpy as np
 
 from warp_lcp.grid.motion import Motion
 from warp_lcp.rigid.body import AXES, PLANAR, RigidBody
+from warp_lcp.rigid.contact_detection import ContactDetection, ContactPair, ContactPoints
 from warp_lcp.rigid.contact_problem import ContactProblem
 from warp_lcp.rigid.contact_shape import ContactShape
+from warp_lcp.rigid.contacts import ContactMemory, Contacts
 from warp_lcp.rigid.firm import SINGULAR, Firm
-from warp_lcp.rigid.near import Found, Neighborhood
-from warp_lcp.rigid.surroundings import Surroundings
-from warp_lcp.rigid.touching import ContactMemory, Touching
+from warp_lcp.rigid.obstacles import Obstacle
 from warp_lcp.stopping import StoppingCriteria
 
 NEAR = 1e-2  # of the smallest body's size: gaps up to it are contacts, besides those that speeds may close in a step
@@ -34,18 +34,26 @@ class ContactSolve:
     Args:
         bodies: all.
         shapes: of the bodies as placed.
-        surroundings: what else there is.
+        obstacles: what else there is.
         dimension: 2 or 3.
+        every: see `ContactDetection`.
 
     Attributes:
         residual: of the last problem, relative to that of no impulses; 0 without contacts.
         memory: impulses of the last step.
     """
 
-    def __init__(self, bodies: Sequence[RigidBody], shapes: Sequence[ContactShape], surroundings: Surroundings, dimension: int) -> None:
-        self.bodies, self.shapes, self.surroundings, self.dimension = list(bodies), list(shapes), surroundings, dimension
+    def __init__(
+        self,
+        bodies: Sequence[RigidBody],
+        shapes: Sequence[ContactShape],
+        obstacles: Sequence[Obstacle],
+        dimension: int,
+        every: bool = False,
+    ) -> None:
+        self.bodies, self.dimension = list(bodies), dimension
         self.residual, self.memory = 0.0, ContactMemory(len(self.bodies))
-        self._near = Neighborhood(self.bodies, self.shapes, surroundings, dimension)
+        self.detection = ContactDetection(self.bodies, shapes, obstacles, dimension, every)
         self._reach = np.array([shape.reach(body.properties.center) for body, shape in zip(bodies, shapes, strict=True)])
         self._size = np.array([shape.size for shape in shapes])
         self._friction = np.array([body.friction for body in bodies])
@@ -61,15 +69,15 @@ class ContactSolve:
             ValueError: which, and with what.
         """
         nothing = np.zeros(len(self.bodies))
-        for found in self._near.find(time, nothing, np.zeros(len(self.surroundings.obstacles))):
-            name, deep = self.bodies[found.first].name, -float(found.touch.gap.min())
+        for found in self.detection.find(time, nothing, np.zeros(len(self.detection.obstacles))):
+            name, deep = self.bodies[found.first].name, -float(found.points.gap.min())
             if deep <= START_OVERLAP * self._size[found.first]:
                 continue
             if found.obstacle is not None:
                 raise ValueError(f"{name} reaches {deep:.3g} m into {found.obstacle.name} at the start: they must lie apart")
             raise ValueError(f"{name} overlaps {self.bodies[found.second].name} by {deep:.3g} m at the start: bodies must lie apart")
 
-    def find(self, time: float, dt: float, gravity: np.ndarray) -> Touching:
+    def find(self, time: float, dt: float, gravity: np.ndarray) -> Contacts:
         """Return where bodies touch now or may in the step.
 
         Args:
@@ -81,90 +89,88 @@ class ContactSolve:
         six = self._six()
         speeds, spins = np.linalg.norm(six[:, :3], axis=1), np.linalg.norm(six[:, 3:], axis=1)
         ways = AHEAD * dt * (speeds + spins * self._reach + falls)
-        brought = [AHEAD * self._obstacle_way(obstacle.motion, time, dt) for obstacle in self.surroundings.obstacles]
+        brought = [AHEAD * self._obstacle_way(obstacle.motion, time, dt) for obstacle in self.detection.obstacles]
         near = NEAR * float(self._size.min())
-        found = self._near.find(time, ways, near + np.array(brought), near)
-        return self._assembled(found, time, dt, gravity) if found else Touching.none(self.dimension)
+        found = self.detection.find(time, ways, near + np.array(brought), near)
+        return self.assembled(found, time, dt, gravity)
 
-    def push_apart(self, touching: Touching, start: np.ndarray | None = None) -> np.ndarray:
+    def push_apart(self, contacts: Contacts, start: np.ndarray | None = None) -> np.ndarray:
         """Solve for the impulses of contacts and give them to the bodies; return them [N s], shape (k, dimension).
 
         Args:
-            touching: the contacts.
+            contacts: the contacts.
             start: impulses to start from; those of the last step if None.
         """
         self.residual = 0.0
-        if not len(touching):
+        if not len(contacts):
             return np.zeros((0, self.dimension))
-        b = touching.velocities(self._velocities())
-        b[:, 0] -= touching.target
-        start = self.memory.recall(touching, self.bodies) if start is None else start
-        problem = self._problem(touching, b, touching.friction)
+        b = contacts.velocities(self._velocities())
+        b[:, 0] -= contacts.target
+        start = self.memory.recall(contacts, self.bodies) if start is None else start
+        problem = self._problem(contacts, b, contacts.friction)
         impulses, self.residual = problem.solve(EXACT, start)
-        for body, impulse in zip(self.bodies, touching.on_bodies(impulses, len(self.bodies)), strict=True):
+        for body, impulse in zip(self.bodies, contacts.on_bodies(impulses, len(self.bodies)), strict=True):
             body.push(impulse)
         return impulses
 
-    def separation(self, touching: Touching, dt: float) -> np.ndarray | None:
+    def separation(self, contacts: Contacts, dt: float) -> np.ndarray | None:
         """Return the smallest ways (m, rad) of the bodies, in the metric of their masses, that reduce overlaps at the end of a step.
 
         They give no velocity, so no energy of motion; a frictionless problem like that of the impulses. Shape (n, q); None: no ways.
         """
-        if not len(touching):
+        if not len(contacts):
             return None
-        gap = touching.gap + dt * touching.velocities(self._velocities())[:, 0]
-        deep = gap < -SLOP * touching.size
+        gap = contacts.gap + dt * contacts.velocities(self._velocities())[:, 0]
+        deep = gap < -SLOP * contacts.size
         if not deep.any():
             return None
         b = np.where(deep, RATE * gap, np.maximum(gap, 0.0))
-        problem = self._problem(touching, b[:, None], np.zeros(len(b)))
+        problem = self._problem(contacts, b[:, None], np.zeros(len(b)))
         x, _ = problem.solve(ROUGH)
-        pushes = touching.on_bodies(x, len(self.bodies))
+        pushes = contacts.on_bodies(x, len(self.bodies))
         roots = self._roots()
         return np.asarray((roots @ (roots.swapaxes(1, 2) @ pushes[:, :, None]))[:, :, 0])
 
-    def hold(self, touching: Touching, impulses: np.ndarray) -> None:
+    def hold(self, contacts: Contacts, impulses: np.ndarray) -> None:
         """Let contacts that bear against walls and other solids take what impulses would move into them, for each body by itself.
 
         A body that is held holds what bears against it where it cannot move itself: a stack on the floor is held up to its top.
         """
-        if len(touching):
-            firm = Firm.of(touching, impulses, len(self.bodies))
+        if len(contacts):
+            firm = Firm.of(contacts, impulses, len(self.bodies))
             roots = self._roots()
-            waiting = np.unique(touching.first[firm.first.any(axis=1)]).tolist()
+            waiting = np.unique(contacts.first[firm.first.any(axis=1)]).tolist()
             while waiting:
                 number = waiting.pop(0)
                 body, G = self.bodies[number], roots[number]
-                squares, V = np.linalg.eigh(firm.square(touching, number, G))
+                squares, V = np.linalg.eigh(firm.square(contacts, number, G))
                 V = V[:, squares > SINGULAR * squares.max()]  # what contacts take, in the metric of the mass
                 body.hold = np.eye(len(G)) - np.linalg.inv(G).T @ V @ V.T @ G.T
-                reached = firm.spread(touching, number, G, G - G @ V @ V.T)
+                reached = firm.spread(contacts, number, G, G - G @ V @ V.T)
                 waiting += [other for other in reached if other not in waiting and self.bodies[other].hold is None]
 
-    def _problem(self, touching: Touching, b: np.ndarray, friction: np.ndarray) -> ContactProblem:
+    def _problem(self, contacts: Contacts, b: np.ndarray, friction: np.ndarray) -> ContactProblem:
         """Return the problem of the first rows of each contact, as many as b has, shape (k, rows)."""
         roots = self._roots()
         roots = np.concatenate([roots, np.zeros((1, *roots.shape[1:]))])
-        one, other = (rows[:, : b.shape[1]] for rows in (touching.one, touching.other))
-        first, second = touching.first, touching.second
+        one, other = (rows[:, : b.shape[1]] for rows in (contacts.one, contacts.other))
+        first, second = contacts.first, contacts.second
         return ContactProblem(first, second, one @ roots[first], other @ roots[second], b, friction, len(self.bodies))
 
-    def _assembled(self, found: Sequence[Found], time: float, dt: float, gravity: np.ndarray) -> Touching:
-        """Return the contacts with their rows."""
-        falls, n, dim = float(np.linalg.norm(gravity)) * dt, len(self.bodies), self.dimension
-        counts = [len(entry.touch) for entry in found]
-        first = np.repeat(np.array([entry.first for entry in found], dtype=int), counts)
-        second = np.repeat(np.array([entry.second for entry in found], dtype=int), counts)
-        point, normal = (
-            np.concatenate([np.zeros((0, 3)), *(getattr(entry.touch, name) for entry in found)]) for name in ("point", "normal")
-        )
-        gap = np.concatenate([np.zeros(0), *(entry.touch.gap for entry in found)])
-        moved = np.concatenate([np.zeros((0, 3)), *(_carried(entry.motion, entry.touch.point, time, dt) for entry in found)])
+    def assembled(self, found: Sequence[ContactPair], time: float, dt: float, gravity: np.ndarray | None) -> Contacts:
+        """Return the contacts with their rows; tangents are along the slip, or along gravity, if that is given."""
+        falls, n, dim = 0.0 if gravity is None else float(np.linalg.norm(gravity)) * dt, len(self.bodies), self.dimension
+        counts = np.array([len(entry.points) for entry in found], dtype=int)
+        first, second = (np.repeat(np.array([getattr(entry, name) for entry in found], dtype=int), counts) for name in ("first", "second"))
+        touch = ContactPoints.joined([entry.points for entry in found])
+        point, normal, gap = touch.point, touch.normal, touch.gap
+        moved = np.concatenate([np.zeros((0, 3)), *(_carried(entry.motion, entry.points.point, time, dt) for entry in found)])
         six = np.concatenate([self._six(), np.zeros((1, 6))])
         at = np.array([body.position for body in self.bodies] + [np.zeros(3)])
         mine, others = point - at[first], point - at[second]
         slip = six[first, :3] + np.cross(six[first, 3:], mine) - six[second, :3] - np.cross(six[second, 3:], others) - moved
-        frames = _frames(normal, slip, dim, ALONG_SLIP * falls, gravity)
+        ways = () if gravity is None else ((gravity, SIDEWAYS * float(np.linalg.norm(gravity))), (slip, ALONG_SLIP * falls))
+        frames = contact_frames(normal, dim, ways)
         one, other = _rows(mine, frames, dim), -_rows(others, frames, dim)
         standing = second == n
         other[standing] = 0.0
@@ -173,12 +179,12 @@ class ContactSolve:
         size, bounce = (pick(values[first], values[partner]) for pick, values in ((np.minimum, self._size), (np.maximum, self._bounce)))
         friction = np.sqrt(self._friction[first] * self._friction[partner])
         target = np.zeros(len(gap))
-        touching = Touching(first, second, point, frames, gap, size, friction, one, other, wall, target)
-        approach = touching.velocities(self._velocities())[:, 0]
+        contacts = Contacts(first, second, point, frames, gap, size, friction, one, other, wall, target)
+        approach = contacts.velocities(self._velocities())[:, 0]
         target -= np.maximum(gap, 0.0) / dt
         hits = (approach < -BOUNCE * falls) & (gap + dt * approach < 0.0) & (bounce > 0.0)
         target[hits] = np.maximum(target, -bounce * approach)[hits]
-        return touching
+        return contacts
 
     def _obstacle_way(self, motion: Motion | None, time: float, dt: float) -> float:
         """Return how far points near the bodies go with an obstacle in a step [m]."""
@@ -220,16 +226,16 @@ def _carried(motion: Motion | None, points: np.ndarray, time: float, dt: float) 
     return np.asarray((way.apply(points) - points) / dt)
 
 
-def _frames(normal: np.ndarray, slip: np.ndarray, dimension: int, slow: float, gravity: np.ndarray) -> np.ndarray:
-    """Return normal and tangents of contacts, shape (k, dimension, 3).
+def contact_frames(normal: np.ndarray, dimension: int, ways: Sequence[tuple[np.ndarray, float]] = ()) -> np.ndarray:
+    """Return normal and tangents of contacts, shape (k, dimension, 3), right-handed in space.
 
-    In space the first tangent is along the slip, where there is none along what gravity would make slip: boxes of friction then are as wide
-    as the cone where it counts.
+    There the first tangent is along the last of some ways that is longer than its least: boxes of friction then are as wide as the cone
+    where it counts.
     """
     if dimension == 2:
         return np.stack([normal, np.stack([-normal[:, 1], normal[:, 0], np.zeros(len(normal))], axis=1)], axis=1)
     u = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
-    for way, least in ((gravity, SIDEWAYS * float(np.linalg.norm(gravity))), (slip, slow)):
+    for way, least in ways:
         along = way - (way * normal).sum(axis=1)[:, None] * normal
         u = np.where((np.linalg.norm(along, axis=1) > least)[:, None], along, u)
     u /= np.linalg.norm(u, axis=1, keepdims=True)

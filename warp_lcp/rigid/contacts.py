@@ -1,180 +1,126 @@
-"""Where bodies touch each other and what surrounds them: points, normals and gaps, a few for each pair."""
+"""The contacts of a step, and what is remembered of them for the next one."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import bsr_array, csr_array
 
-from warp_lcp.grid.motion import Pose
-from warp_lcp.rigid.box_contacts import OrientedBox, box_box
-from warp_lcp.rigid.contact_shape import ContactShape
+from warp_lcp.rigid.body import RigidBody
 
-FLAT = {2: 2, 3: 4}  # contacts of a pair with about one normal: a flat rest needs no more
-MOST = {2: 4, 3: 8}  # contacts of a pair
-OTHER_SIDE = 0.1  # of normals' difference: contacts of sides that differ by less count as of one
-SAME = 1e-6  # of a shape's size: points of contact this close are one
-LOWER = 20.0  # so many times the gap must a point be farther from the others to count more than one with less
-MUCH_LOWER = 200.0  # for those that come on top where others lie lower: what a round rim rests on is not what it may tip over
-MORE = 2  # of these, at most
-LEVEL = 1e-4  # of the smaller shape's size: gaps that differ by less are of one height
+SAME_PLACE = 0.05  # of a body's size: a contact this close to one of the last step starts from its impulse
+KEPT = 32  # contacts remembered for each body, at most
 
 
 @dataclass(frozen=True, eq=False)
-class Touch:
-    """Points where one thing touches another.
+class Contacts:
+    """The contacts of a step, k of them; a contact's rows are its normal and `dimension` - 1 tangents. q: velocities of a body.
 
     Args:
-        point: halfway between the surfaces [m], shape (k, 3).
-        normal: unit vectors from the other to the one, shape (k, 3).
-        gap: [m], negative where they overlap, shape (k,).
+        first: body that the normal points into, shape (k,).
+        second: body that it comes from, the number of bodies where that is none, shape (k,).
+        point: in the world [m], shape (k, 3).
+        frames: normal and tangents, shape (k, dimension, 3).
+        gap: [m], shape (k,).
+        size: of the smaller body [m], shape (k,).
+        friction: Coulomb's coefficient, shape (k,).
+        one: relative velocities of the first body's velocities, shape (k, dimension, q).
+        other: of the second's, 0 where that is none.
+        wall: what surroundings that move add to them [m/s], shape (k, dimension).
+        target: normal velocity that is the least [m/s]: what closes the gap, or bounces, shape (k,).
     """
 
+    first: np.ndarray
+    second: np.ndarray
     point: np.ndarray
-    normal: np.ndarray
+    frames: np.ndarray
     gap: np.ndarray
+    size: np.ndarray
+    friction: np.ndarray
+    one: np.ndarray
+    other: np.ndarray
+    wall: np.ndarray
+    target: np.ndarray
 
     def __len__(self) -> int:
-        """Return the number of points."""
+        """Return the number of contacts."""
         return len(self.gap)
 
-    def turned(self) -> Touch:
-        """Return the same points as the other sees them."""
-        return Touch(self.point, -self.normal, self.gap)
+    def jacobian(self, bodies: int) -> csr_array:
+        """Return J: what velocities of all bodies make at contacts, shape (k dimension, bodies q)."""
+        return jacobian(self.first, self.second, self.one, self.other, bodies)
 
-    def where(self, chosen: np.ndarray) -> Touch:
-        """Return some of the points."""
-        return Touch(self.point[chosen], self.normal[chosen], self.gap[chosen])
+    def velocities(self, of_bodies: np.ndarray) -> np.ndarray:
+        """Return relative velocities at contacts [m/s], shape (k, dimension), from those of the bodies, shape (n, q)."""
+        V = np.vstack([of_bodies, np.zeros(of_bodies.shape[1])])
+        both = (self.one @ V[self.first][:, :, None] + self.other @ V[self.second][:, :, None])[:, :, 0]
+        return np.asarray(both + self.wall)
 
-    @classmethod
-    def joined(cls, touches: Sequence[Touch]) -> Touch:
-        """Return the points of several."""
-        if not touches:
-            return cls(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-        return cls(*(np.concatenate([getattr(touch, name) for touch in touches]) for name in ("point", "normal", "gap")))
-
-
-class Place(NamedTuple):
-    """Where a body is: p becomes rotation @ p + translation; a `Pose` that nobody gave, so that nobody checks it."""
-
-    rotation: np.ndarray
-    translation: np.ndarray
-
-    def apply(self, points: np.ndarray) -> np.ndarray:
-        """Return points [m], shape (n, 3), after the change of place."""
-        return np.asarray(points @ self.rotation.T + self.translation)
+    def on_bodies(self, impulses: np.ndarray, count: int) -> np.ndarray:
+        """Return what impulses of contacts, shape (k, rows) with rows <= dimension, add up to at each body, shape (count, q)."""
+        rows = impulses.shape[1]
+        total = np.zeros((count + 1, self.one.shape[2]))
+        np.add.at(total, self.first, (impulses[:, None] @ self.one[:, :rows])[:, 0])
+        np.add.at(total, self.second, (impulses[:, None] @ self.other[:, :rows])[:, 0])
+        return total[:-1]
 
 
-def on_planes(shape: ContactShape, pose: Pose | Place, points: np.ndarray, normals: np.ndarray, margin: float, dimension: int) -> Touch:
-    """Return where a shape touches planes.
+class ContactMemory:
+    """Impulses of the last step's contacts, from which those of the next one start.
+
+    Attributes:
+        values: first and second body, place in the first body's own axes [m], impulse in the world's [N s]; shape (k, 8).
+    """
+
+    def __init__(self, bodies: int) -> None:
+        self.values, self._most = np.zeros((0, 8)), KEPT * bodies
+
+    def state(self) -> np.ndarray:
+        """Return the values with rows of -1 for those that there are not: of one shape, whatever bodies touch."""
+        return np.concatenate([self.values, np.full((self._most - len(self.values), 8), -1.0)])
+
+    def restore(self, state: np.ndarray) -> None:
+        """Continue from `state`; an empty one is no memory."""
+        values = np.array(state, dtype=np.float64).reshape(-1, 8)
+        self.values = values[values[:, 0] >= 0.0]
+
+    def keep(self, contacts: Contacts, impulses: np.ndarray, bodies: Sequence[RigidBody]) -> None:
+        """Remember impulses, shape (k, dimension)."""
+        world = (impulses[:, None] @ contacts.frames)[:, 0]
+        self.values = np.column_stack([contacts.first, contacts.second, _places(contacts, bodies), world])[: self._most]
+
+    def recall(self, contacts: Contacts, bodies: Sequence[RigidBody]) -> np.ndarray:
+        """Return impulses to start from, shape (k, dimension): those of the nearest contact of the same two, once each."""
+        start, old = np.zeros(contacts.wall.shape), self.values
+        if not len(old) or not len(contacts):
+            return start
+        places = _places(contacts, bodies)
+        same = (contacts.first[:, None] == old[:, 0]) & (contacts.second[:, None] == old[:, 1])
+        way = np.where(same, np.linalg.norm(places[:, None] - old[:, 2:5], axis=2), np.inf)
+        nearest, each = way.argmin(axis=1), np.arange(len(places))
+        known = (way[each, nearest] < SAME_PLACE * contacts.size) & (way.argmin(axis=0)[nearest] == each)
+        start[known] = (contacts.frames[known] @ old[nearest[known], 5:, None])[:, :, 0]
+        return start
+
+
+def _places(contacts: Contacts, bodies: Sequence[RigidBody]) -> np.ndarray:
+    """Return contacts in the axes of their first bodies [m], shape (k, 3)."""
+    at, turned = (np.array([getattr(body, name) for body in bodies]) for name in ("position", "rotation"))
+    return np.asarray(((contacts.point - at[contacts.first])[:, None] @ turned[contacts.first])[:, 0])
+
+
+def jacobian(first: np.ndarray, second: np.ndarray, one: np.ndarray, other: np.ndarray, bodies: int) -> csr_array:
+    """Return J: what velocities of bodies make along the rows of pairs, shape (k rows, q bodies).
 
     Args:
-        shape: of the body, as placed.
-        pose: of the body.
-        points: of the planes [m], shape (m, 3).
-        normals: unit vectors into the open, shape (m, 3).
-        margin: gap [m] up to which there is a contact.
-        dimension: 2 or 3.
+        first: of each pair, shape (k,).
+        second: the other one, `bodies` where it is none.
+        one: rows for the first body, shape (k, rows, q).
+        other: for the second.
+        bodies: their number.
     """
-    centers = pose.apply(shape.points)
-    found = []
-    for point, normal in zip(points, normals, strict=True):
-        gap = (centers - point) @ normal - shape.radius
-        near = gap <= margin
-        if near.any():
-            places = centers[near] - (shape.radius + 0.5 * gap[near])[:, None] * normal
-            touch = Touch(places, np.broadcast_to(normal, places.shape), gap[near])
-            found.append(spread(touch, shape.size, dimension))
-    return Touch.joined(found)
-
-
-def between(one: ContactShape, at: Pose | Place, other: ContactShape, there: Pose | Place, margin: float, dimension: int) -> Touch:
-    """Return where two shapes touch, normals from the other to the one.
-
-    Boxes by the axis along which they overlap least; others by points of either surface and the distance to the other one.
-
-    Args:
-        one: a shape, as placed.
-        at: its pose.
-        other: the other one.
-        there: its pose.
-        margin: gap [m] up to which there is a contact.
-        dimension: 2 or 3.
-    """
-    size = min(one.size, other.size)
-    if one.box is not None and other.box is not None:
-        return spread(_boxes(_moved(one.box, at), _moved(other.box, there), margin, dimension), size, dimension)
-    single = [len(shape.points) == 1 for shape in (one, other)]  # the center of a ball says all
-    found = []
-    if not single[1] or single[0]:
-        found.append(_points_of(one, at, other, there, margin))
-    if not single[0] and len(other.points):
-        found.append(_points_of(other, there, one, at, margin).turned())
-    return spread(Touch.joined(found), size, dimension)
-
-
-def _points_of(one: ContactShape, at: Pose | Place, other: ContactShape, there: Pose | Place, margin: float) -> Touch:
-    """Return the points of one shape that are near the other."""
-    centers = at.apply(one.points)
-    local = (centers - there.translation) @ there.rotation
-    if other.closed and len(local) > 1:  # most points are far away
-        reach = margin + one.radius
-        near = ((local >= other.low - reach) & (local <= other.high + reach)).all(axis=1)
-        centers, local = centers[near], local[near]
-    if not len(local):
-        return Touch.joined([])
-    distance, direction = other.distance(local)
-    gap = distance - one.radius
-    near = gap <= margin
-    normal = direction[near] @ there.rotation.T
-    return Touch(centers[near] - (one.radius + 0.5 * gap[near])[:, None] * normal, normal, gap[near])
-
-
-def _moved(box: OrientedBox, pose: Pose | Place) -> OrientedBox:
-    return OrientedBox(pose.apply(box.center[None])[0], pose.rotation @ box.rotation, box.half)
-
-
-def _boxes(a: OrientedBox, b: OrientedBox, margin: float, dimension: int) -> Touch:
-    """Return where two boxes touch; in 2-D they are thick, and of their contacts those of one face count."""
-    if dimension == 2:
-        deep = max(a.half[2], b.half[2])
-        a, b = (OrientedBox(box.center, box.rotation, np.array([*box.half[:2], deep])) for box in (a, b))
-    hit = box_box(a, b, margin)
-    if hit is None:
-        return Touch.joined([])
-    points, normal, gaps = hit
-    if dimension == 2:
-        points, gaps = points[points[:, 2] > 0.0], gaps[points[:, 2] > 0.0]
-        points[:, 2] = 0.0
-    return Touch(points, np.broadcast_to(normal, points.shape), gaps)
-
-
-def spread(touch: Touch, size: float, dimension: int) -> Touch:
-    """Return the deepest of a pair's points and others that are low and far from each other, as many as hold a body.
-
-    Where all have about one normal that is two points in 2-D and four in 3-D, and up to two more if some of these are higher than others.
-
-    Args:
-        touch: the points.
-        size: of the smaller shape [m].
-        dimension: 2 or 3.
-    """
-    if len(touch) < 2:
-        return touch
-    above = touch.gap - touch.gap.min()
-    chosen = [int(touch.gap.argmin())]
-    way = np.linalg.norm(touch.point - touch.point[chosen[0]], axis=1)
-    side = np.linalg.norm(touch.normal - touch.normal[chosen[0]], axis=1)
-    for lower, flat in ((LOWER, FLAT[dimension]), (MUCH_LOWER, FLAT[dimension] + MORE)):
-        allowed = above < (above[chosen].max() - LEVEL * size if lower == MUCH_LOWER else np.inf)
-        while len(chosen) < MOST[dimension]:
-            usable = allowed & ((side > OTHER_SIDE) | ((way > SAME * size) & (len(chosen) < flat)))
-            if not usable.any():
-                break
-            following = int(np.where(usable, way + size * side - lower * above, -np.inf).argmax())
-            chosen.append(following)
-            way = np.minimum(way, np.linalg.norm(touch.point - touch.point[following], axis=1))
-            side = np.minimum(side, np.linalg.norm(touch.normal - touch.normal[following], axis=1))
-    return touch.where(np.array(chosen))
+    k, rows, q = one.shape
+    blocks, places = np.stack([one, other], axis=1).reshape(2 * k, rows, q), np.stack([first, second], axis=1).ravel()
+    return csr_array(bsr_array((blocks, places, 2 * np.arange(k + 1)), shape=(k * rows, (bodies + 1) * q)).tocsr()[:, : bodies * q])

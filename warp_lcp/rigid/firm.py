@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warp_lcp.rigid.touching import Touching
+from warp_lcp.rigid.contacts import Contacts
 
 BEARS = 1e-6  # of the largest impulse of a body: contacts with less do not hold it
 STILL = 1e-6  # of how a free body yields: what yields less does not
@@ -30,37 +30,37 @@ class Firm:
     bodies: int
 
     @classmethod
-    def of(cls, touching: Touching, impulses: np.ndarray, bodies: int) -> Firm:
+    def of(cls, contacts: Contacts, impulses: np.ndarray, bodies: int) -> Firm:
         """Return what walls and other solids hold, by impulses of shape (k, dimension)."""
         normal = impulses[:, 0]
         largest = np.zeros(bodies + 1)
-        np.maximum.at(largest, touching.first, normal)
-        np.maximum.at(largest, touching.second, normal)
+        np.maximum.at(largest, contacts.first, normal)
+        np.maximum.at(largest, contacts.second, normal)
         largest[bodies] = np.inf
-        bears = normal > BEARS * np.minimum(largest[touching.first], largest[touching.second])
-        sticks = np.abs(impulses[:, 1:]) < (touching.friction * normal)[:, None] * (1.0 - BEARS)
+        bears = normal > BEARS * np.minimum(largest[contacts.first], largest[contacts.second])
+        sticks = np.abs(impulses[:, 1:]) < (contacts.friction * normal)[:, None] * (1.0 - BEARS)
         held = bears[:, None] & np.concatenate([bears[:, None], sticks], axis=1)
-        return cls(held, held & (touching.second == bodies)[:, None], np.zeros_like(held), bodies)
+        return cls(held, held & (contacts.second == bodies)[:, None], np.zeros_like(held), bodies)
 
-    def square(self, touching: Touching, number: int, root: np.ndarray) -> np.ndarray:
+    def square(self, contacts: Contacts, number: int, root: np.ndarray) -> np.ndarray:
         """Return G' J' J G of the rows J that hold a body, shape (q, q); G: `root` of its inverse mass, shape (q, q)."""
-        one, other = touching.first == number, touching.second == number
-        J = np.concatenate([touching.one[one][self.first[one]], touching.other[other][self.second[other]]]) @ root
+        one, other = contacts.first == number, contacts.second == number
+        J = np.concatenate([contacts.one[one][self.first[one]], contacts.other[other][self.second[other]]]) @ root
         return np.asarray(J.T @ J)
 
-    def spread(self, touching: Touching, number: int, free: np.ndarray, left: np.ndarray) -> list[int]:
+    def spread(self, contacts: Contacts, number: int, free: np.ndarray, left: np.ndarray) -> list[int]:
         """Let a body that is held hold others; return which.
 
         Args:
-            touching: the contacts.
+            contacts: the contacts.
             number: of the body.
             free: root of its inverse mass, shape (q, q).
             left: of what is left of that.
         """
         reached: list[int] = []
         sides = (
-            (self.first, touching.second, touching.other, touching.first),
-            (self.second, touching.first, touching.one, touching.second),
+            (self.first, contacts.second, contacts.other, contacts.first),
+            (self.second, contacts.first, contacts.one, contacts.second),
         )
         for rows, mine, J, beyond in sides:
             here = np.flatnonzero((mine == number) & (beyond < self.bodies))

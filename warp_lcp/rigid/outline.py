@@ -60,7 +60,7 @@ class BodySurface:
 
     @classmethod
     def joined(cls, surfaces: Sequence[BodySurface]) -> BodySurface:
-        """Return several as one."""
+        """Return several surfaces as one, their corners counted on."""
         first = np.cumsum([0, *(len(surface.points) for surface in surfaces)])
         corners = np.concatenate([surface.corners + start for surface, start in zip(surfaces, first, strict=False)])
         fields = {name: np.concatenate([surface.fields[name] for surface in surfaces]) for name in surfaces[0].fields}

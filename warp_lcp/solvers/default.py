@@ -9,7 +9,7 @@ from warp_lcp.layout import Array
 from warp_lcp.problem import LCP
 from warp_lcp.protocol import HasStencil, has, takes
 from warp_lcp.result import Record, SolveResult
-from warp_lcp.solve import Solver, Workspace
+from warp_lcp.solve import ConvexSetProblem, Solver, Workspace
 from warp_lcp.solve import solve as solve_by
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.minimum_map_newton_direct import suits
@@ -31,7 +31,7 @@ def default_method(problem: LCP) -> Solver:
 
 
 def solve(
-    problem: LCP,
+    problem: LCP | ConvexSetProblem,
     solver: Solver | None = None,
     *,
     stopping: StoppingCriteria | None = None,
@@ -43,17 +43,17 @@ def solve(
     """Solve a problem by a method.
 
     Args:
-        problem: the LCP.
+        problem: the LCP, or a problem over another convex set than a box.
         solver: the method, say `MinimumMapNewton()`; `default_method(problem)` if None.
         stopping: the criteria; defaults to `StoppingCriteria()`.
-        x0: a guess, field of the problem's shape, projected onto the bounds; clip(0, l, u) if None.
+        x0: a guess, field of the problem's shape, projected onto the bounds; clip(0, l, u) if None (over other sets: x as it is).
         workspace: what `solver.init(problem)` returned, to use its memory again.
         callback: called with each Record as it is made.
         misplaced: nothing; other options are refused.
 
     Returns:
         The best iterate, its status and recomputed residual, the history. The result's x is the caller's to keep, unless the problem
-        works in place: then it is the workspace's own iterate, overwritten by the next solve with that workspace.
+        works in place or is over another set: then it is the workspace's own iterate, overwritten by the next solve with that workspace.
 
     Raises:
         ValueError: an argument is of another kind, x0 has a wrong shape or is not finite, a workspace comes without its solver, or the
@@ -66,5 +66,7 @@ def solve(
         raise TypeError(f"solve takes no {name}: settings are the method's own, say wl.ProjectedSOR(omega=1.5)")
     if solver is None and workspace is not None:
         raise ValueError("workspace: name the solver that made it")
-    solver = default_method(problem) if solver is None else solver
+    if solver is None and isinstance(problem, ConvexSetProblem):
+        raise ValueError(f"solver: a {type(problem).__name__} is solved by methods of its own, name one")
+    solver = default_method(problem) if solver is None else solver  # type: ignore[arg-type]  # an LCP, or refused there
     return solve_by(problem, solver, stopping=stopping, x0=x0, workspace=workspace, callback=callback)

@@ -36,13 +36,6 @@ class Obstacle:
         return Pose.identity() if self.motion is None else self.motion.pose(time)
 
 
-@dataclass(frozen=True)
-class Surroundings:
-    """All that bodies may touch besides each other."""
-
-    obstacles: tuple[Obstacle, ...] = ()
-
-
 def domain_walls(size: Sequence[float], *, open_sides: int = 0, endless: Sequence[int] = ()) -> Obstacle:
     """Return the walls of a box from the origin to `size` [m], shape (2,) or (3,).
 

@@ -1,0 +1,272 @@
+"""Which bodies touch each other and what surrounds them, and where: points, normals and gaps, a few for each pair."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from warp_lcp.grid.motion import Motion, Pose
+from warp_lcp.rigid.body import RigidBody
+from warp_lcp.rigid.box_contacts import OrientedBox, box_box
+from warp_lcp.rigid.contact_shape import ContactShape
+from warp_lcp.rigid.obstacles import Obstacle
+
+FLAT = {2: 2, 3: 4}  # contacts of a pair with about one normal: a flat rest needs no more
+MOST = {2: 4, 3: 8}  # contacts of a pair
+OTHER_SIDE = 0.1  # of normals' difference: contacts of sides that differ by less count as of one
+SAME = 1e-6  # of a shape's size: points of contact this close are one
+LOWER = 20.0  # so many times the gap must a point be farther from the others to count more than one with less
+MUCH_LOWER = 200.0  # for those that come on top where others lie lower: what a round rim rests on is not what it may tip over
+MORE = 2  # of these, at most
+LEVEL = 1e-4  # of the smaller shape's size: gaps that differ by less are of one height
+
+
+@dataclass(frozen=True, eq=False)
+class ContactPoints:
+    """Points where one thing touches another.
+
+    Args:
+        point: halfway between the surfaces [m], shape (k, 3).
+        normal: unit vectors from the other to the one, shape (k, 3).
+        gap: [m], negative where they overlap, shape (k,).
+    """
+
+    point: np.ndarray
+    normal: np.ndarray
+    gap: np.ndarray
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.gap)
+
+    def turned(self) -> ContactPoints:
+        """Return the same points as the other sees them."""
+        return ContactPoints(self.point, -self.normal, self.gap)
+
+    def where(self, chosen: np.ndarray) -> ContactPoints:
+        """Return the points that are chosen, by a mask or their places."""
+        return ContactPoints(self.point[chosen], self.normal[chosen], self.gap[chosen])
+
+    @classmethod
+    def joined(cls, several: Sequence[ContactPoints]) -> ContactPoints:
+        """Return the points of several pairs as one."""
+        none = cls(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+        return cls(*(np.concatenate([getattr(points, name) for points in (none, *several)]) for name in ("point", "normal", "gap")))
+
+
+class Place(NamedTuple):
+    """Where a body is: p becomes rotation @ p + translation; a `Pose` that nobody gave, so that nobody checks it."""
+
+    rotation: np.ndarray
+    translation: np.ndarray
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        """Return points [m], shape (n, 3), after the change of place."""
+        return np.asarray(points @ self.rotation.T + self.translation)
+
+
+def on_plane(shape: ContactShape, pose: Pose | Place, point: np.ndarray, normal: np.ndarray, margin: float) -> ContactPoints:
+    """Return where a shape touches a plane.
+
+    Args:
+        shape: of the body, as placed.
+        pose: of the body.
+        point: of the plane [m], shape (3,).
+        normal: unit vector into the open, shape (3,).
+        margin: gap [m] up to which there is a contact.
+    """
+    centers = pose.apply(shape.points)
+    gap = (centers - point) @ normal - shape.radius
+    near = gap <= margin
+    places = centers[near] - (shape.radius + 0.5 * gap[near])[:, None] * normal
+    return ContactPoints(places, np.broadcast_to(normal, places.shape), gap[near])
+
+
+def between(one: ContactShape, at: Pose | Place, other: ContactShape, there: Pose | Place, margin: float, dimension: int) -> ContactPoints:
+    """Return where two shapes touch, normals from the other to the one.
+
+    Boxes by the axis along which they overlap least; others by points of either surface and the distance to the other one.
+
+    Args:
+        one: a shape, as placed.
+        at: its pose.
+        other: the other one.
+        there: its pose.
+        margin: gap [m] up to which there is a contact.
+        dimension: 2 or 3.
+    """
+    if one.boxes and other.boxes:
+        return ContactPoints.joined([_boxes(_moved(a, at), _moved(b, there), margin, dimension) for a in one.boxes for b in other.boxes])
+    single = [len(shape.points) == 1 for shape in (one, other)]  # the center of a ball says all
+    found = []
+    if not single[1] or single[0]:
+        found.append(_points_of(one, at, other, there, margin))
+    if not single[0] and len(other.points):
+        found.append(_points_of(other, there, one, at, margin).turned())
+    return ContactPoints.joined(found)
+
+
+def _points_of(one: ContactShape, at: Pose | Place, other: ContactShape, there: Pose | Place, margin: float) -> ContactPoints:
+    """Return the points of one shape that are near the other."""
+    centers = at.apply(one.points)
+    local = (centers - there.translation) @ there.rotation
+    if other.closed and len(local) > 1:  # most points are far away
+        reach = margin + one.radius
+        near = ((local >= other.low - reach) & (local <= other.high + reach)).all(axis=1)
+        centers, local = centers[near], local[near]
+    if not len(local):
+        return ContactPoints.joined([])
+    distance, direction = other.distance(local)
+    gap = distance - one.radius
+    near = gap <= margin
+    normal = direction[near] @ there.rotation.T
+    return ContactPoints(centers[near] - (one.radius + 0.5 * gap[near])[:, None] * normal, normal, gap[near])
+
+
+def _moved(box: OrientedBox, pose: Pose | Place) -> OrientedBox:
+    return OrientedBox(pose.apply(box.center[None])[0], pose.rotation @ box.rotation, box.half)
+
+
+def _boxes(a: OrientedBox, b: OrientedBox, margin: float, dimension: int) -> ContactPoints:
+    """Return where two boxes touch; in 2-D they are thick, and of their contacts those of one face count."""
+    if dimension == 2:
+        deep = max(a.half[2], b.half[2])
+        a, b = (OrientedBox(box.center, box.rotation, np.array([*box.half[:2], deep])) for box in (a, b))
+    hit = box_box(a, b, margin)
+    if hit is None:
+        return ContactPoints.joined([])
+    points, normal, gaps = hit
+    if dimension == 2:
+        points, gaps = points[points[:, 2] > 0.0], gaps[points[:, 2] > 0.0]
+        points[:, 2] = 0.0
+    return ContactPoints(points, np.broadcast_to(normal, points.shape), gaps)
+
+
+def spread(points: ContactPoints, size: float, dimension: int) -> ContactPoints:
+    """Return the deepest of a pair's points and others that are low and far from each other, as many as hold a body.
+
+    Where all have about one normal that is two points in 2-D and four in 3-D, and up to two more if some of these are higher than others.
+
+    Args:
+        points: the points.
+        size: of the smaller shape [m].
+        dimension: 2 or 3.
+    """
+    if len(points) < 2:
+        return points
+    above = points.gap - points.gap.min()
+    chosen = [int(points.gap.argmin())]
+    way = np.linalg.norm(points.point - points.point[chosen[0]], axis=1)
+    side = np.linalg.norm(points.normal - points.normal[chosen[0]], axis=1)
+    for lower, flat in ((LOWER, FLAT[dimension]), (MUCH_LOWER, FLAT[dimension] + MORE)):
+        allowed = above < (above[chosen].max() - LEVEL * size if lower == MUCH_LOWER else np.inf)
+        while len(chosen) < MOST[dimension]:
+            usable = allowed & ((side > OTHER_SIDE) | ((way > SAME * size) & (len(chosen) < flat)))
+            if not usable.any():
+                break
+            following = int(np.where(usable, way + size * side - lower * above, -np.inf).argmax())
+            chosen.append(following)
+            way = np.minimum(way, np.linalg.norm(points.point - points.point[following], axis=1))
+            side = np.minimum(side, np.linalg.norm(points.normal - points.normal[following], axis=1))
+    return points.where(np.array(chosen))
+
+
+@dataclass(frozen=True, eq=False)
+class ContactPair:
+    """Contacts of two.
+
+    Args:
+        first: body that normals point into.
+        second: body that they come from; the number of bodies where that is none.
+        points: one at least.
+        obstacle: what they come from if it is no body.
+    """
+
+    first: int
+    second: int
+    points: ContactPoints
+    obstacle: Obstacle | None = None
+
+    @property
+    def motion(self) -> Motion | None:
+        """How the obstacle moves, if there is one and it does."""
+        return None if self.obstacle is None else self.obstacle.motion
+
+
+class ContactDetection:
+    """Finds contacts of bodies with each other and with their surroundings.
+
+    Args:
+        bodies: all.
+        shapes: of the bodies as placed.
+        obstacles: what else there is.
+        dimension: 2 or 3.
+        every: keep every point of a pair, not a few that hold a body.
+    """
+
+    def __init__(
+        self,
+        bodies: Sequence[RigidBody],
+        shapes: Sequence[ContactShape],
+        obstacles: Sequence[Obstacle],
+        dimension: int,
+        every: bool = False,
+    ) -> None:
+        self.obstacles, self._bodies, self._shapes = obstacles, bodies, shapes
+        self._center = np.array([body.properties.center for body in bodies])
+        self._dimension, self._every = dimension, every
+        self._middle = np.array([0.5 * (shape.low + shape.high) for shape in shapes])
+        self._half = np.array([0.5 * (shape.high - shape.low) - shape.radius for shape in shapes])
+        self._radius = np.array([shape.radius for shape in shapes])
+
+    def find(self, time: float, ways: np.ndarray, brought: np.ndarray, near: float = 0.0) -> list[ContactPair]:
+        """Return where bodies touch.
+
+        Args:
+            time: of the state [s].
+            ways: how far each body may come [m], shape (n,).
+            brought: gap up to which a body that rests touches each obstacle [m].
+            near: gap up to which bodies that rest touch each other [m].
+        """
+        turns, at = (np.array([getattr(body, name) for body in self._bodies]) for name in ("rotation", "position"))
+        shifts = at - (turns @ self._center[:, :, None])[:, :, 0]
+        poses = [Place(turn, shift) for turn, shift in zip(turns, shifts, strict=True)]
+        middle = (turns @ self._middle[:, :, None])[:, :, 0] + shifts
+        half = (np.abs(turns) @ self._half[:, :, None])[:, :, 0] + self._radius[:, None]
+        found = []
+        for obstacle, more in zip(self.obstacles, brought, strict=True):
+            found += self._with_obstacle(obstacle, obstacle.pose(time), poses, middle, half, ways + more)
+        margins = near + ways[:, None] + ways
+        apart = (np.abs(middle[:, None] - middle) - half[:, None] - half).max(axis=2)
+        for i, j in np.argwhere(np.tril(apart <= margins, -1)).tolist():
+            points = between(self._shapes[i], poses[i], self._shapes[j], poses[j], float(margins[i, j]), self._dimension)
+            found.append(ContactPair(i, j, self._kept(points, min(self._shapes[i].size, self._shapes[j].size))))
+        return [entry for entry in found if len(entry.points)]
+
+    def _kept(self, points: ContactPoints, size: float) -> ContactPoints:
+        return points if self._every else spread(points, size, self._dimension)
+
+    def _with_obstacle(
+        self, obstacle: Obstacle, there: Pose, poses: list[Place], middle: np.ndarray, half: np.ndarray, margins: np.ndarray
+    ) -> list[ContactPair]:
+        """Return where bodies touch an obstacle."""
+        shape, n, pairs = obstacle.shape, len(poses), []
+        if shape is None:
+            points, normals = there.apply(obstacle.points), obstacle.normals @ there.rotation.T
+            heights = middle @ normals.T - (points * normals).sum(axis=1) - half @ np.abs(normals).T
+            for i in np.flatnonzero((heights <= margins[:, None]).any(axis=1)).tolist():
+                mine, chosen = self._shapes[i], np.flatnonzero(heights[i] <= margins[i])
+                each = [self._kept(on_plane(mine, poses[i], points[m], normals[m], margins[i]), mine.size) for m in chosen]
+                pairs.append(ContactPair(i, n, ContactPoints.joined(each), obstacle))
+        else:
+            near = np.ones(n, dtype=bool)
+            if shape.closed:
+                center, reach = there.apply(0.5 * (shape.low + shape.high)), np.abs(there.rotation) @ (0.5 * (shape.high - shape.low))
+                near = (np.abs(middle - center) - half - reach).max(axis=1) <= margins
+            for i in np.flatnonzero(near).tolist():
+                touch = between(self._shapes[i], poses[i], shape, there, float(margins[i]), self._dimension)
+                pairs.append(ContactPair(i, n, self._kept(touch, min(self._shapes[i].size, shape.size)), obstacle))
+        return pairs
