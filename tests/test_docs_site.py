@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
+import typer
 
 import warp_lcp as wl
 from code_blocks import anchors, links, prose
@@ -49,6 +50,13 @@ def test_every_page_is_in_the_navigation():
     assert {str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md")} <= named
     for name in named - {"first-steps.md"}:
         assert (DOCS / name).is_file() or (ROOT / name).is_file(), name
+
+
+def test_the_page_of_the_command_line_has_every_command():
+    from warp_lcp.driver.cli import app
+
+    cells = re.findall(r"^\| (`.*?`) \| ", (DOCS / "command-line.md").read_text(), flags=re.M)
+    assert {name for cell in cells for name in re.findall(r"`(\w+)", cell)} == set(typer.main.get_command(app).commands)
 
 
 def test_pages_name_no_place_of_a_machine():
