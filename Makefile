@@ -40,7 +40,7 @@ fuzz: $(VENV)/.dev
 # Change the code in 50 places, one at a time, and see whether the tests notice; MUTANTS_ARGS="--count 200 --seed 5 --jobs 8" for more.
 mutants: $(VENV)/.dev
 	$(BIN)/python -m pip install --quiet --editable '.[mutation]'
-	$(BIN)/python -m benchmarks.mutants $(MUTANTS_ARGS)
+	$(BIN)/python -m warp_lcp.benchmarks.mutants $(MUTANTS_ARGS)
 
 # The documentation's site, in build/site; a link or an anchor that leads nowhere ends it.
 docs: $(VENV)/.docs
@@ -58,7 +58,7 @@ wheel-check: $(VENV)/.run
 	cd build/wheel-check && venv/bin/warp-lcp run ceiling-drop --out run --set time.duration=0.05
 	cd build/wheel-check && venv/bin/warp-lcp run hourglass-2d --out sand --set time.duration=0.01 --set domain.resolution=24
 	cd build/wheel-check && venv/bin/python -c "from importlib.resources import files; \
-		assert all((files(package) / 'py.typed').is_file() for package in ('warp_lcp', 'fluids', 'granular'))"
+		assert all((files(package) / 'py.typed').is_file() for package in ('warp_lcp', 'warp_lcp.fluids', 'warp_lcp.granular'))"
 
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)

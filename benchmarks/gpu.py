@@ -19,12 +19,12 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from benchmarks.machine import machine
-from benchmarks.peers.peer import Question
-from benchmarks.problems import BOUNDS, splash
-from benchmarks.record import Record, Table, read_json, write_markdown
-from benchmarks.side_by_side import side_by_side
-from benchmarks.suite import KERNELS, RUN, SCALING, SOLVERS, Suite
+from warp_lcp.benchmarks.machine import machine
+from warp_lcp.benchmarks.peers.peer import Question
+from warp_lcp.benchmarks.problems import BOUNDS, splash
+from warp_lcp.benchmarks.record import Record, Table, read_json, write_markdown
+from warp_lcp.benchmarks.side_by_side import side_by_side
+from warp_lcp.benchmarks.suite import KERNELS, RUN, SCALING, SOLVERS, Suite
 
 TESTS = Path(__file__).parents[1] / "tests"
 METHODS = (wl.ProjectedMultigrid(), wl.MinimumMapNewton(), wl.MPRGP(), wl.FischerNewton())

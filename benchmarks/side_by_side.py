@@ -10,8 +10,8 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from benchmarks.record import MACHINE, Record, Table, read_json, write_markdown
-from benchmarks.timing import Figure
+from warp_lcp.benchmarks.record import MACHINE, Record, Table, read_json, write_markdown
+from warp_lcp.benchmarks.timing import Figure
 
 TIMES = ("to_1e-06", "total", "seconds")  # what is compared: the first of these that both have
 

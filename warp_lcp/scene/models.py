@@ -1,0 +1,99 @@
+"""The models that a scene turns on: why each is there, and what it adds to memory and to a step, from a list of measured prices."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+
+TABLE = "models.toml"
+
+
+@dataclass(frozen=True)
+class Model:
+    """A part of a simulation that a scene turns on.
+
+    Args:
+        name: as in the list of prices.
+        why: the key or what else of the scene asks for it.
+        built: False: it was asked for, but the scene cannot need it; `why` then says so.
+        count: how many the scene has, each of which takes what the list says, such as rigid bodies.
+    """
+
+    name: str
+    why: str
+    built: bool = True
+    count: int = 1
+
+
+@dataclass(frozen=True)
+class Price:
+    """What a model adds, measured on one processor core.
+
+    Args:
+        fixed_seconds: of a step, however small the scene [s]: launches and what the host does.
+        cell_seconds: of a step, a cell of the domain [s].
+        particle_seconds: of a step, a particle [s].
+        cell_bytes: of memory, a cell.
+        particle_bytes: of memory, a particle.
+    """
+
+    fixed_seconds: float = 0.0
+    cell_seconds: float = 0.0
+    particle_seconds: float = 0.0
+    cell_bytes: float = 0.0
+    particle_bytes: float = 0.0
+
+    def seconds(self, cells: int, particles: int) -> float:
+        """Return what it adds to a step [s]."""
+        return self.fixed_seconds + self.cell_seconds * cells + self.particle_seconds * particles
+
+    def bytes(self, cells: int, particles: int) -> int:
+        """Return what it adds to memory."""
+        return max(round(self.cell_bytes * cells + self.particle_bytes * particles), 0)
+
+
+@cache
+def prices(simulator: str, dimension: int) -> Mapping[str, Price]:
+    """Return what models cost by name, `base` among them: what every scene of a simulator has; empty where nothing was measured."""
+    read = tomllib.loads((files("warp_lcp.scene") / TABLE).read_text(encoding="utf-8"))
+    return {name: Price(**price) for name, price in read.get(simulator, {}).get(f"{dimension}d", {}).items()}
+
+
+def predicted_seconds(models: Iterable[Model], listed: Mapping[str, Price], cells: int, particles: int) -> float:
+    """Return how long a step takes by the list of prices [s]; 0: not known."""
+    counts = {"base": 1, **{model.name: model.count for model in models if model.built}}
+    return sum(n * listed[name].seconds(cells, particles) for name, n in counts.items() if name in listed) if "base" in listed else 0.0
+
+
+def model_lines(
+    models: Sequence[Model], listed: Mapping[str, Price], cells: int, particles: int, *, memory: int, measured: float | None = None
+) -> list[tuple[str, str]]:
+    """Return a line for each model, as pairs of a word and a line: why it is there, its share of memory and of a step.
+
+    Args:
+        models: of a scene.
+        listed: of `prices`.
+        cells: of the domain.
+        particles: at most.
+        memory: of the whole run [bytes].
+        measured: how long a step takes here [s], which scales the list; None: as where it was measured.
+    """
+    predicted = predicted_seconds(models, listed, cells, particles)
+    scale = measured / predicted if measured is not None and predicted > 0.0 else 1.0
+    lines = []
+    for model in models:
+        text = f"{model.name}: {model.why}"
+        if model.built and model.name in listed:
+            price = listed[model.name]
+            share = 100.0 * model.count * price.bytes(cells, particles) / memory if memory else 0.0
+            seconds = max(model.count * price.seconds(cells, particles), 0.0)
+            part = 100.0 * seconds / predicted if predicted > 0.0 else 0.0
+            text += f"; {share:.0f} % of memory, {1e3 * scale * seconds:.2g} ms a step ({part:.0f} %)"
+        lines.append(("model" if model.built else "not built", text))
+    if predicted > 0.0:
+        where = "here" if measured is not None else "by the list of prices, on one core"
+        lines.append(("step", f"about {1e3 * scale * predicted:.3g} ms {where}, all models together"))
+    return lines
