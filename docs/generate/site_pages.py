@@ -20,6 +20,9 @@ OUTSIDE = re.compile(r"\]\(\.\./([^)#\s]+)(#[^)]*)?\)")  # a link from a page ri
 # What pymdownx.arithmatex makes of $...$ and $$...$$.
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[([](.*?)\\[])]</\1>', flags=re.S)
 
+LITERAL = re.compile(r"(<(pre|code|math)\b.*?</\2>|<[^>]*>)", flags=re.S)
+POWER = re.compile(r"(?<=[\w)\]|])\^(?:\(([^)]*)\)|(-1/2|-?\d+(?:\.\d+)?|[a-z]\b))")
+
 
 def page_of_notebook(text: str) -> str:
     """Return a notebook as Markdown: its text, its code and what the code printed."""
@@ -70,15 +73,24 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     return inside(markdown).replace(f"]({NOTEBOOK})", f"]({PAGE})") if "/" not in page.file.src_uri else markdown
 
 
-def on_page_content(content: str, **_: Any) -> str:
-    """Make MathML out of TeX."""
+def formula(found: re.Match[str]) -> str:
+    """Return a formula of TeX as MathML."""
     from latex2mathml.converter import convert
 
-    def drawn(found: re.Match[str]) -> str:
-        formula = convert(html.unescape(found[2]), display="block" if found[1] == "div" else "inline")
-        if "\\" in formula:
-            raise ValueError(f"not all of this is TeX that can be drawn: {found[2]}")
-        formula = formula.replace("<mo>&#x0221E;</mo>", "<mi>&#x0221E;</mi>").replace("<mi>&#x027C2;</mi>", "<mo>&#x027C2;</mo>")
-        return f'<div class="formula">{formula}</div>' if found[1] == "div" else formula
+    made = convert(html.unescape(found[2]), display="block" if found[1] == "div" else "inline")
+    if "\\" in made:
+        raise ValueError(f"not all of this is TeX that can be drawn: {found[2]}")
+    made = made.replace("<mo>&#x0221E;</mo>", "<mi>&#x0221E;</mi>").replace("<mi>&#x027C2;</mi>", "<mo>&#x027C2;</mo>")
+    return f'<div class="formula">{made}</div>' if found[1] == "div" else made
 
-    return FORMULA.sub(drawn, content)
+
+def typeset(text: str) -> str:
+    """Return words with powers raised and signs of comparison as they are written by hand."""
+    return POWER.sub(lambda found: f"<sup>{found[1] or found[2]}</sup>", text).replace("&lt;=", "≤").replace("&gt;=", "≥")
+
+
+def on_page_content(content: str, **_: Any) -> str:
+    """Set formulas, and what is like one in the words between tags and code."""
+    parts = LITERAL.split(FORMULA.sub(formula, content))
+    parts[::3] = map(typeset, parts[::3])
+    return "".join(part for place, part in enumerate(parts) if place % 3 < 2)
