@@ -110,7 +110,7 @@ def row(name: str, prop: Definition, required: bool) -> str:
     said = prop.get("description", "")
     default = toml(prop["default"]) if prop.get("default") is not None else ""
     shown = f"`{default}`" if default else "required" if required and "unless given" not in said else "-"
-    return f"| `{name}` | {values(prop)} | {shown} | {said} |"
+    return f"| `{name}` | {said} | {values(prop)} | {shown} |"
 
 
 def table(definition: Definition, leave_out: frozenset[str] = frozenset()) -> str:
@@ -121,7 +121,7 @@ def table(definition: Definition, leave_out: frozenset[str] = frozenset()) -> st
         for name, prop in definition["properties"].items()
         if name not in leave_out and reference(prop) is None
     ]
-    return "\n".join(["| key | values | default | meaning |", "|---|---|---|---|", *rows]) + "\n" if rows else ""
+    return "\n".join(["| key | meaning | values | default |", "|---|---|---|---|", *rows]) + "\n" if rows else ""
 
 
 def said_of(definition: Definition) -> str:
