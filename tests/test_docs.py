@@ -7,41 +7,43 @@ import pytest
 
 import warp_lcp as wl
 from code_blocks import blocks, run
-from warp_lcp.benchmarks import sweep_prices
 from warp_lcp.protocol import CAPABILITIES, families, members
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.solvers.registry import grid_methods
 
 DOCS = Path(__file__).parents[1] / "docs"
 TEXT = (DOCS / "methods.md").read_text()
-COLUMNS = ("name", "class", "book", "takes", "needs", "affine", "step", "when")
-ROWS = [
-    dict(zip(COLUMNS, (cell.strip() for cell in line.strip("|\n ").split("|")), strict=True))
-    for line in TEXT.splitlines()
-    if re.match(r"\| `[a-z-]+`( \*)? \| `\w+` \|", line)
-]
+COLUMNS = ("class", "name", "scene", "book", "needs", "step", "when")
+ROW = re.compile(r"^\| `(\w+)`<br>`([a-z-]+)`(\\\*)?(?:<br>Book (.*?))? \| (.*) \| (.*) \| (.*) \|$", flags=re.M)
+ROWS = [dict(zip(COLUMNS, row, strict=True)) for row in ROW.findall(TEXT)]
 
 
 def test_every_method_has_its_row():
-    assert [row["name"].strip("* ").strip("`") for row in ROWS] == sorted(wl.METHODS)
+    assert sorted(row["name"] for row in ROWS) == sorted(wl.METHODS)
 
 
-@pytest.mark.parametrize("row", ROWS, ids=lambda row: row["class"].strip("`"))
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row["class"])
 def test_rows_say_what_the_classes_say(row):
-    name = row["name"].strip("* ").strip("`")
-    method = wl.METHODS[name]
-    assert row["class"] == f"`{method.__name__}`"
+    method = wl.METHODS[row["name"]]
+    assert row["class"] == method.__name__
     assert getattr(wl, method.__name__) is method
-    assert set(row["takes"].split(", ")) == families(method)
-    assert row["affine"] == ("yes" if getattr(method, "affine_bounds", False) else "no")
-    assert row["name"].endswith("*") == (name in grid_methods())
+    assert bool(row["scene"]) == (row["name"] in grid_methods())
     for needs in (row["needs"], method.needs):
         most = re.search(r"n <= (\d+)", needs)
         assert (int(most.group(1)) if most else None) == getattr(method, "most_unknowns", None)
     assert ("symmetric" in row["needs"]) >= (method.needs.startswith("symmetric"))
-    assert getattr(method, "boxed", True)  # the text says so of all
     section = re.match(r"[\d.]+", row["book"])
     assert section is None or section.group() in method.__doc__
+
+
+def test_what_the_text_says_of_all_methods_holds():
+    """Boxed bounds by all, affine ones by those of one table, every kind of A by all but one."""
+    assert all(getattr(method, "boxed", True) for method in wl.METHODS.values())
+    assert {name for name, method in wl.METHODS.items() if set(families(method)) != {"dense", "sparse", "grid"}} == {"projected-multigrid"}
+    assert set(families(wl.ProjectedMultigrid)) == {"grid"}
+    sweeps = TEXT.split("### Sweeps and splittings")[1].split("###")[0]
+    affine = {name for name, method in wl.METHODS.items() if getattr(method, "affine_bounds", False)}
+    assert {row[1] for row in ROW.findall(sweeps)} == affine
 
 
 def test_capabilities_have_their_rows():
@@ -56,11 +58,9 @@ def test_capabilities_have_their_rows():
 
 
 def test_prices_name_methods():
-    """Rows of the tables of prices are those of the benchmarks."""
-    named = re.findall(r"^\| (?:walls|everywhere) \| ([\w.-]+) \|", TEXT, flags=re.M)
-    assert set(named) <= set(sweep_prices.METHODS)
-    assert "multigrid" in named
-    assert set(re.findall(r"^\| ([a-z-]+) \| (?:\d|refused|[A-Z_]{5})", TEXT, flags=re.M)) <= set(wl.METHODS)
+    named = re.findall(r"^\| `([a-z-]+)`(?:, omega.*?)? \| (?:\d|refused|[A-Z_]{5})", TEXT, flags=re.M)
+    assert "projected-multigrid" in named
+    assert set(named) <= set(wl.METHODS)
 
 
 # The tutorial has a test of its own.

@@ -3,9 +3,11 @@
 import importlib
 import importlib.util
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
+import typer
 
 import warp_lcp as wl
 from code_blocks import anchors, links, prose
@@ -49,6 +51,24 @@ def test_every_page_is_in_the_navigation():
     assert {str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md")} <= named
     for name in named - {"first-steps.md"}:
         assert (DOCS / name).is_file() or (ROOT / name).is_file(), name
+
+
+def test_the_page_of_the_command_line_has_every_command():
+    from warp_lcp.cli.commands import app
+
+    cells = re.findall(r"^\| (`.*?`) \| ", (DOCS / "command-line.md").read_text(), flags=re.M)
+    assert {name for cell in cells for name in re.findall(r"`(\w+)", cell)} == set(typer.main.get_command(app).commands)
+
+
+def test_the_page_of_the_architecture_has_every_room_in_the_contract_s_order():
+    rooms = re.findall(r"^\| `(?:warp_lcp/)?(\w+)(?:\.py)?` \| ", (DOCS / "architecture.md").read_text(), flags=re.M)
+    picture = (DOCS / "architecture.svg").read_text()
+    assert {room for room in rooms if f">{room}</text>" not in picture} == {"benchmarks"}
+    assert {path.parent.name for path in (ROOT / "warp_lcp").glob("*/__init__.py")} <= set(rooms)
+    contract = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"][0]["layers"]
+    layer = {name.strip().removeprefix("warp_lcp."): place for place, names in enumerate(contract) for name in names.split("|")}
+    places = [layer[room] for room in rooms if room in layer]
+    assert places == sorted(places)
 
 
 def test_pages_name_no_place_of_a_machine():

@@ -44,3 +44,11 @@ def test_the_page_shows_code_and_what_it_prints(notebook):
     assert page.startswith("# First steps\n")
     assert page.count("```python\n") == sum(cell["cell_type"] == "code" for cell in notebook["cells"])
     assert page.count("```text\n") == 5
+
+
+def test_powers_and_comparisons_are_set_but_for_code():
+    page = '<p title="a^2">64^3 &lt;= n^(3/2), D^-1/2, m^2/s, <code>a^2 &gt;= 1</code> and <a href="#x^2">x^n</a></p><pre>\n2^n</pre>'
+    assert load("site_pages").on_page_content(page) == (
+        '<p title="a^2">64<sup>3</sup> ≤ n<sup>3/2</sup>, D<sup>-1/2</sup>, m<sup>2</sup>/s, <code>a^2 &gt;= 1</code> and <a href="#x^2">'
+        "x<sup>n</sup></a></p><pre>\n2^n</pre>"
+    )

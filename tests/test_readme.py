@@ -5,11 +5,19 @@ from pathlib import Path
 
 import pytest
 
+import warp_lcp as wl
 from code_blocks import blocks, run
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.scene.scene_file import load_scene
 
 README = Path(__file__).parents[1] / "README.md"
+
+
+def test_it_is_short_and_counts_the_methods():
+    text = README.read_text()
+    assert text.count("\n") <= 110
+    assert f"[{len(wl.METHODS)} methods]" in text
+    assert f">{len(wl.METHODS)} methods: init, step<" in (README.parent / "docs" / "architecture.svg").read_text()
 
 
 @pytest.mark.parametrize("code", blocks(README, "python"))

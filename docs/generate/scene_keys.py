@@ -16,12 +16,16 @@ HEAD = """# Scene files
 
 <!-- Written by docs/generate/scene_keys.py from `warp-lcp schema`; do not edit. -->
 
-A scene is a TOML file in SI units. y is up; a domain of two lengths is 2-D, the x-y plane. The [tutorial](tutorial.md) writes two from
-nothing; `warp-lcp check` says what is wrong with one; `warp-lcp schema` prints what this page says, for editors (`--simulator granular`:
-for sand).
+A scene is a TOML file in SI units, with angles in degrees. y is up; a domain of two lengths is 2-D, the x-y plane. The
+[tutorial](tutorial.md) writes some from nothing; [liquids](liquids.md), [sand](sand.md) and [rigid bodies](bodies.md) say what models do;
+`warp-lcp check` says what is wrong with a scene; `warp-lcp schema` prints what this page says, for editors (of sand: `--simulator
+granular`).
 
 A key with a default may be left out. A key that no table has is refused, and the message names the nearest one. `--set table.key=value` on
 the command line overrides a key.
+"""
+
+TIMES = """### When steps end
 
 Steps end exactly at frames. They end, too, where a source or drain starts or stops or a solid's velocity jumps, unless that is closer than
 a quarter of a step to the step's start or to a frame, or another such time follows within the step: the step then runs across it. What a
@@ -29,9 +33,15 @@ source lets in is exact all the same, the flow has its velocity in the steps in 
 step in part of which it is open.
 """
 
-PLACED = """Any shape may be moved from where its keys put it, in this order: `scale`, `rotate`, `translate`. The first two leave the origin
-where it is, not the shape's center, unless `about` names another point: `about = [0.5, 0.2]` with `rotate = 30.0` turns a box around
-[0.5, 0.2] on the spot. Angles are in degrees everywhere in a scene."""
+PLACED = """Any shape may be moved from where its keys put it, in this order: `scale`, `rotate`, `translate`.
+
+**`rotate` turns about the origin**, the low corner of the domain, and not about the shape's center, unless `about` names another point:
+`about = [0.5, 0.2]` with `rotate = 30.0` turns a box around [0.5, 0.2] on the spot. So does `scale`. In 2-D `rotate` is one angle,
+counterclockwise; in 3-D it is three, about the fixed axes x, then y, then z, each counterclockwise seen from the axis's tip."""
+
+MOVING = """A moving solid has `motion = { kind = "...", ... }`, a function of time alone that starts from where the shape is placed. Angles
+are in degrees; those of `keyframes` are about the axes and in the order of [`rotate`](#placing-a-shape), but through `center`.
+"""
 
 MESHES = """A mesh is a closed surface: what its triangles surround, counted by the winding number, is inside. `warp-lcp check` and the
 start of a run say what was put right, with the file, how many triangles and where the first is:
@@ -100,7 +110,7 @@ def row(name: str, prop: Definition, required: bool) -> str:
     said = prop.get("description", "")
     default = toml(prop["default"]) if prop.get("default") is not None else ""
     shown = f"`{default}`" if default else "required" if required and "unless given" not in said else "-"
-    return f"| `{name}` | {values(prop)} | {shown} | {said} |"
+    return f"| `{name}` | {said} | {values(prop)} | {shown} |"
 
 
 def table(definition: Definition, leave_out: frozenset[str] = frozenset()) -> str:
@@ -111,7 +121,7 @@ def table(definition: Definition, leave_out: frozenset[str] = frozenset()) -> st
         for name, prop in definition["properties"].items()
         if name not in leave_out and reference(prop) is None
     ]
-    return "\n".join(["| key | values | default | meaning |", "|---|---|---|---|", *rows]) + "\n" if rows else ""
+    return "\n".join(["| key | meaning | values | default |", "|---|---|---|---|", *rows]) + "\n" if rows else ""
 
 
 def said_of(definition: Definition) -> str:
@@ -166,7 +176,7 @@ def shape_section(schema: Definition) -> str:
 
 def motion_section(schema: Definition) -> str:
     """Return the kinds of motion."""
-    parts = ["## Motions\n", 'A moving solid has `motion = { kind = "...", ... }`.\n']
+    parts = ["## Motions\n", MOVING]
     for name, definition in schema["$defs"].items():
         if name.endswith("Motion"):
             kind = definition["properties"]["kind"]["const"]
@@ -207,7 +217,7 @@ def page() -> str:
     parts = [HEAD, "## Every scene\n", *(section(3, name, tables["fluids"][name]) for name in shared)]
     alike = [name for name in arrays_of(first) if name in arrays_of(second) and shapes_of(first, name) == shapes_of(second, name)]
     parts += [array_section(first, name) for name in alike]
-    parts += [shape_section(first), motion_section(first), BODIES]
+    parts += [TIMES, shape_section(first), motion_section(first), BODIES]
     for simulator, material in MATERIALS.items():
         schema = schemas[simulator]
         parts.append(f'## {material.capitalize()}\n\n`scene.simulator = "{simulator}"`.\n')

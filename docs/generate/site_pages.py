@@ -1,18 +1,27 @@
-"""Pages of the site that are not Markdown files under docs: a hook of MkDocs.
+"""What the site shows besides Markdown files under docs: a hook of MkDocs.
 
-The notebook becomes a page, and so do the files of the repository that pages link to.
+The notebook becomes a page, and so do the files of the repository that pages link to. Formulas become MathML, which browsers draw
+themselves, without a script, with the font that comes along.
 """
 
 from __future__ import annotations
 
+import html
 import json
 import re
+from importlib.metadata import distribution
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 NOTEBOOK = "first-steps.ipynb"
 PAGE = "first-steps.md"
+FONT = "STIXTwoMath-Regular.ttf"  # of ziamath; docs/site.css names it
 OUTSIDE = re.compile(r"\]\(\.\./([^)#\s]+)(#[^)]*)?\)")  # a link from a page right under docs to a file of the repository
+# What pymdownx.arithmatex makes of $...$ and $$...$$.
+FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[([](.*?)\\[])]</\1>', flags=re.S)
+
+LITERAL = re.compile(r"(<(pre|code|math)\b.*?</\2>|<[^>]*>)", flags=re.S)
+POWER = re.compile(r"(?<=[\w)\]|])\^(?:\(([^)]*)\)|(-1/2|-?\d+(?:\.\d+)?|[a-z]\b))")
 
 
 def page_of_notebook(text: str) -> str:
@@ -42,6 +51,7 @@ def on_files(files: Any, config: Any) -> Any:
     docs = Path(config.docs_dir)
     root = Path(config.config_file_path).parent
     files.append(File.generated(config, PAGE, content=page_of_notebook((docs / NOTEBOOK).read_text())))
+    files.append(File.generated(config, FONT, abs_src_path=str(distribution("ziamath").locate_file(f"ziamath/fonts/{FONT}"))))
     wanted = set().union(*(outside_links(page.read_text()) for page in docs.glob("*.md")))
     wanted |= set(re.findall(r"(benchmarks/\S+\.md|[A-Z]+\.md)", json.dumps(config.nav)))
     for name in sorted(wanted):
@@ -61,3 +71,26 @@ def on_files(files: Any, config: Any) -> Any:
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Make links out of docs, and to the notebook, links within the site."""
     return inside(markdown).replace(f"]({NOTEBOOK})", f"]({PAGE})") if "/" not in page.file.src_uri else markdown
+
+
+def formula(found: re.Match[str]) -> str:
+    """Return a formula of TeX as MathML."""
+    from latex2mathml.converter import convert
+
+    made = convert(html.unescape(found[2]), display="block" if found[1] == "div" else "inline")
+    if "\\" in made:
+        raise ValueError(f"not all of this is TeX that can be drawn: {found[2]}")
+    made = made.replace("<mo>&#x0221E;</mo>", "<mi>&#x0221E;</mi>").replace("<mi>&#x027C2;</mi>", "<mo>&#x027C2;</mo>")
+    return f'<div class="formula">{made}</div>' if found[1] == "div" else made
+
+
+def typeset(text: str) -> str:
+    """Return words with powers raised and signs of comparison as they are written by hand."""
+    return POWER.sub(lambda found: f"<sup>{found[1] or found[2]}</sup>", text).replace("&lt;=", "≤").replace("&gt;=", "≥")
+
+
+def on_page_content(content: str, **_: Any) -> str:
+    """Set formulas, and what is like one in the words between tags and code."""
+    parts = LITERAL.split(FORMULA.sub(formula, content))
+    parts[::3] = map(typeset, parts[::3])
+    return "".join(part for place, part in enumerate(parts) if place % 3 < 2)
