@@ -9,7 +9,7 @@ from typer.testing import CliRunner, Result
 
 from small_runs import ball, write_run
 from warp_lcp.cli import commands as cli
-from warp_lcp.render.film import Gif, Mp4, check_rate, film_kind
+from warp_lcp.render.film import Film, check_rate, film_suffix
 from warp_lcp.render.recording import RenderError
 
 Image = pytest.importorskip("PIL.Image", reason="films need Pillow, which comes with the extra `render`")
@@ -28,8 +28,8 @@ def picture(number: int) -> "Image.Image":
     return Image.fromarray(pixels)
 
 
-def shoot(kind, file, count, rate):
-    with kind(file, (WIDTH, HEIGHT), rate) as film:
+def shoot(file, count, rate):
+    with Film(file, (WIDTH, HEIGHT), rate) as film:
         for number in range(count):
             film.add(lambda number=number: picture(number))
     return file
@@ -39,8 +39,8 @@ def call(*arguments: object) -> Result:
     return CliRunner().invoke(cli.app, ["render", *map(str, arguments)])
 
 
-def test_a_gif_holds_the_images_their_times_and_repeats(tmp_path):
-    with Image.open(shoot(Gif, tmp_path / "film.gif", 12, 30.0)) as film:
+def test_a_gif_holds_the_images_their_times_and_repeats(encoder, tmp_path):
+    with Image.open(shoot(tmp_path / "film.gif", 12, 30.0)) as film:
         assert film.n_frames == 12
         assert film.size == (WIDTH, HEIGHT)
         assert film.info["loop"] == 0
@@ -53,8 +53,8 @@ def test_a_gif_holds_the_images_their_times_and_repeats(tmp_path):
     assert set(durations) == {30, 40}
 
 
-def test_images_that_do_not_change_stay(tmp_path):
-    with Gif(tmp_path / "still.gif", (WIDTH, HEIGHT), 10.0) as film:
+def test_images_that_do_not_change_stay(encoder, tmp_path):
+    with Film(tmp_path / "still.gif", (WIDTH, HEIGHT), 10.0) as film:
         for _ in range(5):
             film.add(lambda: picture(3))
     with Image.open(tmp_path / "still.gif") as read:
@@ -62,9 +62,9 @@ def test_images_that_do_not_change_stay(tmp_path):
         np.testing.assert_allclose(np.asarray(read.convert("RGB"), dtype=int), np.asarray(picture(3)), atol=8)
 
 
-def test_a_gif_leaves_out_what_viewers_cannot_play(tmp_path):
+def test_a_gif_leaves_out_what_viewers_cannot_play(encoder, tmp_path):
     drawn = []
-    with Gif(tmp_path / "fast.gif", (WIDTH, HEIGHT), 120.0) as film:
+    with Film(tmp_path / "fast.gif", (WIDTH, HEIGHT), 120.0) as film:
         for number in range(12):
             film.add(lambda number=number: drawn.append(number) or picture(number))
     assert drawn == [0, 3, 6, 9]
@@ -73,7 +73,7 @@ def test_a_gif_leaves_out_what_viewers_cannot_play(tmp_path):
 
 
 def test_an_mp4_holds_the_images(encoder, tmp_path):
-    file = shoot(Mp4, tmp_path / "film.mp4", 10, 24.0)
+    file = shoot(tmp_path / "film.mp4", 10, 24.0)
     assert file.read_bytes()[4:8] == b"ftyp"
     count, seconds = encoder.count_frames_and_secs(str(file))
     assert count == 10
@@ -85,8 +85,8 @@ def test_an_mp4_holds_the_images(encoder, tmp_path):
         assert np.abs(pixels - np.asarray(picture(number))).mean() < 2.0  # H.264 loses a little
 
 
-@pytest.mark.parametrize("kind", [Gif, Mp4])
-def test_images_are_drawn_one_at_a_time(encoder, tmp_path, kind):
+@pytest.mark.parametrize("suffix", [".gif", ".mp4"])
+def test_images_are_drawn_one_at_a_time(encoder, tmp_path, suffix):
     """No image is asked for before the one before was taken, and none stays in memory."""
     import gc
     import weakref
@@ -100,50 +100,51 @@ def test_images_are_drawn_one_at_a_time(encoder, tmp_path, kind):
         alive.append(weakref.ref(image))
         return image
 
-    with kind(tmp_path / f"film{'.gif' if kind is Gif else '.mp4'}", (WIDTH, HEIGHT), 30.0) as film:
+    with Film(tmp_path / f"film{suffix}", (WIDTH, HEIGHT), 30.0) as film:
         for number in range(12):
             film.add(lambda number=number: draw(number))
     assert len(alive) == 12
 
 
-@pytest.mark.parametrize("kind", [Gif, Mp4])
-def test_a_film_that_is_not_finished_leaves_nothing(encoder, tmp_path, kind):
-    file = tmp_path / "film"
+@pytest.mark.parametrize("suffix", [".gif", ".mp4"])
+def test_a_film_that_is_not_finished_leaves_nothing(encoder, tmp_path, suffix):
+    file = tmp_path / f"film{suffix}"
     file.write_bytes(b"an older film")
-    with pytest.raises(KeyError), kind(file, (WIDTH, HEIGHT), 30.0) as film:
+    with pytest.raises(KeyError), Film(file, (WIDTH, HEIGHT), 30.0) as film:
         film.add(lambda: picture(1))
         raise KeyError
     assert file.read_bytes() == b"an older film"
-    assert [entry.name for entry in tmp_path.iterdir()] == ["film"]
+    assert [entry.name for entry in tmp_path.iterdir()] == [file.name]
 
 
-@pytest.mark.parametrize("kind", [Gif, Mp4])
-def test_a_film_that_cannot_be_written(encoder, tmp_path, kind):
+@pytest.mark.parametrize("suffix", [".gif", ".mp4"])
+def test_a_film_that_cannot_be_written(encoder, tmp_path, suffix):
     (tmp_path / "file").write_text("")
     with pytest.raises(RenderError, match="cannot be written"):
-        shoot(kind, tmp_path / "file" / "film", 2, 30.0)
+        shoot(tmp_path / "file" / f"film{suffix}", 2, 30.0)
 
 
-def test_without_an_encoder_the_command_says_what_to_install(dots, tmp_path, monkeypatch):
+@pytest.mark.parametrize("suffix", [".gif", ".mp4"])
+def test_without_an_encoder_the_command_says_what_to_install(dots, tmp_path, monkeypatch, suffix):
     pytest.importorskip("pyvista")
     folder = write_run(tmp_path / "run", [[ball([0.5, 0.5], 0.2)]])
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    result = call(folder, "--film", tmp_path / "film.mp4")
+    result = call(folder, "--film", tmp_path / f"film{suffix}")
     assert result.exit_code == 2
     assert "pip install 'imageio-ffmpeg" in result.stderr
-    assert not (tmp_path / "film.mp4").exists()
+    assert not (tmp_path / f"film{suffix}").exists()
     assert not list(tmp_path.glob(".film*"))
 
 
 def test_kinds_and_rates(tmp_path):
-    assert film_kind(tmp_path / "a.GIF") is Gif
+    assert film_suffix(tmp_path / "a.GIF") == ".gif"
     assert check_rate(None) is None
     for name in ("a.avi", "a", "a.mp4.png"):
         with pytest.raises(RenderError, match=r"must end in \.mp4 or \.gif"):
-            film_kind(tmp_path / name)
+            film_suffix(tmp_path / name)
     (tmp_path / "b.mp4").mkdir()
     with pytest.raises(RenderError, match="is a folder"):
-        film_kind(tmp_path / "b.mp4")
+        film_suffix(tmp_path / "b.mp4")
     for rate in (0.0, -3.0, 1000.0, float("nan")):
         with pytest.raises(RenderError, match="frames a second"):
             check_rate(rate)

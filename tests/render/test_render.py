@@ -11,11 +11,12 @@ from typer.testing import CliRunner, Result
 
 from warp_lcp.cli import commands as cli
 from warp_lcp.frames.frames import FrameFolder
+from warp_lcp.render.actors import shaded
 from warp_lcp.render.page import Page
-from warp_lcp.render.recording import VIRIDIS, Color, Recording, RenderError, Scale, _round_up, spread
+from warp_lcp.render.picture import Picture
+from warp_lcp.render.recording import Color, Recording, RenderError, Scale, _round_up, spread
 from warp_lcp.render.render import INSTALL, Looks, parse_size, render_run
-from warp_lcp.render.scenery import Outline
-from warp_lcp.render.stage import Stage, shaded
+from warp_lcp.render.solid_meshes import Outline
 from warp_lcp.scene.camera import MARGIN
 from warp_lcp.scene.scene_file import dump_scene, load_scene
 from warp_lcp.simulation import Cells, Points
@@ -154,7 +155,7 @@ def test_a_sheet_shows_evenly_spaced_frames(pyvista, make_run):
     assert result.stdout.strip() == str(folder / "images" / "sheet.png")
     image = pixels(folder / "images" / "sheet.png")
     assert image.shape[1] == 600
-    page = Page(Recording(folder, Color.SPEED), (600, 480), 6, Stage)
+    page = Page(Recording(folder, Color.SPEED), (600, 480), 6, Picture)
     (width, height), columns = page.tile, page.columns
     page.painter.close()
     areas = []
@@ -171,8 +172,8 @@ def test_each_picture_tells_its_own_time(pyvista, make_run, monkeypatch, rate, l
     folder = make_run([drops(1), drops(1)])
     text = folder / "scene.toml"
     text.write_text(re.sub(r"frames_per_second = [0-9.]+", f"frames_per_second = {rate}", text.read_text()))
-    page, texts = Page(Recording(folder, Color.SPEED), (400, 300), 2, Stage), []
-    monkeypatch.setattr(page, "_write", lambda pen, text, x, y, anchor: texts.append(text) or x)
+    page, texts = Page(Recording(folder, Color.SPEED), (400, 300), 2, Picture), []
+    monkeypatch.setattr(page, "_write", lambda figure, text, x, y, anchor: texts.append(text))
     page.draw([0, 1])
     page.painter.close()
     assert label in texts
@@ -180,7 +181,7 @@ def test_each_picture_tells_its_own_time(pyvista, make_run, monkeypatch, rate, l
 
 def test_discs_have_the_size_of_the_particles(pyvista, make_run):
     folder = make_run([drops(30)])
-    page = Page(Recording(folder, Color.SPEED), (400, 300), 1, Stage)
+    page = Page(Recording(folder, Color.SPEED), (400, 300), 1, Picture)
     image = np.asarray(page.draw([0]), dtype=int)[page.line :]
     page.painter.close()
     pixel = MARGIN / page.tile[1]  # [m]; the height is what limits a square domain here
@@ -191,7 +192,7 @@ def test_discs_have_the_size_of_the_particles(pyvista, make_run):
 
 def test_discs_lie_where_the_particles_are(pyvista, make_run):
     folder = make_run([([0.25, 0.75, 0.0], [1.0, 0.0, 0.0])])
-    page = Page(Recording(folder, Color.SPEED), (400, 300), 1, Stage)
+    page = Page(Recording(folder, Color.SPEED), (400, 300), 1, Picture)
     image = np.asarray(page.draw([0]), dtype=int)[page.line :]
     page.painter.close()
     width, height = page.tile
@@ -202,7 +203,7 @@ def test_discs_lie_where_the_particles_are(pyvista, make_run):
 
 def test_flat_solids_are_filled_gray(pyvista, make_run):
     folder = make_run([([0.5, 0.5, 0.0], [1.0, 0.0, 0.0])], DISC)
-    page = Page(Recording(folder, Color.SPEED), (400, 300), 1, Stage)
+    page = Page(Recording(folder, Color.SPEED), (400, 300), 1, Picture)
     image = np.asarray(page.draw([0]), dtype=int)[page.line :]
     page.painter.close()
     gray = (np.ptp(image, axis=-1) < 16) & (image[..., 0] > 150) & (image[..., 0] < 230)  # lighter than the outlines
@@ -306,7 +307,7 @@ def test_a_flat_solid_stands_where_it_is_at_the_time_of_a_frame(pyvista, make_ru
     wall = '[[solid]]\nshape = "box"\nmin = [0.9, 0.0]\nmax = [1.0, 1.0]\n'
     disc = f'[[solid]]\nshape = "sphere"\ncenter = [0.2, 0.6]\nradius = 0.1\nmotion = {motion}\n'
     folder = make_run([([0.05, 0.05, 0.0], [1.0, 0.0, 0.0])] * 5, disc + wall, solids="cut-cell")
-    page = Page(Recording(folder, Color.SPEED), (400, 300), 1, Stage)
+    page = Page(Recording(folder, Color.SPEED), (400, 300), 1, Picture)
     pixel = MARGIN / page.tile[1]  # [m]
     low = 0.5 * (np.array(page.tile) * pixel - 1.0)  # [m] from the image's left and lower edge to the domain's corner
     for frame, expected in ((0, [0.2, 0.6]), (1, [0.4, 0.55]), (4, [0.6, 0.5]), (0, [0.2, 0.6])):
@@ -325,7 +326,7 @@ def test_a_solid_in_a_room_is_drawn_anew_in_every_frame(pyvista, make_run):
     motion = '{ kind = "translation", velocity = [0.0, 8.0, 0.0] }'
     text = f"[[solid]]\n{SOLIDS['sphere']}\nmotion = {motion}\n"
     folder = make_run([([0.9, 0.9, 0.9], [1.0, 0.0, 0.0])] * 4, text, size=ROOM, solids="cut-cell")
-    page = Page(Recording(folder, Color.PLAIN), (400, 300), 1, Stage)
+    page = Page(Recording(folder, Color.PLAIN), (400, 300), 1, Picture)
     images = [np.asarray(page.draw([frame]), dtype=int)[page.line :] for frame in (0, 1, 3, 0)]
     page.painter.close()
     assert (images[0] != images[1]).any()
@@ -354,13 +355,9 @@ def test_liquid_is_lit_from_above_and_drops_are_not():
 
 def test_scales_end_at_round_numbers():
     assert [_round_up(value) for value in (0.0, 0.7, 1.0, 2.1, 9.7, 10.0, 4321.0)] == [1.0, 0.8, 1.0, 2.5, 10.0, 10.0, 5000.0]
-    scale = Scale("", 0.0, 2.0, np.array([[0, 0, 0], [100, 50, 0]]))
-    np.testing.assert_allclose(scale.colors(np.array([-1.0, 1.0, 2.0, 9.0])), [[0, 0, 0], [50, 25, 0], [100, 50, 0], [100, 50, 0]])
-
-
-def test_the_colors_of_pressure_are_viridis():
-    colormaps = pytest.importorskip("matplotlib").colormaps
-    np.testing.assert_array_equal(VIRIDIS, np.round(255 * colormaps["viridis"](np.linspace(0, 1, len(VIRIDIS)))[:, :3]))
+    scale = Scale("", 0.0, 2.0, ("#000000", "#643200"))
+    np.testing.assert_allclose(scale.colors(np.array([-1.0, 1.0, 2.0, 9.0])), [[0, 0, 0], [50, 25, 0], [100, 50, 0], [100, 50, 0]], atol=1)
+    np.testing.assert_array_equal(Scale("", 0.0, 1.0).colors(np.array([0.0, 1.0])), [[68, 1, 84], [253, 231, 36]])  # viridis
 
 
 def test_negative_pressure_extends_the_scale(pyvista, make_run):

@@ -6,11 +6,10 @@ from typer.testing import CliRunner, Result
 
 from small_runs import ball, box, sphere, write_run
 from warp_lcp.cli import commands as cli
-from warp_lcp.render.cast import is_round
-from warp_lcp.render.outline_fill import inside_outline
+from warp_lcp.render.actors import is_round
 from warp_lcp.render.recording import Color, Recording, RenderError, Show
 from warp_lcp.render.render import Looks, render_run
-from warp_lcp.render.scenery import prescribed_solids
+from warp_lcp.render.solid_meshes import prescribed_solids
 from warp_lcp.scene.camera import MARGIN
 from warp_lcp.simulation import Points, Surface
 
@@ -55,21 +54,16 @@ def middle(mask, folder, page_line=20):
     return (columns.mean() + 0.5 - SIZE[0] / 2) * pixel + 0.5, (mask.shape[0] / 2 - rows.mean() - 0.5) * pixel + 0.5
 
 
-def test_outlines_are_filled_inside_and_islands_left_out():
-    outer, inner = ball([30.0, 20.0], 15.0), ball([32.0, 22.0], 5.0)
-    segments = np.concatenate([s.points[s.corners][..., :2] for s in (outer, inner)])
-    inside = inside_outline(segments.astype(float), 40, 60)
-    assert inside.shape == (40, 60)
-    assert inside.sum() == pytest.approx(np.pi * (15.0**2 - 5.0**2), rel=0.02)
-    assert inside[20, 20]
-    assert not inside[22, 32]
-    reversed_order = inside_outline(segments[:, ::-1].astype(float), 40, 60)
-    np.testing.assert_array_equal(inside, reversed_order)
-
-
-def test_an_outline_that_leaves_the_image():
-    inside = inside_outline(ball([0.0, 20.0], 15.0).points[ball([0.0, 20.0], 15.0).corners][..., :2].astype(float), 40, 60)
-    assert inside.sum() == pytest.approx(np.pi * 15.0**2 / 2, rel=0.02)
+def test_outlines_are_filled_inside_and_islands_left_out(pyvista, dots, tmp_path):
+    outer, inner = ball([0.5, 0.5], 0.35), ball([0.55, 0.52], 0.15)
+    both = Surface(
+        "surface", np.concatenate([outer.points, inner.points]), np.concatenate([outer.corners, inner.corners[:, ::-1] + len(outer.points)])
+    )
+    (image,) = draw(write_run(tmp_path / "run", [[both]]))
+    mask = is_blue(image)
+    pixel = MARGIN / image.shape[0]
+    assert mask.sum() * pixel**2 == pytest.approx(np.pi * (0.35**2 - 0.15**2), rel=0.05)
+    assert not mask[round(image.shape[0] / 2 - 0.02 / pixel), round(SIZE[0] / 2 + 0.05 / pixel)]
 
 
 def test_the_surface_is_shown_where_there_is_one(dots, tmp_path):

@@ -10,17 +10,17 @@ import numpy as np
 from warp_lcp.render.recording import Frame, Recording, RenderError
 
 if TYPE_CHECKING:
-    from PIL.Image import Image
-    from PIL.ImageDraw import ImageDraw
+    from matplotlib.figure import Figure
 
 SMALLEST_PICTURE = 32  # pixels along a side
 INK = "#33373b"
+DOTS_AN_INCH, POINTS_AN_INCH = 100, 72
 
 
 class Painter(Protocol):
     """What draws the pictures on a page."""
 
-    def draw(self, frame: Frame) -> Image:
+    def draw(self, frame: Frame) -> np.ndarray:
         """Return a picture of a frame."""
 
     def close(self) -> None:
@@ -43,7 +43,7 @@ class Page:
     def __init__(
         self, recording: Recording, size: tuple[int, int], pictures: int, painter: Callable[[Recording, tuple[int, int]], Painter]
     ) -> None:
-        """Set the stage."""
+        """Divide the image."""
         self.recording, self.size = recording, size
         self.line = max(20, round(0.065 * min(size)))  # heights [pixels]
         self.caption = round(0.8 * self.line) if pictures > 1 else 0
@@ -57,56 +57,50 @@ class Page:
             height = min(height, round(width / aspect))
             self.size = size[0], self.line + -(-pictures // self.columns) * (height + self.caption)
         self.tile = width, height
-        self.scale = recording.scale
         self.painter = painter(recording, self.tile)
 
-    def draw(self, numbers: Sequence[int]) -> Image:
+    def draw(self, numbers: Sequence[int]) -> np.ndarray:
         """Return the image of these frames."""
-        from PIL import Image, ImageDraw
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
 
-        page = Image.new("RGB", self.size, "white")
-        pen = ImageDraw.Draw(page)
+        figure = Figure(figsize=(self.size[0] / DOTS_AN_INCH, self.size[1] / DOTS_AN_INCH), dpi=DOTS_AN_INCH)
+        canvas = FigureCanvasAgg(figure)
         width, height = self.tile
         clock = self.recording.scene.time
         digits = 2 if clock.frames_per_second <= 100 else 3
         for place, number in enumerate(numbers):
             left, top = place % self.columns * width, self.line + place // self.columns * (height + self.caption)
-            moment = clock.frame_time(number)
-            page.paste(self.painter.draw(self.recording.frame(number)), (left, top + self.caption))
-            time = f"t = {moment:.{digits}f} s"
+            figure.figimage(self.painter.draw(self.recording.frame(number)), left, self.size[1] - top - self.caption - height)
+            time = f"t = {clock.frame_time(number):.{digits}f} s"
             if self.caption:
-                self._write(pen, time, left + width / 2, top + self.caption / 2, "mm")
+                self._write(figure, time, left + width / 2, top + self.caption / 2, "center")
             else:
-                self._write(pen, time, 0.5 * self.line, 0.55 * self.line, "lm")
+                self._write(figure, time, 0.5 * self.line, 0.55 * self.line, "left")
         if self.caption:
-            self._write(pen, self.recording.scene.scene.name, 0.5 * self.line, 0.55 * self.line, "lm")
-        self._draw_legend(page)
-        return page
+            self._write(figure, self.recording.scene.scene.name, 0.5 * self.line, 0.55 * self.line, "left")
+        self._draw_legend(figure)
+        canvas.draw()
+        return np.asarray(canvas.buffer_rgba())[..., :3]
 
     def _tile(self, columns: int, pictures: int) -> tuple[int, int]:
         """Return the width and height of a picture when so many stand side by side."""
         return self.size[0] // columns, (self.size[1] - self.line) // -(-pictures // columns) - self.caption
 
-    def _draw_legend(self, page: Image) -> None:
-        """Draw `speed [m/s] 0 [colors] 3` at the right of the first line."""
-        from PIL import Image, ImageDraw
-
-        if not self.scale.label:
+    def _draw_legend(self, figure: Figure) -> None:
+        """Draw `speed [m/s]  0 [colors] 3` at the right of the first line."""
+        scale = self.recording.scale
+        if not scale.label:
             return
-        pen = ImageDraw.Draw(page)
-        width, height, middle = round(0.16 * self.size[0]), round(0.3 * self.line), 0.55 * self.line
-        right = self.size[0] - 0.5 * self.line
-        right = self._write(pen, f"{self.scale.high:g}", right, middle, "rm") - 0.25 * self.line
-        colors = self.scale.colors(np.linspace(self.scale.low, self.scale.high, width))
-        bar = Image.fromarray(np.broadcast_to(colors.astype(np.uint8), (height, width, 3)).copy())
-        page.paste(bar, (round(right) - width, round(middle - 0.5 * height)))
-        right = self._write(pen, f"{self.scale.low:g}", right - width - 0.25 * self.line, middle, "rm")
-        self._write(pen, self.scale.label, right - 0.5 * self.line, middle, "rm")
+        width, height, middle = 0.16 * self.size[0], 0.3 * self.line, 0.55 * self.line
+        left, gap = self.size[0] - width - 2.0 * self.line, 0.25 * self.line
+        place = (left / self.size[0], 1.0 - (middle + height / 2) / self.size[1], width / self.size[0], height / self.size[1])
+        bar = figure.colorbar(scale.mappable, cax=figure.add_axes(place), orientation="horizontal", ticks=[])
+        bar.outline.set_visible(False)
+        self._write(figure, f"{scale.label}  {scale.low:g}", left - gap, middle, "right")
+        self._write(figure, f"{scale.high:g}", left + width + gap, middle, "left")
 
-    def _write(self, pen: ImageDraw, text: str, x: float, y: float, anchor: str) -> float:
-        """Write beside a point and return where the text begins."""
-        from PIL import ImageFont
-
-        font = ImageFont.load_default(0.5 * self.line)
-        pen.text((x, y), text, fill=INK, font=font, anchor=anchor)
-        return x - pen.textlength(text, font=font)
+    def _write(self, figure: Figure, text: str, x: float, y: float, anchor: str) -> None:
+        """Write beside a point, x and y down from the upper left corner [pixels]."""
+        size = 0.45 * self.line * POINTS_AN_INCH / DOTS_AN_INCH
+        figure.text(x / self.size[0], 1.0 - y / self.size[1], text, fontsize=size, color=INK, ha=anchor, va="center")

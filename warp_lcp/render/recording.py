@@ -25,10 +25,9 @@ SCALE_VALUES = 50_000  # about how many values of each
 SUFFIXES = (".vti", ".pvti", ".pvtu", ".vtu")  # of a frame's files; at most one of them is there
 ROUND_NUMBERS = np.array([1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0])
 PALETTES = {  # of speeds, by `Scene.palette`
-    "water": np.array([[14, 62, 138], [22, 106, 190], [58, 160, 224], [130, 208, 240], [206, 240, 250]]),
-    "sand": np.array([[176, 130, 80], [202, 158, 104], [224, 188, 134], [242, 218, 172], [254, 246, 226]]),
+    "water": ("#0e3e8a", "#166abe", "#3aa0e0", "#82d0f0", "#cef0fa"),
+    "sand": ("#b08250", "#ca9e68", "#e0bc86", "#f2daac", "#fef6e2"),
 }
-VIRIDIS = np.array([[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]])
 
 
 class RenderError(InputError):
@@ -85,18 +84,26 @@ class Scale:
         label: quantity and unit.
         low: the value of the first color.
         high: the value of the last color.
-        stops: colors, red, green and blue from 0 to 255, shape (m, 3), evenly spaced.
+        palette: evenly spaced colors; Matplotlib's viridis unless given.
     """
 
     label: str
     low: float
     high: float
-    stops: np.ndarray
+    palette: tuple[str, ...] = ()
+
+    @cached_property
+    def mappable(self) -> Any:
+        """The scale as Matplotlib takes it."""
+        from matplotlib.cm import ScalarMappable
+        from matplotlib.colors import LinearSegmentedColormap, Normalize
+
+        colors = LinearSegmentedColormap.from_list("palette", self.palette) if self.palette else "viridis"
+        return ScalarMappable(Normalize(self.low, self.high), colors)
 
     def colors(self, values: np.ndarray) -> np.ndarray:
         """Return a color for each value, 0 to 255, shape (n, 3)."""
-        at = (values - self.low) / (self.high - self.low) * (len(self.stops) - 1)
-        return np.stack([np.interp(at, np.arange(len(self.stops)), channel) for channel in self.stops.T], axis=-1)
+        return cast(np.ndarray, self.mappable.to_rgba(values, bytes=True)[:, :3])
 
 
 class Recording:
@@ -204,7 +211,7 @@ class Recording:
         low = -_round_up(-low) if low < -0.01 * high else 0.0  # liquid that a wall holds has pressure below 0
         if self.color is Color.SPEED:
             return Scale("speed [m/s]", low, high, PALETTES[self.scene.palette])
-        return Scale(LABELS.get(self.color, "pressure [Pa]"), low, high, VIRIDIS)
+        return Scale(LABELS.get(self.color, "pressure [Pa]"), low, high)
 
     def particle_spacing(self) -> float:
         """Return how far apart neighbors are at the start [m], from the number of particles in the cells that hold some."""

@@ -8,15 +8,13 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import numpy as np
 
 from warp_lcp.frames.atomic import replacing
-from warp_lcp.render.film import film_kind
+from warp_lcp.render.film import Film, film_suffix
 from warp_lcp.render.page import Page, Painter
 from warp_lcp.render.recording import Color, Recording, RenderError, Show, spread
-
-if TYPE_CHECKING:
-    from PIL.Image import Image
 
 INSTALL = "pip install 'pyvista>=0.45'"
 INSTALL_MATPLOTLIB = "pip install 'matplotlib>=3.9'"
@@ -92,13 +90,13 @@ def film_run(folder: Path, film: Path, *, looks: Looks | None = None, rate: floa
         SceneError: the run's scene cannot be read.
     """
     looks = looks or Looks()
-    kind = film_kind(film)
+    film_suffix(film)
     with ExitStack() as stack:
         painter = _painter(looks, stack)
         recording = Recording(folder, looks.color, looks.show, looks.overrides, cells=looks.cut)
         page = Page(recording, looks.size, 1, painter)
         stack.enter_context(closing(page.painter))
-        reel = stack.enter_context(kind(film, page.size, rate or recording.scene.time.frames_per_second))
+        reel = stack.enter_context(Film(film, page.size, rate or recording.scene.time.frames_per_second))
         for number in recording.numbers:
             reel.add(partial(page.draw, [number]))
             yield number
@@ -120,10 +118,10 @@ def _painter(looks: Looks, stack: ExitStack) -> Callable[[Recording, tuple[int, 
         raise RenderError(
             f"images need pyvista, which cannot be loaded ({error}): {INSTALL}; --slice draws a section without it"
         ) from error
-    from warp_lcp.render.stage import Stage
+    from warp_lcp.render.picture import Picture
 
     stack.enter_context(pyvista.vtk_verbosity("off"))  # VTK warns where there is no display, and draws all the same
-    return Stage
+    return Picture
 
 
 def _section(looks: Looks) -> Callable[[Recording, tuple[int, int]], Painter]:
@@ -149,10 +147,12 @@ def parse_size(text: str) -> tuple[int, int]:
     return width, height
 
 
-def _save(image: Image, file: Path) -> None:
+def _save(pixels: np.ndarray, file: Path) -> None:
+    from PIL import Image
+
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         with replacing(file) as temporary:
-            image.save(temporary, format="PNG")
+            Image.fromarray(pixels).save(temporary, format="PNG")
     except OSError as error:
         raise RenderError(f"{file}: cannot be written: {error.strerror}") from error

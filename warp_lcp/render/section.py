@@ -4,24 +4,20 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
 
-from warp_lcp.render.outline_fill import inside_outline
-from warp_lcp.render.recording import Color, Frame, Recording, RenderError, Scale
-from warp_lcp.render.scenery import prescribed_solids
+from warp_lcp.grid.motion import Pose
+from warp_lcp.render.recording import Color, Frame, Recording, RenderError
+from warp_lcp.render.solid_meshes import nearest_distance, prescribed_solids
 from warp_lcp.simulation import Surface
-
-if TYPE_CHECKING:
-    from PIL.Image import Image
 
 DOTS_AN_INCH = 100
 OUTLINE_POINTS = 400  # along the longest side, where solids are sampled
 CELL, DOT, SOLID, EDGE, LINE, BODY = "#e6eaee", "#1c3f63", "#c3c7cc", "#6b7075", "#0c3e80", "#e07a3f"
 BODY_EDGE = "#4a3b33"
-FILL_POINTS = 1200  # along the longest side, where bodies are sampled
 SMALLEST_DOT, LARGEST_DOT = 2.0, 5.0  # points
 
 
@@ -52,11 +48,10 @@ class Section:
             motion = solid.motion.to_motion(self.scene.dimension) if solid.motion else None
             self._solids.append((solid.to_geometry(Path(), self.scene.dimension), motion))
 
-    def draw(self, frame: Frame) -> Image:
+    def draw(self, frame: Frame) -> np.ndarray:
         """Return a picture of a frame."""
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
-        from PIL import Image
 
         width, height = self.size
         figure = Figure(figsize=(width / DOTS_AN_INCH, height / DOTS_AN_INCH), dpi=DOTS_AN_INCH, layout="constrained")
@@ -75,14 +70,14 @@ class Section:
         if self.at is not None:
             axes.set_title(f"z = {self.at:g} m", fontsize="medium")
         canvas.draw()
-        return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+        return np.asarray(canvas.buffer_rgba())[..., :3]
 
     def close(self) -> None:
         """Do nothing: pictures do not share a figure."""
 
     def _draw_cells(self, axes: Any, frame: Frame) -> None:
         """Fill the cut cells, with the colors of their pressure if that is what colors mean."""
-        from matplotlib.colors import ListedColormap, Normalize
+        from matplotlib.colors import ListedColormap
 
         if frame.cells is None:
             return
@@ -94,9 +89,8 @@ class Section:
         colored = self.recording.color is Color.PRESSURE
         table[row, column] = np.asarray(cells.fields["pressure"])[here] if colored else 0.0
         scale = self.recording.scale
-        colors = ListedColormap(_colors(scale) if colored else [CELL])
-        norm = Normalize(scale.low, scale.high) if colored else None
-        axes.imshow(table, origin="lower", extent=(0.0, across * h, 0.0, up * h), cmap=colors, norm=norm, interpolation="nearest", zorder=1)
+        looks = {"cmap": scale.mappable.cmap, "norm": scale.mappable.norm} if colored else {"cmap": ListedColormap([CELL])}
+        axes.imshow(table, origin="lower", extent=(0.0, across * h, 0.0, up * h), interpolation="nearest", zorder=1, **looks)
 
     def _draw_solids(self, axes: Any, time: float) -> None:
         """Fill where the distance to the nearest solid is negative."""
@@ -107,12 +101,8 @@ class Section:
             for side in self.scene.domain.size[:2]
         )
         plane = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), self.at or 0.0)], axis=-1)
-        points = wp.array(plane.reshape(-1, 3), dtype=wp.vec3, device="cpu")
-        distance = wp.empty(len(points), dtype=wp.float32, device="cpu")
-        nearest = np.full(len(points), np.inf)
-        for geometry, motion in self._solids:
-            (geometry.moved(motion.pose(time)) if motion else geometry).signed_distance(points, distance)
-            nearest = np.minimum(nearest, distance.numpy())
+        poses = [(geometry, motion.pose(time) if motion else Pose.identity()) for geometry, motion in self._solids]
+        nearest = nearest_distance(poses, wp.array(plane.reshape(-1, 3), dtype=wp.vec3, device="cpu"))
         if nearest.min() < 0.0 < nearest.max():
             level = nearest.reshape(len(y), len(x))
             axes.contourf(x, y, level, levels=[-math.inf, 0.0], colors=[SOLID], zorder=2)
@@ -127,15 +117,15 @@ class Section:
         axes.add_collection(LineCollection(list(self._segments(surface)), colors=color, linewidths=1.5, zorder=4))
 
     def _fill_bodies(self, axes: Any, bodies: Surface) -> None:
-        """Fill the outlines of the bodies in the plane."""
-        from matplotlib.colors import ListedColormap
+        """Fill the outlines of the bodies in the plane: triangles from the origin to each segment, which wind about what is inside."""
+        from matplotlib.patches import PathPatch
+        from matplotlib.path import Path
 
-        across, up = (round(FILL_POINTS * side / max(self.scene.domain.size[:2])) for side in self.scene.domain.size[:2])
-        pixel = self.scene.domain.size[0] / across
-        inside = inside_outline(self._segments(bodies) / pixel, up, across)
-        where = (0.0, across * pixel, 0.0, up * pixel)
-        mask = np.where(inside, 1.0, np.nan)
-        axes.imshow(mask, origin="lower", extent=where, cmap=ListedColormap([BODY]), interpolation="nearest", zorder=5)
+        ends = self._segments(bodies)
+        origin = np.zeros((len(ends), 1, 2))
+        triangles = np.concatenate([origin, ends, origin], axis=1).reshape(-1, 2)
+        codes = np.tile([Path.MOVETO, Path.LINETO, Path.LINETO, Path.CLOSEPOLY], len(ends))
+        axes.add_patch(PathPatch(Path(triangles, codes), facecolor=BODY, linewidth=0.0, zorder=5))
         self._draw_lines(axes, bodies, BODY_EDGE)
 
     def _segments(self, surface: Surface) -> np.ndarray:
@@ -178,8 +168,7 @@ def cut(triangles: np.ndarray, z: float) -> np.ndarray:
         corner = triangles[own, (alone + other) % 3]
         share = ((z - tip[:, 2]) / (corner[:, 2] - tip[:, 2]))[:, None]
         ends.append((tip + share * (corner - tip))[:, :2])
-    return np.stack(ends, axis=1)
-
-
-def _colors(scale: Scale) -> np.ndarray:
-    return scale.colors(np.linspace(scale.low, scale.high, 256)) / 255.0
+    segments = np.stack(ends, axis=1)
+    under = ~above[own, alone]
+    segments[under] = segments[under][:, ::-1]  # all with what they enclose on the same side
+    return segments

@@ -31,10 +31,10 @@ class Viewer:
 
     def __init__(self, recording: Recording, plotter: Any, clock: Callable[[], float] = time.perf_counter) -> None:
         """Show the first frame."""
-        from warp_lcp.render.stage import Stage
+        from warp_lcp.render.picture import Picture
 
         self.recording, self.plotter, self.clock = recording, plotter, clock
-        self.stage = Stage(recording, plotter.window_size, plotter)
+        self.picture = Picture(recording, plotter.window_size, plotter)
         self.place = 0  # among the recording's frames
         self.playing_since: tuple[float, int] | None = None  # the clock's time and the place then
         self._slider: Any = None
@@ -45,7 +45,7 @@ class Viewer:
         """Show the frame at a place, the nearest if there is none."""
         self.place = min(max(place, 0), len(self.recording.numbers) - 1)
         frame = self.recording.frame(self.recording.numbers[self.place])
-        self.stage.place(frame)
+        self.picture.place(frame)
         self.plotter.add_text(f"t = {frame.time:.3f} s", position="upper_left", font_size=12, color="#33373b", name="time", render=False)
         if self._slider is not None:
             self._slider.GetRepresentation().SetValue(self.place)

@@ -1,0 +1,174 @@
+"""What comes and goes in a run's images: particles, the surface of the material and rigid bodies. Needs the extra `render`."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Sequence
+from typing import Any, cast
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from warp_lcp.scene.camera import THREE_QUARTERS
+from warp_lcp.simulation import Surface
+
+BODY_COLORS = ["#e07a3f", "#d9b23c", "#7fa650", "#b9586b", "#8d6fb0", "#4d9a94", "#c98f63", "#6f7f95"]
+BODY_EDGE = "#4a3b33"
+LIGHTER = 0.5  # of the way to white: every other eighth of a ball
+BOX_POINTS = 8
+ROUND = 1e-3  # how much the distances from the middle of what is round may differ, relative
+SURFACES: dict[str, dict[str, Any]] = {  # in 3-D, by `Scene.palette`
+    "water": {"color": "#3f9fe6", "opacity": 0.45, "specular": 0.5, "specular_power": 40.0, "ambient": 0.5, "diffuse": 0.8},
+    "sand": {"color": "#c9a15f", "specular": 0.0, "ambient": 0.4},
+}
+FILLS = {"water": ["#1254a2", "#78c4ee"], "sand": ["#aa7c46", "#deb87a"]}  # in 2-D, at the domain's bottom and at its top
+OUTLINES = {"water": "#0c3e80", "sand": "#78522a"}
+
+LIGHT = np.array([0.25, 0.9, 0.45]) / np.linalg.norm([0.25, 0.9, 0.45])  # from the domain to the light
+SHADES = {"water": np.array([1.4, 1.0, 0.7]), "sand": np.array([1.1, 1.3, 1.5])}  # shadows of water are blue, of sand brown
+SHEENS = {"water": 0.35, "sand": 0.0}  # how bright the lamp's mirror image is: sand has none
+GLINT = (LIGHT + THREE_QUARTERS) / np.linalg.norm(LIGHT + THREE_QUARTERS)  # the normal that mirrors the light into the camera
+SHADING_CELLS = 4e6  # of the density that shades a liquid, to bound its memory
+
+Drawn = tuple[Any, dict[str, Any]]  # a mesh of pyvista's, and how its plotter is to draw it
+
+
+class Actors:
+    """What stands on a plotter of pyvista's, in groups that are exchanged as a whole."""
+
+    def __init__(self, plotter: Any) -> None:
+        """Begin without any."""
+        self.plotter = plotter
+        self._counts: dict[str, int] = defaultdict(int)
+
+    def exchange(self, group: str, meshes: Sequence[Drawn]) -> list[Any]:
+        """Draw meshes in place of those that the group had; return the actors of those that have points."""
+        for number in range(self._counts[group]):
+            self.plotter.remove_actor(f"{group} {number}", render=False)
+        drawn = [(mesh, looks) for mesh, looks in meshes if mesh.n_points]
+        self._counts[group] = len(drawn)
+        return [
+            self.plotter.add_mesh(mesh, name=f"{group} {number}", reset_camera=False, render=False, show_scalar_bar=False, **looks)
+            for number, (mesh, looks) in enumerate(drawn)
+        ]
+
+
+def surface_meshes(surface: Surface, palette: str, size: Sequence[float], line_width: float) -> list[Drawn]:
+    """Return the surface of a material; in 2-D its inside, deeper in color toward the bottom, and its outline, behind the solids.
+
+    Args:
+        surface: triangles, or closed chains of segments.
+        palette: of the material.
+        size: of the domain [m].
+        line_width: of the outline [pixels].
+    """
+    if not len(surface.corners):
+        return []
+    mesh = poly_data(surface.points, surface.corners)
+    if len(size) == 3:
+        return [(mesh, {"smooth_shading": True, **SURFACES[palette]})]
+    from matplotlib.colors import LinearSegmentedColormap
+
+    behind = -2e-3 * max(size)
+    outline = mesh.clean()
+    inside = outline.triangulate_contours()
+    colors = LinearSegmentedColormap.from_list(palette, FILLS[palette])
+    depth = {"scalars": inside.points[:, 1], "cmap": colors, "clim": [0.0, size[1]], "lighting": False}
+    line = {"color": OUTLINES[palette], "line_width": line_width, "lighting": False}
+    return [(inside.translate((0.0, 0.0, behind)), depth), (outline.translate((0.0, 0.0, 0.95 * behind)), line)]
+
+
+def body_meshes(bodies: Surface | None, at_first: Surface | None, line_width: float) -> list[Drawn]:
+    """Return rigid bodies where they are, each in a color of its own.
+
+    Args:
+        bodies: with the field `body`; None: there are none.
+        at_first: the bodies in the run's first frame, which tells the eighths of balls.
+        line_width: of the outlines of bodies in 2-D [pixels].
+    """
+    if bodies is None:
+        return []
+    of_corner = np.asarray(bodies.fields["body"]).ravel()[bodies.corners[:, 0]]
+    meshes: list[Drawn] = []
+    for number, body in enumerate(np.unique(of_corner)):
+        color, corners = BODY_COLORS[number % len(BODY_COLORS)], bodies.corners[of_corner == body]
+        if corners.shape[1] == 2:
+            meshes += _flat_body(bodies.points, corners, color, line_width)
+        else:
+            meshes.append(_solid_body(bodies.points, corners, color, at_first))
+    return meshes
+
+
+def _solid_body(points: np.ndarray, corners: np.ndarray, color: str, at_first: Surface | None) -> Drawn:
+    """Return a body; a ball in eighths of two shades, which show how it turns."""
+    from matplotlib.colors import to_hex, to_rgb
+
+    mesh = poly_data(points, corners)
+    looks: dict[str, Any] = {"smooth_shading": True, "ambient": 0.45, "specular": 0.25, "specular_power": 30.0}
+    if at_first is None or len(at_first.points) != len(points) or not is_round(points, corners):
+        return mesh, {"color": color, "split_sharp_edges": True, **looks}
+    own = at_first.points[np.unique(corners)]
+    side = np.prod(own - 0.5 * (own.min(axis=0) + own.max(axis=0)), axis=1)  # changes its sign between eighths
+    pale = to_hex(LIGHTER + (1.0 - LIGHTER) * np.array(to_rgb(color)))
+    return mesh, {"scalars": side, "cmap": [color, pale], "n_colors": 2, "clim": np.abs(side).max() * np.array([-1.0, 1.0]), **looks}
+
+
+def _flat_body(points: np.ndarray, corners: np.ndarray, color: str, line_width: float) -> list[Drawn]:
+    """Return the inside and the outline of a body, a little before the particles."""
+    outline = poly_data(points, corners).clean()
+    before = 1e-3 * float(np.ptp(outline.points, axis=0).max())
+    inside = outline.triangulate_contours().translate((0.0, 0.0, before))
+    if is_round(points, corners):  # a radius, which shows how the disc turns
+        outline = outline.merge(poly_data(np.stack([points[corners[:, 0]].mean(axis=0), points[corners[0, 0]]]), np.array([[0, 1]])))
+    line = {"color": BODY_EDGE, "line_width": line_width, "lighting": False}
+    return [(inside, {"color": color, "lighting": False}), (outline.translate((0.0, 0.0, 2.0 * before)), line)]
+
+
+def poly_data(points: np.ndarray, corners: np.ndarray) -> Any:
+    """Return what has these corners, triangles or segments, as pyvista's PolyData of the points that they use."""
+    import pyvista
+
+    used, own = np.unique(corners, return_inverse=True)
+    own = own.reshape(corners.shape)
+    if corners.shape[1] == 3:
+        return pyvista.PolyData.from_regular_faces(points[used], own)
+    return pyvista.PolyData(points[used], lines=np.column_stack([np.full(len(own), 2), own]).ravel())
+
+
+def is_round(points: np.ndarray, corners: np.ndarray) -> bool:
+    """Return whether a body is a disc or a ball: its points [m], more than a box has, lie at one distance from their middle."""
+    own = points[np.unique(corners)]
+    distance = np.linalg.norm(own - 0.5 * (own.min(axis=0) + own.max(axis=0)), axis=1)
+    return len(own) > BOX_POINTS and bool(np.ptp(distance) < ROUND * distance.max())
+
+
+def shaded(points: np.ndarray, colors: np.ndarray, spacing: float, palette: str) -> np.ndarray:
+    """Light particles as the smooth surface of the liquid that they make up, whose normals point down the gradient of their density.
+
+    Particles inside the liquid, and single drops, keep their color.
+
+    Args:
+        points: [m], shape (n, 3).
+        colors: 0 to 255, shape (n, 3).
+        spacing: over which the density is averaged [m].
+        palette: of the material, a key of SHADES.
+
+    Returns:
+        Colors as `colors`.
+    """
+    low, extent = points.min(axis=0), np.ptp(points, axis=0)
+    spacing = max(spacing, (float(np.prod(extent + 6 * spacing)) / SHADING_CELLS) ** (1 / 3))
+    at = (points - low) / spacing + 3.25  # a lattice of two particles a cell then lies well inside the bins
+    density, _ = np.histogramdd(at, bins=[range(math.ceil(side) + 1) for side in at.max(axis=0) + 3.0])
+    density = gaussian_filter(np.minimum(density, 8.0), 1.2)
+    slopes = np.gradient(density)
+    slope = np.stack([map_coordinates(-component, at.T - 0.5, order=1) for component in slopes], axis=-1)
+    steepness = np.linalg.norm(slope, axis=1, keepdims=True)
+    normal = slope / np.maximum(steepness, 1e-9)
+    flatness = np.clip(steepness / 0.8, 0.0, 1.0)  # 0 inside and for drops, 1 at a surface
+    facing = (normal @ LIGHT)[:, None]
+    light = 0.72 + 0.22 * facing + 0.14 * np.maximum(facing, 0.0)
+    glint = SHEENS[palette] * np.maximum(normal @ GLINT, 0.0)[:, None] ** 40
+    lit = np.clip(colors * (1.0 - flatness * SHADES[palette] * (1.0 - light)), 0.0, 255.0)
+    return cast(np.ndarray, lit + flatness * glint * (255.0 - lit))

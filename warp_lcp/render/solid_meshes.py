@@ -1,0 +1,184 @@
+"""The domain and the solids of a run's images, where they are at a frame's time. Needs the extra `render`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.grid.motion import Pose
+from warp_lcp.grid.solids import Geometry
+from warp_lcp.render.actors import Drawn
+from warp_lcp.scene.scene import Scene
+from warp_lcp.scene.shapes import Box, Capsule, Mesh, Plane, Shape, Sphere
+
+OUTLINE_POINTS = 1500  # along the longest side, where 2-D solids are sampled: about a drawn pixel
+FLAT_SOLID, SOLID, EDGE, FLOOR = "#bfc3c8", "#cdd1d5", "#6b7075", "#f1f2f3"
+
+
+class FlatSolids:
+    """A rectangle; solids are filled where the signed distance to them is negative, a little behind the particles.
+
+    Args:
+        size: of the domain [m].
+        line_width: of the domain's edges [pixels].
+    """
+
+    def __init__(self, size: Sequence[float], line_width: float) -> None:
+        """Choose where distances are sampled."""
+        import pyvista
+
+        self.size, self.line_width = size, line_width
+        self._step = max(size) / OUTLINE_POINTS
+        counts = [math.ceil(side / self._step) + 1 for side in size]
+        spacing = [side / (count - 1) for side, count in zip(size, counts, strict=True)]
+        self._plane = pyvista.ImageData(dimensions=(*counts, 1), spacing=(*spacing, 1.0))
+        self._points = wp.array(self._plane.points, dtype=wp.vec3, device="cpu")
+
+    def domain(self) -> list[Drawn]:
+        """Return the edges of the domain."""
+        import pyvista
+
+        edges = pyvista.Rectangle([(0.0, 0.0, 0.0), (self.size[0], 0.0, 0.0), (*self.size, 0.0)]).extract_all_edges()
+        return [(edges, {"color": EDGE, "line_width": self.line_width, "lighting": False})]
+
+    def prepared(self, solid: Shape) -> Geometry:
+        """Return what is needed to draw a solid."""
+        return solid.to_geometry(Path(), 2)
+
+    def meshes(self, solids: Sequence[tuple[Geometry, Pose]]) -> list[Drawn]:
+        """Return where the distance to the nearest of solids is negative, and a line around it."""
+        nearest = nearest_distance(solids, self._points)
+        if nearest.min() >= 0.0:
+            return []
+        behind = -1e-3 * max(self.size)
+        self._plane["distance"] = np.minimum(nearest, 1e3 * self._step)
+        inside = self._plane.clip_scalar(scalars="distance", value=0.0).translate((0.0, 0.0, behind))
+        line = self._plane.contour([0.0], scalars="distance").translate((0.0, 0.0, 0.5 * behind))
+        edge = {"color": EDGE, "line_width": 0.75 * self.line_width, "lighting": False}
+        return [(inside, {"color": FLAT_SOLID, "lighting": False}), (line, edge)]
+
+
+class RoomSolids:
+    """A floor and the edges of a box; solids are surfaces, containers (inverted shapes) their translucent far sides.
+
+    Args:
+        size: of the domain [m].
+        line_width: of the domain's edges [pixels].
+    """
+
+    def __init__(self, size: Sequence[float], line_width: float) -> None:
+        """Take the domain."""
+        self.size, self.line_width = np.array(size), line_width
+
+    def domain(self) -> list[Drawn]:
+        """Return the edges of the domain, and its floor."""
+        import pyvista
+
+        x, y, z = self.size
+        below = -1e-3 * y
+        floor = pyvista.Rectangle([[0.0, below, 0.0], [x, below, 0.0], [x, below, z]])
+        edges = pyvista.Box((0.0, x, 0.0, y, 0.0, z)).extract_all_edges()
+        line = {"color": EDGE, "line_width": 0.6 * self.line_width, "lighting": False}
+        return [(floor, {"color": FLOOR, "lighting": False}), (edges, line)]
+
+    def prepared(self, solid: Shape) -> Outline:
+        """Return what is needed to draw a solid."""
+        return Outline(solid)
+
+    def meshes(self, solids: Sequence[tuple[Outline, Pose]]) -> list[Drawn]:
+        """Return the surfaces of solids, and the edges of containers."""
+        meshes: list[Drawn] = []
+        for outline, pose in solids:
+            mesh = outline.inside(self.size, pose)
+            looks = {"color": SOLID, "smooth_shading": True, "split_sharp_edges": True}
+            if outline.shape.invert and not isinstance(outline.shape, Plane):
+                mesh = _clipped(mesh, self.size, closed=False)  # beyond the walls of the domain there is nothing to contain
+                line = {"color": EDGE, "line_width": 0.5 * self.line_width, "lighting": False}
+                meshes += [(mesh, {"ambient": 0.3, "opacity": 0.3, "culling": "front", **looks}), (mesh.extract_feature_edges(30.0), line)]
+            else:
+                meshes.append((mesh, {"ambient": 0.5, **looks}))
+        return meshes
+
+
+class Outline:
+    """The surface of a 3-D shape, as pyvista's PolyData. Inverted shapes have the surface of what they leave out.
+
+    Args:
+        shape: in 3-D.
+
+    Raises:
+        TypeError: there is no drawing of such a shape.
+    """
+
+    def __init__(self, shape: Shape) -> None:
+        """Make the surface in the shape's own coordinates."""
+        import pyvista
+
+        self.shape = shape
+        match shape:
+            case Plane():
+                mesh = pyvista.PolyData()  # depends on the domain
+            case Box():
+                mesh = pyvista.Box(np.stack([shape.min, shape.max], axis=-1).ravel())
+            case Sphere():
+                mesh = pyvista.Sphere(radius=shape.radius, center=shape.center, theta_resolution=96, phi_resolution=64)
+            case Capsule():
+                start, end = np.array(shape.start), np.array(shape.end)
+                mesh = pyvista.Capsule(
+                    center=0.5 * (start + end), direction=end - start, radius=shape.radius,
+                    cylinder_length=float(np.linalg.norm(end - start)), resolution=64,
+                )  # fmt: skip
+            case Mesh():
+                solid = cast(Any, shape.to_geometry(Path(), 3)).surface
+                mesh = pyvista.PolyData.from_regular_faces(solid.vertices, solid.triangles)
+            case _:
+                raise TypeError(f"a {type(shape).__name__} cannot be drawn")
+        self.mesh = mesh.triangulate().clean() if mesh.n_points else mesh
+
+    def inside(self, size: np.ndarray, pose: Pose) -> Any:
+        """Return the surface where the shape is, cut at the domain's walls unless it is inverted.
+
+        Args:
+            size: of the domain [m], shape (3,).
+            pose: relative to where the shape is placed.
+        """
+        import pyvista
+
+        placement = self.shape.placement(3).moved(pose)
+        if isinstance(self.shape, Plane):
+            normal = placement.rotation @ np.array(self.shape.normal) * (-1.0 if self.shape.invert else 1.0)
+            domain = pyvista.Box(np.stack([np.zeros(3), size], axis=-1).ravel()).clean()
+            return domain.clip_closed_surface(normal=-normal, origin=placement.apply(np.array(self.shape.point)))
+        mesh = self.mesh.copy()
+        mesh.points = placement.apply(mesh.points)
+        return mesh if self.shape.invert else _clipped(mesh, size)
+
+
+def prescribed_solids(scene: Scene) -> list[Any]:
+    """Return the solids whose places the scene tells; where the others, rigid bodies, are only frames know."""
+    return [solid for solid in scene.solid if not solid.is_body]
+
+
+def nearest_distance(solids: Sequence[tuple[Geometry, Pose]], points: wp.array) -> np.ndarray:
+    """Return the signed distance from points [m] on the CPU to the nearest of solids [m], infinite without any."""
+    nearest = np.full(len(points), np.inf, dtype=np.float32)
+    distance = wp.empty(len(points), dtype=wp.float32, device="cpu")
+    for solid, pose in solids:
+        solid.moved(pose).signed_distance(points, distance)
+        np.minimum(nearest, distance.numpy(), out=nearest)
+    return nearest
+
+
+def _clipped(mesh: Any, size: np.ndarray, *, closed: bool = True) -> Any:
+    """Cut a surface at the domain's walls, where it reaches beyond; a closed one is closed again there."""
+    for axis in range(3):
+        for end, sign in ((0.0, 1.0), (size[axis], -1.0)):
+            if mesh.n_points and (sign * (mesh.points[:, axis] - end)).min() < -1e-6 * size[axis]:
+                normal, origin = sign * np.eye(3)[axis], end * np.eye(3)[axis]
+                mesh = mesh.clip_closed_surface(normal=normal, origin=origin) if closed else mesh.clip(-normal, origin)
+    return mesh
