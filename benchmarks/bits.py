@@ -25,7 +25,7 @@ from benchmarks.problems import cut_cells, splash
 from warp_lcp.driver.progress import Lines
 from warp_lcp.driver.run import run_scene
 from warp_lcp.driver.scene_file import load_scene
-from warp_lcp.protocol import families
+from warp_lcp.problem.protocol import families
 from warp_lcp.solvers.mprgp import MPRGP
 from warp_lcp.solvers.registry import METHODS
 

@@ -25,8 +25,8 @@ from granular.body_faces import BodyFaces, entries_near, find_body_faces, unowne
 from granular.packing import Packing
 from granular.yield_set import xyz
 from warp_lcp.grid.staggered import StaggeredGrid
-from warp_lcp.program import Launch
 from warp_lcp.rows import Rows
+from warp_lcp.rows.program import Launch
 
 if typing.TYPE_CHECKING:
     from granular.stress import Velocity, Walls

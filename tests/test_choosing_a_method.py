@@ -7,7 +7,7 @@ import pytest
 
 import warp_lcp as wl
 from benchmarks.method_exponents import MATRICES, outcome
-from warp_lcp import reformulate
+from warp_lcp.problem import reformulate
 from warp_lcp.recommend import RULES
 
 DOCS = Path(__file__).parents[1] / "docs"

@@ -9,7 +9,7 @@ import warp_lcp as wl
 from benchmarks import sweep_prices
 from code_blocks import blocks, run
 from warp_lcp.driver.scene_file import load_scene
-from warp_lcp.protocol import CAPABILITIES, families, members
+from warp_lcp.problem.protocol import CAPABILITIES, families, members
 from warp_lcp.solvers.registry import grid_methods
 
 DOCS = Path(__file__).parents[1] / "docs"

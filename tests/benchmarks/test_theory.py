@@ -9,7 +9,7 @@ import pytest
 
 import warp_lcp as wl
 from benchmarks import theory
-from warp_lcp import reformulate
+from warp_lcp.problem import reformulate
 
 DOCS = Path(__file__).parents[2] / "docs"
 TEXT = (DOCS / "theory.md").read_text()

@@ -11,13 +11,13 @@ from typer.testing import CliRunner, Result
 
 from benchmarks.memory import array_bytes, forget_peak
 from fluids.simulator import FluidsSimulator
-from warp_lcp import claims
 from warp_lcp.driver import check, cli, devices
 from warp_lcp.driver.calibrate import MOST, step_seconds
 from warp_lcp.driver.check import check_memory, check_scene
 from warp_lcp.driver.scene_file import load_scene
 from warp_lcp.driver.simulator import StepFailed
 from warp_lcp.driver.table import SceneError
+from warp_lcp.files import claims
 
 
 def call(*arguments: object) -> Result:

@@ -13,7 +13,7 @@ from granular.simulator import FAR, GranularSimulator, SandSimulation
 from granular.stress import Stress
 from warp_lcp.driver.scene_file import load_scene
 from warp_lcp.driver.simulator import SimulationFailed, StepFailed, Surface
-from warp_lcp.result import SolveStatus
+from warp_lcp.problem.result import SolveStatus
 
 G, DENSITY = 9.81, 1500.0
 

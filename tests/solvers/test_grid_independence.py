@@ -5,9 +5,8 @@ import pytest
 
 import warp_lcp as wl
 from benchmarks import problems
-from warp_lcp import program
 from warp_lcp.multigrid import Hierarchy
-from warp_lcp.rows import layout
+from warp_lcp.rows import layout, program
 
 BOUNDS = ["none", "walls", "everywhere"]
 

@@ -9,7 +9,7 @@ import warp as wp
 import warp_lcp as wl
 from oracle import assemble, natural_residual
 from warp_lcp.krylov import ConjugateGradient
-from warp_lcp.residual import NaturalResidual
+from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.solvers.interior_point import InteriorPoint
 from warp_lcp.solvers.nonsmooth_map import Kink, NonsmoothMap, Reformulation
 from warp_lcp.solvers.principal_system import GridSystem

@@ -10,7 +10,7 @@ from oracle import assemble, boxed, lemke, natural_residual
 from warp_lcp.gallery.contact import contact
 from warp_lcp.gallery.obstacle import ball_obstacle
 from warp_lcp.gallery.psd import semidefinite
-from warp_lcp.residual import NaturalResidual
+from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.solvers.fischer_newton import FischerNewton
 from warp_lcp.solvers.globalization import NonmonotoneSearch
 from warp_lcp.solvers.gradient_descent import GradientDescent

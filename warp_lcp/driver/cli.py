@@ -38,7 +38,7 @@ from warp_lcp.driver.terminal import Commands, Terminal, say, tell
 from warp_lcp.driver.tune import FRAMES, Tuning, tune, write_tuned
 from warp_lcp.driver.versions import shadowing_distributions, versions
 from warp_lcp.driver.viewer import view_run
-from warp_lcp.nearest import nearest
+from warp_lcp.settings import nearest
 
 FAILED = 1
 WRONG_INPUT = 2

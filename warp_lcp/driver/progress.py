@@ -16,7 +16,7 @@ from rich.table import Column
 from warp_lcp.driver.foreign import one_line
 from warp_lcp.driver.log import Value
 from warp_lcp.driver.terminal import say
-from warp_lcp.result import SolveStatus
+from warp_lcp.problem.result import SolveStatus
 
 RESIDUALS = "coupled_residual", "solve_residual"  # the first that a log has is the one that the scene's tolerance is of
 CONVERGED = SolveStatus.CONVERGED.name

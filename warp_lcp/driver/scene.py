@@ -18,8 +18,8 @@ from warp_lcp.driver.shapes import Liquid, Shape, Solid, Wall
 from warp_lcp.driver.table import Complaint, Problem, SceneError, Table, Vector, refuse, validate
 from warp_lcp.grid.sides import SIDES
 from warp_lcp.grid.solid_notes import STRAY
+from warp_lcp.problem.solve import PrecisionName
 from warp_lcp.settings import Count, CountOrZero, Positive, Share, adapter
-from warp_lcp.solve import PrecisionName
 from warp_lcp.solvers.registry import grid_methods
 
 __all__ = ["Complaint", "Liquid", "Problem", "Scene", "SceneError", "Shape", "Solid", "Table", "Vector", "Wall", "validate"]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from warp_lcp.result import SolveStatus
+from warp_lcp.problem.result import SolveStatus
 
 if TYPE_CHECKING:
     from warp_lcp.distributed.ranks import Ranks

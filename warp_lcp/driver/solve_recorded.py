@@ -14,7 +14,7 @@ from warp_lcp.driver.atomic import replacing
 from warp_lcp.driver.solve_file import Outcome, ProblemError, criteria, method_named
 from warp_lcp.gallery.recorded_part import cell_counts, load_part
 from warp_lcp.operators import GridPoisson
-from warp_lcp.problem import LCP
+from warp_lcp.problem.lcp import LCP
 from warp_lcp.solvers.default import solve
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 from warp_lcp.solvers.registry import METHODS

@@ -12,7 +12,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
 from warp_lcp.driver.foreign import one_line
-from warp_lcp.nearest import nearest
+from warp_lcp.settings import nearest
 
 ModelT = TypeVar("ModelT", bound="Table")
 

@@ -10,9 +10,9 @@ import warp as wp
 
 from warp_lcp.deadline import check_time
 from warp_lcp.krylov.conjugate_gradient_kernels import ITERATIONS, PQ, RR, RZ, RZ_OLD, SLOTS, begin_kernel, end_kernel
-from warp_lcp.program import Launch, Program
 from warp_lcp.rows import RowPass
-from warp_lcp.vectors import Reduction, rows_of
+from warp_lcp.rows.program import Launch, Program
+from warp_lcp.rows.vectors import Reduction, rows_of
 
 HEADERS, PLACES = Path(__file__).parent / "headers", {"RZ": int(RZ), "RZ_OLD": int(RZ_OLD), "PQ": int(PQ)}
 DIRECTION = RowPass(

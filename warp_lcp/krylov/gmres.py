@@ -11,7 +11,7 @@ import warp as wp
 from warp_lcp.deadline import check_time
 from warp_lcp.krylov.conjugate_gradient import HEADERS, LinearMap, Preconditioner
 from warp_lcp.rows import RowPass
-from warp_lcp.vectors import ADD, Reduction, rows_of
+from warp_lcp.rows.vectors import ADD, Reduction, rows_of
 
 RESIDUAL = RowPass("gmres.residual", HEADERS / "residual.h", "S", reads={"b": "S", "w": "S"}, writes={"q": "S"}, optional=("w",))
 WEIGH = RowPass("gmres.weigh", HEADERS / "weigh.h", "S", reads={"w": "S"}, writes={"q": "S"}, numbers={"inverse": bool})

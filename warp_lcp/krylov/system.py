@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_lcp.krylov.conjugate_gradient import HEADERS
 from warp_lcp.rows import RowPass
-from warp_lcp.vectors import Reduction, rows_of
+from warp_lcp.rows.vectors import Reduction, rows_of
 
 NORM = RowPass("krylov.norm", HEADERS / "norm.h", "S", reads={"r": "S", "w": "S"}, optional=("w",), sums=("rr",))
 

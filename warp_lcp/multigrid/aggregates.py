@@ -13,7 +13,7 @@ from pyamg.strength import symmetric_strength_of_connection
 
 from warp_lcp.multigrid.aggregates_kernels import correct_kernel, restrict_kernel, settle_kernel
 from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.program import Launch, Program
+from warp_lcp.rows.program import Launch, Program
 
 # of 1, 1.4 and 1.8 with 2 and 3 coarse cycles: obstacles under diffusion and convection on 257^2 cells, Newton's steps after 4 cycles
 OVERCORRECTION = 1.4  # of plain aggregates' corrections, which are too small where x is smooth

@@ -21,8 +21,8 @@ from warp_lcp.multigrid.aggregates import aggregated, symmetric_part
 from warp_lcp.multigrid.algebraic_kernels import densify_kernel, factor_kernel, invert_kernel, places_kernel, solve_kernel
 from warp_lcp.multigrid.cycle_settings import AlgebraicSettings
 from warp_lcp.operators.sparse import GATHER, PRODUCT, ROWS, SparseOperator
-from warp_lcp.program import Launch, Program
 from warp_lcp.rows import Bound, RowPass, Rows
+from warp_lcp.rows.program import Launch, Program
 
 HEADERS = Path(__file__).parent / "headers"
 LEVEL = {**ROWS, "a": "S"}

@@ -9,7 +9,6 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.layout import Padding, zeros
 from warp_lcp.multigrid import cycle_passes as passes
 from warp_lcp.multigrid.coarsest_kernels import coarsest_kernels
 from warp_lcp.multigrid.cycle_passes import UNBOUNDED
@@ -18,10 +17,11 @@ from warp_lcp.multigrid.shared_levels import share_changes, whole_counts
 from warp_lcp.multigrid.small_levels import SmallLevels, first_small
 from warp_lcp.operators.stencil import Stencil
 from warp_lcp.operators.stencil_kernels import coarsen_spans_kernel
-from warp_lcp.program import Launch, Program
 from warp_lcp.rows import Bound, RowPass, Rows
+from warp_lcp.rows.fields import Padding, zeros
+from warp_lcp.rows.program import Launch, Program
 from warp_lcp.rows.sequence import CUDA_THREADS
-from warp_lcp.vectors import convert
+from warp_lcp.rows.vectors import convert
 
 # of a coarsest level's diagonal: what rounding leaves of a singular component's last pivot, with a margin
 PINNED = {wp.float32: 3e-5, wp.float64: 1e-13}

@@ -14,8 +14,8 @@ from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.multigrid.turning_kernels import sample_kernel
 from warp_lcp.operators.stencil import Stencil
-from warp_lcp.program import Program
 from warp_lcp.rows import Bound
+from warp_lcp.rows.program import Program
 
 Strength = list[float]  # mean weights along x, y and z, in units of the largest
 

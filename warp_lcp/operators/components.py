@@ -14,7 +14,7 @@ from warp_lcp.rows import RowPass
 
 if TYPE_CHECKING:
     from warp_lcp.operators.grid_poisson import GridPoisson
-    from warp_lcp.vectors import Across
+    from warp_lcp.rows.vectors import Across
 
 
 Scratch = tuple[wp.array[Any], wp.array[Any]]

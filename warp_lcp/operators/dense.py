@@ -9,12 +9,12 @@ import numpy as np
 import scipy.sparse
 import warp as wp
 
-from warp_lcp.layout import Layout, check_kept, check_storable, real_array
 from warp_lcp.operators.compressed_rows import CompressedRows
-from warp_lcp.pickling import Pickled, made_again
-from warp_lcp.problem import as_operator
+from warp_lcp.problem.lcp import as_operator
+from warp_lcp.problem.pickling import Pickled, made_again
+from warp_lcp.problem.scale import scale_of_matrix
 from warp_lcp.rows import RowPass, Rows
-from warp_lcp.scale import scale_of_matrix
+from warp_lcp.rows.fields import Layout, check_kept, check_storable, real_array
 
 HEADERS, FIELDS = Path(__file__).parent / "headers", dict.fromkeys(("b", "lower", "upper"), "S")
 PRODUCT = RowPass(

@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.layout import Layout, check_storable, layout_of, real_array
 from warp_lcp.operators.dense import is_rounding
 from warp_lcp.operators.low_rank_columns import BlockColumns
 from warp_lcp.operators.low_rank_kernels import weigh_kernel
-from warp_lcp.pickling import Pickled, made_again
-from warp_lcp.program import Launch
+from warp_lcp.problem.pickling import Pickled, made_again
+from warp_lcp.problem.protocol import layout_of
+from warp_lcp.rows.fields import Layout, check_storable, real_array
+from warp_lcp.rows.program import Launch
 
 
 class LowRankOperator(Pickled):

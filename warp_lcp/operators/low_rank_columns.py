@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.program import Launch
 from warp_lcp.rows import RowPass, Rows
-from warp_lcp.vectors import Reduction
+from warp_lcp.rows.program import Launch
+from warp_lcp.rows.vectors import Reduction
 
 HEADERS = Path(__file__).parent / "headers"
 ENTRIES = {"entry_rows": wp.int32, "blocks": wp.int32, "values": "V", "count": wp.int32}

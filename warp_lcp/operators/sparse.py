@@ -10,15 +10,15 @@ import numpy as np
 import scipy.sparse
 import warp as wp
 
-from warp_lcp.layout import Layout, check_kept, check_storable, real_array
 from warp_lcp.operators.compressed_rows import CompressedRows
 from warp_lcp.operators.dense import is_rounding
 from warp_lcp.operators.sparse_kernels import color_kernel
-from warp_lcp.pickling import Pickled, made_again
-from warp_lcp.problem import as_operator
-from warp_lcp.program import Launch
+from warp_lcp.problem.lcp import as_operator
+from warp_lcp.problem.pickling import Pickled, made_again
+from warp_lcp.problem.scale import scale_of_matrix
 from warp_lcp.rows import RowPass, Rows
-from warp_lcp.scale import scale_of_matrix
+from warp_lcp.rows.fields import Layout, check_kept, check_storable, real_array
+from warp_lcp.rows.program import Launch
 
 HEADERS = Path(__file__).parent / "headers"
 ROWS = {"ptr": wp.int32, "col": wp.int32}  # of a matrix: where each begins, columns of the entries

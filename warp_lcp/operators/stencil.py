@@ -9,11 +9,11 @@ from typing import Any, Protocol
 import numpy as np
 import warp as wp
 
-from warp_lcp.layout import Padding
 from warp_lcp.operators.stencil_kernels import PRODUCT, RELAX, WRAP
-from warp_lcp.program import Launch, perform
 from warp_lcp.rows import Bound, Rows
+from warp_lcp.rows.fields import Padding
 from warp_lcp.rows.layout import check_memory, put, stencil_struct
+from warp_lcp.rows.program import Launch, perform
 
 
 class Ghosts(Protocol):

@@ -7,12 +7,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.layout import layout_of
 from warp_lcp.operators.low_rank import LowRankOperator
-from warp_lcp.pickling import Pickled
-from warp_lcp.problem import as_operator
-from warp_lcp.protocol import AppliesPlus, HasCells, HasColumns, HasStencil, NamesComponents, Operator, has, version_of
-from warp_lcp.vectors import ADD, rows_of
+from warp_lcp.problem.lcp import as_operator
+from warp_lcp.problem.pickling import Pickled
+from warp_lcp.problem.protocol import AppliesPlus, HasCells, HasColumns, HasStencil, NamesComponents, Operator, has, layout_of, version_of
+from warp_lcp.rows.vectors import ADD, rows_of
 
 FELT = 1e-5  # of the sum of a column's sizes over a component: open fractions are of float32
 

@@ -10,12 +10,12 @@ import warp as wp
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from warp_lcp.affine_bounds import AffineBounds
 from warp_lcp.operators.dense import DenseOperator
-from warp_lcp.problem import LCP
+from warp_lcp.problem.affine_bounds import AffineBounds
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rigid.contact_kernels import NNCG
 from warp_lcp.rows import Rows
-from warp_lcp.stopping import StoppingCriteria
 
 YIELDS = 1e-6  # of B, along tangents: how friction is shared between contacts then is unique, and rest creeps by 1e-7 m/s at most
 

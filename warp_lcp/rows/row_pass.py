@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from warp_lcp.native import C_TYPES
 from warp_lcp.rows.layout import Bounds, Known, RowLayout, Rows, joined, make_struct, no_rows, stencil_struct, threads
 
 HEADERS = Path(__file__).parent / "headers"
+C_TYPES = {wp.uint8: "unsigned char", wp.float32: "float", wp.float64: "double"}
 C = {**C_TYPES, wp.int8: "signed char", wp.int32: "int", wp.bool: "bool"}
 PLACE = ("k0", "j0", "i0")  # first stored cell of a box
 INTEGERS = {wp.int32: "i", int: "i", wp.int64: "q", wp.bool: "?", bool: "?"}
@@ -147,7 +147,7 @@ class RowPass:
         Args:
             rows: which rows.
             stencil: a `warp_lcp.operators.stencil.Stencil`, or a `Known` product in place of one.
-            bounds: operands of a `warp_lcp.bounds.Bounds`.
+            bounds: operands of a `warp_lcp.problem.bounds.Bounds`.
             given: arrays, numbers, and constants that are not as usual, by name.
 
         Raises:

@@ -8,15 +8,15 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import version_of
-from warp_lcp.residual import NaturalResidual
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import version_of
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.solve import IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
 from warp_lcp.rows import Rows
+from warp_lcp.rows.vectors import Reduction
 from warp_lcp.settings import Count, Positive, Settings
-from warp_lcp.solve import IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
 from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers.spectrum import positive_diagonal, scaled_spectrum
-from warp_lcp.vectors import Reduction
 
 MARGIN = 1.05  # Lanczos' estimate is from below
 FAR = 1.5  # times L: a step of more curvature is taken back

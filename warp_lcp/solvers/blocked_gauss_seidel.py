@@ -10,11 +10,11 @@ import warp as wp
 
 from warp_lcp.operators.compressed_rows import CompressedRows
 from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasRows, HasStencil, check_taken, has
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasRows, HasStencil, check_taken, has
+from warp_lcp.problem.solve import Precision, PrecisionName, Solver, Step
 from warp_lcp.rows.layout import put
 from warp_lcp.settings import Count, Relaxation, Settings, Share
-from warp_lcp.solve import Precision, PrecisionName, Solver, Step
 from warp_lcp.solvers.blocked_gauss_seidel_kernels import BlockLists, block_kernels
 from warp_lcp.solvers.grid_lines import GridLines, LineSweep
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton

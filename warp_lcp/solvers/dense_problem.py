@@ -13,12 +13,12 @@ import scipy.sparse.linalg
 import warp as wp
 
 from warp_lcp.deadline import check_time, seconds_left
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasRows, has
-from warp_lcp.residual import NaturalResidual
-from warp_lcp.result import SolveStatus
-from warp_lcp.scale import scale_of_matrix, scaled, sizes_of_matrix
-from warp_lcp.solve import IterateInPlace, Precision, Step
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasRows, has
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.scale import scale_of_matrix, scaled, sizes_of_matrix
+from warp_lcp.problem.solve import IterateInPlace, Precision, Step
 
 SEMIDEFINITE = 1e-10  # shift with which an equilibrated semi-definite matrix must have a Cholesky factor
 PROVABLE = 250_000  # entries of A up to which a linear program is asked whether there is a solution: seconds

@@ -8,11 +8,11 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
-from warp_lcp.layout import Array, real_array
-from warp_lcp.pickling import FieldsOnHost
-from warp_lcp.problem import LCP
-from warp_lcp.result import SolveStatus
-from warp_lcp.solve import Step
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.pickling import FieldsOnHost
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.solve import Step
+from warp_lcp.rows.fields import Array, real_array
 from warp_lcp.solvers.dense_problem import DenseProblem, DenseWorkspace, check_size
 from warp_lcp.solvers.direct_enumeration_kernels import kernels
 

@@ -14,15 +14,15 @@ import warp as wp
 
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasRows, HasScale, has, version_of
-from warp_lcp.residual import NaturalResidual
-from warp_lcp.result import SolveStatus
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasRows, HasScale, has, version_of
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.scale import scaled
+from warp_lcp.problem.solve import IterateInPlace, Precision, RoundedIterate, Step
 from warp_lcp.rows import RowPass
-from warp_lcp.scale import scaled
-from warp_lcp.solve import IterateInPlace, Precision, RoundedIterate, Step
+from warp_lcp.rows.vectors import rows_of
 from warp_lcp.solvers.dense_problem import power_of_two, proved_infeasible, unit_rows_and_columns
-from warp_lcp.vectors import rows_of
 
 UNITS = RowPass(
     "equilibrated.units", Path(__file__).parent / "headers" / "units.h", wp.float64, reads={"x": wp.float64, "units": wp.float64},

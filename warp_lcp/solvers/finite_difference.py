@@ -9,9 +9,9 @@ import warp as wp
 
 from warp_lcp.krylov.gmres import GMRES
 from warp_lcp.krylov.system import KrylovSystem
-from warp_lcp.problem import LCP
-from warp_lcp.program import Launch
-from warp_lcp.residual import NaturalResidual
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.rows.program import Launch
 from warp_lcp.solvers.nonsmooth_map import Kink, NonsmoothMap, Reformulation
 from warp_lcp.solvers.nonsmooth_map_kernels import difference_kernel, scale_rows_kernel
 

@@ -11,12 +11,12 @@ import warp as wp
 
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.dense import DenseOperator
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasStencil, has
-from warp_lcp.residual import NaturalResidual
-from warp_lcp.result import SolveStatus
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasStencil, has
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.solve import IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
 from warp_lcp.settings import Count, CountOrZero, Settings, Share, ShareOrAll
-from warp_lcp.solve import IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
 from warp_lcp.solvers.finite_difference import FiniteDifferenceSystem
 from warp_lcp.solvers.fischer_newton_dense import FischerDenseWorkspace
 from warp_lcp.solvers.globalization import NonmonotoneSearch

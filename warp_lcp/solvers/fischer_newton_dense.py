@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.linalg
 
-from warp_lcp.problem import LCP
-from warp_lcp.result import SolveStatus
-from warp_lcp.solve import Precision, Step
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.solve import Precision, Step
 from warp_lcp.solvers.dense_problem import DenseProblem, DenseWorkspace
 from warp_lcp.solvers.globalization import NonmonotoneSearch
 from warp_lcp.solvers.gradient_descent import GradientWorkspace

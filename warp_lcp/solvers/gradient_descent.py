@@ -9,11 +9,11 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
-from warp_lcp.problem import LCP
-from warp_lcp.residual import NaturalResidual
-from warp_lcp.result import SolveStatus
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.solve import IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
 from warp_lcp.settings import Count, NonNegative, Settings, ShareOrAll
-from warp_lcp.solve import IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
 from warp_lcp.solvers.globalization import NonmonotoneSearch
 from warp_lcp.solvers.nonsmooth_map import MapName, NonsmoothMap, Reformulation
 

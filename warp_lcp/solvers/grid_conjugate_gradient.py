@@ -7,10 +7,10 @@ import warp as wp
 
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.stencil import Stencil
-from warp_lcp.program import Program
+from warp_lcp.rows.program import Program
+from warp_lcp.rows.vectors import Reduction
 from warp_lcp.solvers import grid_conjugate_gradient_kernels as kernels
 from warp_lcp.solvers import projected_multigrid_kernels as engine
-from warp_lcp.vectors import Reduction
 
 
 class GridConjugateGradient:

@@ -8,8 +8,8 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasStencil, has
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasStencil, has
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.solvers.sweep import check_colors
 

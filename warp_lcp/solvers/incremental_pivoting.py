@@ -9,10 +9,10 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.deadline import time_is_up
-from warp_lcp.problem import LCP
-from warp_lcp.result import SolveStatus
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.solve import Step
 from warp_lcp.settings import Count, Settings
-from warp_lcp.solve import Step
 from warp_lcp.solvers.dense_problem import DenseWorkspace, assemble, check_size, pivots_of, semidefinite
 from warp_lcp.solvers.principal_inverse import PrincipalInverse
 

@@ -10,18 +10,18 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.multigrid.cycle_settings import CycleSettings
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasStencil, has
-from warp_lcp.residual import NaturalResidual
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasStencil, has
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.solve import IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
 from warp_lcp.rows import Known, RowPass, Rows
+from warp_lcp.rows.vectors import Reduction
 from warp_lcp.settings import Count, CountOrZero, Positive, Settings, Share, ShareOrZero
-from warp_lcp.solve import IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
 from warp_lcp.solvers import interior_point_kernels as kernels
 from warp_lcp.solvers.equilibrated import EquilibratedWorkspace
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
 from warp_lcp.solvers.principal_system import GridSystem, principal_system
-from warp_lcp.vectors import Reduction
 
 SUMS, LONGEST = 0, 3  # slots of the device scalars
 NEAR = 10.0  # a near start has w A_ii and s at least this multiple of the residual's root mean square; 3 to 50 measured

@@ -11,10 +11,10 @@ import warp as wp
 from scipy.linalg.blas import dger
 
 from warp_lcp.deadline import time_is_up
-from warp_lcp.problem import LCP
-from warp_lcp.result import SolveStatus
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.solve import Step
 from warp_lcp.settings import Count, Settings
-from warp_lcp.solve import Step
 from warp_lcp.solvers.dense_problem import DenseProblem, DenseWorkspace, check_size, inconsistent, pivots_of, semidefinite
 from warp_lcp.solvers.lemke_banded import BandedFactors, narrow_problem
 from warp_lcp.solvers.lemke_form import LemkeForm

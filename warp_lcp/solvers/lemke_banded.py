@@ -7,7 +7,7 @@ import scipy.linalg
 import scipy.sparse
 
 from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.problem import LCP
+from warp_lcp.problem.lcp import LCP
 from warp_lcp.solvers.dense_problem import DenseProblem
 from warp_lcp.solvers.lemke_form import one_sided
 

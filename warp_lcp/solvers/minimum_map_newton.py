@@ -13,20 +13,20 @@ from warp_lcp.deadline import check_time
 from warp_lcp.multigrid.aggregates import AggregateCycles, suits_multigrid
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasStencil, has
-from warp_lcp.residual import NaturalResidual
-from warp_lcp.result import SolveStatus
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasStencil, has
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.solve import FLOOR_MARGIN, IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
 from warp_lcp.rows import Rows
+from warp_lcp.rows.vectors import Reduction
 from warp_lcp.settings import Count, CountOrZero, Settings, Share
-from warp_lcp.solve import FLOOR_MARGIN, IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
 from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers.minimum_map_newton_direct import DirectNewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
 from warp_lcp.solvers.phases import CoarseProblem, GradientPhase, InteriorSteps, ProximalPoint, projected_cycle
 from warp_lcp.solvers.principal_system import DenseSystem, GridSystem, PrincipalSystem, principal_system
 from warp_lcp.solvers.projected_multigrid_kernels import SLOTS
-from warp_lcp.vectors import Reduction
 
 MOVED, SQUARE = 0, 3  # slots of the device scalars: cells moved, active, shifted, and the free residual's square
 LARGE = 1000  # unknowns from which a cold start on a sparse matrix takes projected cycles

@@ -13,9 +13,9 @@ import warp as wp
 
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.problem import LCP
-from warp_lcp.residual import NaturalResidual
-from warp_lcp.solve import Precision, RoundedIterate, Step
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.solve import Precision, RoundedIterate, Step
 from warp_lcp.solvers.dense_problem import SINGULAR, factored
 
 if TYPE_CHECKING:

@@ -9,9 +9,9 @@ import warp as wp
 
 from warp_lcp.deadline import time_is_up
 from warp_lcp.multigrid.hierarchy import Hierarchy
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasStencil
-from warp_lcp.solve import Precision, Step
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasStencil
+from warp_lcp.problem.solve import Precision, Step
 from warp_lcp.solvers import projected_multigrid_kernels as engine
 from warp_lcp.solvers.projected_multigrid_workspace import AssessedResidual, MultigridWorkspace
 

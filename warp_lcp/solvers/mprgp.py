@@ -13,13 +13,14 @@ from warp_lcp.deadline import check_time
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Level
 from warp_lcp.operators.dense import DenseOperator
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasStencil, has
-from warp_lcp.residual import NaturalResidual
-from warp_lcp.result import SolveStatus
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasStencil, has
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.solve import Precision, PrecisionName, RoundedIterate, Step
 from warp_lcp.rows import Rows
+from warp_lcp.rows.vectors import Reduction
 from warp_lcp.settings import Count, CountOrZero, Positive, Settings
-from warp_lcp.solve import Precision, PrecisionName, RoundedIterate, Step
 from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers import projected_multigrid_kernels as engine
 from warp_lcp.solvers.descent import Descent
@@ -27,7 +28,6 @@ from warp_lcp.solvers.phases import projected_cycle
 from warp_lcp.solvers.principal_system import DiagonalSystem, principal_system
 from warp_lcp.solvers.principal_system_sparse import SparseSystem
 from warp_lcp.solvers.sweep import Diagonal
-from warp_lcp.vectors import Reduction
 
 SINGLE_SLACK = 1.2e-7  # a bound that float32 rounds is met within this part of it
 ENERGY_ROUNDING = 1e-12  # rises of the energy within this part of it are rounding

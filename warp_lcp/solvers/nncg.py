@@ -8,16 +8,16 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasRows, Relaxes, check_taken
-from warp_lcp.residual import WITHIN
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasRows, Relaxes, check_taken
+from warp_lcp.problem.residual import WITHIN
+from warp_lcp.problem.solve import Precision, PrecisionName, Step
 from warp_lcp.rows import Rows
+from warp_lcp.rows.vectors import Reduction
 from warp_lcp.settings import Relaxation, Settings
-from warp_lcp.solve import Precision, PrecisionName, Step
 from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers.psor import DIRECTIONS, Direction, SweepWorkspace
 from warp_lcp.solvers.sweep import sweep_for
-from warp_lcp.vectors import Reduction
 
 
 @dataclass(frozen=True, kw_only=True)

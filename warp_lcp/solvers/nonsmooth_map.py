@@ -8,13 +8,13 @@ from typing import Any, Literal
 import numpy as np
 import warp as wp
 
-from warp_lcp.layout import PaddedLayout
 from warp_lcp.multigrid.hierarchy import Level
-from warp_lcp.problem import LCP
-from warp_lcp.residual import NaturalResidual
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.rows import Bound, RowPass, Rows
+from warp_lcp.rows.fields import PaddedLayout
+from warp_lcp.rows.vectors import Reduction
 from warp_lcp.solvers import nonsmooth_map_kernels as kernels
-from warp_lcp.vectors import Reduction
 
 KINK = 1e-14  # times the size of b: a point this near to both sides of a kink is on it
 

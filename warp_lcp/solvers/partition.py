@@ -14,11 +14,11 @@ from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.grid_poisson import AIR, FLUID, GridPoisson
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.operators.sparse_kernels import color_kernel
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasFaces, HasRows, described, has, version_of
-from warp_lcp.result import SolveResult
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasFaces, HasRows, described, has, version_of
+from warp_lcp.problem.result import SolveResult
 from warp_lcp.rows import RowPass
-from warp_lcp.vectors import rows_of
+from warp_lcp.rows.vectors import rows_of
 
 Blocks = Annotated[Sequence[Any] | np.ndarray, "for each block a list of indices"]
 SELECT = RowPass(

@@ -16,18 +16,18 @@ from warp_lcp.multigrid.coarse_points import coarse_points
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasRows, HasScale, HasStencil, has
-from warp_lcp.residual import NaturalResidual
-from warp_lcp.result import SolveStatus
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasRows, HasScale, HasStencil, has
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.solve import EPS, FLOOR_MARGIN, Step, solve
+from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rows import Rows
-from warp_lcp.solve import EPS, FLOOR_MARGIN, Step, solve
+from warp_lcp.rows.vectors import Reduction
 from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers.dense_problem import proved_infeasible
 from warp_lcp.solvers.principal_system import GridSystem
 from warp_lcp.solvers.projected_multigrid_kernels import GAPS, SIZE
-from warp_lcp.stopping import StoppingCriteria
-from warp_lcp.vectors import Reduction
 
 if TYPE_CHECKING:
     from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton

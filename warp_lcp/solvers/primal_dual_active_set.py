@@ -12,10 +12,10 @@ import warp as wp
 from warp_lcp.deadline import time_is_up
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.dense import DenseOperator
-from warp_lcp.problem import LCP
-from warp_lcp.result import SolveStatus
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.solve import PrecisionName, Step
 from warp_lcp.settings import Count, CountOrZero, Settings, Share
-from warp_lcp.solve import PrecisionName, Step
 from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers.dense_problem import DenseProblem, pivots_of
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace

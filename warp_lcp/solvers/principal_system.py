@@ -22,15 +22,15 @@ from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.operators.sum import SumOperator, grid_and_low_rank
-from warp_lcp.problem import LCP
-from warp_lcp.program import Launch, Program
-from warp_lcp.protocol import HasStencil, has
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasStencil, has
 from warp_lcp.rows import RowPass
+from warp_lcp.rows.program import Launch, Program
+from warp_lcp.rows.vectors import rows_of
 from warp_lcp.solvers.dense_problem import equilibration, factored
 from warp_lcp.solvers.grid_conjugate_gradient import GridConjugateGradient
 from warp_lcp.solvers.principal_system_low_rank import LowRankCorrection
 from warp_lcp.solvers.principal_system_sparse import SparseSystem
-from warp_lcp.vectors import rows_of
 
 HEADERS = Path(__file__).parent / "headers"
 SHIFT = RowPass(

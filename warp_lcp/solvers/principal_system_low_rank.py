@@ -10,10 +10,10 @@ import warp as wp
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.operators.low_rank_columns import ENTRIES
-from warp_lcp.program import Launch
 from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows.program import Launch
+from warp_lcp.rows.vectors import Reduction
 from warp_lcp.solvers import principal_system_low_rank_kernels as kernels
-from warp_lcp.vectors import Reduction
 
 HEADERS = Path(__file__).parent / "headers"
 SQUARES = RowPass(

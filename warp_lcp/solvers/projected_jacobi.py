@@ -7,10 +7,10 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import version_of
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import version_of
+from warp_lcp.problem.solve import Precision, PrecisionName, Step
 from warp_lcp.settings import Positive, Settings
-from warp_lcp.solve import Precision, PrecisionName, Step
 from warp_lcp.solvers.psor import SweepWorkspace
 from warp_lcp.solvers.spectrum import scaled_spectrum
 from warp_lcp.solvers.sweep_kernels import jacobi_kernel

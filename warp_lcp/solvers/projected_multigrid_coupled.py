@@ -8,17 +8,17 @@ import warp as wp
 
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.low_rank import LowRankOperator
-from warp_lcp.problem import LCP
-from warp_lcp.program import Launch, Program
-from warp_lcp.protocol import HasStencil
-from warp_lcp.solve import Precision, Step
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasStencil
+from warp_lcp.problem.solve import Precision, Step
+from warp_lcp.rows.program import Launch, Program
+from warp_lcp.rows.vectors import CONVERT, rows_of
 from warp_lcp.solvers import principal_system_low_rank_kernels as coupling
 from warp_lcp.solvers import projected_multigrid_kernels as kernels
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.phases import Inner
 from warp_lcp.solvers.principal_system_low_rank import LowRankCorrection
 from warp_lcp.solvers.projected_multigrid_workspace import AssessedResidual, MultigridWorkspace
-from warp_lcp.vectors import CONVERT, rows_of
 
 if TYPE_CHECKING:
     from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid

@@ -12,16 +12,16 @@ import warp as wp
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.multigrid.shared_levels import clear_ghosts
 from warp_lcp.multigrid.turning import make_hierarchy
-from warp_lcp.problem import LCP
-from warp_lcp.program import Launch, Program, perform
-from warp_lcp.protocol import HasStencil
-from warp_lcp.residual import NaturalResidual
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasStencil
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.solve import FLOOR_MARGIN, Precision, RoundedIterate, Step
 from warp_lcp.rows import Bound, Rows
-from warp_lcp.solve import FLOOR_MARGIN, Precision, RoundedIterate, Step
+from warp_lcp.rows.program import Launch, Program, perform
+from warp_lcp.rows.vectors import Reduction
 from warp_lcp.solvers import projected_multigrid_kernels as kernels
 from warp_lcp.solvers.descent import Descent
 from warp_lcp.solvers.phases import AlgebraicSteps, Pace
-from warp_lcp.vectors import Reduction
 
 if TYPE_CHECKING:
     from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid

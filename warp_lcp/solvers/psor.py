@@ -7,11 +7,11 @@ from typing import Any, ClassVar, Literal
 
 import warp as wp
 
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasRows, Relaxes, check_taken
-from warp_lcp.residual import NaturalResidual
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasRows, Relaxes, check_taken
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.solve import IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
 from warp_lcp.settings import Relaxation, Settings
-from warp_lcp.solve import IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
 from warp_lcp.solvers.spectrum import scaled_spectrum
 from warp_lcp.solvers.sweep import Contraction, Diagonal, OrderName, Sweep, SweepOrder, sweep_for
 

@@ -11,10 +11,10 @@ import scipy.sparse
 import scipy.sparse.linalg
 import warp as wp
 
-from warp_lcp.problem import LCP
-from warp_lcp.result import SolveStatus
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.solve import Step
 from warp_lcp.settings import Count, Positive, Settings
-from warp_lcp.solve import Step
 from warp_lcp.solvers.dense_problem import SEMIDEFINITE, DenseProblem, DenseWorkspace, check_size, inconsistent, semidefinite, sparse_matrix
 
 

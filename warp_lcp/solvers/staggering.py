@@ -9,11 +9,11 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasFaces, HasRows, check_taken
-from warp_lcp.residual import NaturalResidual
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasFaces, HasRows, check_taken
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.solve import IterateInPlace, Precision, Solver, Step
 from warp_lcp.settings import Count, Settings, Share
-from warp_lcp.solve import IterateInPlace, Precision, Solver, Step
 from warp_lcp.solvers.coupled_problem import StaggeredRound
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.partition import Block, Blocks, block_problem, given_blocks

@@ -10,16 +10,16 @@ import warp as wp
 
 from warp_lcp.deadline import check_time
 from warp_lcp.multigrid.cycle_settings import CycleSettings
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasRows, Relaxes, check_taken
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasRows, Relaxes, check_taken
+from warp_lcp.problem.solve import Precision, PrecisionName, Step
 from warp_lcp.rows import Rows
+from warp_lcp.rows.vectors import Reduction
 from warp_lcp.settings import Count, Ge, Relaxation, Settings, Share
-from warp_lcp.solve import Precision, PrecisionName, Step
 from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers.principal_system import principal_system
 from warp_lcp.solvers.psor import SweepWorkspace
 from warp_lcp.solvers.sweep import sweep_for
-from warp_lcp.vectors import Reduction
 
 MOVED, HELD, FREE_NORM, XY, XB = range(5)  # slots of the device scalars; HELD follows MOVED
 ROUNDING = 1e-14  # relative change of the energy that is none

@@ -8,15 +8,15 @@ from typing import Any, Literal, Protocol
 import numpy as np
 import warp as wp
 
-from warp_lcp.affine_bounds import affine_side
 from warp_lcp.operators.compressed_rows import CompressedRows
 from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasRows, HasStencil, NamesComponents, Relaxes, has
-from warp_lcp.residual import NaturalResidual
-from warp_lcp.result import SolveStatus
+from warp_lcp.problem.affine_bounds import affine_side
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasRows, HasStencil, NamesComponents, Relaxes, has
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.rows.vectors import ADD, rows_of
 from warp_lcp.solvers.sweep_kernels import CHANGE, row_kernels
-from warp_lcp.vectors import ADD, rows_of
 
 
 class SweepOrder(StrEnum):

@@ -28,7 +28,7 @@ from benchmarks.extremes.case import (
 from benchmarks.extremes.problem import GridProblem, MatrixProblem
 from benchmarks.extremes.unseen.draw import Unseen, equality
 from benchmarks.record import Table
-from warp_lcp.protocol import families
+from warp_lcp.problem.protocol import families
 
 FAMILY = "unseen"
 METHODS_FAMILY = "unseen, every method"

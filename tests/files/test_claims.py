@@ -3,8 +3,8 @@
 import pytest
 
 from fuzz.told import limited
-from warp_lcp import claims
-from warp_lcp.claims import ClaimError, check_claim, free_host_memory
+from warp_lcp.files import claims
+from warp_lcp.files.claims import ClaimError, check_claim, free_host_memory
 
 
 @pytest.fixture(autouse=True)

@@ -7,8 +7,8 @@ import scipy.sparse
 
 import warp_lcp as wl
 from oracle import boxed, lemke, natural_residual
-from warp_lcp import reformulate as form
 from warp_lcp.gallery import Plant, banded, definite, skewed
+from warp_lcp.problem import reformulate as form
 
 TIGHT = wl.StoppingCriteria(rtol=1e-11)
 

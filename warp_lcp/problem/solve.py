@@ -14,13 +14,13 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.deadline import Deadline, TimeIsUp
-from warp_lcp.layout import Array
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import NamesComponents, has
-from warp_lcp.residual import NaturalResidual
-from warp_lcp.result import Record, SolveResult, SolveStatus
-from warp_lcp.stopping import StoppingCriteria
-from warp_lcp.vectors import convert
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import NamesComponents, has
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.result import Record, SolveResult, SolveStatus
+from warp_lcp.problem.stopping import StoppingCriteria
+from warp_lcp.rows.fields import Array
+from warp_lcp.rows.vectors import convert
 
 EPS = float(np.finfo(np.float64).eps)
 SMALLEST = 1e-138  # a norm from which on residuals 16 digits smaller have squares that float64 holds

@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeGuard, TypeVar, ru
 import numpy as np
 import warp as wp
 
+from warp_lcp.rows.fields import Layout
+
 if TYPE_CHECKING:
-    from warp_lcp.layout import Layout, PaddedLayout
     from warp_lcp.operators.compressed_rows import CompressedRows
+    from warp_lcp.rows.fields import PaddedLayout
 
 Capability = TypeVar("Capability", bound="Operator")
 
@@ -24,7 +26,7 @@ class Operator(Protocol):
     """A square linear operator A on fields of shape `shape`: what each operator has.
 
     Bring your own by implementing this protocol; docs "Operators of your own" has one. Fields are then plain contiguous arrays of that
-    shape. What more an operator can do are capabilities (`warp_lcp.protocol`): it has one if it has its members.
+    shape. What more an operator can do are capabilities (`warp_lcp.problem.protocol`): it has one if it has its members.
 
     Attributes:
         shape: shape of the fields that A maps to each other.
@@ -204,6 +206,11 @@ def has(A: object, capability: type[Capability]) -> TypeGuard[Capability]:
 def version_of(A: Operator) -> int | None:
     """Return the version of an operator, None of one that does not say when it changes."""
     return A.version if has(A, Versioned) else None
+
+
+def layout_of(A: Operator) -> Layout:
+    """Return the layout of an operator's fields; plain arrays unless it says otherwise."""
+    return A.layout if has(A, HasLayout) else Layout(A.shape, A.device)
 
 
 def takes(method: Any, A: Operator) -> bool:

@@ -1,8 +1,8 @@
 """The natural residual, the one number in which all methods are compared; always evaluated from x in float64.
 
 r_i = d_i (x_i - clip(x_i - y_i / d_i, l_i, u_i)) with d_i = 1 / (r_i c_i) where diag(r) A diag(c) is equilibrated: |A_ii| for positive
-semi-definite matrices and on grids (`warp_lcp.scale`; 1 where a row and a column are empty). r has the units of y and does not change when
-x is rescaled; it vanishes exactly at solutions.
+semi-definite matrices and on grids (`warp_lcp.problem.scale`; 1 where a row and a column are empty). r has the units of y and does not
+change when x is rescaled; it vanishes exactly at solutions.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasRows, HasScale, HasStencil, has, version_of
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasRows, HasScale, HasStencil, has, version_of
+from warp_lcp.problem.scale import scale_by_products
 from warp_lcp.rows import Known, RowPass
-from warp_lcp.scale import scale_by_products
-from warp_lcp.vectors import Reduction, rows_of
+from warp_lcp.rows.vectors import Reduction, rows_of
 
 HEADERS = Path(__file__).parent / "headers"
 f64, i8 = wp.float64, wp.int8

@@ -8,8 +8,8 @@ from scipy.optimize import linprog
 
 import warp_lcp as wl
 from oracle import lemke, natural_scale
-from warp_lcp.residual import NaturalResidual
-from warp_lcp.scale import scale_by_products, scale_of_matrix
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.scale import scale_by_products, scale_of_matrix
 
 TINY = (np.array([[1e-8, -1.0], [1.0, 1e-8]]), np.array([1.0, -1.0]))  # x = (1, 1); (1, 1e-8) and (71, .95) once passed
 SOLVE_IT = ["interior-point", "lemke", "minimum-map-newton", "primal-dual-active-set"]

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.affine_bounds_kernels import AffineSide, evaluate_kernel
-from warp_lcp.layout import Layout, real_array
+from warp_lcp.problem.affine_bounds_kernels import AffineSide, evaluate_kernel
+from warp_lcp.rows.fields import Layout, real_array
 
 SIDES = ("lower", "upper")
 

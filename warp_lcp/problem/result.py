@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING, Any
 
-from warp_lcp.pickling import FieldsOnHost
+from warp_lcp.problem.pickling import FieldsOnHost
 
 if TYPE_CHECKING:
     import warp as wp

@@ -6,7 +6,7 @@ import warp as wp
 
 import warp_lcp as wl
 from oracle import assemble, natural_residual
-from warp_lcp.bounds import Bounds
+from warp_lcp.problem.bounds import Bounds
 
 SHAPE = (5, 6, 7)
 

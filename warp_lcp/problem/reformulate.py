@@ -15,8 +15,8 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
 
-from warp_lcp.problem import LCP, as_operator
-from warp_lcp.scale import scale_of_matrix
+from warp_lcp.problem.lcp import LCP, as_operator
+from warp_lcp.problem.scale import scale_of_matrix
 
 Vector = np.ndarray
 Map = Callable[[Vector], Vector]

@@ -3,8 +3,8 @@
 import numpy as np
 import warp as wp
 
-from warp_lcp.program import CPU_RUNS_BEFORE_CAPTURE, Program, perform
-from warp_lcp.vectors import Reduction
+from warp_lcp.rows.program import CPU_RUNS_BEFORE_CAPTURE, Program, perform
+from warp_lcp.rows.vectors import Reduction
 
 DEVICE = wp.get_device("cpu")
 

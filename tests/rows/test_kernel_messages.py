@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import warp as wp
 
-from warp_lcp.kernel_messages import KernelMessages, hear_kernels
+from warp_lcp.rows.kernel_messages import KernelMessages, hear_kernels
 
 SCRIPT = """
 import numpy as np

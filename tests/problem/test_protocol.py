@@ -7,7 +7,19 @@ import warp as wp
 
 import warp_lcp as wl
 from oracle import lemke
-from warp_lcp.protocol import CAPABILITIES, FAMILIES, HasCells, HasColumns, HasLayout, HasRows, HasScale, families, has, members, takes
+from warp_lcp.problem.protocol import (
+    CAPABILITIES,
+    FAMILIES,
+    HasCells,
+    HasColumns,
+    HasLayout,
+    HasRows,
+    HasScale,
+    families,
+    has,
+    members,
+    takes,
+)
 
 STOPPING = wl.StoppingCriteria(rtol=1e-8, max_iterations=20_000, patience=5000)
 ASKED = {capability for method in wl.METHODS.values() for capability in getattr(method, "supports", ())}

@@ -12,8 +12,6 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.protocol import HasLayout, Operator, has
-
 Array = Any  # a numpy array or a wp.array
 
 
@@ -76,7 +74,7 @@ class Layout:
     """Fields stored as they are.
 
     Attributes:
-        across: who stores the other parts of the fields, see `warp_lcp.vectors.Across`; None: nobody.
+        across: who stores the other parts of the fields, see `warp_lcp.rows.vectors.Across`; None: nobody.
     """
 
     across: Any = None
@@ -184,8 +182,3 @@ class PaddedLayout(Layout):
 
     def _inner(self, stored: np.ndarray) -> np.ndarray:
         return stored[1:-1, 1:-1, 1:-1]
-
-
-def layout_of(A: Operator) -> Layout:
-    """Return the layout of an operator's fields; plain arrays unless it says otherwise."""
-    return A.layout if has(A, HasLayout) else Layout(A.shape, A.device)

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.bounds import INFINITE, LAUNCHED, Bounds
-from warp_lcp.layout import Array, Layout, layout_of, real_array
-from warp_lcp.pickling import OnHost, Pickled
-from warp_lcp.protocol import AppliesPlus, HasCells, Operator, has, members
+from warp_lcp.problem.bounds import HEADERS, INFINITE, LAUNCHED, Bounds
+from warp_lcp.problem.pickling import OnHost, Pickled
+from warp_lcp.problem.protocol import AppliesPlus, HasCells, Operator, has, layout_of, members
 from warp_lcp.rows import RowPass, Rows
-from warp_lcp.vectors import ADD, HEADERS, rows_of
+from warp_lcp.rows.fields import Array, Layout, real_array
+from warp_lcp.rows.vectors import ADD, rows_of
 
 CHECK = RowPass(
     "problem.check", HEADERS / "check.h", wp.float64, bounds=True, reads={"b": wp.float64, "unknown": wp.int8},

@@ -1,6 +1,6 @@
 """Flat fields: conversions, inner products, deterministic sums. The only vector primitives that the solvers use.
 
-Every operator stores its fields as flat arrays (see `warp_lcp.layout`), so that these serve all of them.
+Every operator stores its fields as flat arrays (see `warp_lcp.rows.fields`), so that these serve all of them.
 """
 
 from __future__ import annotations
@@ -11,12 +11,13 @@ from typing import Any, Protocol
 
 import warp as wp
 
-from warp_lcp.native import CUDA_BLOCK, CUDA_SEGMENTS
-from warp_lcp.program import Launch, perform
 from warp_lcp.rows import RowPass, Rows
-from warp_lcp.vector_kernels import add_up_kernel
+from warp_lcp.rows.program import Launch, perform
+from warp_lcp.rows.vector_kernels import add_up_kernel
 
 HEADERS = Path(__file__).parent / "headers"
+CUDA_BLOCK = 256  # threads that add up partial sums
+CUDA_SEGMENTS = 256  # blocks that do so first where there are very many
 DOT = RowPass("vectors.dot", HEADERS / "dot.h", wp.float64, reads={"a": "A", "b": "B"}, sums=("ab",))
 ADD = RowPass("vectors.add", HEADERS / "add.h", "S", reads={"z": "S"}, writes={"x": "S"})  # x += z
 CONVERT = RowPass("vectors.convert", HEADERS / "convert.h", "B", reads={"a": "A"}, writes={"b": "B"})

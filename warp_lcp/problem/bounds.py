@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.affine_bounds import affine_fields
-from warp_lcp.layout import Array, Layout, real_array
-from warp_lcp.pickling import OnHost
+from warp_lcp.problem.affine_bounds import affine_fields
+from warp_lcp.problem.pickling import OnHost
 from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows.fields import Array, Layout, real_array
 
 NAMES, INFINITE = ("lower", "upper"), (-np.inf, np.inf)
 LAUNCHED = 4096  # elements from which a kernel looks at fields on the CPU: below, NumPy takes less than the launch

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warp_lcp import claims
-from warp_lcp.archive import Archive, ArchiveError
+from warp_lcp.files import claims
+from warp_lcp.files.archive import Archive, ArchiveError
 
 ARRAYS = {
     "a": np.arange(24.0).reshape(4, 3, 2),

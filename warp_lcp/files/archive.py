@@ -17,7 +17,7 @@ from typing import IO, Any, Self
 
 import numpy as np
 
-from warp_lcp.claims import ClaimError, check_claim
+from warp_lcp.files.claims import ClaimError, check_claim
 
 SUFFIX = ".npy"  # of an archive's members
 HEADER = re.compile(  # as NumPy writes it; its own reader evaluates whatever stands there
