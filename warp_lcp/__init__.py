@@ -23,13 +23,12 @@ from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.recommend import Budget, Recommendation, recommend
 from warp_lcp.rows.kernel_messages import hear_kernels
 from warp_lcp.solvers.accelerated_projected_gradient import AcceleratedProjectedGradient
-from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel
+from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel, GridLines
 from warp_lcp.solvers.coupled_problem import CoupledBlock, CoupledResult, StaggeredRound, solve_coupled
 from warp_lcp.solvers.default import default_method, solve
 from warp_lcp.solvers.direct_enumeration import BatchResult, DirectEnumeration, enumerate_batch
 from warp_lcp.solvers.fischer_newton import FischerNewton
 from warp_lcp.solvers.gradient_descent import GradientDescent
-from warp_lcp.solvers.grid_lines import GridLines
 from warp_lcp.solvers.incremental_pivoting import IncrementalPivoting
 from warp_lcp.solvers.interior_point import InteriorPoint
 from warp_lcp.solvers.lemke import Lemke

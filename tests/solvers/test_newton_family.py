@@ -11,8 +11,8 @@ from warp_lcp.gallery.contact import contact
 from warp_lcp.gallery.obstacle import ball_obstacle
 from warp_lcp.gallery.psd import semidefinite
 from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.solvers.descent import NonmonotoneSearch
 from warp_lcp.solvers.fischer_newton import FischerNewton
-from warp_lcp.solvers.globalization import NonmonotoneSearch
 from warp_lcp.solvers.gradient_descent import GradientDescent
 from warp_lcp.solvers.interior_point import InteriorPoint
 from warp_lcp.solvers.nonsmooth_map import Kink, NonsmoothMap, Reformulation

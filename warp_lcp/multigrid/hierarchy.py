@@ -15,8 +15,7 @@ from warp_lcp.multigrid.cycle_passes import UNBOUNDED
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.shared_levels import share_changes, whole_counts
 from warp_lcp.multigrid.small_levels import SmallLevels, first_small
-from warp_lcp.operators.stencil import Stencil
-from warp_lcp.operators.stencil_kernels import coarsen_spans_kernel
+from warp_lcp.operators.stencil import Stencil, coarsen_spans_kernel
 from warp_lcp.rows import Bound, RowPass, Rows
 from warp_lcp.rows.fields import Padding, zeros
 from warp_lcp.rows.program import Launch, Program

@@ -12,8 +12,7 @@ import warp as wp
 from warp_lcp.operators import grid_poisson_kernels as kernels
 from warp_lcp.operators.components import ComponentFinder, FloatingComponents, Scratch
 from warp_lcp.operators.grid_poisson_kernels import AIR, FLUID, SOLID
-from warp_lcp.operators.stencil import Ghosts, Stencil
-from warp_lcp.operators.stencil_kernels import find_spans_kernel
+from warp_lcp.operators.stencil import Ghosts, Stencil, find_spans_kernel
 from warp_lcp.problem.pickling import OnHost, Pickled, made_again
 from warp_lcp.rows import Rows
 from warp_lcp.rows.fields import PaddedLayout, check_kept, check_storable, real_array

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, no_type_check
 
 import numpy as np
 import scipy.sparse
@@ -12,13 +12,30 @@ import warp as wp
 
 from warp_lcp.operators.compressed_rows import CompressedRows
 from warp_lcp.operators.dense import is_rounding
-from warp_lcp.operators.sparse_kernels import color_kernel
 from warp_lcp.problem.lcp import as_operator
 from warp_lcp.problem.pickling import Pickled, made_again
 from warp_lcp.problem.scale import scale_of_matrix
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.fields import Layout, check_kept, check_storable, real_array
 from warp_lcp.rows.program import Launch
+
+INDICES = wp.array(dtype=wp.int32)
+
+
+@no_type_check
+@wp.kernel(enable_backward=False, module="warp_lcp.sparse.color")
+def color_kernel(ptr: INDICES, col: INDICES, taken: INDICES, color: INDICES, n: int):
+    """Greedy coloring in row order by one thread: the least color that no neighbor has. `taken[c]` is the last row that saw c, plus one."""
+    for i in range(n):
+        for k in range(ptr[i], ptr[i + 1]):
+            j = col[k]
+            if j < i:
+                taken[color[j]] = i + 1
+        c = int(0)
+        while taken[c] == i + 1:
+            c += 1
+        color[i] = c
+
 
 HEADERS = Path(__file__).parent / "headers"
 ROWS = {"ptr": wp.int32, "col": wp.int32}  # of a matrix: where each begins, columns of the entries
@@ -222,13 +239,7 @@ class SparseOperator(Pickled):
 
     def coloring(self) -> np.ndarray:
         """Return the color of each row, shape (n,), from 0."""
-        pattern = _ones(self._indptr, self._indices)
-        both = (pattern + pattern.T).tocsr()
-        inputs = [wp.array(v, dtype=wp.int32, device="cpu") for v in (both.indptr, both.indices)]
-        taken = wp.zeros(int(np.diff(both.indptr).max(initial=0)) + 2, dtype=wp.int32, device="cpu")
-        color = wp.zeros(self.unknowns, dtype=wp.int32, device="cpu")
-        wp.launch(color_kernel, 1, [*inputs, taken, color, self.unknowns], device="cpu")
-        return color.numpy()
+        return greedy_colors(_ones(self._indptr, self._indices))
 
     def _take(self, host: scipy.sparse.csr_array) -> None:
         """Derive what follows from the entries."""
@@ -264,6 +275,16 @@ class SparseOperator(Pickled):
         if tuple(x.shape) != self.shape:
             raise ValueError(f"x has shape {tuple(x.shape)}: expected {self.shape}")
         return wp.zeros_like(x) if out is None else out
+
+
+def greedy_colors(pattern: scipy.sparse.csr_array) -> np.ndarray:
+    """Return a color of each row, from 0: rows of one color have no entries in each other's columns."""
+    both = (pattern + pattern.T).tocsr()
+    inputs = [wp.array(v, dtype=wp.int32, device="cpu") for v in (both.indptr, both.indices)]
+    taken = wp.zeros(int(np.diff(both.indptr).max(initial=0)) + 2, dtype=wp.int32, device="cpu")
+    color = wp.zeros(pattern.shape[0], dtype=wp.int32, device="cpu")
+    wp.launch(color_kernel, 1, [*inputs, taken, color, color.size], device="cpu")
+    return color.numpy()
 
 
 def _checked(matrix: Any) -> scipy.sparse.csr_array:

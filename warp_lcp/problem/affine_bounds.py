@@ -4,13 +4,43 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, no_type_check
 
 import numpy as np
 import warp as wp
 
-from warp_lcp.problem.affine_bounds_kernels import AffineSide, evaluate_kernel
 from warp_lcp.rows.fields import Layout, real_array
+
+f64, i32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
+
+
+@wp.struct
+class AffineSide:
+    """Lower or upper bounds, constant + coefficient x[index] where index >= 0; the constant where `index` is empty."""
+
+    constant: f64
+    index: i32
+    coefficient: f64
+
+
+@no_type_check
+@wp.func
+def bound_at(S: AffineSide, x: f64, i: int):
+    """The bound of unknown i at x."""
+    value = S.constant[i]
+    if S.index.shape[0] > 0:
+        if S.index[i] >= 0:
+            value = value + S.coefficient[i] * x[S.index[i]]
+    return value
+
+
+@no_type_check
+@wp.kernel(enable_backward=False, module="warp_lcp.affine_bounds")
+def evaluate_kernel(S: AffineSide, x: f64, out: f64):
+    """Bounds at x."""
+    i = wp.tid()
+    out[i] = bound_at(S, x, i)
+
 
 SIDES = ("lower", "upper")
 

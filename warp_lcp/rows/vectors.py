@@ -6,21 +6,41 @@ Every operator stores its fields as flat arrays (see `warp_lcp.rows.fields`), so
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, no_type_check
 
 import warp as wp
 
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.program import Launch, perform
-from warp_lcp.rows.vector_kernels import add_up_kernel
+from warp_lcp.rows.row_pass import HEADERS, text
 
-HEADERS = Path(__file__).parent / "headers"
 CUDA_BLOCK = 256  # threads that add up partial sums
 CUDA_SEGMENTS = 256  # blocks that do so first where there are very many
 DOT = RowPass("vectors.dot", HEADERS / "dot.h", wp.float64, reads={"a": "A", "b": "B"}, sums=("ab",))
 ADD = RowPass("vectors.add", HEADERS / "add.h", "S", reads={"z": "S"}, writes={"x": "S"})  # x += z
 CONVERT = RowPass("vectors.convert", HEADERS / "convert.h", "B", reads={"a": "A"}, writes={"b": "B"})
+
+
+@wp.func_native("\n".join(["", text(HEADERS / "native.h"), text(HEADERS / "add_up.h"), ""]))
+def add_up_span(partials: wp.array(dtype=wp.float64), offset: int, start: int, n: int, stride: int) -> wp.float64:
+    """The sum of every stride-th of the partial sums from `offset` + `start` on."""
+
+
+@no_type_check
+@wp.kernel(enable_backward=False, module="warp_lcp.vectors")
+def add_up_kernel(partials: wp.array(dtype=wp.float64), n: int, threads: int, segments: int, out: wp.array(dtype=wp.float64), slot: int):
+    """out[slot + column * segments + segment] = the sum of every `segments`-th block of a column of n partials, by one block of threads.
+
+    The order of the additions does not change from run to run.
+    """
+    t = wp.tid()
+    block = t // threads
+    column = block // segments
+    segment = block - column * segments
+    s = add_up_span(partials, column * n, segment * threads + t - block * threads, n, threads * segments)
+    total = wp.tile_sum(wp.tile(s))
+    if t == block * threads:
+        out[slot + block] = total[0]
 
 
 class Across(Protocol):

@@ -17,9 +17,9 @@ from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
 from warp_lcp.settings import Count, CountOrZero, Settings, Share, ShareOrAll
+from warp_lcp.solvers.descent import NonmonotoneSearch
 from warp_lcp.solvers.finite_difference import FiniteDifferenceSystem
 from warp_lcp.solvers.fischer_newton_dense import FischerDenseWorkspace
-from warp_lcp.solvers.globalization import NonmonotoneSearch
 from warp_lcp.solvers.gradient_descent import GradientDescent, GradientWorkspace
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace

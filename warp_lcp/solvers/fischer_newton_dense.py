@@ -11,7 +11,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import Precision, Step
 from warp_lcp.solvers.dense_problem import DenseProblem, DenseWorkspace
-from warp_lcp.solvers.globalization import NonmonotoneSearch
+from warp_lcp.solvers.descent import NonmonotoneSearch
 from warp_lcp.solvers.gradient_descent import GradientWorkspace
 from warp_lcp.solvers.nonsmooth_map import KINK, Kink
 

@@ -14,7 +14,7 @@ from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
 from warp_lcp.settings import Count, NonNegative, Settings, ShareOrAll
-from warp_lcp.solvers.globalization import NonmonotoneSearch
+from warp_lcp.solvers.descent import NonmonotoneSearch
 from warp_lcp.solvers.nonsmooth_map import MapName, NonsmoothMap, Reformulation
 
 LEAST = 1e-12  # relative decrease of the merit without which a step is none

@@ -1,9 +1,16 @@
-"""The interior-point method: Newton's method on the Kojima map, with Mehrotra's predictor and corrector."""
+"""The interior-point method: Newton's method on the Kojima map, with Mehrotra's predictor and corrector.
+
+w = x - l and v = u - x, infinite where there is no bound; s and t are their multipliers, 0 there. With dx known,
+ds = (tau - w s - second dx_a ds_a) / w - (s / w) dx and dt = (tau - v t + second dx_a dt_a) / v + (t / v) dx, where dx_a is the
+predictor's step; `joined` is 1 where the correction e comes on top of that. FUSED passes go over the rows of a grid whose system is
+condensed where the step ends, the others over flat fields.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,14 +21,48 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil, has
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.solve import IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
-from warp_lcp.rows import Known, RowPass, Rows
+from warp_lcp.rows import Known, RowPass, Rows, Wave
 from warp_lcp.rows.vectors import Reduction
 from warp_lcp.settings import Count, CountOrZero, Positive, Settings, Share, ShareOrZero
-from warp_lcp.solvers import interior_point_kernels as kernels
 from warp_lcp.solvers.equilibrated import EquilibratedWorkspace
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
 from warp_lcp.solvers.principal_system import GridSystem, principal_system
+
+f64 = wp.float64
+HEADERS = Path(__file__).parent / "headers"
+PAIRS = dict.fromkeys(("w", "v", "s", "t"), f64)
+DIRECTION = dict.fromkeys(("scale", "second", "joined", "tau"), f64)
+FORM = {"UPPER": 0, "FUSED": 0}  # whether there are upper bounds
+
+INSIDE = RowPass(
+    "interior_point.inside", HEADERS / "path_inside.h", f64, bounds=True, reads={"unknown": wp.int8, "d": "D"},
+    writes={"x": f64, "w": f64, "v": f64, "free": wp.uint8}, numbers={"unit": f64, "width": f64}, constants=FORM,
+)  # fmt: skip
+MULTIPLIERS = RowPass(
+    "interior_point.multipliers", HEADERS / "path_multipliers.h", f64, reads={"y": f64, "w": f64, "v": f64}, writes={"s": f64, "t": f64},
+    numbers={"least": f64}, sums=("total", "count"), constants=FORM,
+)  # fmt: skip
+CONDENSE = RowPass(
+    "interior_point.condense", HEADERS / "path_condense.h", f64, stencil=("F", "W"), bounds=True,
+    reads={"x": f64, "b": f64, "unknown": wp.int8, "free": wp.uint8, **PAIRS}, writes={"D": "Q", "r": "S"},
+    numbers={"scale": f64, "tau": f64}, sums=("square", "weighted"), constants=FORM,
+)  # fmt: skip
+MOVE = RowPass(
+    "interior_point.move", HEADERS / "path_move.h", f64, bounds=True, reads={"a": "S", "e": "S"}, writes={"x": f64, **PAIRS},
+    numbers=DIRECTION | {"length": f64}, sums=("total",), constants=FORM,
+)  # fmt: skip
+RATIOS = RowPass(
+    "interior_point.ratios", HEADERS / "path_ratios.h", f64, reads={"a": "S", "e": "S", **PAIRS}, whole={"longest": f64},
+    numbers=DIRECTION, sums=("products",), constants=FORM,
+)  # fmt: skip
+CENTER = RowPass(
+    "interior_point.center", HEADERS / "path_center.h", f64, reads={"e": "S", "y": f64, "free": wp.uint8, "D": "S", **PAIRS},
+    optional=("y", "D"), writes={"a": "S", "r": "S"}, numbers={"scale": f64, "tau": f64, "carried": bool},
+    sums=("weighted",), constants=FORM,
+)  # fmt: skip
+ADVANCE = Wave("interior_point.advance", (MOVE, 0), (CONDENSE, 1))  # a plane is condensed when the one above it has moved
+
 
 SUMS, LONGEST = 0, 3  # slots of the device scalars
 NEAR = 10.0  # a near start has w A_ii and s at least this multiple of the residual's root mean square; 3 to 50 measured
@@ -222,7 +263,7 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
         self.size = max(self.residual.norm, 1e-300)
         tau = 0.0 if s.mehrotra else self.mu / self.steps
         second = 0.0
-        self._launch(kernels.CONDENSE, **self._condensing(x, self._D, tau))
+        self._launch(CONDENSE, **self._condensing(x, self._D, tau))
         self.system.restrict(self.free, self._D if self.problem.bounded else None)
         self._project()
         iterations = self._solve(s.predictor_eta if s.mehrotra and self.count else s.eta)
@@ -270,7 +311,7 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
 
     def _launch(self, declared: RowPass, **given: Any) -> None:
         """Launch a pass over the fields, and add up what it sums."""
-        fused = self._fused and declared in (kernels.RATIOS, kernels.CENTER)
+        fused = self._fused and declared in (RATIOS, CENTER)
         rows, sums = (self._grid, self._sums[1]) if fused else (self._flat, self._sums[0])
         out = {"out": sums.partials} if declared.sums else {}
         declared.bind(rows, **given, **out, UPPER=self._upper, FUSED=fused).launch()
@@ -296,11 +337,9 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
         sums, rows, form = self._sums[1], self._grid, dict[str, Any](UPPER=self._upper, FUSED=True)
         move = self._moving(x, 1.0, tau, length)
         self.size = max(self.residual.norm, 1e-300)
-        moving = kernels.MOVE.bind(rows, **move, **form, out=sums.partials[2 * rows.places :]) if length else None
-        condensing = kernels.CONDENSE.bind(
-            rows, **self._condensing(x, self.system.hierarchy.finest.stencil.d, 0.0), **form, out=sums.partials
-        )
-        kernels.ADVANCE.launch(moving, condensing)
+        moving = MOVE.bind(rows, **move, **form, out=sums.partials[2 * rows.places :]) if length else None
+        condensing = CONDENSE.bind(rows, **self._condensing(x, self.system.hierarchy.finest.stencil.d, 0.0), **form, out=sums.partials)
+        ADVANCE.launch(moving, condensing)
         sums.add_up(SUMS, columns=3)
         self.residual.norm, self.residual.current = self._norm(0), True
         if length:
@@ -314,18 +353,18 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
         """Return the reciprocal of the longest step, 0 if there is none, and the sum of dw ds + dv dt."""
         longest = self._scalars[LONGEST : LONGEST + 1]
         longest.zero_()
-        self._launch(kernels.RATIOS, **self._direction(second, tau), longest=longest)
+        self._launch(RATIOS, **self._direction(second, tau), longest=longest)
         found = self._scalars.numpy()
         return float(found[LONGEST]), float(found[SUMS])
 
     def _correct(self, tau: float, **fields: wp.array[Any] | None) -> None:
         """Write the corrector's right-hand side."""
         common = {"e": self.system.e, "free": self.free, "a": self._predicted, "r": self.system.r}
-        self._launch(kernels.CENTER, **self._pairs, **common, **fields, scale=self.size, tau=tau, carried=self._carries)
+        self._launch(CENTER, **self._pairs, **common, **fields, scale=self.size, tau=tau, carried=self._carries)
 
     def _move(self, x: wp.array[Any], second: float, tau: float, length: float) -> None:
         """Take the step, and remember mu."""
-        self._launch(kernels.MOVE, **self._moving(x, second, tau, length))
+        self._launch(MOVE, **self._moving(x, second, tau, length))
         self.mu = float(self._scalars.numpy()[SUMS]) / max(self.count, 1)
         if self.floating is not None:
             self.floating.settle(x, self.problem.lower, self.problem.upper)
@@ -335,11 +374,11 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
         """Set w and v to at least width / d, and x accordingly."""
         p, r = self.problem, self.residual
         fields = {"x": x, "w": self._w, "v": self._v, "unknown": p.unknown, "free": self.free, "d": r.diagonal}
-        self._launch(kernels.INSIDE, bounds=p.bounds.operands, **fields, unit=r.unit, width=width)
+        self._launch(INSIDE, bounds=p.bounds.operands, **fields, unit=r.unit, width=width)
 
     def _multipliers(self, least: float) -> tuple[float, float]:
         """Set s and t to y's sides, at least `least`; return the sum of products and how many bounds are finite."""
-        self._launch(kernels.MULTIPLIERS, y=self.residual.y, **self._pairs, least=least)
+        self._launch(MULTIPLIERS, y=self.residual.y, **self._pairs, least=least)
         found = self._scalars.numpy()
         return float(found[0]), float(found[1])
 

@@ -12,8 +12,7 @@ import warp as wp
 
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.grid_poisson import AIR, FLUID, GridPoisson
-from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.operators.sparse_kernels import color_kernel
+from warp_lcp.operators.sparse import SparseOperator, greedy_colors
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasFaces, HasRows, described, has, version_of
 from warp_lcp.problem.result import SolveResult
@@ -73,14 +72,8 @@ def color_blocks(matrix: scipy.sparse.csr_array, owner: np.ndarray, count: int) 
     """
     members = scipy.sparse.csr_array((np.ones(len(owner)), (np.arange(len(owner)), owner)), shape=(len(owner), count))
     pattern = scipy.sparse.csr_array((np.ones(matrix.nnz), matrix.indices, matrix.indptr), shape=matrix.shape)
-    between = (members.T @ pattern @ members).tocsr()
-    between = (between + between.T).tocsr()
-    inputs = [wp.array(v, dtype=wp.int32, device="cpu") for v in (between.indptr, between.indices)]
-    taken = wp.zeros(int(np.diff(between.indptr).max()) + 2, dtype=wp.int32, device="cpu")
-    color = wp.zeros(count, dtype=wp.int32, device="cpu")
-    wp.launch(color_kernel, 1, [*inputs, taken, color, count], device="cpu")
-    host = color.numpy()
-    return [np.flatnonzero(host == c) for c in range(int(host.max()) + 1)]
+    color = greedy_colors((members.T @ pattern @ members).tocsr())
+    return [np.flatnonzero(color == c) for c in range(int(color.max()) + 1)]
 
 
 class MatrixBlock:

@@ -11,8 +11,7 @@ import numpy as np
 import scipy.sparse
 import warp as wp
 
-from warp_lcp.multigrid.aggregates import suits_multigrid
-from warp_lcp.multigrid.coarse_points import coarse_points
+from warp_lcp.multigrid.aggregates import coarse_points, suits_multigrid
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.sparse import SparseOperator

@@ -13,7 +13,7 @@ from warp_lcp.problem.protocol import HasStencil
 from warp_lcp.problem.solve import Precision, Step
 from warp_lcp.rows.program import Launch, Program
 from warp_lcp.rows.vectors import CONVERT, rows_of
-from warp_lcp.solvers import principal_system_low_rank_kernels as coupling
+from warp_lcp.solvers import principal_system_low_rank as coupling
 from warp_lcp.solvers import projected_multigrid_kernels as kernels
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.phases import Inner
