@@ -1,7 +1,5 @@
 """Multigrid where the strong direction turns from place to place: a hierarchy for each way in which cells are coupled."""
 
-from __future__ import annotations
-
 import functools
 import math
 from dataclasses import replace

@@ -18,8 +18,8 @@ import warp as wp
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, HasScale, HasStencil, has, version_of
 from warp_lcp.problem.scale import scale_by_products
-from warp_lcp.rows import Known, RowPass
-from warp_lcp.rows.vectors import Reduction, rows_of
+from warp_lcp.rows import Known, RowPass, Rows
+from warp_lcp.rows.vectors import Sums, rows_of
 
 HEADERS = Path(__file__).parent / "headers"
 f64, i8 = wp.float64, wp.int8
@@ -55,8 +55,7 @@ class NaturalResidual:
         self.diagonal = stencil.d if stencil else wp.zeros(layout.size, dtype=problem.A.dtype, device=layout.device)
         self.unit = float(stencil.unit) if stencil else 1.0
         self._diagonal_of = None if stencil else version_of(problem.A)  # of an operator whose scale is a copy
-        self._sums = wp.zeros(2, dtype=wp.float64, device=layout.device)
-        self._reduction = Reduction(layout.size, layout.device, self._sums, across=layout.across)
+        self._sums = Sums(Rows.flat(layout.size, layout.device), across=layout.across)
         if not stencil:
             self.rescale()
 
@@ -76,9 +75,7 @@ class NaturalResidual:
         p.bounds.follow(x)
         self.affine(x)
         fields = {"x": x, "y": self.y, "d": self.diagonal, "unknown": p.unknown, "unit": self.unit}
-        NATURAL.bind(rows_of(x), bounds=p.bounds.operands, **fields, out=self._reduction.partials).launch()
-        self._reduction.add_up(0)
-        self.norm, self.current = float(np.sqrt(self._sums.numpy()[0])), True
+        self.norm, self.current = float(np.sqrt(self._sums.of(NATURAL, bounds=p.bounds.operands, **fields)[0])), True
         return self.norm
 
     def affine(self, x: wp.array[Any]) -> None:
@@ -142,10 +139,7 @@ class NaturalResidual:
 
     def norm_of_b(self) -> float:
         """Return ||b|| over the unknowns."""
-        p = self.problem
-        UNKNOWN_SQUARE.bind(rows_of(p.b), b=p.b, unknown=p.unknown, out=self._reduction.partials).launch()
-        self._reduction.add_up(1)
-        return float(np.sqrt(self._sums.numpy()[1]))
+        return float(np.sqrt(self._sums.of(UNKNOWN_SQUARE, b=self.problem.b, unknown=self.problem.unknown)[0]))
 
     def rounding_floor(self, x: wp.array[Any], epsilon: float) -> float:
         """Return an estimate of the residual that rounding x to `epsilon` leaves: epsilon || 2 |d x| + |b| ||."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 from functools import partial
 from typing import Any, Protocol, no_type_check
 
+import numpy as np
 import warp as wp
 
 from warp_lcp.rows import RowPass, Rows
@@ -105,6 +106,27 @@ class Reduction:
         """Write a.b to scalars[slot]."""
         DOT.bind(rows_of(a), a=a, b=b, out=self.partials).launch(launch)
         self.add_up(slot, launch=launch)
+
+
+class Sums(Reduction):
+    """Sums that passes over the same rows make, read back by the host.
+
+    Args:
+        rows: of the passes.
+        columns: the most sums that one of them makes.
+        slots: of `scalars`, if more than that.
+        across: who has the other parts of the fields; None: nobody.
+    """
+
+    def __init__(self, rows: Rows, columns: int = 1, *, slots: int = 0, across: Across | None = None) -> None:
+        self.rows, scalars = rows, wp.zeros(max(columns, slots), dtype=wp.float64, device=rows.device)
+        super().__init__(rows.size, rows.device, scalars, columns=columns, threads=rows.places, across=across)
+
+    def of(self, declared: RowPass, slot: int = 0, **given: Any) -> np.ndarray:
+        """Launch a pass; return its sums, which are in `scalars` from a slot on."""
+        declared.bind(self.rows, **given, out=self.partials).launch()
+        self.add_up(slot, columns=len(declared.sums))
+        return self.scalars.numpy()[slot : slot + len(declared.sums)]
 
 
 def _add_across(across: Across, scalars: wp.array[wp.float64], slots: slice) -> None:

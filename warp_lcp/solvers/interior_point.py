@@ -21,8 +21,8 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil, has
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.solve import IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
-from warp_lcp.rows import Known, RowPass, Rows, Wave
-from warp_lcp.rows.vectors import Reduction
+from warp_lcp.rows import Known, RowPass, Wave
+from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, CountOrZero, Positive, Settings, Share, ShareOrZero
 from warp_lcp.solvers.equilibrated import EquilibratedWorkspace
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
@@ -64,7 +64,6 @@ CENTER = RowPass(
 ADVANCE = Wave("interior_point.advance", (MOVE, 0), (CONDENSE, 1))  # a plane is condensed when the one above it has moved
 
 
-SUMS, LONGEST = 0, 3  # slots of the device scalars
 NEAR = 10.0  # a near start has w A_ii and s at least this multiple of the residual's root mean square; 3 to 50 measured
 
 
@@ -156,7 +155,7 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
 
     def __init__(self, problem: LCP, settings: InteriorPoint) -> None:
         self.problem, self.settings, self.precision = problem, settings, Precision(settings.precision)
-        layout, device = problem.layout, problem.device
+        layout = problem.layout
         self.x, self.residual = layout.zeros(wp.float64), NaturalResidual(problem)
         self.active_set: GridNewtonWorkspace | NewtonWorkspace | None = None
         newton = MinimumMapNewton(
@@ -179,13 +178,12 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
         self._v, self._t = (layout.zeros(wp.float64), layout.zeros(wp.float64)) if upper else (self._w, self._s)
         self._D, self.free = layout.zeros(wp.float64), layout.zeros(wp.uint8)
         self._predicted = wp.zeros_like(self.system.e)
-        self._scalars = wp.zeros(4, dtype=wp.float64, device=device)
         self._rounded = layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
         self._carries = isinstance(self.system, GridSystem)  # conjugate gradients leave the residual in r
-        self._flat, self._upper, self._fusable, self._grid = Rows.flat(layout.size, device), upper, False, Rows.flat(layout.size, device)
-        if isinstance(self.system, GridSystem) and self.system.fused and problem.bounded and settings.mehrotra and self._rounded is None:
-            self._fusable, self._grid = True, problem.A.stencil.rows  # type: ignore[attr-defined]
-        self._sums = [Reduction(layout.size, device, self._scalars, columns=3, threads=r.places) for r in (self._flat, self._grid)]
+        fused = isinstance(self.system, GridSystem) and self.system.fused
+        self._upper, self._fusable = upper, fused and problem.bounded and settings.mehrotra and self._rounded is None
+        self._sums, self._longest = Sums(rows_of(self.x), 3), wp.zeros(1, dtype=wp.float64, device=problem.device)
+        self._grid_sums = Sums(problem.A.stencil.rows, 3) if self._fusable else self._sums  # type: ignore[attr-defined]
         self.floating: Any = None
         self.cycles_left = self.steps = self.count = 0
         self.near = self.begun = self.crossed = False
@@ -309,14 +307,10 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
     def _pairs(self) -> dict[str, wp.array[Any]]:
         return {"w": self._w, "v": self._v, "s": self._s, "t": self._t}
 
-    def _launch(self, declared: RowPass, **given: Any) -> None:
-        """Launch a pass over the fields, and add up what it sums."""
+    def _launch(self, declared: RowPass, **given: Any) -> np.ndarray:
+        """Launch a pass over the fields; return what it sums."""
         fused = self._fused and declared in (RATIOS, CENTER)
-        rows, sums = (self._grid, self._sums[1]) if fused else (self._flat, self._sums[0])
-        out = {"out": sums.partials} if declared.sums else {}
-        declared.bind(rows, **given, **out, UPPER=self._upper, FUSED=fused).launch()
-        if declared.sums:
-            sums.add_up(SUMS, columns=len(declared.sums))
+        return (self._grid_sums if fused else self._sums).of(declared, **given, UPPER=self._upper, FUSED=fused)
 
     def _direction(self, second: float, tau: float) -> dict[str, Any]:
         """What ds and dt are computed from."""
@@ -334,28 +328,26 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
 
     def _advance(self, x: wp.array[Any], tau: float, length: float) -> None:
         """Move, unless the length is 0, and set the residual's norm and the next system there."""
-        sums, rows, form = self._sums[1], self._grid, dict[str, Any](UPPER=self._upper, FUSED=True)
+        sums, rows, form = self._grid_sums, self._grid_sums.rows, dict[str, Any](UPPER=self._upper, FUSED=True)
         move = self._moving(x, 1.0, tau, length)
         self.size = max(self.residual.norm, 1e-300)
         moving = MOVE.bind(rows, **move, **form, out=sums.partials[2 * rows.places :]) if length else None
         condensing = CONDENSE.bind(rows, **self._condensing(x, self.system.hierarchy.finest.stencil.d, 0.0), **form, out=sums.partials)
         ADVANCE.launch(moving, condensing)
-        sums.add_up(SUMS, columns=3)
+        sums.add_up(0, columns=3)
         self.residual.norm, self.residual.current = self._norm(0), True
         if length:
-            self.mu = float(self._scalars.numpy()[2]) / self.count
+            self.mu = float(sums.scalars.numpy()[2]) / self.count
 
     def _norm(self, slot: int) -> float:
-        """Return the norm whose square a pass has summed."""
-        return float(np.sqrt(self._scalars.numpy()[slot]))
+        """Return the norm whose square a fused pass has summed."""
+        return float(np.sqrt(self._grid_sums.scalars.numpy()[slot]))
 
     def _ratios(self, second: float, tau: float) -> tuple[float, float]:
         """Return the reciprocal of the longest step, 0 if there is none, and the sum of dw ds + dv dt."""
-        longest = self._scalars[LONGEST : LONGEST + 1]
-        longest.zero_()
-        self._launch(RATIOS, **self._direction(second, tau), longest=longest)
-        found = self._scalars.numpy()
-        return float(found[LONGEST]), float(found[SUMS])
+        self._longest.zero_()
+        products = float(self._launch(RATIOS, **self._direction(second, tau), longest=self._longest)[0])
+        return float(self._longest.numpy()[0]), products
 
     def _correct(self, tau: float, **fields: wp.array[Any] | None) -> None:
         """Write the corrector's right-hand side."""
@@ -364,8 +356,7 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
 
     def _move(self, x: wp.array[Any], second: float, tau: float, length: float) -> None:
         """Take the step, and remember mu."""
-        self._launch(MOVE, **self._moving(x, second, tau, length))
-        self.mu = float(self._scalars.numpy()[SUMS]) / max(self.count, 1)
+        self.mu = float(self._launch(MOVE, **self._moving(x, second, tau, length))[0]) / max(self.count, 1)
         if self.floating is not None:
             self.floating.settle(x, self.problem.lower, self.problem.upper)
         self._round(x)
@@ -374,13 +365,12 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
         """Set w and v to at least width / d, and x accordingly."""
         p, r = self.problem, self.residual
         fields = {"x": x, "w": self._w, "v": self._v, "unknown": p.unknown, "free": self.free, "d": r.diagonal}
-        self._launch(INSIDE, bounds=p.bounds.operands, **fields, unit=r.unit, width=width)
+        INSIDE.bind(self._sums.rows, bounds=p.bounds.operands, **fields, unit=r.unit, width=width, UPPER=self._upper, FUSED=False).launch()
 
     def _multipliers(self, least: float) -> tuple[float, float]:
         """Set s and t to y's sides, at least `least`; return the sum of products and how many bounds are finite."""
-        self._launch(MULTIPLIERS, y=self.residual.y, **self._pairs, least=least)
-        found = self._scalars.numpy()
-        return float(found[0]), float(found[1])
+        total, count = self._launch(MULTIPLIERS, y=self.residual.y, **self._pairs, least=least)
+        return float(total), float(count)
 
     def _solve(self, eta: float) -> int:
         """Reduce the right-hand side by a factor; return linear iterations."""

@@ -18,8 +18,7 @@ from warp_lcp.problem.protocol import HasStencil, has
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import FLOOR_MARGIN, IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
-from warp_lcp.rows import Rows
-from warp_lcp.rows.vectors import Reduction
+from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, CountOrZero, Settings, Share
 from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers.minimum_map_newton_direct import DirectNewtonWorkspace
@@ -28,7 +27,6 @@ from warp_lcp.solvers.phases import CoarseProblem, GradientPhase, InteriorSteps,
 from warp_lcp.solvers.principal_system import DenseSystem, GridSystem, PrincipalSystem, principal_system
 from warp_lcp.solvers.projected_multigrid_kernels import SLOTS
 
-MOVED, SQUARE = 0, 3  # slots of the device scalars: cells moved, active, shifted, and the free residual's square
 LARGE = 1000  # unknowns from which a cold start on a sparse matrix takes projected cycles
 WEAK = 30  # iterations of a linear solve that say that its preconditioner is weak
 STALLED = 10  # steps without a smaller residual after which free blocks are taken for singular
@@ -116,9 +114,7 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         self.residual = NaturalResidual(problem)
         self.system = self._principal_system()
         self.free = layout.zeros(wp.uint8)
-        self._scalars = wp.zeros(SLOTS, dtype=wp.float64, device=problem.device)
-        self._reduction = Reduction(layout.size, problem.device, self._scalars, columns=4, across=layout.across)
-        self._rows = Rows.flat(layout.size, problem.device)
+        self._sums = Sums(rows_of(self.x), 4, slots=SLOTS, across=layout.across)
         self._rounded = layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
         self.floating: Any = None
         cycled = self.bounded and isinstance(problem.A, SparseOperator) and problem.A.unknowns >= LARGE
@@ -161,7 +157,7 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
             self._round(x)
             return Step("monotone cycle", 1, None)
         assert isinstance(system, GridSystem)
-        projected_cycle(p, system, x, residual.y, residual.norm, self.free, self._reduction, restrict=self.stale)
+        projected_cycle(p, system, x, residual.y, residual.norm, self.free, self._sums, restrict=self.stale)
         self.stale = True  # the next Newton step takes cells out again
         self._correct(x, system.z, residual.norm, x)
         if self.cycles_left > 0:
@@ -178,10 +174,8 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
             return self._resort(x)
         self.norms = [*self.norms, residual.norm][-self.settings.memory :]
         size = residual.norm
-        fields = {"x": x, "unknown": p.unknown, "free": self.free, "g": self.system.r, "out": self._reduction.partials}
-        passes.CLASSIFY.bind(self._rows, stencil=residual.known, bounds=p.bounds.operands, scale=1 / size, **fields).launch()
-        self._reduction.add_up(MOVED, columns=4)
-        moved, active, shifted, square = self._scalars.numpy()[:4]
+        fields = {"x": x, "unknown": p.unknown, "free": self.free, "g": self.system.r, "scale": 1 / size}
+        moved, active, shifted, square = self._sums.of(passes.CLASSIFY, stencil=residual.known, bounds=p.bounds.operands, **fields)
         if self.coarse is not None and self.coarse.is_due(float(moved)):
             return self._coarse_step(x, int(active))
         if moved or self.stale:
@@ -189,7 +183,8 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
             self.stale = False
         if shifted:  # held unknowns have moved to their bounds
             residual.affine(x)
-            square = self._right_side(size)
+            given = {"y": residual.y, "free": self.free, "g": self.system.r, "scale": 1 / size}
+            square = self._sums.of(passes.ON_FREE, **given)[0]
         if square == 0:
             return Step("newton", 0, int(active))
         iterations = self._solve(float(np.sqrt(square)) / size, size, settled=not moved)
@@ -225,13 +220,6 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         self._correct(x, self.trial, 1.0, x)
         self.norms, self.stale, self._smallest, self._waited = [], True, math.inf, 0
         return Step("coarse problem", 1, active, interim=True)
-
-    def _right_side(self, size: float) -> float:
-        """Set the system's right-hand side to -y / size on the free set; return the square of y's norm there."""
-        fields = {"y": self.residual.y, "free": self.free, "g": self.system.r, "out": self._reduction.partials}
-        passes.ON_FREE.bind(self._rows, scale=1 / size, **fields).launch()
-        self._reduction.add_up(SQUARE)
-        return float(self._scalars.numpy()[SQUARE])
 
     def _solve(self, norm: float, size: float, *, settled: bool) -> int:
         """Solve for the correction, more accurately if the active set has not moved; returns linear iterations."""
@@ -321,5 +309,5 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
 
     def _correct(self, base: wp.array[Any], e: wp.array[Any], scale: float, x: wp.array[Any], kept: wp.array[Any] | None = None) -> None:
         """Set x = clip(base + scale e), rounded, where e is not 0; remember base if `kept` is given."""
-        passes.move(self._rows, self.problem.bounds.operands, base, e, scale, x, kept=kept, guarded=False)
+        passes.move(self._sums.rows, self.problem.bounds.operands, base, e, scale, x, kept=kept, guarded=False)
         self._round(x)

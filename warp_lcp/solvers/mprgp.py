@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -18,8 +19,8 @@ from warp_lcp.problem.protocol import HasStencil, has
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import Precision, PrecisionName, RoundedIterate, Step
-from warp_lcp.rows import Rows
-from warp_lcp.rows.vectors import Reduction
+from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows.vectors import Sums
 from warp_lcp.settings import Count, CountOrZero, Positive, Settings
 from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers import projected_multigrid_kernels as engine
@@ -29,11 +30,20 @@ from warp_lcp.solvers.principal_system import DiagonalSystem, principal_system
 from warp_lcp.solvers.principal_system_sparse import SparseSystem
 from warp_lcp.solvers.sweep import Diagonal
 
+HEADERS, f64, u8 = Path(__file__).parent / "headers", wp.float64, wp.uint8
+SPLIT = RowPass(  # on grids: y = A x + b is computed on the way and not stored
+    "mprgp.split", HEADERS / "split.h", f64, stencil=("D", "W"), bounds=True, reads={"x": f64, "b": f64, "unknown": wp.int8},
+    writes={"free": u8, "g": "S", "step": "S"}, numbers={"inverse": f64, "slack": f64},
+    sums=("norm", "chopped", "reduced", "release", "moved", "active", "energy"),
+)  # fmt: skip
+SPLIT_KNOWN = replace(SPLIT, name="mprgp.split_known", header=HEADERS / "split_known.h")
+RELEASE = RowPass(
+    "mprgp.release", HEADERS / "release.h", f64, stencil=("D", "W"), bounds=True, reads={"x": f64, "step": "S", "q": "S"},
+    writes={"to": f64, "free": u8, "g": "S"}, numbers={"part": f64, "length": f64},
+)  # fmt: skip
+GAIN = RowPass("mprgp.gain", HEADERS / "gain.h", f64, reads={"along": "S", "q": "S", "g": "S"}, sums=("gain", "curvature"))
 SINGLE_SLACK = 1.2e-7  # a bound that float32 rounds is met within this part of it
 ENERGY_ROUNDING = 1e-12  # rises of the energy within this part of it are rounding
-SPLIT_SUMS = len(passes.SPLIT.sums)  # slots of the device scalars; slots of their own have
-GAIN, CURVATURE, SIZE, OVERLAP = 7, 8, int(engine.SIZE), 10
-SLOTS = 11
 NOISE = 1e-14  # of the energy: falls of less, over as many steps as patience lasts, are what rounding its sum may pretend
 
 
@@ -133,15 +143,13 @@ class SplitResidual(NaturalResidual):
 
     def __init__(self, problem: LCP, r: wp.array[Any], chopped_step: wp.array[Any], *, slack: float) -> None:
         super().__init__(problem)
-        device, size = problem.device, problem.layout.size
         self.free, self._r, self._chopped_step, self._slack = problem.layout.zeros(wp.uint8), r, chopped_step, slack
-        self.scalars = wp.zeros(SLOTS, dtype=wp.float64, device=device)
-        self.sums, self.rows = Reduction(size, device, self.scalars, columns=2), Rows.flat(size, device)
+        self.rows = Rows.flat(problem.layout.size, problem.device)
         self.size, self.moved, self.chopped, self.reduced, self.release, self.active, self.energy = 1.0, True, 0.0, 0.0, 0.0, 0, 0.0
         self._norm_of_b = 0.0
         self._stencil = problem.A.stencil if has(problem.A, HasStencil) else None
-        places = self._stencil.rows.places if self._stencil else self.rows.places
-        self._split = Reduction(size, device, self.scalars, columns=SPLIT_SUMS, threads=places)
+        self.sums = Sums(self.rows, 2, slots=engine.SLOTS)
+        self._split = Sums(self._stencil.rows if self._stencil else self.rows, len(SPLIT.sums))
 
     def start(self, x: wp.array[Any], *, keep: bool) -> None:
         """Set x to clip(x, l, u) or clip(0, l, u)."""
@@ -160,22 +168,27 @@ class SplitResidual(NaturalResidual):
         if 0 < self.norm < math.inf:
             self.size = self.norm
         fields = {"x": x, "b": p.b, "unknown": p.unknown, "free": self.free, "g": self._r, "step": self._chopped_step}
-        fields |= {"bounds": p.bounds.operands, "out": self._split.partials, "inverse": 1 / self.size, "slack": self._slack}
+        fields |= {"bounds": p.bounds.operands, "inverse": 1 / self.size, "slack": self._slack}
         if self._stencil is None:
             self.affine(x)
-            passes.SPLIT_KNOWN.bind(self.rows, stencil=self.known, **fields).launch()
+            found = self._split.of(SPLIT_KNOWN, stencil=self.known, **fields)
         else:
             self._stencil.wrap(x)
-            passes.SPLIT.bind(self._stencil.rows, stencil=self._stencil, **fields).launch()
-        self._split.add_up(0, columns=SPLIT_SUMS)
-        square, self.chopped, self.reduced, self.release, moved, active, self.energy = (float(v) for v in self.scalars.numpy()[:SPLIT_SUMS])
+            found = self._split.of(SPLIT, stencil=self._stencil, **fields)
+        square, self.chopped, self.reduced, self.release, moved, active, self.energy = (float(v) for v in found)
         self.norm, self.current, self.active, self.moved = float(np.sqrt(square)), True, int(active), self.moved or moved > 0
         return self.norm
 
-    def measure(self, finest: Level, p: wp.array[Any]) -> None:
-        """Write z'Az, z'Ap, r'z and r'p to the first scalars, on a grid's finest level with its x = z and b = r."""
+    def measure(self, finest: Level, p: wp.array[Any]) -> list[float]:
+        """Return z'Az, z'Ap, r'z and r'p, on a grid's finest level with its x = z and b = r."""
         engine.measuring(finest, p, self._split.partials).launch(wp.launch)
         self._split.add_up(0, columns=4)
+        return [float(v) for v in self._split.scalars.numpy()[:4]]
+
+    def dot(self, a: wp.array[Any], b: wp.array[Any]) -> float:
+        """Return a.b."""
+        self.sums.dot(a, b, 0)
+        return float(self.sums.scalars.numpy()[0])
 
 
 class GradientWorkspace(RoundedIterate):
@@ -246,14 +259,13 @@ class GradientWorkspace(RoundedIterate):
         residual, direction = self.residual, self._chopped
         self._carry, self._released = False, True
         self._product(direction)
-        residual.sums.dot(direction, self._q, CURVATURE)
-        curvature = float(residual.scalars.numpy()[CURVATURE])
+        curvature = residual.dot(direction, self._q)
         if not (self.is_grid and curvature > 0):
             return self._projected_step(direction, residual.release, curvature)
         factor, target, p = residual.release / curvature, self._target(), self.problem
         fields = {"x": self.x, "step": direction, "q": self._q, "to": target, "free": residual.free, "g": self.preconditioner.r}
         numbers, stencil = {"part": factor, "length": factor * residual.size}, p.A.stencil  # type: ignore[attr-defined]
-        passes.RELEASE.bind(residual.rows, stencil=stencil, bounds=p.bounds.operands, **fields, **numbers).launch()
+        RELEASE.bind(residual.rows, stencil=stencil, bounds=p.bounds.operands, **fields, **numbers).launch()
         self._settle(target)
         residual.moved = True
         return True
@@ -277,14 +289,11 @@ class GradientWorkspace(RoundedIterate):
         """Keep q = A p from step to step."""
         residual, M, beta = self.residual, self.preconditioner, 0.0
         if self._carry:
-            residual.sums.dot(M.z, self._q, OVERLAP)
-            beta = -float(residual.scalars.numpy()[OVERLAP]) / self._curvature
+            beta = -residual.dot(M.z, self._q) / self._curvature
         bounds, beta = self.problem.bounds.operands, beta if math.isfinite(beta) else 0.0
         passes.move(residual.rows, bounds, None, self._p, 0.0, None, z=M.z, beta=beta)
         self._product(self._p)
-        passes.GAIN.bind(residual.rows, along=self._p, q=self._q, g=M.r, out=residual.sums.partials).launch()
-        residual.sums.add_up(GAIN, columns=2)
-        gain, curvature = (float(v) for v in residual.scalars.numpy()[GAIN : CURVATURE + 1])
+        gain, curvature = (float(v) for v in residual.sums.of(GAIN, along=self._p, q=self._q, g=M.r))
         self._carry, self._curvature = curvature > 0, curvature
         return self._projected_step(self._p, gain, curvature)
 
@@ -292,8 +301,7 @@ class GradientWorkspace(RoundedIterate):
         """Sum the products of z and p in one pass over the grid, then make p and move x in another."""
         residual, finest = self.residual, self.system.hierarchy.finest
         finest.stencil.wrap(finest.x)
-        residual.measure(finest, self._p)
-        zaz, zap, gz, gp = (float(v) for v in residual.scalars.numpy()[:4])
+        zaz, zap, gz, gp = residual.measure(finest, self._p)
         beta, curvature, gain = 0.0, zaz, gz
         if self._carry:
             beta, curvature, gain = engine.conjugate.func(zaz, zap, gz, gp, self._curvature, engine.LEAST_REST.value)

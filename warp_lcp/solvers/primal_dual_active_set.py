@@ -124,7 +124,7 @@ class ActiveSetWorkspace(NewtonWorkspace):
         if watched:
             wp.copy(self.trial, x)
         bounds = self._unbounded if self._moved else p.bounds.operands  # within rounding of the bounds at the end
-        passes.move(self._rows, bounds, x, self.system.e, size, x)
+        passes.move(self._sums.rows, bounds, x, self.system.e, size, x)
         if self.floating is not None:
             self.floating.settle(x, p.lower, p.upper)
         self._round(x)
