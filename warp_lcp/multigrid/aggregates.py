@@ -107,7 +107,7 @@ class Aggregation:
 
 
 @dataclass(frozen=True)
-class Level:
+class AggregateLevel:
     """A matrix; its iterate, right-hand side, bounds and A x + b; and its aggregates, None on the coarsest level."""
 
     A: SparseOperator
@@ -131,7 +131,7 @@ class AggregateCycles:
     """
 
     def __init__(self, A: SparseOperator) -> None:
-        self.A, self._version, self._levels = A, -1, list[Level]()
+        self.A, self._version, self._levels = A, -1, list[AggregateLevel]()
         self._program: Program | None = None
         self._fields: tuple[Any, ...] = ()
 
@@ -146,7 +146,7 @@ class AggregateCycles:
             host, n = operator.matrix(), operator.unknowns
             found = _aggregates(host) if n > COARSEST else None
             x, b, lower, upper, y = (wp.zeros(n, dtype=wp.float64, device=device) for _ in range(5))
-            self._levels.append(Level(operator, x, b, lower, upper, y, None if found is None else Aggregation.of(found, device)))
+            self._levels.append(AggregateLevel(operator, x, b, lower, upper, y, None if found is None else Aggregation.of(found, device)))
             more = found is not None
             if found is not None:
                 operator = SparseOperator(found.T @ host @ found, device=device, dtype=wp.float64)
@@ -157,10 +157,10 @@ class AggregateCycles:
         fields = tuple(field.ptr for field in (x, b, lower, upper))
         if self._program is None or self._fields != fields:
             finest, self._fields, self._program = self._levels[0], fields, Program(self.A.device)
-            self._visit(Level(finest.A, x, b, lower, upper, finest.y, finest.aggregation), 0, self._program.launch)
+            self._visit(AggregateLevel(finest.A, x, b, lower, upper, finest.y, finest.aggregation), 0, self._program.launch)
         self._program.run()
 
-    def _visit(self, L: Level, depth: int, launch: Launch) -> None:
+    def _visit(self, L: AggregateLevel, depth: int, launch: Launch) -> None:
         """Launch a cycle on a level and those below it."""
         A, device = L.A, self.A.device
         if L.aggregation is None:

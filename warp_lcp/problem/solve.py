@@ -94,30 +94,38 @@ class Workspace(Protocol):
         """Make x the best iterate again."""
 
 
-class IterateInPlace:
-    """Keeps the best iterate by copying it; for methods that move x in place."""
+class IterateMemory:
+    """What workspaces have in common: x, moved in place and rounded to its precision, the residual there, the best iterate by a copy.
 
-    x: wp.array[Any]
+    Args:
+        problem: the problem.
+        precision: of the iterate.
+        x: stored field; its own if None.
+        residual: evaluated at x; a NaturalResidual of its own if None.
+    """
+
+    floating: Any = None
     _best: wp.array[Any] | None = None
 
+    def __init__(
+        self, problem: LCP, precision: str = Precision.DOUBLE, *, x: wp.array[Any] | None = None, residual: NaturalResidual | None = None
+    ) -> None:
+        self.problem, self.precision = problem, Precision(precision)
+        self.x = problem.layout.zeros(wp.float64) if x is None else x
+        self.residual = NaturalResidual(problem) if residual is None else residual
+        self._rounded = problem.layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
+
     def keep(self) -> None:
-        """Remember x."""
+        """Remember x as the best iterate."""
         if self._best is None:
             self._best = wp.clone(self.x)
         else:
             wp.copy(self._best, self.x)
 
     def restore(self) -> None:
-        """Take x back."""
+        """Make x the best iterate again."""
         if self._best is not None:
             wp.copy(self.x, self._best)
-
-
-class RoundedIterate:
-    """Rounds iterates through memory of their precision; `_rounded` is None where they are float64."""
-
-    x: wp.array[Any]
-    _rounded: wp.array[Any] | None
 
     def round_iterate(self) -> None:
         """Round x to its precision."""

@@ -52,7 +52,7 @@ class RowLayout:
 
 
 @wp.struct
-class Bounds:
+class BoundFields:
     """Bounds of x as `warp_lcp.problem.bounds.Bounds.operands` has them."""
 
     lower: wp.array(dtype=wp.float64)

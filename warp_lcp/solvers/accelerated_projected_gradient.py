@@ -11,8 +11,7 @@ import warp as wp
 
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import version_of
-from warp_lcp.problem.residual import NaturalResidual
-from warp_lcp.problem.solve import IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
+from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
 from warp_lcp.rows import RowPass
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, Positive, Settings
@@ -57,7 +56,7 @@ class AcceleratedProjectedGradient(Settings):
     estimate_steps: Count = 20
     precision: PrecisionName = "mixed"
 
-    def init(self, problem: LCP) -> GradientWorkspace:
+    def init(self, problem: LCP) -> AcceleratedWorkspace:
         """Return a workspace.
 
         Raises:
@@ -66,15 +65,15 @@ class AcceleratedProjectedGradient(Settings):
         if not problem.A.symmetric:
             raise ValueError(f"{type(problem.A).__name__} is not symmetric: A x + b is no gradient")
         positive_diagonal(problem)
-        return GradientWorkspace(problem, self)
+        return AcceleratedWorkspace(problem, self)
 
-    def step(self, problem: LCP, work: GradientWorkspace, x: wp.array[Any]) -> Step:
+    def step(self, problem: LCP, work: AcceleratedWorkspace, x: wp.array[Any]) -> Step:
         """Take one step with momentum."""
         work.advance(x)
         return Step("gradient")
 
 
-class GradientWorkspace(IterateInPlace, RoundedIterate):
+class AcceleratedWorkspace(IterateMemory):
     """Memory of the method.
 
     Attributes:
@@ -82,16 +81,13 @@ class GradientWorkspace(IterateInPlace, RoundedIterate):
     """
 
     def __init__(self, problem: LCP, settings: AcceleratedProjectedGradient) -> None:
-        self.problem, self.settings, self.precision = problem, settings, Precision(settings.precision)
-        zeros = problem.layout.zeros
-        self.x, self._x_old, self._y_old, self._z, self._y_z = (zeros(wp.float64) for _ in range(5))
-        self.residual = NaturalResidual(problem)
-        self.floating: Any = None
+        super().__init__(problem, settings.precision)
+        self.settings, zeros = settings, problem.layout.zeros
+        self._x_old, self._y_old, self._z, self._y_z = (zeros(wp.float64) for _ in range(4))
         self.lipschitz = settings.lipschitz or 1.0
         self._version: Any = object()
         self._d = zeros(wp.float64)
         self._sums = Sums(rows_of(self.x), len(PROGRESS.sums))
-        self._rounded = zeros(wp.float32) if self.precision is Precision.SINGLE else None
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the momentum; look at the operator again if it has changed."""

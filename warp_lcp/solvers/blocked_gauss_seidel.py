@@ -14,7 +14,7 @@ from warp_lcp.operators.compressed_rows import CompressedRows
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, HasStencil, check_taken, has
-from warp_lcp.problem.solve import Precision, PrecisionName, Solver, Step
+from warp_lcp.problem.solve import PrecisionName, Solver, Step
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.layout import put
 from warp_lcp.settings import Count, Relaxation, Settings, Share
@@ -169,7 +169,7 @@ class BlockWorkspace(SweepWorkspace):
     """Memory of sweeps over small blocks."""
 
     def __init__(self, problem: LCP, rows: CompressedRows, blocks: list[np.ndarray], settings: BlockedGaussSeidel) -> None:
-        super().__init__(problem, Precision(settings.precision))
+        super().__init__(problem, settings.precision)
         device, n, sizes = problem.device, problem.layout.size, [len(block) for block in blocks]
         members = np.concatenate(blocks)
         owner, place = np.empty(n, dtype=np.int32), np.empty(n, dtype=np.int32)
@@ -203,7 +203,7 @@ class LineWorkspace(SweepWorkspace):
     """Memory of sweeps over a grid's lines."""
 
     def __init__(self, problem: LCP, axis: GridLines, settings: BlockedGaussSeidel) -> None:
-        super().__init__(problem, Precision(settings.precision))
+        super().__init__(problem, settings.precision)
         self._lines = LineSweep(problem, axis, settings.omega)
 
     def start(self, *, warm: bool, tolerance: float) -> None:

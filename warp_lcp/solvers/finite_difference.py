@@ -15,7 +15,7 @@ from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.rows import RowPass
 from warp_lcp.rows.program import Launch
 from warp_lcp.rows.vectors import rows_of
-from warp_lcp.solvers.nonsmooth_map import Kink, NonsmoothMap, Reformulation
+from warp_lcp.solvers.nonsmooth_map import Kink, MapForm, NonsmoothMap
 
 HEADERS, f64 = Path(__file__).parent / "headers", wp.float64
 DIFFERENCE = RowPass(
@@ -42,7 +42,7 @@ class FiniteDifferenceSystem(KrylovSystem):
         share: lambda of the penalized map.
     """
 
-    def __init__(self, problem: LCP, residual: NaturalResidual, map: Reformulation, share: float) -> None:
+    def __init__(self, problem: LCP, residual: NaturalResidual, map: MapForm, share: float) -> None:
         layout, self._problem, self._residual = problem.layout, problem, residual
         self.r, self.z, self._f, self._moved = (layout.zeros(wp.float64) for _ in range(4))
         self._map = NonsmoothMap(problem, residual, map, share, Kink.APPROXIMATION)

@@ -12,7 +12,7 @@ from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import Precision, Step
 from warp_lcp.solvers.dense_problem import DenseProblem, DenseWorkspace
 from warp_lcp.solvers.descent import NonmonotoneSearch
-from warp_lcp.solvers.gradient_descent import GradientWorkspace
+from warp_lcp.solvers.gradient_descent import DescentWorkspace
 from warp_lcp.solvers.nonsmooth_map import KINK, Kink
 
 if TYPE_CHECKING:
@@ -115,7 +115,7 @@ class FischerDenseWorkspace(DenseWorkspace):
         self.cycles_left, self.descents_left, self.stage, self.steps = 0, settings.warm_start, 0, 0
         self.active_set: Any = None
         self._search = NonmonotoneSearch(memory=settings.memory if settings.safeguard else 1)
-        self._gradient: GradientWorkspace | None = None
+        self._gradient: DescentWorkspace | None = None
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Read the problem, and begin the first stage."""
@@ -132,7 +132,7 @@ class FischerDenseWorkspace(DenseWorkspace):
     def descend(self, x: Any) -> Step:
         """Go down the gradient of the same map once."""
         if self._gradient is None:
-            self._gradient = GradientWorkspace(self.problem, self._descent, self.residual)
+            self._gradient = DescentWorkspace(self.problem, self._descent, self.residual)
             self._gradient.start(warm=True, tolerance=self.target)
         step = self._gradient.descend(x)
         self._iterate = self._begun = self.read_iterate() / self.units

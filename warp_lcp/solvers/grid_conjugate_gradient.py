@@ -42,7 +42,7 @@ f64 = wp.array(dtype=wp.float64)
 
 @no_type_check
 @wp.kernel(enable_backward=False, module="warp_lcp.grid_conjugate_gradient")
-def begin_kernel(scalars: f64, going: wp.array(dtype=int), tolerance: wp.float64, limit: int):
+def begin_grid_kernel(scalars: f64, going: wp.array(dtype=int), tolerance: wp.float64, limit: int):
     """Before the first iteration: no old direction, no norm yet."""
     scalars[CARRY] = wp.float64(0.0)
     scalars[NORM] = wp.float64(0.0)
@@ -57,7 +57,7 @@ def begin_kernel(scalars: f64, going: wp.array(dtype=int), tolerance: wp.float64
 
 @no_type_check
 @wp.kernel(enable_backward=False, module="warp_lcp.grid_conjugate_gradient")
-def end_kernel(scalars: f64, going: wp.array(dtype=int)):
+def end_grid_kernel(scalars: f64, going: wp.array(dtype=int)):
     """After an iteration: decide whether to go on."""
     scalars[ITERATIONS] += wp.float64(1.0)
     norm = wp.sqrt(scalars[SQUARE])
@@ -95,7 +95,7 @@ class GridConjugateGradient:
         fields = {"q": self._p, "x": self.x, "r": r, "scalars": self._scalars, "weighted": weighted, "out": sums.partials}
         ADVANCE.launch(direct, STEP_ALONG.bind(s.rows, stencil=s, **fields), launch=program.launch)
         sums.add_up(int(SQUARE), launch=program.launch)
-        program.launch(end_kernel, 1, [self._scalars, self._going], device=device)
+        program.launch(end_grid_kernel, 1, [self._scalars, self._going], device=device)
 
     def clear(self) -> None:
         """Forget what lies outside the rows that the operator has now."""
@@ -108,7 +108,7 @@ class GridConjugateGradient:
         Returns:
             The iterations done and the norm of the carried residual, an estimate that rounding bounds from below.
         """
-        wp.launch(begin_kernel, 1, [self._scalars, self._going, tolerance, max_iterations], device=self.device)
+        wp.launch(begin_grid_kernel, 1, [self._scalars, self._going, tolerance, max_iterations], device=self.device)
         self._program.run_while(self._going)
         scalars = self._scalars.numpy()
         return int(scalars[int(ITERATIONS)]), float(np.sqrt(scalars[int(SQUARE)]))

@@ -20,7 +20,7 @@ from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil, has
 from warp_lcp.problem.residual import NaturalResidual
-from warp_lcp.problem.solve import IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
+from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
 from warp_lcp.rows import Known, RowPass, Wave
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, CountOrZero, Positive, Settings, Share, ShareOrZero
@@ -126,7 +126,7 @@ class InteriorPoint(Settings):
     def init(self, problem: LCP) -> InteriorPointWorkspace | EquilibratedWorkspace:
         """Return a workspace: for dense and sparse problems one that equilibrates them."""
         if EquilibratedWorkspace.suits(problem):
-            return EquilibratedWorkspace(problem, Precision(self.precision), lambda scaled: InteriorPointWorkspace(scaled, self))
+            return EquilibratedWorkspace(problem, self.precision, lambda scaled: InteriorPointWorkspace(scaled, self))
         return InteriorPointWorkspace(problem, self)
 
     def step(self, problem: LCP, work: Any, x: wp.array[Any]) -> Step:
@@ -145,7 +145,7 @@ class InteriorPoint(Settings):
         return work.path_step(x)
 
 
-class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
+class InteriorPointWorkspace(IterateMemory):
     """Memory of the method for one problem.
 
     Attributes:
@@ -154,22 +154,22 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
     """
 
     def __init__(self, problem: LCP, settings: InteriorPoint) -> None:
-        self.problem, self.settings, self.precision = problem, settings, Precision(settings.precision)
-        layout = problem.layout
-        self.x, self.residual = layout.zeros(wp.float64), NaturalResidual(problem)
+        self.settings, layout = settings, problem.layout
         self.active_set: GridNewtonWorkspace | NewtonWorkspace | None = None
         newton = MinimumMapNewton(
             precision=settings.precision, monotone_cycles=settings.monotone_cycles, max_linear_iterations=settings.max_linear_iterations,
             cycle=settings.cycle,
         )  # fmt: skip
         if has(problem.A, HasStencil) and problem.bounded:
-            self.active_set = GridNewtonWorkspace(problem, problem.A, newton, serves=True)
-            self.x, self.scratch = self.active_set.x, self.active_set.scratch
-            self.residual = self.active_set.residual
-        elif problem.bounded and settings.crossover > 0:
-            self.active_set = NewtonWorkspace(problem, newton)
-            self.active_set.residual = self.residual
-        shared = self.active_set.hierarchy if isinstance(self.active_set, GridNewtonWorkspace) else None
+            grid = self.active_set = GridNewtonWorkspace(problem, problem.A, newton, serves=True)
+            self.scratch, shared = grid.scratch, grid.hierarchy
+            super().__init__(problem, settings.precision, x=grid.x, residual=grid.residual)
+        else:
+            shared = None
+            super().__init__(problem, settings.precision)
+            if problem.bounded and settings.crossover > 0:
+                self.active_set = NewtonWorkspace(problem, newton)
+                self.active_set.residual = self.residual
         self.system: Any = principal_system(
             problem, self.precision.correction, bounded=False, settings=settings.cycle, shifted=problem.bounded, hierarchy=shared
         )
@@ -178,13 +178,11 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
         self._v, self._t = (layout.zeros(wp.float64), layout.zeros(wp.float64)) if upper else (self._w, self._s)
         self._D, self.free = layout.zeros(wp.float64), layout.zeros(wp.uint8)
         self._predicted = wp.zeros_like(self.system.e)
-        self._rounded = layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
         self._carries = isinstance(self.system, GridSystem)  # conjugate gradients leave the residual in r
         fused = isinstance(self.system, GridSystem) and self.system.fused
         self._upper, self._fusable = upper, fused and problem.bounded and settings.mehrotra and self._rounded is None
         self._sums, self._longest = Sums(rows_of(self.x), 3), wp.zeros(1, dtype=wp.float64, device=problem.device)
         self._grid_sums = Sums(problem.A.stencil.rows, 3) if self._fusable else self._sums  # type: ignore[attr-defined]
-        self.floating: Any = None
         self.cycles_left = self.steps = self.count = 0
         self.near = self.begun = self.crossed = False
         self.mu = self.target = self.first_norm = self.size = 0.0

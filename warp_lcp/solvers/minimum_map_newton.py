@@ -15,9 +15,8 @@ from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil, has
-from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve import FLOOR_MARGIN, IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
+from warp_lcp.problem.solve import FLOOR_MARGIN, IterateMemory, PrecisionName, Step
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, CountOrZero, Settings, Share
 from warp_lcp.solvers import active_set_passes as passes
@@ -92,7 +91,7 @@ class MinimumMapNewton(Settings):
         return work.step(x)
 
 
-class NewtonWorkspace(IterateInPlace, RoundedIterate):
+class NewtonWorkspace(IterateMemory):
     """Memory of the method for one problem.
 
     Attributes:
@@ -107,16 +106,12 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
     gradients: GradientPhase | None = None
 
     def __init__(self, problem: LCP, settings: MinimumMapNewton) -> None:
-        self.problem, self.settings, self.precision = problem, settings, Precision(settings.precision)
-        layout = problem.layout
-        self.bounded = problem.bounded
-        self.x, self.trial = layout.zeros(wp.float64), layout.zeros(wp.float64)
-        self.residual = NaturalResidual(problem)
+        super().__init__(problem, settings.precision)
+        self.settings, self.bounded, layout = settings, problem.bounded, problem.layout
+        self.trial = layout.zeros(wp.float64)
         self.system = self._principal_system()
         self.free = layout.zeros(wp.uint8)
         self._sums = Sums(rows_of(self.x), 4, slots=SLOTS, across=layout.across)
-        self._rounded = layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
-        self.floating: Any = None
         cycled = self.bounded and isinstance(problem.A, SparseOperator) and problem.A.unknowns >= LARGE
         self.aggregates = AggregateCycles(problem.A) if cycled else None  # type: ignore[arg-type]
         self.coarse = CoarseProblem(problem.A, settings) if cycled else None  # type: ignore[arg-type]

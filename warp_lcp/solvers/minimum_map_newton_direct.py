@@ -15,7 +15,7 @@ from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.residual import NaturalResidual
-from warp_lcp.problem.solve import Precision, RoundedIterate, Step
+from warp_lcp.problem.solve import IterateMemory, Step
 from warp_lcp.solvers.dense_problem import SINGULAR, factored
 
 if TYPE_CHECKING:
@@ -184,7 +184,7 @@ class HostResidual(NaturalResidual):
         return math.sqrt(self.b @ self.b)
 
 
-class DirectNewtonWorkspace(RoundedIterate):
+class DirectNewtonWorkspace(IterateMemory):
     """Whole Newton steps solved by LAPACK on the host, then the safeguarded ones where these lead nowhere.
 
     On an M-matrix whole steps end at the solution, but the contact set may shrink by a layer a step. Where a narrow problem's set has
@@ -202,14 +202,11 @@ class DirectNewtonWorkspace(RoundedIterate):
         A: Any = problem.A
         if not suits(A):
             raise ValueError(f"A: direct = True is for dense and sparse matrices of at most {MOST} unknowns or a bandwidth up to {WIDEST}")
-        self.problem, self.settings, self.precision = problem, settings, Precision(settings.precision)
+        self.settings = settings
         width = bandwidth(A) if A.unknowns > FEW else WIDEST + 1
         self.matrix: SmallMatrix | BandedMatrix = BandedMatrix(A, width) if width <= WIDEST else SmallMatrix(A)
-        self.x = problem.layout.zeros(wp.float64)
         on_host = problem.device.is_cpu and problem.bounds.affine is None
-        self.residual: NaturalResidual = HostResidual(problem, self.matrix) if on_host else NaturalResidual(problem)
-        self._rounded = problem.layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
-        self.floating: Any = None
+        super().__init__(problem, settings.precision, residual=HostResidual(problem, self.matrix) if on_host else None)
 
     def keep(self) -> None:
         """Remember x, on the host."""

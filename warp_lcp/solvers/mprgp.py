@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
@@ -18,7 +18,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil, has
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve import Precision, PrecisionName, RoundedIterate, Step
+from warp_lcp.problem.solve import IterateMemory, Precision, PrecisionName, Step
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.vectors import Sums
 from warp_lcp.settings import Count, CountOrZero, Positive, Settings
@@ -83,7 +83,7 @@ class MPRGP(Settings):
     patience: Count = 3
     cycle: CycleSettings = field(default_factory=CycleSettings)
 
-    def init(self, problem: LCP) -> GradientWorkspace:
+    def init(self, problem: LCP) -> MPRGPWorkspace:
         """Return a workspace.
 
         Raises:
@@ -91,13 +91,13 @@ class MPRGP(Settings):
         """
         if not problem.A.symmetric:
             raise ValueError("A is not symmetric: MPRGP minimizes an energy that only a symmetric A has; take MinimumMapNewton or Lemke")
-        work = GradientWorkspace(problem, self)
+        work = MPRGPWorkspace(problem, self)
         negative = np.count_nonzero(Diagonal(problem, work.residual).values() < 0)
         if negative:
             raise ValueError(f"A has {negative} negative diagonal entries: MPRGP needs a positive semi-definite A")
         return work
 
-    def step(self, problem: LCP, work: GradientWorkspace, x: wp.array[Any]) -> Step:
+    def step(self, problem: LCP, work: MPRGPWorkspace, x: wp.array[Any]) -> Step:
         """Take a monotone cycle while the start is cold, else a projected conjugate-gradient step, after a proportioning one if need be."""
         if work.wants_monotone_cycle():
             return work.monotone_step(x)
@@ -106,19 +106,6 @@ class MPRGP(Settings):
         if (release and not work.proportion()) or not work.conjugate():
             return Step("unbounded", 1, held, SolveStatus.DIVERGED)
         return Step("proportioning" if release else "conjugate gradient", 2 if release else 1, held, interim=work.sinks())
-
-
-class Preconditioner(Protocol):
-    """An approximate inverse of A on a free set: reads r, writes z."""
-
-    r: wp.array[Any]
-    z: wp.array[Any]
-
-    def restrict(self, free: wp.array[Any]) -> None:
-        """Take another free set."""
-
-    def apply(self) -> None:
-        """Write z."""
 
 
 class SplitResidual(NaturalResidual):
@@ -191,7 +178,7 @@ class SplitResidual(NaturalResidual):
         return float(self.sums.scalars.numpy()[0])
 
 
-class GradientWorkspace(RoundedIterate):
+class MPRGPWorkspace(IterateMemory):
     """Memory of the method for one problem.
 
     Args:
@@ -200,18 +187,20 @@ class GradientWorkspace(RoundedIterate):
         system: a sparse matrix's principal system to share; its own if None.
     """
 
+    residual: SplitResidual
+
     def __init__(self, problem: LCP, settings: MPRGP, system: SparseSystem | None = None) -> None:
-        self.problem, self.settings, self.precision = problem, settings, Precision(settings.precision)
+        precision, self.settings = Precision(settings.precision), settings
         self.bounded, self.is_grid = problem.bounded, has(problem.A, HasStencil)
-        self.system, self.preconditioner = _preconditioner(problem, self.precision.correction, settings.cycle, system)
-        z, single = self.preconditioner.z, self.precision is Precision.SINGLE
+        self.system, self.preconditioner = _preconditioner(problem, precision.correction, settings.cycle, system)
+        z = self.preconditioner.z
         self._fields = [problem.layout.zeros(wp.float64) for _ in range(2 if self.is_grid else 3)]
-        self.x, self._best = self._fields[0], self._fields[0]
+        self._best: wp.array[Any] = self._fields[0]
         self._p, self._q = wp.zeros_like(z), wp.zeros_like(z)
-        self._rounded = problem.layout.zeros(wp.float32) if single else None
         self._chopped = z if self.is_grid else wp.zeros_like(z)  # a multigrid cycle leaves nothing of what was in z
-        self.residual = SplitResidual(problem, self.preconditioner.r, self._chopped, slack=SINGLE_SLACK if single else 0.0)
-        self.floating: Any = None
+        slack = SINGLE_SLACK if precision is Precision.SINGLE else 0.0
+        residual = SplitResidual(problem, self.preconditioner.r, self._chopped, slack=slack)
+        super().__init__(problem, precision, x=self._best, residual=residual)
         self._cycles_left, self._cycled, self._released, self._carry, self._curvature = 0, False, False, False, 0.0
         self._descent = Descent(self.precision.epsilon)
 

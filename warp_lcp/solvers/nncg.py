@@ -12,7 +12,7 @@ import warp as wp
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, Relaxes, check_taken
 from warp_lcp.problem.residual import WITHIN
-from warp_lcp.problem.solve import Precision, PrecisionName, Step
+from warp_lcp.problem.solve import PrecisionName, Step
 from warp_lcp.rows import RowPass
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Relaxation, Settings
@@ -62,7 +62,7 @@ class NNCG(Settings):
             ValueError: A cannot be swept; see ProjectedSOR.
         """
         check_taken(self, problem.A)
-        work = NNCGWorkspace(problem, Precision(self.precision))
+        work = NNCGWorkspace(problem, self.precision)
         work.sweep = sweep_for(problem, work.diagonal, self.omega)
         work.diagonal.check()
         return work
@@ -84,7 +84,7 @@ class NNCGWorkspace(SweepWorkspace):
         p: stored field, the direction.
     """
 
-    def __init__(self, problem: LCP, precision: Precision) -> None:
+    def __init__(self, problem: LCP, precision: str) -> None:
         super().__init__(problem, precision)
         self.g, self.p = problem.layout.zeros(wp.float64), problem.layout.zeros(wp.float64)
         affine = problem.bounds.affine

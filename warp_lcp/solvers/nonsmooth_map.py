@@ -65,7 +65,7 @@ STEP = Wave("nonsmooth_map.step", (MOVE, 0), (CONDENSE_AT_ROWS, 1))  # a plane i
 KINK = 1e-14  # times the size of b: a point this near to both sides of a kink is on it
 
 
-class Reformulation(StrEnum):
+class MapForm(StrEnum):
     """Which map ([Book] 1.1.2-3): the minimum map, Fischer and Burmeister's, or Chen, Chen and Kanzow's penalized one."""
 
     NATURAL = "natural"
@@ -87,7 +87,7 @@ class Kink(StrEnum):
     APPROXIMATION = "approximation"
 
 
-MapName = Literal[tuple(map(str, Reformulation))]
+MapName = Literal[tuple(map(str, MapForm))]
 KinkName = Literal[tuple(map(str, Kink))]
 
 
@@ -110,10 +110,10 @@ class NonsmoothMap:
         norm: of the right-hand side that `step` wrote, as its system measures it.
     """
 
-    def __init__(self, problem: LCP, residual: NaturalResidual, map: Reformulation, share: float, kink: Kink = Kink.PERTURBATION) -> None:
+    def __init__(self, problem: LCP, residual: NaturalResidual, map: MapForm, share: float, kink: Kink = Kink.PERTURBATION) -> None:
         self.problem, self.residual, self.map = problem, residual, map
-        layout, self._share = problem.layout, share if map is Reformulation.PENALIZED else 1.0
-        natural, self._random = map is Reformulation.NATURAL, kink is Kink.RANDOM
+        layout, self._share = problem.layout, share if map is MapForm.PENALIZED else 1.0
+        natural, self._random = map is MapForm.NATURAL, kink is Kink.RANDOM
         self._form = {"NATURAL": natural, "UPPER": problem.bounds.may_bind[1], "PENALIZED": self._share < 1}
         self._form["RANDOM"] = self._random and not natural
         self._sums, self.norm = Sums(Rows.flat(layout.size, problem.device), 2), 0.0

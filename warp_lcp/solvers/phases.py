@@ -178,10 +178,10 @@ class GradientPhase:
     """
 
     def __init__(self, problem: LCP, system: SparseSystem, precision: str) -> None:
-        from warp_lcp.solvers.mprgp import MPRGP, GradientWorkspace  # which needs this module
+        from warp_lcp.solvers.mprgp import MPRGP, MPRGPWorkspace  # which needs this module
 
         method = MPRGP(precision=precision)
-        self._inner = Inner(method, problem, GradientWorkspace(problem, method, system))
+        self._inner = Inner(method, problem, MPRGPWorkspace(problem, method, system))
 
     def start(self, x: wp.array[Any], floating: Any, tolerance: float) -> None:
         """Begin at x."""

@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import version_of
-from warp_lcp.problem.solve import Precision, PrecisionName, Step
+from warp_lcp.problem.solve import PrecisionName, Step
 from warp_lcp.settings import Positive, Settings
 from warp_lcp.solvers.psor import SweepWorkspace
 from warp_lcp.solvers.spectrum import scaled_spectrum
@@ -73,7 +73,7 @@ class JacobiWorkspace(SweepWorkspace):
     d: wp.array[Any]
 
     def __init__(self, problem: LCP, settings: ProjectedJacobi) -> None:
-        super().__init__(problem, Precision(settings.precision))
+        super().__init__(problem, settings.precision)
         self._given, self._version = settings.omega, object()
         self.omega = settings.omega or 1.0
 

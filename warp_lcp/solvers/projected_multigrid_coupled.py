@@ -10,7 +10,7 @@ from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil
-from warp_lcp.problem.solve import Precision, Step
+from warp_lcp.problem.solve import Step
 from warp_lcp.rows.program import Launch, Program
 from warp_lcp.rows.vectors import CONVERT, rows_of
 from warp_lcp.solvers import principal_system_low_rank as coupling
@@ -70,15 +70,16 @@ class CoupledWorkspace(MultigridWorkspace):
     residual: CoupledResidual
 
     def __init__(self, problem: LCP, A: HasStencil, low: LowRankOperator, settings: ProjectedMultigrid) -> None:
-        super().__init__(problem, A, settings)
         self._low = low
-        rounded = self.precision is Precision.SINGLE
-        self.residual = CoupledResidual(problem, A, low, self.hierarchy, rounded=rounded)
+        super().__init__(problem, A, settings)
         self.correction = LowRankCorrection(low, self.hierarchy)
         self._along = wp.zeros(low.rank, dtype=wp.float64, device=problem.device)  # U'p
         self._fresh = True  # whether the correction is still that of the last solve
         self._newton: Inner | None = None
         self._searches = False  # whether steps are Newton's
+
+    def _residual(self, problem: LCP, rounded: bool) -> CoupledResidual:
+        return CoupledResidual(problem, self.A, self._low, self.hierarchy, rounded=rounded)
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the search direction; operator and bodies may have changed."""

@@ -15,7 +15,7 @@ from warp_lcp.multigrid.turning import make_hierarchy
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasStencil
 from warp_lcp.problem.residual import NaturalResidual
-from warp_lcp.problem.solve import FLOOR_MARGIN, Precision, RoundedIterate, Step
+from warp_lcp.problem.solve import FLOOR_MARGIN, IterateMemory, Precision, Step
 from warp_lcp.rows import Bound, Rows
 from warp_lcp.rows.program import Launch, Program, perform
 from warp_lcp.rows.vectors import Reduction
@@ -127,34 +127,36 @@ class AssessedResidual(NaturalResidual):
         self.scalars[int(slot) : int(slot) + 1].fill_(value)
 
 
-class MultigridWorkspace(RoundedIterate):
+class MultigridWorkspace(IterateMemory):
     """Memory of the method for one problem.
 
     x is moved in place. The best iterate is not stored while it is x, nor when x is one step past it, for a step can be taken back; it
     is when the residual has risen and goes on from there.
     """
 
+    residual: AssessedResidual
+
     def __init__(self, problem: LCP, A: HasStencil, settings: ProjectedMultigrid, *, shifted: bool = False) -> None:
-        self.problem, self.A, self.settings, self.precision = problem, A, settings, Precision(settings.precision)
-        self.bounded = problem.bounded
-        real = self.precision.correction
-        self.x, self._p = problem.layout.zeros(wp.float64), problem.layout.zeros(real)
+        precision = Precision(settings.precision)
+        real, self.A, self.settings, self.bounded = precision.correction, A, settings, problem.bounded
+        self._p = problem.layout.zeros(real)
         # a projected cycle forgets the search direction, so its lower bounds may lie in that memory: finite numbers, and 0 off the unknowns
         upper = problem.layout.zeros(real) if problem.bounds.may_bind[1] else wp.empty(0, dtype=real, device=A.device)
         options: dict[str, Any] = {"bounded": self.bounded, "settings": settings.cycle, "bounds": (self._p, upper), "shifted": shifted}
         self.hierarchy = make_hierarchy(A.stencil, real, **options)
-        self.residual = AssessedResidual(problem, A, self.hierarchy, rounded=self.precision is Precision.SINGLE)
+        super().__init__(problem, precision, residual=self._residual(problem, precision is Precision.SINGLE))
         self._flat = Rows.flat(problem.layout.size, A.device)
-        self._rounded = problem.layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
         self._programs: dict[tuple[Any, ...], Program] = {}  # truncated cycles
         self._mask: wp.array[Any] | None = None
         self.scratch = self._scratch() if real is wp.float32 else None
-        self.floating: Any = None
-        self._best: wp.array[Any] | None = None
         self._past, self._stored = 0, False  # steps since the best iterate; whether it is in memory of its own
         self._cycles_left, self._descent = 0, Descent(self.precision.epsilon)
         self._tolerance, self._pace = 0.0, Pace(0.0)
         self._algebraic: AlgebraicSteps | None = None
+
+    def _residual(self, problem: LCP, rounded: bool) -> AssessedResidual:
+        """Return what evaluates iterates."""
+        return AssessedResidual(problem, self.A, self.hierarchy, rounded=rounded)
 
     def _scratch(self) -> tuple[wp.array[Any], wp.array[Any]]:
         """Return what is free between cycles, as fields of four bytes and of one byte a cell."""

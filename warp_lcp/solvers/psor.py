@@ -9,8 +9,7 @@ import warp as wp
 
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, Relaxes, check_taken
-from warp_lcp.problem.residual import NaturalResidual
-from warp_lcp.problem.solve import IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
+from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
 from warp_lcp.settings import Relaxation, Settings
 from warp_lcp.solvers.spectrum import scaled_spectrum
 from warp_lcp.solvers.sweep import Contraction, Diagonal, OrderName, Sweep, SweepOrder, sweep_for
@@ -77,7 +76,7 @@ class ProjectedSOR(Settings):
                 meets, or an odd periodic side.
         """
         check_taken(self, problem.A)
-        work = SweepWorkspace(problem, Precision(self.precision))
+        work = SweepWorkspace(problem, self.precision)
         work.sweep = sweep_for(problem, work.diagonal, self.omega, SweepOrder(self.order), self.permutation)
         work.diagonal.check()
         return work
@@ -91,7 +90,7 @@ class ProjectedSOR(Settings):
         return Step("sweep", len(directions), failure=work.contraction.test(x))
 
 
-class SweepWorkspace(IterateInPlace, RoundedIterate):
+class SweepWorkspace(IterateMemory):
     """Memory of a method that sweeps.
 
     Attributes:
@@ -102,14 +101,10 @@ class SweepWorkspace(IterateInPlace, RoundedIterate):
 
     sweep: Sweep
 
-    def __init__(self, problem: LCP, precision: Precision) -> None:
-        self.problem, self.precision = problem, precision
-        self.x = problem.layout.zeros(wp.float64)
-        self.residual = NaturalResidual(problem)
+    def __init__(self, problem: LCP, precision: str) -> None:
+        super().__init__(problem, precision)
         self.diagonal = Diagonal(problem, self.residual)
         self.contraction = Contraction(problem)
-        self.floating: Any = None
-        self._rounded = problem.layout.zeros(wp.float32) if precision is Precision.SINGLE else None
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Look at the operator again; nothing else is carried from solve to solve."""

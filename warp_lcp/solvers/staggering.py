@@ -11,8 +11,7 @@ import warp as wp
 
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasFaces, HasRows, check_taken
-from warp_lcp.problem.residual import NaturalResidual
-from warp_lcp.problem.solve import IterateInPlace, Precision, Solver, Step
+from warp_lcp.problem.solve import IterateMemory, Solver, Step
 from warp_lcp.settings import Count, Settings, Share
 from warp_lcp.solvers.coupled_problem import StaggeredRound
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
@@ -71,7 +70,7 @@ class Staggering(Settings):
         return Step("round", linear, failure=work.contraction.test(x))
 
 
-class StaggeringWorkspace(IterateInPlace):
+class StaggeringWorkspace(IterateMemory):
     """Memory of a problem in blocks that are solved in turn.
 
     Attributes:
@@ -80,13 +79,8 @@ class StaggeringWorkspace(IterateInPlace):
         target: the residual that is asked for.
     """
 
-    precision = Precision.DOUBLE
-
     def __init__(self, problem: LCP, rows: list[np.ndarray], solvers: list[Solver], *, eta: float, max_iterations: int) -> None:
-        self.problem = problem
-        self.x = problem.layout.zeros(wp.float64)
-        self.residual = NaturalResidual(problem)
-        self.floating: Any = None
+        super().__init__(problem)
         self.blocks: list[Block] = [block_problem(problem, self.x, block) for block in rows]
         self.rounds = StaggeredRound(self.blocks, solvers, eta=eta, max_iterations=max_iterations)
         self.contraction = Contraction(problem)
@@ -98,6 +92,3 @@ class StaggeringWorkspace(IterateInPlace):
         for block in self.blocks:
             block.refresh()
         self.contraction.start(self.x)
-
-    def round_iterate(self) -> None:
-        """The iterate is float64."""

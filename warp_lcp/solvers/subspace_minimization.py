@@ -13,7 +13,7 @@ from warp_lcp.deadline import check_time
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, Relaxes, check_taken
-from warp_lcp.problem.solve import Precision, PrecisionName, Step
+from warp_lcp.problem.solve import PrecisionName, Step
 from warp_lcp.rows import RowPass
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, Ge, Relaxation, Settings, Share
@@ -103,7 +103,7 @@ class SubspaceWorkspace(SweepWorkspace):
     """Memory of the method for one problem."""
 
     def __init__(self, problem: LCP, settings: SubspaceMinimization) -> None:
-        super().__init__(problem, Precision(settings.precision))
+        super().__init__(problem, settings.precision)
         self.settings, layout = settings, problem.layout
         self.sweep = sweep_for(problem, self.diagonal, settings.omega)
         self.system = principal_system(problem, self.precision.correction, bounded=False, settings=settings.cycle)
