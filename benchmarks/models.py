@@ -25,12 +25,12 @@ from warp_lcp.benchmarks.machine import machine
 from warp_lcp.benchmarks.memory import array_bytes
 from warp_lcp.benchmarks.record import Record, Results, Table
 from warp_lcp.benchmarks.timing import Figure, Options
-from warp_lcp.scene.models import TABLE, prices
-from warp_lcp.run.profile import Profile
 from warp_lcp.run.loop import plan_dt
+from warp_lcp.run.profile import Profile
+from warp_lcp.scene.models import TABLE, prices
 from warp_lcp.scene.scene import Scene, Time
-from warp_lcp.simulation import simulators
 from warp_lcp.scene.table import validate
+from warp_lcp.simulation import simulators
 
 TITLE = "What models cost"
 RESOLUTION = {2: 128, 3: 48}  # cells along the longest side of the reference scenes
@@ -341,7 +341,7 @@ def main() -> None:
     results = measure(options, Path())
     compared = importlib.import_module("warp_lcp.benchmarks.automatic_tolerance").measure(options, Path())
     head = "# What models add to a step and to memory, by simulator and dimension; written by `python -m warp_lcp.benchmarks.models`.\n\n"
-    Path(str(files("warp_lcp.driver") / TABLE)).write_text(head + tomli_w.dumps(price_list(results.records)), "utf-8")
+    Path(str(files("warp_lcp.scene") / TABLE)).write_text(head + tomli_w.dumps(price_list(results.records)), "utf-8")
     prices.cache_clear()
     results.tables.extend(importlib.import_module("warp_lcp.benchmarks.predictions").measure(options, Path()).tables)
     write_page(given.page, results, compared.tables[0])

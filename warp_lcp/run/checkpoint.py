@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from warp_lcp.files.archive import Archive, ArchiveError
 from warp_lcp.frames.atomic import make_folder, replacing
 from warp_lcp.frames.rank_folder import in_ranks, rank_folder
-from warp_lcp.files.archive import Archive, ArchiveError
 
 FORMAT = 2
 CHECKPOINT_FILE = re.compile(r"step_(?P<step>[0-9]{6,})\.npz")

@@ -8,8 +8,8 @@ from contextlib import contextmanager
 
 import warp as wp
 
-from warp_lcp.run.kernel_cache import cache_error, watch_loads
 from warp_lcp.files.claims import free_host_memory
+from warp_lcp.run.kernel_cache import cache_error, watch_loads
 
 
 class DeviceError(ValueError):
