@@ -25,9 +25,6 @@ class StoppingCriteria(Settings):
             short is finished first: a pivot, a sweep, an iteration of a linear solve, a factorization, PIQP's one call, and on CUDA a
             linear solve, whose loop the host does not see. On ranks time is up for all as soon as it is for one.
 
-    Raises:
-        ValueError: an argument is outside its range.
-
     Example:
         >>> StoppingCriteria(rtol=1e-3, atol=1e-2).tolerance(5.0)
         0.01

@@ -45,9 +45,6 @@ class AcceleratedProjectedGradient(Settings):
         lipschitz: L > 0 in the metric D; estimated if None.
         estimate_steps: products that the estimate takes.
         precision: "mixed" or "double" keep the iterate in float64, "single" rounds it to float32.
-
-    Raises:
-        ValueError: an argument is outside its range.
     """
 
     needs: ClassVar[str] = "symmetric positive semidefinite A"

@@ -18,7 +18,7 @@ from warp_lcp.problem.solve import PrecisionName, Solver, Step
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.layout import put
 from warp_lcp.settings import Count, Relaxation, Settings, Share
-from warp_lcp.solvers.blocked_gauss_seidel_kernels import BlockLists, block_kernels
+from warp_lcp.solvers.blocked_gauss_seidel_kernels import BlockLists, block_sweep_kernel
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.partition import Blocks, blocks_of_size, color_blocks, given_blocks
 from warp_lcp.solvers.psor import DIRECTIONS, Direction, SweepWorkspace
@@ -105,9 +105,6 @@ class BlockedGaussSeidel(Settings):
         direction: "forward", "backward" or "symmetric".
         eta: each solve of a block by a `sub_solver` reduces its residual by this factor, or to what the whole one needs.
         precision: "mixed" or "double" keep the iterate in float64, "single" rounds it to float32.
-
-    Raises:
-        ValueError: an argument is outside its range.
     """
 
     supports: ClassVar = (HasRows, HasStencil)
@@ -184,7 +181,7 @@ class BlockWorkspace(SweepWorkspace):
         names = ("first", "rows", "owner", "place", "order")
         given = put(BlockLists(), {name: wp.array(v, dtype=wp.int32, device=device) for name, v in zip(names, arrays, strict=True)})
         self._operands = [rows.operand, problem.b, *bound_operands(problem), wp.float64(settings.omega), given]
-        self._kernel = block_kernels(rows.values.dtype, max(sizes)).sweep
+        self._kernel = block_sweep_kernel(rows.values.dtype, max(sizes))
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Rows are shared with the operator."""

@@ -60,9 +60,6 @@ class FischerNewton(Settings):
         memory: merits that a safeguarded search remembers.
         cycle: how multigrid cycles go.
 
-    Raises:
-        ValueError: an argument is outside its range.
-
     Example:
         >>> import numpy as np, warp_lcp as wl
         >>> A = wl.DenseOperator(np.array([[2.0, -1.0], [-1.0, 2.0]]), device="cpu")

@@ -42,9 +42,6 @@ class GradientDescent(Settings):
         gradient: of the test for a local minimum, >= 0.
         memory: merits that the search remembers, >= 1; 1 is the book's monotone search.
         precision: "mixed" and "double" are the same here; "single" rounds x to float32.
-
-    Raises:
-        ValueError: an argument is outside its range.
     """
 
     needs: ClassVar[str] = "products with A'"

@@ -38,9 +38,6 @@ class IncrementalPivoting(Settings):
 
     Args:
         pivots_per_step: pivots in a step of the solve loop, which checks, records and counts steps; max(2, n / 8) if None.
-
-    Raises:
-        ValueError: pivots_per_step < 1.
     """
 
     needs: ClassVar[str] = "symmetric, positive semi-definite, n <= 4096"

@@ -98,9 +98,6 @@ class InteriorPoint(Settings):
         max_linear_iterations: the most iterations of one linear solve.
         cycle: how multigrid cycles go.
 
-    Raises:
-        ValueError: an argument is outside its range.
-
     Example:
         >>> import numpy as np, warp_lcp as wl
         >>> A = wl.DenseOperator(np.array([[2.0, -1.0], [-1.0, 2.0]]), device="cpu")

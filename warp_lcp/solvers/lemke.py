@@ -189,9 +189,6 @@ class Lemke(Settings):
     Args:
         pivots_per_step: pivots in a step of the solve loop, which checks, records and counts steps; max(2, n / 8) if None.
         covering_vectors: random covering vectors tried after a ray, >= 1.
-
-    Raises:
-        ValueError: an argument is outside its range.
     """
 
     needs: ClassVar[str] = "n <= 4096; sure of an end for copositive-plus and P-matrices"

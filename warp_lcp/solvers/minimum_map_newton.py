@@ -59,9 +59,6 @@ class MinimumMapNewton(Settings):
         cycle: how multigrid cycles go.
         direct: begin with whole steps that LAPACK solves on the host, for matrices of at most 200 unknowns or a bandwidth up to 3: what
             `default_method` chooses there. The steps above take over where these lead nowhere.
-
-    Raises:
-        ValueError: an argument is outside its range.
     """
 
     needs: ClassVar[str] = "positive definite or P-matrix"

@@ -70,9 +70,6 @@ class MPRGP(Settings):
         gamma: Gamma > 0, how large the chopped gradient may be; larger: bounds are left later.
         patience: steps without a new least energy before monotone cycles are taken on a grid.
         cycle: how multigrid cycles go.
-
-    Raises:
-        ValueError: an argument is outside its range.
     """
 
     needs: ClassVar[str] = "A symmetric, positive semi-definite"

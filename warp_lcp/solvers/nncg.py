@@ -42,9 +42,6 @@ class NNCG(Settings):
         direction: of its sweeps, "forward", "backward" or "symmetric".
         omega: relaxation factor of its sweeps, in (0, 2).
         precision: "mixed" or "double" keep the iterate in float64, "single" rounds it to float32.
-
-    Raises:
-        ValueError: an argument is outside its range.
     """
 
     supports: ClassVar = (Relaxes, HasRows)

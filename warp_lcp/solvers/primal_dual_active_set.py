@@ -49,9 +49,6 @@ class PrimalDualActiveSet(Settings):
         eta: each linear solve reduces its residual by this factor, or to what the whole solve still needs.
         max_linear_iterations: the most conjugate-gradient iterations of one step.
         cycle: how multigrid cycles go.
-
-    Raises:
-        ValueError: an argument is outside its range.
     """
 
     needs: ClassVar[str] = "M-matrix, or P-matrix where dense"

@@ -32,9 +32,6 @@ class ProjectedJacobi(Settings):
         omega: damping > 0; min(1, 1.8 / lambda_max), estimated, if None. Without symmetry, lambda_max is that of A's symmetric part, which
             promises nothing; with a negative diagonal entry, 1.
         precision: "mixed" or "double" keep the iterate in float64, "single" rounds it to float32.
-
-    Raises:
-        ValueError: an argument is outside its range.
     """
 
     needs: ClassVar[str] = "symmetric positive (semi-)definite A for a proof of convergence; A_ii <= 0 case by case"

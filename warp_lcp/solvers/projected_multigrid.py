@@ -35,9 +35,6 @@ class ProjectedMultigrid(Settings):
         monotone_cycles: projected cycles of a cold start.
         patience: steps without a new least energy before monotone cycles are taken.
         cycle: how multigrid cycles go.
-
-    Raises:
-        ValueError: an argument is outside its range.
     """
 
     supports: ClassVar = (HasStencil, HasColumns)

@@ -45,9 +45,6 @@ class ProjectedSOR(Settings):
             "magnitude", the largest |x_i| first, or "greedy", in which a sweep is n times the row that would change most, O(n^2).
         permutation: rows of a matrix in the order of a sweep.
         precision: "mixed" or "double" keep the iterate in float64, "single" rounds it to float32.
-
-    Raises:
-        ValueError: an argument is outside its range.
     """
 
     supports: ClassVar = (Relaxes, HasRows)

@@ -31,9 +31,6 @@ class QuadraticProgram(Settings):
         tolerance: PIQP's absolute and relative tolerance, on the equilibrated problem; > 0. The loop's criteria are checked on
             the natural residual whatever PIQP says.
         max_iterations: the most iterations of PIQP, >= 1.
-
-    Raises:
-        ValueError: an argument is outside its range.
     """
 
     needs: ClassVar[str] = "symmetric, positive semi-definite, n <= 4096 unless sparse; the extra `peers`"

@@ -33,9 +33,6 @@ class Staggering(Settings):
         solvers: a method for each block; MinimumMapNewton for all if empty, one for all if it is a single one, in a list or not.
         eta: each solve of a block reduces its residual by this factor, or to what the whole one needs.
         max_block_iterations: the most steps in a block.
-
-    Raises:
-        ValueError: an argument is outside its range.
     """
 
     supports: ClassVar = (HasRows, HasFaces)

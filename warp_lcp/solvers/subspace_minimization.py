@@ -55,9 +55,6 @@ class SubspaceMinimization(Settings):
         backtracks: halvings of a correction; -1 takes all corrections as they come.
         precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate rounded to float32 as well.
         cycle: how multigrid cycles go.
-
-    Raises:
-        ValueError: an argument is outside its range.
     """
 
     supports: ClassVar = (Relaxes, HasRows)
