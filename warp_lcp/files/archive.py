@@ -135,16 +135,16 @@ class Archive:
         return found
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file and its stream."""
         self._file.close()
         self._stream.close()
 
     def __enter__(self) -> Self:
-        """Return the archive itself."""
+        """Return the open archive itself."""
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        """Close the file."""
+        """Close the file when the block ends."""
         self.close()
 
     def _check_members(self, size: int) -> None:

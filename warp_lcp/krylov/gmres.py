@@ -120,7 +120,7 @@ class GMRES:
         return {"basis": self._basis, "size": self._q.size}
 
     def _combine(self, factors: wp.array[Any], x: wp.array[Any], count: int, *, sign: float = 1.0) -> None:
-        """X += sign times the sum of factors_j v_j over the first `count` vectors; the last of the sums becomes x'x."""
+        """x += sign times the sum of factors_j v_j over the first `count` vectors; the last of the sums becomes x'x."""
         self._sums.of(COMBINE, self._restart + 1, **self._fields, factors=factors, x=x, count=count, sign=sign)
 
     def _stored(self, place: int) -> np.ndarray:
@@ -141,7 +141,7 @@ class GMRES:
         g[k], g[k + 1] = c * g[k], -s * g[k]
 
     def _correct(self, columns: int) -> None:
-        """X += M V y with y from the triangle; columns that are singular to rounding count for nothing."""
+        """x += M V y with y from the triangle; columns that are singular to rounding count for nothing."""
         H, g = self._H[:columns, :columns], self._g
         y = np.zeros(self._restart + 1)
         largest = float(np.abs(np.diag(H)).max(initial=0.0))

@@ -44,5 +44,5 @@ class KrylovSystem:
         return self._norm.of(self.r)
 
     def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
-        """Iterate."""
+        """Iterate from e = 0 until the norm is at most the tolerance; return iterations and the norm reached."""
         return self._krylov.solve(tolerance, max_iterations)

@@ -58,7 +58,7 @@ class DeviceMatrix:
         self.rows, self.operands = Rows.flat(self.shape[0], device), {"ptr": self.indptr, "col": self.indices, "a": self.values}
 
     def product(self, x: wp.array[Any], y: wp.array[Any], launch: Launch, *, add: bool = False) -> None:
-        """Y = A x, or y + A x."""
+        """y = A x, or y + A x."""
         PRODUCT.bind(self.rows, **self.operands, x=x, plus=y if add else None, y=y).launch(launch)
 
 
@@ -105,7 +105,7 @@ class AlgebraicLevel:
         )
 
     def sweep(self, y: wp.array[Any], x: wp.array[Any], omega: float, launch: Launch, *, from_zero: bool = False) -> None:
-        """Y = x + omega (b - A x) over the rows' l1 norms; x is taken for 0 if from_zero."""
+        """y = x + omega (b - A x) over the rows' l1 norms; x is taken for 0 if from_zero."""
         given = {"inverse": self.inverse, "x": x, "b": self.b, "y": y, "omega": omega, "from_zero": from_zero}
         SMOOTH.bind(self.A.rows, **self.A.operands, **given).launch(launch)
 
@@ -156,7 +156,7 @@ class AlgebraicHierarchy:
         self._coarsening.run()
 
     def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
-        """Q = M p."""
+        """q = M p, on the finest level."""
         self.levels[0].A.product(p, q, launch)
 
     @cached_property
@@ -167,7 +167,7 @@ class AlgebraicHierarchy:
         return program
 
     def apply(self) -> None:
-        """Cycle once."""
+        """Cycle once: run `program`."""
         self.program.run()
 
     @cached_property

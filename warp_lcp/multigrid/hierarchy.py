@@ -125,7 +125,7 @@ class Level:
     def sweep(
         self, y: wp.array[Any], x: wp.array[Any], omega: float, *, projected: bool, from_zero: bool = False, launch: Launch = wp.launch
     ) -> None:
-        """Y = x + omega D^-1 (b - A x), clipped to the bounds if projected; x is taken for 0 if from_zero."""
+        """y = x + omega D^-1 (b - A x), clipped to the bounds if projected; x is taken for 0 if from_zero."""
         s = self.stencil
         if not from_zero:
             s.wrap(x, launch=launch)

@@ -73,12 +73,12 @@ class DenseOperator(Pickled):
         self.symmetric = is_rounding(host - host.T, largest[:, None], largest)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the matrix."""
+        """Pickle the matrix as it is now."""
         return made_again(DenseOperator, self.matrix.numpy(), device=self.device, dtype=self.dtype)
 
     @property
     def unknowns(self) -> int:
-        """Number of rows."""
+        """Number of rows, which are all unknowns."""
         return self.shape[0]
 
     def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
@@ -86,7 +86,7 @@ class DenseOperator(Pickled):
         return self._product(x, out, transposed=False)
 
     def apply_transpose(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
-        """Return A' x."""
+        """Return A' x, x as for `apply`."""
         return self._product(x, out, transposed=True)
 
     def diagonal(self) -> wp.array[Any]:

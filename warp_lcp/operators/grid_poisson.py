@@ -151,7 +151,7 @@ class GridPoisson(Pickled):
     apply_transpose = apply  # A is symmetric
 
     def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
-        """Out = A x + b in one pass; stored fields of one type."""
+        """out = A x + b in one pass; stored fields of one type."""
         self.stencil.product(x, out, plus=b)
 
     def relax(self, x: Any, b: Any, lower: Any, upper: Any, omega: float, *, forward: bool = True) -> None:
@@ -208,7 +208,7 @@ class GridPoisson(Pickled):
 
     @property
     def unknowns(self) -> int:
-        """Number of FLUID cells."""
+        """Number of FLUID cells, those of ghosts not counted."""
         return int(np.count_nonzero(self.cells.numpy()[1:-1, 1:-1, 1:-1] == FLUID))
 
     def _stored_face(self, face: Face, axis: int) -> wp.array[Any]:

@@ -19,7 +19,7 @@ from warp_lcp.rows.vectors import Reduction
 
 @wp.kernel(enable_backward=False, module="warp_lcp.low_rank")
 def weigh_kernel(weights: wp.array2d(dtype=wp.float64), c: wp.array(dtype=wp.float64), out: wp.array(dtype=wp.float64)):
-    """Out = W c, c's first entries."""
+    """out = W c, c's first entries."""
     i = wp.tid()
     s = wp.float64(0.0)
     for j in range(weights.shape[1]):
@@ -118,7 +118,7 @@ class BlockColumns:
         self, factors: wp.array[Any], base: wp.array[Any], out: wp.array[Any], *, mask: wp.array[Any] | None = None,
         sign: float = 1.0, fused: bool = True, launch: Launch = wp.launch,
     ) -> None:  # fmt: skip
-        """Out = base + sign U f on U's rows; other rows of `out` stay as they are, and so do those where `mask` is 0.
+        """out = base + sign U f on U's rows; other rows of `out` stay as they are, and so do those where `mask` is 0.
 
         `fused`: products are rounded with the sums that they are added to.
         """
@@ -126,7 +126,7 @@ class BlockColumns:
         SCATTER.bind(self._each, **self.entry_fields, **given).launch(launch)
 
     def add_diagonal(self, weights: wp.array[Any], out: wp.array[Any]) -> None:
-        """Out += the diagonal of U W U', W of shape (rank * rank,)."""
+        """out += the diagonal of U W U', W of shape (rank * rank,)."""
         DIAGONAL.bind(self._each, **self.entry_fields, rank=self.rank, weights=weights, result=out).launch()
 
     @property
@@ -243,7 +243,7 @@ class LowRankOperator(Pickled):
         self, x: wp.array[Any], base: wp.array[Any], out: wp.array[Any], *, mask: wp.array[Any] | None = None, transposed: bool = False,
         launch: Launch = wp.launch,
     ) -> None:  # fmt: skip
-        """Out = base + U W U' x on U's rows where `mask` (uint8) is not 0; other rows of `out` stay. All are flat stored fields."""
+        """out = base + U W U' x on U's rows where `mask` (uint8) is not 0; other rows of `out` stay. All are flat stored fields."""
         W = self._transposed if transposed else self.weights
         launch(weigh_kernel, self.rank, [W, self.columns.gather(x, launch=launch), self._weighed], device=self.device)
         self.columns.scatter(self._weighed, base, out, mask=mask, launch=launch)

@@ -97,17 +97,17 @@ class SparseOperator(Pickled):
         self._take(host)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the matrix."""
+        """Pickle the matrix as it is now."""
         return made_again(SparseOperator, self.matrix(), device=self.device, dtype=self.dtype)
 
     @property
     def unknowns(self) -> int:
-        """Number of rows."""
+        """Number of rows, which are all unknowns."""
         return self.shape[0]
 
     @property
     def nnz(self) -> int:
-        """Number of stored entries."""
+        """Number of stored entries, zeros among them."""
         return int(self.values.size)
 
     @cached_property
@@ -163,11 +163,11 @@ class SparseOperator(Pickled):
         return out
 
     def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
-        """Out = A x + b in one pass; fields of one type."""
+        """out = A x + b in one pass; fields of one type."""
         self.product(x, out, plus=b)
 
     def product(self, x: wp.array[Any], out: wp.array[Any], plus: wp.array[Any] | None = None, *, launch: Launch = wp.launch) -> None:
-        """Out = A x, or A x + plus; kernel launches only."""
+        """out = A x, or A x + plus; kernel launches only."""
         PRODUCT.bind(Rows.flat(x.size, self.device), **self._rows, x=x, plus=plus, y=out).launch(launch)
 
     def diagonal(self) -> wp.array[Any]:

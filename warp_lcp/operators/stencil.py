@@ -191,7 +191,7 @@ class Stencil:
         return [Rows.edge(self.padding, self.device, axis) for axis in range(3)]
 
     def product(self, x: wp.array[Any], out: wp.array[Any], plus: wp.array[Any] | None = None, *, launch: Launch = wp.launch) -> None:
-        """Out = A x, or A x + plus. All of one float type; rows that are no unknowns give 0 (or plus)."""
+        """out = A x, or A x + plus. All of one float type; rows that are no unknowns give 0 (or plus)."""
         self.wrap(x, launch=launch)
         PRODUCT.bind(self.rows, stencil=self, x=x, b=plus, y=out).launch(launch)
 

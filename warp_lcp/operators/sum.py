@@ -63,12 +63,12 @@ class SumOperator(Pickled):
             self.grid, self.low = self._plain, self._low
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the terms."""
+        """Pickle the terms as they are now."""
         return SumOperator, (self.first, self.second)
 
     @property
     def symmetric(self) -> bool:
-        """Whether both terms are."""
+        """Whether both terms are symmetric now."""
         return self.first.symmetric and self.second.symmetric
 
     @property
@@ -94,7 +94,7 @@ class SumOperator(Pickled):
         return None if grid_and_low_rank(self) is None else self.layout.load(self.diagonal(), self.dtype).numpy()
 
     def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
-        """Out = A x + B x + b; flat stored fields of one type."""
+        """out = A x + B x + b; flat stored fields of one type."""
         plain, low = self._plain, self._low
         if isinstance(low, LowRankOperator) and has(plain, AppliesPlus):
             plain.apply_plus(x, b, out)

@@ -37,7 +37,7 @@ def bound_at(S: AffineSide, x: f64, i: int):
 @no_type_check
 @wp.kernel(enable_backward=False, module="warp_lcp.affine_bounds")
 def evaluate_kernel(S: AffineSide, x: f64, out: f64):
-    """Bounds at x."""
+    """Write the bounds at x, an unknown a thread."""
     i = wp.tid()
     out[i] = bound_at(S, x, i)
 
@@ -67,7 +67,7 @@ class AffineBounds:
     coefficient: Any
 
     def __post_init__(self) -> None:
-        """Broadcast and check."""
+        """Broadcast numbers to the shape of `index`, and check all."""
         index = np.asarray(self.index)
         if not np.issubdtype(index.dtype, np.integer):
             raise ValueError(f"index has type {index.dtype}: expected integers")

@@ -101,16 +101,16 @@ class LCP(Pickled):
 
     @cached_property
     def lower(self) -> wp.array[Any]:
-        """L as a stored field, float64."""
+        """l as a stored field, float64."""
         return self.bounds.as_field(0)
 
     @cached_property
     def upper(self) -> wp.array[Any]:
-        """U as a stored field, float64."""
+        """u as a stored field, float64."""
         return self.bounds.as_field(1)
 
     def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
-        """Out = A x + b, flat stored fields of one type: in one pass where the operator has it."""
+        """out = A x + b, flat stored fields of one type: in one pass where the operator has it."""
         if has(self.A, AppliesPlus):
             self.A.apply_plus(x, b, out)
             return

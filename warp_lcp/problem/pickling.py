@@ -35,7 +35,7 @@ class FieldsOnHost(Pickled):
     """A dataclass that pickles its fields, device arrays as host arrays."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the fields."""
+        """Pickle the fields in their order, as arguments."""
         values = [getattr(self, field.name) for field in dataclasses.fields(self)]  # type: ignore[arg-type]
         return type(self), tuple(OnHost(v) if isinstance(v, wp.array) else v for v in values)
 

@@ -153,7 +153,7 @@ class AppliesPlus(Operator, Protocol):
     """A x + b in one pass: saves each residual one over memory."""
 
     def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
-        """Out = A x + b; flat stored fields of one type."""
+        """out = A x + b; flat stored fields of one type."""
 
 
 class HasScale(Operator, Protocol):

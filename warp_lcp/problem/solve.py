@@ -36,12 +36,12 @@ class Precision(StrEnum):
 
     @property
     def iterate(self) -> Any:
-        """Type of the iterate."""
+        """Warp's type of the iterate."""
         return wp.float32 if self is Precision.SINGLE else wp.float64
 
     @property
     def correction(self) -> Any:
-        """Type of corrections."""
+        """Warp's type of corrections."""
         return wp.float64 if self is Precision.DOUBLE else wp.float32
 
     @property
@@ -303,7 +303,7 @@ class _Loop:
         return wp.clone(stored) if stored.ptr == self.work.x.ptr else stored
 
     def _take(self, guess: wp.array[Any]) -> None:
-        """Start from a guess."""
+        """Start from a guess, projected onto the bounds."""
         wp.copy(self.work.x, guess)
         self.residual.start(self.work.x, keep=True)
         self.work.round_iterate()

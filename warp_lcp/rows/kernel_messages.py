@@ -44,7 +44,7 @@ class KernelMessages:
             )  # fmt: skip
 
     def warning(self, message: str, category: type[Warning] | None = None, stacklevel: int = 1) -> None:
-        """Pass a message on."""
+        """Pass a warning on, at its caller's place."""
         self._logger.warning(message, category, stacklevel=stacklevel + 1)
 
 

@@ -26,7 +26,7 @@ class Launch(Protocol):
     """Launches a kernel now, as `wp.launch` does, or records it, as `Program.launch` does."""
 
     def __call__(self, kernel: Any, dim: Any, inputs: Any, *, device: Any, block_dim: int = ...) -> Any:
-        """Launch or record."""
+        """Launch the kernel now, or record its launch."""
 
 
 class Task:
@@ -69,7 +69,7 @@ class Program:
         return len(self._commands)
 
     def launch(self, kernel: Any, dim: Any, inputs: Any, *, device: Any, block_dim: int = 256) -> None:
-        """Record a launch."""
+        """Record a launch, and keep its arguments alive."""
         self._arguments.append(inputs)
         self._commands.append(wp.launch(kernel, dim, inputs, device=device, block_dim=block_dim, record_cmd=True))
 
@@ -83,7 +83,7 @@ class Program:
         self._arguments += other._arguments
 
     def run(self) -> None:
-        """Launch everything once."""
+        """Launch everything once, as a graph where one has been made."""
         if self._graph is not None:
             wp.capture_launch(self._graph)
             return

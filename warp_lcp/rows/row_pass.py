@@ -383,7 +383,7 @@ class Bound(NamedTuple):
 
     @property
     def layout(self) -> Any:
-        """Where the rows are."""
+        """Where the rows are, for a pass that sums or one that does not."""
         return self.rows.summed if self.form.declared.sums else self.rows.single
 
     def launch(self, launch: Any = None) -> None:

@@ -103,7 +103,7 @@ class Reduction:
             perform(partial(_add_across, self._across, self.scalars, slice(slot, slot + columns)), launch)
 
     def dot(self, a: wp.array[Any], b: wp.array[Any], slot: int, *, launch: Launch = wp.launch) -> None:
-        """Write a.b to scalars[slot]."""
+        """Write the inner product a.b to scalars[slot]."""
         DOT.bind(rows_of(a), a=a, b=b, out=self.partials).launch(launch)
         self.add_up(slot, launch=launch)
 
@@ -144,7 +144,7 @@ def rows_of(field: wp.array[Any]) -> Rows:
 
 
 def convert(a: wp.array[Any], b: wp.array[Any]) -> None:
-    """B = a, between float types."""
+    """b = a, between float types."""
     if a.dtype is b.dtype:
         wp.copy(b, a)
     else:

@@ -45,44 +45,6 @@ class GridLines(Enum):
     Z = 2
 
 
-class LineSweep:
-    """Solves the lines of a grid, those of one color of a checkerboard after those of the other.
-
-    A line is a tridiagonal M-matrix with bounds; its active set is changed until none is wrong, each change a tridiagonal solve.
-
-    Args:
-        problem: on a grid.
-        axis: of the lines.
-        omega: relaxation factor.
-
-    Raises:
-        ValueError: the lines are periodic, or another periodic side has an odd number of cells.
-    """
-
-    def __init__(self, problem: LCP, axis: GridLines, omega: float) -> None:
-        A = problem.A
-        assert has(A, HasStencil)
-        if A.periodic[axis.value]:
-            raise ValueError(f"blocks = {axis}: lines along a periodic axis have no ends; take another axis")
-        check_colors(problem)
-        self.problem, padding = problem, A.layout.padding
-        strides, counts = (1, padding.row, padding.plane), tuple(reversed(padding.counts))
-        a, b = (other for other in (2, 1, 0) if other != axis.value)
-        self._lines = Rows.strided(padding.size, problem.device, (sum(strides), strides[a], strides[b]), (counts[a], counts[b], 1))
-        zeros, numbers = problem.layout.zeros, {"AXIS": axis.value, "cells": counts[axis.value], "most": CHANGES, "omega": omega}
-        memory = {name: zeros(f64) for name in ("c", "q", "z")} | {"s": zeros(wp.uint8)}
-        self._given: dict[str, Any] = memory | numbers | {"s1": padding.plane, "s2": padding.row}
-
-    def run(self, x: wp.array[Any], *, forward: bool) -> None:
-        """Sweep."""
-        p = self.problem
-        stencil = p.A.stencil  # type: ignore[attr-defined]
-        p.bounds.follow(x)
-        for color in (0, 1) if forward else (1, 0):
-            stencil.wrap(x)
-            SOLVE_LINE.bind(self._lines, stencil=stencil, x=x, b=p.b, l=p.lower, u=p.upper, color=color, **self._given).launch()
-
-
 @dataclass(frozen=True, kw_only=True)
 class BlockedGaussSeidel(Settings):
     """Solve blocks of unknowns in turn, the others held ([Book] 2.2.3).
@@ -197,16 +159,43 @@ class BlockWorkspace(SweepWorkspace):
 
 
 class LineWorkspace(SweepWorkspace):
-    """Memory of sweeps over a grid's lines."""
+    """Memory of sweeps over a grid's lines, those of one color of a checkerboard after those of the other.
+
+    A line is a tridiagonal M-matrix with bounds; its active set is changed until none is wrong, each change a tridiagonal solve.
+
+    Args:
+        problem: on a grid.
+        axis: of the lines.
+        settings: the method.
+
+    Raises:
+        ValueError: the lines are periodic, or another periodic side has an odd number of cells.
+    """
 
     def __init__(self, problem: LCP, axis: GridLines, settings: BlockedGaussSeidel) -> None:
         super().__init__(problem, settings.precision)
-        self._lines = LineSweep(problem, axis, settings.omega)
+        A = problem.A
+        assert has(A, HasStencil)
+        if A.periodic[axis.value]:
+            raise ValueError(f"blocks = {axis}: lines along a periodic axis have no ends; take another axis")
+        check_colors(problem)
+        padding = A.layout.padding
+        strides, counts = (1, padding.row, padding.plane), tuple(reversed(padding.counts))
+        a, b = (other for other in (2, 1, 0) if other != axis.value)
+        self._lines = Rows.strided(padding.size, problem.device, (sum(strides), strides[a], strides[b]), (counts[a], counts[b], 1))
+        zeros, numbers = problem.layout.zeros, {"AXIS": axis.value, "cells": counts[axis.value], "most": CHANGES, "omega": settings.omega}
+        memory = {name: zeros(f64) for name in ("c", "q", "z")} | {"s": zeros(wp.uint8)}
+        self._given: dict[str, Any] = memory | numbers | {"s1": padding.plane, "s2": padding.row}
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """The stencil is the operator's own."""
         self.contraction.start(self.x)
 
     def run(self, x: wp.array[Any], *, forward: bool) -> None:
-        """Solve each line once."""
-        self._lines.run(x, forward=forward)
+        """Solve the lines of one color, then those of the other."""
+        p = self.problem
+        stencil = p.A.stencil  # type: ignore[attr-defined]
+        p.bounds.follow(x)
+        for color in (0, 1) if forward else (1, 0):
+            stencil.wrap(x)
+            SOLVE_LINE.bind(self._lines, stencil=stencil, x=x, b=p.b, l=p.lower, u=p.upper, color=color, **self._given).launch()

@@ -72,7 +72,7 @@ class DenseProblem:
         return DenseProblem(self.rows, scaled(self.A, R, C), b / beta, self.lower / units, self.upper / units, self.symmetric), units
 
     def _units(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return R and C."""
+        """Return R and C of `scaled`, powers of 2."""
         if not self.symmetric:
             return unit_rows_and_columns(self.A)
         S = equilibration(self.A)

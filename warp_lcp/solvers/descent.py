@@ -112,7 +112,7 @@ class NonmonotoneSearch:
     merits: list[float] = field(default_factory=list)
 
     def forget(self) -> None:
-        """Begin anew."""
+        """Forget the merits of the last solve."""
         self.merits.clear()
 
     def remember(self, merit: float) -> None:

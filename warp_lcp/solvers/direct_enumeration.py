@@ -45,7 +45,7 @@ class DirectEnumeration:
         return DenseWorkspace(problem)
 
     def step(self, problem: LCP, work: DenseWorkspace, x: wp.array[Any]) -> Step:
-        """Try all sets."""
+        """Try all sets, and take the best one's x."""
         candidates, measures = _candidates(work.data)
         best = int(measures.argmin())
         if measures[best] <= ACCEPTED[wp.float64]:

@@ -55,11 +55,11 @@ class GradientDescent(Settings):
     precision: PrecisionName = "double"
 
     def init(self, problem: LCP) -> DescentWorkspace:
-        """Return a workspace."""
+        """Return memory for the problem, any operator's."""
         return DescentWorkspace(problem, self)
 
     def step(self, problem: LCP, work: DescentWorkspace, x: wp.array[Any]) -> Step:
-        """Go down once."""
+        """Go down along the projected path of the gradient once."""
         return work.descend(x)
 
 
@@ -82,7 +82,7 @@ class DescentWorkspace(IterateMemory):
         self.length, self._square = 1.0, 0.0
 
     def start(self, *, warm: bool, tolerance: float) -> None:
-        """Forget the last length."""
+        """Forget the last length and merits; b may have changed."""
         self.length, self._square = 1.0, 0.0
         self._search.forget()
         self._map.begin()

@@ -8,7 +8,7 @@ from typing import no_type_check
 import numpy as np
 import warp as wp
 
-from warp_lcp.krylov.conjugate_gradient import GROWTH
+from warp_lcp.krylov.conjugate_gradient import first_iteration, next_iteration
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.stencil import Stencil
 from warp_lcp.rows import RowPass, Wave
@@ -18,12 +18,8 @@ from warp_lcp.solvers import projected_multigrid_kernels as engine
 from warp_lcp.solvers.projected_multigrid_kernels import BETA, CARRY, NORM, SIZE, STEP
 from warp_lcp.solvers.projected_multigrid_kernels import SLOTS as STEP_SLOTS
 
-# slots of the device scalars after those of a step
-SQUARE = wp.constant(STEP_SLOTS)  # of the carried residual's norm
-TOLERANCE = wp.constant(STEP_SLOTS + 1)
-BEST = wp.constant(STEP_SLOTS + 2)  # the least norm so far
-ITERATIONS = wp.constant(STEP_SLOTS + 3)  # done, and the most allowed
-LIMIT = wp.constant(STEP_SLOTS + 4)
+SQUARE = wp.constant(STEP_SLOTS)  # slots of the device scalars after those of a step: from the carried residual's square on
+ITERATIONS = wp.constant(STEP_SLOTS + 3)
 SLOTS = STEP_SLOTS + 5
 
 HEADERS = Path(__file__).parent / "headers"
@@ -47,23 +43,15 @@ def begin_grid_kernel(scalars: f64, going: wp.array(dtype=int), tolerance: wp.fl
     scalars[CARRY] = wp.float64(0.0)
     scalars[NORM] = wp.float64(0.0)
     scalars[SIZE] = wp.float64(1.0)
-    scalars[SQUARE] = wp.float64(wp.inf)
-    scalars[BEST] = wp.float64(wp.inf)
-    scalars[TOLERANCE] = tolerance
-    scalars[ITERATIONS] = wp.float64(0.0)
-    scalars[LIMIT] = wp.float64(limit)
-    going[0] = wp.where(limit > 0, 1, 0)
+    going[0] = first_iteration(scalars, SQUARE, tolerance, limit)
 
 
 @no_type_check
 @wp.kernel(enable_backward=False, module="warp_lcp.grid_conjugate_gradient")
 def end_grid_kernel(scalars: f64, going: wp.array(dtype=int)):
     """After an iteration: decide whether to go on."""
-    scalars[ITERATIONS] += wp.float64(1.0)
-    norm = wp.sqrt(scalars[SQUARE])
-    enough = norm <= scalars[TOLERANCE] or norm >= GROWTH * scalars[BEST] or scalars[ITERATIONS] >= scalars[LIMIT]
-    going[0] = wp.where(enough or not wp.isfinite(norm) or scalars[STEP] == wp.float64(0.0), 0, 1)
-    scalars[BEST] = wp.min(scalars[BEST], norm)
+    more = next_iteration(scalars, SQUARE)
+    going[0] = wp.where(scalars[STEP] == wp.float64(0.0), 0, more)
 
 
 class GridConjugateGradient:

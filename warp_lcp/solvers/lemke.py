@@ -46,7 +46,7 @@ class LemkeForm:
 
     @classmethod
     def of(cls, data: DenseProblem) -> LemkeForm:
-        """Reformulate a boxed problem."""
+        """Return the form of a boxed problem; of a sparse one whose rows are all one-sided, too."""
         if scipy.sparse.issparse(data.A):
             return cls._of_one_sided(data)
         A, lower, upper, n = data.A, data.lower, data.upper, len(data.b)
@@ -94,7 +94,7 @@ class LemkeForm:
         return cls((S @ data.A @ S).tocsr(), S @ data.affine(base), base, S)
 
     def solution(self, z: np.ndarray) -> np.ndarray:
-        """Return x."""
+        """Return x, shape (n,), for z of shape (m,)."""
         return self.base + self.map @ z
 
 
@@ -144,7 +144,7 @@ class BandedFactors:
         return bool(info == 0 and self._denominator != 0 and np.isfinite(self._update).all())
 
     def column(self, j: int) -> np.ndarray:
-        """Return -M_j."""
+        """Return -M_j, shape (m,), from the bands."""
         column, first, last = np.zeros(self.m), max(j - self.k, 0), min(j + self.k + 1, self.m)
         column[first:last] = self._bands[2 * self.k + first - j : 2 * self.k + last - j, j]
         return column
@@ -335,7 +335,7 @@ class BandedBasis(Basis):
         self.missing, self.regular = -1, True  # the pair both of whose variables are out, once z0 is in
 
     def refresh(self) -> None:
-        """The factors are fresh."""
+        """Nothing to do: factors are made at each pivot."""
 
     def _rows_of_inverse(self, rows: np.ndarray) -> np.ndarray:
         return self.factors.rows(rows) if self.missing >= 0 else np.eye(self.m)[rows]
@@ -395,7 +395,7 @@ class LemkeWorkspace(DenseWorkspace):
 
     @property
     def held(self) -> int:
-        """Unknowns at a bound."""
+        """Number of unknowns at a bound."""
         x = self.read_iterate()
         return int(np.count_nonzero((x <= self.data.lower) | (x >= self.data.upper)))
 

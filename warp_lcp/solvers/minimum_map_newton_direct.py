@@ -42,7 +42,7 @@ class SmallMatrix:
         self._host = A.matrix().toarray() if isinstance(A, SparseOperator) else A.matrix.numpy().astype(np.float64, copy=False)
 
     def product(self, x: np.ndarray) -> np.ndarray:
-        """Return A x."""
+        """Return A x, shape (n,), on the host."""
         return self._host @ x
 
     def solve(self, free: np.ndarray, r: np.ndarray) -> np.ndarray | None:
@@ -91,7 +91,7 @@ class BandedMatrix:
         self._size, self._own = sizes.max(), np.where(sizes > 0, sizes, 1.0)
 
     def product(self, x: np.ndarray) -> np.ndarray:
-        """Return A x."""
+        """Return A x, shape (n,), on the host."""
         n, k = len(x), self.width
         return scipy.linalg.blas.dgbmv(n, n, k, k, 1.0, self._by_columns, x)
 
@@ -176,11 +176,11 @@ class HostResidual(NaturalResidual):
         return self._values
 
     def host_y(self) -> np.ndarray:
-        """Return y's memory."""
+        """Return y's memory on the host, shape (n,)."""
         return self._y
 
     def norm_of_b(self) -> float:
-        """Return ||b||."""
+        """Return ||b||, by NumPy."""
         return math.sqrt(self.b @ self.b)
 
 
@@ -213,11 +213,11 @@ class DirectNewtonWorkspace(IterateMemory):
         self._kept = self._read(self.x).copy()
 
     def restore(self) -> None:
-        """Take x back."""
+        """Make x the best iterate again."""
         self._write(self.x, self._kept)
 
     def start(self, *, warm: bool, tolerance: float) -> None:
-        """Forget the sets."""
+        """Forget the sets, and read the bounds as they are now."""
         self._warm, self._target, self.rest = warm, tolerance, None
         residual, bounds, self._b = self.residual, self.problem.bounds, self.problem.b.numpy()
         if isinstance(residual, HostResidual):

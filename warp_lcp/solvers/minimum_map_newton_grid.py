@@ -38,7 +38,7 @@ class MinimumMapResidual(AssessedResidual):
 
     @property
     def away(self) -> bool:
-        """Read it."""
+        """Whether held unknowns are not at their bounds, on any rank; read back."""
         found, across = bool(self._away.numpy().any()), self.problem.layout.across
         return found if across is None else across.any(found)
 

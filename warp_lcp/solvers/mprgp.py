@@ -334,7 +334,7 @@ class MPRGPWorkspace(IterateMemory):
         return next(f for f in self._fields if f is not self._best and f is not self.x)
 
     def _advance(self, origin: wp.array[Any], direction: wp.array[Any], length: float, target: wp.array[Any]) -> None:
-        """X = clip(origin + length direction, l, u)."""
+        """x = clip(origin + length direction, l, u)."""
         passes.move(self.residual.rows, self.problem.bounds.operands, origin, direction, length, target)
         self._settle(target)
 
@@ -363,7 +363,7 @@ class MPRGPWorkspace(IterateMemory):
         return float(gaps.min())
 
     def _product(self, direction: wp.array[Any]) -> None:
-        """Q = A times a direction."""
+        """q = A times a direction."""
         A, shape = self.problem.A, self.problem.layout.stored_shape
         if self.is_grid:
             A.stencil.product(direction, self._q)  # type: ignore[attr-defined]

@@ -92,7 +92,7 @@ class NNCGWorkspace(SweepWorkspace):
         self._sums = Sums(rows_of(self.x), slots=2)
 
     def start(self, *, warm: bool, tolerance: float) -> None:
-        """Forget the direction."""
+        """Forget the direction; the operator may have changed."""
         super().start(warm=warm, tolerance=tolerance)
         self._sums.scalars.zero_()
         self.p.zero_()

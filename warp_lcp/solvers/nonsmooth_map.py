@@ -129,7 +129,7 @@ class NonsmoothMap:
         self._numbers = {"share": self._share, "over": float(1 / scale), "kinks": float(KINK * scale), "seed": 0}
 
     def merit(self, x: wp.array[Any]) -> float:
-        """Return f.f / 2."""
+        """Return f.f / 2 at x, where the residual was evaluated."""
         return self._half_sum(MERIT, x)
 
     def values(self, x: wp.array[Any], out: wp.array[Any]) -> None:
@@ -200,7 +200,7 @@ class NonsmoothMap:
 
     @property
     def direction(self) -> wp.array[Any]:
-        """What `descend` wrote."""
+        """The gradient that `descend` wrote last."""
         return self._gradients[0]
 
     def advance(self, base: wp.array[Any], e: wp.array[Any], scale: float, x: wp.array[Any], *, projected: bool) -> None:

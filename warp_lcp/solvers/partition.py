@@ -94,7 +94,7 @@ class MatrixBlock:
         self._version = version_of(whole.A)
 
     def refresh(self) -> None:
-        """Take A's entries again."""
+        """Take A's entries again where they have changed."""
         A, version = self.problem.A, version_of(self._whole.A)
         if isinstance(A, SparseOperator) and version == self._version:
             return
@@ -114,11 +114,11 @@ class MatrixBlock:
             field.assign(source.numpy()[rows])
 
     def guess(self) -> wp.array[Any]:
-        """Return x_B."""
+        """Return x_B, a copy on the device."""
         return wp.array(self._x.numpy()[self._rows], dtype=wp.float64, device=self._whole.device)
 
     def accept(self, result: SolveResult) -> None:
-        """Write x_B."""
+        """Write a block's x_B to the common iterate."""
         values = self._x.numpy()
         values[self._rows] = result.x.numpy()
         self._x.assign(values)
@@ -186,7 +186,7 @@ class GridBlock:
         return self._guess
 
     def accept(self, result: SolveResult) -> None:
-        """Write x_B."""
+        """Write a block's x_B to the common iterate."""
         SELECT.bind(rows_of(self._x), x=result.x.flatten(), less=None, member=self._member, target=self._x, kept=True).launch()
 
     def _cells(self) -> np.ndarray:

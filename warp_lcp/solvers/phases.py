@@ -184,7 +184,7 @@ class GradientPhase:
         self._inner = Inner(method, problem, MPRGPWorkspace(problem, method, system))
 
     def start(self, x: wp.array[Any], floating: Any, tolerance: float) -> None:
-        """Begin at x."""
+        """Begin at x; `floating` are the operator's floating components."""
         work, self._tolerance = self._inner.work, tolerance
         work.floating = floating
         work.residual.start(work.x, keep=False)
@@ -322,29 +322,27 @@ class InteriorSteps:
         from warp_lcp.solvers.interior_point import InteriorPoint  # which knows the active-set methods
 
         self._problem, self._residual, self._tolerance = problem, residual, tolerance
-        self._method = InteriorPoint(precision="double")
-        self._work = work = self._method.init(problem)
-        work.residual.start(work.x, keep=False)
-        work.residual.evaluate(work.x)
-        work.start(warm=False, tolerance=tolerance)
+        self._inner = Inner(InteriorPoint(precision="double"), problem)
+        self._inner.work.residual.start(self._inner.work.x, keep=False)
+        self._inner.begin(self._inner.work.x, tolerance, warm=False)
         self._smallest, self._idle = math.inf, 0
         self._begun: wp.array[Any] | None = None
         self._next: ProximalPoint | None = None
 
     def step(self, x: wp.array[Any]) -> Step:
-        """Take one step."""
+        """Take one step, and write the iterate to x."""
         if self._next is not None:
             return self._next.step(x)
         if self._begun is None:
             self._begun = wp.clone(x)
-        step = self._method.step(self._problem, self._work, self._work.x)
+        step = self._inner.step()
         if step.failure is SolveStatus.INFEASIBLE:
             return step
-        norm = self._work.residual.norm
+        norm = self._inner.work.residual.norm
         self._idle = 0 if norm <= FALL * self._smallest else self._idle + 1
         self._smallest = min(norm, self._smallest)
         over = step.failure is not None or self._idle >= PATH_IDLE
-        wp.copy(x, self._begun if over else self._work.x)
+        wp.copy(x, self._begun if over else self._inner.work.x)
         if over:
             self._residual.evaluate(x)
             self._next = ProximalPoint(self._problem, self._residual, self._tolerance)

@@ -125,7 +125,7 @@ class GridSystem(KrylovSystem):
         return self.hierarchy.cycle
 
     def apply(self) -> None:
-        """Precondition."""
+        """Precondition: run `program`."""
         self.program.run()
 
     def monotone_cycle(self) -> None:
@@ -200,11 +200,11 @@ class DenseSystem:
         self._shift = None if shift is None else shift.numpy()[self._free].astype(np.float64)
 
     def norm(self) -> float:
-        """Return ||r||."""
+        """Return ||r||, plain for matrices solved directly."""
         return float(np.linalg.norm(self.r.numpy()))
 
     def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
-        """Factor and solve."""
+        """Factor the free block and solve, whatever the tolerance."""
         free, r, e = self._free, self.r.numpy(), np.zeros(self.e.size)
         norm = 0.0
         if free.size:
@@ -243,7 +243,7 @@ class DiagonalSystem(KrylovSystem):
         self.refresh()
 
     def refresh(self) -> None:
-        """Take the diagonal again."""
+        """Take the diagonal of A again; entries may have changed."""
         self._own = self._layout.load(self._A.diagonal().numpy(), wp.float64)
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:

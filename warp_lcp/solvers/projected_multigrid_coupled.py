@@ -46,7 +46,7 @@ class CoupledResidual(AssessedResidual):
         super().start(x, keep=keep)
 
     def assess(self, x: wp.array[Any], *, launch: Launch = wp.launch) -> None:
-        """Launch the evaluation."""
+        """Launch the evaluation, of b + U W U' x first."""
         self._low.add(x, self.problem.b, self._b, launch=launch)
         self._at = x
         super().assess(x, launch=launch)

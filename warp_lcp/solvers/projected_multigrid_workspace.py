@@ -75,7 +75,7 @@ class AssessedResidual(NaturalResidual):
         return self.read()
 
     def assess(self, x: wp.array[Any], *, launch: Launch = wp.launch) -> None:
-        """Launch the evaluation."""
+        """Launch the evaluation at x; `read` has what it finds."""
         self._A.stencil.wrap(x, launch=launch)
         kernels.ADVANCE.launch(None, self._assessing(x), launch=launch)
         self.sums.add_up(int(kernels.NORM), columns=4, launch=launch)
@@ -123,7 +123,7 @@ class AssessedResidual(NaturalResidual):
         return self.norm
 
     def set(self, slot: int, value: float) -> None:
-        """Write a scalar."""
+        """Write a scalar to its slot on the device."""
         self.scalars[int(slot) : int(slot) + 1].fill_(value)
 
 
@@ -406,7 +406,7 @@ class MultigridWorkspace(IterateMemory):
         self.residual.classify = self._cycles_left == 0
 
     def _forget(self) -> None:
-        """Drop the search direction."""
+        """Let the next step begin without a search direction."""
         self.residual.set(kernels.CARRY, 0.0)
 
     def _project(self) -> None:

@@ -58,7 +58,7 @@ class ProjectedSOR(Settings):
     precision: PrecisionName = "mixed"
 
     def __post_init__(self) -> None:
-        """Check the settings."""
+        """Check the settings; a permutation may be any sequence."""
         if self.permutation is not None:
             object.__setattr__(self, "permutation", tuple(int(i) for i in self.permutation))
         super().__post_init__()

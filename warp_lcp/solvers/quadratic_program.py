@@ -57,7 +57,7 @@ class QuadraticProgram(Settings):
         return work
 
     def step(self, problem: LCP, work: QuadraticProgramWorkspace, x: wp.array[Any]) -> Step:
-        """Solve the quadratic program."""
+        """Solve the quadratic program as a whole."""
         iterations = work.minimize(self.tolerance, self.max_iterations)
         values = work.read_iterate()
         held = (values <= work.data.lower) | (values >= work.data.upper)

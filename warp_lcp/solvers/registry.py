@@ -35,7 +35,7 @@ class Methods(dict[str, type[Any]]):
     """Methods by their names; an unknown one's KeyError says which there are."""
 
     def __missing__(self, name: str) -> type[Any]:
-        """Refuse the name."""
+        """Refuse a name that no method has."""
         raise KeyError(f"no method is called {name!r}: {nearest(str(name), self)}")
 
 

@@ -62,7 +62,7 @@ class Staggering(Settings):
         return StaggeringWorkspace(problem, rows, solvers, eta=self.eta, max_iterations=self.max_block_iterations)
 
     def step(self, problem: LCP, work: StaggeringWorkspace, x: wp.array[Any]) -> Step:
-        """Solve each block once."""
+        """Solve each block once, the others held."""
         linear = work.rounds.run(work.target)
         return Step("round", linear, failure=work.contraction.test(x))
 
