@@ -17,7 +17,7 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import HasRows, has
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.scale import scale_of_matrix, scaled, sizes_of_matrix
-from warp_lcp.problem.solve import IterateMemory, Step
+from warp_lcp.problem.solve import IterateMemory, Precision, Step
 
 SEMIDEFINITE = 1e-10  # shift with which an equilibrated semi-definite matrix must have a Cholesky factor
 PROVABLE = 250_000  # entries of A up to which a linear program is asked whether there is a solution: seconds
@@ -225,8 +225,8 @@ class DenseWorkspace(IterateMemory):
         ended: the status with which the method gives up if the iterate does not meet the criteria; None while it goes on.
     """
 
-    def __init__(self, problem: LCP) -> None:
-        super().__init__(problem)
+    def __init__(self, problem: LCP, precision: str = Precision.DOUBLE) -> None:
+        super().__init__(problem, precision)
         self.data: DenseProblem = None  # type: ignore[assignment]
         self.ended: SolveStatus | None = None
 

@@ -9,7 +9,7 @@ import scipy.linalg
 
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve import Precision, Step
+from warp_lcp.problem.solve import Step
 from warp_lcp.solvers.dense_problem import DenseProblem, DenseWorkspace
 from warp_lcp.solvers.descent import NonmonotoneSearch
 from warp_lcp.solvers.gradient_descent import DescentWorkspace
@@ -110,8 +110,8 @@ class FischerDenseWorkspace(DenseWorkspace):
     """
 
     def __init__(self, problem: LCP, settings: FischerNewton) -> None:
-        super().__init__(problem)
-        self.settings, self._descent, self.precision = settings, settings.descent(problem), Precision(settings.precision)
+        super().__init__(problem, settings.precision)
+        self.settings, self._descent = settings, settings.descent(problem)
         self.cycles_left, self.descents_left, self.stage, self.steps = 0, settings.warm_start, 0, 0
         self.active_set: Any = None
         self._search = NonmonotoneSearch(memory=settings.memory if settings.safeguard else 1)
@@ -152,13 +152,6 @@ class FischerDenseWorkspace(DenseWorkspace):
         self.round_iterate()
         name = "fischer" if self.stage == 0 else "homotopy"
         return Step(name, 1, None, failure, interim=self.settings.safeguard and failure is None)
-
-    def round_iterate(self) -> None:
-        """Round x to its precision."""
-        self.x.assign(self._rounded(self.x.numpy()))
-
-    def _rounded(self, x: np.ndarray) -> np.ndarray:
-        return x.astype(np.float32).astype(np.float64) if self.precision is Precision.SINGLE else x
 
     def _plain(self) -> SolveStatus | None:
         """Take a step of the book's method: algorithm 12."""
