@@ -19,6 +19,7 @@ from pyamg.strength import symmetric_strength_of_connection
 
 from warp_lcp.multigrid.aggregates import aggregated, symmetric_part
 from warp_lcp.multigrid.algebraic_kernels import densify_kernel, factor_kernel, invert_kernel, places_kernel, solve_kernel
+from warp_lcp.multigrid.coarsest_kernels import PINNED
 from warp_lcp.multigrid.cycle_settings import AlgebraicSettings
 from warp_lcp.operators.sparse import GATHER, PRODUCT, ROWS, SparseOperator
 from warp_lcp.rows import Bound, RowPass, Rows
@@ -43,7 +44,6 @@ SMOOTH = RowPass(
     numbers={"omega": "S", "from_zero": bool},
 )  # fmt: skip
 REMAINDER = RowPass("algebraic.remainder", HEADERS / "remainder.h", "S", whole={**LEVEL, "x": "S"}, reads={"b": "S"}, writes={"y": "S"})
-PINNED = {wp.float32: 3e-5, wp.float64: 1e-13}  # of a coarsest level's diagonal: what rounding leaves of a singular component's last pivot
 WIDEST = np.iinfo(np.uint16).max  # entries of a row whose places are known
 Matrix = Any  # a scipy.sparse.csr_array
 

@@ -10,7 +10,7 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.multigrid import cycle_passes as passes
-from warp_lcp.multigrid.coarsest_kernels import coarsest_kernels
+from warp_lcp.multigrid.coarsest_kernels import PINNED, coarsest_kernels
 from warp_lcp.multigrid.cycle_passes import UNBOUNDED
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.shared_levels import share_changes, whole_counts
@@ -21,9 +21,6 @@ from warp_lcp.rows.fields import Padding, zeros
 from warp_lcp.rows.program import Launch, Program
 from warp_lcp.rows.sequence import CUDA_THREADS
 from warp_lcp.rows.vectors import convert
-
-# of a coarsest level's diagonal: what rounding leaves of a singular component's last pivot, with a margin
-PINNED = {wp.float32: 3e-5, wp.float64: 1e-13}
 
 Pair = tuple[wp.array[Any], wp.array[Any]]
 

@@ -15,7 +15,7 @@ from warp_lcp.deadline import time_is_up
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve import Step
+from warp_lcp.problem.solve import EPS, Step
 from warp_lcp.settings import Count, Settings
 from warp_lcp.solvers.dense_problem import DenseProblem, DenseWorkspace, check_size, inconsistent, pivots_of, semidefinite
 
@@ -165,7 +165,6 @@ class BandedFactors:
         return scipy.linalg.lapack.dgbtrs(self._lu, self.k, self.k, r, self._pivots, trans=int(transposed))[0]
 
 
-EPS = float(np.finfo(np.float64).eps)
 PIVOT = 1e-10  # entries of the entering column below this part of its largest are no pivots (methods.md: 200 of 200 with it)
 TIE = 1e-12  # relative difference of ratios that counts as a tie, which the lexicographic rule breaks
 NOISE = 1e-6  # residual, relative to that of clip(0, l, u), beyond which an end of the path is no solution
