@@ -19,11 +19,10 @@ from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import FLOOR_MARGIN, IterateMemory, PrecisionName, Step
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, CountOrZero, Settings, Share
-from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers.minimum_map_newton_direct import DirectNewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
 from warp_lcp.solvers.phases import CoarseProblem, GradientPhase, InteriorSteps, ProximalPoint, projected_cycle
-from warp_lcp.solvers.principal_system import DenseSystem, GridSystem, PrincipalSystem, principal_system
+from warp_lcp.solvers.principal_system import CLASSIFY, ON_FREE, DenseSystem, GridSystem, PrincipalSystem, principal_system, projected_move
 from warp_lcp.solvers.projected_multigrid_kernels import SLOTS
 
 LARGE = 1000  # unknowns from which a cold start on a sparse matrix takes projected cycles
@@ -167,7 +166,7 @@ class NewtonWorkspace(IterateMemory):
         self.norms = [*self.norms, residual.norm][-self.settings.memory :]
         size = residual.norm
         fields = {"x": x, "unknown": p.unknown, "free": self.free, "g": self.system.r, "scale": 1 / size}
-        moved, active, shifted, square = self._sums.of(passes.CLASSIFY, stencil=residual.known, bounds=p.bounds.operands, **fields)
+        moved, active, shifted, square = self._sums.of(CLASSIFY, stencil=residual.known, bounds=p.bounds.operands, **fields)
         if self.coarse is not None and self.coarse.is_due(float(moved)):
             return self._coarse_step(x, int(active))
         if moved or self.stale:
@@ -176,7 +175,7 @@ class NewtonWorkspace(IterateMemory):
         if shifted:  # held unknowns have moved to their bounds
             residual.affine(x)
             given = {"y": residual.y, "free": self.free, "g": self.system.r, "scale": 1 / size}
-            square = self._sums.of(passes.ON_FREE, **given)[0]
+            square = self._sums.of(ON_FREE, **given)[0]
         if square == 0:
             return Step("newton", 0, int(active))
         iterations = self._solve(float(np.sqrt(square)) / size, size, settled=not moved)
@@ -301,5 +300,5 @@ class NewtonWorkspace(IterateMemory):
 
     def _correct(self, base: wp.array[Any], e: wp.array[Any], scale: float, x: wp.array[Any], kept: wp.array[Any] | None = None) -> None:
         """Set x = clip(base + scale e), rounded, where e is not 0; remember base if `kept` is given."""
-        passes.move(self._sums.rows, self.problem.bounds.operands, base, e, scale, x, kept=kept, guarded=False)
+        projected_move(self._sums.rows, self.problem.bounds.operands, base, e, scale, x, kept=kept, guarded=False)
         self._round(x)

@@ -22,11 +22,10 @@ from warp_lcp.problem.solve import IterateMemory, Precision, PrecisionName, Step
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.vectors import Sums
 from warp_lcp.settings import Count, CountOrZero, Positive, Settings
-from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers import projected_multigrid_kernels as engine
 from warp_lcp.solvers.descent import Descent
 from warp_lcp.solvers.phases import projected_cycle
-from warp_lcp.solvers.principal_system import DiagonalSystem, principal_system
+from warp_lcp.solvers.principal_system import DiagonalSystem, principal_system, projected_move
 from warp_lcp.solvers.principal_system_sparse import SparseSystem
 from warp_lcp.solvers.sweep import Diagonal
 
@@ -277,7 +276,7 @@ class MPRGPWorkspace(IterateMemory):
         if self._carry:
             beta = -residual.dot(M.z, self._q) / self._curvature
         bounds, beta = self.problem.bounds.operands, beta if math.isfinite(beta) else 0.0
-        passes.move(residual.rows, bounds, None, self._p, 0.0, None, z=M.z, beta=beta)
+        projected_move(residual.rows, bounds, None, self._p, 0.0, None, z=M.z, beta=beta)
         self._product(self._p)
         gain, curvature = (float(v) for v in residual.sums.of(GAIN, along=self._p, q=self._q, g=M.r))
         self._carry, self._curvature = curvature > 0, curvature
@@ -297,7 +296,7 @@ class MPRGPWorkspace(IterateMemory):
             return self._projected_step(self._p, gz, zaz)
         self._carry, self._curvature = True, curvature
         target, bounds, length = self._target(), self.problem.bounds.operands, gain / curvature * residual.size
-        passes.move(residual.rows, bounds, self.x, self._p, length, target, z=finest.x, beta=beta)
+        projected_move(residual.rows, bounds, self.x, self._p, length, target, z=finest.x, beta=beta)
         self._settle(target)
         return True
 
@@ -335,7 +334,7 @@ class MPRGPWorkspace(IterateMemory):
 
     def _advance(self, origin: wp.array[Any], direction: wp.array[Any], length: float, target: wp.array[Any]) -> None:
         """x = clip(origin + length direction, l, u)."""
-        passes.move(self.residual.rows, self.problem.bounds.operands, origin, direction, length, target)
+        projected_move(self.residual.rows, self.problem.bounds.operands, origin, direction, length, target)
         self._settle(target)
 
     def _settle(self, target: wp.array[Any]) -> None:

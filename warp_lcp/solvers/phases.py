@@ -23,9 +23,8 @@ from warp_lcp.problem.solve import EPS, FLOOR_MARGIN, Step, solve
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rows import Rows
 from warp_lcp.rows.vectors import Reduction
-from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers.dense_problem import proved_infeasible
-from warp_lcp.solvers.principal_system import GridSystem
+from warp_lcp.solvers.principal_system import ALL_FREE, ON_FREE, GridSystem
 from warp_lcp.solvers.projected_multigrid_kernels import GAPS, SIZE
 
 if TYPE_CHECKING:
@@ -72,10 +71,10 @@ def projected_cycle(
         restrict: whether the system does not have all unknowns yet.
     """
     rows, finest = Rows.flat(problem.layout.size, problem.device), system.hierarchy.finest
-    passes.ALL_FREE.bind(rows, unknown=problem.unknown, free=free).launch()
+    ALL_FREE.bind(rows, unknown=problem.unknown, free=free).launch()
     if restrict:
         system.restrict(free)
-    passes.ON_FREE.bind(rows, y=y, free=free, g=system.r, scale=1 / size, out=sums.partials).launch()
+    ON_FREE.bind(rows, y=y, free=free, g=system.r, scale=1 / size, out=sums.partials).launch()
     sums.scalars[int(SIZE) : int(SIZE) + 1].fill_(size)
     gaps = {"lo": finest.lower, "hi": finest.upper, "scalars": sums.scalars}
     GAPS.bind(rows, bounds=problem.bounds.operands, x=x, unknown=problem.unknown, **gaps).launch()

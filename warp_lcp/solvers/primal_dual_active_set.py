@@ -16,10 +16,10 @@ from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.problem.solve import PrecisionName, Step
 from warp_lcp.settings import Count, CountOrZero, Settings, Share
-from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers.dense_problem import DenseProblem, pivots_of
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
 from warp_lcp.solvers.phases import ProximalPoint
+from warp_lcp.solvers.principal_system import projected_move
 
 LOWER, FREE, UPPER = -1, 0, 1  # where least-index pivoting has an unknown
 STUCK = 2  # steps on one set that leave the residual where it is: its free block is singular
@@ -121,7 +121,7 @@ class ActiveSetWorkspace(NewtonWorkspace):
         if watched:
             wp.copy(self.trial, x)
         bounds = self._unbounded if self._moved else p.bounds.operands  # within rounding of the bounds at the end
-        passes.move(self._sums.rows, bounds, x, self.system.e, size, x)
+        projected_move(self._sums.rows, bounds, x, self.system.e, size, x)
         if self.floating is not None:
             self.floating.settle(x, p.lower, p.upper)
         self._round(x)

@@ -17,8 +17,7 @@ from warp_lcp.problem.solve import PrecisionName, Step
 from warp_lcp.rows import RowPass
 from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, Ge, Relaxation, Settings, Share
-from warp_lcp.solvers import active_set_passes as passes
-from warp_lcp.solvers.principal_system import principal_system
+from warp_lcp.solvers.principal_system import ON_FREE, principal_system, projected_move
 from warp_lcp.solvers.psor import SweepWorkspace
 from warp_lcp.solvers.sweep import sweep_for
 
@@ -152,7 +151,7 @@ class SubspaceWorkspace(SweepWorkspace):
     def _correct(self, x: wp.array[Any], scale: float) -> None:
         p = self.problem
         p.bounds.follow(self._before)
-        passes.move(self._sums.rows, p.bounds.operands, self._before, self.system.e, scale, x, guarded=False)
+        projected_move(self._sums.rows, p.bounds.operands, self._before, self.system.e, scale, x, guarded=False)
         if self._old_bounds:
             for old, bound in zip(self._old_bounds, (p.lower, p.upper), strict=True):
                 wp.copy(old, bound)
@@ -173,4 +172,4 @@ class SubspaceWorkspace(SweepWorkspace):
 
     def _right_side(self, scale: float) -> float:
         """Set the system's right-hand side to -scale y on the free set; return y's norm there."""
-        return float(np.sqrt(self._sums.of(passes.ON_FREE, y=self.residual.y, free=self.free, g=self.system.r, scale=scale)[0]))
+        return float(np.sqrt(self._sums.of(ON_FREE, y=self.residual.y, free=self.free, g=self.system.r, scale=scale)[0]))
