@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, no_type_check
 import numpy as np
 import warp as wp
 
-from warp_lcp.operators.grid_poisson_kernels import FLUID
+from warp_lcp.problem.protocol import FLUID
 from warp_lcp.rows import RowPass
 
 options: dict[str, Any] = {"enable_backward": False, "module": "warp_lcp.components"}

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from warp_lcp.operators.compressed_rows import CompressedRows
     from warp_lcp.rows.fields import PaddedLayout
 
+AIR, FLUID, SOLID = 0, 1, 2  # types of a grid's cells
 Capability = TypeVar("Capability", bound="Operator")
 
 

@@ -337,7 +337,7 @@ class MultigridWorkspace(IterateMemory):
 
     def _correct(self, program: Program) -> None:
         """Record a cycle, the measuring of its correction and the plan of the step; on the CPU the cycle's last leg measures."""
-        residual, hierarchy, device = self.residual, self.hierarchy, self.A.device
+        residual, hierarchy = self.residual, self.hierarchy
         if hierarchy.unswept_cycle is not None:
             program.extend(hierarchy.unswept_cycle)
             self._sweep_and_measure(program.launch)
@@ -349,8 +349,7 @@ class MultigridWorkspace(IterateMemory):
         program.extend(hierarchy.open_cycle)
         measuring = kernels.measuring(hierarchy.finest, self._p, residual.sums.partials)
         kernels.CLIMB.launch(*hierarchy.last_leg(), measuring, launch=program.launch)
-        residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=program.launch)
-        program.launch(kernels.plan_step_kernel, 1, [residual.scalars], device=device)
+        self._plan(program.launch)
 
     def _sweep_and_measure(self, launch: Launch) -> None:
         """Make a shared cycle's last sweep, measure its correction, and plan the step."""
@@ -365,24 +364,22 @@ class MultigridWorkspace(IterateMemory):
         (nz, ny, _), partials = s.padding.counts, residual.sums.partials
         for axis, end in s.ghosts.cuts:
             beside = Rows.beyond(s.padding, device, axis, end, inside=True)
-            numbers: dict[str, Any] = {
-                "axis": axis,
-                "end": end,
-                "place": end * (0, ny - 1, (nz - 1) * ny)[axis],
-                "lines": ny,
-                "places": s.rows.places,
-            }
+            place = end * (0, ny - 1, (nz - 1) * ny)[axis]
+            numbers: dict[str, Any] = {"axis": axis, "end": end, "place": place, "lines": ny, "places": s.rows.places}
             kernels.SIDE.bind(beside, stencil=s, z=finest.x, q=self._p, sums=partials, **numbers).launch(launch)
-        residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=launch)
-        launch(kernels.plan_step_kernel, 1, [residual.scalars], device=device)
+        self._plan(launch)
 
     def _measure(self, *, launch: Launch = wp.launch) -> None:
         """Measure the cycle's correction and plan the step."""
-        residual, finest, device = self.residual, self.hierarchy.finest, self.A.device
+        finest = self.hierarchy.finest
         finest.stencil.wrap(finest.x, launch=launch)
-        kernels.measuring(finest, self._p, residual.sums.partials).launch(launch)
-        residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=launch)
-        launch(kernels.plan_step_kernel, 1, [residual.scalars], device=device)
+        kernels.measuring(finest, self._p, self.residual.sums.partials).launch(launch)
+        self._plan(launch)
+
+    def _plan(self, launch: Launch) -> None:
+        """Add up what has been measured, and plan the step."""
+        self.residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=launch)
+        launch(kernels.plan_step_kernel, 1, [self.residual.scalars], device=self.A.device)
 
     def _advance(self, *, settle: bool = False) -> None:
         """Take the planned step and evaluate the residual there."""
