@@ -22,7 +22,7 @@ from rich.console import Console
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.problems import cut_cells, splash
-from warp_lcp.protocol import families
+from warp_lcp.problem.protocol import families
 from warp_lcp.run.loop import RunRequest, run_scene
 from warp_lcp.run.progress import Lines
 from warp_lcp.scene.scene_file import load_scene

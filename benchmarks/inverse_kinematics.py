@@ -18,7 +18,7 @@ import scipy.optimize
 import warp_lcp as wl
 from warp_lcp.gallery.articulated_figure import ArticulatedFigure, branching_figure, planar_chain, spatial_chain
 from warp_lcp.gallery.inverse_kinematics import InverseKinematics, ReachedPose
-from warp_lcp.protocol import families
+from warp_lcp.problem.protocol import families
 
 SAME = 1e-6  # of reach^2: objectives that differ by less are one optimum
 OUTSIDE = 1e-9  # [rad] beyond the limits

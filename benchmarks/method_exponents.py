@@ -14,7 +14,7 @@ import warp_lcp as wl
 from warp_lcp import gallery
 from warp_lcp.gallery import Plant, Problem, planted
 from warp_lcp.gallery.matrices import spectrum_matrix
-from warp_lcp.protocol import families
+from warp_lcp.problem.protocol import families
 
 SIZES = {"dense": (200, 400), "grid": (32, 64)}  # unknowns; cells along a side of a splash, half of them liquid
 LIMITS = {"max_iterations": 400, "patience": 100}

@@ -12,7 +12,7 @@ import warp_lcp as wl
 from warp_lcp.fluids import coupling_kernels as kernels
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.material.cut_boundary import CutBoundary
-from warp_lcp.operators.low_rank_columns import BlockColumns
+from warp_lcp.operators.low_rank import BlockColumns
 from warp_lcp.rigid.bodies import RigidBodies
 
 SPARE = 1.5  # room for entries, times those there are when there is none left

@@ -16,7 +16,7 @@ from warp_lcp.fluids.tolerance import TimeErrorTolerance
 from warp_lcp.grid.staggered import Window
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.operators.grid_poisson import FLUID
-from warp_lcp.vectors import convert
+from warp_lcp.rows.vectors import convert
 
 
 class DistributedPressure(PressureProjection):

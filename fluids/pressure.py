@@ -17,7 +17,7 @@ from warp_lcp.gallery import recorded
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.operators.grid_poisson import FLUID
-from warp_lcp.vectors import convert
+from warp_lcp.rows.vectors import convert
 
 ROUNDING = 4 * float(np.finfo(np.float32).eps)  # of an outflow, relative to the speeds it is the difference of (float32 faces)
 RELEASE_FACTOR = 10.0  # a wall cell lets go if its outflow exceeds this multiple of the accepted residual: resting ceilings are degenerate

@@ -10,7 +10,7 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.rows import RowPass
-from warp_lcp.vectors import Across, Reduction, convert, rows_of
+from warp_lcp.rows.vectors import Across, Reduction, convert, rows_of
 
 f64 = wp.float64
 CHANGE = RowPass("tolerance.change", Path(__file__).parent / "headers" / "change.h", f64, reads={"x": f64}, writes={"guess": f64})

@@ -18,7 +18,7 @@ from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.density_correction import SHIFT
 from warp_lcp.operators.grid_poisson import FLUID
-from warp_lcp.vectors import convert
+from warp_lcp.rows.vectors import convert
 
 
 class UnilateralPressure(PressureProjection):

@@ -25,8 +25,8 @@ from warp_lcp.granular.body_faces import BodyFaces, entries_near, find_body_face
 from warp_lcp.granular.packing import Packing
 from warp_lcp.granular.yield_set import F64, I32, U8, xyz
 from warp_lcp.grid.staggered import StaggeredGrid
-from warp_lcp.program import Launch
 from warp_lcp.rows import Rows
+from warp_lcp.rows.program import Launch
 
 if typing.TYPE_CHECKING:
     from warp_lcp.granular.stress import Velocity, Walls

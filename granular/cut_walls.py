@@ -20,8 +20,8 @@ from warp_lcp.granular.yield_set import COLUMNS, xyz
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
-from warp_lcp.program import Launch
 from warp_lcp.rows import Rows
+from warp_lcp.rows.program import Launch
 
 if TYPE_CHECKING:
     from warp_lcp.granular.stress import Velocity

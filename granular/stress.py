@@ -15,9 +15,9 @@ from warp_lcp.granular.packing import SHEARS, Packing
 from warp_lcp.granular.solids import Walls
 from warp_lcp.granular.stress_kernels import BETA_X, NEXT_X, PERIOD, RESIDUAL_X, REST, STATE, STRESSES, momentum_kernel, stress_passes
 from warp_lcp.granular.yield_set import COLUMNS, LOOKAHEAD, NUMBERS, PRESSURE_STEP, SHEAR_STEP, xyz
-from warp_lcp.program import Launch, Program
 from warp_lcp.rows import Rows
-from warp_lcp.vectors import Reduction
+from warp_lcp.rows.program import Launch, Program
+from warp_lcp.rows.vectors import Reduction
 
 WALL_GRAIN = 256  # wall faces a CPU thread takes
 MOST_MOMENTUM = 0.985  # unless a method wants less

@@ -12,7 +12,7 @@ import scipy.sparse
 import warp_lcp as wl
 from oracle import natural_residual
 from warp_lcp import deadline
-from warp_lcp.protocol import families
+from warp_lcp.problem.protocol import families
 from warp_lcp.solvers.partition import block_problem
 
 S = wl.SolveStatus

@@ -2,8 +2,6 @@
 
 from importlib.metadata import PackageNotFoundError, version
 
-from warp_lcp.affine_bounds import AffineBounds
-from warp_lcp.kernel_messages import hear_kernels
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators import (
     AIR,
@@ -16,19 +14,21 @@ from warp_lcp.operators import (
     SparseOperator,
     SumOperator,
 )
-from warp_lcp.problem import LCP
+from warp_lcp.problem.affine_bounds import AffineBounds
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.result import Record, SolveResult, SolveStatus
+from warp_lcp.problem.solve import ConvexSetProblem, Precision, Step
+from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.recommend import Budget, Recommendation, recommend
-from warp_lcp.residual import NaturalResidual
-from warp_lcp.result import Record, SolveResult, SolveStatus
-from warp_lcp.solve import ConvexSetProblem, Precision, Step
+from warp_lcp.rows.kernel_messages import hear_kernels
 from warp_lcp.solvers.accelerated_projected_gradient import AcceleratedProjectedGradient
-from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel
+from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel, GridLines
 from warp_lcp.solvers.coupled_problem import CoupledBlock, CoupledResult, StaggeredRound, solve_coupled
 from warp_lcp.solvers.default import default_method, solve
 from warp_lcp.solvers.direct_enumeration import BatchResult, DirectEnumeration, enumerate_batch
 from warp_lcp.solvers.fischer_newton import FischerNewton
 from warp_lcp.solvers.gradient_descent import GradientDescent
-from warp_lcp.solvers.grid_lines import GridLines
 from warp_lcp.solvers.incremental_pivoting import IncrementalPivoting
 from warp_lcp.solvers.interior_point import InteriorPoint
 from warp_lcp.solvers.lemke import Lemke
@@ -43,7 +43,6 @@ from warp_lcp.solvers.quadratic_program import QuadraticProgram
 from warp_lcp.solvers.registry import METHODS
 from warp_lcp.solvers.staggering import Staggering
 from warp_lcp.solvers.subspace_minimization import SubspaceMinimization
-from warp_lcp.stopping import StoppingCriteria
 
 hear_kernels()
 

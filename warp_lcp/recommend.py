@@ -9,12 +9,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from warp_lcp.problem import LCP
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.solve import Solver, solve
+from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.settings import Count, Positive, Settings, Share, checked
-from warp_lcp.solve import Solver, solve
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.registry import METHODS
-from warp_lcp.stopping import StoppingCriteria
 from warp_lcp.traits import TRIAL, Traits, traits_of
 
 ACCURACIES = {"rough": 1e-2, "usual": 1e-6, "exact": 1e-10}

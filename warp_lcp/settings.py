@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from difflib import get_close_matches
 from enum import StrEnum
 from functools import cache
 from reprlib import repr as short
@@ -148,3 +149,10 @@ def adapter(annotation: Any) -> Any:
     if dataclasses.is_dataclass(annotation):
         return TypeAdapter(InstanceOf[annotation])
     return TypeAdapter(annotation, config=ConfigDict(strict=True, allow_inf_nan=False, arbitrary_types_allowed=True))
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """Return `did you mean ...?` for a word that is near a known one, and the list of known ones otherwise."""
+    known = sorted(known)
+    match = get_close_matches(word, known, n=1, cutoff=0.6)
+    return f"did you mean {match[0]!r}?" if match else f"choose from {', '.join(known)}"

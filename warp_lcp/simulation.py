@@ -11,7 +11,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 import warp as wp
 
-from warp_lcp.result import SolveStatus
+from warp_lcp.problem.result import SolveStatus
 
 NOTHING = nullcontext()
 

@@ -10,15 +10,14 @@ import scipy.linalg
 import scipy.sparse
 import warp as wp
 
-from warp_lcp.layout import layout_of
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasRows, HasStencil, has, takes
-from warp_lcp.solve import Solver, solve
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasRows, HasStencil, has, layout_of, takes
+from warp_lcp.problem.solve import Solver, solve
+from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel
 from warp_lcp.solvers.minimum_map_newton_direct import suits
 from warp_lcp.solvers.psor import ProjectedSOR
 from warp_lcp.solvers.registry import METHODS
-from warp_lcp.stopping import StoppingCriteria
 
 MOST_FACTORED = 1500  # unknowns of a matrix whose Cholesky factorization is tried: it takes 0.1 s there, a Newton step's time
 TRIAL, TRIAL_RATE = 8, 4  # sweeps on trial, and how many of the last tell the rate: the first ones remove what is rough in the error

@@ -15,7 +15,7 @@ from warp_lcp.benchmarks.book.traces import RTOL
 from warp_lcp.benchmarks.record import Chart, Lines, Record, Results, Sheet, Table
 from warp_lcp.benchmarks.timing import Figure
 from warp_lcp.gallery import Plant, Problem, contact, poisson, splash
-from warp_lcp.protocol import families
+from warp_lcp.problem.protocol import families
 
 MOST = 300  # steps
 DEEP = 1e-10  # tolerance of the curves: far enough to see how fast a method is at its end

@@ -9,8 +9,8 @@ import pytest
 import scipy.io
 import scipy.sparse
 
-from warp_lcp.claims import ClaimError
 from warp_lcp.cli.matrix_market import MarketError, read_market
+from warp_lcp.files.claims import ClaimError
 
 RANDOM = np.random.default_rng(733)
 FULL = RANDOM.standard_normal((5, 5))

@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 import warp_lcp as wl
 from oracle import assemble, natural_residual
 from small_liquids import box, create, dam, scene
-from warp_lcp import claims
 from warp_lcp.cli import commands as cli
+from warp_lcp.files import claims
 from warp_lcp.gallery.recorded import FORMAT, cell_counts, files, load
 from warp_lcp.run.folder import OutputError
 from warp_lcp.run.problem_folder import ProblemFolder

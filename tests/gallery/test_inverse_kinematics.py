@@ -11,7 +11,7 @@ import warp_lcp as wl
 from warp_lcp.benchmarks.inverse_kinematics import MODELS, OUTSIDE, compare, targets
 from warp_lcp.gallery.articulated_figure import ArticulatedFigure, branching_figure, planar_chain, spatial_chain
 from warp_lcp.gallery.inverse_kinematics import InverseKinematics, StepProblem
-from warp_lcp.protocol import families
+from warp_lcp.problem.protocol import families
 
 FIGURES = {"planar": planar_chain([1.0, 0.8, 0.6, 0.4]), "spatial": spatial_chain([0.3] * 7), "branching": branching_figure()}
 TIGHT = wl.StoppingCriteria(rtol=1e-12, max_iterations=300)

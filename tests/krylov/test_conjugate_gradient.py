@@ -6,12 +6,12 @@ import warp as wp
 
 import warp_lcp as wl
 from oracle import assemble
-from warp_lcp import program
 from warp_lcp.krylov import ConjugateGradient
-from warp_lcp.krylov.conjugate_gradient_kernels import BEST, ITERATIONS, LIMIT, RR, RZ, RZ_OLD, SLOTS, TOLERANCE, end_kernel
+from warp_lcp.krylov.conjugate_gradient import BEST, ITERATIONS, LIMIT, RR, RZ, RZ_OLD, SLOTS, TOLERANCE, end_kernel
 from warp_lcp.operators.grid_poisson import GridPoisson
+from warp_lcp.rows import program
+from warp_lcp.rows.vectors import rows_of
 from warp_lcp.solvers.principal_system import DIVIDE
-from warp_lcp.vectors import rows_of
 
 SHAPE = (5, 6, 7)
 

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.operators.low_rank_columns import BlockColumns
+from warp_lcp.operators.low_rank import BlockColumns
 
 ROWS, BLOCKS = np.array([2, 2, 5, 9, 9, 11]), np.array([0, 1, 1, 0, 1, 0])  # two rows belong to both blocks
 

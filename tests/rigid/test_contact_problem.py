@@ -9,9 +9,9 @@ from bodies_at_hand import GRAVITY, bodies_of, run
 import warp_lcp as wl
 from warp_lcp.gallery.contact_models import BoxedModel, ContactSystem
 from warp_lcp.grid.solids import Box, Sphere
-from warp_lcp.residual import NaturalResidual
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rigid.contact_problem import ContactProblem
-from warp_lcp.stopping import StoppingCriteria
 
 EXACT = StoppingCriteria(rtol=1e-7, max_iterations=2000)
 

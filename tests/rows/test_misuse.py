@@ -10,9 +10,9 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.layout import Padding
-from warp_lcp.program import Program
 from warp_lcp.rows import Known, RowPass, Rows, Sequence, Wave
+from warp_lcp.rows.fields import Padding
+from warp_lcp.rows.program import Program
 
 CPU, EACH = wp.get_device("cpu"), "for (int k = 0; k < n; ++k) "
 

@@ -9,8 +9,8 @@ import warp as wp
 import warp_lcp as wl
 from code_blocks import blocks, run
 from oracle import assemble
-from warp_lcp.layout import Padding
 from warp_lcp.rows import Known, RowPass, Rows, Wave, layout
+from warp_lcp.rows.fields import Padding
 from warp_lcp.rows.row_pass import text
 
 SHAPE = (5, 6, 37)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_lcp.layout import Padding
 from warp_lcp.rows import RowPass, Rows, Sequence
+from warp_lcp.rows.fields import Padding
 
 COUNTS = (3, 4, 21)
 

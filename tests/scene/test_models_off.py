@@ -131,7 +131,7 @@ CASES = {
         files=("fluids/surface.py", "warp_lcp/grid/level_set.py"),
     ),
     "smoothing": Case({"pressure": {"smoothing": 2}}, {"pressure": {}}),
-    "separating walls": Case({"wall": "separating"}, modules=("warp_lcp.bounds",), files=("warp_lcp/bounds.py",)),
+    "separating walls": Case({"wall": "separating"}, modules=("warp_lcp.bounds",), files=("warp_lcp/problem/bounds.py",)),
     "unilateral pressure": Case(
         {"pressure": {"model": "unilateral"}}, {"pressure": {}}, modules=("fluids.unilateral",), files=("fluids/unilateral.py",)
     ),

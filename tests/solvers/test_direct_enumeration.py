@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import warp_lcp as wl
 from oracle import boxed, natural_residual
 from warp_lcp.solvers.direct_enumeration import BatchResult, DirectEnumeration, enumerate_batch
-from warp_lcp.solvers.direct_enumeration_kernels import kernels
+from warp_lcp.solvers.direct_enumeration_kernels import enumeration_kernels
 
 TIGHT = wl.StoppingCriteria(rtol=1e-12)
 
@@ -136,7 +136,7 @@ def test_out_of_another_shape_is_refused():
 
 def test_kernels_compile_for_cuda(tmp_path):
     for n in (1, 4):
-        name = kernels(n, wp.float64).batch.module.name
+        name = enumeration_kernels(n, wp.float64).batch.module.name
         wp.compile_aot_module(name, device=None, arch=[90], module_dir=tmp_path / str(n), use_ptx=True)
         assert list((tmp_path / str(n)).rglob("*.ptx"))
 

@@ -7,8 +7,8 @@ import warp as wp
 
 import warp_lcp as wl
 from oracle import lemke, natural_residual
-from warp_lcp.protocol import families
-from warp_lcp.residual import NaturalResidual
+from warp_lcp.problem.protocol import families
+from warp_lcp.problem.residual import NaturalResidual
 
 N, EMPTY = 12, (3, 4, 9)
 NAMES = [name for name, cls in wl.METHODS.items() if "sparse" in families(cls) and name != "direct-enumeration"]

@@ -9,9 +9,9 @@ import warp as wp
 import warp_lcp as wl
 from oracle import assemble, natural_residual
 from warp_lcp.krylov import ConjugateGradient
-from warp_lcp.residual import NaturalResidual
+from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.solvers.interior_point import InteriorPoint
-from warp_lcp.solvers.nonsmooth_map import Kink, NonsmoothMap, Reformulation
+from warp_lcp.solvers.nonsmooth_map import Kink, MapForm, NonsmoothMap
 from warp_lcp.solvers.principal_system import GridSystem
 from warp_lcp.solvers.projected_multigrid_kernels import BETA, CARRY, NORM, SIZE, SLOTS, STEP, plan_whole_step_kernel
 
@@ -83,7 +83,7 @@ def test_a_fischer_step_is_its_move_its_residual_and_its_system(form, upper, sha
     """Against the map's separate kernels, which other tests hold to finite differences, and the dense residual."""
     s = scene(form, lower=np.where(np.arange(np.prod(SHAPE)) % 3, 0.0, -np.inf).reshape(SHAPE), upper=upper)
     residual = NaturalResidual(s.problem)
-    kind = Reformulation.FISCHER if share == 1 else Reformulation.PENALIZED
+    kind = MapForm.FISCHER if share == 1 else MapForm.PENALIZED
     map_ = NonsmoothMap(s.problem, residual, kind, share, Kink.PERTURBATION)
     system = GridSystem(s.problem.A, real, bounded=False, shifted=True)
     start, e = (s.rng.standard_normal(s.fluid.size) * s.fluid for _ in range(2))

@@ -10,12 +10,12 @@ from oracle import assemble, boxed, lemke, natural_residual
 from warp_lcp.gallery.contact_scenes import contact
 from warp_lcp.gallery.matrices import semidefinite
 from warp_lcp.gallery.obstacle import ball_obstacle
-from warp_lcp.residual import NaturalResidual
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.solvers.descent import NonmonotoneSearch
 from warp_lcp.solvers.fischer_newton import FischerNewton
-from warp_lcp.solvers.globalization import NonmonotoneSearch
 from warp_lcp.solvers.gradient_descent import GradientDescent
 from warp_lcp.solvers.interior_point import InteriorPoint
-from warp_lcp.solvers.nonsmooth_map import Kink, NonsmoothMap, Reformulation
+from warp_lcp.solvers.nonsmooth_map import Kink, MapForm, NonsmoothMap
 
 TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=300)
 KINKS = [k.value for k in Kink]
@@ -117,7 +117,7 @@ def test_unsymmetric_sparse_matrix(method):
     np.testing.assert_allclose(result.x.numpy(), lemke(S.toarray(), b), atol=1e-7)
 
 
-@pytest.mark.parametrize("map_", list(Reformulation))
+@pytest.mark.parametrize("map_", list(MapForm))
 def test_gradient_of_the_merit(map_):
     """Against central differences at a point off the kinks: any wrong sign in p or q shows."""
     rng = np.random.default_rng(2237)
@@ -141,7 +141,7 @@ def test_gradient_of_the_merit(map_):
     assert square == pytest.approx(float(np.sum((gradient / d) ** 2)))
 
 
-@pytest.mark.parametrize("map_", list(Reformulation))
+@pytest.mark.parametrize("map_", list(MapForm))
 def test_maps_vanish_at_solutions_only(map_):
     rng = np.random.default_rng(2239)
     A, b, lower, upper = random_boxed(rng)

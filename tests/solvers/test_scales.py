@@ -6,7 +6,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.protocol import families
+from warp_lcp.problem.protocol import families
 
 N = 20
 GRID = np.array([[0] * 5] + [[1] * 5] * 3)

@@ -7,7 +7,7 @@ import scipy.spatial
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.multigrid.coarse_points import coarse_points
+from warp_lcp.multigrid.aggregates import coarse_points
 
 
 def laplacian(n):

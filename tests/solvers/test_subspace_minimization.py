@@ -7,9 +7,9 @@ import warp as wp
 
 import warp_lcp as wl
 from oracle import assemble, lemke
+from warp_lcp.rows.vectors import rows_of
 from warp_lcp.solvers.subspace_minimization import SubspaceMinimization
 from warp_lcp.solvers.sweep_kernels import CHANGE
-from warp_lcp.vectors import rows_of
 
 TIGHT = wl.StoppingCriteria(rtol=1e-10, max_iterations=500)
 

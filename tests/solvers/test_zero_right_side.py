@@ -6,7 +6,7 @@ import scipy.sparse
 
 import warp_lcp as wl
 from oracle import boxed, lemke
-from warp_lcp.protocol import families
+from warp_lcp.problem.protocol import families
 
 STOPPING = wl.StoppingCriteria(rtol=1e-8, max_iterations=2000, patience=2000)
 

@@ -18,7 +18,6 @@ from warp_lcp.cli.solve_file import Outcome, solve_files
 from warp_lcp.cli.solve_recorded import SUFFIX, check_recorded, file_digest, solve_recorded
 from warp_lcp.cli.suites import benchmarks
 from warp_lcp.material.particle_scene import ParticleScene
-from warp_lcp.nearest import nearest
 from warp_lcp.render.film import check_rate
 from warp_lcp.render.recording import Color, RenderError, Show
 from warp_lcp.render.render import Looks, film_run, parse_size, render_run
@@ -37,6 +36,7 @@ from warp_lcp.run.trial import step_seconds
 from warp_lcp.run.tune import FRAMES, Tuning, tune, write_tuned
 from warp_lcp.scene.presets import PresetName
 from warp_lcp.scene.scene_file import built_in_scenes, installed_simulators, load_scene
+from warp_lcp.settings import nearest
 from warp_lcp.simulation import InputError, SimulationFailed, StepFailed
 
 FAILED = 1

@@ -14,16 +14,15 @@ from rich.table import Table
 
 from warp_lcp.cli.matrix_market import MarketError, read_market
 from warp_lcp.frames.atomic import replacing
-from warp_lcp.nearest import nearest
 from warp_lcp.operators import DenseOperator, SparseOperator
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import families
-from warp_lcp.result import SolveResult
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import families
+from warp_lcp.problem.result import SolveResult
+from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.run.problem_folder import ProblemError
-from warp_lcp.settings import SettingError
+from warp_lcp.settings import SettingError, nearest
 from warp_lcp.solvers.default import default_method, solve
 from warp_lcp.solvers.registry import METHODS
-from warp_lcp.stopping import StoppingCriteria
 
 MOST_ROWS = 40  # of the table of iterations: a longer history shows its first and last ones
 FORMAT = "a Matrix Market file (https://math.nist.gov/MatrixMarket/formats.html)"

@@ -11,12 +11,12 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.distributed.halo import Halo
-from warp_lcp.layout import Padding
 from warp_lcp.multigrid import cycle_passes as passes
 from warp_lcp.multigrid.hierarchy import Hierarchy, Level
 from warp_lcp.operators.stencil import Stencil
-from warp_lcp.program import Launch, Program, perform
 from warp_lcp.rows import Rows
+from warp_lcp.rows.fields import Padding
+from warp_lcp.rows.program import Launch, Program, perform
 
 GATHERED = 32_768  # cells from which on a level is gathered: exchanges between ranks would take as long as its cells
 

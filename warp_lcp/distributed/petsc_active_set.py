@@ -10,10 +10,10 @@ import warp as wp
 from warp_lcp.distributed.petsc_matrix import PetscGrid
 from warp_lcp.distributed.ranks import petsc
 from warp_lcp.multigrid.cycle_settings import CycleSettings
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasStencil, check_taken, has
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasStencil, check_taken, has
+from warp_lcp.problem.solve import PrecisionName, Step
 from warp_lcp.settings import Count, CountOrZero, Settings, Share
-from warp_lcp.solve import PrecisionName, Step
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
 from warp_lcp.solvers.principal_system import GridSystem, PrincipalSystem
 

@@ -17,13 +17,13 @@ import warp as wp
 
 from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
 from warp_lcp.distributed.ranks import petsc
-from warp_lcp.layout import zeros
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.multigrid.turning import make_hierarchy
 from warp_lcp.operators.stencil import Stencil
-from warp_lcp.protocol import HasStencil
+from warp_lcp.problem.protocol import HasStencil
 from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows.fields import zeros
 
 if TYPE_CHECKING:
     from petsc4py import PETSc

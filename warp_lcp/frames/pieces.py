@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from warp_lcp.claims import read_whole
+from warp_lcp.files.claims import read_whole
 from warp_lcp.frames.atomic import write_text
 from warp_lcp.frames.rank_folder import RANK_FOLDER
 from warp_lcp.frames.vti import GHOSTS, extent_of, image_box, image_end

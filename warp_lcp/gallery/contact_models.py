@@ -12,8 +12,8 @@ from typing import Protocol
 import numpy as np
 import scipy.sparse
 
-from warp_lcp.affine_bounds import AffineBounds
 from warp_lcp.gallery.problem import Problem
+from warp_lcp.problem.affine_bounds import AffineBounds
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,8 +17,8 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
 
-from warp_lcp.archive import DEFLATED
-from warp_lcp.claims import ClaimError, check_claim
+from warp_lcp.files.archive import DEFLATED
+from warp_lcp.files.claims import ClaimError, check_claim
 from warp_lcp.gallery.contact_models import ContactSystem
 
 

@@ -12,7 +12,7 @@ import warp as wp
 from warp_lcp.gallery.problem import M_MATRIX, Problem
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID, GridPoisson
-from warp_lcp.problem import LCP
+from warp_lcp.problem.lcp import LCP
 
 BOUNDS = ("linear", "walls", "everywhere")
 SOLID_CENTER, SOLID_RADIUS = (0.55, 0.5, 0.3), 0.15

@@ -9,12 +9,12 @@ import numpy as np
 
 from warp_lcp.gallery.articulated_figure import ArticulatedFigure
 from warp_lcp.operators.dense import DenseOperator
-from warp_lcp.problem import LCP
-from warp_lcp.result import SolveStatus
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.solve import Solver, solve
+from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.settings import CountOrZero, NonNegative, Positive, Settings
-from warp_lcp.solve import Solver, solve
 from warp_lcp.solvers.incremental_pivoting import IncrementalPivoting
-from warp_lcp.stopping import StoppingCriteria
 
 Vector = np.ndarray
 AGREES, DISAGREES = 0.75, 0.25  # shares of the model's decrease from which on the trust region grows, and below which it shrinks

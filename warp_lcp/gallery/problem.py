@@ -9,12 +9,12 @@ import numpy as np
 import scipy.sparse
 import warp as wp
 
-from warp_lcp.affine_bounds import AffineBounds
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.grid_poisson import FLUID, GridPoisson
 from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.problem import LCP
+from warp_lcp.problem.affine_bounds import AffineBounds
+from warp_lcp.problem.lcp import LCP
 
 FACTS = frozenset(
     {

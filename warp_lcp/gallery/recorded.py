@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.archive import Archive
-from warp_lcp.claims import check_claim
+from warp_lcp.files.archive import Archive
+from warp_lcp.files.claims import check_claim
 from warp_lcp.gallery.problem import Problem
 from warp_lcp.operators.grid_poisson import AXES, FLUID, GridPoisson
-from warp_lcp.problem import LCP
+from warp_lcp.problem.lcp import LCP
 
 FORMAT = 1
 PROBLEM_FILE = re.compile(r"problem_(?P<step>\d{6,})\.npz")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_lcp.claims import check_claim
+from warp_lcp.files.claims import check_claim
 
 FORMATS = (".obj", ".ply", ".stl")
 STL_HEADER = 84  # bytes before the first triangle of a binary STL: 80 of text and a count

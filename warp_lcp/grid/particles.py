@@ -10,8 +10,8 @@ from warp_lcp.grid import particles_kernels as kernels
 from warp_lcp.grid.particle_loops import launch, on_grid
 from warp_lcp.grid.runge_kutta import MARGIN
 from warp_lcp.grid.staggered import StaggeredGrid
-from warp_lcp.layout import zeros
 from warp_lcp.rows import Rows
+from warp_lcp.rows.fields import zeros
 
 CHUNK = 256  # the fewest particles that one thread adds up
 THREADS = 1024  # the most threads of a sum, each a partial result that the host reads

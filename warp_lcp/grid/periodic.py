@@ -11,7 +11,7 @@ from warp_lcp.grid.runge_kutta import MARGIN
 from warp_lcp.grid.sides import SIDES, side_bits
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.transfer import TINY_WEIGHT
-from warp_lcp.program import Launch
+from warp_lcp.rows.program import Launch
 
 END = 0.6 * MARGIN  # cells from the upper side within which no particle may lie: a tent there would reach beyond what is stored
 

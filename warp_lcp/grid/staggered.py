@@ -14,9 +14,9 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
-from warp_lcp.native import grain
-from warp_lcp.program import Launch
 from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows.layout import grain
+from warp_lcp.rows.program import Launch
 
 
 @wp.struct

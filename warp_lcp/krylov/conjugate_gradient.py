@@ -3,16 +3,63 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, no_type_check
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.deadline import check_time
-from warp_lcp.krylov.conjugate_gradient_kernels import ITERATIONS, PQ, RR, RZ, RZ_OLD, SLOTS, begin_kernel, end_kernel
-from warp_lcp.program import Launch, Program
 from warp_lcp.rows import RowPass
-from warp_lcp.vectors import Reduction, rows_of
+from warp_lcp.rows.program import Launch, Program
+from warp_lcp.rows.vectors import Reduction, rows_of
+
+RZ, PQ, RZ_OLD = wp.constant(0), wp.constant(1), wp.constant(2)  # slots of the device scalars
+RR = wp.constant(3)  # those of the decision to go on begin here, as elsewhere at the residual's square
+TOLERANCE, BEST, ITERATIONS, LIMIT = (wp.constant(int(RR) + i) for i in range(1, 5))  # the least norm so far; done, and the most allowed
+SLOTS = 8
+
+GROWTH = wp.constant(wp.float64(1e3))  # of the carried residual over its least: A or M is not positive definite to this precision
+
+
+@no_type_check
+@wp.func
+def first_iteration(scalars: wp.array(dtype=wp.float64), rr: int, tolerance: wp.float64, limit: int):
+    """Prepare the slots from the residual's square on: no norm yet. Return whether an iteration follows."""
+    scalars[rr] = wp.float64(wp.inf)
+    scalars[rr + 1] = tolerance
+    scalars[rr + 2] = wp.float64(wp.inf)
+    scalars[rr + 3] = wp.float64(0.0)
+    scalars[rr + 4] = wp.float64(limit)
+    return wp.where(limit > 0, 1, 0)
+
+
+@no_type_check
+@wp.func
+def next_iteration(scalars: wp.array(dtype=wp.float64), rr: int):
+    """Count an iteration; return whether another one follows."""
+    scalars[rr + 3] += wp.float64(1.0)
+    norm = wp.sqrt(scalars[rr])
+    best = scalars[rr + 2]
+    enough = norm <= scalars[rr + 1] or norm >= GROWTH * best or scalars[rr + 3] >= scalars[rr + 4]
+    scalars[rr + 2] = wp.min(best, norm)
+    return wp.where(enough or not wp.isfinite(norm), 0, 1)
+
+
+@no_type_check
+@wp.kernel(enable_backward=False, module="warp_lcp.conjugate_gradient")
+def begin_kernel(scalars: wp.array(dtype=wp.float64), going: wp.array(dtype=int), tolerance: wp.float64, limit: int):
+    """Before the first iteration: no old direction."""
+    scalars[RZ_OLD] = wp.float64(0.0)
+    going[0] = first_iteration(scalars, RR, tolerance, limit)
+
+
+@no_type_check
+@wp.kernel(enable_backward=False, module="warp_lcp.conjugate_gradient")
+def end_kernel(scalars: wp.array(dtype=wp.float64), going: wp.array(dtype=int)):
+    """After an iteration: remember r.z for beta, and decide whether to go on."""
+    scalars[RZ_OLD] = scalars[RZ]
+    going[0] = next_iteration(scalars, RR)
+
 
 HEADERS, PLACES = Path(__file__).parent / "headers", {"RZ": int(RZ), "RZ_OLD": int(RZ_OLD), "PQ": int(PQ)}
 DIRECTION = RowPass(
@@ -29,7 +76,7 @@ class LinearMap(Protocol):
     """q = A p on stored fields, launched through `launch` if it is kernel launches only."""
 
     def __call__(self, p: wp.array[Any], q: wp.array[Any], /, *, launch: Launch = ...) -> None:
-        """Write q."""
+        """Write q = A p."""
 
 
 class Preconditioner(Protocol):
@@ -39,7 +86,7 @@ class Preconditioner(Protocol):
     z: wp.array[Any]
 
     def apply(self) -> None:
-        """Write z."""
+        """Write z = M r."""
 
 
 class ConjugateGradient:

@@ -11,7 +11,7 @@ import warp as wp
 from warp_lcp.deadline import check_time
 from warp_lcp.krylov.conjugate_gradient import HEADERS, LinearMap, Preconditioner
 from warp_lcp.rows import RowPass
-from warp_lcp.vectors import ADD, Reduction, rows_of
+from warp_lcp.rows.vectors import ADD, Sums, rows_of
 
 RESIDUAL = RowPass("gmres.residual", HEADERS / "residual.h", "S", reads={"b": "S", "w": "S"}, writes={"q": "S"}, optional=("w",))
 WEIGH = RowPass("gmres.weigh", HEADERS / "weigh.h", "S", reads={"w": "S"}, writes={"q": "S"}, numbers={"inverse": bool})
@@ -50,8 +50,7 @@ class GMRES:
         self._b, self._q = wp.zeros_like(r), wp.zeros_like(r)
         self._weight = weight
         self._basis = wp.zeros((restart + 1) * r.size, dtype=r.dtype, device=r.device)  # fields, one after another
-        self._sums = wp.zeros(restart + 2, dtype=wp.float64, device=r.device)  # products with them, and a square at last
-        self._reduction = Reduction(r.size, r.device, self._sums, columns=restart + 1)
+        self._sums = Sums(rows_of(r), restart + 1, slots=restart + 2)  # products with them, and a square at last
         self._factors = wp.zeros(restart + 1, dtype=wp.float64, device=r.device)
         self._residual = RESIDUAL.bind(rows_of(r), b=self._b, w=weight, q=self._q)
         self._increase = ADD.bind(rows_of(r), z=preconditioner.z, x=self.x)
@@ -110,10 +109,10 @@ class GMRES:
         """Take the first vectors out of `_q`, twice, and store the rest as the next one; return the column of H."""
         column = np.zeros(count)
         for _ in range(2):
-            DOTS.bind(rows_of(self._q), **self._fields, count=count, x=self._q, out=self._reduction.partials).launch()
-            self._reduction.add_up(0, columns=count)
-            self._combine(self._sums, self._q, count, sign=-1.0)
-            column += self._sums.numpy()[:count]
+            DOTS.bind(rows_of(self._q), **self._fields, count=count, x=self._q, out=self._sums.partials).launch()
+            self._sums.add_up(0, columns=count)
+            self._combine(self._sums.scalars, self._q, count, sign=-1.0)
+            column += self._sums.scalars.numpy()[:count]
         return np.r_[column, np.sqrt(self._stored(count)[-1])]
 
     @property
@@ -121,15 +120,13 @@ class GMRES:
         return {"basis": self._basis, "size": self._q.size}
 
     def _combine(self, factors: wp.array[Any], x: wp.array[Any], count: int, *, sign: float = 1.0) -> None:
-        """X += sign times the sum of factors_j v_j over the first `count` vectors; the last of the sums becomes x'x."""
-        given = {"factors": factors, "x": x, "count": count, "sign": sign, "out": self._reduction.partials}
-        COMBINE.bind(rows_of(x), **self._fields, **given).launch()
-        self._reduction.add_up(self._restart + 1)
+        """x += sign times the sum of factors_j v_j over the first `count` vectors; the last of the sums becomes x'x."""
+        self._sums.of(COMBINE, self._restart + 1, **self._fields, factors=factors, x=x, count=count, sign=sign)
 
     def _stored(self, place: int) -> np.ndarray:
         """Store `_q`, normalized, as a vector; return the sums."""
-        STORE.bind(rows_of(self._q), **self._fields, place=place, sums=self._sums, x=self._q, last=self._restart + 1).launch()
-        return self._sums.numpy()
+        STORE.bind(rows_of(self._q), **self._fields, place=place, sums=self._sums.scalars, x=self._q, last=self._restart + 1).launch()
+        return self._sums.scalars.numpy()
 
     def _rotate(self, k: int) -> None:
         """Make column k of H upper triangular by the old rotations and a new one."""
@@ -144,7 +141,7 @@ class GMRES:
         g[k], g[k + 1] = c * g[k], -s * g[k]
 
     def _correct(self, columns: int) -> None:
-        """X += M V y with y from the triangle; columns that are singular to rounding count for nothing."""
+        """x += M V y with y from the triangle; columns that are singular to rounding count for nothing."""
         H, g = self._H[:columns, :columns], self._g
         y = np.zeros(self._restart + 1)
         largest = float(np.abs(np.diag(H)).max(initial=0.0))

@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_lcp.krylov.conjugate_gradient import HEADERS
 from warp_lcp.rows import RowPass
-from warp_lcp.vectors import Reduction, rows_of
+from warp_lcp.rows.vectors import Sums, rows_of
 
 NORM = RowPass("krylov.norm", HEADERS / "norm.h", "S", reads={"r": "S", "w": "S"}, optional=("w",), sums=("rr",))
 
@@ -23,14 +23,11 @@ class WeightedNorm:
     """
 
     def __init__(self, like: wp.array[Any], weight: wp.array[Any] | None = None) -> None:
-        self._weight, self._sum = weight, wp.zeros(1, dtype=wp.float64, device=like.device)
-        self._reduction = Reduction(like.size, like.device, self._sum)
+        self._weight, self._sums = weight, Sums(rows_of(like))
 
     def of(self, r: wp.array[Any]) -> float:
         """Return the norm of r."""
-        NORM.bind(rows_of(r), r=r, w=self._weight, out=self._reduction.partials).launch()
-        self._reduction.add_up(0)
-        return float(np.sqrt(self._sum.numpy()[0]))
+        return float(np.sqrt(self._sums.of(NORM, r=r, w=self._weight)[0]))
 
 
 class KrylovSystem:
@@ -47,5 +44,5 @@ class KrylovSystem:
         return self._norm.of(self.r)
 
     def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
-        """Iterate."""
+        """Iterate from e = 0 until the norm is at most the tolerance; return iterations and the norm reached."""
         return self._krylov.solve(tolerance, max_iterations)

@@ -15,7 +15,7 @@ from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material import density_correction_kernels as kernels
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.operators.grid_poisson import SOLID
-from warp_lcp.vectors import convert
+from warp_lcp.rows.vectors import convert
 
 LONGEST = 0.5  # cells that a correction moves a particle at most
 EXCESS = 1e-3  # of a cell, root mean square over the over-full cells, that is not worth a solve

@@ -3,17 +3,75 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, no_type_check
 
 import numpy as np
 import scipy.sparse
 import warp as wp
 from pyamg.aggregation.aggregate import standard_aggregation
-from pyamg.strength import symmetric_strength_of_connection
+from pyamg.classical.interpolate import classical_interpolation
+from pyamg.classical.split import RS
+from pyamg.strength import classical_strength_of_connection, symmetric_strength_of_connection
 
-from warp_lcp.multigrid.aggregates_kernels import correct_kernel, restrict_kernel, settle_kernel
 from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.program import Launch, Program
+from warp_lcp.rows.program import Launch, Program
+
+f64, i32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
+
+
+@no_type_check
+@wp.kernel(enable_backward=False, module="warp_lcp.aggregates")
+def restrict_kernel(
+    first: i32, members: i32, y: f64, x: f64, lower: f64, upper: f64, factor: wp.float64, b: f64, low: f64, high: f64, e: f64
+):
+    """Sum y over an aggregate; bound its correction by the narrowest of the members' gaps over `factor`, and begin it at 0."""
+    j = wp.tid()
+    total, least, most = wp.float64(0.0), wp.float64(-wp.inf), wp.float64(wp.inf)
+    for k in range(first[j], first[j + 1]):
+        i = members[k]
+        total += y[i]
+        least = wp.max(least, (lower[i] - x[i]) / factor)
+        most = wp.min(most, (upper[i] - x[i]) / factor)
+    b[j] = total
+    low[j] = wp.min(least, wp.float64(0.0))
+    high[j] = wp.max(most, wp.float64(0.0))
+    e[j] = wp.float64(0.0)
+
+
+@no_type_check
+@wp.kernel(enable_backward=False, module="warp_lcp.aggregates")
+def correct_kernel(owner: i32, e: f64, factor: wp.float64, lower: f64, upper: f64, x: f64):
+    """Add `factor` times its aggregate's correction to each unknown, projected; unknowns of none stay."""
+    i = wp.tid()
+    j = owner[i]
+    if j >= 0:
+        x[i] = wp.clamp(x[i] + factor * e[j], lower[i], upper[i])
+
+
+@no_type_check
+@wp.kernel(enable_backward=False, module="warp_lcp.aggregates")
+def settle_kernel(
+    indptr: i32, indices: i32, values: f64, diagonal: f64, b: f64, lower: f64, upper: f64, sweeps: int, enough: wp.float64, x: f64
+):
+    """Sweep a small level forth and back by one thread, until the largest change is small beside the first one."""
+    n = x.shape[0]
+    first, change = wp.float64(0.0), wp.float64(1.0)
+    for sweep in range(sweeps):
+        if sweep == 0 or change > enough * first:
+            change = wp.float64(0.0)
+            for k in range(2 * n):
+                i = k
+                if k >= n:
+                    i = 2 * n - 1 - k
+                y = b[i]
+                for p in range(indptr[i], indptr[i + 1]):
+                    y += values[p] * x[indices[p]]
+                new = wp.clamp(x[i] - y / diagonal[i], lower[i], upper[i])
+                change = wp.max(change, wp.abs(new - x[i]))
+                x[i] = new
+            if sweep == 0:
+                first = change
+
 
 # of 1, 1.4 and 1.8 with 2 and 3 coarse cycles: obstacles under diffusion and convection on 257^2 cells, Newton's steps after 4 cycles
 OVERCORRECTION = 1.4  # of plain aggregates' corrections, which are too small where x is smooth
@@ -49,7 +107,7 @@ class Aggregation:
 
 
 @dataclass(frozen=True)
-class Level:
+class AggregateLevel:
     """A matrix; its iterate, right-hand side, bounds and A x + b; and its aggregates, None on the coarsest level."""
 
     A: SparseOperator
@@ -73,7 +131,7 @@ class AggregateCycles:
     """
 
     def __init__(self, A: SparseOperator) -> None:
-        self.A, self._version, self._levels = A, -1, list[Level]()
+        self.A, self._version, self._levels = A, -1, list[AggregateLevel]()
         self._program: Program | None = None
         self._fields: tuple[Any, ...] = ()
 
@@ -88,7 +146,7 @@ class AggregateCycles:
             host, n = operator.matrix(), operator.unknowns
             found = _aggregates(host) if n > COARSEST else None
             x, b, lower, upper, y = (wp.zeros(n, dtype=wp.float64, device=device) for _ in range(5))
-            self._levels.append(Level(operator, x, b, lower, upper, y, None if found is None else Aggregation.of(found, device)))
+            self._levels.append(AggregateLevel(operator, x, b, lower, upper, y, None if found is None else Aggregation.of(found, device)))
             more = found is not None
             if found is not None:
                 operator = SparseOperator(found.T @ host @ found, device=device, dtype=wp.float64)
@@ -99,10 +157,10 @@ class AggregateCycles:
         fields = tuple(field.ptr for field in (x, b, lower, upper))
         if self._program is None or self._fields != fields:
             finest, self._fields, self._program = self._levels[0], fields, Program(self.A.device)
-            self._visit(Level(finest.A, x, b, lower, upper, finest.y, finest.aggregation), 0, self._program.launch)
+            self._visit(AggregateLevel(finest.A, x, b, lower, upper, finest.y, finest.aggregation), 0, self._program.launch)
         self._program.run()
 
-    def _visit(self, L: Level, depth: int, launch: Launch) -> None:
+    def _visit(self, L: AggregateLevel, depth: int, launch: Launch) -> None:
         """Launch a cycle on a level and those below it."""
         A, device = L.A, self.A.device
         if L.aggregation is None:
@@ -150,3 +208,28 @@ def suits_multigrid(host: scipy.sparse.csr_array) -> bool:
     if total > 0 and float(off.data[off.data > 0].sum()) > POSITIVE * total:
         return False
     return float((magnitude <= 1.01 * d).mean()) >= DOMINANT
+
+
+STRONG = 0.25  # entries from this share of a row's largest on are strong: PyAMG's own choice
+LEAST = 4  # fine unknowns a coarse one: two splits of a five-point stencil leave an eighth
+SPLIT_KEEPS = 0.9  # the largest share of the unknowns that a split may keep
+
+
+def coarse_points(host: Any) -> tuple[Any, Any, np.ndarray] | None:
+    """Return P, P'A P and the points, for a scipy.sparse matrix A that is nearly an M-matrix; None where it does not get smaller.
+
+    A coarse unknown is one of the fine ones: (P e)_i = e_j where point j is unknown i. So the bounds of the coarse problem are those of
+    unknowns, where those of aggregates would have to be averaged.
+    """
+    A, P, points = scipy.sparse.csr_matrix(host), None, np.arange(host.shape[0])
+    while len(points) * LEAST > host.shape[0]:
+        strong = classical_strength_of_connection(A, theta=STRONG)
+        splitting = RS(strong)
+        if not 0 < splitting.sum() <= SPLIT_KEEPS * len(points):
+            return None
+        step = scipy.sparse.csr_matrix(classical_interpolation(A, strong, splitting))
+        A, P, points = (step.T @ A @ step).tocsr(), step if P is None else (P @ step).tocsr(), points[splitting != 0]
+    return (P, A, points) if P is not None else None
+
+
+__all__ = ["coarse_points"]

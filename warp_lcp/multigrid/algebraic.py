@@ -19,10 +19,11 @@ from pyamg.strength import symmetric_strength_of_connection
 
 from warp_lcp.multigrid.aggregates import aggregated, symmetric_part
 from warp_lcp.multigrid.algebraic_kernels import densify_kernel, factor_kernel, invert_kernel, places_kernel, solve_kernel
+from warp_lcp.multigrid.coarsest_kernels import PINNED
 from warp_lcp.multigrid.cycle_settings import AlgebraicSettings
 from warp_lcp.operators.sparse import GATHER, PRODUCT, ROWS, SparseOperator
-from warp_lcp.program import Launch, Program
 from warp_lcp.rows import Bound, RowPass, Rows
+from warp_lcp.rows.program import Launch, Program
 
 HEADERS = Path(__file__).parent / "headers"
 LEVEL = {**ROWS, "a": "S"}
@@ -43,7 +44,6 @@ SMOOTH = RowPass(
     numbers={"omega": "S", "from_zero": bool},
 )  # fmt: skip
 REMAINDER = RowPass("algebraic.remainder", HEADERS / "remainder.h", "S", whole={**LEVEL, "x": "S"}, reads={"b": "S"}, writes={"y": "S"})
-PINNED = {wp.float32: 3e-5, wp.float64: 1e-13}  # of a coarsest level's diagonal: what rounding leaves of a singular component's last pivot
 WIDEST = np.iinfo(np.uint16).max  # entries of a row whose places are known
 Matrix = Any  # a scipy.sparse.csr_array
 
@@ -58,7 +58,7 @@ class DeviceMatrix:
         self.rows, self.operands = Rows.flat(self.shape[0], device), {"ptr": self.indptr, "col": self.indices, "a": self.values}
 
     def product(self, x: wp.array[Any], y: wp.array[Any], launch: Launch, *, add: bool = False) -> None:
-        """Y = A x, or y + A x."""
+        """y = A x, or y + A x."""
         PRODUCT.bind(self.rows, **self.operands, x=x, plus=y if add else None, y=y).launch(launch)
 
 
@@ -105,7 +105,7 @@ class AlgebraicLevel:
         )
 
     def sweep(self, y: wp.array[Any], x: wp.array[Any], omega: float, launch: Launch, *, from_zero: bool = False) -> None:
-        """Y = x + omega (b - A x) over the rows' l1 norms; x is taken for 0 if from_zero."""
+        """y = x + omega (b - A x) over the rows' l1 norms; x is taken for 0 if from_zero."""
         given = {"inverse": self.inverse, "x": x, "b": self.b, "y": y, "omega": omega, "from_zero": from_zero}
         SMOOTH.bind(self.A.rows, **self.A.operands, **given).launch(launch)
 
@@ -156,7 +156,7 @@ class AlgebraicHierarchy:
         self._coarsening.run()
 
     def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
-        """Q = M p."""
+        """q = M p, on the finest level."""
         self.levels[0].A.product(p, q, launch)
 
     @cached_property
@@ -167,7 +167,7 @@ class AlgebraicHierarchy:
         return program
 
     def apply(self) -> None:
-        """Cycle once."""
+        """Cycle once: run `program`."""
         self.program.run()
 
     @cached_property

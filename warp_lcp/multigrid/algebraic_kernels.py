@@ -89,7 +89,7 @@ def invert_kernel(factors: MATRIX, inverse: MATRIX):
 
 @wp.kernel(enable_backward=False, module="warp_lcp.algebraic")
 def solve_kernel(inverse: MATRIX, b: wp.array(dtype=Any), x: wp.array(dtype=Any)):
-    """X = the inverse times b."""
+    """x = the inverse times b."""
     i = wp.tid()
     s = wp.float64(0.0)
     for j in range(inverse.shape[1]):

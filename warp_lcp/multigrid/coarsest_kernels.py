@@ -15,6 +15,8 @@ from warp_lcp.rows.layout import RowLayout, stencil_struct
 from warp_lcp.rows.sequence import CUDA_THREADS, meet
 
 square = wp.array2d(dtype=wp.float64)
+# of a coarsest level's diagonal: what rounding leaves of a singular component's last pivot, with a margin
+PINNED = {wp.float32: 3e-5, wp.float64: 1e-13}
 
 
 @wp.func

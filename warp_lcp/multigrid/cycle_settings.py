@@ -14,7 +14,7 @@ class Smoothing(Settings):
     interval: tuple[float, float]
 
     def __post_init__(self) -> None:
-        """Check the settings."""
+        """Check the settings, and that the interval is one."""
         super().__post_init__()
         if not self.interval[0] < self.interval[1]:
             raise SettingError("interval", self.interval, "in order")

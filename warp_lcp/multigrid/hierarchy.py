@@ -9,22 +9,18 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.layout import Padding, zeros
 from warp_lcp.multigrid import cycle_passes as passes
-from warp_lcp.multigrid.coarsest_kernels import coarsest_kernels
+from warp_lcp.multigrid.coarsest_kernels import PINNED, coarsest_kernels
 from warp_lcp.multigrid.cycle_passes import UNBOUNDED
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.shared_levels import share_changes, whole_counts
 from warp_lcp.multigrid.small_levels import SmallLevels, first_small
-from warp_lcp.operators.stencil import Stencil
-from warp_lcp.operators.stencil_kernels import coarsen_spans_kernel
-from warp_lcp.program import Launch, Program
+from warp_lcp.operators.stencil import Stencil, coarsen_spans_kernel
 from warp_lcp.rows import Bound, RowPass, Rows
+from warp_lcp.rows.fields import Padding, zeros
+from warp_lcp.rows.program import Launch, Program
 from warp_lcp.rows.sequence import CUDA_THREADS
-from warp_lcp.vectors import convert
-
-# of a coarsest level's diagonal: what rounding leaves of a singular component's last pivot, with a margin
-PINNED = {wp.float32: 3e-5, wp.float64: 1e-13}
+from warp_lcp.rows.vectors import convert
 
 Pair = tuple[wp.array[Any], wp.array[Any]]
 
@@ -126,7 +122,7 @@ class Level:
     def sweep(
         self, y: wp.array[Any], x: wp.array[Any], omega: float, *, projected: bool, from_zero: bool = False, launch: Launch = wp.launch
     ) -> None:
-        """Y = x + omega D^-1 (b - A x), clipped to the bounds if projected; x is taken for 0 if from_zero."""
+        """y = x + omega D^-1 (b - A x), clipped to the bounds if projected; x is taken for 0 if from_zero."""
         s = self.stencil
         if not from_zero:
             s.wrap(x, launch=launch)

@@ -8,8 +8,8 @@ import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from warp_lcp.program import Launch
 from warp_lcp.rows import Bound, Sequence
+from warp_lcp.rows.program import Launch
 
 if TYPE_CHECKING:
     from warp_lcp.multigrid.cycle_settings import CycleSettings

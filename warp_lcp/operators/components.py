@@ -3,18 +3,72 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, no_type_check
 
 import numpy as np
 import warp as wp
 
-from warp_lcp.operators import components_kernels as kernels
-from warp_lcp.operators.grid_poisson_kernels import FLUID
+from warp_lcp.problem.protocol import FLUID
 from warp_lcp.rows import RowPass
+
+options: dict[str, Any] = {"enable_backward": False, "module": "warp_lcp.components"}
+F64, I32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
+
+
+@no_type_check
+@wp.kernel(**options)
+def component_sums_kernel(label: I32, free: wp.array(dtype=wp.uint8), r: wp.array(dtype=Any), sums: F64, held: I32):
+    """Sum r over each component, and note which have an unknown that is not free."""
+    i = wp.tid()
+    c = label[i]
+    if c >= 0:
+        if free[i] != wp.uint8(0):
+            wp.atomic_add(sums, c, wp.float64(r[i]))
+        else:
+            held[c] = 1
+
+
+@no_type_check
+@wp.kernel(**options)
+def remove_means_kernel(label: I32, sums: F64, held: I32, sizes: F64, r: wp.array(dtype=Any)):
+    """Take the mean off every component that is free as a whole."""
+    i = wp.tid()
+    c = label[i]
+    if c >= 0:
+        if held[c] == 0:
+            r[i] = r[i] - r.dtype(sums[c] / sizes[c])
+
+
+@no_type_check
+@wp.kernel(**options)
+def smallest_gap_kernel(label: I32, x: F64, lower: F64, upper: F64, below: F64, above: F64):
+    """Smallest distance to the lower and to the upper bounds over each component."""
+    i = wp.tid()
+    c = label[i]
+    if c >= 0:
+        wp.atomic_min(below, c, x[i] - lower[i])
+        wp.atomic_min(above, c, upper[i] - x[i])
+
+
+@no_type_check
+@wp.kernel(**options)
+def shift_components_kernel(label: I32, held: I32, constant: F64, lower: F64, upper: F64, x: F64):
+    """Add each component's constant, where the component is free as a whole; the sum's rounding stays within the bounds."""
+    i = wp.tid()
+    c = label[i]
+    if c >= 0:
+        if held[c] == 0:
+            x[i] = wp.clamp(x[i] + constant[c], lower[i], upper[i])
+
+
+for _T in (wp.float32, wp.float64):
+    wp.overload(component_sums_kernel, [I32, wp.array(dtype=wp.uint8), wp.array(dtype=_T), F64, I32])
+    wp.overload(remove_means_kernel, [I32, F64, I32, F64, wp.array(dtype=_T)])
+
 
 if TYPE_CHECKING:
     from warp_lcp.operators.grid_poisson import GridPoisson
-    from warp_lcp.vectors import Across
+    from warp_lcp.rows.vectors import Across
 
 
 Scratch = tuple[wp.array[Any], wp.array[Any]]
@@ -101,11 +155,11 @@ class FloatingComponents:
         self._sums.zero_()
         self._held.zero_()
         n = r.size
-        wp.launch(kernels.component_sums_kernel, n, [self._label, free, r, self._sums, self._held], device=self.device)
+        wp.launch(component_sums_kernel, n, [self._label, free, r, self._sums, self._held], device=self.device)
         if self._across is not None:
             self._sums.assign(self._across.sum(self._sums.numpy()))
             self._held.assign(self._across.max(self._held.numpy()))
-        wp.launch(kernels.remove_means_kernel, n, [self._label, self._sums, self._held, self._sizes, r], device=self.device)
+        wp.launch(remove_means_kernel, n, [self._label, self._sums, self._held, self._sizes, r], device=self.device)
 
     def settle(self, x: wp.array[Any], lower: wp.array[Any], upper: wp.array[Any]) -> None:
         """Choose the constants that the last `project` left open.
@@ -114,7 +168,7 @@ class FloatingComponents:
         whole move.
         """
         below, above = (wp.full(self.count, np.inf, dtype=wp.float64, device=self.device) for _ in range(2))
-        wp.launch(kernels.smallest_gap_kernel, x.size, [self._label, x, lower, upper, below, above], device=self.device)
+        wp.launch(smallest_gap_kernel, x.size, [self._label, x, lower, upper, below, above], device=self.device)
         gap_below, gap_above = -self._largest(-below.numpy()), -self._largest(-above.numpy())
         inside = self.label >= 0
         mean = self._total(np.bincount(self.label[inside], x.numpy()[inside], self.count)) / self.sizes
@@ -122,7 +176,7 @@ class FloatingComponents:
         up = np.isfinite(gap_above) & ((self._net < 0) | ~np.isfinite(gap_below))
         constant = np.where(up, gap_above, np.where(np.isfinite(gap_below), -gap_below, -mean))
         constants = wp.array(constant, dtype=wp.float64, device=self.device)
-        wp.launch(kernels.shift_components_kernel, x.size, [self._label, self._held, constants, lower, upper, x], device=self.device)
+        wp.launch(shift_components_kernel, x.size, [self._label, self._held, constants, lower, upper, x], device=self.device)
 
 
 class ComponentFinder:

@@ -36,7 +36,7 @@ class CompressedRows:
 
     @property
     def operand(self) -> Any:
-        """What kernels take."""
+        """The struct of the rows that kernels take."""
         made = matrix_rows(self.values.dtype)()
         made.ptr, made.col, made.a = self.indptr, self.indices, self.values
         return made

@@ -9,12 +9,12 @@ import numpy as np
 import scipy.sparse
 import warp as wp
 
-from warp_lcp.layout import Layout, check_kept, check_storable, real_array
 from warp_lcp.operators.compressed_rows import CompressedRows
-from warp_lcp.pickling import Pickled, made_again
-from warp_lcp.problem import as_operator
+from warp_lcp.problem.lcp import as_operator
+from warp_lcp.problem.pickling import Pickled, made_again
+from warp_lcp.problem.scale import scale_of_matrix
 from warp_lcp.rows import RowPass, Rows
-from warp_lcp.scale import scale_of_matrix
+from warp_lcp.rows.fields import Layout, check_kept, check_storable, real_array
 
 HEADERS, FIELDS = Path(__file__).parent / "headers", dict.fromkeys(("b", "lower", "upper"), "S")
 PRODUCT = RowPass(
@@ -73,12 +73,12 @@ class DenseOperator(Pickled):
         self.symmetric = is_rounding(host - host.T, largest[:, None], largest)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the matrix."""
+        """Pickle the matrix as it is now."""
         return made_again(DenseOperator, self.matrix.numpy(), device=self.device, dtype=self.dtype)
 
     @property
     def unknowns(self) -> int:
-        """Number of rows."""
+        """Number of rows, which are all unknowns."""
         return self.shape[0]
 
     def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
@@ -86,7 +86,7 @@ class DenseOperator(Pickled):
         return self._product(x, out, transposed=False)
 
     def apply_transpose(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
-        """Return A' x."""
+        """Return A' x, x as for `apply`."""
         return self._product(x, out, transposed=True)
 
     def diagonal(self) -> wp.array[Any]:

@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse
 
 from warp_lcp.operators.grid_poisson import FLUID
-from warp_lcp.protocol import HasStencil
+from warp_lcp.problem.protocol import HasStencil
 
 
 def grid_matrix(A: HasStencil) -> scipy.sparse.csr_array:

@@ -4,20 +4,40 @@ from __future__ import annotations
 
 import copy
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from warp_lcp.layout import PaddedLayout, check_kept, check_storable, real_array
-from warp_lcp.operators import grid_poisson_kernels as kernels
 from warp_lcp.operators.components import ComponentFinder, FloatingComponents, Scratch
-from warp_lcp.operators.grid_poisson_kernels import AIR, FLUID, SOLID
-from warp_lcp.operators.stencil import Ghosts, Stencil
-from warp_lcp.operators.stencil_kernels import find_spans_kernel
-from warp_lcp.pickling import OnHost, Pickled, made_again
-from warp_lcp.rows import Rows
-from warp_lcp.vectors import Across
+from warp_lcp.operators.stencil import Ghosts, Stencil, find_spans_kernel
+from warp_lcp.problem.pickling import OnHost, Pickled, made_again
+from warp_lcp.problem.protocol import AIR, FLUID, SOLID
+from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows.fields import PaddedLayout, check_kept, check_storable, real_array
+from warp_lcp.rows.vectors import Across
+
+HEADERS = Path(__file__).parent / "headers"
+CELLS = {"cells": wp.int8}
+FIELDS = ("fx", "fy", "fz")
+AROUND = dict.fromkeys(("around_x", "around_y", "around_z"), bool)
+
+COPY_CELLS = RowPass("grid_poisson.copy_cells", HEADERS / "copy.h", wp.int8, reads={"source": wp.int8}, writes={"to": wp.int8})
+COUNT_FACES = RowPass(
+    "grid_poisson.count_faces", HEADERS / "count_faces.h", wp.uint8, reads=CELLS, writes={"diagonal": wp.uint8}, numbers=AROUND
+)
+FACES: dict[str, Any] = {"optional": (*FIELDS, "shift"), "numbers": dict.fromkeys(("nx", "ny", "nz"), "S")}
+GIVEN = dict.fromkeys(("FIELD_X", "FIELD_Y", "FIELD_Z"), 0)  # which of them are fields
+DIAGONAL = RowPass(
+    "grid_poisson.diagonal", HEADERS / "diagonal.h", "S", reads={**CELLS, **dict.fromkeys((*FIELDS, "shift"), "S")},
+    writes={"diagonal": "S"}, constants=GIVEN | {"SHIFTED": 0}, **FACES,
+)  # fmt: skip
+WEIGHTS = RowPass(
+    "grid_poisson.weights", HEADERS / "weights.h", "S", reads={**CELLS, **dict.fromkeys(FIELDS, "S")},
+    writes=dict.fromkeys(("wx", "wy", "wz"), "S"), constants=GIVEN, **FACES,
+)  # fmt: skip
+
 
 __all__ = ["AIR", "FLUID", "SOLID", "GridPoisson"]
 
@@ -152,7 +172,7 @@ class GridPoisson(Pickled):
     apply_transpose = apply  # A is symmetric
 
     def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
-        """Out = A x + b in one pass; stored fields of one type."""
+        """out = A x + b in one pass; stored fields of one type."""
         self.stencil.product(x, out, plus=b)
 
     def relax(self, x: Any, b: Any, lower: Any, upper: Any, omega: float, *, forward: bool = True) -> None:
@@ -209,7 +229,7 @@ class GridPoisson(Pickled):
 
     @property
     def unknowns(self) -> int:
-        """Number of FLUID cells."""
+        """Number of FLUID cells, those of ghosts not counted."""
         return int(np.count_nonzero(self.cells.numpy()[1:-1, 1:-1, 1:-1] == FLUID))
 
     def _stored_face(self, face: Face, axis: int) -> wp.array[Any]:
@@ -302,7 +322,7 @@ class GridPoisson(Pickled):
         counts, s = self.layout.padding.counts, self.stencil
         padding, whole = self.layout.padding, self._whole_rows
         if cells is not self.cells:
-            kernels.COPY_CELLS.bind(whole, source=cells.flatten(), to=self.cells.flatten()).launch()
+            COPY_CELLS.bind(whole, source=cells.flatten(), to=self.cells.flatten()).launch()
         wp.launch(find_spans_kernel, counts[:2], [self.cells, counts[2], self._spans], device=self.device)
         self.version += 1
         if self.cells_around is not self.cells:
@@ -311,16 +331,16 @@ class GridPoisson(Pickled):
         around = {"cells": self.cells_around.flatten()}
         if self._counts_faces:
             axes: dict[str, Any] = {f"around_{a}": c > 0 for a, c in zip(AXES, self.uniform, strict=True)}
-            kernels.COUNT_FACES.bind(whole, **around, diagonal=s.d, **axes).launch()
+            COUNT_FACES.bind(whole, **around, diagonal=s.d, **axes).launch()
             return
         faces: dict[str, Any] = {}
         for axis, field, number in zip(AXES, self.faces, self.uniform, strict=True):
             faces |= {f"f{axis}": field.flatten() if field.size else None, f"n{axis}": number, f"FIELD_{axis.upper()}": field.size > 0}
         shift = self.shift.flatten() if self.shift.size else None
-        kernels.DIAGONAL.bind(whole, **around, **faces, shift=shift, SHIFTED=self.shift.size > 0, diagonal=s.d).launch()
+        DIAGONAL.bind(whole, **around, **faces, shift=shift, SHIFTED=self.shift.size > 0, diagonal=s.d).launch()
         if s.weights is not None:
             weights = dict(zip(("wx", "wy", "wz"), s.weights, strict=True))
-            kernels.WEIGHTS.bind(Rows.of(padding, self.device, more=1), **around, **faces, **weights).launch()
+            WEIGHTS.bind(Rows.of(padding, self.device, more=1), **around, **faces, **weights).launch()
 
     @cached_property
     def _whole_rows(self) -> Rows:

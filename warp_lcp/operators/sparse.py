@@ -4,21 +4,38 @@ from __future__ import annotations
 
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, no_type_check
 
 import numpy as np
 import scipy.sparse
 import warp as wp
 
-from warp_lcp.layout import Layout, check_kept, check_storable, real_array
 from warp_lcp.operators.compressed_rows import CompressedRows
 from warp_lcp.operators.dense import is_rounding
-from warp_lcp.operators.sparse_kernels import color_kernel
-from warp_lcp.pickling import Pickled, made_again
-from warp_lcp.problem import as_operator
-from warp_lcp.program import Launch
+from warp_lcp.problem.lcp import as_operator
+from warp_lcp.problem.pickling import Pickled, made_again
+from warp_lcp.problem.scale import scale_of_matrix
 from warp_lcp.rows import RowPass, Rows
-from warp_lcp.scale import scale_of_matrix
+from warp_lcp.rows.fields import Layout, check_kept, check_storable, real_array
+from warp_lcp.rows.program import Launch
+
+INDICES = wp.array(dtype=wp.int32)
+
+
+@no_type_check
+@wp.kernel(enable_backward=False, module="warp_lcp.sparse.color")
+def color_kernel(ptr: INDICES, col: INDICES, taken: INDICES, color: INDICES, n: int):
+    """Greedy coloring in row order by one thread: the least color that no neighbor has. `taken[c]` is the last row that saw c, plus one."""
+    for i in range(n):
+        for k in range(ptr[i], ptr[i + 1]):
+            j = col[k]
+            if j < i:
+                taken[color[j]] = i + 1
+        c = int(0)
+        while taken[c] == i + 1:
+            c += 1
+        color[i] = c
+
 
 HEADERS = Path(__file__).parent / "headers"
 ROWS = {"ptr": wp.int32, "col": wp.int32}  # of a matrix: where each begins, columns of the entries
@@ -80,17 +97,17 @@ class SparseOperator(Pickled):
         self._take(host)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the matrix."""
+        """Pickle the matrix as it is now."""
         return made_again(SparseOperator, self.matrix(), device=self.device, dtype=self.dtype)
 
     @property
     def unknowns(self) -> int:
-        """Number of rows."""
+        """Number of rows, which are all unknowns."""
         return self.shape[0]
 
     @property
     def nnz(self) -> int:
-        """Number of stored entries."""
+        """Number of stored entries, zeros among them."""
         return int(self.values.size)
 
     @cached_property
@@ -146,11 +163,11 @@ class SparseOperator(Pickled):
         return out
 
     def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
-        """Out = A x + b in one pass; fields of one type."""
+        """out = A x + b in one pass; fields of one type."""
         self.product(x, out, plus=b)
 
     def product(self, x: wp.array[Any], out: wp.array[Any], plus: wp.array[Any] | None = None, *, launch: Launch = wp.launch) -> None:
-        """Out = A x, or A x + plus; kernel launches only."""
+        """out = A x, or A x + plus; kernel launches only."""
         PRODUCT.bind(Rows.flat(x.size, self.device), **self._rows, x=x, plus=plus, y=out).launch(launch)
 
     def diagonal(self) -> wp.array[Any]:
@@ -222,13 +239,7 @@ class SparseOperator(Pickled):
 
     def coloring(self) -> np.ndarray:
         """Return the color of each row, shape (n,), from 0."""
-        pattern = _ones(self._indptr, self._indices)
-        both = (pattern + pattern.T).tocsr()
-        inputs = [wp.array(v, dtype=wp.int32, device="cpu") for v in (both.indptr, both.indices)]
-        taken = wp.zeros(int(np.diff(both.indptr).max(initial=0)) + 2, dtype=wp.int32, device="cpu")
-        color = wp.zeros(self.unknowns, dtype=wp.int32, device="cpu")
-        wp.launch(color_kernel, 1, [*inputs, taken, color, self.unknowns], device="cpu")
-        return color.numpy()
+        return greedy_colors(_ones(self._indptr, self._indices))
 
     def _take(self, host: scipy.sparse.csr_array) -> None:
         """Derive what follows from the entries."""
@@ -264,6 +275,16 @@ class SparseOperator(Pickled):
         if tuple(x.shape) != self.shape:
             raise ValueError(f"x has shape {tuple(x.shape)}: expected {self.shape}")
         return wp.zeros_like(x) if out is None else out
+
+
+def greedy_colors(pattern: scipy.sparse.csr_array) -> np.ndarray:
+    """Return a color of each row, from 0: rows of one color have no entries in each other's columns."""
+    both = (pattern + pattern.T).tocsr()
+    inputs = [wp.array(v, dtype=wp.int32, device="cpu") for v in (both.indptr, both.indices)]
+    taken = wp.zeros(int(np.diff(both.indptr).max(initial=0)) + 2, dtype=wp.int32, device="cpu")
+    color = wp.zeros(pattern.shape[0], dtype=wp.int32, device="cpu")
+    wp.launch(color_kernel, 1, [*inputs, taken, color, color.size], device="cpu")
+    return color.numpy()
 
 
 def _checked(matrix: Any) -> scipy.sparse.csr_array:

@@ -1,19 +1,80 @@
-"""The 7-point stencil on a padded grid: arrays, sizes and launches. An operator and each level of its multigrid are one of these."""
+"""The 7-point stencil on a padded grid: arrays, sizes and launches. An operator and each level of its multigrid are one of these.
+
+(A x)_i = d_i x_i - sum of w_f x_neighbor, for d_i != 0; rows with d_i = 0 are no unknowns and give 0. Fields are 0 in cells that are no
+unknowns, so a neighbor needs no test. Two forms of one source: `uniform` has a weight an axis (and d may be a count of open faces in one
+byte, d_scale its unit), `variable` has an array of lower faces an axis.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any, Protocol
+from pathlib import Path
+from typing import Any, Protocol, no_type_check
 
 import numpy as np
 import warp as wp
 
-from warp_lcp.layout import Padding
-from warp_lcp.operators.stencil_kernels import PRODUCT, RELAX, WRAP
-from warp_lcp.program import Launch, perform
-from warp_lcp.rows import Bound, Rows
+from warp_lcp.rows import Bound, RowPass, Rows
+from warp_lcp.rows.fields import Padding
 from warp_lcp.rows.layout import check_memory, put, stencil_struct
+from warp_lcp.rows.program import Launch, perform
+
+HEADERS = Path(__file__).parent / "headers"
+PRODUCT = RowPass(
+    "stencil.product", HEADERS / "stencil_product.h", "S", stencil=("D", "W"), reads={"x": "S", "b": "S"}, optional=("b",),
+    writes={"y": "S"},
+)  # fmt: skip
+RELAX = RowPass(
+    "stencil.relax", HEADERS / "stencil_relax.h", "S", stencil=("D", "W"), reads={"b": "S", "lower": "S", "upper": "S"},
+    writes={"x": "S"}, numbers={"omega": "S", "color": int},
+)  # fmt: skip
+WRAP = RowPass("stencil.wrap", HEADERS / "wrap.h", "S", writes={"x": "S"}, numbers={"cells": int, "step": wp.int64})
+SPAN_CELLS = wp.constant(16)  # spans begin at multiples of this, so that rows stay whole vectors and aggregates whole
+
+
+@no_type_check
+@wp.func
+def whole_span(first: int, last: int, n: int):
+    """A span of whole vectors around first ... last of n cells; an empty one where there are none."""
+    begin = first // SPAN_CELLS * SPAN_CELLS
+    end = last
+    if last <= begin:
+        begin = 0
+        end = 0
+    return wp.vec2i(begin, wp.min(n, (end + SPAN_CELLS - 1) // SPAN_CELLS * SPAN_CELLS))
+
+
+@no_type_check
+@wp.kernel(enable_backward=False, module="warp_lcp.stencil")
+def find_spans_kernel(cells: wp.array3d(dtype=wp.int8), n: int, spans: wp.array2d(dtype=wp.vec2i)):
+    """The span of a row is what lies between its first and its last FLUID cell, both included, grown to whole vectors."""
+    k, j = wp.tid()
+    first = int(0)
+    while first < n and cells[k + 1, j + 1, first + 1] != wp.int8(1):
+        first += 1
+    last = int(n)
+    while last > first and cells[k + 1, j + 1, last] != wp.int8(1):
+        last -= 1
+    spans[k, j] = whole_span(first, last, n)
+
+
+@no_type_check
+@wp.kernel(enable_backward=False, module="warp_lcp.stencil")
+def coarsen_spans_kernel(fine: wp.array2d(dtype=wp.vec2i), factors: wp.vec3i, n: int, spans: wp.array2d(dtype=wp.vec2i)):
+    """A coarse row's span covers those of its rows; factors = cells an aggregate along z, y, x."""
+    k, j = wp.tid()
+    first = int(n)
+    last = int(0)
+    for a in range(factors[0]):
+        for b in range(factors[1]):
+            z = factors[0] * k + a
+            y = factors[1] * j + b
+            if z < fine.shape[0] and y < fine.shape[1]:
+                if fine[z, y][1] > fine[z, y][0]:
+                    first = wp.min(first, fine[z, y][0] // factors[2])
+                    last = wp.max(last, (fine[z, y][1] + factors[2] - 1) // factors[2])
+    spans[k, j] = whole_span(first, last, n)
 
 
 class Ghosts(Protocol):
@@ -130,7 +191,7 @@ class Stencil:
         return [Rows.edge(self.padding, self.device, axis) for axis in range(3)]
 
     def product(self, x: wp.array[Any], out: wp.array[Any], plus: wp.array[Any] | None = None, *, launch: Launch = wp.launch) -> None:
-        """Out = A x, or A x + plus. All of one float type; rows that are no unknowns give 0 (or plus)."""
+        """out = A x, or A x + plus. All of one float type; rows that are no unknowns give 0 (or plus)."""
         self.wrap(x, launch=launch)
         PRODUCT.bind(self.rows, stencil=self, x=x, b=plus, y=out).launch(launch)
 

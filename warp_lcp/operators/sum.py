@@ -7,12 +7,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.layout import layout_of
 from warp_lcp.operators.low_rank import LowRankOperator
-from warp_lcp.pickling import Pickled
-from warp_lcp.problem import as_operator
-from warp_lcp.protocol import AppliesPlus, HasCells, HasColumns, HasStencil, NamesComponents, Operator, has, version_of
-from warp_lcp.vectors import ADD, rows_of
+from warp_lcp.problem.lcp import as_operator
+from warp_lcp.problem.pickling import Pickled
+from warp_lcp.problem.protocol import AppliesPlus, HasCells, HasColumns, HasStencil, NamesComponents, Operator, has, layout_of, version_of
+from warp_lcp.rows.vectors import ADD, rows_of
 
 FELT = 1e-5  # of the sum of a column's sizes over a component: open fractions are of float32
 
@@ -64,12 +63,12 @@ class SumOperator(Pickled):
             self.grid, self.low = self._plain, self._low
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the terms."""
+        """Pickle the terms as they are now."""
         return SumOperator, (self.first, self.second)
 
     @property
     def symmetric(self) -> bool:
-        """Whether both terms are."""
+        """Whether both terms are symmetric now."""
         return self.first.symmetric and self.second.symmetric
 
     @property
@@ -95,7 +94,7 @@ class SumOperator(Pickled):
         return None if grid_and_low_rank(self) is None else self.layout.load(self.diagonal(), self.dtype).numpy()
 
     def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
-        """Out = A x + B x + b; flat stored fields of one type."""
+        """out = A x + B x + b; flat stored fields of one type."""
         plain, low = self._plain, self._low
         if isinstance(low, LowRankOperator) and has(plain, AppliesPlus):
             plain.apply_plus(x, b, out)

@@ -16,9 +16,9 @@ import warp as wp
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rigid.contacts import jacobian
 from warp_lcp.rows import RowPass, Rows
-from warp_lcp.stopping import StoppingCriteria
 
 YIELDS = 1e-6  # of B, along tangents: how friction is shared between contacts then is unique, and rest creeps by 1e-7 m/s at most
 _INDICES = ("one", "other", "starts")  # a contact's bodies, an island's first contact

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from warp_lcp.grid.motion import Motion
+from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rigid.body import AXES, PLANAR, RigidBody
 from warp_lcp.rigid.contact_detection import ContactDetection, ContactPair, ContactPoints
 from warp_lcp.rigid.contact_problem import ContactProblem
@@ -14,7 +15,6 @@ from warp_lcp.rigid.contact_shape import ContactShape
 from warp_lcp.rigid.contacts import ContactMemory, Contacts
 from warp_lcp.rigid.firm import SINGULAR, Firm
 from warp_lcp.rigid.obstacles import Obstacle
-from warp_lcp.stopping import StoppingCriteria
 
 NEAR = 1e-2  # of the smallest body's size: gaps up to it are contacts, besides those that speeds may close in a step
 AHEAD = 2.0  # of the way that speeds and gravity make in a step: what a material gives a body is not known before it is solved for

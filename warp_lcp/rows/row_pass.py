@@ -15,15 +15,15 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from warp_lcp.native import C_TYPES
-from warp_lcp.rows.layout import Bounds, Known, RowLayout, Rows, joined, make_struct, no_rows, stencil_struct, threads
+from warp_lcp.rows.layout import BoundFields, Known, RowLayout, Rows, joined, make_struct, no_rows, stencil_struct, threads
 
 HEADERS = Path(__file__).parent / "headers"
+C_TYPES = {wp.uint8: "unsigned char", wp.float32: "float", wp.float64: "double"}
 C = {**C_TYPES, wp.int8: "signed char", wp.int32: "int", wp.bool: "bool"}
 PLACE = ("k0", "j0", "i0")  # first stored cell of a box
 INTEGERS = {wp.int32: "i", int: "i", wp.int64: "q", wp.bool: "?", bool: "?"}
 PACKED = {wp.float32: "f", wp.float64: "d", **INTEGERS}  # numbers, as `struct` calls them
-NO_BOUNDS, SIDES = Bounds(), struct.Struct("dd")
+NO_BOUNDS, SIDES = BoundFields(), struct.Struct("dd")
 LARGEST = 4  # passes of a wave
 STAGES = ("L1", "F1", "L2", "F2", "L3", "F3", "L4", "F4")  # their layouts and fields
 NUMBERS = "numbers"  # that are the same everywhere, infinite ones too; else "coded", "fields"
@@ -147,7 +147,7 @@ class RowPass:
         Args:
             rows: which rows.
             stencil: a `warp_lcp.operators.stencil.Stencil`, or a `Known` product in place of one.
-            bounds: operands of a `warp_lcp.bounds.Bounds`.
+            bounds: operands of a `warp_lcp.problem.bounds.Bounds`.
             given: arrays, numbers, and constants that are not as usual, by name.
 
         Raises:
@@ -280,7 +280,7 @@ class Form:
         kinds = [shape] * bool(d.stencil) + [bounds] * (d.bounds and bounds != NUMBERS)
         self.words = [*kinds, *(t.__name__ for _, t in sorted(letters.items())), *differing]
         parts = {"stencil": stencil_struct(of(d.stencil[0]), of(d.stencil[1]) if shape == VARIABLE else wp.float32)} if d.stencil else {}
-        parts |= {"bounds": Bounds} if d.bounds else {}
+        parts |= {"bounds": BoundFields} if d.bounds else {}
         self.types = {name: of(kind) for name, kind in d.arrays.items()}
         members = {n: wp.array(dtype=t) for n, t in self.types.items()} | {n: of(t) for n, t in d.numbers.items()}
         self._numbers = struct.Struct("".join(PACKED[of(t)] for t in d.numbers.values()))
@@ -383,7 +383,7 @@ class Bound(NamedTuple):
 
     @property
     def layout(self) -> Any:
-        """Where the rows are."""
+        """Where the rows are, for a pass that sums or one that does not."""
         return self.rows.summed if self.form.declared.sums else self.rows.single
 
     def launch(self, launch: Any = None) -> None:

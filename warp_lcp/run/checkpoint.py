@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.archive import Archive, ArchiveError
 from warp_lcp.distributed.meeting import Meeting, on_root
+from warp_lcp.files.archive import Archive, ArchiveError
 from warp_lcp.frames.atomic import make_folder, replacing
 from warp_lcp.frames.rank_folder import in_ranks, rank_folder
 

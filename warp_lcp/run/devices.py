@@ -11,7 +11,7 @@ from importlib.metadata import PackageNotFoundError, version
 
 import warp as wp
 
-from warp_lcp.claims import free_host_memory
+from warp_lcp.files.claims import free_host_memory
 from warp_lcp.run.kernel_cache import cache_error, watch_loads
 from warp_lcp.simulation import InputError
 

@@ -4,20 +4,29 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import version_of
-from warp_lcp.residual import NaturalResidual
-from warp_lcp.rows import Rows
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import version_of
+from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
+from warp_lcp.rows import RowPass
+from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, Positive, Settings
-from warp_lcp.solve import IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
-from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers.spectrum import positive_diagonal, scaled_spectrum
-from warp_lcp.vectors import Reduction
 
+HEADERS, f64 = Path(__file__).parent / "headers", wp.float64
+PROGRESS = RowPass(
+    "accelerated.progress", HEADERS / "progress.h", f64,
+    reads=dict.fromkeys(("x", "x_old", "y", "z", "y_z", "d"), f64) | {"unknown": wp.int8},
+    sums=("curvature", "metric", "turned", "size"),
+)  # fmt: skip
+EXTRAPOLATE = RowPass(
+    "accelerated.extrapolate", HEADERS / "extrapolate.h", f64, bounds=True, reads={"y": f64, "d": f64, "unknown": wp.int8},
+    writes=dict.fromkeys(("x", "x_old", "y_old", "z", "y_z"), f64), numbers={"beta": f64, "lipschitz": f64},
+)  # fmt: skip
 MARGIN = 1.05  # Lanczos' estimate is from below
 FAR = 1.5  # times L: a step of more curvature is taken back
 NOISE = 1e-20  # relative (squared) length of a step below which its curvature is rounding
@@ -36,9 +45,6 @@ class AcceleratedProjectedGradient(Settings):
         lipschitz: L > 0 in the metric D; estimated if None.
         estimate_steps: products that the estimate takes.
         precision: "mixed" or "double" keep the iterate in float64, "single" rounds it to float32.
-
-    Raises:
-        ValueError: an argument is outside its range.
     """
 
     needs: ClassVar[str] = "symmetric positive semidefinite A"
@@ -47,7 +53,7 @@ class AcceleratedProjectedGradient(Settings):
     estimate_steps: Count = 20
     precision: PrecisionName = "mixed"
 
-    def init(self, problem: LCP) -> GradientWorkspace:
+    def init(self, problem: LCP) -> AcceleratedWorkspace:
         """Return a workspace.
 
         Raises:
@@ -56,15 +62,15 @@ class AcceleratedProjectedGradient(Settings):
         if not problem.A.symmetric:
             raise ValueError(f"{type(problem.A).__name__} is not symmetric: A x + b is no gradient")
         positive_diagonal(problem)
-        return GradientWorkspace(problem, self)
+        return AcceleratedWorkspace(problem, self)
 
-    def step(self, problem: LCP, work: GradientWorkspace, x: wp.array[Any]) -> Step:
+    def step(self, problem: LCP, work: AcceleratedWorkspace, x: wp.array[Any]) -> Step:
         """Take one step with momentum."""
         work.advance(x)
         return Step("gradient")
 
 
-class GradientWorkspace(IterateInPlace, RoundedIterate):
+class AcceleratedWorkspace(IterateMemory):
     """Memory of the method.
 
     Attributes:
@@ -72,18 +78,13 @@ class GradientWorkspace(IterateInPlace, RoundedIterate):
     """
 
     def __init__(self, problem: LCP, settings: AcceleratedProjectedGradient) -> None:
-        self.problem, self.settings, self.precision = problem, settings, Precision(settings.precision)
-        zeros = problem.layout.zeros
-        self.x, self._x_old, self._y_old, self._z, self._y_z = (zeros(wp.float64) for _ in range(5))
-        self.residual = NaturalResidual(problem)
-        self.floating: Any = None
+        super().__init__(problem, settings.precision)
+        self.settings, zeros = settings, problem.layout.zeros
+        self._x_old, self._y_old, self._z, self._y_z = (zeros(wp.float64) for _ in range(4))
         self.lipschitz = settings.lipschitz or 1.0
         self._version: Any = object()
         self._d = zeros(wp.float64)
-        self._scalars = wp.zeros(4, dtype=wp.float64, device=problem.device)
-        self._reduction = Reduction(problem.layout.size, problem.device, self._scalars, columns=4)
-        self._rows = Rows.flat(problem.layout.size, problem.device)
-        self._rounded = zeros(wp.float32) if self.precision is Precision.SINGLE else None
+        self._sums = Sums(rows_of(self.x), len(PROGRESS.sums))
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the momentum; look at the operator again if it has changed."""
@@ -102,14 +103,12 @@ class GradientWorkspace(IterateInPlace, RoundedIterate):
         if self._momentum == 0:
             self._momentum = 1.0
         fields = {**self._fields(x), "y_old": self._y_old, "beta": beta, "lipschitz": self.lipschitz}
-        passes.EXTRAPOLATE.bind(self._rows, bounds=p.bounds.operands, **fields).launch()
+        EXTRAPOLATE.bind(self._sums.rows, bounds=p.bounds.operands, **fields).launch()
         self.round_iterate()
 
     def _beta(self, x: wp.array[Any]) -> float:
         """Look at the last step, correct L, return the share of it that goes on."""
-        passes.PROGRESS.bind(self._rows, **self._fields(x), out=self._reduction.partials).launch()
-        self._reduction.add_up(0, columns=4)
-        curvature, metric, turned, size = self._scalars.numpy()
+        curvature, metric, turned, size = self._sums.of(PROGRESS, **self._fields(x))
         exceeded = metric > NOISE * size and curvature > self.lipschitz * metric
         if exceeded:
             rejected = curvature > FAR * self.lipschitz * metric

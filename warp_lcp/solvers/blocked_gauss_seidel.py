@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -10,21 +12,37 @@ import warp as wp
 
 from warp_lcp.operators.compressed_rows import CompressedRows
 from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasRows, HasStencil, check_taken, has
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasRows, HasStencil, check_taken, has
+from warp_lcp.problem.solve import PrecisionName, Solver, Step
+from warp_lcp.rows import RowPass, Rows
 from warp_lcp.rows.layout import put
 from warp_lcp.settings import Count, Relaxation, Settings, Share
-from warp_lcp.solve import Precision, PrecisionName, Solver, Step
-from warp_lcp.solvers.blocked_gauss_seidel_kernels import BlockLists, block_kernels
-from warp_lcp.solvers.grid_lines import GridLines, LineSweep
+from warp_lcp.solvers.blocked_gauss_seidel_kernels import BlockLists, block_sweep_kernel
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.partition import Blocks, blocks_of_size, color_blocks, given_blocks
 from warp_lcp.solvers.psor import DIRECTIONS, Direction, SweepWorkspace
 from warp_lcp.solvers.staggering import StaggeringWorkspace
-from warp_lcp.solvers.sweep import bound_operands
+from warp_lcp.solvers.sweep import bound_operands, check_colors
 
 CONSECUTIVE = 3  # unknowns of a block unless given: a contact in space
 MOST = 6  # unknowns of a block that a thread solves by active sets
+CHANGES = 60  # of a line's set; few are needed, and what is left is projected
+
+f64 = wp.float64
+SOLVE_LINE = RowPass(  # of each line's first cell
+    "grid_lines.solve", Path(__file__).parent / "headers" / "solve_line.h", f64, stencil=("D", "W"),
+    reads=dict.fromkeys(("b", "l", "u"), f64), writes={**dict.fromkeys(("x", "c", "q", "z"), f64), "s": wp.uint8},
+    numbers={"s1": wp.int64, "s2": wp.int64, "cells": int, "most": int, "color": int, "omega": f64}, constants={"AXIS": 0},
+)  # fmt: skip
+
+
+class GridLines(Enum):
+    """Along which axis the cells of a block lie: that of the strongest coefficients is the one that pays."""
+
+    X = 0
+    Y = 1
+    Z = 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,9 +67,6 @@ class BlockedGaussSeidel(Settings):
         direction: "forward", "backward" or "symmetric".
         eta: each solve of a block by a `sub_solver` reduces its residual by this factor, or to what the whole one needs.
         precision: "mixed" or "double" keep the iterate in float64, "single" rounds it to float32.
-
-    Raises:
-        ValueError: an argument is outside its range.
     """
 
     supports: ClassVar = (HasRows, HasStencil)
@@ -113,7 +128,7 @@ class BlockWorkspace(SweepWorkspace):
     """Memory of sweeps over small blocks."""
 
     def __init__(self, problem: LCP, rows: CompressedRows, blocks: list[np.ndarray], settings: BlockedGaussSeidel) -> None:
-        super().__init__(problem, Precision(settings.precision))
+        super().__init__(problem, settings.precision)
         device, n, sizes = problem.device, problem.layout.size, [len(block) for block in blocks]
         members = np.concatenate(blocks)
         owner, place = np.empty(n, dtype=np.int32), np.empty(n, dtype=np.int32)
@@ -128,7 +143,7 @@ class BlockWorkspace(SweepWorkspace):
         names = ("first", "rows", "owner", "place", "order")
         given = put(BlockLists(), {name: wp.array(v, dtype=wp.int32, device=device) for name, v in zip(names, arrays, strict=True)})
         self._operands = [rows.operand, problem.b, *bound_operands(problem), wp.float64(settings.omega), given]
-        self._kernel = block_kernels(rows.values.dtype, max(sizes)).sweep
+        self._kernel = block_sweep_kernel(rows.values.dtype, max(sizes))
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Rows are shared with the operator."""
@@ -144,16 +159,43 @@ class BlockWorkspace(SweepWorkspace):
 
 
 class LineWorkspace(SweepWorkspace):
-    """Memory of sweeps over a grid's lines."""
+    """Memory of sweeps over a grid's lines, those of one color of a checkerboard after those of the other.
+
+    A line is a tridiagonal M-matrix with bounds; its active set is changed until none is wrong, each change a tridiagonal solve.
+
+    Args:
+        problem: on a grid.
+        axis: of the lines.
+        settings: the method.
+
+    Raises:
+        ValueError: the lines are periodic, or another periodic side has an odd number of cells.
+    """
 
     def __init__(self, problem: LCP, axis: GridLines, settings: BlockedGaussSeidel) -> None:
-        super().__init__(problem, Precision(settings.precision))
-        self._lines = LineSweep(problem, axis, settings.omega)
+        super().__init__(problem, settings.precision)
+        A = problem.A
+        assert has(A, HasStencil)
+        if A.periodic[axis.value]:
+            raise ValueError(f"blocks = {axis}: lines along a periodic axis have no ends; take another axis")
+        check_colors(problem)
+        padding = A.layout.padding
+        strides, counts = (1, padding.row, padding.plane), tuple(reversed(padding.counts))
+        a, b = (other for other in (2, 1, 0) if other != axis.value)
+        self._lines = Rows.strided(padding.size, problem.device, (sum(strides), strides[a], strides[b]), (counts[a], counts[b], 1))
+        zeros, numbers = problem.layout.zeros, {"AXIS": axis.value, "cells": counts[axis.value], "most": CHANGES, "omega": settings.omega}
+        memory = {name: zeros(f64) for name in ("c", "q", "z")} | {"s": zeros(wp.uint8)}
+        self._given: dict[str, Any] = memory | numbers | {"s1": padding.plane, "s2": padding.row}
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """The stencil is the operator's own."""
         self.contraction.start(self.x)
 
     def run(self, x: wp.array[Any], *, forward: bool) -> None:
-        """Solve each line once."""
-        self._lines.run(x, forward=forward)
+        """Solve the lines of one color, then those of the other."""
+        p = self.problem
+        stencil = p.A.stencil  # type: ignore[attr-defined]
+        p.bounds.follow(x)
+        for color in (0, 1) if forward else (1, 0):
+            stencil.wrap(x)
+            SOLVE_LINE.bind(self._lines, stencil=stencil, x=x, b=p.b, l=p.lower, u=p.upper, color=color, **self._given).launch()

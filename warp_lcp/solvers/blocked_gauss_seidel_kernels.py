@@ -2,13 +2,12 @@
 """Kernels of blocked Gauss-Seidel: small boxed problems, solved exactly by active sets, one block after the other."""
 
 import functools
-from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
-from warp_lcp.affine_bounds_kernels import AffineSide, bound_at
 from warp_lcp.operators.compressed_rows import matrix_rows
+from warp_lcp.problem.affine_bounds import AffineSide, bound_at
 from warp_lcp.solvers.sweep_kernels import INFINITE, ZERO, scalar_solution
 
 f64, i32 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32)
@@ -29,7 +28,7 @@ class BlockLists:
 
 
 @functools.cache
-def block_kernels(a_type: Any, m: int) -> SimpleNamespace:
+def block_sweep_kernel(a_type: Any, m: int) -> Any:
     """Return the kernel for entries of type a_type and blocks of at most m unknowns."""
     name = f"warp_lcp.blocked_gauss_seidel.{a_type.__name__}_{m}"
     Rows = matrix_rows(a_type)
@@ -39,34 +38,39 @@ def block_kernels(a_type: Any, m: int) -> SimpleNamespace:
     extended = wp.types.vector(length=m + 1, dtype=wp.float64)
 
     @wp.struct
-    class Box:
-        """Bounds of a block's unknowns; within it they may be affine in another unknown, `*_at` >= 0."""
+    class BlockSide:
+        """Lower or upper bounds of a block's unknowns; within it they may be affine in another unknown, `at` >= 0."""
 
-        l: vector
-        l_slope: vector
-        l_at: places
-        u: vector
-        u_slope: vector
-        u_at: places
+        constant: vector
+        slope: vector
+        at: places
 
     @wp.func
-    def lower_at(box: Box, x: vector, p: int):
-        value = box.l[p]
-        q = box.l_at[p]
+    def side_at(side: BlockSide, x: vector, p: int):
+        """The bound of unknown p at x."""
+        value = side.constant[p]
+        q = side.at[p]
         if q >= 0:
-            value = value + box.l_slope[p] * x[q]
+            value = value + side.slope[p] * x[q]
         return value
 
     @wp.func
-    def upper_at(box: Box, x: vector, p: int):
-        value = box.u[p]
-        q = box.u_at[p]
-        if q >= 0:
-            value = value + box.u_slope[p] * x[q]
-        return value
+    def set_side(side: BlockSide, p: int, S: AffineSide, B: BlockLists, x: f64, i: int, block: int):
+        """The side with the bound of unknown i as its p-th one: affine in an unknown of the block, or constant while that is solved."""
+        made = side
+        made.constant[p] = bound_at(S, x, i)
+        made.at[p] = -1
+        if S.index.shape[0] > 0:
+            j = S.index[i]
+            if j >= 0:
+                if B.owner[j] == block:
+                    made.constant[p] = S.constant[i]
+                    made.slope[p] = S.coefficient[i]
+                    made.at[p] = B.place[j]
+        return made
 
     @wp.func
-    def solve_set(a: table, box: Box, state: places, n: int):
+    def solve_set(a: table, low: BlockSide, high: BlockSide, state: places, n: int):
         """Solve rows of A x = -c where free, x = bound elsewhere; the last component is 1, or 0 where the set is singular."""
         t = a
         largest = ZERO
@@ -76,14 +80,13 @@ def block_kernels(a_type: Any, m: int) -> SimpleNamespace:
                 for q in range(n):
                     t[p, q] = ZERO
                 t[p, p] = wp.float64(1.0)
-                kind = state[p]
-                j = box.l_at[p]
-                slope = box.l_slope[p]
-                t[p, m] = box.l[p]
-                if kind == AT_UPPER:
-                    j = box.u_at[p]
-                    slope = box.u_slope[p]
-                    t[p, m] = box.u[p]
+                j = low.at[p]
+                slope = low.slope[p]
+                t[p, m] = low.constant[p]
+                if state[p] == AT_UPPER:
+                    j = high.at[p]
+                    slope = high.slope[p]
+                    t[p, m] = high.constant[p]
                 if j >= 0:
                     t[p, j] -= slope
             for q in range(n):
@@ -121,7 +124,7 @@ def block_kernels(a_type: Any, m: int) -> SimpleNamespace:
         return out
 
     @wp.func
-    def wanted(a: table, box: Box, x: vector, state: places, n: int):
+    def wanted(a: table, low: BlockSide, high: BlockSide, x: vector, state: places, n: int):
         """The set that x asks for: states that are wrong, changed."""
         new = state
         size = ZERO
@@ -133,8 +136,8 @@ def block_kernels(a_type: Any, m: int) -> SimpleNamespace:
             for q in range(n):
                 y += a[p, q] * x[q]
                 terms += wp.abs(a[p, q] * x[q])
-            l = lower_at(box, x, p)
-            u = upper_at(box, x, p)
+            l = side_at(low, x, p)
+            u = side_at(high, x, p)
             if state[p] == FREE:
                 if x[p] < l - ROUNDING * size:
                     new[p] = AT_LOWER
@@ -149,27 +152,27 @@ def block_kernels(a_type: Any, m: int) -> SimpleNamespace:
         return new
 
     @wp.func
-    def solve_block(a: table, box: Box, x: vector, n: int):
+    def solve_block(a: table, low: BlockSide, high: BlockSide, x: vector, n: int):
         """Solve the block: change wrong states, all at first, then the one of least index; else try all sets; else scalar problems."""
         state = places()
         for p in range(n):
             state[p] = FREE
-            if x[p] <= lower_at(box, x, p):
+            if x[p] <= side_at(low, x, p):
                 state[p] = AT_LOWER
-            elif x[p] >= upper_at(box, x, p):
+            elif x[p] >= side_at(high, x, p):
                 state[p] = AT_UPPER
         solved = int(0)
         out = x
         going = int(1)
         count = int(0)
         while going == 1:
-            z = solve_set(a, box, state, n)
+            z = solve_set(a, low, high, state, n)
             going = 0
             if z[m] > ZERO:
                 v = vector()
                 for p in range(n):
                     v[p] = z[p]
-                new = wanted(a, box, v, state, n)
+                new = wanted(a, low, high, v, state, n)
                 first = int(-1)
                 for p in range(n):
                     q = n - 1 - p
@@ -197,18 +200,18 @@ def block_kernels(a_type: Any, m: int) -> SimpleNamespace:
                     state[p] = rest % 3
                     rest = rest // 3
                     if state[p] == AT_LOWER:
-                        if box.l[p] < -INFINITE:
+                        if low.constant[p] < -INFINITE:
                             possible = 0
                     if state[p] == AT_UPPER:
-                        if box.u[p] > INFINITE:
+                        if high.constant[p] > INFINITE:
                             possible = 0
                 if possible == 1:
-                    z = solve_set(a, box, state, n)
+                    z = solve_set(a, low, high, state, n)
                     if z[m] > ZERO:
                         v = vector()
                         for p in range(n):
                             v[p] = z[p]
-                        new = wanted(a, box, v, state, n)
+                        new = wanted(a, low, high, v, state, n)
                         same = int(1)
                         for p in range(n):
                             if new[p] != state[p]:
@@ -223,7 +226,7 @@ def block_kernels(a_type: Any, m: int) -> SimpleNamespace:
                 y = a[p, m]
                 for q in range(n):
                     y += a[p, q] * out[q]
-                out[p] = scalar_solution(out[p], y, a[p, p], lower_at(box, out, p), upper_at(box, out, p), wp.float64(1.0))
+                out[p] = scalar_solution(out[p], y, a[p, p], side_at(low, out, p), side_at(high, out, p), wp.float64(1.0))
         return out
 
     @wp.kernel(enable_backward=False, module=name)
@@ -241,7 +244,8 @@ def block_kernels(a_type: Any, m: int) -> SimpleNamespace:
             start = B.first[block]
             n = B.first[block + 1] - start
             a = table()
-            box = Box()
+            low = BlockSide()
+            high = BlockSide()
             old = vector()
             for p in range(n):
                 i = B.rows[start + p]
@@ -259,30 +263,15 @@ def block_kernels(a_type: Any, m: int) -> SimpleNamespace:
                     else:
                         c += v * x[j]
                 a[p, m] = c
-                box.l[p] = bound_at(lowers, x, i)
-                box.u[p] = bound_at(uppers, x, i)
-                box.l_at[p] = -1
-                box.u_at[p] = -1
-                if lowers.index.shape[0] > 0:
-                    j = lowers.index[i]
-                    if j >= 0:
-                        if B.owner[j] == block:
-                            box.l[p] = lowers.constant[i]
-                            box.l_slope[p] = lowers.coefficient[i]
-                            box.l_at[p] = B.place[j]
-                    j = uppers.index[i]
-                    if j >= 0:
-                        if B.owner[j] == block:
-                            box.u[p] = uppers.constant[i]
-                            box.u_slope[p] = uppers.coefficient[i]
-                            box.u_at[p] = B.place[j]
-            new = solve_block(a, box, old, n)
+                low = set_side(low, p, lowers, B, x, i, block)
+                high = set_side(high, p, uppers, B, x, i, block)
+            new = solve_block(a, low, high, old, n)
             for p in range(n):
                 new[p] = old[p] + omega * (new[p] - old[p])
             for p in range(n):  # unknowns that others' bounds depend on have constant ones, so that their order does not matter
-                if box.l_at[p] < 0 and box.u_at[p] < 0:
-                    new[p] = wp.clamp(new[p], box.l[p], box.u[p])
+                if low.at[p] < 0 and high.at[p] < 0:
+                    new[p] = wp.clamp(new[p], low.constant[p], high.constant[p])
             for p in range(n):
-                x[B.rows[start + p]] = wp.clamp(new[p], lower_at(box, new, p), upper_at(box, new, p))
+                x[B.rows[start + p]] = wp.clamp(new[p], side_at(low, new, p), side_at(high, new, p))
 
-    return SimpleNamespace(sweep=sweep)
+    return sweep

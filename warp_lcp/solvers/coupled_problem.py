@@ -13,10 +13,10 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.deadline import Deadline, TimeIsUp, check_time
-from warp_lcp.problem import LCP
-from warp_lcp.result import SolveResult, SolveStatus
-from warp_lcp.solve import Solver, solve
-from warp_lcp.stopping import StoppingCriteria
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.result import SolveResult, SolveStatus
+from warp_lcp.problem.solve import Solver, solve
+from warp_lcp.problem.stopping import StoppingCriteria
 
 SHARE = 0.3  # of the coupled tolerance, which a block need not be solved beyond
 

@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Never
 
-from warp_lcp.layout import Array
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasStencil, has, takes
-from warp_lcp.result import Record, SolveResult
-from warp_lcp.solve import ConvexSetProblem, Solver, Workspace
-from warp_lcp.solve import solve as solve_by
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasStencil, has, takes
+from warp_lcp.problem.result import Record, SolveResult
+from warp_lcp.problem.solve import ConvexSetProblem, Solver, Workspace
+from warp_lcp.problem.solve import solve as solve_by
+from warp_lcp.problem.stopping import StoppingCriteria
+from warp_lcp.rows.fields import Array
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.minimum_map_newton_direct import suits
 from warp_lcp.solvers.projected_jacobi import ProjectedJacobi
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 from warp_lcp.solvers.psor import ProjectedSOR
-from warp_lcp.stopping import StoppingCriteria
 
 
 def default_method(problem: LCP) -> Solver:

@@ -13,12 +13,11 @@ import scipy.sparse.linalg
 import warp as wp
 
 from warp_lcp.deadline import check_time, seconds_left
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasRows, has
-from warp_lcp.residual import NaturalResidual
-from warp_lcp.result import SolveStatus
-from warp_lcp.scale import scale_of_matrix, scaled, sizes_of_matrix
-from warp_lcp.solve import IterateInPlace, Precision, Step
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasRows, has
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.scale import scale_of_matrix, scaled, sizes_of_matrix
+from warp_lcp.problem.solve import IterateMemory, Precision, Step
 
 SEMIDEFINITE = 1e-10  # shift with which an equilibrated semi-definite matrix must have a Cholesky factor
 PROVABLE = 250_000  # entries of A up to which a linear program is asked whether there is a solution: seconds
@@ -73,7 +72,7 @@ class DenseProblem:
         return DenseProblem(self.rows, scaled(self.A, R, C), b / beta, self.lower / units, self.upper / units, self.symmetric), units
 
     def _units(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return R and C."""
+        """Return R and C of `scaled`, powers of 2."""
         if not self.symmetric:
             return unit_rows_and_columns(self.A)
         S = equilibration(self.A)
@@ -218,7 +217,7 @@ def check_size(problem: LCP, method: str, most: int) -> int:
     return n
 
 
-class DenseWorkspace(IterateInPlace):
+class DenseWorkspace(IterateMemory):
     """Memory of a method that works on a DenseProblem and writes its iterate back.
 
     Attributes:
@@ -226,13 +225,8 @@ class DenseWorkspace(IterateInPlace):
         ended: the status with which the method gives up if the iterate does not meet the criteria; None while it goes on.
     """
 
-    precision = Precision.DOUBLE
-
-    def __init__(self, problem: LCP) -> None:
-        self.problem = problem
-        self.x = problem.layout.zeros(wp.float64)
-        self.residual = NaturalResidual(problem)
-        self.floating: Any = None
+    def __init__(self, problem: LCP, precision: str = Precision.DOUBLE) -> None:
+        super().__init__(problem, precision)
         self.data: DenseProblem = None  # type: ignore[assignment]
         self.ended: SolveStatus | None = None
 
@@ -243,9 +237,6 @@ class DenseWorkspace(IterateInPlace):
     def read(self) -> DenseProblem:
         """Copy the problem to the host."""
         return DenseProblem.read(self.problem)
-
-    def round_iterate(self) -> None:
-        """The iterate is float64."""
 
     def read_iterate(self) -> np.ndarray:
         """Return the iterate's unknowns, shape (n,)."""

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from warp_lcp.deadline import check_time
 
 NOISE = 500.0  # rounding units of the iterate, in parts of the energy: what rounding may pretend
 LEAP = 1e3  # times the least residual: a step that ends there, and sets no new least energy, was wrong
@@ -89,3 +93,45 @@ class Descent:
         if self._owed > 0:
             vain = fell < WORTH * self._owed
             self._pause, self._wait, self._owed = (self._wait, 2 * self._wait, 0.0) if vain else (0, 1, 0.0)
+
+
+DECREASE = 1e-4  # share of the slope that a step must gain: Armijo's constant
+
+
+@dataclass
+class NonmonotoneSearch:
+    """Backtracking from the full step against the largest of the last merits.
+
+    Args:
+        memory: merits remembered; 1 is Armijo's monotone search.
+        least: the shortest step tried.
+    """
+
+    memory: int = 8
+    least: float = 1e-8
+    merits: list[float] = field(default_factory=list)
+
+    def forget(self) -> None:
+        """Forget the merits of the last solve."""
+        self.merits.clear()
+
+    def remember(self, merit: float) -> None:
+        """Note the merit where a step starts."""
+        self.merits = [*self.merits, merit][-self.memory :]
+
+    def search(self, trial: Callable[[float], float], slope: float, *, first: float = 1.0) -> tuple[float, float]:
+        """Return the first of the halved steps that the merits allow, and its merit; step 0 if none down to `least` is.
+
+        Args:
+            trial: moves to a step length and returns the merit there.
+            slope: derivative of the merit along the direction, < 0.
+            first: the first length tried.
+        """
+        limit, length = max(self.merits), first
+        while length >= self.least:
+            check_time()
+            merit = trial(length)
+            if math.isfinite(merit) and merit <= limit + DECREASE * length * slope:
+                return length, merit
+            length *= 0.5
+        return 0.0, math.inf

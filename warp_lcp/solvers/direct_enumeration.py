@@ -8,13 +8,13 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
-from warp_lcp.layout import Array, real_array
-from warp_lcp.pickling import FieldsOnHost
-from warp_lcp.problem import LCP
-from warp_lcp.result import SolveStatus
-from warp_lcp.solve import Step
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.pickling import FieldsOnHost
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.solve import Step
+from warp_lcp.rows.fields import Array, real_array
 from warp_lcp.solvers.dense_problem import DenseProblem, DenseWorkspace, check_size
-from warp_lcp.solvers.direct_enumeration_kernels import kernels
+from warp_lcp.solvers.direct_enumeration_kernels import enumeration_kernels
 
 MOST = 4  # unknowns: 3^4 = 81 sets
 ACCEPTED = {wp.float64: 1e-10, wp.float32: 3e-5}  # measure of a solution: natural residual over the terms of y, of cond(A) < 1e5
@@ -45,7 +45,7 @@ class DirectEnumeration:
         return DenseWorkspace(problem)
 
     def step(self, problem: LCP, work: DenseWorkspace, x: wp.array[Any]) -> Step:
-        """Try all sets."""
+        """Try all sets, and take the best one's x."""
         candidates, measures = _candidates(work.data)
         best = int(measures.argmin())
         if measures[best] <= ACCEPTED[wp.float64]:
@@ -145,7 +145,7 @@ def enumerate_batch(
     if tuple(out.x.shape) != (m, n) or tuple(out.sets.shape) != (m,) or out.x.dtype is not dtype or out.x.device != device:
         raise ValueError(f"out holds x of shape {tuple(out.x.shape)} and type {out.x.dtype}: expected {(m, n)} and {dtype} on {device}")
     inputs = [matrices, right, *bounds, dtype(ACCEPTED[dtype]), out.x, out.sets]
-    wp.launch(kernels(n, dtype).batch, m, inputs, device=device)
+    wp.launch(enumeration_kernels(n, dtype).batch, m, inputs, device=device)
     return out
 
 
@@ -157,7 +157,7 @@ def _candidates(data: DenseProblem) -> tuple[np.ndarray, np.ndarray]:
     n, (scaled, units) = len(data.b), data.scaled()
     inputs = [wp.array(field, dtype=wp.float64, device="cpu") for field in (scaled.A, scaled.b, scaled.lower, scaled.upper)]
     x, measures = wp.empty((3**n, n), dtype=wp.float64, device="cpu"), wp.empty(3**n, dtype=wp.float64, device="cpu")
-    wp.launch(kernels(n, wp.float64).each, 3**n, [*inputs, x, measures], device="cpu")
+    wp.launch(enumeration_kernels(n, wp.float64).each, 3**n, [*inputs, x, measures], device="cpu")
     return x.numpy() * units, measures.numpy()
 
 

@@ -13,7 +13,7 @@ EQUILIBRATIONS = 8  # sweeps of Ruiz's iteration at most; the first changes noth
 
 
 @functools.cache
-def kernels(n: int, dtype: type) -> SimpleNamespace:
+def enumeration_kernels(n: int, dtype: type) -> SimpleNamespace:
     """Return the kernels `batch` (a problem a thread) and `each` (a set a thread of one problem) for n unknowns.
 
     `enumerate_sets(A, b, low, high)` is the function behind `batch`, for kernels that have a small problem at hand: it returns x, its

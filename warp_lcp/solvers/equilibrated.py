@@ -14,15 +14,14 @@ import warp as wp
 
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasRows, HasScale, has, version_of
-from warp_lcp.residual import NaturalResidual
-from warp_lcp.result import SolveStatus
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasRows, HasScale, has, version_of
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.scale import scaled
+from warp_lcp.problem.solve import IterateMemory, Step
 from warp_lcp.rows import RowPass
-from warp_lcp.scale import scaled
-from warp_lcp.solve import IterateInPlace, Precision, RoundedIterate, Step
+from warp_lcp.rows.vectors import rows_of
 from warp_lcp.solvers.dense_problem import power_of_two, proved_infeasible, unit_rows_and_columns
-from warp_lcp.vectors import rows_of
 
 UNITS = RowPass(
     "equilibrated.units", Path(__file__).parent / "headers" / "units.h", wp.float64, reads={"x": wp.float64, "units": wp.float64},
@@ -35,7 +34,7 @@ GROWN = 1e4  # growth of the residual after which it is
 EARLY = 10  # steps before which a residual says little: a path is joined far from the start
 
 
-class EquilibratedWorkspace(IterateInPlace, RoundedIterate):
+class EquilibratedWorkspace(IterateMemory):
     """A method's workspace for R A C x' + R b, bounds l / C and u / C, and the problem's own iterate x = C x'.
 
     R and C are powers of 2 with R_i C_i near 1 / d_i of the natural residual, equal where A is symmetric (of semi-definite matrices:
@@ -51,13 +50,10 @@ class EquilibratedWorkspace(IterateInPlace, RoundedIterate):
         inner: that workspace.
     """
 
-    def __init__(self, problem: LCP, precision: Precision, make: Callable[[LCP], Any]) -> None:
-        self.problem, self.precision = problem, precision
+    def __init__(self, problem: LCP, precision: str, make: Callable[[LCP], Any]) -> None:
+        super().__init__(problem, precision)
         layout, bounds = problem.layout, problem.bounds
-        self.x, self._rows, self._units = (layout.zeros(wp.float64) for _ in range(3))
-        self.residual = NaturalResidual(problem)
-        self._rounded = layout.zeros(wp.float32) if precision is Precision.SINGLE else None
-        self.floating: Any = None
+        self._rows, self._units = layout.zeros(wp.float64), layout.zeros(wp.float64)
         matrix = self._scaled()
         made: Any = SparseOperator if scipy.sparse.issparse(matrix) else DenseOperator
         sides = [layout.zeros(wp.float64) if bounds.varying[k] or bounds.values[k] not in (0.0, -np.inf, np.inf) else None for k in (0, 1)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,12 +10,23 @@ import warp as wp
 
 from warp_lcp.krylov.gmres import GMRES
 from warp_lcp.krylov.system import KrylovSystem
-from warp_lcp.problem import LCP
-from warp_lcp.program import Launch
-from warp_lcp.residual import NaturalResidual
-from warp_lcp.solvers.nonsmooth_map import Kink, NonsmoothMap, Reformulation
-from warp_lcp.solvers.nonsmooth_map_kernels import difference_kernel, scale_rows_kernel
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.rows import RowPass
+from warp_lcp.rows.program import Launch
+from warp_lcp.rows.vectors import rows_of
+from warp_lcp.solvers.nonsmooth_map import Kink, MapForm, NonsmoothMap
 
+HEADERS, f64 = Path(__file__).parent / "headers", wp.float64
+DIFFERENCE = RowPass(
+    "finite_difference.difference",
+    HEADERS / "difference.h",
+    f64,
+    reads={"free": wp.uint8, "f": f64},
+    writes={"q": f64},
+    numbers={"over": f64},
+)
+SCALE = RowPass("finite_difference.scale", HEADERS / "divide_by_size.h", f64, reads={"r": f64, "d": f64}, writes={"z": f64})
 STEP = 1e-7  # relative to ||x|| / ||p||: half the digits of float64
 
 
@@ -30,7 +42,7 @@ class FiniteDifferenceSystem(KrylovSystem):
         share: lambda of the penalized map.
     """
 
-    def __init__(self, problem: LCP, residual: NaturalResidual, map: Reformulation, share: float) -> None:
+    def __init__(self, problem: LCP, residual: NaturalResidual, map: MapForm, share: float) -> None:
         layout, self._problem, self._residual = problem.layout, problem, residual
         self.r, self.z, self._f, self._moved = (layout.zeros(wp.float64) for _ in range(4))
         self._map = NonsmoothMap(problem, residual, map, share, Kink.APPROXIMATION)
@@ -49,12 +61,11 @@ class FiniteDifferenceSystem(KrylovSystem):
         self._map.values(x, self._f)
         self._length = 1 + self._norm.of(x)
         self.r.zero_()
-        inputs = [free, self._f, wp.float64(1 / size), self.r]
-        wp.launch(difference_kernel, self.r.size, inputs, device=self._problem.device)
+        DIFFERENCE.bind(rows_of(self.r), free=free, f=self._f, over=1 / size, q=self.r).launch()
 
     def apply(self) -> None:
         """Precondition: z = r / d."""
-        wp.launch(scale_rows_kernel, self.r.size, [self.r, self._diagonal, self.z], device=self._problem.device)
+        SCALE.bind(rows_of(self.r), r=self.r, d=self._diagonal, z=self.z).launch()
 
     def _product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
         norm = self._norm.of(p)
@@ -65,4 +76,4 @@ class FiniteDifferenceSystem(KrylovSystem):
         self._map.advance(self._x, p, h, self._moved, projected=False)
         self._residual.affine(self._moved)
         self._map.values(self._moved, q)
-        wp.launch(difference_kernel, q.size, [self._free, self._f, wp.float64(1 / h), q], device=self._problem.device)
+        DIFFERENCE.bind(rows_of(q), free=self._free, f=self._f, over=1 / h, q=q).launch()

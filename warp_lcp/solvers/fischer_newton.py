@@ -11,19 +11,19 @@ import warp as wp
 
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.dense import DenseOperator
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasStencil, has
-from warp_lcp.residual import NaturalResidual
-from warp_lcp.result import SolveStatus
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasStencil, has
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.solve import IterateMemory, Precision, PrecisionName, Step
 from warp_lcp.settings import Count, CountOrZero, Settings, Share, ShareOrAll
-from warp_lcp.solve import IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
+from warp_lcp.solvers.descent import NonmonotoneSearch
 from warp_lcp.solvers.finite_difference import FiniteDifferenceSystem
 from warp_lcp.solvers.fischer_newton_dense import FischerDenseWorkspace
-from warp_lcp.solvers.globalization import NonmonotoneSearch
-from warp_lcp.solvers.gradient_descent import GradientDescent, GradientWorkspace
+from warp_lcp.solvers.gradient_descent import DescentWorkspace, GradientDescent
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
-from warp_lcp.solvers.nonsmooth_map import Kink, KinkName, NonsmoothMap, Reformulation
+from warp_lcp.solvers.nonsmooth_map import Kink, KinkName, MapForm, NonsmoothMap
 from warp_lcp.solvers.principal_system import GridSystem, principal_system
 
 SHARE = 0.95  # lambda of the penalized map for dense problems: measured on frictional contacts
@@ -60,9 +60,6 @@ class FischerNewton(Settings):
         memory: merits that a safeguarded search remembers.
         cycle: how multigrid cycles go.
 
-    Raises:
-        ValueError: an argument is outside its range.
-
     Example:
         >>> import numpy as np, warp_lcp as wl
         >>> A = wl.DenseOperator(np.array([[2.0, -1.0], [-1.0, 2.0]]), device="cpu")
@@ -87,7 +84,7 @@ class FischerNewton(Settings):
     def descent(self, problem: LCP) -> GradientDescent:
         """Return the gradient descent whose map is this method's for the problem: the only one consistent with it as a warm start."""
         share = self.share if self.share is not None else SHARE if isinstance(problem.A, DenseOperator) else 1.0
-        map_ = Reformulation.FISCHER if share == 1 else Reformulation.PENALIZED
+        map_ = MapForm.FISCHER if share == 1 else MapForm.PENALIZED
         return GradientDescent(map=map_.value, share=share, precision="single" if self.precision == "single" else "double")
 
     def init(self, problem: LCP) -> FischerWorkspace | FischerDenseWorkspace:
@@ -107,22 +104,22 @@ class FischerNewton(Settings):
         return work.newton_step(x)
 
 
-class FischerWorkspace(IterateInPlace, RoundedIterate):
+class FischerWorkspace(IterateMemory):
     """Memory of the method for one problem, on the device."""
 
     def __init__(self, problem: LCP, settings: FischerNewton) -> None:
-        self.problem, self.settings, self.precision = problem, settings, Precision(settings.precision)
-        layout, self.kink = problem.layout, Kink(settings.kink)
+        self.settings, self.kink, layout = settings, Kink(settings.kink), problem.layout
         self.active_set: GridNewtonWorkspace | None = None
-        self.x, self.residual = layout.zeros(wp.float64), NaturalResidual(problem)
         if has(problem.A, HasStencil) and self.kink is not Kink.APPROXIMATION:
             newton = MinimumMapNewton(precision=settings.precision, monotone_cycles=settings.monotone_cycles, cycle=settings.cycle)
             self.active_set = GridNewtonWorkspace(problem, problem.A, newton, serves=True)
-            self.x, self.residual, self.scratch = self.active_set.x, self.active_set.residual, self.active_set.scratch
+            self.scratch = self.active_set.scratch
+        shared: dict[str, Any] = {"x": self.active_set.x, "residual": self.active_set.residual} if self.active_set else {}
+        super().__init__(problem, settings.precision, **shared)
         self._from, self._shift = layout.zeros(wp.float64), layout.zeros(wp.float64)
         self.free = layout.zeros(wp.uint8)
         self._descent = settings.descent(problem)
-        map_, share = Reformulation(self._descent.map), self._descent.share
+        map_, share = MapForm(self._descent.map), self._descent.share
         self.system: Any = (
             FiniteDifferenceSystem(problem, self.residual, map_, share)
             if self.kink is Kink.APPROXIMATION
@@ -135,9 +132,7 @@ class FischerWorkspace(IterateInPlace, RoundedIterate):
         grid = isinstance(self.system, GridSystem) and self.system.fused
         self._fusable = grid and settings.safeguard and self.precision is not Precision.SINGLE
         self._search = NonmonotoneSearch(memory=settings.memory if settings.safeguard else 1)
-        self._gradient: GradientWorkspace | None = None
-        self._rounded = layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
-        self.floating: Any = None
+        self._gradient: DescentWorkspace | None = None
         self.cycles_left = self.descents_left = self.steps = 0
         self.target = self._scale = self._merit = self._gone = 0.0
 
@@ -233,7 +228,7 @@ class FischerWorkspace(IterateInPlace, RoundedIterate):
         """Go down the gradient of the same map once."""
         shared = self.active_set is None  # a grid's own residual does not keep y
         if self._gradient is None:
-            self._gradient = GradientWorkspace(self.problem, self._descent, self.residual if shared else NaturalResidual(self.problem))
+            self._gradient = DescentWorkspace(self.problem, self._descent, self.residual if shared else NaturalResidual(self.problem))
             self._gradient.start(warm=True, tolerance=self.target)
         if shared:
             return self._gradient.descend(x)

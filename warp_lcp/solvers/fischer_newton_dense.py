@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.linalg
 
-from warp_lcp.problem import LCP
-from warp_lcp.result import SolveStatus
-from warp_lcp.solve import Precision, Step
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.solve import Step
 from warp_lcp.solvers.dense_problem import DenseProblem, DenseWorkspace
-from warp_lcp.solvers.globalization import NonmonotoneSearch
-from warp_lcp.solvers.gradient_descent import GradientWorkspace
+from warp_lcp.solvers.descent import NonmonotoneSearch
+from warp_lcp.solvers.gradient_descent import DescentWorkspace
 from warp_lcp.solvers.nonsmooth_map import KINK, Kink
 
 if TYPE_CHECKING:
@@ -110,12 +110,12 @@ class FischerDenseWorkspace(DenseWorkspace):
     """
 
     def __init__(self, problem: LCP, settings: FischerNewton) -> None:
-        super().__init__(problem)
-        self.settings, self._descent, self.precision = settings, settings.descent(problem), Precision(settings.precision)
+        super().__init__(problem, settings.precision)
+        self.settings, self._descent = settings, settings.descent(problem)
         self.cycles_left, self.descents_left, self.stage, self.steps = 0, settings.warm_start, 0, 0
         self.active_set: Any = None
         self._search = NonmonotoneSearch(memory=settings.memory if settings.safeguard else 1)
-        self._gradient: GradientWorkspace | None = None
+        self._gradient: DescentWorkspace | None = None
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Read the problem, and begin the first stage."""
@@ -132,7 +132,7 @@ class FischerDenseWorkspace(DenseWorkspace):
     def descend(self, x: Any) -> Step:
         """Go down the gradient of the same map once."""
         if self._gradient is None:
-            self._gradient = GradientWorkspace(self.problem, self._descent, self.residual)
+            self._gradient = DescentWorkspace(self.problem, self._descent, self.residual)
             self._gradient.start(warm=True, tolerance=self.target)
         step = self._gradient.descend(x)
         self._iterate = self._begun = self.read_iterate() / self.units
@@ -152,13 +152,6 @@ class FischerDenseWorkspace(DenseWorkspace):
         self.round_iterate()
         name = "fischer" if self.stage == 0 else "homotopy"
         return Step(name, 1, None, failure, interim=self.settings.safeguard and failure is None)
-
-    def round_iterate(self) -> None:
-        """Round x to its precision."""
-        self.x.assign(self._rounded(self.x.numpy()))
-
-    def _rounded(self, x: np.ndarray) -> np.ndarray:
-        return x.astype(np.float32).astype(np.float64) if self.precision is Precision.SINGLE else x
 
     def _plain(self) -> SolveStatus | None:
         """Take a step of the book's method: algorithm 12."""

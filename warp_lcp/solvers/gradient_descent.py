@@ -9,13 +9,13 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
-from warp_lcp.problem import LCP
-from warp_lcp.residual import NaturalResidual
-from warp_lcp.result import SolveStatus
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
 from warp_lcp.settings import Count, NonNegative, Settings, ShareOrAll
-from warp_lcp.solve import IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
-from warp_lcp.solvers.globalization import NonmonotoneSearch
-from warp_lcp.solvers.nonsmooth_map import MapName, NonsmoothMap, Reformulation
+from warp_lcp.solvers.descent import NonmonotoneSearch
+from warp_lcp.solvers.nonsmooth_map import MapForm, MapName, NonsmoothMap
 
 LEAST = 1e-12  # relative decrease of the merit without which a step is none
 LONGEST = 1e6  # length tried
@@ -42,9 +42,6 @@ class GradientDescent(Settings):
         gradient: of the test for a local minimum, >= 0.
         memory: merits that the search remembers, >= 1; 1 is the book's monotone search.
         precision: "mixed" and "double" are the same here; "single" rounds x to float32.
-
-    Raises:
-        ValueError: an argument is outside its range.
     """
 
     needs: ClassVar[str] = "products with A'"
@@ -57,16 +54,16 @@ class GradientDescent(Settings):
     memory: Count = 10
     precision: PrecisionName = "double"
 
-    def init(self, problem: LCP) -> GradientWorkspace:
-        """Return a workspace."""
-        return GradientWorkspace(problem, self)
+    def init(self, problem: LCP) -> DescentWorkspace:
+        """Return memory for the problem, any operator's."""
+        return DescentWorkspace(problem, self)
 
-    def step(self, problem: LCP, work: GradientWorkspace, x: wp.array[Any]) -> Step:
-        """Go down once."""
+    def step(self, problem: LCP, work: DescentWorkspace, x: wp.array[Any]) -> Step:
+        """Go down along the projected path of the gradient once."""
         return work.descend(x)
 
 
-class GradientWorkspace(IterateInPlace, RoundedIterate):
+class DescentWorkspace(IterateMemory):
     """Memory of the method for one problem; another method's where it shares that one's residual.
 
     Args:
@@ -76,18 +73,16 @@ class GradientWorkspace(IterateInPlace, RoundedIterate):
     """
 
     def __init__(self, problem: LCP, settings: GradientDescent, residual: NaturalResidual | None = None) -> None:
-        self.problem, self.settings, self.precision = problem, settings, Precision(settings.precision)
-        self.residual = residual or NaturalResidual(problem)
-        self.x = problem.layout.zeros(wp.float64) if residual is None else wp.empty(0, dtype=wp.float64, device=problem.device)
+        x = None if residual is None else wp.empty(0, dtype=wp.float64, device=problem.device)
+        super().__init__(problem, settings.precision, x=x, residual=residual)
+        self.settings = settings
         self._from = problem.layout.zeros(wp.float64)
-        self._map = NonsmoothMap(problem, self.residual, Reformulation(settings.map), settings.share)
+        self._map = NonsmoothMap(problem, self.residual, MapForm(settings.map), settings.share)
         self._search = NonmonotoneSearch(memory=settings.memory, least=1e-18)
-        self._rounded = problem.layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
-        self.floating: Any = None
         self.length, self._square = 1.0, 0.0
 
     def start(self, *, warm: bool, tolerance: float) -> None:
-        """Forget the last length."""
+        """Forget the last length and merits; b may have changed."""
         self.length, self._square = 1.0, 0.0
         self._search.forget()
         self._map.begin()

@@ -2,15 +2,56 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import no_type_check
+
 import numpy as np
 import warp as wp
 
+from warp_lcp.krylov.conjugate_gradient import first_iteration, next_iteration
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.stencil import Stencil
-from warp_lcp.program import Program
-from warp_lcp.solvers import grid_conjugate_gradient_kernels as kernels
+from warp_lcp.rows import RowPass, Wave
+from warp_lcp.rows.program import Program
+from warp_lcp.rows.vectors import Reduction
 from warp_lcp.solvers import projected_multigrid_kernels as engine
-from warp_lcp.vectors import Reduction
+from warp_lcp.solvers.projected_multigrid_kernels import BETA, CARRY, NORM, SIZE, STEP
+from warp_lcp.solvers.projected_multigrid_kernels import SLOTS as STEP_SLOTS
+
+SQUARE = wp.constant(STEP_SLOTS)  # slots of the device scalars after those of a step: from the carried residual's square on
+ITERATIONS = wp.constant(STEP_SLOTS + 3)
+SLOTS = STEP_SLOTS + 5
+
+HEADERS = Path(__file__).parent / "headers"
+DIRECT = RowPass(
+    "grid_conjugate_gradient.direct", HEADERS / "conjugate_direction.h", "S", reads={"z": "S"}, writes={"q": "S"},
+    whole={"scalars": wp.float64}, constants={"BETA": BETA},
+)  # fmt: skip
+STEP_ALONG = RowPass(
+    "grid_conjugate_gradient.step", HEADERS / "conjugate_step.h", "S", stencil=("F", "S"), reads={"q": "S"}, writes={"x": "S", "r": "S"},
+    whole={"scalars": wp.float64}, numbers={"weighted": bool}, sums=("square",), constants={"STEP": STEP, "ITERATIONS": ITERATIONS},
+)  # fmt: skip
+ADVANCE = Wave("grid_conjugate_gradient.advance", (DIRECT, 0), (STEP_ALONG, 1))  # both planes are in the cache
+
+f64 = wp.array(dtype=wp.float64)
+
+
+@no_type_check
+@wp.kernel(enable_backward=False, module="warp_lcp.grid_conjugate_gradient")
+def begin_grid_kernel(scalars: f64, going: wp.array(dtype=int), tolerance: wp.float64, limit: int):
+    """Before the first iteration: no old direction, no norm yet."""
+    scalars[CARRY] = wp.float64(0.0)
+    scalars[NORM] = wp.float64(0.0)
+    scalars[SIZE] = wp.float64(1.0)
+    going[0] = first_iteration(scalars, SQUARE, tolerance, limit)
+
+
+@no_type_check
+@wp.kernel(enable_backward=False, module="warp_lcp.grid_conjugate_gradient")
+def end_grid_kernel(scalars: f64, going: wp.array(dtype=int)):
+    """After an iteration: decide whether to go on."""
+    more = next_iteration(scalars, SQUARE)
+    going[0] = wp.where(scalars[STEP] == wp.float64(0.0), 0, more)
 
 
 class GridConjugateGradient:
@@ -29,7 +70,7 @@ class GridConjugateGradient:
         finest, device = hierarchy.finest, hierarchy.device
         r, s = finest.b, finest.stencil
         self.device, self.x, self._p = device, wp.zeros_like(r), wp.zeros_like(r)
-        self._scalars = wp.zeros(kernels.SLOTS, dtype=wp.float64, device=device)
+        self._scalars = wp.zeros(SLOTS, dtype=wp.float64, device=device)
         self._going = wp.zeros(1, dtype=wp.int32, device=device)
         sums = Reduction(r.size, device, self._scalars, columns=4, threads=s.rows.places)
         program = self._program = Program(device)
@@ -38,11 +79,11 @@ class GridConjugateGradient:
         engine.CLIMB.launch(*hierarchy.last_leg(), engine.measuring(finest, self._p, sums.partials), launch=program.launch)
         sums.add_up(int(engine.ZAZ), columns=4, launch=program.launch)
         program.launch(engine.plan_step_kernel, 1, [self._scalars], device=device)
-        direct = kernels.DIRECT.bind(s.rows, z=finest.x, q=self._p, scalars=self._scalars)
+        direct = DIRECT.bind(s.rows, z=finest.x, q=self._p, scalars=self._scalars)
         fields = {"q": self._p, "x": self.x, "r": r, "scalars": self._scalars, "weighted": weighted, "out": sums.partials}
-        kernels.ADVANCE.launch(direct, kernels.STEP_ALONG.bind(s.rows, stencil=s, **fields), launch=program.launch)
-        sums.add_up(int(kernels.SQUARE), launch=program.launch)
-        program.launch(kernels.end_kernel, 1, [self._scalars, self._going], device=device)
+        ADVANCE.launch(direct, STEP_ALONG.bind(s.rows, stencil=s, **fields), launch=program.launch)
+        sums.add_up(int(SQUARE), launch=program.launch)
+        program.launch(end_grid_kernel, 1, [self._scalars, self._going], device=device)
 
     def clear(self) -> None:
         """Forget what lies outside the rows that the operator has now."""
@@ -55,7 +96,7 @@ class GridConjugateGradient:
         Returns:
             The iterations done and the norm of the carried residual, an estimate that rounding bounds from below.
         """
-        wp.launch(kernels.begin_kernel, 1, [self._scalars, self._going, tolerance, max_iterations], device=self.device)
+        wp.launch(begin_grid_kernel, 1, [self._scalars, self._going, tolerance, max_iterations], device=self.device)
         self._program.run_while(self._going)
         scalars = self._scalars.numpy()
-        return int(scalars[int(kernels.ITERATIONS)]), float(np.sqrt(scalars[int(kernels.SQUARE)]))
+        return int(scalars[int(ITERATIONS)]), float(np.sqrt(scalars[int(SQUARE)]))

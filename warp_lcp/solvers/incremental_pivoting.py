@@ -9,14 +9,13 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.deadline import time_is_up
-from warp_lcp.problem import LCP
-from warp_lcp.result import SolveStatus
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.solve import EPS, Step
 from warp_lcp.settings import Count, Settings
-from warp_lcp.solve import Step
 from warp_lcp.solvers.dense_problem import DenseWorkspace, assemble, check_size, pivots_of, semidefinite
 from warp_lcp.solvers.principal_inverse import PrincipalInverse
 
-EPS = float(np.finfo(np.float64).eps)
 ZERO = 1e-11  # a rate below this part of the terms that it is a sum of is rounding: nothing changes there
 CLEAR = 1e-8  # of the largest sum that a row's terms can make: a y beyond it is no rounding, whatever x has gone through
 CORRECTED = 32  # rows driven after which y is computed afresh
@@ -38,9 +37,6 @@ class IncrementalPivoting(Settings):
 
     Args:
         pivots_per_step: pivots in a step of the solve loop, which checks, records and counts steps; max(2, n / 8) if None.
-
-    Raises:
-        ValueError: pivots_per_step < 1.
     """
 
     needs: ClassVar[str] = "symmetric, positive semi-definite, n <= 4096"

@@ -1,29 +1,69 @@
-"""The interior-point method: Newton's method on the Kojima map, with Mehrotra's predictor and corrector."""
+"""The interior-point method: Newton's method on the Kojima map, with Mehrotra's predictor and corrector.
+
+w = x - l and v = u - x, infinite where there is no bound; s and t are their multipliers, 0 there. With dx known,
+ds = (tau - w s - second dx_a ds_a) / w - (s / w) dx and dt = (tau - v t + second dx_a dt_a) / v + (t / v) dx, where dx_a is the
+predictor's step; `joined` is 1 where the correction e comes on top of that. FUSED passes go over the rows of a grid whose system is
+condensed where the step ends, the others over flat fields.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.multigrid.cycle_settings import CycleSettings
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasStencil, has
-from warp_lcp.residual import NaturalResidual
-from warp_lcp.rows import Known, RowPass, Rows
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasStencil, has
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
+from warp_lcp.rows import Known, RowPass, Wave
+from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, CountOrZero, Positive, Settings, Share, ShareOrZero
-from warp_lcp.solve import IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
-from warp_lcp.solvers import interior_point_kernels as kernels
 from warp_lcp.solvers.equilibrated import EquilibratedWorkspace
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
 from warp_lcp.solvers.principal_system import GridSystem, principal_system
-from warp_lcp.vectors import Reduction
 
-SUMS, LONGEST = 0, 3  # slots of the device scalars
+f64 = wp.float64
+HEADERS = Path(__file__).parent / "headers"
+PAIRS = dict.fromkeys(("w", "v", "s", "t"), f64)
+DIRECTION = dict.fromkeys(("scale", "second", "joined", "tau"), f64)
+FORM = {"UPPER": 0, "FUSED": 0}  # whether there are upper bounds
+
+INSIDE = RowPass(
+    "interior_point.inside", HEADERS / "path_inside.h", f64, bounds=True, reads={"unknown": wp.int8, "d": "D"},
+    writes={"x": f64, "w": f64, "v": f64, "free": wp.uint8}, numbers={"unit": f64, "width": f64}, constants=FORM,
+)  # fmt: skip
+MULTIPLIERS = RowPass(
+    "interior_point.multipliers", HEADERS / "path_multipliers.h", f64, reads={"y": f64, "w": f64, "v": f64}, writes={"s": f64, "t": f64},
+    numbers={"least": f64}, sums=("total", "count"), constants=FORM,
+)  # fmt: skip
+CONDENSE = RowPass(
+    "interior_point.condense", HEADERS / "path_condense.h", f64, stencil=("F", "W"), bounds=True,
+    reads={"x": f64, "b": f64, "unknown": wp.int8, "free": wp.uint8, **PAIRS}, writes={"D": "Q", "r": "S"},
+    numbers={"scale": f64, "tau": f64}, sums=("square", "weighted"), constants=FORM,
+)  # fmt: skip
+MOVE = RowPass(
+    "interior_point.move", HEADERS / "path_move.h", f64, bounds=True, reads={"a": "S", "e": "S"}, writes={"x": f64, **PAIRS},
+    numbers=DIRECTION | {"length": f64}, sums=("total",), constants=FORM,
+)  # fmt: skip
+RATIOS = RowPass(
+    "interior_point.ratios", HEADERS / "path_ratios.h", f64, reads={"a": "S", "e": "S", **PAIRS}, whole={"longest": f64},
+    numbers=DIRECTION, sums=("products",), constants=FORM,
+)  # fmt: skip
+CENTER = RowPass(
+    "interior_point.center", HEADERS / "path_center.h", f64, reads={"e": "S", "y": f64, "free": wp.uint8, "D": "S", **PAIRS},
+    optional=("y", "D"), writes={"a": "S", "r": "S"}, numbers={"scale": f64, "tau": f64, "carried": bool},
+    sums=("weighted",), constants=FORM,
+)  # fmt: skip
+ADVANCE = Wave("interior_point.advance", (MOVE, 0), (CONDENSE, 1))  # a plane is condensed when the one above it has moved
+
+
 NEAR = 10.0  # a near start has w A_ii and s at least this multiple of the residual's root mean square; 3 to 50 measured
 
 
@@ -58,9 +98,6 @@ class InteriorPoint(Settings):
         max_linear_iterations: the most iterations of one linear solve.
         cycle: how multigrid cycles go.
 
-    Raises:
-        ValueError: an argument is outside its range.
-
     Example:
         >>> import numpy as np, warp_lcp as wl
         >>> A = wl.DenseOperator(np.array([[2.0, -1.0], [-1.0, 2.0]]), device="cpu")
@@ -86,7 +123,7 @@ class InteriorPoint(Settings):
     def init(self, problem: LCP) -> InteriorPointWorkspace | EquilibratedWorkspace:
         """Return a workspace: for dense and sparse problems one that equilibrates them."""
         if EquilibratedWorkspace.suits(problem):
-            return EquilibratedWorkspace(problem, Precision(self.precision), lambda scaled: InteriorPointWorkspace(scaled, self))
+            return EquilibratedWorkspace(problem, self.precision, lambda scaled: InteriorPointWorkspace(scaled, self))
         return InteriorPointWorkspace(problem, self)
 
     def step(self, problem: LCP, work: Any, x: wp.array[Any]) -> Step:
@@ -105,7 +142,7 @@ class InteriorPoint(Settings):
         return work.path_step(x)
 
 
-class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
+class InteriorPointWorkspace(IterateMemory):
     """Memory of the method for one problem.
 
     Attributes:
@@ -114,22 +151,22 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
     """
 
     def __init__(self, problem: LCP, settings: InteriorPoint) -> None:
-        self.problem, self.settings, self.precision = problem, settings, Precision(settings.precision)
-        layout, device = problem.layout, problem.device
-        self.x, self.residual = layout.zeros(wp.float64), NaturalResidual(problem)
+        self.settings, layout = settings, problem.layout
         self.active_set: GridNewtonWorkspace | NewtonWorkspace | None = None
         newton = MinimumMapNewton(
             precision=settings.precision, monotone_cycles=settings.monotone_cycles, max_linear_iterations=settings.max_linear_iterations,
             cycle=settings.cycle,
         )  # fmt: skip
         if has(problem.A, HasStencil) and problem.bounded:
-            self.active_set = GridNewtonWorkspace(problem, problem.A, newton, serves=True)
-            self.x, self.scratch = self.active_set.x, self.active_set.scratch
-            self.residual = self.active_set.residual
-        elif problem.bounded and settings.crossover > 0:
-            self.active_set = NewtonWorkspace(problem, newton)
-            self.active_set.residual = self.residual
-        shared = self.active_set.hierarchy if isinstance(self.active_set, GridNewtonWorkspace) else None
+            grid = self.active_set = GridNewtonWorkspace(problem, problem.A, newton, serves=True)
+            self.scratch, shared = grid.scratch, grid.hierarchy
+            super().__init__(problem, settings.precision, x=grid.x, residual=grid.residual)
+        else:
+            shared = None
+            super().__init__(problem, settings.precision)
+            if problem.bounded and settings.crossover > 0:
+                self.active_set = NewtonWorkspace(problem, newton)
+                self.active_set.residual = self.residual
         self.system: Any = principal_system(
             problem, self.precision.correction, bounded=False, settings=settings.cycle, shifted=problem.bounded, hierarchy=shared
         )
@@ -138,14 +175,11 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
         self._v, self._t = (layout.zeros(wp.float64), layout.zeros(wp.float64)) if upper else (self._w, self._s)
         self._D, self.free = layout.zeros(wp.float64), layout.zeros(wp.uint8)
         self._predicted = wp.zeros_like(self.system.e)
-        self._scalars = wp.zeros(4, dtype=wp.float64, device=device)
-        self._rounded = layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
         self._carries = isinstance(self.system, GridSystem)  # conjugate gradients leave the residual in r
-        self._flat, self._upper, self._fusable, self._grid = Rows.flat(layout.size, device), upper, False, Rows.flat(layout.size, device)
-        if isinstance(self.system, GridSystem) and self.system.fused and problem.bounded and settings.mehrotra and self._rounded is None:
-            self._fusable, self._grid = True, problem.A.stencil.rows  # type: ignore[attr-defined]
-        self._sums = [Reduction(layout.size, device, self._scalars, columns=3, threads=r.places) for r in (self._flat, self._grid)]
-        self.floating: Any = None
+        fused = isinstance(self.system, GridSystem) and self.system.fused
+        self._upper, self._fusable = upper, fused and problem.bounded and settings.mehrotra and self._rounded is None
+        self._sums, self._longest = Sums(rows_of(self.x), 3), wp.zeros(1, dtype=wp.float64, device=problem.device)
+        self._grid_sums = Sums(problem.A.stencil.rows, 3) if self._fusable else self._sums  # type: ignore[attr-defined]
         self.cycles_left = self.steps = self.count = 0
         self.near = self.begun = self.crossed = False
         self.mu = self.target = self.first_norm = self.size = 0.0
@@ -222,7 +256,7 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
         self.size = max(self.residual.norm, 1e-300)
         tau = 0.0 if s.mehrotra else self.mu / self.steps
         second = 0.0
-        self._launch(kernels.CONDENSE, **self._condensing(x, self._D, tau))
+        self._launch(CONDENSE, **self._condensing(x, self._D, tau))
         self.system.restrict(self.free, self._D if self.problem.bounded else None)
         self._project()
         iterations = self._solve(s.predictor_eta if s.mehrotra and self.count else s.eta)
@@ -268,14 +302,10 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
     def _pairs(self) -> dict[str, wp.array[Any]]:
         return {"w": self._w, "v": self._v, "s": self._s, "t": self._t}
 
-    def _launch(self, declared: RowPass, **given: Any) -> None:
-        """Launch a pass over the fields, and add up what it sums."""
-        fused = self._fused and declared in (kernels.RATIOS, kernels.CENTER)
-        rows, sums = (self._grid, self._sums[1]) if fused else (self._flat, self._sums[0])
-        out = {"out": sums.partials} if declared.sums else {}
-        declared.bind(rows, **given, **out, UPPER=self._upper, FUSED=fused).launch()
-        if declared.sums:
-            sums.add_up(SUMS, columns=len(declared.sums))
+    def _launch(self, declared: RowPass, **given: Any) -> np.ndarray:
+        """Launch a pass over the fields; return what it sums."""
+        fused = self._fused and declared in (RATIOS, CENTER)
+        return (self._grid_sums if fused else self._sums).of(declared, **given, UPPER=self._upper, FUSED=fused)
 
     def _direction(self, second: float, tau: float) -> dict[str, Any]:
         """What ds and dt are computed from."""
@@ -293,40 +323,35 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
 
     def _advance(self, x: wp.array[Any], tau: float, length: float) -> None:
         """Move, unless the length is 0, and set the residual's norm and the next system there."""
-        sums, rows, form = self._sums[1], self._grid, dict[str, Any](UPPER=self._upper, FUSED=True)
+        sums, rows, form = self._grid_sums, self._grid_sums.rows, dict[str, Any](UPPER=self._upper, FUSED=True)
         move = self._moving(x, 1.0, tau, length)
         self.size = max(self.residual.norm, 1e-300)
-        moving = kernels.MOVE.bind(rows, **move, **form, out=sums.partials[2 * rows.places :]) if length else None
-        condensing = kernels.CONDENSE.bind(
-            rows, **self._condensing(x, self.system.hierarchy.finest.stencil.d, 0.0), **form, out=sums.partials
-        )
-        kernels.ADVANCE.launch(moving, condensing)
-        sums.add_up(SUMS, columns=3)
+        moving = MOVE.bind(rows, **move, **form, out=sums.partials[2 * rows.places :]) if length else None
+        condensing = CONDENSE.bind(rows, **self._condensing(x, self.system.hierarchy.finest.stencil.d, 0.0), **form, out=sums.partials)
+        ADVANCE.launch(moving, condensing)
+        sums.add_up(0, columns=3)
         self.residual.norm, self.residual.current = self._norm(0), True
         if length:
-            self.mu = float(self._scalars.numpy()[2]) / self.count
+            self.mu = float(sums.scalars.numpy()[2]) / self.count
 
     def _norm(self, slot: int) -> float:
-        """Return the norm whose square a pass has summed."""
-        return float(np.sqrt(self._scalars.numpy()[slot]))
+        """Return the norm whose square a fused pass has summed."""
+        return float(np.sqrt(self._grid_sums.scalars.numpy()[slot]))
 
     def _ratios(self, second: float, tau: float) -> tuple[float, float]:
         """Return the reciprocal of the longest step, 0 if there is none, and the sum of dw ds + dv dt."""
-        longest = self._scalars[LONGEST : LONGEST + 1]
-        longest.zero_()
-        self._launch(kernels.RATIOS, **self._direction(second, tau), longest=longest)
-        found = self._scalars.numpy()
-        return float(found[LONGEST]), float(found[SUMS])
+        self._longest.zero_()
+        products = float(self._launch(RATIOS, **self._direction(second, tau), longest=self._longest)[0])
+        return float(self._longest.numpy()[0]), products
 
     def _correct(self, tau: float, **fields: wp.array[Any] | None) -> None:
         """Write the corrector's right-hand side."""
         common = {"e": self.system.e, "free": self.free, "a": self._predicted, "r": self.system.r}
-        self._launch(kernels.CENTER, **self._pairs, **common, **fields, scale=self.size, tau=tau, carried=self._carries)
+        self._launch(CENTER, **self._pairs, **common, **fields, scale=self.size, tau=tau, carried=self._carries)
 
     def _move(self, x: wp.array[Any], second: float, tau: float, length: float) -> None:
         """Take the step, and remember mu."""
-        self._launch(kernels.MOVE, **self._moving(x, second, tau, length))
-        self.mu = float(self._scalars.numpy()[SUMS]) / max(self.count, 1)
+        self.mu = float(self._launch(MOVE, **self._moving(x, second, tau, length))[0]) / max(self.count, 1)
         if self.floating is not None:
             self.floating.settle(x, self.problem.lower, self.problem.upper)
         self._round(x)
@@ -335,13 +360,12 @@ class InteriorPointWorkspace(IterateInPlace, RoundedIterate):
         """Set w and v to at least width / d, and x accordingly."""
         p, r = self.problem, self.residual
         fields = {"x": x, "w": self._w, "v": self._v, "unknown": p.unknown, "free": self.free, "d": r.diagonal}
-        self._launch(kernels.INSIDE, bounds=p.bounds.operands, **fields, unit=r.unit, width=width)
+        INSIDE.bind(self._sums.rows, bounds=p.bounds.operands, **fields, unit=r.unit, width=width, UPPER=self._upper, FUSED=False).launch()
 
     def _multipliers(self, least: float) -> tuple[float, float]:
         """Set s and t to y's sides, at least `least`; return the sum of products and how many bounds are finite."""
-        self._launch(kernels.MULTIPLIERS, y=self.residual.y, **self._pairs, least=least)
-        found = self._scalars.numpy()
-        return float(found[0]), float(found[1])
+        total, count = self._launch(MULTIPLIERS, y=self.residual.y, **self._pairs, least=least)
+        return float(total), float(count)
 
     def _solve(self, eta: float) -> int:
         """Reduce the right-hand side by a factor; return linear iterations."""

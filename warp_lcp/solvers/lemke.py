@@ -6,20 +6,165 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
+import scipy.linalg
 import scipy.sparse
 import warp as wp
 from scipy.linalg.blas import dger
 
 from warp_lcp.deadline import time_is_up
-from warp_lcp.problem import LCP
-from warp_lcp.result import SolveStatus
+from warp_lcp.operators.sparse import SparseOperator
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.solve import EPS, Step
 from warp_lcp.settings import Count, Settings
-from warp_lcp.solve import Step
 from warp_lcp.solvers.dense_problem import DenseProblem, DenseWorkspace, check_size, inconsistent, pivots_of, semidefinite
-from warp_lcp.solvers.lemke_banded import BandedFactors, narrow_problem
-from warp_lcp.solvers.lemke_form import LemkeForm
 
-EPS = float(np.finfo(np.float64).eps)
+REGULAR = 1e-10  # reciprocal condition number above which the equations' block is eliminated
+
+
+@dataclass(frozen=True)
+class LemkeForm:
+    """M, q and the affine map from z back to x ([Book] 1.2.2 and table 3.4 state the reformulations).
+
+    - l = u: x is known; its row asks nothing.
+    - a finite l: x = l + z; only u finite: x = u - z, and the row changes its sign.
+    - both finite: one more pair, s = u - l - z >= 0 with v >= 0 and y = w - v: M = [[A, I], [-I, 0]], positive semi-definite if A is.
+    - equations: x_E = -A_EE^-1 (b_E + A_EI x_I) is eliminated where A_EE is regular (M is then the Schur complement); otherwise x = x+ - x-
+      with M = [[A, -A], [-A, A]], positive semi-definite if A is.
+
+    Attributes:
+        M: shape (m, m); sparse, like `map`, where the problem is.
+        q: shape (m,).
+        base: x at z = 0, shape (n,).
+        map: x = base + map z, shape (n, m).
+    """
+
+    M: Any
+    q: np.ndarray
+    base: np.ndarray
+    map: Any
+
+    @classmethod
+    def of(cls, data: DenseProblem) -> LemkeForm:
+        """Return the form of a boxed problem; of a sparse one whose rows are all one-sided, too."""
+        if scipy.sparse.issparse(data.A):
+            return cls._of_one_sided(data)
+        A, lower, upper, n = data.A, data.lower, data.upper, len(data.b)
+        fixed = lower == upper
+        below, above = np.isfinite(lower) & ~fixed, np.isfinite(upper) & ~fixed
+        equations = np.flatnonzero(~below & ~above & ~fixed)
+        sided = np.flatnonzero(below | above)
+        base = np.where(np.isfinite(lower), lower, np.where(np.isfinite(upper), upper, 0.0))
+        sign = np.where(below, 1.0, -1.0)[sided]
+        # columns: what z does to x; the rows of y are combined likewise
+        columns = np.zeros((n, len(sided)))
+        columns[sided, np.arange(len(sided))] = sign
+        if len(sided) == n:
+            M, q = sign[:, None] * A * sign, sign * (A @ base + data.b)
+        elif len(equations):
+            block = A[np.ix_(equations, equations)]
+            if 1 / np.linalg.cond(block) > REGULAR:
+                base[equations] = 0.0
+                base[equations] = -np.linalg.solve(block, (A @ base + data.b)[equations])
+                columns[equations] = -np.linalg.solve(block, (A @ columns)[equations])
+                tests = columns[sided].T
+                M, q = tests @ (A @ columns)[sided], tests @ (A @ base + data.b)[sided]
+            else:
+                split = np.zeros((n, 2 * len(equations)))
+                split[np.r_[equations, equations], np.arange(2 * len(equations))] = np.repeat([1.0, -1.0], len(equations))
+                columns = np.hstack([columns, split])
+                M, q = columns.T @ A @ columns, columns.T @ (A @ base + data.b)
+        else:  # a choice of rows and columns with signs, no product of matrices
+            M, q = sign[:, None] * A[np.ix_(sided, sided)] * sign, sign * (A @ base + data.b)[sided]
+        both = np.flatnonzero((below & above)[sided])
+        if len(both):
+            m, k = len(q), len(both)
+            pick = np.zeros((k, m))
+            pick[np.arange(k), both] = 1.0
+            M = np.block([[M, pick.T], [-pick, np.zeros((k, k))]])
+            q = np.r_[q, (upper - lower)[sided][both]]
+            columns = np.hstack([columns, np.zeros((n, k))])
+        return cls(M, q, base, columns)
+
+    @classmethod
+    def _of_one_sided(cls, data: DenseProblem) -> LemkeForm:
+        """Reformulate a sparse problem all of whose rows are one-sided."""
+        below = np.isfinite(data.lower)
+        S, base = scipy.sparse.diags_array(np.where(below, 1.0, -1.0)), np.where(below, data.lower, data.upper)
+        return cls((S @ data.A @ S).tocsr(), S @ data.affine(base), base, S)
+
+    def solution(self, z: np.ndarray) -> np.ndarray:
+        """Return x, shape (n,), for z of shape (m,)."""
+        return self.base + self.map @ z
+
+
+def one_sided(data: DenseProblem) -> np.ndarray:
+    """Return which rows have one finite bound, shape (n,)."""
+    return np.isfinite(data.lower) != np.isfinite(data.upper)
+
+
+WIDEST, FEW = 3, 30  # bandwidth that is called narrow, and unknowns up to which a dense inverse costs no more
+
+
+def narrow_problem(problem: LCP) -> DenseProblem | None:
+    """Return a sparse problem of small bandwidth whose every row has one finite bound, None if it is another one."""
+    A = problem.A
+    if not isinstance(A, SparseOperator) or A.unknowns <= FEW or A.bandwidth > WIDEST:
+        return None
+    data = DenseProblem.read(problem, keep_sparse=True)
+    return data if one_sided(data).all() else None
+
+
+class BandedFactors:
+    """C = T + u e_p' and its factors: column i of T is e_i or -M_i, that of the pair p, both of whose variables are out, is e_p.
+
+    Args:
+        M: sparse, shape (m, m).
+        d: covering vector: z0's column is -d, and stands in place p.
+    """
+
+    def __init__(self, M: scipy.sparse.csr_array, d: np.ndarray) -> None:
+        m, entries = len(d), M.tocoo()
+        self.m, self.k = m, int(np.abs(entries.row - entries.col).max(initial=0))
+        self._bands, self._unit = np.zeros((3 * self.k + 1, m)), np.zeros((3 * self.k + 1, m))
+        self._bands[2 * self.k + entries.row - entries.col, entries.col] = -entries.data
+        self._unit[2 * self.k] = 1.0
+        self._d = d
+
+    def factor(self, by_z: np.ndarray, p: int) -> bool:
+        """Take -M_i where `by_z` says so; return whether T is regular."""
+        self._p = p
+        chosen = by_z.copy()
+        chosen[p] = False
+        self._lu, self._pivots, info = scipy.linalg.lapack.dgbtrf(np.where(chosen, self._bands, self._unit), self.k, self.k)
+        u = -self._d.copy()
+        u[p] -= 1.0
+        self._update = self._back(u)
+        self._denominator = 1.0 + self._update[p]
+        return bool(info == 0 and self._denominator != 0 and np.isfinite(self._update).all())
+
+    def column(self, j: int) -> np.ndarray:
+        """Return -M_j, shape (m,), from the bands."""
+        column, first, last = np.zeros(self.m), max(j - self.k, 0), min(j + self.k + 1, self.m)
+        column[first:last] = self._bands[2 * self.k + first - j : 2 * self.k + last - j, j]
+        return column
+
+    def solve(self, r: np.ndarray) -> np.ndarray:
+        """Return C^-1 r, r of shape (m,) or (m, columns)."""
+        s = self._back(r)
+        return s - np.multiply.outer(self._update, s[self._p] / self._denominator)
+
+    def rows(self, indices: np.ndarray) -> np.ndarray:
+        """Return rows of C^-1, shape (len(indices), m)."""
+        unit = np.zeros((self.m, len(indices) + 1))
+        unit[np.r_[indices, self._p], np.arange(len(indices) + 1)] = 1.0
+        t = self._back(unit, transposed=True).T
+        return t[:-1] - np.multiply.outer(self._update[indices] / self._denominator, t[-1])
+
+    def _back(self, r: np.ndarray, *, transposed: bool = False) -> np.ndarray:
+        return scipy.linalg.lapack.dgbtrs(self._lu, self.k, self.k, r, self._pivots, trans=int(transposed))[0]
+
+
 PIVOT = 1e-10  # entries of the entering column below this part of its largest are no pivots (methods.md: 200 of 200 with it)
 TIE = 1e-12  # relative difference of ratios that counts as a tie, which the lexicographic rule breaks
 NOISE = 1e-6  # residual, relative to that of clip(0, l, u), beyond which an end of the path is no solution
@@ -43,9 +188,6 @@ class Lemke(Settings):
     Args:
         pivots_per_step: pivots in a step of the solve loop, which checks, records and counts steps; max(2, n / 8) if None.
         covering_vectors: random covering vectors tried after a ray, >= 1.
-
-    Raises:
-        ValueError: an argument is outside its range.
     """
 
     needs: ClassVar[str] = "n <= 4096; sure of an end for copositive-plus and P-matrices"
@@ -192,7 +334,7 @@ class BandedBasis(Basis):
         self.missing, self.regular = -1, True  # the pair both of whose variables are out, once z0 is in
 
     def refresh(self) -> None:
-        """The factors are fresh."""
+        """Nothing to do: factors are made at each pivot."""
 
     def _rows_of_inverse(self, rows: np.ndarray) -> np.ndarray:
         return self.factors.rows(rows) if self.missing >= 0 else np.eye(self.m)[rows]
@@ -252,7 +394,7 @@ class LemkeWorkspace(DenseWorkspace):
 
     @property
     def held(self) -> int:
-        """Unknowns at a bound."""
+        """Number of unknowns at a bound."""
         x = self.read_iterate()
         return int(np.count_nonzero((x <= self.data.lower) | (x >= self.data.upper)))
 

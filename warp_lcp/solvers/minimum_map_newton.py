@@ -13,22 +13,18 @@ from warp_lcp.deadline import check_time
 from warp_lcp.multigrid.aggregates import AggregateCycles, suits_multigrid
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasStencil, has
-from warp_lcp.residual import NaturalResidual
-from warp_lcp.result import SolveStatus
-from warp_lcp.rows import Rows
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasStencil, has
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.solve import FLOOR_MARGIN, IterateMemory, PrecisionName, Step
+from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, CountOrZero, Settings, Share
-from warp_lcp.solve import FLOOR_MARGIN, IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
-from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers.minimum_map_newton_direct import DirectNewtonWorkspace
 from warp_lcp.solvers.minimum_map_newton_grid import GridNewtonWorkspace
 from warp_lcp.solvers.phases import CoarseProblem, GradientPhase, InteriorSteps, ProximalPoint, projected_cycle
-from warp_lcp.solvers.principal_system import DenseSystem, GridSystem, PrincipalSystem, principal_system
+from warp_lcp.solvers.principal_system import CLASSIFY, ON_FREE, DenseSystem, GridSystem, PrincipalSystem, principal_system, projected_move
 from warp_lcp.solvers.projected_multigrid_kernels import SLOTS
-from warp_lcp.vectors import Reduction
 
-MOVED, SQUARE = 0, 3  # slots of the device scalars: cells moved, active, shifted, and the free residual's square
 LARGE = 1000  # unknowns from which a cold start on a sparse matrix takes projected cycles
 WEAK = 30  # iterations of a linear solve that say that its preconditioner is weak
 STALLED = 10  # steps without a smaller residual after which free blocks are taken for singular
@@ -62,9 +58,6 @@ class MinimumMapNewton(Settings):
         cycle: how multigrid cycles go.
         direct: begin with whole steps that LAPACK solves on the host, for matrices of at most 200 unknowns or a bandwidth up to 3: what
             `default_method` chooses there. The steps above take over where these lead nowhere.
-
-    Raises:
-        ValueError: an argument is outside its range.
     """
 
     needs: ClassVar[str] = "positive definite or P-matrix"
@@ -94,7 +87,7 @@ class MinimumMapNewton(Settings):
         return work.step(x)
 
 
-class NewtonWorkspace(IterateInPlace, RoundedIterate):
+class NewtonWorkspace(IterateMemory):
     """Memory of the method for one problem.
 
     Attributes:
@@ -109,18 +102,12 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
     gradients: GradientPhase | None = None
 
     def __init__(self, problem: LCP, settings: MinimumMapNewton) -> None:
-        self.problem, self.settings, self.precision = problem, settings, Precision(settings.precision)
-        layout = problem.layout
-        self.bounded = problem.bounded
-        self.x, self.trial = layout.zeros(wp.float64), layout.zeros(wp.float64)
-        self.residual = NaturalResidual(problem)
+        super().__init__(problem, settings.precision)
+        self.settings, self.bounded, layout = settings, problem.bounded, problem.layout
+        self.trial = layout.zeros(wp.float64)
         self.system = self._principal_system()
         self.free = layout.zeros(wp.uint8)
-        self._scalars = wp.zeros(SLOTS, dtype=wp.float64, device=problem.device)
-        self._reduction = Reduction(layout.size, problem.device, self._scalars, columns=4, across=layout.across)
-        self._rows = Rows.flat(layout.size, problem.device)
-        self._rounded = layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
-        self.floating: Any = None
+        self._sums = Sums(rows_of(self.x), 4, slots=SLOTS, across=layout.across)
         cycled = self.bounded and isinstance(problem.A, SparseOperator) and problem.A.unknowns >= LARGE
         self.aggregates = AggregateCycles(problem.A) if cycled else None  # type: ignore[arg-type]
         self.coarse = CoarseProblem(problem.A, settings) if cycled else None  # type: ignore[arg-type]
@@ -161,7 +148,7 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
             self._round(x)
             return Step("monotone cycle", 1, None)
         assert isinstance(system, GridSystem)
-        projected_cycle(p, system, x, residual.y, residual.norm, self.free, self._reduction, restrict=self.stale)
+        projected_cycle(p, system, x, residual.y, residual.norm, self.free, self._sums, restrict=self.stale)
         self.stale = True  # the next Newton step takes cells out again
         self._correct(x, system.z, residual.norm, x)
         if self.cycles_left > 0:
@@ -178,10 +165,8 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
             return self._resort(x)
         self.norms = [*self.norms, residual.norm][-self.settings.memory :]
         size = residual.norm
-        fields = {"x": x, "unknown": p.unknown, "free": self.free, "g": self.system.r, "out": self._reduction.partials}
-        passes.CLASSIFY.bind(self._rows, stencil=residual.known, bounds=p.bounds.operands, scale=1 / size, **fields).launch()
-        self._reduction.add_up(MOVED, columns=4)
-        moved, active, shifted, square = self._scalars.numpy()[:4]
+        fields = {"x": x, "unknown": p.unknown, "free": self.free, "g": self.system.r, "scale": 1 / size}
+        moved, active, shifted, square = self._sums.of(CLASSIFY, stencil=residual.known, bounds=p.bounds.operands, **fields)
         if self.coarse is not None and self.coarse.is_due(float(moved)):
             return self._coarse_step(x, int(active))
         if moved or self.stale:
@@ -189,7 +174,8 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
             self.stale = False
         if shifted:  # held unknowns have moved to their bounds
             residual.affine(x)
-            square = self._right_side(size)
+            given = {"y": residual.y, "free": self.free, "g": self.system.r, "scale": 1 / size}
+            square = self._sums.of(ON_FREE, **given)[0]
         if square == 0:
             return Step("newton", 0, int(active))
         iterations = self._solve(float(np.sqrt(square)) / size, size, settled=not moved)
@@ -225,13 +211,6 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
         self._correct(x, self.trial, 1.0, x)
         self.norms, self.stale, self._smallest, self._waited = [], True, math.inf, 0
         return Step("coarse problem", 1, active, interim=True)
-
-    def _right_side(self, size: float) -> float:
-        """Set the system's right-hand side to -y / size on the free set; return the square of y's norm there."""
-        fields = {"y": self.residual.y, "free": self.free, "g": self.system.r, "out": self._reduction.partials}
-        passes.ON_FREE.bind(self._rows, scale=1 / size, **fields).launch()
-        self._reduction.add_up(SQUARE)
-        return float(self._scalars.numpy()[SQUARE])
 
     def _solve(self, norm: float, size: float, *, settled: bool) -> int:
         """Solve for the correction, more accurately if the active set has not moved; returns linear iterations."""
@@ -321,5 +300,5 @@ class NewtonWorkspace(IterateInPlace, RoundedIterate):
 
     def _correct(self, base: wp.array[Any], e: wp.array[Any], scale: float, x: wp.array[Any], kept: wp.array[Any] | None = None) -> None:
         """Set x = clip(base + scale e), rounded, where e is not 0; remember base if `kept` is given."""
-        passes.move(self._rows, self.problem.bounds.operands, base, e, scale, x, kept=kept, guarded=False)
+        projected_move(self._sums.rows, self.problem.bounds.operands, base, e, scale, x, kept=kept, guarded=False)
         self._round(x)

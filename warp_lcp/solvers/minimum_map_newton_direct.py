@@ -13,9 +13,9 @@ import warp as wp
 
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.problem import LCP
-from warp_lcp.residual import NaturalResidual
-from warp_lcp.solve import Precision, RoundedIterate, Step
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.solve import IterateMemory, Step
 from warp_lcp.solvers.dense_problem import SINGULAR, factored
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ class SmallMatrix:
         self._host = A.matrix().toarray() if isinstance(A, SparseOperator) else A.matrix.numpy().astype(np.float64, copy=False)
 
     def product(self, x: np.ndarray) -> np.ndarray:
-        """Return A x."""
+        """Return A x, shape (n,), on the host."""
         return self._host @ x
 
     def solve(self, free: np.ndarray, r: np.ndarray) -> np.ndarray | None:
@@ -91,7 +91,7 @@ class BandedMatrix:
         self._size, self._own = sizes.max(), np.where(sizes > 0, sizes, 1.0)
 
     def product(self, x: np.ndarray) -> np.ndarray:
-        """Return A x."""
+        """Return A x, shape (n,), on the host."""
         n, k = len(x), self.width
         return scipy.linalg.blas.dgbmv(n, n, k, k, 1.0, self._by_columns, x)
 
@@ -176,15 +176,15 @@ class HostResidual(NaturalResidual):
         return self._values
 
     def host_y(self) -> np.ndarray:
-        """Return y's memory."""
+        """Return y's memory on the host, shape (n,)."""
         return self._y
 
     def norm_of_b(self) -> float:
-        """Return ||b||."""
+        """Return ||b||, by NumPy."""
         return math.sqrt(self.b @ self.b)
 
 
-class DirectNewtonWorkspace(RoundedIterate):
+class DirectNewtonWorkspace(IterateMemory):
     """Whole Newton steps solved by LAPACK on the host, then the safeguarded ones where these lead nowhere.
 
     On an M-matrix whole steps end at the solution, but the contact set may shrink by a layer a step. Where a narrow problem's set has
@@ -202,25 +202,22 @@ class DirectNewtonWorkspace(RoundedIterate):
         A: Any = problem.A
         if not suits(A):
             raise ValueError(f"A: direct = True is for dense and sparse matrices of at most {MOST} unknowns or a bandwidth up to {WIDEST}")
-        self.problem, self.settings, self.precision = problem, settings, Precision(settings.precision)
+        self.settings = settings
         width = bandwidth(A) if A.unknowns > FEW else WIDEST + 1
         self.matrix: SmallMatrix | BandedMatrix = BandedMatrix(A, width) if width <= WIDEST else SmallMatrix(A)
-        self.x = problem.layout.zeros(wp.float64)
         on_host = problem.device.is_cpu and problem.bounds.affine is None
-        self.residual: NaturalResidual = HostResidual(problem, self.matrix) if on_host else NaturalResidual(problem)
-        self._rounded = problem.layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
-        self.floating: Any = None
+        super().__init__(problem, settings.precision, residual=HostResidual(problem, self.matrix) if on_host else None)
 
     def keep(self) -> None:
         """Remember x, on the host."""
         self._kept = self._read(self.x).copy()
 
     def restore(self) -> None:
-        """Take x back."""
+        """Make x the best iterate again."""
         self._write(self.x, self._kept)
 
     def start(self, *, warm: bool, tolerance: float) -> None:
-        """Forget the sets."""
+        """Forget the sets, and read the bounds as they are now."""
         self._warm, self._target, self.rest = warm, tolerance, None
         residual, bounds, self._b = self.residual, self.problem.bounds, self.problem.b.numpy()
         if isinstance(residual, HostResidual):

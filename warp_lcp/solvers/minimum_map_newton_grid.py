@@ -9,9 +9,9 @@ import warp as wp
 
 from warp_lcp.deadline import time_is_up
 from warp_lcp.multigrid.hierarchy import Hierarchy
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasStencil
-from warp_lcp.solve import Precision, Step
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasStencil
+from warp_lcp.problem.solve import Step
 from warp_lcp.solvers import projected_multigrid_kernels as engine
 from warp_lcp.solvers.projected_multigrid_workspace import AssessedResidual, MultigridWorkspace
 
@@ -38,7 +38,7 @@ class MinimumMapResidual(AssessedResidual):
 
     @property
     def away(self) -> bool:
-        """Read it."""
+        """Whether held unknowns are not at their bounds, on any rank; read back."""
         found, across = bool(self._away.numpy().any()), self.problem.layout.across
         return found if across is None else across.any(found)
 
@@ -73,8 +73,10 @@ class GridNewtonWorkspace(MultigridWorkspace):
 
     def __init__(self, problem: LCP, A: HasStencil, settings: MinimumMapNewton, *, serves: bool = False) -> None:
         super().__init__(problem, A, settings, shifted=serves)  # type: ignore[arg-type]
-        self.residual = MinimumMapResidual(problem, A, self.hierarchy, rounded=self.precision is Precision.SINGLE)
         self._newton, self._norms, self._target, self._serves = settings, list[float](), 0.0, serves
+
+    def _residual(self, problem: LCP, rounded: bool) -> MinimumMapResidual:
+        return MinimumMapResidual(problem, self.A, self.hierarchy, rounded=rounded)
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the search direction and the residuals; the operator may have changed."""

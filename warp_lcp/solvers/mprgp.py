@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import Any, ClassVar, Protocol
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
@@ -13,27 +14,35 @@ from warp_lcp.deadline import check_time
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.multigrid.hierarchy import Level
 from warp_lcp.operators.dense import DenseOperator
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasStencil, has
-from warp_lcp.residual import NaturalResidual
-from warp_lcp.result import SolveStatus
-from warp_lcp.rows import Rows
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasStencil, has
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.solve import IterateMemory, Precision, PrecisionName, Step
+from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows.vectors import Sums
 from warp_lcp.settings import Count, CountOrZero, Positive, Settings
-from warp_lcp.solve import Precision, PrecisionName, RoundedIterate, Step
-from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers import projected_multigrid_kernels as engine
 from warp_lcp.solvers.descent import Descent
 from warp_lcp.solvers.phases import projected_cycle
-from warp_lcp.solvers.principal_system import DiagonalSystem, principal_system
+from warp_lcp.solvers.principal_system import DiagonalSystem, principal_system, projected_move
 from warp_lcp.solvers.principal_system_sparse import SparseSystem
 from warp_lcp.solvers.sweep import Diagonal
-from warp_lcp.vectors import Reduction
 
+HEADERS, f64, u8 = Path(__file__).parent / "headers", wp.float64, wp.uint8
+SPLIT = RowPass(  # on grids: y = A x + b is computed on the way and not stored
+    "mprgp.split", HEADERS / "split.h", f64, stencil=("D", "W"), bounds=True, reads={"x": f64, "b": f64, "unknown": wp.int8},
+    writes={"free": u8, "g": "S", "step": "S"}, numbers={"inverse": f64, "slack": f64},
+    sums=("norm", "chopped", "reduced", "release", "moved", "active", "energy"),
+)  # fmt: skip
+SPLIT_KNOWN = replace(SPLIT, name="mprgp.split_known", header=HEADERS / "split_known.h")
+RELEASE = RowPass(
+    "mprgp.release", HEADERS / "release.h", f64, stencil=("D", "W"), bounds=True, reads={"x": f64, "step": "S", "q": "S"},
+    writes={"to": f64, "free": u8, "g": "S"}, numbers={"part": f64, "length": f64},
+)  # fmt: skip
+GAIN = RowPass("mprgp.gain", HEADERS / "gain.h", f64, reads={"along": "S", "q": "S", "g": "S"}, sums=("gain", "curvature"))
 SINGLE_SLACK = 1.2e-7  # a bound that float32 rounds is met within this part of it
 ENERGY_ROUNDING = 1e-12  # rises of the energy within this part of it are rounding
-SPLIT_SUMS = len(passes.SPLIT.sums)  # slots of the device scalars; slots of their own have
-GAIN, CURVATURE, SIZE, OVERLAP = 7, 8, int(engine.SIZE), 10
-SLOTS = 11
 NOISE = 1e-14  # of the energy: falls of less, over as many steps as patience lasts, are what rounding its sum may pretend
 
 
@@ -60,9 +69,6 @@ class MPRGP(Settings):
         gamma: Gamma > 0, how large the chopped gradient may be; larger: bounds are left later.
         patience: steps without a new least energy before monotone cycles are taken on a grid.
         cycle: how multigrid cycles go.
-
-    Raises:
-        ValueError: an argument is outside its range.
     """
 
     needs: ClassVar[str] = "A symmetric, positive semi-definite"
@@ -73,7 +79,7 @@ class MPRGP(Settings):
     patience: Count = 3
     cycle: CycleSettings = field(default_factory=CycleSettings)
 
-    def init(self, problem: LCP) -> GradientWorkspace:
+    def init(self, problem: LCP) -> MPRGPWorkspace:
         """Return a workspace.
 
         Raises:
@@ -81,13 +87,13 @@ class MPRGP(Settings):
         """
         if not problem.A.symmetric:
             raise ValueError("A is not symmetric: MPRGP minimizes an energy that only a symmetric A has; take MinimumMapNewton or Lemke")
-        work = GradientWorkspace(problem, self)
+        work = MPRGPWorkspace(problem, self)
         negative = np.count_nonzero(Diagonal(problem, work.residual).values() < 0)
         if negative:
             raise ValueError(f"A has {negative} negative diagonal entries: MPRGP needs a positive semi-definite A")
         return work
 
-    def step(self, problem: LCP, work: GradientWorkspace, x: wp.array[Any]) -> Step:
+    def step(self, problem: LCP, work: MPRGPWorkspace, x: wp.array[Any]) -> Step:
         """Take a monotone cycle while the start is cold, else a projected conjugate-gradient step, after a proportioning one if need be."""
         if work.wants_monotone_cycle():
             return work.monotone_step(x)
@@ -96,19 +102,6 @@ class MPRGP(Settings):
         if (release and not work.proportion()) or not work.conjugate():
             return Step("unbounded", 1, held, SolveStatus.DIVERGED)
         return Step("proportioning" if release else "conjugate gradient", 2 if release else 1, held, interim=work.sinks())
-
-
-class Preconditioner(Protocol):
-    """An approximate inverse of A on a free set: reads r, writes z."""
-
-    r: wp.array[Any]
-    z: wp.array[Any]
-
-    def restrict(self, free: wp.array[Any]) -> None:
-        """Take another free set."""
-
-    def apply(self) -> None:
-        """Write z."""
 
 
 class SplitResidual(NaturalResidual):
@@ -133,15 +126,13 @@ class SplitResidual(NaturalResidual):
 
     def __init__(self, problem: LCP, r: wp.array[Any], chopped_step: wp.array[Any], *, slack: float) -> None:
         super().__init__(problem)
-        device, size = problem.device, problem.layout.size
         self.free, self._r, self._chopped_step, self._slack = problem.layout.zeros(wp.uint8), r, chopped_step, slack
-        self.scalars = wp.zeros(SLOTS, dtype=wp.float64, device=device)
-        self.sums, self.rows = Reduction(size, device, self.scalars, columns=2), Rows.flat(size, device)
+        self.rows = Rows.flat(problem.layout.size, problem.device)
         self.size, self.moved, self.chopped, self.reduced, self.release, self.active, self.energy = 1.0, True, 0.0, 0.0, 0.0, 0, 0.0
         self._norm_of_b = 0.0
         self._stencil = problem.A.stencil if has(problem.A, HasStencil) else None
-        places = self._stencil.rows.places if self._stencil else self.rows.places
-        self._split = Reduction(size, device, self.scalars, columns=SPLIT_SUMS, threads=places)
+        self.sums = Sums(self.rows, 2, slots=engine.SLOTS)
+        self._split = Sums(self._stencil.rows if self._stencil else self.rows, len(SPLIT.sums))
 
     def start(self, x: wp.array[Any], *, keep: bool) -> None:
         """Set x to clip(x, l, u) or clip(0, l, u)."""
@@ -160,25 +151,30 @@ class SplitResidual(NaturalResidual):
         if 0 < self.norm < math.inf:
             self.size = self.norm
         fields = {"x": x, "b": p.b, "unknown": p.unknown, "free": self.free, "g": self._r, "step": self._chopped_step}
-        fields |= {"bounds": p.bounds.operands, "out": self._split.partials, "inverse": 1 / self.size, "slack": self._slack}
+        fields |= {"bounds": p.bounds.operands, "inverse": 1 / self.size, "slack": self._slack}
         if self._stencil is None:
             self.affine(x)
-            passes.SPLIT_KNOWN.bind(self.rows, stencil=self.known, **fields).launch()
+            found = self._split.of(SPLIT_KNOWN, stencil=self.known, **fields)
         else:
             self._stencil.wrap(x)
-            passes.SPLIT.bind(self._stencil.rows, stencil=self._stencil, **fields).launch()
-        self._split.add_up(0, columns=SPLIT_SUMS)
-        square, self.chopped, self.reduced, self.release, moved, active, self.energy = (float(v) for v in self.scalars.numpy()[:SPLIT_SUMS])
+            found = self._split.of(SPLIT, stencil=self._stencil, **fields)
+        square, self.chopped, self.reduced, self.release, moved, active, self.energy = (float(v) for v in found)
         self.norm, self.current, self.active, self.moved = float(np.sqrt(square)), True, int(active), self.moved or moved > 0
         return self.norm
 
-    def measure(self, finest: Level, p: wp.array[Any]) -> None:
-        """Write z'Az, z'Ap, r'z and r'p to the first scalars, on a grid's finest level with its x = z and b = r."""
+    def measure(self, finest: Level, p: wp.array[Any]) -> list[float]:
+        """Return z'Az, z'Ap, r'z and r'p, on a grid's finest level with its x = z and b = r."""
         engine.measuring(finest, p, self._split.partials).launch(wp.launch)
         self._split.add_up(0, columns=4)
+        return [float(v) for v in self._split.scalars.numpy()[:4]]
+
+    def dot(self, a: wp.array[Any], b: wp.array[Any]) -> float:
+        """Return a.b."""
+        self.sums.dot(a, b, 0)
+        return float(self.sums.scalars.numpy()[0])
 
 
-class GradientWorkspace(RoundedIterate):
+class MPRGPWorkspace(IterateMemory):
     """Memory of the method for one problem.
 
     Args:
@@ -187,18 +183,20 @@ class GradientWorkspace(RoundedIterate):
         system: a sparse matrix's principal system to share; its own if None.
     """
 
+    residual: SplitResidual
+
     def __init__(self, problem: LCP, settings: MPRGP, system: SparseSystem | None = None) -> None:
-        self.problem, self.settings, self.precision = problem, settings, Precision(settings.precision)
+        precision, self.settings = Precision(settings.precision), settings
         self.bounded, self.is_grid = problem.bounded, has(problem.A, HasStencil)
-        self.system, self.preconditioner = _preconditioner(problem, self.precision.correction, settings.cycle, system)
-        z, single = self.preconditioner.z, self.precision is Precision.SINGLE
+        self.system, self.preconditioner = _preconditioner(problem, precision.correction, settings.cycle, system)
+        z = self.preconditioner.z
         self._fields = [problem.layout.zeros(wp.float64) for _ in range(2 if self.is_grid else 3)]
-        self.x, self._best = self._fields[0], self._fields[0]
+        self._best: wp.array[Any] = self._fields[0]
         self._p, self._q = wp.zeros_like(z), wp.zeros_like(z)
-        self._rounded = problem.layout.zeros(wp.float32) if single else None
         self._chopped = z if self.is_grid else wp.zeros_like(z)  # a multigrid cycle leaves nothing of what was in z
-        self.residual = SplitResidual(problem, self.preconditioner.r, self._chopped, slack=SINGLE_SLACK if single else 0.0)
-        self.floating: Any = None
+        slack = SINGLE_SLACK if precision is Precision.SINGLE else 0.0
+        residual = SplitResidual(problem, self.preconditioner.r, self._chopped, slack=slack)
+        super().__init__(problem, precision, x=self._best, residual=residual)
         self._cycles_left, self._cycled, self._released, self._carry, self._curvature = 0, False, False, False, 0.0
         self._descent = Descent(self.precision.epsilon)
 
@@ -246,14 +244,13 @@ class GradientWorkspace(RoundedIterate):
         residual, direction = self.residual, self._chopped
         self._carry, self._released = False, True
         self._product(direction)
-        residual.sums.dot(direction, self._q, CURVATURE)
-        curvature = float(residual.scalars.numpy()[CURVATURE])
+        curvature = residual.dot(direction, self._q)
         if not (self.is_grid and curvature > 0):
             return self._projected_step(direction, residual.release, curvature)
         factor, target, p = residual.release / curvature, self._target(), self.problem
         fields = {"x": self.x, "step": direction, "q": self._q, "to": target, "free": residual.free, "g": self.preconditioner.r}
         numbers, stencil = {"part": factor, "length": factor * residual.size}, p.A.stencil  # type: ignore[attr-defined]
-        passes.RELEASE.bind(residual.rows, stencil=stencil, bounds=p.bounds.operands, **fields, **numbers).launch()
+        RELEASE.bind(residual.rows, stencil=stencil, bounds=p.bounds.operands, **fields, **numbers).launch()
         self._settle(target)
         residual.moved = True
         return True
@@ -277,14 +274,11 @@ class GradientWorkspace(RoundedIterate):
         """Keep q = A p from step to step."""
         residual, M, beta = self.residual, self.preconditioner, 0.0
         if self._carry:
-            residual.sums.dot(M.z, self._q, OVERLAP)
-            beta = -float(residual.scalars.numpy()[OVERLAP]) / self._curvature
+            beta = -residual.dot(M.z, self._q) / self._curvature
         bounds, beta = self.problem.bounds.operands, beta if math.isfinite(beta) else 0.0
-        passes.move(residual.rows, bounds, None, self._p, 0.0, None, z=M.z, beta=beta)
+        projected_move(residual.rows, bounds, None, self._p, 0.0, None, z=M.z, beta=beta)
         self._product(self._p)
-        passes.GAIN.bind(residual.rows, along=self._p, q=self._q, g=M.r, out=residual.sums.partials).launch()
-        residual.sums.add_up(GAIN, columns=2)
-        gain, curvature = (float(v) for v in residual.scalars.numpy()[GAIN : CURVATURE + 1])
+        gain, curvature = (float(v) for v in residual.sums.of(GAIN, along=self._p, q=self._q, g=M.r))
         self._carry, self._curvature = curvature > 0, curvature
         return self._projected_step(self._p, gain, curvature)
 
@@ -292,8 +286,7 @@ class GradientWorkspace(RoundedIterate):
         """Sum the products of z and p in one pass over the grid, then make p and move x in another."""
         residual, finest = self.residual, self.system.hierarchy.finest
         finest.stencil.wrap(finest.x)
-        residual.measure(finest, self._p)
-        zaz, zap, gz, gp = (float(v) for v in residual.scalars.numpy()[:4])
+        zaz, zap, gz, gp = residual.measure(finest, self._p)
         beta, curvature, gain = 0.0, zaz, gz
         if self._carry:
             beta, curvature, gain = engine.conjugate.func(zaz, zap, gz, gp, self._curvature, engine.LEAST_REST.value)
@@ -303,7 +296,7 @@ class GradientWorkspace(RoundedIterate):
             return self._projected_step(self._p, gz, zaz)
         self._carry, self._curvature = True, curvature
         target, bounds, length = self._target(), self.problem.bounds.operands, gain / curvature * residual.size
-        passes.move(residual.rows, bounds, self.x, self._p, length, target, z=finest.x, beta=beta)
+        projected_move(residual.rows, bounds, self.x, self._p, length, target, z=finest.x, beta=beta)
         self._settle(target)
         return True
 
@@ -340,8 +333,8 @@ class GradientWorkspace(RoundedIterate):
         return next(f for f in self._fields if f is not self._best and f is not self.x)
 
     def _advance(self, origin: wp.array[Any], direction: wp.array[Any], length: float, target: wp.array[Any]) -> None:
-        """X = clip(origin + length direction, l, u)."""
-        passes.move(self.residual.rows, self.problem.bounds.operands, origin, direction, length, target)
+        """x = clip(origin + length direction, l, u)."""
+        projected_move(self.residual.rows, self.problem.bounds.operands, origin, direction, length, target)
         self._settle(target)
 
     def _settle(self, target: wp.array[Any]) -> None:
@@ -369,7 +362,7 @@ class GradientWorkspace(RoundedIterate):
         return float(gaps.min())
 
     def _product(self, direction: wp.array[Any]) -> None:
-        """Q = A times a direction."""
+        """q = A times a direction."""
         A, shape = self.problem.A, self.problem.layout.stored_shape
         if self.is_grid:
             A.stencil.product(direction, self._q)  # type: ignore[attr-defined]

@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import warp as wp
 
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasRows, Relaxes, check_taken
-from warp_lcp.residual import WITHIN
-from warp_lcp.rows import Rows
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasRows, Relaxes, check_taken
+from warp_lcp.problem.residual import WITHIN
+from warp_lcp.problem.solve import PrecisionName, Step
+from warp_lcp.rows import RowPass
+from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Relaxation, Settings
-from warp_lcp.solve import Precision, PrecisionName, Step
-from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers.psor import DIRECTIONS, Direction, SweepWorkspace
 from warp_lcp.solvers.sweep import sweep_for
-from warp_lcp.vectors import Reduction
+
+HEADERS, f64 = Path(__file__).parent / "headers", wp.float64
+TAKEN = RowPass("nncg.taken", HEADERS / "taken.h", f64, reads={"x": f64, "unknown": wp.int8}, writes={"g": f64}, sums=("square",))
+CARRY_ON = RowPass(
+    "nncg.carry_on", HEADERS / "carry_on.h", f64, bounds=True, reads={"g": f64, "unknown": wp.int8}, writes={"x": f64, "along": f64},
+    whole={"squares": f64},
+)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,9 +42,6 @@ class NNCG(Settings):
         direction: of its sweeps, "forward", "backward" or "symmetric".
         omega: relaxation factor of its sweeps, in (0, 2).
         precision: "mixed" or "double" keep the iterate in float64, "single" rounds it to float32.
-
-    Raises:
-        ValueError: an argument is outside its range.
     """
 
     supports: ClassVar = (Relaxes, HasRows)
@@ -55,7 +59,7 @@ class NNCG(Settings):
             ValueError: A cannot be swept; see ProjectedSOR.
         """
         check_taken(self, problem.A)
-        work = NNCGWorkspace(problem, Precision(self.precision))
+        work = NNCGWorkspace(problem, self.precision)
         work.sweep = sweep_for(problem, work.diagonal, self.omega)
         work.diagonal.check()
         return work
@@ -77,7 +81,7 @@ class NNCGWorkspace(SweepWorkspace):
         p: stored field, the direction.
     """
 
-    def __init__(self, problem: LCP, precision: Precision) -> None:
+    def __init__(self, problem: LCP, precision: str) -> None:
         super().__init__(problem, precision)
         self.g, self.p = problem.layout.zeros(wp.float64), problem.layout.zeros(wp.float64)
         affine = problem.bounds.affine
@@ -85,27 +89,24 @@ class NNCGWorkspace(SweepWorkspace):
         if affine is not None:
             sides = zip(affine.constant, affine.index, (-np.inf, np.inf), strict=True)
             self._constant[0], self._constant[2] = (_where_constant(*side) for side in sides)
-        self._scalars = wp.zeros(2, dtype=wp.float64, device=problem.device)
-        self._reduction = Reduction(problem.layout.size, problem.device, self._scalars)
-        self._rows = Rows.flat(problem.layout.size, problem.device)
+        self._sums = Sums(rows_of(self.x), slots=2)
 
     def start(self, *, warm: bool, tolerance: float) -> None:
-        """Forget the direction."""
+        """Forget the direction; the operator may have changed."""
         super().start(warm=warm, tolerance=tolerance)
-        self._scalars.zero_()
+        self._sums.scalars.zero_()
         self.p.zero_()
 
     def advance(self, x: wp.array[Any]) -> None:
         """Move x, which a sweep has just moved, along p, and turn p."""
-        p, fields = self.problem, {"x": x, "g": self.g, "unknown": self.problem.unknown}
-        passes.TAKEN.bind(self._rows, **fields, out=self._reduction.partials).launch()
-        self._reduction.add_up(0)
+        p, sums, fields = self.problem, self._sums, {"x": x, "g": self.g, "unknown": self.problem.unknown}
+        sums.of(TAKEN, **fields)
         bounds = p.bounds.operands if p.bounds.affine is None else self._constant
-        passes.CARRY_ON.bind(self._rows, bounds=bounds, **fields, along=self.p, squares=self._scalars).launch()
+        CARRY_ON.bind(sums.rows, bounds=bounds, **fields, along=self.p, squares=sums.scalars).launch()
         if p.bounds.affine is not None:
             p.bounds.follow(x)
-            WITHIN.bind(self._rows, bounds=p.bounds.operands, x=x, unknown=p.unknown, keep=True).launch()
-        wp.copy(self._scalars, self._scalars, dest_offset=1, src_offset=0, count=1)
+            WITHIN.bind(sums.rows, bounds=p.bounds.operands, x=x, unknown=p.unknown, keep=True).launch()
+        wp.copy(sums.scalars, sums.scalars, dest_offset=1, src_offset=0, count=1)
         self.round_iterate()
 
 

@@ -1,25 +1,71 @@
-"""An LCP as a system of nonsmooth equations f(x) = 0 on the device: the maps that Newton-type and gradient methods descend on."""
+"""An LCP as a system of nonsmooth equations f(x) = 0 on the device: the maps that Newton-type and gradient methods descend on.
+
+With a = d (x - l), c = d (u - x) and psi(a, b) = a + b - sqrt(a^2 + b^2): h = -psi(-y, c) stands for y where there is an upper bound, and
+f = psi(a, h) where there is a lower one, else f = h; penalized: f <- lambda f + (1 - lambda) (a+ y+ - c+ (-y)+) / scale. A generalized
+Jacobian is diag(p d) + diag(q) A with p, q >= 0. FUSED passes go over the rows of a grid, whose system is condensed where the step ends, in
+the type of corrections, the others over flat fields.
+"""
 
 from __future__ import annotations
 
 from enum import StrEnum
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import warp as wp
 
-from warp_lcp.layout import PaddedLayout
 from warp_lcp.multigrid.hierarchy import Level
-from warp_lcp.problem import LCP
-from warp_lcp.residual import NaturalResidual
-from warp_lcp.rows import Bound, RowPass, Rows
-from warp_lcp.solvers import nonsmooth_map_kernels as kernels
-from warp_lcp.vectors import Reduction
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.rows import RowPass, Rows, Wave
+from warp_lcp.rows.fields import PaddedLayout
+from warp_lcp.rows.vectors import Sums
+
+LEAST_Q = 1e-6  # of q where it divides: measured; less makes D needlessly large, more slows convergence
+
+f64, u8 = wp.float64, wp.uint8
+HEADERS = Path(__file__).parent / "headers"
+NUMBERS = {"share": f64, "over": f64, "kinks": f64, "seed": wp.int64}
+FORM = {"NATURAL": 0, "UPPER": 0, "PENALIZED": 0, "RANDOM": 0, "FUSED": 0}  # what of the maps a problem needs: the rest is not computed
+
+
+def _flat(name: str, writes: dict[str, Any], sums: tuple[str, ...], **numbers: Any) -> RowPass:
+    """Return a pass over the values of a map."""
+    reads = {"x": f64, "y": f64, "unknown": wp.int8, "d": "D"}
+    declared = NUMBERS | {"unit": f64} | numbers
+    header = HEADERS / f"map_{name}.h"
+    return RowPass(
+        f"nonsmooth_map.{name}", header, f64, bounds=True, reads=reads, writes=writes, numbers=declared, sums=sums, constants=FORM
+    )
+
+
+CONDENSING = {"scale": f64, "least": f64, "drop": bool}
+MERIT = _flat("merit", {}, ("merit",))
+VALUES = _flat("values", {"values": f64}, ())
+CONDENSE = _flat("condense", {"D": f64, "r": "S", "free": u8}, ("merit",), **CONDENSING)
+WEIGHTED = _flat("weighted", {"by_x": f64, "by_y": f64}, ("merit",))
+GRADIENT = RowPass(
+    "nonsmooth_map.gradient", HEADERS / "map_gradient.h", f64, reads={"product": f64, "last": f64, "unknown": wp.int8, "d": "D"},
+    writes={"gradient": f64}, numbers={"unit": f64}, sums=("square", "inner"),
+)  # fmt: skip
+ADVANCE = RowPass(
+    "nonsmooth_map.advance", HEADERS / "map_advance.h", f64, bounds=True, reads={"base": f64, "e": "S", "unknown": wp.int8},
+    writes={"x": f64}, numbers={"scale": f64, "projected": bool},
+)  # fmt: skip
+MOVE = RowPass("nonsmooth_map.move", HEADERS / "map_move.h", f64, reads={"e": "S"}, writes={"x": f64}, numbers={"step": f64})
+CONDENSE_AT_ROWS = RowPass(
+    "nonsmooth_map.condense_at_rows", HEADERS / "map_condense.h", f64, stencil=("F", "W"), bounds=True,
+    reads={"x": f64, "b": f64, "unknown": wp.int8}, writes={"D": "S", "r": "S"}, numbers=NUMBERS | CONDENSING,
+    sums=("square", "merit", "weighted"), constants=FORM | {"FUSED": 1},
+)  # fmt: skip
+STEP = Wave("nonsmooth_map.step", (MOVE, 0), (CONDENSE_AT_ROWS, 1))  # a plane is condensed when the one above it has moved
+
 
 KINK = 1e-14  # times the size of b: a point this near to both sides of a kink is on it
 
 
-class Reformulation(StrEnum):
+class MapForm(StrEnum):
     """Which map ([Book] 1.1.2-3): the minimum map, Fischer and Burmeister's, or Chen, Chen and Kanzow's penalized one."""
 
     NATURAL = "natural"
@@ -41,7 +87,7 @@ class Kink(StrEnum):
     APPROXIMATION = "approximation"
 
 
-MapName = Literal[tuple(map(str, Reformulation))]
+MapName = Literal[tuple(map(str, MapForm))]
 KinkName = Literal[tuple(map(str, Kink))]
 
 
@@ -64,15 +110,14 @@ class NonsmoothMap:
         norm: of the right-hand side that `step` wrote, as its system measures it.
     """
 
-    def __init__(self, problem: LCP, residual: NaturalResidual, map: Reformulation, share: float, kink: Kink = Kink.PERTURBATION) -> None:
+    def __init__(self, problem: LCP, residual: NaturalResidual, map: MapForm, share: float, kink: Kink = Kink.PERTURBATION) -> None:
         self.problem, self.residual, self.map = problem, residual, map
-        layout, self._share = problem.layout, share if map is Reformulation.PENALIZED else 1.0
-        natural, self._rows, self._random = map is Reformulation.NATURAL, Rows.flat(layout.size, problem.device), kink is Kink.RANDOM
+        layout, self._share = problem.layout, share if map is MapForm.PENALIZED else 1.0
+        natural, self._random = map is MapForm.NATURAL, kink is Kink.RANDOM
         self._form = {"NATURAL": natural, "UPPER": problem.bounds.may_bind[1], "PENALIZED": self._share < 1}
         self._form["RANDOM"] = self._random and not natural
-        self._sums, self.norm = wp.zeros(3, dtype=wp.float64, device=problem.device), 0.0
-        self._reduction = Reduction(layout.size, problem.device, self._sums, columns=2, threads=self._rows.places)
-        self._by_rows: Reduction | None = None  # made when first asked for, as is this one and the last gradient, the product, the weights
+        self._sums, self.norm = Sums(Rows.flat(layout.size, problem.device), 2), 0.0
+        self._by_rows: Sums | None = None  # made when first asked for, as is this one and the last gradient, the product, the weights
         self._gradients: list[wp.array[Any]] = []
         self._drops = kink in (Kink.ZERO, Kink.APPROXIMATION)
         self.begin()
@@ -84,12 +129,12 @@ class NonsmoothMap:
         self._numbers = {"share": self._share, "over": float(1 / scale), "kinks": float(KINK * scale), "seed": 0}
 
     def merit(self, x: wp.array[Any]) -> float:
-        """Return f.f / 2."""
-        return self._half_sum(kernels.MERIT, x)
+        """Return f.f / 2 at x, where the residual was evaluated."""
+        return self._half_sum(MERIT, x)
 
     def values(self, x: wp.array[Any], out: wp.array[Any]) -> None:
         """Write f to a stored field."""
-        self._bind(kernels.VALUES, x, values=out).launch()
+        VALUES.bind(self._sums.rows, **self._given(x), values=out).launch()
 
     def condense(self, x: wp.array[Any], shift: wp.array[Any], r: wp.array[Any], free: wp.array[Any], scale: float, turn: int) -> float:
         """Write Newton's system divided by q: (A + D) dx = -f / q with D = d p / q, q at least 1e-6; return the merit.
@@ -102,11 +147,11 @@ class NonsmoothMap:
             scale: of the right-hand side.
             turn: number of the step, so that random elements differ from step to step.
         """
-        return self._half_sum(kernels.CONDENSE, x, D=shift, r=r, free=free, **self._condensing(scale, turn))
+        return self._half_sum(CONDENSE, x, D=shift, r=r, free=free, **self._condensing(scale, turn))
 
     def _condensing(self, scale: float, turn: int) -> dict[str, Any]:
         self._numbers["seed"] = turn * self.problem.layout.size  # other random elements than in the last step
-        return {"scale": scale, "least": kernels.LEAST_Q, "drop": self._drops}
+        return {"scale": scale, "least": LEAST_Q, "drop": self._drops}
 
     def step(self, x: wp.array[Any], e: wp.array[Any], length: float, finest: Level, scale: float, turn: int) -> float:
         """Move x by length e, set the residual's norm, and condense the next system there, for one CPU thread and no periodic axes.
@@ -124,14 +169,14 @@ class NonsmoothMap:
         """
         p, stencil = self.problem, self.problem.A.stencil  # type: ignore[attr-defined]
         if self._by_rows is None:
-            self._by_rows = Reduction(p.layout.size, p.device, self._sums, columns=3, threads=stencil.rows.places)
-        moving = kernels.MOVE.bind(stencil.rows, e=e, x=x, step=length) if length else None
+            self._by_rows = Sums(stencil.rows, 3)
+        moving = MOVE.bind(stencil.rows, e=e, x=x, step=length) if length else None
         fields = {"x": x, "b": p.b, "unknown": p.unknown, "D": finest.stencil.d, "r": finest.b, "out": self._by_rows.partials}
         numbers = self._condensing(scale, turn) | self._numbers | self._form
-        condensing = kernels.CONDENSE_AT_ROWS.bind(stencil.rows, stencil=stencil, bounds=p.bounds.operands, **fields, **numbers)
-        kernels.STEP.launch(moving, condensing)
+        condensing = CONDENSE_AT_ROWS.bind(stencil.rows, stencil=stencil, bounds=p.bounds.operands, **fields, **numbers)
+        STEP.launch(moving, condensing)
         self._by_rows.add_up(0, columns=3)
-        square, merit, weighted = self._sums.numpy()
+        square, merit, weighted = self._by_rows.scalars.numpy()
         self.residual.norm, self.residual.current, self.norm = float(np.sqrt(square)), True, float(np.sqrt(weighted))
         return 0.5 * float(merit) / scale**2
 
@@ -146,32 +191,29 @@ class NonsmoothMap:
             self._gradients = [p.layout.zeros(wp.float64) for _ in range(4)]
         last, new, product, weights = self._gradients
         self._gradients = [new, last, product, weights]
-        self._half_sum(kernels.WEIGHTED, x, by_x=new, by_y=weights)
+        self._half_sum(WEIGHTED, x, by_x=new, by_y=weights)
         shape = (p.layout.size,) if isinstance(p.layout, PaddedLayout) else p.layout.stored_shape  # grids take stored fields flat
         p.A.apply_transpose(weights.reshape(shape), product.reshape(shape))
         r, fields = self.residual, {"gradient": new, "product": product, "last": last, "unknown": p.unknown}
-        kernels.GRADIENT.bind(self._rows, **fields, d=r.diagonal, unit=r.unit, out=self._reduction.partials).launch()
-        self._reduction.add_up(0, columns=2)
-        square, inner = self._sums.numpy()[:2]
+        square, inner = self._sums.of(GRADIENT, **fields, d=r.diagonal, unit=r.unit)
         return float(square), float(inner)
 
     @property
     def direction(self) -> wp.array[Any]:
-        """What `descend` wrote."""
+        """The gradient that `descend` wrote last."""
         return self._gradients[0]
 
     def advance(self, base: wp.array[Any], e: wp.array[Any], scale: float, x: wp.array[Any], *, projected: bool) -> None:
         """Set x = base + scale e, projected onto the bounds or not; base and x may be one field."""
         p = self.problem
         fields = {"base": base, "e": e, "unknown": p.unknown, "x": x}
-        kernels.ADVANCE.bind(self._rows, bounds=p.bounds.operands, **fields, scale=scale, projected=projected).launch()
+        ADVANCE.bind(self._sums.rows, bounds=p.bounds.operands, **fields, scale=scale, projected=projected).launch()
 
     def _half_sum(self, declared: RowPass, x: wp.array[Any], **given: Any) -> float:
-        self._bind(declared, x, **given, out=self._reduction.partials).launch()
-        self._reduction.add_up(0)
-        return 0.5 * float(self._sums.numpy()[0])
+        return 0.5 * float(self._sums.of(declared, **self._given(x), **given)[0])
 
-    def _bind(self, declared: RowPass, x: wp.array[Any], **given: Any) -> Bound:
+    def _given(self, x: wp.array[Any]) -> dict[str, Any]:
+        """Return what passes over the values of a map take."""
         p, r = self.problem, self.residual
         fields = {"x": x, "y": r.y, "d": r.diagonal, "unknown": p.unknown, "unit": r.unit}
-        return declared.bind(self._rows, bounds=p.bounds.operands, **fields, **given, **self._numbers, **self._form)
+        return {"bounds": p.bounds.operands, **fields, **self._numbers, **self._form}

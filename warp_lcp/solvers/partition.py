@@ -12,13 +12,12 @@ import warp as wp
 
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.grid_poisson import AIR, FLUID, GridPoisson
-from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.operators.sparse_kernels import color_kernel
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasFaces, HasRows, described, has, version_of
-from warp_lcp.result import SolveResult
+from warp_lcp.operators.sparse import SparseOperator, greedy_colors
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasFaces, HasRows, described, has, version_of
+from warp_lcp.problem.result import SolveResult
 from warp_lcp.rows import RowPass
-from warp_lcp.vectors import rows_of
+from warp_lcp.rows.vectors import rows_of
 
 Blocks = Annotated[Sequence[Any] | np.ndarray, "for each block a list of indices"]
 SELECT = RowPass(
@@ -73,14 +72,8 @@ def color_blocks(matrix: scipy.sparse.csr_array, owner: np.ndarray, count: int) 
     """
     members = scipy.sparse.csr_array((np.ones(len(owner)), (np.arange(len(owner)), owner)), shape=(len(owner), count))
     pattern = scipy.sparse.csr_array((np.ones(matrix.nnz), matrix.indices, matrix.indptr), shape=matrix.shape)
-    between = (members.T @ pattern @ members).tocsr()
-    between = (between + between.T).tocsr()
-    inputs = [wp.array(v, dtype=wp.int32, device="cpu") for v in (between.indptr, between.indices)]
-    taken = wp.zeros(int(np.diff(between.indptr).max()) + 2, dtype=wp.int32, device="cpu")
-    color = wp.zeros(count, dtype=wp.int32, device="cpu")
-    wp.launch(color_kernel, 1, [*inputs, taken, color, count], device="cpu")
-    host = color.numpy()
-    return [np.flatnonzero(host == c) for c in range(int(host.max()) + 1)]
+    color = greedy_colors((members.T @ pattern @ members).tocsr())
+    return [np.flatnonzero(color == c) for c in range(int(color.max()) + 1)]
 
 
 class MatrixBlock:
@@ -101,7 +94,7 @@ class MatrixBlock:
         self._version = version_of(whole.A)
 
     def refresh(self) -> None:
-        """Take A's entries again."""
+        """Take A's entries again where they have changed."""
         A, version = self.problem.A, version_of(self._whole.A)
         if isinstance(A, SparseOperator) and version == self._version:
             return
@@ -121,11 +114,11 @@ class MatrixBlock:
             field.assign(source.numpy()[rows])
 
     def guess(self) -> wp.array[Any]:
-        """Return x_B."""
+        """Return x_B, a copy on the device."""
         return wp.array(self._x.numpy()[self._rows], dtype=wp.float64, device=self._whole.device)
 
     def accept(self, result: SolveResult) -> None:
-        """Write x_B."""
+        """Write a block's x_B to the common iterate."""
         values = self._x.numpy()
         values[self._rows] = result.x.numpy()
         self._x.assign(values)
@@ -193,7 +186,7 @@ class GridBlock:
         return self._guess
 
     def accept(self, result: SolveResult) -> None:
-        """Write x_B."""
+        """Write a block's x_B to the common iterate."""
         SELECT.bind(rows_of(self._x), x=result.x.flatten(), less=None, member=self._member, target=self._x, kept=True).launch()
 
     def _cells(self) -> np.ndarray:

@@ -11,23 +11,21 @@ import numpy as np
 import scipy.sparse
 import warp as wp
 
-from warp_lcp.multigrid.aggregates import suits_multigrid
-from warp_lcp.multigrid.coarse_points import coarse_points
+from warp_lcp.multigrid.aggregates import coarse_points, suits_multigrid
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasRows, HasScale, HasStencil, has
-from warp_lcp.residual import NaturalResidual
-from warp_lcp.result import SolveStatus
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasRows, HasScale, HasStencil, has
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.solve import EPS, FLOOR_MARGIN, Step, solve
+from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rows import Rows
-from warp_lcp.solve import EPS, FLOOR_MARGIN, Step, solve
-from warp_lcp.solvers import active_set_passes as passes
+from warp_lcp.rows.vectors import Reduction
 from warp_lcp.solvers.dense_problem import proved_infeasible
-from warp_lcp.solvers.principal_system import GridSystem
+from warp_lcp.solvers.principal_system import ALL_FREE, ON_FREE, GridSystem
 from warp_lcp.solvers.projected_multigrid_kernels import GAPS, SIZE
-from warp_lcp.stopping import StoppingCriteria
-from warp_lcp.vectors import Reduction
 
 if TYPE_CHECKING:
     from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
@@ -73,10 +71,10 @@ def projected_cycle(
         restrict: whether the system does not have all unknowns yet.
     """
     rows, finest = Rows.flat(problem.layout.size, problem.device), system.hierarchy.finest
-    passes.ALL_FREE.bind(rows, unknown=problem.unknown, free=free).launch()
+    ALL_FREE.bind(rows, unknown=problem.unknown, free=free).launch()
     if restrict:
         system.restrict(free)
-    passes.ON_FREE.bind(rows, y=y, free=free, g=system.r, scale=1 / size, out=sums.partials).launch()
+    ON_FREE.bind(rows, y=y, free=free, g=system.r, scale=1 / size, out=sums.partials).launch()
     sums.scalars[int(SIZE) : int(SIZE) + 1].fill_(size)
     gaps = {"lo": finest.lower, "hi": finest.upper, "scalars": sums.scalars}
     GAPS.bind(rows, bounds=problem.bounds.operands, x=x, unknown=problem.unknown, **gaps).launch()
@@ -179,13 +177,13 @@ class GradientPhase:
     """
 
     def __init__(self, problem: LCP, system: SparseSystem, precision: str) -> None:
-        from warp_lcp.solvers.mprgp import MPRGP, GradientWorkspace  # which needs this module
+        from warp_lcp.solvers.mprgp import MPRGP, MPRGPWorkspace  # which needs this module
 
         method = MPRGP(precision=precision)
-        self._inner = Inner(method, problem, GradientWorkspace(problem, method, system))
+        self._inner = Inner(method, problem, MPRGPWorkspace(problem, method, system))
 
     def start(self, x: wp.array[Any], floating: Any, tolerance: float) -> None:
-        """Begin at x."""
+        """Begin at x; `floating` are the operator's floating components."""
         work, self._tolerance = self._inner.work, tolerance
         work.floating = floating
         work.residual.start(work.x, keep=False)
@@ -323,29 +321,27 @@ class InteriorSteps:
         from warp_lcp.solvers.interior_point import InteriorPoint  # which knows the active-set methods
 
         self._problem, self._residual, self._tolerance = problem, residual, tolerance
-        self._method = InteriorPoint(precision="double")
-        self._work = work = self._method.init(problem)
-        work.residual.start(work.x, keep=False)
-        work.residual.evaluate(work.x)
-        work.start(warm=False, tolerance=tolerance)
+        self._inner = Inner(InteriorPoint(precision="double"), problem)
+        self._inner.work.residual.start(self._inner.work.x, keep=False)
+        self._inner.begin(self._inner.work.x, tolerance, warm=False)
         self._smallest, self._idle = math.inf, 0
         self._begun: wp.array[Any] | None = None
         self._next: ProximalPoint | None = None
 
     def step(self, x: wp.array[Any]) -> Step:
-        """Take one step."""
+        """Take one step, and write the iterate to x."""
         if self._next is not None:
             return self._next.step(x)
         if self._begun is None:
             self._begun = wp.clone(x)
-        step = self._method.step(self._problem, self._work, self._work.x)
+        step = self._inner.step()
         if step.failure is SolveStatus.INFEASIBLE:
             return step
-        norm = self._work.residual.norm
+        norm = self._inner.work.residual.norm
         self._idle = 0 if norm <= FALL * self._smallest else self._idle + 1
         self._smallest = min(norm, self._smallest)
         over = step.failure is not None or self._idle >= PATH_IDLE
-        wp.copy(x, self._begun if over else self._work.x)
+        wp.copy(x, self._begun if over else self._inner.work.x)
         if over:
             self._residual.evaluate(x)
             self._next = ProximalPoint(self._problem, self._residual, self._tolerance)

@@ -12,14 +12,14 @@ import warp as wp
 from warp_lcp.deadline import time_is_up
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.dense import DenseOperator
-from warp_lcp.problem import LCP
-from warp_lcp.result import SolveStatus
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.solve import PrecisionName, Step
 from warp_lcp.settings import Count, CountOrZero, Settings, Share
-from warp_lcp.solve import PrecisionName, Step
-from warp_lcp.solvers import active_set_passes as passes
 from warp_lcp.solvers.dense_problem import DenseProblem, pivots_of
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
 from warp_lcp.solvers.phases import ProximalPoint
+from warp_lcp.solvers.principal_system import projected_move
 
 LOWER, FREE, UPPER = -1, 0, 1  # where least-index pivoting has an unknown
 STUCK = 2  # steps on one set that leave the residual where it is: its free block is singular
@@ -49,9 +49,6 @@ class PrimalDualActiveSet(Settings):
         eta: each linear solve reduces its residual by this factor, or to what the whole solve still needs.
         max_linear_iterations: the most conjugate-gradient iterations of one step.
         cycle: how multigrid cycles go.
-
-    Raises:
-        ValueError: an argument is outside its range.
     """
 
     needs: ClassVar[str] = "M-matrix, or P-matrix where dense"
@@ -124,7 +121,7 @@ class ActiveSetWorkspace(NewtonWorkspace):
         if watched:
             wp.copy(self.trial, x)
         bounds = self._unbounded if self._moved else p.bounds.operands  # within rounding of the bounds at the end
-        passes.move(self._rows, bounds, x, self.system.e, size, x)
+        projected_move(self._sums.rows, bounds, x, self.system.e, size, x)
         if self.floating is not None:
             self.floating.settle(x, p.lower, p.upper)
         self._round(x)

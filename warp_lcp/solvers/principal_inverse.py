@@ -40,7 +40,7 @@ class PrincipalInverse:
 
     @property
     def block(self) -> np.ndarray:
-        """A_FF, shape (k, k)."""
+        """A_FF in the order of `members`, shape (k, k)."""
         return self._permuted[: self.count, : self.count]
 
     def direction(self, j: int) -> tuple[np.ndarray, np.ndarray]:

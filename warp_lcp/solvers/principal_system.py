@@ -1,7 +1,8 @@
 """The system on the free unknowns that Newton-type methods share: (P A P + P D P) e = r with a free set P and a shift D >= 0.
 
 Grids take multigrid-preconditioned conjugate gradients, dense matrices a factorization, sparse ones algebraic multigrid or incomplete
-factors, other operators Krylov methods preconditioned by the diagonal: conjugate gradients where A is symmetric, else GMRES.
+factors, other operators Krylov methods preconditioned by the diagonal: conjugate gradients where A is symmetric, else GMRES. The passes
+that make free sets, right-hand sides on them and projected steps stand here too.
 """
 
 from __future__ import annotations
@@ -22,17 +23,33 @@ from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.low_rank import LowRankOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.operators.sum import SumOperator, grid_and_low_rank
-from warp_lcp.problem import LCP
-from warp_lcp.program import Launch, Program
-from warp_lcp.protocol import HasStencil, has
-from warp_lcp.rows import RowPass
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasStencil, has
+from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows.program import Launch, Program
+from warp_lcp.rows.vectors import rows_of
 from warp_lcp.solvers.dense_problem import equilibration, factored
 from warp_lcp.solvers.grid_conjugate_gradient import GridConjugateGradient
 from warp_lcp.solvers.principal_system_low_rank import LowRankCorrection
 from warp_lcp.solvers.principal_system_sparse import SparseSystem
-from warp_lcp.vectors import rows_of
 
 HEADERS = Path(__file__).parent / "headers"
+f64, i8, u8 = wp.float64, wp.int8, wp.uint8
+ANY_STENCIL = ("D", "W")
+
+CLASSIFY = RowPass(
+    "active_set.classify", HEADERS / "classify.h", f64, stencil=ANY_STENCIL, bounds=True, reads={"unknown": i8},
+    writes={"x": f64, "free": u8, "g": "S"}, numbers={"scale": f64}, sums=("moved", "active", "shifted", "square"),
+)  # fmt: skip
+ALL_FREE = RowPass("active_set.all_free", HEADERS / "all_free.h", f64, reads={"unknown": i8}, writes={"free": u8})
+ON_FREE = RowPass(
+    "active_set.on_free", HEADERS / "on_free.h", f64, reads={"y": f64, "free": u8}, writes={"g": "S"}, numbers={"scale": f64},
+    sums=("square",),
+)  # fmt: skip
+STEP = RowPass(
+    "active_set.step", HEADERS / "step.h", f64, bounds=True, reads={"x": f64, "z": "S"}, writes={"along": "S", "to": f64, "kept": f64},
+    optional=("x", "z", "to", "kept"), numbers={"beta": f64, "step": f64, "guarded": bool},
+)  # fmt: skip
 SHIFT = RowPass(
     "principal_system.shift", HEADERS / "shift.h", "S", reads={"d": "D", "free": wp.uint8, "shift": wp.float64}, optional=("shift",),
     writes={"diagonal": "S", "weight": "S"}, numbers={"unit": wp.float64},
@@ -44,6 +61,15 @@ MASK = RowPass(
 DIVIDE = RowPass(
     "principal_system.divide", HEADERS / "divide.h", wp.float64, reads={"r": wp.float64, "d": wp.float64}, writes={"z": wp.float64}
 )
+
+
+def projected_move(
+    rows: Rows, bounds: list[Any], x: Any, along: Any, length: float, to: Any, *, z: Any = None, beta: float = 0.0, kept: Any = None,
+    guarded: bool = True,
+) -> None:  # fmt: skip
+    """Set `to` = clip(x + length along, l, u) where the direction is not 0; see `step.h`."""
+    fields = {"x": x, "z": z, "along": along, "to": to, "kept": kept}
+    STEP.bind(rows, bounds=bounds, beta=beta, step=length, guarded=guarded, **fields).launch()
 
 
 class PrincipalSystem(Protocol):
@@ -125,7 +151,7 @@ class GridSystem(KrylovSystem):
         return self.hierarchy.cycle
 
     def apply(self) -> None:
-        """Precondition."""
+        """Precondition: run `program`."""
         self.program.run()
 
     def monotone_cycle(self) -> None:
@@ -200,11 +226,11 @@ class DenseSystem:
         self._shift = None if shift is None else shift.numpy()[self._free].astype(np.float64)
 
     def norm(self) -> float:
-        """Return ||r||."""
+        """Return ||r||, plain for matrices solved directly."""
         return float(np.linalg.norm(self.r.numpy()))
 
     def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
-        """Factor and solve."""
+        """Factor the free block and solve, whatever the tolerance."""
         free, r, e = self._free, self.r.numpy(), np.zeros(self.e.size)
         norm = 0.0
         if free.size:
@@ -243,7 +269,7 @@ class DiagonalSystem(KrylovSystem):
         self.refresh()
 
     def refresh(self) -> None:
-        """Take the diagonal again."""
+        """Take the diagonal of A again; entries may have changed."""
         self._own = self._layout.load(self._A.diagonal().numpy(), wp.float64)
 
     def restrict(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> None:

@@ -17,7 +17,7 @@ from warp_lcp.multigrid.aggregates import suits_multigrid
 from warp_lcp.multigrid.algebraic import AlgebraicHierarchy
 from warp_lcp.multigrid.cycle_settings import AlgebraicSettings
 from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.program import Launch
+from warp_lcp.rows.program import Launch
 
 # symmetric matrices far from M-matrices: on plates of 60^2 and 120^2 0.55 times the iterations of the usual settings, .8 on elastic blocks
 FAR_FROM_M = partial(AlgebraicSettings, strength=0.08, interval=(0.05, 1.0))
@@ -35,10 +35,10 @@ class SparsePreconditioner(Protocol):
         """Take a free set and a shift."""
 
     def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
-        """Q = M p."""
+        """q = M p, on the device."""
 
     def apply(self) -> None:
-        """Write z."""
+        """Write z, about M^-1 r."""
 
 
 class SparseSystem(KrylovSystem):
@@ -113,11 +113,11 @@ class IncompleteFactors:
         self._solve = self._factor(matrix[self._free][:, self._free].tocsc()) if self._free.size else None
 
     def product(self, p: wp.array[Any], q: wp.array[Any], *, launch: Launch = wp.launch) -> None:
-        """Q = M p, on the host."""
+        """q = M p, on the host."""
         q.assign(self._M @ p.numpy())
 
     def apply(self) -> None:
-        """Precondition."""
+        """Precondition on the host: z = the factors' inverse times r."""
         if self._solve is not None:
             with np.errstate(over="ignore"):  # the method sees that its iterate is not finite
                 self.z.numpy()[self._free] = self._solve(self.r.numpy()[self._free].astype(np.float64))

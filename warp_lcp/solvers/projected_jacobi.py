@@ -7,10 +7,10 @@ from typing import Any, ClassVar
 
 import warp as wp
 
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import version_of
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import version_of
+from warp_lcp.problem.solve import PrecisionName, Step
 from warp_lcp.settings import Positive, Settings
-from warp_lcp.solve import Precision, PrecisionName, Step
 from warp_lcp.solvers.psor import SweepWorkspace
 from warp_lcp.solvers.spectrum import scaled_spectrum
 from warp_lcp.solvers.sweep_kernels import jacobi_kernel
@@ -32,9 +32,6 @@ class ProjectedJacobi(Settings):
         omega: damping > 0; min(1, 1.8 / lambda_max), estimated, if None. Without symmetry, lambda_max is that of A's symmetric part, which
             promises nothing; with a negative diagonal entry, 1.
         precision: "mixed" or "double" keep the iterate in float64, "single" rounds it to float32.
-
-    Raises:
-        ValueError: an argument is outside its range.
     """
 
     needs: ClassVar[str] = "symmetric positive (semi-)definite A for a proof of convergence; A_ii <= 0 case by case"
@@ -73,7 +70,7 @@ class JacobiWorkspace(SweepWorkspace):
     d: wp.array[Any]
 
     def __init__(self, problem: LCP, settings: ProjectedJacobi) -> None:
-        super().__init__(problem, Precision(settings.precision))
+        super().__init__(problem, settings.precision)
         self._given, self._version = settings.omega, object()
         self.omega = settings.omega or 1.0
 

@@ -9,10 +9,10 @@ import warp as wp
 
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.sum import grid_and_low_rank
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasColumns, HasStencil, check_taken, has
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasColumns, HasStencil, check_taken, has
+from warp_lcp.problem.solve import PrecisionName, Step
 from warp_lcp.settings import Count, CountOrZero, Settings
-from warp_lcp.solve import PrecisionName, Step
 from warp_lcp.solvers.projected_multigrid_coupled import CoupledWorkspace
 from warp_lcp.solvers.projected_multigrid_workspace import MultigridWorkspace
 
@@ -35,9 +35,6 @@ class ProjectedMultigrid(Settings):
         monotone_cycles: projected cycles of a cold start.
         patience: steps without a new least energy before monotone cycles are taken.
         cycle: how multigrid cycles go.
-
-    Raises:
-        ValueError: an argument is outside its range.
     """
 
     supports: ClassVar = (HasStencil, HasColumns)

@@ -8,17 +8,17 @@ import warp as wp
 
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.low_rank import LowRankOperator
-from warp_lcp.problem import LCP
-from warp_lcp.program import Launch, Program
-from warp_lcp.protocol import HasStencil
-from warp_lcp.solve import Precision, Step
-from warp_lcp.solvers import principal_system_low_rank_kernels as coupling
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasStencil
+from warp_lcp.problem.solve import Step
+from warp_lcp.rows.program import Launch, Program
+from warp_lcp.rows.vectors import CONVERT, rows_of
+from warp_lcp.solvers import principal_system_low_rank as coupling
 from warp_lcp.solvers import projected_multigrid_kernels as kernels
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.phases import Inner
 from warp_lcp.solvers.principal_system_low_rank import LowRankCorrection
 from warp_lcp.solvers.projected_multigrid_workspace import AssessedResidual, MultigridWorkspace
-from warp_lcp.vectors import CONVERT, rows_of
 
 if TYPE_CHECKING:
     from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
@@ -46,7 +46,7 @@ class CoupledResidual(AssessedResidual):
         super().start(x, keep=keep)
 
     def assess(self, x: wp.array[Any], *, launch: Launch = wp.launch) -> None:
-        """Launch the evaluation."""
+        """Launch the evaluation, of b + U W U' x first."""
         self._low.add(x, self.problem.b, self._b, launch=launch)
         self._at = x
         super().assess(x, launch=launch)
@@ -70,15 +70,16 @@ class CoupledWorkspace(MultigridWorkspace):
     residual: CoupledResidual
 
     def __init__(self, problem: LCP, A: HasStencil, low: LowRankOperator, settings: ProjectedMultigrid) -> None:
-        super().__init__(problem, A, settings)
         self._low = low
-        rounded = self.precision is Precision.SINGLE
-        self.residual = CoupledResidual(problem, A, low, self.hierarchy, rounded=rounded)
+        super().__init__(problem, A, settings)
         self.correction = LowRankCorrection(low, self.hierarchy)
         self._along = wp.zeros(low.rank, dtype=wp.float64, device=problem.device)  # U'p
         self._fresh = True  # whether the correction is still that of the last solve
         self._newton: Inner | None = None
         self._searches = False  # whether steps are Newton's
+
+    def _residual(self, problem: LCP, rounded: bool) -> CoupledResidual:
+        return CoupledResidual(problem, self.A, self._low, self.hierarchy, rounded=rounded)
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Forget the search direction; operator and bodies may have changed."""

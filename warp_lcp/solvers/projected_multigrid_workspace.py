@@ -12,16 +12,16 @@ import warp as wp
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.multigrid.shared_levels import clear_ghosts
 from warp_lcp.multigrid.turning import make_hierarchy
-from warp_lcp.problem import LCP
-from warp_lcp.program import Launch, Program, perform
-from warp_lcp.protocol import HasStencil
-from warp_lcp.residual import NaturalResidual
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasStencil
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.solve import FLOOR_MARGIN, IterateMemory, Precision, Step
 from warp_lcp.rows import Bound, Rows
-from warp_lcp.solve import FLOOR_MARGIN, Precision, RoundedIterate, Step
+from warp_lcp.rows.program import Launch, Program, perform
+from warp_lcp.rows.vectors import Reduction
 from warp_lcp.solvers import projected_multigrid_kernels as kernels
 from warp_lcp.solvers.descent import Descent
 from warp_lcp.solvers.phases import AlgebraicSteps, Pace
-from warp_lcp.vectors import Reduction
 
 if TYPE_CHECKING:
     from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
@@ -75,7 +75,7 @@ class AssessedResidual(NaturalResidual):
         return self.read()
 
     def assess(self, x: wp.array[Any], *, launch: Launch = wp.launch) -> None:
-        """Launch the evaluation."""
+        """Launch the evaluation at x; `read` has what it finds."""
         self._A.stencil.wrap(x, launch=launch)
         kernels.ADVANCE.launch(None, self._assessing(x), launch=launch)
         self.sums.add_up(int(kernels.NORM), columns=4, launch=launch)
@@ -123,38 +123,40 @@ class AssessedResidual(NaturalResidual):
         return self.norm
 
     def set(self, slot: int, value: float) -> None:
-        """Write a scalar."""
+        """Write a scalar to its slot on the device."""
         self.scalars[int(slot) : int(slot) + 1].fill_(value)
 
 
-class MultigridWorkspace(RoundedIterate):
+class MultigridWorkspace(IterateMemory):
     """Memory of the method for one problem.
 
     x is moved in place. The best iterate is not stored while it is x, nor when x is one step past it, for a step can be taken back; it
     is when the residual has risen and goes on from there.
     """
 
+    residual: AssessedResidual
+
     def __init__(self, problem: LCP, A: HasStencil, settings: ProjectedMultigrid, *, shifted: bool = False) -> None:
-        self.problem, self.A, self.settings, self.precision = problem, A, settings, Precision(settings.precision)
-        self.bounded = problem.bounded
-        real = self.precision.correction
-        self.x, self._p = problem.layout.zeros(wp.float64), problem.layout.zeros(real)
+        precision = Precision(settings.precision)
+        real, self.A, self.settings, self.bounded = precision.correction, A, settings, problem.bounded
+        self._p = problem.layout.zeros(real)
         # a projected cycle forgets the search direction, so its lower bounds may lie in that memory: finite numbers, and 0 off the unknowns
         upper = problem.layout.zeros(real) if problem.bounds.may_bind[1] else wp.empty(0, dtype=real, device=A.device)
         options: dict[str, Any] = {"bounded": self.bounded, "settings": settings.cycle, "bounds": (self._p, upper), "shifted": shifted}
         self.hierarchy = make_hierarchy(A.stencil, real, **options)
-        self.residual = AssessedResidual(problem, A, self.hierarchy, rounded=self.precision is Precision.SINGLE)
+        super().__init__(problem, precision, residual=self._residual(problem, precision is Precision.SINGLE))
         self._flat = Rows.flat(problem.layout.size, A.device)
-        self._rounded = problem.layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
         self._programs: dict[tuple[Any, ...], Program] = {}  # truncated cycles
         self._mask: wp.array[Any] | None = None
         self.scratch = self._scratch() if real is wp.float32 else None
-        self.floating: Any = None
-        self._best: wp.array[Any] | None = None
         self._past, self._stored = 0, False  # steps since the best iterate; whether it is in memory of its own
         self._cycles_left, self._descent = 0, Descent(self.precision.epsilon)
         self._tolerance, self._pace = 0.0, Pace(0.0)
         self._algebraic: AlgebraicSteps | None = None
+
+    def _residual(self, problem: LCP, rounded: bool) -> AssessedResidual:
+        """Return what evaluates iterates."""
+        return AssessedResidual(problem, self.A, self.hierarchy, rounded=rounded)
 
     def _scratch(self) -> tuple[wp.array[Any], wp.array[Any]]:
         """Return what is free between cycles, as fields of four bytes and of one byte a cell."""
@@ -335,7 +337,7 @@ class MultigridWorkspace(RoundedIterate):
 
     def _correct(self, program: Program) -> None:
         """Record a cycle, the measuring of its correction and the plan of the step; on the CPU the cycle's last leg measures."""
-        residual, hierarchy, device = self.residual, self.hierarchy, self.A.device
+        residual, hierarchy = self.residual, self.hierarchy
         if hierarchy.unswept_cycle is not None:
             program.extend(hierarchy.unswept_cycle)
             self._sweep_and_measure(program.launch)
@@ -347,8 +349,7 @@ class MultigridWorkspace(RoundedIterate):
         program.extend(hierarchy.open_cycle)
         measuring = kernels.measuring(hierarchy.finest, self._p, residual.sums.partials)
         kernels.CLIMB.launch(*hierarchy.last_leg(), measuring, launch=program.launch)
-        residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=program.launch)
-        program.launch(kernels.plan_step_kernel, 1, [residual.scalars], device=device)
+        self._plan(program.launch)
 
     def _sweep_and_measure(self, launch: Launch) -> None:
         """Make a shared cycle's last sweep, measure its correction, and plan the step."""
@@ -363,24 +364,22 @@ class MultigridWorkspace(RoundedIterate):
         (nz, ny, _), partials = s.padding.counts, residual.sums.partials
         for axis, end in s.ghosts.cuts:
             beside = Rows.beyond(s.padding, device, axis, end, inside=True)
-            numbers: dict[str, Any] = {
-                "axis": axis,
-                "end": end,
-                "place": end * (0, ny - 1, (nz - 1) * ny)[axis],
-                "lines": ny,
-                "places": s.rows.places,
-            }
+            place = end * (0, ny - 1, (nz - 1) * ny)[axis]
+            numbers: dict[str, Any] = {"axis": axis, "end": end, "place": place, "lines": ny, "places": s.rows.places}
             kernels.SIDE.bind(beside, stencil=s, z=finest.x, q=self._p, sums=partials, **numbers).launch(launch)
-        residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=launch)
-        launch(kernels.plan_step_kernel, 1, [residual.scalars], device=device)
+        self._plan(launch)
 
     def _measure(self, *, launch: Launch = wp.launch) -> None:
         """Measure the cycle's correction and plan the step."""
-        residual, finest, device = self.residual, self.hierarchy.finest, self.A.device
+        finest = self.hierarchy.finest
         finest.stencil.wrap(finest.x, launch=launch)
-        kernels.measuring(finest, self._p, residual.sums.partials).launch(launch)
-        residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=launch)
-        launch(kernels.plan_step_kernel, 1, [residual.scalars], device=device)
+        kernels.measuring(finest, self._p, self.residual.sums.partials).launch(launch)
+        self._plan(launch)
+
+    def _plan(self, launch: Launch) -> None:
+        """Add up what has been measured, and plan the step."""
+        self.residual.sums.add_up(int(kernels.ZAZ), columns=4, launch=launch)
+        launch(kernels.plan_step_kernel, 1, [self.residual.scalars], device=self.A.device)
 
     def _advance(self, *, settle: bool = False) -> None:
         """Take the planned step and evaluate the residual there."""
@@ -404,7 +403,7 @@ class MultigridWorkspace(RoundedIterate):
         self.residual.classify = self._cycles_left == 0
 
     def _forget(self) -> None:
-        """Drop the search direction."""
+        """Let the next step begin without a search direction."""
         self.residual.set(kernels.CARRY, 0.0)
 
     def _project(self) -> None:

@@ -7,11 +7,10 @@ from typing import Any, ClassVar, Literal
 
 import warp as wp
 
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasRows, Relaxes, check_taken
-from warp_lcp.residual import NaturalResidual
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasRows, Relaxes, check_taken
+from warp_lcp.problem.solve import IterateMemory, PrecisionName, Step
 from warp_lcp.settings import Relaxation, Settings
-from warp_lcp.solve import IterateInPlace, Precision, PrecisionName, RoundedIterate, Step
 from warp_lcp.solvers.spectrum import scaled_spectrum
 from warp_lcp.solvers.sweep import Contraction, Diagonal, OrderName, Sweep, SweepOrder, sweep_for
 
@@ -46,9 +45,6 @@ class ProjectedSOR(Settings):
             "magnitude", the largest |x_i| first, or "greedy", in which a sweep is n times the row that would change most, O(n^2).
         permutation: rows of a matrix in the order of a sweep.
         precision: "mixed" or "double" keep the iterate in float64, "single" rounds it to float32.
-
-    Raises:
-        ValueError: an argument is outside its range.
     """
 
     supports: ClassVar = (Relaxes, HasRows)
@@ -62,7 +58,7 @@ class ProjectedSOR(Settings):
     precision: PrecisionName = "mixed"
 
     def __post_init__(self) -> None:
-        """Check the settings."""
+        """Check the settings; a permutation may be any sequence."""
         if self.permutation is not None:
             object.__setattr__(self, "permutation", tuple(int(i) for i in self.permutation))
         super().__post_init__()
@@ -77,7 +73,7 @@ class ProjectedSOR(Settings):
                 meets, or an odd periodic side.
         """
         check_taken(self, problem.A)
-        work = SweepWorkspace(problem, Precision(self.precision))
+        work = SweepWorkspace(problem, self.precision)
         work.sweep = sweep_for(problem, work.diagonal, self.omega, SweepOrder(self.order), self.permutation)
         work.diagonal.check()
         return work
@@ -91,7 +87,7 @@ class ProjectedSOR(Settings):
         return Step("sweep", len(directions), failure=work.contraction.test(x))
 
 
-class SweepWorkspace(IterateInPlace, RoundedIterate):
+class SweepWorkspace(IterateMemory):
     """Memory of a method that sweeps.
 
     Attributes:
@@ -102,14 +98,10 @@ class SweepWorkspace(IterateInPlace, RoundedIterate):
 
     sweep: Sweep
 
-    def __init__(self, problem: LCP, precision: Precision) -> None:
-        self.problem, self.precision = problem, precision
-        self.x = problem.layout.zeros(wp.float64)
-        self.residual = NaturalResidual(problem)
+    def __init__(self, problem: LCP, precision: str) -> None:
+        super().__init__(problem, precision)
         self.diagonal = Diagonal(problem, self.residual)
         self.contraction = Contraction(problem)
-        self.floating: Any = None
-        self._rounded = problem.layout.zeros(wp.float32) if precision is Precision.SINGLE else None
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Look at the operator again; nothing else is carried from solve to solve."""

@@ -11,10 +11,10 @@ import scipy.sparse
 import scipy.sparse.linalg
 import warp as wp
 
-from warp_lcp.problem import LCP
-from warp_lcp.result import SolveStatus
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.solve import Step
 from warp_lcp.settings import Count, Positive, Settings
-from warp_lcp.solve import Step
 from warp_lcp.solvers.dense_problem import SEMIDEFINITE, DenseProblem, DenseWorkspace, check_size, inconsistent, semidefinite, sparse_matrix
 
 
@@ -31,9 +31,6 @@ class QuadraticProgram(Settings):
         tolerance: PIQP's absolute and relative tolerance, on the equilibrated problem; > 0. The loop's criteria are checked on
             the natural residual whatever PIQP says.
         max_iterations: the most iterations of PIQP, >= 1.
-
-    Raises:
-        ValueError: an argument is outside its range.
     """
 
     needs: ClassVar[str] = "symmetric, positive semi-definite, n <= 4096 unless sparse; the extra `peers`"
@@ -60,7 +57,7 @@ class QuadraticProgram(Settings):
         return work
 
     def step(self, problem: LCP, work: QuadraticProgramWorkspace, x: wp.array[Any]) -> Step:
-        """Solve the quadratic program."""
+        """Solve the quadratic program as a whole."""
         iterations = work.minimize(self.tolerance, self.max_iterations)
         values = work.read_iterate()
         held = (values <= work.data.lower) | (values >= work.data.upper)

@@ -1,16 +1,16 @@
 """The methods by name: the one table that scenes, the command line, the tests and the documentation read.
 
 A new method is one file and one line here. Each class says in `supports` which capabilities it asks of an operator, any one of them (see
-`warp_lcp.protocol`; nothing where every operator will do), and in `needs` what must hold of A ("symmetric", ...). A class that takes small
-problems only has `most_unknowns`; one that takes no upper bounds and no equations has `boxed = False`.
+`warp_lcp.problem.protocol`; nothing where every operator will do), and in `needs` what must hold of A ("symmetric", ...). A class that
+takes small problems only has `most_unknowns`; one that takes no upper bounds and no equations has `boxed = False`.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-from warp_lcp.nearest import nearest
-from warp_lcp.protocol import families
+from warp_lcp.problem.protocol import families
+from warp_lcp.settings import nearest
 from warp_lcp.solvers.accelerated_projected_gradient import AcceleratedProjectedGradient
 from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel
 from warp_lcp.solvers.direct_enumeration import DirectEnumeration
@@ -35,7 +35,7 @@ class Methods(dict[str, type[Any]]):
     """Methods by their names; an unknown one's KeyError says which there are."""
 
     def __missing__(self, name: str) -> type[Any]:
-        """Refuse the name."""
+        """Refuse a name that no method has."""
         raise KeyError(f"no method is called {name!r}: {nearest(str(name), self)}")
 
 

@@ -9,7 +9,7 @@ import scipy.linalg
 import warp as wp
 
 from warp_lcp.deadline import check_time
-from warp_lcp.problem import LCP
+from warp_lcp.problem.lcp import LCP
 
 SEED = 20151
 

@@ -9,11 +9,10 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasFaces, HasRows, check_taken
-from warp_lcp.residual import NaturalResidual
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasFaces, HasRows, check_taken
+from warp_lcp.problem.solve import IterateMemory, Solver, Step
 from warp_lcp.settings import Count, Settings, Share
-from warp_lcp.solve import IterateInPlace, Precision, Solver, Step
 from warp_lcp.solvers.coupled_problem import StaggeredRound
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.partition import Block, Blocks, block_problem, given_blocks
@@ -34,9 +33,6 @@ class Staggering(Settings):
         solvers: a method for each block; MinimumMapNewton for all if empty, one for all if it is a single one, in a list or not.
         eta: each solve of a block reduces its residual by this factor, or to what the whole one needs.
         max_block_iterations: the most steps in a block.
-
-    Raises:
-        ValueError: an argument is outside its range.
     """
 
     supports: ClassVar = (HasRows, HasFaces)
@@ -66,12 +62,12 @@ class Staggering(Settings):
         return StaggeringWorkspace(problem, rows, solvers, eta=self.eta, max_iterations=self.max_block_iterations)
 
     def step(self, problem: LCP, work: StaggeringWorkspace, x: wp.array[Any]) -> Step:
-        """Solve each block once."""
+        """Solve each block once, the others held."""
         linear = work.rounds.run(work.target)
         return Step("round", linear, failure=work.contraction.test(x))
 
 
-class StaggeringWorkspace(IterateInPlace):
+class StaggeringWorkspace(IterateMemory):
     """Memory of a problem in blocks that are solved in turn.
 
     Attributes:
@@ -80,13 +76,8 @@ class StaggeringWorkspace(IterateInPlace):
         target: the residual that is asked for.
     """
 
-    precision = Precision.DOUBLE
-
     def __init__(self, problem: LCP, rows: list[np.ndarray], solvers: list[Solver], *, eta: float, max_iterations: int) -> None:
-        self.problem = problem
-        self.x = problem.layout.zeros(wp.float64)
-        self.residual = NaturalResidual(problem)
-        self.floating: Any = None
+        super().__init__(problem)
         self.blocks: list[Block] = [block_problem(problem, self.x, block) for block in rows]
         self.rounds = StaggeredRound(self.blocks, solvers, eta=eta, max_iterations=max_iterations)
         self.contraction = Contraction(problem)
@@ -98,6 +89,3 @@ class StaggeringWorkspace(IterateInPlace):
         for block in self.blocks:
             block.refresh()
         self.contraction.start(self.x)
-
-    def round_iterate(self) -> None:
-        """The iterate is float64."""

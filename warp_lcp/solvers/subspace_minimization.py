@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -10,18 +11,22 @@ import warp as wp
 
 from warp_lcp.deadline import check_time
 from warp_lcp.multigrid.cycle_settings import CycleSettings
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasRows, Relaxes, check_taken
-from warp_lcp.rows import Rows
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasRows, Relaxes, check_taken
+from warp_lcp.problem.solve import PrecisionName, Step
+from warp_lcp.rows import RowPass
+from warp_lcp.rows.vectors import Sums, rows_of
 from warp_lcp.settings import Count, Ge, Relaxation, Settings, Share
-from warp_lcp.solve import Precision, PrecisionName, Step
-from warp_lcp.solvers import active_set_passes as passes
-from warp_lcp.solvers.principal_system import principal_system
+from warp_lcp.solvers.principal_system import ON_FREE, principal_system, projected_move
 from warp_lcp.solvers.psor import SweepWorkspace
 from warp_lcp.solvers.sweep import sweep_for
-from warp_lcp.vectors import Reduction
 
-MOVED, HELD, FREE_NORM, XY, XB = range(5)  # slots of the device scalars; HELD follows MOVED
+HEADERS, f64 = Path(__file__).parent / "headers", wp.float64
+BETWEEN = RowPass(
+    "subspace.between", HEADERS / "between.h", f64, bounds=True, reads={"x": f64, "unknown": wp.int8}, writes={"free": wp.uint8},
+    sums=("moved", "held"),
+)  # fmt: skip
+FOLLOW = RowPass("subspace.follow", HEADERS / "follow.h", f64, bounds=True, reads={"old_lower": f64, "old_upper": f64}, writes={"x": f64})
 ROUNDING = 1e-14  # relative change of the energy that is none
 
 
@@ -49,9 +54,6 @@ class SubspaceMinimization(Settings):
         backtracks: halvings of a correction; -1 takes all corrections as they come.
         precision: "mixed": iterate float64, corrections float32; "double"; or "single": the iterate rounded to float32 as well.
         cycle: how multigrid cycles go.
-
-    Raises:
-        ValueError: an argument is outside its range.
     """
 
     supports: ClassVar = (Relaxes, HasRows)
@@ -97,16 +99,14 @@ class SubspaceWorkspace(SweepWorkspace):
     """Memory of the method for one problem."""
 
     def __init__(self, problem: LCP, settings: SubspaceMinimization) -> None:
-        super().__init__(problem, Precision(settings.precision))
+        super().__init__(problem, settings.precision)
         self.settings, layout = settings, problem.layout
         self.sweep = sweep_for(problem, self.diagonal, settings.omega)
         self.system = principal_system(problem, self.precision.correction, bounded=False, settings=settings.cycle)
         self.free, self._before = layout.zeros(wp.uint8), layout.zeros(wp.float64)
         affine = problem.bounds.affine is not None
         self._old_bounds = [layout.zeros(wp.float64) for _ in range(2)] if affine else []
-        self._scalars = wp.zeros(5, dtype=wp.float64, device=problem.device)
-        self._reduction = Reduction(layout.size, problem.device, self._scalars, columns=2)
-        self._rows = Rows.flat(layout.size, problem.device)
+        self._sums = Sums(rows_of(self.x), 2)
         self._stale, self._target = True, 0.0
 
     def start(self, *, warm: bool, tolerance: float) -> None:
@@ -117,12 +117,10 @@ class SubspaceWorkspace(SweepWorkspace):
 
     def classify(self, x: wp.array[Any]) -> tuple[int, int]:
         """Find the free set; return how many unknowns entered or left it, and how many are held."""
-        p, r = self.problem, self._reduction
+        p = self.problem
         p.bounds.follow(x)
-        fields = {"x": x, "unknown": p.unknown, "free": self.free, "out": r.partials}
-        passes.BETWEEN.bind(self._rows, bounds=p.bounds.operands, **fields).launch()
-        r.add_up(MOVED, columns=2)
-        moved, held = (int(v) for v in self._scalars.numpy()[:2])
+        found = self._sums.of(BETWEEN, bounds=p.bounds.operands, x=x, unknown=p.unknown, free=self.free)
+        moved, held = (int(v) for v in found)
         if moved or self._stale:
             self.system.restrict(self.free)
             self._stale = False
@@ -153,13 +151,13 @@ class SubspaceWorkspace(SweepWorkspace):
     def _correct(self, x: wp.array[Any], scale: float) -> None:
         p = self.problem
         p.bounds.follow(self._before)
-        passes.move(self._rows, p.bounds.operands, self._before, self.system.e, scale, x, guarded=False)
+        projected_move(self._sums.rows, p.bounds.operands, self._before, self.system.e, scale, x, guarded=False)
         if self._old_bounds:
             for old, bound in zip(self._old_bounds, (p.lower, p.upper), strict=True):
                 wp.copy(old, bound)
             p.bounds.follow(x)
             old = dict(zip(("old_lower", "old_upper"), self._old_bounds, strict=True))
-            passes.FOLLOW.bind(self._rows, bounds=p.bounds.operands, x=x, **old).launch()
+            FOLLOW.bind(self._sums.rows, bounds=p.bounds.operands, x=x, **old).launch()
         if self.floating is not None:
             self.floating.settle(x, p.lower, p.upper)
         self.round_iterate()
@@ -168,13 +166,10 @@ class SubspaceWorkspace(SweepWorkspace):
         """Return x'A x / 2 + b'x = x'(y + b) / 2, y being that of x; infinite where there is none: A not symmetric, bounds affine."""
         if not self.problem.A.symmetric or self._old_bounds:
             return np.inf
-        self._reduction.dot(x, self.residual.y, XY)
-        self._reduction.dot(x, self.problem.b, XB)
-        return 0.5 * float(self._scalars.numpy()[XY:].sum())
+        for slot, other in enumerate((self.residual.y, self.problem.b)):
+            self._sums.dot(x, other, slot)
+        return 0.5 * float(self._sums.scalars.numpy().sum())
 
     def _right_side(self, scale: float) -> float:
         """Set the system's right-hand side to -scale y on the free set; return y's norm there."""
-        fields = {"y": self.residual.y, "free": self.free, "g": self.system.r, "out": self._reduction.partials}
-        passes.ON_FREE.bind(self._rows, scale=scale, **fields).launch()
-        self._reduction.add_up(FREE_NORM)
-        return float(np.sqrt(self._scalars.numpy()[FREE_NORM]))
+        return float(np.sqrt(self._sums.of(ON_FREE, y=self.residual.y, free=self.free, g=self.system.r, scale=scale)[0]))

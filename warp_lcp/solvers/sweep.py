@@ -8,15 +8,15 @@ from typing import Any, Literal, Protocol
 import numpy as np
 import warp as wp
 
-from warp_lcp.affine_bounds import affine_side
 from warp_lcp.operators.compressed_rows import CompressedRows
 from warp_lcp.operators.sparse import SparseOperator
-from warp_lcp.problem import LCP
-from warp_lcp.protocol import HasRows, HasStencil, NamesComponents, Relaxes, has
-from warp_lcp.residual import NaturalResidual
-from warp_lcp.result import SolveStatus
+from warp_lcp.problem.affine_bounds import affine_side
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasRows, HasStencil, NamesComponents, Relaxes, has
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.rows.vectors import ADD, rows_of
 from warp_lcp.solvers.sweep_kernels import CHANGE, row_kernels
-from warp_lcp.vectors import ADD, rows_of
 
 
 class SweepOrder(StrEnum):
@@ -32,10 +32,10 @@ OrderName = Literal[tuple(map(str, SweepOrder))]
 
 
 class Sweep(Protocol):
-    """Sweeps a problem's iterate."""
+    """Sweeps a problem's iterate, in an order of its own."""
 
     def start(self) -> None:
-        """Take A's diagonal again."""
+        """Take A's diagonal again; a solve begins."""
 
     def run(self, x: wp.array[Any], *, forward: bool) -> None:
         """Sweep x (stored, float64) once."""
@@ -52,7 +52,7 @@ class OperatorSweep:
         """The operator knows its diagonal."""
 
     def run(self, x: wp.array[Any], *, forward: bool) -> None:
-        """Sweep."""
+        """Sweep by the operator; bounds are those at x."""
         p = self.problem
         p.bounds.follow(x)
         self._A.relax(x, p.b, p.lower, p.upper, self.omega, forward=forward, **self._options)
@@ -90,7 +90,7 @@ class RowSweep:
         """Rows are shared with the operator."""
 
     def run(self, x: wp.array[Any], *, forward: bool) -> None:
-        """Sweep."""
+        """Sweep by one thread, the order chosen now where it depends on x."""
         p = self.problem
         if self._y is not None:
             p.A.apply(x, self._y)
@@ -111,11 +111,11 @@ class DiagonalSweep:
         self._own, self._by_rows, self._diagonal, self._current = own, by_rows, diagonal, own
 
     def start(self) -> None:
-        """Look at the diagonal."""
+        """Look at the diagonal, which decides how to sweep."""
         self._current = self._own if self._by_rows is None or self._diagonal.positive() else self._by_rows
 
     def run(self, x: wp.array[Any], *, forward: bool) -> None:
-        """Sweep."""
+        """Sweep in the way that the diagonal allows."""
         self._current.run(x, forward=forward)
 
 
@@ -230,7 +230,7 @@ class Contraction:
         self.factor = np.nan
 
     def start(self, x: wp.array[Any]) -> None:
-        """Begin with x."""
+        """Begin with x as the iterate before the first sweep."""
         wp.copy(self._old, x)
         self._last, self._least, self._rises, self.factor = np.nan, np.inf, 0, np.nan
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.affine_bounds_kernels import AffineSide, bound_at
 from warp_lcp.operators.compressed_rows import matrix_rows
+from warp_lcp.problem.affine_bounds import AffineSide, bound_at
 from warp_lcp.rows import RowPass
 
 f64, i32, i8 = wp.array(dtype=wp.float64), wp.array(dtype=wp.int32), wp.array(dtype=wp.int8)

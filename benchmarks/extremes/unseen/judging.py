@@ -28,7 +28,7 @@ from warp_lcp.benchmarks.extremes.case import (
 from warp_lcp.benchmarks.extremes.problem import GridProblem, MatrixProblem
 from warp_lcp.benchmarks.extremes.unseen.draw import Unseen, equality
 from warp_lcp.benchmarks.record import Table
-from warp_lcp.protocol import families
+from warp_lcp.problem.protocol import families
 
 FAMILY = "unseen"
 METHODS_FAMILY = "unseen, every method"

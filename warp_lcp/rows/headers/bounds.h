@@ -1,5 +1,5 @@
 // Bounds of x. body(lower, upper) is called with functions of the cell, so that a loop over them tests none: numbers, a code of two bits, or
-// fields and numbers, see `warp_lcp.bounds`. What there is, BOUNDS, is known when the kernel is made: the rest is not compiled.
+// fields and numbers, see `warp_lcp.problem.bounds`. What there is, BOUNDS, is known when the kernel is made: the rest is not compiled.
 const auto with_bounds = [&](auto body) {
     const double *l = given.bounds.lower.data + p, *u = given.bounds.upper.data + p; const auto* code = given.bounds.code.data + p;
     const double l_value = given.bounds.least, u_value = given.bounds.most;

@@ -1,0 +1,1 @@
+"""What readers of files believe: sizes that fit, arrays of plain numbers."""

@@ -1,0 +1,217 @@
+"""Arrays of .npz files: types and sizes are checked against the file and the memory before an array is read; nothing is unpickled."""
+
+from __future__ import annotations
+
+import re
+import struct
+import warnings
+import zipfile
+import zlib
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from math import prod
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, Self
+
+import numpy as np
+
+from warp_lcp.files.claims import ClaimError, check_claim
+
+SUFFIX = ".npy"  # of an archive's members
+HEADER = re.compile(  # as NumPy writes it; its own reader evaluates whatever stands there
+    rb"\{'descr': '(?P<type>[<>|=][?bBiufcSUO]\d*)', 'fortran_order': (?P<order>True|False), "
+    rb"'shape': \((?P<shape>(?:\d{1,19}, ?)*(?:\d{1,19})?)\),? ?\}\s*"
+)
+LENGTH_BYTES = {(1, 0): 2, (2, 0): 4, (3, 0): 4}  # of a header's length, by the version of the format
+LONGEST = 10_000  # characters of a header, NumPy's own limit
+DEFLATED = 1032  # a byte that deflate wrote never becomes more (zlib.net/zlib_tech.html)
+FAULTS = (  # what zipfile, zlib and NumPy raise for files that are no archives
+    OSError, ValueError, TypeError, LookupError, ArithmeticError, EOFError, MemoryError, RuntimeError, SyntaxError,
+    struct.error, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+
+
+class ArchiveError(ValueError):
+    """A file that is no archive of plain arrays, or a damaged one; the message says why, not which file."""
+
+
+@dataclass(frozen=True)
+class Header:
+    """What an archive says of one of its arrays.
+
+    Args:
+        shape: of the array.
+        dtype: its type.
+        fastest_first: its first axis is the one whose neighbors are side by side.
+        length: bytes of its member before the first value.
+    """
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    fastest_first: bool
+    length: int
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that the array takes [bytes]."""
+        return prod(self.shape) * self.dtype.itemsize
+
+    def __str__(self) -> str:
+        """Return type and shape as messages have them."""
+        return f"{self.dtype} of shape {self.shape}"
+
+
+class Archive:
+    """An open .npz file. Use it in a `with` block.
+
+    Args:
+        path: the file.
+
+    Attributes:
+        headers: of all arrays, by name.
+
+    Raises:
+        ArchiveError: the file cannot be read, is no archive, or says of an array what cannot be.
+    """
+
+    headers: dict[str, Header]
+
+    def __init__(self, path: Path) -> None:
+        """Open a file and read what it says of its arrays."""
+        with _faults_named():
+            if path.exists() and not path.is_file():  # a pipe would be waited for
+                raise ArchiveError("it is no file")
+            self._stream = open(path, "rb")  # noqa: SIM115 - `close` closes it; zipfile leaves a broken file open
+        try:
+            with _faults_named():
+                self._file = zipfile.ZipFile(self._stream)
+                self._members = {info.filename.removesuffix(SUFFIX): info for info in self._file.infolist()}
+                self._check_members(path.stat().st_size)
+                self.headers = {name: self._header(info) for name, info in self._members.items()}
+        except ArchiveError:
+            self._stream.close()
+            raise
+
+    def read(self, names: Collection[str]) -> dict[str, np.ndarray]:
+        """Read arrays.
+
+        Raises:
+            ArchiveError: there are no such arrays, they are damaged, or together they do not fit the free memory.
+        """
+        self._check_memory(names)
+        found = {}
+        for name in names:
+            with _faults_named(name), self._file.open(self._members[name]) as stream:
+                found[name] = np.lib.format.read_array(stream, allow_pickle=False)
+        return found
+
+    def read_box(self, name: str, box: tuple[slice, ...]) -> np.ndarray:
+        """Read a part of an array, all of one without axes; from the file's start to the part's end, a plane or row at a time.
+
+        Args:
+            name: of the array.
+            box: a slice with start and stop of each axis, within the array.
+
+        Raises:
+            ArchiveError: there is no such array, it is damaged, or does not fit the free memory.
+        """
+        header = self.headers.get(name)
+        if header is None or not header.shape or header.fastest_first:
+            whole = self.read([name])[name]
+            return np.ascontiguousarray(whole[box]) if whole.ndim else whole
+        rows, *others = box
+        plane = prod(header.shape[1:]) * header.dtype.itemsize
+        shape = [part.stop - part.start for part in box]
+        with _faults_named(name), self._file.open(self._members[name]) as stream:
+            check_claim(f"{'x'.join(map(str, shape))} values", prod(shape) * header.dtype.itemsize + plane)
+            found = np.empty(shape, dtype=header.dtype)
+            _exactly(stream, header.length)
+            for row in range(rows.stop):
+                read = _exactly(stream, plane)
+                if row >= rows.start:
+                    found[row - rows.start] = np.frombuffer(read, dtype=header.dtype).reshape(header.shape[1:])[tuple(others)]
+        return found
+
+    def close(self) -> None:
+        """Close the file and its stream."""
+        self._file.close()
+        self._stream.close()
+
+    def __enter__(self) -> Self:
+        """Return the open archive itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """Close the file when the block ends."""
+        self.close()
+
+    def _check_members(self, size: int) -> None:
+        """Refuse members of which one says what another denies, or more than the file has."""
+        infos = self._file.infolist()
+        if len(self._members) != len(infos):
+            raise ArchiveError("it holds two arrays of one name")
+        if sum(info.compress_size for info in infos) > size:
+            raise ArchiveError(f"its arrays take more than its {size} bytes")
+        for name, info in self._members.items():
+            if info.filename != name + SUFFIX or info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or info.flag_bits & 1:
+                raise ArchiveError(f"{info.filename!r} is no plain array")
+            most = info.compress_size * (DEFLATED if info.compress_type == zipfile.ZIP_DEFLATED else 1)
+            check_claim(f"{name!r} of {info.file_size} bytes", 0, stored=info.file_size, held=most)
+
+    def _header(self, info: zipfile.ZipInfo) -> Header:
+        """Read what an archive says of an array, and compare it with the room that this takes."""
+        with _faults_named(info.filename.removesuffix(SUFFIX)), self._file.open(info) as stream:
+            version = np.lib.format.read_magic(stream)
+            if version not in LENGTH_BYTES:
+                raise ArchiveError(f"its format is {'.'.join(map(str, version))}")
+            length = int.from_bytes(_exactly(stream, LENGTH_BYTES[version]), "little")
+            begin = np.lib.format.MAGIC_LEN + LENGTH_BYTES[version] + length
+            match = HEADER.fullmatch(_exactly(stream, length)) if length <= LONGEST else None
+            if match is None:
+                raise ArchiveError("its header is not one of NumPy's, or of structured values")
+            dtype = np.dtype(match["type"].decode())
+            if dtype.hasobject:
+                raise ArchiveError("it holds objects")
+            shape = tuple(int(count) for count in match["shape"].split(b",") if count.strip())
+            header = Header(shape, dtype, match["order"] == b"True", begin)
+            if header.nbytes != info.file_size - begin:
+                what = f"{'x'.join(map(str, shape)) or 'one'} of {dtype.itemsize} bytes"
+                raise ArchiveError(f"{what}: these take {header.nbytes} bytes, and the file has {info.file_size - begin}")
+            return header
+
+    def _check_memory(self, names: Collection[str]) -> None:
+        """Refuse arrays that are not there, or for which there is no room."""
+        missing = sorted(set(names) - self.headers.keys())
+        if missing:
+            raise ArchiveError(f"it lacks {', '.join(missing)}")
+        try:
+            check_claim(f"{len(names)} arrays", sum(self.headers[name].nbytes for name in names))
+        except ClaimError as error:
+            raise ArchiveError(str(error)) from error
+
+
+@contextmanager
+def _faults_named(name: str = "") -> Iterator[None]:
+    """Turn what can go wrong while an archive is read into one error, which names the array."""
+    try:
+        with warnings.catch_warnings(action="ignore", category=UserWarning):  # of NumPy, on headers that Python 2 wrote
+            yield
+    except FAULTS as error:
+        if isinstance(error, ArchiveError) and not name:
+            raise
+        reason = (error.strerror if isinstance(error, OSError) else None) or str(error) or type(error).__name__
+        raise ArchiveError(f"{name!r}: {reason}" if name else reason) from error
+
+
+def _exactly(stream: IO[bytes], count: int) -> bytes:
+    """Return so many bytes.
+
+    Raises:
+        ArchiveError: there are fewer.
+    """
+    read = stream.read(count)
+    if len(read) != count:
+        raise ArchiveError("it is cut short")
+    return read

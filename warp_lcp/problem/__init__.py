@@ -1,0 +1,1 @@
+"""The problem, what it is solved to, and the one loop that solves it."""

@@ -1,0 +1,173 @@
+"""Bounds of a problem: numbers, fields, or, where all finite ones are equal, a byte a cell instead of eight."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.problem.affine_bounds import affine_fields
+from warp_lcp.problem.pickling import OnHost
+from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows.fields import Array, Layout, real_array
+
+NAMES, INFINITE = ("lower", "upper"), (-np.inf, np.inf)
+LAUNCHED = 4096  # elements from which a kernel looks at fields on the CPU: below, NumPy takes less than the launch
+BITS = (1, 2)  # of a code: the lower bound is finite, the upper one is
+HEADERS, SIDES = Path(__file__).parent / "headers", {"lower": wp.float64, "upper": wp.float64}
+ENCODE = RowPass(
+    "bounds.encode", HEADERS / "encode.h", wp.float64, reads=SIDES, optional=("lower", "upper"), writes={"code": wp.uint8},
+    numbers={"least": wp.float64, "most": wp.float64}, sums=("others",),
+)  # fmt: skip
+FINITE = {"value": wp.float64, "infinite": wp.float64, "bit": int}
+CODE_ROWS = RowPass(
+    "bounds.code_rows", HEADERS / "code_rows.h", wp.float64, whole={"source": wp.float64}, writes={"code": wp.uint8}, numbers=FINITE,
+    sums=("others",),
+)  # fmt: skip
+DECODE = RowPass("bounds.decode", HEADERS / "decode.h", wp.float64, reads={"code": wp.uint8}, writes={"field": wp.float64}, numbers=FINITE)
+
+
+class Bounds:
+    """Lower and upper bounds, each a number or a field.
+
+    A pressure is bounded by 0 on wall cells and not at all elsewhere: such bounds are coded, one byte a cell with a bit for each side.
+    Fields from the host are not kept then. Fields on the device, which the caller may change, are; `refresh` codes them again.
+
+    Args:
+        layout: of the problem's fields.
+        lower: a number or a field, or AffineBounds.
+        upper: likewise.
+
+    Attributes:
+        affine: where bounds depend on x: what they are made of; `fields` then hold them at the x of the last `follow`.
+        fields: stored float64 fields; empty where a number or the code counts.
+        values: the numbers that count where there is no field; where bounds are coded, the value of the finite ones.
+        code: stored uint8 field, bit 1 where the lower bound is finite, bit 2 where the upper one is; empty if bounds are not coded.
+    """
+
+    def __init__(self, layout: Layout, lower: Any, upper: Any) -> None:
+        self.layout, self.device = layout, layout.device
+        self._none = wp.empty(0, dtype=wp.float64, device=self.device)
+        self._no_code = wp.empty(0, dtype=wp.uint8, device=self.device)
+        self.fields, self.values, self.code = [self._none, self._none], list(INFINITE), self._no_code
+        self._memory: wp.array[Any] | None = None
+        self.affine = affine_fields(layout, lower, upper)
+        if self.affine is not None:
+            self.fields, self.values, self.varying, self.in_place = list(self.affine.values), [0.0, 0.0], (True, True), False
+            return
+        low, high = (v if isinstance(v, wp.array) else real_array(v, name) for v, name in zip((lower, upper), NAMES, strict=True))
+        sides = (low, high)
+        varies = [v.ndim > 0 for v in sides]
+        self.varying = (varies[0], varies[1])
+        self.in_place = any(varies[s] and layout.holds(sides[s], wp.float64) for s in (0, 1))
+        for side in (0, 1):
+            if not varies[side]:
+                self.values[side] = float(sides[side])
+        if any(varies) and not self.in_place and self._code_from_host(sides):
+            return
+        for side in (0, 1):
+            if varies[side]:
+                self.fields[side] = layout.load(sides[side], wp.float64, NAMES[side])
+                self.values[side] = 0.0
+        if self.in_place:
+            self.refresh()
+
+    @property
+    def may_bind(self) -> tuple[bool, bool]:
+        """Whether a lower and an upper bound may be finite, now or after the caller changed a field."""
+        below, above = (self.varying[side] or bool(np.isfinite(self.values[side])) for side in (0, 1))
+        return below, above
+
+    @property
+    def operands(self) -> list[Any]:
+        """As kernels that know the code take them: a field or an empty array and the number that then counts, for each; the code."""
+        numbers = [wp.float64(v) for v in self.values]
+        if self.code.size:
+            return [self._none, numbers[0], self._none, numbers[1], self.code]
+        return [self.fields[0], numbers[0], self.fields[1], numbers[1], self.code]
+
+    def follow(self, x: wp.array[Any]) -> None:
+        """Evaluate bounds that depend on x at x (stored, float64)."""
+        if self.affine is not None:
+            self.affine.evaluate(x)
+
+    def given_again(self) -> tuple[Any, Any]:
+        """Return both sides as they are now, for a pickle."""
+        if self.affine is not None:
+            return self.affine.sides
+        sides = []
+        for side in (0, 1):
+            held = self.fields[side].size and self.in_place
+            field = self.as_field(side) if self.varying[side] else None
+            sides.append(self.values[side] if field is None else OnHost(field) if held else field.numpy().copy())
+        return sides[0], sides[1]
+
+    def refresh(self) -> None:
+        """Code fields again that the caller may have changed, where all their finite values are 0."""
+        if not self.in_place:
+            return
+        if self._memory is None:
+            self._memory = self.layout.zeros(wp.uint8)
+            self._others = wp.zeros(self._rows.places, dtype=wp.float64, device=self.device)
+        least, most = (0.0 if field.size else v for field, v in zip(self.fields, self.values, strict=True))
+        given = {"lower": self.fields[0], "upper": self.fields[1], "least": least, "most": most, "code": self._memory}
+        ENCODE.bind(self._rows, **given, out=self._others).launch()
+        self.code = self._no_code if self._others.numpy().any() else self._memory
+
+    def as_field(self, side: int) -> wp.array[Any]:
+        """Return a stored float64 field of the lower (0) or the upper bound (1)."""
+        if self.fields[side].size:
+            return self.fields[side]
+        field = wp.full(self.layout.size, self.values[side], dtype=wp.float64, device=self.device)
+        if self.code.size and not self.in_place:
+            given: dict[str, Any] = {"bit": BITS[side], "value": self.values[side], "infinite": INFINITE[side]}
+            DECODE.bind(self._rows, code=self.code, field=field, **given).launch()
+        return field
+
+    def host(self, side: int) -> np.ndarray:
+        """Return `as_field` on the host, without a launch: the caller's memory where there is a field on the CPU."""
+        if self.fields[side].size:
+            return self.fields[side].numpy()
+        field = np.full(self.layout.size, self.values[side])
+        if self.code.size and not self.in_place:
+            field[self.code.numpy() & BITS[side] == 0] = INFINITE[side]
+        return field
+
+    @property
+    def _rows(self) -> Rows:
+        return Rows.flat(self.layout.size, self.device)
+
+    def _code_from_host(self, sides: tuple[Array, Array]) -> bool:
+        """Code fields that are not stored yet; returns False, with nothing done, if their finite values differ or one is a NaN."""
+        code, values = np.zeros(self.layout.stored_shape, dtype=np.uint8), list(self.values)
+        for side in (0, 1):
+            host = real_array(sides[side], NAMES[side])
+            if not self.varying[side]:
+                code += np.uint8(BITS[side] * bool(np.isfinite(values[side])))
+                continue
+            if not self.layout.fits(host) or host.dtype.kind not in "fiu":
+                return False
+            value = float(host.max() if side == 0 else host.min())
+            if value == -INFINITE[side] or np.isnan(value) or not self._code_rows(side, host, value, code):
+                return False
+            values[side] = value
+        self.values = values
+        self.code = wp.array(code.ravel(), dtype=wp.uint8, device=self.device)
+        return True
+
+    def _code_rows(self, side: int, host: np.ndarray, value: float, code: np.ndarray) -> bool:
+        """Add a side's bits to a code on the host; returns False if there are other finite values."""
+        target = self.layout.target(code, host)
+        if host.size <= LAUNCHED:
+            finite = host != INFINITE[side]
+            target += (BITS[side] * finite).astype(np.uint8).reshape(target.shape)
+            return not (finite & (host != value)).any()
+        target = target if target.ndim == 3 else target.reshape(1, 1, -1)
+        first = target.__array_interface__["data"][0] - code.__array_interface__["data"][0]
+        rows = Rows.strided(code.size, wp.get_device("cpu"), (first, *target.strides[:2]), target.shape)
+        arrays = (np.ascontiguousarray(host, dtype=np.float64).ravel(), code.ravel(), np.zeros(rows.places))
+        source, bits, out = (wp.array(a, device="cpu", copy=False) for a in arrays)
+        CODE_ROWS.bind(rows, source=source, code=bits, value=value, infinite=INFINITE[side], bit=BITS[side], out=out).launch()
+        return not out.numpy().any()

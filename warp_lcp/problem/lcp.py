@@ -1,0 +1,158 @@
+"""The problem: y = A x + b with bounds l <= x <= u. LCP, mixed LCP, boxed LCP and linear system are one class."""
+
+from __future__ import annotations
+
+from functools import cached_property, singledispatch
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.problem.bounds import HEADERS, INFINITE, LAUNCHED, Bounds
+from warp_lcp.problem.pickling import OnHost, Pickled
+from warp_lcp.problem.protocol import AppliesPlus, HasCells, Operator, has, layout_of, members
+from warp_lcp.rows import RowPass, Rows
+from warp_lcp.rows.fields import Array, Layout, real_array
+from warp_lcp.rows.vectors import ADD, rows_of
+
+CHECK = RowPass(
+    "problem.check", HEADERS / "check.h", wp.float64, bounds=True, reads={"b": wp.float64, "unknown": wp.int8},
+    sums=("bad", "nan_lower", "nan_upper", "crossed", "no_lower", "no_upper"),
+)  # fmt: skip
+
+
+@singledispatch
+def as_operator(A: Any, device: Any = None) -> Operator:
+    """Return A as an operator; operators register here which arrays they take (numpy arrays, scipy.sparse matrices).
+
+    What converts to an array, by `__array__` or `to_numpy` (a data frame), is taken as one.
+
+    Args:
+        A: an operator, or what one is made of.
+        device: where an operator is made; the default device if None.
+
+    Raises:
+        ValueError: A is neither, or lacks members of `wl.Operator`; the message names them.
+    """
+    missing = [name for name in members(Operator) if not hasattr(A, name)]
+    if not missing:
+        return A
+    if hasattr(A, "__array__") or hasattr(A, "to_numpy"):
+        return as_operator(real_array(A, "A"), device)
+    if hasattr(A, "apply"):
+        raise ValueError(f"A is a {type(A).__name__} without {', '.join(missing)}: an operator needs them, see wl.Operator")
+    raise ValueError(f"A is a {type(A).__name__}: expected an operator, a numpy array or a scipy.sparse matrix")
+
+
+class LCP(Pickled):
+    """A linear complementarity problem ([Book] 1.2).
+
+    y = A x + b, l <= x <= u, and for every i: y_i > 0 => x_i = l_i; y_i < 0 => x_i = u_i; y_i = 0 otherwise. `lower=0`, `upper=inf` is
+    the LCP; a row with bounds -inf and inf is an equation; without finite bounds the problem is a linear system.
+
+    Fields that are device arrays of type wp.float64 in the operator's stored layout already (for a grid: padded by one cell, shape
+    (nz + 2, ny + 2, nx + 2)) are used in place, so that a time-stepping code can change them between solves; results then come back in
+    that layout too.
+
+    Args:
+        A: an Operator, or an array (numpy, Warp) or scipy.sparse matrix of shape (n, n), which becomes one on b's device.
+        b: field of A's shape, units of y.
+        lower: l, a number or a field; -inf where there is none; or AffineBounds, which depend on x.
+        upper: u, a number or a field; inf where there is none; or AffineBounds.
+
+    Raises:
+        ValueError: a NaN, a wrong shape, l > u, l = inf, u = -inf, or no unknown; the message names the argument.
+
+    Example:
+        >>> import numpy as np, warp_lcp as wl
+        >>> A = wl.DenseOperator(np.array([[2.0, -1.0], [-1.0, 2.0]]), device="cpu")
+        >>> result = wl.solve(wl.LCP(A, np.array([0.5, -2.5])), wl.MinimumMapNewton())
+        >>> print(result.status.name, result.x.numpy())
+        CONVERGED [0.5 1.5]
+        >>> print(wl.solve(wl.LCP(A, np.array([2.0, -3.0])), wl.MinimumMapNewton()).x.numpy())
+        [0.  1.5]
+    """
+
+    def __init__(self, A: Operator | Array, b: Array, lower: Any = 0.0, upper: Any = np.inf) -> None:
+        A = as_operator(A, b.device if isinstance(b, wp.array) else None)
+        self.A, self.layout = A, layout_of(A)
+        self.unknown = _unknown(A, self.layout)
+        if has(A, HasCells) and self._totals(np.array([np.count_nonzero(self.unknown.numpy() == 1)])) == [0]:
+            raise ValueError("A has no unknowns: the problem is empty")
+        self.in_place = isinstance(b, wp.array) and self.layout.holds(b, wp.float64) and tuple(b.shape) != tuple(A.shape)
+        self.b = self.layout.load(b, wp.float64, "b")
+        self.bounds = Bounds(self.layout, lower, upper)
+        self._check()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the operator, b and the bounds as they are now; fields that are used in place come back as device arrays."""
+        b = OnHost(self.b.reshape(self.layout.stored_shape)) if self.in_place else self.b.numpy().copy()
+        return LCP, (self.A, b, *self.bounds.given_again())
+
+    @property
+    def device(self) -> wp.Device:
+        """The device of the problem's arrays."""
+        return self.layout.device
+
+    @property
+    def bounded(self) -> bool:
+        """Whether a bound may be finite."""
+        return any(self.bounds.may_bind)
+
+    @cached_property
+    def lower(self) -> wp.array[Any]:
+        """l as a stored field, float64."""
+        return self.bounds.as_field(0)
+
+    @cached_property
+    def upper(self) -> wp.array[Any]:
+        """u as a stored field, float64."""
+        return self.bounds.as_field(1)
+
+    def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
+        """out = A x + b, flat stored fields of one type: in one pass where the operator has it."""
+        if has(self.A, AppliesPlus):
+            self.A.apply_plus(x, b, out)
+            return
+        self.A.apply(x.reshape(self.layout.stored_shape), out.reshape(self.layout.stored_shape))
+        ADD.bind(rows_of(x), z=b, x=out).launch()
+
+    def not_finite(self, field: wp.array[Any]) -> int:
+        """Return how many unknowns of a stored field are not finite."""
+        return self._faults(field, Bounds(self.layout, *INFINITE))[0]
+
+    def _faults(self, field: wp.array[Any], bounds: Bounds) -> list[int]:
+        """Count values of a stored field that are not finite, NaN in l and in u, crossed bounds, l = inf, u = -inf."""
+        if self.device.is_cpu and self.layout.size <= LAUNCHED:
+            inside = self.unknown.numpy() == 1
+            b, lower, upper = field.numpy()[inside], bounds.host(0)[inside], bounds.host(1)[inside]
+            faults = (~np.isfinite(b), np.isnan(lower), np.isnan(upper), lower > upper, lower == np.inf, upper == -np.inf)
+            return self._totals(np.array([np.count_nonzero(fault) for fault in faults]))
+        rows = Rows.flat(self.layout.size, self.device)
+        counts = wp.zeros(len(CHECK.sums) * rows.places, dtype=wp.float64, device=self.device)
+        CHECK.bind(rows, bounds=bounds.operands, b=field, unknown=self.unknown, out=counts).launch()
+        return self._totals(counts.numpy().reshape(-1, rows.places).sum(axis=1))
+
+    def _totals(self, found: np.ndarray) -> list[int]:
+        return [int(n) for n in (found if self.layout.across is None else self.layout.across.sum(found))]
+
+    def _check(self) -> None:
+        """Refuse data that no method could use."""
+        bad_b, nan_lower, nan_upper, crossed, no_lower, no_upper = self._faults(self.b, self.bounds)
+        if bad_b:
+            raise ValueError(f"b holds {bad_b} values that are not finite")
+        for name, count in (("lower", nan_lower), ("upper", nan_upper)):
+            if count:
+                raise ValueError(f"{name} holds {count} NaN")
+        for name, count, wrong in (("lower", no_lower, "inf"), ("upper", no_upper, "-inf")):
+            if count:
+                raise ValueError(f"{name} holds {wrong}: no x could meet it")
+        if crossed:
+            raise ValueError(f"lower > upper in {crossed} unknowns")
+
+
+def _unknown(A: Operator, layout: Layout) -> wp.array[Any]:
+    """Return a stored int8 field that is 1 on unknowns: a grid's cell types serve as they are."""
+    if has(A, HasCells):
+        return A.cells.flatten()
+    return wp.full(layout.size, 1, dtype=wp.int8, device=layout.device)

@@ -1,0 +1,247 @@
+"""What solvers ask of an operator: the members that each has, and capabilities that some methods need and others make use of.
+
+An operator has a capability if it has the members; `has` says so, and is the only place that looks for them by name. A method lists in
+`supports` the capabilities of which it needs one.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeGuard, TypeVar, runtime_checkable
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.rows.fields import Layout
+
+if TYPE_CHECKING:
+    from warp_lcp.operators.compressed_rows import CompressedRows
+    from warp_lcp.rows.fields import PaddedLayout
+
+AIR, FLUID, SOLID = 0, 1, 2  # types of a grid's cells
+Capability = TypeVar("Capability", bound="Operator")
+
+
+@runtime_checkable
+class Operator(Protocol):
+    """A square linear operator A on fields of shape `shape`: what each operator has.
+
+    Bring your own by implementing this protocol; docs "Operators of your own" has one. Fields are then plain contiguous arrays of that
+    shape. What more an operator can do are capabilities (`warp_lcp.problem.protocol`): it has one if it has its members.
+
+    Attributes:
+        shape: shape of the fields that A maps to each other.
+        dtype: type in which A's entries are stored, wp.float32 or wp.float64.
+        device: the device of A's arrays.
+        symmetric: whether A equals its transpose.
+    """
+
+    shape: tuple[int, ...]
+    dtype: Any
+    device: wp.Device
+    symmetric: bool
+
+    def apply(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+        """Return A x, written to `out` if that is given."""
+
+    def apply_transpose(self, x: wp.array[Any], out: wp.array[Any] | None = None) -> wp.array[Any]:
+        """Return A' x, written to `out` if that is given."""
+
+    def diagonal(self) -> wp.array[Any]:
+        """Return the diagonal of A as a field of type `dtype`."""
+
+    def masked(self, free: wp.array[Any], shift: wp.array[Any] | None = None) -> Operator:
+        """Return P A P + P D P, with P the restriction to the unknowns where `free` is not 0 and D = diag(shift)."""
+
+
+class HasRows(Operator, Protocol):
+    """The entries of A by rows: for sweeps in any order, blocks, and proofs that there is no solution.
+
+    Attributes:
+        row_sizes: the largest magnitude of each row, shape (n,), wp.float64; None where no row is empty. The unknown of an empty row goes
+            to the bound that b's sign asks for.
+    """
+
+    row_sizes: wp.array[Any] | None
+
+    def rows(self) -> CompressedRows:
+        """Return the rows of A between the elements of flat stored fields, in the operator's own memory."""
+
+
+class Relaxes(Operator, Protocol):
+    """A sweep in an order of the operator's own."""
+
+    def relax(self, x: Any, b: Any, lower: Any, upper: Any, omega: float, *, forward: bool = True) -> None:
+        """Set each x_i in turn to clip(x_i - omega (A x + b)_i / A_ii, l_i, u_i), or in the reverse order if not `forward`.
+
+        All are flat stored fields of one type; x is moved in place. Rows with a zero diagonal are passed over.
+        """
+
+
+class HasLayout(Operator, Protocol):
+    """Fields that are stored otherwise than as plain arrays.
+
+    Attributes:
+        layout: loads and unloads them. `apply` and `apply_transpose` take stored fields too, flat or of `layout.stored_shape`.
+    """
+
+    layout: Layout
+
+
+class Versioned(Operator, Protocol):
+    """Entries that change in place.
+
+    Attributes:
+        version: another number after each change; what methods have derived from A is derived again when the next solve starts.
+    """
+
+    version: int
+
+
+class HasCells(Operator, Protocol):
+    """Elements of a field that are no unknowns.
+
+    Attributes:
+        cells: wp.int8, one for each element of a stored field, 1 (FLUID) where it is an unknown; others stay 0.
+    """
+
+    cells: wp.array[Any]
+
+
+class HasStencil(HasCells, HasLayout, Versioned, Protocol):
+    """The 5- or 7-point stencil of a grid: for multigrid and for passes that compute A x on the way.
+
+    Attributes:
+        stencil: the diagonal and the weights of neighbors, A symmetric with weights >= 0 and weakly dominant rows.
+        periodic: whether x, y, z wrap around.
+        layout: with a ghost cell on each side.
+    """
+
+    stencil: Any
+    periodic: tuple[bool, bool, bool]
+    layout: PaddedLayout
+
+
+class HasFaces(HasCells, HasLayout, Versioned, Protocol):
+    """What a `wl.GridPoisson` on some of the cells is made from, the others taken as AIR: a block of the unknowns.
+
+    Attributes:
+        faces: coefficients of the faces normal to x, y, z as padded arrays, empty where they are a number.
+        uniform: those numbers.
+        shift: padded, empty where there is none.
+        periodic: whether x, y, z wrap around.
+    """
+
+    faces: list[wp.array[Any]]
+    uniform: tuple[float, float, float]
+    shift: wp.array[Any]
+    periodic: tuple[bool, bool, bool]
+
+
+class HasColumns(Operator, Protocol):
+    """A = G + U W U', with a stencil and a few columns.
+
+    Attributes:
+        grid: G, an operator that has a stencil.
+        low: U W U', a `wl.LowRankOperator` stored as G's fields are.
+    """
+
+    grid: HasStencil
+    low: Any
+
+
+class AppliesPlus(Operator, Protocol):
+    """A x + b in one pass: saves each residual one over memory."""
+
+    def apply_plus(self, x: wp.array[Any], b: wp.array[Any], out: wp.array[Any]) -> None:
+        """out = A x + b; flat stored fields of one type."""
+
+
+class HasScale(Operator, Protocol):
+    """The d of the natural residual, d_i (x_i - clip(x_i - y_i / d_i, l_i, u_i)); without it, d is estimated by 16 products."""
+
+    def scale(self) -> np.ndarray | None:
+        """Return d > 0, units of y over those of x, as a flat stored field; None: it is to be estimated."""
+
+
+class NamesComponents(Operator, Protocol):
+    """Sets of unknowns on which A is singular with the constants as null space: they are projected out, or b is INFEASIBLE there."""
+
+    def floating_components(self, scratch: Any = None) -> Any:
+        """Return them (`warp_lcp.operators.components.FloatingComponents`), None if there are none.
+
+        Args:
+            scratch: stored fields, of 4-byte elements and of bytes, that may be overwritten; None: there are none.
+        """
+
+
+FAMILIES = {"dense": "wl.DenseOperator", "sparse": "wl.SparseOperator", "grid": "wl.GridPoisson"}
+CAPABILITIES: dict[type[Operator], tuple[str, tuple[str, ...]]] = {  # what to call each, and which of our own families have it
+    HasRows: ("rows", ("dense", "sparse")),
+    Relaxes: ("a sweep", ("dense", "sparse", "grid")),
+    HasStencil: ("a stencil", ("grid",)),
+    HasFaces: ("faces", ("grid",)),
+    HasColumns: ("a stencil and columns", ()),
+    HasLayout: ("a layout", ("dense", "sparse", "grid")),
+    Versioned: ("a version", ("sparse", "grid")),
+    HasCells: ("cells", ("grid",)),
+    AppliesPlus: ("sums with products", ("sparse", "grid")),
+    HasScale: ("a scale", ("dense", "sparse")),
+    NamesComponents: ("components", ("grid",)),
+}
+
+
+@cache
+def members(capability: type[Operator]) -> tuple[str, ...]:
+    """Return the names of a capability's members beside those of `Operator`; of `Operator`, its own."""
+    bases = [base for base in reversed(capability.__mro__) if base not in (object, Generic, Protocol)]
+    own = [base for base in bases if base is not Operator] or bases
+    return tuple(dict.fromkeys(name for base in own for name in (*base.__annotations__, *vars(base)) if not name.startswith("_")))
+
+
+def has(A: object, capability: type[Capability]) -> TypeGuard[Capability]:
+    """Return whether an operator has a capability: all of its members. `isinstance` of protocols would take 10 us."""
+    return all(hasattr(A, name) for name in members(capability))
+
+
+def version_of(A: Operator) -> int | None:
+    """Return the version of an operator, None of one that does not say when it changes."""
+    return A.version if has(A, Versioned) else None
+
+
+def layout_of(A: Operator) -> Layout:
+    """Return the layout of an operator's fields; plain arrays unless it says otherwise."""
+    return A.layout if has(A, HasLayout) else Layout(A.shape, A.device)
+
+
+def takes(method: Any, A: Operator) -> bool:
+    """Return whether a method, or its class, takes an operator: A has one of the capabilities in `supports`, if that names any."""
+    asked = getattr(method, "supports", ())
+    return not asked or any(has(A, capability) for capability in asked)
+
+
+def families(method: Any) -> set[str]:
+    """Return which of our own families of operators a method, or its class, takes: "dense", "sparse", "grid"."""
+    asked = getattr(method, "supports", ())
+    return {family for capability in asked for family in CAPABILITIES[capability][1]} if asked else set(FAMILIES)
+
+
+def described(*capabilities: type[Operator]) -> str:
+    """Return what capabilities are called, and which of our own operators have them, for messages."""
+    return " or ".join(
+        name + (f" ({', '.join(FAMILIES[family] for family in having)})" if having else "")
+        for name, having in (CAPABILITIES[capability] for capability in capabilities)
+    )
+
+
+def check_taken(method: Any, A: Operator) -> None:
+    """Check that a method takes an operator.
+
+    Raises:
+        ValueError: it does not; the message names what is missing, and methods that ask for nothing.
+    """
+    if not takes(method, A):
+        others = "take MinimumMapNewton, or ProjectedJacobi where bounds are affine in x, which need products only"
+        raise ValueError(
+            f"{type(method).__name__} needs an operator with {described(*method.supports)}; {type(A).__name__} has none: {others}"
+        )

@@ -1,0 +1,150 @@
+"""The natural residual, the one number in which all methods are compared; always evaluated from x in float64.
+
+r_i = d_i (x_i - clip(x_i - y_i / d_i, l_i, u_i)) with d_i = 1 / (r_i c_i) where diag(r) A diag(c) is equilibrated: |A_ii| for positive
+semi-definite matrices and on grids (`warp_lcp.problem.scale`; 1 where a row and a column are empty). r has the units of y and does not
+change when x is rescaled; it vanishes exactly at solutions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import HasRows, HasScale, HasStencil, has, version_of
+from warp_lcp.problem.scale import scale_by_products
+from warp_lcp.rows import Known, RowPass, Rows
+from warp_lcp.rows.vectors import Sums, rows_of
+
+HEADERS = Path(__file__).parent / "headers"
+f64, i8 = wp.float64, wp.int8
+NATURAL = RowPass(
+    "residual.natural", HEADERS / "natural.h", f64, bounds=True, reads={"x": f64, "y": f64, "d": "D", "unknown": i8},
+    numbers={"unit": f64}, sums=("square",),
+)  # fmt: skip
+UNKNOWN_SQUARE = RowPass("residual.unknown_square", HEADERS / "unknown_square.h", f64, reads={"b": f64, "unknown": i8}, sums=("square",))
+WITHIN = RowPass(
+    "residual.within", HEADERS / "within.h", f64, bounds=True, reads={"unknown": i8}, writes={"x": f64}, numbers={"keep": bool}
+)
+SETTLE_ISOLATED = RowPass(
+    "residual.settle_isolated", HEADERS / "settle_isolated.h", f64, bounds=True, reads={"d": "D", "b": f64, "unknown": i8},
+    writes={"x": f64},
+)  # fmt: skip
+
+
+class NaturalResidual:
+    """Evaluates y = A x + b and the norm of the natural residual, in float64.
+
+    Attributes:
+        y: stored field, A x + b at the x of the last evaluation.
+        norm: the residual's norm there, units of y.
+        diagonal: d / unit, stored field: on grids the stencil's own diagonal, with its sign, and 0 where no unknown or an empty row is.
+        current: whether `y` and `norm` belong to the iterate as it is; a method that moves x sets it to False.
+    """
+
+    def __init__(self, problem: LCP) -> None:
+        self.problem = problem
+        layout = problem.layout
+        self.norm, self.current = 0.0, False
+        stencil = problem.A.stencil if has(problem.A, HasStencil) else None
+        self.diagonal = stencil.d if stencil else wp.zeros(layout.size, dtype=problem.A.dtype, device=layout.device)
+        self.unit = float(stencil.unit) if stencil else 1.0
+        self._diagonal_of = None if stencil else version_of(problem.A)  # of an operator whose scale is a copy
+        self._sums = Sums(Rows.flat(layout.size, layout.device), across=layout.across)
+        if not stencil:
+            self.rescale()
+
+    @cached_property
+    def y(self) -> wp.array[Any]:
+        """Memory of y, made when it is first asked for."""
+        return self.problem.layout.zeros(wp.float64)
+
+    @cached_property
+    def known(self) -> Known:
+        """What passes take of y in place of a stencil."""
+        return Known(self.diagonal, self.unit, self.y)
+
+    def evaluate(self, x: wp.array[Any]) -> float:
+        """Compute y and return the norm of the natural residual at x (stored, float64)."""
+        p = self.problem
+        p.bounds.follow(x)
+        self.affine(x)
+        fields = {"x": x, "y": self.y, "d": self.diagonal, "unknown": p.unknown, "unit": self.unit}
+        self.norm, self.current = float(np.sqrt(self._sums.of(NATURAL, bounds=p.bounds.operands, **fields)[0])), True
+        return self.norm
+
+    def affine(self, x: wp.array[Any]) -> None:
+        """Set y = A x + b."""
+        self.problem.apply_plus(x, self.problem.b, self.y)
+
+    def start(self, x: wp.array[Any], *, keep: bool) -> None:
+        """Set x to clip(x, l, u), or to clip(0, l, u), and to 0 where there is no unknown."""
+        p = self.problem
+        if self._diagonal_of is not None and self._diagonal_of != version_of(p.A):
+            self._diagonal_of = version_of(p.A)
+            self.rescale()
+        for _ in range(1 if p.bounds.affine is None else 2):  # bounds that depend on x: at x as it is, then at x within its bounds
+            p.bounds.follow(x)
+            WITHIN.bind(rows_of(x), bounds=p.bounds.operands, x=x, unknown=p.unknown, keep=keep).launch()
+        self.current = False
+
+    def rescale(self) -> None:
+        """Take d again from an operator that has changed; grids share theirs."""
+        A = self.problem.A
+        own = A.scale() if has(A, HasScale) else None
+        d = self._estimated_scale() if own is None else own
+        self.diagonal.assign(np.maximum(d, np.finfo(wp.dtype_to_numpy(self.diagonal.dtype)).tiny))
+
+    def _estimated_scale(self) -> np.ndarray:
+        """Return d of an operator that does not know it, a flat stored field."""
+        p, layout = self.problem, self.problem.layout
+        z, image, unknown = layout.zeros(wp.float64), layout.zeros(wp.float64), p.unknown.numpy() == 1
+
+        def images(apply: Callable[..., Any]) -> Callable[[np.ndarray], np.ndarray]:
+            def product(values: np.ndarray) -> np.ndarray:
+                z.assign(values * unknown)
+                apply(z.reshape(layout.stored_shape), image.reshape(layout.stored_shape))
+                return image.numpy() * unknown
+
+            return product
+
+        d = layout.load(p.A.diagonal(), wp.float64).numpy() * unknown
+        return scale_by_products(d, images(p.A.apply), images(p.A.apply if p.A.symmetric else p.A.apply_transpose))
+
+    @property
+    def row_sizes(self) -> wp.array[Any] | None:
+        """The largest magnitude of each row of a matrix with empty ones, None of others."""
+        return self.problem.A.row_sizes if has(self.problem.A, HasRows) else None
+
+    def settle_isolated(self, x: wp.array[Any]) -> None:
+        """Set x where A's row is empty, so that y = b, to the bound that b's sign asks for; methods move coupled unknowns only."""
+        p, sizes = self.problem, self.row_sizes
+        zero_if_empty = self.diagonal if sizes is None else sizes  # of grids, only an empty row has a zero diagonal
+        fields = {"d": zero_if_empty, "b": p.b, "unknown": p.unknown, "x": x}
+        SETTLE_ISOLATED.bind(rows_of(x), bounds=p.bounds.operands, **fields).launch()
+        self.current = False
+
+    def unattainable(self) -> float:
+        """Return the norm of b where a matrix has an empty row and b's sign asks for a bound that is infinite: no x will do."""
+        p, sizes = self.problem, self.row_sizes
+        if sizes is None:
+            return 0.0
+        b = np.where(sizes.numpy() == 0, p.b.numpy(), 0.0)
+        return float(np.linalg.norm(b[np.where(b > 0, np.isneginf(p.lower.numpy()), np.isposinf(p.upper.numpy()))]))
+
+    def norm_of_b(self) -> float:
+        """Return ||b|| over the unknowns."""
+        return float(np.sqrt(self._sums.of(UNKNOWN_SQUARE, b=self.problem.b, unknown=self.problem.unknown)[0]))
+
+    def rounding_floor(self, x: wp.array[Any], epsilon: float) -> float:
+        """Return an estimate of the residual that rounding x to `epsilon` leaves: epsilon || 2 |d x| + |b| ||."""
+        inside = self.problem.unknown.numpy() == 1
+        d = np.abs(self.diagonal.numpy()[inside].astype(np.float64)) * self.unit
+        parts = 2 * d * np.abs(x.numpy()[inside]) + np.abs(self.problem.b.numpy()[inside])
+        across = self.problem.layout.across
+        return float(epsilon * (np.linalg.norm(parts) if across is None else np.sqrt(across.sum(float(parts @ parts)))))

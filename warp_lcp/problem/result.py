@@ -1,0 +1,85 @@
+"""What a solve returns: status, iterate, residuals and history."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import TYPE_CHECKING, Any
+
+from warp_lcp.problem.pickling import FieldsOnHost
+
+if TYPE_CHECKING:
+    import warp as wp
+
+
+class SolveStatus(Enum):
+    """How a solve ended. The value says what it means and what to try next."""
+
+    CONVERGED = "the recomputed residual meets the criteria"
+    MAX_ITERATIONS = (
+        "the iteration limit came first: raise max_iterations, start warmer, or take a faster method; "
+        "where coefficients differ by more than 1e5, precision='double'"
+    )
+    TIME_LIMIT = "`max_seconds` came first: raise it, start from this x, or take a faster method, that of wl.solve(problem) or wl.recommend"
+    STAGNATED = "no smaller residual in the last `patience` steps: take another method or precision='double'"
+    FLOOR = "the precision's floor is reached before the tolerance: loosen rtol or use precision='double'"
+    LOCAL_MINIMUM = "the merit function has a stationary point that is no solution: start elsewhere or take another method"
+    NON_DESCENT = "no step reduces the merit function: take another method, for example ProjectedSOR"
+    DIVERGED = "the residual grew beyond `divergence` times the first one: the method's assumptions on A do not hold"
+    NON_FINITE = (
+        "a NaN or an infinity appeared: check b, the bounds and the coefficients; where these are beyond 1e36 or below 1e-36, "
+        "scale A and b, or take precision='double'"
+    )
+    INFEASIBLE = "the problem has no solution: b is incompatible with a singular component, or the method has proved it"
+
+    def __reduce_ex__(self, protocol: Any) -> tuple[Any, ...]:
+        """Pickle the name: what the value says may change."""
+        return getattr, (SolveStatus, self.name)
+
+
+@dataclass(frozen=True)
+class Record:
+    """One line of a history, taken before step `iteration` (the last one: at the end).
+
+    Args:
+        iteration: steps done.
+        residual: norm of the natural residual, recomputed in float64, units of y.
+        linear_iterations: iterations on the finest grid so far.
+        active: unknowns held at a bound in the last step; None where the method has no active set.
+        step: what the last step was, a word of the method ("newton", "monotone cycle", "sweep", ...).
+        seconds: wall time since the start of the solve.
+    """
+
+    iteration: int
+    residual: float
+    linear_iterations: int
+    active: int | None
+    step: str
+    seconds: float
+
+
+@dataclass(frozen=True)
+class SolveResult(FieldsOnHost):
+    """The outcome of `wl.solve`; true only if the recomputed residual meets the criteria.
+
+    Attributes:
+        x: the best iterate found, shape of the problem's fields, float64 unless the solver's precision is "single".
+        status: how the solve ended.
+        iterations: steps of the method.
+        linear_iterations: linear iterations on the finest grid, monotone cycles included.
+        residual: norm of the natural residual at x, recomputed in float64, units of y.
+        relative_residual: residual over the one at clip(0, l, u); 0 where both vanish.
+        history: a Record for the start and one for each step.
+    """
+
+    x: wp.array[Any]
+    status: SolveStatus
+    iterations: int
+    linear_iterations: int
+    residual: float
+    relative_residual: float
+    history: list[Record] = field(repr=False)
+
+    def __bool__(self) -> bool:
+        """Return whether the solve converged."""
+        return self.status is SolveStatus.CONVERGED

@@ -1,0 +1,457 @@
+"""The one outer loop: start, criteria, status, history, best iterate. Methods only step."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import cache
+from typing import Any, Literal, Protocol, get_args, get_type_hints, runtime_checkable
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.deadline import Deadline, TimeIsUp
+from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.protocol import NamesComponents, has
+from warp_lcp.problem.residual import NaturalResidual
+from warp_lcp.problem.result import Record, SolveResult, SolveStatus
+from warp_lcp.problem.stopping import StoppingCriteria
+from warp_lcp.rows.fields import Array
+from warp_lcp.rows.vectors import convert
+
+EPS = float(np.finfo(np.float64).eps)
+SMALLEST = 1e-138  # a norm from which on residuals 16 digits smaller have squares that float64 holds
+FLOOR_MARGIN = 8.0  # a stagnated residual within this multiple of the rounding estimate is called the precision's floor
+
+
+class Precision(StrEnum):
+    """Types of iterate and corrections: `mixed` keeps the iterate in float64 and computes corrections in float32."""
+
+    MIXED = "mixed"
+    SINGLE = "single"
+    DOUBLE = "double"
+
+    @property
+    def iterate(self) -> Any:
+        """Warp's type of the iterate."""
+        return wp.float32 if self is Precision.SINGLE else wp.float64
+
+    @property
+    def correction(self) -> Any:
+        """Warp's type of corrections."""
+        return wp.float64 if self is Precision.DOUBLE else wp.float32
+
+    @property
+    def epsilon(self) -> float:
+        """Rounding unit of the iterate."""
+        return float(np.finfo(np.float32 if self is Precision.SINGLE else np.float64).eps)
+
+
+PrecisionName = Literal[tuple(map(str, Precision))]
+
+
+@dataclass(frozen=True)
+class Step:
+    """What one step of a method did.
+
+    Args:
+        name: a word of the method.
+        linear_iterations: iterations on the finest grid.
+        active: unknowns held at a bound, None where the method has no active set.
+        failure: the status with which the method gives up, None to go on.
+        interim: the residual need not fall (a pivot on the way, or a step that lowers the energy): patience and divergence do not apply.
+        iterations: steps that it stands for, of a method that takes several at once.
+        due: the residual is worth recomputing; else nothing is recorded and the solve goes on, unless a limit has come.
+        final: the iterate is the result so far, though an earlier one may have had a smaller residual.
+    """
+
+    name: str
+    linear_iterations: int = 1
+    active: int | None = None
+    failure: SolveStatus | None = None
+    interim: bool = False
+    iterations: int = 1
+    due: bool = True
+    final: bool = False
+
+
+class ConvexSetProblem:
+    """Base of problems over a convex set K that is no box: find x in K with y(x)'(z - x) >= 0 for all z in K (a variational inequality).
+
+    x solves it where it is the nearest point of K to x - y/d, for any d > 0, and how far that projection moves x is the natural residual.
+    K = [l, u], where the projection is a clip, and y = A x + b make an `LCP`; K may depend on x. Of another set the loop needs no more
+    than the residual: K, y and the projection are between the problem, its methods and their workspaces, which may compute gradient and
+    projection in one pass. The stresses of sand (`granular.stress.Stress`) are such a problem.
+
+    The workspace of such a problem has the iterate, which starts as it is unless an x0 is assigned to it and which a result has in place,
+    and a `Residual`. A method names the class of problems that it takes as `problems`.
+    """
+
+
+class Residual(Protocol):
+    """What the loop asks of a natural residual.
+
+    Attributes:
+        norm: at the x of the last evaluation, in units of y or of d x.
+        current: whether that is the iterate as it is; the loop sets it to False before each step.
+    """
+
+    norm: float
+    current: bool
+
+    def evaluate(self, x: wp.array[Any]) -> float:
+        """Return the norm at x, recomputed in float64."""
+
+    def rounding_floor(self, x: wp.array[Any], epsilon: float) -> float:
+        """Return an estimate of the norm that rounding x to `epsilon` leaves; 0 where there is none."""
+
+
+class Workspace(Protocol):
+    """What a method allocates once for a problem; can be used again when b, the bounds or the cells change in place."""
+
+    problem: Any
+    x: wp.array[Any]
+    residual: Any  # a NaturalResidual of an LCP, else a Residual
+    precision: Precision
+    floating: Any  # the operator's floating components, set by the loop before `start`; None if there are none
+
+    def start(self, *, warm: bool, tolerance: float) -> bool | None:
+        """Forget the last solve; return True where steps are wanted even if the start meets the tolerance.
+
+        Args:
+            warm: x is a guess better than clip(0, l, u).
+            tolerance: the residual norm that is asked for.
+        """
+
+    def round_iterate(self) -> None:
+        """Round x to its precision."""
+
+    def keep(self) -> None:
+        """Remember x as the best iterate."""
+
+    def restore(self) -> None:
+        """Make x the best iterate again."""
+
+
+class IterateMemory:
+    """What workspaces have in common: x, moved in place and rounded to its precision, the residual there, the best iterate by a copy.
+
+    Args:
+        problem: the problem.
+        precision: of the iterate.
+        x: stored field; its own if None.
+        residual: evaluated at x; a NaturalResidual of its own if None.
+    """
+
+    floating: Any = None
+    _best: wp.array[Any] | None = None
+
+    def __init__(
+        self, problem: LCP, precision: str = Precision.DOUBLE, *, x: wp.array[Any] | None = None, residual: NaturalResidual | None = None
+    ) -> None:
+        self.problem, self.precision = problem, Precision(precision)
+        self.x = problem.layout.zeros(wp.float64) if x is None else x
+        self.residual = NaturalResidual(problem) if residual is None else residual
+        self._rounded = problem.layout.zeros(wp.float32) if self.precision is Precision.SINGLE else None
+
+    def keep(self) -> None:
+        """Remember x as the best iterate."""
+        if self._best is None:
+            self._best = wp.clone(self.x)
+        else:
+            wp.copy(self._best, self.x)
+
+    def restore(self) -> None:
+        """Make x the best iterate again."""
+        if self._best is not None:
+            wp.copy(self.x, self._best)
+
+    def round_iterate(self) -> None:
+        """Round x to its precision."""
+        self._round(self.x)
+
+    def _round(self, x: wp.array[Any]) -> None:
+        if self._rounded is not None:
+            convert(x, self._rounded)
+            convert(self._rounded, x)
+
+
+@runtime_checkable
+class Solver(Protocol):
+    """A method is its settings; its memory is a Workspace."""
+
+    def init(self, problem: Any) -> Any:
+        """Return a workspace for the problem.
+
+        Raises:
+            ValueError: the method's assumptions on A do not hold.
+        """
+
+    def step(self, problem: Any, work: Any, x: wp.array[Any]) -> Step:
+        """Move x once. `work.residual` is current at x; leave `work.residual.current` False unless it is at the new x."""
+
+
+def solve(
+    problem: LCP | ConvexSetProblem,
+    solver: Solver,
+    *,
+    stopping: StoppingCriteria | None = None,
+    x0: Array | None = None,
+    workspace: Workspace | None = None,
+    callback: Callable[[Record], None] | None = None,
+) -> SolveResult:
+    """Solve a problem by a method; what `wl.solve` documents, for callers that bring the method themselves."""
+    if not isinstance(problem, (LCP, ConvexSetProblem)):
+        raise ValueError(f"problem is a {type(problem).__name__}: expected an LCP")
+    if isinstance(solver, type) or not (hasattr(solver, "init") and hasattr(solver, "step")):
+        kind = f"the class {solver.__name__}" if isinstance(solver, type) else f"a {type(solver).__name__}"
+        raise ValueError(f"solver is {kind}: expected a method with its settings, say MinimumMapNewton()")
+    if not (stopping is None or isinstance(stopping, StoppingCriteria)):
+        raise ValueError(f"stopping is a {type(stopping).__name__}: expected StoppingCriteria(rtol=...)")
+    taken: type = getattr(solver, "problems", LCP)
+    if not isinstance(problem, taken):
+        raise ValueError(f"{type(solver).__name__} takes problems of the class {taken.__name__}: this is a {type(problem).__name__}")
+    across, loop = None, _Loop
+    if isinstance(problem, LCP):
+        across, loop = problem.layout.across, _LoopInBox
+        if problem.bounds.affine is not None and not getattr(solver, "affine_bounds", False):
+            raise ValueError(f"{type(solver).__name__} takes no bounds that are affine in x: take ProjectedSOR or another sweeping method")
+        if across is not None and not getattr(solver, "distributed", False):
+            raise ValueError(f"{type(solver).__name__} does not work on several ranks: take ProjectedMultigrid or MinimumMapNewton")
+    stopping = stopping or StoppingCriteria()
+    deadline = Deadline(stopping.max_seconds, across)
+    work = solver.init(problem) if workspace is None else _checked(workspace, problem, solver)
+    return loop(problem, solver, stopping, deadline, work, callback).run(x0)
+
+
+def _checked(work: Any, problem: Any, solver: Solver) -> Workspace:
+    """Return a workspace that a caller brought, if it is one, and that of this problem and method."""
+    name = type(solver).__name__
+    if isinstance(work, type) or not all(hasattr(work, part) for part in ("problem", "x", "residual", "start")):
+        kind = f"the class {work.__name__}" if isinstance(work, type) else f"a {type(work).__name__}"
+        raise ValueError(f"workspace is {kind}: expected what {name}.init(problem) returned")
+    made = _workspaces_of(type(solver))
+    if made and type(work) not in made:
+        raise ValueError(f"workspace is a {type(work).__name__}, made by another method: expected what {name}.init(problem) returned")
+    if work.problem is not problem:
+        raise ValueError("workspace was made for another problem: problems that change in place keep theirs")
+    return work
+
+
+@cache
+def _workspaces_of(method: type) -> tuple[type, ...]:
+    """Return the kinds of workspace that a method's `init` says it returns, none where it does not say."""
+    try:
+        hint = get_type_hints(method.init).get("return")  # type: ignore[attr-defined]
+    except NameError:  # a user's method, with names that are there for type checkers only
+        return ()
+    return tuple(kind for kind in get_args(hint) or (hint,) if isinstance(kind, type) and kind is not type(None))
+
+
+class _Loop:
+    """The state of one solve."""
+
+    def __init__(
+        self, problem: Any, solver: Solver, stopping: StoppingCriteria, deadline: Deadline, work: Workspace,
+        callback: Callable[[Record], None] | None,
+    ) -> None:  # fmt: skip
+        self.problem, self.solver, self.stopping, self.work, self.callback = problem, solver, stopping, work, callback
+        self.deadline = deadline
+        self.residual, self.history = work.residual, list[Record]()
+        self.begun = time.perf_counter()
+        self.linear = 0
+        self.best_iteration, self.best_norm, self.progress = 0, math.inf, 0
+
+    def run(self, x0: Array | None) -> SolveResult:
+        """Solve from where the workspace's iterate is, from x0 or, in a box, from clip(0, l, u)."""
+        ended = self._begin(x0)
+        if ended is not None:
+            return self._finish(ended, 0)
+        try:
+            with self.deadline:
+                wanted = self.work.start(warm=self.warm, tolerance=self.tolerance) and self.stopping.max_iterations > 0
+                return self._iterate(None if wanted else self._status(0, None))
+        except TimeIsUp:  # within a step, of which nothing is left
+            self._restore()
+            ended = SolveStatus.CONVERGED if self.residual.norm <= self.tolerance else SolveStatus.TIME_LIMIT
+            return self._finish(ended, self.history[-1].iteration)
+
+    def _begin(self, x0: Array | None) -> SolveStatus | None:
+        """Evaluate the residual at the start; return the status if there is nothing to solve."""
+        if x0 is not None:
+            self.work.x.assign(x0)
+        self.warm = True
+        self._refer()
+        self._record(0, Step("start", 0))
+        self._keep(0)
+        return None if math.isfinite(self.reference) else SolveStatus.NON_FINITE
+
+    def _refer(self) -> None:
+        self.reference = self.residual.evaluate(self.work.x)
+        self.tolerance = self.stopping.tolerance(self.reference)
+
+    def _iterate(self, status: SolveStatus | None) -> SolveResult:
+        iteration = 0
+        while status is None:
+            self.residual.current = False
+            step = self.solver.step(self.problem, self.work, self.work.x)
+            iteration += step.iterations
+            self.linear += step.linear_iterations
+            if not step.due and iteration < self.stopping.max_iterations and self.deadline.left() > 0:
+                continue
+            if not self.residual.current:
+                self.residual.evaluate(self.work.x)
+            self._record(iteration, step)
+            if step.final or self.residual.norm < self.best_norm:
+                self._keep(iteration)
+            if step.interim:
+                self.progress = iteration
+            status = self._status(iteration, step.failure, interim=step.interim)
+        return self._finish(status, iteration)
+
+    def _status(self, iteration: int, failure: SolveStatus | None, *, interim: bool = False) -> SolveStatus | None:
+        """Return how the solve ends now, None if it goes on."""
+        norm, stopping = self.residual.norm, self.stopping
+        if not math.isfinite(norm):
+            return SolveStatus.NON_FINITE
+        if norm <= self.tolerance:
+            return SolveStatus.CONVERGED
+        if failure is not None:
+            return self._floor_or(failure)
+        if not interim and norm > stopping.divergence * max(self.history[0].residual, self.reference):
+            return SolveStatus.DIVERGED
+        if iteration >= stopping.max_iterations:
+            return SolveStatus.MAX_ITERATIONS
+        if not interim and iteration - max(self.best_iteration, self.progress) >= stopping.patience:
+            return self._floor_or(SolveStatus.STAGNATED)
+        return None if self.deadline.left() > 0 else SolveStatus.TIME_LIMIT
+
+    def _floor_or(self, status: SolveStatus) -> SolveStatus:
+        """Return FLOOR where the best iterate's residual is what rounding leaves, else the status: the solve ends with it.
+
+        A proof that there is no solution stays one: iterates that leave for infinity have any rounding.
+        """
+        if self.best_iteration != self.history[-1].iteration:
+            self.work.restore()
+        floor = FLOOR_MARGIN * self.residual.rounding_floor(self.work.x, self.work.precision.epsilon)
+        return SolveStatus.FLOOR if self.best_norm <= floor and status is not SolveStatus.INFEASIBLE else status
+
+    def _record(self, iteration: int, step: Step) -> None:
+        seconds = time.perf_counter() - self.begun
+        record = Record(iteration, self.residual.norm, self.linear, step.active, step.name, seconds)
+        self.history.append(record)
+        if self.callback is not None:
+            self.callback(record)
+
+    def _keep(self, iteration: int) -> None:
+        """Remember the iterate as the best one."""
+        self.work.keep()
+        self.best_iteration, self.best_norm = iteration, self.residual.norm
+
+    def _restore(self) -> None:
+        """Take the best iterate back."""
+        self.work.restore()
+        self.residual.evaluate(self.work.x)
+
+    def _finish(self, status: SolveStatus, iterations: int) -> SolveResult:
+        if self.best_iteration != iterations or not math.isfinite(self.residual.norm):
+            self._restore()
+        norm = self.residual.norm
+        relative = norm / self.reference if self.reference > 0 else 0.0
+        return SolveResult(self._found(), status, iterations, self.linear, norm, relative, self.history)
+
+    def _found(self) -> wp.array[Any]:
+        """Return x as the result has it: in place."""
+        return self.work.x
+
+
+class _LoopInBox(_Loop):
+    """The state of a solve of an LCP."""
+
+    problem: LCP
+
+    def _begin(self, x0: Array | None) -> SolveStatus | None:
+        """Start from clip(0, l, u), whose residual is what a tolerance is relative to, and go on from x0."""
+        x, residual = self.work.x, self.residual
+        guess = None if x0 is None else self._guess(x0)
+        self.warm = guess is not None
+        self.problem.bounds.refresh()
+        residual.start(x, keep=False)
+        self.work.round_iterate()
+        self._refer()
+        ended = self._trivial()
+        if ended is not None:
+            self._record(0, Step("start", 0))
+            self._keep(0)
+            return ended
+        A = self.problem.A
+        floating = A.floating_components(getattr(self.work, "scratch", None)) if has(A, NamesComponents) else None
+        self.work.floating = floating
+        lost = floating.unattainable(self.problem.b, self.problem.lower, self.problem.upper) if floating else residual.unattainable()
+        if guess is not None:
+            self._take(guess)
+        if floating is not None or residual.row_sizes is not None:
+            residual.settle_isolated(self.work.x)
+            residual.evaluate(self.work.x)
+        self._record(0, Step("start", 0))
+        self._keep(0)
+        return SolveStatus.INFEASIBLE if lost > self.tolerance else None
+
+    def _trivial(self) -> SolveStatus | None:
+        """Return how a solve ends whose data are not finite or solved by the start; refuse what would seem so."""
+        if not math.isfinite(self.reference) or not math.isfinite(self.residual.norm_of_b()):
+            self._refuse_unrepresentable()
+            return SolveStatus.NON_FINITE
+        self._refuse_vanishing()
+        return SolveStatus.CONVERGED if self.reference <= 4 * EPS * self.residual.norm_of_b() else None
+
+    def _refuse_unrepresentable(self) -> None:
+        """Refuse bounds that no x in the method's precision can meet."""
+        iterate, p = self.work.precision.iterate, self.problem
+        for name, side, sign in (("lower", p.lower, 1), ("upper", p.upper, -1)):
+            least = float((sign * side.numpy()).max())  # x must be as large, in this direction
+            if float(np.finfo(wp.dtype_to_numpy(iterate)).max) < least < math.inf:
+                raise ValueError(f"{name}: x must be {sign * least:.1e}, too large for precision='single': take 'mixed'")
+
+    def _refuse_vanishing(self) -> None:
+        """Refuse data so small that squares of residuals are 0: anything would look like a solution."""
+        if max(self.reference, self.stopping.atol) >= SMALLEST or self.residual.norm_of_b() >= SMALLEST:
+            return
+        inside = self.problem.unknown.numpy() == 1
+        for name, field in (("b", self.problem.b), ("lower, upper", self.work.x)):
+            largest, across = float(np.abs(field.numpy()[inside]).max(initial=0.0)), self.problem.layout.across
+            largest = largest if across is None else across.max(largest)
+            if 0.0 < largest < SMALLEST:
+                raise ValueError(
+                    f"{name}: values up to {largest:.1e} only, whose squares vanish in float64; multiply b and the bounds by one factor"
+                )
+
+    def _guess(self, x0: Array) -> wp.array[Any]:
+        """Return a guess as a stored field that is not the iterate itself."""
+        stored = self.problem.layout.load(x0, wp.float64, "x0")
+        if self.problem.not_finite(stored):
+            raise ValueError(f"x0 holds {self.problem.not_finite(stored)} values that are not finite")
+        return wp.clone(stored) if stored.ptr == self.work.x.ptr else stored
+
+    def _take(self, guess: wp.array[Any]) -> None:
+        """Start from a guess."""
+        wp.copy(self.work.x, guess)
+        self.residual.start(self.work.x, keep=True)
+        self.work.round_iterate()
+        if not math.isfinite(self.residual.evaluate(self.work.x)):
+            raise ValueError("x0 gives a residual that is not finite")
+
+    def _found(self) -> wp.array[Any]:
+        """Return x in the layout that the problem was given in, rounded to its precision."""
+        layout, x = self.problem.layout, self.work.x
+        if self.problem.in_place:
+            out = x.reshape(layout.stored_shape)
+        else:
+            out = layout.unload(x)
+            out = wp.clone(out) if out.ptr == x.ptr else out
+        if self.work.precision.iterate is not wp.float64:
+            out = wp.array(out.numpy(), dtype=self.work.precision.iterate, device=layout.device)
+        return out

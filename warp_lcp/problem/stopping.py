@@ -1,0 +1,46 @@
+"""When an iteration may stop."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated
+
+from annotated_types import Gt
+
+from warp_lcp.settings import Count, CountOrZero, NonNegative, OrInfinite, Settings, ShareOrZero
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoppingCriteria(Settings):
+    """Say when a solve is done: ||r|| <= max(atol, rtol ||r(clip(0, l, u))||), r the natural residual in float64.
+
+    Args:
+        rtol: relative tolerance, in [0, 1).
+        atol: absolute tolerance >= 0, in the units of y.
+        max_iterations: the most steps of the method, >= 0; the limit is honored exactly, by sand's after the ten it takes at once.
+        patience: steps without a new smallest residual after which the solve has stagnated, >= 1.
+        divergence: the solve has diverged when the residual exceeds this multiple of the first one, > 1.
+        max_seconds: wall time after which the solve ends with TIME_LIMIT, > 0; inf: never. A method's set-up counts. What cannot be cut
+            short is finished first: a pivot, a sweep, an iteration of a linear solve, a factorization, PIQP's one call, and on CUDA a
+            linear solve, whose loop the host does not see. On ranks time is up for all as soon as it is for one.
+
+    Example:
+        >>> StoppingCriteria(rtol=1e-3, atol=1e-2).tolerance(5.0)
+        0.01
+        >>> StoppingCriteria(rtol=2)
+        Traceback (most recent call last):
+        ...
+        warp_lcp.settings.SettingError: rtol = 2: must be in [0, 1)
+    """
+
+    rtol: ShareOrZero = 1e-6
+    atol: NonNegative = 0.0
+    max_iterations: CountOrZero = 100
+    patience: Count = 30
+    divergence: Annotated[float, Gt(1), OrInfinite] = 1e8
+    max_seconds: Annotated[float, Gt(0), OrInfinite] = math.inf
+
+    def tolerance(self, reference: float) -> float:
+        """Return the absolute tolerance for a reference residual norm."""
+        return max(self.atol, self.rtol * reference)

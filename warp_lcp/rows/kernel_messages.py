@@ -1,0 +1,55 @@
+"""What a user hears of Warp: one line when kernels are compiled, instead of a banner and a line for every module."""
+
+from __future__ import annotations
+
+import re
+import sys
+from typing import TextIO
+
+import warp as wp
+
+OURS = ("warp_lcp", "fluids", "granular", "benchmarks", "warp")  # whose modules of kernels are not worth a line each
+BANNER = re.compile(r"Warp \S+ initialized:")
+LOADED = re.compile(r"\s*Module (\w+)\S* .*load on device '(\S+)'.* took [0-9.]+ ms +\((\w+)\)")
+
+
+class KernelMessages:
+    """A logger for Warp that says once for each device that kernels are being compiled, when the first of them has been.
+
+    It drops Warp's banner and what Warp says of each module of this library; all else goes where it went. `wp.config.log_level` has its
+    usual meaning: above `wp.LOG_INFO` there is no line either, at `wp.LOG_DEBUG` Warp says all that it says without this library, and so
+    it does after `wp.set_logger(None)`.
+
+    Args:
+        logger: takes the rest.
+        stream: takes the line; the error stream as it is then unless given.
+    """
+
+    def __init__(self, logger: wp.Logger, stream: TextIO | None = None) -> None:
+        self._logger, self._stream = logger, stream
+        self._told: set[str] = set()
+        self.debug, self.error = logger.debug, logger.error
+
+    def info(self, message: str) -> None:
+        """Pass a message on, unless it is of the banner or a module of ours."""
+        found = LOADED.match(message)
+        hidden = (found is not None and found[1] in OURS) or BANNER.match(message)
+        if not hidden or wp.config.log_level <= wp.LOG_DEBUG:
+            self._logger.info(message)
+        elif found and found[3] == "compiled" and found[2] not in self._told:
+            self._told.add(found[2])
+            print(
+                f"compiling kernels for {found[2]}, which takes seconds at their first use; they are kept in {wp.config.kernel_cache_dir}",
+                file=self._stream or sys.stderr, flush=True,
+            )  # fmt: skip
+
+    def warning(self, message: str, category: type[Warning] | None = None, stacklevel: int = 1) -> None:
+        """Pass a warning on, at its caller's place."""
+        self._logger.warning(message, category, stacklevel=stacklevel + 1)
+
+
+def hear_kernels() -> None:
+    """Put `KernelMessages` in the place of Warp's own logger; one that a program has set stays."""
+    logger = wp.get_logger()
+    if type(logger).__module__.startswith("warp."):
+        wp.set_logger(KernelMessages(logger))
