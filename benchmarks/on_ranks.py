@@ -28,11 +28,10 @@ from benchmarks.record import Record, write_json
 from benchmarks.scaling import FIGURES, SCENE_BYTES, SOLVE_BYTES, Growing
 from benchmarks.timing import Figure, ratios
 from warp_lcp.distributed.decomposition import Decomposition
-from warp_lcp.distributed.devices import device_of_rank
 from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
 from warp_lcp.distributed.halo import Halo
 from warp_lcp.distributed.meeting import Meeting, RankFailed
-from warp_lcp.distributed.ranks import Ranks
+from warp_lcp.distributed.ranks import Ranks, device_of_rank
 from warp_lcp.driver.devices import devices, free_memory
 
 PAUSE = 0.002  # [s] between two looks of a rank that waits: it leaves its core to the one that computes

@@ -23,8 +23,7 @@ from fluids.pressure import PressureProjection
 from fluids.scene import LiquidScene
 from fluids.simulator import LiquidSimulation
 from fluids.surface import FreeSurface
-from warp_lcp.distributed.balance import balanced_processes, pool
-from warp_lcp.distributed.decomposition import Decomposition
+from warp_lcp.distributed.decomposition import Decomposition, balanced_processes, pool
 from warp_lcp.distributed.particles import SharedParticles
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.solids import boundary_of_part

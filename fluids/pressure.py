@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import numpy as np
@@ -11,13 +14,53 @@ import warp as wp
 
 import warp_lcp as wl
 from fluids.coupling import BodyCoupling
-from fluids.pressure_kernels import COUNT, FACES, pressure_passes
 from fluids.tolerance import TimeErrorTolerance
 from warp_lcp.gallery import recorded
 from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.boundary import Boundary
-from warp_lcp.operators.grid_poisson import FLUID
+from warp_lcp.material.boundary_kernels import HELD, LETS_GO, RELEASED, TOUCHES
+from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
+from warp_lcp.rows import RowPass
 from warp_lcp.vectors import convert
+
+HEADERS = Path(__file__).parent / "headers"
+CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR, "TOUCHES": TOUCHES, "LETS_GO": LETS_GO, "RELEASED": RELEASED, "HELD": HELD}
+THETA_MIN = 1e-3  # the nearest that air comes to a FLUID cell's center, in cells
+F32, F64, I8, U8 = wp.float32, wp.float64, wp.int8, wp.uint8
+FACES = {f"{what}_{axis}": F32 for what in ("open", "solid") for axis in "xyz"}
+COUNT = RowPass(
+    "fluids.pressure.count_fluid", HEADERS / "count_fluid.h", F64, box={"kind": I8}, whole={"sums": F64}, constants={"FLUID": FLUID}
+)
+
+
+@functools.cache
+def pressure_passes(cut: bool, moving: bool, ghost: bool, bounded: bool = True) -> SimpleNamespace:
+    """Return `prepare`, `subtract_gradient`, `support` and `contact`.
+
+    Args:
+        cut: whether faces have open fractions.
+        moving: whether solids have velocities.
+        ghost: whether the free surface lies between cells.
+        bounded: whether a wall lets go; else there is no lower bound.
+    """
+    module = "fluids.pressure" + "_cut" * cut + "_moving" * moving + "_ghost" * ghost + "_equations" * (not bounded)
+    flags = {"CUT": cut, "MOVING": moving, "GHOST": ghost, "BOUNDED": bounded, "THETA_MIN": THETA_MIN, "TINY_WEIGHT": TINY_WEIGHT}
+
+    def made(name: str, fields: dict[str, Any], numbers: dict[str, Any], **more: Any) -> RowPass:
+        box, optional = {"kind": I8, **FACES, "phi": F32} | fields, (*FACES, "phi", "w", "lower", "shift")
+        numbers, path = {"planes": int} | numbers, HEADERS / f"{name}.h"
+        return RowPass(f"{module}.{name}", path, F64, box=box, numbers=numbers, constants=CONSTANTS | flags, optional=optional, **more)
+
+    liquid, faces = {"u": F32, "v": F32, "w": F32, "touch": U8}, {"x": F64, "field": F32, "known": I8}
+    problem = {"previous": F64, "b": F64, "lower": F64, "start": F64, "shift": F32}
+    return SimpleNamespace(
+        prepare=made("prepare", liquid | problem, {"ratio": F64}),
+        subtract_gradient=made("subtract_gradient", faces, {"axis": int}),
+        support=made("support", faces | {"weight": F32}, {"axis": int, "limit": F32}),
+        contact=made("contact", liquid | {"x": F64, "contact": U8}, {"threshold": F64}, whole={"sums": F64}),
+    )
+
 
 ROUNDING = 4 * float(np.finfo(np.float32).eps)  # of an outflow, relative to the speeds it is the difference of (float32 faces)
 RELEASE_FACTOR = 10.0  # a wall cell lets go if its outflow exceeds this multiple of the accepted residual: resting ceilings are degenerate

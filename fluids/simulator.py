@@ -29,10 +29,9 @@ from warp_lcp.driver.simulator import Cells, Part, SimulationFailed, missed_by_f
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary
-from warp_lcp.material.contact import RELEASED, TOUCHES_NOTHING
+from warp_lcp.material.boundary_kernels import RELEASED, TOUCHES_NOTHING
 from warp_lcp.material.narrow_band import NarrowBand
-from warp_lcp.material.outlets import Outlets
-from warp_lcp.material.sources import Sources
+from warp_lcp.material.sources import Outlets, Sources
 from warp_lcp.rigid.bodies import RigidBodies
 
 if TYPE_CHECKING:

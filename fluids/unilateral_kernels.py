@@ -5,7 +5,7 @@ import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, F64, I8, U8, cell_kernel
 from warp_lcp.grid.transfer import TINY_WEIGHT
-from warp_lcp.material.contact import HELD, LETS_GO, RELEASED, TOUCHES
+from warp_lcp.material.boundary_kernels import HELD, LETS_GO, RELEASED, TOUCHES
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 
 FULL = 0.8  # density, of that at rest, from which a cell counts as full: less than 1 by more than what the sampling makes of it

@@ -10,7 +10,7 @@ import warp as wp
 
 from granular import packing_kernels as kernels
 from granular.yield_set import xyz
-from warp_lcp.grid.periodic import PeriodicSides
+from warp_lcp.grid.sides import PeriodicSides
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.operators.grid_poisson import SOLID
 

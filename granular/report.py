@@ -11,7 +11,7 @@ import warp as wp
 from granular.report_kernels import REPORT_COLUMNS, contact_kernel, report_pass, take_kernel
 from granular.stress import Stress
 from granular.yield_set import xyz
-from warp_lcp.material.contact import HELD, RELEASED
+from warp_lcp.material.boundary_kernels import HELD, RELEASED
 
 
 @dataclass(frozen=True)

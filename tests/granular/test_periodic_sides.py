@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from granular.scene import SandScene
 from granular.simulator import GranularSimulator, SandSimulation
 from warp_lcp.driver.scene import SceneError, validate
-from warp_lcp.grid.periodic import PeriodicSides
+from warp_lcp.grid.sides import PeriodicSides
 from warp_lcp.grid.staggered import StaggeredGrid
 
 DX, DT = 0.02, 2e-3  # [m], [s]

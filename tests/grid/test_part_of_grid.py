@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_lcp.grid.advection import advect, clearance
+from warp_lcp.grid.advection import advect, advect_with_distance, clearance
 from warp_lcp.grid.cut_cells import CutCells
-from warp_lcp.grid.distance_advection import advect_with_distance
 from warp_lcp.grid.level_set import particle_density
 from warp_lcp.grid.particles import Particles, seed
 from warp_lcp.grid.sides import side_bits

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from warp_lcp import AIR, FLUID, SOLID
 from warp_lcp.grid.staggered import StaggeredGrid
-from warp_lcp.material.contact import HELD, RELEASED, TOUCHES_NOTHING
+from warp_lcp.material.boundary_kernels import HELD, RELEASED, TOUCHES_NOTHING
 from warp_lcp.material.cut_wall import extend_velocity_cut
 from warp_lcp.material.wall import extend_velocity
 

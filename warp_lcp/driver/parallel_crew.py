@@ -13,9 +13,8 @@ from typing import Any
 import typer
 import warp as wp
 
-from warp_lcp.distributed.devices import device_of_rank
 from warp_lcp.distributed.meeting import Meeting, RankFailed
-from warp_lcp.distributed.ranks import Ranks
+from warp_lcp.distributed.ranks import Ranks, device_of_rank
 from warp_lcp.driver.continuation import mesh_digests
 from warp_lcp.driver.crew import Crew
 from warp_lcp.driver.devices import DeviceError, devices

@@ -14,8 +14,7 @@ from warp_lcp.driver.particle_volume import ParticleVolume
 from warp_lcp.driver.shapes import SolidProperties
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.particles import Particles, seed
-from warp_lcp.grid.periodic import PeriodicSides, periodic_sides
-from warp_lcp.grid.sides import side_bits
+from warp_lcp.grid.sides import PeriodicSides, periodic_sides, side_bits
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.surface_mesh import Obstacles, SurfaceMesh
@@ -24,9 +23,8 @@ from warp_lcp.material.boundary import Boundary, WholeCells
 from warp_lcp.material.cut_boundary import CutBoundary
 from warp_lcp.material.density_correction import Crowding, DensityCorrection
 from warp_lcp.material.narrow_band import NarrowBand
-from warp_lcp.material.outlets import Drain, Outlets
 from warp_lcp.material.reseeding import Reseeding
-from warp_lcp.material.sources import Source, Sources
+from warp_lcp.material.sources import Drain, Outlets, Source, Sources
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import BodyMotion, RigidBody
 from warp_lcp.rigid.mass_properties import mass_properties

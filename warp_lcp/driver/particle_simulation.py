@@ -24,9 +24,8 @@ from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.flight import Flights
 from warp_lcp.material.gravity import accelerate
 from warp_lcp.material.narrow_band import NarrowBand, without_band
-from warp_lcp.material.outlets import Drain, Outlets
 from warp_lcp.material.resample import resampled, resampling_notes
-from warp_lcp.material.sources import Source, Sources
+from warp_lcp.material.sources import Drain, Outlets, Source, Sources
 from warp_lcp.rigid.bodies import RigidBodies
 
 Row = dict[str, float | int | str | None]  # of the log
@@ -226,7 +225,7 @@ class ParticleSimulation(ABC):
             window: faces to consider.
             known: int8 of each component (updated): 1 on valid faces, 0 on others, -1 inside solids of whole cells.
             kind: int8 of AIR, FLUID, SOLID.
-            contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED, see `warp_lcp.material.contact`.
+            contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED, see `warp_lcp.material.boundary_kernels`.
         """
         wall = self.boundary
         with self.watch.stage("extrapolation", *self.velocity, *self.weights, *known, kind, contact, *wall.open):

@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.grid import cut_cells_kernels as kernels
-from warp_lcp.grid.capacity_kernels import integrate_kernel
+from warp_lcp.grid.cut_cells_kernels import integrate_kernel
 from warp_lcp.grid.motion import Motion, RigidMotion
 from warp_lcp.grid.node_distance import NodeDistances, NodeSampler, nodes_near
 from warp_lcp.grid.sides import SIDES, continue_beyond, open_ring

@@ -8,7 +8,7 @@ import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
 from warp_lcp.grid.staggered import Window
-from warp_lcp.grid.transfer_kernels import TINY_WEIGHT
+from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.rows import RowPass
 
 BLOCKED = -1  # not to be filled

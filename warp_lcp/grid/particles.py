@@ -7,8 +7,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.grid import particles_kernels as kernels
-from warp_lcp.grid.particle_loops import launch, on_grid
-from warp_lcp.grid.runge_kutta import MARGIN
+from warp_lcp.grid.particle_loops import MARGIN, launch, on_grid
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.layout import zeros
 from warp_lcp.rows import Rows

@@ -10,10 +10,9 @@ import warp as wp
 from warp_lcp.grid import surface_mesh_kernels as kernels
 from warp_lcp.grid.extrapolate import extrapolate, weighted_kernel
 from warp_lcp.grid.level_set_kernels import BINOMIAL, SCATTER
-from warp_lcp.grid.marching_cubes import MarchingCubes, Mesh
+from warp_lcp.grid.marching_cubes import DeviceMesh, MarchingCubes
 from warp_lcp.grid.mesh_smoothing import smooth as smooth_mesh
-from warp_lcp.grid.particle_loops import launch
-from warp_lcp.grid.runge_kutta import MARGIN
+from warp_lcp.grid.particle_loops import MARGIN, launch
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
 
@@ -105,7 +104,7 @@ class SurfaceMesh:
         self._cubes = MarchingCubes(self.lattice)
         self._placed = False
 
-    def find(self, position: wp.array, interior: Interior | None = None) -> Mesh:
+    def find(self, position: wp.array, interior: Interior | None = None) -> DeviceMesh:
         """Return the surface around particles; on CUDA sums over particles, and so the last bits, may differ from run to run.
 
         Args:

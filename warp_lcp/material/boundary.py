@@ -12,8 +12,7 @@ import warp as wp
 
 from warp_lcp.grid.advection import advect, clearance
 from warp_lcp.grid.level_set import whole_cell_capacity
-from warp_lcp.grid.periodic import PeriodicSides, with_periodic
-from warp_lcp.grid.sides import continue_beyond
+from warp_lcp.grid.sides import PeriodicSides, continue_beyond, with_periodic
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.voxelize import VoxelSolids
 from warp_lcp.material import boundary_kernels as kernels

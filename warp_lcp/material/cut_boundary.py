@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
+from warp_lcp.grid.advection import MARGIN, advect_with_distance, push_out
 from warp_lcp.grid.cut_cells import CutCells
-from warp_lcp.grid.distance_advection import MARGIN, advect_with_distance, push_out
 from warp_lcp.grid.motion import kinks, top_speed
-from warp_lcp.grid.periodic import PeriodicSides, with_periodic
+from warp_lcp.grid.sides import PeriodicSides, with_periodic
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material import boundary_kernels as kernels
 from warp_lcp.material.boundary import Faces

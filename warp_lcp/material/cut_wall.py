@@ -22,7 +22,7 @@ from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.extrapolate import extrapolate
 from warp_lcp.grid.staggered import Window
 from warp_lcp.grid.transfer import TINY_WEIGHT
-from warp_lcp.material.contact import HELD, RELEASED, TOUCHES_NOTHING
+from warp_lcp.material.boundary_kernels import HELD, RELEASED, TOUCHES_NOTHING
 from warp_lcp.material.wall import KEEP_SPRAY, Join, keep_released_kernel
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 from warp_lcp.rows import RowPass

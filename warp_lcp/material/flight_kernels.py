@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, U8
 from warp_lcp.grid.transfer import TINY_WEIGHT
-from warp_lcp.material.contact import TOUCHES
+from warp_lcp.material.boundary_kernels import TOUCHES
 from warp_lcp.operators.grid_poisson import SOLID
 from warp_lcp.rows import RowPass
 

@@ -9,7 +9,7 @@ the distance to the surface [cells], and W the band's width.
    say, which reach beyond any kernel around these. So the surface is the particles' alone, and no error of d* builds up: after the
    solve d is measured anew as a chamfer distance from the cells of air, whose level set gives the part of a cell; solids are no shore.
 2. How fast. On faces deeper than W - 1 the velocity u* is the last step's, carried along by a semi-Lagrangian step of third order
-   (`warp_lcp.grid.semi_lagrangian`); on those above W - 2 it is the particles' mean, in between it goes over linearly. Gravity and
+   (`warp_lcp.grid.advection`); on those above W - 2 it is the particles' mean, in between it goes over linearly. Gravity and
    pressure act on both alike.
 3. Exchange. Particles deeper than W go. The band's last layer, W - 1 < d <= W, and what was {d* > W - 1} and is now shallower (a wall has
    let go of it, say), gets fresh particles in each step: a reservoir of even density, out of which the flow takes exactly what it carries
@@ -33,8 +33,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import warp as wp
 
+from warp_lcp.grid.advection import CENTERS, carry_field
 from warp_lcp.grid.particles import Particles, ParticleTotals
-from warp_lcp.grid.semi_lagrangian import CENTERS, carry_field
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.transfer import faces_to_particles
 from warp_lcp.material import narrow_band_kernels as kernels

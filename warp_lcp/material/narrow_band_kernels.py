@@ -6,7 +6,7 @@ from pathlib import Path
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, F64, I8, I32, INTS, POINTS, U8, cell_kernel
-from warp_lcp.material.contact import RELEASED
+from warp_lcp.material.boundary_kernels import RELEASED
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 from warp_lcp.rows import RowPass
 

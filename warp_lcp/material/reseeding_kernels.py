@@ -4,7 +4,7 @@
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, I32, INTS, POINTS, U8, cell_kernel
-from warp_lcp.material.contact import TOUCHES
+from warp_lcp.material.boundary_kernels import TOUCHES
 from warp_lcp.operators.grid_poisson import AIR
 
 JITTER = 0.25  # of half a cell: how far from the center of its part of a cell a particle is put at random, as at the start

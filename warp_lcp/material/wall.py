@@ -20,7 +20,7 @@ from warp_lcp.grid.cell_kernel import F32, I8, I32, U8, cell_below, cell_kernel
 from warp_lcp.grid.extrapolate import BLOCKED, extrapolate
 from warp_lcp.grid.staggered import Window
 from warp_lcp.grid.transfer import TINY_WEIGHT
-from warp_lcp.material.contact import RELEASED
+from warp_lcp.material.boundary_kernels import RELEASED
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 from warp_lcp.rows import RowPass
 
