@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import warp as wp
 
-from fluids.assembly import stays_full
 from fluids.scene import LiquidScene
+from fluids.simulator import stays_full
 from fluids.surface import FreeSurface, GhostFluidSurface, NoSurface, WholeCellSurface
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.grid.particles import Particles
@@ -52,7 +52,7 @@ class SharedGhostFluid(GhostFluidSurface):
 
     def volume(self, cells: int) -> float:
         """Return the volume inside the surface."""
-        window = self._part.clipped(self._window)
+        window = self._window.common(self._part.owned)
         mine = self.level_set.volume(self.boundary.distance, window) if window is not None else 0.0
         return float(self._part.ranks.sum(mine))
 

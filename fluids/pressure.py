@@ -349,8 +349,7 @@ class PressureProjection:
 
     def _found(self) -> tuple[float, float]:
         """Return the sum of what kernels have found in rows, and the largest of what else they have."""
-        low, high = self._solved.low, self._solved.high
-        rows = self._sums.numpy()[low[0] : high[0], low[1] : high[1]]
+        rows = self._solved.rows_of(self._sums)
         return float(rows[..., 0].sum()), float(rows[..., 1].max())
 
 

@@ -12,8 +12,7 @@ from granular.stress import Walls
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid, voxelize
 from warp_lcp.material import boundary_kernels as kernels
-from warp_lcp.material.boundary import Boundary, Faces
-from warp_lcp.material.cut_boundary import CutBoundary
+from warp_lcp.material.boundary import Boundary, CutBoundary, Faces
 
 
 class SandSolids:

@@ -9,8 +9,7 @@ from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.solid_notes import placement_notes, thin_notes
 from warp_lcp.grid.voxelize import PlacedSolid, voxelize
-from warp_lcp.material.boundary import Boundary, WholeCells
-from warp_lcp.material.cut_boundary import CutBoundary
+from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
 
 
 def boundary_of_part(

@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_lcp.distributed.decomposition import Box, Decomposition
 from warp_lcp.distributed.halo import exchange_all, star_forest
-from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.staggered import StaggeredGrid
 
 LAYERS = 5  # of ghost cells: at a face that a wall closes the liquid up to 4.8 cells away tells whether it is held
 
@@ -114,14 +114,6 @@ class Subdomain:
         """Return the view of a field on the cells of the box and one cell around it, in the stored shape of such a box."""
         low, high = self.owned.low, self.owned.high
         return field[low[0] - 1 : high[0] + 1, low[1] - 1 : high[1] + 1, low[2] - 1 : high[2] + 1]
-
-    def clipped(self, window: Window) -> Window | None:
-        """Return the part of a window in the box, None if there is none."""
-        low = [max(a, b) for a, b in zip(window.low, self.owned.low, strict=True)]
-        high = [min(a, b) for a, b in zip(window.high, self.owned.high, strict=True)]
-        if any(a >= b for a, b in zip(low, high, strict=True)):
-            return None
-        return Window((low[0], low[1], low[2]), (high[0], high[1], high[2]), window.device)
 
     def owners(self, cells: np.ndarray) -> np.ndarray:
         """Return the rank that has each cell (x, y, z) of the whole domain, shape (n, 3)."""

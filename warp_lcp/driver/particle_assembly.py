@@ -19,8 +19,7 @@ from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.surface_mesh import Obstacles, SurfaceMesh
 from warp_lcp.grid.voxelize import PlacedSolid, inside, placement_notes, voxelize
-from warp_lcp.material.boundary import Boundary, WholeCells
-from warp_lcp.material.cut_boundary import CutBoundary
+from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
 from warp_lcp.material.density_correction import Crowding, DensityCorrection
 from warp_lcp.material.narrow_band import NarrowBand
 from warp_lcp.material.reseeding import Reseeding

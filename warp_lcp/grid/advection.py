@@ -218,7 +218,6 @@ def carry_field(
         least: see `out`.
     """
     u, v, w = [*velocity, None][:3]
-    low = tuple(max(start, 1) for start in window.low)
-    inner = Window((low[0], low[1], low[2]), window.high, window.device)
+    inner = Window.of([max(start, 1) for start in window.low], window.high, window.device)
     given = {"u": u, "v": v, "w": w, "level": level, "field": field, "out": out}
     inner.run(carry_pass(axis), planes=grid.planes, h=dt / grid.spacing, least=least, **given)

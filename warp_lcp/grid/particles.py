@@ -1,7 +1,7 @@
 """Particles in about the order of their cells: positions, velocities and the gradients that APIC carries."""
 
 import typing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import warp as wp
@@ -34,15 +34,15 @@ class ParticleTotals:
         bad_velocities: particles whose velocity is not finite (or its square overflows).
     """
 
-    count: int
-    mean_square_speed: float
-    velocity: np.ndarray
-    center: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    max_speed: float
-    bad_positions: int
-    bad_velocities: int
+    count: int = 0
+    mean_square_speed: float = 0.0
+    velocity: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    center: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    low: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    high: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    max_speed: float = 0.0
+    bad_positions: int = 0
+    bad_velocities: int = 0
 
     @property
     def finite(self) -> bool:
@@ -248,7 +248,7 @@ class Particles:
     def totals(self) -> ParticleTotals:
         """Return sums over the particles as they are now; the same bits on every run. Without particles all are 0."""
         if self.count == 0:
-            return ParticleTotals(0, 0.0, np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), 0.0, 0, 0)
+            return ParticleTotals()
         chunk = max(CHUNK, -(-self.count // THREADS))
         rows = Rows.entries(self.count, self.grid.device, chunk)
         given = {"position": self.position, "velocity": self.velocity, "sums": self._partials}

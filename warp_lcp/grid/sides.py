@@ -190,7 +190,7 @@ class PeriodicSides:
         low, high = list(window.low), list(window.high)
         for axis in self.axes:
             low[2 - axis], high[2 - axis] = 0, self.grid.shape[2 - axis]
-        return Window((low[0], low[1], low[2]), (high[0], high[1], high[2]), window.device)
+        return Window.of(low, high, window.device)
 
     def _lines(self, axis: int) -> tuple[int, tuple[int, int]]:
         """Return the first plane of a field in use, and how many lines along an axis there are: planes or rows, and rows or columns."""

@@ -86,15 +86,9 @@ class Crowding:
         b = self.boundary
         filled = {"base": b.base, "density": density, "capacity": b.capacity}
         self.grid.domain.run(CROWD, whole=True, **filled, most=self.max_density, sums=self._sums)
-        sums = _inner(self.grid, self._sums)
+        sums = self.grid.domain.rows_of(self._sums)
         held = float(sums[..., 2].sum())
         return (float(sums[..., 0].sum()) / held if held > 0.0 else 0.0), float(sums[..., 1].max())
-
-
-def _inner(grid: StaggeredGrid, sums: wp.array) -> np.ndarray:
-    """Return the sums of the domain's rows."""
-    low, high = grid.domain.low, grid.domain.high
-    return np.asarray(sums.numpy()[low[0] : high[0], low[1] : high[1]])
 
 
 @dataclass(frozen=True)
@@ -235,7 +229,7 @@ class DensityCorrection:
         if self._inside is not None:
             numbers: dict[str, Any] = {"least": min(most, 2.0 - most), "planes": self.grid.planes - 1}
             run(EVEN, whole=True, **fields, **numbers, lower=self._lower)
-        sums = _inner(self.grid, self._sums)
+        sums = self.grid.domain.rows_of(self._sums)
         return int(sums[..., [0, 2]].sum()), float(sums[..., 1].max())
 
     def _solve(self, over_full: int) -> wl.SolveResult:
