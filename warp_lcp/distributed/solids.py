@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import warp_lcp as wl
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.grid.cut_cells import CutCells
-from warp_lcp.grid.solid_notes import placement_notes, thin_notes
+from warp_lcp.grid.solid_notes import check_open, placement_notes, small_notes, thin_notes
 from warp_lcp.grid.voxelize import PlacedSolid, voxelize
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
 
@@ -49,12 +49,7 @@ def boundary_of_part(
         grid.counts, grid.spacing, grid.dimension, solids, wall_separating=wall_separating, device=grid.device, open_sides=part.cuts,
         origin=grid.origin, remarks=False,
     )  # fmt: skip
-    covered = ranks.sum([*voxels.covered, 0])
-    notes += [
-        f"{solid.name} is too small for the grid: no center of a cell of {grid.spacing:.4g} m lies inside it"
-        for solid, cells in zip(solids, covered, strict=False)
-        if not cells
-    ]
+    notes += small_notes((solid.name for solid in solids), ranks.sum([*voxels.covered, 0]), grid.spacing)
     part.fill(voxels.index)
     boundary = WholeCells(grid, voxels, open_sides=part.cuts)
     part.fill(*boundary.placed())
@@ -63,8 +58,4 @@ def boundary_of_part(
 
 
 def _check_open(part: Subdomain, boundary: Boundary) -> None:
-    """Refuse solids that leave no open cell on any rank."""
-    if not part.ranks.any(bool((part.box_of(boundary.base.numpy()) != wl.SOLID).any())):
-        raise ValueError(
-            "the solids fill the whole domain: no open cell is left (is one inverted, or a plane's normal the wrong way round?)"
-        )
+    check_open(part.ranks.any(bool((part.box_of(boundary.base.numpy()) != wl.SOLID).any())))

@@ -16,7 +16,7 @@ from warp_lcp.grid.cut_cells_kernels import integrate_kernel
 from warp_lcp.grid.motion import Motion, RigidMotion
 from warp_lcp.grid.node_distance import NodeDistances, NodeSampler, nodes_near
 from warp_lcp.grid.sides import SIDES, continue_beyond, open_ring
-from warp_lcp.grid.solid_notes import placement_notes, repair_notes, thin_notes
+from warp_lcp.grid.solid_notes import check_open, placement_notes, repair_notes, thin_notes
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid
@@ -244,10 +244,7 @@ class CutCells:
     def _result_notes(self, dropped: int) -> list[str]:
         """Return what is to be said about the faces."""
         grid = self.grid
-        if self.solids and not (grid.interior(self.base.numpy()) != SOLID).any():
-            raise ValueError(
-                "the solids fill the whole domain: no open cell is left (is one inverted, or a plane's normal the wrong way round?)"
-            )
+        check_open(not self.solids or bool((grid.interior(self.base.numpy()) != SOLID).any()))
         counts = [np.bincount(wall.numpy().ravel() + 1, minlength=1 + len(self.names)) for wall in self.wall]
         closed = np.sum(counts, axis=0)[1:]
         notes = [

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import warp as wp
 
-from warp_lcp.grid.cell_kernel import F32, POINTS
+from warp_lcp.grid.cell_kernel import F32, POINTS, interpolated
 from warp_lcp.grid.marching_cubes import DeviceMesh
 from warp_lcp.grid.particle_loops import chunks
 from warp_lcp.grid.staggered import StaggeredGrid
@@ -37,22 +37,7 @@ def hold_kernel(planes: int, dx: float, points: POINTS, room: F32, counts: wp.ve
         if x[axis] < TOUCHING or x[axis] > counts[axis] - TOUCHING:
             stays = True
     if room:
-        i = int(x[0] + 0.5)
-        j = int(x[1] + 0.5)
-        k = int(1)
-        fz = float(0.0)
-        up = int(0)
-        if planes == 2:
-            k = int(x[2] + 0.5)
-            fz = x[2] + 0.5 - float(k)
-            up = int(1)
-        fx = x[0] + 0.5 - float(i)
-        fy = x[1] + 0.5 - float(j)
-        low = wp.lerp(wp.lerp(room[k, j, i], room[k, j, i + 1], fx), wp.lerp(room[k, j + 1, i], room[k, j + 1, i + 1], fx), fy)
-        high = wp.lerp(
-            wp.lerp(room[k + up, j, i], room[k + up, j, i + 1], fx), wp.lerp(room[k + up, j + 1, i], room[k + up, j + 1, i + 1], fx), fy
-        )
-        if wp.lerp(low, high, fz) < NEAR:
+        if interpolated(room, planes, x[0] + 0.5, x[1] + 0.5, x[2] + 0.5) < NEAR:
             stays = True
     held[p] = wp.where(stays, wp.uint8(1), wp.uint8(0))
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 import warp as wp
 
@@ -10,6 +12,24 @@ from warp_lcp.grid.solids import Geometry, TriangleMesh
 STRAY = 0.5  # of a cell: a mesh may reach this far out of the domain before anyone is told
 THIN_SHARE = 0.01  # of a mesh's surface, from which thin parts are worth a warning
 INVERTED_SHARE = 0.01  # of a mesh's surface, from which what is inside out is no longer a blemish: its inside would be missing
+
+
+def check_open(any_open: bool) -> None:
+    """Refuse solids that leave no open cell.
+
+    Raises:
+        ValueError: `any_open` is False.
+    """
+    if not any_open:
+        raise ValueError(
+            "the solids fill the whole domain: no open cell is left (is one inverted, or a plane's normal the wrong way round?)"
+        )
+
+
+def small_notes(names: Iterable[str], covered: Iterable[int], spacing: float) -> list[str]:
+    """Return warnings about solids that cover no center of a cell of `spacing` [m]."""
+    note = f"is too small for the grid: no center of a cell of {spacing:.4g} m lies inside it"
+    return [f"{name} {note}" for name, cells in zip(names, covered, strict=False) if not cells]
 
 
 def placement_notes(geometry: Geometry, name: str, counts: tuple[int, int, int], spacing: float, dimension: int) -> list[str]:

@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_lcp.grid.motion import Motion
 from warp_lcp.grid.sides import open_ring
-from warp_lcp.grid.solid_notes import placement_notes, thin_notes
+from warp_lcp.grid.solid_notes import check_open, placement_notes, small_notes, thin_notes
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.solids_kernels import block_of, claim_cells, item_points
 
@@ -102,15 +102,9 @@ def voxelize(
             notes += thin_notes(solid.geometry, solid.name, solid.among, spacing, device)
         _claim(index, covered, solid.geometry, number, spacing, dimension, origin)
     claimed = covered.numpy()[1:]
-    notes += [
-        f"{solid.name} is too small for the grid: no center of a cell of {spacing:.4g} m lies inside it"
-        for solid, cells in zip(solids, claimed, strict=True)
-        if remarks and not cells
-    ]
-    if remarks and solids and not (index.numpy()[1:-1, 1:-1, 1:-1] == OPEN).any():
-        raise ValueError(
-            "the solids fill the whole domain: no open cell is left (is one inverted, or a plane's normal the wrong way round?)"
-        )
+    if remarks:
+        notes += small_notes((solid.name for solid in solids), claimed, spacing)
+        check_open(not solids or bool((index.numpy()[1:-1, 1:-1, 1:-1] == OPEN).any()))
     return VoxelSolids(
         index=index,
         separating=wp.array([wall_separating, *(solid.separating for solid in solids)], dtype=wp.uint8, device=device),

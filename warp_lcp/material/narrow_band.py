@@ -247,9 +247,8 @@ class NarrowBand:
         for axis, field in enumerate(self.velocity):
             near = wanted | np.roll(wanted, 1, axis=2 - axis)
             faces[f"interior_velocity_{axis}"] = np.where(near, field.numpy(), np.float32(0.0))
-        sums = np.hstack(
-            [self.held, self.width, *list(vars(self.interior).values())[:7]]
-        )  # over where solids were, in an order that windows set
+        inside = list(vars(self.interior).values())[:7]  # all but the bad ones; over where solids were, in an order that windows set
+        sums = np.hstack([self.held, self.width, *inside])
         return {"depth": np.where(wanted, depth, np.float32(0.0)), "interior": sums} | faces
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
