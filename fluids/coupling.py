@@ -108,6 +108,6 @@ class BodyCoupling:
             window.launch(kernels.enclosed_kernel, list(fields))
 
     def _weights(self) -> np.ndarray:
-        """Return rho dx^d M^-1."""
+        """Return rho dx^d M^-1 of all bodies, block diagonal."""
         inverses = [body.inverse_mass(self.grid.dimension) for body in self.bodies.bodies]
         return self._share * self._scale * np.asarray(scipy.linalg.block_diag(*inverses))

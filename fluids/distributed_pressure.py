@@ -34,7 +34,6 @@ class DistributedPressure(PressureProjection):
     """
 
     def __init__(self, part: Subdomain, boundary: Boundary, solver: Any, **settings: Any) -> None:
-        """Allocate the fields."""
         super().__init__(part.grid, boundary, solver, **settings)
         self.part, self._solved = part, part.owned
         if self._phi is None:

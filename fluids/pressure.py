@@ -137,7 +137,6 @@ class PressureProjection:
         weights: Sequence[wp.array] | None = None,
         gravity: float = 0.0,
     ) -> None:
-        """Allocate the fields."""
         self.grid, self.boundary, self.solver, self._phi, self.coupling = grid, boundary, solver, phi, coupling
         self._weights, self._gravity = list(weights or ()), gravity
         self.tolerance, self.max_iterations = tolerance, max_iterations

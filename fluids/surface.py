@@ -88,7 +88,7 @@ class WholeCellSurface:
         self.density = self._level_set.density if self._level_set is not None else None
 
     def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
-        """Write the cells' kinds."""
+        """Write the cells' kinds: FLUID where a particle is."""
         wp.copy(kind, self.boundary.base)
         wp.launch(mark_particles_kernel, particles.count, [particles.key, kind.flatten()], device=self.grid.device)
         if self._level_set is not None:
@@ -96,7 +96,7 @@ class WholeCellSurface:
             window.launch(mark_inside_kernel, [self._level_set.phi, self.boundary.capacity, SLIVER, kind])
 
     def complete(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
-        """Give u* to slivers."""
+        """Give u* to faces of slivers that hold no particle."""
         if self._level_set is not None:
             complete(window, velocity, weights, known)
 
@@ -121,7 +121,7 @@ class NoSurface:
         self._volume = float(_open_shares(grid, boundary)[cells][filled].sum()) * grid.cell_volume
 
     def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
-        """Write the cells' kinds."""
+        """Write the cells' kinds: FLUID in all open ones."""
         wp.copy(kind, self._kind)
 
     def complete(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
@@ -145,7 +145,6 @@ class GhostFluidSurface:
     """
 
     def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int, smoothing: int, fill: Fill | None = None) -> None:
-        """Allocate the level set."""
         self.grid, self.boundary, self._fill = grid, boundary, fill
         self.level_set = LevelSet(grid, particles_a_cell=particles_a_cell, smoothing=smoothing)
         self.phi: wp.array | None = self.level_set.phi

@@ -82,14 +82,13 @@ class UnilateralPressure(PressureProjection):
         coupling: BodyCoupling | None = None,
         gravity: float = 0.0,
     ) -> None:
-        """Allocate the fields."""
         super().__init__(grid, boundary, solver, tolerance=tolerance, max_iterations=max_iterations, coupling=coupling, gravity=gravity)
         self._weights = list(weights)
         self._cells = grid.field(wp.int8)
         wp.copy(self._cells, boundary.base)  # the ring stays as it is
         if boundary.open and self._shift is None:  # pockets between solids that are too full
             self._shift = grid.field()
-        setting = kernels.Setting()
+        setting = kernels.UnilateralSetting()
         setting.planes = grid.planes
         setting.density, setting.capacity = level_set.density, boundary.capacity
         setting.cells, setting.base = self._cells, boundary.base

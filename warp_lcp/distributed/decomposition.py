@@ -97,7 +97,7 @@ class Decomposition:
 
     @property
     def box(self) -> Box:
-        """This rank's cells."""
+        """The box of this rank's cells."""
         return self.boxes[self.ranks.rank]
 
     @property

@@ -96,7 +96,7 @@ class Meeting:
         return self._comm.bcast(value)
 
     def enter(self) -> None:
-        """Begin a block."""
+        """Begin a block, perhaps inside another."""
         self._depth += 1
 
     def leave(self, error: BaseException | None, *, named: bool) -> None:
@@ -177,11 +177,11 @@ class _Alone:
     rank, size = 0, 1
 
     def allgather(self, value: Any) -> list[Any]:
-        """Return what was given."""
+        """Return what the only rank has given."""
         return [value]
 
     def bcast(self, value: Any) -> Any:
-        """Return what was given."""
+        """Return what the only rank has given."""
         return value
 
 

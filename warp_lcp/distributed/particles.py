@@ -38,7 +38,7 @@ COUNT, DATA = 7101, 7102  # tags of messages
 
 
 class Post(Protocol):
-    """Carries messages between neighbors."""
+    """Carries messages from each rank to its neighbors."""
 
     def swap(self, outgoing: Mapping[int, np.ndarray]) -> list[np.ndarray]:
         """Return what the neighbors have sent, in the order of their ranks.

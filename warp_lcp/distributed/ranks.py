@@ -49,7 +49,7 @@ class Ranks:
 
     @property
     def size(self) -> int:
-        """How many there are."""
+        """How many ranks there are."""
         return int(self.comm.size)
 
     @property

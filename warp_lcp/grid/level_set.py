@@ -48,7 +48,6 @@ class LevelSet:
     """
 
     def __init__(self, grid: StaggeredGrid, *, particles_a_cell: int, smoothing: int = 0) -> None:
-        """Allocate the fields, all air."""
         if particles_a_cell < 1:
             raise ValueError(f"particles_a_cell = {particles_a_cell}: must be at least 1")
         if smoothing < 0:
@@ -94,7 +93,8 @@ class LevelSet:
         if smooth is not None:
             shifted = next(field for field in self._scratch if field is not smooth)
             window.launch(kernels.wall_shift_kernel, [self._spread**2, self.limit, smooth, self.phi, self._known, shifted])
-            window.launch(kernels.copy_kernel, [shifted, self.phi])
+            box = tuple(map(slice, window.low, window.high))
+            wp.copy(self.phi[box], shifted[box])
         extrapolate(window, self._known, self.phi, kernels.EXTENDED)
 
     def volume(self, distance: wp.array | None, window: Window) -> float:

@@ -94,12 +94,6 @@ def wall_shift_kernel(k, j, i, variance: float, limit: float, capacity: F32, phi
 
 
 @cell_kernel("warp_lcp.grid.level_set")
-def copy_kernel(k, j, i, source: F32, out: F32):
-    """Copy a field."""
-    out[k, j, i] = source[k, j, i]
-
-
-@cell_kernel("warp_lcp.grid.level_set")
 def clear_kernel(k, j, i, limit: float, phi: F32, known: I8):
     """Forget what an earlier update left: air."""
     phi[k, j, i] = limit

@@ -168,7 +168,6 @@ class MarchingCubes:
     """
 
     def __init__(self, grid: StaggeredGrid) -> None:
-        """Bring the table of cases to the device."""
         self.grid = grid
         self._table = wp.array(triangle_table() if grid.dimension == 3 else segment_table(), dtype=wp.int8, device=grid.device)
 

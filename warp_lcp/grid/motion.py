@@ -122,7 +122,7 @@ class Translation:
     stop: float = math.inf
 
     def __post_init__(self) -> None:
-        """Check the values."""
+        """Check the values, and bring the velocity into space."""
         object.__setattr__(self, "velocity", _in_space("velocity", self.velocity))
         _check_interval(self.start, self.stop)
 

@@ -38,7 +38,6 @@ class NodeDistances:
     """
 
     def __init__(self, grid: StaggeredGrid, *, second: bool) -> None:
-        """Allocate the fields."""
         self.grid = grid
         self.near, self.owner = grid.field(), grid.field(wp.int16)
         self.next_near, self.next_owner = (grid.field(), grid.field(wp.int16)) if second else (self.near, self.owner)
@@ -50,7 +49,7 @@ class NodeDistances:
 
     @property
     def arrays(self) -> list[wp.array]:
-        """All fields."""
+        """The four fields, in the order of the attributes."""
         return [self.near, self.owner, self.next_near, self.next_owner]
 
     def copy_from(self, other: NodeDistances) -> None:
@@ -80,7 +79,6 @@ class NodeSampler:
     """
 
     def __init__(self, grid: StaggeredGrid) -> None:
-        """Allocate what a part needs."""
         self.grid = grid
         self.snap = max(SNAP * max(grid.whole or grid.counts), 1e-6)
         size = max(min(CHUNK, grid.size), max(grid.shape) * COARSE**2)  # a row of groups fits

@@ -59,7 +59,6 @@ class Column:
     """
 
     def __init__(self, capacity: int, count: int, device: wp.Device) -> None:
-        """Allocate zeros."""
         if device.is_cpu:  # NumPy's zeros take no memory before a particle has been there
             self.store = wp.array(np.zeros((capacity, 3), dtype=np.float32), dtype=wp.vec3, device=device, copy=False)
         else:
@@ -94,7 +93,6 @@ class Particles:
     def __init__(
         self, grid: StaggeredGrid, position: np.ndarray, velocity: np.ndarray, *, affine: bool, indexed: bool | None = None
     ) -> None:
-        """Copy the particles to the device."""
         _check_shapes(position, velocity)
         self.grid, self.count, self._capacity = grid, 0, 0
         indexed = grid.device.is_cuda if indexed is None else indexed
@@ -112,12 +110,12 @@ class Particles:
 
     @property
     def position(self) -> wp.array:
-        """[m], wp.vec3, shape (count,)."""
+        """Positions [m], wp.vec3, shape (count,)."""
         return self._columns["position"].view
 
     @property
     def velocity(self) -> wp.array:
-        """[m/s], wp.vec3, shape (count,)."""
+        """Velocities [m/s], wp.vec3, shape (count,)."""
         return self._columns["velocity"].view
 
     @property

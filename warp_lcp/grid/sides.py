@@ -141,7 +141,6 @@ class PeriodicSides:
     """
 
     def __init__(self, grid: StaggeredGrid, axes: Sequence[int]) -> None:
-        """Note the sides."""
         self.grid, self.axes = grid, tuple(axes)
         self.bits = sum(1 << axis for axis in self.axes)
 

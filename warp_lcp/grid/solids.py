@@ -17,7 +17,7 @@ import warp as wp
 
 from warp_lcp.grid.motion import Pose, Vector, checked_vector, in_space, keep_checked, unit
 from warp_lcp.grid.solids_kernels import (
-    Frame,
+    ShapeFrame,
     box_distance,
     capsule_distance,
     mesh_distance,
@@ -145,7 +145,7 @@ class _Shape(ABC):
         self._measure(self.kernel, points, out)
 
     def _measure(self, kernel: Any, points: wp.array, out: wp.array) -> None:
-        placement, frame, device = self.placement, Frame(), points.device
+        placement, frame, device = self.placement, ShapeFrame(), points.device
         translation = placement.translation + placement.scale * placement.rotation @ self._origin()
         frame.inverse_rotation, frame.translation = wp.mat33(placement.rotation.T), wp.vec3(*translation)
         frame.scale, frame.sign = placement.scale * self._unit(), -1.0 if self.invert else 1.0
@@ -203,7 +203,7 @@ class Box(_Shape):
     kernel: ClassVar[Any] = box_distance
 
     def __post_init__(self) -> None:
-        """Check the corners."""
+        """Check that low is below high."""
         lower, upper = checked_vector("min", self.lower), checked_vector("max", self.upper)
         if len(lower) != len(upper):
             raise ValueError(f"a box's min has {len(lower)} numbers and its max {len(upper)}")
@@ -255,7 +255,7 @@ class Sphere(_Shape):
     kernel: ClassVar[Any] = sphere_distance
 
     def __post_init__(self) -> None:
-        """Check center and radius."""
+        """Check that center and radius are finite."""
         object.__setattr__(self, "center", checked_vector("center", self.center))
         object.__setattr__(self, "radius", checked("radius", self.radius, Positive))
 
@@ -291,7 +291,7 @@ class Capsule(_Shape):
     kernel: ClassVar[Any] = capsule_distance
 
     def __post_init__(self) -> None:
-        """Check ends and radius."""
+        """Check that the ends are two points."""
         start, end = checked_vector("from", self.start), checked_vector("to", self.end)
         if len(start) != len(end):
             raise ValueError(f"a capsule's from has {len(start)} numbers and its to {len(end)}")

@@ -79,7 +79,6 @@ class SurfaceMesh:
         self, grid: StaggeredGrid, *, per_axis: int, resolution: int | None = None, smoothing: float = 1.5,
         obstacles: Obstacles | None = None,
     ) -> None:  # fmt: skip
-        """Allocate the lattice."""
         parts = per_axis if resolution is None else resolution
         if per_axis < 1 or parts < 1:
             raise ValueError(f"per_axis = {per_axis}, resolution = {resolution}: must be at least 1")

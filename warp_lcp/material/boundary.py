@@ -101,7 +101,6 @@ class WholeCells:
         self, grid: StaggeredGrid, solids: VoxelSolids, wall_velocity: np.ndarray | None = None, *, open_sides: int,
         sides: PeriodicSides | None = None,
     ) -> None:  # fmt: skip
-        """Allocate the fields."""
         self.grid, self.solids, self.sides = grid, solids, sides
         self.open_sides, self._endless = with_periodic(open_sides, sides), sides.bits if sides is not None else 0
         if wall_velocity is not None and np.shape(wall_velocity) != (len(solids.separating), 3):
@@ -184,7 +183,6 @@ class CutBoundary:
     """
 
     def __init__(self, grid: StaggeredGrid, cut: CutCells, *, sides: PeriodicSides | None = None) -> None:
-        """Allocate the fields."""
         self.grid, self.cut, self.moves, self.sides = grid, cut, cut.moves, sides
         self.open_sides, self._endless = with_periodic(cut.open_sides, sides), sides.bits if sides is not None else 0
         self.base, self.open, self.capacity, self.distance = cut.base, cut.open, cut.capacity, cut.distance

@@ -67,7 +67,6 @@ class Crowding:
     """
 
     def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int, max_density: float) -> None:
-        """Allocate the sums."""
         self.grid, self.boundary, self.particles_a_cell, self.max_density = grid, boundary, particles_a_cell, max_density
         self._sums = wp.zeros((*grid.shape[:2], COLUMNS), dtype=wp.float64, device=grid.device)
         self._density: wp.array | None = None
@@ -162,7 +161,6 @@ class DensityCorrection:
         tolerance: float = 1e-2,
         max_iterations: int = 20,
     ) -> None:
-        """Allocate the fields."""
         self.grid, self.boundary, self.solver = grid, boundary, solver
         self.particles_a_cell, self.max_density, self.gain = particles_a_cell, max_density, gain
         self.every = every

@@ -79,7 +79,6 @@ class NarrowBand:
         self, grid: StaggeredGrid, boundary: Boundary, *, width: float, per_axis: int, jitter: float, random_seed: int,
         keep: np.ndarray | None = None,
     ) -> None:  # fmt: skip
-        """Allocate the fields: no interior yet."""
         if not width >= 3.0:
             raise ValueError(f"width = {width}: must be at least 3 cells")
         self.grid, self.boundary, self.width = grid, boundary, float(width)

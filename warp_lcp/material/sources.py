@@ -72,7 +72,6 @@ class Sources:
     def __init__(
         self, grid: StaggeredGrid, boundary: Boundary, sources: Sequence[Source], *, per_axis: int, jitter: float, random_seed: int
     ) -> None:
-        """Find the cells."""
         self.grid, self.boundary, self.sources = grid, boundary, tuple(sources)
         self.per_axis, self.jitter, self.random_seed = per_axis, jitter, random_seed
         owner = _owners(grid, boundary, self.sources)
@@ -312,7 +311,6 @@ class Outlets:
     """
 
     def __init__(self, grid: StaggeredGrid, drains: Sequence[Drain], open_sides: int) -> None:
-        """Keep the arguments."""
         self.grid, self.drains, self.open_sides = grid, tuple(drains), open_sides
         self._distance = wp.zeros(0, dtype=wp.float32, device=grid.device)
 
