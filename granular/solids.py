@@ -68,10 +68,7 @@ class SandSolids:
             )
             for solid in self._placed
         ]  # fmt: skip
-        found = voxelize(
-            grid.counts, grid.spacing, grid.dimension, now, wall_separating=True, device=grid.device,
-            open_sides=self._boundary.open_sides, remarks=False,
-        )  # fmt: skip
+        found = voxelize(grid, now, wall_separating=True, open_sides=self._boundary.open_sides, remarks=False)
         self.index, self._covered = found.index, found.covered
         if self._boundary.sides is not None:
             self._boundary.sides.wrap(self.index)

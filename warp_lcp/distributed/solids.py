@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import warp_lcp as wl
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.grid.cut_cells import CutCells
-from warp_lcp.grid.solid_notes import check_open, placement_notes, small_notes, thin_notes
-from warp_lcp.grid.voxelize import PlacedSolid, voxelize
+from warp_lcp.grid.voxelize import PlacedSolid, check_open, small_notes, start_notes, voxelize
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
 
 
@@ -40,15 +39,8 @@ def boundary_of_part(
             part.fill(*boundary.placed())
             _check_open(part, boundary)
             return boundary, list(cut.notes)
-    whole = grid.whole or grid.counts
-    notes: list[str] = []
-    for solid in solids:
-        notes += placement_notes(solid.geometry, solid.name, whole, grid.spacing, grid.dimension)
-        notes += thin_notes(solid.geometry, solid.name, solid.among, grid.spacing, grid.device)
-    voxels = voxelize(
-        grid.counts, grid.spacing, grid.dimension, solids, wall_separating=wall_separating, device=grid.device, open_sides=part.cuts,
-        origin=grid.origin, remarks=False,
-    )  # fmt: skip
+    notes = start_notes(solids, grid)
+    voxels = voxelize(grid, solids, wall_separating=wall_separating, open_sides=part.cuts, remarks=False)
     notes += small_notes((solid.name for solid in solids), ranks.sum([*voxels.covered, 0]), grid.spacing)
     part.fill(voxels.index)
     boundary = WholeCells(grid, voxels, open_sides=part.cuts)

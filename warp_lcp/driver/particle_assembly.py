@@ -100,10 +100,7 @@ def make_boundary(
         cut = CutCells(grid, placed, wall_separating=separating, open_sides=sides)
         if not cut.whole_cells:
             return CutBoundary(grid, cut, sides=around), cut.notes
-    voxels = voxelize(
-        grid.counts, grid.spacing, grid.dimension, placed, wall_separating=separating, device=grid.device,
-        open_sides=sides | side_bits(periodic_sides(scene.endless)),
-    )  # fmt: skip
+    voxels = voxelize(grid, placed, wall_separating=separating, open_sides=sides | side_bits(periodic_sides(scene.endless)))
     if wall_velocity is None and scene.source:
         wall_velocity = np.zeros((1 + len(placed), 3))  # what a source's faces are given goes there
     return WholeCells(grid, voxels, wall_velocity, open_sides=sides, sides=around), voxels.notes
@@ -150,7 +147,7 @@ def seed_materials(
     names = [f"{key}[{number}] ({material.shape})" for number, material in enumerate(materials)]
     notes: list[str] = []
     for name, geometry in zip(names, geometries, strict=True):
-        notes += placement_notes(geometry, name, grid.whole or grid.counts, grid.spacing, grid.dimension)
+        notes += placement_notes(geometry, name, grid)
     settings = scene.particles
     open_cells = grid.interior(boundary.base.numpy()) != wl.SOLID
     if without is not None:

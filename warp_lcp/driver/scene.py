@@ -17,7 +17,7 @@ from warp_lcp.driver.presets import PresetName, fill_in, preset_line
 from warp_lcp.driver.shapes import Liquid, Shape, Solid, Wall
 from warp_lcp.driver.table import Complaint, Problem, SceneError, Table, Vector, refuse, validate
 from warp_lcp.grid.sides import SIDES
-from warp_lcp.grid.solid_notes import STRAY
+from warp_lcp.grid.voxelize import STRAY
 from warp_lcp.settings import Count, CountOrZero, Positive, Share, adapter
 from warp_lcp.solve import PrecisionName
 from warp_lcp.solvers.registry import grid_methods
