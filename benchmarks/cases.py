@@ -13,9 +13,9 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from benchmarks.memory import array_bytes, forget_peak, resident_bytes
-from benchmarks.problems import Splash, warm_changes
-from benchmarks.timing import Figure
+from warp_lcp.benchmarks.memory import array_bytes, forget_peak, resident_bytes
+from warp_lcp.benchmarks.problems import Splash, warm_changes
+from warp_lcp.benchmarks.timing import Figure
 
 RTOL = 1e-6
 TOLERANCES = (1e-4, 1e-6, 1e-8)

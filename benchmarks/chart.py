@@ -1,4 +1,4 @@
-"""The chart of the README from a kept result: `python -m benchmarks.chart benchmarks/results/MACHINE/peers.json docs/peers.png`."""
+"""The chart of the README from a kept result: `python -m warp_lcp.benchmarks.chart benchmarks/results/MACHINE/peers.json docs/peers.png`."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from benchmarks.machine import present
-from benchmarks.plots import COLOR
-from benchmarks.record import MACHINE, Record, read_json
+from warp_lcp.benchmarks.machine import present
+from warp_lcp.benchmarks.plots import COLOR
+from warp_lcp.benchmarks.record import MACHINE, Record, read_json
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -70,7 +70,7 @@ def _panel(axes: Axes, title: str, seconds: dict[str, float]) -> None:
 
 def main(arguments: list[str] | None = None) -> None:
     """Draw the chart of a file."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.chart", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m warp_lcp.benchmarks.chart", description=__doc__)
     parser.add_argument("result", type=Path, help="peers.json")
     parser.add_argument("image", type=Path)
     given = parser.parse_args(arguments)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from benchmarks.record import MACHINE, Record, read_json
-from benchmarks.side_by_side import device, plain, side_by_side
-from benchmarks.timing import Figure
+from warp_lcp.benchmarks.record import MACHINE, Record, read_json
+from warp_lcp.benchmarks.side_by_side import device, plain, side_by_side
+from warp_lcp.benchmarks.timing import Figure
 
 ALLOWED = 0.25  # share of a ratio to a peer that may be lost
 # ratios of a peer's time to ours, of the same rounds: what is compared across states of the code and across machines

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import warp_lcp as wl
-from benchmarks.machine import machine
-from benchmarks.record import Chart, Lines, Record, Results, Table
-from benchmarks.timing import Figure, Options
+from warp_lcp.benchmarks.machine import machine
+from warp_lcp.benchmarks.record import Chart, Lines, Record, Results, Table
+from warp_lcp.benchmarks.timing import Figure, Options
 from warp_lcp.gallery.contact_models import BoxedModel, ContactModel, ContactSystem, StewartTrinkleModel
 from warp_lcp.gallery.contact_scenes import SCENES, SETTLING, heavy_on_light
 from warp_lcp.gallery.contact_stepper import ContactStepper

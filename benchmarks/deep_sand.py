@@ -1,4 +1,4 @@
-"""Deep sand that yields: which steps reach their tolerance, and what stalls the others. `python -m benchmarks.deep_sand --out out/deep`.
+"""Deep sand that yields: which steps reach their tolerance, and what stalls the others. `python -m warp_lcp.benchmarks.deep_sand --out out/deep`.
 
 Random hourglasses, silos and columns by `--seed`; without one, those of the validation and neighbors.
 """
@@ -21,12 +21,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from benchmarks.validation import sand_hourglass, sand_pit, tank
-from granular import stress_kernels
-from granular.coupled import AcceleratedProjection, CoupledOutcome
-from granular.simulator import SandSimulation
-from granular.stress import Stress
-from granular.yield_set import HOLDS
+from warp_lcp.benchmarks.validation import sand_hourglass, sand_pit, tank
+from warp_lcp.granular import stress_kernels
+from warp_lcp.granular.coupled import AcceleratedProjection, CoupledOutcome
+from warp_lcp.granular.simulator import SandSimulation
+from warp_lcp.granular.stress import Stress
+from warp_lcp.granular.yield_set import HOLDS
 from warp_lcp import SolveStatus
 from warp_lcp.rows import RowPass
 

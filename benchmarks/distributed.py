@@ -13,14 +13,14 @@ from pathlib import Path
 
 import warp as wp
 
-from benchmarks import on_ranks
-from benchmarks.cases import TOLERANCES
-from benchmarks.machine import COPIED, machine
-from benchmarks.problems import BOUNDS
-from benchmarks.record import Chart, Lines, Record, Results, Table, read_json
-from benchmarks.scaling import FIGURES
-from benchmarks.targets import Target
-from benchmarks.timing import Figure, Options
+from warp_lcp.benchmarks import on_ranks
+from warp_lcp.benchmarks.cases import TOLERANCES
+from warp_lcp.benchmarks.machine import COPIED, machine
+from warp_lcp.benchmarks.problems import BOUNDS
+from warp_lcp.benchmarks.record import Chart, Lines, Record, Results, Table, read_json
+from warp_lcp.benchmarks.scaling import FIGURES
+from warp_lcp.benchmarks.targets import Target
+from warp_lcp.benchmarks.timing import Figure, Options
 from warp_lcp.distributed import launch
 
 TITLE = "Solves on several ranks"
@@ -81,7 +81,7 @@ def _started(count: int, sizes: Sequence[int], options: Options) -> list[Record]
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "records.json"
         asked = [part for n in sizes for part in ("--size", str(n))]
-        arguments = ["-m", "benchmarks.on_ranks", *asked, "--repeat", str(options.repeat), "--device", options.device, "--out", str(file)]
+        arguments = ["-m", "warp_lcp.benchmarks.on_ranks", *asked, "--repeat", str(options.repeat), "--device", options.device, "--out", str(file)]
         waiting = {"OMPI_MCA_mpi_yield_when_idle": str(int(count > (os.cpu_count() or 1)))}  # to give cores away costs microseconds
         process = subprocess.run(launch.command(count, *arguments), env=launch.environment() | waiting, check=False)
         if process.returncode != 0:

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 
 import warp_lcp as wl
-from benchmarks.machine import COPIED, machine
-from benchmarks.problems import Splash, splash
-from benchmarks.record import Chart, Lines, Record, Results, Table
-from benchmarks.targets import Target
-from benchmarks.timing import Figure, Options
-from warp_lcp.driver.devices import free_memory
+from warp_lcp.benchmarks.machine import COPIED, machine
+from warp_lcp.benchmarks.problems import Splash, splash
+from warp_lcp.benchmarks.record import Chart, Lines, Record, Results, Table
+from warp_lcp.benchmarks.targets import Target
+from warp_lcp.benchmarks.timing import Figure, Options
+from warp_lcp.run.devices import free_memory
 
 TITLE = "The smallest residual of each precision against the size of the grid"
 SIZES = (16, 32, 64, 128, 256)

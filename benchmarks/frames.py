@@ -1,6 +1,6 @@
 """What frames cost: formats of a grid's cells against each other, and the share of a run's time that its frames take.
 
-python -m benchmarks.frames 64 96 128 --scene dam-break --set time.duration=0.4
+python -m warp_lcp.benchmarks.frames 64 96 128 --scene dam-break --set time.duration=0.4
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.driver.atomic import replacing
-from warp_lcp.driver.nvdb import write_nvdb
-from warp_lcp.driver.profile import Profile
-from warp_lcp.driver.run import run_scene
-from warp_lcp.driver.scene_file import load_scene
-from warp_lcp.driver.simulator import Cells, Volume
-from warp_lcp.driver.vti import write_vti
-from warp_lcp.driver.vtu import write_vtu
+from warp_lcp.frames.atomic import replacing
+from warp_lcp.frames.nvdb import write_nvdb
+from warp_lcp.run.profile import Profile
+from warp_lcp.run.loop import run_scene
+from warp_lcp.scene.scene_file import load_scene
+from warp_lcp.simulation import Cells, Volume
+from warp_lcp.frames.vti import write_vti
+from warp_lcp.frames.vtu import write_vtu
 
 SEED = 977
 NO_FRAMES = tuple(f"output.{part}=false" for part in ("particles", "grid", "surface", "volume"))

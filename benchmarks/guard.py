@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import warp_lcp as wl
-from benchmarks.cases import RTOL, Case
-from benchmarks.machine import cpu_model, machine
-from benchmarks.peers.linear import pyamg_aggregation
-from benchmarks.peers.peer import Question
-from benchmarks.problems import BOUNDS, splash
-from benchmarks.record import MACHINE, Record, Results, Table, read_json
-from benchmarks.timing import Options, ratios
+from warp_lcp.benchmarks.cases import RTOL, Case
+from warp_lcp.benchmarks.machine import cpu_model, machine
+from warp_lcp.benchmarks.peers.linear import pyamg_aggregation
+from warp_lcp.benchmarks.peers.peer import Question
+from warp_lcp.benchmarks.problems import BOUNDS, splash
+from warp_lcp.benchmarks.record import MACHINE, Record, Results, Table, read_json
+from warp_lcp.benchmarks.timing import Options, ratios
 
 TITLE = "Ratios to PyAMG"
 SIZE = 64

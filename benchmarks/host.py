@@ -7,9 +7,9 @@ from typing import Any
 import warp as wp
 
 import warp_lcp as wl
-from benchmarks.problems import splash
-from benchmarks.record import Record
-from benchmarks.timing import Figure, in_turns
+from warp_lcp.benchmarks.problems import splash
+from warp_lcp.benchmarks.record import Record
+from warp_lcp.benchmarks.timing import Figure, in_turns
 
 NODES = 1000
 WARM_UP = 40  # runs after which the engine has recorded what it records

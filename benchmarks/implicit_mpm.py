@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from benchmarks.machine import machine
-from benchmarks.peers.foreign import Home, PeerFailed, Worker
-from benchmarks.record import Record, Results, Table
-from benchmarks.sand import collapse
-from benchmarks.targets import Target
-from benchmarks.timing import Figure, Options, ratios
-from granular import SIMULATOR
-from granular.scene import SandScene
+from warp_lcp.benchmarks.machine import machine
+from warp_lcp.benchmarks.peers.foreign import Home, PeerFailed, Worker
+from warp_lcp.benchmarks.record import Record, Results, Table
+from warp_lcp.benchmarks.sand import collapse
+from warp_lcp.benchmarks.targets import Target
+from warp_lcp.benchmarks.timing import Figure, Options, ratios
+from warp_lcp.granular import SIMULATOR
+from warp_lcp.granular.scene import SandScene
 
 TITLE = "Steps of sand against newton's implicit MPM"
 NEWTON = Home("newton", "WARP_LCP_NEWTON_PYTHON", "implicit_mpm", "pip install newton, in a venv of its own, and name its interpreter")

@@ -1,8 +1,8 @@
 """Inverse kinematics with joint limits beside SciPy's bounded least squares, and the price of damping.
 
-python -m benchmarks.inverse_kinematics compare 1000
-python -m benchmarks.inverse_kinematics damping 40
-python -m benchmarks.inverse_kinematics methods 20
+python -m warp_lcp.benchmarks.inverse_kinematics compare 1000
+python -m warp_lcp.benchmarks.inverse_kinematics damping 40
+python -m warp_lcp.benchmarks.inverse_kinematics methods 20
 """
 
 from __future__ import annotations

@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-import fluids
-import granular
+from warp_lcp import fluids
+from warp_lcp import granular
 import warp_lcp
-from benchmarks.record import MACHINE, SOURCE, Record
-from benchmarks.timing import Figure, in_turns
-from warp_lcp.driver.versions import versions
+from warp_lcp.benchmarks.record import MACHINE, SOURCE, Record
+from warp_lcp.benchmarks.timing import Figure, in_turns
+from warp_lcp.run.versions import versions
 
 PEERS = ("pyamg", "scipy", "numba", "matplotlib")
 COPIED = 1 << 26  # float32 elements of the arrays that are copied: 256 MiB, beyond any cache

@@ -1,6 +1,6 @@
 """What methods cost on matrices: steps, iterations and seconds to 1e-8, and how each ends, on five problems of the gallery.
 
-python -m benchmarks.matrix_prices lemke fischer-newton
+python -m warp_lcp.benchmarks.matrix_prices lemke fischer-newton
 """
 
 from __future__ import annotations

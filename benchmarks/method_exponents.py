@@ -1,6 +1,6 @@
 """How the cost of each method grows with n, and what methods do with matrices they are not for: the tables of docs/choosing-a-method.md.
 
-python -m benchmarks.method_exponents
+python -m warp_lcp.benchmarks.method_exponents
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What each model that a scene can turn on adds to a step and to memory: the list of prices that `warp-lcp check` tells runs by.
 
-python -m benchmarks.models          # also writes warp_lcp/driver/models.toml and docs/models.md, in a checkout
+python -m warp_lcp.benchmarks.models          # also writes warp_lcp/scene/models.toml and docs/models.md, in a checkout
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ import numpy as np
 import tomli_w
 import warp as wp
 
-from benchmarks.machine import machine
-from benchmarks.memory import array_bytes
-from benchmarks.record import Record, Results, Table
-from benchmarks.timing import Figure, Options
-from warp_lcp.driver.models import TABLE, prices
-from warp_lcp.driver.profile import Profile
-from warp_lcp.driver.run import plan_dt
-from warp_lcp.driver.scene import Scene, Time
-from warp_lcp.driver.simulator import simulators
-from warp_lcp.driver.table import validate
+from warp_lcp.benchmarks.machine import machine
+from warp_lcp.benchmarks.memory import array_bytes
+from warp_lcp.benchmarks.record import Record, Results, Table
+from warp_lcp.benchmarks.timing import Figure, Options
+from warp_lcp.scene.models import TABLE, prices
+from warp_lcp.run.profile import Profile
+from warp_lcp.run.loop import plan_dt
+from warp_lcp.scene.scene import Scene, Time
+from warp_lcp.simulation import simulators
+from warp_lcp.scene.table import validate
 
 TITLE = "What models cost"
 RESOLUTION = {2: 128, 3: 48}  # cells along the longest side of the reference scenes
@@ -264,7 +264,7 @@ def table_of(simulator: str, dimension: int, records: list[Record]) -> Table:
 
 
 def price_list(records: list[Record]) -> Mapping[str, Any]:
-    """Return what `warp_lcp/driver/models.toml` holds: by simulator, dimension and model what a `warp_lcp.driver.models.Price` has."""
+    """Return what `warp_lcp/scene/models.toml` holds: by simulator, dimension and model what a `warp_lcp.scene.models.Price` has."""
     listed: dict[str, Any] = {}
     for record in records:
         where, separator, name = record.name.partition(": ")
@@ -278,7 +278,7 @@ def price_list(records: list[Record]) -> Mapping[str, Any]:
 
 PAGE = """# What models cost
 
-<!-- Written by `python -m benchmarks.models`; do not edit. -->
+<!-- Written by `python -m warp_lcp.benchmarks.models`; do not edit. -->
 
 A scene has what it asks for and nothing else: a model that is off loads no kernel, allocates no byte and logs no column (a test for each of
 them proves it). `warp-lcp check SCENE` says which models a scene turns on and why, and what they take of its memory and of a step, by the
@@ -339,11 +339,11 @@ def main() -> None:
     given = parser.parse_args()
     options = Options(given.device, (), given.repeat, lambda text: sys.stderr.write(f"{text}\n"))
     results = measure(options, Path())
-    compared = importlib.import_module("benchmarks.automatic_tolerance").measure(options, Path())
-    head = "# What models add to a step and to memory, by simulator and dimension; written by `python -m benchmarks.models`.\n\n"
+    compared = importlib.import_module("warp_lcp.benchmarks.automatic_tolerance").measure(options, Path())
+    head = "# What models add to a step and to memory, by simulator and dimension; written by `python -m warp_lcp.benchmarks.models`.\n\n"
     Path(str(files("warp_lcp.driver") / TABLE)).write_text(head + tomli_w.dumps(price_list(results.records)), "utf-8")
     prices.cache_clear()
-    results.tables.extend(importlib.import_module("benchmarks.predictions").measure(options, Path()).tables)
+    results.tables.extend(importlib.import_module("warp_lcp.benchmarks.predictions").measure(options, Path()).tables)
     write_page(given.page, results, compared.tables[0])
 
 

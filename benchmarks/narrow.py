@@ -11,10 +11,10 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from benchmarks.machine import machine
-from benchmarks.record import Record, Results, Table
-from benchmarks.small_problems import SmallProblem, option, plain_active_set, stepped, string
-from benchmarks.timing import Figure, Options, in_turns, ratios
+from warp_lcp.benchmarks.machine import machine
+from warp_lcp.benchmarks.record import Record, Results, Table
+from warp_lcp.benchmarks.small_problems import SmallProblem, option, plain_active_set, stepped, string
+from warp_lcp.benchmarks.timing import Figure, Options, in_turns, ratios
 from warp_lcp.gallery.banded import banded_matrix
 
 TITLE = "Small and narrow problems"

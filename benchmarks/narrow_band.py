@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from benchmarks.machine import machine
-from benchmarks.memory import array_bytes, forget_peak, resident_bytes
-from benchmarks.record import Record, Results, Table
-from benchmarks.timing import Figure, Options
-from fluids import FluidsSimulator, LiquidScene, LiquidSimulation
+from warp_lcp.benchmarks.machine import machine
+from warp_lcp.benchmarks.memory import array_bytes, forget_peak, resident_bytes
+from warp_lcp.benchmarks.record import Record, Results, Table
+from warp_lcp.benchmarks.timing import Figure, Options
+from warp_lcp.fluids import FluidsSimulator, LiquidScene, LiquidSimulation
 
 TITLE = "Narrow band of particles"
 SIZES = (64, 96)  # cells along the longest side

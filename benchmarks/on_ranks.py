@@ -1,6 +1,6 @@
 """What every rank of a measurement does: solves of the splash whose grid the ranks share, each of which makes its own box of it only.
 
-`mpiexec -n N python -m benchmarks.on_ranks --size 128 --out FILE.json`; `benchmarks.distributed` starts it and reads the file.
+`mpiexec -n N python -m warp_lcp.benchmarks.on_ranks --size 128 --out FILE.json`; `benchmarks.distributed` starts it and reads the file.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from benchmarks.cases import MIDST, TOLERANCES
-from benchmarks.floor import natural
-from benchmarks.memory import array_bytes, forget_peak, resident_bytes
-from benchmarks.problems import BOUNDS, SplashPart, splash, splash_part
-from benchmarks.record import Record, write_json
-from benchmarks.scaling import FIGURES, SCENE_BYTES, SOLVE_BYTES, Growing
-from benchmarks.timing import Figure, ratios
+from warp_lcp.benchmarks.cases import MIDST, TOLERANCES
+from warp_lcp.benchmarks.floor import natural
+from warp_lcp.benchmarks.memory import array_bytes, forget_peak, resident_bytes
+from warp_lcp.benchmarks.problems import BOUNDS, SplashPart, splash, splash_part
+from warp_lcp.benchmarks.record import Record, write_json
+from warp_lcp.benchmarks.scaling import FIGURES, SCENE_BYTES, SOLVE_BYTES, Growing
+from warp_lcp.benchmarks.timing import Figure, ratios
 from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
 from warp_lcp.distributed.halo import Halo
 from warp_lcp.distributed.meeting import Meeting, RankFailed
 from warp_lcp.distributed.ranks import Ranks, device_of_rank
-from warp_lcp.driver.devices import devices, free_memory
+from warp_lcp.run.devices import devices, free_memory
 
 PAUSE = 0.002  # [s] between two looks of a rank that waits: it leaves its core to the one that computes
 PLANNED = (ValueError, MemoryError, OSError)  # whose messages say enough
@@ -236,7 +236,7 @@ def together(sizes: Sequence[int], *, device: str, repeat: int, say: Callable[[s
 
 def main() -> None:
     """Measure and write the records; every rank calls it."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.on_ranks")
+    parser = argparse.ArgumentParser(prog="python -m warp_lcp.benchmarks.on_ranks")
     parser.add_argument("--size", type=int, action="append", required=True)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--repeat", type=int, default=5)

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from benchmarks.machine import present
-from benchmarks.record import Bars, Chart, Lines
+from warp_lcp.benchmarks.machine import present
+from warp_lcp.benchmarks.record import Bars, Chart, Lines
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

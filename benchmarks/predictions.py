@@ -1,6 +1,6 @@
 """The time of a step that the list of prices predicts, against the measured one, on the built-in scenes: none of them made the list.
 
-python -m benchmarks.predictions          # prints the table; those of `python -m benchmarks.models` go to docs/models.md
+python -m warp_lcp.benchmarks.predictions          # prints the table; those of `python -m warp_lcp.benchmarks.models` go to docs/models.md
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ import math
 import sys
 from pathlib import Path
 
-from benchmarks.models import create, markdown, step_seconds_of
-from benchmarks.record import Record, Results, Table
-from benchmarks.timing import Figure, Options
-from warp_lcp.driver.models import predicted_seconds, prices
-from warp_lcp.driver.particle_scene import ParticleScene
-from warp_lcp.driver.run import SAME_TIME, plan_dt
-from warp_lcp.driver.scene_file import built_in_scenes, load_scene
+from warp_lcp.benchmarks.models import create, markdown, step_seconds_of
+from warp_lcp.benchmarks.record import Record, Results, Table
+from warp_lcp.benchmarks.timing import Figure, Options
+from warp_lcp.scene.models import predicted_seconds, prices
+from warp_lcp.material.particle_scene import ParticleScene
+from warp_lcp.run.loop import SAME_TIME, plan_dt
+from warp_lcp.scene.scene_file import built_in_scenes, load_scene
 
 TITLE = "Predicted and measured"
 ENOUGH = 4.0  # seconds of steps, of a run's beginning

@@ -10,9 +10,9 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from benchmarks.machine import COPIED, machine
-from benchmarks.record import Bars, Lines, Record, Results, Table
-from benchmarks.timing import Figure, Options
+from warp_lcp.benchmarks.machine import COPIED, machine
+from warp_lcp.benchmarks.record import Bars, Lines, Record, Results, Table
+from warp_lcp.benchmarks.timing import Figure, Options
 from warp_lcp.gallery.recorded import RecordedProblem, files, load
 
 TITLE = "Recorded pressure problems"

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from benchmarks.machine import present
-from benchmarks.plots import draw
-from benchmarks.record import MACHINE, Results, write_csv, write_json, write_markdown
-from benchmarks.timing import Options
+from warp_lcp.benchmarks.machine import present
+from warp_lcp.benchmarks.plots import draw
+from warp_lcp.benchmarks.record import MACHINE, Results, write_csv, write_json, write_markdown
+from warp_lcp.benchmarks.timing import Options
 
 
 def write(name: str, title: str, results: Results, options: Options, out: Path) -> list[str]:

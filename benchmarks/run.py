@@ -14,14 +14,14 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from benchmarks.machine import machine
-from benchmarks.record import Bars, Record, Results, Table
-from benchmarks.stopwatch import timed
-from benchmarks.timing import Figure, Options
-from warp_lcp.driver import particle_simulation
-from warp_lcp.driver.run import run_scene
-from warp_lcp.driver.scene_file import load_scene
-from warp_lcp.driver.simulator import simulators
+from warp_lcp.benchmarks.machine import machine
+from warp_lcp.benchmarks.record import Bars, Record, Results, Table
+from warp_lcp.benchmarks.stopwatch import timed
+from warp_lcp.benchmarks.timing import Figure, Options
+from warp_lcp.material import particle_simulation
+from warp_lcp.run.loop import run_scene
+from warp_lcp.scene.scene_file import load_scene
+from warp_lcp.simulation import simulators
 from warp_lcp.material.boundary import WholeCells
 
 TITLE = "Runs of built-in scenes"

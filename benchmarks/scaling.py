@@ -13,13 +13,13 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from benchmarks.cases import TOLERANCES, Case
-from benchmarks.machine import COPIED, machine
-from benchmarks.problems import BOUNDS, Splash, splash
-from benchmarks.record import Chart, Lines, Record, Results, Table
-from benchmarks.targets import Target
-from benchmarks.timing import Figure, Options
-from warp_lcp.driver.devices import free_memory
+from warp_lcp.benchmarks.cases import TOLERANCES, Case
+from warp_lcp.benchmarks.machine import COPIED, machine
+from warp_lcp.benchmarks.problems import BOUNDS, Splash, splash
+from warp_lcp.benchmarks.record import Chart, Lines, Record, Results, Table
+from warp_lcp.benchmarks.targets import Target
+from warp_lcp.benchmarks.timing import Figure, Options
+from warp_lcp.run.devices import free_memory
 
 TITLE = "Cost of a solve against the size of the grid"
 CPU_SIZES, CUDA_SIZES = (32, 64, 128, 256), (32, 64, 128, 256, 512, 1024)

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks.energy import Ledger
-from benchmarks.machine import machine
-from benchmarks.record import Record, Results, Table
-from benchmarks.timing import Figure, Options
-from warp_lcp.driver.scene_file import load_scene
-from warp_lcp.driver.simulator import SimulationFailed, StepFailed, simulators
+from warp_lcp.benchmarks.energy import Ledger
+from warp_lcp.benchmarks.machine import machine
+from warp_lcp.benchmarks.record import Record, Results, Table
+from warp_lcp.benchmarks.timing import Figure, Options
+from warp_lcp.scene.scene_file import load_scene
+from warp_lcp.simulation import SimulationFailed, StepFailed, simulators
 
 TITLE = "Steps of any length"
 SCENES = {  # cells along the longest side, and the time [s] whose parts are the moments: small enough for seconds, see `MOMENTS`

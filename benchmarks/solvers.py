@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 
 import warp_lcp as wl
-from benchmarks.cases import RTOL, Case
-from benchmarks.host import host_overhead
-from benchmarks.machine import COPIED, machine, present
-from benchmarks.peers.linear import pyamg_aggregation, scipy_cg
-from benchmarks.peers.peer import Answer, Question
-from benchmarks.problems import BOUNDS, anisotropic, cut_cells, splash
-from benchmarks.record import Bars, Lines, Record, Results, Table
-from benchmarks.targets import targets
-from benchmarks.timing import Figure, Options, ratios
+from warp_lcp.benchmarks.cases import RTOL, Case
+from warp_lcp.benchmarks.host import host_overhead
+from warp_lcp.benchmarks.machine import COPIED, machine, present
+from warp_lcp.benchmarks.peers.linear import pyamg_aggregation, scipy_cg
+from warp_lcp.benchmarks.peers.peer import Answer, Question
+from warp_lcp.benchmarks.problems import BOUNDS, anisotropic, cut_cells, splash
+from warp_lcp.benchmarks.record import Bars, Lines, Record, Results, Table
+from warp_lcp.benchmarks.targets import targets
+from warp_lcp.benchmarks.timing import Figure, Options, ratios
 
 TITLE = "Linear and LCP pressure solves"
 SIZES = (64, 128)

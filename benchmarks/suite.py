@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from benchmarks.compare import comparison
+from warp_lcp.benchmarks.compare import comparison
 from warp_lcp.distributed import launch
 from warp_lcp.gallery import recorded
 from warp_lcp.solvers.registry import METHODS
@@ -105,7 +105,7 @@ class Suite:
             arguments += ["--size", str(size)]
         arguments += [part for method in methods for part in ("--method", method)]
         arguments += ["--problems", str(problems)] if problems is not None else []
-        process = subprocess.run([sys.executable, "-m", "benchmarks", *arguments], env={**os.environ, **ONE_THREAD}, check=False)
+        process = subprocess.run([sys.executable, "-m", "warp_lcp.benchmarks", *arguments], env={**os.environ, **ONE_THREAD}, check=False)
         if name == DISTRIBUTED and launch.rank_here():  # the first of several ranks speaks for all
             raise SystemExit(process.returncode)
         if process.returncode == WRONG_INPUT:

@@ -9,7 +9,7 @@ from html import escape
 
 import numpy as np
 
-from benchmarks.record import Lines
+from warp_lcp.benchmarks.record import Lines
 
 WIDTH, HEIGHT = 640.0, 360.0  # of the drawing without its legend, in its own units
 LEFT, RIGHT, TOP, BOTTOM = 66.0, 14.0, 30.0, 46.0  # around the axes

@@ -1,6 +1,6 @@
 """What methods cost on a grid: steps and seconds to 1e-3 and to 1e-6, beside projected multigrid.
 
-python -m benchmarks.sweep_prices 64 pgs nncg
+python -m warp_lcp.benchmarks.sweep_prices 64 pgs nncg
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 
 import warp_lcp as wl
-from benchmarks.problems import splash
+from warp_lcp.benchmarks.problems import splash
 from warp_lcp.solvers.accelerated_projected_gradient import AcceleratedProjectedGradient
 from warp_lcp.solvers.nncg import NNCG
 from warp_lcp.solvers.projected_jacobi import ProjectedJacobi

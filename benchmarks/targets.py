@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.record import MACHINE, SOURCE, Record, Table, read_json
-from benchmarks.timing import Figure
+from warp_lcp.benchmarks.record import MACHINE, SOURCE, Record, Table, read_json
+from warp_lcp.benchmarks.timing import Figure
 
 ENGINE = "ProjectedMultigrid"
 NOT_MEASURED = "not measured here"

@@ -1,6 +1,6 @@
 """Pictures of the theory ([Book] 1.1-1.2, 2.1.1): solutions in one dimension, reformulations as surfaces, complementarity cones.
 
-python -m benchmarks.theory docs
+python -m warp_lcp.benchmarks.theory docs
 """
 
 from __future__ import annotations

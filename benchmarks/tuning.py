@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks.machine import machine
-from benchmarks.record import Record, Results, Table
-from benchmarks.timing import Figure, Options
-from warp_lcp.driver.presets import PresetName, Prices, changed, price_table
-from warp_lcp.driver.scene import Scene
-from warp_lcp.driver.scene_file import load_scene
-from warp_lcp.driver.simulator import SimulationFailed, StepFailed
-from warp_lcp.driver.trial import trial
-from warp_lcp.driver.tune import CORRECTED_EVERY, FRAMES, Tuning, tune
+from warp_lcp.benchmarks.machine import machine
+from warp_lcp.benchmarks.record import Record, Results, Table
+from warp_lcp.benchmarks.timing import Figure, Options
+from warp_lcp.scene.presets import PresetName, Prices, changed, price_table
+from warp_lcp.scene.scene import Scene
+from warp_lcp.scene.scene_file import load_scene
+from warp_lcp.simulation import SimulationFailed, StepFailed
+from warp_lcp.run.trial import trial
+from warp_lcp.run.tune import CORRECTED_EVERY, FRAMES, Tuning, tune
 
 TITLE = "Tuned settings against the best of all"
 ACCURACY: PresetName = "standard"

@@ -13,8 +13,8 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from fluids.coupling import BodyCoupling
-from fluids.tolerance import TimeErrorTolerance
+from warp_lcp.fluids.coupling import BodyCoupling
+from warp_lcp.fluids.tolerance import TimeErrorTolerance
 from warp_lcp.gallery import recorded
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.transfer import TINY_WEIGHT

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import warp_lcp as wl
-from benchmarks.method_exponents import MATRICES, outcome
+from warp_lcp.benchmarks.method_exponents import MATRICES, outcome
 from warp_lcp import reformulate
 from warp_lcp.recommend import RULES
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from benchmarks.book import convergence, robustness, sizes, starts
-from benchmarks.book.claims import claims
-from benchmarks.book.problems import Scale
-from benchmarks.machine import COPIED, machine
-from benchmarks.record import Results
-from benchmarks.timing import Options
+from warp_lcp.benchmarks.book import convergence, robustness, sizes, starts
+from warp_lcp.benchmarks.book.claims import claims
+from warp_lcp.benchmarks.book.problems import Scale
+from warp_lcp.benchmarks.machine import COPIED, machine
+from warp_lcp.benchmarks.record import Results
+from warp_lcp.benchmarks.timing import Options
 
 TITLE = "The book's experiments"
 

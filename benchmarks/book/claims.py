@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from benchmarks.record import Record, Table
+from warp_lcp.benchmarks.record import Record, Table
 
 
 def claims(records: Sequence[Record]) -> Table:

@@ -9,11 +9,11 @@ from typing import Any
 import warp as wp
 
 import warp_lcp as wl
-from benchmarks.book.problems import SEED, ZEROS, Scale, contacts, fluids
-from benchmarks.book.robustness import FISCHER, PENALIZED
-from benchmarks.book.traces import RTOL
-from benchmarks.record import Chart, Lines, Record, Results, Sheet, Table
-from benchmarks.timing import Figure
+from warp_lcp.benchmarks.book.problems import SEED, ZEROS, Scale, contacts, fluids
+from warp_lcp.benchmarks.book.robustness import FISCHER, PENALIZED
+from warp_lcp.benchmarks.book.traces import RTOL
+from warp_lcp.benchmarks.record import Chart, Lines, Record, Results, Sheet, Table
+from warp_lcp.benchmarks.timing import Figure
 from warp_lcp.gallery import Plant, Problem, contact, poisson, splash
 from warp_lcp.protocol import families
 

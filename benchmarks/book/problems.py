@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from benchmarks.timing import Options
+from warp_lcp.benchmarks.timing import Options
 from warp_lcp.gallery import Plant, Problem, contact, planted, poisson
 from warp_lcp.gallery.banded import banded_matrix
 

@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import warp_lcp as wl
-from benchmarks.book.problems import Scale, contacts, fluids
-from benchmarks.book.traces import Merit, Trace, Verdict, counted, follow, judge, spread
-from benchmarks.record import Record, Results, Sheet, Table
-from benchmarks.timing import Figure
+from warp_lcp.benchmarks.book.problems import Scale, contacts, fluids
+from warp_lcp.benchmarks.book.traces import Merit, Trace, Verdict, counted, follow, judge, spread
+from warp_lcp.benchmarks.record import Record, Results, Sheet, Table
+from warp_lcp.benchmarks.timing import Figure
 from warp_lcp.gallery import Problem
 
 # the book's methods: no search with a memory, no cycles first, linear systems solved

@@ -11,10 +11,10 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from benchmarks.book.convergence import RTOL
-from benchmarks.book.problems import SEED, Scale
-from benchmarks.record import Chart, Lines, Record, Results, Sheet, Table
-from benchmarks.timing import Figure
+from warp_lcp.benchmarks.book.convergence import RTOL
+from warp_lcp.benchmarks.book.problems import SEED, Scale
+from warp_lcp.benchmarks.record import Chart, Lines, Record, Results, Sheet, Table
+from warp_lcp.benchmarks.timing import Figure
 from warp_lcp.gallery import contact, splash
 
 STEPS = 10  # the book measures the time of so many

@@ -12,11 +12,11 @@ import numpy as np
 import scipy.optimize
 
 import warp_lcp as wl
-from benchmarks.book.problems import SEED, Scale, definite_matrix, properly, recipe
-from benchmarks.book.robustness import FISCHER, MINIMUM_MAP
-from benchmarks.book.traces import Merit, counted, follow, judge, spread
-from benchmarks.record import Bars, Chart, Lines, Record, Results, Sheet, Table
-from benchmarks.timing import Figure
+from warp_lcp.benchmarks.book.problems import SEED, Scale, definite_matrix, properly, recipe
+from warp_lcp.benchmarks.book.robustness import FISCHER, MINIMUM_MAP
+from warp_lcp.benchmarks.book.traces import Merit, counted, follow, judge, spread
+from warp_lcp.benchmarks.record import Bars, Chart, Lines, Record, Results, Sheet, Table
+from warp_lcp.benchmarks.timing import Figure
 from warp_lcp.gallery import Problem
 
 PGS_SWEEPS = 10

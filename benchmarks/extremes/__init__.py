@@ -11,12 +11,12 @@ from itertools import chain
 from pathlib import Path
 from random import SystemRandom
 
-from benchmarks.extremes import bounds, broken, coefficients, matrices, refused, shapes, simulations
-from benchmarks.extremes.case import PRECISIONS, Case, Expected, Verdict, judge
-from benchmarks.extremes.unseen import FRESH, judging
-from benchmarks.machine import machine
-from benchmarks.record import Record, Results, Table
-from benchmarks.timing import Figure, Options
+from warp_lcp.benchmarks.extremes import bounds, broken, coefficients, matrices, refused, shapes, simulations
+from warp_lcp.benchmarks.extremes.case import PRECISIONS, Case, Expected, Verdict, judge
+from warp_lcp.benchmarks.extremes.unseen import FRESH, judging
+from warp_lcp.benchmarks.machine import machine
+from warp_lcp.benchmarks.record import Record, Results, Table
+from warp_lcp.benchmarks.timing import Figure, Options
 
 TITLE = "Extremes: hostile problems and scenes, and what they come to"
 FAMILIES = (

@@ -11,14 +11,14 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from benchmarks.memory import array_bytes
-from benchmarks.record import Record
-from benchmarks.replay import Quality
-from benchmarks.timing import Figure, Options
-from warp_lcp.driver.problem_folder import ProblemFolder
-from warp_lcp.driver.run import plan_dt
-from warp_lcp.driver.scene import Scene
-from warp_lcp.driver.simulator import Recorded, simulators
+from warp_lcp.benchmarks.memory import array_bytes
+from warp_lcp.benchmarks.record import Record
+from warp_lcp.benchmarks.replay import Quality
+from warp_lcp.benchmarks.timing import Figure, Options
+from warp_lcp.run.problem_folder import ProblemFolder
+from warp_lcp.run.loop import plan_dt
+from warp_lcp.scene.scene import Scene
+from warp_lcp.simulation import Recorded, simulators
 from warp_lcp.gallery.recorded import RecordedProblem, files, load
 from warp_lcp.solvers.registry import grid_methods
 

@@ -8,10 +8,10 @@ from __future__ import annotations
 import inspect
 from pathlib import Path
 
-from benchmarks.machine import machine
-from benchmarks.record import Results
-from benchmarks.timing import Options
-from benchmarks.validation import (
+from warp_lcp.benchmarks.machine import machine
+from warp_lcp.benchmarks.record import Results
+from warp_lcp.benchmarks.timing import Options
+from warp_lcp.benchmarks.validation import (
     ceiling,
     dam_break,
     flight,
@@ -32,8 +32,8 @@ from benchmarks.validation import (
     transfers,
     volume,
 )
-from benchmarks.validation.finding import Trial, table
-from benchmarks.validation.html_page import Section, page
+from warp_lcp.benchmarks.validation.finding import Trial, table
+from warp_lcp.benchmarks.validation.html_page import Section, page
 
 TITLE = "Liquids, sand and rigid bodies against known answers"
 CHECKS = {

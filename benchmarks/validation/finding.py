@@ -7,9 +7,9 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
-from benchmarks.record import Record, Table
-from benchmarks.timing import Figure
-from warp_lcp.driver.simulator import SimulationFailed, StepFailed
+from warp_lcp.benchmarks.record import Record, Table
+from warp_lcp.benchmarks.timing import Figure
+from warp_lcp.simulation import SimulationFailed, StepFailed
 
 COLUMNS = ("check", "resolution", "figure", "measured", "bound", "as it must be?")
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any
 
-from benchmarks import svg
-from benchmarks.record import Chart, Lines, Record
-from benchmarks.validation.finding import Finding, Trial
+from warp_lcp.benchmarks import svg
+from warp_lcp.benchmarks.record import Chart, Lines, Record
+from warp_lcp.benchmarks.validation.finding import Finding, Trial
 
 STYLE = """
 :root { color-scheme: light; font-size: 15px; }

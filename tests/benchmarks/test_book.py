@@ -11,12 +11,12 @@ import scipy.optimize
 from typer.testing import CliRunner
 
 import warp_lcp as wl
-from benchmarks.book.problems import Scale, contact_matrix, contacts, definite_matrix, fluids, properly, recipe
-from benchmarks.book.robustness import FISCHER
-from benchmarks.book.sizes import exponent
-from benchmarks.book.traces import Merit, Trace, follow, judge, spread
-from benchmarks.timing import Options
-from warp_lcp.driver import cli
+from warp_lcp.benchmarks.book.problems import Scale, contact_matrix, contacts, definite_matrix, fluids, properly, recipe
+from warp_lcp.benchmarks.book.robustness import FISCHER
+from warp_lcp.benchmarks.book.sizes import exponent
+from warp_lcp.benchmarks.book.traces import Merit, Trace, follow, judge, spread
+from warp_lcp.benchmarks.timing import Options
+from warp_lcp.cli import commands as cli
 from warp_lcp.gallery.banded import banded_matrix
 
 STATUS = wl.SolveStatus

@@ -2,11 +2,11 @@
 
 import pytest
 
-from benchmarks import gpu, guard
-from benchmarks.compare import comparison, losses
-from benchmarks.record import Record, read_json, write_json
-from benchmarks.suite import ONE_THREAD, Suite
-from benchmarks.timing import Figure
+from warp_lcp.benchmarks import gpu, guard
+from warp_lcp.benchmarks.compare import comparison, losses
+from warp_lcp.benchmarks.record import Record, read_json, write_json
+from warp_lcp.benchmarks.suite import ONE_THREAD, Suite
+from warp_lcp.benchmarks.timing import Figure
 
 WIDE = 2.0  # range of the samples of a ratio from which on they tell nothing
 TRIES = 3

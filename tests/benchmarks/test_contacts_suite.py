@@ -4,8 +4,8 @@ import csv
 
 import pytest
 
-from benchmarks import contacts
-from benchmarks.timing import Options
+from warp_lcp.benchmarks import contacts
+from warp_lcp.benchmarks.timing import Options
 
 
 @pytest.fixture

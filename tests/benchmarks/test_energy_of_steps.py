@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import short_steps
-from benchmarks.energy import Ledger
-from benchmarks.validation import flight, sand_pit, tank, time_steps
-from benchmarks.validation.tank import DENSITY, SUB_CELL, VOXEL, box
+from warp_lcp.benchmarks import short_steps
+from warp_lcp.benchmarks.energy import Ledger
+from warp_lcp.benchmarks.validation import flight, sand_pit, tank, time_steps
+from warp_lcp.benchmarks.validation.tank import DENSITY, SUB_CELL, VOXEL, box
 
 LENGTHS = (0.02, 1e-6, 0.013, 1e-4, 1e-4, 0.02)  # [s]
 STILL = {"gravity": [0.0, 0.0]}

@@ -8,9 +8,9 @@ import scipy.sparse.linalg
 from typer.testing import CliRunner
 
 import warp_lcp as wl
-from benchmarks import floor
-from benchmarks.problems import splash
-from warp_lcp.driver import cli
+from warp_lcp.benchmarks import floor
+from warp_lcp.benchmarks.problems import splash
+from warp_lcp.cli import commands as cli
 
 
 @pytest.mark.parametrize("bounds", floor.BOUNDS)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.frames import format_table, share_table, waves, write_vtkhdf
+from warp_lcp.benchmarks.frames import format_table, share_table, waves, write_vtkhdf
 
 
 def test_every_format_is_measured(tmp_path):

@@ -6,14 +6,14 @@ from pathlib import Path
 import pytest
 import warp as wp
 
-import benchmarks
-from benchmarks import machine, plots
-from benchmarks.compare import bounds, comparison
-from benchmarks.memory import array_bytes, resident_bytes
-from benchmarks.record import Bars, Lines, Record, Table, read_json, write_json, write_markdown
-from benchmarks.stopwatch import timed
-from benchmarks.targets import Target, targets
-from benchmarks.timing import Figure, in_turns, ratios
+from warp_lcp import benchmarks
+from warp_lcp.benchmarks import machine, plots
+from warp_lcp.benchmarks.compare import bounds, comparison
+from warp_lcp.benchmarks.memory import array_bytes, resident_bytes
+from warp_lcp.benchmarks.record import Bars, Lines, Record, Table, read_json, write_json, write_markdown
+from warp_lcp.benchmarks.stopwatch import timed
+from warp_lcp.benchmarks.targets import Target, targets
+from warp_lcp.benchmarks.timing import Figure, in_turns, ratios
 
 
 def record(name, *samples, **facts):

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from benchmarks import scaling, side_by_side
-from benchmarks.compare import comparison
-from benchmarks.record import Record, write_json
-from benchmarks.side_by_side import side_by_side as beside
-from benchmarks.timing import Figure
-from warp_lcp.driver import cli
+from warp_lcp.benchmarks import scaling, side_by_side
+from warp_lcp.benchmarks.compare import comparison
+from warp_lcp.benchmarks.record import Record, write_json
+from warp_lcp.benchmarks.side_by_side import side_by_side as beside
+from warp_lcp.benchmarks.timing import Figure
+from warp_lcp.cli import commands as cli
 
 
 def test_exponent_is_that_of_a_power_law():

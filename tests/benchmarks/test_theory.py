@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import warp_lcp as wl
-from benchmarks import theory
+from warp_lcp.benchmarks import theory
 from warp_lcp import reformulate
 
 DOCS = Path(__file__).parents[2] / "docs"

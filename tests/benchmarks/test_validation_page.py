@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-import benchmarks
-from benchmarks import svg
-from benchmarks.record import Lines, Record
-from benchmarks.validation import CHECKS, KNOWN
-from benchmarks.validation.finding import Findings, Trial, attempt
-from benchmarks.validation.html_page import Section, page
-from warp_lcp.driver.simulator import StepFailed
+from warp_lcp import benchmarks
+from warp_lcp.benchmarks import svg
+from warp_lcp.benchmarks.record import Lines, Record
+from warp_lcp.benchmarks.validation import CHECKS, KNOWN
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.validation.html_page import Section, page
+from warp_lcp.simulation import StepFailed
 
 MACHINE = Record(
     "machine", {}, {"date": "2030-01-02 03:04 UTC", "hardware": {"cpu": "Z80", "device": "cpu"}, "versions": {"warp-lang": "9"}}
