@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_lcp import SolveStatus
 from warp_lcp.benchmarks.validation import sand_hourglass, sand_pit, tank
 from warp_lcp.granular import stress_kernels
 from warp_lcp.granular.coupled import AcceleratedProjection, CoupledOutcome
 from warp_lcp.granular.simulator import SandSimulation
 from warp_lcp.granular.stress import Stress
 from warp_lcp.granular.yield_set import HOLDS
-from warp_lcp import SolveStatus
 from warp_lcp.rows import RowPass
 
 SILO_WIDTH = 0.2  # [m]

@@ -81,7 +81,17 @@ def _started(count: int, sizes: Sequence[int], options: Options) -> list[Record]
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "records.json"
         asked = [part for n in sizes for part in ("--size", str(n))]
-        arguments = ["-m", "warp_lcp.benchmarks.on_ranks", *asked, "--repeat", str(options.repeat), "--device", options.device, "--out", str(file)]
+        arguments = [
+            "-m",
+            "warp_lcp.benchmarks.on_ranks",
+            *asked,
+            "--repeat",
+            str(options.repeat),
+            "--device",
+            options.device,
+            "--out",
+            str(file),
+        ]
         waiting = {"OMPI_MCA_mpi_yield_when_idle": str(int(count > (os.cpu_count() or 1)))}  # to give cores away costs microseconds
         process = subprocess.run(launch.command(count, *arguments), env=launch.environment() | waiting, check=False)
         if process.returncode != 0:

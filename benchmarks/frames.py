@@ -18,12 +18,12 @@ import numpy as np
 
 from warp_lcp.frames.atomic import replacing
 from warp_lcp.frames.nvdb import write_nvdb
-from warp_lcp.run.profile import Profile
-from warp_lcp.run.loop import run_scene
-from warp_lcp.scene.scene_file import load_scene
-from warp_lcp.simulation import Cells, Volume
 from warp_lcp.frames.vti import write_vti
 from warp_lcp.frames.vtu import write_vtu
+from warp_lcp.run.loop import run_scene
+from warp_lcp.run.profile import Profile
+from warp_lcp.scene.scene_file import load_scene
+from warp_lcp.simulation import Cells, Volume
 
 SEED = 977
 NO_FRAMES = tuple(f"output.{part}=false" for part in ("particles", "grid", "surface", "volume"))

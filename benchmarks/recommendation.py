@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.recommendation_problems import DEVICE, FAMILIES, make
 from warp_lcp import gallery
+from warp_lcp.benchmarks.recommendation_problems import DEVICE, FAMILIES, make
 
 RESULTS = Path(__file__).parent / "results" / "amd-epyc"
 WITHIN = 1.5  # times the best measured method

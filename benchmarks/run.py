@@ -19,10 +19,10 @@ from warp_lcp.benchmarks.record import Bars, Record, Results, Table
 from warp_lcp.benchmarks.stopwatch import timed
 from warp_lcp.benchmarks.timing import Figure, Options
 from warp_lcp.material import particle_simulation
+from warp_lcp.material.boundary import WholeCells
 from warp_lcp.run.loop import run_scene
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.simulation import simulators
-from warp_lcp.material.boundary import WholeCells
 
 TITLE = "Runs of built-in scenes"
 SCENES = {"dam-break-2d": 0.3, "dam-break": 0.2}  # [s] simulated

@@ -11,12 +11,12 @@ from typing import Any
 from warp_lcp.benchmarks.machine import machine
 from warp_lcp.benchmarks.record import Record, Results, Table
 from warp_lcp.benchmarks.timing import Figure, Options
+from warp_lcp.run.trial import trial
+from warp_lcp.run.tune import CORRECTED_EVERY, FRAMES, Tuning, tune
 from warp_lcp.scene.presets import PresetName, Prices, changed, price_table
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.simulation import SimulationFailed, StepFailed
-from warp_lcp.run.trial import trial
-from warp_lcp.run.tune import CORRECTED_EVERY, FRAMES, Tuning, tune
 
 TITLE = "Tuned settings against the best of all"
 ACCURACY: PresetName = "standard"

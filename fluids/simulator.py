@@ -15,6 +15,11 @@ from warp_lcp.fluids.pressure import PressureProjection, Projection
 from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.fluids.surface import FreeSurface, GhostFluidSurface, NoSurface, WholeCellSurface
 from warp_lcp.fluids.unilateral import UnilateralPressure
+from warp_lcp.grid.particles import Particles
+from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.material.boundary import Boundary, CutBoundary
+from warp_lcp.material.boundary_kernels import RELEASED, TOUCHES_NOTHING
+from warp_lcp.material.narrow_band import NarrowBand
 from warp_lcp.material.particle_assembly import (
     make_bodies,
     make_boundary,
@@ -25,15 +30,10 @@ from warp_lcp.material.particle_assembly import (
     placed_solids,
 )
 from warp_lcp.material.particle_simulation import ParticleSimulation, Row
-from warp_lcp.scene.scene import Scene
-from warp_lcp.simulation import Cells, Part, SimulationFailed, missed_by_far
-from warp_lcp.grid.particles import Particles
-from warp_lcp.grid.staggered import StaggeredGrid, Window
-from warp_lcp.material.boundary import Boundary, CutBoundary
-from warp_lcp.material.boundary_kernels import RELEASED, TOUCHES_NOTHING
-from warp_lcp.material.narrow_band import NarrowBand
 from warp_lcp.material.sources import Outlets, Sources
 from warp_lcp.rigid.bodies import RigidBodies
+from warp_lcp.scene.scene import Scene
+from warp_lcp.simulation import Cells, Part, SimulationFailed, missed_by_far
 
 
 def make_surface(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, band: NarrowBand | None) -> FreeSurface:
@@ -84,8 +84,8 @@ def stays_full(scene: LiquidScene, boundary: Boundary) -> bool:
 
 
 if TYPE_CHECKING:
-    from warp_lcp.fluids.distributed import DistributedLiquid
     from warp_lcp.distributed.ranks import Ranks
+    from warp_lcp.fluids.distributed import DistributedLiquid
 
 
 class LiquidSimulation(ParticleSimulation):

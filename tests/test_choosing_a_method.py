@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.method_exponents import MATRICES, outcome
 from warp_lcp import reformulate
+from warp_lcp.benchmarks.method_exponents import MATRICES, outcome
 from warp_lcp.recommend import RULES
 
 DOCS = Path(__file__).parents[1] / "docs"

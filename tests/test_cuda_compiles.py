@@ -12,9 +12,9 @@ import pytest
 import scipy.sparse
 import warp as wp
 
-from warp_lcp import fluids
-from warp_lcp import granular
 import warp_lcp as wl
+from warp_lcp import fluids, granular
+from warp_lcp.distributed.petsc_matrix import ENTER, LEAVE
 from warp_lcp.fluids.pressure import pressure_passes
 from warp_lcp.granular.bodies_kernels import body_kernels
 from warp_lcp.granular.checkerboard import damping_pass
@@ -22,7 +22,6 @@ from warp_lcp.granular.cut_walls_kernels import traction_pass
 from warp_lcp.granular.interleaved_kernels import interleaved_passes
 from warp_lcp.granular.report_kernels import report_pass
 from warp_lcp.granular.stress_kernels import stress_passes
-from warp_lcp.distributed.petsc_matrix import ENTER, LEAVE
 from warp_lcp.grid.advection import CENTERS, advect_pass, carry_pass, distance_pass
 from warp_lcp.grid.sides import ring_kernels
 from warp_lcp.grid.transfer import transfer_passes

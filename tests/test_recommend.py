@@ -5,9 +5,9 @@ import pytest
 import scipy.sparse
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.recommendation_problems import FAMILIES, make
 from oracle import natural_residual
 from warp_lcp import gallery
+from warp_lcp.benchmarks.recommendation_problems import FAMILIES, make
 from warp_lcp.recommend import MEMORY, RULES, memory_of
 from warp_lcp.traits import traits_of
 

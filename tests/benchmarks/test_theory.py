@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import warp_lcp as wl
-from warp_lcp.benchmarks import theory
 from warp_lcp import reformulate
+from warp_lcp.benchmarks import theory
 
 DOCS = Path(__file__).parents[2] / "docs"
 TEXT = (DOCS / "theory.md").read_text()

@@ -8,8 +8,8 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.small_problems import FAMILIES, SmallProblem, option, plain_active_set, stepped, string
 from oracle import boxed, lemke, natural_residual
+from warp_lcp.benchmarks.small_problems import FAMILIES, SmallProblem, option, plain_active_set, stepped, string
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.solvers.lemke import BandedBasis, Basis
 

@@ -12,8 +12,8 @@ import scipy.io
 import scipy.sparse
 from rich.table import Table
 
-from warp_lcp.frames.atomic import replacing
 from warp_lcp.cli.matrix_market import MarketError, read_market
+from warp_lcp.frames.atomic import replacing
 from warp_lcp.nearest import nearest
 from warp_lcp.operators import DenseOperator, SparseOperator
 from warp_lcp.problem import LCP

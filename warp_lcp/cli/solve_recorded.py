@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warp_lcp.frames.atomic import replacing
 from warp_lcp.cli.solve_file import Outcome, ProblemError, criteria, method_named
+from warp_lcp.frames.atomic import replacing
 from warp_lcp.gallery.recorded_part import cell_counts, load_part
 from warp_lcp.operators import GridPoisson
 from warp_lcp.problem import LCP

@@ -10,12 +10,6 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.material.particle_assembly import make_particle_volume, make_surface_mesh
-from warp_lcp.material.particle_rearrangement import Rearrangement
-from warp_lcp.material.particle_scene import ParticleScene
-from warp_lcp.material.particle_state import check_state, other_spacing, particle_trouble, signature
-from warp_lcp.run.profile import NoStopwatch, Stopwatch
-from warp_lcp.simulation import Points, SimulationFailed, Surface, Volume
 from warp_lcp.grid.particles import MARGIN, Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.surface_mesh import Interior, faces_from_particles, sample
@@ -24,9 +18,15 @@ from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.flight import Flights
 from warp_lcp.material.gravity import accelerate
 from warp_lcp.material.narrow_band import NarrowBand, without_band
+from warp_lcp.material.particle_assembly import make_particle_volume, make_surface_mesh
+from warp_lcp.material.particle_rearrangement import Rearrangement
+from warp_lcp.material.particle_scene import ParticleScene
+from warp_lcp.material.particle_state import check_state, other_spacing, particle_trouble, signature
 from warp_lcp.material.resample import resampled, resampling_notes
 from warp_lcp.material.sources import Drain, Outlets, Source, Sources
 from warp_lcp.rigid.bodies import RigidBodies
+from warp_lcp.run.profile import NoStopwatch, Stopwatch
+from warp_lcp.simulation import Points, SimulationFailed, Surface, Volume
 
 Row = dict[str, float | int | str | None]  # of the log
 
