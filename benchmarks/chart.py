@@ -1,4 +1,4 @@
-"""The chart of the README from a kept result: `python -m warp_lcp.benchmarks.chart benchmarks/results/MACHINE/peers.json docs/peers.png`."""
+"""The chart of the README from a kept result: `python -m warp_lcp.benchmarks.chart results/MACHINE/peers.json docs/peers.png`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Deep sand that yields: which steps reach their tolerance, and what stalls the others. `python -m warp_lcp.benchmarks.deep_sand --out out/deep`.
+"""Deep sand that yields: which steps reach their tolerance, and what stalls the others. `python -m benchmarks.deep_sand --out out/deep`.
 
 Random hourglasses, silos and columns by `--seed`; without one, those of the validation and neighbors.
 """

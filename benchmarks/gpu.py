@@ -1,4 +1,4 @@
-"""All that there is to do on a machine with a CUDA device: `python -m warp_lcp.benchmarks.gpu --out DIR`. A wheel's dependencies are enough.
+"""All that there is to do on a machine with a CUDA device: `python -m benchmarks.gpu --out DIR`. A wheel's dependencies are enough.
 
 Solves on both devices are compared, the CUDA tests run where the source tree and pytest are there, the suites measure the device and the
 CPU beside it, and DIR/gpu.md says how each part ended.
@@ -101,7 +101,7 @@ def _attempt(name: str, work: Callable[[], list[Part]]) -> list[Part]:
 
 def main(arguments: list[str] | None = None) -> None:
     """Do everything and write gpu.md."""
-    parser = argparse.ArgumentParser(prog="python -m warp_lcp.benchmarks.gpu", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.gpu", description=__doc__)
     parser.add_argument("--device", default="cuda:0")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--size", type=int, action="append", default=[], help="of the suites, instead of their own")

@@ -341,7 +341,7 @@ def main() -> None:
     results = measure(options, Path())
     compared = importlib.import_module("warp_lcp.benchmarks.automatic_tolerance").measure(options, Path())
     head = "# What models add to a step and to memory, by simulator and dimension; written by `python -m warp_lcp.benchmarks.models`.\n\n"
-    Path(str(files("warp_lcp.driver") / TABLE)).write_text(head + tomli_w.dumps(price_list(results.records)), "utf-8")
+    Path(str(files("warp_lcp.scene") / TABLE)).write_text(head + tomli_w.dumps(price_list(results.records)), "utf-8")
     prices.cache_clear()
     results.tables.extend(importlib.import_module("warp_lcp.benchmarks.predictions").measure(options, Path()).tables)
     write_page(given.page, results, compared.tables[0])

@@ -1,8 +1,8 @@
 """How good `wl.recommend` is: every method on random problems, and the time of the recommended one beside the best.
 
-python -m warp_lcp.benchmarks.recommendation measure train 0 4      seeds 0 ... 3 of every family, and 100 ... 108: what the rules were made from
-python -m warp_lcp.benchmarks.recommendation measure check 200 209  seeds that no rule has seen
-python -m warp_lcp.benchmarks.recommendation report                 the share of problems within 1.5 x of the best, CSV and Markdown
+python -m benchmarks.recommendation measure train 0 4      seeds 0 ... 3 of every family, and 100 ... 108: what the rules were made from
+python -m benchmarks.recommendation measure check 200 209  seeds that no rule has seen
+python -m benchmarks.recommendation report                 the share of problems within 1.5 x of the best, CSV and Markdown
 """
 
 from __future__ import annotations
@@ -206,7 +206,7 @@ def report(train: Sequence[Verdict], check: Sequence[Verdict]) -> str:
     lines = [
         "# How good `wl.recommend` is",
         "",
-        "`python -m warp_lcp.benchmarks.recommendation report`, from `recommendation-train.csv` and `recommendation-check.csv`: all methods of",
+        "`python -m benchmarks.recommendation report`, from `recommendation-train.csv` and `recommendation-check.csv`: all methods of",
         "`wl.METHODS` with their default settings, CPU time of set-up and solve on one core of a shared, busy AMD EPYC, the median of",
         f"{REPEAT} in turns. A choice is right if it converges within {WITHIN} x the best method's time, or is no more than",
         f"{1e3 * NOISE:g} ms slower. Direct methods were not tried beyond 1000 unknowns. A recommendation's own time is not counted.",

@@ -1,6 +1,6 @@
 """Two results of one suite on different devices in one table, each beside its own machine's copy bandwidth.
 
-`python -m warp_lcp.benchmarks.side_by_side A.json B.json --out DIR` writes DIR/side-by-side.md; `warp-lcp bench SUITE --compare` shows the rows too.
+`python -m benchmarks.side_by_side A.json B.json --out DIR` writes DIR/side-by-side.md; `warp-lcp bench SUITE --compare` shows the rows too.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def plain(table: Table) -> str:
 
 def main(arguments: list[str] | None = None) -> None:
     """Write the report of two files."""
-    parser = argparse.ArgumentParser(prog="python -m warp_lcp.benchmarks.side_by_side", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.side_by_side", description=__doc__)
     parser.add_argument("a", type=Path)
     parser.add_argument("b", type=Path)
     parser.add_argument("--out", type=Path, required=True)

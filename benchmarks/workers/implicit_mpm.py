@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 from newton.solvers import SolverImplicitMPM
 
-from warp_lcp.benchmarks.workers.exchange import Reply, Request, serve
+from .exchange import Reply, Request, serve
 
 ITERATION = re.compile(r"iteration #(\d+)|after (\d+) iterations")
 LOGGER = "newton._src.solvers.implicit_mpm.solve_rheology"

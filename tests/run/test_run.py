@@ -19,11 +19,11 @@ from warp_lcp.run import loop as run_module
 from warp_lcp.run.checkpoint import CheckpointFolder
 from warp_lcp.run.folder import OutputError, RunRecord
 from warp_lcp.run.loop import plan_dt, run_scene
-from warp_lcp.run.profile import NoStopwatch, Profile
+from warp_lcp.run.profile import Profile
 from warp_lcp.run.progress import Lines
 from warp_lcp.scene.scene import SceneError, Time
 from warp_lcp.scene.scene_file import load_scene
-from warp_lcp.simulation import SimulationFailed, StepFailed
+from warp_lcp.simulation import NoStopwatch, SimulationFailed, StepFailed
 
 VOLATILE = "seconds"  # the log's only column that a repetition does not repeat
 

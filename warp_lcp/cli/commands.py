@@ -14,7 +14,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 import warp as wp
 
-from warp_lcp.cli.solve_file import Outcome, ProblemError, solve_files
+from warp_lcp.cli.solve_file import Outcome, solve_files
 from warp_lcp.cli.solve_recorded import SUFFIX, check_recorded, file_digest, solve_recorded
 from warp_lcp.cli.suites import benchmarks
 from warp_lcp.material.particle_scene import ParticleScene
@@ -30,11 +30,12 @@ from warp_lcp.run.engine import Engine, EngineError, EngineOption
 from warp_lcp.run.folder import OutputError, RunRecord, mark_stopped
 from warp_lcp.run.interruption import Interrupted, Interruption
 from warp_lcp.run.launcher import crew_of, default_folder
+from warp_lcp.run.problem_folder import ProblemError
 from warp_lcp.run.profile import Profile
 from warp_lcp.run.progress import Bar, Lines
 from warp_lcp.run.terminal import Commands, Terminal, say, tell
 from warp_lcp.run.tune import FRAMES, Tuning, tune, write_tuned
-from warp_lcp.run.versions import shadowing_distributions, versions
+from warp_lcp.run.versions import versions
 from warp_lcp.scene.presets import PresetName
 from warp_lcp.scene.scene_file import built_in_scenes, installed_simulators, load_scene
 from warp_lcp.scene.table import SceneError
@@ -383,8 +384,6 @@ def info() -> None:
     lines += [(f"device {alias}", text) for alias, text in devices().items()]
     lines += [("CUDA driver", cuda_driver()), ("kernel cache", str(wp.config.kernel_cache_dir))]
     _print_pairs(lines)
-    for other in shadowing_distributions():
-        tell(f"warning: the distribution {other} installs a package that has a simulator's name; uninstall it", error=True)
     with _wrong_input():
         _print_pairs([(f"simulator {name}", simulator.summary) for name, simulator in installed_simulators().items()])
 

@@ -25,8 +25,7 @@ from warp_lcp.material.particle_state import check_state, other_spacing, particl
 from warp_lcp.material.resample import resampled, resampling_notes
 from warp_lcp.material.sources import Drain, Outlets, Source, Sources
 from warp_lcp.rigid.bodies import RigidBodies
-from warp_lcp.run.profile import NoStopwatch, Stopwatch
-from warp_lcp.simulation import Points, SimulationFailed, Surface, Volume
+from warp_lcp.simulation import NoStopwatch, Points, SimulationFailed, Stopwatch, Surface, Volume
 
 Row = dict[str, float | int | str | None]  # of the log
 
@@ -60,7 +59,7 @@ class ParticleSimulation(ABC):
     Rigid bodies take part by themselves: `begin_step` starts their step and `move` ends it. In between the subclass gives them the impulses
     of its solve, or calls `restore_bodies` if it fails.
 
-    With `boundary`, `particles`, `sources`, `outlets` and `bodies` of `warp_lcp.material.particle_assembly` it has a Simulation's clock, time
+    With `boundary`, `particles`, `sources`, `outlets` and `bodies` of `particle_assembly` it has a Simulation's clock, time
     step, checkpoints, resampling, notes and columns; `step` and `frame` are the subclass's.
 
     Args:

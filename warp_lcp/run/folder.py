@@ -24,13 +24,12 @@ from warp_lcp.run.continuation import MAY_CHANGE, RESOLUTION, Change, difference
 from warp_lcp.run.folder_lock import LOCK, FolderBusyError, locked
 from warp_lcp.run.gaps import gaps
 from warp_lcp.run.log import Log
-from warp_lcp.run.profile import Stopwatch
 from warp_lcp.run.versions import versions
 from warp_lcp.scene.foreign import one_line
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import dump_scene, keys, load_scene, table_keys
 from warp_lcp.scene.table import SceneError
-from warp_lcp.simulation import Part
+from warp_lcp.simulation import Part, Stopwatch
 
 Status = Literal["running", "finished", "stopped", "failed"]
 

@@ -16,13 +16,14 @@ from warp_lcp.run.folder import BEFORE, Continuation, OutputError, RunFolder, Ru
 from warp_lcp.run.interruption import Interrupted
 from warp_lcp.run.log import Log, Value
 from warp_lcp.run.problem_folder import ProblemFolder
-from warp_lcp.run.profile import NoStopwatch, Profile, Stopwatch
+from warp_lcp.run.profile import Profile
 from warp_lcp.run.progress import Observer, missed, residual_of
 from warp_lcp.scene.scene import Scene, Time
 from warp_lcp.scene.table import Problem, SceneError
 from warp_lcp.simulation import (
     Cells,
     Joined,
+    NoStopwatch,
     Part,
     Points,
     Profiled,
@@ -32,6 +33,7 @@ from warp_lcp.simulation import (
     Simulation,
     SimulationFailed,
     StepFailed,
+    Stopwatch,
     Surface,
     Volume,
 )

@@ -16,9 +16,8 @@ from warp_lcp.run.folder import CHECKPOINTS, RECORD, Continuation, OutputError, 
 from warp_lcp.run.log import Log, Value
 from warp_lcp.run.parallel_checkpoint import ParallelCheckpoints
 from warp_lcp.run.parallel_frames import ParallelFrames, ParallelFrameWriter
-from warp_lcp.run.profile import Stopwatch
 from warp_lcp.scene.scene import Scene
-from warp_lcp.simulation import Part
+from warp_lcp.simulation import Part, Stopwatch
 
 
 class ParallelLog(Log):

@@ -14,6 +14,10 @@ from warp_lcp.run.folder import OutputError
 README = "README.md"
 
 
+class ProblemError(ValueError):
+    """The files do not make a problem, or the method does not take it; the message names the file or the option."""
+
+
 class ProblemFolder:
     """Files `problem_<step>.npz` and a README.md that says what they hold.
 

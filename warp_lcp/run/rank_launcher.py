@@ -13,7 +13,6 @@ from typing import Any
 import typer
 import warp as wp
 
-from warp_lcp.cli.solve_file import ProblemError
 from warp_lcp.distributed.meeting import Meeting, RankFailed
 from warp_lcp.distributed.ranks import Ranks, device_of_rank
 from warp_lcp.run.continuation import mesh_digests
@@ -23,6 +22,7 @@ from warp_lcp.run.folder import OutputError, RunFolder, RunRecord
 from warp_lcp.run.given_scene import GivenScene
 from warp_lcp.run.launcher import Crew
 from warp_lcp.run.parallel_run import run_on_ranks
+from warp_lcp.run.problem_folder import ProblemError
 from warp_lcp.run.profile import Profile
 from warp_lcp.run.progress import Observer
 from warp_lcp.run.terminal import Terminal, say, tell
