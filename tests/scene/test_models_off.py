@@ -156,7 +156,7 @@ CASES = {
     ),
     "outlets": Case(
         {"drain": [small_liquids.box([0.0, 0.0], [0.1, 0.1])]}, modules=("warp_lcp.material.outlets",),
-        files=("warp_lcp/material/outlets.py",), columns=("drained",),
+        files=("warp_lcp/material/sources.py",), columns=("drained",),
     ),
     "surface mesh": Case(
         {"output": QUIET | {"surface": True}}, modules=("warp_lcp.grid.surface_mesh", "warp_lcp.grid.marching_cubes"),
