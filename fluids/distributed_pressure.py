@@ -71,7 +71,7 @@ class DistributedPressure(PressureProjection):
         self._problem = wl.LCP(self._operator, self._rhs, -np.inf if self._box_lower is None else self._box_lower, np.inf)
         self._work = self.solver.init(self._problem)
 
-    def _update(self, cells: wp.array) -> None:
+    def _update(self) -> None:
         self._copy_to_box()
         self._operator.update(self._box_kind)
 

@@ -145,8 +145,10 @@ class PressureProjection:
         self.kind, self.shown, self.contact = grid.field(wp.int8), grid.field(wp.int8), grid.field(wp.uint8)
         self.pressure, self.known = grid.field(wp.float64), grid.faces(wp.int8)
         wp.copy(self.kind, boundary.base)
+        self._cells = self.kind  # FLUID where there is an unknown
         self._b, self._start = (grid.field(wp.float64) for _ in range(2))
         self._lower = wp.full(grid.shape, -np.inf, dtype=wp.float64, device=grid.device) if lets_go else None
+        self._least: Any = -np.inf if self._lower is None else self._lower
         self._shift = grid.field() if phi is not None or boundary.open_sides else None
         self._sums = wp.zeros((*grid.shape[:2], 2), dtype=wp.float64, device=grid.device)
         self._solved, self._rhs, self._guess = grid.domain, self._b, self._start  # what is solved for
@@ -173,7 +175,7 @@ class PressureProjection:
             return 0
         problem = {"previous": self.pressure, "b": self._b, "lower": self._lower, "start": self._start, "shift": self._shift}
         self._solved.run(self._passes.prepare, **self._liquid(velocity), **problem, ratio=self._ratio)
-        self._update(self.kind)
+        self._update()
         return unknowns
 
     def leave(self) -> Projection:
@@ -190,20 +192,20 @@ class PressureProjection:
 
     def _make_problem(self) -> None:
         faces = {f"face_{axis}": field for axis, field in zip("xyz", self.boundary.open, strict=False)}
-        cells = self.grid.interior(self.kind.numpy())
+        cells = self.grid.interior(self._cells.numpy())
         self._operator = wl.GridPoisson(cells, shift=self._shift, device=self.grid.device, **faces)
-        self._problem = wl.LCP(self._joined(), self._b, -np.inf if self._lower is None else self._lower, np.inf)
+        self._problem = wl.LCP(self._joined(), self._b, self._least, np.inf)
         self._work = self.solver.init(self._problem)
 
     def _joined(self) -> wl.GridPoisson | wl.SumOperator:
         """Return the operator, with the bodies' term if there are bodies."""
         return self._operator if self.coupling is None else self.coupling.join(self._operator)
 
-    def _update(self, cells: wp.array) -> None:
+    def _update(self) -> None:
         """Take the cells, and where bodies meet them."""
-        self._operator.update(cells)
+        self._operator.update(self._cells)
         if self.coupling is not None:
-            self.coupling.take(cells)
+            self.coupling.take(self._cells)
 
     def _faces(self) -> dict[str, Any]:
         """Return what passes take of cells, solids and surface."""
@@ -295,8 +297,9 @@ class PressureProjection:
         return Projection(result, unknowns, int(released), worst)
 
     def unknowns(self) -> int:
-        """Return the number of FLUID cells."""
-        return self._count(self.kind)
+        """Return the number of unknowns."""
+        self._solved.run(COUNT, whole=True, kind=self._cells, sums=self._sums)
+        return int(self._found()[0])
 
     def not_finite(self) -> np.ndarray:
         """Return the cells (x, y, z), counted from 0, whose right-hand side is not finite, shape (n, 3)."""
@@ -336,11 +339,6 @@ class PressureProjection:
         for axis, (field, weight, known) in enumerate(zip(velocity, self._weights, self.known, strict=False)):
             faces = self._faces() | {"x": self.pressure, "field": field, "known": known, "weight": weight}
             window.run(self._passes.support, axis=axis, limit=self._gravity * self._last, **faces)
-
-    def _count(self, kind: wp.array) -> int:
-        """Return the number of cells that are FLUID in a field."""
-        self._solved.run(COUNT, whole=True, kind=kind, sums=self._sums)
-        return int(self._found()[0])
 
     def _take(self, x: wp.array) -> None:
         """Take the solution of the problem as the pressure."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 import warp as wp
@@ -15,6 +15,7 @@ from warp_lcp.fluids.pressure import PressureProjection, Projection
 from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.fluids.surface import FreeSurface, GhostFluidSurface, NoSurface, WholeCellSurface
 from warp_lcp.fluids.unilateral import UnilateralPressure
+from warp_lcp.grid.level_set import Fill
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary, CutBoundary
@@ -36,15 +37,32 @@ from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import Cells, Part, SimulationFailed, missed_by_far
 
 
-def make_surface(scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, band: NarrowBand | None) -> FreeSurface:
-    """Return the free surface that a scene asks for, around particles that are everywhere or in a band."""
-    if stays_full(scene, boundary):
-        return NoSurface(grid, boundary)
+def make_surface(
+    scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, fill: Fill | None = None, counted: Window | None = None
+) -> FreeSurface:
+    """Return the free surface that a scene asks for.
+
+    Args:
+        scene: the scene.
+        grid: its grid.
+        boundary: its solids.
+        fill: adds to the particles' density what none of them stands for, as where they are in a band alone.
+        counted: cells whose volume is asked for; None: all.
+    """
+    if scene.stays_full and not boundary.velocity:  # walls that a caller moves might make room
+        return NoSurface(grid, boundary, counted)
     count = scene.particles.per_axis**grid.dimension
     if scene.pressure.surface == "ghost-fluid":
-        fill = band.fill if band is not None else None
-        return GhostFluidSurface(grid, boundary, particles_a_cell=count, smoothing=scene.pressure.smoothing, fill=fill)
-    return WholeCellSurface(grid, boundary, particles_a_cell=count)
+        smoothing = scene.pressure.smoothing
+        return GhostFluidSurface(grid, boundary, particles_a_cell=count, smoothing=smoothing, fill=fill, counted=counted)
+    return WholeCellSurface(grid, boundary, particles_a_cell=count, fill=fill)
+
+
+def pressure_settings(scene: LiquidScene, surface: FreeSurface, weights: list[wp.array]) -> dict[str, Any]:
+    """Return what a scene sets of `PressureProjection`, with the weights of the particles on each component's faces."""
+    settings, gravity = scene.solver, float(np.linalg.norm(scene.physics.gravity))
+    resting = {"lets_go": scene.lets_go, "weights": weights if scene.short_steps else None, "phi": surface.phi}
+    return {"tolerance": settings.tolerance, "max_iterations": settings.max_iterations, "gravity": gravity} | resting
 
 
 def make_pressure(
@@ -60,27 +78,15 @@ def make_pressure(
         weights: those of the particles on each component's faces.
         bodies: those that the liquid moves, among the solids; None: there are none.
     """
-    settings = scene.solver
-    solver = wl.METHODS[settings.method](precision=settings.precision)
-    coupling = None
+    solver = wl.METHODS[scene.solver.method](precision=scene.solver.precision)
+    coupling, settings = None, pressure_settings(scene, surface, weights)
     if bodies is not None:
         assert isinstance(boundary, CutBoundary), "a scene with bodies has cut cells"
         coupling = BodyCoupling(grid, boundary, bodies, scene.physics.density)
-    gravity = float(np.linalg.norm(scene.physics.gravity))
     if isinstance(surface, GhostFluidSurface) and scene.pressure.model == "unilateral":
-        return UnilateralPressure(
-            grid, boundary, solver, level_set=surface.level_set, weights=weights, tolerance=settings.tolerance,
-            max_iterations=settings.max_iterations, coupling=coupling, gravity=gravity,
-        )  # fmt: skip
-    return PressureProjection(
-        grid, boundary, solver, tolerance=settings.tolerance, max_iterations=settings.max_iterations, phi=surface.phi, coupling=coupling,
-        lets_go=scene.lets_go, weights=weights if scene.short_steps else None, gravity=gravity,
-    )  # fmt: skip
-
-
-def stays_full(scene: LiquidScene, boundary: Boundary) -> bool:
-    """Return whether every cell is liquid for ever: walls that a caller moves might make room."""
-    return scene.stays_full and not boundary.velocity
+        settings = {name: settings[name] for name in ("tolerance", "max_iterations", "gravity")} | {"level_set": surface.level_set}
+        return UnilateralPressure(grid, boundary, solver, weights=weights, coupling=coupling, **settings)
+    return PressureProjection(grid, boundary, solver, coupling=coupling, **settings)
 
 
 if TYPE_CHECKING:
@@ -132,7 +138,7 @@ class LiquidSimulation(ParticleSimulation):
         self.mark()
 
     def _surface(self) -> FreeSurface:
-        return make_surface(self.scene, self.grid, self.boundary, self.band)
+        return make_surface(self.scene, self.grid, self.boundary, self.band.fill if self.band is not None else None)
 
     def _pressure(self) -> PressureProjection:
         return make_pressure(self.scene, self.grid, self.boundary, self.surface, self.weights, self.bodies)

@@ -142,14 +142,18 @@ class GhostFluidSurface:
         particles_a_cell: of liquid at rest.
         smoothing: binomial passes over the density: quieter, and less accurate in thin sheets.
         fill: adds to the density what no particle stands for.
+        counted: cells whose volume is asked for; None: all.
     """
 
-    def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int, smoothing: int, fill: Fill | None = None) -> None:
+    def __init__(
+        self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int, smoothing: int, fill: Fill | None = None,
+        counted: Window | None = None,
+    ) -> None:  # fmt: skip
         self.grid, self.boundary, self._fill = grid, boundary, fill
         self.level_set = LevelSet(grid, particles_a_cell=particles_a_cell, smoothing=smoothing)
         self.phi: wp.array | None = self.level_set.phi
         self.density: wp.array | None = self.level_set.density
-        self._window = grid.everywhere
+        self._window, self._counted = grid.everywhere, counted or grid.domain
 
     def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
         """Write the cells' kinds: FLUID below the surface."""
@@ -164,7 +168,8 @@ class GhostFluidSurface:
 
     def volume(self, cells: int) -> float:
         """Return the volume inside the surface."""
-        return self.level_set.volume(self.boundary.distance, self._window)
+        window = self._window.common(self._counted)
+        return 0.0 if window is None else self.level_set.volume(self.boundary.distance, window)
 
 
 def _open_shares(grid: StaggeredGrid, boundary: Boundary) -> np.ndarray:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from types import TracebackType
+from types import SimpleNamespace
 from typing import Any
 
 from warp_lcp.distributed.ranks import Ranks
@@ -77,15 +77,15 @@ class Meeting:
     @classmethod
     def of_one(cls) -> Meeting:
         """Return the meeting of a process that has no others, which needs no MPI."""
-        return cls(Ranks(_Alone()))
+        return cls(Ranks(SimpleNamespace(rank=0, size=1, allgather=lambda value: [value], bcast=lambda value: value)))
 
     def together(self) -> AbstractContextManager[None]:
         """Return the context of what all ranks do."""
-        return _Block(self, named=True)
+        return self._block(named=True)
 
     def led(self) -> AbstractContextManager[None]:
         """Return the context of what the first rank does for all; its message speaks for itself."""
-        return _Block(self, named=False)
+        return self._block(named=False)
 
     def exchange(self, value: Any) -> list[Any]:
         """Return what each rank has given."""
@@ -95,11 +95,17 @@ class Meeting:
         """Return what the first rank has given."""
         return self._comm.bcast(value)
 
-    def enter(self) -> None:
-        """Begin a block, perhaps inside another."""
+    @contextmanager
+    def _block(self, *, named: bool) -> Iterator[None]:
         self._depth += 1
+        try:
+            yield
+        except BaseException as error:
+            self._leave(error, named=named)
+            raise
+        self._leave(None, named=named)
 
-    def leave(self, error: BaseException | None, *, named: bool) -> None:
+    def _leave(self, error: BaseException | None, *, named: bool) -> None:
         """End a block.
 
         Args:
@@ -156,33 +162,6 @@ class Meeting:
         text = str(error) if isinstance(error, self._planned) else "".join(traceback.format_exception(error)).rstrip()
         self.last_words(f"rank {self.ranks.rank} of {self.ranks.size}: {text}\nall ranks end")
         self._comm.Abort(1)
-
-
-class _Block:
-    """A block of a meeting."""
-
-    def __init__(self, meeting: Meeting, *, named: bool) -> None:
-        self._meeting, self._named = meeting, named
-
-    def __enter__(self) -> None:
-        self._meeting.enter()
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self._meeting.leave(error, named=self._named)
-
-
-class _Alone:
-    """A communicator of one rank."""
-
-    rank, size = 0, 1
-
-    def allgather(self, value: Any) -> list[Any]:
-        """Return what the only rank has given."""
-        return [value]
-
-    def bcast(self, value: Any) -> Any:
-        """Return what the only rank has given."""
-        return value
 
 
 def _done(request: Any) -> bool:
