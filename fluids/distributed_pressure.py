@@ -53,7 +53,7 @@ class DistributedPressure(PressureProjection):
 
     def fluid_cells(self) -> np.ndarray:
         """Return where in the box FLUID was in the last projection, as (k, j, i) in the stored shape of the part, shape (n, 3)."""
-        return np.argwhere(self.part.box_of(self.shown.numpy()) == FLUID) + np.array(self.part.owned.low)
+        return np.argwhere(self.part.box_of(self.cells.numpy()) == FLUID) + np.array(self.part.owned.low)
 
     def not_finite(self) -> np.ndarray:
         """Return the cells (x, y, z), counted from 0 in the whole domain, whose right-hand side is not finite, shape (n, 3)."""

@@ -104,24 +104,19 @@ class PieceReader:
         Raises:
             ValueError: the pieces do not belong to this scene, or do not cover the domain; on all ranks.
         """
-        trouble, taken = self._read(pieces, base)
-        told = [text for text in self.part.ranks.comm.allgather(trouble) if text]
-        if told:
-            raise ValueError(told[0])
-        assert taken is not None
-        return taken
+        with self.part.decomposition.meeting.led():
+            return self._read(pieces, base)
 
-    def _read(self, pieces: Sequence[Piece], base: wp.array) -> tuple[str, Taken | None]:
-        """Return what is wrong, "" if nothing, and what was read."""
+    def _read(self, pieces: Sequence[Piece], base: wp.array) -> Taken:
         names = [*NUMBERS, *self._particles, "place", *CELLS, "box"]
         missing = sorted({name for piece in pieces for name in names if name not in piece})
         if missing or not pieces:
-            return f"the state lacks {', '.join(missing) or 'pieces'}: it does not belong to this scene on ranks", None
+            raise ValueError(f"the state lacks {', '.join(missing) or 'pieces'}: it does not belong to this scene on ranks")
         numbers = {name: np.asarray(pieces[0][name]) for name in NUMBERS}
         if not np.array_equal(numbers["signature"], self._signature):
-            return "the state's grid, spacing, number of particles a cell or transfer differ from this scene's", None
+            raise ValueError("the state's grid, spacing, number of particles a cell or transfer differ from this scene's")
         if any(not np.array_equal(numbers[name], piece[name]) for piece in pieces for name in NUMBERS):
-            return "the pieces are of different states", None
+            raise ValueError("the pieces are of different states")
         cells = {name: np.zeros(self.part.box.counts[::-1], dtype=dtype) for name, dtype in CELLS.items()}
         covered, found = 0, []
         for piece in pieces:
@@ -133,12 +128,12 @@ class PieceReader:
         place = particles.pop("place", np.empty(0, dtype=np.int64))
         particles = particles or {name: np.empty((0, 3), dtype=np.float32) for name in self._particles}
         if covered != self.part.box.cells:
-            return "the pieces do not cover the domain: some are missing, or twice there", None
+            raise ValueError("the pieces do not cover the domain: some are missing, or twice there")
         if any(not np.isfinite(values).all() for values in (*particles.values(), cells["pressure"])):
-            return "the pieces hold values that are not finite", None
+            raise ValueError("the pieces hold values that are not finite")
         if not np.array_equal(cells["cells"] == wl.SOLID, self.part.box_of(base.numpy()) == wl.SOLID):
-            return "the state's solids are not this scene's", None
-        return "", Taken(particles, place, cells, numbers)
+            raise ValueError("the state's solids are not this scene's")
+        return Taken(particles, place, cells, numbers)
 
     def _take_cells(self, piece: Piece, box: Box, cells: dict[str, np.ndarray]) -> int:
         """Take a piece's cells that lie in this rank's box, and return how many there are."""

@@ -116,7 +116,7 @@ class PressureProjection:
 
     Attributes:
         kind: int8 of AIR, FLUID, SOLID, which the caller marks.
-        shown: `kind` of the last projection, which pressure and contact belong to; as first marked before it.
+        cells: `kind` of the last projection, which pressure and contact belong to; as first marked before it.
         pressure: last accepted x [m/s], float64.
         contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED.
         known: int8, one field a component: which faces the last projection made valid, see `warp_lcp.grid.extrapolate`.
@@ -142,10 +142,10 @@ class PressureProjection:
         self.tolerance, self.max_iterations = tolerance, max_iterations
         self.automatic = TimeErrorTolerance(grid.size, grid.device) if tolerance == "auto" else None
         self._passes = pressure_passes(bool(boundary.open), bool(boundary.velocity), phi is not None, lets_go)
-        self.kind, self.shown, self.contact = grid.field(wp.int8), grid.field(wp.int8), grid.field(wp.uint8)
+        self.kind, self.cells, self.contact = grid.field(wp.int8), grid.field(wp.int8), grid.field(wp.uint8)
         self.pressure, self.known = grid.field(wp.float64), grid.faces(wp.int8)
         wp.copy(self.kind, boundary.base)
-        self._cells = self.kind  # FLUID where there is an unknown
+        self._unknown = self.kind  # FLUID where there is an unknown
         self._b, self._start = (grid.field(wp.float64) for _ in range(2))
         self._lower = wp.full(grid.shape, -np.inf, dtype=wp.float64, device=grid.device) if lets_go else None
         self._least: Any = -np.inf if self._lower is None else self._lower
@@ -157,7 +157,7 @@ class PressureProjection:
 
     def show(self) -> None:
         """Show `kind` in frames though nothing has been projected yet."""
-        wp.copy(self.shown, self.kind)
+        wp.copy(self.cells, self.kind)
 
     def prepare(self, velocity: Sequence[wp.array], dt: float, kick_dt: float) -> int:
         """Set up the problem of the marked cells and return the number of unknowns. The first guess is the last pressure.
@@ -192,7 +192,7 @@ class PressureProjection:
 
     def _make_problem(self) -> None:
         faces = {f"face_{axis}": field for axis, field in zip("xyz", self.boundary.open, strict=False)}
-        cells = self.grid.interior(self._cells.numpy())
+        cells = self.grid.interior(self._unknown.numpy())
         self._operator = wl.GridPoisson(cells, shift=self._shift, device=self.grid.device, **faces)
         self._problem = wl.LCP(self._joined(), self._b, self._least, np.inf)
         self._work = self.solver.init(self._problem)
@@ -203,9 +203,9 @@ class PressureProjection:
 
     def _update(self) -> None:
         """Take the cells, and where bodies meet them."""
-        self._operator.update(self._cells)
+        self._operator.update(self._unknown)
         if self.coupling is not None:
-            self.coupling.take(self._cells)
+            self.coupling.take(self._unknown)
 
     def _faces(self) -> dict[str, Any]:
         """Return what passes take of cells, solids and surface."""
@@ -281,7 +281,7 @@ class PressureProjection:
             unknowns: of `prepare`.
         """
         self._take(result.x)
-        wp.copy(self.shown, self.kind)
+        wp.copy(self.cells, self.kind)
         self._last = self._kick
         for axis, field in enumerate(velocity):
             self.known[axis].zero_()
@@ -298,7 +298,7 @@ class PressureProjection:
 
     def unknowns(self) -> int:
         """Return the number of unknowns."""
-        self._solved.run(COUNT, whole=True, kind=self._cells, sums=self._sums)
+        self._solved.run(COUNT, whole=True, kind=self._unknown, sums=self._sums)
         return int(self._found()[0])
 
     def not_finite(self) -> np.ndarray:
@@ -308,14 +308,14 @@ class PressureProjection:
 
     def fluid_cells(self) -> np.ndarray:
         """Return where FLUID was in the last projection, as (k, j, i) in the stored shape, shape (n, 3)."""
-        return np.argwhere(self.shown.numpy() == FLUID)
+        return np.argwhere(self.cells.numpy() == FLUID)
 
     def state(self) -> dict[str, np.ndarray]:
         """Return what the next projection starts from, and what a frame shows of the last."""
         return {
             "pressure": self.pressure.numpy().copy(),
             "pressure_dt": np.array(self._last),
-            "cells": self.shown.numpy().copy(),
+            "cells": self.cells.numpy().copy(),
             "contact": self.contact.numpy().copy(),
             "time_error": np.array([-1.0, 0.0]) if self.automatic is None else self.automatic.state(),
         }
@@ -323,7 +323,7 @@ class PressureProjection:
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Continue from `state`, whose arrays have been checked."""
         self.pressure.assign(state["pressure"])
-        self.shown.assign(state["cells"])
+        self.cells.assign(state["cells"])
         self.contact.assign(state["contact"])
         self._last = float(state["pressure_dt"])
         if self.automatic is not None:

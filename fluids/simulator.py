@@ -271,7 +271,7 @@ class LiquidSimulation(ParticleSimulation):
     def _held(self, projected: Projection) -> Projection:
         """Give the sources' faces their velocity back, and show their cells as liquid."""
         if self.sources is not None:
-            self.sources.hold(self.velocity, self.projection.known, self.projection.shown)
+            self.sources.hold(self.velocity, self.projection.known, self.projection.cells)
         return projected
 
     def _explain(self, result: wl.SolveResult) -> NoReturn:

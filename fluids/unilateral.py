@@ -69,14 +69,14 @@ class UnilateralPressure(PressureProjection):
     ) -> None:
         super().__init__(grid, boundary, solver, **settings)
         self._weights = list(weights)
-        self._cells, self._least = grid.field(wp.int8), 0.0
-        wp.copy(self._cells, boundary.base)  # the ring stays as it is
+        self._unknown, self._least = grid.field(wp.int8), 0.0
+        wp.copy(self._unknown, boundary.base)  # the ring stays as it is
         if boundary.open and self._shift is None:  # pockets between solids that are too full
             self._shift = grid.field()
         setting = kernels.UnilateralSetting()
         setting.planes = grid.planes
         setting.density, setting.capacity = level_set.density, boundary.capacity
-        setting.cells, setting.base = self._cells, boundary.base
+        setting.cells, setting.base = self._unknown, boundary.base
         self._setting = setting
 
     def prepare(self, velocity: Sequence[wp.array], dt: float, kick_dt: float) -> int:
@@ -113,7 +113,7 @@ class UnilateralPressure(PressureProjection):
             unknowns: of `prepare`.
         """
         self._take(result.x)
-        wp.copy(self.shown, self.kind)
+        wp.copy(self.cells, self.kind)
         self._last = self._kick
         for axis, field in enumerate(velocity):
             self.known[axis].zero_()
@@ -127,7 +127,7 @@ class UnilateralPressure(PressureProjection):
 
     def fluid_cells(self) -> np.ndarray:
         """Return where there was liquid or pressure in the last projection, as (k, j, i) in the stored shape, shape (n, 3)."""
-        return np.argwhere((self.shown.numpy() == FLUID) | (self.pressure.numpy() > 0.0))
+        return np.argwhere((self.cells.numpy() == FLUID) | (self.pressure.numpy() > 0.0))
 
     def _at(self, velocity: Sequence[wp.array]) -> Any:
         """Return the setting with velocities, open fractions and solids' velocities as they are."""

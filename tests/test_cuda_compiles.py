@@ -22,7 +22,7 @@ from warp_lcp.granular.interleaved_kernels import interleaved_passes
 from warp_lcp.granular.report_kernels import report_pass
 from warp_lcp.granular.stress_kernels import stress_passes
 from warp_lcp.grid.advection import CENTERS, advect_pass, carry_pass, distance_pass
-from warp_lcp.grid.sides import ring_kernels
+from warp_lcp.grid.sides import wrap_kernel
 from warp_lcp.grid.transfer import transfer_passes
 from warp_lcp.material.density_correction import displacement_pass
 from warp_lcp.multigrid import CycleSettings, Hierarchy
@@ -196,7 +196,7 @@ def test_kernels_compile_for_cuda(reals, archs, tmp_path):
     for axis in (0, 1, 2, CENTERS):
         carry_pass(axis)
     for dtype in (wp.int8, wp.uint8, wp.int32, wp.float32, wp.float64):
-        ring_kernels(dtype)
+        wrap_kernel(dtype)
     for d_type, real in itertools.product((wp.uint8, wp.float32, wp.float64), (wp.float32, wp.float64)):
         field, vector = wp.zeros(8, dtype=real, device="cpu"), wp.zeros(8, dtype=wp.float64, device="cpu")
         rows = Rows.flat(8, field.device).beside(Rows.flat(8, field.device), (1, 1, 1))

@@ -51,29 +51,41 @@ STATES = RowPass(
 def open_area(a: float, b: float, c: float, d: float) -> float: ...
 
 
+@wp.func
+def corner(axis: int, planes: int, n: int):
+    """Return how far (k, j, i) the n-th of the four corners of a lower face is from the first."""
+    a = n & 1
+    b = n >> 1
+    dk = b * wp.where(axis == 2, 0, planes - 1)
+    dj = a * wp.where(axis == 0, 1, 0) + b * wp.where(axis == 2, 1, 0)
+    return dk, dj, a * wp.where(axis == 0, 0, 1)
+
+
+@wp.func
+def open_face(near: F32, axis: int, planes: int, k: int, j: int, i: int):
+    """Return which share of a lower face is open, from a distance at nodes."""
+    c, b, a = corner(axis, planes, 1)
+    z, y, x = corner(axis, planes, 2)
+    return open_area(near[k, j, i], near[k + c, j + b, i + a], near[k + c + z, j + b + y, i + a + x], near[k + z, j + y, i + x])
+
+
 @cell_kernel("warp_lcp.grid.cut_cells")
 def side_kernel(k, j, i, planes: int, axis: int, near: F32, owner: I16, open: F32, wall: I16, counts: wp.array(dtype=wp.int32)):
     """Fill open fractions and wall numbers of the faces on an open side of the domain; count the dropped and the partial ones."""
-    dj = wp.where(axis == 0, 1, 0)
-    di = 1 - dj
-    dk = wp.where(axis == 2, 0, planes - 1)
-    ej = wp.where(axis == 2, 1, 0)
-    free = open_area(near[k, j, i], near[k, j + dj, i + di], near[k + dk, j + dj + ej, i + di], near[k + dk, j + ej, i])
+    free = open_face(near, axis, planes, k, j, i)
     if free > 0.0 and free < DROP:
         free = float(0.0)
         wp.atomic_add(counts, 0, 1)
     if free > 0.0 and free < 1.0:
         wp.atomic_add(counts, 1, 1)
     number = int(-1)
-    if free < 1.0:  # the solid that is nearest to a corner: (0), along (di, dj, 0), and along (0, ej, dk)
+    if free < 1.0:  # the solid that is nearest to a corner
         least = float(1.0e30)
         for n in range(4):
-            a = n & 1
-            b = n >> 1
-            d = near[k + b * dk, j + a * dj + b * ej, i + a * di]
-            if d < least:
-                least = d
-                number = int(owner[k + b * dk, j + a * dj + b * ej, i + a * di])
+            dk, dj, di = corner(axis, planes, n)
+            if near[k + dk, j + dj, i + di] < least:
+                least = near[k + dk, j + dj, i + di]
+                number = int(owner[k + dk, j + dj, i + di])
     open[k, j, i] = free
     wall[k, j, i] = wp.int16(number)
 
@@ -114,32 +126,23 @@ def moving_part(S: Moving, axis: int, planes: int, k: int, j: int, i: int, open:
     solid = int(0)
     part = float(0.0)
     if free < 1.0:
-        dj = wp.where(axis == 0, 1, 0)
-        di = 1 - dj
-        dk = planes - 1
-        ej = wp.where(axis == 2, 1, 0)
-        if axis == 2:
-            dk = 0
         solid = int(wall[k, j, i])
         least = float(1.0e30)
-        if S.moves[wp.max(solid, 0)] == wp.uint8(0):  # the corners are (0), along (di, dj, 0), and along (0, ej, dk)
+        if S.moves[wp.max(solid, 0)] == wp.uint8(0):
             solid = 0
             for n in range(4):
-                a = n & 1
-                b = n >> 1
-                found, d = least_moving(S, k + b * dk, j + a * dj + b * ej, i + a * di)
+                dk, dj, di = corner(axis, planes, n)
+                found, d = least_moving(S, k + dk, j + dj, i + di)
                 if found > 0 and d < least:
                     least = d
                     solid = found
         if solid > 0:
             if wall[k, j, i] == wp.int16(0):
-                near = S.nodes.near
-                free = open_area(near[k, j, i], near[k, j + dj, i + di], near[k + dk, j + dj + ej, i + di], near[k + dk, j + ej, i])
+                free = open_face(S.nodes.near, axis, planes, k, j, i)
                 closed = float(1.0)
             else:
                 closed = 1.0 - free
-            rest = S.standing
-            at_rest = 1.0 - open_area(rest[k, j, i], rest[k, j + dj, i + di], rest[k + dk, j + dj + ej, i + di], rest[k + dk, j + ej, i])
+            at_rest = 1.0 - open_face(S.standing, axis, planes, k, j, i)
             part = wp.clamp((1.0 - free - at_rest) / closed, 0.0, 1.0)
     return wp.max(solid, 0), part
 

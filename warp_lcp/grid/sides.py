@@ -7,7 +7,6 @@ other, and each field's ring holds what lies there.
 import functools
 import typing
 from collections.abc import Iterable, Sequence
-from types import SimpleNamespace
 
 import numpy as np
 import warp as wp
@@ -148,16 +147,15 @@ class PeriodicSides:
         """Fill the ring of fields, in the stored shape or stacked in layers of it, from the other side."""
         for field in fields:
             layers = field if field.ndim == 4 else field.reshape((1, *self.grid.shape))
-            kernel = ring_kernels(field.dtype).wrap
             for axis in self.axes:
-                plane, lines = self._lines(axis)
-                launch(kernel, (layers.shape[0], *lines), [axis, self.grid.counts[axis], plane, layers], device=self.grid.device)
+                lines = self._lines(layers, axis)
+                launch(wrap_kernel(field.dtype), lines.shape[:3], [self.grid.counts[axis], lines], device=self.grid.device)
 
     def add(self, field: wp.array) -> None:
         """Add what lies in the ring of a sum over particles to the cells that it repeats."""
         for axis in self.axes:
-            plane, lines = self._lines(axis)
-            wp.launch(add_kernel, lines, [axis, self.grid.counts[axis], plane, field], device=self.grid.device)
+            lines = self._lines(field, axis)
+            wp.launch(add_kernel, lines.shape[:2], [self.grid.counts[axis], lines], device=self.grid.device)
         self.wrap(field)
 
     def average(self, velocity: Sequence[wp.array], weights: Sequence[wp.array], saved: Sequence[wp.array] = ()) -> None:
@@ -171,9 +169,8 @@ class PeriodicSides:
         for number, (field, weight) in enumerate(zip(velocity, weights, strict=True)):
             old = saved[number] if saved else None
             for axis in self.axes:
-                plane, lines = self._lines(axis)
-                inputs = [axis, self.grid.counts[axis], plane, weight, field, old]
-                wp.launch(average_kernel, lines, inputs, device=self.grid.device)
+                lines, means = self._lines(weight, axis), [None if v is None else self._lines(v, axis) for v in (field, old)]
+                wp.launch(average_kernel, lines.shape[:2], [self.grid.counts[axis], lines, *means], device=self.grid.device)
             self.wrap(field, *([old] if old is not None else []))
 
     def carry(self, position: wp.array) -> None:
@@ -191,77 +188,56 @@ class PeriodicSides:
             low[2 - axis], high[2 - axis] = 0, self.grid.shape[2 - axis]
         return Window.of(low, high, window.device)
 
-    def _lines(self, axis: int) -> tuple[int, tuple[int, int]]:
-        """Return the first plane of a field in use, and how many lines along an axis there are: planes or rows, and rows or columns."""
-        planes, rows, columns = self.grid.shape
-        plane = 1 if self.grid.dimension == 2 else 0
-        return plane, (1 if plane else planes, rows) if axis == 0 else (rows, columns)
+    def _lines(self, field: wp.array, axis: int) -> wp.array:
+        """Return a view of a field, or of layers of it, whose last index goes along an axis; in 2-D of the plane in use."""
+        if self.grid.dimension == 2:
+            field = field[..., 1:2, :, :]
+        spatial, before = field.ndim - 3, tuple(range(field.ndim - 3))
+        last = spatial + 2 - axis
+        return field.transpose((*before, *(n for n in range(spatial, field.ndim) if n != last), last))
 
 
 @functools.cache
-def ring_kernels(dtype: typing.Any) -> SimpleNamespace:
+def wrap_kernel(dtype: typing.Any) -> wp.Kernel:
     """Return the kernel that fills the ring of fields of a type."""
 
     @wp.kernel(enable_backward=False, module=f"warp_lcp.grid.periodic_{dtype.__name__}")
     @typing.no_type_check
-    def wrap(axis: int, count: int, plane: int, field: wp.array4d(dtype=dtype)):
+    def wrap(count: int, lines: wp.array4d(dtype=dtype)):
         layer, a, b = wp.tid()
-        if axis == 0:
-            k = a + plane
-            field[layer, k, b, 0] = field[layer, k, b, count]
-            field[layer, k, b, count + 1] = field[layer, k, b, 1]
-        else:
-            field[layer, 0, a, b] = field[layer, count, a, b]
-            field[layer, count + 1, a, b] = field[layer, 1, a, b]
+        lines[layer, a, b, 0] = lines[layer, a, b, count]
+        lines[layer, a, b, count + 1] = lines[layer, a, b, 1]
 
-    return SimpleNamespace(wrap=wrap)
+    return wrap
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.periodic")
 @typing.no_type_check
-def add_kernel(axis: int, count: int, plane: int, field: wp.array3d(dtype=wp.float32)):
+def add_kernel(count: int, lines: F32):
     """Add the two ends of a line to the cells that they repeat."""
     a, b = wp.tid()
-    if axis == 0:
-        k = a + plane
-        low = field[k, b, 0]
-        field[k, b, 1] = field[k, b, 1] + field[k, b, count + 1]
-        field[k, b, count] = field[k, b, count] + low
-    else:
-        low = field[0, a, b]
-        field[1, a, b] = field[1, a, b] + field[count + 1, a, b]
-        field[count, a, b] = field[count, a, b] + low
+    low = lines[a, b, 0]
+    lines[a, b, 1] = lines[a, b, 1] + lines[a, b, count + 1]
+    lines[a, b, count] = lines[a, b, count] + low
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.periodic")
 @typing.no_type_check
-def average_kernel(
-    axis: int, count: int, plane: int, weight: wp.array3d(dtype=wp.float32), field: wp.array3d(dtype=wp.float32),
-    saved: wp.array3d(dtype=wp.float32),
-):  # fmt: skip
+def average_kernel(count: int, weight: F32, field: F32, saved: F32):
     """Bring the two ends of a line into the faces that they repeat, as means with their weights."""
     a, b = wp.tid()
     for end in range(2):
-        k = a + plane
-        j = b
-        i = wp.where(end == 0, 0, count + 1)
-        kk = k
-        ii = wp.where(end == 0, count, 1)
-        if axis == 2:
-            k = wp.where(end == 0, 0, count + 1)
-            kk = wp.where(end == 0, count, 1)
-            j = a
-            i = b
-            ii = b
-        more = weight[k, j, i]
-        there = weight[kk, j, ii]
+        ring = wp.where(end == 0, 0, count + 1)
+        same = wp.where(end == 0, count, 1)
+        more = weight[a, b, ring]
+        there = weight[a, b, same]
         total = more + there
         if more > 0.0 and total > TINY_WEIGHT:
-            field[kk, j, ii] = (there * field[kk, j, ii] + more * field[k, j, i]) / total
+            field[a, b, same] = (there * field[a, b, same] + more * field[a, b, ring]) / total
             if saved:
-                saved[kk, j, ii] = (there * saved[kk, j, ii] + more * saved[k, j, i]) / total
-        weight[kk, j, ii] = total
-        weight[k, j, i] = 0.0
+                saved[a, b, same] = (there * saved[a, b, same] + more * saved[a, b, ring]) / total
+        weight[a, b, same] = total
+        weight[a, b, ring] = 0.0
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.periodic")

@@ -162,12 +162,11 @@ class SurfaceMesh:
             source, first, second = first, second, first
         return source
 
-    def _mirror(self, field: wp.array | None, *, fold: bool = False) -> None:
+    def _mirror(self, field: wp.array, *, fold: bool = False) -> None:
         """Continue a field beyond the domain's sides as in a mirror; `fold`: after folding in what has been added there."""
-        shape = self.lattice.shape
         for axis in range(self.lattice.dimension):
-            lines = [n for plane, n in enumerate(shape) if plane != 2 - axis]
-            wp.launch(kernels.mirror_kernel, lines, [axis, fold, field], device=self.lattice.device)
+            lines = field.transpose((*(n for n in range(3) if n != 2 - axis), 2 - axis))
+            wp.launch(kernels.mirror_kernel, lines.shape[:2], [fold, lines], device=self.lattice.device)
 
 
 def faces_from_particles(

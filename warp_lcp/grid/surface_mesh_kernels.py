@@ -47,25 +47,16 @@ BOOST = particle_pass(
 
 
 @wp.kernel(**_options)
-def mirror_kernel(axis: int, fold: bool, field: F32):
-    """Give the ring at both ends of an axis the values beside it, after adding to those what the ring holds; a thread a line."""
+def mirror_kernel(fold: bool, lines: F32):
+    """Give the ring at both ends of a line the values beside it, after adding to those what the ring holds; a thread a line."""
     a, b = wp.tid()
-    last = field.shape[2 - axis] - 1
+    last = lines.shape[2] - 1
     for end in range(2):
         ring = end * last
         beside = wp.where(end == 0, 1, last - 1)
-        if axis == 0:
-            if fold:
-                field[a, b, beside] += field[a, b, ring]
-            field[a, b, ring] = field[a, b, beside]
-        elif axis == 1:
-            if fold:
-                field[a, beside, b] += field[a, ring, b]
-            field[a, ring, b] = field[a, beside, b]
-        else:
-            if fold:
-                field[beside, a, b] += field[ring, a, b]
-            field[ring, a, b] = field[beside, a, b]
+        if fold:
+            lines[a, b, beside] += lines[a, b, ring]
+        lines[a, b, ring] = lines[a, b, beside]
 
 
 @wp.func

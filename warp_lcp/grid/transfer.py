@@ -14,12 +14,14 @@ part of a grid. In 2-D the nodes of one plane are used: the coordinate along z i
 
 import functools
 import typing
+from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import warp as wp
 
-from warp_lcp.grid.cell_kernel import cell_kernel
+from warp_lcp.grid.cell_kernel import F32, cell_kernel
 from warp_lcp.grid.particle_loops import launch, on_grid, particle_pass
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.rows import RowPass
@@ -123,3 +125,25 @@ def faces_to_particles(
         old = saved[axis] if saved and flip > 0.0 else None
         particles = {"position": position, "velocity": velocity, "gradient": gradient}
         launch(passes.interpolate, len(position), grid, axis=axis, flip=flip, field=field, saved=old, **particles)
+
+
+@cell_kernel("warp_lcp.grid.gravity")
+@typing.no_type_check
+def accelerate_kernel(k, j, i, change: float, weight: F32, field: F32):
+    """Add a change of velocity [m/s] to every face with weight."""
+    if weight[k, j, i] > TINY_WEIGHT:
+        field[k, j, i] = field[k, j, i] + change
+
+
+def accelerate(window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], change: np.ndarray) -> None:
+    """Change the velocity of every face that particles gave weight, closed faces included: they pass it on to the material beside them.
+
+    Args:
+        window: faces that particles can reach.
+        velocity: each component [m/s] (updated).
+        weights: of the particles on each component's faces.
+        change: of each component [m/s], shape (3,).
+    """
+    for axis, (field, weight) in enumerate(zip(velocity, weights, strict=True)):
+        if change[axis] != 0.0:
+            window.launch(accelerate_kernel, [float(change[axis]), weight, field])

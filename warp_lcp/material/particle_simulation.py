@@ -13,10 +13,9 @@ import warp_lcp as wl
 from warp_lcp.grid.particles import MARGIN, Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.surface_mesh import Interior, faces_from_particles, sample
-from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
+from warp_lcp.grid.transfer import accelerate, faces_to_particles, particles_to_faces
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.flight import Flights
-from warp_lcp.material.gravity import accelerate
 from warp_lcp.material.narrow_band import NarrowBand, without_band
 from warp_lcp.material.particle_assembly import make_particle_volume, make_surface_mesh
 from warp_lcp.material.particle_rearrangement import Rearrangement
