@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.distributed.decomposition import Box
+from warp_lcp.distributed.decomposition import CellBox
 from warp_lcp.distributed.subdomain import Subdomain
 
 Piece = Mapping[str, np.ndarray]  # what one rank has of a simulation's state
@@ -120,7 +120,7 @@ class PieceReader:
         cells = {name: np.zeros(self.part.box.counts[::-1], dtype=dtype) for name, dtype in CELLS.items()}
         covered, found = 0, []
         for piece in pieces:
-            box = Box(*(tuple(int(n) for n in corner) for corner in piece["box"]))  # type: ignore[arg-type]
+            box = CellBox(*(tuple(int(n) for n in corner) for corner in piece["box"]))  # type: ignore[arg-type]
             covered += self._take_cells(piece, box, cells)
             if box.grown(self.part.layers).common(self.part.box).cells:  # particles move on to their rank when the next step begins
                 found.append(self._own_particles(piece))
@@ -135,7 +135,7 @@ class PieceReader:
             raise ValueError("the state's solids are not this scene's")
         return Taken(particles, place, cells, numbers)
 
-    def _take_cells(self, piece: Piece, box: Box, cells: dict[str, np.ndarray]) -> int:
+    def _take_cells(self, piece: Piece, box: CellBox, cells: dict[str, np.ndarray]) -> int:
         """Take a piece's cells that lie in this rank's box, and return how many there are."""
         shared = box.common(self.part.box)
         if shared.cells:

@@ -21,7 +21,7 @@ Triple = tuple[int, int, int]
 
 
 @dataclass(frozen=True)
-class Box:
+class CellBox:
     """Cells from `low` up to `high`, exclusive, along x, y, z."""
 
     low: Triple
@@ -44,23 +44,23 @@ class Box:
         x, y, z = (slice(l, h) for l, h in zip(self.low, self.high, strict=True))
         return z, y, x
 
-    def grown(self, width: int) -> Box:
+    def grown(self, width: int) -> CellBox:
         """Return the box with so many cells more on all sides."""
         return self._mapped(lambda l: l - width, lambda h: h + width)
 
-    def common(self, other: Box) -> Box:
+    def common(self, other: CellBox) -> CellBox:
         """Return the cells that are in both."""
         low = tuple(max(a, b) for a, b in zip(self.low, other.low, strict=True))
         high = tuple(min(a, b) for a, b in zip(self.high, other.high, strict=True))
-        return Box(low, high)  # type: ignore[arg-type]
+        return CellBox(low, high)  # type: ignore[arg-type]
 
-    def moved(self, by: Sequence[int], sign: int = 1) -> Box:
+    def moved(self, by: Sequence[int], sign: int = 1) -> CellBox:
         """Return the box moved by so many cells along x, y, z, or back."""
         low, high = (tuple(a + sign * b for a, b in zip(corner, by, strict=True)) for corner in (self.low, self.high))
-        return Box(low, high)  # type: ignore[arg-type]
+        return CellBox(low, high)  # type: ignore[arg-type]
 
-    def _mapped(self, low: Any, high: Any) -> Box:
-        return Box(tuple(map(low, self.low)), tuple(map(high, self.high)))
+    def _mapped(self, low: Any, high: Any) -> CellBox:
+        return CellBox(tuple(map(low, self.low)), tuple(map(high, self.high)))
 
 
 class Decomposition:
@@ -96,7 +96,7 @@ class Decomposition:
         return rank % px, rank // px % py, rank // (px * py)
 
     @property
-    def box(self) -> Box:
+    def box(self) -> CellBox:
         """The box of this rank's cells."""
         return self.boxes[self.ranks.rank]
 
@@ -146,10 +146,10 @@ class Decomposition:
         )  # fmt: skip
 
     @staticmethod
-    def _box(starts: list[list[int]], place: Triple) -> Box:
+    def _box(starts: list[list[int]], place: Triple) -> CellBox:
         low = tuple(s[p] for s, p in zip(starts, place, strict=True))
         high = tuple(s[p + 1] for s, p in zip(starts, place, strict=True))
-        return Box(low, high)  # type: ignore[arg-type]
+        return CellBox(low, high)  # type: ignore[arg-type]
 
 
 def parts(n: int, p: int) -> list[int]:
@@ -239,10 +239,10 @@ def pool(counts: Triple, dimension: int, volume: float, gravity: np.ndarray) -> 
 def _most_work(counts: Triple, cuts: list[list[int]], layers: int, state: Sequence[Corners]) -> float:
     """Return what the busiest rank has to do, in cells full of material."""
     ends = [np.concatenate([[0], np.cumsum(cut)]) for cut in cuts]
-    whole, most = Box((0, 0, 0), counts), 0.0
+    whole, most = CellBox((0, 0, 0), counts), 0.0
     for place in np.ndindex(*(len(cut) for cut in cuts)):
         low, high = (np.array([end[n + side] for end, n in zip(ends, place, strict=True)]) for side in range(2))
-        box = Box((int(low[0]), int(low[1]), int(low[2])), (int(high[0]), int(high[1]), int(high[2])))
+        box = CellBox((int(low[0]), int(low[1]), int(low[2])), (int(high[0]), int(high[1]), int(high[2])))
         full = sum(float(np.prod(np.clip(np.minimum(b, high) - np.maximum(a, low), 0.0, None))) for a, b in state)
         most = max(most, full + OPEN * box.grown(layers).common(whole).cells)
     return most

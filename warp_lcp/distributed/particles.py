@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 import warp as wp
 
-from warp_lcp.distributed.decomposition import Box
+from warp_lcp.distributed.decomposition import CellBox
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.grid import particles_kernels as kernels
 from warp_lcp.grid.particle_loops import launch, particle_pass
@@ -243,6 +243,6 @@ class SharedParticles(Particles):
         self.place = places
 
 
-def _within(cells: np.ndarray, box: Box) -> np.ndarray:
+def _within(cells: np.ndarray, box: CellBox) -> np.ndarray:
     """Tell which cells (x, y, z), shape (n, 3), are in a box."""
     return np.asarray(((cells >= np.array(box.low)) & (cells < np.array(box.high))).all(axis=1))
