@@ -27,10 +27,11 @@ from warp_lcp.benchmarks.problems import BOUNDS, SplashPart, splash, splash_part
 from warp_lcp.benchmarks.record import Record, write_json
 from warp_lcp.benchmarks.scaling import FIGURES, SCENE_BYTES, SOLVE_BYTES, Growing
 from warp_lcp.benchmarks.timing import Figure, ratios
+from warp_lcp.distributed.collective import Collective as Meeting
+from warp_lcp.distributed.collective import RankFailed
 from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
 from warp_lcp.distributed.halo import Halo
-from warp_lcp.distributed.meeting import Meeting, RankFailed
 from warp_lcp.distributed.ranks import Ranks, device_of_rank
 from warp_lcp.run.devices import devices, free_memory
 

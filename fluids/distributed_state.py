@@ -104,7 +104,7 @@ class PieceReader:
         Raises:
             ValueError: the pieces do not belong to this scene, or do not cover the domain; on all ranks.
         """
-        with self.part.decomposition.meeting.led():
+        with self.part.decomposition.collective.led():
             return self._read(pieces, base)
 
     def _read(self, pieces: Sequence[Piece], base: wp.array) -> Taken:

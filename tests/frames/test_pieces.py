@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warp_lcp.distributed.meeting import Meeting
+from warp_lcp.distributed.collective import Collective as Meeting
 from warp_lcp.frames.frames import FrameFolder
 from warp_lcp.frames.pieces import describe, one_grid, piece_files, write_whole
 from warp_lcp.render import recording

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from warp_lcp.distributed.meeting import Meeting
+from warp_lcp.distributed.collective import Collective as Meeting
 from warp_lcp.run.checkpoint import PIECES, Checkpoint, CheckpointFolder
 from warp_lcp.run.continuation import fingerprint
 from warp_lcp.run.loop import run_scene

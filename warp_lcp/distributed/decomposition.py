@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.distributed.meeting import Meeting
+from warp_lcp.distributed.collective import Collective
 from warp_lcp.distributed.ranks import Ranks, petsc
 
 UNEVEN = 1.125  # the largest part may exceed an even share by this factor, so that cuts lie at multiples of large powers of two
@@ -132,9 +132,9 @@ class Decomposition:
         return Halo(self, 1)
 
     @cached_property
-    def meeting(self) -> Meeting:
+    def collective(self) -> Collective:
         """Blocks of code that the ranks leave alike: what fails on one fails on all."""
-        return Meeting(self.ranks, planned=(ValueError, OSError), last_words=sys.stderr.write)
+        return Collective(self.ranks, planned=(ValueError, OSError), last_words=sys.stderr.write)
 
     @cached_property
     def dmda(self) -> Any:

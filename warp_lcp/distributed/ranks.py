@@ -54,7 +54,7 @@ class Ranks:
 
     @property
     def first(self) -> bool:
-        """Whether this is the rank that speaks for all."""
+        """Whether this is the root rank, which writes and tells for all."""
         return self.rank == 0
 
     def gather(self, values: Any) -> np.ndarray:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.distributed.meeting import Meeting
+from warp_lcp.distributed.collective import Collective as Meeting
 from warp_lcp.frames.atomic import make_folder
 from warp_lcp.run.checkpoint import PIECES, Checkpoint, CheckpointError, CheckpointFolder
 

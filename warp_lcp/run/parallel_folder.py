@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_lcp.distributed.meeting import Meeting
+from warp_lcp.distributed.collective import Collective as Meeting
 from warp_lcp.frames.frames import FrameWriter
 from warp_lcp.run.checkpoint import PIECES
 from warp_lcp.run.folder import CHECKPOINTS, RECORD, Continuation, OutputError, RunFolder, RunRecord

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from pathlib import Path
 
-from warp_lcp.distributed.meeting import Meeting
+from warp_lcp.distributed.collective import Collective as Meeting
 from warp_lcp.frames.atomic import make_folder
 from warp_lcp.frames.frames import FrameFolder, FrameWriter, GridFormat
 from warp_lcp.frames.pieces import WHOLE, Kind, Piece, describe, write_whole

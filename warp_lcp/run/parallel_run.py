@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_lcp.distributed.meeting import Meeting, RankFailed
+from warp_lcp.distributed.collective import Collective as Meeting
+from warp_lcp.distributed.collective import RankFailed
 from warp_lcp.run.check import check_memory
 from warp_lcp.run.checkpoint import PIECES
 from warp_lcp.run.engine import Engine

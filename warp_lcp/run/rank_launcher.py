@@ -13,7 +13,8 @@ from typing import Any
 import typer
 import warp as wp
 
-from warp_lcp.distributed.meeting import Meeting, RankFailed
+from warp_lcp.distributed.collective import Collective as Meeting
+from warp_lcp.distributed.collective import RankFailed
 from warp_lcp.distributed.ranks import Ranks, device_of_rank
 from warp_lcp.run.continuation import mesh_digests
 from warp_lcp.run.devices import DeviceError, devices

@@ -40,7 +40,7 @@ class Failure:
     told: bool
 
 
-class Meeting:
+class Collective:
     """Blocks that all ranks enter, and leave in the same way.
 
     At the end of a block the ranks meet and tell each other how it went. If it failed on some, all raise: the error's own kind if that is
@@ -55,7 +55,7 @@ class Meeting:
     Attributes:
         failed: the ranks on which the last block failed.
 
-    >>> alone = Meeting.of_one()
+    >>> alone = Collective.of_one()
     >>> with alone.together():
     ...     raise OSError("the disk is full")
     Traceback (most recent call last):
@@ -65,7 +65,7 @@ class Meeting:
     def __init__(
         self, ranks: Ranks, planned: tuple[type[Exception], ...] = (OSError,), last_words: Callable[[str], object] = lambda text: None
     ) -> None:
-        """Take a communicator of its own, so that meetings are never mistaken for other messages."""
+        """Take a communicator of its own, so that its messages are never mistaken for others."""
         self.ranks = ranks
         self.last_words = last_words
         self._planned = planned
@@ -75,8 +75,8 @@ class Meeting:
         self._told: BaseException | None = None  # what a block has raised on all ranks
 
     @classmethod
-    def of_one(cls) -> Meeting:
-        """Return the meeting of a process that has no others, which needs no MPI."""
+    def of_one(cls) -> Collective:
+        """Return that of a process that has no others, which needs no MPI."""
         return cls(Ranks(SimpleNamespace(rank=0, size=1, allgather=lambda value: [value], bcast=lambda value: value)))
 
     def together(self) -> AbstractContextManager[None]:
@@ -84,7 +84,7 @@ class Meeting:
         return self._block(named=True)
 
     def led(self) -> AbstractContextManager[None]:
-        """Return the context of what the first rank does for all; its message speaks for itself."""
+        """Return the context of what the root rank does for all; its message speaks for itself."""
         return self._block(named=False)
 
     def exchange(self, value: Any) -> list[Any]:
@@ -92,7 +92,7 @@ class Meeting:
         return list(self._comm.allgather(value))
 
     def share(self, value: Any) -> Any:
-        """Return what the first rank has given."""
+        """Return what the root rank has given."""
         return self._comm.bcast(value)
 
     @contextmanager
