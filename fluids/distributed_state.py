@@ -120,7 +120,7 @@ class PieceReader:
         cells = {name: np.zeros(self.part.box.counts[::-1], dtype=dtype) for name, dtype in CELLS.items()}
         covered, found = 0, []
         for piece in pieces:
-            box = CellBox(*(tuple(int(n) for n in corner) for corner in piece["box"]))  # type: ignore[arg-type]
+            box = CellBox.of(*piece["box"])
             covered += self._take_cells(piece, box, cells)
             if box.grown(self.part.layers).common(self.part.box).cells:  # particles move on to their rank when the next step begins
                 found.append(self._own_particles(piece))

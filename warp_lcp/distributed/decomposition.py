@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -27,6 +27,12 @@ class CellBox:
     low: Triple
     high: Triple
 
+    @classmethod
+    def of(cls, low: Iterable[int], high: Iterable[int]) -> CellBox:
+        """Return the box between two corners of any type."""
+        (a, b, c), (d, e, f) = low, high
+        return cls((int(a), int(b), int(c)), (int(d), int(e), int(f)))
+
     @property
     def counts(self) -> Triple:
         """Cells along x, y, z; 0 where the box is empty."""
@@ -46,21 +52,15 @@ class CellBox:
 
     def grown(self, width: int) -> CellBox:
         """Return the box with so many cells more on all sides."""
-        return self._mapped(lambda l: l - width, lambda h: h + width)
+        return CellBox.of((l - width for l in self.low), (h + width for h in self.high))
 
     def common(self, other: CellBox) -> CellBox:
         """Return the cells that are in both."""
-        low = tuple(max(a, b) for a, b in zip(self.low, other.low, strict=True))
-        high = tuple(min(a, b) for a, b in zip(self.high, other.high, strict=True))
-        return CellBox(low, high)  # type: ignore[arg-type]
+        return CellBox.of(map(max, self.low, other.low), map(min, self.high, other.high))
 
     def moved(self, by: Sequence[int], sign: int = 1) -> CellBox:
         """Return the box moved by so many cells along x, y, z, or back."""
-        low, high = (tuple(a + sign * b for a, b in zip(corner, by, strict=True)) for corner in (self.low, self.high))
-        return CellBox(low, high)  # type: ignore[arg-type]
-
-    def _mapped(self, low: Any, high: Any) -> CellBox:
-        return CellBox(tuple(map(low, self.low)), tuple(map(high, self.high)))
+        return CellBox.of(*((a + sign * b for a, b in zip(corner, by, strict=True)) for corner in (self.low, self.high)))
 
 
 class Decomposition:
@@ -88,7 +88,8 @@ class Decomposition:
             raise ValueError(f"processes = {self.processes}: their product must be the number of ranks, {ranks.size}")
         self.parts = [list(c) for c in cuts] if cuts else [parts(n, p) for n, p in zip(counts, self.processes, strict=True)]
         starts = [[0, *itertools.accumulate(part)] for part in self.parts]
-        self.boxes = [self._box(starts, place) for place in map(self.place, range(ranks.size))]
+        places = map(self.place, range(ranks.size))
+        self.boxes = [CellBox.of(*((s[p + n] for s, p in zip(starts, place, strict=True)) for n in range(2))) for place in places]
 
     def place(self, rank: int) -> Triple:
         """Return where a rank is among the ranks along x, y, z, as DMDA numbers them."""
@@ -145,12 +146,6 @@ class Decomposition:
             stencil_type=PETSc.DMDA.StencilType.STAR, comm=self.ranks.comm,
         )  # fmt: skip
 
-    @staticmethod
-    def _box(starts: list[list[int]], place: Triple) -> CellBox:
-        low = tuple(s[p] for s, p in zip(starts, place, strict=True))
-        high = tuple(s[p + 1] for s, p in zip(starts, place, strict=True))
-        return CellBox(low, high)  # type: ignore[arg-type]
-
 
 def parts(n: int, p: int) -> list[int]:
     """Return how many of n cells each of p ranks has: about as many, with cuts at multiples of a power of two.
@@ -180,8 +175,8 @@ def _processes(counts: Triple, size: int) -> Triple:
 
 def _cuttings(counts: Triple, size: int) -> list[Triple]:
     """Return the numbers of ranks along x, y, z, whose product is `size`, that leave each rank a cell."""
-    pairs = [(px, py) for px in range(1, size + 1) if size % px == 0 for py in range(1, size // px + 1) if size // px % py == 0]
-    triples = [(px, py, size // (px * py)) for px, py in pairs]
+    divisors = [p for p in range(1, size + 1) if size % p == 0]
+    triples = [(px, py, size // (px * py)) for px in divisors for py in divisors if size // px % py == 0]
     return [p for p in triples if all(a <= n for a, n in zip(p, counts, strict=True))]
 
 
@@ -204,15 +199,11 @@ def balanced_processes(counts: Triple, size: int, *, layers: int, states: Sequen
     (1, 1, 2)
     """
     found = []
-    for px in (d for d in range(1, size + 1) if size % d == 0):
-        for py in (d for d in range(1, size // px + 1) if size // px % d == 0):
-            p = px, py, size // (px * py)
-            if any(a > 1 and a * layers > n for a, n in zip(p, counts, strict=True)):
-                continue
-            cuts = [parts(n, a) for n, a in zip(counts, p, strict=True)]
-            if all(len(cut) == 1 or min(cut) >= layers for cut in cuts):
-                found.append((sum(_most_work(counts, cuts, layers, state) for state in states), px, py, p))
-    return min(found)[3] if found else None
+    for p in _cuttings(counts, size):
+        cuts = [parts(n, a) for n, a in zip(counts, p, strict=True)]
+        if all(len(cut) == 1 or min(cut) >= layers for cut in cuts):
+            found.append((sum(_most_work(counts, cuts, layers, state) for state in states), p))
+    return min(found)[1] if found else None
 
 
 def pool(counts: Triple, dimension: int, volume: float, gravity: np.ndarray) -> Corners:
@@ -242,7 +233,7 @@ def _most_work(counts: Triple, cuts: list[list[int]], layers: int, state: Sequen
     whole, most = CellBox((0, 0, 0), counts), 0.0
     for place in np.ndindex(*(len(cut) for cut in cuts)):
         low, high = (np.array([end[n + side] for end, n in zip(ends, place, strict=True)]) for side in range(2))
-        box = CellBox((int(low[0]), int(low[1]), int(low[2])), (int(high[0]), int(high[1]), int(high[2])))
+        box = CellBox.of(low, high)
         full = sum(float(np.prod(np.clip(np.minimum(b, high) - np.maximum(a, low), 0.0, None))) for a, b in state)
         most = max(most, full + OPEN * box.grown(layers).common(whole).cells)
     return most

@@ -92,7 +92,7 @@ class Subdomain:
         for axis in range(self.dimension):  # in 2-D one plane is used
             low[axis] -= low[axis] == 0
             high[axis] += high[axis] == self.decomposition.counts[axis]
-        return CellBox((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+        return CellBox.of(low, high)
 
     def fill(self, *fields: wp.array) -> None:
         """Fill the ghost cells of fields of the part; collective."""
