@@ -26,7 +26,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.grid.particle_loops import HEADERS, MARGIN, launch, particle_pass
+from warp_lcp.grid.particle_loops import MARGIN, cell_pass, launch, particle_pass
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.operators.grid_poisson import SOLID
 from warp_lcp.rows import RowPass
@@ -91,10 +91,9 @@ def distance_pass(endless: int) -> RowPass:
 @functools.cache
 def carry_pass(axis: int) -> RowPass:
     """Return the pass of `carry_field` for the faces of an axis or `CENTERS`."""
-    box = {**dict.fromkeys("uvw", wp.float32), **dict.fromkeys(("level", "field", "out"), wp.float32)}
-    constants, numbers = {"AXIS": axis, "CENTERS": CENTERS, "ENDLESS": 0}, {"planes": int, "h": wp.float32, "least": wp.float32}
-    name, path = f"warp_lcp.grid.semi_lagrangian_{axis}.carry", HEADERS / "carry.h"
-    return RowPass(name, path, wp.float32, box=box, numbers=numbers, constants=constants, optional=("w",))
+    name, numbers = f"warp_lcp.grid.semi_lagrangian_{axis}.carry", {"planes": int, "h": wp.float32, "least": wp.float32}
+    constants = {"AXIS": axis, "CENTERS": CENTERS, "ENDLESS": 0}
+    return cell_pass(name, "u v w level field out", numbers=numbers, constants=constants, optional=("w",))
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.grid.clearance")

@@ -1,15 +1,13 @@
 """Smooth a closed surface without shrinking it, as Taubin does: a step of Laplacian smoothing, then a slightly longer one back."""
 
 import typing
-from pathlib import Path
 
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, POINTS, interpolated
 from warp_lcp.grid.marching_cubes import DeviceMesh
-from warp_lcp.grid.particle_loops import chunks
+from warp_lcp.grid.particle_loops import cell_pass, chunks
 from warp_lcp.grid.staggered import StaggeredGrid
-from warp_lcp.rows import RowPass
 
 TOUCHING = 0.015  # lattice cells from the domain's side: points that close the surface there are 0.01 off its other sides
 NEAR = 0.25  # lattice cells: a point on a solid, as accurately as a distance that is linear between nodes can tell
@@ -17,13 +15,8 @@ NEAR = 0.25  # lattice cells: a point on a solid, as accurately as a distance th
 _SUMS, _BYTES = wp.array2d(dtype=wp.float32), wp.array(dtype=wp.uint8)
 _options = {"enable_backward": False, "module": "warp_lcp.grid.mesh_smoothing"}
 
-SEE_NEIGHBORS = RowPass(
-    "warp_lcp.grid.mesh_smoothing.see_neighbors",
-    Path(__file__).parent / "headers" / "see_neighbors.h",
-    wp.float32,
-    box={"corners": wp.int32},
-    whole={"points": wp.vec3, "sums": wp.float32},
-)
+_WHOLE = {"points": wp.vec3, "sums": wp.float32}
+SEE_NEIGHBORS = cell_pass("warp_lcp.grid.mesh_smoothing.see_neighbors", "", {"corners": wp.int32}, whole=_WHOLE)
 
 
 @wp.kernel(**_options)

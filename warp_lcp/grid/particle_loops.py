@@ -22,6 +22,20 @@ HEADERS = Path(__file__).parent / "headers"
 NONE: Mapping[str, Any] = {}
 
 
+def cell_pass(name: str, fields: str, box: Mapping[str, Any] = NONE, *, headers: Path = HEADERS, **more: Any) -> RowPass:
+    """Return a pass over the cells of a window in single precision, in the header that its name ends in.
+
+    Args:
+        name: of the pass, with its Warp module.
+        fields: names of its float32 fields.
+        box: other fields of cells.
+        headers: where the header is.
+        more: of the pass.
+    """
+    box = dict.fromkeys(fields.split(), wp.float32) | dict(box)
+    return RowPass(name, headers / f"{name.rpartition('.')[2]}.h", wp.float32, box=box, **more)
+
+
 def particle_pass(
     name: str, box: Mapping[str, Any], *, real: Any = wp.float32, numbers: Mapping[str, Any] = NONE, headers: Path = HEADERS, **more: Any
 ) -> RowPass:

@@ -10,10 +10,10 @@ from typing import Any
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, U8, interpolated
+from warp_lcp.grid.particle_loops import cell_pass
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.boundary_kernels import TOUCHES
 from warp_lcp.operators.grid_poisson import SOLID
-from warp_lcp.rows import RowPass
 
 COLUMNS = 18  # of a body's sums, see `add_up`
 LEAVES = 17  # of them, the particles that come near a wall or an open side
@@ -48,14 +48,15 @@ class Flight:
     sums: wp.array2d(dtype=wp.int64)
 
 
-def _made(name: str, box: dict[str, Any], *trees: str) -> RowPass:
-    whole = {"parent": wp.int32} | dict.fromkeys(trees, wp.uint8)
-    constants, path = {"SOLID": SOLID, "TOUCHES": TOUCHES, "TINY_WEIGHT": TINY_WEIGHT}, Path(__file__).parent / "headers" / f"{name}.h"
-    return RowPass(f"warp_lcp.material.flight.{name}", path, wp.float32, box=box, whole=whole, constants=constants, optional=("w",))
-
-
-UNITE = _made("unite", dict.fromkeys("uvw", wp.float32))
-HOLD = _made("hold", {"kind": wp.int8, "touch": wp.uint8}, "held", "several")
+_MORE: dict[str, Any] = {
+    "headers": Path(__file__).parent / "headers",
+    "constants": {"SOLID": SOLID, "TOUCHES": TOUCHES, "TINY_WEIGHT": TINY_WEIGHT},
+}
+UNITE = cell_pass("warp_lcp.material.flight.unite", "u v w", whole={"parent": wp.int32}, optional=("w",), **_MORE)
+HOLD = cell_pass(
+    "warp_lcp.material.flight.hold", "", {"kind": wp.int8, "touch": wp.uint8},
+    whole={"parent": wp.int32, "held": wp.uint8, "several": wp.uint8}, **_MORE,
+)  # fmt: skip
 
 
 @wp.func
