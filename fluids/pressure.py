@@ -124,19 +124,10 @@ class PressureProjection:
     """
 
     def __init__(
-        self,
-        grid: StaggeredGrid,
-        boundary: Boundary,
-        solver: Any,
-        *,
-        tolerance: float | Literal["auto"],
-        max_iterations: int,
-        phi: wp.array | None = None,
-        coupling: BodyCoupling | None = None,
-        lets_go: bool = True,
-        weights: Sequence[wp.array] | None = None,
+        self, grid: StaggeredGrid, boundary: Boundary, solver: Any, *, tolerance: float | Literal["auto"], max_iterations: int,
+        phi: wp.array | None = None, coupling: BodyCoupling | None = None, lets_go: bool = True, weights: Sequence[wp.array] | None = None,
         gravity: float = 0.0,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.grid, self.boundary, self.solver, self._phi, self.coupling = grid, boundary, solver, phi, coupling
         self._weights, self._gravity = list(weights or ()), gravity
         self.tolerance, self.max_iterations = tolerance, max_iterations

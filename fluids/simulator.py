@@ -117,18 +117,9 @@ class LiquidSimulation(ParticleSimulation):
     scene: LiquidScene
 
     def __init__(
-        self,
-        scene: LiquidScene,
-        grid: StaggeredGrid,
-        boundary: Boundary,
-        particles: Particles,
-        *,
-        sources: Sources | None = None,
-        outlets: Outlets | None = None,
-        bodies: RigidBodies | None = None,
-        band: NarrowBand | None = None,
-        notes: Sequence[str] = (),
-    ) -> None:
+        self, scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, particles: Particles, *, sources: Sources | None = None,
+        outlets: Outlets | None = None, bodies: RigidBodies | None = None, band: NarrowBand | None = None, notes: Sequence[str] = (),
+    ) -> None:  # fmt: skip
         """Allocate the fields and find the liquid's cells."""
         super().__init__(scene, grid, boundary, particles, sources=sources, outlets=outlets, bodies=bodies, band=band, notes=notes)
         self.record: Callable[[Mapping[str, np.ndarray]], object] | None = None

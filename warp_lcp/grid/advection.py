@@ -154,16 +154,9 @@ def advect(
 
 
 def advect_with_distance(
-    grid: StaggeredGrid,
-    fields: list[wp.array],
-    distance: wp.array,
-    dt: float,
-    position: wp.array,
-    stopped: wp.array,
-    *,
-    open_sides: int = 0,
-    endless: int = 0,
-) -> None:
+    grid: StaggeredGrid, fields: list[wp.array], distance: wp.array, dt: float, position: wp.array, stopped: wp.array, *,
+    open_sides: int = 0, endless: int = 0,
+) -> None:  # fmt: skip
     """Move particles through the grid's velocity for a time step; nobody ends within MARGIN cells of a wall who did not start there.
 
     Where no way back out of a wall is found within a cell, a particle stays where its last stride was open. A move goes at most 1024

@@ -307,14 +307,9 @@ def lattice(grid: StaggeredGrid, per_axis: int, jitter: float, rng: np.random.Ge
 
 
 def seed(
-    grid: StaggeredGrid,
-    regions: typing.Sequence[typing.Callable[[np.ndarray], np.ndarray]],
-    open_cells: np.ndarray,
-    *,
-    per_axis: int,
-    jitter: float,
-    random_seed: int,
-) -> tuple[np.ndarray, np.ndarray]:
+    grid: StaggeredGrid, regions: typing.Sequence[typing.Callable[[np.ndarray], np.ndarray]], open_cells: np.ndarray, *, per_axis: int,
+    jitter: float, random_seed: int,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Fill regions with particles on a jittered lattice; a point in several regions belongs to the first.
 
     Args:

@@ -61,16 +61,9 @@ def transfer_passes(real: Any) -> SimpleNamespace:
 
 
 def particles_to_faces(
-    grid: StaggeredGrid,
-    position: wp.array,
-    velocity: wp.array,
-    affine: list[wp.array],
-    fields: list[wp.array],
-    weights: list[wp.array],
-    *,
-    window: Window | None = None,
-    offsets: wp.array | None = None,
-) -> None:
+    grid: StaggeredGrid, position: wp.array, velocity: wp.array, affine: list[wp.array], fields: list[wp.array], weights: list[wp.array], *,
+    window: Window | None = None, offsets: wp.array | None = None,
+) -> None:  # fmt: skip
     """Average the particles' velocities on the faces, all particles alike.
 
     Args:
@@ -99,15 +92,9 @@ def particles_to_faces(
 
 
 def faces_to_particles(
-    grid: StaggeredGrid,
-    fields: list[wp.array],
-    position: wp.array,
-    velocity: wp.array,
-    affine: list[wp.array],
-    *,
-    saved: list[wp.array] | None = None,
-    flip: float = 0.0,
-) -> None:
+    grid: StaggeredGrid, fields: list[wp.array], position: wp.array, velocity: wp.array, affine: list[wp.array], *,
+    saved: list[wp.array] | None = None, flip: float = 0.0,
+) -> None:  # fmt: skip
     """Interpolate the faces' velocities at the particles.
 
     Args:

@@ -148,19 +148,9 @@ class DensityCorrection:
     """
 
     def __init__(
-        self,
-        grid: StaggeredGrid,
-        boundary: Boundary,
-        solver: Any,
-        *,
-        particles_a_cell: int,
-        max_density: float,
-        gain: float = 1.0,
-        even: bool = False,
-        every: int = 1,
-        tolerance: float = 1e-2,
-        max_iterations: int = 20,
-    ) -> None:
+        self, grid: StaggeredGrid, boundary: Boundary, solver: Any, *, particles_a_cell: int, max_density: float, gain: float = 1.0,
+        even: bool = False, every: int = 1, tolerance: float = 1e-2, max_iterations: int = 20,
+    ) -> None:  # fmt: skip
         self.grid, self.boundary, self.solver = grid, boundary, solver
         self.particles_a_cell, self.max_density, self.gain = particles_a_cell, max_density, gain
         self.every = every

@@ -98,19 +98,9 @@ def closed_face_kernel(k, j, i, axis: int, kind: I8, contact: U8, index: I32, se
 
 
 def extend_velocity(
-    window: Window,
-    velocity: Sequence[wp.array],
-    weights: Sequence[wp.array],
-    known: Sequence[wp.array],
-    kind: wp.array,
-    contact: wp.array,
-    index: wp.array,
-    separating: wp.array,
-    solid_velocity: Sequence[wp.array],
-    layers: int,
-    *,
-    join: Join | None = None,
-) -> None:
+    window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array], kind: wp.array, contact: wp.array,
+    index: wp.array, separating: wp.array, solid_velocity: Sequence[wp.array], layers: int, *, join: Join | None = None,
+) -> None:  # fmt: skip
     """Continue the projected velocity into air and walls.
 
     Args:
@@ -161,18 +151,9 @@ TAKE = cell_pass("warp_lcp.material.cut_wall.take", "open result field", _MARKS,
 
 
 def extend_velocity_cut(
-    window: Window,
-    velocity: Sequence[wp.array],
-    weights: Sequence[wp.array],
-    known: Sequence[wp.array],
-    kind: wp.array,
-    contact: wp.array,
-    cut: CutCells,
-    scratch: Sequence[wp.array],
-    layers: int,
-    *,
-    join: Join | None = None,
-) -> None:
+    window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array], kind: wp.array, contact: wp.array,
+    cut: CutCells, scratch: Sequence[wp.array], layers: int, *, join: Join | None = None,
+) -> None:  # fmt: skip
     """Continue the projected velocity into air and walls.
 
     Args as of `extend_velocity`, but:
