@@ -191,10 +191,9 @@ class PeriodicSides:
     def _lines(self, field: wp.array, axis: int) -> wp.array:
         """Return a view of a field, or of layers of it, whose last index goes along an axis; in 2-D of the plane in use."""
         if self.grid.dimension == 2:
-            field = field[..., 1:2, :, :]
-        spatial, before = field.ndim - 3, tuple(range(field.ndim - 3))
-        last = spatial + 2 - axis
-        return field.transpose((*before, *(n for n in range(spatial, field.ndim) if n != last), last))
+            field = field[1:2] if field.ndim == 3 else field[:, 1:2]
+        last = field.ndim - 1 - axis
+        return field.transpose((*(n for n in range(field.ndim) if n != last), last))
 
 
 @functools.cache
