@@ -22,7 +22,7 @@ from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.solids import boundary_of_part
 from warp_lcp.distributed.subdomain import Subdomain, ghost_layers
 from warp_lcp.fluids.distributed_pressure import DistributedPressure
-from warp_lcp.fluids.distributed_state import Piece, PieceReader, piece_of
+from warp_lcp.fluids.distributed_state import Piece, piece_of, take_pieces
 from warp_lcp.fluids.pressure import PressureProjection
 from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.fluids.simulator import LiquidSimulation, make_surface, pressure_settings
@@ -207,19 +207,18 @@ class DistributedLiquid(LiquidSimulation):
         Raises:
             ValueError: the pieces do not belong to this scene, or do not cover the domain; on all ranks.
         """
-        reader = PieceReader(self.part, list(self.particles.arrays()), signature(self.scene, self.part.grid))
-        taken = reader.read(pieces, self.boundary.base)
-        everyone = int(self.part.ranks.sum(len(taken.place)))
+        names, own_signature = list(self.particles.arrays()), signature(self.scene, self.part.grid)
+        particles, cells, numbers = take_pieces(self.part, names, own_signature, pieces, self.boundary.base)
+        everyone = int(self.part.ranks.sum(len(particles["place"])))
         if everyone != self._everyone:
             raise ValueError(f"the pieces have {everyone} particles: this scene has {self._everyone}")
-        self.particles.assign_with_places(taken.particles, taken.place)
+        self.particles.assign_with_places(particles, particles["place"])
         self._faces_know = False
         own = self.own_state()
-        for name, values in taken.cells.items():
+        for name, values in cells.items():
             self.part.box_of(own[name])[...] = values
-        self.restore_own(own | {"pressure_dt": taken.numbers["pressure_dt"], "time_error": taken.numbers["time_error"]})
-        self.time, self.step_count = float(taken.numbers["time"]), int(taken.numbers["step_count"])
-        self.last_dt = float(taken.numbers["last_dt"])
+        self.restore_own(own | {name: numbers[name] for name in ("pressure_dt", "time_error")})
+        self.time, self.step_count, self.last_dt = float(numbers["time"]), int(numbers["step_count"]), float(numbers["last_dt"])
 
     def state(self) -> dict[str, np.ndarray]:
         """Return this rank's part of the state, see `piece_state`."""
