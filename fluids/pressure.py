@@ -271,9 +271,7 @@ class PressureProjection:
             criteria: of `solve`.
             unknowns: of `prepare`.
         """
-        self._take(result.x)
-        wp.copy(self.cells, self.kind)
-        self._last = self._kick
+        self._accept(result.x)
         for axis, field in enumerate(velocity):
             self.known[axis].zero_()
             faces = self._faces() | {"x": self.pressure, "field": field, "known": self.known[axis]}
@@ -330,6 +328,12 @@ class PressureProjection:
         for axis, (field, weight, known) in enumerate(zip(velocity, self._weights, self.known, strict=False)):
             faces = self._faces() | {"x": self.pressure, "field": field, "known": known, "weight": weight}
             window.run(self._passes.support, axis=axis, limit=self._gravity * self._last, **faces)
+
+    def _accept(self, x: wp.array) -> None:
+        """Take the solution of the problem, and show its cells."""
+        self._take(x)
+        wp.copy(self.cells, self.kind)
+        self._last = self._kick
 
     def _take(self, x: wp.array) -> None:
         """Take the solution of the problem as the pressure."""

@@ -20,7 +20,6 @@ from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary, CutBoundary
 from warp_lcp.material.boundary_kernels import RELEASED, TOUCHES_NOTHING
-from warp_lcp.material.narrow_band import NarrowBand
 from warp_lcp.material.particle_assembly import (
     make_bodies,
     make_boundary,
@@ -31,7 +30,6 @@ from warp_lcp.material.particle_assembly import (
     placed_solids,
 )
 from warp_lcp.material.particle_simulation import ParticleSimulation, Row
-from warp_lcp.material.sources import Outlets, Sources
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import Cells, Part, SimulationFailed, missed_by_far
@@ -102,11 +100,7 @@ class LiquidSimulation(ParticleSimulation):
         grid: its grid.
         boundary: its solids and the domain's walls.
         particles: the liquid at the start.
-        sources: where liquid comes in.
-        outlets: where it leaves.
-        bodies: solids that it moves.
-        band: where its particles are, if not everywhere.
-        notes: facts for the start of a run.
+        parts: `sources`, `outlets`, `bodies`, `band` and `notes` as of `ParticleSimulation`.
 
     Attributes:
         surface: the free surface.
@@ -116,12 +110,8 @@ class LiquidSimulation(ParticleSimulation):
 
     scene: LiquidScene
 
-    def __init__(
-        self, scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, particles: Particles, *, sources: Sources | None = None,
-        outlets: Outlets | None = None, bodies: RigidBodies | None = None, band: NarrowBand | None = None, notes: Sequence[str] = (),
-    ) -> None:  # fmt: skip
-        """Allocate the fields and find the liquid's cells."""
-        super().__init__(scene, grid, boundary, particles, sources=sources, outlets=outlets, bodies=bodies, band=band, notes=notes)
+    def __init__(self, scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, particles: Particles, **parts: Any) -> None:
+        super().__init__(scene, grid, boundary, particles, **parts)
         self.record: Callable[[Mapping[str, np.ndarray]], object] | None = None
         self.surface = self._surface()
         self.projection = self._pressure()

@@ -80,13 +80,7 @@ class UnilateralPressure(PressureProjection):
         self._setting = setting
 
     def prepare(self, velocity: Sequence[wp.array], dt: float, kick_dt: float) -> int:
-        """Set up the problem of all cells that are not SOLID and return their number. The first guess is the last pressure.
-
-        Args:
-            velocity: u* of each component [m/s].
-            dt: time step [s].
-            kick_dt: how long forces have acted on u* [s].
-        """
+        """Set up the problem of all cells that are not SOLID and return their number; arguments as of the base class."""
         self._begin(kick_dt)
         self._setting.rate = wp.float64(self.grid.spacing / dt)
         self._setting.settling = min(math.sqrt(self._gravity * self.grid.spacing), self.grid.spacing / dt)
@@ -103,18 +97,8 @@ class UnilateralPressure(PressureProjection):
     def project(
         self, velocity: Sequence[wp.array], window: Window, result: wl.SolveResult, criteria: wl.StoppingCriteria, unknowns: int
     ) -> Projection:
-        """Take a result: let the pressure act, mark valid faces, find the walls that liquid presses on.
-
-        Args:
-            velocity: u* of each component [m/s] (updated).
-            window: cells that hold all liquid, with one to spare on each side.
-            result: of `solve`.
-            criteria: of `solve`.
-            unknowns: of `prepare`.
-        """
-        self._take(result.x)
-        wp.copy(self.cells, self.kind)
-        self._last = self._kick
+        """Take a result: let the pressure act, mark valid faces, find the walls that liquid presses on; arguments as of the base class."""
+        self._accept(result.x)
         for axis, field in enumerate(velocity):
             self.known[axis].zero_()
             open_ = self.boundary.open[axis] if self.boundary.open else None
