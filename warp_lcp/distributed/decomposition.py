@@ -60,7 +60,7 @@ class CellBox:
 
     def moved(self, by: Sequence[int], sign: int = 1) -> CellBox:
         """Return the box moved by so many cells along x, y, z, or back."""
-        return CellBox.of(*((a + sign * b for a, b in zip(corner, by, strict=True)) for corner in (self.low, self.high)))
+        return CellBox.of(*([a + sign * b for a, b in zip(corner, by, strict=True)] for corner in (self.low, self.high)))
 
 
 class Decomposition:
@@ -89,7 +89,7 @@ class Decomposition:
         self.parts = [list(c) for c in cuts] if cuts else [parts(n, p) for n, p in zip(counts, self.processes, strict=True)]
         starts = [[0, *itertools.accumulate(part)] for part in self.parts]
         places = map(self.place, range(ranks.size))
-        self.boxes = [CellBox.of(*((s[p + n] for s, p in zip(starts, place, strict=True)) for n in range(2))) for place in places]
+        self.boxes = [CellBox.of(*([s[p + n] for s, p in zip(starts, place, strict=True)] for n in range(2))) for place in places]
 
     def place(self, rank: int) -> Triple:
         """Return where a rank is among the ranks along x, y, z, as DMDA numbers them."""
