@@ -27,12 +27,11 @@ from warp_lcp.benchmarks.problems import BOUNDS, SplashPart, splash, splash_part
 from warp_lcp.benchmarks.record import Record, write_json
 from warp_lcp.benchmarks.scaling import FIGURES, SCENE_BYTES, SOLVE_BYTES, Growing
 from warp_lcp.benchmarks.timing import Figure, ratios
+from warp_lcp.distributed.collective import Collective, RankFailed
 from warp_lcp.distributed.decomposition import Decomposition
-from warp_lcp.distributed.devices import device_of_rank
 from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
 from warp_lcp.distributed.halo import Halo
-from warp_lcp.distributed.meeting import Meeting, RankFailed
-from warp_lcp.distributed.ranks import Ranks
+from warp_lcp.distributed.ranks import Ranks, device_of_rank
 from warp_lcp.run.devices import devices, free_memory
 
 PAUSE = 0.002  # [s] between two looks of a rank that waits: it leaves its core to the one that computes
@@ -224,7 +223,7 @@ def together(sizes: Sequence[int], *, device: str, repeat: int, say: Callable[[s
     """
     ranks = Ranks.world()
     try:
-        with Meeting(ranks, PLANNED, say).together():
+        with Collective(ranks, PLANNED, say).together():
             records = measure(ranks, sizes, device=device, repeat=repeat, say=say)
     except (RankFailed, *PLANNED) as error:
         if ranks.first:

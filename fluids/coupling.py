@@ -11,7 +11,7 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.fluids import coupling_kernels as kernels
 from warp_lcp.grid.staggered import StaggeredGrid
-from warp_lcp.material.cut_boundary import CutBoundary
+from warp_lcp.material.boundary import CutBoundary
 from warp_lcp.operators.low_rank import BlockColumns
 from warp_lcp.rigid.bodies import RigidBodies
 
@@ -108,6 +108,6 @@ class BodyCoupling:
             window.launch(kernels.enclosed_kernel, list(fields))
 
     def _weights(self) -> np.ndarray:
-        """Return rho dx^d M^-1."""
+        """Return rho dx^d M^-1 of all bodies, block diagonal."""
         inverses = [body.inverse_mass(self.grid.dimension) for body in self.bodies.bodies]
         return self._share * self._scale * np.asarray(scipy.linalg.block_diag(*inverses))

@@ -16,20 +16,18 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.distributed.balance import balanced_processes, pool
-from warp_lcp.distributed.decomposition import Decomposition
+from warp_lcp.distributed.decomposition import Decomposition, balanced_processes, pool
 from warp_lcp.distributed.particles import SharedParticles
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.solids import boundary_of_part
 from warp_lcp.distributed.subdomain import Subdomain, ghost_layers
 from warp_lcp.fluids.distributed_pressure import DistributedPressure
-from warp_lcp.fluids.distributed_state import Piece, PieceReader, piece_of
-from warp_lcp.fluids.distributed_surface import make_shared_surface
+from warp_lcp.fluids.distributed_state import Piece, piece_of, take_pieces
 from warp_lcp.fluids.pressure import PressureProjection
 from warp_lcp.fluids.scene import LiquidScene
-from warp_lcp.fluids.simulator import LiquidSimulation
-from warp_lcp.fluids.surface import FreeSurface
-from warp_lcp.grid.particles import ParticleTotals
+from warp_lcp.fluids.simulator import LiquidSimulation, make_surface, pressure_settings
+from warp_lcp.fluids.surface import FreeSurface, WholeCellSurface
+from warp_lcp.grid.particles import Particles, ParticleTotals
 from warp_lcp.grid.staggered import Window
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.particle_assembly import placed_solids, seed_materials, start_velocities
@@ -41,6 +39,30 @@ from warp_lcp.simulation import SimulationFailed, StepFailed
 LEAST_RIGHT = 2  # layers of ghost cells that stay right while the velocity is continued: faces at cut cells look so far
 METHODS = ("projected-multigrid", "minimum-map-newton")  # that solve problems of several ranks
 NOT_ON_RANKS = "is not there on several processes (--engine petsc) yet: leave it out, or run on one process"
+
+
+class SharedSurface:
+    """The free surface of liquid that ranks share: each finds it on its part, with what others know of the cells beside.
+
+    `mark` and `volume` are collective.
+
+    Args:
+        part: where this rank works; its particles come with ghosts.
+        surface: on that part, its volume counted in the box.
+    """
+
+    def __init__(self, part: Subdomain, surface: FreeSurface) -> None:
+        self.phi, self.density, self.complete, self._part, self._surface = surface.phi, surface.density, surface.complete, part, surface
+
+    def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
+        """Write the cells' kinds, those of the ghost layers and what they come from by other ranks."""
+        self._surface.mark(particles, window, kind)
+        self._part.fill(kind, *([] if self.phi is None else [self.phi]))
+
+    def volume(self, cells: int) -> float:
+        """Return the volume of all ranks' liquid, given the number of all FLUID cells."""
+        mine = self._surface.volume(cells)
+        return mine if isinstance(self._surface, WholeCellSurface) else float(self._part.ranks.sum(mine))
 
 
 class DistributedLiquid(LiquidSimulation):
@@ -71,16 +93,12 @@ class DistributedLiquid(LiquidSimulation):
         super().__init__(scene, part.grid, boundary, particles, notes=notes)
 
     def _surface(self) -> FreeSurface:
-        return make_shared_surface(self.scene, self.part, self.boundary)
+        part = self.part
+        return SharedSurface(part, make_surface(self.scene, self.grid, self.boundary, lambda _, density: part.fill(density), part.owned))
 
     def _pressure(self) -> PressureProjection:
-        settings = self.scene.solver
-        solver = wl.METHODS[settings.method](precision=settings.precision)
-        return DistributedPressure(
-            self.part, self.boundary, solver, tolerance=settings.tolerance, max_iterations=settings.max_iterations, phi=self.surface.phi,
-            lets_go=self.scene.lets_go, weights=self.weights if self.scene.short_steps else None,
-            gravity=float(np.linalg.norm(self.gravity)),
-        )  # fmt: skip
+        solver = wl.METHODS[self.scene.solver.method](precision=self.scene.solver.precision)
+        return DistributedPressure(self.part, self.boundary, solver, **pressure_settings(self.scene, self.surface, self.weights))
 
     def _flights(self) -> None:
         """Bodies reach across the cuts between ranks, where none of them knows the whole of one."""
@@ -189,19 +207,18 @@ class DistributedLiquid(LiquidSimulation):
         Raises:
             ValueError: the pieces do not belong to this scene, or do not cover the domain; on all ranks.
         """
-        reader = PieceReader(self.part, list(self.particles.arrays()), signature(self.scene, self.part.grid))
-        taken = reader.read(pieces, self.boundary.base)
-        everyone = int(self.part.ranks.sum(len(taken.place)))
+        names, own_signature = list(self.particles.arrays()), signature(self.scene, self.part.grid)
+        particles, cells, numbers = take_pieces(self.part, names, own_signature, pieces, self.boundary.base)
+        everyone = int(self.part.ranks.sum(len(particles["place"])))
         if everyone != self._everyone:
             raise ValueError(f"the pieces have {everyone} particles: this scene has {self._everyone}")
-        self.particles.assign_with_places(taken.particles, taken.place)
+        self.particles.assign_with_places(particles, particles["place"])
         self._faces_know = False
         own = self.own_state()
-        for name, values in taken.cells.items():
+        for name, values in cells.items():
             self.part.box_of(own[name])[...] = values
-        self.restore_own(own | {"pressure_dt": taken.numbers["pressure_dt"], "time_error": taken.numbers["time_error"]})
-        self.time, self.step_count = float(taken.numbers["time"]), int(taken.numbers["step_count"])
-        self.last_dt = float(taken.numbers["last_dt"])
+        self.restore_own(own | {name: numbers[name] for name in ("pressure_dt", "time_error")})
+        self.time, self.step_count, self.last_dt = float(numbers["time"]), int(numbers["step_count"]), float(numbers["last_dt"])
 
     def state(self) -> dict[str, np.ndarray]:
         """Return this rank's part of the state, see `piece_state`."""

@@ -34,13 +34,14 @@ class DistributedPressure(PressureProjection):
     """
 
     def __init__(self, part: Subdomain, boundary: Boundary, solver: Any, **settings: Any) -> None:
-        """Allocate the fields."""
         super().__init__(part.grid, boundary, solver, **settings)
         self.part, self._solved = part, part.owned
         if self._phi is None:
             self._shift = None  # the part's sides at cuts are open, the domain's are not
-        self._box_kind, self._rhs, self._guess = (self._box_like(field) for field in (self.kind, self._b, self._start))
-        self._box_lower, self._box_shift = (None if field is None else self._box_like(field) for field in (self._lower, self._shift))
+        self._boxes: list[Any] = [
+            None if f is None else self._box_like(f) for f in (self.kind, self._b, self._start, self._lower, self._shift)
+        ]
+        _, self._rhs, self._guess, _, _ = self._boxes
         if settings["tolerance"] == "auto":
             self.automatic = TimeErrorTolerance(self._rhs.size, part.grid.device, part.ranks)
 
@@ -54,7 +55,7 @@ class DistributedPressure(PressureProjection):
 
     def fluid_cells(self) -> np.ndarray:
         """Return where in the box FLUID was in the last projection, as (k, j, i) in the stored shape of the part, shape (n, 3)."""
-        return np.argwhere(self.part.box_of(self.shown.numpy()) == FLUID) + np.array(self.part.owned.low)
+        return np.argwhere(self.part.box_of(self.cells.numpy()) == FLUID) + np.array(self.part.owned.low)
 
     def not_finite(self) -> np.ndarray:
         """Return the cells (x, y, z), counted from 0 in the whole domain, whose right-hand side is not finite, shape (n, 3)."""
@@ -67,14 +68,15 @@ class DistributedPressure(PressureProjection):
         for axis, field in zip("xyz", self.boundary.open, strict=False):
             face = faces[f"face_{axis}"] = self._box_like(field)
             self._copy(field, face)
-        cells, decomposition = self._box_kind.numpy()[1:-1, 1:-1, 1:-1], self.part.decomposition
-        self._operator = DistributedGridPoisson(decomposition, cells, shift=self._box_shift, device=self.grid.device, **faces)
-        self._problem = wl.LCP(self._operator, self._rhs, -np.inf if self._box_lower is None else self._box_lower, np.inf)
+        kind, _, _, lower, shift = self._boxes
+        cells, decomposition = kind.numpy()[1:-1, 1:-1, 1:-1], self.part.decomposition
+        self._operator = DistributedGridPoisson(decomposition, cells, shift=shift, device=self.grid.device, **faces)
+        self._problem = wl.LCP(self._operator, self._rhs, -np.inf if lower is None else lower, np.inf)
         self._work = self.solver.init(self._problem)
 
-    def _update(self, cells: wp.array) -> None:
+    def _update(self) -> None:
         self._copy_to_box()
-        self._operator.update(self._box_kind)
+        self._operator.update(self._boxes[0])
 
     def _support(self, velocity: Sequence[wp.array], window: Window) -> None:
         """Let the pressure act on what rests on the surface, beside projected faces of other ranks too."""
@@ -82,8 +84,7 @@ class DistributedPressure(PressureProjection):
         super()._support(velocity, window)
 
     def _copy_to_box(self) -> None:
-        boxes = (self._box_kind, self._rhs, self._guess, self._box_lower, self._box_shift)
-        for field, box in zip((self.kind, self._b, self._start, self._lower, self._shift), boxes, strict=True):
+        for field, box in zip((self.kind, self._b, self._start, self._lower, self._shift), self._boxes, strict=True):
             if box is not None:
                 self._copy(field, box)
 

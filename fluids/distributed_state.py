@@ -3,36 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.distributed.decomposition import Box
+from warp_lcp.distributed.decomposition import CellBox
 from warp_lcp.distributed.subdomain import Subdomain
 
 Piece = Mapping[str, np.ndarray]  # what one rank has of a simulation's state
 
 CELLS = {"pressure": np.float64, "cells": np.int8, "contact": np.uint8}
 NUMBERS = ("time", "step_count", "last_dt", "pressure_dt", "time_error", "signature", "counts")
-
-
-@dataclass(frozen=True)
-class Taken:
-    """What a rank takes from pieces.
-
-    Args:
-        particles: float32 of shape (n, 3) by name.
-        place: int64, shape (n,).
-        cells: of this rank's box, shape (nz, ny, nx), by name.
-        numbers: that all pieces have alike.
-    """
-
-    particles: dict[str, np.ndarray]
-    place: np.ndarray
-    cells: dict[str, np.ndarray]
-    numbers: dict[str, np.ndarray]
 
 
 def piece_of(state: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -82,80 +64,67 @@ def state_of(pieces: Sequence[Piece], like: Mapping[str, np.ndarray]) -> dict[st
     return whole
 
 
-class PieceReader:
-    """Takes from pieces what lies in a rank's box.
+def take_pieces(
+    part: Subdomain, particles: Sequence[str], signature: np.ndarray, pieces: Sequence[Piece], base: wp.array
+) -> tuple[Piece, Piece, Piece]:
+    """Take from pieces what lies in this rank's box; collective.
 
     Args:
         part: where this rank works.
-        particles: names of the particles' arrays.
+        particles: names of the particles' arrays, float32 of shape (n, 3).
         signature: numbers that tell this scene's state from another's.
+        pieces: of all ranks of a run.
+        base: int8, SOLID in cells without liquid, of the part.
+
+    Returns:
+        By name: the particles with their `place`, the cells of this rank's box, shape (nz, ny, nx), and numbers that all pieces have alike.
+
+    Raises:
+        ValueError: the pieces do not belong to this scene, or do not cover the domain; on all ranks.
     """
-
-    def __init__(self, part: Subdomain, particles: Sequence[str], signature: np.ndarray) -> None:
-        self.part, self._particles, self._signature = part, particles, signature
-
-    def read(self, pieces: Sequence[Piece], base: wp.array) -> Taken:
-        """Return this rank's particles and cells; collective.
-
-        Args:
-            pieces: of all ranks of a run.
-            base: int8, SOLID in cells without liquid, of the part.
-
-        Raises:
-            ValueError: the pieces do not belong to this scene, or do not cover the domain; on all ranks.
-        """
-        trouble, taken = self._read(pieces, base)
-        told = [text for text in self.part.ranks.comm.allgather(trouble) if text]
-        if told:
-            raise ValueError(told[0])
-        assert taken is not None
-        return taken
-
-    def _read(self, pieces: Sequence[Piece], base: wp.array) -> tuple[str, Taken | None]:
-        """Return what is wrong, "" if nothing, and what was read."""
-        names = [*NUMBERS, *self._particles, "place", *CELLS, "box"]
-        missing = sorted({name for piece in pieces for name in names if name not in piece})
-        if missing or not pieces:
-            return f"the state lacks {', '.join(missing) or 'pieces'}: it does not belong to this scene on ranks", None
-        numbers = {name: np.asarray(pieces[0][name]) for name in NUMBERS}
-        if not np.array_equal(numbers["signature"], self._signature):
-            return "the state's grid, spacing, number of particles a cell or transfer differ from this scene's", None
-        if any(not np.array_equal(numbers[name], piece[name]) for piece in pieces for name in NUMBERS):
-            return "the pieces are of different states", None
-        cells = {name: np.zeros(self.part.box.counts[::-1], dtype=dtype) for name, dtype in CELLS.items()}
-        covered, found = 0, []
+    with part.decomposition.collective.led():
+        numbers = _numbers(pieces, [*particles, "place", *CELLS, "box"], signature)
+        cells = {name: np.zeros(part.box.counts[::-1], dtype=dtype) for name, dtype in CELLS.items()}
+        own: Piece = {name: np.empty((0, 3), dtype=np.float32) for name in particles} | {"place": np.empty(0, dtype=np.int64)}
+        covered, found = 0, [own]
         for piece in pieces:
-            box = Box(*(tuple(int(n) for n in corner) for corner in piece["box"]))  # type: ignore[arg-type]
-            covered += self._take_cells(piece, box, cells)
-            if box.grown(self.part.layers).common(self.part.box).cells:  # particles move on to their rank when the next step begins
-                found.append(self._own_particles(piece))
-        particles = {name: np.concatenate([p[name] for p in found]) for name in (*self._particles, "place")} if found else {}
-        place = particles.pop("place", np.empty(0, dtype=np.int64))
-        particles = particles or {name: np.empty((0, 3), dtype=np.float32) for name in self._particles}
-        if covered != self.part.box.cells:
-            return "the pieces do not cover the domain: some are missing, or twice there", None
-        if any(not np.isfinite(values).all() for values in (*particles.values(), cells["pressure"])):
-            return "the pieces hold values that are not finite", None
-        if not np.array_equal(cells["cells"] == wl.SOLID, self.part.box_of(base.numpy()) == wl.SOLID):
-            return "the state's solids are not this scene's", None
-        return "", Taken(particles, place, cells, numbers)
+            box = CellBox.of(*piece["box"])
+            shared = box.common(part.box)
+            covered += shared.cells
+            for name, values in cells.items() if shared.cells else ():
+                values[shared.moved(part.box.low, -1).slices] = piece[name][shared.moved(box.low, -1).slices]
+            if box.grown(part.layers).common(part.box).cells:  # particles move on to their rank when the next step begins
+                inside = _in_box(part, piece)
+                found.append({name: np.asarray(piece[name])[inside] for name in own})
+        own = {name: np.ascontiguousarray(np.concatenate([p[name] for p in found])) for name in own}
+        if covered != part.box.cells:
+            raise ValueError("the pieces do not cover the domain: some are missing, or twice there")
+        if any(not np.isfinite(values).all() for values in (*own.values(), cells["pressure"])):
+            raise ValueError("the pieces hold values that are not finite")
+        if not np.array_equal(cells["cells"] == wl.SOLID, part.box_of(base.numpy()) == wl.SOLID):
+            raise ValueError("the state's solids are not this scene's")
+        return own, cells, numbers
 
-    def _take_cells(self, piece: Piece, box: Box, cells: dict[str, np.ndarray]) -> int:
-        """Take a piece's cells that lie in this rank's box, and return how many there are."""
-        shared = box.common(self.part.box)
-        if shared.cells:
-            for name, values in cells.items():
-                values[shared.moved(self.part.box.low, -1).slices] = piece[name][shared.moved(box.low, -1).slices]
-        return shared.cells
 
-    def _own_particles(self, piece: Piece) -> dict[str, np.ndarray]:
-        """Return a piece's particles in this rank's box; cells are found as kernels find them."""
-        grid, box = self.part.grid, self.part.box
-        inverse, one = np.float32(1.0 / grid.spacing), np.float32(1.0)
-        last = np.array(self.part.decomposition.counts)
-        inside = np.ones(len(piece["place"]), dtype=bool)
-        for axis in range(grid.dimension):
-            coordinate = np.asarray(piece["position"][:, axis], dtype=np.float32) * inverse + one
-            cell = np.clip(coordinate, one, np.float32(last[axis])).astype(np.int64) - 1
-            inside &= (cell >= box.low[axis]) & (cell < box.high[axis])
-        return {name: np.ascontiguousarray(piece[name][inside]) for name in (*self._particles, "place")}
+def _numbers(pieces: Sequence[Piece], others: Sequence[str], signature: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the numbers that all pieces have alike, after a look whether they have all else, and belong to a scene."""
+    missing = sorted({name for piece in pieces for name in (*NUMBERS, *others) if name not in piece})
+    if missing or not pieces:
+        raise ValueError(f"the state lacks {', '.join(missing) or 'pieces'}: it does not belong to this scene on ranks")
+    numbers = {name: np.asarray(pieces[0][name]) for name in NUMBERS}
+    if not np.array_equal(numbers["signature"], signature):
+        raise ValueError("the state's grid, spacing, number of particles a cell or transfer differ from this scene's")
+    if any(not np.array_equal(numbers[name], piece[name]) for piece in pieces for name in NUMBERS):
+        raise ValueError("the pieces are of different states")
+    return numbers
+
+
+def _in_box(part: Subdomain, piece: Piece) -> np.ndarray:
+    """Tell which of a piece's particles are in this rank's box; cells are found as kernels find them."""
+    inverse, one = np.float32(1.0 / part.grid.spacing), np.float32(1.0)
+    inside = np.ones(len(piece["place"]), dtype=bool)
+    for axis in range(part.grid.dimension):
+        coordinate = np.asarray(piece["position"][:, axis], dtype=np.float32) * inverse + one
+        cell = np.clip(coordinate, one, np.float32(part.decomposition.counts[axis])).astype(np.int64) - 1
+        inside &= (cell >= part.box.low[axis]) & (cell < part.box.high[axis])
+    return inside

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import numpy as np
@@ -11,13 +14,53 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.fluids.coupling import BodyCoupling
-from warp_lcp.fluids.pressure_kernels import COUNT, FACES, pressure_passes
 from warp_lcp.fluids.tolerance import TimeErrorTolerance
 from warp_lcp.gallery import recorded
 from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.material.boundary import Boundary
-from warp_lcp.operators.grid_poisson import FLUID
+from warp_lcp.material.boundary_kernels import HELD, LETS_GO, RELEASED, TOUCHES
+from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
+from warp_lcp.rows import RowPass
 from warp_lcp.rows.vectors import convert
+
+HEADERS = Path(__file__).parent / "headers"
+CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR, "TOUCHES": TOUCHES, "LETS_GO": LETS_GO, "RELEASED": RELEASED, "HELD": HELD}
+THETA_MIN = 1e-3  # the nearest that air comes to a FLUID cell's center, in cells
+F32, F64, I8, U8 = wp.float32, wp.float64, wp.int8, wp.uint8
+FACES = {f"{what}_{axis}": F32 for what in ("open", "solid") for axis in "xyz"}
+COUNT = RowPass(
+    "fluids.pressure.count_fluid", HEADERS / "count_fluid.h", F64, box={"kind": I8}, whole={"sums": F64}, constants={"FLUID": FLUID}
+)
+
+
+@functools.cache
+def pressure_passes(cut: bool, moving: bool, ghost: bool, bounded: bool = True) -> SimpleNamespace:
+    """Return `prepare`, `subtract_gradient`, `support` and `contact`.
+
+    Args:
+        cut: whether faces have open fractions.
+        moving: whether solids have velocities.
+        ghost: whether the free surface lies between cells.
+        bounded: whether a wall lets go; else there is no lower bound.
+    """
+    module = "fluids.pressure" + "_cut" * cut + "_moving" * moving + "_ghost" * ghost + "_equations" * (not bounded)
+    flags = {"CUT": cut, "MOVING": moving, "GHOST": ghost, "BOUNDED": bounded, "THETA_MIN": THETA_MIN, "TINY_WEIGHT": TINY_WEIGHT}
+
+    def made(name: str, fields: dict[str, Any], numbers: dict[str, Any], **more: Any) -> RowPass:
+        box, optional = {"kind": I8, **FACES, "phi": F32} | fields, (*FACES, "phi", "w", "lower", "shift")
+        numbers, path = {"planes": int} | numbers, HEADERS / f"{name}.h"
+        return RowPass(f"{module}.{name}", path, F64, box=box, numbers=numbers, constants=CONSTANTS | flags, optional=optional, **more)
+
+    liquid, faces = {"u": F32, "v": F32, "w": F32, "touch": U8}, {"x": F64, "field": F32, "known": I8}
+    problem = {"previous": F64, "b": F64, "lower": F64, "start": F64, "shift": F32}
+    return SimpleNamespace(
+        prepare=made("prepare", liquid | problem, {"ratio": F64}),
+        subtract_gradient=made("subtract_gradient", faces, {"axis": int}),
+        support=made("support", faces | {"weight": F32}, {"axis": int, "limit": F32}),
+        contact=made("contact", liquid | {"x": F64, "contact": U8}, {"threshold": F64}, whole={"sums": F64}),
+    )
+
 
 ROUNDING = 4 * float(np.finfo(np.float32).eps)  # of an outflow, relative to the speeds it is the difference of (float32 faces)
 RELEASE_FACTOR = 10.0  # a wall cell lets go if its outflow exceeds this multiple of the accepted residual: resting ceilings are degenerate
@@ -73,7 +116,7 @@ class PressureProjection:
 
     Attributes:
         kind: int8 of AIR, FLUID, SOLID, which the caller marks.
-        shown: `kind` of the last projection, which pressure and contact belong to; as first marked before it.
+        cells: `kind` of the last projection, which pressure and contact belong to; as first marked before it.
         pressure: last accepted x [m/s], float64.
         contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED.
         known: int8, one field a component: which faces the last projection made valid, see `warp_lcp.grid.extrapolate`.
@@ -81,30 +124,22 @@ class PressureProjection:
     """
 
     def __init__(
-        self,
-        grid: StaggeredGrid,
-        boundary: Boundary,
-        solver: Any,
-        *,
-        tolerance: float | Literal["auto"],
-        max_iterations: int,
-        phi: wp.array | None = None,
-        coupling: BodyCoupling | None = None,
-        lets_go: bool = True,
-        weights: Sequence[wp.array] | None = None,
+        self, grid: StaggeredGrid, boundary: Boundary, solver: Any, *, tolerance: float | Literal["auto"], max_iterations: int,
+        phi: wp.array | None = None, coupling: BodyCoupling | None = None, lets_go: bool = True, weights: Sequence[wp.array] | None = None,
         gravity: float = 0.0,
-    ) -> None:
-        """Allocate the fields."""
+    ) -> None:  # fmt: skip
         self.grid, self.boundary, self.solver, self._phi, self.coupling = grid, boundary, solver, phi, coupling
         self._weights, self._gravity = list(weights or ()), gravity
         self.tolerance, self.max_iterations = tolerance, max_iterations
         self.automatic = TimeErrorTolerance(grid.size, grid.device) if tolerance == "auto" else None
         self._passes = pressure_passes(bool(boundary.open), bool(boundary.velocity), phi is not None, lets_go)
-        self.kind, self.shown, self.contact = grid.field(wp.int8), grid.field(wp.int8), grid.field(wp.uint8)
+        self.kind, self.cells, self.contact = grid.field(wp.int8), grid.field(wp.int8), grid.field(wp.uint8)
         self.pressure, self.known = grid.field(wp.float64), grid.faces(wp.int8)
         wp.copy(self.kind, boundary.base)
+        self._unknown = self.kind  # FLUID where there is an unknown
         self._b, self._start = (grid.field(wp.float64) for _ in range(2))
         self._lower = wp.full(grid.shape, -np.inf, dtype=wp.float64, device=grid.device) if lets_go else None
+        self._least: Any = -np.inf if self._lower is None else self._lower
         self._shift = grid.field() if phi is not None or boundary.open_sides else None
         self._sums = wp.zeros((*grid.shape[:2], 2), dtype=wp.float64, device=grid.device)
         self._solved, self._rhs, self._guess = grid.domain, self._b, self._start  # what is solved for
@@ -113,7 +148,7 @@ class PressureProjection:
 
     def show(self) -> None:
         """Show `kind` in frames though nothing has been projected yet."""
-        wp.copy(self.shown, self.kind)
+        wp.copy(self.cells, self.kind)
 
     def prepare(self, velocity: Sequence[wp.array], dt: float, kick_dt: float) -> int:
         """Set up the problem of the marked cells and return the number of unknowns. The first guess is the last pressure.
@@ -131,7 +166,7 @@ class PressureProjection:
             return 0
         problem = {"previous": self.pressure, "b": self._b, "lower": self._lower, "start": self._start, "shift": self._shift}
         self._solved.run(self._passes.prepare, **self._liquid(velocity), **problem, ratio=self._ratio)
-        self._update(self.kind)
+        self._update()
         return unknowns
 
     def leave(self) -> Projection:
@@ -148,20 +183,20 @@ class PressureProjection:
 
     def _make_problem(self) -> None:
         faces = {f"face_{axis}": field for axis, field in zip("xyz", self.boundary.open, strict=False)}
-        cells = self.grid.interior(self.kind.numpy())
+        cells = self.grid.interior(self._unknown.numpy())
         self._operator = wl.GridPoisson(cells, shift=self._shift, device=self.grid.device, **faces)
-        self._problem = wl.LCP(self._joined(), self._b, -np.inf if self._lower is None else self._lower, np.inf)
+        self._problem = wl.LCP(self._joined(), self._b, self._least, np.inf)
         self._work = self.solver.init(self._problem)
 
     def _joined(self) -> wl.GridPoisson | wl.SumOperator:
         """Return the operator, with the bodies' term if there are bodies."""
         return self._operator if self.coupling is None else self.coupling.join(self._operator)
 
-    def _update(self, cells: wp.array) -> None:
+    def _update(self) -> None:
         """Take the cells, and where bodies meet them."""
-        self._operator.update(cells)
+        self._operator.update(self._unknown)
         if self.coupling is not None:
-            self.coupling.take(cells)
+            self.coupling.take(self._unknown)
 
     def _faces(self) -> dict[str, Any]:
         """Return what passes take of cells, solids and surface."""
@@ -236,9 +271,7 @@ class PressureProjection:
             criteria: of `solve`.
             unknowns: of `prepare`.
         """
-        self._take(result.x)
-        wp.copy(self.shown, self.kind)
-        self._last = self._kick
+        self._accept(result.x)
         for axis, field in enumerate(velocity):
             self.known[axis].zero_()
             faces = self._faces() | {"x": self.pressure, "field": field, "known": self.known[axis]}
@@ -253,8 +286,9 @@ class PressureProjection:
         return Projection(result, unknowns, int(released), worst)
 
     def unknowns(self) -> int:
-        """Return the number of FLUID cells."""
-        return self._count(self.kind)
+        """Return the number of unknowns."""
+        self._solved.run(COUNT, whole=True, kind=self._unknown, sums=self._sums)
+        return int(self._found()[0])
 
     def not_finite(self) -> np.ndarray:
         """Return the cells (x, y, z), counted from 0, whose right-hand side is not finite, shape (n, 3)."""
@@ -263,14 +297,14 @@ class PressureProjection:
 
     def fluid_cells(self) -> np.ndarray:
         """Return where FLUID was in the last projection, as (k, j, i) in the stored shape, shape (n, 3)."""
-        return np.argwhere(self.shown.numpy() == FLUID)
+        return np.argwhere(self.cells.numpy() == FLUID)
 
     def state(self) -> dict[str, np.ndarray]:
         """Return what the next projection starts from, and what a frame shows of the last."""
         return {
             "pressure": self.pressure.numpy().copy(),
             "pressure_dt": np.array(self._last),
-            "cells": self.shown.numpy().copy(),
+            "cells": self.cells.numpy().copy(),
             "contact": self.contact.numpy().copy(),
             "time_error": np.array([-1.0, 0.0]) if self.automatic is None else self.automatic.state(),
         }
@@ -278,7 +312,7 @@ class PressureProjection:
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Continue from `state`, whose arrays have been checked."""
         self.pressure.assign(state["pressure"])
-        self.shown.assign(state["cells"])
+        self.cells.assign(state["cells"])
         self.contact.assign(state["contact"])
         self._last = float(state["pressure_dt"])
         if self.automatic is not None:
@@ -295,10 +329,11 @@ class PressureProjection:
             faces = self._faces() | {"x": self.pressure, "field": field, "known": known, "weight": weight}
             window.run(self._passes.support, axis=axis, limit=self._gravity * self._last, **faces)
 
-    def _count(self, kind: wp.array) -> int:
-        """Return the number of cells that are FLUID in a field."""
-        self._solved.run(COUNT, whole=True, kind=kind, sums=self._sums)
-        return int(self._found()[0])
+    def _accept(self, x: wp.array) -> None:
+        """Take the solution of the problem, and show its cells."""
+        self._take(x)
+        wp.copy(self.cells, self.kind)
+        self._last = self._kick
 
     def _take(self, x: wp.array) -> None:
         """Take the solution of the problem as the pressure."""
@@ -306,8 +341,7 @@ class PressureProjection:
 
     def _found(self) -> tuple[float, float]:
         """Return the sum of what kernels have found in rows, and the largest of what else they have."""
-        low, high = self._solved.low, self._solved.high
-        rows = self._sums.numpy()[low[0] : high[0], low[1] : high[1]]
+        rows = self._solved.rows_of(self._sums)
         return float(rows[..., 0].sum()), float(rows[..., 1].max())
 
 

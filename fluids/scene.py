@@ -38,7 +38,7 @@ class Pressure(Table):
 
 
 class LiquidScene(ParticleScene):
-    """A scene of liquid."""
+    """A scene of liquid: the tables of all materials, `pressure` and `liquid`."""
 
     solve_bytes: ClassVar[int] = PRESSURE_BYTES
     carried_by_grid: ClassVar[bool] = True

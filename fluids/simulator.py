@@ -4,22 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.fluids.assembly import make_pressure, make_surface
+from warp_lcp.fluids.coupling import BodyCoupling
 from warp_lcp.fluids.pressure import PressureProjection, Projection
 from warp_lcp.fluids.scene import LiquidScene
-from warp_lcp.fluids.surface import FreeSurface
+from warp_lcp.fluids.surface import FreeSurface, GhostFluidSurface, NoSurface, WholeCellSurface
+from warp_lcp.fluids.unilateral import UnilateralPressure
+from warp_lcp.grid.level_set import Fill
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
-from warp_lcp.material.boundary import Boundary
-from warp_lcp.material.contact import RELEASED, TOUCHES_NOTHING
-from warp_lcp.material.narrow_band import NarrowBand
-from warp_lcp.material.outlets import Outlets
+from warp_lcp.material.boundary import Boundary, CutBoundary
+from warp_lcp.material.boundary_kernels import RELEASED, TOUCHES_NOTHING
 from warp_lcp.material.particle_assembly import (
     make_bodies,
     make_boundary,
@@ -30,10 +30,62 @@ from warp_lcp.material.particle_assembly import (
     placed_solids,
 )
 from warp_lcp.material.particle_simulation import ParticleSimulation, Row
-from warp_lcp.material.sources import Sources
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import Cells, Part, SimulationFailed, missed_by_far
+
+
+def make_surface(
+    scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, fill: Fill | None = None, counted: Window | None = None
+) -> FreeSurface:
+    """Return the free surface that a scene asks for.
+
+    Args:
+        scene: the scene.
+        grid: its grid.
+        boundary: its solids.
+        fill: adds to the particles' density what none of them stands for, as where they are in a band alone.
+        counted: cells whose volume is asked for; None: all.
+    """
+    if scene.stays_full and not boundary.velocity:  # walls that a caller moves might make room
+        return NoSurface(grid, boundary, counted)
+    count = scene.particles.per_axis**grid.dimension
+    if scene.pressure.surface == "ghost-fluid":
+        smoothing = scene.pressure.smoothing
+        return GhostFluidSurface(grid, boundary, particles_a_cell=count, smoothing=smoothing, fill=fill, counted=counted)
+    return WholeCellSurface(grid, boundary, particles_a_cell=count, fill=fill)
+
+
+def pressure_settings(scene: LiquidScene, surface: FreeSurface, weights: list[wp.array]) -> dict[str, Any]:
+    """Return what a scene sets of `PressureProjection`, with the weights of the particles on each component's faces."""
+    settings, gravity = scene.solver, float(np.linalg.norm(scene.physics.gravity))
+    resting = {"lets_go": scene.lets_go, "weights": weights if scene.short_steps else None, "phi": surface.phi}
+    return {"tolerance": settings.tolerance, "max_iterations": settings.max_iterations, "gravity": gravity} | resting
+
+
+def make_pressure(
+    scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, surface: FreeSurface, weights: list[wp.array], bodies: RigidBodies | None
+) -> PressureProjection:
+    """Return the pressure that a scene asks for, of liquid and the bodies in it.
+
+    Args:
+        scene: the scene.
+        grid: its grid.
+        boundary: its solids.
+        surface: the free surface.
+        weights: those of the particles on each component's faces.
+        bodies: those that the liquid moves, among the solids; None: there are none.
+    """
+    solver = wl.METHODS[scene.solver.method](precision=scene.solver.precision)
+    coupling, settings = None, pressure_settings(scene, surface, weights)
+    if bodies is not None:
+        assert isinstance(boundary, CutBoundary), "a scene with bodies has cut cells"
+        coupling = BodyCoupling(grid, boundary, bodies, scene.physics.density)
+    if isinstance(surface, GhostFluidSurface) and scene.pressure.model == "unilateral":
+        settings = {name: settings[name] for name in ("tolerance", "max_iterations", "gravity")} | {"level_set": surface.level_set}
+        return UnilateralPressure(grid, boundary, solver, weights=weights, coupling=coupling, **settings)
+    return PressureProjection(grid, boundary, solver, coupling=coupling, **settings)
+
 
 if TYPE_CHECKING:
     from warp_lcp.distributed.ranks import Ranks
@@ -48,11 +100,7 @@ class LiquidSimulation(ParticleSimulation):
         grid: its grid.
         boundary: its solids and the domain's walls.
         particles: the liquid at the start.
-        sources: where liquid comes in.
-        outlets: where it leaves.
-        bodies: solids that it moves.
-        band: where its particles are, if not everywhere.
-        notes: facts for the start of a run.
+        parts: `sources`, `outlets`, `bodies`, `band` and `notes` as of `ParticleSimulation`.
 
     Attributes:
         surface: the free surface.
@@ -62,21 +110,8 @@ class LiquidSimulation(ParticleSimulation):
 
     scene: LiquidScene
 
-    def __init__(
-        self,
-        scene: LiquidScene,
-        grid: StaggeredGrid,
-        boundary: Boundary,
-        particles: Particles,
-        *,
-        sources: Sources | None = None,
-        outlets: Outlets | None = None,
-        bodies: RigidBodies | None = None,
-        band: NarrowBand | None = None,
-        notes: Sequence[str] = (),
-    ) -> None:
-        """Allocate the fields and find the liquid's cells."""
-        super().__init__(scene, grid, boundary, particles, sources=sources, outlets=outlets, bodies=bodies, band=band, notes=notes)
+    def __init__(self, scene: LiquidScene, grid: StaggeredGrid, boundary: Boundary, particles: Particles, **parts: Any) -> None:
+        super().__init__(scene, grid, boundary, particles, **parts)
         self.record: Callable[[Mapping[str, np.ndarray]], object] | None = None
         self.surface = self._surface()
         self.projection = self._pressure()
@@ -84,7 +119,7 @@ class LiquidSimulation(ParticleSimulation):
         self.mark()
 
     def _surface(self) -> FreeSurface:
-        return make_surface(self.scene, self.grid, self.boundary, self.band)
+        return make_surface(self.scene, self.grid, self.boundary, self.band.fill if self.band is not None else None)
 
     def _pressure(self) -> PressureProjection:
         return make_pressure(self.scene, self.grid, self.boundary, self.surface, self.weights, self.bodies)
@@ -217,7 +252,7 @@ class LiquidSimulation(ParticleSimulation):
     def _held(self, projected: Projection) -> Projection:
         """Give the sources' faces their velocity back, and show their cells as liquid."""
         if self.sources is not None:
-            self.sources.hold(self.velocity, self.projection.known, self.projection.shown)
+            self.sources.hold(self.velocity, self.projection.known, self.projection.cells)
         return projected
 
     def _explain(self, result: wl.SolveResult) -> NoReturn:

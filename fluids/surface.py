@@ -1,7 +1,6 @@
 """The free surface: which cells hold liquid, and where between cells it ends."""
 
-from __future__ import annotations
-
+import typing
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -9,12 +8,39 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.fluids import surface_kernels as kernels
+from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
 from warp_lcp.grid.extrapolate import complete
 from warp_lcp.grid.level_set import Fill, LevelSet
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary
+from warp_lcp.operators.grid_poisson import AIR, FLUID
+
+_AIR = wp.constant(wp.int8(AIR))
+_FLUID = wp.constant(wp.int8(FLUID))
+
+
+options: dict[str, typing.Any] = {"enable_backward": False, "module": "fluids.surface"}
+
+
+@wp.kernel(**options)
+@typing.no_type_check
+def mark_particles_kernel(key: wp.array(dtype=wp.int32), kind: wp.array(dtype=wp.int8)):
+    """A cell that holds a particle is FLUID."""
+    cell = key[wp.tid()]
+    if kind[cell] == _AIR:
+        kind[cell] = _FLUID
+
+
+@cell_kernel("fluids.surface")
+@typing.no_type_check
+def mark_inside_kernel(k, j, first, end, phi: F32, capacity: F32, most: float, kind: I8):
+    """An open cell of the domain below the free surface is FLUID, if the share of its kernel that is open is no more than `most`."""
+    for i in range(wp.max(first, 1), wp.min(end, kind.shape[2] - 1)):
+        if kind[k, j, i] == _AIR and k > 0 and j > 0 and k + 1 < kind.shape[0] and j + 1 < kind.shape[1]:
+            if phi[k, j, i] < 0.0 and capacity[k, j, i] <= most:
+                kind[k, j, i] = _FLUID
+
 
 SLIVER = 0.35  # a cell whose open share is smaller may hold no particle though liquid fills it: the level set decides
 SAMPLES = 8  # points along the edge of a cut cell, of a volume that is found once
@@ -62,15 +88,15 @@ class WholeCellSurface:
         self.density = self._level_set.density if self._level_set is not None else None
 
     def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
-        """Write the cells' kinds."""
+        """Write the cells' kinds: FLUID where a particle is."""
         wp.copy(kind, self.boundary.base)
-        wp.launch(kernels.mark_particles_kernel, particles.count, [particles.key, kind.flatten()], device=self.grid.device)
+        wp.launch(mark_particles_kernel, particles.count, [particles.key, kind.flatten()], device=self.grid.device)
         if self._level_set is not None:
             self._level_set.update(particles, window, self.boundary.capacity, self.boundary.base, fill=self._fill)
-            window.launch(kernels.mark_inside_kernel, [self._level_set.phi, self.boundary.capacity, SLIVER, kind])
+            window.launch(mark_inside_kernel, [self._level_set.phi, self.boundary.capacity, SLIVER, kind])
 
     def complete(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
-        """Give u* to slivers."""
+        """Give u* to faces of slivers that hold no particle."""
         if self._level_set is not None:
             complete(window, velocity, weights, known)
 
@@ -95,7 +121,7 @@ class NoSurface:
         self._volume = float(_open_shares(grid, boundary)[cells][filled].sum()) * grid.cell_volume
 
     def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
-        """Write the cells' kinds."""
+        """Write the cells' kinds: FLUID in all open ones."""
         wp.copy(kind, self._kind)
 
     def complete(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
@@ -116,22 +142,25 @@ class GhostFluidSurface:
         particles_a_cell: of liquid at rest.
         smoothing: binomial passes over the density: quieter, and less accurate in thin sheets.
         fill: adds to the density what no particle stands for.
+        counted: cells whose volume is asked for; None: all.
     """
 
-    def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int, smoothing: int, fill: Fill | None = None) -> None:
-        """Allocate the level set."""
+    def __init__(
+        self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int, smoothing: int, fill: Fill | None = None,
+        counted: Window | None = None,
+    ) -> None:  # fmt: skip
         self.grid, self.boundary, self._fill = grid, boundary, fill
         self.level_set = LevelSet(grid, particles_a_cell=particles_a_cell, smoothing=smoothing)
         self.phi: wp.array | None = self.level_set.phi
         self.density: wp.array | None = self.level_set.density
-        self._window = grid.everywhere
+        self._window, self._counted = grid.everywhere, counted or grid.domain
 
     def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:
         """Write the cells' kinds: FLUID below the surface."""
         self._window = window
         self.level_set.update(particles, window, self.boundary.capacity, self.boundary.base, fill=self._fill)
         wp.copy(kind, self.boundary.base)
-        window.launch(kernels.mark_inside_kernel, [self.level_set.phi, self.boundary.capacity, 2.0, kind])
+        window.launch(mark_inside_kernel, [self.level_set.phi, self.boundary.capacity, 2.0, kind])
 
     def complete(self, window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array]) -> None:
         """Give u* to FLUID faces between particles."""
@@ -139,7 +168,8 @@ class GhostFluidSurface:
 
     def volume(self, cells: int) -> float:
         """Return the volume inside the surface."""
-        return self.level_set.volume(self.boundary.distance, self._window)
+        window = self._window.common(self._counted)
+        return 0.0 if window is None else self.level_set.volume(self.boundary.distance, window)
 
 
 def _open_shares(grid: StaggeredGrid, boundary: Boundary) -> np.ndarray:

@@ -102,5 +102,5 @@ class TimeErrorTolerance:
         return np.array([-1.0 if self.time_error is None else self.time_error, self._reference])
 
     def restore(self, state: np.ndarray) -> None:
-        """Continue from `state`."""
+        """Continue from what `state` returned."""
         self.time_error, self._reference = float(state[0]) if state[0] >= 0.0 else None, float(state[1])

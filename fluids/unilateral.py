@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.fluids import unilateral_kernels as kernels
-from warp_lcp.fluids.coupling import BodyCoupling
 from warp_lcp.fluids.pressure import PressureProjection, Projection, three
 from warp_lcp.grid.level_set import LevelSet
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.density_correction import SHIFT
 from warp_lcp.operators.grid_poisson import FLUID
-from warp_lcp.rows.vectors import convert
 
 
 class UnilateralPressure(PressureProjection):
@@ -61,48 +59,28 @@ class UnilateralPressure(PressureProjection):
         solver: settings of the method.
         level_set: of the liquid's surface, whose density is used.
         weights: of the particles on each component's faces: faces without keep nothing.
-        tolerance: relative residual at which a solve is done.
-        max_iterations: of the method a solve may take.
-        coupling: with bodies that the pressure moves; None: there are none.
-        gravity: its size [m/s^2]; without it nothing settles.
+        settings: `tolerance`, `max_iterations`, `coupling` and `gravity` as of `PressureProjection`; without gravity nothing settles.
 
     Attributes: as of `PressureProjection`; `kind` says where the level set lies in the liquid.
     """
 
     def __init__(
-        self,
-        grid: StaggeredGrid,
-        boundary: Boundary,
-        solver: Any,
-        *,
-        level_set: LevelSet,
-        weights: Sequence[wp.array],
-        tolerance: float | Literal["auto"],
-        max_iterations: int,
-        coupling: BodyCoupling | None = None,
-        gravity: float = 0.0,
+        self, grid: StaggeredGrid, boundary: Boundary, solver: Any, *, level_set: LevelSet, weights: Sequence[wp.array], **settings: Any
     ) -> None:
-        """Allocate the fields."""
-        super().__init__(grid, boundary, solver, tolerance=tolerance, max_iterations=max_iterations, coupling=coupling, gravity=gravity)
+        super().__init__(grid, boundary, solver, **settings)
         self._weights = list(weights)
-        self._cells = grid.field(wp.int8)
-        wp.copy(self._cells, boundary.base)  # the ring stays as it is
+        self._unknown, self._least = grid.field(wp.int8), 0.0
+        wp.copy(self._unknown, boundary.base)  # the ring stays as it is
         if boundary.open and self._shift is None:  # pockets between solids that are too full
             self._shift = grid.field()
-        setting = kernels.Setting()
+        setting = kernels.UnilateralSetting()
         setting.planes = grid.planes
         setting.density, setting.capacity = level_set.density, boundary.capacity
-        setting.cells, setting.base = self._cells, boundary.base
+        setting.cells, setting.base = self._unknown, boundary.base
         self._setting = setting
 
     def prepare(self, velocity: Sequence[wp.array], dt: float, kick_dt: float) -> int:
-        """Set up the problem of all cells that are not SOLID and return their number. The first guess is the last pressure.
-
-        Args:
-            velocity: u* of each component [m/s].
-            dt: time step [s].
-            kick_dt: how long forces have acted on u* [s].
-        """
+        """Set up the problem of all cells that are not SOLID and return their number; arguments as of the base class."""
         self._begin(kick_dt)
         self._setting.rate = wp.float64(self.grid.spacing / dt)
         self._setting.settling = min(math.sqrt(self._gravity * self.grid.spacing), self.grid.spacing / dt)
@@ -113,28 +91,14 @@ class UnilateralPressure(PressureProjection):
         if unknowns and self._problem is None:
             self._make_problem()
         if unknowns:
-            self._update(self._cells)
+            self._update()
         return unknowns
-
-    def unknowns(self) -> int:
-        """Return the number of unknowns."""
-        return self._count(self._cells)
 
     def project(
         self, velocity: Sequence[wp.array], window: Window, result: wl.SolveResult, criteria: wl.StoppingCriteria, unknowns: int
     ) -> Projection:
-        """Take a result: let the pressure act, mark valid faces, find the walls that liquid presses on.
-
-        Args:
-            velocity: u* of each component [m/s] (updated).
-            window: cells that hold all liquid, with one to spare on each side.
-            result: of `solve`.
-            criteria: of `solve`.
-            unknowns: of `prepare`.
-        """
-        convert(result.x.flatten(), self.pressure.flatten())
-        wp.copy(self.shown, self.kind)
-        self._last = self._kick
+        """Take a result: let the pressure act, mark valid faces, find the walls that liquid presses on; arguments as of the base class."""
+        self._accept(result.x)
         for axis, field in enumerate(velocity):
             self.known[axis].zero_()
             open_ = self.boundary.open[axis] if self.boundary.open else None
@@ -147,14 +111,7 @@ class UnilateralPressure(PressureProjection):
 
     def fluid_cells(self) -> np.ndarray:
         """Return where there was liquid or pressure in the last projection, as (k, j, i) in the stored shape, shape (n, 3)."""
-        return np.argwhere((self.shown.numpy() == FLUID) | (self.pressure.numpy() > 0.0))
-
-    def _make_problem(self) -> None:
-        faces = {f"face_{axis}": field for axis, field in zip("xyz", self.boundary.open, strict=False)}
-        cells = self.grid.interior(self._cells.numpy())
-        self._operator = wl.GridPoisson(cells, shift=self._shift, device=self.grid.device, **faces)
-        self._problem = wl.LCP(self._joined(), self._b, 0.0, np.inf)
-        self._work = self.solver.init(self._problem)
+        return np.argwhere((self.cells.numpy() == FLUID) | (self.pressure.numpy() > 0.0))
 
     def _at(self, velocity: Sequence[wp.array]) -> Any:
         """Return the setting with velocities, open fractions and solids' velocities as they are."""

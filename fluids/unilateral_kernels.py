@@ -5,7 +5,7 @@ import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, F64, I8, U8, cell_kernel
 from warp_lcp.grid.transfer import TINY_WEIGHT
-from warp_lcp.material.contact import HELD, LETS_GO, RELEASED, TOUCHES
+from warp_lcp.material.boundary_kernels import HELD, LETS_GO, RELEASED, TOUCHES
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 
 FULL = 0.8  # density, of that at rest, from which a cell counts as full: less than 1 by more than what the sampling makes of it
@@ -18,7 +18,7 @@ _SOLID = wp.constant(wp.int8(SOLID))
 
 
 @wp.struct
-class Setting:
+class UnilateralSetting:
     """What is the same for all cells of a step, and the fields that say where liquid is."""
 
     planes: int
@@ -40,7 +40,7 @@ class Setting:
 
 
 @wp.func
-def open_part(s: Setting, open: F32, k: int, j: int, i: int, c: int, b: int, a: int):
+def open_part(s: UnilateralSetting, open: F32, k: int, j: int, i: int, c: int, b: int, a: int):
     """Return the open fraction of the lower face of cell (k, j, i), beyond which cell (c, b, a) lies."""
     part = float(1.0)
     if open:
@@ -51,13 +51,13 @@ def open_part(s: Setting, open: F32, k: int, j: int, i: int, c: int, b: int, a: 
 
 
 @wp.func
-def filled(s: Setting, k: int, j: int, i: int):
+def filled(s: UnilateralSetting, k: int, j: int, i: int):
     """Return which share of a cell is filled: never more than all of it, whatever it holds."""
     return wp.min(s.density[k, j, i] / (FULL * wp.max(s.capacity[k, j, i], LEAST_SHARE)), 1.0)
 
 
 @wp.func
-def face_density(s: Setting, k: int, j: int, i: int, c: int, b: int, a: int):
+def face_density(s: UnilateralSetting, k: int, j: int, i: int, c: int, b: int, a: int):
     """Return the density on the face between two cells, of a full cell's."""
     total = float(0.0)
     count = float(0.0)
@@ -71,7 +71,7 @@ def face_density(s: Setting, k: int, j: int, i: int, c: int, b: int, a: int):
 
 
 @wp.func
-def passing(s: Setting, u: F32, open: F32, solid: F32, k: int, j: int, i: int, c: int, b: int, a: int):
+def passing(s: UnilateralSetting, u: F32, open: F32, solid: F32, k: int, j: int, i: int, c: int, b: int, a: int):
     """Return what passes the lower face of cell (k, j, i) [m/s], in units of what full cells let pass; solids take their place."""
     part = open_part(s, open, k, j, i, c, b, a)
     flow = part * u[k, j, i]
@@ -85,7 +85,7 @@ def passing(s: Setting, u: F32, open: F32, solid: F32, k: int, j: int, i: int, c
 
 
 @wp.func
-def slack(s: Setting, k: int, j: int, i: int):
+def slack(s: UnilateralSetting, k: int, j: int, i: int):
     """Return y of a cell: what it may still take, what it is off the density at rest, and what flows out of it [m/s]."""
     left = passing(s, s.u, s.open_x, s.solid_x, k, j, i, k, j, i - 1)
     right = passing(s, s.u, s.open_x, s.solid_x, k, j, i + 1, k, j, i)
@@ -107,7 +107,7 @@ def slack(s: Setting, k: int, j: int, i: int):
 
 
 @cell_kernel("fluids.unilateral")
-def prepare_kernel(k, j, i, s: Setting, kind: I8, last: F64, ratio: wp.float64, least: float, b: F64, start: F64, shift: F32):
+def prepare_kernel(k, j, i, s: UnilateralSetting, kind: I8, last: F64, ratio: wp.float64, least: float, b: F64, start: F64, shift: F32):
     """Mark the unknowns; fill right-hand side, first guess and what the open sides add to the diagonal."""
     unknown = s.base[k, j, i] != _SOLID and kind[k, j, i] != _SOLID
     value = wp.float64(0.0)
@@ -137,7 +137,7 @@ def prepare_kernel(k, j, i, s: Setting, kind: I8, last: F64, ratio: wp.float64, 
 
 
 @cell_kernel("fluids.unilateral")
-def push_kernel(k, j, i, s: Setting, axis: int, x: F64, open: F32, weight: F32, field: F32, known: I8):
+def push_kernel(k, j, i, s: UnilateralSetting, axis: int, x: F64, open: F32, weight: F32, field: F32, known: I8):
     """Let the pressure act on the open faces that particles gave weight, and mark them 1; others 0, or -1 inside solids of whole cells."""
     c = k - wp.where(axis == 2, 1, 0)
     b = j - wp.where(axis == 1, 1, 0)
@@ -159,7 +159,7 @@ def push_kernel(k, j, i, s: Setting, axis: int, x: F64, open: F32, weight: F32, 
 
 
 @cell_kernel("fluids.unilateral")
-def contact_kernel(k, j, first, end, s: Setting, kind: I8, touch: U8, x: F64, contact: U8, sums: F64):
+def contact_kernel(k, j, first, end, s: UnilateralSetting, kind: I8, touch: U8, x: F64, contact: U8, sums: F64):
     """Find the wall cells that hold liquid and those that let go, [0] their number in a row, and [1] the largest |y| of full cells."""
     released = int(0)
     worst = wp.float64(0.0)

@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_lcp.granular import packing_kernels as kernels
 from warp_lcp.granular.yield_set import xyz
-from warp_lcp.grid.periodic import PeriodicSides
+from warp_lcp.grid.sides import PeriodicSides
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.rows.layout import put
 

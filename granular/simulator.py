@@ -22,10 +22,9 @@ from warp_lcp.grid.level_set import particle_density
 from warp_lcp.grid.particles import Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary
-from warp_lcp.material.outlets import Outlets
 from warp_lcp.material.particle_assembly import make_bodies, make_boundary, make_outlets, make_particles, make_sources, placed_solids
 from warp_lcp.material.particle_simulation import ParticleSimulation, Row
-from warp_lcp.material.sources import Sources
+from warp_lcp.material.sources import Outlets, Sources
 from warp_lcp.material.wall import extend_velocity
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 from warp_lcp.rigid.bodies import RigidBodies

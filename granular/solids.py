@@ -13,8 +13,7 @@ from warp_lcp.granular.packing import Packing
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid, voxelize
 from warp_lcp.material import boundary_kernels as kernels
-from warp_lcp.material.boundary import Boundary, Faces
-from warp_lcp.material.cut_boundary import CutBoundary
+from warp_lcp.material.boundary import Boundary, CutBoundary, Faces
 
 
 class Walls:
@@ -115,10 +114,7 @@ class SandSolids:
             )
             for solid in self._placed
         ]  # fmt: skip
-        found = voxelize(
-            grid.counts, grid.spacing, grid.dimension, now, wall_separating=True, device=grid.device,
-            open_sides=self._boundary.open_sides, remarks=False,
-        )  # fmt: skip
+        found = voxelize(grid, now, wall_separating=True, open_sides=self._boundary.open_sides, remarks=False)
         self.index, self._covered = found.index, found.covered
         if self._boundary.sides is not None:
             self._boundary.sides.wrap(self.index)

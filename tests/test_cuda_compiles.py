@@ -14,16 +14,15 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.distributed.petsc_matrix import ENTER, LEAVE
-from warp_lcp.fluids.pressure_kernels import pressure_passes
+from warp_lcp.fluids.pressure import pressure_passes
 from warp_lcp.granular.bodies_kernels import body_kernels
 from warp_lcp.granular.coupled import interleaved_passes
 from warp_lcp.granular.report_kernels import report_pass
 from warp_lcp.granular.stress_kernels import stress_passes
-from warp_lcp.grid import advection_kernels, distance_advection_kernels, transfer_kernels
-from warp_lcp.grid.periodic import ring_kernels
-from warp_lcp.grid.semi_lagrangian import CENTERS
-from warp_lcp.grid.semi_lagrangian_kernels import carry_pass
-from warp_lcp.material.density_correction_kernels import displacement_pass
+from warp_lcp.grid.advection import CENTERS, advect_pass, carry_pass, distance_pass
+from warp_lcp.grid.sides import wrap_kernel
+from warp_lcp.grid.transfer import transfer_passes
+from warp_lcp.material.density_correction import displacement_pass
 from warp_lcp.multigrid import CycleSettings, Hierarchy
 from warp_lcp.rows import Rows
 from warp_lcp.rows.row_pass import Form
@@ -53,7 +52,7 @@ def use_every_kernel(reals):
                 assert wl.solve(problem, solver, stopping=wl.StoppingCriteria(rtol=1e-4))
         assert Hierarchy(problem.A.stencil, dtype, bounded=False, settings=ONE_LAUNCH[1])._small.coarsening.kernel
     for real in (wp.float32, wp.float64):
-        transfer_kernels.kernels(real)
+        transfer_passes(real)
     wl.solve(wl.LCP(wl.DenseOperator(np.eye(3), device="cpu"), -np.ones(3)), wl.MinimumMapNewton(precision="single"))
 
 
@@ -185,14 +184,14 @@ def test_kernels_compile_for_cuda(reals, archs, tmp_path):
     for cut in (False, True):
         displacement_pass(cut)
     for endless in (0, 1, 4, 5):
-        advection_kernels.advect_pass(endless)
-        distance_advection_kernels.advect_pass(endless)
+        advect_pass(endless)
+        distance_pass(endless)
     for variant in itertools.product((False, True), repeat=4):
         pressure_passes(*variant)
     for axis in (0, 1, 2, CENTERS):
         carry_pass(axis)
     for dtype in (wp.int8, wp.uint8, wp.int32, wp.float32, wp.float64):
-        ring_kernels(dtype)
+        wrap_kernel(dtype)
     for d_type, real in itertools.product((wp.uint8, wp.float32, wp.float64), (wp.float32, wp.float64)):
         field, vector = wp.zeros(8, dtype=real, device="cpu"), wp.zeros(8, dtype=wp.float64, device="cpu")
         rows = Rows.flat(8, field.device).beside(Rows.flat(8, field.device), (1, 1, 1))

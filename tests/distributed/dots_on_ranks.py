@@ -16,7 +16,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from warp_lcp.cli import commands as cli
-from warp_lcp.distributed import meeting
+from warp_lcp.distributed import collective
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.frames import frames
 from warp_lcp.scene import simulator as plug_ins
@@ -150,7 +150,7 @@ def trouble(dots: Dots) -> None:
 def main(words: list[str]) -> None:
     """Run commands of the command line with this simulator alone."""
     plug_ins.entry_points = lambda group: [SimpleNamespace(name="dots", load=DotsSimulator)]
-    meeting.PATIENCE = 1.0
+    collective.PATIENCE = 1.0
     while words:
         end = words.index("then") if "then" in words else len(words)
         command, words = words[:end], words[end + 1 :]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from warp_lcp.distributed.balance import balanced_processes, pool
+from warp_lcp.distributed.decomposition import balanced_processes, pool
 
 ALL = np.zeros(3), np.array([64.0, 32.0, 32.0])
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from warp_lcp.distributed.devices import dealt
+from warp_lcp.distributed.ranks import dealt
 
 
 @pytest.mark.parametrize(
@@ -28,7 +28,7 @@ def test_a_missing_device_is_named(name, choices):
 def test_ranks_of_one_machine_count_through_its_devices(mpi):
     text = """
     import warp as wp
-    from warp_lcp.distributed import devices
+    from warp_lcp.distributed import ranks as devices
     from warp_lcp.distributed.ranks import Ranks
     wp.config.log_level = wp.LOG_ERROR
     devices.dealt = lambda name, number, found: f"{name} {number}"  # without a GPU at hand

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warp_lcp.distributed.decomposition import Box, parts
+from warp_lcp.distributed.decomposition import CellBox, parts
 
 PROGRAMS = Path(__file__).parent
 
@@ -31,10 +31,10 @@ def test_parts_cover_all_cells_about_evenly():
 
 
 def test_boxes():
-    box = Box((0, 2, 4), (3, 5, 9))
+    box = CellBox((0, 2, 4), (3, 5, 9))
     assert box.counts == (3, 3, 5)
     assert box.cells == 45
-    assert box.grown(1) == Box((-1, 1, 3), (4, 6, 10))
-    assert box.common(Box((2, 0, 0), (9, 9, 5))) == Box((2, 2, 4), (3, 5, 5))
-    assert box.common(Box((3, 0, 0), (9, 9, 9))).cells == 0
+    assert box.grown(1) == CellBox((-1, 1, 3), (4, 6, 10))
+    assert box.common(CellBox((2, 0, 0), (9, 9, 5))) == CellBox((2, 2, 4), (3, 5, 5))
+    assert box.common(CellBox((3, 0, 0), (9, 9, 9))).cells == 0
     assert np.zeros((9, 5, 3))[box.slices].shape == (5, 3, 3)

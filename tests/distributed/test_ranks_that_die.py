@@ -4,17 +4,17 @@ import pytest
 
 FAIL = """
     import os, signal, sys, time
-    from warp_lcp.distributed import meeting as meetings
+    from warp_lcp.distributed import collective as collectives
     from warp_lcp.distributed.ranks import Ranks
 
     def say(text):
         sys.stderr.write(text + "\\n")
 
-    meetings.PATIENCE = 2.0
+    collectives.PATIENCE = 2.0
     ranks = Ranks.world()
     what = sys.argv[1]
     try:
-        with meetings.Meeting(ranks, (ValueError,), say).together():
+        with collectives.Collective(ranks, (ValueError,), say).together():
             if what == "interrupt" and ranks.rank == 1:
                 os.kill(os.getpid(), signal.SIGINT)
                 time.sleep(30)

@@ -8,8 +8,7 @@ import pytest
 
 import warp_lcp as wl
 from small_liquids import GRAVITY, advance, box, create, scene
-from warp_lcp.material.boundary import WholeCells
-from warp_lcp.material.cut_boundary import CutBoundary
+from warp_lcp.material.boundary import CutBoundary, WholeCells
 
 SLOPE = math.radians(30)
 V = [{"shape": "plane", "point": [0.5, 0.1], "normal": [side * math.sin(SLOPE), math.cos(SLOPE)]} for side in (-1, 1)]

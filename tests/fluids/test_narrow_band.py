@@ -48,7 +48,7 @@ def test_particles_are_near_the_surface_only(dimension):
     rows = counts(simulation).sum(axis=(0, 2))
     full = counts(everywhere).sum(axis=(0, 2))
     assert np.array_equal(rows[20:24], full[20:24]) and not rows[:20].any()
-    assert band.held == full[:20].sum() and band.interior.cells == band.held // 2**dimension
+    assert band.held == full[:20].sum() and band.interior.count == band.held // 2**dimension
     before, after = everywhere.checked_totals("at"), simulation.checked_totals("at")
     assert after.count == before.count and np.allclose(after.center, before.center, atol=1e-4)
     assert simulation.surface.volume(0) == pytest.approx(everywhere.surface.volume(0), rel=1e-6)
@@ -112,13 +112,13 @@ def test_a_block_in_free_flight_keeps_its_shape(dimension):
     start = {"liquid": [box(low, high, velocity=speed)], "resolution": 48, "physics": {"gravity": [0.0] * dimension}}
     simulation = tank(dimension, **start)
     band = without(simulation)
-    cells, volume = band.interior.cells, simulation.surface.volume(0)
+    cells, volume = band.interior.count, simulation.surface.volume(0)
     assert cells > 0
     for _ in range(12):
         row = simulation.step(0.01)
     moved = np.array([0.12 * s for s in (*speed, 0.0)[:3]])
     assert row["volume"] == pytest.approx(volume, rel=0.01)
-    assert band.interior.cells == pytest.approx(cells, rel=0.12)
+    assert band.interior.count == pytest.approx(cells, rel=0.12)
     middle = 0.5 * np.array([*np.add(low, high), 0.0][:3]) + moved
     assert np.allclose(band.interior.center, middle, atol=0.5 / 48)  # of whole cells
     assert row["max_speed"] == pytest.approx(np.linalg.norm(speed), rel=2e-3)
@@ -137,7 +137,7 @@ def test_a_ceiling_lets_go(dimension):
     low, high = [0.2, 0.5, 0.05][:dimension], [0.8, 1.0, 0.45][:dimension]
     simulation = tank(dimension, 40, liquid=[box(low, high)])
     volume = simulation.surface.volume(0)
-    assert without(simulation).interior.cells > 0
+    assert without(simulation).interior.count > 0
     rows = advance(simulation, 0.2)
     assert rows[-1]["max_speed"] == pytest.approx(GRAVITY * (0.2 - 0.5 * simulation.last_dt), rel=1e-3)
     assert rows[-1]["kinetic_energy"] == pytest.approx(0.5 * rows[-1]["mass"] * (GRAVITY * 0.2) ** 2, rel=1e-3)
@@ -153,7 +153,7 @@ def test_a_body_dives_into_the_interior():
     disk = {"shape": "sphere", "center": [0.5, 0.92], "radius": 0.06, "motion": plunge}
     simulation, other = (tank(2, 48, solid=[disk], particles=p, density_correction={}) for p in (particles, {}))
     rows, reference = advance(simulation, 0.5), advance(other, 0.5)
-    assert without(simulation).interior.cells > 0
+    assert without(simulation).interior.count > 0
     assert rows[-1]["mass"] == reference[-1]["mass"]
     assert rows[-1]["volume"] == pytest.approx(reference[-1]["volume"], rel=0.01)
     near = np.hypot(*(simulation.particles.position.numpy()[:, :2] - [0.5, 0.42]).T)
@@ -256,7 +256,7 @@ def test_a_run_goes_on_as_if_it_had_not_stopped(tables):
     tables = dict(tables)
     particles = tables.pop("particles", BAND)
     simulation, rows = dams(particles, 0.5, **tables)
-    assert without(simulation).interior.cells > 0
+    assert without(simulation).interior.count > 0
     assert not any(row.get("stuck") for row in rows)
     twin, _ = dams(particles, 0.0, **tables)
     twin.restore(simulation.state())

@@ -9,7 +9,7 @@ from warp_lcp.fluids.pressure import PressureProjection
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import OPEN, VoxelSolids
 from warp_lcp.material.boundary import WholeCells
-from warp_lcp.material.contact import HELD, RELEASED, TOUCHES_NOTHING
+from warp_lcp.material.boundary_kernels import HELD, RELEASED, TOUCHES_NOTHING
 
 NX, NY = 6, 7
 

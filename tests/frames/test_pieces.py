@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warp_lcp.distributed.meeting import Meeting
+from warp_lcp.distributed.collective import Collective
 from warp_lcp.frames.frames import FrameFolder
 from warp_lcp.frames.pieces import describe, one_grid, piece_files, write_whole
 from warp_lcp.render import recording
@@ -53,13 +53,13 @@ def write(folder: Path, grid_format: str, frames: int = 1) -> None:
     for index in range(frames):
         found = []
         for rank, box in enumerate(BOXES):
-            meeting = Meeting.of_one()
-            meeting.ranks.comm.rank = rank  # of ranks that are asked nothing else
-            mine = RankFrames(FrameFolder(folder, grid_format), meeting)
+            collective = Collective.of_one()
+            collective.ranks.comm.rank = rank  # of ranks that are asked nothing else
+            mine = RankFrames(FrameFolder(folder, grid_format), collective)
             mine.write(index, 0.5 * index, piece(box))
             found.append(mine.describe(piece(box)))
         if index == 0:
-            first = RankFrames(FrameFolder(folder, grid_format), Meeting.of_one())
+            first = RankFrames(FrameFolder(folder, grid_format), Collective.of_one())
         first.publish(index, 0.5 * index, found)
 
 
@@ -168,9 +168,9 @@ def test_pieces_are_files_of_the_run(dots, tmp_path):
 
 
 def test_a_folder_that_ranks_do_not_share_is_refused(dots, scene_file, tmp_path):
-    meeting = Meeting.of_one()
-    meeting.ranks.comm.rank = 1  # the first one writes elsewhere
-    folder = RunFolder(tmp_path / "out", load_scene(scene_file), meeting)
+    collective = Collective.of_one()
+    collective.ranks.comm.rank = 1  # the first one writes elsewhere
+    folder = RunFolder(tmp_path / "out", load_scene(scene_file), collective)
     with pytest.raises(OutputError, match="is not the folder that rank 0 writes; choose one that all machines share"):
         folder.start(RunRecord("dots", "dots", "cpu"))
 

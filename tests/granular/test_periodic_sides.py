@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import GranularSimulator, SandSimulation
-from warp_lcp.grid.periodic import PeriodicSides
+from warp_lcp.grid.sides import PeriodicSides
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.scene.scene import SceneError, validate
 

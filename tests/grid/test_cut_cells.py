@@ -180,9 +180,7 @@ def test_boxes_of_whole_cells_leave_whole_cells(name, dimension, size):
         solids = [Box(lower=b.lower, upper=b.upper, invert=b.invert, placement=p) for b, p in zip(solids, scaled, strict=True)]
     grid = grid_of(dimension, (8, 7, 6), SPACING * size)
     cut = cut_cells(grid, *solids)
-    index = voxelize(
-        grid.counts, grid.spacing, dimension, [placed(box) for box in solids], wall_separating=False, device="cpu"
-    ).index.numpy()
+    index = voxelize(grid, [placed(box) for box in solids], wall_separating=False).index.numpy()
     assert cut.whole_cells
     assert cut.dropped == 0
     np.testing.assert_array_equal(grid.interior(cut.base.numpy()), np.where(grid.interior(index) < 0, wl.AIR, wl.SOLID))

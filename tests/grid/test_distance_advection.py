@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from warp_lcp import AIR, SOLID
-from warp_lcp.grid.advection import advect, clearance
-from warp_lcp.grid.distance_advection import MARGIN, PUSH, advect_with_distance, push_out
+from warp_lcp.grid.advection import MARGIN, PUSH, advect, advect_with_distance, clearance, push_out
 from warp_lcp.grid.staggered import StaggeredGrid
 
 FLAT = StaggeredGrid((24, 20, 1), 0.1, 2)

@@ -5,8 +5,7 @@ import pytest
 import warp as wp
 
 from mesh_checks import assert_closed, enclosed, pieces
-from warp_lcp.grid.marching_cubes import MarchingCubes
-from warp_lcp.grid.marching_cubes_table import EDGES, segment_table, triangle_table
+from warp_lcp.grid.marching_cubes import EDGES, MarchingCubes, segment_table, triangle_table
 from warp_lcp.grid.staggered import StaggeredGrid
 
 FLAT, DEEP = StaggeredGrid((23, 30, 1), 0.5, 2), StaggeredGrid((13, 9, 16), 0.5, 3)

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from mesh_checks import assert_closed, enclosed
-from warp_lcp.grid.marching_cubes import MarchingCubes, Mesh
+from warp_lcp.grid.marching_cubes import DeviceMesh, MarchingCubes
 from warp_lcp.grid.mesh_smoothing import MOST, smooth
 from warp_lcp.grid.staggered import StaggeredGrid
 
@@ -67,6 +67,6 @@ def test_a_drop_of_six_points_stays_a_drop():
 
 
 def test_nothing_stays_nothing():
-    empty = Mesh(wp.empty(0, dtype=wp.vec3, device="cpu"), wp.empty((0, 3), dtype=wp.int32, device="cpu"))
+    empty = DeviceMesh(wp.empty(0, dtype=wp.vec3, device="cpu"), wp.empty((0, 3), dtype=wp.int32, device="cpu"))
     smooth(empty, GRID, None, 3)
     assert len(empty.points) == 0

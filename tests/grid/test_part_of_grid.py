@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_lcp.grid.advection import advect, clearance
+from warp_lcp.grid.advection import advect, advect_with_distance, clearance
 from warp_lcp.grid.cut_cells import CutCells
-from warp_lcp.grid.distance_advection import advect_with_distance
 from warp_lcp.grid.level_set import particle_density
 from warp_lcp.grid.particles import Particles, seed
 from warp_lcp.grid.sides import side_bits
@@ -153,10 +152,7 @@ def test_solids_cut_the_same_cells(whole, part):
     for a, b in [*pairs, *zip(of_whole.open, of_part.open, strict=True), *zip(of_whole.wall, of_part.wall, strict=True)]:
         np.testing.assert_array_equal(b.numpy()[inner], a.numpy()[stored(part)][inner])
     assert not of_part.whole_cells
-    voxels = [
-        voxelize(g.counts, SPACING, g.dimension, solids, wall_separating=True, device="cpu", origin=g.origin, remarks=g is whole)
-        for g in (whole, part)
-    ]
+    voxels = [voxelize(g, solids, wall_separating=True, remarks=g is whole) for g in (whole, part)]
     inner = away(part, 1)
     np.testing.assert_array_equal(voxels[1].index.numpy()[inner], voxels[0].index.numpy()[stored(part)][inner])
     assert voxels[0].covered == voxels[1].covered > (10,)

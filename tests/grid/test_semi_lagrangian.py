@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_lcp.grid.semi_lagrangian import CENTERS, carry_field
+from warp_lcp.grid.advection import CENTERS, carry_field
 from warp_lcp.grid.staggered import StaggeredGrid
 
 CELLS = 32

@@ -6,8 +6,10 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from warp_lcp.grid import node_distance
 from warp_lcp.grid import voxelize as voxelize_module
 from warp_lcp.grid.solids import Box, Capsule, Placement, Plane, Sphere, TriangleMesh
+from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.triangle_mesh import builtin_mesh
 from warp_lcp.grid.voxelize import PlacedSolid, inside, placement_notes, voxelize
 
@@ -19,7 +21,7 @@ def placed(geometry, separating=True, name="solid[0]"):
 
 
 def cells(counts, spacing, dimension, *solids):
-    return voxelize(counts, spacing, dimension, solids, wall_separating=False, device="cpu")
+    return voxelize(StaggeredGrid(counts, spacing, dimension), solids, wall_separating=False)
 
 
 def test_empty_domain_has_a_ring_of_wall():
@@ -90,6 +92,7 @@ def test_every_cell_is_claimed_by_its_center(center, angles, scale, shape, chunk
     counts, spacing = (10, 8, 9), 0.1
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(voxelize_module, "CHUNK", chunk)
+        patch.setattr(node_distance, "CHUNK", chunk)
         host = np.stack(np.meshgrid(*(spacing * (np.arange(n) + 0.5) for n in counts), indexing="ij"), axis=-1)
         claimed = inside([geometry], np.asarray(host.reshape(-1, 3), dtype=np.float32), device="cpu").reshape(counts)
         if claimed.all():
@@ -115,11 +118,6 @@ def test_solids_that_leave_no_cell_are_refused():
         cells((5, 5, 1), 0.2, 2, placed(Plane(point=[0.0, 2.0], normal=[0.0, 1.0])))
 
 
-def test_two_dimensions_have_one_layer():
-    with pytest.raises(ValueError, match="one layer of cells, not 3"):
-        cells((5, 5, 3), 0.2, 2)
-
-
 @pytest.mark.parametrize(
     ("geometry", "dimension"),
     [
@@ -137,10 +135,10 @@ def test_a_solid_outside_the_domain_is_refused(geometry, dimension):
 def test_a_solid_that_has_moved_may_be_anywhere():
     """Outside the domain, or over all of it: without remarks neither is refused, and nothing is noted."""
     outside = PlacedSolid(geometry=Sphere(center=[9.0, 9.0], radius=0.2), separating=True, name="ball")
-    found = voxelize((4, 4, 1), 0.25, 2, [outside], wall_separating=True, device="cpu", remarks=False)
+    found = voxelize(StaggeredGrid((4, 4, 1), 0.25, 2), [outside], wall_separating=True, remarks=False)
     assert (found.index.numpy()[1, 1:-1, 1:-1] == -1).all()
     everywhere = PlacedSolid(geometry=Sphere(center=[0.5, 0.5], radius=9.0), separating=True, name="ball")
-    found = voxelize((4, 4, 1), 0.25, 2, [everywhere], wall_separating=True, device="cpu", remarks=False)
+    found = voxelize(StaggeredGrid((4, 4, 1), 0.25, 2), [everywhere], wall_separating=True, remarks=False)
     assert (found.index.numpy()[1, 1:-1, 1:-1] == 1).all()
     assert found.notes == ()
 
@@ -160,8 +158,10 @@ def test_a_mesh_is_cut_in_two_dimensions():
 
 def test_a_mesh_that_sticks_out_is_reported():
     mesh = TriangleMesh(surface=builtin_mesh("torus"), placement=Placement(translation=[0.2, 0.5, 0.5]))
-    assert placement_notes(mesh, "cow", (50, 50, 50), 0.02, 3) == ["cow reaches 0.3 m out of the domain; what is out there has no effect"]
-    assert placement_notes(Sphere(center=[0.0, 0.5, 0.5], radius=0.3), "sphere", (50, 50, 50), 0.02, 3) == []
+    assert placement_notes(mesh, "cow", StaggeredGrid((50, 50, 50), 0.02, 3)) == [
+        "cow reaches 0.3 m out of the domain; what is out there has no effect"
+    ]
+    assert placement_notes(Sphere(center=[0.0, 0.5, 0.5], radius=0.3), "sphere", StaggeredGrid((50, 50, 50), 0.02, 3)) == []
 
 
 def test_a_mesh_thinner_than_a_cell_is_reported():

@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 
 from warp_lcp import AIR, FLUID, SOLID
 from warp_lcp.grid.staggered import StaggeredGrid
-from warp_lcp.material.contact import HELD, RELEASED, TOUCHES_NOTHING
-from warp_lcp.material.cut_wall import extend_velocity_cut
-from warp_lcp.material.wall import extend_velocity
+from warp_lcp.material.boundary_kernels import HELD, RELEASED, TOUCHES_NOTHING
+from warp_lcp.material.wall import extend_velocity, extend_velocity_cut
 
 FLAT = StaggeredGrid((24, 22, 1), 0.1, 2)
 SPACE = StaggeredGrid((12, 13, 11), 0.1, 3)

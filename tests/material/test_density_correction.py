@@ -13,7 +13,7 @@ from small_liquids import advance, box, create, dam, scene
 from warp_lcp.benchmarks.validation.enclosed import enclosed_cells
 from warp_lcp.grid.particles import Particles
 from warp_lcp.material.boundary import Boundary
-from warp_lcp.material.contact import HELD, RELEASED
+from warp_lcp.material.boundary_kernels import HELD, RELEASED
 from warp_lcp.material.density_correction import LONGEST, DensityCorrection
 
 BALL = {"shape": "sphere", "center": [0.5, 0.5], "radius": 0.23}

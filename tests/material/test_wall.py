@@ -4,7 +4,7 @@ import warp as wp
 
 from warp_lcp import AIR, FLUID, SOLID
 from warp_lcp.grid.staggered import StaggeredGrid, Window
-from warp_lcp.material.contact import HELD, RELEASED
+from warp_lcp.material.boundary_kernels import HELD, RELEASED
 from warp_lcp.material.wall import extend_velocity
 
 GRID = StaggeredGrid((5, 6, 1), 0.1, 2, "cpu")

@@ -116,7 +116,7 @@ CASES = {
     "cut cells": Case(
         {"solid": [BALL]}, {"solid": [BALL], "solids": "voxel"},
         modules=("warp_lcp.grid.cut_cells", "warp_lcp.grid.distance_advection", "warp_lcp.material.cut_wall", "fluids.pressure_cut"),
-        files=("warp_lcp/grid/cut_cells.py", "warp_lcp/grid/node_distance.py", "warp_lcp/material/cut_boundary.py"),
+        files=("warp_lcp/grid/cut_cells.py",),
     ),
     "moving solids": Case(
         {"solid": [SWAYING]}, {"solid": [BALL]}, modules=("warp_lcp.grid.push_out", "fluids.pressure_cut_moving"),
@@ -156,7 +156,7 @@ CASES = {
     ),
     "outlets": Case(
         {"drain": [small_liquids.box([0.0, 0.0], [0.1, 0.1])]}, modules=("warp_lcp.material.outlets",),
-        files=("warp_lcp/material/outlets.py",), columns=("drained",),
+        files=("warp_lcp/material/sources.py",), columns=("drained",),
     ),
     "surface mesh": Case(
         {"output": QUIET | {"surface": True}}, modules=("warp_lcp.grid.surface_mesh", "warp_lcp.grid.marching_cubes"),

@@ -5,12 +5,14 @@ from __future__ import annotations
 import itertools
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from warp_lcp.distributed.meeting import Meeting
+import numpy as np
+
+from warp_lcp.distributed.collective import Collective
 from warp_lcp.distributed.ranks import Ranks, petsc
 
 UNEVEN = 1.125  # the largest part may exceed an even share by this factor, so that cuts lie at multiples of large powers of two
@@ -19,11 +21,17 @@ Triple = tuple[int, int, int]
 
 
 @dataclass(frozen=True)
-class Box:
+class CellBox:
     """Cells from `low` up to `high`, exclusive, along x, y, z."""
 
     low: Triple
     high: Triple
+
+    @classmethod
+    def of(cls, low: Iterable[int], high: Iterable[int]) -> CellBox:
+        """Return the box between two corners of any type."""
+        (a, b, c), (d, e, f) = low, high
+        return cls((int(a), int(b), int(c)), (int(d), int(e), int(f)))
 
     @property
     def counts(self) -> Triple:
@@ -42,23 +50,17 @@ class Box:
         x, y, z = (slice(l, h) for l, h in zip(self.low, self.high, strict=True))
         return z, y, x
 
-    def grown(self, width: int) -> Box:
+    def grown(self, width: int) -> CellBox:
         """Return the box with so many cells more on all sides."""
-        return self._mapped(lambda l: l - width, lambda h: h + width)
+        return CellBox.of((l - width for l in self.low), (h + width for h in self.high))
 
-    def common(self, other: Box) -> Box:
+    def common(self, other: CellBox) -> CellBox:
         """Return the cells that are in both."""
-        low = tuple(max(a, b) for a, b in zip(self.low, other.low, strict=True))
-        high = tuple(min(a, b) for a, b in zip(self.high, other.high, strict=True))
-        return Box(low, high)  # type: ignore[arg-type]
+        return CellBox.of(map(max, self.low, other.low), map(min, self.high, other.high))
 
-    def moved(self, by: Sequence[int], sign: int = 1) -> Box:
+    def moved(self, by: Sequence[int], sign: int = 1) -> CellBox:
         """Return the box moved by so many cells along x, y, z, or back."""
-        low, high = (tuple(a + sign * b for a, b in zip(corner, by, strict=True)) for corner in (self.low, self.high))
-        return Box(low, high)  # type: ignore[arg-type]
-
-    def _mapped(self, low: Any, high: Any) -> Box:
-        return Box(tuple(map(low, self.low)), tuple(map(high, self.high)))
+        return CellBox.of(*([a + sign * b for a, b in zip(corner, by, strict=True)] for corner in (self.low, self.high)))
 
 
 class Decomposition:
@@ -86,7 +88,8 @@ class Decomposition:
             raise ValueError(f"processes = {self.processes}: their product must be the number of ranks, {ranks.size}")
         self.parts = [list(c) for c in cuts] if cuts else [parts(n, p) for n, p in zip(counts, self.processes, strict=True)]
         starts = [[0, *itertools.accumulate(part)] for part in self.parts]
-        self.boxes = [self._box(starts, place) for place in map(self.place, range(ranks.size))]
+        places = map(self.place, range(ranks.size))
+        self.boxes = [CellBox.of(*([s[p + n] for s, p in zip(starts, place, strict=True)] for n in range(2))) for place in places]
 
     def place(self, rank: int) -> Triple:
         """Return where a rank is among the ranks along x, y, z, as DMDA numbers them."""
@@ -94,8 +97,8 @@ class Decomposition:
         return rank % px, rank // px % py, rank // (px * py)
 
     @property
-    def box(self) -> Box:
-        """This rank's cells."""
+    def box(self) -> CellBox:
+        """The box of this rank's cells."""
         return self.boxes[self.ranks.rank]
 
     @property
@@ -130,9 +133,9 @@ class Decomposition:
         return Halo(self, 1)
 
     @cached_property
-    def meeting(self) -> Meeting:
+    def collective(self) -> Collective:
         """Blocks of code that the ranks leave alike: what fails on one fails on all."""
-        return Meeting(self.ranks, planned=(ValueError, OSError), last_words=sys.stderr.write)
+        return Collective(self.ranks, planned=(ValueError, OSError), last_words=sys.stderr.write)
 
     @cached_property
     def dmda(self) -> Any:
@@ -142,12 +145,6 @@ class Decomposition:
             dim=3, dof=1, sizes=self.counts, proc_sizes=self.processes, ownership_ranges=self.parts, stencil_width=1,
             stencil_type=PETSc.DMDA.StencilType.STAR, comm=self.ranks.comm,
         )  # fmt: skip
-
-    @staticmethod
-    def _box(starts: list[list[int]], place: Triple) -> Box:
-        low = tuple(s[p] for s, p in zip(starts, place, strict=True))
-        high = tuple(s[p + 1] for s, p in zip(starts, place, strict=True))
-        return Box(low, high)  # type: ignore[arg-type]
 
 
 def parts(n: int, p: int) -> list[int]:
@@ -178,6 +175,65 @@ def _processes(counts: Triple, size: int) -> Triple:
 
 def _cuttings(counts: Triple, size: int) -> list[Triple]:
     """Return the numbers of ranks along x, y, z, whose product is `size`, that leave each rank a cell."""
-    pairs = [(px, py) for px in range(1, size + 1) if size % px == 0 for py in range(1, size // px + 1) if size // px % py == 0]
-    triples = [(px, py, size // (px * py)) for px, py in pairs]
+    divisors = [p for p in range(1, size + 1) if size % p == 0]
+    triples = [(px, py, size // (px * py)) for px in divisors for py in divisors if size // px % py == 0]
     return [p for p in triples if all(a <= n for a, n in zip(p, counts, strict=True))]
+
+
+OPEN = 0.1  # of the work that a cell full of material makes: what a cell without makes, ghost cells too
+
+Corners = tuple[np.ndarray, np.ndarray]  # low and high x, y, z of a box of material, in cells
+
+
+def balanced_processes(counts: Triple, size: int, *, layers: int, states: Sequence[Sequence[Corners]]) -> Triple | None:
+    """Return the ranks along x, y, z for which the busiest has least to do; None if there are too many for the grid.
+
+    Args:
+        counts: cells (nx, ny, nz).
+        size: ranks.
+        layers: of ghost cells, which no box may be thinner than.
+        states: where the material is at different times, each as boxes of it.
+
+    >>> dam, pool = (np.zeros(3), np.array([16, 20, 32])), (np.zeros(3), np.array([64, 5, 32]))
+    >>> balanced_processes((64, 32, 32), 2, layers=5, states=[[dam], [pool]])
+    (1, 1, 2)
+    """
+    found = []
+    for p in _cuttings(counts, size):
+        cuts = [parts(n, a) for n, a in zip(counts, p, strict=True)]
+        if all(len(cut) == 1 or min(cut) >= layers for cut in cuts):
+            found.append((sum(_most_work(counts, cuts, layers, state) for state in states), p))
+    return min(found)[1] if found else None
+
+
+def pool(counts: Triple, dimension: int, volume: float, gravity: np.ndarray) -> Corners:
+    """Return the box that some cells of material fill when they have come to rest.
+
+    Args:
+        counts: cells (nx, ny, nz).
+        dimension: 2 or 3.
+        volume: of the material, in cells.
+        gravity: [m/s^2]; the box lies at the side that it points to most; 0: it is the whole grid.
+    """
+    low, high = np.zeros(3), np.array(counts, dtype=float)
+    axis = int(np.argmax(np.abs(gravity[:dimension])))
+    if gravity[axis] == 0.0:
+        return low, high
+    depth = min(volume / math.prod(counts), 1.0) * counts[axis]
+    if gravity[axis] < 0.0:
+        high[axis] = depth
+    else:
+        low[axis] = counts[axis] - depth
+    return low, high
+
+
+def _most_work(counts: Triple, cuts: list[list[int]], layers: int, state: Sequence[Corners]) -> float:
+    """Return what the busiest rank has to do, in cells full of material."""
+    ends = [np.concatenate([[0], np.cumsum(cut)]) for cut in cuts]
+    whole, most = CellBox((0, 0, 0), counts), 0.0
+    for place in np.ndindex(*(len(cut) for cut in cuts)):
+        low, high = (np.array([end[n + side] for end, n in zip(ends, place, strict=True)]) for side in range(2))
+        box = CellBox.of(low, high)
+        full = sum(float(np.prod(np.clip(np.minimum(b, high) - np.maximum(a, low), 0.0, None))) for a, b in state)
+        most = max(most, full + OPEN * box.grown(layers).common(whole).cells)
+    return most

@@ -43,13 +43,13 @@ class DistributedGridPoisson(GridPoisson):
 
     def __init__(self, decomposition: Decomposition, cells: Any, **coefficients: Any) -> None:
         self.decomposition = decomposition
-        with decomposition.meeting.together():
+        with decomposition.collective.together():
             self._check(cells, coefficients)
         kinds = [(name, np.ndim(value) > 0 or value) for name, value in sorted(coefficients.items()) if name not in ("device", "dtype")]
         decomposition.ranks.agree("what the coefficients are", kinds)
         if decomposition.ranks.size > 1:
             self._ghosts, self._across = decomposition.halo, decomposition.ranks
-        with decomposition.meeting.together():
+        with decomposition.collective.together():
             super().__init__(cells, **coefficients)
 
     def _check(self, cells: Any, coefficients: dict[str, Any]) -> None:

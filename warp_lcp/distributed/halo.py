@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.distributed.decomposition import Box, Decomposition
+from warp_lcp.distributed.decomposition import CellBox, Decomposition
 from warp_lcp.distributed.ranks import Ranks, petsc
 
 
@@ -115,7 +115,7 @@ class Gathering:
 
     def __init__(self, decomposition: Decomposition) -> None:
         self.decomposition = decomposition
-        whole = Box((0, 0, 0), decomposition.counts)
+        whole = CellBox((0, 0, 0), decomposition.counts)
         leaves, remotes = [], []
         for rank, box in enumerate(decomposition.boxes):
             leaves.append(_elements(box, whole.grown(1)))
@@ -158,7 +158,7 @@ def exchange_all(forest: Any, pairs: Sequence[tuple[np.ndarray, np.ndarray]]) ->
             step(units[roots.dtype.itemsize], roots, leaves, MPI.REPLACE)
 
 
-def star_forest(ranks: Ranks, owned: Sequence[Box], stored: Sequence[Box]) -> Any:
+def star_forest(ranks: Ranks, owned: Sequence[CellBox], stored: Sequence[CellBox]) -> Any:
     """Return the star forest whose leaves are this rank's ghost cells and whose roots are the cells that they repeat; collective.
 
     Args:
@@ -178,7 +178,7 @@ def star_forest(ranks: Ranks, owned: Sequence[Box], stored: Sequence[Box]) -> An
     return forest
 
 
-def _elements(box: Box, within: Box) -> np.ndarray:
+def _elements(box: CellBox, within: CellBox) -> np.ndarray:
     """Return where a box's cells lie in a flat array of the cells of another box."""
     nx, ny, _ = within.counts
     x, y, z = (np.arange(l, h) - o for l, h, o in zip(box.low, box.high, within.low, strict=True))

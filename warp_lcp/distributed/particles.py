@@ -9,17 +9,26 @@ star forest would have to be made anew each time.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import warp as wp
 
-from warp_lcp.distributed.decomposition import Box
-from warp_lcp.distributed.particles_kernels import INNER, OUTSIDE, WHERE
+from warp_lcp.distributed.decomposition import CellBox
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.grid import particles_kernels as kernels
-from warp_lcp.grid.particle_loops import launch
+from warp_lcp.grid.particle_loops import launch, particle_pass
 from warp_lcp.grid.particles import SORT_EVERY, Particles, ParticleTotals
+
+INNER, BORDER, OUTSIDE = 0, 1, 2  # of a box: in it and away from its cuts, within reach of them, beyond them
+WHERE = particle_pass(
+    "warp_lcp.distributed.particles.where",
+    {"position": wp.vec3, "where": wp.uint8},
+    numbers=dict.fromkeys((f"{end}_{axis}" for end in ("low", "high") for axis in "xyz"), wp.float32) | {"reach": wp.float32},
+    headers=Path(__file__).parent / "headers",
+)
+
 
 MOST_A_CELL = 1 << 20  # particles; places of one cell are numbers below those of the next
 REACH = 1  # cells from a box within which particles touch its faces and cells
@@ -29,7 +38,7 @@ COUNT, DATA = 7101, 7102  # tags of messages
 
 
 class Post(Protocol):
-    """Carries messages between neighbors."""
+    """Carries messages from each rank to its neighbors."""
 
     def swap(self, outgoing: Mapping[int, np.ndarray]) -> list[np.ndarray]:
         """Return what the neighbors have sent, in the order of their ranks.
@@ -234,6 +243,6 @@ class SharedParticles(Particles):
         self.place = places
 
 
-def _within(cells: np.ndarray, box: Box) -> np.ndarray:
+def _within(cells: np.ndarray, box: CellBox) -> np.ndarray:
     """Tell which cells (x, y, z), shape (n, 3), are in a box."""
     return np.asarray(((cells >= np.array(box.low)) & (cells < np.array(box.high))).all(axis=1))

@@ -99,7 +99,7 @@ class KSPWorkspace(NewtonWorkspace):
 
     @property
     def ksp(self) -> Any:
-        """Return it."""
+        """PETSc's solver of the free set's system."""
         assert isinstance(self.system, KSPSystem)
         return self.system.iteration.ksp
 

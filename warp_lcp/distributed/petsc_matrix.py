@@ -107,14 +107,14 @@ class StencilMatrix:
         self._x, self._y = (zeros(stencil.padding.size, wp.float64, stencil.device) for _ in range(2))
 
     def as_mat(self) -> PETSc.Mat:
-        """Return the Mat."""
+        """Return it as a Mat of PETSc."""
         matrix = petsc().Mat().createPython((self._copies.sizes,) * 2, self, comm=self._copies.comm)
         matrix.setOption(petsc().Mat.Option.SYMMETRIC, True)
         matrix.setUp()
         return matrix
 
     def mult(self, matrix: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Y = B x."""
+        """Write the product B x to y."""
         self._copies.enter(x, self._x)
         self._stencil.product(self._x, self._y)
         self._copies.leave(self._y, x, y)
@@ -128,7 +128,7 @@ class StencilMatrix:
         return petsc().Mat().createSubMatrixVirtual(matrix, rows, columns)
 
     def getDiagonal(self, matrix: PETSc.Mat, d: PETSc.Vec) -> None:  # noqa: N802  # PETSc's name
-        """D = diag(B)."""
+        """Write the diagonal of B to d."""
         padding = self._stencil.padding
         own = self._stencil.d.numpy().reshape(padding.shape)[1:-1, 1:-1, 1:-1].astype(np.float64) * self._stencil.unit
         d.setArray(np.where(own == 0, 1.0, own).ravel())

@@ -7,10 +7,8 @@ from collections.abc import Sequence
 import warp_lcp as wl
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.grid.cut_cells import CutCells
-from warp_lcp.grid.solid_notes import placement_notes, thin_notes
-from warp_lcp.grid.voxelize import PlacedSolid, voxelize
-from warp_lcp.material.boundary import Boundary, WholeCells
-from warp_lcp.material.cut_boundary import CutBoundary
+from warp_lcp.grid.voxelize import PlacedSolid, check_open, small_notes, start_notes, voxelize
+from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
 
 
 def boundary_of_part(
@@ -41,21 +39,9 @@ def boundary_of_part(
             part.fill(*boundary.placed())
             _check_open(part, boundary)
             return boundary, list(cut.notes)
-    whole = grid.whole or grid.counts
-    notes: list[str] = []
-    for solid in solids:
-        notes += placement_notes(solid.geometry, solid.name, whole, grid.spacing, grid.dimension)
-        notes += thin_notes(solid.geometry, solid.name, solid.among, grid.spacing, grid.device)
-    voxels = voxelize(
-        grid.counts, grid.spacing, grid.dimension, solids, wall_separating=wall_separating, device=grid.device, open_sides=part.cuts,
-        origin=grid.origin, remarks=False,
-    )  # fmt: skip
-    covered = ranks.sum([*voxels.covered, 0])
-    notes += [
-        f"{solid.name} is too small for the grid: no center of a cell of {grid.spacing:.4g} m lies inside it"
-        for solid, cells in zip(solids, covered, strict=False)
-        if not cells
-    ]
+    notes = start_notes(solids, grid)
+    voxels = voxelize(grid, solids, wall_separating=wall_separating, open_sides=part.cuts, remarks=False)
+    notes += small_notes((solid.name for solid in solids), ranks.sum([*voxels.covered, 0]), grid.spacing)
     part.fill(voxels.index)
     boundary = WholeCells(grid, voxels, open_sides=part.cuts)
     part.fill(*boundary.placed())
@@ -64,8 +50,4 @@ def boundary_of_part(
 
 
 def _check_open(part: Subdomain, boundary: Boundary) -> None:
-    """Refuse solids that leave no open cell on any rank."""
-    if not part.ranks.any(bool((part.box_of(boundary.base.numpy()) != wl.SOLID).any())):
-        raise ValueError(
-            "the solids fill the whole domain: no open cell is left (is one inverted, or a plane's normal the wrong way round?)"
-        )
+    check_open(part.ranks.any(bool((part.box_of(boundary.base.numpy()) != wl.SOLID).any())))

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_lcp.distributed.decomposition import Box, Decomposition
+from warp_lcp.distributed.decomposition import CellBox, Decomposition
 from warp_lcp.distributed.halo import exchange_all, star_forest
-from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.staggered import StaggeredGrid
 
 LAYERS = 5  # of ghost cells: at a face that a wall closes the liquid up to 4.8 cells away tells whether it is held
 
@@ -73,9 +73,9 @@ class Subdomain:
             for side in range(2):
                 self.cuts |= (decomposition.neighbor(axis, side) is not None) << (2 * axis + side)
 
-    def _cells(self, box: Box) -> Box:
+    def _cells(self, box: CellBox) -> CellBox:
         """Return the cells of the part around a box, without its ring."""
-        return box.grown(self.layers - 1).common(Box((0, 0, 0), self.decomposition.counts))
+        return box.grown(self.layers - 1).common(CellBox((0, 0, 0), self.decomposition.counts))
 
     @cached_property
     def _forest(self) -> Any:
@@ -86,13 +86,13 @@ class Subdomain:
         owned = [self._with_sides(box) for box in boxes]
         return star_forest(self.ranks, owned, [self._cells(box).grown(1) for box in boxes])
 
-    def _with_sides(self, box: Box) -> Box:
+    def _with_sides(self, box: CellBox) -> CellBox:
         """Return a box with the ring beyond the domain's sides that it touches: it is the one to know that, too."""
         low, high = list(box.low), list(box.high)
         for axis in range(self.dimension):  # in 2-D one plane is used
             low[axis] -= low[axis] == 0
             high[axis] += high[axis] == self.decomposition.counts[axis]
-        return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+        return CellBox.of(low, high)
 
     def fill(self, *fields: wp.array) -> None:
         """Fill the ghost cells of fields of the part; collective."""
@@ -114,14 +114,6 @@ class Subdomain:
         """Return the view of a field on the cells of the box and one cell around it, in the stored shape of such a box."""
         low, high = self.owned.low, self.owned.high
         return field[low[0] - 1 : high[0] + 1, low[1] - 1 : high[1] + 1, low[2] - 1 : high[2] + 1]
-
-    def clipped(self, window: Window) -> Window | None:
-        """Return the part of a window in the box, None if there is none."""
-        low = [max(a, b) for a, b in zip(window.low, self.owned.low, strict=True)]
-        high = [min(a, b) for a, b in zip(window.high, self.owned.high, strict=True)]
-        if any(a >= b for a, b in zip(low, high, strict=True)):
-            return None
-        return Window((low[0], low[1], low[2]), (high[0], high[1], high[2]), window.device)
 
     def owners(self, cells: np.ndarray) -> np.ndarray:
         """Return the rank that has each cell (x, y, z) of the whole domain, shape (n, 3)."""

@@ -1,19 +1,120 @@
-"""Particles carried by the grid's velocity, never into a SOLID cell.
+"""Particles and fields carried by the grid's velocity.
 
-Third-order Runge-Kutta with the weights 2/9, 3/9, 4/9 at 0, 1/2, 3/4 of the step [Ralston 1962]. Every stage walks from cell to cell: a
-particle that meets a closed face stops short of it and slides on along it. With solids of whole cells no distance is needed, and none
-would do: pushing particles out along a distance strands them in SOLID cells. The number of cells to the nearest solid tells which
-particles nothing can stop; only the others walk.
+Third-order Runge-Kutta with the weights 2/9, 3/9, 4/9 at 0, 1/2, 3/4 of the step [Ralston 1962]. Three ways:
+
+Particles among whole cells (`advect`) never enter a SOLID one. Every stage walks from cell to cell: a particle that meets a closed face
+stops short of it and slides on along it. With solids of whole cells no distance is needed, and none would do: pushing particles out along
+a distance strands them in SOLID cells. The number of cells to the nearest solid tells which particles nothing can stop; only the others
+walk.
+
+Particles among walls that are given by their distance (`advect_with_distance`). One whose distance to walls exceeds its way needs no care.
+The others go in strides that the distance allows, but of half a cell at least, so that one that rests on a wall gets on; whoever ends a
+stride too near a wall or inside it is put back along the normal. On a plane that takes just the normal part from the way. The rest of the
+way loses its part into the wall, and between two walls all but the part along their edge. A stride that would end on another side of a
+wall is halved, so that plates of more than a cell are not tunnelled at any speed. Positions are measured by the distance that is
+interpolated between nodes, which defines where solids are, and by that to the domain's walls.
+
+Fields (`carry_field`): f(x, t + dt) = f(y, t), where y is found by such a step back along the velocity, so that they go the same way as
+particles. A velocity is interpolated by cubics through four nodes along each axis (Catmull and Rom's), kept within the range of the
+2^dimension nodes around y: a wave of 16 cells that moves by 0.4 cells a step has 87 % of its height after 80 steps, with linear
+interpolation 23 %. A distance is interpolated linearly, which is exact where it is one to a plane.
 """
+
+import functools
+import typing
+from typing import Any
 
 import warp as wp
 
-from warp_lcp.grid.advection_kernels import MAX_CLEARANCE, advect_pass, clearance_kernel
-from warp_lcp.grid.particle_loops import launch
-from warp_lcp.grid.runge_kutta import MARGIN
-from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.grid.particle_loops import MARGIN, cell_pass, launch, particle_pass
+from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.operators.grid_poisson import SOLID
+from warp_lcp.rows import RowPass
 
-__all__ = ["MARGIN", "MAX_CLEARANCE", "advect", "clearance"]
+MAX_CLEARANCE = 6  # cells; a particle that moves further in a step takes the careful way, which is always right
+CENTERS = 3  # the `axis` of a field at cell centers
+
+AIM = 1.1 * MARGIN  # where particles are put: float32 positions in 10^3 cells round by less than the difference
+SLACK = 0.25  # cells by which the interpolated distance may exceed the way that is free
+STRIDE = 0.5  # cells a particle goes near a wall before it looks again; shorter where it would come out on another side
+SHORTEST = 0.02  # cells a stride is cut to where a wall is thinner than that
+STRIDES = 64  # of a move: 32 cells along a wall
+CORNER = 0.5  # walls whose normals are further apart (cosine) stop a particle between them, nearer ones it slides over
+BEND = 0.9  # normals that are nearer than this are one wall
+LEG = 0.25  # cells of such a search in one direction
+REACH = 1.0  # cells that a step may put a particle back: more than its stride and the diagonal of the walls' rounding
+PUSH = 3.0  # cells that a wall may push a particle in a step
+
+_WALLS = {"AIM": AIM, "SLACK": SLACK, "STRIDE": STRIDE, "SHORTEST": SHORTEST, "LEG": LEG, "REACH": REACH} | {
+    "STRIDES": STRIDES, "CORNER": CORNER, "BEND": BEND,
+}  # fmt: skip
+
+PUSH_OUT = particle_pass(
+    "warp_lcp.grid.push_out.push_out",
+    {"position": wp.vec3},
+    whole={"distance": wp.float32, "moved": wp.int32, "left": wp.int32},
+    numbers={"open_sides": int},
+    constants={"MARGIN": MARGIN, "ENDLESS": 0, "LEG": LEG, "AIM": AIM, "PUSH": PUSH},
+)
+
+
+def _runge_kutta(module: str, name: str, walls: dict[str, Any], endless: int, **more: Any) -> RowPass:
+    """Return a pass that moves particles and counts those that were stopped.
+
+    Args:
+        module: of Warp, for a domain all of whose axes end.
+        name: of the pass.
+        walls: what stops them.
+        endless: has bit n set if axis n has no end; the header finds it as ENDLESS.
+        more: `numbers` and `constants` of the pass.
+    """
+    more["numbers"] = {"h": wp.float32} | more.get("numbers", {})
+    more["constants"] = {"MARGIN": MARGIN, "ENDLESS": endless} | more.get("constants", {})
+    whole = dict.fromkeys("uvw", wp.float32) | walls | {"stopped": wp.int32}
+    module += f"_{endless}" * (endless > 0)
+    return particle_pass(f"{module}.{name}", {"position": wp.vec3}, whole=whole, optional=("w",), **more)
+
+
+@functools.cache
+def advect_pass(endless: int) -> RowPass:
+    """Return the pass of `advect` for a domain whose axis n has no end where bit n is set."""
+    return _runge_kutta("warp_lcp.grid.advection", "advect", {"room": wp.int8}, endless)
+
+
+@functools.cache
+def distance_pass(endless: int) -> RowPass:
+    """Return the pass of `advect_with_distance` for such a domain."""
+    walls, more = {"distance": wp.float32}, {"numbers": {"open_sides": int}, "constants": _WALLS}
+    return _runge_kutta("warp_lcp.grid.distance_advection", "advect_with_distance", walls, endless, **more)
+
+
+@functools.cache
+def carry_pass(axis: int) -> RowPass:
+    """Return the pass of `carry_field` for the faces of an axis or `CENTERS`."""
+    name, numbers = f"warp_lcp.grid.semi_lagrangian_{axis}.carry", {"planes": int, "h": wp.float32, "least": wp.float32}
+    constants = {"AXIS": axis, "CENTERS": CENTERS, "ENDLESS": 0}
+    return cell_pass(name, "u v w level field out", numbers=numbers, constants=constants, optional=("w",))
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.grid.clearance")
+@typing.no_type_check
+def clearance_kernel(cells: wp.array3d(dtype=wp.int8), planes: int, distance: int, room: wp.array3d(dtype=wp.int8)):
+    """Pass `distance` = 0 marks SOLID cells 0 and others MAX_CLEARANCE; pass d marks those around cells of d - 1 with d.
+
+    In place without a race: a cell that another thread marks in this launch was more than d - 1 and becomes d, no source either way.
+    """
+    k, j, i = wp.tid()
+    if distance == 0:
+        room[k, j, i] = wp.where(cells[k, j, i] == wp.int8(SOLID), wp.int8(0), wp.int8(MAX_CLEARANCE))
+    elif int(room[k, j, i]) > distance:
+        near = int(0)
+        for c in range(wp.max(k - planes + 1, 0), wp.min(k + planes, room.shape[0])):
+            for b in range(wp.max(j - 1, 0), wp.min(j + 2, room.shape[1])):
+                for a in range(wp.max(i - 1, 0), wp.min(i + 2, room.shape[2])):
+                    if int(room[c, b, a]) == distance - 1:
+                        near = 1
+        if near > 0:
+            room[k, j, i] = wp.int8(distance)
 
 
 def clearance(grid: StaggeredGrid, cells: wp.array) -> wp.array:
@@ -50,3 +151,65 @@ def advect(
     u, v, w = [*fields, None][:3]
     given = {"u": u, "v": v, "w": w, "room": room, "stopped": stopped, "h": dt * (1.0 / grid.spacing)}
     launch(advect_pass(endless), len(position), grid, position=position, **given)
+
+
+def advect_with_distance(
+    grid: StaggeredGrid, fields: list[wp.array], distance: wp.array, dt: float, position: wp.array, stopped: wp.array, *,
+    open_sides: int = 0, endless: int = 0,
+) -> None:  # fmt: skip
+    """Move particles through the grid's velocity for a time step; nobody ends within MARGIN cells of a wall who did not start there.
+
+    Where no way back out of a wall is found within a cell, a particle stays where its last stride was open. A move goes at most 1024
+    cells, and 32 along walls.
+
+    Args:
+        grid: the grid.
+        fields: velocity of each component on the faces [m/s].
+        distance: to solids at the low corners of the cells, float32 in cells, > 0 in the open; in the stored shape. In 2-D the plane
+            k = 1 is used. The domain's walls need not be in it.
+        dt: time step [s].
+        position: [m], shape (n,) (updated).
+        stopped: int32, shape (1,): raised by the number of particles that met a wall.
+        open_sides: of `warp_lcp.grid.sides.side_bits`: they stop nobody. Who crosses them ends on them or beyond.
+        endless: has bit n set if axis n has no end, see `advect`; its sides are open, and alike.
+    """
+    u, v, w = [*fields, None][:3]
+    given = {"u": u, "v": v, "w": w, "distance": distance, "stopped": stopped, "h": dt * (1.0 / grid.spacing)}
+    launch(distance_pass(endless), len(position), grid, position=position, open_sides=open_sides, **given)
+
+
+def push_out(grid: StaggeredGrid, distance: wp.array, position: wp.array, moved: wp.array, left: wp.array, *, open_sides: int = 0) -> None:
+    """Put particles that walls have run over, or come too near, back into the open along the gradient of the distance.
+
+    Args:
+        grid: the grid.
+        distance: to solids in cells, as for `advect_with_distance`.
+        position: [m], shape (n,) (updated): moved by at most PUSH cells.
+        moved: int32, shape (1,): raised by the number of particles that were put outside.
+        left: int32, shape (1,): raised by the number of those for which no way out was found; they stay where they were.
+        open_sides: of `warp_lcp.grid.sides.side_bits`: particles beyond stay there.
+    """
+    launch(PUSH_OUT, len(position), grid, position=position, distance=distance, open_sides=open_sides, moved=moved, left=left)
+
+
+def carry_field(
+    grid: StaggeredGrid, window: Window, velocity: list[wp.array], dt: float, field: wp.array, out: wp.array, *, axis: int, level: wp.array,
+    least: float,
+) -> None:  # fmt: skip
+    """Find what a field will be after a time step.
+
+    Args:
+        grid: the grid.
+        window: cells to consider, in the domain and the ring's upper layer.
+        velocity: of each component on the faces [m/s].
+        dt: time step [s].
+        field: float32, of faces or cells; not `out`.
+        out: float32 (written). Where the level is no more than `least`: the velocity as it was, 0 at cell centers.
+        axis: whose faces the field lies on, or `CENTERS`.
+        level: float32 of cells; a face has the mean of its two.
+        least: see `out`.
+    """
+    u, v, w = [*velocity, None][:3]
+    inner = Window.of([max(start, 1) for start in window.low], window.high, window.device)
+    given = {"u": u, "v": v, "w": w, "level": level, "field": field, "out": out}
+    inner.run(carry_pass(axis), planes=grid.planes, h=dt / grid.spacing, least=least, **given)

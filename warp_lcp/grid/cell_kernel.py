@@ -33,6 +33,27 @@ def cell_below(axis: int, k: int, j: int, i: int):
     )
 
 
+@wp.func
+def interpolated(field: F32, planes: int, x: float, y: float, z: float):
+    """Return what lies between a field's elements, at coordinates that are brought within the array; in 2-D those of the plane k = 1."""
+    cx = wp.clamp(x, 0.0, float(field.shape[2]) - 1.001)
+    cy = wp.clamp(y, 0.0, float(field.shape[1]) - 1.001)
+    i = int(cx)
+    j = int(cy)
+    k = int(1)
+    fx = cx - float(i)
+    fy = cy - float(j)
+    value = wp.lerp(wp.lerp(field[1, j, i], field[1, j, i + 1], fx), wp.lerp(field[1, j + 1, i], field[1, j + 1, i + 1], fx), fy)
+    if planes == 2:
+        cz = wp.clamp(z, 0.0, float(field.shape[0]) - 1.001)
+        k = int(cz)
+        low = wp.lerp(wp.lerp(field[k, j, i], field[k, j, i + 1], fx), wp.lerp(field[k, j + 1, i], field[k, j + 1, i + 1], fx), fy)
+        k += 1
+        high = wp.lerp(wp.lerp(field[k, j, i], field[k, j, i + 1], fx), wp.lerp(field[k, j + 1, i], field[k, j + 1, i + 1], fx), fy)
+        value = wp.lerp(low, high, cz - float(k - 1))
+    return value
+
+
 def cell_kernel(module: str) -> Callable[[Callable], wp.Kernel]:
     """Return a decorator that makes a kernel(cells, ...) for `Window.launch`, in a Warp module, of what is done to a cell or a piece.
 

@@ -12,14 +12,13 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.grid import cut_cells_kernels as kernels
-from warp_lcp.grid.capacity_kernels import integrate_kernel
+from warp_lcp.grid.cut_cells_kernels import integrate_kernel
 from warp_lcp.grid.motion import Motion, RigidMotion
 from warp_lcp.grid.node_distance import NodeDistances, NodeSampler, nodes_near
 from warp_lcp.grid.sides import SIDES, continue_beyond, open_ring
-from warp_lcp.grid.solid_notes import placement_notes, repair_notes, thin_notes
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid
-from warp_lcp.grid.voxelize import PlacedSolid
+from warp_lcp.grid.voxelize import PlacedSolid, check_open, start_notes
 from warp_lcp.operators.grid_poisson import SOLID
 
 DEEP = 1e-2  # cells: nodes within it of a solid's surface lie on it
@@ -78,7 +77,7 @@ class CutCells:
         self._counts = wp.zeros(2, dtype=wp.int32, device=grid.device)
         self.turn = wp.zeros(1 + len(solids), dtype=wp.mat33, device=grid.device)
         self.shift = wp.zeros(1 + len(solids), dtype=wp.vec3, device=grid.device)
-        notes = self._solid_notes()
+        notes = start_notes(self.solids, grid)
         self._sampler, self._nodes = NodeSampler(grid), NodeDistances(grid, second=len(solids) > 1)
         self.distance = self._nodes.near
         self.nearest = self._nodes.arrays[1:] if self.moves else []
@@ -229,25 +228,10 @@ class CutCells:
             corners = np.minimum(corners, np.roll(corners, -1, axis=2 - axis))
         return bool((self.grid.interior(corners)[self.grid.interior(self.base.numpy()) != SOLID] < -DEEP).any())
 
-    def _solid_notes(self) -> list[str]:
-        """Return what is to be said about the solids before they are sampled."""
-        grid, notes = self.grid, []
-        for solid in self.solids:
-            geometry = solid.geometry
-            if solid.motion is None:
-                notes += placement_notes(geometry, solid.name, grid.whole or grid.counts, grid.spacing, grid.dimension)
-            else:  # it may come in later
-                notes += repair_notes(geometry, solid.name)
-            notes += thin_notes(geometry, solid.name, solid.among, grid.spacing, grid.device)
-        return notes
-
     def _result_notes(self, dropped: int) -> list[str]:
         """Return what is to be said about the faces."""
         grid = self.grid
-        if self.solids and not (grid.interior(self.base.numpy()) != SOLID).any():
-            raise ValueError(
-                "the solids fill the whole domain: no open cell is left (is one inverted, or a plane's normal the wrong way round?)"
-            )
+        check_open(not self.solids or bool((grid.interior(self.base.numpy()) != SOLID).any()))
         counts = [np.bincount(wall.numpy().ravel() + 1, minlength=1 + len(self.names)) for wall in self.wall]
         closed = np.sum(counts, axis=0)[1:]
         notes = [

@@ -1,43 +1,33 @@
 # mypy: ignore-errors
 """What solids leave open of faces and cells, and how fast they move, from their distances at the nodes (`node_distance`)."""
 
-from pathlib import Path
+import itertools
 
 import warp as wp
 
-from warp_lcp.grid.cell_kernel import F32, I16, cell_kernel
+from warp_lcp.grid.cell_kernel import F32, I8, I16, cell_kernel
 from warp_lcp.grid.node_distance_kernels import HOLLOW, Nearest
+from warp_lcp.grid.particle_loops import HEADERS, cell_pass
+from warp_lcp.grid.staggered import CellRange, Window
 from warp_lcp.operators.grid_poisson import AIR, SOLID
-from warp_lcp.rows import RowPass
 from warp_lcp.rows.row_pass import text
 
 DROP = 1.0e-3  # open fractions below become 0: raised, they would lift a flow along the wall; kept, they spoil the condition number
 CLOSED, OPEN, CUT = 0, 1, 2  # states of cells
 
-_HEADERS, _F32, _I16 = Path(__file__).parent / "headers", wp.float32, wp.int16
-_FACES = {f"{what}{axis}": kind for what, kind in (("a", _F32), ("w", _I16)) for axis in "xyz"}
-FRACTIONS = RowPass(
-    "warp_lcp.grid.cut_cells.fractions",
-    _HEADERS / "fractions.h",
-    _F32,
-    box={"d": _F32, "o": _I16, "d2": _F32, "o2": _I16, "marks": wp.int8, **_FACES},
-    whole={"counts": wp.int32},
-    numbers={"planes": int},
-    constants={"DROP": DROP, "HOLLOW": HOLLOW},
-)
-STATES = RowPass(
-    "warp_lcp.grid.cut_cells.states",
-    _HEADERS / "states.h",
-    _F32,
-    box={"d": _F32, "base": wp.int8, "state": wp.int8, **dict.fromkeys(("ax", "ay", "az"), _F32)},
-    numbers={"planes": int},
+FRACTIONS = cell_pass(
+    "warp_lcp.grid.cut_cells.fractions", "d d2 ax ay az", {"marks": wp.int8, **dict.fromkeys(("o", "o2", "wx", "wy", "wz"), wp.int16)},
+    whole={"counts": wp.int32}, numbers={"planes": int}, constants={"DROP": DROP, "HOLLOW": HOLLOW},
+)  # fmt: skip
+STATES = cell_pass(
+    "warp_lcp.grid.cut_cells.states", "d ax ay az", {"base": wp.int8, "state": wp.int8}, numbers={"planes": int},
     constants={"AIR": AIR, "SOLID": SOLID},
-)
+)  # fmt: skip
 
 
 @wp.func_native(
     "\n"
-    + text(_HEADERS / "cut_area.h")
+    + text(HEADERS / "cut_area.h")
     + """
     const float v[4] = {a, b, c, d};
     const bool open = a >= 0.0f && b >= 0.0f && c >= 0.0f && d >= 0.0f && a + b + c + d > 0.0f;
@@ -49,29 +39,41 @@ STATES = RowPass(
 def open_area(a: float, b: float, c: float, d: float) -> float: ...
 
 
+@wp.func
+def corner(axis: int, planes: int, n: int):
+    """Return how far (k, j, i) the n-th of the four corners of a lower face is from the first."""
+    a = n & 1
+    b = n >> 1
+    dk = b * wp.where(axis == 2, 0, planes - 1)
+    dj = a * wp.where(axis == 0, 1, 0) + b * wp.where(axis == 2, 1, 0)
+    return dk, dj, a * wp.where(axis == 0, 0, 1)
+
+
+@wp.func
+def open_face(near: F32, axis: int, planes: int, k: int, j: int, i: int):
+    """Return which share of a lower face is open, from a distance at nodes."""
+    c, b, a = corner(axis, planes, 1)
+    z, y, x = corner(axis, planes, 2)
+    return open_area(near[k, j, i], near[k + c, j + b, i + a], near[k + c + z, j + b + y, i + a + x], near[k + z, j + y, i + x])
+
+
 @cell_kernel("warp_lcp.grid.cut_cells")
 def side_kernel(k, j, i, planes: int, axis: int, near: F32, owner: I16, open: F32, wall: I16, counts: wp.array(dtype=wp.int32)):
     """Fill open fractions and wall numbers of the faces on an open side of the domain; count the dropped and the partial ones."""
-    dj = wp.where(axis == 0, 1, 0)
-    di = 1 - dj
-    dk = wp.where(axis == 2, 0, planes - 1)
-    ej = wp.where(axis == 2, 1, 0)
-    free = open_area(near[k, j, i], near[k, j + dj, i + di], near[k + dk, j + dj + ej, i + di], near[k + dk, j + ej, i])
+    free = open_face(near, axis, planes, k, j, i)
     if free > 0.0 and free < DROP:
         free = float(0.0)
         wp.atomic_add(counts, 0, 1)
     if free > 0.0 and free < 1.0:
         wp.atomic_add(counts, 1, 1)
     number = int(-1)
-    if free < 1.0:  # the solid that is nearest to a corner: (0), along (di, dj, 0), and along (0, ej, dk)
+    if free < 1.0:  # the solid that is nearest to a corner
         least = float(1.0e30)
         for n in range(4):
-            a = n & 1
-            b = n >> 1
-            d = near[k + b * dk, j + a * dj + b * ej, i + a * di]
-            if d < least:
-                least = d
-                number = int(owner[k + b * dk, j + a * dj + b * ej, i + a * di])
+            dk, dj, di = corner(axis, planes, n)
+            if near[k + dk, j + dj, i + di] < least:
+                least = near[k + dk, j + dj, i + di]
+                number = int(owner[k + dk, j + dj, i + di])
     open[k, j, i] = free
     wall[k, j, i] = wp.int16(number)
 
@@ -112,32 +114,23 @@ def moving_part(S: Moving, axis: int, planes: int, k: int, j: int, i: int, open:
     solid = int(0)
     part = float(0.0)
     if free < 1.0:
-        dj = wp.where(axis == 0, 1, 0)
-        di = 1 - dj
-        dk = planes - 1
-        ej = wp.where(axis == 2, 1, 0)
-        if axis == 2:
-            dk = 0
         solid = int(wall[k, j, i])
         least = float(1.0e30)
-        if S.moves[wp.max(solid, 0)] == wp.uint8(0):  # the corners are (0), along (di, dj, 0), and along (0, ej, dk)
+        if S.moves[wp.max(solid, 0)] == wp.uint8(0):
             solid = 0
             for n in range(4):
-                a = n & 1
-                b = n >> 1
-                found, d = least_moving(S, k + b * dk, j + a * dj + b * ej, i + a * di)
+                dk, dj, di = corner(axis, planes, n)
+                found, d = least_moving(S, k + dk, j + dj, i + di)
                 if found > 0 and d < least:
                     least = d
                     solid = found
         if solid > 0:
             if wall[k, j, i] == wp.int16(0):
-                near = S.nodes.near
-                free = open_area(near[k, j, i], near[k, j + dj, i + di], near[k + dk, j + dj + ej, i + di], near[k + dk, j + ej, i])
+                free = open_face(S.nodes.near, axis, planes, k, j, i)
                 closed = float(1.0)
             else:
                 closed = 1.0 - free
-            rest = S.standing
-            at_rest = 1.0 - open_area(rest[k, j, i], rest[k, j + dj, i + di], rest[k + dk, j + dj + ej, i + di], rest[k + dk, j + ej, i])
+            at_rest = 1.0 - open_face(S.standing, axis, planes, k, j, i)
             part = wp.clamp((1.0 - free - at_rest) / closed, 0.0, 1.0)
     return wp.max(solid, 0), part
 
@@ -156,3 +149,53 @@ def velocity_kernel(
             x[2] = 0.0
         value = part * (wp.dot(turn[solid][axis], x) + shift[solid][axis])
     velocity[k, j, i] = value
+
+
+options = {"enable_backward": False, "module": "warp_lcp.grid.capacity"}
+COLORS = 3  # along an axis: as many cells as a kernel reaches over
+
+OPEN_CELLS = cell_pass("warp_lcp.grid.capacity.open_cells", "capacity", {"state": wp.int8}, numbers={"planes": int})
+
+
+@wp.func_native("\n" + text(HEADERS / "cut_cell.h") + "\n")
+def cut_cell(near_: F32, out_: F32, planes: int, k: int, j: int, i: int): ...
+
+
+@wp.kernel(**options)
+def cut_kernel(cells: CellRange, color: wp.vec3i, planes: int, near: F32, state: I8, capacity: F32):
+    """Integrate over every third cut cell along each axis, from cell (color[2], color[1], color[0]) of the box on.
+
+    Cells add to their neighbors: those of one color have none in common, so nothing races and sums keep their order.
+    """
+    plane, row, chunk = wp.tid()
+    k = cells.k + color[2] + COLORS * plane
+    j = cells.j + color[1] + COLORS * row
+    first = cells.i + color[0] + COLORS * chunk * cells.grain
+    for i in range(first, wp.min(first + COLORS * cells.grain, cells.end), COLORS):
+        if state[k, j, i] == wp.int8(CUT):
+            cut_cell(near, capacity, planes, k, j, i)
+
+
+def integrate_kernel(
+    window: Window, planes: int, near: wp.array, state: wp.array, capacity: wp.array, origin: tuple[int, int, int] = (0, 0, 0)
+) -> None:
+    """Integrate each cell's kernel over what is open.
+
+    Args:
+        window: all cells of the grid without the ring.
+        planes: 1 in 2-D, 2 in 3-D.
+        near: float32, signed distance of the solids at the nodes [cells].
+        state: int8, CLOSED, OPEN or CUT.
+        capacity: float32 (written, the ring included).
+        origin: of a part of a grid, in which sums then keep the order that they have in all of it.
+    """
+    everywhere = Window((1, 0, 0) if planes == 1 else (0, 0, 0), (2 if planes == 1 else state.shape[0], *state.shape[1:]), window.device)
+    everywhere.run(OPEN_CELLS, planes=planes, state=state, capacity=capacity)
+    chunks = -(-(window.high[2] - window.low[2]) // window.cells.grain)
+    for color in itertools.product(range(COLORS if planes == 2 else 1), range(COLORS), range(COLORS)):
+        z, y, x = ((c - before) % COLORS for c, before in zip(color, reversed(origin), strict=True))
+        # rows and planes of this color; chunks of a row are counted in cells of this color too, the last may be empty
+        rows = [-(-max(high - low - color, 0) // COLORS) for low, high, color in zip(window.low, window.high, (z, y, x), strict=True)]
+        if min(rows) > 0:
+            dim = (rows[0], rows[1], -(-rows[2] // window.cells.grain) if chunks > 1 else 1)
+            wp.launch(cut_kernel, dim, [window.cells, wp.vec3i(x, y, z), planes, near, state, capacity], device=window.device)

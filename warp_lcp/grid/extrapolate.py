@@ -2,23 +2,19 @@
 
 import typing
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
+from warp_lcp.grid.particle_loops import cell_pass
 from warp_lcp.grid.staggered import Window
-from warp_lcp.grid.transfer_kernels import TINY_WEIGHT
-from warp_lcp.rows import RowPass
+from warp_lcp.grid.transfer import TINY_WEIGHT
 
 BLOCKED = -1  # not to be filled
 UNKNOWN = 0  # to be filled; positive: known since that layer, 1 from the start
 REACH = 2  # layers around faces with weight: as far as the density of a cell tells of particles beyond its neighbors
 
-_FIELDS, _NUMBERS = {"known": wp.int8, "field": wp.float32}, {"layer": int, "fill": int}
-LAYER = RowPass(
-    "warp_lcp.grid.extrapolate.layer", Path(__file__).parent / "headers" / "fill_layer.h", wp.float32, box=_FIELDS, numbers=_NUMBERS
-)
+LAYER = cell_pass("warp_lcp.grid.extrapolate.fill_layer", "field", {"known": wp.int8}, numbers={"layer": int, "fill": int})
 
 
 @cell_kernel("warp_lcp.grid.extrapolate")

@@ -48,7 +48,6 @@ class LevelSet:
     """
 
     def __init__(self, grid: StaggeredGrid, *, particles_a_cell: int, smoothing: int = 0) -> None:
-        """Allocate the fields, all air."""
         if particles_a_cell < 1:
             raise ValueError(f"particles_a_cell = {particles_a_cell}: must be at least 1")
         if smoothing < 0:
@@ -94,7 +93,8 @@ class LevelSet:
         if smooth is not None:
             shifted = next(field for field in self._scratch if field is not smooth)
             window.launch(kernels.wall_shift_kernel, [self._spread**2, self.limit, smooth, self.phi, self._known, shifted])
-            window.launch(kernels.copy_kernel, [shifted, self.phi])
+            box = tuple(map(slice, window.low, window.high))
+            wp.copy(self.phi[box], shifted[box])
         extrapolate(window, self._known, self.phi, kernels.EXTENDED)
 
     def volume(self, distance: wp.array | None, window: Window) -> float:
@@ -106,15 +106,12 @@ class LevelSet:
             window: that of the last update.
         """
         grid = self.grid
-        low = [max(a, b) for a, b in zip(window.low, grid.domain.low, strict=True)]
-        high = [min(a, b) for a, b in zip(window.high, grid.domain.high, strict=True)]
-        if any(a >= b for a, b in zip(low, high, strict=True)):
+        box = window.common(grid.domain)
+        if box is None:
             return 0.0
-        box = Window((low[0], low[1], low[2]), (high[0], high[1], high[2]), grid.device)
         found = {"phi": self.phi, "known": self._known, "distance": distance, "sums": self._sums}
         box.run(kernels.VOLUME, whole=True, **found, planes=grid.planes, parts=PARTS[grid.dimension])
-        rows = self._sums.numpy()[low[0] : high[0], low[1] : high[1]]
-        return float(np.sum(rows)) * grid.cell_volume
+        return float(np.sum(box.rows_of(self._sums))) * grid.cell_volume
 
     def _smoothed(self, window: Window, source: wp.array, first: wp.array, second: wp.array) -> wp.array:
         """Return the source after the binomial passes; in one of two scratch fields."""

@@ -6,14 +6,11 @@ filled up to s cells from its center holds, is a cubic in pieces: (s + 3/2)^3 / 
 G(-s) = 1 - G(s).
 """
 
-from pathlib import Path
-
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
-from warp_lcp.grid.particle_loops import particle_pass
+from warp_lcp.grid.particle_loops import cell_pass, particle_pass
 from warp_lcp.operators.grid_poisson import SOLID
-from warp_lcp.rows import RowPass
 
 # Of a cell's kernel: where less is open, too few particles fit to tell (one, of four a cell), and an empty wedge deep in the liquid would
 # count as air, into which the liquid falls. Such a cell is given its neighbors' distance.
@@ -21,30 +18,17 @@ MIN_CAPACITY = 0.25
 TAIL = 1e-4  # the least filled share whose quantile is taken after smoothing
 EXTENDED = 2  # layers of cells without a distance of their own that are given one
 
-_LEVEL_SET, _DENSITY, _HEADERS = "warp_lcp.grid.level_set", "warp_lcp.grid.density", Path(__file__).parent / "headers"
+_LEVEL_SET, _DENSITY = "warp_lcp.grid.level_set", "warp_lcp.grid.density"
 _CONSTANTS = {"MIN_CAPACITY": MIN_CAPACITY, "TAIL": TAIL, "SOLID": SOLID}
-_PHI = {"phi": wp.float32, "known": wp.int8}
-BINOMIAL = RowPass(
-    f"{_LEVEL_SET}.binomial", _HEADERS / "binomial.h", wp.float32, box={"source": wp.float32, "out": wp.float32}, numbers={"planes": int}
-)
-DISTANCE = RowPass(
-    f"{_LEVEL_SET}.distance",
-    _HEADERS / "level_set_distance.h",
-    wp.float32,
-    box=_PHI | {"density": wp.float32, "capacity": wp.float32, "smooth": wp.float32, "base": wp.int8},
-    numbers={"spread": wp.float32, "limit": wp.float32},
-    optional=("capacity", "smooth"),
-    constants=_CONSTANTS,
-)
-VOLUME = RowPass(  # in a module of its own: few runs ask for it
-    "warp_lcp.grid.volume.enclosed",
-    _HEADERS / "volume.h",
-    wp.float32,
-    box=_PHI | {"distance": wp.float32},
-    whole={"sums": wp.float64},
-    numbers={"planes": int, "parts": int},
-    optional=("distance",),
-)
+BINOMIAL = cell_pass(f"{_LEVEL_SET}.binomial", "source out", numbers={"planes": int})
+DISTANCE = cell_pass(
+    f"{_LEVEL_SET}.level_set_distance", "phi density capacity smooth", {"known": wp.int8, "base": wp.int8},
+    numbers={"spread": wp.float32, "limit": wp.float32}, optional=("capacity", "smooth"), constants=_CONSTANTS,
+)  # fmt: skip
+VOLUME = cell_pass(  # in a module of its own: few runs ask for it
+    "warp_lcp.grid.volume.volume", "phi distance", {"known": wp.int8}, whole={"sums": wp.float64},
+    numbers={"planes": int, "parts": int}, optional=("distance",),
+)  # fmt: skip
 SCATTER = particle_pass(f"{_DENSITY}.scatter_density", {"position": wp.vec3}, whole={"density": wp.float32}, numbers={"each": wp.float32})
 GATHER = particle_pass(
     f"{_DENSITY}.gather_density", {"density": wp.float32}, whole={"offsets": wp.int32, "position": wp.vec3}, numbers={"each": wp.float32}
@@ -91,12 +75,6 @@ def wall_shift_kernel(k, j, i, variance: float, limit: float, capacity: F32, phi
         s = s / wp.max(wp.length(s), 1.0)
         value = wp.clamp(here - wp.dot(s, grad), -limit, limit)
     out[k, j, i] = value
-
-
-@cell_kernel("warp_lcp.grid.level_set")
-def copy_kernel(k, j, i, source: F32, out: F32):
-    """Copy a field."""
-    out[k, j, i] = source[k, j, i]
 
 
 @cell_kernel("warp_lcp.grid.level_set")

@@ -1,19 +1,154 @@
-"""Marching cubes on a device: the surface phi = 0 as triangles, in 2-D as segments, closed and without duplicate points."""
+"""Marching cubes on a device: the surface phi = 0 as triangles, in 2-D as segments, closed and without duplicate points.
 
-from __future__ import annotations
+One thread takes a row of cells, and knows from a scan where its points and triangles go. A point belongs to the node at the low end of its
+edge; a node's points are numbered x, y, z from the number that the node keeps.
+
+The triangles of a case are worked out from the cube instead of typed in. Corner c of a cell lies at (c & 1, c >> 1 & 1, c >> 2 & 1), x
+first; bit c of a case is set if the corner is inside. Edge 4 a + b runs along axis a from the b-th of the four corners that are low along
+it. On a face each run of inside corners is cut off by a segment, so that two cells see the same segments on the face between them: the
+surface is closed. No triangle has an edge within a face that is no segment, so that each of its edges belongs to two triangles.
+"""
 
 import functools
+import itertools
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import warp as wp
 
-from warp_lcp.grid import marching_cubes_kernels as kernels
-from warp_lcp.grid.marching_cubes_table import segment_table, triangle_table
+from warp_lcp.grid.particle_loops import HEADERS
 from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.rows import RowPass
+
+MOST = 5  # triangles of a cell
+EDGES = tuple((corner, corner | 1 << axis) for axis in range(3) for corner in range(8) if not corner >> axis & 1)
+Edge = int
+Loop = tuple[Edge, ...]
+Cut = tuple[float, tuple[tuple[Edge, Edge, Edge], ...]]  # a length, and triangles
+
+
+@functools.cache
+def _faces() -> list[tuple[int, int, int, int]]:
+    """Return the corners of the cell's faces, counterclockwise seen from outside."""
+    faces = []
+    for axis in range(3):
+        u, v = 1 << (axis + 1) % 3, 1 << (axis + 2) % 3
+        low = (0, v, u | v, u)
+        faces += [low, tuple(corner | 1 << axis for corner in reversed(low))]
+    return [(f[0], f[1], f[2], f[3]) for f in faces]
+
+
+def _edge(a: int, b: int) -> Edge:
+    return EDGES.index((min(a, b), max(a, b)))
+
+
+def _segments(case: int, face: tuple[int, int, int, int]) -> list[tuple[Edge, Edge]]:
+    """Return what cuts off the runs of inside corners of a face, each from the edge before a run to the edge after it."""
+    inside = [bool(case >> corner & 1) for corner in face]
+    found = []
+    for n in range(4):
+        if inside[n] and not inside[n - 1]:
+            last = n
+            while inside[(last + 1) % 4]:
+                last = (last + 1) % 4
+            found.append((_edge(face[n - 1], face[n]), _edge(face[last], face[(last + 1) % 4])))
+    return found
+
+
+def _loops(case: int) -> list[Loop]:
+    """Return the closed lines in which the surface meets the cell's faces, counterclockwise seen from outside the material."""
+    follows = dict(itertools.chain(*(_segments(case, face) for face in _faces())))
+    loops = []
+    while follows:
+        first, edge = next(iter(follows.items()))
+        loop = [first]
+        del follows[first]
+        while edge != first:
+            loop.append(edge)
+            edge = follows.pop(edge)
+        loops.append(tuple(loop))
+    return loops
+
+
+@functools.cache
+def _on_one_face(a: Edge, b: Edge) -> bool:
+    corners = set(EDGES[a] + EDGES[b])
+    return any(corners <= set(face) for face in _faces())
+
+
+@functools.cache
+def _midpoint(edge: Edge) -> np.ndarray:
+    return np.array([[corner >> axis & 1 for axis in range(3)] for corner in EDGES[edge]]).mean(axis=0)
+
+
+@functools.cache
+def _cut(loop: Loop) -> Cut | None:
+    """Return the triangulation of a loop with the shortest diagonals, and their length; None: all have a diagonal within a face."""
+    if len(loop) == 3:
+        return 0.0, ((loop[0], loop[1], loop[2]),)
+    best = None
+    for middle in range(1, len(loop) - 1):  # the corner opposite to the side between the loop's ends
+        parts: list[Cut] = [(0.0, ((loop[0], loop[middle], loop[-1]),))]
+        for part in (loop[: middle + 1], loop[middle:]):
+            if len(part) < 3:
+                continue
+            found = None if _on_one_face(part[0], part[-1]) else _cut(part)
+            if found is None:
+                break
+            parts.append((found[0] + float(np.linalg.norm(_midpoint(part[0]) - _midpoint(part[-1]))), found[1]))
+        else:
+            length = sum(part[0] for part in parts)
+            if best is None or length < best[0] - 1e-9:
+                best = length, tuple(itertools.chain(*(part[1] for part in parts)))
+    return best
+
+
+@functools.cache
+def triangle_table() -> np.ndarray:
+    """Return the triangles of each case as edges, int8, shape (256, 1 + 3 MOST): their number, then three edges each."""
+    table = np.full((256, 1 + 3 * MOST), -1, dtype=np.int8)
+    for case in range(256):
+        triangles: list[Edge] = []
+        for loop in _loops(case):
+            found = _cut(loop)
+            assert found is not None  # true of all 256 cases
+            triangles += itertools.chain(*found[1])
+        table[case, 0] = len(triangles) // 3
+        table[case, 1 : 1 + len(triangles)] = triangles
+    return table
+
+
+@functools.cache
+def segment_table() -> np.ndarray:
+    """Return the segments of a square's cases as edges, int8, shape (16, 5): their number, then two edges each, the inside on the left."""
+    table = np.full((16, 5), -1, dtype=np.int8)
+    low = _faces()[4]  # z = 0, seen from below
+    for case in range(16):
+        ends = [edge for segment in _segments(case, low) for edge in segment]
+        table[case, 0] = len(ends) // 2
+        table[case, 1 : 1 + len(ends)] = ends
+    return table
+
+
+CLOSEST = 0.01  # of an edge: how near to its end a point may come, so that no triangle shrinks to nothing
+
+_I32, _ROWS = wp.int32, {"ends": wp.int32, "counts": wp.int32}
+
+
+def _made(name: str, box: dict[str, Any], numbers: dict[str, Any], by_row: dict[str, Any], **whole: Any) -> RowPass:
+    box, numbers, constants = {"phi": wp.float32} | box, {"planes": int} | numbers, {"CLOSEST": CLOSEST}
+    area, path = "warp_lcp.grid.marching_cubes", HEADERS / f"cube_{name}.h"
+    return RowPass(f"{area}.{name}", path, wp.float32, box=box, numbers=numbers, by_row=by_row, whole=whole, constants=constants)
+
+
+COUNT = _made("count", {}, {}, {"owned": _I32, "made": _I32}, table=wp.int8)
+POINTS = _made("points", {"number": _I32}, {"dx": wp.float32}, _ROWS, into=wp.vec3)
+CORNERS = _made("corners", {"number": _I32}, {}, _ROWS, table=wp.int8, into=_I32)
 
 
 @dataclass(frozen=True)
-class Mesh:
+class DeviceMesh:
     """A surface on a device.
 
     Attributes:
@@ -33,11 +168,10 @@ class MarchingCubes:
     """
 
     def __init__(self, grid: StaggeredGrid) -> None:
-        """Bring the table of cases to the device."""
         self.grid = grid
         self._table = wp.array(triangle_table() if grid.dimension == 3 else segment_table(), dtype=wp.int8, device=grid.device)
 
-    def contour(self, phi: wp.array, number: wp.array) -> Mesh:
+    def contour(self, phi: wp.array, number: wp.array) -> DeviceMesh:
         """Return the surface phi = 0, linear between the cells' centers, and flat on the domain's sides where it is cut off there.
 
         Where it meets a side at a right angle it ends there in an edge: what crosses it between centers beside a side is put on the side.
@@ -53,12 +187,14 @@ class MarchingCubes:
         cells = Window(low, high, device)  # between the centers of cells and of their upper neighbors
         counts = [wp.empty(cells.rows, dtype=wp.int32, device=device) for _ in range(2)]
         run = functools.partial(cells.run, whole=True, phi=phi, planes=grid.planes)
-        run(kernels.COUNT, table=self._table, owned=counts[0], made=counts[1])
+        run(COUNT, table=self._table, owned=counts[0], made=counts[1])
         ends = [wp.empty(count.size, dtype=wp.int32, device=device) for count in counts]
         for count, end in zip(counts, ends, strict=True):
             wp.utils.array_scan(count.flatten(), end, inclusive=True)
         points, corners = (int(end[-1:].numpy()[0]) for end in ends)
-        mesh = Mesh(wp.empty(points, dtype=wp.vec3, device=device), wp.empty((corners, grid.dimension), dtype=wp.int32, device=device))
-        run(kernels.POINTS, dx=grid.spacing, number=number, counts=counts[0], ends=ends[0], into=mesh.points)
-        run(kernels.CORNERS, table=self._table, number=number, counts=counts[1], ends=ends[1], into=mesh.corners)
+        mesh = DeviceMesh(
+            wp.empty(points, dtype=wp.vec3, device=device), wp.empty((corners, grid.dimension), dtype=wp.int32, device=device)
+        )
+        run(POINTS, dx=grid.spacing, number=number, counts=counts[0], ends=ends[0], into=mesh.points)
+        run(CORNERS, table=self._table, number=number, counts=counts[1], ends=ends[1], into=mesh.corners)
         return mesh

@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -126,7 +127,7 @@ def _parse_ply(data: bytes) -> tuple[np.ndarray, Corners]:
     order, elements = _ply_header(head[1].decode("ascii", "replace"))
     points = np.empty((0, 3))
     polygons: list[Sequence[int] | np.ndarray] = []
-    source = _TextRecords(data[head.end() :]) if order is None else _BinaryRecords(data[head.end() :], order)
+    source = _Records(data[head.end() :], order)
     for element in elements:
         names = [name for name, _, _ in element.properties]
         if not names or not element.count:
@@ -169,74 +170,48 @@ def _ply_header(text: str) -> tuple[str | None, list[_Element]]:
     return order, elements
 
 
-class _TextRecords:
-    """The words of a PLY file's body, one record after the other."""
+class _Records:
+    """The body of a PLY file, one record after the other: numbers of bytes in an order, or words, where that is None."""
 
-    def __init__(self, body: bytes) -> None:
-        self.words, self.at = body.split(), 0
+    def __init__(self, body: bytes, order: str | None) -> None:
+        self.body: Any = body.split() if order is None else body
+        self.order, self.at = order, 0
 
     def claim(self, element: _Element) -> dict[str, int]:
         """Return the least that an element's records take, `stored`, and what is left for them, `held` [bytes, two a word]."""
-        return {"stored": 2 * element.count * len(element.properties), "held": 2 * (len(self.words) - self.at)}
+        each = 2 if self.order is None else 1
+        least = sum(self._width(length or kind) for _, kind, length in element.properties)
+        return {"stored": each * element.count * least, "held": each * (len(self.body) - self.at)}
 
     def table(self, element: _Element) -> np.ndarray:
         """Return records without lists, float64 of shape (count, properties)."""
-        width = len(element.properties)
-        begin, self.at = self.at, self.at + element.count * width
-        return np.array([float(word) for word in self.words[begin : self.at]]).reshape(element.count, width)
-
-    def lists(self, element: _Element, wanted: int) -> list[Sequence[int]]:
-        """Return a list property of each record, none if `wanted` is -1."""
-        found: list[Sequence[int]] = []
-        for _ in range(element.count):
-            for number, (_, _, length) in enumerate(element.properties):
-                if self.at >= len(self.words):
-                    raise ValueError(f"it ends before the last {element.name}")
-                size = int(self.words[self.at]) if length else 0
-                begin, self.at = self.at + 1, self.at + 1 + size
-                if size < 0 or self.at > len(self.words):
-                    raise ValueError(f"a list of {size} entries does not fit into it")
-                if number == wanted:
-                    found.append([_index(word) for word in self.words[begin : self.at]])
-        return found
-
-
-class _BinaryRecords:
-    """The bytes of a PLY file's body, one record after the other."""
-
-    def __init__(self, body: bytes, order: str) -> None:
-        self.body, self.order, self.at = body, order, 0
-
-    def claim(self, element: _Element) -> dict[str, int]:
-        """Return the least that an element's records take, `stored`, and what is left for them, `held` [bytes]."""
-        least = sum(int((length or kind)[1]) for _, kind, length in element.properties)
-        return {"stored": element.count * least, "held": len(self.body) - self.at}
-
-    def table(self, element: _Element) -> np.ndarray:
-        """Return records without lists, float64 of shape (count, properties)."""
+        if self.order is None:
+            words = self._take("f8", element.count * len(element.properties), element)
+            return np.array([float(word) for word in words]).reshape(element.count, -1)
         record = np.dtype([(str(number), self.order + kind) for number, (_, kind, _) in enumerate(element.properties)])
         rows = np.frombuffer(self.body, record, element.count, self.at)
         self.at += rows.nbytes
         return np.stack([rows[name].astype(np.float64) for name in record.names or ()], axis=1)
 
-    def lists(self, element: _Element, wanted: int) -> list[np.ndarray]:
+    def lists(self, element: _Element, wanted: int) -> list[Sequence[int] | np.ndarray]:
         """Return a list property of each record, none if `wanted` is -1."""
-        found = []
+        found: list[Sequence[int] | np.ndarray] = []
         for _ in range(element.count):
             for number, (_, kind, length) in enumerate(element.properties):
-                size = int(self._take(length, 1, element)[0]) if length else 1
-                entries = self._take(kind, size, element)
+                entries = self._take(kind, int(self._take(length, 1, element)[0]) if length else 1, element)
                 if number == wanted:
-                    found.append(entries)
+                    found.append(entries if self.order else [_index(word) for word in entries])
         return found
 
-    def _take(self, kind: str, count: int, element: _Element) -> np.ndarray:
-        """Return the next numbers of a type."""
-        width = int(kind[1])
-        if not 0 <= count <= (len(self.body) - self.at) // width:
+    def _width(self, kind: str) -> int:
+        return 1 if self.order is None else int(kind[1])
+
+    def _take(self, kind: str, count: int, element: _Element) -> Any:
+        """Return the next numbers of a type, or words."""
+        begin, self.at = self.at, self.at + count * self._width(kind)
+        if not begin <= self.at <= len(self.body):
             raise ValueError(f"it ends within a {element.name}")
-        begin, self.at = self.at, self.at + count * width
-        return np.frombuffer(self.body, self.order + kind, count, begin)
+        return self.body[begin : self.at] if self.order is None else np.frombuffer(self.body, self.order + kind, count, begin)
 
 
 def _parse_obj(data: bytes) -> tuple[np.ndarray, Corners]:

@@ -1,19 +1,62 @@
 """Smooth a closed surface without shrinking it, as Taubin does: a step of Laplacian smoothing, then a slightly longer one back."""
 
-from __future__ import annotations
+import typing
 
 import warp as wp
 
-from warp_lcp.grid import mesh_smoothing_kernels as kernels
-from warp_lcp.grid.marching_cubes import Mesh
-from warp_lcp.grid.particle_loops import chunks
+from warp_lcp.grid.cell_kernel import F32, POINTS, interpolated
+from warp_lcp.grid.marching_cubes import DeviceMesh
+from warp_lcp.grid.particle_loops import cell_pass, chunks
 from warp_lcp.grid.staggered import StaggeredGrid
+
+TOUCHING = 0.015  # lattice cells from the domain's side: points that close the surface there are 0.01 off its other sides
+NEAR = 0.25  # lattice cells: a point on a solid, as accurately as a distance that is linear between nodes can tell
+
+_SUMS, _BYTES = wp.array2d(dtype=wp.float32), wp.array(dtype=wp.uint8)
+_options = {"enable_backward": False, "module": "warp_lcp.grid.mesh_smoothing"}
+
+_WHOLE = {"points": wp.vec3, "sums": wp.float32}
+SEE_NEIGHBORS = cell_pass("warp_lcp.grid.mesh_smoothing.see_neighbors", "", {"corners": wp.int32}, whole=_WHOLE)
+
+
+@wp.kernel(**_options)
+@typing.no_type_check
+def hold_kernel(planes: int, dx: float, points: POINTS, room: F32, counts: wp.vec3, held: _BYTES):
+    """Mark points that stay: those on the domain's sides, so that these end in an edge, and on solids."""
+    p = wp.tid()
+    x = points[p] / dx
+    stays = bool(False)
+    for axis in range(planes + 1):
+        if x[axis] < TOUCHING or x[axis] > counts[axis] - TOUCHING:
+            stays = True
+    if room:
+        if interpolated(room, planes, x[0] + 0.5, x[1] + 0.5, x[2] + 0.5) < NEAR:
+            stays = True
+    held[p] = wp.where(stays, wp.uint8(1), wp.uint8(0))
+
+
+@wp.kernel(**_options)
+@typing.no_type_check
+def move_kernel(share: float, most: float, sums: _SUMS, held: _BYTES, size: wp.vec3, start: POINTS, points: POINTS):
+    """Move a point a share of the way to the mean of its neighbors, within the domain and not too far from where it started."""
+    p = wp.tid()
+    if held[p] != wp.uint8(0):
+        return
+    x = points[p]
+    for axis in range(3):
+        x[axis] += share * (sums[p, axis] / sums[p, 3] - x[axis])
+    way = x - start[p]
+    far = wp.length(way)
+    if far > most:
+        x = start[p] + (most / far) * way
+    points[p] = wp.vec3(wp.clamp(x[0], 0.0, size[0]), wp.clamp(x[1], 0.0, size[1]), wp.clamp(x[2], 0.0, size[2]))
+
 
 FORTH, BACK = 0.5, -0.53  # shares of the way to the neighbors' mean: waves longer than about 9 points keep their height, short ones lose it
 MOST = 0.3  # lattice cells that a point may move: facets are shallower, drops of few points are not squeezed to nothing
 
 
-def smooth(mesh: Mesh, lattice: StaggeredGrid, room: wp.array | None, rounds: int) -> None:
+def smooth(mesh: DeviceMesh, lattice: StaggeredGrid, room: wp.array | None, rounds: int) -> None:
     """Move the points of a surface but for those on the domain's sides and on solids.
 
     Args:
@@ -26,14 +69,12 @@ def smooth(mesh: Mesh, lattice: StaggeredGrid, room: wp.array | None, rounds: in
     if not count or not rounds:
         return
     held = wp.empty(count, dtype=wp.uint8, device=device)
-    wp.launch(
-        kernels.hold_kernel, count, [lattice.planes, lattice.spacing, mesh.points, room, wp.vec3(*lattice.counts), held], device=device
-    )
+    wp.launch(hold_kernel, count, [lattice.planes, lattice.spacing, mesh.points, room, wp.vec3(*lattice.counts), held], device=device)
     start, most = wp.clone(mesh.points), MOST * lattice.spacing
     sums = wp.empty((count, 4), dtype=wp.float32, device=device)  # of the neighbors' coordinates, and how many they are
     size = wp.vec3(*(n * lattice.spacing for n in lattice.counts))
     rows = chunks(len(mesh.corners), device)
     for share in (FORTH, BACK) * rounds:
         sums.zero_()
-        kernels.SEE_NEIGHBORS.bind(rows, corners=mesh.corners, points=mesh.points, sums=sums).launch()
-        wp.launch(kernels.move_kernel, count, [share, most, sums, held, size, start, mesh.points], device=device)
+        SEE_NEIGHBORS.bind(rows, corners=mesh.corners, points=mesh.points, sums=sums).launch()
+        wp.launch(move_kernel, count, [share, most, sums, held, size, start, mesh.points], device=device)

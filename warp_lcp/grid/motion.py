@@ -122,7 +122,7 @@ class Translation:
     stop: float = math.inf
 
     def __post_init__(self) -> None:
-        """Check the values."""
+        """Check the values, and bring the velocity into space."""
         object.__setattr__(self, "velocity", _in_space("velocity", self.velocity))
         _check_interval(self.start, self.stop)
 
@@ -156,7 +156,7 @@ class Rotation:
         """Check the values, and give the axis unit length."""
         _check_finite("rate", self.rate)
         object.__setattr__(self, "center", _in_space("center", self.center))
-        object.__setattr__(self, "axis", _unit("axis", self.axis))
+        object.__setattr__(self, "axis", unit("axis", _in_space("axis", self.axis)))
         _check_interval(self.start, self.stop)
 
     def pose(self, time: float) -> Pose:
@@ -198,7 +198,7 @@ class Sinusoid:
         _check_finite("angle", self.angle)
         object.__setattr__(self, "amplitude", _in_space("amplitude", self.amplitude))
         object.__setattr__(self, "center", _in_space("center", self.center))
-        object.__setattr__(self, "axis", _unit("axis", self.axis))
+        object.__setattr__(self, "axis", unit("axis", _in_space("axis", self.axis)))
 
     def pose(self, time: float) -> Pose:
         """Return shift and turn at `time` [s]."""
@@ -390,19 +390,36 @@ def _elapsed(time: float, start: float, stop: float) -> float:
     return min(max(time, start), stop) - start
 
 
-def _in_space(name: str, value: Vector) -> tuple[float, ...]:
-    """Return a point or direction of two or three finite coordinates in space, z = 0 in 2-D."""
+def checked_vector(name: str, value: Vector) -> tuple[float, ...]:
+    """Return two or three finite numbers.
+
+    Raises:
+        ValueError: there are more or fewer, or one is not finite.
+    """
     numbers = tuple(float(v) for v in value)
     if len(numbers) not in (2, 3):
         raise ValueError(f"{name} needs 2 or 3 numbers, not {len(numbers)}")
     if not np.isfinite(numbers).all():
         raise ValueError(f"{name} must be finite, not {list(numbers)}")
-    return (*numbers, 0.0)[:3]
+    return numbers
 
 
-def _unit(name: str, value: Vector) -> tuple[float, ...]:
-    """Return a direction in space with unit length."""
-    direction = np.array(_in_space(name, value))
+def in_space(vector: Vector) -> np.ndarray:
+    """Return a point or direction of two or three coordinates in space, z = 0 in 2-D."""
+    return np.array([*vector, 0.0][:3])
+
+
+def _in_space(name: str, value: Vector) -> tuple[float, ...]:
+    return (*checked_vector(name, value), 0.0)[:3]
+
+
+def unit(name: str, value: Vector) -> tuple[float, ...]:
+    """Return a direction of unit length, as many numbers.
+
+    Raises:
+        ValueError: it is zero.
+    """
+    direction = np.array(value)
     largest = np.abs(direction).max()
     if largest == 0.0:
         raise ValueError(f"{name} must not be zero")

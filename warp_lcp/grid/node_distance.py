@@ -38,7 +38,6 @@ class NodeDistances:
     """
 
     def __init__(self, grid: StaggeredGrid, *, second: bool) -> None:
-        """Allocate the fields."""
         self.grid = grid
         self.near, self.owner = grid.field(), grid.field(wp.int16)
         self.next_near, self.next_owner = (grid.field(), grid.field(wp.int16)) if second else (self.near, self.owner)
@@ -50,7 +49,7 @@ class NodeDistances:
 
     @property
     def arrays(self) -> list[wp.array]:
-        """All fields."""
+        """The four fields, in the order of the attributes."""
         return [self.near, self.owner, self.next_near, self.next_owner]
 
     def copy_from(self, other: NodeDistances) -> None:
@@ -59,13 +58,13 @@ class NodeDistances:
             wp.copy(target, source)
 
 
-def nodes_near(grid: StaggeredGrid, geometry: Geometry) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the first stored node and the one past the last (x, y, z) within `FAR` cells of a solid's bounds; None: there are none."""
+def nodes_near(grid: StaggeredGrid, geometry: Geometry, reach: float = FAR) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the first stored node and the one past the last (x, y, z) within `reach` cells of a solid's bounds; None: there are none."""
     end = np.array(grid.shape[::-1])
     low, high = np.zeros(3, dtype=np.int64), end.copy()
     bounds = geometry.bounds()
     if bounds is not None:
-        touched = np.clip(bounds / grid.spacing + 1.0 - np.array(grid.origin) + np.array([[-FAR], [FAR]]), -1.0, end)
+        touched = np.clip(bounds / grid.spacing + 1.0 - np.array(grid.origin) + np.array([[-reach], [reach]]), -1.0, end)
         low, high = np.ceil(np.maximum(touched[0], 0.0)).astype(np.int64), np.minimum(np.floor(touched[1]).astype(np.int64) + 1, end)
     if grid.dimension == 2:
         low[2], high[2] = 1, 2
@@ -73,14 +72,13 @@ def nodes_near(grid: StaggeredGrid, geometry: Geometry) -> tuple[np.ndarray, np.
 
 
 class NodeSampler:
-    """Measure solids at nodes, a part of the nodes at a time.
+    """Measure solids at nodes, or at the centers of cells, a part of them at a time.
 
     Args:
         grid: the grid.
     """
 
     def __init__(self, grid: StaggeredGrid) -> None:
-        """Allocate what a part needs."""
         self.grid = grid
         self.snap = max(SNAP * max(grid.whole or grid.counts), 1e-6)
         size = max(min(CHUNK, grid.size), max(grid.shape) * COARSE**2)  # a row of groups fits
@@ -103,9 +101,7 @@ class NodeSampler:
         # A mesh takes microseconds a node, most of them for the sign: the distance at the middle of a group of nodes tells whether the
         # others matter, and the sign of many.
         stride = COARSE if isinstance(geometry, TriangleMesh) else 1
-        for block in self._parts(*near, stride):
-            counts = block.counts
-            distances = self._measure(geometry, counts[0] * counts[1] * counts[2], item_points, [block])
+        for block, distances in self.measured(geometry, *near, stride=stride, offset=0.5 * (stride - 1)):
             if stride == 1:
                 inputs = [block, distances, self.snap, number, nodes.struct]
                 wp.launch(kernels.claim_nodes, len(distances), inputs, device=self.grid.device)
@@ -164,8 +160,18 @@ class NodeSampler:
     def _block(self, low: np.ndarray, high: np.ndarray, **more: Any) -> Any:
         return block_of(low, high, self.grid.spacing, self.grid.dimension, self.grid.origin, **more)
 
-    def _parts(self, low: np.ndarray, high: np.ndarray, stride: int) -> Iterator[Any]:
-        """Cut a box of nodes into blocks that fit: planes, or else rows."""
+    def measured(
+        self, geometry: Geometry, low: np.ndarray, high: np.ndarray, *, stride: int = 1, offset: float
+    ) -> Iterator[tuple[Any, wp.array]]:
+        """Cut a box of nodes into blocks that fit, planes or else rows, and yield each with its distances [m].
+
+        Args:
+            geometry: the solid.
+            low: first node (x, y, z).
+            high: one past the last.
+            stride: nodes along each axis for which one distance stands.
+            offset: from the low one of them to where it is measured, in cells.
+        """
         room = len(self._points) // stride**3
         across, rows, _ = (int(v) for v in -(-(high - low) // stride))
         depth, height = (room // (across * rows), rows) if across * rows <= room else (1, max(room // across, 1))
@@ -173,7 +179,9 @@ class NodeSampler:
             for front in range(int(low[1]), int(high[1]), height * stride):
                 begin = np.array([low[0], front, bottom])
                 end = np.minimum(begin + np.array([high[0] - low[0], height * stride, depth * stride]), high)
-                yield self._block(begin, end, stride=stride, offset=0.5 * (stride - 1))
+                block = self._block(begin, end, stride=stride, offset=offset)
+                counts = block.counts
+                yield block, self._measure(geometry, counts[0] * counts[1] * counts[2], item_points, [block])
 
 
 def _kji(corner: np.ndarray) -> tuple[int, int, int]:

@@ -17,8 +17,23 @@ if TYPE_CHECKING:
     from warp_lcp.grid.staggered import StaggeredGrid
 
 CPU_GRAIN = 4096  # particles that a CPU thread takes: the launch then costs nothing, the arrays stay in the L2 cache
+MARGIN = 1e-3  # how far from a wall particles stay, in cells: well above the rounding of float32 positions in 10^3 cells
 HEADERS = Path(__file__).parent / "headers"
 NONE: Mapping[str, Any] = {}
+
+
+def cell_pass(name: str, fields: str, box: Mapping[str, Any] = NONE, *, headers: Path = HEADERS, **more: Any) -> RowPass:
+    """Return a pass over the cells of a window in single precision, in the header that its name ends in.
+
+    Args:
+        name: of the pass, with its Warp module.
+        fields: names of its float32 fields.
+        box: other fields of cells.
+        headers: where the header is.
+        more: of the pass.
+    """
+    box = dict.fromkeys(fields.split(), wp.float32) | dict(box)
+    return RowPass(name, headers / f"{name.rpartition('.')[2]}.h", wp.float32, box=box, **more)
 
 
 def particle_pass(

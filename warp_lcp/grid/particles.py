@@ -1,14 +1,13 @@
 """Particles in about the order of their cells: positions, velocities and the gradients that APIC carries."""
 
 import typing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.grid import particles_kernels as kernels
-from warp_lcp.grid.particle_loops import launch, on_grid
-from warp_lcp.grid.runge_kutta import MARGIN
+from warp_lcp.grid.particle_loops import MARGIN, launch, on_grid
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.rows import Rows
 from warp_lcp.rows.fields import zeros
@@ -35,15 +34,15 @@ class ParticleTotals:
         bad_velocities: particles whose velocity is not finite (or its square overflows).
     """
 
-    count: int
-    mean_square_speed: float
-    velocity: np.ndarray
-    center: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    max_speed: float
-    bad_positions: int
-    bad_velocities: int
+    count: int = 0
+    mean_square_speed: float = 0.0
+    velocity: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    center: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    low: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    high: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    max_speed: float = 0.0
+    bad_positions: int = 0
+    bad_velocities: int = 0
 
     @property
     def finite(self) -> bool:
@@ -60,7 +59,6 @@ class Column:
     """
 
     def __init__(self, capacity: int, count: int, device: wp.Device) -> None:
-        """Allocate zeros."""
         if device.is_cpu:  # NumPy's zeros take no memory before a particle has been there
             self.store = wp.array(np.zeros((capacity, 3), dtype=np.float32), dtype=wp.vec3, device=device, copy=False)
         else:
@@ -95,7 +93,6 @@ class Particles:
     def __init__(
         self, grid: StaggeredGrid, position: np.ndarray, velocity: np.ndarray, *, affine: bool, indexed: bool | None = None
     ) -> None:
-        """Copy the particles to the device."""
         _check_shapes(position, velocity)
         self.grid, self.count, self._capacity = grid, 0, 0
         indexed = grid.device.is_cuda if indexed is None else indexed
@@ -113,12 +110,12 @@ class Particles:
 
     @property
     def position(self) -> wp.array:
-        """[m], wp.vec3, shape (count,)."""
+        """Positions [m], wp.vec3, shape (count,)."""
         return self._columns["position"].view
 
     @property
     def velocity(self) -> wp.array:
-        """[m/s], wp.vec3, shape (count,)."""
+        """Velocities [m/s], wp.vec3, shape (count,)."""
         return self._columns["velocity"].view
 
     @property
@@ -249,7 +246,7 @@ class Particles:
     def totals(self) -> ParticleTotals:
         """Return sums over the particles as they are now; the same bits on every run. Without particles all are 0."""
         if self.count == 0:
-            return ParticleTotals(0, 0.0, np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), 0.0, 0, 0)
+            return ParticleTotals()
         chunk = max(CHUNK, -(-self.count // THREADS))
         rows = Rows.entries(self.count, self.grid.device, chunk)
         given = {"position": self.position, "velocity": self.velocity, "sums": self._partials}
@@ -310,14 +307,9 @@ def lattice(grid: StaggeredGrid, per_axis: int, jitter: float, rng: np.random.Ge
 
 
 def seed(
-    grid: StaggeredGrid,
-    regions: typing.Sequence[typing.Callable[[np.ndarray], np.ndarray]],
-    open_cells: np.ndarray,
-    *,
-    per_axis: int,
-    jitter: float,
-    random_seed: int,
-) -> tuple[np.ndarray, np.ndarray]:
+    grid: StaggeredGrid, regions: typing.Sequence[typing.Callable[[np.ndarray], np.ndarray]], open_cells: np.ndarray, *, per_axis: int,
+    jitter: float, random_seed: int,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Fill regions with particles on a jittered lattice; a point in several regions belongs to the first.
 
     Args:

@@ -1,14 +1,21 @@
-"""Open sides of the domain: beyond them lies open air instead of a wall, and what crosses them has left."""
+"""Sides of the domain without a wall.
 
+Beyond an open side lies open air, and what crosses it has left. An axis without an end is periodic: what leaves at one side comes in at the
+other, and each field's ring holds what lies there.
+"""
+
+import functools
 import typing
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, cell_kernel
-from warp_lcp.grid.runge_kutta import MARGIN
-from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.grid.particle_loops import MARGIN
+from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.transfer import TINY_WEIGHT
+from warp_lcp.rows.program import Launch
 
 SIDES = ("left", "right", "bottom", "top", "back", "front")  # at low x, high x, low y, high y, low z, high z; bit n is side n
 GONE = 0.75 * MARGIN  # cells from an open side at which a particle has left: nearer than particles keep from walls
@@ -99,3 +106,160 @@ def mark_gone(grid: StaggeredGrid, bits: int, position: wp.array, marks: wp.arra
     high = [(count - GONE) * grid.spacing for count in grid.counts]
     inputs = [bits, grid.dimension, GONE * grid.spacing, wp.vec3(*high), position, marks]
     wp.launch(gone_kernel, len(position), inputs, device=grid.device)
+
+
+END = 0.6 * MARGIN  # cells from the upper side within which no particle may lie: a tent there would reach beyond what is stored
+
+
+def periodic_sides(axes: Sequence[int]) -> list[str]:
+    """Return the names of the sides of some axes, as `warp_lcp.grid.sides` has them.
+
+    >>> periodic_sides([2])
+    ['back', 'front']
+    """
+    return [SIDES[2 * axis + side] for axis in axes for side in range(2)]
+
+
+def with_periodic(open_sides: int, sides: "PeriodicSides | None") -> int:
+    """Return the bits of sides that stop nobody: open ones, and those of axes without an end."""
+    return open_sides if sides is None else open_sides | side_bits(periodic_sides(sides.axes))
+
+
+class PeriodicSides:
+    """Join the sides of axes that have no end.
+
+    Of n cells along such an axis, stored with a ring, 0 is cell n again and n + 1 is cell 1; so it is with faces. What particles add up
+    in the ring belongs to the cells and faces that it repeats.
+
+    Args:
+        grid: the grid.
+        axes: those without an end, of 0 and 2.
+
+    Attributes:
+        bits: bit n is set if axis n has no end.
+    """
+
+    def __init__(self, grid: StaggeredGrid, axes: Sequence[int]) -> None:
+        self.grid, self.axes = grid, tuple(axes)
+        self.bits = sum(1 << axis for axis in self.axes)
+
+    def wrap(self, *fields: wp.array, launch: Launch = wp.launch) -> None:
+        """Fill the ring of fields, in the stored shape or stacked in layers of it, from the other side."""
+        for field in fields:
+            layers = field if field.ndim == 4 else field.reshape((1, *self.grid.shape))
+            for axis in self.axes:
+                lines = self._lines(layers, axis)
+                launch(wrap_kernel(field.dtype), lines.shape[:3], [self.grid.counts[axis], lines], device=self.grid.device)
+
+    def add(self, field: wp.array) -> None:
+        """Add what lies in the ring of a sum over particles to the cells that it repeats."""
+        for axis in self.axes:
+            lines = self._lines(field, axis)
+            wp.launch(add_kernel, lines.shape[:2], [self.grid.counts[axis], lines], device=self.grid.device)
+        self.wrap(field)
+
+    def average(self, velocity: Sequence[wp.array], weights: Sequence[wp.array], saved: Sequence[wp.array] = ()) -> None:
+        """Make means over particles of the means on faces that are the same.
+
+        Args:
+            velocity: of each component [m/s] (updated).
+            weights: of the particles (updated: none in the ring).
+            saved: more velocities that the weights belong to [m/s] (updated), or empty.
+        """
+        for number, (field, weight) in enumerate(zip(velocity, weights, strict=True)):
+            old = saved[number] if saved else None
+            for axis in self.axes:
+                lines, means = self._lines(weight, axis), [None if v is None else self._lines(v, axis) for v in (field, old)]
+                wp.launch(average_kernel, lines.shape[:2], [self.grid.counts[axis], lines, *means], device=self.grid.device)
+            self.wrap(field, *([old] if old is not None else []))
+
+    def carry(self, position: wp.array) -> None:
+        """Bring particles [m] that have gone out at a side in at the other; floor and ceiling stay what they are."""
+        grid = self.grid
+        endless = wp.vec3i(*(int(axis in self.axes) for axis in range(3)))
+        size = wp.vec3(*(count * grid.spacing for count in grid.counts))
+        inputs = [endless, grid.dimension, size, grid.spacing, position]
+        wp.launch(carry_kernel, len(position), inputs, device=grid.device)
+
+    def widen(self, window: Window) -> Window:
+        """Return a window of cells that reaches from ring to ring along the axes without an end."""
+        low, high = list(window.low), list(window.high)
+        for axis in self.axes:
+            low[2 - axis], high[2 - axis] = 0, self.grid.shape[2 - axis]
+        return Window.of(low, high, window.device)
+
+    def _lines(self, field: wp.array, axis: int) -> wp.array:
+        """Return a view of a field, or of layers of it, whose last index goes along an axis; in 2-D of the plane in use."""
+        if self.grid.dimension == 2:
+            field = field[1:2] if field.ndim == 3 else field[:, 1:2]
+        last = field.ndim - 1 - axis
+        return field.transpose((*(n for n in range(field.ndim) if n != last), last))
+
+
+@functools.cache
+def wrap_kernel(dtype: typing.Any) -> wp.Kernel:
+    """Return the kernel that fills the ring of fields of a type."""
+
+    @wp.kernel(enable_backward=False, module=f"warp_lcp.grid.periodic_{dtype.__name__}")
+    @typing.no_type_check
+    def wrap(count: int, lines: wp.array4d(dtype=dtype)):
+        layer, a, b = wp.tid()
+        lines[layer, a, b, 0] = lines[layer, a, b, count]
+        lines[layer, a, b, count + 1] = lines[layer, a, b, 1]
+
+    return wrap
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.grid.periodic")
+@typing.no_type_check
+def add_kernel(count: int, lines: F32):
+    """Add the two ends of a line to the cells that they repeat."""
+    a, b = wp.tid()
+    low = lines[a, b, 0]
+    lines[a, b, 1] = lines[a, b, 1] + lines[a, b, count + 1]
+    lines[a, b, count] = lines[a, b, count] + low
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.grid.periodic")
+@typing.no_type_check
+def average_kernel(count: int, weight: F32, field: F32, saved: F32):
+    """Bring the two ends of a line into the faces that they repeat, as means with their weights."""
+    a, b = wp.tid()
+    for end in range(2):
+        ring = wp.where(end == 0, 0, count + 1)
+        same = wp.where(end == 0, count, 1)
+        more = weight[a, b, ring]
+        there = weight[a, b, same]
+        total = more + there
+        if more > 0.0 and total > TINY_WEIGHT:
+            field[a, b, same] = (there * field[a, b, same] + more * field[a, b, ring]) / total
+            if saved:
+                saved[a, b, same] = (there * saved[a, b, same] + more * saved[a, b, ring]) / total
+        weight[a, b, same] = total
+        weight[a, b, ring] = 0.0
+
+
+@wp.kernel(enable_backward=False, module="warp_lcp.grid.periodic")
+@typing.no_type_check
+def carry_kernel(endless: wp.vec3i, axes: int, size: wp.vec3, spacing: float, position: wp.array(dtype=wp.vec3)):
+    """Positions modulo the domain's size, off the very end of it; who has crossed keeps off the walls, which stopped nobody beyond."""
+    p = wp.tid()
+    x = position[p]
+    end = END * spacing
+    crossed = bool(False)
+    for axis in range(axes):
+        if endless[axis] != 0:
+            if x[axis] < 0.0:
+                x[axis] = x[axis] + size[axis]
+                crossed = True
+            elif x[axis] >= size[axis]:
+                x[axis] = x[axis] - size[axis]
+                crossed = True
+            if x[axis] > size[axis] - 0.5 * end:
+                x[axis] = 0.0
+            elif x[axis] > size[axis] - end:
+                x[axis] = size[axis] - end
+    for axis in range(axes):
+        if crossed and endless[axis] == 0:
+            x[axis] = wp.clamp(x[axis], MARGIN * spacing, size[axis] - MARGIN * spacing)
+    position[p] = x

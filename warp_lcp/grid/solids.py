@@ -8,7 +8,6 @@ distance is the one to the surface in space, never more than the one to the cut.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, Self, runtime_checkable
@@ -16,9 +15,9 @@ from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 import numpy as np
 import warp as wp
 
-from warp_lcp.grid.motion import Pose, keep_checked
+from warp_lcp.grid.motion import Pose, Vector, checked_vector, in_space, keep_checked, unit
 from warp_lcp.grid.solids_kernels import (
-    Frame,
+    ShapeFrame,
     box_distance,
     capsule_distance,
     mesh_distance,
@@ -28,8 +27,6 @@ from warp_lcp.grid.solids_kernels import (
 )
 from warp_lcp.grid.triangle_mesh import ClosedSurface, load_surface
 from warp_lcp.settings import Positive, checked
-
-Vector = Sequence[float] | np.ndarray
 
 
 @runtime_checkable
@@ -44,21 +41,6 @@ class Geometry(Protocol):
 
     def moved(self, pose: Pose) -> Geometry:
         """Return the region after a change of place; surface data is shared with this one."""
-
-
-def _vector(name: str, value: Vector) -> tuple[float, ...]:
-    """Return `value` as two or three finite numbers."""
-    numbers = tuple(float(v) for v in value)
-    if len(numbers) not in (2, 3):
-        raise ValueError(f"{name} needs 2 or 3 numbers, not {len(numbers)}")
-    if not np.isfinite(numbers).all():
-        raise ValueError(f"{name} must be finite, not {list(numbers)}")
-    return numbers
-
-
-def _in_space(vector: Vector) -> np.ndarray:
-    """Return a point or direction of two or three coordinates in space, z = 0 in 2-D."""
-    return np.array([*vector, 0.0][:3])
 
 
 def _rotation_about(axis: int, degrees: float) -> np.ndarray:
@@ -122,7 +104,7 @@ class Placement:
         if dimension == 2:
             angles = [0.0, 0.0, *angles]
         x, y, z = (_rotation_about(axis, angle) for axis, angle in enumerate(angles))
-        return cls(scale=scale, rotation=z @ y @ x, translation=_in_space(_vector("translate", translate)))
+        return cls(scale=scale, rotation=z @ y @ x, translation=in_space(checked_vector("translate", translate)))
 
     def apply(self, points: np.ndarray) -> np.ndarray:
         """Return `points`, shape (m, 3), of the shape's coordinates in the domain's [m]."""
@@ -130,7 +112,7 @@ class Placement:
 
     def about(self, point: Vector) -> Placement:
         """Return this placement with scale and rotation about a point [m], of two or three coordinates, instead of the origin."""
-        center = _in_space(_vector("about", point))
+        center = in_space(checked_vector("about", point))
         return replace(self, translation=self.translation + center - self.scale * self.rotation @ center)
 
     def moved(self, pose: Pose) -> Placement:
@@ -163,7 +145,7 @@ class _Shape(ABC):
         self._measure(self.kernel, points, out)
 
     def _measure(self, kernel: Any, points: wp.array, out: wp.array) -> None:
-        placement, frame, device = self.placement, Frame(), points.device
+        placement, frame, device = self.placement, ShapeFrame(), points.device
         translation = placement.translation + placement.scale * placement.rotation @ self._origin()
         frame.inverse_rotation, frame.translation = wp.mat33(placement.rotation.T), wp.vec3(*translation)
         frame.scale, frame.sign = placement.scale * self._unit(), -1.0 if self.invert else 1.0
@@ -221,8 +203,8 @@ class Box(_Shape):
     kernel: ClassVar[Any] = box_distance
 
     def __post_init__(self) -> None:
-        """Check the corners."""
-        lower, upper = _vector("min", self.lower), _vector("max", self.upper)
+        """Check that low is below high."""
+        lower, upper = checked_vector("min", self.lower), checked_vector("max", self.upper)
         if len(lower) != len(upper):
             raise ValueError(f"a box's min has {len(lower)} numbers and its max {len(upper)}")
         if not all(a < b for a, b in zip(lower, upper, strict=True)):
@@ -231,7 +213,7 @@ class Box(_Shape):
         object.__setattr__(self, "upper", upper)
 
     def _origin(self) -> np.ndarray:
-        return 0.5 * (_in_space(self.lower) + _in_space(self.upper))
+        return 0.5 * (in_space(self.lower) + in_space(self.upper))
 
     def _half(self) -> np.ndarray:
         half = 0.5 * (np.asarray(self.upper) - np.asarray(self.lower))
@@ -273,12 +255,12 @@ class Sphere(_Shape):
     kernel: ClassVar[Any] = sphere_distance
 
     def __post_init__(self) -> None:
-        """Check center and radius."""
-        object.__setattr__(self, "center", _vector("center", self.center))
+        """Check that center and radius are finite."""
+        object.__setattr__(self, "center", checked_vector("center", self.center))
         object.__setattr__(self, "radius", checked("radius", self.radius, Positive))
 
     def _origin(self) -> np.ndarray:
-        return _in_space(self.center)
+        return in_space(self.center)
 
     def _parameters(self, device: wp.Device) -> list[Any]:
         return [self.radius]
@@ -309,8 +291,8 @@ class Capsule(_Shape):
     kernel: ClassVar[Any] = capsule_distance
 
     def __post_init__(self) -> None:
-        """Check ends and radius."""
-        start, end = _vector("from", self.start), _vector("to", self.end)
+        """Check that the ends are two points."""
+        start, end = checked_vector("from", self.start), checked_vector("to", self.end)
         if len(start) != len(end):
             raise ValueError(f"a capsule's from has {len(start)} numbers and its to {len(end)}")
         if start == end:
@@ -320,13 +302,13 @@ class Capsule(_Shape):
         object.__setattr__(self, "radius", checked("radius", self.radius, Positive))
 
     def _origin(self) -> np.ndarray:
-        return _in_space(self.start)
+        return in_space(self.start)
 
     def _parameters(self, device: wp.Device) -> list[Any]:
-        return [wp.vec3(*(_in_space(self.end) - _in_space(self.start))), self.radius]
+        return [wp.vec3(*(in_space(self.end) - in_space(self.start))), self.radius]
 
     def _hull(self) -> tuple[np.ndarray, float]:
-        return np.stack([_in_space(self.start), _in_space(self.end)]), self.radius
+        return np.stack([in_space(self.start), in_space(self.end)]), self.radius
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -350,21 +332,17 @@ class Plane(_Shape):
 
     def __post_init__(self) -> None:
         """Check the point, and give the normal unit length."""
-        point, normal = _vector("point", self.point), _vector("normal", self.normal)
+        point, normal = checked_vector("point", self.point), checked_vector("normal", self.normal)
         if len(point) != len(normal):
             raise ValueError(f"a plane's point has {len(point)} numbers and its normal {len(normal)}")
-        largest = max(abs(v) for v in normal)
-        if largest == 0.0:
-            raise ValueError("a plane's normal must not be zero")
-        unit = np.asarray(normal) / largest  # first, so that the length neither overflows nor underflows
         object.__setattr__(self, "point", point)
-        object.__setattr__(self, "normal", tuple((unit / np.linalg.norm(unit)).tolist()))
+        object.__setattr__(self, "normal", unit("a plane's normal", normal))
 
     def _origin(self) -> np.ndarray:
-        return _in_space(self.point)
+        return in_space(self.point)
 
     def _parameters(self, device: wp.Device) -> list[Any]:
-        return [wp.vec3(*_in_space(self.normal))]
+        return [wp.vec3(*in_space(self.normal))]
 
     def _hull(self) -> tuple[np.ndarray, float]:
         return np.empty((0, 3)), 0.0

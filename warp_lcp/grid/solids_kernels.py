@@ -11,7 +11,7 @@ FAR = 1.0e10  # a mesh query's reach, in half diagonals of the mesh; its square 
 
 
 @wp.struct
-class Frame:
+class ShapeFrame:
     """Where a shape stands, whose own coordinates q are counted from its center or another point of it: q = R' (p - t) / s of a point p."""
 
     inverse_rotation: wp.mat33
@@ -21,13 +21,13 @@ class Frame:
 
 
 @wp.func
-def to_shape(p: wp.vec3, frame: Frame) -> wp.vec3:
+def to_shape(p: wp.vec3, frame: ShapeFrame) -> wp.vec3:
     """Return q of a point p."""
     return frame.inverse_rotation * (p - frame.translation) / frame.scale
 
 
 @wp.kernel(enable_backward=False, module=MODULE)
-def box_distance(points: Points, frame: Frame, half: wp.vec3, out: Distances):
+def box_distance(points: Points, frame: ShapeFrame, half: wp.vec3, out: Distances):
     """Measure a box of half extents `half` (infinite in z in 2-D) about the origin."""
     i = wp.tid()
     q = to_shape(points[i], frame)
@@ -39,7 +39,7 @@ def box_distance(points: Points, frame: Frame, half: wp.vec3, out: Distances):
 
 
 @wp.kernel(enable_backward=False, module=MODULE)
-def sphere_distance(points: Points, frame: Frame, radius: float, out: Distances):
+def sphere_distance(points: Points, frame: ShapeFrame, radius: float, out: Distances):
     """Measure a sphere about the origin."""
     i = wp.tid()
     q = to_shape(points[i], frame)
@@ -47,7 +47,7 @@ def sphere_distance(points: Points, frame: Frame, radius: float, out: Distances)
 
 
 @wp.kernel(enable_backward=False, module=MODULE)
-def capsule_distance(points: Points, frame: Frame, axis: wp.vec3, radius: float, out: Distances):
+def capsule_distance(points: Points, frame: ShapeFrame, axis: wp.vec3, radius: float, out: Distances):
     """Measure all within `radius` of the segment from the origin along `axis`."""
     i = wp.tid()
     q = to_shape(points[i], frame)
@@ -56,7 +56,7 @@ def capsule_distance(points: Points, frame: Frame, axis: wp.vec3, radius: float,
 
 
 @wp.kernel(enable_backward=False, module=MODULE)
-def plane_distance(points: Points, frame: Frame, normal: wp.vec3, out: Distances):
+def plane_distance(points: Points, frame: ShapeFrame, normal: wp.vec3, out: Distances):
     """Measure the half-space below the plane through the origin with a unit `normal`."""
     i = wp.tid()
     q = to_shape(points[i], frame)
@@ -64,7 +64,7 @@ def plane_distance(points: Points, frame: Frame, normal: wp.vec3, out: Distances
 
 
 @wp.kernel(enable_backward=False, module=MODULE)
-def mesh_distance(points: Points, frame: Frame, mesh: wp.uint64, out: Distances):
+def mesh_distance(points: Points, frame: ShapeFrame, mesh: wp.uint64, out: Distances):
     """Measure the inside of a closed mesh: distance to the closest triangle, sign from the winding number."""
     i = wp.tid()
     q = to_shape(points[i], frame)
@@ -77,7 +77,7 @@ def mesh_distance(points: Points, frame: Frame, mesh: wp.uint64, out: Distances)
 
 
 @wp.kernel(enable_backward=False, module=MODULE)
-def mesh_surface_distance(points: Points, frame: Frame, mesh: wp.uint64, out: Distances):
+def mesh_surface_distance(points: Points, frame: ShapeFrame, mesh: wp.uint64, out: Distances):
     """Measure the distance to the closest triangle, without the sign, which takes most of the time."""
     i = wp.tid()
     q = to_shape(points[i], frame)

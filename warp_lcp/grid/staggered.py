@@ -63,6 +63,17 @@ class Window:
     high: tuple[int, int, int]
     device: wp.Device
 
+    @classmethod
+    def of(cls, low: typing.Sequence[int], high: typing.Sequence[int], device: wp.Device) -> "Window":
+        """Return the box between two corners (k, j, i) of any sequence type."""
+        (k, j, i), (c, b, a) = low, high
+        return cls((k, j, i), (c, b, a), device)
+
+    def common(self, other: "Window") -> "Window | None":
+        """Return the cells that are in both windows; None: there are none."""
+        low, high = np.maximum(self.low, other.low), np.minimum(self.high, other.high)
+        return Window.of(low.tolist(), high.tolist(), self.device) if (low < high).all() else None
+
     @cached_property
     def cells(self) -> typing.Any:
         """The CellRange that kernels take as their first argument."""
@@ -83,6 +94,10 @@ class Window:
     def chunks(self) -> int:
         """Threads that share a row."""
         return -(-(self.high[2] - self.low[2]) // self.cells.grain)
+
+    def rows_of(self, sums: wp.array) -> np.ndarray:
+        """Return what rows of the box have in a field of sums, one entry or several a row of the grid."""
+        return np.asarray(sums.numpy()[self.low[0] : self.high[0], self.low[1] : self.high[1]])
 
     def run(self, passed: RowPass, *, whole: bool = False, launch: Launch | None = None, **given: typing.Any) -> None:
         """Launch a pass over the box, or record it with `Program.launch`.
@@ -153,18 +168,13 @@ class StaggeredGrid:
 
     @property
     def size(self) -> int:
-        """Elements of a field."""
+        """Elements of a field, ring included."""
         return int(np.prod(self.shape))
 
     @property
     def extent(self) -> np.ndarray:
         """Sides of the domain [m], the larger grid's if this is a part of one, shape (3,)."""
         return np.array(self.whole or self.counts) * self.spacing
-
-    @property
-    def first(self) -> wp.vec3i:
-        """`origin` as kernels take it."""
-        return wp.vec3i(*self.origin)
 
     @property
     def planes(self) -> int:
@@ -219,4 +229,4 @@ class StaggeredGrid:
                 continue
             first.append(min(max(int(low[axis]) - grow, 0), self.counts[axis] + 1))
             last.append(max(min(int(high[axis]) + grow + 1, self.counts[axis] + 2), first[-1] + 1))
-        return Window((first[0], first[1], first[2]), (last[0], last[1], last[2]), self.device)
+        return Window.of(first, last, self.device)

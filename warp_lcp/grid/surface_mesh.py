@@ -10,10 +10,9 @@ import warp as wp
 from warp_lcp.grid import surface_mesh_kernels as kernels
 from warp_lcp.grid.extrapolate import extrapolate, weighted_kernel
 from warp_lcp.grid.level_set_kernels import BINOMIAL, SCATTER
-from warp_lcp.grid.marching_cubes import MarchingCubes, Mesh
+from warp_lcp.grid.marching_cubes import DeviceMesh, MarchingCubes
 from warp_lcp.grid.mesh_smoothing import smooth as smooth_mesh
-from warp_lcp.grid.particle_loops import launch
-from warp_lcp.grid.runge_kutta import MARGIN
+from warp_lcp.grid.particle_loops import MARGIN, launch
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
 
@@ -80,7 +79,6 @@ class SurfaceMesh:
         self, grid: StaggeredGrid, *, per_axis: int, resolution: int | None = None, smoothing: float = 1.5,
         obstacles: Obstacles | None = None,
     ) -> None:  # fmt: skip
-        """Allocate the lattice."""
         parts = per_axis if resolution is None else resolution
         if per_axis < 1 or parts < 1:
             raise ValueError(f"per_axis = {per_axis}, resolution = {resolution}: must be at least 1")
@@ -105,7 +103,7 @@ class SurfaceMesh:
         self._cubes = MarchingCubes(self.lattice)
         self._placed = False
 
-    def find(self, position: wp.array, interior: Interior | None = None) -> Mesh:
+    def find(self, position: wp.array, interior: Interior | None = None) -> DeviceMesh:
         """Return the surface around particles; on CUDA sums over particles, and so the last bits, may differ from run to run.
 
         Args:
@@ -164,12 +162,11 @@ class SurfaceMesh:
             source, first, second = first, second, first
         return source
 
-    def _mirror(self, field: wp.array | None, *, fold: bool = False) -> None:
+    def _mirror(self, field: wp.array, *, fold: bool = False) -> None:
         """Continue a field beyond the domain's sides as in a mirror; `fold`: after folding in what has been added there."""
-        shape = self.lattice.shape
         for axis in range(self.lattice.dimension):
-            lines = [n for plane, n in enumerate(shape) if plane != 2 - axis]
-            wp.launch(kernels.mirror_kernel, lines, [axis, fold, field], device=self.lattice.device)
+            lines = field.transpose((*(n for n in range(3) if n != 2 - axis), 2 - axis))
+            wp.launch(kernels.mirror_kernel, lines.shape[:2], [fold, lines], device=self.lattice.device)
 
 
 def faces_from_particles(

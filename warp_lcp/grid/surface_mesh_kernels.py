@@ -1,15 +1,11 @@
 # mypy: ignore-errors
 """Kernels of the surface that a picture shows: its field on a lattice, what solids take away of it, and how fast it moves."""
 
-from pathlib import Path
-from typing import Any
-
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, cell_kernel
-from warp_lcp.grid.particle_loops import particle_pass
+from warp_lcp.grid.particle_loops import cell_pass, particle_pass
 from warp_lcp.operators.grid_poisson import SOLID
-from warp_lcp.rows import RowPass
 
 FAR = 2.0  # lattice cells: a distance to solids that takes nothing from the liquid
 LEAST_OPEN = 0.25  # of a kernel: where less of it is open the distance is continued from outside the solid
@@ -21,23 +17,15 @@ THIN, POWER = 0.6, 0.4
 _options = {"enable_backward": False, "module": "warp_lcp.grid.surface_mesh"}
 
 
-def _made(name: str, header: str, fields: str, **more: Any) -> RowPass:
-    box = {n: wp.int8 if n == "known" else wp.float32 for n in fields.split()}
-    return RowPass(f"warp_lcp.grid.surface_mesh.{name}", Path(__file__).parent / "headers" / header, wp.float32, box=box, **more)
-
-
-DISTANCE = _made(
-    "distance",
-    "surface_distance.h",
-    "phi smooth thin capacity known",
-    numbers={"planes": int, "spread": wp.float32},
-    optional=("capacity", "known"),
-    constants={"LEAST_OPEN": LEAST_OPEN},
-)
-ROOM = _made("room", "room.h", "out", whole={"distance": wp.float32}, numbers={"planes": int, "parts": int})
-CARVE = _made("carve", "carve.h", "room phi")
+_MODULE = "warp_lcp.grid.surface_mesh"
+DISTANCE = cell_pass(
+    f"{_MODULE}.surface_distance", "phi smooth thin capacity", {"known": wp.int8}, numbers={"planes": int, "spread": wp.float32},
+    optional=("capacity", "known"), constants={"LEAST_OPEN": LEAST_OPEN},
+)  # fmt: skip
+ROOM = cell_pass(f"{_MODULE}.room", "out", whole={"distance": wp.float32}, numbers={"planes": int, "parts": int})
+CARVE = cell_pass(f"{_MODULE}.carve", "room phi")
 BOOST = particle_pass(
-    "warp_lcp.grid.surface_mesh.boost",
+    f"{_MODULE}.boost",
     {"position": wp.vec3},
     whole=dict.fromkeys(("smooth", "capacity", "thin"), wp.float32),
     numbers=dict.fromkeys(("each", "gain", "most"), wp.float32),
@@ -47,25 +35,16 @@ BOOST = particle_pass(
 
 
 @wp.kernel(**_options)
-def mirror_kernel(axis: int, fold: bool, field: F32):
-    """Give the ring at both ends of an axis the values beside it, after adding to those what the ring holds; a thread a line."""
+def mirror_kernel(fold: bool, lines: F32):
+    """Give the ring at both ends of a line the values beside it, after adding to those what the ring holds; a thread a line."""
     a, b = wp.tid()
-    last = field.shape[2 - axis] - 1
+    last = lines.shape[2] - 1
     for end in range(2):
         ring = end * last
         beside = wp.where(end == 0, 1, last - 1)
-        if axis == 0:
-            if fold:
-                field[a, b, beside] += field[a, b, ring]
-            field[a, b, ring] = field[a, b, beside]
-        elif axis == 1:
-            if fold:
-                field[a, beside, b] += field[a, ring, b]
-            field[a, ring, b] = field[a, beside, b]
-        else:
-            if fold:
-                field[beside, a, b] += field[ring, a, b]
-            field[ring, a, b] = field[beside, a, b]
+        if fold:
+            lines[a, b, beside] += lines[a, b, ring]
+        lines[a, b, ring] = lines[a, b, beside]
 
 
 @wp.func

@@ -7,28 +7,63 @@ grad w_ip v_i, so that linear and angular momentum survive the round trip.
 The sum over particles has two forms. Particles *scatter* to the faces around them: the faster form on a CPU, whose launches are serial
 and so always add in the same order. Or each face *gathers* from the particles of the cells around it, which takes sorted particles and
 the first particle of each cell: no two threads write one face, so that a GPU too gives the same bits on every run.
+
+Node (k, j, i) of component `axis` lies at the grid coordinates (i, j + 1/2, k + 1/2) with the axis' own 1/2 left out, plus the origin of a
+part of a grid. In 2-D the nodes of one plane are used: the coordinate along z is that of the plane, and the plane above is the same one.
 """
 
+import functools
+import typing
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
 import warp as wp
 
-from warp_lcp.grid.particle_loops import launch, on_grid
+from warp_lcp.grid.cell_kernel import F32, cell_kernel
+from warp_lcp.grid.particle_loops import launch, on_grid, particle_pass
 from warp_lcp.grid.staggered import StaggeredGrid, Window
-from warp_lcp.grid.transfer_kernels import TINY_WEIGHT, kernels
+from warp_lcp.rows import RowPass
 
-__all__ = ["TINY_WEIGHT", "faces_to_particles", "particles_to_faces"]
+TINY_WEIGHT = 1e-9  # below it a face counts as untouched
+# A particle that lies exactly on the boundary between cells would leave one face of its own cell without weight, hence without gravity.
+EDGE = {wp.float32: 1e-5, wp.float64: 1e-12}
+VECTORS = {wp.float32: wp.vec3, wp.float64: wp.vec3d}
+
+
+@functools.cache
+def transfer_passes(real: Any) -> SimpleNamespace:
+    """Return the passes for float32 or float64: two forms of one sum, `interpolate`, which is its adjoint, and what makes means of sums."""
+    name, vector = f"warp_lcp.grid.transfer_{real.__name__}", VECTORS[real]
+    constants, particles = {"EDGE": EDGE[real], "TINY_WEIGHT": TINY_WEIGHT}, dict.fromkeys(("position", "velocity", "gradient"), vector)
+
+    def made(which: str, box: dict[str, Any], whole: dict[str, Any], numbers: dict[str, Any]) -> RowPass:
+        absent = ("gradient", "saved")
+        more: dict[str, Any] = {"whole": whole, "numbers": {"axis": int} | numbers, "constants": constants, "optional": absent}
+        return particle_pass(f"{name}.{which}", box, real=real, **more)
+
+    @cell_kernel(name)
+    @typing.no_type_check
+    def normalize(k, j, i, weight: wp.array3d(dtype=real), field: wp.array3d(dtype=real)):
+        w = weight[k, j, i]
+        if w > real(TINY_WEIGHT):
+            field[k, j, i] = field[k, j, i] / w
+        else:
+            field[k, j, i] = real(0.0)
+
+    return SimpleNamespace(
+        scatter=made("scatter", particles, {"momentum": real, "weight": real}, {}),
+        interpolate=made("interpolate", particles, {"field": real, "saved": real}, {"flip": real}),
+        gather_weights=made("gather_weights", {"field": real, "weight": real}, {"offsets": wp.int32, **particles}, {}),
+        normalize=normalize,
+    )
 
 
 def particles_to_faces(
-    grid: StaggeredGrid,
-    position: wp.array,
-    velocity: wp.array,
-    affine: list[wp.array],
-    fields: list[wp.array],
-    weights: list[wp.array],
-    *,
-    window: Window | None = None,
-    offsets: wp.array | None = None,
-) -> None:
+    grid: StaggeredGrid, position: wp.array, velocity: wp.array, affine: list[wp.array], fields: list[wp.array], weights: list[wp.array], *,
+    window: Window | None = None, offsets: wp.array | None = None,
+) -> None:  # fmt: skip
     """Average the particles' velocities on the faces, all particles alike.
 
     Args:
@@ -42,7 +77,7 @@ def particles_to_faces(
         offsets: first particle of each stored cell, int32, shape (cells + 1,), of particles that are sorted by cell: faces gather.
             None: particles scatter, in any order; on CUDA the last bits then differ from run to run.
     """
-    kernel = kernels(fields[0].dtype)
+    passes = transfer_passes(fields[0].dtype)
     window = window or grid.everywhere
     for axis, (field, weight) in enumerate(zip(fields, weights, strict=True)):
         field.zero_()
@@ -50,22 +85,16 @@ def particles_to_faces(
         gradient = affine[axis] if affine else None
         particles = {"position": position, "velocity": velocity, "gradient": gradient, "axis": axis}
         if offsets is not None:
-            window.run(kernel.gather_weights, offsets=offsets, field=field, weight=weight, **particles, **on_grid(grid))
+            window.run(passes.gather_weights, offsets=offsets, field=field, weight=weight, **particles, **on_grid(grid))
             continue
-        launch(kernel.scatter, len(position), grid, momentum=field, weight=weight, **particles)
-        window.launch(kernel.normalize, [weight, field])
+        launch(passes.scatter, len(position), grid, momentum=field, weight=weight, **particles)
+        window.launch(passes.normalize, [weight, field])
 
 
 def faces_to_particles(
-    grid: StaggeredGrid,
-    fields: list[wp.array],
-    position: wp.array,
-    velocity: wp.array,
-    affine: list[wp.array],
-    *,
-    saved: list[wp.array] | None = None,
-    flip: float = 0.0,
-) -> None:
+    grid: StaggeredGrid, fields: list[wp.array], position: wp.array, velocity: wp.array, affine: list[wp.array], *,
+    saved: list[wp.array] | None = None, flip: float = 0.0,
+) -> None:  # fmt: skip
     """Interpolate the faces' velocities at the particles.
 
     Args:
@@ -77,9 +106,31 @@ def faces_to_particles(
         saved: the faces' velocities as they came from the particles [m/s], for FLIP.
         flip: share of FLIP, 0 (PIC) to 1; needs `saved`.
     """
-    kernel = kernels(fields[0].dtype)
+    passes = transfer_passes(fields[0].dtype)
     for axis, field in enumerate(fields):
         gradient = affine[axis] if affine else None
         old = saved[axis] if saved and flip > 0.0 else None
         particles = {"position": position, "velocity": velocity, "gradient": gradient}
-        launch(kernel.interpolate, len(position), grid, axis=axis, flip=flip, field=field, saved=old, **particles)
+        launch(passes.interpolate, len(position), grid, axis=axis, flip=flip, field=field, saved=old, **particles)
+
+
+@cell_kernel("warp_lcp.grid.gravity")
+@typing.no_type_check
+def accelerate_kernel(k, j, i, change: float, weight: F32, field: F32):
+    """Add a change of velocity [m/s] to every face with weight."""
+    if weight[k, j, i] > TINY_WEIGHT:
+        field[k, j, i] = field[k, j, i] + change
+
+
+def accelerate(window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], change: np.ndarray) -> None:
+    """Change the velocity of every face that particles gave weight, closed faces included: they pass it on to the material beside them.
+
+    Args:
+        window: faces that particles can reach.
+        velocity: each component [m/s] (updated).
+        weights: of the particles on each component's faces.
+        change: of each component [m/s], shape (3,).
+    """
+    for axis, (field, weight) in enumerate(zip(velocity, weights, strict=True)):
+        if change[axis] != 0.0:
+            window.launch(accelerate_kernel, [float(change[axis]), weight, field])

@@ -1,22 +1,28 @@
-"""Which cells of the grid are solid, and which points lie inside a region."""
+"""Which cells of the grid are solid, which points lie inside a region, and what to warn about before a run.
+
+Warnings are of meshes that needed repair, that reach out of the domain or are thinner than a cell.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
 from warp_lcp.grid.motion import Motion
+from warp_lcp.grid.node_distance import CHUNK, NodeSampler, nodes_near
 from warp_lcp.grid.sides import open_ring
-from warp_lcp.grid.solid_notes import placement_notes, thin_notes
-from warp_lcp.grid.solids import Geometry
-from warp_lcp.grid.solids_kernels import block_of, claim_cells, item_points
+from warp_lcp.grid.solids import Geometry, TriangleMesh
+from warp_lcp.grid.solids_kernels import claim_cells
+from warp_lcp.grid.staggered import StaggeredGrid
 
 OPEN = -1
 DOMAIN_WALL = 0
-CHUNK = 1 << 20  # points at a time: 16 MB of positions and distances
+STRAY = 0.5  # of a cell: a mesh may reach this far out of the domain before anyone is told
+THIN_SHARE = 0.01  # of a mesh's surface, from which thin parts are worth a warning
+INVERTED_SHARE = 0.01  # of a mesh's surface, from which what is inside out is no longer a blemish: its inside would be missing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,61 +65,39 @@ class VoxelSolids:
 
 
 def voxelize(
-    counts: tuple[int, int, int],
-    spacing: float,
-    dimension: int,
-    solids: Sequence[PlacedSolid],
-    *,
-    wall_separating: bool,
-    device: wp.Device | str,
-    open_sides: int = 0,
-    origin: tuple[int, int, int] = (0, 0, 0),
-    remarks: bool = True,
+    grid: StaggeredGrid, solids: Sequence[PlacedSolid], *, wall_separating: bool, open_sides: int = 0, remarks: bool = True
 ) -> VoxelSolids:
     """Give every cell whose center lies inside a solid to the first such solid.
 
     Args:
-        counts: number of cells (nx, ny, nz), nz = 1 in 2-D.
-        spacing: side of a cell [m].
-        dimension: 2 or 3.
+        grid: the grid.
         solids: in the order of their claims.
         wall_separating: whether liquid may leave the domain's wall.
-        device: where the arrays live.
         open_sides: of `warp_lcp.grid.sides.side_bits`: beyond them cells are open.
-        origin: cells (x, y, z) of a larger grid before the first one, if this is a part of one.
         remarks: make notes and refuse what makes no sense at the start of a run; False: solids are where they have moved to.
 
     Raises:
         ValueError: with `remarks`, a solid lies wholly outside the domain, or the solids leave no open cell.
     """
-    nx, ny, nz = counts
-    if dimension == 2 and nz != 1:
-        raise ValueError(f"a 2-D grid has one layer of cells, not {nz}")
-    device = wp.get_device(device)
-    host = np.full((nz + 2, ny + 2, nx + 2), DOMAIN_WALL, dtype=np.int32)
-    host[1:-1, 1:-1, 1:-1] = OPEN
-    host[open_ring((nz + 2, ny + 2, nx + 2), open_sides)] = OPEN
-    index = wp.array(host, dtype=wp.int32, device=device)
-    covered = wp.zeros(1 + len(solids), dtype=wp.int32, device=device)
-    notes: list[str] = []
+    host = np.full(grid.shape, DOMAIN_WALL, dtype=np.int32)
+    grid.interior(host)[...] = OPEN
+    host[open_ring(grid.shape, open_sides)] = OPEN
+    index = wp.array(host, dtype=wp.int32, device=grid.device)
+    covered = wp.zeros(1 + len(solids), dtype=wp.int32, device=grid.device)
+    notes = start_notes(solids, grid) if remarks else []
+    sampler, end = NodeSampler(grid), np.array(grid.shape[::-1]) - 1
     for number, solid in enumerate(solids, start=1):
-        if remarks:
-            notes += placement_notes(solid.geometry, solid.name, counts, spacing, dimension)
-            notes += thin_notes(solid.geometry, solid.name, solid.among, spacing, device)
-        _claim(index, covered, solid.geometry, number, spacing, dimension, origin)
+        near = nodes_near(grid, solid.geometry, reach=1.0)
+        low, high = (end, end) if near is None else (np.maximum(near[0], 1), np.minimum(near[1], end))
+        for block, distances in sampler.measured(solid.geometry, low, high, offset=0.5) if (low < high).all() else ():
+            wp.launch(claim_cells, len(distances), [block, distances, number, index, covered], device=grid.device)
     claimed = covered.numpy()[1:]
-    notes += [
-        f"{solid.name} is too small for the grid: no center of a cell of {spacing:.4g} m lies inside it"
-        for solid, cells in zip(solids, claimed, strict=True)
-        if remarks and not cells
-    ]
-    if remarks and solids and not (index.numpy()[1:-1, 1:-1, 1:-1] == OPEN).any():
-        raise ValueError(
-            "the solids fill the whole domain: no open cell is left (is one inverted, or a plane's normal the wrong way round?)"
-        )
+    if remarks:
+        notes += small_notes((solid.name for solid in solids), claimed, grid.spacing)
+        check_open(not solids or bool((grid.interior(index.numpy()) == OPEN).any()))
     return VoxelSolids(
         index=index,
-        separating=wp.array([wall_separating, *(solid.separating for solid in solids)], dtype=wp.uint8, device=device),
+        separating=wp.array([wall_separating, *(solid.separating for solid in solids)], dtype=wp.uint8, device=grid.device),
         names=("domain", *(solid.name for solid in solids)),
         covered=tuple(int(cells) for cells in claimed),
         notes=tuple(notes),
@@ -126,7 +110,7 @@ def inside(geometries: Sequence[Geometry], points: np.ndarray, *, device: wp.Dev
     Args:
         geometries: the regions; none contain nothing.
         points: [m], shape (m, 3); z = 0 in 2-D.
-        device: where distances are evaluated, `CHUNK` points at a time.
+        device: where distances are evaluated.
 
     Returns:
         bool of shape (m,).
@@ -154,41 +138,101 @@ def inside(geometries: Sequence[Geometry], points: np.ndarray, *, device: wp.Dev
     return result
 
 
-def _claim(
-    index: wp.array3d(dtype=wp.int32),
-    covered: wp.array(dtype=wp.int32),
-    geometry: Geometry,
-    number: int,
-    spacing: float,
-    dimension: int,
-    origin: tuple[int, int, int],
-) -> None:
-    """Give the open cells inside a geometry to solid `number`, a few layers of its bounds at a time."""
-    low, high = _cell_range(index.shape, geometry.bounds(), spacing, dimension, origin)
-    across = high[:2] - low[:2]
-    if not (low < high).all():
-        return
-    layers = max(1, CHUNK // int(across.prod()))
-    for bottom in range(int(low[2]), int(high[2]), layers):
-        top = min(bottom + layers, int(high[2]))
-        size = int(across.prod()) * (top - bottom)
-        block = block_of([*low[:2], bottom], [*high[:2], top], spacing, dimension, origin, offset=0.5)
-        points = wp.empty(size, dtype=wp.vec3, device=index.device)
-        distance = wp.empty(size, dtype=wp.float32, device=index.device)
-        wp.launch(item_points, size, [block, points], device=index.device)
-        geometry.signed_distance(points, distance)
-        wp.launch(claim_cells, size, [block, distance, number, index, covered], device=index.device)
+def start_notes(solids: Sequence[PlacedSolid], grid: StaggeredGrid) -> list[str]:
+    """Return what is to be said about solids before they are measured: of those that move, which may come in later, less.
+
+    Raises:
+        ValueError: a solid that stands still lies wholly outside the domain, or a part of a mesh is turned inside out.
+    """
+    notes = []
+    for solid in solids:
+        still = solid.motion is None
+        notes += placement_notes(solid.geometry, solid.name, grid) if still else repair_notes(solid.geometry, solid.name)
+        notes += _thin_notes(solid, grid)
+    return notes
 
 
-def _cell_range(
-    shape: tuple[int, ...], bounds: np.ndarray | None, spacing: float, dimension: int, origin: tuple[int, int, int]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first and one past the last interior cell (x, y, z) that bounds [m] can touch, with a cell to spare."""
-    end = np.array(shape[::-1]) - 1
-    low, high = np.ones(3, dtype=np.int64), end.copy()
-    if bounds is not None:
-        touched = np.clip(bounds / spacing + 1.0 - np.array(origin), 0.0, end)
-        axes = slice(dimension)
-        low[axes] = np.clip(np.floor(touched[0]) - 1, 1, end)[axes].astype(np.int64)
-        high[axes] = np.clip(np.floor(touched[1]) + 2, 1, end)[axes].astype(np.int64)
-    return low, high
+def check_open(any_open: bool) -> None:
+    """Refuse solids that leave no open cell.
+
+    Raises:
+        ValueError: `any_open` is False.
+    """
+    if not any_open:
+        raise ValueError(
+            "the solids fill the whole domain: no open cell is left (is one inverted, or a plane's normal the wrong way round?)"
+        )
+
+
+def small_notes(names: Iterable[str], covered: Iterable[int], spacing: float) -> list[str]:
+    """Return warnings about solids that cover no center of a cell of `spacing` [m]."""
+    note = f"is too small for the grid: no center of a cell of {spacing:.4g} m lies inside it"
+    return [f"{name} {note}" for name, cells in zip(names, covered, strict=False) if not cells]
+
+
+def placement_notes(geometry: Geometry, name: str, grid: StaggeredGrid) -> list[str]:
+    """Return warnings about a region: what its mesh needed repaired, and that a mesh sticks out of the domain.
+
+    Args:
+        geometry: a solid, or the liquid's start.
+        name: what messages call it.
+        grid: the grid, or a part of one.
+
+    Raises:
+        ValueError: the region lies wholly outside the domain.
+    """
+    notes = repair_notes(geometry, name)
+    bounds = geometry.bounds()
+    if bounds is None:
+        return notes
+    low, high = bounds
+    dimension, spacing = grid.dimension, grid.spacing
+    if dimension == 2 and (low[2] > 0.0 or high[2] < 0.0):
+        raise ValueError(
+            f"{name} spans z = [{low[2]:.4g}, {high[2]:.4g}] m and misses the plane z = 0, which is a 2-D scene's; check its translation"
+        )
+    low, high = low[:dimension], high[:dimension]
+    size = spacing * np.array((grid.whole or grid.counts)[:dimension])
+    if (high <= 0.0).any() or (low >= size).any():
+        spans = " x ".join(f"[{a:.4g}, {b:.4g}]" for a, b in zip(low, high, strict=True))
+        domain = " x ".join(f"[0, {extent:.4g}]" for extent in size)
+        raise ValueError(
+            f"{name} lies wholly outside the domain: it spans {spans} m, the domain {domain} m; check its scale and translation"
+        )
+    stray = max(float((-low).max()), float((high - size).max()))
+    if isinstance(geometry, TriangleMesh) and stray > STRAY * spacing:
+        notes.append(f"{name} reaches {stray:.4g} m out of the domain; what is out there has no effect")
+    return notes
+
+
+def repair_notes(geometry: Geometry, name: str) -> list[str]:
+    """Return what a mesh needed repaired and where it crosses itself, a line each.
+
+    Raises:
+        ValueError: a part of the mesh is turned inside out, so that its inside would count as outside.
+    """
+    if not isinstance(geometry, TriangleMesh):
+        return []
+    surface, found = geometry.surface, geometry.surface.crossings
+    notes = [f"{name}: {warning}" for warning in surface.warnings]
+    if found.place is None:
+        return notes
+    what = f"{found.count} of its {len(surface.triangles)} triangles cross others, first" if found.count else "a part lies inside another,"
+    what += f" at {[float(f'{coordinate:.4g}') for coordinate in found.place]}"
+    if found.inverted > INVERTED_SHARE:
+        raise ValueError(
+            f"{name}: {surface.name}: {what}, and about {found.inverted:.0%} of its surface is inside out there: what that surrounds would "
+            "count as outside. Repair the mesh (in Blender: a Remesh modifier; in MeshLab: Remove Self Intersecting Faces, Close Holes)"
+        )
+    return [*notes, f"{name}: {surface.name}: {what}; what is surrounded twice counts as inside, once"]
+
+
+def _thin_notes(solid: PlacedSolid, grid: StaggeredGrid) -> list[str]:
+    """Return a warning when a mesh has walls that the cells may miss, so that what it is among may pass."""
+    geometry = solid.geometry
+    if not isinstance(geometry, TriangleMesh) or geometry.invert:
+        return []
+    thin = geometry.thin_fraction(grid.spacing, grid.device)
+    if thin <= THIN_SHARE:
+        return []
+    return [f"{solid.name} is thinner than a cell of {grid.spacing:.4g} m under {thin:.0%} of its surface: {solid.among} may pass there"]

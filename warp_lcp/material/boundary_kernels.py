@@ -6,8 +6,15 @@ import typing
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, I16, I32, U8, cell_below, cell_kernel
-from warp_lcp.material.contact import LETS_GO, TOUCHES
 from warp_lcp.operators.grid_poisson import AIR, SOLID
+
+TOUCHES_NOTHING = 0  # no solid face
+HELD = 1  # a wall cell whose material stays on its walls
+RELEASED = 2  # a wall cell whose material is leaving
+
+TOUCHES = 1  # bits of `touch`: a face of the cell is not open,
+LETS_GO = 2  # and one of those belongs to a wall that separates
+
 
 _AIR = wp.constant(wp.int8(AIR))
 _SOLID = wp.constant(wp.int8(SOLID))

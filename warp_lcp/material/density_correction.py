@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,10 +14,42 @@ import warp_lcp as wl
 from warp_lcp.grid.level_set import Fill, particle_density
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
-from warp_lcp.material import density_correction_kernels as kernels
 from warp_lcp.material.boundary import Boundary
-from warp_lcp.operators.grid_poisson import SOLID
+from warp_lcp.material.boundary_kernels import RELEASED
+from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
+from warp_lcp.rows import RowPass
 from warp_lcp.rows.vectors import convert
+
+HEADERS = Path(__file__).parent / "headers"
+F32, F64, U8 = wp.float32, wp.float64, wp.uint8
+COLUMNS = 3  # of a row's sums, see `prepare` and `crowd`
+CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR, "COLUMNS": COLUMNS, "RELEASED": RELEASED} | {
+    "LEAST_DENSITY": 0.5,  # that displacements are divided by: thin spray need not carry off what a full cell has too much
+    "LEAST_CAPACITY": 0.1,  # that densities are divided by there
+    "HALF": 0.5,  # of what a cell holds: with less it is at the surface
+}
+FILLED, PROBLEM = {"density": F32, "capacity": F32}, {"kind": wp.int8, "b": F64, "x": F64}
+
+
+def _made(name: str, box: dict[str, Any], numbers: dict[str, Any], module: str = "density_correction", cut: bool = False) -> RowPass:
+    sums = {} if name == "displace" else {"sums": F64}
+    path, constants, absent = HEADERS / f"{name}.h", CONSTANTS | {"CUT": cut}, ("contact", "inside", "open")
+    return RowPass(
+        f"warp_lcp.material.{module}.{name}", path, F64, box=box, whole=sums, numbers=numbers, optional=absent, constants=constants
+    )
+
+
+PREPARE = _made("prepare_correction", PROBLEM | FILLED | {"base": wp.int8, "contact": U8, "inside": U8}, {"most": F32, "gain": F32})
+EVEN = _made("even", PROBLEM | FILLED | {"inside": U8, "lower": F64}, {"least": F32, "planes": int})
+CROWD = _made("crowd", FILLED | {"base": wp.int8}, {"most": F32}, "crowding")
+
+
+@functools.cache
+def displacement_pass(cut: bool) -> RowPass:
+    """Return the pass of the displacement; `cut`: faces have open fractions."""
+    fields, numbers = {"x": F64, "kind": wp.int8, "open": F32, "d": F32} | FILLED, {"axis": int, "most": F32, "dx": F32}
+    return _made("displace", fields, numbers, "density_correction" + "_cut" * cut, cut)
+
 
 LONGEST = 0.5  # cells that a correction moves a particle at most
 EXCESS = 1e-3  # of a cell, root mean square over the over-full cells, that is not worth a solve
@@ -33,9 +67,8 @@ class Crowding:
     """
 
     def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int, max_density: float) -> None:
-        """Allocate the sums."""
         self.grid, self.boundary, self.particles_a_cell, self.max_density = grid, boundary, particles_a_cell, max_density
-        self._sums = wp.zeros((*grid.shape[:2], kernels.COLUMNS), dtype=wp.float64, device=grid.device)
+        self._sums = wp.zeros((*grid.shape[:2], COLUMNS), dtype=wp.float64, device=grid.device)
         self._density: wp.array | None = None
 
     def measure(self, density: wp.array | None, particles: Particles, window: Window) -> tuple[float, float]:
@@ -51,16 +84,10 @@ class Crowding:
             particle_density(self.grid, particles, window, self.particles_a_cell, density)
         b = self.boundary
         filled = {"base": b.base, "density": density, "capacity": b.capacity}
-        self.grid.domain.run(kernels.CROWD, whole=True, **filled, most=self.max_density, sums=self._sums)
-        sums = _inner(self.grid, self._sums)
+        self.grid.domain.run(CROWD, whole=True, **filled, most=self.max_density, sums=self._sums)
+        sums = self.grid.domain.rows_of(self._sums)
         held = float(sums[..., 2].sum())
         return (float(sums[..., 0].sum()) / held if held > 0.0 else 0.0), float(sums[..., 1].max())
-
-
-def _inner(grid: StaggeredGrid, sums: wp.array) -> np.ndarray:
-    """Return the sums of the domain's rows."""
-    low, high = grid.domain.low, grid.domain.high
-    return np.asarray(sums.numpy()[low[0] : high[0], low[1] : high[1]])
 
 
 @dataclass(frozen=True)
@@ -121,20 +148,9 @@ class DensityCorrection:
     """
 
     def __init__(
-        self,
-        grid: StaggeredGrid,
-        boundary: Boundary,
-        solver: Any,
-        *,
-        particles_a_cell: int,
-        max_density: float,
-        gain: float = 1.0,
-        even: bool = False,
-        every: int = 1,
-        tolerance: float = 1e-2,
-        max_iterations: int = 20,
-    ) -> None:
-        """Allocate the fields."""
+        self, grid: StaggeredGrid, boundary: Boundary, solver: Any, *, particles_a_cell: int, max_density: float, gain: float = 1.0,
+        even: bool = False, every: int = 1, tolerance: float = 1e-2, max_iterations: int = 20,
+    ) -> None:  # fmt: skip
         self.grid, self.boundary, self.solver = grid, boundary, solver
         self.particles_a_cell, self.max_density, self.gain = particles_a_cell, max_density, gain
         self.every = every
@@ -142,8 +158,8 @@ class DensityCorrection:
         self.x, self._b = grid.field(wp.float64), grid.field(wp.float64)
         self.density, self.displacement, self._kind = grid.field(), grid.faces(), grid.field(wp.int8)
         wp.copy(self._kind, boundary.base)
-        self._displace = kernels.displacement_pass(bool(boundary.open))
-        self._sums = wp.zeros((*grid.shape[:2], kernels.COLUMNS), dtype=wp.float64, device=grid.device)
+        self._displace = displacement_pass(bool(boundary.open))
+        self._sums = wp.zeros((*grid.shape[:2], COLUMNS), dtype=wp.float64, device=grid.device)
         self._inside = self._lower = None
         if even:  # the ring stays as it is
             self._inside = wp.array(boundary.base.numpy() == SOLID, dtype=wp.uint8, device=grid.device)
@@ -160,7 +176,7 @@ class DensityCorrection:
             particles: the material (moved). If they are indexed they are sorted first.
             window: cells that hold all particles, with two to spare on each side.
             fill: adds to the density in a window what no particle stands for.
-            contact: uint8, RELEASED where walls let go, see `warp_lcp.material.contact`; None: they do not.
+            contact: uint8, RELEASED where walls let go, see `warp_lcp.material.boundary_kernels`; None: they do not.
             share: of the displacement that particles go.
         """
         if particles.offsets is not None:
@@ -197,11 +213,11 @@ class DensityCorrection:
             "inside": self._inside,
         }
         fields["sums"], run = self._sums, self.grid.domain.run
-        run(kernels.PREPARE, whole=True, **fields, base=b.base, contact=contact, most=most, gain=self.gain)
+        run(PREPARE, whole=True, **fields, base=b.base, contact=contact, most=most, gain=self.gain)
         if self._inside is not None:
             numbers: dict[str, Any] = {"least": min(most, 2.0 - most), "planes": self.grid.planes - 1}
-            run(kernels.EVEN, whole=True, **fields, **numbers, lower=self._lower)
-        sums = _inner(self.grid, self._sums)
+            run(EVEN, whole=True, **fields, **numbers, lower=self._lower)
+        sums = self.grid.domain.rows_of(self._sums)
         return int(sums[..., [0, 2]].sum()), float(sums[..., 1].max())
 
     def _solve(self, over_full: int) -> wl.SolveResult:

@@ -42,7 +42,6 @@ class Flights:
     """
 
     def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, coheres: bool = True, settles: bool = False) -> None:
-        """Allocate the fields."""
         self.grid, self.boundary, self._settles = grid, boundary, settles
         self._parent, self._number = (wp.zeros(grid.size, dtype=wp.int32, device=grid.device) for _ in range(2))
         self._held, self._several = (wp.zeros(grid.size, dtype=wp.uint8, device=grid.device) for _ in range(2))

@@ -9,11 +9,11 @@ from typing import Any
 
 import warp as wp
 
-from warp_lcp.grid.cell_kernel import F32, I8, U8
+from warp_lcp.grid.cell_kernel import F32, I8, U8, interpolated
+from warp_lcp.grid.particle_loops import cell_pass
 from warp_lcp.grid.transfer import TINY_WEIGHT
-from warp_lcp.material.contact import TOUCHES
+from warp_lcp.material.boundary_kernels import TOUCHES
 from warp_lcp.operators.grid_poisson import SOLID
-from warp_lcp.rows import RowPass
 
 COLUMNS = 18  # of a body's sums, see `add_up`
 LEAVES = 17  # of them, the particles that come near a wall or an open side
@@ -48,14 +48,15 @@ class Flight:
     sums: wp.array2d(dtype=wp.int64)
 
 
-def _made(name: str, box: dict[str, Any], *trees: str) -> RowPass:
-    whole = {"parent": wp.int32} | dict.fromkeys(trees, wp.uint8)
-    constants, path = {"SOLID": SOLID, "TOUCHES": TOUCHES, "TINY_WEIGHT": TINY_WEIGHT}, Path(__file__).parent / "headers" / f"{name}.h"
-    return RowPass(f"warp_lcp.material.flight.{name}", path, wp.float32, box=box, whole=whole, constants=constants, optional=("w",))
-
-
-UNITE = _made("unite", dict.fromkeys("uvw", wp.float32))
-HOLD = _made("hold", {"kind": wp.int8, "touch": wp.uint8}, "held", "several")
+_MORE: dict[str, Any] = {
+    "headers": Path(__file__).parent / "headers",
+    "constants": {"SOLID": SOLID, "TOUCHES": TOUCHES, "TINY_WEIGHT": TINY_WEIGHT},
+}
+UNITE = cell_pass("warp_lcp.material.flight.unite", "u v w", whole={"parent": wp.int32}, optional=("w",), **_MORE)
+HOLD = cell_pass(
+    "warp_lcp.material.flight.hold", "", {"kind": wp.int8, "touch": wp.uint8},
+    whole={"parent": wp.int32, "held": wp.uint8, "several": wp.uint8}, **_MORE,
+)  # fmt: skip
 
 
 @wp.func
@@ -135,35 +136,14 @@ def lift_kernel(flight: Flight, position: Vectors, start: Vectors):
 
 
 @wp.func
-def component(field: Field, planes: int, x: float, y: float, z: float):
-    """Return a component at node coordinates, which are brought within the array."""
-    cx = wp.clamp(x, 0.0, float(field.shape[2]) - 1.001)
-    cy = wp.clamp(y, 0.0, float(field.shape[1]) - 1.001)
-    i = int(cx)
-    j = int(cy)
-    k = int(1)
-    fx = cx - float(i)
-    fy = cy - float(j)
-    value = wp.lerp(wp.lerp(field[1, j, i], field[1, j, i + 1], fx), wp.lerp(field[1, j + 1, i], field[1, j + 1, i + 1], fx), fy)
-    if planes == 2:
-        cz = wp.clamp(z, 0.0, float(field.shape[0]) - 1.001)
-        k = int(cz)
-        low = wp.lerp(wp.lerp(field[k, j, i], field[k, j, i + 1], fx), wp.lerp(field[k, j + 1, i], field[k, j + 1, i + 1], fx), fy)
-        k += 1
-        high = wp.lerp(wp.lerp(field[k, j, i], field[k, j, i + 1], fx), wp.lerp(field[k, j + 1, i], field[k, j + 1, i + 1], fx), fy)
-        value = wp.lerp(low, high, cz - float(k - 1))
-    return value
-
-
-@wp.func
 def velocity_at(u: Field, v: Field, w: Field, planes: int, x: wp.vec3):
     """Return the velocity of the faces at x [cells]."""
     a = x[0] + 1.0
     b = x[1] + 1.0
     c = x[2] + 1.0
-    at = wp.vec3(component(u, planes, a, b - 0.5, c - 0.5), component(v, planes, a - 0.5, b, c - 0.5), 0.0)
+    at = wp.vec3(interpolated(u, planes, a, b - 0.5, c - 0.5), interpolated(v, planes, a - 0.5, b, c - 0.5), 0.0)
     if planes == 2:
-        at[2] = component(w, planes, a - 0.5, b - 0.5, c)
+        at[2] = interpolated(w, planes, a - 0.5, b - 0.5, c)
     return at
 
 

@@ -9,7 +9,7 @@ the distance to the surface [cells], and W the band's width.
    say, which reach beyond any kernel around these. So the surface is the particles' alone, and no error of d* builds up: after the
    solve d is measured anew as a chamfer distance from the cells of air, whose level set gives the part of a cell; solids are no shore.
 2. How fast. On faces deeper than W - 1 the velocity u* is the last step's, carried along by a semi-Lagrangian step of third order
-   (`warp_lcp.grid.semi_lagrangian`); on those above W - 2 it is the particles' mean, in between it goes over linearly. Gravity and
+   (`warp_lcp.grid.advection`); on those above W - 2 it is the particles' mean, in between it goes over linearly. Gravity and
    pressure act on both alike.
 3. Exchange. Particles deeper than W go. The band's last layer, W - 1 < d <= W, and what was {d* > W - 1} and is now shallower (a wall has
    let go of it, say), gets fresh particles in each step: a reservoir of even density, out of which the flow takes exactly what it carries
@@ -28,13 +28,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import warp as wp
 
+from warp_lcp.grid.advection import CENTERS, carry_field
 from warp_lcp.grid.particles import Particles, ParticleTotals
-from warp_lcp.grid.semi_lagrangian import CENTERS, carry_field
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.transfer import faces_to_particles
 from warp_lcp.material import narrow_band_kernels as kernels
@@ -46,29 +46,6 @@ BEYOND = 3.0  # cells below the band that depths are told apart: what is carried
 DEEP = 2.0  # cells below the surface from which on a cell counts as full whatever particles say
 REACH = 1.5  # of a cell's kernel, in cells
 UNEVEN = 0.1  # how far the interior's density may differ from that at rest
-
-
-@dataclass(frozen=True)
-class Interior:
-    """Sums over the cells without particles.
-
-    Attributes:
-        cells: how many there are.
-        mean_square_speed: [m^2/s^2].
-        velocity: mean velocity [m/s], shape (3,).
-        center: mean position [m], shape (3,).
-        low: smallest coordinates of cell centers [m], shape (3,).
-        high: largest coordinates of cell centers [m], shape (3,).
-        max_speed: [m/s].
-    """
-
-    cells: int
-    mean_square_speed: float
-    velocity: np.ndarray
-    center: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    max_speed: float
 
 
 class NarrowBand:
@@ -90,7 +67,7 @@ class NarrowBand:
         depth: d* [cells], float32; 0 in air. More than `width` where there are no particles.
         velocity: of each component's faces, carried along with it [m/s].
         held: H, particles that the interior stands for; negative if the band has got more than there was.
-        interior: sums over the cells without particles.
+        interior: sums over the cells without particles, at their centers; its count is theirs.
         full: depth from which on cells count as full [cells].
         fresh: particles that the last exchange has put into the band.
 
@@ -102,7 +79,6 @@ class NarrowBand:
         self, grid: StaggeredGrid, boundary: Boundary, *, width: float, per_axis: int, jitter: float, random_seed: int,
         keep: np.ndarray | None = None,
     ) -> None:  # fmt: skip
-        """Allocate the fields: no interior yet."""
         if not width >= 3.0:
             raise ValueError(f"width = {width}: must be at least 3 cells")
         self.grid, self.boundary, self.width = grid, boundary, float(width)
@@ -123,7 +99,7 @@ class NarrowBand:
     @property
     def mean_density(self) -> float | None:
         """H by what the interior would hold at rest; None: there is no interior."""
-        return self.held / (self.particles_a_cell * self.interior.cells) if self.interior.cells else None
+        return self.held / (self.particles_a_cell * self.interior.count) if self.interior.count else None
 
     @property
     def density(self) -> float:
@@ -247,9 +223,9 @@ class NarrowBand:
         with every particle that the band has more or less than its share.
         """
         inside, count = self.interior, totals.count + self.held
-        if inside.cells == 0 or count <= 0:
+        if inside.count == 0 or count <= 0:
             return replace(totals, count=max(count, 0))
-        at_rest = self.particles_a_cell * inside.cells
+        at_rest = self.particles_a_cell * inside.count
         share = at_rest / (totals.count + at_rest)
         return replace(
             totals,
@@ -270,7 +246,8 @@ class NarrowBand:
         for axis, field in enumerate(self.velocity):
             near = wanted | np.roll(wanted, 1, axis=2 - axis)
             faces[f"interior_velocity_{axis}"] = np.where(near, field.numpy(), np.float32(0.0))
-        sums = np.hstack([self.held, self.width, *vars(self.interior).values()])  # over where solids were, in an order that windows set
+        inside = list(vars(self.interior).values())[:7]  # all but the bad ones; over where solids were, in an order that windows set
+        sums = np.hstack([self.held, self.width, *inside])
         return {"depth": np.where(wanted, depth, np.float32(0.0)), "interior": sums} | faces
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
@@ -287,7 +264,7 @@ class NarrowBand:
             field.assign(state[f"interior_velocity_{axis}"])
         self.held = int(held)
         velocity, center, low, high = np.reshape(vectors, (4, 3))
-        self.interior = Interior(int(cells), squares, velocity, center, low, high, fastest)
+        self.interior = ParticleTotals(int(cells), squares, velocity, center, low, high, fastest)
 
     def forget(self) -> None:
         """Begin with particles everywhere; the next exchange removes those deeper than the band."""
@@ -321,22 +298,22 @@ class NarrowBand:
             tail = particles.position[first:], particles.velocity[first:]
             faces_to_particles(grid, list(saved), *tail, [])
 
-    def _summed(self, window: Window) -> Interior:
+    def _summed(self, window: Window) -> ParticleTotals:
         """Add up the cells without particles."""
         u, v, w = [*self.velocity, None][:3]
         inputs = [self.grid.planes, self.width, self.boundary.base, self.depth, u, v, w, self._sums]
-        low = [max(a, b) for a, b in zip(window.low, self.grid.domain.low, strict=True)]
-        high = [min(a, b) for a, b in zip(window.high, self.grid.domain.high, strict=True)]
-        Window((low[0], low[1], low[2]), (high[0], high[1], high[2]), window.device).launch_rows(kernels.sum_kernel, inputs)
-        rows = self._sums.numpy()[low[0] : high[0], low[1] : high[1]].reshape(-1, kernels.COLUMNS)
+        box = window.common(self.grid.domain)
+        assert box is not None, "windows reach into the domain"
+        box.launch_rows(kernels.sum_kernel, inputs)
+        rows = box.rows_of(self._sums).reshape(-1, kernels.COLUMNS)
         cells, dx = int(rows[:, 0].sum()), self.grid.spacing
         if cells == 0:
-            return Interior(0, 0.0, np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), 0.0)
+            return ParticleTotals()
         center, lowest, highest = rows[:, 2:5].sum(axis=0) / cells, rows[:, 6:9].min(axis=0), rows[:, 9:12].max(axis=0)
         places = (np.stack([center, lowest, highest]) - 0.5) * dx
         places[:, self.grid.dimension :] = 0.0
         squares, fastest = float(rows[:, 1].sum()) / cells, float(rows[:, 5].max())
-        return Interior(cells, squares, rows[:, 12:15].sum(axis=0) / cells, places[0], places[1], places[2], math.sqrt(fastest))
+        return ParticleTotals(cells, squares, rows[:, 12:15].sum(axis=0) / cells, places[0], places[1], places[2], math.sqrt(fastest))
 
 
 def without_band(state: Mapping[str, np.ndarray], spacing: float, random_seed: int) -> Mapping[str, np.ndarray]:

@@ -6,9 +6,9 @@ from pathlib import Path
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, F64, I8, I32, INTS, POINTS, U8, cell_kernel
-from warp_lcp.material.contact import RELEASED
+from warp_lcp.grid.particle_loops import cell_pass
+from warp_lcp.material.boundary_kernels import RELEASED
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
-from warp_lcp.rows import RowPass
 
 NEAR = 1.0  # cells from a solid inside the domain within which particles stay
 INSET = 1e-3  # of a cell: particles are put no nearer to its faces
@@ -18,14 +18,10 @@ _FLUID = wp.constant(wp.int8(FLUID))
 _SOLID = wp.constant(wp.int8(SOLID))
 _RELEASED = wp.constant(wp.uint8(RELEASED))
 
-RELAX = RowPass(
-    "warp_lcp.material.narrow_band.relax",
-    Path(__file__).parent / "headers" / "relax_depth.h",
-    wp.float32,
-    box={"depth": wp.float32},
-    whole={"changed": wp.int32},
+RELAX = cell_pass(
+    "warp_lcp.material.narrow_band.relax_depth", "depth", headers=Path(__file__).parent / "headers", whole={"changed": wp.int32},
     numbers=dict.fromkeys(("planes", "last_plane", "last_row"), int),
-)
+)  # fmt: skip
 
 
 @wp.func
@@ -103,19 +99,13 @@ def renewed(now: float, before: float, width: float):
     return now <= width and (now > width - 1.0 or (now >= 0.0 and before > width - 1.0))
 
 
-@wp.func
-def fraction(x: float):
-    """Return x modulo 1."""
-    return x - wp.floor(x)
-
-
 @cell_kernel("warp_lcp.material.narrow_band")
 def quota_kernel(k, j, i, width: float, particles: float, seed: int, shift: float, base: I8, depth: F32, before: F32, quota: I32):
     """Find how many fresh particles each cell gets: so many on average, over the cells and, as `shift` goes on, over the steps."""
     count = int(0)
     if base[k, j, i] != _SOLID and renewed(depth[k, j, i], before[k, j, i], width):
         cell = (k * depth.shape[1] + j) * depth.shape[2] + i
-        count = int(particles + 0.9999 * fraction(wp.randf(wp.rand_init(seed, cell)) + shift))
+        count = int(particles + 0.9999 * wp.frac(wp.randf(wp.rand_init(seed, cell)) + shift))
     quota[k, j, i] = count
 
 
@@ -157,7 +147,7 @@ def seed_kernel(k, j, i, S: Sites, behind: int, ny: int, nx: int, total: INTS, p
             state = wp.rand_init(seed + 1, cell * 64 + n)
             x = wp.vec3(float(site % per_axis), float((site // per_axis) % per_axis), float(site // (per_axis * per_axis)))
             x = (x + S.jitter * wp.vec3(wp.randf(state), wp.randf(state), wp.randf(state))) / float(per_axis) + way
-            x = wp.vec3(fraction(x[0]), fraction(x[1]), fraction(x[2])) * (1.0 - 2.0 * INSET) + wp.vec3(INSET, INSET, INSET)
+            x = wp.vec3(wp.frac(x[0]), wp.frac(x[1]), wp.frac(x[2])) * (1.0 - 2.0 * INSET) + wp.vec3(INSET, INSET, INSET)
             x = (x + wp.vec3(float(i - 1), float(j - 1), float(k - 1))) * S.dx
             position[behind + start + n] = wp.vec3(x[0], x[1], wp.where(planes == 2, x[2], 0.0))
 

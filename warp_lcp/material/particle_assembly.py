@@ -11,21 +11,18 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.particles import Particles, seed
-from warp_lcp.grid.periodic import PeriodicSides, periodic_sides
-from warp_lcp.grid.sides import side_bits
+from warp_lcp.grid.sides import PeriodicSides, periodic_sides, side_bits
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.surface_mesh import Obstacles, SurfaceMesh
 from warp_lcp.grid.voxelize import PlacedSolid, inside, placement_notes, voxelize
-from warp_lcp.material.boundary import Boundary, WholeCells
-from warp_lcp.material.cut_boundary import CutBoundary
+from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
 from warp_lcp.material.density_correction import Crowding, DensityCorrection
 from warp_lcp.material.narrow_band import NarrowBand
-from warp_lcp.material.outlets import Drain, Outlets
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_volume import ParticleVolume
 from warp_lcp.material.reseeding import Reseeding
-from warp_lcp.material.sources import Source, Sources
+from warp_lcp.material.sources import Drain, Outlets, Source, Sources
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import BodyMotion, RigidBody
 from warp_lcp.rigid.mass_properties import mass_properties
@@ -103,10 +100,7 @@ def make_boundary(
         cut = CutCells(grid, placed, wall_separating=separating, open_sides=sides)
         if not cut.whole_cells:
             return CutBoundary(grid, cut, sides=around), cut.notes
-    voxels = voxelize(
-        grid.counts, grid.spacing, grid.dimension, placed, wall_separating=separating, device=grid.device,
-        open_sides=sides | side_bits(periodic_sides(scene.endless)),
-    )  # fmt: skip
+    voxels = voxelize(grid, placed, wall_separating=separating, open_sides=sides | side_bits(periodic_sides(scene.endless)))
     if wall_velocity is None and scene.source:
         wall_velocity = np.zeros((1 + len(placed), 3))  # what a source's faces are given goes there
     return WholeCells(grid, voxels, wall_velocity, open_sides=sides, sides=around), voxels.notes
@@ -153,7 +147,7 @@ def seed_materials(
     names = [f"{key}[{number}] ({material.shape})" for number, material in enumerate(materials)]
     notes: list[str] = []
     for name, geometry in zip(names, geometries, strict=True):
-        notes += placement_notes(geometry, name, grid.whole or grid.counts, grid.spacing, grid.dimension)
+        notes += placement_notes(geometry, name, grid)
     settings = scene.particles
     open_cells = grid.interior(boundary.base.numpy()) != wl.SOLID
     if without is not None:

@@ -13,18 +13,16 @@ import warp_lcp as wl
 from warp_lcp.grid.particles import MARGIN, Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.surface_mesh import Interior, faces_from_particles, sample
-from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
+from warp_lcp.grid.transfer import accelerate, faces_to_particles, particles_to_faces
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.flight import Flights
-from warp_lcp.material.gravity import accelerate
 from warp_lcp.material.narrow_band import NarrowBand, without_band
-from warp_lcp.material.outlets import Drain, Outlets
 from warp_lcp.material.particle_assembly import make_particle_volume, make_surface_mesh
 from warp_lcp.material.particle_rearrangement import Rearrangement
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_state import check_state, other_spacing, particle_trouble, signature
 from warp_lcp.material.resample import resampled, resampling_notes
-from warp_lcp.material.sources import Source, Sources
+from warp_lcp.material.sources import Drain, Outlets, Source, Sources
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.simulation import NoStopwatch, Points, SimulationFailed, Stopwatch, Surface, Volume
 
@@ -225,7 +223,7 @@ class ParticleSimulation(ABC):
             window: faces to consider.
             known: int8 of each component (updated): 1 on valid faces, 0 on others, -1 inside solids of whole cells.
             kind: int8 of AIR, FLUID, SOLID.
-            contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED, see `warp_lcp.material.contact`.
+            contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED, see `warp_lcp.material.boundary_kernels`.
         """
         wall = self.boundary
         with self.watch.stage("extrapolation", *self.velocity, *self.weights, *known, kind, contact, *wall.open):

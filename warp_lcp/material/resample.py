@@ -14,14 +14,9 @@ PLASTIC = {2: 1.32471795724474602596, 3: 1.22074408460575947536}  # x^(d+1) = x 
 
 
 def resampled(
-    state: Mapping[str, np.ndarray],
-    grid: StaggeredGrid,
-    admits: Callable[[np.ndarray], np.ndarray],
-    *,
-    spacing: float,
-    per_axis: int,
+    state: Mapping[str, np.ndarray], grid: StaggeredGrid, admits: Callable[[np.ndarray], np.ndarray], *, spacing: float, per_axis: int,
     random_seed: int,
-) -> tuple[dict[str, np.ndarray], int]:
+) -> tuple[dict[str, np.ndarray], int]:  # fmt: skip
     """Return the particles of a state, made finer or coarser for another grid.
 
     With k > 1 times as many particles as there were, every one is followed by k on average, spread over the square or cube that was its

@@ -41,7 +41,6 @@ class Reseeding:
     """
 
     def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, least: int, most: int, particles_a_cell: int, every: int) -> None:
-        """Allocate the fields."""
         if not 1 <= least <= particles_a_cell <= most:
             raise ValueError(f"least = {least}, most = {most}: must be at least 1, and {particles_a_cell} between them")
         self.grid, self.boundary, self.every = grid, boundary, every
@@ -70,7 +69,7 @@ class Reseeding:
             wp.launch(offset_kernel, grid.size + 1, [particles.key, particles.count, offsets], device=grid.device)
         self._numbers.zero_()
         window.launch(kernels.count_kernel, [offsets, self._count])
-        b, s = self.boundary, kernels.Setting()
+        b, s = self.boundary, kernels.ReseedingSetting()
         s.planes, s.seed, s.dx, s.inverse_dx = grid.planes, step, grid.spacing, 1.0 / grid.spacing
         s.least, s.at_rest, s.most = self.least, self.particles_a_cell, self.most
         window.launch(kernels.find_kernel, [s, self._count, b.capacity, b.base, b.touch, self._takers, self._numbers])

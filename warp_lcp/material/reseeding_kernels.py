@@ -4,7 +4,7 @@
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, I32, INTS, POINTS, U8, cell_kernel
-from warp_lcp.material.contact import TOUCHES
+from warp_lcp.material.boundary_kernels import TOUCHES
 from warp_lcp.operators.grid_poisson import AIR
 
 JITTER = 0.25  # of half a cell: how far from the center of its part of a cell a particle is put at random, as at the start
@@ -15,7 +15,7 @@ _TOUCHES = wp.constant(wp.uint8(TOUCHES))
 
 
 @wp.struct
-class Setting:
+class ReseedingSetting:
     """How many particles a cell should hold, and what else is the same for all cells of a step."""
 
     planes: int
@@ -29,13 +29,13 @@ class Setting:
 
 @cell_kernel("warp_lcp.material.reseeding")
 def count_kernel(k, j, i, offsets: INTS, count: I32):
-    """Count each cell's particles."""
+    """Count the particles of each cell from the offsets."""
     cell = (k * count.shape[1] + j) * count.shape[2] + i
     count[k, j, i] = offsets[cell + 1] - offsets[cell]
 
 
 @cell_kernel("warp_lcp.material.reseeding")
-def find_kernel(k, j, i, s: Setting, count: I32, capacity: F32, base: I8, touch: U8, takers: INTS, numbers: INTS):
+def find_kernel(k, j, i, s: ReseedingSetting, count: I32, capacity: F32, base: I8, touch: U8, takers: INTS, numbers: INTS):
     """List open cells that no wall touches, that want particles, and whose surroundings, themselves included, are full but for a little.
 
     The order of the list differs from run to run on CUDA, and does not matter.
@@ -77,7 +77,7 @@ def emptiest(planes: int, i: int, j: int, k: int, start: int, here: int, inverse
 
 
 @wp.kernel(enable_backward=False, module="warp_lcp.material.reseeding")
-def exchange_kernel(way: wp.vec3i, s: Setting, takers: INTS, offsets: INTS, count: I32, position: POINTS, numbers: INTS):
+def exchange_kernel(way: wp.vec3i, s: ReseedingSetting, takers: INTS, offsets: INTS, count: I32, position: POINTS, numbers: INTS):
     """Let each cell that wants particles take some from the neighbor in one direction.
 
     No race, though a cell may be the neighbor of another that takes: whoever gives holds more than `at_rest` before and no less after,

@@ -63,13 +63,7 @@ def occupy_kernel(k, j, i, slots: I32, sources: wp.array(dtype=wp.int32), runnin
 
 @wp.kernel(**options)
 def occupants_kernel(
-    inverse_dx: float,
-    nx: int,
-    ny: int,
-    nz: int,
-    slots: I32,
-    position: wp.array(dtype=wp.vec3),
-    counts: wp.array(dtype=wp.int32),
+    inverse_dx: float, nx: int, ny: int, nz: int, slots: I32, position: wp.array(dtype=wp.vec3), counts: wp.array(dtype=wp.int32)
 ):
     """Count the particles in each slot."""
     x = position[wp.tid()] * inverse_dx

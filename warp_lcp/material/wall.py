@@ -8,33 +8,37 @@ extrapolated from all of them. Closed faces have taken part and now carry the ma
 closed faces the wall's normal velocity (not merely less of the inward one: a moving wall drags its material along); released and AIR cells
 lose only the part into the wall, so that the last particles can leave. 5. Faces inside solids follow the faces beside them, so that
 tangential flow is not slowed by a wall.
+
+Where walls cut cells the order is the same, for the same reasons; partly open faces have been projected and keep their velocity. 4. With n
+the gradient of the distance to the wall that closes a face, at the face's center, u the velocity there (of known faces alone) and u_s the
+wall's, w = n.(u - u_s) is the relative normal velocity. (Beside two walls the gradient of the smaller distance lies between their normals:
+with one wall's u_s it would turn the flow before a piston away from the floor.) Where the wall holds the material the face loses w n, of
+either sign; released cells and AIR lose it only where w < 0. 5. Faces of the ring beside the domain's walls follow the faces next to them.
 """
 
 import typing
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, I8, I32, U8, cell_below, cell_kernel
+from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.extrapolate import BLOCKED, extrapolate
+from warp_lcp.grid.particle_loops import cell_pass
 from warp_lcp.grid.staggered import Window
 from warp_lcp.grid.transfer import TINY_WEIGHT
-from warp_lcp.material.contact import RELEASED
+from warp_lcp.material.boundary_kernels import HELD, RELEASED, TOUCHES_NOTHING
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
-from warp_lcp.rows import RowPass
 
 Join = Callable[[wp.array, wp.array], None]  # takes the marks and the velocity of a component
 
-KEEP_SPRAY = RowPass(
-    "warp_lcp.material.wall.keep_spray",
-    Path(__file__).parent / "headers" / "keep_spray.h",
-    wp.float32,
-    box={"known": wp.int8, "weight": wp.float32, "kind": wp.int8, "open": wp.float32},
-    numbers={"axis": int},
-    constants={"TINY_WEIGHT": TINY_WEIGHT, "SOLID": SOLID},
-    optional=("open",),
-)
+HEADERS = Path(__file__).parent / "headers"
+KEEP_SPRAY = cell_pass(
+    "warp_lcp.material.wall.keep_spray", "weight open", {"known": wp.int8, "kind": wp.int8}, headers=HEADERS, numbers={"axis": int},
+    constants={"TINY_WEIGHT": TINY_WEIGHT, "SOLID": SOLID}, optional=("open",),
+)  # fmt: skip
 _FLUID = wp.constant(wp.int8(FLUID))
 
 
@@ -94,19 +98,9 @@ def closed_face_kernel(k, j, i, axis: int, kind: I8, contact: U8, index: I32, se
 
 
 def extend_velocity(
-    window: Window,
-    velocity: Sequence[wp.array],
-    weights: Sequence[wp.array],
-    known: Sequence[wp.array],
-    kind: wp.array,
-    contact: wp.array,
-    index: wp.array,
-    separating: wp.array,
-    solid_velocity: Sequence[wp.array],
-    layers: int,
-    *,
-    join: Join | None = None,
-) -> None:
+    window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array], kind: wp.array, contact: wp.array,
+    index: wp.array, separating: wp.array, solid_velocity: Sequence[wp.array], layers: int, *, join: Join | None = None,
+) -> None:  # fmt: skip
     """Continue the projected velocity into air and walls.
 
     Args:
@@ -135,3 +129,53 @@ def extend_velocity(
             join(marks, field)
         # a particle's tent reaches faces inside a solid beside its cell, and in 3-D beside those
         extrapolate(window, marks, field, len(velocity) - 1, start=layers + 1, fill=BLOCKED, join=join)
+
+
+DEPTH = 2.0  # cells inside a wall beyond which no particle's tent reaches a face: sqrt(3), and what the distance errs
+
+_F32, _I8, _I16 = wp.float32, wp.int8, wp.int16
+_CONSTANTS = {"TINY_WEIGHT": TINY_WEIGHT, "DEPTH": DEPTH, "SOLID": SOLID, "FLUID": FLUID} | {
+    "TOUCHES_NOTHING": TOUCHES_NOTHING, "HELD": HELD, "RELEASED": RELEASED,
+}  # fmt: skip
+_MARKS, _AXIS = {"known": _I8}, {"axis": int, "planes": int}
+_COMPONENTS = {f"{name}{c}": kind for name, kind in (("", _F32), ("known_", _I8), ("wall_", _I16), ("moving_", _F32)) for c in "uvw"}
+_NEAREST = {"owner": _I16, "next_near": _F32, "next_owner": _I16}
+
+
+_ABSENT: dict[str, Any] = {"headers": HEADERS, "constants": _CONSTANTS, "optional": (*_COMPONENTS, *_NEAREST)}
+CONSTRAIN = cell_pass(
+    "warp_lcp.material.cut_wall.constrain", "open result distance", _MARKS | _COMPONENTS | _NEAREST | {"kind": _I8, "contact": wp.uint8},
+    numbers=_AXIS | {"dx": _F32}, whole={"turn": wp.mat33, "shift": wp.vec3, "separating": wp.uint8}, **_ABSENT,
+)  # fmt: skip
+TAKE = cell_pass("warp_lcp.material.cut_wall.take", "open result field", _MARKS, numbers=_AXIS, **_ABSENT)
+
+
+def extend_velocity_cut(
+    window: Window, velocity: Sequence[wp.array], weights: Sequence[wp.array], known: Sequence[wp.array], kind: wp.array, contact: wp.array,
+    cut: CutCells, scratch: Sequence[wp.array], layers: int, *, join: Join | None = None,
+) -> None:  # fmt: skip
+    """Continue the projected velocity into air and walls.
+
+    Args as of `extend_velocity`, but:
+        known: -1 on faces deep inside solids.
+        cut: the walls: distances at nodes, open fractions, whose wall closes a face, and its velocity.
+        scratch: a float32 field for each component (written).
+        layers: how far into air and walls, in faces.
+    """
+    for axis, (field, weight, marks, fraction) in enumerate(zip(velocity, weights, known, cut.open, strict=True)):
+        window.launch(keep_released_kernel, [axis, kind, contact, weight, field, marks])
+        extrapolate(window, marks, field, 1, join=join)
+        window.run(KEEP_SPRAY, axis=axis, known=marks, weight=weight, kind=kind, open=fraction)
+        extrapolate(window, marks, field, layers, join=join)
+    parts = zip(("", "known_", "wall_", "moving_"), (velocity, known, cut.wall, cut.velocity or ()), strict=True)
+    fields: dict[str, Any] = dict.fromkeys(_COMPONENTS) | {
+        f"{name}{c}": field for name, of in parts for c, field in zip("uvw", of, strict=False)
+    }
+    fields |= dict(zip(_NEAREST, cut.nearest or [None] * 3, strict=True)) | {"kind": kind, "contact": contact, "distance": cut.distance}
+    fields |= {"turn": cut.turn, "shift": cut.shift, "separating": cut.separating, "dx": cut.grid.spacing}
+    faces = [{"known": m, "open": o, "result": r} for m, o, r in zip(known, cut.open, scratch, strict=True)]
+    planes = len(velocity) - 1
+    for axis, face in enumerate(faces):
+        window.run(CONSTRAIN, axis=axis, planes=planes, **face, **fields)
+    for axis, (face, field) in enumerate(zip(faces, velocity, strict=True)):
+        window.run(TAKE, axis=axis, planes=planes, **face, field=field)

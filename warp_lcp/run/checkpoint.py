@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.distributed.meeting import Meeting, on_root
+from warp_lcp.distributed.collective import Collective, on_root
 from warp_lcp.files.archive import Archive, ArchiveError
 from warp_lcp.frames.atomic import make_folder, replacing
 from warp_lcp.frames.rank_folder import in_ranks, rank_folder
@@ -91,15 +91,15 @@ class CheckpointFolder:
         folder: made when the first checkpoint is written.
         fingerprint: tells the run's scene from others, whatever may change when it goes on.
         keys: of the scene, with their values, written with each checkpoint.
-        meeting: of the ranks that share the run, whose checkpoints are in pieces; `write`, `complete` and `prune` are collective then.
+        collective: of the ranks that share the run, whose checkpoints are in pieces; `write`, `complete` and `prune` are collective then.
 
     Attributes:
         spared: steps whose checkpoints `prune` leaves, as something that is missing can be made again from them.
     """
 
-    def __init__(self, folder: Path, fingerprint: str, keys: Mapping[str, Any] | None = None, meeting: Meeting | None = None) -> None:
+    def __init__(self, folder: Path, fingerprint: str, keys: Mapping[str, Any] | None = None, collective: Collective | None = None) -> None:
         """Look at a folder."""
-        self.folder, self.meeting, self._in_pieces = folder, meeting or Meeting.of_one(), meeting is not None
+        self.folder, self.collective, self._in_pieces = folder, collective or Collective.of_one(), collective is not None
         self._refused: dict[int, str] = {}  # why the pieces of a step cannot be used, as its ranks have found
         self._continued: int | None = None  # the step that ranks go on from, whose pieces are not to be replaced
         self.fingerprint = fingerprint
@@ -129,12 +129,12 @@ class CheckpointFolder:
             return self._write(checkpoint)
         if checkpoint.step == self._continued:
             return self.path(checkpoint.step)
-        with self.meeting.together():
+        with self.collective.together():
             make_folder(self.folder)
-            file = self.of_rank(self.meeting.ranks.rank)._write(checkpoint)
-        checksums = self.meeting.exchange(checkpoint.checksum)
-        with self.meeting.led():
-            if self.meeting.ranks.first:
+            file = self.of_rank(self.collective.ranks.rank)._write(checkpoint)
+        checksums = self.collective.exchange(checkpoint.checksum)
+        with self.collective.led():
+            if self.collective.ranks.first:
                 self._write(Checkpoint(checkpoint.step, checkpoint.time, {PIECES: np.array(checksums)}))
         return file
 
@@ -228,10 +228,10 @@ class CheckpointFolder:
     def complete(self, checkpoint: Checkpoint) -> bool:
         """Verify the pieces of a checkpoint, each on one rank; without a valid one `newest` refuses the checkpoint from now on."""
         self._continued = checkpoint.step
-        ranks = self.meeting.ranks
+        ranks = self.collective.ranks
         mine = range(ranks.rank, len(checkpoint.state.get(PIECES, ())), ranks.size)
         problems = [problem for rank in mine if (problem := self.problem(checkpoint, rank))]
-        found = [problem for those in self.meeting.exchange(problems) for problem in those]
+        found = [problem for those in self.collective.exchange(problems) for problem in those]
         if found:
             more = f" (and {len(found) - 1} other pieces)" if len(found) > 1 else ""
             self._refused[checkpoint.step] = found[0] + more

@@ -17,7 +17,7 @@ from typing import Any, Literal, get_type_hints
 import numpy as np
 from pydantic import TypeAdapter
 
-from warp_lcp.distributed.meeting import Meeting, on_root
+from warp_lcp.distributed.collective import Collective, on_root
 from warp_lcp.frames.atomic import SPARE, SUFFIX, make_folder, reserve, sync_folder, write_text
 from warp_lcp.frames.frames import FRAME_FILE, FrameFolder, FrameWriter
 from warp_lcp.frames.rank_folder import in_ranks, remove_empty_ranks
@@ -119,21 +119,21 @@ class RunFolder:
     Args:
         path: of the folder, which all ranks see.
         scene: what runs.
-        meeting: of the ranks that share the run; None: this process has it alone.
+        collective: of the ranks that share the run; None: this process has it alone.
 
     Raises:
         SceneError: a mesh file of the scene cannot be read.
     """
 
-    def __init__(self, path: Path, scene: Scene, meeting: Meeting | None = None) -> None:
+    def __init__(self, path: Path, scene: Scene, collective: Collective | None = None) -> None:
         """Look at a folder, there or not; nothing is written yet."""
         self.path, self.scene, self.log = path, scene, path / "log.csv"
-        self.meeting, self._shared = meeting or Meeting.of_one(), meeting is not None
-        with self.meeting.together():
+        self.collective, self._shared = collective or Collective.of_one(), collective is not None
+        with self.collective.together():
             self.mesh_files = mesh_digests(scene)
         whole = FrameFolder(path, scene.output.grid_format, surface_ply=scene.output.surface_ply)
-        self.frames = RankFrames(whole, meeting) if meeting else whole
-        self.checkpoints = CheckpointFolder(path / CHECKPOINTS, fingerprint(scene, self.mesh_files), keys(scene), meeting)
+        self.frames = RankFrames(whole, collective) if collective else whole
+        self.checkpoints = CheckpointFolder(path / CHECKPOINTS, fingerprint(scene, self.mesh_files), keys(scene), collective)
 
     @contextmanager
     def held(self, *, resume: bool) -> Iterator[list[str]]:
@@ -222,13 +222,13 @@ class RunFolder:
             whole: Mapping[str, np.ndarray] = {}
             if found and found.checkpoint and PIECES not in found.checkpoint.state:  # too much for a message
                 whole, found = found.checkpoint.state, replace(found, checkpoint=replace(found.checkpoint, state={}))
-            continued: Continuation = self.meeting.share(found)
+            continued: Continuation = self.collective.share(found)
             checkpoint = continued.checkpoint
             if checkpoint is None or (checkpoint.state and self.checkpoints.complete(checkpoint)):
                 return continued
             if not checkpoint.state:
-                with self.meeting.together():
-                    state = whole if self.meeting.ranks.first else self.checkpoints.read(checkpoint.step).state
+                with self.collective.together():
+                    state = whole if self.collective.ranks.first else self.checkpoints.read(checkpoint.step).state
                 return replace(continued, checkpoint=replace(checkpoint, state=state))
 
     @on_root
@@ -297,7 +297,7 @@ class RunFolder:
 
     def open_log(self, columns: tuple[str, ...], *, after_step: int | None = None) -> Log:
         """Begin the log or continue it, see `Log`."""
-        return Log(self.log, columns, after_step=after_step, meeting=self.meeting)
+        return Log(self.log, columns, after_step=after_step, collective=self.collective)
 
     def frame_writer(self, watch: Stopwatch) -> FrameWriter | RankFrameWriter:
         """Return what writes the frames while the simulation goes on."""
@@ -309,7 +309,7 @@ class RunFolder:
         Raises:
             OSError: the disk is full before the run begins, or cannot be written at all; on the root rank.
         """
-        if not self.meeting.ranks.first:
+        if not self.collective.ranks.first:
             return
         text, begins = json.dumps(asdict(record), indent=2) + "\n", record.status == "running"
         if begins:
@@ -325,7 +325,7 @@ class RunFolder:
         Raises:
             OutputError: there is less free.
         """
-        self._check_space(sum(self.meeting.exchange(needed)))
+        self._check_space(sum(self.collective.exchange(needed)))
 
     @on_root
     def _check_space(self, needed: int) -> None:
@@ -338,7 +338,7 @@ class RunFolder:
 
     def _check_shared(self) -> None:
         """Refuse a folder that the root rank has begun to write and that others do not see."""
-        with self.meeting.together():
+        with self.collective.together():
             if not (self.path / RECORD).is_file():
                 raise OutputError(f"{self.path}: is not the folder that rank 0 writes; choose one that all machines share")
 

@@ -18,7 +18,7 @@ from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import load_scene
 
 if TYPE_CHECKING:
-    from warp_lcp.distributed.meeting import Meeting
+    from warp_lcp.distributed.collective import Collective
     from warp_lcp.distributed.ranks import Ranks
 
 
@@ -27,10 +27,10 @@ class Launcher:
 
     Attributes:
         console: takes messages; those of the root rank.
-        meeting: of the ranks that share the work; None if this process has it alone.
+        collective: of the ranks that share the work; None if this process has it alone.
     """
 
-    meeting: Meeting | None = None
+    collective: Collective | None = None
 
     def __init__(self, console: Terminal | None = None) -> None:
         """Write messages to the error stream."""
@@ -39,12 +39,12 @@ class Launcher:
     @property
     def is_root(self) -> bool:
         """Whether this process tells the user what happens."""
-        return self.meeting is None or self.meeting.ranks.first
+        return self.collective is None or self.collective.ranks.first
 
     @property
     def ranks(self) -> Ranks | None:
         """Who share the work; None if this process has it alone."""
-        return self.meeting.ranks if self.meeting else None
+        return self.collective.ranks if self.collective else None
 
     def load(self, scene: str | None, overrides: Sequence[str], options: Mapping[str, Any]) -> GivenScene:
         """Return the scene of a run, or of one that goes on.
@@ -97,7 +97,7 @@ class Launcher:
             OutputError: the folder cannot take the run.
             SceneError: the scene cannot be simulated.
         """
-        return run_scene(request, observer=observer, stop=stop, profile=profile, meeting=self.meeting)
+        return run_scene(request, observer=observer, stop=stop, profile=profile, collective=self.collective)
 
 
 def default_folder(scene: Scene) -> Path:

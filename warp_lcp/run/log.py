@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TextIO
 
-from warp_lcp.distributed.meeting import Meeting, on_root
+from warp_lcp.distributed.collective import Collective, on_root
 from warp_lcp.frames.atomic import write_text
 from warp_lcp.simulation import InputError
 
@@ -26,20 +26,22 @@ class Log:
     The root rank writes it; methods are collective, so that a full disk ends all ranks.
     """
 
-    def __init__(self, path: Path, columns: tuple[str, ...], *, after_step: int | None = None, meeting: Meeting | None = None) -> None:
+    def __init__(
+        self, path: Path, columns: tuple[str, ...], *, after_step: int | None = None, collective: Collective | None = None
+    ) -> None:
         """Begin a log, or continue one.
 
         Args:
             path: the file.
             columns: all of its columns; the first is `step`.
             after_step: continue an existing file behind this step; later rows, and a last row cut short, are dropped.
-            meeting: of the ranks that share the run.
+            collective: of the ranks that share the run.
 
         Raises:
             OSError: the file cannot be written.
             OutputError: the existing file has other columns.
         """
-        self.columns, self.meeting = columns, meeting or Meeting.of_one()
+        self.columns, self.collective = columns, collective or Collective.of_one()
         self._open(path, columns, after_step)
 
     @on_root
@@ -72,7 +74,7 @@ class Log:
 
     def close(self) -> None:
         """Close the file; the only method that is not collective."""
-        if self.meeting.ranks.first:
+        if self.collective.ranks.first:
             self._file.close()
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
-from warp_lcp.distributed.meeting import Meeting
+from warp_lcp.distributed.collective import Collective
 from warp_lcp.frames.frames import frame_bytes
 from warp_lcp.run.check import check_memory, check_ranks, start
 from warp_lcp.run.checkpoint import PIECES, Checkpoint
@@ -80,7 +80,7 @@ def run_scene(
     observer: Observer,
     stop: Callable[[], bool | str] = lambda: False,
     profile: Profile | None = None,
-    meeting: Meeting | None = None,
+    collective: Collective | None = None,
 ) -> RunRecord:
     """Simulate a scene into a folder; collective where ranks share the run.
 
@@ -89,7 +89,7 @@ def run_scene(
         observer: learns of every step.
         stop: asked after every step; True, or what it is interrupted by, ends the run with a checkpoint, on any rank.
         profile: measures the run's stages; written to profile.json at the end.
-        meeting: of the ranks that share the run; None: this process has it alone.
+        collective: of the ranks that share the run; None: this process has it alone.
 
     Returns:
         How the run ended, as in run.json.
@@ -98,19 +98,19 @@ def run_scene(
         OutputError: the folder cannot take the run; on all ranks, as everything here.
         SceneError: the scene cannot be simulated, or not on ranks.
     """
-    scene, everyone = request.scene, meeting or Meeting.of_one()
-    if meeting is not None and request.record_problems is not None:
+    scene, everyone = request.scene, collective or Collective.of_one()
+    if collective is not None and request.record_problems is not None:
         raise OutputError("--record-problems: not with --engine petsc, whose ranks have but parts of a problem")
     share = everyone.share_of_device(request.device)
     with everyone.together():
-        if meeting is not None:
+        if collective is not None:
             check_ranks(scene)
         if not request.force_memory:
             check_memory(scene, request.device, share=share)
-    folder = RunFolder(request.out, scene, meeting)
+    folder = RunFolder(request.out, scene, collective)
     record = RunRecord(scene.scene.name, scene.scene.simulator, request.device, overrides=list(request.overrides))
-    if meeting is not None:
-        record.engine, record.ranks = Engine.PETSC.value, meeting.ranks.size
+    if collective is not None:
+        record.engine, record.ranks = Engine.PETSC.value, collective.ranks.size
     with folder.held(resume=request.resume) as remarks:
         record.warnings, record.mesh_files = list(remarks), folder.mesh_files
         continued: Continuation | None = None
@@ -123,7 +123,7 @@ def run_scene(
         else:
             folder.check_new(force=request.force)
         with everyone.together():
-            simulation, notes = _simulation(request, folder, meeting, continued)
+            simulation, notes = _simulation(request, folder, collective, continued)
         record.warnings += notes
         for note in record.warnings:
             observer.note(note)
@@ -136,22 +136,22 @@ def run_scene(
 
 
 def _simulation(
-    request: RunRequest, folder: RunFolder, meeting: Meeting | None, continued: Continuation | None
+    request: RunRequest, folder: RunFolder, collective: Collective | None, continued: Continuation | None
 ) -> tuple[Simulation, list[str]]:
     """Return the simulation where the run begins or goes on, or this rank's part of it, and what it has to say."""
     scene, notes = request.scene, list[str]()
-    simulation = start(scene, request.device, meeting.ranks if meeting else None)
+    simulation = start(scene, request.device, collective.ranks if collective else None)
     try:
         if continued and continued.checkpoint:
-            notes = _go_on(simulation, folder, continued, on_ranks=meeting is not None)
+            notes = _go_on(simulation, folder, continued, on_ranks=collective is not None)
     except ValueError as error:
         raise SceneError(scene.scene.name, [Problem("", str(error))]) from error
     if request.record_problems is not None:
         _record_problems(simulation, scene, request.record_problems, more=request.resume)
     notes = simulation.notes() + notes
-    if meeting is None:
+    if collective is None:
         return simulation, notes
-    return RankSimulation(cast(DistributedSimulation, simulation), meeting), notes
+    return RankSimulation(cast(DistributedSimulation, simulation), collective), notes
 
 
 def _go_on(simulation: Simulation, folder: RunFolder, continued: Continuation, *, on_ranks: bool) -> list[str]:
@@ -211,7 +211,7 @@ class Run:
         if isinstance(simulation, Profiled):
             simulation.watch = self.watch
         self.writer = folder.frame_writer(self.watch)
-        self._somewhere = folder.meeting.ranks.any  # what only this process knows holds for the run if it does on some rank
+        self._somewhere = folder.collective.ranks.any  # what only this process knows holds for the run if it does on some rank
         self._has_bodies = any(solid.is_body for solid in scene.solid)  # whose surfaces are part of every frame
         self._begun = clock.perf_counter()
         self._first_step = 0

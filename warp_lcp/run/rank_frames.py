@@ -7,7 +7,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from warp_lcp.distributed.meeting import Meeting, on_root
+from warp_lcp.distributed.collective import Collective, on_root
 from warp_lcp.frames.atomic import make_folder
 from warp_lcp.frames.frames import FrameFolder, FrameWriter
 from warp_lcp.frames.pieces import WHOLE, Kind, Piece, describe, write_whole
@@ -22,14 +22,14 @@ class RankFrames:
 
     Args:
         whole: the folder of the run's frames.
-        meeting: of the ranks.
+        collective: of the ranks.
     """
 
-    def __init__(self, whole: FrameFolder, meeting: Meeting) -> None:
+    def __init__(self, whole: FrameFolder, collective: Collective) -> None:
         """Look at a run's folder; nothing is written before the first frame."""
-        self.whole, self.meeting = whole, meeting
+        self.whole, self.collective = whole, collective
         self.frames = whole.frames
-        self.pieces = self.frames / rank_folder(meeting.ranks.rank)
+        self.pieces = self.frames / rank_folder(collective.ranks.rank)
 
     def write(self, index: int, time: float, frame: list[Part]) -> list[Path]:
         """Write the rank's pieces of a frame.
@@ -98,7 +98,7 @@ class RankFrameWriter:
     def __init__(self, frames: RankFrames, watch: Stopwatch) -> None:
         """Begin without frames."""
         self.newest: int | None = None
-        self._frames, self._meeting, self._mine = frames, frames.meeting, FrameWriter(frames, watch)
+        self._frames, self._collective, self._mine = frames, frames.collective, FrameWriter(frames, watch)
         self._waiting: deque[tuple[int, float, list[Pieces]]] = deque()
 
     def put(self, index: int, time: float, frame: list[Part]) -> None:
@@ -107,10 +107,10 @@ class RankFrameWriter:
         Raises:
             OSError: an earlier frame could not be written on some rank.
         """
-        with self._meeting.together():
+        with self._collective.together():
             pieces = self._frames.describe(frame)
             self._mine.put(index, time, frame)
-        self._waiting.append((index, time, self._meeting.exchange(pieces)))
+        self._waiting.append((index, time, self._collective.exchange(pieces)))
         self._publish()
 
     def check(self) -> None:
@@ -120,7 +120,7 @@ class RankFrameWriter:
             OSError: a frame could not be written.
         """
         if self._waiting:  # as on every rank
-            with self._meeting.together():
+            with self._collective.together():
                 self._mine.check()
             self._publish()
 
@@ -130,7 +130,7 @@ class RankFrameWriter:
         Raises:
             OSError: a frame could not be written.
         """
-        with self._meeting.together():
+        with self._collective.together():
             self._mine.flush()
         self._publish()
 
@@ -145,7 +145,7 @@ class RankFrameWriter:
             self.flush()
 
     def _publish(self) -> None:
-        done = min(-1 if written is None else written for written in self._meeting.exchange(self._mine.newest))
+        done = min(-1 if written is None else written for written in self._collective.exchange(self._mine.newest))
         while self._waiting and self._waiting[0][0] <= done:
             index, time, pieces = self._waiting.popleft()
             self._frames.publish(index, time, pieces)

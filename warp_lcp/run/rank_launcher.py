@@ -13,9 +13,8 @@ from typing import Any
 import typer
 import warp as wp
 
-from warp_lcp.distributed.devices import device_of_rank
-from warp_lcp.distributed.meeting import Meeting, RankFailed
-from warp_lcp.distributed.ranks import Ranks
+from warp_lcp.distributed.collective import Collective, RankFailed
+from warp_lcp.distributed.ranks import Ranks, device_of_rank
 from warp_lcp.run.continuation import mesh_digests
 from warp_lcp.run.devices import DeviceError, EngineError, devices
 from warp_lcp.run.folder import OutputError, RunRecord, mark_ended
@@ -47,7 +46,7 @@ class RankLauncher(Launcher):
         super().__init__(Terminal(stderr=True, quiet=not ranks.first))
         if not ranks.first:
             wp.config.log_level = wp.LOG_ERROR
-        self.meeting: Meeting = Meeting(ranks, PLANNED, self._last_words)
+        self.collective: Collective = Collective(ranks, PLANNED, self._last_words)
         self._folder: Path | None = None
 
     def load(self, scene: str | None, overrides: Sequence[str], options: Mapping[str, Any]) -> GivenScene:
@@ -57,7 +56,7 @@ class RankLauncher(Launcher):
             SceneError: listing everything that is wrong.
             OutputError: ranks were started with different scenes or options; the message names what differs.
         """
-        with self.meeting.together():
+        with self.collective.together():
             given = super().load(scene, overrides, options)
             meshes = {f"the content of {key}": value for key, value in mesh_digests(given.scene).items()}
         self.agree({**options, **keys(given.scene), **meshes})
@@ -70,15 +69,15 @@ class RankLauncher(Launcher):
             DeviceError: there is no such device.
         """
         devices()  # starts Warp without its native messages
-        with self.meeting.together():
+        with self.collective.together():
             try:
-                return device_of_rank(self.meeting.ranks, name)
+                return device_of_rank(self.collective.ranks, name)
             except ValueError as error:
-                raise DeviceError(str(error).removesuffix(f" (rank {self.meeting.ranks.rank})")) from error  # the meeting names it
+                raise DeviceError(str(error).removesuffix(f" (rank {self.collective.ranks.rank})")) from error  # the collective names it
 
     def place(self, device: str) -> str:
         """Return where the ranks work, in words."""
-        size = self.meeting.ranks.size
+        size = self.collective.ranks.size
         return f"{size} rank{'s' if size > 1 else ''} ({device})"
 
     def run(self, request: RunRequest, *, observer: Observer, stop: Callable[[], bool | str], profile: Profile | None) -> RunRecord:
@@ -92,10 +91,10 @@ class RankLauncher(Launcher):
         Raises:
             OutputError: they were not; the message names what differs.
         """
-        digests = self.meeting.exchange(hashlib.blake2b(pickle.dumps(sorted(given.items(), key=lambda item: item[0]))).digest())
+        digests = self.collective.exchange(hashlib.blake2b(pickle.dumps(sorted(given.items(), key=lambda item: item[0]))).digest())
         if digests.count(digests[0]) == len(digests):
             return
-        everyone = self.meeting.exchange(dict(given))
+        everyone = self.collective.exchange(dict(given))
         names = sorted({name for values in everyone for name in values if any(other.get(name) != values[name] for other in everyone)})
         lines = []
         for name in names[:SHOWN]:
@@ -110,7 +109,7 @@ class RankLauncher(Launcher):
         tell(text, error=True)
         if self._folder is not None:
             lines = text.splitlines()
-            who = f"rank {self.meeting.ranks.rank}"
+            who = f"rank {self.collective.ranks.rank}"
             mark_ended(self._folder, "failed", f"{who}: {lines[-2]}" if "Traceback" in lines[0] else lines[0])
 
 
@@ -136,7 +135,7 @@ def ranks_together() -> Iterator[RankLauncher]:
         )
     try:
         launcher = RankLauncher(ranks)
-        with launcher.meeting.together():
+        with launcher.collective.together():
             yield launcher
     except RankFailed as error:
         say(launcher.console, str(error))

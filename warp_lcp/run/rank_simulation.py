@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from warp_lcp.distributed.meeting import Meeting, RankFailed
+from warp_lcp.distributed.collective import Collective, RankFailed
 from warp_lcp.run.log import Value
 from warp_lcp.simulation import (
     Cells,
@@ -30,16 +30,16 @@ class RankSimulation:
 
     Args:
         simulation: of this rank, where the run begins or goes on.
-        meeting: of the ranks.
+        collective: of the ranks.
 
     Attributes:
         time: the simulation's [s].
         step_count: steps done.
     """
 
-    def __init__(self, simulation: DistributedSimulation, meeting: Meeting) -> None:
+    def __init__(self, simulation: DistributedSimulation, collective: Collective) -> None:
         """Take over a simulation."""
-        self._simulation, self._meeting = simulation, meeting
+        self._simulation, self._collective = simulation, collective
         self.time, self.step_count = simulation.time, simulation.step_count
         self._watch: Stopwatch = NoStopwatch()
 
@@ -56,9 +56,9 @@ class RankSimulation:
 
     def stable_dt(self) -> float:
         """Return the largest time step [s] that all ranks allow."""
-        with self._meeting.together():
+        with self._collective.together():
             mine = self._simulation.stable_dt()
-        return float(self._meeting.share(mine))
+        return float(self._collective.share(mine))
 
     def events(self, until: float) -> list[float]:
         """Return when something starts or stops, up to `until` [s]; all ranks know it."""
@@ -72,12 +72,12 @@ class RankSimulation:
             SimulationFailed: the run cannot go on.
         """
         try:
-            with self._meeting.together():
+            with self._collective.together():
                 row = self._simulation.step(dt)
         except RankFailed as error:
             raise SimulationFailed(str(error)) from error
         except StepFailed as error:
-            if len(self._meeting.failed) < self._meeting.ranks.size:  # the others have gone on: there is no state to try again from
+            if len(self._collective.failed) < self._collective.ranks.size:  # the others have gone on: there is no state to try again from
                 raise SimulationFailed(f"{error} (but not on all ranks)") from error
             raise
         self.time, self.step_count = self._simulation.time, self._simulation.step_count
@@ -89,12 +89,12 @@ class RankSimulation:
 
     def frame(self) -> list[Part]:
         """Return this rank's pieces of a frame; cells know which part of the grid they are from."""
-        with self._meeting.together():
+        with self._collective.together():
             return [replace(part, box=part.box or self._box) if isinstance(part, Cells) else part for part in self._simulation.frame()]
 
     def state(self) -> dict[str, np.ndarray]:
         """Return this rank's piece of the state."""
-        with self._meeting.together():
+        with self._collective.together():
             return self._simulation.piece_state()
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:

@@ -12,7 +12,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from warp_lcp.grid.sides import SIDES
-from warp_lcp.grid.solid_notes import STRAY
+from warp_lcp.grid.voxelize import STRAY
 from warp_lcp.problem.solve import PrecisionName
 from warp_lcp.scene.camera import Camera
 from warp_lcp.scene.motions import SinusoidMotion

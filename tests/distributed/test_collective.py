@@ -2,74 +2,74 @@
 
 import pytest
 
-from warp_lcp.distributed.meeting import Meeting
+from warp_lcp.distributed.collective import Collective
 
 BLOCKS = """
     import sys
-    from warp_lcp.distributed import meeting as meetings
+    from warp_lcp.distributed import collective as collectives
     from warp_lcp.distributed.ranks import Ranks
 
     ranks = Ranks.world()
-    meetings.PATIENCE = 1.0
-    meeting = meetings.Meeting(ranks, (OSError, ValueError), lambda text: sys.stderr.write(text + "\\n"))
+    collectives.PATIENCE = 1.0
+    collective = collectives.Collective(ranks, (OSError, ValueError), lambda text: sys.stderr.write(text + "\\n"))
 
     def one():
-        with meeting.together():
+        with collective.together():
             if ranks.rank == 1:
                 raise OSError(28, "No space left")
 
     def in_another():
-        with meeting.together(), meeting.together():
+        with collective.together(), collective.together():
             if ranks.rank == 1:
                 raise ValueError("inside")
 
     def between():
-        with meeting.together():
+        with collective.together():
             if ranks.rank == 1:
                 raise ValueError("not inside")
-            with meeting.together():
+            with collective.together():
                 pass
 
     def bug():
-        with meeting.together():
+        with collective.together():
             if ranks.rank == 1:
                 {}["key"]
 
     def all_alike():
-        with meeting.together():
+        with collective.together():
             raise ValueError("wrong")
 
     def all_but_one():
-        with meeting.together():
+        with collective.together():
             if ranks.rank:
                 raise ValueError("wrong")
 
     def led():
-        with meeting.led():
+        with collective.led():
             if ranks.first:
                 raise ValueError("from the first")
 
     def none():
-        with meeting.together():
-            assert meeting.exchange(ranks.rank) == [0, 1, 2]
-            assert meeting.share(ranks.rank) == 0
+        with collective.together():
+            assert collective.exchange(ranks.rank) == [0, 1, 2]
+            assert collective.share(ranks.rank) == 0
 
     for block in (one, in_another, between, bug, all_alike, all_but_one, led, none):
         try:
             block()
             text = "fine"
         except BaseException as error:
-            text = f"{type(error).__name__} {error} {getattr(error, 'errno', '')} {getattr(error, '__notes__', '')} {meeting.failed}"
+            text = f"{type(error).__name__} {error} {getattr(error, 'errno', '')} {getattr(error, '__notes__', '')} {collective.failed}"
         print(f"{ranks.rank} {block.__name__}: {text.strip()}\\n", end="")
 """
 ALONE = """
     import sys
-    from warp_lcp.distributed import meeting as meetings
+    from warp_lcp.distributed import collective as collectives
     from warp_lcp.distributed.ranks import Ranks
 
     ranks = Ranks.world()
-    meetings.PATIENCE = 1.0
-    with meetings.Meeting(ranks, (ValueError,), lambda text: sys.stderr.write(text + "\\n")).together():
+    collectives.PATIENCE = 1.0
+    with collectives.Collective(ranks, (ValueError,), lambda text: sys.stderr.write(text + "\\n")).together():
         if ranks.rank == 1:
             raise ValueError("left alone")
         ranks.sum(1)  # without rank 1
@@ -102,7 +102,7 @@ def test_a_rank_that_nobody_meets_ends_all(mpi):
 
 
 def test_one_process_needs_no_others():
-    alone = Meeting.of_one()
+    alone = Collective.of_one()
     with pytest.raises(KeyError), alone.together():
         {}["key"]
     with pytest.raises(OSError, match="full") as found, alone.led():

@@ -7,9 +7,9 @@ import socket
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from types import TracebackType
+from types import SimpleNamespace
 from typing import Any
 
 from warp_lcp.distributed.ranks import Ranks
@@ -42,7 +42,7 @@ class Failure:
     told: bool
 
 
-class Meeting:
+class Collective:
     """Blocks that all ranks enter, and leave in the same way.
 
     At the end of a block the ranks meet and tell each other how it went. If it failed on some, all raise: the error's own kind if that is
@@ -57,7 +57,7 @@ class Meeting:
     Attributes:
         failed: the ranks on which the last block failed.
 
-    >>> alone = Meeting.of_one()
+    >>> alone = Collective.of_one()
     >>> with alone.together():
     ...     raise OSError("the disk is full")
     Traceback (most recent call last):
@@ -67,7 +67,7 @@ class Meeting:
     def __init__(
         self, ranks: Ranks, planned: tuple[type[Exception], ...] = (OSError,), last_words: Callable[[str], object] = lambda text: None
     ) -> None:
-        """Take a communicator of its own, so that meetings are never mistaken for other messages."""
+        """Take a communicator of its own, so that its messages are never mistaken for others."""
         self.ranks = ranks
         self.last_words = last_words
         self._planned = planned
@@ -77,24 +77,24 @@ class Meeting:
         self._told: BaseException | None = None  # what a block has raised on all ranks
 
     @classmethod
-    def of_one(cls) -> Meeting:
-        """Return the meeting of a process that has no others, which needs no MPI."""
-        return cls(Ranks(_Alone()))
+    def of_one(cls) -> Collective:
+        """Return that of a process that has no others, which needs no MPI."""
+        return cls(Ranks(SimpleNamespace(rank=0, size=1, allgather=lambda value: [value], bcast=lambda value: value)))
 
     def together(self) -> AbstractContextManager[None]:
         """Return the context of what all ranks do."""
-        return _Block(self, named=True)
+        return self._block(named=True)
 
     def led(self) -> AbstractContextManager[None]:
-        """Return the context of what the first rank does for all; its message speaks for itself."""
-        return _Block(self, named=False)
+        """Return the context of what the root rank does for all; its message speaks for itself."""
+        return self._block(named=False)
 
     def exchange(self, value: Any) -> list[Any]:
         """Return what each rank has given."""
         return list(self._comm.allgather(value))
 
     def share(self, value: Any) -> Any:
-        """Return what the first rank has given."""
+        """Return what the root rank has given."""
         return self._comm.bcast(value)
 
     def share_of_device(self, device: str) -> float:
@@ -102,11 +102,17 @@ class Meeting:
         places = self.exchange((socket.gethostname(), device))
         return places.count(places[self.ranks.rank]) / len(places)
 
-    def enter(self) -> None:
-        """Begin a block."""
+    @contextmanager
+    def _block(self, *, named: bool) -> Iterator[None]:
         self._depth += 1
+        try:
+            yield
+        except BaseException as error:
+            self._leave(error, named=named)
+            raise
+        self._leave(None, named=named)
 
-    def leave(self, error: BaseException | None, *, named: bool) -> None:
+    def _leave(self, error: BaseException | None, *, named: bool) -> None:
         """End a block.
 
         Args:
@@ -168,33 +174,6 @@ class Meeting:
         self._comm.Abort(1)
 
 
-class _Block:
-    """A block of a meeting."""
-
-    def __init__(self, meeting: Meeting, *, named: bool) -> None:
-        self._meeting, self._named = meeting, named
-
-    def __enter__(self) -> None:
-        self._meeting.enter()
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self._meeting.leave(error, named=self._named)
-
-
-class _Alone:
-    """A communicator of one rank."""
-
-    rank, size = 0, 1
-
-    def allgather(self, value: Any) -> list[Any]:
-        """Return what was given."""
-        return [value]
-
-    def bcast(self, value: Any) -> Any:
-        """Return what was given."""
-        return value
-
-
 def _done(request: Any) -> bool:
     """Wait for the other ranks, but not for ever."""
     end = time.monotonic() + PATIENCE
@@ -228,11 +207,11 @@ def _lines(failed: list[tuple[int, Failure]]) -> Iterator[str]:
 
 
 def on_root(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Have the root rank alone run a method of an object with a `meeting`, collectively: the others get None, and its error is theirs."""
+    """Have the root rank alone run a method of an object with a `collective`: the others get None, and its error is theirs."""
 
     @functools.wraps(method)
     def collective(self: Any, *arguments: Any, **options: Any) -> Any:
-        with self.meeting.led():
-            return method(self, *arguments, **options) if self.meeting.ranks.first else None
+        with self.collective.led():
+            return method(self, *arguments, **options) if self.collective.ranks.first else None
 
     return collective
