@@ -178,12 +178,12 @@ def measure(ranks: Ranks, sizes: Sequence[int], *, device: str, repeat: int, say
         for case in shared:
             case.sample(keep=False)
             case.counts |= {name: shared[WALLS].counts[name] for name in MEMORY}
-        scene = splash(n) if ranks.first and _fits(n**3, here) else None
+        scene = splash(n) if ranks.is_root and _fits(n**3, here) else None
         cases += [(case, None if scene is None else Growing(scene, case.bounds, here)) for case in shared]
     if not cases:
         raise MemoryError(f"none of the sizes {', '.join(map(str, sizes))} fits")
     for turn in range(repeat + 1):
-        if ranks.first:
+        if ranks.is_root:
             say(f"ranks: {ranks.size}, round {turn} of {repeat}")
         for case, plain in cases:
             if turn:
@@ -226,10 +226,10 @@ def together(sizes: Sequence[int], *, device: str, repeat: int, say: Callable[[s
         with Collective(ranks, PLANNED, say).together():
             records = measure(ranks, sizes, device=device, repeat=repeat, say=say)
     except (RankFailed, *PLANNED) as error:
-        if ranks.first:
+        if ranks.is_root:
             say(str(error))
         raise SystemExit(WRONG_INPUT if isinstance(error, ValueError) else FAILED) from error
-    if not ranks.first:
+    if not ranks.is_root:
         raise SystemExit(0)
     return records
 

@@ -163,7 +163,7 @@ class DistributedLiquid(LiquidSimulation):
         return totals
 
     def _trouble(self, totals: ParticleTotals, end: np.ndarray) -> str:
-        """Return what the first rank says on whose part something is wrong."""
+        """Return what the root rank says on whose part something is wrong."""
         told = self.part.ranks.comm.allgather(super()._trouble(totals, end))
         return next((text for text in told if text), "")
 

@@ -64,7 +64,7 @@ def run(ranks: Ranks, folder: Path) -> None:
         box_ = simulation.part.box
         assert ((everyone[ranks.rank][1].index >= box_.low) & (everyone[ranks.rank][1].index < box_.high)).all()
         pressure = np.concatenate([cells.fields["pressure"] for _, cells in everyone])
-        if ranks.first:
+        if ranks.is_root:
             order = np.lexsort(cells.T)
             np.savez(folder / f"{name}_{ranks.size}.npz", cells=cells[order], pressure=pressure[order])
             (folder / f"{name}_{ranks.size}.json").write_text(json.dumps(rows))
@@ -76,7 +76,7 @@ def keep(ranks: Ranks, folder: Path) -> None:
     first = advance(simulation, 5)
     np.savez(folder / f"piece_{ranks.rank}.npz", **simulation.piece_state())
     rows = first + advance(simulation, 5)
-    if ranks.first:
+    if ranks.is_root:
         (folder / "whole.json").write_text(json.dumps(rows))
     ranks.comm.Barrier()  # all pieces are there
 
@@ -87,7 +87,7 @@ def go_on(ranks: Ranks, folder: Path) -> None:
     simulation = start(ranks, "cut")
     simulation.restore_pieces(pieces)
     rows = advance(simulation, 5)
-    if ranks.first:
+    if ranks.is_root:
         (folder / f"rest_{ranks.size}.json").write_text(json.dumps(rows))
     with pytest.raises(ValueError, match="do not cover the domain"):
         simulation.restore_pieces(pieces[1:])
@@ -123,7 +123,7 @@ def dam(ranks: Ranks, folder: Path) -> None:
     """Run the scene that comes with the package."""
     simulation = create(load_scene("dam-break"), ranks, device="cpu", folder=Path())
     rows = advance(simulation, DAM_STEPS)
-    if ranks.first:
+    if ranks.is_root:
         (folder / "dam.json").write_text(json.dumps(rows))
 
 

@@ -47,5 +47,5 @@ if __name__ == "__main__":
         "closed": told(closed(0.0), PetscActiveSet()),
         "closed, filled": told(closed(1.0), PetscActiveSet()),
     }
-    if Ranks.world().first:
+    if Ranks.world().is_root:
         print(json.dumps(found))

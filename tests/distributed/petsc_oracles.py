@@ -190,5 +190,5 @@ def differences(x, places, other_x, other_places):
 if __name__ == "__main__":
     wp.config.log_level = wp.LOG_ERROR
     found = {f"{name}, {bounds}": compare(small(name, bounds)) for name in sys.argv[1:] for bounds in BOUNDS}
-    if Ranks.world().first:
+    if Ranks.world().is_root:
         print(json.dumps(found))

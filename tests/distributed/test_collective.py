@@ -46,7 +46,7 @@ BLOCKS = """
 
     def led():
         with collective.led():
-            if ranks.first:
+            if ranks.is_root:
                 raise ValueError("from the first")
 
     def none():

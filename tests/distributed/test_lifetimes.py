@@ -13,7 +13,7 @@ PROGRAM = """
         return forest
 
     kept = make()
-    if ranks.first:
+    if ranks.is_root:
         del kept
         gc.collect()
     make()

@@ -24,7 +24,7 @@ FAIL = """
                 ranks.agree("the scene", f"text {ranks.rank == 1}")
             ranks.sum(1)  # with the others they wait here for a rank that does not come
     except ValueError as error:
-        if ranks.first:
+        if ranks.is_root:
             say(str(error))
         sys.exit(2)
     print("done")

@@ -47,7 +47,7 @@ def test_a_wrong_solution_is_seen(mpi):
     right = walls.residual(x)
     x[0, 3, 3] += 0.1 * walls.ranks.rank  # beside the cut, on one rank only
     wrong = walls.residual(x)
-    if walls.ranks.first:
+    if walls.ranks.is_root:
         print(right < 1e-8, wrong > 1e-3)
     """
     assert mpi(2, text).stdout.split() == ["True", "True"]

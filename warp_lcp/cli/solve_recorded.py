@@ -158,9 +158,9 @@ def _bound(values: np.ndarray) -> float | np.ndarray:
 
 
 def _write_boxes(path: Path, x: np.ndarray, shape: tuple[int, ...], decomposition: Decomposition) -> None:
-    """Write the ranks' boxes of x into one array, of which the first rank holds one box at a time."""
+    """Write the ranks' boxes of x into one array, of which the root rank holds one box at a time."""
     comm, boxes = decomposition.ranks.comm, decomposition.boxes
-    if not decomposition.ranks.first:
+    if not decomposition.ranks.is_root:
         comm.Send(np.ascontiguousarray(x, dtype=np.float64), dest=0)
         return
     with replacing(path) as temporary:

@@ -212,6 +212,6 @@ def on_root(method: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(method)
     def collective(self: Any, *arguments: Any, **options: Any) -> Any:
         with self.collective.led():
-            return method(self, *arguments, **options) if self.collective.ranks.first else None
+            return method(self, *arguments, **options) if self.collective.ranks.is_root else None
 
     return collective

@@ -53,7 +53,7 @@ class Ranks:
         return int(self.comm.size)
 
     @property
-    def first(self) -> bool:
+    def is_root(self) -> bool:
         """Whether this is the root rank, which writes and tells for all."""
         return self.rank == 0
 

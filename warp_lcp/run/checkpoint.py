@@ -134,7 +134,7 @@ class CheckpointFolder:
             file = self.of_rank(self.collective.ranks.rank)._write(checkpoint)
         checksums = self.collective.exchange(checkpoint.checksum)
         with self.collective.led():
-            if self.collective.ranks.first:
+            if self.collective.ranks.is_root:
                 self._write(Checkpoint(checkpoint.step, checkpoint.time, {PIECES: np.array(checksums)}))
         return file
 

@@ -228,7 +228,7 @@ class RunFolder:
                 return continued
             if not checkpoint.state:
                 with self.collective.together():
-                    state = whole if self.collective.ranks.first else self.checkpoints.read(checkpoint.step).state
+                    state = whole if self.collective.ranks.is_root else self.checkpoints.read(checkpoint.step).state
                 return replace(continued, checkpoint=replace(checkpoint, state=state))
 
     @on_root
@@ -309,7 +309,7 @@ class RunFolder:
         Raises:
             OSError: the disk is full before the run begins, or cannot be written at all; on the root rank.
         """
-        if not self.collective.ranks.first:
+        if not self.collective.ranks.is_root:
             return
         text, begins = json.dumps(asdict(record), indent=2) + "\n", record.status == "running"
         if begins:

@@ -39,7 +39,7 @@ class Launcher:
     @property
     def is_root(self) -> bool:
         """Whether this process tells the user what happens."""
-        return self.collective is None or self.collective.ranks.first
+        return self.collective is None or self.collective.ranks.is_root
 
     @property
     def ranks(self) -> Ranks | None:

@@ -74,7 +74,7 @@ class Log:
 
     def close(self) -> None:
         """Close the file; the only method that is not collective."""
-        if self.collective.ranks.first:
+        if self.collective.ranks.is_root:
             self._file.close()
 
 

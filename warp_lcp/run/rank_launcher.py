@@ -43,8 +43,8 @@ class RankLauncher(Launcher):
 
     def __init__(self, ranks: Ranks) -> None:
         """Have messages of the root rank alone."""
-        super().__init__(Terminal(stderr=True, quiet=not ranks.first))
-        if not ranks.first:
+        super().__init__(Terminal(stderr=True, quiet=not ranks.is_root))
+        if not ranks.is_root:
             wp.config.log_level = wp.LOG_ERROR
         self.collective: Collective = Collective(ranks, PLANNED, self._last_words)
         self._folder: Path | None = None
@@ -105,7 +105,7 @@ class RankLauncher(Launcher):
         raise OutputError("\n  ".join(["the ranks were started with different scenes or options", *lines]))
 
     def _last_words(self, text: str) -> None:
-        """Say why all processes end now, and write it into run.json, which the first rank cannot do from inside MPI."""
+        """Say why all processes end now, and write it into run.json, which the root rank cannot do from inside MPI."""
         tell(text, error=True)
         if self._folder is not None:
             lines = text.splitlines()
@@ -141,7 +141,7 @@ def ranks_together() -> Iterator[RankLauncher]:
         say(launcher.console, str(error))
         raise typer.Exit(1) from error
     except PLANNED as error:
-        if ranks.first:
+        if ranks.is_root:
             raise
         raise typer.Exit(2 if isinstance(error, InputError) else 1) from error
 
