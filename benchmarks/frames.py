@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.frames.atomic import replacing
+from warp_lcp.files.atomic import replacing
 from warp_lcp.frames.nvdb import write_nvdb
 from warp_lcp.frames.vti import write_vti
 from warp_lcp.frames.vtu import write_vtu

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warp_lcp.frames.atomic import replacing, write_text
+from warp_lcp.files.atomic import replacing, write_text
 from warp_lcp.run.checkpoint import Checkpoint, CheckpointError, CheckpointFolder
 
 STATE = {"position": np.random.default_rng(977).random((30, 3)), "count": np.array(7), "name": np.array("apic"), "none": np.empty((0, 3))}

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from test_crash_points import contents, go
 
-from warp_lcp.frames import atomic
+from warp_lcp.files import atomic
 from warp_lcp.run import folder as run_folder
 from warp_lcp.run.folder import OutputError, RunRecord
 

@@ -15,7 +15,7 @@ import pytest
 from test_crash_points import contents, go, revive
 
 from warp_lcp.cli.solve_file import write_vector
-from warp_lcp.frames import atomic
+from warp_lcp.files import atomic
 from warp_lcp.frames.ply import write_ply
 from warp_lcp.run.checkpoint import CheckpointFolder
 from warp_lcp.run.problem_folder import ProblemFolder

@@ -13,10 +13,10 @@ from typer.testing import CliRunner, Result
 
 from small_runs import MINIMAL, run_into
 from warp_lcp.cli import commands as cli
+from warp_lcp.files.foreign import one_line, visible
 from warp_lcp.run import folder as run_folder
 from warp_lcp.run.progress import Lines
 from warp_lcp.run.terminal import Terminal, say
-from warp_lcp.scene.foreign import one_line, visible
 from warp_lcp.scene.scene_file import load_scene
 
 FORGED = "finished: frame 4 of 4 reached"

@@ -13,7 +13,7 @@ import scipy.sparse
 from rich.table import Table
 
 from warp_lcp.cli.matrix_market import MarketError, read_market
-from warp_lcp.frames.atomic import replacing
+from warp_lcp.files.atomic import replacing
 from warp_lcp.operators import DenseOperator, SparseOperator
 from warp_lcp.problem.lcp import LCP
 from warp_lcp.problem.protocol import families

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from warp_lcp.cli.solve_file import Outcome, criteria, method_named
-from warp_lcp.frames.atomic import replacing
+from warp_lcp.files.atomic import replacing
 from warp_lcp.gallery.recorded import cell_counts, load_part
 from warp_lcp.operators import GridPoisson
 from warp_lcp.problem.lcp import LCP

@@ -1,1 +1,1 @@
-"""What readers of files believe: sizes that fit, arrays of plain numbers."""
+"""Files of any program: written whole or not at all, read without believing what they claim, told without obeying what they say."""

@@ -11,7 +11,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Literal, Protocol, Self
 
-from warp_lcp.frames.atomic import make_folder, write_text
+from warp_lcp.files.atomic import make_folder, write_text
 from warp_lcp.frames.nvdb import nvdb_bytes, write_nvdb
 from warp_lcp.frames.pieces import WHOLE, piece_files
 from warp_lcp.frames.ply import ply_bytes, write_ply

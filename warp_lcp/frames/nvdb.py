@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_lcp.frames.atomic import replacing
+from warp_lcp.files.atomic import replacing
 from warp_lcp.frames.vtk_xml import raw
 from warp_lcp.simulation import Volume
 

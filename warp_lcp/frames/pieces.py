@@ -9,8 +9,8 @@ from typing import Literal
 
 import numpy as np
 
+from warp_lcp.files.atomic import write_text
 from warp_lcp.files.claims import read_whole
-from warp_lcp.frames.atomic import write_text
 from warp_lcp.frames.rank_folder import RANK_FOLDER
 from warp_lcp.frames.vti import GHOSTS, extent_of, image_box, image_end
 from warp_lcp.frames.vtk_xml import attributes, opening, read_back, root, writable

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_lcp.frames.atomic import replacing
+from warp_lcp.files.atomic import replacing
 from warp_lcp.simulation import Surface
 
 TYPES = {"f4": "float", "f8": "double", "i4": "int", "u4": "uint", "i2": "short", "u2": "ushort", "i1": "char", "u1": "uchar"}

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from warp_lcp.files.atomic import replacing
 from warp_lcp.files.claims import read_whole
-from warp_lcp.frames.atomic import replacing
 from warp_lcp.frames.vtk_xml import inline, inline_values, opening, read_back, root, writable
 from warp_lcp.simulation import Cells, Points, Surface
 

@@ -11,7 +11,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from warp_lcp.frames.atomic import replacing
+from warp_lcp.files.atomic import replacing
 from warp_lcp.render.recording import RenderError
 
 INSTALL_ENCODER = "pip install 'imageio-ffmpeg>=0.6'"

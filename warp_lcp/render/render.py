@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_lcp.frames.atomic import replacing
+from warp_lcp.files.atomic import replacing
 from warp_lcp.render.film import Film, film_suffix
 from warp_lcp.render.page import Page, Painter
 from warp_lcp.render.recording import Color, Recording, RenderError, Show, spread

@@ -16,7 +16,7 @@ import numpy as np
 
 from warp_lcp.distributed.collective import Collective, on_root
 from warp_lcp.files.archive import Archive, ArchiveError
-from warp_lcp.frames.atomic import make_folder, replacing
+from warp_lcp.files.atomic import make_folder, replacing
 from warp_lcp.frames.rank_folder import in_ranks, rank_folder
 
 FORMAT = 2

@@ -18,7 +18,8 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from warp_lcp.distributed.collective import Collective, on_root
-from warp_lcp.frames.atomic import SPARE, SUFFIX, make_folder, reserve, sync_folder, write_text
+from warp_lcp.files.atomic import SPARE, SUFFIX, make_folder, reserve, sync_folder, write_text
+from warp_lcp.files.foreign import one_line
 from warp_lcp.frames.frames import FRAME_FILE, FrameFolder, FrameWriter
 from warp_lcp.frames.rank_folder import in_ranks, remove_empty_ranks
 from warp_lcp.run.checkpoint import CHECKPOINT_FILE, PIECES, REFUSED_FILE, Checkpoint, CheckpointFolder
@@ -28,7 +29,6 @@ from warp_lcp.run.folder_lock import LOCK, FolderBusyError, locked
 from warp_lcp.run.gaps import gaps
 from warp_lcp.run.log import Log, OutputError
 from warp_lcp.run.rank_frames import RankFrames, RankFrameWriter
-from warp_lcp.scene.foreign import one_line
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import dump_scene, keys, load_scene, table_keys
 from warp_lcp.scene.table import SceneError

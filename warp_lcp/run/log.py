@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TextIO
 
 from warp_lcp.distributed.collective import Collective, on_root
-from warp_lcp.frames.atomic import write_text
+from warp_lcp.files.atomic import write_text
 from warp_lcp.simulation import InputError
 
 Value = float | int | str | None

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_lcp.frames.atomic import make_folder, replacing, write_text
+from warp_lcp.files.atomic import make_folder, replacing, write_text
 from warp_lcp.gallery.recorded import DESCRIPTION, files
 from warp_lcp.run.folder import OutputError
 from warp_lcp.simulation import InputError

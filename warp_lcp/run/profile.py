@@ -12,7 +12,7 @@ from pathlib import Path
 
 import warp as wp
 
-from warp_lcp.frames.atomic import write_text
+from warp_lcp.files.atomic import write_text
 from warp_lcp.run.terminal import table_lines
 
 PROFILE = "profile.json"

@@ -8,7 +8,7 @@ from types import TracebackType
 from typing import Self
 
 from warp_lcp.distributed.collective import Collective, on_root
-from warp_lcp.frames.atomic import make_folder
+from warp_lcp.files.atomic import make_folder
 from warp_lcp.frames.frames import FrameFolder, FrameWriter
 from warp_lcp.frames.pieces import WHOLE, Kind, Piece, describe, write_whole
 from warp_lcp.frames.rank_folder import rank_folder

@@ -14,8 +14,8 @@ from rich.table import Column, Table
 from rich.text import Text
 from typer.core import TyperGroup
 
+from warp_lcp.files.foreign import one_line, visible
 from warp_lcp.run.kernel_cache import KernelCacheError
-from warp_lcp.scene.foreign import one_line, visible
 
 FREE_TEXT = "--set"  # its values may be arrays of several lines
 Refusal: Any = typer.BadParameter.__mro__[2]  # click's ClickException, which new versions of typer have inside them

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from warp_lcp.frames.atomic import write_text
+from warp_lcp.files.atomic import write_text
 from warp_lcp.run.trial import Bounds, Trial, spread_of, trial
 from warp_lcp.scene.presets import Preset, PresetName, Prices, changed, price_table
 from warp_lcp.scene.scene import Scene
