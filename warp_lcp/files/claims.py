@@ -1,4 +1,4 @@
-"""What files claim to hold: sizes that nobody believes before they fit what the file has and the memory that is free."""
+"""What others wrote: sizes that nobody believes before they fit the file and the memory, and text that is shown and not obeyed."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ except ImportError:  # not on Windows
     resource = None  # type: ignore[assignment]
 
 MEMORY = Path("/proc/meminfo")
+LAYOUT = "\n\t"  # what a text of several lines may hold
 OWN_SIZE = Path("/proc/self/statm")  # pages, those of the address space first
 
 
@@ -73,3 +74,23 @@ def _bytes(count: int) -> str:
     """Return a number of bytes as a reader grasps it."""
     count = min(count, 10**24)  # beyond what a float holds nobody counts
     return f"{count} bytes" if count < 10_000 else f"{count / 1e6:.3g} MB" if count < 10_000_000 else f"{count / 1e9:.3g} GB"
+
+
+def visible(text: str) -> str:
+    r"""Return a text with an escape in place of each character that does not print: controls, writing directions, half of a pair.
+
+    >>> visible("\x1b]0;title\x07\n\u202e\udcff")
+    '\\x1b]0;title\\x07\n\\u202e\\udcff'
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c in LAYOUT else c.encode("unicode_escape").decode() for c in text)
+
+
+def one_line(text: str) -> str:
+    r"""Return a text that stands within a line, where a break would let it pretend to be another message.
+
+    >>> one_line("pool\nfinished: frame 4 of 4")
+    'pool\\nfinished: frame 4 of 4'
+    """
+    return text if text.isprintable() else "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

@@ -19,7 +19,7 @@ from pydantic import TypeAdapter
 
 from warp_lcp.distributed.collective import Collective, on_root
 from warp_lcp.files.atomic import SPARE, SUFFIX, make_folder, reserve, sync_folder, write_text
-from warp_lcp.files.foreign import one_line
+from warp_lcp.files.claims import one_line
 from warp_lcp.frames.frames import FRAME_FILE, FrameFolder, FrameWriter
 from warp_lcp.frames.rank_folder import in_ranks, remove_empty_ranks
 from warp_lcp.run.checkpoint import CHECKPOINT_FILE, PIECES, REFUSED_FILE, Checkpoint, CheckpointFolder

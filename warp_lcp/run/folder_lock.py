@@ -12,7 +12,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from warp_lcp.files.foreign import one_line
+from warp_lcp.files.claims import one_line
 
 try:
     import fcntl

@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn
 from rich.table import Column
 
-from warp_lcp.files.foreign import one_line
+from warp_lcp.files.claims import one_line
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.run.log import Value
 from warp_lcp.run.terminal import say
