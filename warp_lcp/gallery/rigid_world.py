@@ -63,9 +63,7 @@ class World:
     contact_solve: ContactSolve = field(init=False)
 
     def __post_init__(self) -> None:
-        """Check friction and gravity, and make the bodies."""
-        if not 0 <= self.friction < np.inf:
-            raise ValueError(f"friction = {self.friction}: must be >= 0 and finite")
+        """Check gravity, and make the bodies, which check the rest."""
         if not np.isfinite(self.gravity).all():
             raise ValueError(f"gravity = {self.gravity}: must be finite, in m/s^2")
         if not len(self.solids):
@@ -112,14 +110,14 @@ class World:
         """
         if not (dt > 0 and 0 <= rate <= 1):
             raise ValueError(f"dt = {dt}, rate = {rate}: must be > 0 and in [0, 1]")
-        n, contacts, dim = len(self.bodies), self.contacts(dt), 3
+        n, contacts = len(self.bodies), self.contacts(dt)
         joints = [hinge.rows(self.bodies, dt, rate) for hinge in self.hinges]
         J = scipy.sparse.csr_array(scipy.sparse.vstack([contacts.jacobian(n), *(rows.J for rows in joints)]))
         masses = [np.zeros((6, 6)) if still else body.free_inverse_mass(3) for body, still in zip(self.bodies, self.fixed, strict=True)]
         response = scipy.sparse.csr_array(scipy.sparse.bsr_array((np.array(masses), np.arange(n), np.arange(n + 1))) @ J.T)
         falling = self.velocities()
         falling[~self.fixed, :3] += dt * np.array(self.gravity)
-        bias, gap = np.zeros((len(contacts), dim)), contacts.gap
+        bias, gap = np.zeros((len(contacts), 3)), contacts.gap
         bias[:, 0] = np.where(gap > 0, gap, rate * np.minimum(gap + SLOP * self.size, 0.0)) / dt
         bias, low, high = (
             np.concatenate([own, *(getattr(rows, name) for rows in joints)])

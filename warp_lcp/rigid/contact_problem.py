@@ -16,7 +16,6 @@ import warp as wp
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from warp_lcp.rigid.contacts import jacobian
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.stopping import StoppingCriteria
 
@@ -63,11 +62,6 @@ class ContactProblem:
         more = YIELDS * own
         more[:, 0] = 0.0
         return (own + more).ravel(), more.ravel()
-
-    def matrix(self) -> np.ndarray:
-        """Return B, shape (k rows, k rows)."""
-        J = jacobian(self.first, self.second, self.one, self.other, self.bodies)
-        return np.asarray((J @ J.T).toarray() + np.diag(self.yields()[1]))
 
     def islands(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the contacts sorted by groups of bodies that touch each other, and where each group begins."""

@@ -11,7 +11,7 @@ from warp_lcp.rigid.body import AXES, PLANAR, RigidBody
 from warp_lcp.rigid.contact_detection import ContactDetection, ContactPair, ContactPoints
 from warp_lcp.rigid.contact_problem import ContactProblem
 from warp_lcp.rigid.contact_shape import ContactShape
-from warp_lcp.rigid.contacts import ContactMemory, Contacts
+from warp_lcp.rigid.contacts import ContactMemory, Contacts, contact_frames
 from warp_lcp.rigid.firm import SINGULAR, Firm
 from warp_lcp.rigid.obstacles import Obstacle
 from warp_lcp.stopping import StoppingCriteria
@@ -224,19 +224,3 @@ def _carried(motion: Motion | None, points: np.ndarray, time: float, dt: float) 
         return np.zeros_like(points)
     way = motion.pose(time + dt).after(motion.pose(time).inverse())
     return np.asarray((way.apply(points) - points) / dt)
-
-
-def contact_frames(normal: np.ndarray, dimension: int, ways: Sequence[tuple[np.ndarray, float]] = ()) -> np.ndarray:
-    """Return normal and tangents of contacts, shape (k, dimension, 3), right-handed in space.
-
-    There the first tangent is along the last of some ways that is longer than its least: boxes of friction then are as wide as the cone
-    where it counts.
-    """
-    if dimension == 2:
-        return np.stack([normal, np.stack([-normal[:, 1], normal[:, 0], np.zeros(len(normal))], axis=1)], axis=1)
-    u = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
-    for way, least in ways:
-        along = way - (way * normal).sum(axis=1)[:, None] * normal
-        u = np.where((np.linalg.norm(along, axis=1) > least)[:, None], along, u)
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    return np.stack([normal, u, np.cross(normal, u)], axis=1)
