@@ -12,6 +12,7 @@ from warp_lcp.gallery.contact_models import ContactSystem
 from warp_lcp.gallery.hinges import Hinge
 from warp_lcp.grid.solids import Box, Sphere
 from warp_lcp.rigid.body import RigidBody
+from warp_lcp.rigid.contact_detection import ContactDetection
 from warp_lcp.rigid.contact_shape import ContactShape
 from warp_lcp.rigid.contact_solve import ContactSolve
 from warp_lcp.rigid.contacts import Contacts
@@ -72,7 +73,7 @@ class World:
         made = [_made(solid, 1.0 if m == FIXED else m) for solid, m in zip(self.solids, self.mass, strict=True)]
         self.bodies = [RigidBody(properties, name=f"body {i}", friction=self.friction) for i, (properties, _) in enumerate(made)]
         shapes = [shape for _, shape in made]
-        self.contact_solve = ContactSolve(self.bodies, shapes, self.obstacles, 3, every=True)
+        self.contact_solve = ContactSolve(ContactDetection(self.bodies, shapes, self.obstacles, 3, every=True))
         self.size = min(shape.reach(properties.center) for properties, shape in made)  # reach of the smallest body [m]
 
     def velocities(self) -> np.ndarray:

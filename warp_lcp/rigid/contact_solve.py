@@ -7,13 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from warp_lcp.grid.motion import Motion
-from warp_lcp.rigid.body import AXES, PLANAR, RigidBody
+from warp_lcp.rigid.body import AXES, PLANAR
 from warp_lcp.rigid.contact_detection import ContactDetection, ContactPair, ContactPoints
 from warp_lcp.rigid.contact_problem import ContactProblem
-from warp_lcp.rigid.contact_shape import ContactShape
 from warp_lcp.rigid.contacts import ContactMemory, Contacts, contact_frames
 from warp_lcp.rigid.firm import SINGULAR, Firm
-from warp_lcp.rigid.obstacles import Obstacle
 from warp_lcp.stopping import StoppingCriteria
 
 NEAR = 1e-2  # of the smallest body's size: gaps up to it are contacts, besides those that speeds may close in a step
@@ -32,28 +30,17 @@ class ContactSolve:
     """Find contacts and solve for their impulses.
 
     Args:
-        bodies: all.
-        shapes: of the bodies as placed.
-        obstacles: what else there is.
-        dimension: 2 or 3.
-        every: see `ContactDetection`.
+        detection: of the bodies.
 
     Attributes:
         residual: of the last problem, relative to that of no impulses; 0 without contacts.
         memory: impulses of the last step.
     """
 
-    def __init__(
-        self,
-        bodies: Sequence[RigidBody],
-        shapes: Sequence[ContactShape],
-        obstacles: Sequence[Obstacle],
-        dimension: int,
-        every: bool = False,
-    ) -> None:
-        self.bodies, self.dimension = list(bodies), dimension
+    def __init__(self, detection: ContactDetection) -> None:
+        self.detection, self.bodies, self.dimension = detection, detection.bodies, detection.dimension
         self.residual, self.memory = 0.0, ContactMemory(len(self.bodies))
-        self.detection = ContactDetection(self.bodies, shapes, obstacles, dimension, every)
+        bodies, shapes = self.bodies, detection.shapes
         self._reach = np.array([shape.reach(body.properties.center) for body, shape in zip(bodies, shapes, strict=True)])
         self._size = np.array([shape.size for shape in shapes])
         self._friction = np.array([body.friction for body in bodies])
