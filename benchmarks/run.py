@@ -22,7 +22,7 @@ from warp_lcp.material import particle_simulation
 from warp_lcp.material.boundary import WholeCells
 from warp_lcp.run.loop import RunRequest, run_scene
 from warp_lcp.scene.scene_file import load_scene
-from warp_lcp.simulation import simulators
+from warp_lcp.scene.simulator import simulators
 
 TITLE = "Runs of built-in scenes"
 SCENES = {"dam-break-2d": 0.3, "dam-break": 0.2}  # [s] simulated

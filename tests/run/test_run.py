@@ -364,7 +364,9 @@ def test_a_frame_that_fails_late_ends_the_run_without_a_checkpoint_after_it(dots
     assert result.reason.startswith("the disk is full")
     assert sorted(path.name for path in out.glob("frames/particles*")) == [f"particles_{k:06d}.vtu" for k in range(3)]
     monkeypatch.undo()
-    monkeypatch.setattr("warp_lcp.simulation.entry_points", lambda group: [type("Entry", (), {"name": "dots", "load": lambda _: dots})()])
+    monkeypatch.setattr(
+        "warp_lcp.scene.simulator.entry_points", lambda group: [type("Entry", (), {"name": "dots", "load": lambda _: dots})()]
+    )
     assert go(scene_file, out, resume=True).status == "finished"
     assert contents(out) == contents(whole)
 
