@@ -46,6 +46,7 @@ class World:
         bodies: their state; steps write it.
         fixed: which do not move, shape (n,).
         contact_solve: what finds contacts, and remembers their impulses.
+        size: reach of the smallest body [m].
 
     Raises:
         ValueError: there is no body, a mass is not positive, friction is negative, or gravity is not finite.
@@ -62,6 +63,7 @@ class World:
     bodies: list[RigidBody] = field(init=False)
     fixed: np.ndarray = field(init=False)
     contact_solve: ContactSolve = field(init=False)
+    size: float = field(init=False)
 
     def __post_init__(self) -> None:
         """Check gravity, and make the bodies, which check the rest."""
@@ -74,7 +76,7 @@ class World:
         self.bodies = [RigidBody(properties, name=f"body {i}", friction=self.friction) for i, (properties, _) in enumerate(made)]
         shapes = [shape for _, shape in made]
         self.contact_solve = ContactSolve(ContactDetection(self.bodies, shapes, self.obstacles, 3, every=True))
-        self.size = min(shape.reach(properties.center) for properties, shape in made)  # reach of the smallest body [m]
+        self.size = min(shape.reach(properties.center) for properties, shape in made)
 
     def velocities(self) -> np.ndarray:
         """Return velocities, linear and angular, of the bodies [m/s, rad/s], shape (n, 6)."""
