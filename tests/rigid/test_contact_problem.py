@@ -12,6 +12,7 @@ from warp_lcp.grid.solids import Box, Sphere
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rigid.contact_problem import ContactProblem
+from warp_lcp.rigid.contacts import jacobian
 
 EXACT = StoppingCriteria(rtol=1e-7, max_iterations=2000)
 
@@ -38,7 +39,9 @@ def test_impulses_solve_the_lcp_with_affine_bounds(dimension, seed):
     """The residual is recomputed by the package from the matrix, and its own NNCG finds the same impulses."""
     made = problem_of(dimension, seed)
     x, relative = made.solve(EXACT)
-    system = ContactSystem("", scipy.sparse.csr_array(made.matrix()), made.b.ravel(), made.friction, dim=dimension)
+    J = jacobian(made.first, made.second, made.one, made.other, made.bodies)
+    B = scipy.sparse.csr_array(J @ J.T + scipy.sparse.diags_array(made.yields()[1]))
+    system = ContactSystem("", B, made.b.ravel(), made.friction, dim=dimension)
     problem = BoxedModel().problem(system).dense().lcp(device="cpu")
     residual, field = NaturalResidual(problem), problem.layout.load(x.ravel(), wp.float64, "x")
     problem.bounds.refresh()

@@ -18,8 +18,7 @@ from warp_lcp.gallery.hinges import WORLD, Hinge
 from warp_lcp.gallery.problem import Problem
 from warp_lcp.gallery.rigid_world import FIXED, GRAVITY, Parts, World
 from warp_lcp.grid.solids import Box, Placement, Sphere
-from warp_lcp.rigid.contact_solve import contact_frames
-from warp_lcp.rigid.contacts import jacobian
+from warp_lcp.rigid.contacts import contact_frames, jacobian
 from warp_lcp.rigid.obstacles import Obstacle
 from warp_lcp.solvers.nncg import NNCG
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from warp_lcp.rigid.body import RigidBody
-from warp_lcp.rigid.contacts import jacobian
+from warp_lcp.rigid.contacts import contact_frames, jacobian
 
 WORLD = -1  # in the place of a body: the hinge is fixed in space
 NEAR_LIMIT = 0.2  # [rad]: a limit that is farther away has no row
@@ -68,7 +68,8 @@ class Hinge:
     def angle(self, bodies: Sequence[RigidBody]) -> float:
         """Return the angle of first relative to second [rad], in (-pi, pi]."""
         R, S = (self.side(bodies, number)[2] for number in (self.first, self.second))
-        mine, other = R @ _across(self.axis), S @ _across(self.axis)
+        zero = contact_frames(self.axis[None], 3)[0, 1]  # a direction across the axis that is the same for both at angle 0
+        mine, other = R @ zero, S @ zero
         return float(np.arctan2(np.cross(other, mine) @ (R @ self.axis), other @ mine))
 
     def rows(self, bodies: Sequence[RigidBody], dt: float, rate: float) -> HingeRows:
@@ -80,9 +81,8 @@ class Hinge:
         (arm, anchor, R), (other_arm, other_anchor, S) = (self.side(bodies, number) for number in (self.first, self.second))
         apart, axis, other_axis = anchor - other_anchor, R @ self.axis, S @ self.axis
         arm, other_arm = arm - 0.5 * apart, other_arm + 0.5 * apart  # one point for both impulses: they keep the angular momentum
-        u = _across(axis)
         linear = [np.concatenate([e, np.cross(arm, e), -e, -np.cross(other_arm, e)]) for e in np.eye(3)]
-        across = np.array([u, np.cross(axis, u)])
+        across = contact_frames(axis[None], 3)[0, 1:]
         turn = np.array([np.concatenate([np.zeros(3), d, np.zeros(3), -d]) for d in (*across, axis)])
         error = np.concatenate([apart, -across @ np.cross(axis, other_axis)])
         rows, bias = [*linear, *turn[:2]], list(rate / dt * error)
@@ -114,9 +114,3 @@ class HingeRows:
     bias: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
-
-
-def _across(axis: np.ndarray) -> np.ndarray:
-    """Return a unit vector normal to a direction."""
-    u = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-    return np.asarray(u / np.linalg.norm(u))

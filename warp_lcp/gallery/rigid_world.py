@@ -12,6 +12,7 @@ from warp_lcp.gallery.contact_models import ContactSystem
 from warp_lcp.gallery.hinges import Hinge
 from warp_lcp.grid.solids import Box, Sphere
 from warp_lcp.rigid.body import RigidBody
+from warp_lcp.rigid.contact_detection import ContactDetection
 from warp_lcp.rigid.contact_shape import ContactShape
 from warp_lcp.rigid.contact_solve import ContactSolve
 from warp_lcp.rigid.contacts import Contacts
@@ -45,6 +46,7 @@ class World:
         bodies: their state; steps write it.
         fixed: which do not move, shape (n,).
         contact_solve: what finds contacts, and remembers their impulses.
+        size: reach of the smallest body [m].
 
     Raises:
         ValueError: there is no body, a mass is not positive, friction is negative, or gravity is not finite.
@@ -61,11 +63,10 @@ class World:
     bodies: list[RigidBody] = field(init=False)
     fixed: np.ndarray = field(init=False)
     contact_solve: ContactSolve = field(init=False)
+    size: float = field(init=False)
 
     def __post_init__(self) -> None:
-        """Check friction and gravity, and make the bodies."""
-        if not 0 <= self.friction < np.inf:
-            raise ValueError(f"friction = {self.friction}: must be >= 0 and finite")
+        """Check gravity, and make the bodies, which check the rest."""
         if not np.isfinite(self.gravity).all():
             raise ValueError(f"gravity = {self.gravity}: must be finite, in m/s^2")
         if not len(self.solids):
@@ -74,8 +75,8 @@ class World:
         made = [_made(solid, 1.0 if m == FIXED else m) for solid, m in zip(self.solids, self.mass, strict=True)]
         self.bodies = [RigidBody(properties, name=f"body {i}", friction=self.friction) for i, (properties, _) in enumerate(made)]
         shapes = [shape for _, shape in made]
-        self.contact_solve = ContactSolve(self.bodies, shapes, self.obstacles, 3, every=True)
-        self.size = min(shape.reach(properties.center) for properties, shape in made)  # reach of the smallest body [m]
+        self.contact_solve = ContactSolve(ContactDetection(self.bodies, shapes, self.obstacles, 3, every=True))
+        self.size = min(shape.reach(properties.center) for properties, shape in made)
 
     def velocities(self) -> np.ndarray:
         """Return velocities, linear and angular, of the bodies [m/s, rad/s], shape (n, 6)."""
@@ -112,14 +113,14 @@ class World:
         """
         if not (dt > 0 and 0 <= rate <= 1):
             raise ValueError(f"dt = {dt}, rate = {rate}: must be > 0 and in [0, 1]")
-        n, contacts, dim = len(self.bodies), self.contacts(dt), 3
+        n, contacts = len(self.bodies), self.contacts(dt)
         joints = [hinge.rows(self.bodies, dt, rate) for hinge in self.hinges]
         J = scipy.sparse.csr_array(scipy.sparse.vstack([contacts.jacobian(n), *(rows.J for rows in joints)]))
         masses = [np.zeros((6, 6)) if still else body.free_inverse_mass(3) for body, still in zip(self.bodies, self.fixed, strict=True)]
         response = scipy.sparse.csr_array(scipy.sparse.bsr_array((np.array(masses), np.arange(n), np.arange(n + 1))) @ J.T)
         falling = self.velocities()
         falling[~self.fixed, :3] += dt * np.array(self.gravity)
-        bias, gap = np.zeros((len(contacts), dim)), contacts.gap
+        bias, gap = np.zeros((len(contacts), 3)), contacts.gap
         bias[:, 0] = np.where(gap > 0, gap, rate * np.minimum(gap + SLOP * self.size, 0.0)) / dt
         bias, low, high = (
             np.concatenate([own, *(getattr(rows, name) for rows in joints)])

@@ -9,6 +9,7 @@ import numpy as np
 
 from warp_lcp.grid.solids import Geometry
 from warp_lcp.rigid.body import BodyMotion, RigidBody
+from warp_lcp.rigid.contact_detection import ContactDetection
 from warp_lcp.rigid.contact_shape import ContactShape
 from warp_lcp.rigid.contact_solve import Contacts, ContactSolve
 from warp_lcp.rigid.obstacles import Obstacle
@@ -73,7 +74,7 @@ class RigidBodies:
         self.motions = [BodyMotion(body) for body in bodies]
         self._geometries = list(geometries)
         self.shapes = [ContactShape.of(geometry, dimension) for geometry in geometries]
-        self._solve = ContactSolve(self.bodies, self.shapes, obstacles, dimension)
+        self._solve = ContactSolve(ContactDetection(self.bodies, self.shapes, obstacles, dimension))
         self._surfaces: list[BodySurface] | None = None
         self._begun: _Begun | None = None
         self.contacts, self.contact_residual = 0, 0.0

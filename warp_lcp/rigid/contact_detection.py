@@ -215,9 +215,8 @@ class ContactDetection:
         dimension: int,
         every: bool = False,
     ) -> None:
-        self.obstacles, self._bodies, self._shapes = obstacles, bodies, shapes
+        self.bodies, self.shapes, self.obstacles, self.dimension, self._every = list(bodies), shapes, obstacles, dimension, every
         self._center = np.array([body.properties.center for body in bodies])
-        self._dimension, self._every = dimension, every
         self._middle = np.array([0.5 * (shape.low + shape.high) for shape in shapes])
         self._half = np.array([0.5 * (shape.high - shape.low) - shape.radius for shape in shapes])
         self._radius = np.array([shape.radius for shape in shapes])
@@ -231,7 +230,7 @@ class ContactDetection:
             brought: gap up to which a body that rests touches each obstacle [m].
             near: gap up to which bodies that rest touch each other [m].
         """
-        turns, at = (np.array([getattr(body, name) for body in self._bodies]) for name in ("rotation", "position"))
+        turns, at = (np.array([getattr(body, name) for body in self.bodies]) for name in ("rotation", "position"))
         shifts = at - (turns @ self._center[:, :, None])[:, :, 0]
         poses = [Place(turn, shift) for turn, shift in zip(turns, shifts, strict=True)]
         middle = (turns @ self._middle[:, :, None])[:, :, 0] + shifts
@@ -242,12 +241,12 @@ class ContactDetection:
         margins = near + ways[:, None] + ways
         apart = (np.abs(middle[:, None] - middle) - half[:, None] - half).max(axis=2)
         for i, j in np.argwhere(np.tril(apart <= margins, -1)).tolist():
-            points = between(self._shapes[i], poses[i], self._shapes[j], poses[j], float(margins[i, j]), self._dimension)
-            found.append(ContactPair(i, j, self._kept(points, min(self._shapes[i].size, self._shapes[j].size))))
+            points = between(self.shapes[i], poses[i], self.shapes[j], poses[j], float(margins[i, j]), self.dimension)
+            found.append(ContactPair(i, j, self._kept(points, min(self.shapes[i].size, self.shapes[j].size))))
         return [entry for entry in found if len(entry.points)]
 
     def _kept(self, points: ContactPoints, size: float) -> ContactPoints:
-        return points if self._every else spread(points, size, self._dimension)
+        return points if self._every else spread(points, size, self.dimension)
 
     def _with_obstacle(
         self, obstacle: Obstacle, there: Pose, poses: list[Place], middle: np.ndarray, half: np.ndarray, margins: np.ndarray
@@ -258,7 +257,7 @@ class ContactDetection:
             points, normals = there.apply(obstacle.points), obstacle.normals @ there.rotation.T
             heights = middle @ normals.T - (points * normals).sum(axis=1) - half @ np.abs(normals).T
             for i in np.flatnonzero((heights <= margins[:, None]).any(axis=1)).tolist():
-                mine, chosen = self._shapes[i], np.flatnonzero(heights[i] <= margins[i])
+                mine, chosen = self.shapes[i], np.flatnonzero(heights[i] <= margins[i])
                 each = [self._kept(on_plane(mine, poses[i], points[m], normals[m], margins[i]), mine.size) for m in chosen]
                 pairs.append(ContactPair(i, n, ContactPoints.joined(each), obstacle))
         else:
@@ -267,6 +266,6 @@ class ContactDetection:
                 center, reach = there.apply(0.5 * (shape.low + shape.high)), np.abs(there.rotation) @ (0.5 * (shape.high - shape.low))
                 near = (np.abs(middle - center) - half - reach).max(axis=1) <= margins
             for i in np.flatnonzero(near).tolist():
-                touch = between(self._shapes[i], poses[i], shape, there, float(margins[i]), self._dimension)
-                pairs.append(ContactPair(i, n, self._kept(touch, min(self._shapes[i].size, shape.size)), obstacle))
+                touch = between(self.shapes[i], poses[i], shape, there, float(margins[i]), self.dimension)
+                pairs.append(ContactPair(i, n, self._kept(touch, min(self.shapes[i].size, shape.size)), obstacle))
         return pairs

@@ -17,7 +17,6 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from warp_lcp.problem.stopping import StoppingCriteria
-from warp_lcp.rigid.contacts import jacobian
 from warp_lcp.rows import RowPass, Rows
 
 YIELDS = 1e-6  # of B, along tangents: how friction is shared between contacts then is unique, and rest creeps by 1e-7 m/s at most
@@ -63,11 +62,6 @@ class ContactProblem:
         more = YIELDS * own
         more[:, 0] = 0.0
         return (own + more).ravel(), more.ravel()
-
-    def matrix(self) -> np.ndarray:
-        """Return B, shape (k rows, k rows)."""
-        J = jacobian(self.first, self.second, self.one, self.other, self.bodies)
-        return np.asarray((J @ J.T).toarray() + np.diag(self.yields()[1]))
 
     def islands(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the contacts sorted by groups of bodies that touch each other, and where each group begins."""

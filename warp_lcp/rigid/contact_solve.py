@@ -8,13 +8,11 @@ import numpy as np
 
 from warp_lcp.grid.motion import Motion
 from warp_lcp.problem.stopping import StoppingCriteria
-from warp_lcp.rigid.body import AXES, PLANAR, RigidBody
+from warp_lcp.rigid.body import AXES, PLANAR
 from warp_lcp.rigid.contact_detection import ContactDetection, ContactPair, ContactPoints
 from warp_lcp.rigid.contact_problem import ContactProblem
-from warp_lcp.rigid.contact_shape import ContactShape
-from warp_lcp.rigid.contacts import ContactMemory, Contacts
+from warp_lcp.rigid.contacts import ContactMemory, Contacts, contact_frames
 from warp_lcp.rigid.firm import SINGULAR, Firm
-from warp_lcp.rigid.obstacles import Obstacle
 
 NEAR = 1e-2  # of the smallest body's size: gaps up to it are contacts, besides those that speeds may close in a step
 AHEAD = 2.0  # of the way that speeds and gravity make in a step: what a material gives a body is not known before it is solved for
@@ -32,28 +30,17 @@ class ContactSolve:
     """Find contacts and solve for their impulses.
 
     Args:
-        bodies: all.
-        shapes: of the bodies as placed.
-        obstacles: what else there is.
-        dimension: 2 or 3.
-        every: see `ContactDetection`.
+        detection: of the bodies.
 
     Attributes:
         residual: of the last problem, relative to that of no impulses; 0 without contacts.
         memory: impulses of the last step.
     """
 
-    def __init__(
-        self,
-        bodies: Sequence[RigidBody],
-        shapes: Sequence[ContactShape],
-        obstacles: Sequence[Obstacle],
-        dimension: int,
-        every: bool = False,
-    ) -> None:
-        self.bodies, self.dimension = list(bodies), dimension
+    def __init__(self, detection: ContactDetection) -> None:
+        self.detection, self.bodies, self.dimension = detection, detection.bodies, detection.dimension
         self.residual, self.memory = 0.0, ContactMemory(len(self.bodies))
-        self.detection = ContactDetection(self.bodies, shapes, obstacles, dimension, every)
+        bodies, shapes = self.bodies, detection.shapes
         self._reach = np.array([shape.reach(body.properties.center) for body, shape in zip(bodies, shapes, strict=True)])
         self._size = np.array([shape.size for shape in shapes])
         self._friction = np.array([body.friction for body in bodies])
@@ -224,19 +211,3 @@ def _carried(motion: Motion | None, points: np.ndarray, time: float, dt: float) 
         return np.zeros_like(points)
     way = motion.pose(time + dt).after(motion.pose(time).inverse())
     return np.asarray((way.apply(points) - points) / dt)
-
-
-def contact_frames(normal: np.ndarray, dimension: int, ways: Sequence[tuple[np.ndarray, float]] = ()) -> np.ndarray:
-    """Return normal and tangents of contacts, shape (k, dimension, 3), right-handed in space.
-
-    There the first tangent is along the last of some ways that is longer than its least: boxes of friction then are as wide as the cone
-    where it counts.
-    """
-    if dimension == 2:
-        return np.stack([normal, np.stack([-normal[:, 1], normal[:, 0], np.zeros(len(normal))], axis=1)], axis=1)
-    u = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
-    for way, least in ways:
-        along = way - (way * normal).sum(axis=1)[:, None] * normal
-        u = np.where((np.linalg.norm(along, axis=1) > least)[:, None], along, u)
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    return np.stack([normal, u, np.cross(normal, u)], axis=1)

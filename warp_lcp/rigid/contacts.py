@@ -124,3 +124,19 @@ def jacobian(first: np.ndarray, second: np.ndarray, one: np.ndarray, other: np.n
     k, rows, q = one.shape
     blocks, places = np.stack([one, other], axis=1).reshape(2 * k, rows, q), np.stack([first, second], axis=1).ravel()
     return csr_array(bsr_array((blocks, places, 2 * np.arange(k + 1)), shape=(k * rows, (bodies + 1) * q)).tocsr()[:, : bodies * q])
+
+
+def contact_frames(normal: np.ndarray, dimension: int, ways: Sequence[tuple[np.ndarray, float]] = ()) -> np.ndarray:
+    """Return normal and tangents of contacts, shape (k, dimension, 3), right-handed in space.
+
+    There the first tangent is along the last of some ways that is longer than its least: boxes of friction then are as wide as the cone
+    where it counts.
+    """
+    if dimension == 2:
+        return np.stack([normal, np.stack([-normal[:, 1], normal[:, 0], np.zeros(len(normal))], axis=1)], axis=1)
+    u = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
+    for way, least in ways:
+        along = way - (way * normal).sum(axis=1)[:, None] * normal
+        u = np.where((np.linalg.norm(along, axis=1) > least)[:, None], along, u)
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    return np.stack([normal, u, np.cross(normal, u)], axis=1)
