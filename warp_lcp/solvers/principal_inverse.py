@@ -88,15 +88,13 @@ class PrincipalInverse:
         """Return z with A_FF z = r, refined; the least-squares solution where A_FF is singular."""
         if self.count == 0:
             return np.zeros(0)
-        if not self.singular:
-            z = self._refined(r)
-            if self._meets(z, r):
-                return z
-            self.refresh()
-        if not self.singular:
-            z = self._refined(r)
-            if self._meets(z, r):
-                return z
+        for fresh in (False, True):
+            if not self.singular:
+                z = self._refined(r)
+                if self._meets(z, r):
+                    return z
+                if not fresh:
+                    self.refresh()
         return np.linalg.lstsq(self.block, r, rcond=RANK)[0]
 
     def refresh(self) -> None:
