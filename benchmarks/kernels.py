@@ -14,12 +14,12 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
+from benchmarks.harness.machine import COPIED, machine, present
+from benchmarks.harness.record import Bars, Record, Results, Table
+from benchmarks.harness.timing import Figure, Options, in_turns, ratios
 from benchmarks.kernel_peers import numba_products, plain_product
 from benchmarks.launches import Launch, Traffic, distinct, listen, stored_sizes, traffic
-from benchmarks.machine import COPIED, machine, present
 from benchmarks.problems import Splash, basin
-from benchmarks.record import Bars, Record, Results, Table
-from benchmarks.timing import Figure, Options, in_turns, ratios
 
 TITLE = "Kernels of the grid engine on the finest grid"
 SIZES = (128, 256)

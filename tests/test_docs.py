@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 import warp_lcp as wl
-from benchmarks import sweep_prices
 from code_blocks import blocks, run
 from warp_lcp.driver.scene_file import load_scene
 from warp_lcp.protocol import CAPABILITIES, families, members
@@ -56,10 +55,6 @@ def test_capabilities_have_their_rows():
 
 
 def test_prices_name_methods():
-    """Rows of the tables of prices are those of the benchmarks."""
-    named = re.findall(r"^\| (?:walls|everywhere) \| ([\w.-]+) \|", TEXT, flags=re.M)
-    assert set(named) <= set(sweep_prices.METHODS)
-    assert "multigrid" in named
     assert set(re.findall(r"^\| ([a-z-]+) \| (?:\d|refused|[A-Z_]{5})", TEXT, flags=re.M)) <= set(wl.METHODS)
 
 

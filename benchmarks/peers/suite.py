@@ -9,14 +9,13 @@ from pathlib import Path
 
 import warp_lcp as wl
 from benchmarks.cases import RTOL, Case
-from benchmarks.machine import COPIED, machine
+from benchmarks.harness.machine import COPIED, machine
+from benchmarks.harness.record import MACHINE, Bars, Record, Results, Table, Target
+from benchmarks.harness.timing import Figure, Options, ratios
 from benchmarks.peers.foreign import PeerFailed
 from benchmarks.peers.peer import Answer, Peer, Question
 from benchmarks.peers.roster import Roster, roster
 from benchmarks.problems import BOUNDS, splash
-from benchmarks.record import MACHINE, Bars, Record, Results, Table
-from benchmarks.targets import Target
-from benchmarks.timing import Figure, Options, ratios
 
 TITLE = "Pressure solves against peers"
 SIZES = (32, 64, 128)

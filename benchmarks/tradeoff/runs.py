@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
 
-from benchmarks.memory import array_bytes
-from benchmarks.timing import Figure, Options
+from benchmarks.harness.machine import array_bytes
+from benchmarks.harness.timing import Figure, Options
 from benchmarks.tradeoff.settings import REFERENCE, Setting
 from warp_lcp.driver.presets import changed, price_table
 from warp_lcp.driver.scene import Scene

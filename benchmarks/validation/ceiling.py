@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from benchmarks.record import Chart
+from benchmarks.harness.record import Chart
 from benchmarks.validation.finding import Findings, Trial, attempt
 from benchmarks.validation.tank import DENSITY, GRAVITY, SUB_CELL, VOXEL, Numerics, box, create, positions, pressures, steps
 from fluids import LiquidSimulation

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.record import Chart, Lines
+from benchmarks.harness.record import Chart, Lines
 from benchmarks.validation.enclosed import filled_fraction
 from benchmarks.validation.finding import Findings, Trial, attempt
 from benchmarks.validation.signals import best_pace, best_shift, front, relative_rms, stays, surface_height
@@ -57,11 +57,10 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
     for t in trials:
         fronts |= {f"{t.resolution}{label[5:]}": curve for label, curve in t.curves.items() if label.startswith("front")}
         heights |= {f"{t.resolution}{label[6:]}": curve for label, curve in t.curves.items() if label.startswith("height")}
-    linear = {"logarithmic_x": False, "logarithmic_y": False}
     data = frozenset({"Martin & Moyce"})
     return trials, [
-        Lines("dam-break-front", "Front of a collapsing column", "T = n t sqrt(g / a)", "Z = x / a", fronts, marked=data, **linear),
-        Lines("dam-break-height", "Height at the wall", "tau = t sqrt(g / a)", "H = y / (n^2 a)", heights, marked=data, **linear),
+        Lines("dam-break-front", "Front of a collapsing column", "T = n t sqrt(g / a)", "Z = x / a", fronts, marked=data, log=""),
+        Lines("dam-break-height", "Height at the wall", "tau = t sqrt(g / a)", "H = y / (n^2 a)", heights, marked=data, log=""),
     ]
 
 

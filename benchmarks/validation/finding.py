@@ -7,11 +7,11 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
-from benchmarks.record import Record, Table
-from benchmarks.timing import Figure
+from benchmarks.harness.record import Record, Table
+from benchmarks.harness.timing import Figure
 from warp_lcp.driver.simulator import SimulationFailed, StepFailed
 
-COLUMNS = ("check", "resolution", "figure", "measured", "bound", "as it must be?")
+COLUMNS = ("at", "figure", "measured", "bound", "as it must be?")
 
 
 @dataclass(frozen=True)
@@ -144,10 +144,8 @@ class Findings:
         self.findings.append(control(Finding(what, float(value), low, high, unit)))
 
 
-def table(trials: Sequence[Trial]) -> Table:
-    """Return all findings."""
-    rows = [[t.check, t.resolution, *f.row()] for t in trials for f in t.findings]
-    rows += [[t.check, t.resolution, "error", t.error, "none", "NO"] for t in trials if t.error]
-    wrong = sum(row[-1] == "NO" for row in rows)
-    remark = f"{len(rows)} figures in {sum(t.seconds for t in trials):.0f} s, {wrong} not as they must be."
-    return Table("Findings", COLUMNS, rows, remark + " A control is wrong on purpose: it must break its bound.")
+def table(check: str, remark: str, trials: Sequence[Trial]) -> Table:
+    """Return all findings of a check; a control is wrong on purpose: it must break its bound."""
+    rows = [[t.name, *f.row()] for t in trials for f in sorted(t.findings, key=lambda f: f.control)]
+    rows += [[t.name, "error", t.error, "none", "NO"] for t in trials if t.error]
+    return Table(check, COLUMNS, rows, remark)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.record import Chart
+from benchmarks.harness.record import Chart
 from benchmarks.validation import sand_pit, tank
 from benchmarks.validation.finding import Findings, Trial, attempt
 from benchmarks.validation.tank import GRAVITY, SUB_CELL, VOXEL, box

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.record import Chart
+from benchmarks.harness.record import Chart
 from benchmarks.validation.finding import Findings, Trial, attempt
 from benchmarks.validation.tank import DENSITY, GRAVITY, SUB_CELL, VOXEL, box, create, steps
 from fluids import LiquidSimulation

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.record import Chart, Lines
+from benchmarks.harness.record import Chart, Lines
 from benchmarks.validation.finding import Findings, Trial, attempt
 from granular.materials import MATERIALS
 from granular.scene import SandScene
@@ -54,8 +54,8 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
     y = np.linspace(0.0, DEPTH, 40)
     profiles |= {f"Bagnold, {a:g} degrees": ((y / DEPTH).tolist(), bagnold_profile(y, a).tolist()) for a in STEADY}
     return trials, [
-        Lines("inclined-layer", title, "slope [degrees]", "a / g", curves, logarithmic_x=False, logarithmic_y=False),
-        Lines("bagnold-layer", f"{BAGNOLD}: speed", "y / depth", "u [m/s]", profiles, logarithmic_x=False, logarithmic_y=False),
+        Lines("inclined-layer", title, "slope [degrees]", "a / g", curves, log=""),
+        Lines("bagnold-layer", f"{BAGNOLD}: speed", "y / depth", "u [m/s]", profiles, log=""),
     ]
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.record import Chart, Lines
+from benchmarks.harness.record import Chart, Lines
 from benchmarks.validation import tank
 from benchmarks.validation.enclosed import enclosed_cells
 from benchmarks.validation.finding import Findings, Trial, attempt
@@ -71,13 +71,9 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
             if t.check == check and label != "profile"
         }
         name = check.replace(" ", "-")
-        charts.append(Lines(name, title, "t [s]", "largest speed / sqrt(g dx)", speeds, logarithmic_x=False))
+        charts.append(Lines(name, title, "t [s]", "largest speed / sqrt(g dx)", speeds, log="y"))
     exact = {"rho g (h - y)": ([0.0, 1.0], [1.0, 0.0])}
-    charts.append(
-        Lines(
-            "pressure", "Pressure in a pool at rest", "y / h", "p / (rho g h)", exact | profiles, logarithmic_x=False, logarithmic_y=False
-        )
-    )
+    charts.append(Lines("pressure", "Pressure in a pool at rest", "y / h", "p / (rho g h)", exact | profiles, log=""))
     return trials, charts
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.record import Chart, Lines
+from benchmarks.harness.record import Chart, Lines
 from benchmarks.validation.finding import Findings, Trial, attempt
 from benchmarks.validation.sand_pit import (
     FLOOR,
@@ -102,7 +102,7 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
             "sand-runout", "Runout of collapsing columns", "a = height / width", "runout / width", curves,
             marked=frozenset(t.resolution for t in trials),
         ),
-        Lines("sand-piles", "Piles", "x / width", "y / width", shapes, logarithmic_x=False, logarithmic_y=False),
+        Lines("sand-piles", "Piles", "x / width", "y / width", shapes, log=""),
     ]  # fmt: skip
 
 

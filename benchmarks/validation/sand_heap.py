@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from benchmarks.record import Chart, Lines
+from benchmarks.harness.record import Chart, Lines
 from benchmarks.validation.finding import Findings, Trial, attempt
 from benchmarks.validation.sand_pit import create, positions, share_solved, steps
 from granular.simulator import SandSimulation
@@ -72,7 +72,7 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
 
     trials.append(attempt("sand heap", "both", compare))
     curves: dict[str, Any] = {f"{t.resolution}: {label}": curve for t in trials for label, curve in t.curves.items()}
-    return trials, [Lines("sand-heaps", "Heaps and wedges", "x [m]", "y [m]", curves, logarithmic_x=False, logarithmic_y=False)]
+    return trials, [Lines("sand-heaps", "Heaps and wedges", "x [m]", "y [m]", curves, log="")]
 
 
 def heaps(cells: int, device: str = "cpu", angles: Sequence[float] = ANGLES, *, controls: bool = True) -> Trial:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.record import Chart, Lines
+from benchmarks.harness.record import Chart, Lines
 from benchmarks.validation import tank
 from benchmarks.validation.finding import Findings, Trial, attempt
 from benchmarks.validation.sand_pit import CORRECTED, GRAVITY, Row, create, positions, share_solved, steps
@@ -57,11 +57,11 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
     return trials, [
         Lines(
             "sand-discharge", "Discharge of a bin over its fill", "fill / width", "rate / first rate", rates,
-            logarithmic_x=False, logarithmic_y=False,
+            log="",
         ),
         Lines(
             "sand-slot", "Discharge over the slot", "D [m]", "(rate)^(2/3) [m^(4/3) / s^(2/3)]", laws,
-            logarithmic_x=False, logarithmic_y=False, marked=frozenset(t.resolution for t in trials),
+            log="", marked=frozenset(t.resolution for t in trials),
         ),
     ]  # fmt: skip
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.record import Chart, Lines
+from benchmarks.harness.record import Chart, Lines
 from benchmarks.validation.finding import Findings, Trial, attempt
 from benchmarks.validation.sand_pit import GRAVITY, TOLERANCE, WIDTH, Row, column, steps
 from granular.simulator import SandSimulation
@@ -21,7 +21,7 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
     trials = [trial(n, device) for n in RESOLUTIONS]
     curves = {f"{t.resolution}: {label}": curve for t in trials for label, curve in t.curves.items()}
     title = "Densest cell of a collapsing column"
-    return trials, [Lines("sand-density", title, "t [s]", "fraction", curves, logarithmic_x=False, logarithmic_y=False)]
+    return trials, [Lines("sand-density", title, "t [s]", "fraction", curves, log="")]
 
 
 def trial(cells: int, device: str = "cpu", duration: float = DURATION) -> Trial:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.record import Chart
+from benchmarks.harness.record import Chart
 from benchmarks.validation.finding import Findings, Trial, attempt
 from benchmarks.validation.sand_pit import CORRECTED, GRAVITY, create, steps
 from benchmarks.validation.tank import box

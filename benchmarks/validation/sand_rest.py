@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.record import Chart, Lines
+from benchmarks.harness.record import Chart, Lines
 from benchmarks.validation.finding import Findings, Trial, attempt
 from benchmarks.validation.sand_collapse import envelope
 from benchmarks.validation.sand_pit import GRAVITY, WIDTH, column, drift, runout, share_solved, steps
@@ -30,7 +30,7 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
     """Run the check at its resolutions."""
     trials = [trial(n, device) for n in RESOLUTIONS] + [models(RESOLUTIONS[0], device)]
     curves = {f"{t.resolution}: {label}": curve for t in trials for label, curve in t.curves.items()}
-    return trials, [Lines("sand-rest", "Drift of a pile", "t [s]", "heights / s", curves, logarithmic_x=False)]
+    return trials, [Lines("sand-rest", "Drift of a pile", "t [s]", "heights / s", curves, log="y")]
 
 
 def trial(cells: int, device: str = "cpu", watches: int = WATCHES) -> Trial:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from benchmarks.record import Chart, Lines
+from benchmarks.harness.record import Chart, Lines
 from benchmarks.validation.finding import Findings, Trial, attempt
 from benchmarks.validation.sand_pit import GRAVITY, Row, create
 from granular.simulator import SandSimulation
@@ -77,7 +77,7 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
     for ratio in RATIOS:
         curves[f"Janssen, mu = 0.5, K = {ratio:.2g}"] = (depths, [janssen(z, 0.5, ratio) for z in depths])
     title = "Vertical stress in a silo"
-    return trials, [Lines("sand-silo", title, "z / W", "sigma / (rho g W)", curves, logarithmic_x=False, logarithmic_y=False)]
+    return trials, [Lines("sand-silo", title, "z / W", "sigma / (rho g W)", curves, log="")]
 
 
 def trial(cells: int, dimension: int = 2, device: str = "cpu", frictions: tuple[float, ...] = FRICTIONS, deep: float = 0.0) -> Trial:

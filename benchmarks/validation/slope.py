@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.record import Chart
+from benchmarks.harness.record import Chart
 from benchmarks.validation.finding import Findings, Trial, attempt
 from benchmarks.validation.tank import SUB_CELL, VOXEL, Numerics, box, create, positions, steps, velocities
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.record import Chart, Lines
+from benchmarks.harness.record import Chart, Lines
 from benchmarks.validation.finding import Findings, Trial, attempt
 from benchmarks.validation.signals import mode, period
 from benchmarks.validation.tank import GRAVITY, PER_AXIS, SUB_CELL, VOXEL, Numerics, create, positions, steps
@@ -37,7 +37,7 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
     curves = {"linear theory": (time.tolist(), np.cos(2.0 * math.pi * time / PERIOD).tolist())}
     for t in trials:
         curves |= t.curves
-    chart = Lines("sloshing", "First mode of the elevation", "t [s]", "amplitude / start", curves, logarithmic_x=False, logarithmic_y=False)
+    chart = Lines("sloshing", "First mode of the elevation", "t [s]", "amplitude / start", curves, log="")
     return [*trials, comparison], [chart]
 
 

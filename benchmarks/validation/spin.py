@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.record import Chart, Lines
+from benchmarks.harness.record import Chart, Lines
 from benchmarks.validation.finding import Findings, Trial, attempt
 from benchmarks.validation.tank import GRAVITY, SUB_CELL, create, positions, steps
 from benchmarks.validation.transfers import angular_momentum

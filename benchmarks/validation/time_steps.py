@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.energy import Ledger
-from benchmarks.record import Chart, Lines
+from benchmarks.harness.record import Chart, Lines
 from benchmarks.validation import sand_pit, tank
+from benchmarks.validation.energy import Ledger
 from benchmarks.validation.finding import Findings, Trial, attempt
 from benchmarks.validation.tank import SUB_CELL, VOXEL, box
 from warp_lcp.operators.grid_poisson import FLUID
@@ -30,7 +30,7 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
     trials = [trial(n, device, what) for n in RESOLUTIONS for what in LONGEST]
     curves = {f"{t.resolution}: {label}": curve for t in trials for label, curve in t.curves.items()}
     title = "Energy of a collapse by the length of steps"
-    return trials, [Lines("time-steps", title, "t [s]", "energy / start", curves, logarithmic_x=False, logarithmic_y=False)]
+    return trials, [Lines("time-steps", title, "t [s]", "energy / start", curves, log="")]
 
 
 def trial(cells: int, device: str, what: str) -> Trial:

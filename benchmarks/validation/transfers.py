@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from benchmarks.record import Chart, Lines
+from benchmarks.harness.record import Chart, Lines
 from benchmarks.validation.finding import Findings, Trial, attempt
 from benchmarks.validation.signals import order
 from warp_lcp.grid.advection import advect, clearance

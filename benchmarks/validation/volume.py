@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.record import Chart, Lines
+from benchmarks.harness.record import Chart, Lines
 from benchmarks.validation import dam_break
 from benchmarks.validation.enclosed import enclosed_cells
 from benchmarks.validation.finding import Findings, Trial, attempt
@@ -25,7 +25,7 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
     trials = [*(trial(n, device) for n in RESOLUTIONS), *(dam_trial(n, device) for n in dam_break.RESOLUTIONS)]
     curves = {f"{t.resolution}: {label}": curve for t in trials for label, curve in t.curves.items()}
     title = "Volume of two columns that collapse"
-    return trials, [Lines("volume", title, "t [s]", "volume / start", curves, logarithmic_x=False, logarithmic_y=False)]
+    return trials, [Lines("volume", title, "t [s]", "volume / start", curves, log="")]
 
 
 def trial(resolution: int, device: str, numerics: Numerics = SUB_CELL) -> Trial:

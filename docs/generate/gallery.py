@@ -18,7 +18,7 @@ from typing import Any
 
 from PIL import Image
 
-from benchmarks.machine import cpu_model
+from benchmarks.harness.machine import cpu_model
 
 DOCS = Path(__file__).parents[1]
 PAGE, FOLDER = DOCS / "gallery.md", DOCS / "gallery"

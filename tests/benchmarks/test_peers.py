@@ -7,19 +7,19 @@ from functools import partial
 
 import numpy as np
 import pytest
+from benchmarks.implicit_mpm import NEWTON
 from typer.testing import CliRunner
 
 import warp_lcp as wl
 from benchmarks import chart
-from benchmarks.implicit_mpm import NEWTON
+from benchmarks.harness.record import Record, read_json, write_json
+from benchmarks.harness.timing import Figure
 from benchmarks.peers import foreign, linear, quadratic, suite
 from benchmarks.peers.foreign import Home, PeerFailed, Worker
 from benchmarks.peers.peer import Answer, Peer, Question
 from benchmarks.peers.roster import PETSC, roster
 from benchmarks.problems import splash
-from benchmarks.record import Record, read_json, write_json
 from benchmarks.suite import Suite
-from benchmarks.timing import Figure
 from benchmarks.workers import exchange
 from warp_lcp.driver import cli
 

@@ -15,9 +15,9 @@ from benchmarks.extremes.problem import GridProblem
 from benchmarks.extremes.unseen import judging
 from benchmarks.extremes.unseen.draw import AIR, FLUID, SOLID, Pools, changed, equality, solvable
 from benchmarks.extremes.unseen.judging import EveryMethodCase, UnseenCase
-from benchmarks.record import write_json
+from benchmarks.harness.record import write_json
+from benchmarks.harness.timing import Options
 from benchmarks.suite import EXTREMES, SOLVERS
-from benchmarks.timing import Options
 from oracle import boxed, lemke
 
 SEEDS = (4217, 4218)  # of the second b changes, too

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
-from benchmarks.memory import array_bytes, forget_peak
+from benchmarks.harness.machine import array_bytes, forget_peak
 from fluids.simulator import FluidsSimulator
 from warp_lcp import claims
 from warp_lcp.driver import check, cli, devices

@@ -8,8 +8,8 @@ import pytest
 from typer.testing import CliRunner
 
 from benchmarks import predictions
+from benchmarks.harness.timing import Options
 from benchmarks.models import offers
-from benchmarks.timing import Options
 from warp_lcp.driver import cli
 from warp_lcp.driver.check import check_scene
 from warp_lcp.driver.models import Model, Price, model_lines, predicted_seconds, prices

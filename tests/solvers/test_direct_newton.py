@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import scipy.sparse
 import warp as wp
+from benchmarks.small_problems import FAMILIES, SmallProblem, option, plain_active_set, stepped, string
 
 import warp_lcp as wl
-from benchmarks.small_problems import FAMILIES, SmallProblem, option, plain_active_set, stepped, string
 from oracle import boxed, lemke, natural_residual
 from warp_lcp.residual import NaturalResidual
 from warp_lcp.solvers.lemke import BandedBasis, Basis

@@ -27,7 +27,7 @@ from benchmarks.extremes.case import (
 )
 from benchmarks.extremes.problem import GridProblem, MatrixProblem
 from benchmarks.extremes.unseen.draw import Unseen, equality
-from benchmarks.record import Table
+from benchmarks.harness.record import Table
 from warp_lcp.protocol import families
 
 FAMILY = "unseen"
