@@ -276,6 +276,7 @@ def targets(found: Found, sizes: Sequence[int]) -> Table:
         counts = [v for count in RANKS if (n, "walls", count) in found and (v := found[n, "walls", count].value(f"iterations_{TOLD}"))]
         one, two = found.get((n, "walls", 1)), found.get((n, "walls", 2))
         spread_ = Figure(max(counts) - min(counts)) if len(counts) == len(RANKS) else None
+        single = one.figures.get(f"{TOLD}_over_single") if one else None
         gain = _ratio(one, two, TOLD) if (os.cpu_count() or 1) >= 2 else None  # without a core for each rank it tells nothing
         rows += [
             Target(f"{n}^3 walls: iterations to 1e-6, the most of any number of ranks less the least", 1, spread_),

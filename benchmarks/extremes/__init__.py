@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 from random import SystemRandom
+from typing import Any
 
 from benchmarks.extremes import bounds, broken, coefficients, matrices, refused, shapes, simulations
 from benchmarks.extremes.case import PRECISIONS, Case, Expected, Verdict, judge
@@ -68,7 +69,12 @@ def measure(options: Options, out: Path) -> Results:
 def record(verdict: Verdict) -> Record:
     """Return what the file keeps of a case that is not as it must be."""
     attempt = verdict.attempt
-    facts = {"family": verdict.case.family, "precision": verdict.precision, "expected": str(verdict.promise), "outcome": verdict.outcome}
+    facts: dict[str, Any] = {
+        "family": verdict.case.family,
+        "precision": verdict.precision,
+        "expected": str(verdict.promise),
+        "outcome": verdict.outcome,
+    }
     facts |= {"status": attempt.status, "residual": attempt.residual, "message": attempt.message, **attempt.facts}
     return Record(verdict.name, {"seconds": Figure(attempt.seconds, "s")}, facts)
 

@@ -99,8 +99,8 @@ def summary(trials: Mapping[str, Sequence[Trial]]) -> Table:
         rows.append([name, f"{counts[0]} of {counts[1]}", f"{counts[2]} of {counts[3]}", f"{seconds:.1f}", verdict])
     remark = (
         f"{sums[0]} of {sums[1]} figures keep their tolerance, and {sums[2]} of {sums[3]} negative controls fail theirs, as they must; "
-        f"{sum(t.seconds for own in trials.values() for t in own):.0f} s in all. A negative control is a set-up that is wrong on purpose: a "
-        "check that it passes would prove nothing."
+        f"{sum(t.seconds for own in trials.values() for t in own):.0f} s in all. A negative control is a set-up that is wrong on "
+        "purpose: a check that it passes would prove nothing."
     )
     return Table("Checks", ["check", "within tolerance", "controls that fail", "seconds", "verdict"], rows, remark)
 
