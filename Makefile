@@ -40,7 +40,7 @@ fuzz: $(VENV)/.dev
 # Change the code in 50 places, one at a time, and see whether the tests notice; MUTANTS_ARGS="--count 200 --seed 5 --jobs 8" for more.
 mutants: $(VENV)/.dev
 	$(BIN)/python -m pip install --quiet --editable '.[mutation]'
-	$(BIN)/python -m benchmarks.mutants $(MUTANTS_ARGS)
+	$(BIN)/python -m warp_lcp.benchmarks.mutants $(MUTANTS_ARGS)
 
 # The documentation's site, in build/site; a link or an anchor that leads nowhere ends it.
 docs: $(VENV)/.docs

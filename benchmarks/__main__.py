@@ -1,4 +1,4 @@
-"""The process that measures: `python -m benchmarks SUITE --device cpu --out DIR`; `warp-lcp bench` starts it."""
+"""The process that measures: `python -m warp_lcp.benchmarks SUITE --device cpu --out DIR`; `warp-lcp bench` starts it."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import importlib
 import sys
 from pathlib import Path
 
-from benchmarks import launches
-from benchmarks.harness.timing import Options
+from warp_lcp.benchmarks import launches
+from warp_lcp.benchmarks.harness.timing import Options
 
 SUITES = ("kernels", "solvers", "scaling", "ranks", "peers", "run", "sand", "contacts", "models", "tradeoff", "validation", "extremes")
 
 
 def main() -> None:
     """Measure a suite and write its files."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks")
+    parser = argparse.ArgumentParser(prog="python -m warp_lcp.benchmarks")
     parser.add_argument("suite", choices=SUITES)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path, required=True)
@@ -26,7 +26,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int)
     given = parser.parse_args()
     launches.install()  # before anything imports warp_lcp
-    suite, report = importlib.import_module(f"benchmarks.{given.suite}"), importlib.import_module("benchmarks.harness.report")
+    suite, report = importlib.import_module(f"warp_lcp.benchmarks.{given.suite}"), importlib.import_module("warp_lcp.benchmarks.harness.report")
     options = Options(given.device, tuple(given.size), given.repeat, lambda text: sys.stderr.write(f"{text}\n"), given.scene, given.seed)
     given.out.mkdir(parents=True, exist_ok=True)
     gc.collect()

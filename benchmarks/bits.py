@@ -1,4 +1,4 @@
-"""Digests of what solvers compute on grids, to the last bit: `python -m benchmarks.bits --out before.txt`, then `diff`.
+"""Digests of what solvers compute on grids, to the last bit: `python -m warp_lcp.benchmarks.bits --out before.txt`, then `diff`.
 
 A line a solve: the problem, the method, its status, steps, a digest of x and one of the residuals of all iterates; or what it refuses.
 """
@@ -21,10 +21,10 @@ import warp as wp
 from rich.console import Console
 
 import warp_lcp as wl
-from benchmarks.problems import cut_cells, splash
-from warp_lcp.driver.progress import Lines
-from warp_lcp.driver.run import run_scene
-from warp_lcp.driver.scene_file import load_scene
+from warp_lcp.benchmarks.problems import cut_cells, splash
+from warp_lcp.run.progress import Lines
+from warp_lcp.run.loop import run_scene
+from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.protocol import families
 from warp_lcp.solvers.mprgp import MPRGP
 from warp_lcp.solvers.registry import METHODS
@@ -200,7 +200,7 @@ def _digest(*parts: Any) -> str:
 
 def main() -> None:
     """Write the lines."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.bits", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m warp_lcp.benchmarks.bits", description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--part", choices=PARTS, action="append")
     parser.add_argument("--seed", type=int, default=0, help="of other problems of the same kinds (but scenes and splashes)")

@@ -13,9 +13,9 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from benchmarks.harness.machine import array_bytes, forget_peak, resident_bytes
-from benchmarks.harness.timing import Figure
-from benchmarks.problems import Splash, warm_changes
+from warp_lcp.benchmarks.harness.machine import array_bytes, forget_peak, resident_bytes
+from warp_lcp.benchmarks.harness.timing import Figure
+from warp_lcp.benchmarks.problems import Splash, warm_changes
 
 RTOL = 1e-6
 STOPPING = wl.StoppingCriteria(rtol=RTOL)

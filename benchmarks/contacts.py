@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import warp_lcp as wl
-from benchmarks.harness.machine import machine
-from benchmarks.harness.record import Chart, Lines, Record, Results, Table
-from benchmarks.harness.timing import Figure, Options
+from warp_lcp.benchmarks.harness.machine import machine
+from warp_lcp.benchmarks.harness.record import Chart, Lines, Record, Results, Table
+from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.gallery.contact_models import BoxedModel, ContactModel, ContactSystem, StewartTrinkleModel
 from warp_lcp.gallery.contact_scenes import SCENES, SETTLING, heavy_on_light
 from warp_lcp.gallery.contact_stepper import ContactStepper

@@ -14,12 +14,12 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from benchmarks.harness.machine import COPIED, machine, present
-from benchmarks.harness.record import Bars, Record, Results, Table
-from benchmarks.harness.timing import Figure, Options, in_turns, ratios
-from benchmarks.kernel_peers import numba_products, plain_product
-from benchmarks.launches import Launch, Traffic, distinct, listen, stored_sizes, traffic
-from benchmarks.problems import Splash, basin
+from warp_lcp.benchmarks.harness.machine import COPIED, machine, present
+from warp_lcp.benchmarks.harness.record import Bars, Record, Results, Table
+from warp_lcp.benchmarks.harness.timing import Figure, Options, in_turns, ratios
+from warp_lcp.benchmarks.kernel_peers import numba_products, plain_product
+from warp_lcp.benchmarks.launches import Launch, Traffic, distinct, listen, stored_sizes, traffic
+from warp_lcp.benchmarks.problems import Splash, basin
 
 TITLE = "Kernels of the grid engine on the finest grid"
 SIZES = (128, 256)

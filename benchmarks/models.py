@@ -1,6 +1,6 @@
 """What each model that a scene can turn on adds to a step and to memory: the list of prices that `warp-lcp check` tells runs by.
 
-python -m benchmarks.models          # also writes warp_lcp/driver/models.toml and docs/models.md, in a checkout
+python -m warp_lcp.benchmarks.models          # also writes warp_lcp/scene/models.toml and docs/models.md, in a checkout
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ import numpy as np
 import tomli_w
 import warp as wp
 
-from benchmarks.harness.machine import array_bytes, machine
-from benchmarks.harness.record import Record, Results, Table
-from benchmarks.harness.report import markdown
-from benchmarks.harness.timing import Figure, Options, clock
-from warp_lcp.driver.models import TABLE
-from warp_lcp.driver.profile import Profile
-from warp_lcp.driver.run import plan_dt
-from warp_lcp.driver.scene import Scene, Time
-from warp_lcp.driver.simulator import simulators
-from warp_lcp.driver.table import validate
+from warp_lcp.benchmarks.harness.machine import array_bytes, machine
+from warp_lcp.benchmarks.harness.record import Record, Results, Table
+from warp_lcp.benchmarks.harness.report import markdown
+from warp_lcp.benchmarks.harness.timing import Figure, Options, clock
+from warp_lcp.scene.models import TABLE
+from warp_lcp.run.profile import Profile
+from warp_lcp.run.loop import plan_dt
+from warp_lcp.scene.scene import Scene, Time
+from warp_lcp.simulation import simulators
+from warp_lcp.scene.table import validate
 
 TITLE = "What models cost"
 RESOLUTION = {2: 128, 3: 48}  # cells along the longest side of the reference scenes
@@ -37,7 +37,7 @@ WATCHED = 3  # steps that the shares of the stages are taken from
 STAGES = ("sort", "particles-to-grid", "grid-to-particles", "advection", "diagnostics")  # whose time is the particles'
 QUIET = {"diagnostics": False}
 REFERENCE = "{}"  # the tables of the reference scene, as text
-BEGIN, END = "<!-- Written by `python -m benchmarks.models` down to the next mark; do not edit. -->", "<!-- end -->"
+BEGIN, END = "<!-- Written by `python -m warp_lcp.benchmarks.models` down to the next mark; do not edit. -->", "<!-- end -->"
 Tables = dict[str, Any]
 
 
@@ -263,7 +263,7 @@ def table_of(simulator: str, dimension: int, records: list[Record]) -> Table:
 
 
 def price_list(records: list[Record]) -> Mapping[str, Any]:
-    """Return what `warp_lcp/driver/models.toml` holds: by simulator, dimension and model what a `warp_lcp.driver.models.Price` has."""
+    """Return what `warp_lcp/scene/models.toml` holds: by simulator, dimension and model what a `warp_lcp.scene.models.Price` has."""
     listed: dict[str, Any] = {}
     for record in records:
         where, separator, name = record.name.partition(": ")
@@ -292,7 +292,7 @@ def main() -> None:
     given = parser.parse_args()
     options = Options(given.device, (), given.repeat, lambda text: sys.stderr.write(f"{text}\n"))
     results = measure(options, Path())
-    head = "# What models add to a step and to memory, by simulator and dimension; written by `python -m benchmarks.models`.\n\n"
+    head = "# What models add to a step and to memory, by simulator and dimension; written by `python -m warp_lcp.benchmarks.models`.\n\n"
     Path(str(files("warp_lcp.driver") / TABLE)).write_text(head + tomli_w.dumps(price_list(results.records)), "utf-8")
     write_page(given.page, results)
 

@@ -22,12 +22,12 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from benchmarks.cases import MIDST, TOLERANCES
-from benchmarks.harness.machine import array_bytes, forget_peak, machine, resident_bytes
-from benchmarks.harness.record import Lines, Record, Results, Table, Target, read_json, shown, spread, table_of_targets
-from benchmarks.harness.timing import Figure, Options, ratios
-from benchmarks.problems import BOUNDS, SplashPart, natural, splash, splash_part
-from benchmarks.scaling import FIGURES, SCENE_BYTES, SOLVE_BYTES, Growing
+from warp_lcp.benchmarks.cases import MIDST, TOLERANCES
+from warp_lcp.benchmarks.harness.machine import array_bytes, forget_peak, machine, resident_bytes
+from warp_lcp.benchmarks.harness.record import Lines, Record, Results, Table, Target, read_json, shown, spread, table_of_targets
+from warp_lcp.benchmarks.harness.timing import Figure, Options, ratios
+from warp_lcp.benchmarks.problems import BOUNDS, SplashPart, natural, splash, splash_part
+from warp_lcp.benchmarks.scaling import FIGURES, SCENE_BYTES, SOLVE_BYTES, Growing
 from warp_lcp.distributed import launch
 from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.devices import device_of_rank
@@ -35,7 +35,7 @@ from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
 from warp_lcp.distributed.halo import Halo
 from warp_lcp.distributed.meeting import Meeting, RankFailed
 from warp_lcp.distributed.ranks import Ranks
-from warp_lcp.driver.devices import devices, free_memory
+from warp_lcp.run.devices import devices, free_memory
 
 TITLE = "Solves on several ranks"
 SIZES = (64, 128)
@@ -178,7 +178,7 @@ def _started(count: int, sizes: Sequence[int], options: Options) -> list[Record]
     """Measure on so many ranks, started here."""
     with tempfile.TemporaryDirectory() as folder:
         asked = [part for n in sizes for part in ("--size", str(n))]
-        arguments = ["-m", "benchmarks", "ranks", *asked, "--repeat", str(options.repeat), "--device", options.device, "--out", folder]
+        arguments = ["-m", "warp_lcp.benchmarks", "ranks", *asked, "--repeat", str(options.repeat), "--device", options.device, "--out", folder]
         waiting = {"OMPI_MCA_mpi_yield_when_idle": str(int(count > (os.cpu_count() or 1)))}  # to give cores away costs microseconds
         process = subprocess.run(launch.command(count, *arguments), env=launch.environment() | waiting, check=False)
         if process.returncode != 0:

@@ -14,13 +14,13 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from benchmarks.harness.machine import machine
-from benchmarks.harness.record import Bars, Record, Results, Table
-from benchmarks.harness.timing import Figure, Options, timed
-from warp_lcp.driver import particle_simulation
-from warp_lcp.driver.run import run_scene
-from warp_lcp.driver.scene_file import load_scene
-from warp_lcp.driver.simulator import simulators
+from warp_lcp.benchmarks.harness.machine import machine
+from warp_lcp.benchmarks.harness.record import Bars, Record, Results, Table
+from warp_lcp.benchmarks.harness.timing import Figure, Options, timed
+from warp_lcp.material import particle_simulation
+from warp_lcp.run.loop import run_scene
+from warp_lcp.scene.scene_file import load_scene
+from warp_lcp.simulation import simulators
 from warp_lcp.material.boundary import WholeCells
 
 TITLE = "Runs of built-in scenes"

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness.machine import machine
-from benchmarks.harness.record import Lines, Record, Results, Table
-from benchmarks.harness.timing import Figure, Options
-from granular import SIMULATOR
-from granular.coupled import METHODS, CoupledOutcome
-from granular.scene import SandScene
-from granular.simulator import SandSimulation
+from warp_lcp.benchmarks.harness.machine import machine
+from warp_lcp.benchmarks.harness.record import Lines, Record, Results, Table
+from warp_lcp.benchmarks.harness.timing import Figure, Options
+from warp_lcp.granular import SIMULATOR
+from warp_lcp.granular.coupled import METHODS, CoupledOutcome
+from warp_lcp.granular.scene import SandScene
+from warp_lcp.granular.simulator import SandSimulation
 
 TITLE = "Sand: pressure and friction together"
 STATES = {"falling": 0.1, "mid-flow": 0.25, "spreading": 0.4, "coming to rest": 0.8}  # [s] into the collapse

@@ -17,12 +17,12 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from benchmarks.cases import TOLERANCES, Case
-from benchmarks.harness.machine import COPIED, machine
-from benchmarks.harness.record import Chart, Lines, Record, Results, Table, Target, shown, spread, table_of_targets
-from benchmarks.harness.timing import Figure, Options
-from benchmarks.problems import BOUNDS, Splash, natural, splash
-from warp_lcp.driver.devices import free_memory
+from warp_lcp.benchmarks.cases import TOLERANCES, Case
+from warp_lcp.benchmarks.harness.machine import COPIED, machine
+from warp_lcp.benchmarks.harness.record import Chart, Lines, Record, Results, Table, Target, shown, spread, table_of_targets
+from warp_lcp.benchmarks.harness.timing import Figure, Options
+from warp_lcp.benchmarks.problems import BOUNDS, Splash, natural, splash
+from warp_lcp.run.devices import free_memory
 
 TITLE = "Cost of a solve against the size of the grid"
 CPU_SIZES, CUDA_SIZES = (32, 64, 128, 256), (32, 64, 128, 256, 512, 1024)

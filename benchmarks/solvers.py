@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 
 import warp_lcp as wl
-from benchmarks.cases import RTOL, Case
-from benchmarks.harness.machine import COPIED, machine, present
-from benchmarks.harness.record import Chart, Lines, Record, Results, Table, shown, spread
-from benchmarks.harness.timing import Figure, Options, ratios
-from benchmarks.peers.linear import pyamg_aggregation, scipy_cg
-from benchmarks.peers.peer import Answer, Question
-from benchmarks.problems import BOUNDS, anisotropic, cut_cells, splash
+from warp_lcp.benchmarks.cases import RTOL, Case
+from warp_lcp.benchmarks.harness.machine import COPIED, machine, present
+from warp_lcp.benchmarks.harness.record import Chart, Lines, Record, Results, Table, shown, spread
+from warp_lcp.benchmarks.harness.timing import Figure, Options, ratios
+from warp_lcp.benchmarks.peers.linear import pyamg_aggregation, scipy_cg
+from warp_lcp.benchmarks.peers.peer import Answer, Question
+from warp_lcp.benchmarks.problems import BOUNDS, anisotropic, cut_cells, splash
 from warp_lcp import gallery
 
 TITLE = "Linear and LCP pressure solves"

@@ -8,7 +8,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.harness.compare import comparison
+from warp_lcp.benchmarks.harness.compare import comparison
 from warp_lcp.distributed import launch
 
 WRONG_INPUT = 2  # exit code of a suite that says what is wrong with its input
@@ -84,7 +84,7 @@ class Suite:
         arguments += ["--seed", str(seed)] if seed is not None else []
         for size in sizes:
             arguments += ["--size", str(size)]
-        process = subprocess.run([sys.executable, "-m", "benchmarks", *arguments], env={**os.environ, **ONE_THREAD}, check=False)
+        process = subprocess.run([sys.executable, "-m", "warp_lcp.benchmarks", *arguments], env={**os.environ, **ONE_THREAD}, check=False)
         if shared and launch.rank_here():  # the first of several ranks speaks for all
             raise SystemExit(process.returncode)
         if process.returncode == WRONG_INPUT:

@@ -1,8 +1,8 @@
 """Liquids on a staggered grid that let go of their walls: the plug-in `fluids` of warp_lcp."""
 
-from fluids.pressure import PressureProjection, Projection
-from fluids.scene import LiquidScene
-from fluids.simulator import FluidsSimulator, LiquidSimulation
+from warp_lcp.fluids.pressure import PressureProjection, Projection
+from warp_lcp.fluids.scene import LiquidScene
+from warp_lcp.fluids.simulator import FluidsSimulator, LiquidSimulation
 
 SIMULATOR = FluidsSimulator()
 

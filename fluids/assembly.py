@@ -6,11 +6,11 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from fluids.coupling import BodyCoupling
-from fluids.pressure import PressureProjection
-from fluids.scene import LiquidScene
-from fluids.surface import FreeSurface, GhostFluidSurface, NoSurface, WholeCellSurface
-from fluids.unilateral import UnilateralPressure
+from warp_lcp.fluids.coupling import BodyCoupling
+from warp_lcp.fluids.pressure import PressureProjection
+from warp_lcp.fluids.scene import LiquidScene
+from warp_lcp.fluids.surface import FreeSurface, GhostFluidSurface, NoSurface, WholeCellSurface
+from warp_lcp.fluids.unilateral import UnilateralPressure
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.cut_boundary import CutBoundary

@@ -9,7 +9,7 @@ import scipy.linalg
 import warp as wp
 
 import warp_lcp as wl
-from fluids import coupling_kernels as kernels
+from warp_lcp.fluids import coupling_kernels as kernels
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.material.cut_boundary import CutBoundary
 from warp_lcp.operators.low_rank_columns import BlockColumns

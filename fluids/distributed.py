@@ -16,24 +16,24 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from fluids.distributed_pressure import DistributedPressure
-from fluids.distributed_state import Piece, PieceReader, piece_of
-from fluids.distributed_surface import make_shared_surface
-from fluids.pressure import PressureProjection
-from fluids.scene import LiquidScene
-from fluids.simulator import LiquidSimulation
-from fluids.surface import FreeSurface
+from warp_lcp.fluids.distributed_pressure import DistributedPressure
+from warp_lcp.fluids.distributed_state import Piece, PieceReader, piece_of
+from warp_lcp.fluids.distributed_surface import make_shared_surface
+from warp_lcp.fluids.pressure import PressureProjection
+from warp_lcp.fluids.scene import LiquidScene
+from warp_lcp.fluids.simulator import LiquidSimulation
+from warp_lcp.fluids.surface import FreeSurface
 from warp_lcp.distributed.balance import balanced_processes, pool
 from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.particles import SharedParticles
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.solids import boundary_of_part
 from warp_lcp.distributed.subdomain import Subdomain, ghost_layers
-from warp_lcp.driver.particle_assembly import placed_solids, seed_materials, start_velocities
-from warp_lcp.driver.particle_simulation import Row
-from warp_lcp.driver.particle_state import signature
-from warp_lcp.driver.scene import Scene
-from warp_lcp.driver.simulator import SimulationFailed, StepFailed
+from warp_lcp.material.particle_assembly import placed_solids, seed_materials, start_velocities
+from warp_lcp.material.particle_simulation import Row
+from warp_lcp.material.particle_state import signature
+from warp_lcp.scene.scene import Scene
+from warp_lcp.simulation import SimulationFailed, StepFailed
 from warp_lcp.grid.particles import ParticleTotals
 from warp_lcp.grid.staggered import Window
 from warp_lcp.material.boundary import Boundary
@@ -44,7 +44,7 @@ NOT_ON_RANKS = "is not there on several processes (--engine petsc) yet: leave it
 
 
 class DistributedLiquid(LiquidSimulation):
-    """A rank's part of a liquid in progress; implements `warp_lcp.driver.simulator.Simulation`.
+    """A rank's part of a liquid in progress; implements `warp_lcp.simulation.Simulation`.
 
     Making it, `stable_dt`, `step`, `mark` and `restore_pieces` are collective and give every rank the same numbers, or raise the same error
     on all: rows of the log are of the whole liquid. `frame` shows this rank's particles and cells, with positions and cells' numbers of the

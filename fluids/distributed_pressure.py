@@ -9,8 +9,8 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from fluids.pressure import PressureProjection, Projection
-from fluids.tolerance import TimeErrorTolerance
+from warp_lcp.fluids.pressure import PressureProjection, Projection
+from warp_lcp.fluids.tolerance import TimeErrorTolerance
 from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.grid.staggered import Window

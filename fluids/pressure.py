@@ -10,9 +10,9 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from fluids.coupling import BodyCoupling
-from fluids.pressure_kernels import COUNT, FACES, pressure_passes
-from fluids.tolerance import TimeErrorTolerance
+from warp_lcp.fluids.coupling import BodyCoupling
+from warp_lcp.fluids.pressure_kernels import COUNT, FACES, pressure_passes
+from warp_lcp.fluids.tolerance import TimeErrorTolerance
 from warp_lcp.gallery import recorded
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary

@@ -7,10 +7,10 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from warp_lcp.driver.models import Model
-from warp_lcp.driver.particle_scene import ParticleScene
-from warp_lcp.driver.scene import Complaint, Liquid, Table
-from warp_lcp.driver.shapes import MaterialProperties
+from warp_lcp.scene.models import Model
+from warp_lcp.material.particle_scene import ParticleScene
+from warp_lcp.scene.scene import Complaint, Liquid, Table
+from warp_lcp.scene.shapes import MaterialProperties
 
 # Measured at 96^3 as the growth of a process on the CPU, first step included; bytes a cell.
 PRESSURE_BYTES = 92  # fields of the pressure solve

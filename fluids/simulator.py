@@ -10,11 +10,11 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from fluids.assembly import make_pressure, make_surface
-from fluids.pressure import PressureProjection, Projection
-from fluids.scene import LiquidScene
-from fluids.surface import FreeSurface
-from warp_lcp.driver.particle_assembly import (
+from warp_lcp.fluids.assembly import make_pressure, make_surface
+from warp_lcp.fluids.pressure import PressureProjection, Projection
+from warp_lcp.fluids.scene import LiquidScene
+from warp_lcp.fluids.surface import FreeSurface
+from warp_lcp.material.particle_assembly import (
     make_bodies,
     make_boundary,
     make_narrow_band,
@@ -23,9 +23,9 @@ from warp_lcp.driver.particle_assembly import (
     make_sources,
     placed_solids,
 )
-from warp_lcp.driver.particle_simulation import ParticleSimulation, Row
-from warp_lcp.driver.scene import Scene
-from warp_lcp.driver.simulator import Cells, Part, SimulationFailed, missed_by_far
+from warp_lcp.material.particle_simulation import ParticleSimulation, Row
+from warp_lcp.scene.scene import Scene
+from warp_lcp.simulation import Cells, Part, SimulationFailed, missed_by_far
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary
@@ -36,12 +36,12 @@ from warp_lcp.material.sources import Sources
 from warp_lcp.rigid.bodies import RigidBodies
 
 if TYPE_CHECKING:
-    from fluids.distributed import DistributedLiquid
+    from warp_lcp.fluids.distributed import DistributedLiquid
     from warp_lcp.distributed.ranks import Ranks
 
 
 class LiquidSimulation(ParticleSimulation):
-    """A liquid in progress; implements `warp_lcp.driver.simulator.Simulation`.
+    """A liquid in progress; implements `warp_lcp.simulation.Simulation`.
 
     Args:
         scene: what to simulate.
@@ -181,7 +181,7 @@ class LiquidSimulation(ParticleSimulation):
         Raises:
             ValueError: the pieces do not belong to this scene.
         """
-        from fluids.distributed_state import state_of  # what only such runs need
+        from warp_lcp.fluids.distributed_state import state_of  # what only such runs need
 
         self.restore(state_of(pieces, self.state()))
 
@@ -276,6 +276,6 @@ class FluidsSimulator:
 
     def create_distributed(self, scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> DistributedLiquid:
         """Build a rank's part of a simulation of `scene`, see `fluids.distributed.create`."""
-        from fluids.distributed import create  # what it needs is an extra
+        from warp_lcp.fluids.distributed import create  # what it needs is an extra
 
         return create(scene, ranks, device=device, folder=folder)

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from fluids import surface_kernels as kernels
+from warp_lcp.fluids import surface_kernels as kernels
 from warp_lcp.grid.extrapolate import complete
 from warp_lcp.grid.level_set import Fill, LevelSet
 from warp_lcp.grid.particles import Particles

@@ -10,9 +10,9 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from fluids import unilateral_kernels as kernels
-from fluids.coupling import BodyCoupling
-from fluids.pressure import PressureProjection, Projection, three
+from warp_lcp.fluids import unilateral_kernels as kernels
+from warp_lcp.fluids.coupling import BodyCoupling
+from warp_lcp.fluids.pressure import PressureProjection, Projection, three
 from warp_lcp.grid.level_set import LevelSet
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary

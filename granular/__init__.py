@@ -1,6 +1,6 @@
 """Sand that flows, piles up and comes to rest: a plug-in of warp_lcp."""
 
-from granular.simulator import GranularSimulator
+from warp_lcp.granular.simulator import GranularSimulator
 
 SIMULATOR = GranularSimulator()
 

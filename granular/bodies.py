@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import warp as wp
 
-from granular.bodies_kernels import (
+from warp_lcp.granular.bodies_kernels import (
     Edges,
     Shape,
     body_kernels,
@@ -21,15 +21,15 @@ from granular.bodies_kernels import (
     respond_kernel,
     stiffness_kernel,
 )
-from granular.body_faces import BodyFaces, entries_near, find_body_faces, unowned_copies
-from granular.packing import Packing
-from granular.yield_set import xyz
+from warp_lcp.granular.body_faces import BodyFaces, entries_near, find_body_faces, unowned_copies
+from warp_lcp.granular.packing import Packing
+from warp_lcp.granular.yield_set import xyz
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.program import Launch
 from warp_lcp.rows import Rows
 
 if typing.TYPE_CHECKING:
-    from granular.stress import Velocity, Walls
+    from warp_lcp.granular.stress import Velocity, Walls
 
 ROUNDS = 2  # trial steps before a step: one is exact while all stresses around a body are free; a second took a sixth of the steps less
 GRAIN = {False: 1024, True: 64}  # cells or edges whose forces a thread adds up, on the CPU and on CUDA

@@ -8,8 +8,8 @@ from typing import Any
 
 import warp as wp
 
-from granular.stress_kernels import CELLS, MOMENTUM, STEP, STRESSES
-from granular.yield_set import HOLDS, NEARLY, SHEARS_HERE, STEP_OF_CELL, WALLS, sand_pass, xyz
+from warp_lcp.granular.stress_kernels import CELLS, MOMENTUM, STEP, STRESSES
+from warp_lcp.granular.yield_set import HOLDS, NEARLY, SHEARS_HERE, STEP_OF_CELL, WALLS, sand_pass, xyz
 from warp_lcp.rows.layout import make_struct, put
 
 _INTS, _BYTES, _REALS = wp.array(dtype=wp.int32), wp.array(dtype=wp.uint8), wp.array(dtype=wp.float64)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from granular.packing import SHEARS
+from warp_lcp.granular.packing import SHEARS
 from warp_lcp.grid.staggered import StaggeredGrid
 
 Rows = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # places, bodies, rows of each pair, bodies of the place

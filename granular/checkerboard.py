@@ -8,7 +8,7 @@ and no velocity changes. Only cells deep in dense sand take part, away from soli
 
 import functools
 
-from granular.yield_set import F32, U8, sand_pass, xyz
+from warp_lcp.granular.yield_set import F32, U8, sand_pass, xyz
 from warp_lcp.rows import RowPass
 
 DAMPED = 0.15  # of the pattern in a step

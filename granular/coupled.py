@@ -11,10 +11,10 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from granular.interleaved_kernels import APART, interleaved_passes
-from granular.stress import Stress
-from granular.stress_kernels import PERIOD
-from granular.yield_set import xyz
+from warp_lcp.granular.interleaved_kernels import APART, interleaved_passes
+from warp_lcp.granular.stress import Stress
+from warp_lcp.granular.stress_kernels import PERIOD
+from warp_lcp.granular.yield_set import xyz
 from warp_lcp.rows import RowPass, Rows
 from warp_lcp.settings import Count, CountOrZero, NonNegative, Part, Positive, Relaxation, Settings, ShareOrZero
 

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from granular.cut_walls_kernels import traction_pass
-from granular.packing import SHEARS, Packing
-from granular.yield_set import COLUMNS, xyz
+from warp_lcp.granular.cut_walls_kernels import traction_pass
+from warp_lcp.granular.packing import SHEARS, Packing
+from warp_lcp.granular.yield_set import COLUMNS, xyz
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
@@ -25,7 +25,7 @@ from warp_lcp.program import Launch
 from warp_lcp.rows import Rows
 
 if TYPE_CHECKING:
-    from granular.stress import Velocity
+    from warp_lcp.granular.stress import Velocity
 
 SAMPLES = {2: 8, 3: 4}  # of a half cell along each axis, for its volume
 LEAST_WALL = 1e-4  # of a cell's face, below which there is no wall

@@ -3,8 +3,8 @@
 import functools
 from typing import Any
 
-from granular.stress_kernels import MOMENTUM, STEP, STRESSES
-from granular.yield_set import F32, F64, I32, U8, sand_pass, xyz
+from warp_lcp.granular.stress_kernels import MOMENTUM, STEP, STRESSES
+from warp_lcp.granular.yield_set import F32, F64, I32, U8, sand_pass, xyz
 from warp_lcp.rows import RowPass
 
 

@@ -8,7 +8,7 @@ import functools
 from types import SimpleNamespace
 from typing import Any
 
-from granular.yield_set import F32, I32, U8, WALLS, sand_pass, xyz
+from warp_lcp.granular.yield_set import F32, I32, U8, WALLS, sand_pass, xyz
 
 APART = 3  # cells along an axis, so that two threads change no velocity in common
 

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from granular import packing_kernels as kernels
-from granular.yield_set import xyz
+from warp_lcp.granular import packing_kernels as kernels
+from warp_lcp.granular.yield_set import xyz
 from warp_lcp.grid.periodic import PeriodicSides
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.operators.grid_poisson import SOLID
 
 if TYPE_CHECKING:
-    from granular.cut_walls import CutWalls
+    from warp_lcp.granular.cut_walls import CutWalls
 
 SHEARS = {2: ((0, 1),), 3: ((0, 1), (0, 2), (1, 2))}  # the axes of each shear
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from granular.report_kernels import REPORT_COLUMNS, contact_kernel, report_pass, take_kernel
-from granular.stress import Stress
-from granular.yield_set import xyz
+from warp_lcp.granular.report_kernels import REPORT_COLUMNS, contact_kernel, report_pass, take_kernel
+from warp_lcp.granular.stress import Stress
+from warp_lcp.granular.yield_set import xyz
 from warp_lcp.material.contact import HELD, RELEASED
 
 

@@ -5,7 +5,7 @@ import functools
 
 import warp as wp
 
-from granular.yield_set import sand_pass, xyz
+from warp_lcp.granular.yield_set import sand_pass, xyz
 from warp_lcp.grid.cell_kernel import F32, F64, I8, U8, cell_below, cell_kernel
 from warp_lcp.grid.extrapolate import BLOCKED
 from warp_lcp.operators.grid_poisson import SOLID

@@ -9,11 +9,11 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from granular.materials import MATERIALS, AngleOf, Material, slope
-from warp_lcp.driver.particle_scene import ParticleScene
-from warp_lcp.driver.presets import PresetName
-from warp_lcp.driver.scene import PRESET_KEY, Complaint, Domain, Table, Time
-from warp_lcp.driver.shapes import (
+from warp_lcp.granular.materials import MATERIALS, AngleOf, Material, slope
+from warp_lcp.material.particle_scene import ParticleScene
+from warp_lcp.scene.presets import PresetName
+from warp_lcp.scene.scene import PRESET_KEY, Complaint, Domain, Table, Time
+from warp_lcp.scene.shapes import (
     FRICTIONS,
     STICKS,
     Box,

@@ -10,17 +10,17 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from granular.bodies import SandBodies
-from granular.coupled import METHODS, CoupledMethod, CoupledOutcome
-from granular.packing import Packing
-from granular.report import Outcome
-from granular.scene import SandScene
-from granular.solids import SandSolids
-from granular.stress import Stress, YieldSet
-from warp_lcp.driver.particle_assembly import make_bodies, make_boundary, make_outlets, make_particles, make_sources, placed_solids
-from warp_lcp.driver.particle_simulation import ParticleSimulation, Row
-from warp_lcp.driver.scene import Scene
-from warp_lcp.driver.simulator import Cells, Part, SimulationFailed, missed_by_far
+from warp_lcp.granular.bodies import SandBodies
+from warp_lcp.granular.coupled import METHODS, CoupledMethod, CoupledOutcome
+from warp_lcp.granular.packing import Packing
+from warp_lcp.granular.report import Outcome
+from warp_lcp.granular.scene import SandScene
+from warp_lcp.granular.solids import SandSolids
+from warp_lcp.granular.stress import Stress, YieldSet
+from warp_lcp.material.particle_assembly import make_bodies, make_boundary, make_outlets, make_particles, make_sources, placed_solids
+from warp_lcp.material.particle_simulation import ParticleSimulation, Row
+from warp_lcp.scene.scene import Scene
+from warp_lcp.simulation import Cells, Part, SimulationFailed, missed_by_far
 from warp_lcp.grid.extrapolate import complete
 from warp_lcp.grid.level_set import particle_density
 from warp_lcp.grid.particles import Particles, ParticleTotals
@@ -50,7 +50,7 @@ DIAGNOSTICS = ("yielded", "dissipation", "predicted_excess")  # of them, those t
 
 
 class SandSimulation(ParticleSimulation):
-    """Sand in progress; implements `warp_lcp.driver.simulator.Simulation`.
+    """Sand in progress; implements `warp_lcp.simulation.Simulation`.
 
     A step brings the particles' mass and velocity to the grid, solves for pressure and friction together, brings the velocity that they
     leave back to the particles and moves them.

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from granular.cut_walls import CutWalls
-from granular.stress import Walls
+from warp_lcp.granular.cut_walls import CutWalls
+from warp_lcp.granular.stress import Walls
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import PlacedSolid, voxelize
 from warp_lcp.material import boundary_kernels as kernels

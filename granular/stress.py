@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from granular.bodies import SandBodies
-from granular.checkerboard import damping_pass
-from granular.packing import SHEARS, Packing, wall_faces
-from granular.stress_kernels import BETA_X, NEXT_X, PERIOD, RESIDUAL_X, REST, STATE, STRESSES, momentum_kernel, stress_passes
-from granular.yield_set import COLUMNS, LOOKAHEAD, NUMBERS, PRESSURE_STEP, SHEAR_STEP, xyz
+from warp_lcp.granular.bodies import SandBodies
+from warp_lcp.granular.checkerboard import damping_pass
+from warp_lcp.granular.packing import SHEARS, Packing, wall_faces
+from warp_lcp.granular.stress_kernels import BETA_X, NEXT_X, PERIOD, RESIDUAL_X, REST, STATE, STRESSES, momentum_kernel, stress_passes
+from warp_lcp.granular.yield_set import COLUMNS, LOOKAHEAD, NUMBERS, PRESSURE_STEP, SHEAR_STEP, xyz
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.program import Launch, Program
 from warp_lcp.rows import Rows

@@ -7,7 +7,7 @@ from typing import Any
 
 import warp as wp
 
-from granular.yield_set import COLUMNS, F32, F64, I32, U8, WALLS, sand_pass, xyz
+from warp_lcp.granular.yield_set import COLUMNS, F32, F64, I32, U8, WALLS, sand_pass, xyz
 
 # The momentum's state: steps done; the most of it for pressure and friction; that of this step; that of the next; estimates of the natural
 # residuals over the last PERIOD steps; sums over these; 1 less the most that the momentum may grow to.

@@ -5,9 +5,9 @@ from __future__ import annotations
 import random
 from typing import Any
 
-from warp_lcp.driver.scene import Scene
-from warp_lcp.driver.simulator import simulators
-from warp_lcp.driver.table import SceneError, validate
+from warp_lcp.scene.scene import Scene
+from warp_lcp.simulation import simulators
+from warp_lcp.scene.table import SceneError, validate
 
 LIQUID_METHODS = ["projected-multigrid"] * 6 + ["minimum-map-newton", "primal-dual-active-set", "mprgp", "nncg", "psor", "projected-jacobi"]
 Tables = dict[str, Any]

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.driver.run import take_step
-from warp_lcp.driver.scene import Scene
-from warp_lcp.driver.simulator import Part, Simulation, simulators
+from warp_lcp.run.loop import take_step
+from warp_lcp.scene.scene import Scene
+from warp_lcp.simulation import Part, Simulation, simulators
 
 Told = dict[str, Any]
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from fluids import SIMULATOR, LiquidScene, LiquidSimulation
+from warp_lcp.fluids import SIMULATOR, LiquidScene, LiquidSimulation
 
 GRAVITY = 9.81
 STEPS = 2000

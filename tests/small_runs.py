@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_lcp.driver.frames import FrameFolder
-from warp_lcp.driver.scene_file import dump_scene, load_scene
-from warp_lcp.driver.simulator import Part, Surface
+from warp_lcp.frames.frames import FrameFolder
+from warp_lcp.scene.scene_file import dump_scene, load_scene
+from warp_lcp.simulation import Part, Surface
 
 MINIMAL = """
 [scene]

@@ -3,9 +3,9 @@
 from pathlib import Path
 from typing import Any
 
-from granular import SIMULATOR
-from granular.scene import SandScene
-from granular.simulator import SandSimulation
+from warp_lcp.granular import SIMULATOR
+from warp_lcp.granular.scene import SandScene
+from warp_lcp.granular.simulator import SandSimulation
 
 GRAVITY = 9.81
 STEPS = 3000

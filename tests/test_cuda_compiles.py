@@ -12,16 +12,16 @@ import pytest
 import scipy.sparse
 import warp as wp
 
-import fluids
-import granular
+from warp_lcp import fluids
+from warp_lcp import granular
 import warp_lcp as wl
-from fluids.pressure_kernels import pressure_passes
-from granular.bodies_kernels import body_kernels
-from granular.checkerboard import damping_pass
-from granular.cut_walls_kernels import traction_pass
-from granular.interleaved_kernels import interleaved_passes
-from granular.report_kernels import report_pass
-from granular.stress_kernels import stress_passes
+from warp_lcp.fluids.pressure_kernels import pressure_passes
+from warp_lcp.granular.bodies_kernels import body_kernels
+from warp_lcp.granular.checkerboard import damping_pass
+from warp_lcp.granular.cut_walls_kernels import traction_pass
+from warp_lcp.granular.interleaved_kernels import interleaved_passes
+from warp_lcp.granular.report_kernels import report_pass
+from warp_lcp.granular.stress_kernels import stress_passes
 from warp_lcp.distributed.petsc_matrix import ENTER, LEAVE
 from warp_lcp.grid import advection_kernels, distance_advection_kernels, transfer_kernels
 from warp_lcp.grid.periodic import ring_kernels

@@ -88,7 +88,7 @@ def test_generated_pages_are_up_to_date(name):
 
 def test_the_page_of_scene_files_has_every_key():
     """From the schemas themselves, not by way of the generator."""
-    from warp_lcp.driver.scene_file import installed_simulators
+    from warp_lcp.scene.scene_file import installed_simulators
 
     text = (DOCS / "scenes.md").read_text()
     for simulator in installed_simulators().values():

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from code_blocks import blocks, run
-from warp_lcp.driver.particle_scene import ParticleScene
-from warp_lcp.driver.scene_file import load_scene
+from warp_lcp.material.particle_scene import ParticleScene
+from warp_lcp.scene.scene_file import load_scene
 
 README = Path(__file__).parents[1] / "README.md"
 

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import warp_lcp as wl
-from granular.coupled import METHODS as SAND
+from warp_lcp.granular.coupled import METHODS as SAND
 from warp_lcp.distributed.petsc_active_set import PetscActiveSet
 from warp_lcp.gallery.inverse_kinematics import InverseKinematics
 from warp_lcp.gallery.planted import Plant

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from code_blocks import blocks, run
-from warp_lcp.driver.cli import app
+from warp_lcp.cli.commands import app
 
 TUTORIAL = Path(__file__).parents[1] / "docs" / "tutorial.md"
 SCENES = blocks(TUTORIAL, "toml")

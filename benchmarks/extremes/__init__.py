@@ -12,12 +12,12 @@ from pathlib import Path
 from random import SystemRandom
 from typing import Any
 
-from benchmarks.extremes import bounds, broken, coefficients, matrices, refused, shapes, simulations
-from benchmarks.extremes.case import PRECISIONS, Case, Expected, Verdict, judge
-from benchmarks.extremes.unseen import FRESH, judging
-from benchmarks.harness.machine import machine
-from benchmarks.harness.record import Record, Results, Table, shown
-from benchmarks.harness.timing import Figure, Options
+from warp_lcp.benchmarks.extremes import bounds, broken, coefficients, matrices, refused, shapes, simulations
+from warp_lcp.benchmarks.extremes.case import PRECISIONS, Case, Expected, Verdict, judge
+from warp_lcp.benchmarks.extremes.unseen import FRESH, judging
+from warp_lcp.benchmarks.harness.machine import machine
+from warp_lcp.benchmarks.harness.record import Record, Results, Table, shown
+from warp_lcp.benchmarks.harness.timing import Figure, Options
 
 TITLE = "Extremes: hostile problems and scenes, and what they come to"
 FAMILIES = (

@@ -7,9 +7,9 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.extremes.case import BELOW_ROUNDING, EITHER, PRECISIONS, Case, Expected, Promise, refusal
-from benchmarks.extremes.problem import GridProblem
-from benchmarks.extremes.shapes import AIR, FLUID, SEED, both, noise, pool, same
+from warp_lcp.benchmarks.extremes.case import BELOW_ROUNDING, EITHER, PRECISIONS, Case, Expected, Promise, refusal
+from warp_lcp.benchmarks.extremes.problem import GridProblem
+from warp_lcp.benchmarks.extremes.shapes import AIR, FLUID, SEED, both, noise, pool, same
 
 SHAPE = (40, 44)
 OVERFLOWS = Promise(Expected.STOPPED, frozenset({"NON_FINITE"}))

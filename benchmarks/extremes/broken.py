@@ -10,8 +10,8 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from benchmarks.extremes.case import Case, Expected, Promise, SolveCase
-from benchmarks.extremes.shapes import grounded, pool, same
+from warp_lcp.benchmarks.extremes.case import Case, Expected, Promise, SolveCase
+from warp_lcp.benchmarks.extremes.shapes import grounded, pool, same
 
 CAUGHT = same(Promise(Expected.CAUGHT))
 

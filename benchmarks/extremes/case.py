@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from benchmarks.extremes.problem import Problem
+from warp_lcp.benchmarks.extremes.problem import Problem
 
 PRECISIONS = ("single", "mixed", "double")
 RTOL = {"single": 1e-3, "mixed": 1e-8, "double": 1e-8}

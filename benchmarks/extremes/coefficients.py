@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.extremes.case import EITHER, PRECISIONS, Case, SolveCase
-from benchmarks.extremes.problem import GridProblem
-from benchmarks.extremes.shapes import AIR, FLUID, SEED, SOLID, both, noise, pool, same
+from warp_lcp.benchmarks.extremes.case import EITHER, PRECISIONS, Case, SolveCase
+from warp_lcp.benchmarks.extremes.problem import GridProblem
+from warp_lcp.benchmarks.extremes.shapes import AIR, FLUID, SEED, SOLID, both, noise, pool, same
 
 SHAPES = ((48, 53), (17, 18, 19))
 ROUGH = {"rtol": 1e-6}  # where the matrix's own rounding is felt: 12 decades beside each other

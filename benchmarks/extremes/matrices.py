@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from benchmarks.extremes.case import EITHER, INFEASIBLE, Case, Promise, SolveCase
-from benchmarks.extremes.problem import MatrixProblem
-from benchmarks.extremes.shapes import SEED, same
+from warp_lcp.benchmarks.extremes.case import EITHER, INFEASIBLE, Case, Promise, SolveCase
+from warp_lcp.benchmarks.extremes.problem import MatrixProblem
+from warp_lcp.benchmarks.extremes.shapes import SEED, same
 
 N = 24
 

@@ -11,7 +11,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
-from benchmarks.extremes.exact import Exact, stencil
+from warp_lcp.benchmarks.extremes.exact import Exact, stencil
 
 
 class Problem(Protocol):

@@ -11,7 +11,7 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
-from benchmarks.extremes.case import Case, RefusalCase
+from warp_lcp.benchmarks.extremes.case import Case, RefusalCase
 
 SHAPE = (4, 5)
 CELLS = np.array([[1] * 5] * 3 + [[0] * 5])

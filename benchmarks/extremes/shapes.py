@@ -11,9 +11,9 @@ import scipy.sparse
 import scipy.sparse.csgraph
 
 import warp_lcp as wl
-from benchmarks.extremes.case import EITHER, INFEASIBLE, PRECISIONS, Case, Promise, RefusalCase, SolveCase
-from benchmarks.extremes.exact import stencil
-from benchmarks.extremes.problem import GridProblem
+from warp_lcp.benchmarks.extremes.case import EITHER, INFEASIBLE, PRECISIONS, Case, Promise, RefusalCase, SolveCase
+from warp_lcp.benchmarks.extremes.exact import stencil
+from warp_lcp.benchmarks.extremes.problem import GridProblem
 
 AIR, FLUID, SOLID = wl.AIR, wl.FLUID, wl.SOLID
 SEED = 7919

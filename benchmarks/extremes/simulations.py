@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from benchmarks.extremes.case import PRECISIONS, Attempt, Case, Expected, Promise
-from benchmarks.extremes.problem import GridProblem
-from fluids import SIMULATOR as FLUIDS
-from fluids import LiquidScene, LiquidSimulation
-from granular import SIMULATOR as GRANULAR
-from granular.scene import SandScene
-from granular.simulator import SandSimulation
-from warp_lcp.driver.simulator import SimulationFailed, StepFailed
+from warp_lcp.benchmarks.extremes.case import PRECISIONS, Attempt, Case, Expected, Promise
+from warp_lcp.benchmarks.extremes.problem import GridProblem
+from warp_lcp.fluids import SIMULATOR as FLUIDS
+from warp_lcp.fluids import LiquidScene, LiquidSimulation
+from warp_lcp.granular import SIMULATOR as GRANULAR
+from warp_lcp.granular.scene import SandScene
+from warp_lcp.granular.simulator import SandSimulation
+from warp_lcp.simulation import SimulationFailed, StepFailed
 from warp_lcp.grid.particles import MARGIN
 
 ParticleSimulation = LiquidSimulation | SandSimulation

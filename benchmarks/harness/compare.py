@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from benchmarks.harness.record import MACHINE, Record, read_json
-from benchmarks.harness.timing import Figure
+from warp_lcp.benchmarks.harness.record import MACHINE, Record, read_json
+from warp_lcp.benchmarks.harness.timing import Figure
 
 ALLOWED = 0.25  # share of a ratio to a peer that may be lost
 # ratios of a peer's time to ours, of the same rounds: what is compared across states of the code and across machines

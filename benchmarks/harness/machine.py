@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-import fluids
-import granular
+from warp_lcp import fluids
+from warp_lcp import granular
 import warp_lcp
-from benchmarks.harness.record import MACHINE, SOURCE, Record
-from benchmarks.harness.timing import Figure, in_turns
-from warp_lcp.driver.versions import versions
+from warp_lcp.benchmarks.harness.record import MACHINE, SOURCE, Record
+from warp_lcp.benchmarks.harness.timing import Figure, in_turns
+from warp_lcp.run.versions import versions
 
 PEERS = ("pyamg", "scipy", "numba", "matplotlib")
 STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from benchmarks.harness.timing import Figure
+from warp_lcp.benchmarks.harness.timing import Figure
 
 SOURCE = "source digest"  # fact of that record: which state of the code was measured
 MACHINE = "machine"  # name of the record that says where and when the others were measured

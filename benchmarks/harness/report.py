@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from benchmarks.harness.machine import present
-from benchmarks.harness.record import MACHINE, Bars, Chart, Lines, Record, Results, Table, write_json
+from warp_lcp.benchmarks.harness.machine import present
+from warp_lcp.benchmarks.harness.record import MACHINE, Bars, Chart, Lines, Record, Results, Table, write_json
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

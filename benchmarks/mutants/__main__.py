@@ -1,4 +1,4 @@
-"""Draw mutants, run the tests of each and report who survives: `python -m benchmarks.mutants --count 50 --seed 7`."""
+"""Draw mutants, run the tests of each and report who survives: `python -m warp_lcp.benchmarks.mutants --count 50 --seed 7`."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Any, NoReturn
 
-from benchmarks.mutants.mutations import Mutant, draw, mutated
-from benchmarks.mutants.tests_of import tests_of
+from warp_lcp.benchmarks.mutants.mutations import Mutant, draw, mutated
+from warp_lcp.benchmarks.mutants.tests_of import tests_of
 
 ROOT = Path(__file__).resolve().parents[2]
 HANGS = 40  # seconds of processor time that no single test takes
@@ -164,7 +164,7 @@ def report(results: list[dict[str, object]], out: Path, seed: int) -> None:
 
 def options() -> argparse.Namespace:
     """Read the command line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.mutants", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m warp_lcp.benchmarks.mutants", description=__doc__)
     parser.add_argument("--count", type=int, default=50, help="how many mutants, spread over all modules")
     parser.add_argument("--seed", type=int, default=7, help="of which ones")
     parser.add_argument("--jobs", type=int, default=2, help="processes")

@@ -1,5 +1,5 @@
 """Other solvers of the same problems."""
 
-from benchmarks.peers.suite import TITLE, measure
+from warp_lcp.benchmarks.peers.suite import TITLE, measure
 
 __all__ = ["TITLE", "measure"]

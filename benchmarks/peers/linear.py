@@ -9,7 +9,7 @@ from typing import Any
 import scipy.sparse as sp
 import scipy.sparse.linalg
 
-from benchmarks.peers.peer import Answer, Question
+from warp_lcp.benchmarks.peers.peer import Answer, Question
 
 PATIENCE = 20_000  # iterations of plain conjugate gradients
 

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse as sp
 
-from benchmarks.problems import Splash
+from warp_lcp.benchmarks.problems import Splash
 from warp_lcp.operators.grid_poisson import FLUID
 
 

@@ -7,7 +7,7 @@ import time
 import numpy as np
 import scipy.sparse as sp
 
-from benchmarks.peers.peer import Answer, Question
+from warp_lcp.benchmarks.peers.peer import Answer, Question
 
 PATIENCE = 100_000  # OSQP's iterations
 

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.peers import linear, quadratic
-from benchmarks.peers.foreign import Home, PeerFailed, Worker
-from benchmarks.peers.peer import Answer, Peer, Question
-from benchmarks.problems import BOUNDS
+from warp_lcp.benchmarks.peers import linear, quadratic
+from warp_lcp.benchmarks.peers.foreign import Home, PeerFailed, Worker
+from warp_lcp.benchmarks.peers.peer import Answer, Peer, Question
+from warp_lcp.benchmarks.problems import BOUNDS
 
 PETSC = Home("petsc4py", "WARP_LCP_PETSC_PYTHON", "petsc", "apt-get install python3-petsc4py, or name an interpreter that has it")
 INEQUALITIES = BOUNDS[1:]

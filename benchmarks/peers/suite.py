@@ -8,14 +8,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import warp_lcp as wl
-from benchmarks.cases import RTOL, Case
-from benchmarks.harness.machine import COPIED, machine
-from benchmarks.harness.record import MACHINE, Bars, Record, Results, Table, Target
-from benchmarks.harness.timing import Figure, Options, ratios
-from benchmarks.peers.foreign import PeerFailed
-from benchmarks.peers.peer import Answer, Peer, Question
-from benchmarks.peers.roster import Roster, roster
-from benchmarks.problems import BOUNDS, splash
+from warp_lcp.benchmarks.cases import RTOL, Case
+from warp_lcp.benchmarks.harness.machine import COPIED, machine
+from warp_lcp.benchmarks.harness.record import MACHINE, Bars, Record, Results, Table, Target
+from warp_lcp.benchmarks.harness.timing import Figure, Options, ratios
+from warp_lcp.benchmarks.peers.foreign import PeerFailed
+from warp_lcp.benchmarks.peers.peer import Answer, Peer, Question
+from warp_lcp.benchmarks.peers.roster import Roster, roster
+from warp_lcp.benchmarks.problems import BOUNDS, splash
 
 TITLE = "Pressure solves against peers"
 SIZES = (32, 64, 128)

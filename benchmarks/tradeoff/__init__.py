@@ -5,17 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from benchmarks.harness.machine import machine
-from benchmarks.harness.record import Record, Results
-from benchmarks.harness.timing import Options
-from benchmarks.tradeoff.charts import preset_table, run_chart, run_table, solve_chart, solve_table
-from benchmarks.tradeoff.runs import FRAMES, Run, Runs
-from benchmarks.tradeoff.settings import Setting, settings_of
-from benchmarks.tradeoff.solves import measure_solves
-from benchmarks.tradeoff.steps import measure_steps
-from warp_lcp.driver.presets import PRESETS, price_table
-from warp_lcp.driver.scene_file import load_scene
-from warp_lcp.driver.simulator import StepFailed
+from warp_lcp.benchmarks.harness.machine import machine
+from warp_lcp.benchmarks.harness.record import Record, Results
+from warp_lcp.benchmarks.harness.timing import Options
+from warp_lcp.benchmarks.tradeoff.charts import preset_table, run_chart, run_table, solve_chart, solve_table
+from warp_lcp.benchmarks.tradeoff.runs import FRAMES, Run, Runs
+from warp_lcp.benchmarks.tradeoff.settings import Setting, settings_of
+from warp_lcp.benchmarks.tradeoff.solves import measure_solves
+from warp_lcp.benchmarks.tradeoff.steps import measure_steps
+from warp_lcp.scene.presets import PRESETS, price_table
+from warp_lcp.scene.scene_file import load_scene
+from warp_lcp.simulation import StepFailed
 
 TITLE = "What accuracy costs"
 SCENES = {"dam-break": 32, "column-collapse-2d": 48}  # cells along the longest side

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 
-from benchmarks.harness.record import Chart, Lines, Record, Table
-from benchmarks.tradeoff.runs import front_of
+from warp_lcp.benchmarks.harness.record import Chart, Lines, Record, Table
+from warp_lcp.benchmarks.tradeoff.runs import front_of
 
 PARETO = "Pareto front"
 FINEST = "distance_to_finest"

@@ -7,15 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
 
-from benchmarks.harness.machine import array_bytes
-from benchmarks.harness.timing import Figure, Options
-from benchmarks.tradeoff.settings import REFERENCE, Setting
-from warp_lcp.driver.presets import changed, price_table
-from warp_lcp.driver.scene import Scene
-from warp_lcp.driver.scene_file import load_scene
-from warp_lcp.driver.simulator import SimulationFailed, StepFailed
-from warp_lcp.driver.table import SceneError
-from warp_lcp.driver.trial import BIN, Trial, trial
+from warp_lcp.benchmarks.harness.machine import array_bytes
+from warp_lcp.benchmarks.harness.timing import Figure, Options
+from warp_lcp.benchmarks.tradeoff.settings import REFERENCE, Setting
+from warp_lcp.scene.presets import changed, price_table
+from warp_lcp.scene.scene import Scene
+from warp_lcp.scene.scene_file import load_scene
+from warp_lcp.simulation import SimulationFailed, StepFailed
+from warp_lcp.scene.table import SceneError
+from warp_lcp.run.trial import BIN, Trial, trial
 
 FRAMES = 18
 

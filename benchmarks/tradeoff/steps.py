@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from benchmarks.harness.record import Record
-from benchmarks.harness.timing import Figure, Options, clock
-from warp_lcp.driver.presets import changed
-from warp_lcp.driver.run import plan_dt
-from warp_lcp.driver.scene import Scene
-from warp_lcp.driver.simulator import simulators
+from warp_lcp.benchmarks.harness.record import Record
+from warp_lcp.benchmarks.harness.timing import Figure, Options, clock
+from warp_lcp.scene.presets import changed
+from warp_lcp.run.loop import plan_dt
+from warp_lcp.scene.scene import Scene
+from warp_lcp.simulation import simulators
 
 STATES = 3  # of a run, at equal distances
 METHODS = ("accelerated-projection", "interleaved-sweeps")

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.harness.machine import machine
-from benchmarks.harness.record import Chart, Results, Table
-from benchmarks.harness.timing import Options
-from benchmarks.validation import (
+from warp_lcp.benchmarks.harness.machine import machine
+from warp_lcp.benchmarks.harness.record import Chart, Results, Table
+from warp_lcp.benchmarks.harness.timing import Options
+from warp_lcp.benchmarks.validation import (
     ceiling,
     dam_break,
     flight,
@@ -35,7 +35,7 @@ from benchmarks.validation import (
     transfers,
     volume,
 )
-from benchmarks.validation.finding import Trial, table
+from warp_lcp.benchmarks.validation.finding import Trial, table
 
 TITLE = "Liquids, sand and rigid bodies against known answers"
 CHECKS = {

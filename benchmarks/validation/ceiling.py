@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from benchmarks.harness.record import Chart
-from benchmarks.validation.finding import Findings, Trial, attempt
-from benchmarks.validation.tank import DENSITY, GRAVITY, SUB_CELL, VOXEL, Numerics, box, create, positions, pressures, steps
-from fluids import LiquidSimulation
+from warp_lcp.benchmarks.harness.record import Chart
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.validation.tank import DENSITY, GRAVITY, SUB_CELL, VOXEL, Numerics, box, create, positions, pressures, steps
+from warp_lcp.fluids import LiquidSimulation
 
 RESOLUTIONS = (32, 64)  # cells of the domain's height
 DURATION = 0.25  # [s]

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.harness.record import Chart, Lines
-from benchmarks.validation.enclosed import filled_fraction
-from benchmarks.validation.finding import Findings, Trial, attempt
-from benchmarks.validation.signals import best_pace, best_shift, front, relative_rms, stays, surface_height
-from benchmarks.validation.tank import GRAVITY, PER_AXIS, SUB_CELL, Numerics, box, create, fill, positions, steps
-from fluids import LiquidSimulation
+from warp_lcp.benchmarks.harness.record import Chart, Lines
+from warp_lcp.benchmarks.validation.enclosed import filled_fraction
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.validation.signals import best_pace, best_shift, front, relative_rms, stays, surface_height
+from warp_lcp.benchmarks.validation.tank import GRAVITY, PER_AXIS, SUB_CELL, Numerics, box, create, fill, positions, steps
+from warp_lcp.fluids import LiquidSimulation
 
 RESOLUTIONS = (12, 24)  # cells of a
 LIMITS = {12: 5.0, 24: 3.0}  # [%] of the RMS error after the best shift

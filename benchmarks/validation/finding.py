@@ -7,9 +7,9 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
-from benchmarks.harness.record import Record, Table
-from benchmarks.harness.timing import Figure
-from warp_lcp.driver.simulator import SimulationFailed, StepFailed
+from warp_lcp.benchmarks.harness.record import Record, Table
+from warp_lcp.benchmarks.harness.timing import Figure
+from warp_lcp.simulation import SimulationFailed, StepFailed
 
 COLUMNS = ("at", "figure", "measured", "bound", "as it must be?")
 

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness.record import Chart
-from benchmarks.validation import sand_pit, tank
-from benchmarks.validation.finding import Findings, Trial, attempt
-from benchmarks.validation.tank import GRAVITY, SUB_CELL, VOXEL, box
+from warp_lcp.benchmarks.harness.record import Chart
+from warp_lcp.benchmarks.validation import sand_pit, tank
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.validation.tank import GRAVITY, SUB_CELL, VOXEL, box
 
 RESOLUTIONS = (32, 64)  # cells along the domain
 CFL = (2.0, 8.0)

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness.record import Chart
-from benchmarks.validation.finding import Findings, Trial, attempt
-from benchmarks.validation.tank import DENSITY, GRAVITY, SUB_CELL, VOXEL, box, create, steps
-from fluids import LiquidSimulation
+from warp_lcp.benchmarks.harness.record import Chart
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.validation.tank import DENSITY, GRAVITY, SUB_CELL, VOXEL, box, create, steps
+from warp_lcp.fluids import LiquidSimulation
 from warp_lcp.grid.staggered import Window
 
 WIDE = 6  # diameters of the body that the closed tank has

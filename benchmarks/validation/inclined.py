@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness.record import Chart, Lines
-from benchmarks.validation.finding import Findings, Trial, attempt
-from granular.materials import MATERIALS
-from granular.scene import SandScene
-from granular.simulator import GranularSimulator, SandSimulation
+from warp_lcp.benchmarks.harness.record import Chart, Lines
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.granular.materials import MATERIALS
+from warp_lcp.granular.scene import SandScene
+from warp_lcp.granular.simulator import GranularSimulator, SandSimulation
 
 GRAVITY = 9.81  # [m/s^2]
 DEPTH, LENGTH = 0.32, 0.16  # [m]: of the layer, and of the domain

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness.record import Chart, Lines
-from benchmarks.validation import tank
-from benchmarks.validation.enclosed import enclosed_cells
-from benchmarks.validation.finding import Findings, Trial, attempt
-from benchmarks.validation.tank import DENSITY, GRAVITY, SMOOTHED, SUB_CELL, VOXEL, Numerics
-from fluids import LiquidSimulation
+from warp_lcp.benchmarks.harness.record import Chart, Lines
+from warp_lcp.benchmarks.validation import tank
+from warp_lcp.benchmarks.validation.enclosed import enclosed_cells
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.validation.tank import DENSITY, GRAVITY, SMOOTHED, SUB_CELL, VOXEL, Numerics
+from warp_lcp.fluids import LiquidSimulation
 
 RESOLUTIONS = (20, 40)  # cells a side
 SIDE, LEVEL = 0.8, 0.4  # [m]: of the domain, and of a pool

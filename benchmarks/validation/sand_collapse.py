@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness.record import Chart, Lines
-from benchmarks.validation.finding import Findings, Trial, attempt
-from benchmarks.validation.sand_pit import (
+from warp_lcp.benchmarks.harness.record import Chart, Lines
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.validation.sand_pit import (
     FLOOR,
     FRICTION_ANGLE,
     GRAVITY,

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from benchmarks.harness.record import Chart, Lines
-from benchmarks.validation.finding import Findings, Trial, attempt
-from benchmarks.validation.sand_pit import create, positions, share_solved, steps
-from granular.simulator import SandSimulation
+from warp_lcp.benchmarks.harness.record import Chart, Lines
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.validation.sand_pit import create, positions, share_solved, steps
+from warp_lcp.granular.simulator import SandSimulation
 
 ANGLES = (20.0, 30.0, 40.0)  # degrees, at which a layer stops
 RESOLUTIONS = (96, 144)  # cells of the domain's length

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness.record import Chart, Lines
-from benchmarks.validation import tank
-from benchmarks.validation.finding import Findings, Trial, attempt
-from benchmarks.validation.sand_pit import CORRECTED, GRAVITY, Row, create, positions, share_solved, steps
+from warp_lcp.benchmarks.harness.record import Chart, Lines
+from warp_lcp.benchmarks.validation import tank
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.validation.sand_pit import CORRECTED, GRAVITY, Row, create, positions, share_solved, steps
 
 OPENINGS = {1: (8, 12, 16), 2: (16,)}  # cells, by refinement
 WIDTH, DEPTH, BELOW = 0.24, 0.44, 0.12  # [m]: of the bin, the sand in it at the start, and the room below

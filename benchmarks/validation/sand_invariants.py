@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.harness.record import Chart, Lines
-from benchmarks.validation.finding import Findings, Trial, attempt
-from benchmarks.validation.sand_pit import GRAVITY, TOLERANCE, WIDTH, Row, column, steps
-from granular.simulator import SandSimulation
+from warp_lcp.benchmarks.harness.record import Chart, Lines
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.validation.sand_pit import GRAVITY, TOLERANCE, WIDTH, Row, column, steps
+from warp_lcp.granular.simulator import SandSimulation
 
 RESOLUTIONS = (20, 40)  # cells of a column's width
 ASPECT, LENGTH, DURATION = 2.0, 7.0, 1.2  # of the column; of the domain [widths]; [s]

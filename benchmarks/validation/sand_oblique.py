@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness.record import Chart
-from benchmarks.validation.finding import Findings, Trial, attempt
-from benchmarks.validation.sand_pit import CORRECTED, GRAVITY, create, steps
-from benchmarks.validation.tank import box
-from granular.simulator import SandSimulation
-from granular.solids import SandSolids
+from warp_lcp.benchmarks.harness.record import Chart
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.validation.sand_pit import CORRECTED, GRAVITY, create, steps
+from warp_lcp.benchmarks.validation.tank import box
+from warp_lcp.granular.simulator import SandSimulation
+from warp_lcp.granular.solids import SandSolids
 
 RESOLUTIONS = (8, 16)  # cells of the block's height
 PLANES = ((10.0, 0.1), (20.0, 0.2), (30.0, 0.3), (45.0, 0.5))  # degrees, friction of planes that the block slides on

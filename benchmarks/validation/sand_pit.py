@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from granular.scene import SandScene
-from granular.simulator import GranularSimulator, SandSimulation
+from warp_lcp.granular.scene import SandScene
+from warp_lcp.granular.simulator import GranularSimulator, SandSimulation
 
 GRAVITY = 9.81  # [m/s^2]
 FRICTION_ANGLE = 30.0  # degrees

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness.record import Chart, Lines
-from benchmarks.validation.finding import Findings, Trial, attempt
-from benchmarks.validation.sand_collapse import envelope
-from benchmarks.validation.sand_pit import GRAVITY, WIDTH, column, drift, runout, share_solved, steps
+from warp_lcp.benchmarks.harness.record import Chart, Lines
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.validation.sand_collapse import envelope
+from warp_lcp.benchmarks.validation.sand_pit import GRAVITY, WIDTH, column, drift, runout, share_solved, steps
 
 RESOLUTIONS = (20, 40)  # cells of a column's width
 ASPECT, LENGTH = 2.0, 7.0  # of the column; of the domain [widths]

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from benchmarks.harness.record import Chart, Lines
-from benchmarks.validation.finding import Findings, Trial, attempt
-from benchmarks.validation.sand_pit import GRAVITY, Row, create
-from granular.simulator import SandSimulation
+from warp_lcp.benchmarks.harness.record import Chart, Lines
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.validation.sand_pit import GRAVITY, Row, create
+from warp_lcp.granular.simulator import SandSimulation
 
 RESOLUTIONS = {2: (16, 24), 3: (16,)}  # cells of the width, by dimension
 SLOT = 4  # cells along z of a silo without an end there

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.harness.record import Chart
-from benchmarks.validation.finding import Findings, Trial, attempt
-from benchmarks.validation.tank import SUB_CELL, VOXEL, Numerics, box, create, positions, steps, velocities
+from warp_lcp.benchmarks.harness.record import Chart
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.validation.tank import SUB_CELL, VOXEL, Numerics, box, create, positions, steps, velocities
 
 RESOLUTIONS = (10, 20)  # cells of the layer's depth
 WAY_IN_DEPTHS, LENGTH_IN_DEPTHS = 10.0, 4.0  # the way, and the layer's length

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.harness.record import Chart, Lines
-from benchmarks.validation.finding import Findings, Trial, attempt
-from benchmarks.validation.signals import mode, period
-from benchmarks.validation.tank import GRAVITY, PER_AXIS, SUB_CELL, VOXEL, Numerics, create, positions, steps
+from warp_lcp.benchmarks.harness.record import Chart, Lines
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.validation.signals import mode, period
+from warp_lcp.benchmarks.validation.tank import GRAVITY, PER_AXIS, SUB_CELL, VOXEL, Numerics, create, positions, steps
 
 RESOLUTIONS = (14, 28)  # cells of depth
 LENGTH, DEPTH, HEIGHT = 1.0, 0.5, 0.75  # [m]: of the tank, of the liquid, of the tank

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness.record import Chart, Lines
-from benchmarks.validation.finding import Findings, Trial, attempt
-from benchmarks.validation.tank import GRAVITY, SUB_CELL, create, positions, steps
-from benchmarks.validation.transfers import angular_momentum
-from fluids import LiquidSimulation
+from warp_lcp.benchmarks.harness.record import Chart, Lines
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.validation.tank import GRAVITY, SUB_CELL, create, positions, steps
+from warp_lcp.benchmarks.validation.transfers import angular_momentum
+from warp_lcp.fluids import LiquidSimulation
 
 RESOLUTIONS = (32, 64)  # cells a meter
 KEPT = {32: 0.95, 64: 0.98}  # of the angular momentum

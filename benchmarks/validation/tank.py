@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from fluids import FluidsSimulator, LiquidScene, LiquidSimulation
-from warp_lcp.driver.simulator import Cells
+from warp_lcp.fluids import FluidsSimulator, LiquidScene, LiquidSimulation
+from warp_lcp.simulation import Cells
 
 GRAVITY = 9.81  # [m/s^2]
 DENSITY = 1000.0  # [kg/m^3]

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness.record import Chart, Lines
-from benchmarks.validation import sand_pit, tank
-from benchmarks.validation.energy import Ledger
-from benchmarks.validation.finding import Findings, Trial, attempt
-from benchmarks.validation.tank import SUB_CELL, VOXEL, box
+from warp_lcp.benchmarks.harness.record import Chart, Lines
+from warp_lcp.benchmarks.validation import sand_pit, tank
+from warp_lcp.benchmarks.validation.energy import Ledger
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.validation.tank import SUB_CELL, VOXEL, box
 from warp_lcp.operators.grid_poisson import FLUID
 
 RESOLUTIONS = (24, 48)  # cells along the domain

@@ -10,9 +10,9 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from benchmarks.harness.record import Chart, Lines
-from benchmarks.validation.finding import Findings, Trial, attempt
-from benchmarks.validation.signals import order
+from warp_lcp.benchmarks.harness.record import Chart, Lines
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.validation.signals import order
 from warp_lcp.grid.advection import advect, clearance
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces

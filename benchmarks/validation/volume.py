@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.harness.record import Chart, Lines
-from benchmarks.validation import dam_break
-from benchmarks.validation.enclosed import enclosed_cells
-from benchmarks.validation.finding import Findings, Trial, attempt
-from benchmarks.validation.tank import PER_AXIS, SUB_CELL, Numerics, box, create, positions, steps
-from fluids import LiquidSimulation
+from warp_lcp.benchmarks.harness.record import Chart, Lines
+from warp_lcp.benchmarks.validation import dam_break
+from warp_lcp.benchmarks.validation.enclosed import enclosed_cells
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.validation.tank import PER_AXIS, SUB_CELL, Numerics, box, create, positions, steps
+from warp_lcp.fluids import LiquidSimulation
 
 RESOLUTIONS = (64, 96)  # cells along the domain
 SIZE, COLUMN = [1.6, 0.8], 0.4  # [m]: of the domain, and the side of each column

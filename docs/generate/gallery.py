@@ -18,7 +18,7 @@ from typing import Any
 
 from PIL import Image
 
-from benchmarks.harness.machine import cpu_model
+from warp_lcp.benchmarks.harness.machine import cpu_model
 
 DOCS = Path(__file__).parents[1]
 PAGE, FOLDER = DOCS / "gallery.md", DOCS / "gallery"
@@ -41,12 +41,12 @@ about {base} MB of it the program itself. Pictures of liquids in 3-D are of thei
 
 def scene_text(name: str) -> str:
     """Return a built-in scene's file."""
-    return (files("warp_lcp.driver.scenes") / f"{name}.toml").read_text()
+    return (files("warp_lcp.scene.scenes") / f"{name}.toml").read_text()
 
 
 def scene_names() -> list[str]:
     """Return the built-in scenes, liquids first."""
-    names = [Path(entry.name).stem for entry in files("warp_lcp.driver.scenes").iterdir() if entry.name.endswith(".toml")]
+    names = [Path(entry.name).stem for entry in files("warp_lcp.scene.scenes").iterdir() if entry.name.endswith(".toml")]
     return sorted(names, key=lambda name: (tomllib.loads(scene_text(name))["scene"]["simulator"], name))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from warp_lcp.driver.scene_file import installed_simulators
+from warp_lcp.scene.scene_file import installed_simulators
 
 PAGE = Path(__file__).parents[1] / "scenes.md"
 MATERIALS = {"fluids": "liquid", "granular": "sand"}

@@ -2,9 +2,9 @@
 
 import pytest
 
-from benchmarks.harness.compare import comparison, losses
-from benchmarks.harness.record import Record, write_json
-from benchmarks.harness.timing import Figure
+from warp_lcp.benchmarks.harness.compare import comparison, losses
+from warp_lcp.benchmarks.harness.record import Record, write_json
+from warp_lcp.benchmarks.harness.timing import Figure
 
 
 def result(*samples, figure="pyamg_over_this"):

@@ -2,8 +2,8 @@
 
 import pytest
 
-from benchmarks import contacts
-from benchmarks.harness.timing import Options
+from warp_lcp.benchmarks import contacts
+from warp_lcp.benchmarks.harness.timing import Options
 
 
 @pytest.fixture

@@ -6,11 +6,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from benchmarks.validation import flight, sand_pit, tank, time_steps
-from benchmarks.validation.energy import Ledger
-from benchmarks.validation.tank import DENSITY, SUB_CELL, VOXEL, box
-from warp_lcp.driver.scene_file import load_scene
-from warp_lcp.driver.simulator import simulators
+from warp_lcp.benchmarks.validation import flight, sand_pit, tank, time_steps
+from warp_lcp.benchmarks.validation.energy import Ledger
+from warp_lcp.benchmarks.validation.tank import DENSITY, SUB_CELL, VOXEL, box
+from warp_lcp.scene.scene_file import load_scene
+from warp_lcp.simulation import simulators
 
 LENGTHS = (0.02, 1e-6, 0.013, 1e-4, 1e-4, 0.02)  # [s]
 STILL = {"gravity": [0.0, 0.0]}

@@ -10,13 +10,13 @@ import scipy.sparse
 from typer.testing import CliRunner
 
 import warp_lcp as wl
-from benchmarks import extremes
-from benchmarks.extremes import broken, case, matrices, refused, shapes
-from benchmarks.extremes.case import Attempt, Expected, Promise, RefusalCase, SolveCase, judge, violations
-from benchmarks.extremes.exact import Exact, norm, stencil
-from benchmarks.extremes.problem import GridProblem, MatrixProblem
+from warp_lcp.benchmarks import extremes
+from warp_lcp.benchmarks.extremes import broken, case, matrices, refused, shapes
+from warp_lcp.benchmarks.extremes.case import Attempt, Expected, Promise, RefusalCase, SolveCase, judge, violations
+from warp_lcp.benchmarks.extremes.exact import Exact, norm, stencil
+from warp_lcp.benchmarks.extremes.problem import GridProblem, MatrixProblem
 from oracle import assemble, natural_residual
-from warp_lcp.driver import cli
+from warp_lcp.cli import commands as cli
 
 FAST = (shapes.masks, shapes.closed_pools, matrices.singular, matrices.cycling, refused.wrong_arguments)
 

@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import warp_lcp as wl
-from benchmarks.extremes.case import HONEST, PRECISIONS, SolveCase, judge
-from benchmarks.extremes.problem import GridProblem, MatrixProblem
-from benchmarks.extremes.simulations import RunCase, liquid, made, sand
+from warp_lcp.benchmarks.extremes.case import HONEST, PRECISIONS, SolveCase, judge
+from warp_lcp.benchmarks.extremes.problem import GridProblem, MatrixProblem
+from warp_lcp.benchmarks.extremes.simulations import RunCase, liquid, made, sand
 
 METHODS = ("projected-multigrid", "minimum-map-newton")
 TAME = 2  # decades of coefficients that every precision but single must cope with

@@ -3,8 +3,8 @@
 import numpy as np
 import warp as wp
 
-from benchmarks import launches
-from benchmarks.launches import Launch, distinct, listen, stored_sizes, traffic
+from warp_lcp.benchmarks import launches
+from warp_lcp.benchmarks.launches import Launch, distinct, listen, stored_sizes, traffic
 
 N = 64
 FIELD = wp.array(dtype=wp.float32)

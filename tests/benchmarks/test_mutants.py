@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.mutants.tests_of import tests_of as chosen_for
+from warp_lcp.benchmarks.mutants.tests_of import tests_of as chosen_for
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -17,7 +17,7 @@ def test_tests_that_bear_a_modules_name_come_first():
 
 def test_a_mutant_is_one_change_that_still_is_python():
     pytest.importorskip("cosmic_ray")
-    from benchmarks.mutants.mutations import draw, mutated
+    from warp_lcp.benchmarks.mutants.mutations import draw, mutated
 
     drawn = draw(ROOT, 3, 5)
     assert drawn == draw(ROOT, 3, 5)
@@ -33,7 +33,7 @@ def test_a_mutant_is_one_change_that_still_is_python():
 
 def test_headers_are_changed_between_operands_only():
     pytest.importorskip("cosmic_ray")
-    from benchmarks.mutants.mutations import mutated, native_places
+    from warp_lcp.benchmarks.mutants.mutations import mutated, native_places
 
     source = "#if A && B\nconst float* x = (const float*)y + row;  // a < b\nif (*x < -1) { z = a*b; }\n"
     swapped = {mutated(source, "NativeSwap", n) for n in range(len(native_places(source)))}

@@ -7,25 +7,25 @@ from functools import partial
 
 import numpy as np
 import pytest
-from benchmarks.implicit_mpm import NEWTON
+from warp_lcp.benchmarks.implicit_mpm import NEWTON
 from typer.testing import CliRunner
 
 import warp_lcp as wl
-from benchmarks import chart
-from benchmarks.harness.record import Record, read_json, write_json
-from benchmarks.harness.timing import Figure
-from benchmarks.peers import foreign, linear, quadratic, suite
-from benchmarks.peers.foreign import Home, PeerFailed, Worker
-from benchmarks.peers.peer import Answer, Peer, Question
-from benchmarks.peers.roster import PETSC, roster
-from benchmarks.problems import splash
-from benchmarks.suite import Suite
-from benchmarks.workers import exchange
-from warp_lcp.driver import cli
+from warp_lcp.benchmarks import chart
+from warp_lcp.benchmarks.harness.record import Record, read_json, write_json
+from warp_lcp.benchmarks.harness.timing import Figure
+from warp_lcp.benchmarks.peers import foreign, linear, quadratic, suite
+from warp_lcp.benchmarks.peers.foreign import Home, PeerFailed, Worker
+from warp_lcp.benchmarks.peers.peer import Answer, Peer, Question
+from warp_lcp.benchmarks.peers.roster import PETSC, roster
+from warp_lcp.benchmarks.problems import splash
+from warp_lcp.benchmarks.suite import Suite
+from warp_lcp.benchmarks.workers import exchange
+from warp_lcp.cli import commands as cli
 
 STUB = """
 import os
-from benchmarks.workers.exchange import serve
+from warp_lcp.benchmarks.workers.exchange import serve
 
 def double(request):
     print("a library prints")

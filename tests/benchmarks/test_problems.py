@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
-from benchmarks.problems import BOUNDS, anisotropic, basin, cut_cells, splash, splash_part, warm_changes
+from warp_lcp.benchmarks.problems import BOUNDS, anisotropic, basin, cut_cells, splash, splash_part, warm_changes
 
 
 def test_splash_has_liquid_on_walls_and_no_outflow_elsewhere():

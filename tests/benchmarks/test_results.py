@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 import warp as wp
 
-import benchmarks
-from benchmarks.harness import machine, report
-from benchmarks.harness.compare import bounds, comparison
-from benchmarks.harness.machine import array_bytes, resident_bytes
-from benchmarks.harness.record import Bars, Lines, Record, Results, Table, Target, read_json, write_json
-from benchmarks.harness.timing import Figure, in_turns, ratios, timed
+from warp_lcp import benchmarks
+from warp_lcp.benchmarks.harness import machine, report
+from warp_lcp.benchmarks.harness.compare import bounds, comparison
+from warp_lcp.benchmarks.harness.machine import array_bytes, resident_bytes
+from warp_lcp.benchmarks.harness.record import Bars, Lines, Record, Results, Table, Target, read_json, write_json
+from warp_lcp.benchmarks.harness.timing import Figure, in_turns, ratios, timed
 
 
 def record(name, *samples, **facts):

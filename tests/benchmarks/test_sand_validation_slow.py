@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.validation import sand_collapse, sand_hourglass, sand_rest
+from warp_lcp.benchmarks.validation import sand_collapse, sand_hourglass, sand_rest
 
 
 @pytest.mark.slow

@@ -8,11 +8,11 @@ import scipy.sparse.linalg
 from typer.testing import CliRunner
 
 import warp_lcp as wl
-from benchmarks import scaling
-from benchmarks.harness.record import Record
-from benchmarks.harness.timing import Figure
-from benchmarks.problems import BOUNDS, natural, splash
-from warp_lcp.driver import cli
+from warp_lcp.benchmarks import scaling
+from warp_lcp.benchmarks.harness.record import Record
+from warp_lcp.benchmarks.harness.timing import Figure
+from warp_lcp.benchmarks.problems import BOUNDS, natural, splash
+from warp_lcp.cli import commands as cli
 
 
 def test_exponent_is_that_of_a_power_law():

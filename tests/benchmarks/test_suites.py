@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from warp_lcp.driver import cli
-from warp_lcp.driver.benchmark import benchmarks
+from warp_lcp.cli import commands as cli
+from warp_lcp.cli.suites import benchmarks
 
 
 def call(*arguments):

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from benchmarks import tradeoff
-from benchmarks.harness import report
-from benchmarks.harness.timing import Options
-from benchmarks.tradeoff import solves, steps
-from benchmarks.tradeoff.runs import Runs, front_of
-from benchmarks.tradeoff.settings import Setting, settings_of
-from warp_lcp.driver import cli
-from warp_lcp.driver.scene_file import load_scene
+from warp_lcp.benchmarks import tradeoff
+from warp_lcp.benchmarks.harness import report
+from warp_lcp.benchmarks.harness.timing import Options
+from warp_lcp.benchmarks.tradeoff import solves, steps
+from warp_lcp.benchmarks.tradeoff.runs import Runs, front_of
+from warp_lcp.benchmarks.tradeoff.settings import Setting, settings_of
+from warp_lcp.cli import commands as cli
+from warp_lcp.scene.scene_file import load_scene
 
 
 def options(**changes: object) -> Options:

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 import warp_lcp as wl
-from benchmarks import extremes
-from benchmarks.extremes import broken, unseen
-from benchmarks.extremes.case import Attempt, Verdict, judge
-from benchmarks.extremes.problem import GridProblem
-from benchmarks.extremes.unseen import judging
-from benchmarks.extremes.unseen.draw import AIR, FLUID, SOLID, Pools, changed, equality, solvable
-from benchmarks.extremes.unseen.judging import EveryMethodCase, UnseenCase
-from benchmarks.harness.record import write_json
-from benchmarks.harness.timing import Options
-from benchmarks.suite import EXTREMES, SOLVERS
+from warp_lcp.benchmarks import extremes
+from warp_lcp.benchmarks.extremes import broken, unseen
+from warp_lcp.benchmarks.extremes.case import Attempt, Verdict, judge
+from warp_lcp.benchmarks.extremes.problem import GridProblem
+from warp_lcp.benchmarks.extremes.unseen import judging
+from warp_lcp.benchmarks.extremes.unseen.draw import AIR, FLUID, SOLID, Pools, changed, equality, solvable
+from warp_lcp.benchmarks.extremes.unseen.judging import EveryMethodCase, UnseenCase
+from warp_lcp.benchmarks.harness.record import write_json
+from warp_lcp.benchmarks.harness.timing import Options
+from warp_lcp.benchmarks.suite import EXTREMES, SOLVERS
 from oracle import boxed, lemke
 
 SEEDS = (4217, 4218)  # of the second b changes, too

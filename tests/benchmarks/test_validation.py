@@ -11,14 +11,14 @@ import pytest
 from scipy.integrate import trapezoid
 
 import benchmarks.__main__ as process
-from benchmarks import validation
-from benchmarks.harness.record import Lines
-from benchmarks.suite import VALIDATION
-from benchmarks.validation import ceiling, dam_break, rest, signals, slope, sloshing, transfers
-from benchmarks.validation.enclosed import cumulative, enclosed_cells, filled_fraction
-from benchmarks.validation.finding import Finding, Findings, Trial, attempt, control, table
-from benchmarks.validation.tank import SUB_CELL, VOXEL, Numerics, create, fill
-from warp_lcp.driver.simulator import StepFailed
+from warp_lcp.benchmarks import validation
+from warp_lcp.benchmarks.harness.record import Lines
+from warp_lcp.benchmarks.suite import VALIDATION
+from warp_lcp.benchmarks.validation import ceiling, dam_break, rest, signals, slope, sloshing, transfers
+from warp_lcp.benchmarks.validation.enclosed import cumulative, enclosed_cells, filled_fraction
+from warp_lcp.benchmarks.validation.finding import Finding, Findings, Trial, attempt, control, table
+from warp_lcp.benchmarks.validation.tank import SUB_CELL, VOXEL, Numerics, create, fill
+from warp_lcp.simulation import StepFailed
 from warp_lcp.grid.triangle_mesh import load_surface
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.validation import CHECKS, KNOWN
+from warp_lcp.benchmarks.validation import CHECKS, KNOWN
 
 ALWAYS = {"rest", "sand hourglass"}  # the others come close enough to hold on some machines
 UNMET = {name: pytest.mark.xfail(strict=name in ALWAYS, reason=reason) for name, reason in KNOWN.items()}

@@ -13,10 +13,11 @@ import pytest
 from dots_on_ranks import COUNT, SCENE, DotsSimulator
 from typer.testing import CliRunner
 
-from warp_lcp.driver import cli, simulator
-from warp_lcp.driver.pieces import one_mesh, piece_files
-from warp_lcp.driver.recording import Recording
-from warp_lcp.driver.vtu import read_vtu
+from warp_lcp.cli import commands as cli
+from warp_lcp import simulation as simulator
+from warp_lcp.frames.pieces import one_mesh, piece_files
+from warp_lcp.render.recording import Recording
+from warp_lcp.frames.vtu import read_vtu
 
 PROGRAM = Path(__file__).with_name("dots_on_ranks.py")
 
@@ -225,7 +226,7 @@ def test_liquid_goes_on_on_other_numbers_of_ranks(mpi, tmp_path):
     """From two ranks to three, and on in one process: one log, and frames with the particles and cells of a run in one process."""
     one, out = tmp_path / "one", tmp_path / "out"
     words = shlex.split(f"run dam-break-2d --device cpu {LIQUID}")
-    go = ["-c", "from warp_lcp.driver.cli import main; main()", *words]
+    go = ["-c", "from warp_lcp.cli.commands import main; main()", *words]
     mpi(2, *go, "--out", "out", "--engine", "petsc", "--frames", 3)
     mpi(3, *go, "--out", "out", "--engine", "petsc", "--frames", 6, "--resume")
     for options in (["--out", str(one)], ["--out", str(out), "--resume"]):

@@ -5,12 +5,12 @@ import json
 import pytest
 from typer.testing import CliRunner
 
-from benchmarks import ranks
-from benchmarks.harness.record import Record
-from benchmarks.harness.timing import Figure, Options
-from warp_lcp.driver import cli
+from warp_lcp.benchmarks import ranks
+from warp_lcp.benchmarks.harness.record import Record
+from warp_lcp.benchmarks.harness.timing import Figure, Options
+from warp_lcp.cli import commands as cli
 
-MAIN = "import sys; from warp_lcp.driver.cli import main; main()"
+MAIN = "import sys; from warp_lcp.cli.commands import main; main()"
 
 
 def records(file):
@@ -38,7 +38,7 @@ def test_a_wrong_solution_is_seen(mpi):
     text = """
     import warp as wp
     wp.config.log_level = wp.LOG_ERROR
-    from benchmarks import ranks
+    from warp_lcp.benchmarks import ranks
     from warp_lcp.distributed.ranks import Ranks
     walls = ranks.shared_cases(16, Ranks.world(), "cpu")[1]
     problem, solver, work = walls.build()

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 import warp_lcp as wl
-from benchmarks.problems import cut_cells, splash
-from warp_lcp.driver.solve_recorded import solve_recorded
+from warp_lcp.benchmarks.problems import cut_cells, splash
+from warp_lcp.cli.solve_recorded import solve_recorded
 from warp_lcp.gallery.recorded import NUMBERS
 
-NOTE = "import sys; from warp_lcp.driver.cli import main; main()"
+NOTE = "import sys; from warp_lcp.cli.commands import main; main()"
 
 
 def write(path, cells, b, lower, upper=np.inf, **faces):
@@ -70,7 +70,7 @@ WRONG = {  # commands, with what is said of each
 def test_wrong_input_is_said_once(mpi, problem):
     text = """
     import sys
-    from warp_lcp.driver.cli import main
+    from warp_lcp.cli.commands import main
     commands = sys.argv[1:]
     for command in commands:
         sys.argv[1:] = ["solve", *command.split(), "--engine", "petsc"]
@@ -90,7 +90,7 @@ def test_wrong_input_is_said_once(mpi, problem):
 def test_ranks_with_different_files_end(mpi, problem, tmp_path):
     text = """
     import os, sys
-    from warp_lcp.driver.cli import main
+    from warp_lcp.cli.commands import main
     from warp_lcp.distributed.launch import rank_here
     os.chdir(sys.argv.pop())
     if rank_here() == 1:

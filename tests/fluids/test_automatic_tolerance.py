@@ -10,10 +10,10 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
-from fluids import SIMULATOR, LiquidScene
-from fluids.tolerance import FIRST, FRACTION, LEAST, MOST
+from warp_lcp.fluids import SIMULATOR, LiquidScene
+from warp_lcp.fluids.tolerance import FIRST, FRACTION, LEAST, MOST
 from small_liquids import GRAVITY, advance, box, create, dam, scene
-from warp_lcp.driver.table import SceneError, validate
+from warp_lcp.scene.table import SceneError, validate
 
 AUTO = {"tolerance": "auto"}
 

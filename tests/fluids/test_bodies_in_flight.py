@@ -9,7 +9,7 @@ import pytest
 
 import small_liquids
 import small_sands
-from fluids import LiquidSimulation
+from warp_lcp.fluids import LiquidSimulation
 from small_liquids import GRAVITY, advance, box, create, scene
 
 RIM = 2.0  # [m/s] of drops that spin: three quarters of a turn of a drop of .17 m in .4 s

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from fluids import LiquidSimulation
+from warp_lcp.fluids import LiquidSimulation
 from small_liquids import GRAVITY, STEPS, box, create, scene
 from warp_lcp.material import boundary
 

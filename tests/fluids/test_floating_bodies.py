@@ -6,7 +6,7 @@ import warp as wp
 from pydantic import ValidationError
 
 from small_liquids import advance, box, create, scene
-from warp_lcp.driver.simulator import StepFailed
+from warp_lcp.simulation import StepFailed
 
 FLAT = {"physics": {"gravity": [0.0, 0.0]}}
 VOXEL = {"pressure": {"surface": "voxel"}}

@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.validation.floating import displacement
+from warp_lcp.benchmarks.validation.floating import displacement
 from small_liquids import GRAVITY, box, create, scene
 
 STEP = 1e-3  # [s]

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from warp_lcp.driver.cli import app
-from warp_lcp.driver.nvdb import LEAF, LEAF_NODE
-from warp_lcp.driver.recording import Color, Recording
-from warp_lcp.driver.scene_file import load_scene
-from warp_lcp.driver.table import SceneError
+from warp_lcp.cli.commands import app
+from warp_lcp.frames.nvdb import LEAF, LEAF_NODE
+from warp_lcp.render.recording import Color, Recording
+from warp_lcp.scene.scene_file import load_scene
+from warp_lcp.scene.table import SceneError
 
 SMALL = ("domain.resolution=24", "domain.size=[1.2, 0.6, 0.6]", "time.duration=0.1")
 

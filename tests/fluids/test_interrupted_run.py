@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from small_liquids import box, create, scene
-from warp_lcp.driver.run import run_scene
-from warp_lcp.driver.scene_file import load_scene
+from warp_lcp.run.loop import run_scene
+from warp_lcp.scene.scene_file import load_scene
 
 
 class Silent:

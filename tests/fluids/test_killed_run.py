@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from warp_lcp.driver import cli
+from warp_lcp.cli import commands as cli
 
 SCENE = """
 [scene]
@@ -39,7 +39,7 @@ motion = { kind = "sinusoid", period = 0.7, amplitude = [0.1, 0.0] }
 [output]
 checkpoint_every = 7
 """
-PROGRAM = "from warp_lcp.driver.cli import main; main()"
+PROGRAM = "from warp_lcp.cli.commands import main; main()"
 LIMIT = 120  # [s] that a process may take
 
 pytestmark = [

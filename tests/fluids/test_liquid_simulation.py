@@ -4,9 +4,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fluids import SIMULATOR, LiquidSimulation
+from warp_lcp.fluids import SIMULATOR, LiquidSimulation
 from small_liquids import GRAVITY, advance, box, create, dam, scene
-from warp_lcp.driver.simulator import Cells, Points, Profiled, SimulationFailed, Simulator, StepFailed, simulators
+from warp_lcp.simulation import Cells, Points, Profiled, SimulationFailed, Simulator, StepFailed, simulators
 from warp_lcp.grid.particles import Particles
 
 DIMENSIONS = [2, 3]
@@ -329,7 +329,7 @@ def test_a_piston_drives_the_liquid_of_a_scene() -> None:
 
 
 def test_scenes_of_something_else_are_refused() -> None:
-    from warp_lcp.driver.scene import Scene
+    from warp_lcp.scene.scene import Scene
 
     data = {"scene": {"simulator": "fluids"}, "time": {"duration": 1.0}, "domain": {"size": [1.0, 1.0], "resolution": 4}}
     with pytest.raises(ValueError, match="liquid"):

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 from small_liquids import GRAVITY, advance, box, create, scene
-from warp_lcp.driver.simulator import SimulationFailed
+from warp_lcp.simulation import SimulationFailed
 from warp_lcp.grid.motion import Pose
 
 SPEED = 0.5  # of the piston [m/s]

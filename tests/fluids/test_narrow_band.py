@@ -8,8 +8,8 @@ import pytest
 import warp as wp
 from pydantic import ValidationError
 
-from fluids import LiquidScene, LiquidSimulation
-from granular.scene import SandScene
+from warp_lcp.fluids import LiquidScene, LiquidSimulation
+from warp_lcp.granular.scene import SandScene
 from small_liquids import GRAVITY, advance, box, create, scene
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.material.narrow_band import NarrowBand

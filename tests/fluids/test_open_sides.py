@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from fluids import LiquidScene
+from warp_lcp.fluids import LiquidScene
 from small_liquids import GRAVITY, advance, box, create, scene
 from warp_lcp.grid.sides import SIDES
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fluids.distributed_state import CELLS, piece_of, state_of
+from warp_lcp.fluids.distributed_state import CELLS, piece_of, state_of
 from small_liquids import advance, dam
 
 

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
-from fluids.pressure import PressureProjection
+from warp_lcp.fluids.pressure import PressureProjection
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.voxelize import OPEN, VoxelSolids
 from warp_lcp.material.boundary import WholeCells

@@ -10,10 +10,10 @@ import warp_lcp as wl
 from oracle import assemble, natural_residual
 from small_liquids import box, create, dam, scene
 from warp_lcp import claims
-from warp_lcp.driver import cli
-from warp_lcp.driver.problem_folder import ProblemFolder
-from warp_lcp.driver.run_folder import OutputError
-from warp_lcp.driver.simulator import Recorded
+from warp_lcp.cli import commands as cli
+from warp_lcp.run.problem_folder import ProblemFolder
+from warp_lcp.run.folder import OutputError
+from warp_lcp.simulation import Recorded
 from warp_lcp.gallery.recorded import FORMAT, files, load
 from warp_lcp.gallery.recorded_part import cell_counts
 

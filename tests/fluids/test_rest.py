@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fluids import LiquidSimulation
+from warp_lcp.fluids import LiquidSimulation
 from small_liquids import GRAVITY, advance, box, create, scene
 
 SLOPE = math.radians(30)

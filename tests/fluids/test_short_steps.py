@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fluids import SIMULATOR
+from warp_lcp.fluids import SIMULATOR
 from small_liquids import advance, box, create, scene
-from warp_lcp.driver.scene_file import load_scene
+from warp_lcp.scene.scene_file import load_scene
 
 
 @pytest.mark.parametrize("cfl", [0.4, 0.125])

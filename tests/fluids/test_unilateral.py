@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fluids import LiquidSimulation
+from warp_lcp.fluids import LiquidSimulation
 from small_liquids import GRAVITY, advance, box, create, scene
 
 UNILATERAL = {"pressure": {"model": "unilateral"}}

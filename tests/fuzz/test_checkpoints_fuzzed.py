@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from mutated import mutated
 from told import costly, limited, told
 
-from warp_lcp.driver.checkpoint import PIECES, Checkpoint, CheckpointError, CheckpointFolder
+from warp_lcp.run.checkpoint import PIECES, Checkpoint, CheckpointError, CheckpointFolder
 
 STATE = {
     "position": np.random.default_rng(59).random((5, 3)),

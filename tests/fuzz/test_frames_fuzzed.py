@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from mutated import mutated
 from told import costly, limited
 
-from warp_lcp.driver.frames import FrameFolder
-from warp_lcp.driver.pieces import describe, write_whole
-from warp_lcp.driver.recording import Color, Recording, RenderError, Show
-from warp_lcp.driver.simulator import Cells, Part, Points, Surface
-from warp_lcp.driver.table import SceneError
+from warp_lcp.frames.frames import FrameFolder
+from warp_lcp.frames.pieces import describe, write_whole
+from warp_lcp.render.recording import Color, Recording, RenderError, Show
+from warp_lcp.simulation import Cells, Part, Points, Surface
+from warp_lcp.scene.table import SceneError
 
 SCENE = """
 scene.simulator = "fluids"

@@ -11,7 +11,7 @@ from hypothesis import given
 from mutated import mutated
 from told import limited, told
 
-from warp_lcp.driver import check
+from warp_lcp.run import check
 from warp_lcp.grid.triangle_mesh import read_mesh
 
 POINTS = np.array([[x, y, z] for z in (0.25, 0.75) for y in (0.25, 0.75) for x in (0.25, 0.75)])

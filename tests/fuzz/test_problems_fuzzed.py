@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from mutated import mutated
 from told import costly, told
 
-from warp_lcp.driver import cli
+from warp_lcp.cli import commands as cli
 
 SIDE = 4
 FIELD = np.random.default_rng(61).random((SIDE, SIDE))

@@ -20,10 +20,10 @@ from hypothesis import strategies as st
 from mutated import mutated
 from told import limited, told
 
-from warp_lcp.driver import check
-from warp_lcp.driver.check import check_scene
-from warp_lcp.driver.scene_file import built_in_scenes
-from warp_lcp.driver.table import SceneError
+from warp_lcp.run import check
+from warp_lcp.run.check import check_scene
+from warp_lcp.scene.scene_file import built_in_scenes
+from warp_lcp.scene.table import SceneError
 
 ROOM = 8 << 20  # bytes of memory that a scene may take to be made: those of a few thousand cells
 NUMBERS = [0, -1, 1, 2, 3, 7, 4096, 10**9, 2**63 - 1, -(2**63), 2**64, 10**400, math.nan, math.inf, -math.inf]

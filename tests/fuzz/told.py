@@ -10,10 +10,10 @@ from pathlib import Path
 from hypothesis import settings
 from typer.testing import CliRunner
 
-from warp_lcp.driver import cli
-from warp_lcp.driver.check import start
-from warp_lcp.driver.foreign import visible
-from warp_lcp.driver.scene_file import load_scene
+from warp_lcp.cli import commands as cli
+from warp_lcp.run.check import start
+from warp_lcp.scene.foreign import visible
+from warp_lcp.scene.scene_file import load_scene
 
 try:
     import resource

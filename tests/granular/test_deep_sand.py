@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from granular.coupled import AcceleratedProjection
-from granular.simulator import SandSimulation
+from warp_lcp.granular.coupled import AcceleratedProjection
+from warp_lcp.granular.simulator import SandSimulation
 from small_sands import GRAVITY, box, create, scene
 
 

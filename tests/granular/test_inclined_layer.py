@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.validation import inclined
+from warp_lcp.benchmarks.validation import inclined
 
 
 def test_a_layer_rests_and_runs_as_its_friction_angle_says_and_the_box_does_not() -> None:

@@ -5,9 +5,9 @@ import pytest
 import warp as wp
 from test_sand_stress import make
 
-from granular.coupled import colors
-from granular.interleaved_kernels import APART, interleaved_passes
-from granular.yield_set import xyz
+from warp_lcp.granular.coupled import colors
+from warp_lcp.granular.interleaved_kernels import APART, interleaved_passes
+from warp_lcp.granular.yield_set import xyz
 from warp_lcp.rows import Rows
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from granular.packing import Packing
-from granular.stress import Stress, Walls, YieldSet
+from warp_lcp.granular.packing import Packing
+from warp_lcp.granular.stress import Stress, Walls, YieldSet
 from warp_lcp.grid.staggered import StaggeredGrid
 
 CELLS, PRESSURE, SLOPE, RATE = 6, 1.0, 0.5, 300.0  # cells an edge; p and k of the yield set [m/s]; shear of the flow, times dx [m/s]

@@ -9,9 +9,9 @@ import pytest
 import warp as wp
 from scipy.spatial import cKDTree
 
-from granular.scene import SandScene
-from granular.simulator import GranularSimulator, SandSimulation
-from warp_lcp.driver.scene import SceneError, validate
+from warp_lcp.granular.scene import SandScene
+from warp_lcp.granular.simulator import GranularSimulator, SandSimulation
+from warp_lcp.scene.scene import SceneError, validate
 from warp_lcp.grid.periodic import PeriodicSides
 from warp_lcp.grid.staggered import StaggeredGrid
 

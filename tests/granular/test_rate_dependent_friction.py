@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from benchmarks.validation import inclined
-from granular.scene import SandScene
+from warp_lcp.benchmarks.validation import inclined
+from warp_lcp.granular.scene import SandScene
 from small_sands import box, create, scene
-from warp_lcp.driver.table import SceneError, validate
+from warp_lcp.scene.table import SceneError, validate
 
 GROWS = {"dynamic_angle": 40.0, "grain_size": 0.01}
 GLASS = {"dynamic_angle": inclined.DYNAMIC, "grain_size": inclined.GRAIN, "inertial_number": inclined.INERTIAL}

@@ -7,10 +7,10 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
-from granular.bodies import SandBodies
-from granular.coupled import AcceleratedProjection
-from granular.packing import Packing
-from granular.stress import Stress, Walls, YieldSet
+from warp_lcp.granular.bodies import SandBodies
+from warp_lcp.granular.coupled import AcceleratedProjection
+from warp_lcp.granular.packing import Packing
+from warp_lcp.granular.stress import Stress, Walls, YieldSet
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
 
@@ -293,7 +293,7 @@ def test_a_step_is_implicit_in_the_bodies_velocity(monkeypatch: pytest.MonkeyPat
     """With enough trial steps, the stresses of a step leave the bodies the very velocity that the step was taken with."""
     left = []
     for rounds in (1, 60):
-        monkeypatch.setattr("granular.bodies.ROUNDS", rounds)
+        monkeypatch.setattr("warp_lcp.granular.bodies.ROUNDS", rounds)
         case = make(2, (28, 20), [((11, 6, 0), (17, 12, 1))], ratio=0.02, depth=9)
         assert case.bodies is not None
         case.stress.residual()

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import warp as wp
 
-from benchmarks.validation import sand_oblique
-from granular.coupled import AcceleratedProjection
-from granular.cut_walls import CutWalls
-from granular.packing import SHEARS, Packing
-from granular.scene import SandScene
-from granular.simulator import GranularSimulator, SandSimulation
-from granular.solids import SandSolids
-from granular.stress import Stress, Walls, YieldSet
+from warp_lcp.benchmarks.validation import sand_oblique
+from warp_lcp.granular.coupled import AcceleratedProjection
+from warp_lcp.granular.cut_walls import CutWalls
+from warp_lcp.granular.packing import SHEARS, Packing
+from warp_lcp.granular.scene import SandScene
+from warp_lcp.granular.simulator import GranularSimulator, SandSimulation
+from warp_lcp.granular.solids import SandSolids
+from warp_lcp.granular.stress import Stress, Walls, YieldSet
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.solids import Plane
 from warp_lcp.grid.staggered import StaggeredGrid

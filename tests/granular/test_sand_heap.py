@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from benchmarks.validation import sand_heap
-from benchmarks.validation.sand_pit import positions, steps
+from warp_lcp.benchmarks.validation import sand_heap
+from warp_lcp.benchmarks.validation.sand_pit import positions, steps
 
 CELLS, STANDS = 40, 0.5  # cells of length; [s]
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from granular.simulator import SandSimulation
+from warp_lcp.granular.simulator import SandSimulation
 from small_sands import GRAVITY, advance, box, create, scene
 
 FLIGHT = 0.3  # [s]

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from small_sands import box, create, scene
-from warp_lcp.driver.run import run_scene
-from warp_lcp.driver.scene_file import load_scene
+from warp_lcp.run.loop import run_scene
+from warp_lcp.scene.scene_file import load_scene
 
 FAST = ["output.checkpoint_every=5", "solver.max_iterations=60"]
 SLIDER = {**box([0.55, -0.1], [0.65, 0.3]), "motion": {"kind": "translation", "velocity": [-0.6, 0.0]}}

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from granular.simulator import SandSimulation
+from warp_lcp.granular.simulator import SandSimulation
 from small_sands import GRAVITY, advance, box, create, scene
-from warp_lcp.driver.simulator import StepFailed
+from warp_lcp.simulation import StepFailed
 
 SPEED = 0.5  # of a paddle [m/s]
 FEW = {"max_iterations": 60}  # of a solve: enough where nothing depends on its accuracy

@@ -11,8 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 from small_sands import box, create, scene
-from warp_lcp.driver import cli
-from warp_lcp.driver.recording import Color, Recording
+from warp_lcp.cli import commands as cli
+from warp_lcp.render.recording import Color, Recording
 
 SMALL = ["--set", "domain.resolution=24", "--set", "time.duration=0.1", "--device", "cpu"]
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from granular.packing import Packing, wall_faces
+from warp_lcp.granular.packing import Packing, wall_faces
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
 

@@ -5,10 +5,10 @@ from typing import Any
 
 import pytest
 
-from granular.scene import STICKS, SandScene
+from warp_lcp.granular.scene import STICKS, SandScene
 from small_sands import box, scene
-from warp_lcp.driver.scene_file import load_scene
-from warp_lcp.driver.table import SceneError, validate
+from warp_lcp.scene.scene_file import load_scene
+from warp_lcp.scene.table import SceneError, validate
 
 FILE = """[scene]
 simulator = "granular"

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warp_lcp.driver.run import run_scene
-from warp_lcp.driver.scene_file import load_scene
+from warp_lcp.run.loop import run_scene
+from warp_lcp.scene.scene_file import load_scene
 
 
 class Silent:

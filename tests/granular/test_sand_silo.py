@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from benchmarks.validation import sand_silo
-from benchmarks.validation.sand_pit import create
+from warp_lcp.benchmarks.validation import sand_silo
+from warp_lcp.benchmarks.validation.sand_pit import create
 
 SHORT = 0.125  # [s]: at rest after the first steps
 

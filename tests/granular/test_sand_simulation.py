@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from granular.simulator import SandSimulation
+from warp_lcp.granular.simulator import SandSimulation
 from small_sands import GRAVITY, advance, box, column, create, scene
-from warp_lcp.driver.simulator import SimulationFailed
+from warp_lcp.simulation import SimulationFailed
 
 DENSITY = 1600.0
 
@@ -144,7 +144,7 @@ def boxed(dimension: int, solver: dict[str, object]) -> SandSimulation:
     data["friction"] = {"model": "box"}
     data["domain"]["friction"] = 0.4
     data["density_correction"] = {}
-    from granular.scene import SandScene
+    from warp_lcp.granular.scene import SandScene
 
     return create(SandScene.model_validate(data))
 

@@ -9,8 +9,8 @@ import pytest
 import scipy.optimize
 import warp as wp
 
-from granular.packing import Packing
-from granular.stress import Stress, Walls, YieldSet
+from warp_lcp.granular.packing import Packing
+from warp_lcp.granular.stress import Stress, Walls, YieldSet
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.validation import sand_collapse, sand_hourglass, sand_invariants, sand_pit, sand_rest
+from warp_lcp.benchmarks.validation import sand_collapse, sand_hourglass, sand_invariants, sand_pit, sand_rest
 
 
 def test_the_envelope_is_that_of_the_experiments() -> None:

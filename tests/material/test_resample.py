@@ -10,10 +10,10 @@ import pytest
 from rich.console import Console
 
 from small_liquids import advance, box, create, scene
-from warp_lcp.driver.progress import Lines
-from warp_lcp.driver.run import run_scene
-from warp_lcp.driver.run_folder import OutputError
-from warp_lcp.driver.scene_file import load_scene
+from warp_lcp.run.progress import Lines
+from warp_lcp.run.loop import run_scene
+from warp_lcp.run.folder import OutputError
+from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.material.resample import resampled
 
 BALL = {"shape": "sphere", "center": [0.7, 0.2], "radius": 0.15}

@@ -46,7 +46,7 @@ def mesh_outline(mesh: TriangleMesh) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class BodySurface:
-    """Triangles, in 2-D segments; as `warp_lcp.driver.simulator.Surface` without a name.
+    """Triangles, in 2-D segments; as `warp_lcp.simulation.Surface` without a name.
 
     Args:
         points: [m], shape (n, 3).

@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from benchmarks.extremes.problem import GridProblem
-from benchmarks.extremes.unseen import domains, matrices, media, obstacles
-from benchmarks.extremes.unseen.draw import Draw, Unseen, changed, solvable
+from warp_lcp.benchmarks.extremes.problem import GridProblem
+from warp_lcp.benchmarks.extremes.unseen import domains, matrices, media, obstacles
+from warp_lcp.benchmarks.extremes.unseen.draw import Draw, Unseen, changed, solvable
 
 RESERVED = range(10_000, 20_000)  # seeds for acceptance
 FRESH = range(20_000, 1 << 31)  # seeds that a run draws from

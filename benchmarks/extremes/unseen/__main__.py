@@ -1,13 +1,13 @@
-"""Solve problems by kind and seed: `python -m benchmarks.extremes.unseen KIND[,KIND] FIRST [LAST]`, KIND may be all."""
+"""Solve problems by kind and seed: `python -m warp_lcp.benchmarks.extremes.unseen KIND[,KIND] FIRST [LAST]`, KIND may be all."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
 
-from benchmarks.extremes.case import judge
-from benchmarks.extremes.unseen import KINDS
-from benchmarks.extremes.unseen.judging import EveryMethodCase, UnseenCase, summary
+from warp_lcp.benchmarks.extremes.case import judge
+from warp_lcp.benchmarks.extremes.unseen import KINDS
+from warp_lcp.benchmarks.extremes.unseen.judging import EveryMethodCase, UnseenCase, summary
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import scipy.ndimage
 
-from benchmarks.extremes.problem import GridProblem
-from benchmarks.extremes.unseen.draw import AIR, FLUID, SOLID, Draw
+from warp_lcp.benchmarks.extremes.problem import GridProblem
+from warp_lcp.benchmarks.extremes.unseen.draw import AIR, FLUID, SOLID, Draw
 
 
 def some_bounds(draw: Draw, shape: tuple[int, ...]) -> dict[str, Any]:

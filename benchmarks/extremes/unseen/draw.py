@@ -13,8 +13,8 @@ import scipy.ndimage
 import scipy.sparse.csgraph
 
 import warp_lcp as wl
-from benchmarks.extremes.exact import Exact
-from benchmarks.extremes.problem import GridProblem, MatrixProblem
+from warp_lcp.benchmarks.extremes.exact import Exact
+from warp_lcp.benchmarks.extremes.problem import GridProblem, MatrixProblem
 
 AIR, FLUID, SOLID = wl.AIR, wl.FLUID, wl.SOLID
 SIDES = {2: (30, 300), 3: (12, 48)}  # cells, by dimensions

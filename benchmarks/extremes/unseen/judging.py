@@ -12,8 +12,8 @@ import scipy.sparse
 import warp as wp
 
 import warp_lcp as wl
-from benchmarks.extremes import unseen
-from benchmarks.extremes.case import (
+from warp_lcp.benchmarks.extremes import unseen
+from warp_lcp.benchmarks.extremes.case import (
     HONEST,
     REFUSED,
     SOLVED,
@@ -25,9 +25,9 @@ from benchmarks.extremes.case import (
     checked,
     interrupted_after,
 )
-from benchmarks.extremes.problem import GridProblem, MatrixProblem
-from benchmarks.extremes.unseen.draw import Unseen, equality
-from benchmarks.harness.record import Table
+from warp_lcp.benchmarks.extremes.problem import GridProblem, MatrixProblem
+from warp_lcp.benchmarks.extremes.unseen.draw import Unseen, equality
+from warp_lcp.benchmarks.harness.record import Table
 from warp_lcp.protocol import families
 
 FAMILY = "unseen"

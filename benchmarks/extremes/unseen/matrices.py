@@ -9,9 +9,9 @@ import numpy as np
 import scipy.sparse
 import scipy.spatial
 
-from benchmarks.extremes.problem import GridProblem, MatrixProblem
-from benchmarks.extremes.unseen import domains, media, obstacles
-from benchmarks.extremes.unseen.draw import Draw, solvable
+from warp_lcp.benchmarks.extremes.problem import GridProblem, MatrixProblem
+from warp_lcp.benchmarks.extremes.unseen import domains, media, obstacles
+from warp_lcp.benchmarks.extremes.unseen.draw import Draw, solvable
 
 GRIDS = (obstacles.torsion, obstacles.stairs, obstacles.dam, domains.voxels_2d, domains.bend, media.anisotropic, media.shifted)
 SMALLEST_DIAGONALS = (0.0, 1e-12, 1e-4)  # none, and the range of those that are tiny

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.extremes.problem import GridProblem
-from benchmarks.extremes.unseen import domains, obstacles
-from benchmarks.extremes.unseen.draw import AIR, FLUID, SOLID, Draw, framed
+from warp_lcp.benchmarks.extremes.problem import GridProblem
+from warp_lcp.benchmarks.extremes.unseen import domains, obstacles
+from warp_lcp.benchmarks.extremes.unseen.draw import AIR, FLUID, SOLID, Draw, framed
 
 SIMPLE = (domains.vent, domains.voxels_2d, domains.liquid, obstacles.torsion, obstacles.membrane, obstacles.rough, obstacles.ball)
 CONTRAST = 1e4  # within the limits that docs/methods.md tells

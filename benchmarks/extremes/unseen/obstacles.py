@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import scipy.ndimage
 
-from benchmarks.extremes.problem import GridProblem
-from benchmarks.extremes.unseen.draw import FLUID, Draw, framed
+from warp_lcp.benchmarks.extremes.problem import GridProblem
+from warp_lcp.benchmarks.extremes.unseen.draw import FLUID, Draw, framed
 
 
 def unit_square(n: int) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,97 @@
+"""Matrix Market files: what SciPy writes is read, and what harms SciPy's reader is refused."""
+
+import bz2
+import gzip
+import io
+
+import numpy as np
+import pytest
+import scipy.io
+import scipy.sparse
+
+from warp_lcp.claims import ClaimError
+from warp_lcp.cli.matrix_market import MarketError, read_market
+
+RANDOM = np.random.default_rng(733)
+FULL = RANDOM.standard_normal((5, 5))
+THIN = np.where(RANDOM.random((5, 5)) < 0.4, FULL, 0.0)
+OF = {"general": lambda m: m, "symmetric": lambda m: m + m.T, "skew-symmetric": lambda m: m - m.T}
+REAL = b"%%MatrixMarket matrix coordinate real general\n"
+
+
+def read(path, data: bytes, fits=lambda rows, columns: True):
+    path.write_bytes(data)
+    return read_market(path, fits, "expected another")
+
+
+def written(matrix, **options) -> bytes:
+    stream = io.BytesIO()
+    scipy.io.mmwrite(stream, matrix, comment="two\nlines", precision=17, **options)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize("symmetry", OF)
+@pytest.mark.parametrize("sparse", [False, True])
+def test_what_scipy_writes_is_read(tmp_path, symmetry, sparse):
+    matrix = OF[symmetry](THIN if sparse else FULL)
+    found = read(tmp_path / "a.mtx", written(scipy.sparse.coo_array(matrix) if sparse else matrix, symmetry=symmetry))
+    assert scipy.sparse.issparse(found) == sparse
+    np.testing.assert_array_equal(found.toarray() if sparse else found, matrix)
+
+
+def test_other_fields_shapes_and_spellings(tmp_path):
+    whole = np.arange(-3, 3).reshape(2, 3)
+    np.testing.assert_array_equal(read(tmp_path / "a.mtx", written(whole)), whole)
+    pattern = read(tmp_path / "a.mtx", written(scipy.sparse.coo_array(whole), field="pattern"))
+    np.testing.assert_array_equal(pattern.toarray(), whole != 0)
+    text = b"%%matrixmarket MATRIX Coordinate Real General\r\n% a\r\n\r\n 2  2 3 \r\n1 1 .5e1\r\n\r\n 2 2 -inf\r\n1 1 1"
+    np.testing.assert_array_equal(read(tmp_path / "a.mtx", text).toarray(), [[6.0, 0.0], [0.0, -np.inf]])
+    assert read(tmp_path / "a.mtx", REAL + b"3 3 0\n").nnz == 0
+
+
+@pytest.mark.parametrize(("suffix", "pack"), [("gz", gzip.compress), ("bz2", bz2.compress)])
+def test_packed_files(tmp_path, suffix, pack):
+    path = tmp_path / f"a.mtx.{suffix}"
+    np.testing.assert_array_equal(read(path, pack(written(FULL))), FULL)
+    with pytest.raises(MarketError, match="cannot be unpacked"):
+        read(path, pack(written(FULL))[:-9])
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"", "does not begin with %%MatrixMarket"),
+        (b"%%MatrixMarket vector array real general\n3\n", "does not begin with %%MatrixMarket"),
+        (REAL + b"\n" * 100_000, "does not begin with %%MatrixMarket"),
+        (REAL + b"2 2\n1 1\n", "its size is not that of its form"),
+        (REAL + b"1" + b"0" * 30 + b" 4 1\n1 1 1\n", "does not begin"),
+        (REAL + b"2 2 1\n1 1 1.9[[[[[", "something that is no number"),  # these end SciPy 1.17 with a segmentation fault
+        (REAL + b"2 2 2\n1 1 1.5\n2 2 1\x00.5\n", "something that is no number"),
+        (REAL + b"2 2 2\n1 1 1.5\n2 ", "these take 11 bytes, and the file has 10"),
+        (REAL + b"2 2 2\n1 1 1.5\n222222 ", "it holds 4 numbers, 2 x 2 with 2 entries are 6"),
+        (REAL + b"2 2 1\n1 3 1.5\n", "rows 1 to 2 and columns 1 to 2"),
+        (REAL + b"2 2 1\n0 1 1.5\n", "rows 1 to 2 and columns 1 to 2"),
+        (REAL + b"2 2 1\n1.5 1 1\n", "rows 1 to 2 and columns 1 to 2"),
+        (REAL + b"2 2 1\nnan 1 1\n", "rows 1 to 2 and columns 1 to 2"),
+        (REAL.replace(b"general", b"symmetric") + b"2 3 1\n1 1 1\n", "symmetric matrices are square"),
+        (REAL.replace(b"real", b"complex") + b"2 2 1\n1 1 1 0\n", "holds complex numbers"),
+        (REAL + b"3 3 1000000000000\n1 1 1.0\n", "the file has 8 bytes"),
+        (REAL + b"1000000000000 1000000000000 1\n1 1 1.0\n", "1000000000000 entries|GB of memory"),
+        (REAL.replace(b"coordinate", b"array") + b"4294967296 4294967296\n1.0\n", "the file has 4 bytes"),
+    ],
+)
+def test_what_is_wrong_is_told(tmp_path, data, message):
+    with pytest.raises(ValueError, match=message) as found:
+        read(tmp_path / "a.mtx", data)
+    assert isinstance(found.value, MarketError | ClaimError) or "complex" in message
+
+
+def test_a_shape_is_refused_before_its_matrix_is_read(tmp_path):
+    with pytest.raises(ValueError, match="has shape 2 x 3: expected another"):
+        read(tmp_path / "a.mtx", REAL + b"2 3 1\nno numbers at all\n", lambda rows, columns: rows == columns)
+
+
+def test_a_device_is_no_file(tmp_path):
+    (tmp_path / "zero.mtx").symlink_to("/dev/zero")
+    with pytest.raises(ClaimError, match="it is no file"):
+        read_market(tmp_path / "zero.mtx", lambda rows, columns: True, "")

@@ -1,0 +1,154 @@
+"""Every signal that asks a process to end leaves a checkpoint, a status that is true and a message; before the first step at once."""
+
+import json
+import os
+import signal
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from warp_lcp.cli import commands as cli
+from warp_lcp.run import interruption
+from warp_lcp.run.interruption import SIGNALS, Interruption
+from warp_lcp.run.loop import run_scene
+from warp_lcp.run.folder import mark_stopped
+
+EACH = pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
+
+
+@pytest.fixture
+def run(scene_file, tmp_path):
+    def call(*more: object) -> Result:
+        arguments = ["run", scene_file, "--out", tmp_path / "out", "--device", "cpu", "--set", "time.duration=0.2", *more]
+        return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
+
+    return call
+
+
+def record(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "out" / "run.json").read_text())
+
+
+def at(step: int, *numbers: signal.Signals) -> Any:
+    def before_step(simulation: Any, dt: float) -> None:
+        if simulation.step_count == step:
+            for number in numbers:
+                signal.raise_signal(number)
+
+    return before_step
+
+
+@EACH
+def test_after_a_step(dots, run, tmp_path, number):
+    handlers = [signal.getsignal(each) for each in SIGNALS]
+    dots.before_step = at(5, number)
+    result = run()
+    assert result.exit_code == 1
+    assert result.stderr.count(f"{number.name}: stopping after this step") == 1
+    assert f"stopped: interrupted by {number.name}\n" in result.stderr
+    found = record(tmp_path)
+    assert (found["status"], found["reason"], found["steps"]) == ("stopped", f"interrupted by {number.name}", 6)
+    assert (tmp_path / "out" / "checkpoints" / "step_000006.npz").is_file()
+    assert [signal.getsignal(each) for each in SIGNALS] == handlers
+    dots.before_step = at(-1)
+    assert run("--resume").exit_code == 0
+    assert record(tmp_path)["resumed_from_step"] == 6
+
+
+@EACH
+@pytest.mark.parametrize("frames", [1, 10])
+def test_before_the_first_step_has_ended(dots, run, tmp_path, number, frames):
+    dots.before_step = at(0, number)
+    result = run("--frames", frames)
+    assert result.exit_code == 1
+    assert f"{number.name}: stopping before the first step has ended" in result.stderr
+    found = record(tmp_path)
+    assert (found["status"], found["steps"]) == ("stopped", 0)
+    assert found["reason"] == f"interrupted by {number.name} before its first step had ended"
+    dots.before_step = at(-1)
+    assert run("--resume", "--frames", frames).exit_code == 0
+
+
+def test_before_the_first_step_of_a_part(dots, run, tmp_path):
+    assert run("--frames", 2).exit_code == 0
+    begun = record(tmp_path)["steps"]
+    dots.before_step = at(begun, signal.SIGTERM)
+    assert run("--resume").exit_code == 1
+    assert (record(tmp_path)["status"], record(tmp_path)["steps"]) == ("stopped", begun)
+
+
+def test_before_the_run_has_begun(dots, run, tmp_path, monkeypatch):
+    create = dots.create
+    monkeypatch.setattr(dots, "create", lambda *more, **options: (signal.raise_signal(signal.SIGTERM), create(*more, **options))[1])
+    result = run()
+    assert result.exit_code == 1
+    assert "stopped: interrupted by SIGTERM before the run began" in result.stderr
+    assert not (tmp_path / "out" / "run.json").exists()
+
+
+def test_several_signals_are_one(dots, run, tmp_path):
+    dots.before_step = at(5, signal.SIGTERM, signal.SIGINT, signal.SIGTERM)
+    result = run()
+    assert result.stderr.count("stopping after this step") == 1
+    assert record(tmp_path)["reason"] == "interrupted by SIGTERM"
+
+
+def test_a_second_ctrl_c_does_not_wait(dots, run, tmp_path):
+    dots.before_step = at(5, signal.SIGINT, signal.SIGINT)
+    assert run().exit_code == 1
+    assert record(tmp_path)["status"] == "failed"
+    assert record(tmp_path)["steps"] == 5
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="Windows")
+def test_what_is_ignored_stays_ignored(dots, run, tmp_path):
+    """As under nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        dots.before_step = at(5, signal.SIGHUP)
+        assert run().exit_code == 0
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert record(tmp_path)["status"] == "finished"
+
+
+def test_a_compiler_is_not_waited_for(monkeypatch):
+    """Python hands a signal on only once native code is back."""
+
+    class Compiling(Interruption):
+        def _take(self, given: int, frame: Any) -> None:
+            pass
+
+    said, ended = [], threading.Event()
+    monkeypatch.setattr(interruption, "GRACE", 0.01)
+    monkeypatch.setattr(os, "_exit", lambda code: (said.append(code), ended.set()))
+    with Compiling(said.append, last=said.append):
+        signal.raise_signal(signal.SIGINT)
+        ended.wait()
+    assert said == ["SIGINT: stopping before the first step has ended", "SIGINT", 1]
+
+
+def test_the_record_of_a_run_that_is_ended(run, tmp_path):
+    assert run("--frames", 0).exit_code == 0
+    mark_stopped(tmp_path / "out", "SIGINT")
+    assert record(tmp_path)["status"] == "finished"
+    (tmp_path / "out" / "run.json").write_text(json.dumps({**record(tmp_path), "status": "running"}))
+    mark_stopped(tmp_path / "out", "SIGINT")
+    found = record(tmp_path)
+    assert (found["status"], found["reason"]) == ("stopped", "interrupted by SIGINT before its first step had ended")
+    mark_stopped(tmp_path, "SIGINT")  # of a run that has not begun
+
+
+def test_ranks_wait_for_each_other():
+    with Interruption(lambda text: None, at_once=False) as stop:
+        signal.raise_signal(signal.SIGTERM)
+        assert stop() == "SIGTERM"
+
+
+def test_those_who_call_the_library_need_not_name_a_signal(scene_file, tmp_path):
+    from test_run import Watcher, load_scene
+
+    assert run_scene(load_scene(scene_file), tmp_path / "out", device="cpu", observer=Watcher(), stop=lambda: True).reason == "interrupted"

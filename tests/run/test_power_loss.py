@@ -1,0 +1,261 @@
+"""A power failure leaves what had been brought to the disk, and that is a run which goes on."""
+
+import os
+import shutil
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from test_crash_points import contents, go, revive
+
+from warp_lcp.frames import atomic
+from warp_lcp.run.checkpoint import CheckpointFolder
+from warp_lcp.frames.ply import write_ply
+from warp_lcp.run.problem_folder import ProblemFolder
+from warp_lcp.simulation import Surface
+from warp_lcp.cli.solve_file import write_vector
+
+Names = dict[str, int]  # of a folder, with the numbers of what they stand for
+AUDITED = {"open", "os.rename", "os.remove", "os.mkdir", "os.truncate"}
+
+pytestmark = pytest.mark.skipif(os.name == "nt", reason="folders cannot be brought to the disk there")
+
+
+@dataclass(frozen=True)
+class Moment:
+    """What a disk may hold if the power fails now.
+
+    Args:
+        names: of each folder, as they are.
+        durable: of each folder, as `fsync` has brought them to the disk.
+        files: what `fsync` has brought to the disk of each file.
+        promised: the newest step whose checkpoint had been written, for all that the run knew; -1 if none.
+    """
+
+    names: dict[int, Names]
+    durable: dict[int, Names]
+    files: dict[int, bytes]
+    promised: int
+
+    def durable_file(self, root: int, folder: str, name: str) -> bytes:
+        """Return what is in a file after the failure at the latest."""
+        number = self.durable.get(self.durable.get(root, {}).get(folder, 0), {}).get(name, 0)
+        return self.files.get(number, b"")
+
+    def restore(self, root: int, out: Path, *, ahead: bool) -> None:
+        """Make a folder what it is after the failure.
+
+        Args:
+            root: the number of the folder above.
+            out: the folder, which is not there.
+            ahead: names have reached the disk at once, before what is in the files; they may also come as late as they can.
+        """
+        known = self.names if ahead else self.durable
+        waiting = [(known.get(root, {}).get(out.name), out)]
+        while waiting:
+            number, path = waiting.pop()
+            if number in self.names:
+                path.mkdir()
+                waiting += [(inner, path / name) for name, inner in known.get(number, {}).items()]
+            elif number is not None:
+                path.write_bytes(self.files.get(number, b""))
+
+
+@dataclass
+class Disk:
+    """Watches what is done to a folder and remembers each moment.
+
+    Args:
+        root: above the folder.
+    """
+
+    root: Path
+    moments: list[Moment] = field(default_factory=list)
+    calls: list[tuple[str, str]] = field(default_factory=list)
+    files: dict[int, bytes] = field(default_factory=dict)
+    durable: dict[int, Names] = field(default_factory=dict)
+    promised: int = -1
+    _held: list[int] = field(default_factory=list)  # so that no number is used again
+    _lock: Any = field(default_factory=threading.RLock)
+    _busy: bool = False
+    on: bool = True
+
+    @property
+    def number(self) -> int:
+        return self.root.stat().st_ino
+
+    def names(self) -> dict[int, Names]:
+        folders = [self.root, *(path for path in self.root.rglob("*") if path.is_dir())]
+        return {folder.stat().st_ino: {entry.name: entry.inode() for entry in os.scandir(folder)} for folder in folders}
+
+    def look(self) -> None:
+        try:
+            now = self.names()
+        except FileNotFoundError:  # another thread was faster: the next moment is soon
+            return
+        last = self.moments[-1] if self.moments else None
+        moment = Moment(now, {key: dict(value) for key, value in self.durable.items()}, dict(self.files), self.promised)
+        if moment != last:
+            self.moments.append(moment)
+
+    def sync(self, descriptor: int) -> None:
+        """What `os.fsync` does."""
+        if not self.on:
+            return
+        with self.quietly():
+            self.look()
+            status = os.fstat(descriptor)
+            path = os.readlink(f"/proc/self/fd/{descriptor}")
+            if os.path.isdir(path):
+                self.durable[status.st_ino] = {entry.name: entry.inode() for entry in os.scandir(path)}
+                self.calls.append(("fsync folder", os.path.basename(path)))
+            else:
+                self.files[status.st_ino] = Path(path).read_bytes()
+                self.calls.append(("fsync", os.path.basename(path)))
+            self._held.append(os.dup(descriptor))
+            self.look()
+
+    def hook(self, event: str, arguments: tuple) -> None:
+        if not self.on or event not in AUDITED or self._busy or not str(arguments[0]).startswith(str(self.root)):
+            return
+        with self.quietly():
+            self.look()
+            if event == "os.rename":
+                self.calls.append(("rename", os.path.basename(str(arguments[1]))))
+            elif event == "open" and isinstance(arguments[2], int) and arguments[2] & os.O_ACCMODE != os.O_RDONLY:
+                self.calls.append(("open", os.path.basename(str(arguments[0]))))
+
+    @contextmanager
+    def quietly(self) -> Iterator[None]:
+        with self._lock:
+            before, self._busy = self._busy, True
+            try:
+                yield
+            finally:
+                self._busy = before
+
+    def close(self) -> None:
+        self.on = False
+        for descriptor in self._held:
+            os.close(descriptor)
+
+
+@pytest.fixture
+def disk(tmp_path, monkeypatch) -> Iterator[Disk]:
+    if not Path("/proc/self/fd").is_dir():
+        pytest.skip("tells which file a descriptor is of")
+    root = tmp_path / "disk"
+    root.mkdir()
+    disk = Disk(root)
+    disk.durable[disk.number] = {}
+    monkeypatch.setattr(os, "fsync", disk.sync)
+    write = CheckpointFolder.write
+
+    def promise(self: CheckpointFolder, checkpoint: Any) -> Path:
+        path = write(self, checkpoint)
+        disk.promised = checkpoint.step
+        return path
+
+    monkeypatch.setattr(CheckpointFolder, "write", promise)
+    sys.addaudithook(disk.hook)  # for good: it cannot be taken back, only be quiet
+    yield disk
+    disk.close()
+
+
+def survives(scene: Path, folder: Path, disk: Disk, run: Callable[[Path], Any], stride: int) -> list[int]:
+    """Let the power fail at every `stride`-th moment of a run; return the steps that were gone on from."""
+    whole = folder / "whole"
+    go(scene, whole)
+    expected, steps = contents(whole), []
+    disk.moments.clear()
+    disk.promised = -1
+    run(disk.root / "out")
+    disk.on = False
+    disk.look()
+    for index, moment in enumerate(disk.moments[::-1][::stride][::-1]):
+        for ahead in (False, True):
+            out = folder / f"{index}_{ahead}" / "out"
+            out.parent.mkdir()
+            moment.restore(disk.number, out, ahead=ahead)
+            step = revive(scene, out)
+            assert step >= moment.promised or moment.promised < 0, (index, ahead, step, moment.promised)
+            assert contents(out) == expected, (index, ahead)
+            steps.append(step)
+            shutil.rmtree(out.parent)
+    return steps
+
+
+@pytest.mark.parametrize("stride", [13, pytest.param(1, marks=pytest.mark.slow)])
+def test_at_any_moment(disk, scene_file, tmp_path, stride):
+    steps = survives(scene_file, tmp_path, disk, lambda out: go(scene_file, out), stride)
+    assert len(disk.moments) > 100
+    assert len(set(steps)) > 3
+
+
+@pytest.mark.parametrize("stride", [29, pytest.param(1, marks=pytest.mark.slow)])
+def test_without_frames(disk, scene_file, tmp_path, stride):
+    """Whose collections would bring the folder's names to the disk along with theirs."""
+    scene_file.write_text(scene_file.read_text() + "particles = false\ngrid = false\n")
+    survives(scene_file, tmp_path, disk, lambda out: go(scene_file, out), stride)
+
+
+@pytest.mark.parametrize("stride", [29, pytest.param(1, marks=pytest.mark.slow)])
+def test_over_another_run(disk, scene_file, tmp_path, stride):
+    """What --force has deleted does not come back as the checkpoints of the run that took its place."""
+
+    def twice(out: Path) -> None:
+        go(scene_file, out, "time.duration=0.2")
+        disk.moments.clear()
+        disk.promised = -1
+        go(scene_file, out, force=True)
+
+    go(scene_file, tmp_path / "whole")
+    twice(disk.root / "out")
+    disk.on = False
+    begun = [moment for moment in disk.moments if b'"running"' in moment.durable_file(disk.number, "out", "run.json")]
+    early = [moment for moment in begun if moment.promised < 0]
+    for index, moment in enumerate([*early[:: stride // 6 + 1], *begun[::stride]]):
+        out = tmp_path / f"{index}" / "out"
+        out.parent.mkdir()
+        moment.restore(disk.number, out, ahead=False)
+        revive(scene_file, out)
+        assert contents(out) == contents(tmp_path / "whole")
+
+
+def test_the_end_is_durable(disk, scene_file, tmp_path):
+    go(scene_file, disk.root / "out")
+    disk.look()
+    disk.moments[-1].restore(disk.number, tmp_path / "out", ahead=False)
+    found = contents(tmp_path / "out")
+    assert found == found | contents(disk.root / "out")  # a checkpoint that was deleted may be there again
+    assert (tmp_path / "out" / "run.json").read_bytes() == (disk.root / "out" / "run.json").read_bytes()
+
+
+def _problem(folder: Path) -> None:
+    ProblemFolder(folder).write({"step": np.array(3)})
+
+
+SURFACE = Surface("surface", np.zeros((3, 3), np.float32), np.array([[0, 1, 2]]), {})
+WRITERS: dict[str, Callable[[Path], Any]] = {
+    "text.md": lambda path: atomic.write_text(path, "text"),
+    "x.mtx": lambda path: write_vector(path, np.ones(3)),
+    "surface.ply": lambda path: write_ply(path, SURFACE),
+    "problem_000003.npz": lambda path: _problem(path.parent),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_the_order_of_calls(disk, name):
+    """Of files that no run depends on, too: written, brought to the disk, named, and the name brought to the disk."""
+    folder = disk.root / "files"
+    folder.mkdir()
+    disk.calls.clear()
+    WRITERS[name](folder / name)
+    calls = [call for call in disk.calls if call[1] in (f".{name}.part", name, "files")]
+    assert calls[-4:] == [("open", f".{name}.part"), ("fsync", f".{name}.part"), ("rename", name), ("fsync folder", "files")]

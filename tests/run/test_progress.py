@@ -1,0 +1,68 @@
+"""The time left, and what is shown of a step."""
+
+import io
+
+import pytest
+from rich.console import Console
+
+from warp_lcp.run.progress import Bar, Lines, TimeLeft, describe
+
+ROW = {"step": 3, "time": 0.5, "dt": 0.01, "solve_iterations": 5, "solve_residual": 2.5e-5, "volume": None}
+
+
+def test_time_left_follows_the_recent_rate():
+    now = 0.0
+    left = TimeLeft(lambda: now)
+    left.start(0.0, 10.0)
+    assert str(left) == "-:--:--"
+    now = 60.0  # a long first step, which compiles
+    left.advance(0.1)
+    assert left.seconds() is None
+    for step in range(1, 11):
+        now += 1.0
+        left.advance(0.1 + 0.2 * step)
+    assert left.seconds() == pytest.approx((10.0 - 2.1) / 0.2)
+    for step in range(1, 41):  # it grows ten times slower: the past fades
+        now += 1.0
+        left.advance(2.1 + 0.02 * step)
+    assert left.seconds() == pytest.approx((10.0 - 2.9) / 0.02, rel=0.01)
+    assert str(left) == "0:05:55"
+
+
+def test_describe_leaves_out_what_is_not_there():
+    assert describe(ROW) == "step 3  dt 0.01 s  5 iterations  residual 2.5e-05"
+    assert describe({"step": 1, "time": 0.5, "dt": 0.01}) == "step 1  dt 0.01 s"
+
+
+def test_the_residual_shown_is_the_one_that_the_tolerance_is_of():
+    sand = ROW | {"solve_status": "STAGNATED", "solve_residual": 9.4e-3, "coupled_residual": 2e-3}
+    assert describe(sand).endswith("residual 2.0e-03 (STAGNATED)")
+    assert describe(sand | {"solve_status": "CONVERGED", "coupled_residual": 8e-4}).endswith("residual 8.0e-04")
+    assert describe({"step": 1, "time": 0.5, "dt": 0.01, "solve_status": None, "coupled_residual": None}) == "step 1  dt 0.01 s"
+
+
+def test_lines_have_one_a_frame():
+    stream = io.StringIO()
+    with Lines(Console(file=stream, width=200)) as lines:
+        lines.start(0.0, 1.0)
+        lines.note("a [note]")
+        lines.frame(0, 2)
+        lines.step(ROW)
+        lines.step(ROW)
+        lines.frame(1, 2)
+    text = stream.getvalue().splitlines()
+    assert text[:2] == ["a [note]", "frame 0/2"]
+    assert text[2].startswith("frame 1/2  t 0.5 s  step 3")
+    assert len(text) == 3
+
+
+def test_bar_shows_the_step():
+    stream = io.StringIO()
+    with Bar(Console(file=stream, width=200, force_terminal=True)) as bar:
+        bar.start(0.0, 1.0)
+        bar.note("a [note]")
+        bar.step(ROW)
+        bar.frame(1, 2)
+    assert "a [note]" in stream.getvalue()
+    assert "50%" in stream.getvalue()
+    assert "5 iterations" in stream.getvalue()

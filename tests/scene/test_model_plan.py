@@ -1,0 +1,93 @@
+"""What `check` says of a scene's models, and the list of prices that it says it by."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from warp_lcp.benchmarks import predictions
+from warp_lcp.benchmarks.harness.timing import Options
+from warp_lcp.benchmarks.models import offers
+from warp_lcp.cli import commands as cli
+from warp_lcp.run.check import check_scene
+from warp_lcp.scene.models import Model, Price, model_lines, predicted_seconds, prices
+from warp_lcp.material.particle_scene import ParticleScene
+from warp_lcp.scene.scene_file import built_in_scenes, load_scene
+
+CELLS, PARTICLES = 1000, 4000
+LISTED = {
+    "base": Price(cell_seconds=1e-6, particle_seconds=1e-6, cell_bytes=100.0),
+    "walls": Price(cell_seconds=2e-6, cell_bytes=50.0),
+    "band": Price(particle_seconds=-1e-7, cell_bytes=-20.0),
+}
+
+
+def test_prices_add_up() -> None:
+    models = [Model("walls", "asked for"), Model("band", "asked for"), Model("unknown", "asked for"), Model("walls", "", built=False)]
+    assert predicted_seconds(models, LISTED, CELLS, PARTICLES) == pytest.approx(5e-3 + 2e-3 - 4e-4)
+    assert predicted_seconds(models, {}, CELLS, PARTICLES) == 0.0, "nothing is known"
+    bodies = Model("walls", "three of them", count=3)
+    assert predicted_seconds([bodies], LISTED, CELLS, PARTICLES) == pytest.approx(5e-3 + 3 * 2e-3)
+    assert model_lines([bodies], LISTED, CELLS, PARTICLES, memory=200_000)[0][1].endswith("75 % of memory, 6 ms a step (55 %)")
+
+
+def test_a_line_tells_why_and_what_it_takes() -> None:
+    models = [Model("walls", "asked for"), Model("surface", "there is none", built=False), Model("band", "too")]
+    lines = model_lines(models, LISTED, CELLS, PARTICLES, memory=200_000)
+    assert lines[0] == ("model", "walls: asked for; 25 % of memory, 2 ms a step (30 %)")
+    assert lines[1] == ("not built", "surface: there is none")
+    assert lines[2] == ("model", "band: too; 0 % of memory, 0 ms a step (0 %)"), "what saves takes nothing"
+    assert lines[3] == ("step", "about 6.6 ms by the list of prices, on one core, all models together")
+
+
+def test_a_measured_step_scales_the_prices() -> None:
+    lines = model_lines([Model("walls", "asked for")], LISTED, CELLS, PARTICLES, memory=200_000, measured=14e-3)
+    assert lines == [
+        ("model", "walls: asked for; 25 % of memory, 4 ms a step (29 %)"),
+        ("step", "about 14 ms here, all models together"),
+    ]
+
+
+@pytest.mark.parametrize("simulator", ["fluids", "granular"])
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_every_model_that_is_measured_has_its_price(simulator: str, dimension: int) -> None:
+    listed = prices(simulator, dimension)
+    assert set(listed) == {"base", *offers(simulator, dimension)}
+    assert listed["base"].seconds(CELLS, PARTICLES) > 0.0
+    assert listed["cut cells"].bytes(CELLS, PARTICLES) > 0
+
+
+@pytest.mark.parametrize("name", sorted(built_in_scenes()))
+def test_every_built_in_scene_says_which_models_it_has(name: str) -> None:
+    scene, lines = check_scene(name)
+    assert isinstance(scene, ParticleScene)
+    said = [line.partition(":")[0] for word, line in lines if word == "model"]
+    assert said == [model.name for model in scene.models() if model.built]
+    assert ("rigid bodies" in said) == any(solid.is_body for solid in scene.solid)
+    assert "moving solids" in said or "rigid bodies" not in said, "a body moves, too"
+    assert all(model.count == sum(solid.is_body for solid in scene.solid) for model in scene.models() if model.name == "rigid bodies")
+    assert ("cut cells" in said) == (bool(scene.solid) and scene.domain.solids == "cut-cell")
+    assert sum(word == "step" for word, _ in lines) == 1
+
+
+def test_predictions_are_measured_on_scenes_of_their_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Two scenes of a plane; one of space is left out."""
+    monkeypatch.setattr(predictions, "built_in_scenes", lambda: ["dam-break-2d", "dam-break", "column-collapse-2d"])
+    monkeypatch.setattr(predictions, "ENOUGH", 0.05)
+    results = predictions.measure(Options("cpu", (), 1, lambda text: None), tmp_path)
+    assert [record.name for record in results.records] == ["column-collapse-2d", "dam-break-2d"]
+    for record in results.records:
+        figures = {name: figure.value for name, figure in record.figures.items()}
+        assert figures["ratio"] == pytest.approx(figures["predicted"] / figures["measured"])
+        assert figures["iterations"] > 0.0
+        assert figures["predicted"] > 0.0
+    assert len(results.tables[0].rows) == 2
+
+
+def test_the_command_says_it_too() -> None:
+    shown = CliRunner().invoke(cli.app, ["check", "dam-break-2d", "--set", "density_correction.every=1"])
+    assert shown.exit_code == 0
+    assert "density correction: [density_correction]; " in shown.stdout
+    assert load_scene("dam-break-2d").solver.tolerance == 1e-4

@@ -1,0 +1,430 @@
+"""The command line: `warp-lcp run | render | view | check | tune | scenes | schema | solve | bench | info`."""
+
+from __future__ import annotations
+
+import errno
+import json
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+import typer
+import warp as wp
+
+from warp_lcp.cli.suites import benchmarks
+from warp_lcp.run.calibrate import step_seconds
+from warp_lcp.run.check import check_memory, check_scene, start
+from warp_lcp.run.launcher import crew_of, default_folder
+from warp_lcp.run.devices import DeviceError, choose_device, cuda_driver, devices
+from warp_lcp.run.engine import Engine, EngineError, EngineOption
+from warp_lcp.render.film import check_rate
+from warp_lcp.run.interruption import Interrupted, Interruption
+from warp_lcp.material.particle_scene import ParticleScene
+from warp_lcp.scene.presets import PresetName
+from warp_lcp.run.profile import Profile
+from warp_lcp.run.progress import Bar, Lines
+from warp_lcp.render.recording import Color, RenderError, Show
+from warp_lcp.render.render import Looks, film_run, parse_size, render_run
+from warp_lcp.run.folder import OutputError, RunRecord, mark_stopped
+from warp_lcp.scene.scene_file import built_in_scenes, installed_simulators, load_scene
+from warp_lcp.simulation import SimulationFailed, StepFailed
+from warp_lcp.cli.solve_file import Outcome, ProblemError, solve_files
+from warp_lcp.cli.solve_recorded import SUFFIX, check_recorded, file_digest, solve_recorded
+from warp_lcp.scene.table import SceneError
+from warp_lcp.run.terminal import Commands, Terminal, say, tell
+from warp_lcp.run.tune import FRAMES, Tuning, tune, write_tuned
+from warp_lcp.run.versions import shadowing_distributions, versions
+from warp_lcp.render.viewer import view_run
+from warp_lcp.nearest import nearest
+
+FAILED = 1
+WRONG_INPUT = 2
+RANKED_SUITE = "scaling"  # what `bench --engine petsc` measures
+
+app = typer.Typer(
+    name="warp-lcp",
+    cls=Commands,
+    help="Simulate scenes with complementarity solvers. Exit codes: 0 done, 1 the run failed or was stopped, 2 the input is wrong.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+SceneArgument = Annotated[
+    str, typer.Argument(metavar="SCENE", help="A scene file, or the name of a built-in scene (see `warp-lcp scenes`).")
+]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Override a key of the scene; may be repeated. Arrays: liquid.0.max=[1,1]."),
+]
+
+RunArgument = Annotated[Path, typer.Argument(metavar="DIR", help="The folder of a run.")]
+ShowOption = Annotated[
+    Show | None, typer.Option(help="What is drawn; the surface where the run wrote one, else particles.", show_default=False)
+]
+ColorOption = Annotated[
+    Color | None, typer.Option(help="What colors the particles, on one scale for the whole run; speed unless given.", show_default=False)
+]
+CameraOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="camera.KEY=VALUE", help="Override a key of the scene's table camera; may be repeated."),
+]
+ForceMemory = Annotated[bool, typer.Option("--force-memory", help="Run even what will not fit into the device's free memory.")]
+
+
+def main() -> None:
+    """Run the command line."""
+    app()
+
+
+@app.command()
+def run(
+    scene: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="SCENE",
+            help="A scene file, or the name of a built-in scene (see `warp-lcp scenes`); --resume --out DIR does without.",
+            show_default=False,
+        ),
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="The run's folder; out/NAME unless given.", show_default=False)] = None,
+    device: Annotated[str | None, typer.Option(help="cpu or cuda:N; a GPU where there is one unless given.", show_default=False)] = None,
+    frames: Annotated[int | None, typer.Option(min=0, metavar="N", help="End after frame N.", show_default=False)] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue the run in the folder, with what --set gave it, from its newest checkpoint.")
+    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Delete the run in the folder first.")] = False,
+    force_memory: ForceMemory = False,
+    profile: Annotated[bool, typer.Option("--profile", help="Measure where the time goes; also into profile.json.")] = False,
+    record_problems: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Write each step's pressure problem into DIR.", show_default=False)
+    ] = None,
+    engine: EngineOption = Engine.SINGLE,
+    overrides: SetOption = None,
+) -> None:
+    """Simulate a scene into a folder that ParaView opens."""
+    given = {"--out": out, "--device": device, "--frames": frames, "--resume": resume, "--force": force, "--force-memory": force_memory}
+    with _wrong_input(), crew_of(engine) as crew:
+        if resume and force:
+            raise OutputError("--resume continues a run and --force deletes it: choose one")
+        loaded = crew.load(scene, overrides or (), given)
+        chosen, console = crew.choose_device(device), crew.console
+        folder, name = out or default_folder(loaded.scene), loaded.scene.scene.name
+        say(console, f"{name} on {crew.place(chosen)}, into {folder}")
+        if loaded.kept:
+            say(console, f"--set as before: {', '.join(loaded.kept)}")
+        stop = Interruption(partial(say, console), at_once=crew.ranks is None, last=partial(mark_stopped, folder))
+        with stop, Bar(console) if console.is_terminal else Lines(console) as observer:
+            watch = Profile(chosen) if profile and crew.speaks else None
+            record = crew.run(
+                loaded, folder, device=chosen, observer=observer, last_frame=frames, resume=resume, force=force, force_memory=force_memory,
+                stop=stop, profile=watch, record_problems=record_problems,
+            )  # fmt: skip
+    if not crew.speaks:
+        raise typer.Exit(0 if record.status == "finished" else FAILED)
+    if watch:
+        tell("\n".join(watch.table(record.steps - (record.resumed_from_step or 0), record.seconds)))
+    _report(record, folder)
+
+
+@app.command()
+def render(
+    folder: RunArgument,
+    frame: Annotated[
+        list[int] | None, typer.Option(metavar="N", help="Draw frame N, counted from the end if negative; may be repeated.")
+    ] = None,
+    size: Annotated[str, typer.Option(metavar="WxH", help="Pixels of an image; a sheet may be less high.")] = "1280x720",
+    out: Annotated[Path | None, typer.Option(help="The images' folder; DIR/images unless given.", show_default=False)] = None,
+    show: ShowOption = None,
+    color: ColorOption = None,
+    sheet: Annotated[bool, typer.Option("--sheet", help="Draw the frames, or six of them, side by side into sheet.png.")] = False,
+    film: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draw all frames into FILE, an .mp4 or a .gif that repeats.", show_default=False)
+    ] = None,
+    fps: Annotated[float | None, typer.Option(help="Frames a second of the film; the scene's unless given.", show_default=False)] = None,
+    cut: Annotated[bool, typer.Option("--slice", help="Draw a section with Matplotlib, which needs no pyvista.")] = False,
+    at: Annotated[
+        float | None, typer.Option(metavar="Z", help="Where a 3-D run is cut, in meters; in its middle unless given.", show_default=False)
+    ] = None,
+    overrides: CameraOption = None,
+) -> None:
+    """Draw a run's frames as PNG images or as a film (needs the extra `render`)."""
+    images = []
+    devices()  # starts Warp, which draws surfaces and samples 2-D solids, without its native messages
+    with _wrong_input(), Terminal(stderr=True).status("drawing") as status:
+        looks = Looks(size=parse_size(size), color=color, show=show, cut=cut, at=at, overrides=overrides or ())
+        if film is not None:
+            if frame or sheet or out:
+                raise RenderError("--film: shows all frames in one file; leave out --frame, --sheet and --out")
+            count = 0
+            for number in film_run(folder, film, looks=looks, rate=check_rate(fps)):
+                status.update(f"drew frame {number}")
+                count += 1
+            tell(f"{film}: {count} frames")
+            return
+        if fps is not None:
+            raise RenderError("--fps: is of a film; give --film")
+        for image in render_run(folder, frames=frame or (), looks=looks, out=out, sheet=sheet):
+            images.append(image)
+            status.update(f"drew {image.name}")
+    tell(f"{images[0]}" if len(images) == 1 else f"{len(images)} images, {images[0]} to {images[-1].name}")
+
+
+@app.command()
+def view(
+    folder: RunArgument,
+    show: ShowOption = None,
+    color: ColorOption = None,
+    overrides: CameraOption = None,
+) -> None:
+    """Show a run's frames in a window: Space plays, the arrow keys step, the mouse turns (needs a display and the extra `render`)."""
+    devices()
+    with _wrong_input():
+        view_run(folder, Looks(color=color, show=show, overrides=overrides or ()))
+
+
+@app.command()
+def check(
+    scene: SceneArgument,
+    device: Annotated[str | None, typer.Option(help="cpu or cuda:N, whose memory counts.", show_default=False)] = None,
+    calibrate: Annotated[bool, typer.Option("--calibrate", help="Also take a few steps, and say how long a step takes.")] = False,
+    force_memory: ForceMemory = False,
+    overrides: SetOption = None,
+) -> None:
+    """Say whether a scene is valid and fits into memory, what a run of it would do, and what it would say at its start."""
+    with _wrong_input():
+        chosen = choose_device(device)
+        loaded, lines = check_scene(scene, overrides or ())
+        _print_pairs(lines)
+        if not force_memory:
+            check_memory(loaded, chosen)
+            _print_pairs([("note", note) for note in start(loaded, chosen).notes()])
+        if not calibrate:
+            return
+        try:
+            seconds, steps = step_seconds(loaded, device=chosen)
+        except (StepFailed, SimulationFailed) as error:
+            _end(str(error), FAILED)
+    _print_pairs([("seconds a step", f"about {seconds:.3g} on {chosen}, the median of {steps}")])
+    if isinstance(loaded, ParticleScene):
+        _print_pairs(loaded.model_plan(seconds))
+
+
+@app.command("tune")
+def tune_scene(
+    scene: SceneArgument,
+    accuracy: Annotated[PresetName, typer.Option(help="How near to the reference run: a preset's distance from it.")] = "standard",
+    frames: Annotated[int, typer.Option(min=1, metavar="N", help="Frames of each trial run.")] = FRAMES,
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Where the tuned scene goes.", show_default=False)] = None,
+    device: Annotated[str | None, typer.Option(help="cpu or cuda:N, which is to run the scene.", show_default=False)] = None,
+    overrides: SetOption = None,
+) -> None:
+    """Measure which settings of a scene are the fastest for an accuracy, on its first frames."""
+    with _wrong_input():
+        chosen = choose_device(device)
+        loaded = load_scene(scene, overrides or ())
+        if out is not None and (out.is_dir() or not out.parent.is_dir()):
+            raise OutputError(f"--out {out}: must be a file in a folder that is there")
+        check_memory(loaded, chosen)
+        try:
+            tuning = tune(loaded, accuracy=accuracy, device=chosen, frames=frames, say=partial(say, Terminal(stderr=True)))
+        except (StepFailed, SimulationFailed) as error:
+            _end(str(error), FAILED)
+        if out is not None:
+            try:
+                write_tuned(out, tuning, accuracy, chosen)
+            except OSError as error:
+                raise OutputError(f"--out {out}: {error}") from error
+    _print_tuning(tuning, accuracy, chosen)
+
+
+@app.command()
+def scenes() -> None:
+    """List the built-in scenes."""
+    with _wrong_input():
+        _print_pairs([(name, load_scene(name).scene.description) for name in built_in_scenes()])
+
+
+@app.command()
+def schema(simulator: Annotated[str, typer.Option(help="Whose scenes.")] = "fluids") -> None:
+    """Print the JSON schema of scene files, for editors and other programs."""
+    with _wrong_input():
+        installed = installed_simulators()
+    if simulator not in installed:
+        _end(f"--simulator {simulator}: no such simulator; {nearest(simulator, installed)}", WRONG_INPUT)
+    tell(json.dumps(installed[simulator].scene_model.model_json_schema(by_alias=True), indent=2))
+
+
+@app.command()
+def solve(
+    problem: Annotated[
+        Path,
+        typer.Argument(metavar="PROBLEM", help="A.mtx, A of y = A x + b, a Matrix Market file; or a recorded problem_STEP.npz of a grid."),
+    ],
+    right_side: Annotated[Path | None, typer.Argument(metavar="[b.mtx]", help="b, a vector.", show_default=False)] = None,
+    lower: Annotated[
+        str | None, typer.Option(metavar="NUMBER|FILE", help="Lower bounds of x; -inf for none; 0 unless given.", show_default=False)
+    ] = None,
+    upper: Annotated[
+        str | None, typer.Option(metavar="NUMBER|FILE", help="Upper bounds of x; inf unless given.", show_default=False)
+    ] = None,
+    method: Annotated[str | None, typer.Option(metavar="NAME", help="The fastest for A unless given.", show_default=False)] = None,
+    tolerance: Annotated[float, typer.Option(metavar="T", help="Of the residual, relative to the one at clip(0, lower, upper).")] = 1e-6,
+    max_iterations: Annotated[int, typer.Option(metavar="N", help="The most steps.")] = 1000,
+    max_seconds: Annotated[
+        float, typer.Option(metavar="S", help="The most wall time of the solve; no limit unless given.", show_default=False)
+    ] = math.inf,
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Where x goes: x.mtx, or x.npy of a grid.", show_default=False)] = None,
+    device: Annotated[str, typer.Option(help="cpu, cuda:N, or with --engine petsc cuda.")] = "cpu",
+    engine: EngineOption = Engine.SINGLE,
+) -> None:
+    """Solve a complementarity problem, y = A x + b, lower <= x <= upper: of a matrix and a vector, or one that a run has recorded."""
+    options: dict[str, Any] = {
+        "method": method, "tolerance": tolerance, "max_iterations": max_iterations, "max_seconds": max_seconds
+    }  # fmt: skip
+    with _wrong_input(), crew_of(engine) as crew:
+        crew.agree({"the problem": file_digest(problem), "--out": out, "--device": device, **options})
+        chosen = crew.choose_device(device)
+        if out is not None and not out.parent.is_dir():
+            raise ProblemError(f"--out {out}: there is no folder {out.parent}")
+        if out is not None and out.is_dir():
+            raise ProblemError(f"--out {out}: is a folder; name a file")
+        outcome: Outcome
+        if problem.suffix == SUFFIX:
+            check_recorded(problem, right_side=right_side, lower=lower, upper=upper, out=out)
+            outcome = solve_recorded(problem, device=chosen, ranks=crew.ranks, **options)
+        elif engine is Engine.PETSC:
+            raise ProblemError(f"{problem}: --engine petsc solves problems of grids, which `warp-lcp run --record-problems` writes")
+        elif right_side is None:
+            raise ProblemError(f"{problem}: is a matrix: name b too, warp-lcp solve A.mtx b.mtx")
+        else:
+            outcome = solve_files(problem, right_side, device=chosen, lower=lower or "0", upper=upper or "inf", **options)
+        if out is not None:
+            outcome.write(out)
+    if not crew.speaks:
+        raise typer.Exit(0 if outcome.result else FAILED)
+    console = Terminal(soft_wrap=True, highlight=False)
+    say(console, outcome.heading())
+    console.print(outcome.table())
+    if not outcome.result:
+        _end(outcome.ending(), FAILED)
+    say(console, outcome.ending())
+
+
+@app.command()
+def bench(
+    suite: Annotated[
+        str,
+        typer.Argument(
+            metavar="SUITE", help="kernels, solvers, scaling, peers, run, sand, contacts, models, tradeoff, validation or extremes."
+        ),
+    ],
+    scene: Annotated[
+        str | None, typer.Argument(metavar="[SCENE]", help="The scene of tradeoff; its own unless given.", show_default=False)
+    ] = None,
+    device: Annotated[str, typer.Option(help="cpu or cuda:N.")] = "cpu",
+    out: Annotated[Path, typer.Option(help="The folder of SUITE.json, SUITE.md and the plots.")] = Path("out/bench"),
+    size: Annotated[list[int] | None, typer.Option(metavar="N", help="Cells along a side; may be repeated.", show_default=False)] = None,
+    repeat: Annotated[int, typer.Option(min=1, metavar="K", help="Samples of each timing.")] = 5,
+    engine: Annotated[
+        Engine, typer.Option(help="petsc: scaling on 1, 2 and 4 ranks, or on those of `mpiexec -n N warp-lcp ...`.")
+    ] = Engine.SINGLE,
+    seed: Annotated[
+        int | None, typer.Option(metavar="N", help="With extremes: the random problems of these seeds again.", show_default=False)
+    ] = None,
+    compare: Annotated[
+        tuple[Path, Path] | None,
+        typer.Option(metavar="A.json B.json", help="Compare two results instead of measuring.", show_default=False),
+    ] = None,
+) -> None:
+    """Measure this machine, or compare two results; says how long a suite takes on two cores, and what it needs, before it begins."""
+    installed = benchmarks()
+    if suite not in installed:
+        _end(f"{suite}: no such suite; {nearest(suite, installed)}", WRONG_INPUT)
+    with _wrong_input():
+        chosen = device if engine is Engine.PETSC else choose_device(device)  # ranks choose for themselves
+        if scene:
+            load_scene(scene)
+    shared = engine is Engine.PETSC
+    if shared and suite != RANKED_SUITE:
+        _end(f"--engine petsc: the suite {suite} measures one process; use {RANKED_SUITE}", WRONG_INPUT)
+    try:
+        if compare is not None:
+            tell(installed[suite].compare(*compare))
+            return
+        asked: dict[str, Any] = ({"scene": scene} if scene else {}) | ({} if seed is None else {"seed": seed})
+        tell(f"{suite}: {installed[suite].takes}", error=True)
+        files = installed[suite].run(device=chosen, out=out, sizes=tuple(size or ()), repeat=repeat, shared=shared, **asked)
+    except ValueError as error:
+        _end(str(error), WRONG_INPUT)
+    except RuntimeError as error:
+        _end(str(error), FAILED)
+    for file in files:
+        tell(file)
+
+
+@app.command()
+def info() -> None:
+    """Print versions, devices and simulators."""
+    lines = list(versions().items())
+    lines += [(f"device {alias}", text) for alias, text in devices().items()]
+    lines += [("CUDA driver", cuda_driver()), ("kernel cache", str(wp.config.kernel_cache_dir))]
+    _print_pairs(lines)
+    for other in shadowing_distributions():
+        tell(f"warning: the distribution {other} installs a package that has a simulator's name; uninstall it", error=True)
+    with _wrong_input():
+        _print_pairs([(f"simulator {name}", simulator.summary) for name, simulator in installed_simulators().items()])
+
+
+def _print_tuning(tuning: Tuning, accuracy: str, device: str) -> None:
+    """Say what was measured, and which settings are the fastest."""
+    rows = tuning.rows()
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    for row in rows:
+        tell("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    tell(f"{tuning.frames} frames on {device}; distance: share of the mass elsewhere than in a run of {tuning.reference.steps} steps")
+    for line in tuning.verdict(accuracy):
+        tell(line)
+
+
+def _print_pairs(pairs: list[tuple[str, str]]) -> None:
+    for word, line in pairs:
+        tell(f"{word:<20}  {line}")
+
+
+@contextmanager
+def _wrong_input() -> Iterator[None]:
+    try:
+        yield
+    except (SceneError, OutputError, DeviceError, RenderError, ProblemError, EngineError) as error:
+        _end(str(error), WRONG_INPUT)
+    except OSError as error:
+        if error.filename is None or error.errno not in (errno.ENAMETOOLONG, errno.EACCES, errno.ENOTDIR):
+            raise
+        _end(f"{error.filename}: {error.strerror}", WRONG_INPUT)
+    except Interrupted as error:
+        _end(f"stopped: interrupted by {error} before the run began", FAILED)
+
+
+def _report(record: RunRecord, folder: Path) -> None:
+    """Say how a run ended."""
+    taken = f"{record.steps} steps, {record.time:.6g} s simulated in {record.seconds:.1f} s"
+    if record.status == "finished":
+        tell(f"finished: {record.reason}; {taken}; ParaView opens the .pvd files in {folder}")
+        return
+    message = f"{record.status}: {record.reason}\n{taken}; frames 0 to {record.frames} are in {folder}"
+    newest = max(folder.glob("checkpoints/step_*.npz"), key=lambda file: int(file.stem.removeprefix("step_")), default=None)
+    if newest is None:
+        _end(f"{message}; there is no checkpoint yet", FAILED)
+    again = f"warp-lcp run {folder / 'scene.toml'} --out {folder} --device {record.device} --resume"
+    if record.engine != Engine.SINGLE:
+        again = f"mpiexec -n {record.ranks} {again} --engine {record.engine}"
+    _end(f"{message}\nlast checkpoint: {newest}\ncontinue with: {again}", FAILED)
+
+
+def _end(message: str, code: int) -> NoReturn:
+    tell(message, error=True)
+    raise typer.Exit(code)

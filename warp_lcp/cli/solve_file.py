@@ -1,0 +1,220 @@
+"""A problem from Matrix Market files, solved: `warp-lcp solve`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.io
+import scipy.sparse
+from rich.table import Table
+
+from warp_lcp.frames.atomic import replacing
+from warp_lcp.cli.matrix_market import MarketError, read_market
+from warp_lcp.nearest import nearest
+from warp_lcp.operators import DenseOperator, SparseOperator
+from warp_lcp.problem import LCP
+from warp_lcp.protocol import families
+from warp_lcp.result import SolveResult
+from warp_lcp.settings import SettingError
+from warp_lcp.solvers.default import default_method, solve
+from warp_lcp.solvers.registry import METHODS
+from warp_lcp.stopping import StoppingCriteria
+
+MOST_ROWS = 40  # of the table of iterations: a longer history shows its first and last ones
+FORMAT = "a Matrix Market file (https://math.nist.gov/MatrixMarket/formats.html)"
+
+
+class ProblemError(ValueError):
+    """The files do not make a problem, or the method does not take it; the message names the file or the option."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What was solved and how it went.
+
+    Attributes:
+        problem: the problem.
+        solver: the method.
+        name: its name in `METHODS`.
+        result: the result.
+    """
+
+    problem: LCP
+    solver: Any
+    name: str
+    result: SolveResult
+
+    def heading(self) -> str:
+        """Return a line that says what was solved."""
+        A = self.problem.A
+        kind = f"{A.nnz} entries, " if isinstance(A, SparseOperator) else "dense, "
+        symmetry = "symmetric" if A.symmetric else "unsymmetric"
+        return f"{self.problem.layout.size} unknowns, {kind}{symmetry}, by {self.name} on {self.problem.device}"
+
+    def table(self) -> Table:
+        """Return the history as a table."""
+        table = Table("iteration", "residual", "linear", "active", "step", "seconds", box=None, header_style="bold")
+        for column in table.columns[:4]:
+            column.justify = "right"
+        history = self.result.history
+        shown = [*history[: MOST_ROWS // 2], None, *history[-(MOST_ROWS // 2) :]] if len(history) > MOST_ROWS else history
+        for record in shown:
+            if record is None:
+                table.add_row("...")
+                continue
+            active = "" if record.active is None else str(record.active)
+            row = [str(record.iteration), f"{record.residual:.3e}", str(record.linear_iterations), active, record.step]
+            table.add_row(*row, f"{record.seconds:.3f}")
+        return table
+
+    def ending(self) -> str:
+        """Return a line that says how it ended."""
+        r = self.result
+        size = f"residual {r.residual:.3e}, relative {r.relative_residual:.3e}"
+        return f"{r.status.name}: {r.status.value}; {r.iterations} iterations, {size}"
+
+    def write(self, path: Path) -> None:
+        """Write x as a Matrix Market array, n x 1.
+
+        Raises:
+            ProblemError: the file cannot be written.
+        """
+        write_vector(path, self.result.x.numpy())
+
+
+def solve_files(
+    matrix: Path,
+    right_side: Path,
+    *,
+    lower: str,
+    upper: str,
+    method: str | None,
+    tolerance: float,
+    max_iterations: int,
+    max_seconds: float,
+    device: str,
+) -> Outcome:
+    """Solve y = A x + b, lower <= x <= upper, from files.
+
+    Args:
+        matrix: A, sparse (coordinate) or dense (array).
+        right_side: b, a vector of either form.
+        lower: a number or the file of a vector.
+        upper: likewise.
+        method: a name in `METHODS`; the default method for A if None.
+        tolerance: of the residual, relative to the one at clip(0, lower, upper).
+        max_iterations: the most steps.
+        max_seconds: the most wall time of the solve.
+        device: a Warp device.
+
+    Raises:
+        ProblemError: a file or an option is wrong.
+    """
+    A = read_matrix(matrix)
+    n = A.shape[0]
+    b = read_vector(right_side, n)
+    sides = [_bound(value, n, f"--{name}") for name, value in (("lower", lower), ("upper", upper))]
+    stopping = criteria(tolerance, max_iterations, max_seconds)
+    try:
+        operator = SparseOperator(A, device=device) if scipy.sparse.issparse(A) else DenseOperator(A, device=device)
+        problem = LCP(operator, b, *sides)
+        family = "sparse" if isinstance(operator, SparseOperator) else "dense"
+        solver = default_method(problem) if method is None else method_named(method, family)
+        result = solve(problem, solver, stopping=stopping)
+    except ValueError as error:
+        raise ProblemError(str(error)) from error
+    name = next((name for name, kind in METHODS.items() if type(solver) is kind), type(solver).__name__)
+    return Outcome(problem, solver, name, result)
+
+
+def criteria(tolerance: float, max_iterations: int, max_seconds: float) -> StoppingCriteria:
+    """Return the criteria that options ask for.
+
+    Raises:
+        ProblemError: an option is outside its range; the message names it.
+    """
+    try:
+        return StoppingCriteria(rtol=tolerance, max_iterations=max_iterations, max_seconds=max_seconds)
+    except SettingError as error:
+        option = "tolerance" if error.name == "rtol" else error.name.replace("_", "-")
+        raise ProblemError(f"--{option} {error.value}: must be {error.rule}") from error
+
+
+def read_matrix(path: Path) -> Any:
+    """Return a square matrix, scipy.sparse or numpy as the file says.
+
+    Raises:
+        ProblemError: the file cannot be read, or holds no finite real square matrix.
+    """
+    return _read(path, lambda rows, columns: rows == columns > 0, "A must be square")
+
+
+def read_vector(path: Path, n: int, *, infinite: bool = False) -> np.ndarray:
+    """Return a vector of n finite numbers, or also infinite ones, from a file of shape n x 1 or 1 x n.
+
+    Raises:
+        ProblemError: the file cannot be read, or holds something else.
+    """
+    expected = f"expected {n} x 1, a number for each row of A"
+    matrix = _read(path, lambda rows, columns: (rows, columns) in ((n, 1), (1, n)), expected, infinite=infinite)
+    return (matrix.toarray() if scipy.sparse.issparse(matrix) else matrix).ravel()
+
+
+def write_vector(path: Path, x: np.ndarray) -> None:
+    """Write a vector as a Matrix Market array, n x 1.
+
+    Raises:
+        ProblemError: the file cannot be written.
+    """
+    try:
+        with replacing(path) as temporary, temporary.open("wb") as stream:
+            scipy.io.mmwrite(stream, x.reshape(-1, 1), precision=17)
+    except OSError as error:
+        raise ProblemError(f"--out {path}: {error.strerror}") from error
+
+
+def _read(path: Path, fits: Callable[[int, int], bool], expected: str, *, infinite: bool = False) -> Any:
+    """Return what a file of a shape that fits holds: finite real numbers, or also infinite ones."""
+    try:
+        matrix = read_market(path, fits, expected)
+    except FileNotFoundError as error:
+        raise ProblemError(f"{path}: no such file") from error
+    except OSError as error:
+        raise ProblemError(f"{path}: {error.strerror or error}") from error
+    except MarketError as error:
+        raise ProblemError(f"{path}: is not {FORMAT}: {error}") from error
+    except ValueError as error:
+        raise ProblemError(f"{path}: {error}") from error
+    values = matrix.data if scipy.sparse.issparse(matrix) else matrix
+    wrong = np.isnan(values) if infinite else ~np.isfinite(values)
+    if wrong.any():
+        raise ProblemError(f"{path}: holds {np.count_nonzero(wrong)} values that are {'NaN' if infinite else 'not finite'}")
+    return matrix
+
+
+def _bound(value: str, n: int, option: str) -> float | np.ndarray:
+    """Return a bound: a number, or the vector in a file."""
+    try:
+        return float(value)
+    except ValueError:
+        if not Path(value).exists():
+            raise ProblemError(f"{option} {value}: neither a number nor a file") from None
+        return read_vector(Path(value), n, infinite=True)
+
+
+def method_named(name: str, family: str, *, shared: bool = False) -> Any:
+    """Return a method by its name, for a family of operators, perhaps on several ranks."""
+    if name not in METHODS:
+        raise ProblemError(f"--method {name}: no such method; {nearest(name, METHODS)}")
+    fits = [known for known, kind in METHODS.items() if family in families(kind) and (not shared or getattr(kind, "distributed", False))]
+    if name not in fits:
+        what = "work on several ranks" if shared else "take grids" if family == "grid" else f"take {family} matrices"
+        raise ProblemError(f"--method {name}: does not {what}; choose from {', '.join(fits)}")
+    try:
+        return METHODS[name]()
+    except (ImportError, TypeError) as error:
+        raise ProblemError(f"--method {name}: {error}") from error

@@ -1,0 +1,174 @@
+"""A problem of a grid from a file that `run --record-problems` wrote, solved by this process or by the ranks: `warp-lcp solve FILE.npz`."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from warp_lcp.frames.atomic import replacing
+from warp_lcp.cli.solve_file import Outcome, ProblemError, criteria, method_named
+from warp_lcp.gallery.recorded_part import cell_counts, load_part
+from warp_lcp.operators import GridPoisson
+from warp_lcp.problem import LCP
+from warp_lcp.solvers.default import solve
+from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
+from warp_lcp.solvers.registry import METHODS
+
+if TYPE_CHECKING:
+    from warp_lcp.distributed.decomposition import Decomposition
+    from warp_lcp.distributed.ranks import Ranks
+
+SUFFIX = ".npz"  # of recorded problems
+FIELD = ".npy"  # of their solutions
+
+
+@dataclass(frozen=True)
+class GridOutcome(Outcome):
+    """What was solved and how it went.
+
+    Attributes:
+        shape: of the whole grid's cells, (nz, ny, nx) or (ny, nx).
+        unknowns: of the whole grid.
+        decomposition: whose box of x the result has; None: all of it.
+    """
+
+    shape: tuple[int, ...]
+    unknowns: int
+    decomposition: Decomposition | None
+
+    def heading(self) -> str:
+        """Return a line that says what was solved."""
+        cells = " x ".join(map(str, reversed(self.shape)))
+        line = f"{self.unknowns} unknowns, {cells} cells, by {self.name} on {self.problem.device}"
+        if self.decomposition is None:
+            return line
+        boxes = " x ".join(map(str, self.decomposition.processes))
+        return f"{line}, ranks: {self.decomposition.ranks.size}, {boxes} boxes"
+
+    def write(self, path: Path) -> None:
+        """Write x as a NumPy array of the shape of the cells; on ranks collective, the first one writes what the others send.
+
+        Raises:
+            ProblemError: the file cannot be written.
+        """
+        try:
+            x = self.result.x.numpy()
+            if self.decomposition is None:
+                with replacing(path) as temporary, temporary.open("wb") as stream:
+                    np.save(stream, x)
+            else:
+                _write_boxes(path, x, self.shape, self.decomposition)
+        except OSError as error:
+            raise ProblemError(f"--out {path}: {error.strerror or error}") from error
+
+
+def solve_recorded(
+    path: Path,
+    *,
+    method: str | None = None,
+    tolerance: float = 1e-6,
+    max_iterations: int = 1000,
+    max_seconds: float = math.inf,
+    device: str = "cpu",
+    ranks: Ranks | None = None,
+) -> GridOutcome:
+    """Solve a recorded problem, from x = clip(0, lower, upper).
+
+    Args:
+        path: the file.
+        method: a name in `METHODS`; the default method for grids if None.
+        tolerance: of the residual, relative to the one at clip(0, lower, upper).
+        max_iterations: the most steps.
+        max_seconds: the most wall time of the solve.
+        device: a Warp device.
+        ranks: who solve it together, each of them its own box of cells; collective. None: this process alone.
+
+    Raises:
+        ProblemError: the file or an option is wrong.
+    """
+    stopping = criteria(tolerance, max_iterations, max_seconds)
+    solver = ProjectedMultigrid() if method is None else method_named(method, "grid", shared=ranks is not None and ranks.size > 1)
+    name = next(name for name, kind in METHODS.items() if type(solver) is kind)
+    try:
+        shape = cell_counts(path)
+        decomposition = None if ranks is None else _decomposition(shape, ranks)
+        problem = _problem(path, shape, decomposition, device)
+        result = solve(problem, solver, stopping=stopping)
+    except ValueError as error:
+        raise ProblemError(str(error)) from error
+    return GridOutcome(problem, solver, name, result, shape, problem.A.unknowns, decomposition)  # type: ignore[attr-defined]
+
+
+def check_recorded(path: Path, *, right_side: Path | None, lower: str | None, upper: str | None, out: Path | None) -> None:
+    """Refuse options that are of matrices.
+
+    Raises:
+        ProblemError: one was given; the message names it.
+    """
+    if right_side is not None:
+        raise ProblemError(f"{right_side}: {path} has a right-hand side of its own")
+    for option, value in (("lower", lower), ("upper", upper)):
+        if value is not None:
+            raise ProblemError(f"--{option} {value}: {path} has bounds of its own")
+    if out is not None and out.suffix != FIELD:
+        raise ProblemError(f"--out {out}: x of a grid becomes a NumPy array: name a {FIELD} file")
+
+
+def file_digest(path: Path) -> str | None:
+    """Return what tells a file's content from another's; None if it cannot be read, or has no end as a device has none."""
+    if not path.is_file():
+        return None
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "blake2b").hexdigest()[:16]
+    except OSError:
+        return None
+
+
+def _decomposition(shape: tuple[int, ...], ranks: Ranks) -> Decomposition:
+    """Return the boxes of a grid's cells."""
+    from warp_lcp.distributed.decomposition import Decomposition
+
+    nx, ny, nz = (*reversed(shape), 1)[:3]
+    return Decomposition((nx, ny, nz), ranks)
+
+
+def _problem(path: Path, shape: tuple[int, ...], decomposition: Decomposition | None, device: str) -> LCP:
+    """Return the problem, or this rank's part of it."""
+    part = tuple(slice(0, n) for n in shape) if decomposition is None else decomposition.box.slices[-len(shape) :]
+    kept = load_part(path, part)
+    cells, b, lower, upper = (kept.pop(name) for name in ("cells", "b", "lower", "upper"))
+    coefficients: dict[str, Any] = {**kept, "device": device}
+    if decomposition is None:
+        return LCP(GridPoisson(cells, **coefficients), b, _bound(lower), _bound(upper))
+    from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
+
+    return LCP(DistributedGridPoisson(decomposition, cells, **coefficients), b, _bound(lower), _bound(upper))
+
+
+def _bound(values: np.ndarray) -> float | np.ndarray:
+    """Return a bound as an LCP takes it: a number, or a field."""
+    return values if values.ndim else float(values)
+
+
+def _write_boxes(path: Path, x: np.ndarray, shape: tuple[int, ...], decomposition: Decomposition) -> None:
+    """Write the ranks' boxes of x into one array, of which the first rank holds one box at a time."""
+    comm, boxes = decomposition.ranks.comm, decomposition.boxes
+    if not decomposition.ranks.first:
+        comm.Send(np.ascontiguousarray(x, dtype=np.float64), dest=0)
+        return
+    with replacing(path) as temporary:
+        whole = np.lib.format.open_memmap(temporary, mode="w+", dtype=np.float64, shape=shape)
+        for rank, box in enumerate(boxes):
+            part = box.slices[-len(shape) :]
+            mine = x if rank == 0 else np.empty([s.stop - s.start for s in part])
+            if rank:
+                comm.Recv(mine, source=rank)
+            whole[part] = mine
+        whole.flush()
+        del whole

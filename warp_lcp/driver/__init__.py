@@ -1,1 +1,0 @@
-"""Scene files, the run loop, frames, logs, checkpoints and the command line."""

@@ -1,0 +1,1 @@
+"""Frames as ParaView, renderers and modelers open them."""

@@ -1,0 +1,254 @@
+"""Frames as ParaView opens them: VTU or VTI files, and PVD collections that give each its time; volumes as NanoVDB, surfaces as PLY too."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import deque
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from types import TracebackType
+from typing import Literal, Self
+
+from warp_lcp.frames.atomic import make_folder, write_text
+from warp_lcp.frames.nvdb import nvdb_bytes, write_nvdb
+from warp_lcp.frames.pieces import WHOLE, piece_files
+from warp_lcp.frames.ply import ply_bytes, write_ply
+from warp_lcp.run.profile import NoStopwatch, Stopwatch
+from warp_lcp.frames.rank_folder import in_ranks
+from warp_lcp.simulation import Cells, Part, Surface, Volume
+from warp_lcp.frames.vti import vti_bytes, write_vti
+from warp_lcp.frames.vtu import vtu_bytes, write_vtu
+
+FRAME_FILE = re.compile(r"(?P<name>[a-z][a-z_]*)_(?P<index>\d{6,})\.(?P<format>p?vtu|p?vti|ply|nvdb)")
+COLLECTED = ("vtu", "vti", "pvtu", "pvti")  # what ParaView opens as a series
+WAITING = 2  # frames in memory, the one being written included
+END = b"</VTKFile>\n"  # of those that are whole
+
+GridFormat = Literal["vtu", "vti"]
+
+
+class FrameFolder:
+    """The frames of one run: `frames/<name>_<index>.vtu` (or .vti, .nvdb) and, but for volumes, `<name>.pvd` beside the folder.
+
+    Args:
+        folder: of the run.
+        grid_format: of the cells.
+        surface_ply: write surfaces as PLY files too.
+    """
+
+    def __init__(self, folder: Path, grid_format: GridFormat = "vtu", *, surface_ply: bool = False) -> None:
+        """Look at a run's folder; nothing is written before the first frame."""
+        self.folder = folder
+        self.grid_format, self.surface_ply = grid_format, surface_ply
+        self.frames = folder / "frames"
+        self._times: dict[str, list[tuple[float, str]]] = {}
+
+    def write(self, index: int, time: float, frame: list[Part]) -> list[Path]:
+        """Write a frame and add it to the collections.
+
+        Args:
+            index: the frame's number.
+            time: of the frame [s].
+            frame: what it shows.
+
+        Returns:
+            Its files.
+
+        Raises:
+            OSError: a file cannot be written; the earlier ones are intact.
+        """
+        make_folder(self.frames)
+        files = []
+        for part in frame:
+            file = self.write_part(self.frames / f"{part.name}_{index:06d}", part)
+            files.append(file)
+            if self.surface_ply and isinstance(part, Surface):
+                files.append(file.with_suffix(".ply"))
+                write_ply(files[-1], part)
+            if not isinstance(part, Volume):
+                self.collect(part.name, time, file)
+        return files
+
+    def collect(self, name: str, time: float, file: Path) -> None:
+        """Add the file of a frame's part to the part's collection.
+
+        Raises:
+            OSError: the collection cannot be written.
+        """
+        times = self._times.setdefault(name, [])
+        times.append((time, f"frames/{file.name}"))
+        write_text(self.folder / f"{name}.pvd", collection(times))
+
+    def resume(self, times: list[float]) -> None:
+        """Continue after the frames of `times`: later files are deleted, the collections are those of the frames that are there.
+
+        Args:
+            times: of the frames that stay, beginning with frame 0 [s].
+
+        Raises:
+            OSError: a file cannot be deleted or written.
+        """
+        self._times.clear()
+        for file in sorted(in_ranks(self.frames)):
+            match = FRAME_FILE.fullmatch(file.name)
+            if match is None:
+                continue
+            index = int(match["index"])
+            if index >= len(times):
+                file.unlink()
+            elif match["format"] in COLLECTED and file.parent == self.frames:
+                self._times.setdefault(match["name"], []).append((times[index], f"frames/{file.name}"))
+        for name, entries in self._times.items():
+            write_text(self.folder / f"{name}.pvd", collection(entries))
+
+    def kinds(self, frame: Sequence[Part]) -> list[str]:
+        """Return what `missing` looks for in a frame: the names of its parts, with `.ply` where a part has such a file too."""
+        return [part.name for part in frame] + [f"{part.name}.ply" for part in frame if self.surface_ply and isinstance(part, Surface)]
+
+    def missing(self, kind: str, count: int) -> list[int]:
+        """Return which of the first `count` frames have no file of a kind, or not all pieces of one that ranks wrote.
+
+        Raises:
+            OSError: a file cannot be read.
+        """
+        found, ply = set(), kind.endswith(".ply")
+        for file in self.frames.iterdir() if self.frames.is_dir() else ():
+            match = FRAME_FILE.fullmatch(file.name)
+            if match and match["name"] == kind.removesuffix(".ply") and (match["format"] == "ply") == ply and _is_whole(file):
+                found.add(int(match["index"]))
+        return sorted({*range(count)} - found)
+
+    def write_part(self, path: Path, part: Part) -> Path:
+        """Write a part to a path that gets the suffix of its format; return the file.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        if isinstance(part, Volume):
+            file = path.with_suffix(".nvdb")
+            write_nvdb(file, part)
+        elif isinstance(part, Cells) and self.grid_format == "vti":
+            file = path.with_suffix(".vti")
+            write_vti(file, part)
+        else:
+            file = path.with_suffix(".vtu")
+            write_vtu(file, part)
+        return file
+
+
+class FrameWriter:
+    """Write frames on a thread of its own while the simulation goes on; at most WAITING frames are in memory.
+
+    What goes wrong there is raised by every later call of `put`, `check` or `flush`, and no later frame is written. Leaving the `with`
+    block waits for the frames that were put, whatever ended the block, and raises only if nothing else did.
+    """
+
+    def __init__(self, folder: FrameFolder, watch: Stopwatch | None = None) -> None:
+        """Begin without frames."""
+        self.written: int | None = None  # the number of the newest frame that the thread brought to disk
+        self._folder = folder
+        self._watch = watch or NoStopwatch()
+        self._pending: deque[Future[None]] = deque()
+        self._failed = False
+        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="frames")
+
+    @property
+    def newest(self) -> int | None:
+        """The number of the newest frame that is there as a whole."""
+        return self.written
+
+    def put(self, index: int, time: float, frame: list[Part]) -> None:
+        """Hand over a frame, whose arrays nobody changes any more; wait if there are too many already.
+
+        Raises:
+            OSError: an earlier frame could not be written.
+        """
+        while len(self._pending) >= WAITING:
+            self._finish()
+        self._pending.append(self._thread.submit(self._write, index, time, frame))
+
+    def check(self) -> None:
+        """Raise what went wrong so far, without waiting.
+
+        Raises:
+            OSError: a frame could not be written.
+        """
+        while self._pending and self._pending[0].done():
+            self._finish()
+
+    def flush(self) -> None:
+        """Wait until every frame is on disk.
+
+        Raises:
+            OSError: a frame could not be written.
+        """
+        while self._pending:
+            self._finish()
+
+    def __enter__(self) -> Self:
+        """Return the writer itself."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """End the thread."""
+        self._thread.shutdown()
+        if kind is None:
+            self.flush()
+
+    def _finish(self) -> None:
+        """Wait for the oldest frame; one that failed stays the oldest, so that it is raised again."""
+        self._pending[0].result()
+        self._pending.popleft()
+
+    def _write(self, index: int, time: float, frame: list[Part]) -> None:
+        if self._failed:  # a run that ends at this frame must not leave a later one
+            return
+        self._failed = True
+        with self._watch.beside("frames, written"):
+            files = self._folder.write(index, time, frame)
+        self._watch.wrote("frames, written", *files)
+        self._failed, self.written = False, index
+
+
+def frame_bytes(frame: list[Part], grid_format: GridFormat = "vtu", *, surface_ply: bool = False) -> int:
+    """Return about how many bytes the files of a frame take; rather more than less.
+
+    Args:
+        frame: what it shows.
+        grid_format: of the cells.
+        surface_ply: count the PLY files of surfaces.
+    """
+    more = sum(ply_bytes(part) for part in frame if surface_ply and isinstance(part, Surface))
+    return more + sum(_bytes(part, grid_format) for part in frame)
+
+
+def _is_whole(file: Path) -> bool:
+    """Return whether a frame's file has an end, and so have all that one with the pieces of ranks names."""
+    try:
+        return _has_end(file) and (file.suffix[1:] not in WHOLE.values() or all(map(_has_end, piece_files(file))))
+    except ValueError:
+        return False
+
+
+def _has_end(file: Path) -> bool:
+    """Return whether a file is there and was not cut."""
+    if not file.is_file():
+        return False
+    with open(file, "rb") as stream:
+        stream.seek(-min(file.stat().st_size, len(END)), os.SEEK_END)
+        return stream.read() == END if file.suffix.endswith(("vtu", "vti")) else stream.tell() > 0
+
+
+def collection(entries: list[tuple[float, str]]) -> str:
+    """Return a PVD collection of files [s, path relative to the collection] as text."""
+    lines = [f'    <DataSet timestep="{time!r}" group="" part="0" file="{file}"/>' for time, file in entries]
+    head = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1">', "  <Collection>"]
+    return "\n".join([*head, *lines, "  </Collection>", "</VTKFile>", ""])
+
+
+def _bytes(part: Part, grid_format: GridFormat) -> int:
+    if isinstance(part, Volume):
+        return nvdb_bytes(part)
+    return vti_bytes(part) if isinstance(part, Cells) and grid_format == "vti" else vtu_bytes(part)

@@ -1,0 +1,211 @@
+"""NanoVDB files of volumes: sparse voxels as renderers and Warp read them, written by NumPy, so that no other thread is disturbed.
+
+The places are those of the format's version 32, for trees of 5, 4 and 3 bits an axis (Warp's `native/nanovdb/NanoVDB.h` describes them):
+a grid's header, the tree's, a root with one entry, one upper node of 32^3 entries, lower nodes of 16^3 and leaves of 8^3 voxels. An entry
+is a value, or how far after its own node the child begins.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from warp_lcp.frames.atomic import replacing
+from warp_lcp.simulation import Volume
+from warp_lcp.frames.vtk_xml import raw
+
+LEAF, LOWER, UPPER = 8, 16, 32  # entries along an edge of a node
+LARGEST = LEAF * LOWER * UPPER  # voxels along an edge of what one upper node holds
+VERSION = 32 << 21 | 3 << 10 | 3
+LEVEL_SET, FOG_VOLUME = 1, 2  # classes of grids
+FLOAT = 1  # type of values
+HAS_BOX, BREADTH_FIRST = 2, 32  # flags
+NO_CHECKSUM = 2**64 - 1
+
+GRID = np.dtype(
+    {
+        "names": [
+            "magic", "checksum", "version", "flags", "count", "bytes", "name", "float_map", "float_inverse", "float_origin", "float_taper",
+            "map", "inverse", "origin", "taper", "box", "voxel", "class", "type", "blind_data",
+        ],
+        "formats": [
+            "S8", "<u8", "<u4", "<u4", "<u4", "<u8", "S256", ("<f4", 9), ("<f4", 9), ("<f4", 3), "<f4",
+            ("<f8", 9), ("<f8", 9), ("<f8", 3), "<f8", ("<f8", 6), ("<f8", 3), "<u4", "<u4", "<i8",
+        ],
+        "offsets": [0, 8, 16, 20, 28, 32, 40, 296, 332, 368, 380, 384, 456, 528, 552, 560, 608, 632, 636, 640],
+        "itemsize": 672,
+    }
+)  # fmt: skip
+BOX = [("low", "<i4", 3), ("high", "<i4", 3)]  # of active voxels
+TREE = np.dtype([("offsets", "<i8", 4), ("nodes", "<u4", 3), ("tiles", "<u4", 3), ("voxels", "<u8")])  # leaves, lower, upper, root
+ROOT = np.dtype(
+    [
+        *BOX, ("entries", "<u4"), ("background", "<f4"), ("statistics", "<f4", 4), ("padding", "V16"),
+        ("key", "<u8"), ("child", "<i8"), ("state", "<u4"), ("value", "<f4"), ("more", "V8"),  # its only entry
+    ]
+)  # fmt: skip
+VALUE = np.dtype({"names": ["value", "child"], "formats": ["<f4", "<i8"], "offsets": [0, 0], "itemsize": 8})  # an entry of a node
+UPPER_NODE, LOWER_NODE = (
+    np.dtype(
+        [
+            *BOX, ("flags", "<u8"), ("active", "u1", edge**3 // 8), ("children", "u1", edge**3 // 8), ("statistics", "<f4", 4),
+            ("padding", "V16"), ("table", VALUE, edge**3),
+        ]
+    )
+    for edge in (UPPER, LOWER)
+)  # fmt: skip
+LEAF_NODE = np.dtype(
+    [
+        ("low", "<i4", 3), ("extent", "u1", 3), ("flags", "u1"), ("active", "u1", LEAF**3 // 8), ("statistics", "<f4", 4),
+        ("values", "<f4", LEAF**3),
+    ]
+)  # fmt: skip
+FILE = np.dtype([("magic", "S8"), ("version", "<u4"), ("grids", "<u2"), ("codec", "<u2")])
+META = np.dtype(
+    [
+        ("grid_bytes", "<u8"), ("file_bytes", "<u8"), ("name_key", "<u8"), ("voxels", "<u8"), ("type", "<u4"), ("class", "<u4"),
+        ("world_box", "<f8", 6), ("index_low", "<i4", 3), ("index_high", "<i4", 3), ("voxel", "<f8", 3), ("name_bytes", "<u4"),
+        ("nodes", "<u4", 4), ("tiles", "<u4", 3), ("codec", "<u2"), ("padding", "<u2"), ("version", "<u4"),
+    ]
+)  # fmt: skip
+
+
+def write_nvdb(path: Path, volume: Volume) -> None:
+    """Write a volume as a NanoVDB file, uncompressed, atomically.
+
+    Index (i, j, k) is the center of that cell. A level set has its band's width where it is not known: + outside and - inside, neither of
+    which takes room. Voxels are active within the band; those of a density are where it is not 0.
+
+    Args:
+        path: the file.
+        volume: the values.
+
+    Raises:
+        OSError: the file cannot be written.
+        ValueError: the values are not of a 3-D grid, not finite, or more than 4096 along an axis.
+    """
+    if volume.values.ndim != 3 or not np.isfinite(volume.values).all() or max(volume.values.shape) > LARGEST:
+        raise ValueError(f"the volume {volume.name!r} must hold finite values of a 3-D grid, at most {LARGEST} along an axis")
+    grid, header = _grid(volume)
+    with replacing(path) as temporary, open(temporary, "wb") as file:
+        file.write(header)
+        for part in grid:
+            file.write(raw(part))
+
+
+def nvdb_bytes(volume: Volume) -> int:
+    """Return how many bytes the file of a volume takes at most."""
+    leaves, lower = (int(np.prod([-(-count // edge) for count in volume.values.shape])) for edge in (LEAF, LEAF * LOWER))
+    return 2 * GRID.itemsize + UPPER_NODE.itemsize + lower * LOWER_NODE.itemsize + leaves * LEAF_NODE.itemsize
+
+
+def name_key(name: bytes) -> int:
+    """Return the number by which readers look a grid's name up."""
+    key = 0
+    for letter in name:
+        key = (key * 67 + letter + (key >> 56)) % 2**64
+    return key
+
+
+def _grid(volume: Volume) -> tuple[list[np.ndarray], bytes]:
+    """Return a grid as a file has it, part by part, and what stands before it."""
+    background = np.float32(0.0 if volume.band is None else volume.band)
+    tiles = _tiles(volume.values, background)
+    high, low = tiles.max(axis=(3, 4, 5)), tiles.min(axis=(3, 4, 5))
+    inside = np.zeros(high.shape, dtype=bool) if volume.band is None else high <= -background
+    used = high > 0.0 if volume.band is None else (low < background) & ~inside
+    leaves = _leaves(tiles, used, volume.band)
+    lower, upper = _nodes(used, inside, background)
+    root, tree, grid = np.zeros(1, dtype=ROOT), np.zeros(1, dtype=TREE), np.zeros(1, dtype=GRID)
+    parts = [grid, tree, root, upper, lower, leaves]
+    begins = np.cumsum([part.nbytes for part in parts]) - grid.nbytes  # of the next part, from the tree's beginning
+    tree["offsets"], tree["nodes"] = begins[[4, 3, 2, 1]], [len(leaves), len(lower), 1]
+    tree["voxels"] = np.unpackbits(leaves["active"]).sum(dtype=np.int64)
+    root["entries"], root["background"], root["child"] = 1, background, root.nbytes
+    root["low"], root["high"] = upper["low"], upper["high"] = lower["low"], lower["high"] = _box(leaves)
+    _describe(grid, root, volume, sum(part.nbytes for part in parts))
+    return parts, _header(grid, tree, root)
+
+
+def _tiles(values: np.ndarray, background: np.float32) -> np.ndarray:
+    """Return the values of each tile, shape (nx, ny, nz, 8, 8, 8) with nx, ny and nz tiles; a view."""
+    nz, ny, nx = counts = [-(-count // LEAF) for count in values.shape]
+    padded = np.full([LEAF * count for count in counts], background, dtype=np.float32)
+    padded[tuple(slice(count) for count in values.shape)] = values
+    return padded.reshape(nz, LEAF, ny, LEAF, nx, LEAF).transpose(4, 2, 0, 5, 3, 1)
+
+
+def _leaves(tiles: np.ndarray, used: np.ndarray, band: float | None) -> np.ndarray:
+    """Return the leaves, in the order of their places."""
+    values = tiles[used].reshape(-1, LEAF**3)
+    leaves = np.zeros(len(values), dtype=LEAF_NODE)
+    if band is not None:
+        np.clip(values, -np.float32(band), np.float32(band), out=values)
+    active = values > 0.0 if band is None else np.abs(values) < np.float32(band)
+    leaves["low"], leaves["extent"], leaves["flags"] = LEAF * np.argwhere(used), LEAF - 1, HAS_BOX
+    leaves["values"], leaves["active"] = values, np.packbits(active, axis=1, bitorder="little")
+    return leaves
+
+
+def _nodes(used: np.ndarray, inside: np.ndarray, background: np.float32) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lower nodes, in the order of their places, and the upper one."""
+    counts = [-(-count // LOWER) for count in used.shape]
+    kinds = np.zeros([LOWER * count for count in counts], dtype=np.int64)  # 0: outside, -1: inside, else the number of a leaf, from 1
+    kinds[tuple(slice(count) for count in used.shape)] = np.where(used, np.cumsum(used).reshape(used.shape), -1 * inside)
+    nx, ny, nz = counts
+    kinds = kinds.reshape(nx, LOWER, ny, LOWER, nz, LOWER).transpose(0, 2, 4, 1, 3, 5)
+    found = kinds.any(axis=(3, 4, 5))
+    kinds = kinds[found].reshape(-1, LOWER**3)
+    lower, upper = np.zeros(len(kinds), dtype=LOWER_NODE), np.zeros(1, dtype=UPPER_NODE)
+    lower["table"]["value"] = np.where(kinds < 0, -background, background)
+    lower["children"] = np.packbits(kinds > 0, axis=1, bitorder="little")
+    node, entry = np.nonzero(kinds > 0)
+    begin = (len(lower) - node) * LOWER_NODE.itemsize  # of the leaves, from the node
+    lower["table"]["child"][node, entry] = begin + (kinds[node, entry] - 1) * LEAF_NODE.itemsize
+    upper["table"]["value"] = background
+    x, y, z = np.argwhere(found).T
+    place = (x * UPPER + y) * UPPER + z
+    upper["table"]["child"][0, place] = upper.nbytes + np.arange(len(lower)) * LOWER_NODE.itemsize
+    children = np.zeros(UPPER**3, dtype=bool)
+    children[place] = True
+    upper["children"] = np.packbits(children, bitorder="little")
+    return lower, upper
+
+
+def _box(leaves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first and the last active voxel along each axis; an empty box if there is none."""
+    active = np.unpackbits(leaves["active"], axis=1, bitorder="little").astype(bool).reshape(-1, LEAF, LEAF, LEAF)
+    low, high = np.zeros(3, dtype=np.int32), np.full(3, -1, dtype=np.int32)
+    for axis, others in enumerate([(2, 3), (1, 3), (1, 2)]) if active.any() else ():
+        found = (leaves["low"][:, axis, None] + np.arange(LEAF))[active.any(axis=others)]
+        low[axis], high[axis] = found.min(), found.max()
+    return low, high
+
+
+def _describe(grid: np.ndarray, root: np.ndarray, volume: Volume, size: int) -> None:
+    """Write what the grid is, and where."""
+    spacing = float(volume.spacing)
+    grid["magic"], grid["checksum"], grid["version"], grid["flags"] = b"NanoVDB1", NO_CHECKSUM, VERSION, HAS_BOX | BREADTH_FIRST
+    grid["count"], grid["bytes"], grid["blind_data"] = 1, size, size
+    grid["name"], grid["type"], grid["class"] = volume.name.encode(), FLOAT, FOG_VOLUME if volume.band is None else LEVEL_SET
+    grid["float_map"] = grid["map"] = spacing * np.eye(3).ravel()
+    grid["float_inverse"] = grid["inverse"] = np.eye(3).ravel() / spacing
+    grid["float_origin"] = grid["origin"] = spacing / 2
+    grid["float_taper"] = grid["taper"] = 1.0
+    grid["voxel"] = spacing
+    grid["box"] = np.concatenate([root["low"], root["high"] + 1], axis=1) * spacing + spacing / 2
+
+
+def _header(grid: np.ndarray, tree: np.ndarray, root: np.ndarray) -> bytes:
+    """Return what stands before a grid in a file, by which readers find it."""
+    name = bytes(grid["name"][0])
+    file, meta = np.zeros(1, dtype=FILE), np.zeros(1, dtype=META)
+    file["magic"], file["version"], file["grids"] = b"NanoVDB0", VERSION, 1
+    meta["grid_bytes"] = meta["file_bytes"] = grid["bytes"]
+    meta["name_key"], meta["name_bytes"] = name_key(name), len(name) + 1
+    for key in ("type", "class", "voxel", "version"):
+        meta[key] = grid[key]
+    meta["world_box"], meta["index_low"], meta["index_high"] = grid["box"], root["low"], root["high"]
+    meta["voxels"], meta["nodes"][:, :3], meta["nodes"][:, 3] = tree["voxels"], tree["nodes"], 1
+    return file.tobytes() + meta.tobytes() + name + b"\0"

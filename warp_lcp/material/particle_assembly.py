@@ -1,0 +1,330 @@
+"""What a scene of particles asks for, made: walls, the first particles, where material comes in and goes out, what evens it out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+import warp_lcp as wl
+from warp_lcp.material.particle_scene import ParticleScene
+from warp_lcp.material.particle_volume import ParticleVolume
+from warp_lcp.scene.shapes import SolidProperties
+from warp_lcp.grid.cut_cells import CutCells
+from warp_lcp.grid.particles import Particles, seed
+from warp_lcp.grid.periodic import PeriodicSides, periodic_sides
+from warp_lcp.grid.sides import side_bits
+from warp_lcp.grid.solids import Geometry
+from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.grid.surface_mesh import Obstacles, SurfaceMesh
+from warp_lcp.grid.voxelize import PlacedSolid, inside, placement_notes, voxelize
+from warp_lcp.material.boundary import Boundary, WholeCells
+from warp_lcp.material.cut_boundary import CutBoundary
+from warp_lcp.material.density_correction import Crowding, DensityCorrection
+from warp_lcp.material.narrow_band import NarrowBand
+from warp_lcp.material.outlets import Drain, Outlets
+from warp_lcp.material.reseeding import Reseeding
+from warp_lcp.material.sources import Source, Sources
+from warp_lcp.rigid.bodies import RigidBodies
+from warp_lcp.rigid.body import BodyMotion, RigidBody
+from warp_lcp.rigid.mass_properties import mass_properties
+from warp_lcp.rigid.surroundings import Surroundings, domain_walls, obstacle
+
+
+def placed_solids(scene: ParticleScene, folder: Path) -> list[PlacedSolid]:
+    """Return the scene's solids, rigid bodies with the motion of a body each; files that it names are relative to `folder`.
+
+    Raises:
+        ValueError: a file cannot be read, or a rigid body has no mass of its own.
+    """
+    placed = []
+    for number, (solid, friction) in enumerate(zip(scene.solid, scene.body_frictions(), strict=True)):
+        geometry, name = solid.to_geometry(folder, scene.dimension), f"solid[{number}] ({solid.shape})"
+        motion = solid.motion.to_motion(scene.dimension) if solid.motion else None
+        if solid.is_body:
+            motion = BodyMotion(_body(solid, geometry, name, friction, scene.dimension))
+        separating = (solid.wall or scene.domain.wall) == "separating"
+        placed.append(PlacedSolid(geometry=geometry, separating=separating, name=name, motion=motion, among=scene.materials()[0]))
+    return placed
+
+
+def make_bodies(scene: ParticleScene, placed: Sequence[PlacedSolid]) -> RigidBodies | None:
+    """Return the rigid bodies among a scene's solids, if there are any, among its walls and the other solids.
+
+    Args:
+        scene: the scene.
+        placed: its solids, of `placed_solids`: the boundary must be of the same.
+
+    Raises:
+        ValueError: a body overlaps a wall, a solid or another body, or its center lies outside the domain.
+    """
+    motions = {number: solid.motion for number, solid in enumerate(placed, start=1) if isinstance(solid.motion, BodyMotion)}
+    if not motions:
+        return None
+    walls = domain_walls(scene.domain.size, open_sides=side_bits(scene.domain.open), endless=scene.endless)
+    others = [obstacle(solid, scene.dimension) for number, solid in enumerate(placed, start=1) if number not in motions]
+    bodies = [motion.body for motion in motions.values()]
+    for body in bodies:
+        if not ((body.position >= 0.0) & (body.position <= np.array(_vector(scene.domain.size)))).all():
+            raise ValueError(f"{body.name} has its center of mass at {body.position.round(6).tolist()} m, outside the domain")
+    shapes = [placed[number - 1].geometry for number in motions]
+    return RigidBodies(bodies, shapes, list(motions), Surroundings((walls, *others)), scene.dimension)
+
+
+def make_boundary(
+    scene: ParticleScene,
+    grid: StaggeredGrid,
+    folder: Path,
+    wall_velocity: np.ndarray | None = None,
+    *,
+    solids: Sequence[PlacedSolid] | None = None,
+) -> tuple[Boundary, tuple[str, ...]]:
+    """Return solids and walls as the scene asks for them, and warnings.
+
+    Args:
+        scene: the scene.
+        grid: its grid.
+        folder: where the files are that it names.
+        wall_velocity: velocity [m/s] of the domain's wall and of each solid, shape (1 + solids, 3), constant; None: all stand still, or
+            have their own motion.
+        solids: of `placed_solids`; made anew if None.
+
+    Raises:
+        ValueError: solids cut cells and there is a `wall_velocity`.
+    """
+    placed = placed_solids(scene, folder) if solids is None else solids
+    around = PeriodicSides(grid, scene.endless) if scene.endless else None
+    separating, sides = scene.domain.wall == "separating", side_bits(scene.domain.open)
+    if scene.domain.solids == "cut-cell":
+        if wall_velocity is not None:
+            raise ValueError('wall_velocity: only for solids = "voxel"; solids that cut cells have a motion')
+        cut = CutCells(grid, placed, wall_separating=separating, open_sides=sides)
+        if not cut.whole_cells:
+            return CutBoundary(grid, cut, sides=around), cut.notes
+    voxels = voxelize(
+        grid.counts, grid.spacing, grid.dimension, placed, wall_separating=separating, device=grid.device,
+        open_sides=sides | side_bits(periodic_sides(scene.endless)),
+    )  # fmt: skip
+    if wall_velocity is None and scene.source:
+        wall_velocity = np.zeros((1 + len(placed), 3))  # what a source's faces are given goes there
+    return WholeCells(grid, voxels, wall_velocity, open_sides=sides, sides=around), voxels.notes
+
+
+def make_surface_mesh(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> SurfaceMesh | None:
+    """Return what wraps the particles in a surface, if the scene's output has one."""
+    if not scene.output.surface:
+        return None
+    return SurfaceMesh(
+        grid, per_axis=scene.particles.per_axis, resolution=scene.output.surface_resolution, smoothing=scene.output.surface_smoothing,
+        obstacles=Obstacles(boundary.base, boundary.distance, boundary.moves) if scene.solid else None,
+    )  # fmt: skip
+
+
+def make_particle_volume(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> ParticleVolume | None:
+    """Return what measures the material's volume, if the scene's output has it."""
+    if not scene.output.volume:
+        return None
+    return ParticleVolume(grid, boundary, particles_a_cell=scene.particles.per_axis**grid.dimension)
+
+
+def seed_materials(
+    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, folder: Path, without: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Fill the scene's materials with points.
+
+    Args:
+        scene: the scene.
+        grid: its grid.
+        boundary: its solids.
+        folder: where the files are that it names.
+        without: cells that get no points, bool of shape (nz, ny, nx).
+
+    Returns:
+        Positions [m], float32, shape (n, 3); the entry of `scene.materials()` that each belongs to, shape (n,); warnings.
+
+    Raises:
+        ValueError: a material has no particle.
+    """
+    key, materials = scene.materials()
+    geometries = [material.to_geometry(folder, scene.dimension) for material in materials]
+    regions = [_region(geometry, boundary, grid.device) for geometry in geometries]
+    names = [f"{key}[{number}] ({material.shape})" for number, material in enumerate(materials)]
+    notes: list[str] = []
+    for name, geometry in zip(names, geometries, strict=True):
+        notes += placement_notes(geometry, name, grid.whole or grid.counts, grid.spacing, grid.dimension)
+    settings = scene.particles
+    open_cells = grid.interior(boundary.base.numpy()) != wl.SOLID
+    if without is not None:
+        open_cells &= ~without
+    position, owner = seed(
+        grid, regions, open_cells, per_axis=settings.per_axis, jitter=settings.jitter, random_seed=settings.seed
+    )  # fmt: skip
+    counts = np.bincount(owner, minlength=len(geometries))
+    for name, count in zip(names, counts, strict=False):
+        if count == 0 and without is None:
+            raise ValueError(
+                f"{name} holds no particle: it is too small for cells of {grid.spacing:.4g} m, or lies in solids, outside the domain or in "
+                f"an earlier {key}"
+            )
+    return position, owner, notes
+
+
+def make_particles(
+    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, folder: Path, without: np.ndarray | None = None
+) -> tuple[Particles, list[str]]:
+    """Return the particles of all materials, in the order of `seed_materials`, and warnings; arguments as there.
+
+    Raises:
+        ValueError: a material has no particle.
+    """
+    position, owner, notes = seed_materials(scene, grid, boundary, folder, without)
+    velocity = start_velocities(scene).astype(np.float32)[owner]
+    return Particles(grid, position, velocity, affine=scene.particles.transfer == "apic"), notes
+
+
+def start_velocities(scene: ParticleScene) -> np.ndarray:
+    """Return the velocity of each material at the start [m/s], shape (materials, 3); one of rest if there is none."""
+    return np.array([_vector(material.velocity or [0.0, 0.0]) for material in scene.materials()[1]] or [_vector([0.0, 0.0])])
+
+
+def make_sources(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, folder: Path) -> Sources | None:
+    """Return the scene's sources, if it has any.
+
+    Raises:
+        ValueError: a source has no open cell.
+    """
+    if not scene.source:
+        return None
+    sources = [
+        Source(
+            name=f"source[{number}] ({source.shape})",
+            contains=_inside(source.to_geometry(folder, scene.dimension), grid.device),
+            velocity=np.array(_vector(source.velocity)),
+            start=source.begin,
+            stop=np.inf if source.stop is None else source.stop,
+        )
+        for number, source in enumerate(scene.source)
+    ]
+    settings = scene.particles
+    return Sources(grid, boundary, sources, per_axis=settings.per_axis, jitter=settings.jitter, random_seed=settings.seed)
+
+
+def make_outlets(scene: ParticleScene, grid: StaggeredGrid, folder: Path) -> Outlets | None:
+    """Return the scene's drains and open sides, if it has any."""
+    if not scene.drain and not scene.domain.open:
+        return None
+    drains = [
+        Drain(drain.to_geometry(folder, scene.dimension), drain.begin, np.inf if drain.stop is None else drain.stop)
+        for drain in scene.drain
+    ]
+    return Outlets(grid, drains, side_bits(scene.domain.open))
+
+
+def make_narrow_band(
+    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, folder: Path
+) -> tuple[NarrowBand | None, np.ndarray | None]:
+    """Return what carries the material deeper than a band, and its cells at the start, bool of shape (nz, ny, nx); None: nothing does."""
+    settings, particles = scene.particles.narrow_band, scene.particles
+    if settings is None:
+        return None, None
+    regions = [_region(material.to_geometry(folder, scene.dimension), boundary, grid.device) for material in scene.materials()[1]]
+    open_cells = grid.interior(boundary.base.numpy()) != wl.SOLID
+    position, number = seed(grid, regions, open_cells, per_axis=1, jitter=0.0, random_seed=0)
+    i, j, k = (position / grid.spacing).astype(int).T
+    owner = np.full(open_cells.shape, -1)
+    owner[k, j, i] = number
+    band = NarrowBand(
+        grid, boundary, width=settings.width, per_axis=particles.per_axis, jitter=particles.jitter, random_seed=particles.seed,
+        keep=_exchange_cells(scene, grid, folder),
+    )  # fmt: skip
+    return band, band.start(owner, start_velocities(scene))
+
+
+def _exchange_cells(scene: ParticleScene, grid: StaggeredGrid, folder: Path) -> np.ndarray | None:
+    """Return which stored cells are near a source or a drain; None: there is none."""
+    regions = [*scene.source, *scene.drain]
+    if not regions:
+        return None
+    near = np.zeros(grid.shape, dtype=bool)
+    K, J, I = np.meshgrid(*(np.arange(1, n + 1) for n in grid.counts[::-1]), indexing="ij")
+    centers = grid.to_world(np.stack([I.ravel(), J.ravel(), K.ravel()], axis=1) + 0.5)
+    if grid.dimension == 2:
+        centers[:, 2] = 0.0
+    points = wp.array(centers.astype(np.float32), dtype=wp.vec3, device=grid.device)
+    distance = wp.zeros(len(centers), dtype=wp.float32, device=grid.device)
+    for region in regions:
+        region.to_geometry(folder, scene.dimension).signed_distance(points, distance)
+        near[1:-1, 1:-1, 1:-1] |= (distance.numpy() < grid.spacing).reshape(grid.counts[::-1])
+    return near
+
+
+def make_reseeding(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> Reseeding | None:
+    """Return what evens out the particles if a scene asks for it."""
+    settings = scene.particles.reseed
+    if settings is None:
+        return None
+    at_rest = scene.particles.per_axis**grid.dimension
+    least, most = scene.particles.reseed_range(grid.dimension)
+    return Reseeding(grid, boundary, least=least, most=most, particles_a_cell=at_rest, every=settings.every)
+
+
+def make_density_correction(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> DensityCorrection:
+    """Return what moves the particles of a scene apart.
+
+    Raises:
+        ValueError: the scene has none.
+    """
+    settings = scene.correction
+    if settings is None:
+        raise ValueError("density_correction.every = 0: must be at least 1")
+    solver = wl.ProjectedMultigrid(precision=scene.solver.precision)
+    return DensityCorrection(
+        grid, boundary, solver, particles_a_cell=scene.particles.per_axis**grid.dimension,
+        max_density=settings.largest(scene.particles.per_axis), every=settings.every, gain=scene.correction_gain, even=scene.keeps_volume,
+        tolerance=settings.tolerance,
+    )  # fmt: skip
+
+
+def make_crowding(scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> Crowding | None:
+    """Return what tells when the particles of a scene are to be moved apart; None: the scene says so itself, or they never are."""
+    settings = scene.correction
+    if scene.density_correction is not None or settings is None or grid.whole is not None:
+        return None
+    count = scene.particles.per_axis
+    return Crowding(grid, boundary, particles_a_cell=count**grid.dimension, max_density=settings.largest(count))
+
+
+def _body(solid: SolidProperties, geometry: Geometry, name: str, friction: float, dimension: int) -> RigidBody:
+    """Return the rigid body that a solid is."""
+    try:
+        properties = mass_properties(geometry, dimension, mass=solid.mass, density=solid.density)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
+    spin = np.radians(solid.angular_velocity or [0.0] * 3)
+    return RigidBody(
+        properties, name=name, friction=friction, restitution=solid.restitution, velocity=np.array(_vector(solid.velocity or [0.0, 0.0])),
+        angular_velocity=np.array([0.0, 0.0, *spin][-3:]),
+    )  # fmt: skip
+
+
+def _vector(entries: list[float]) -> list[float]:
+    """Return a vector of two or three entries as one of three."""
+    return [*entries, 0.0][:3]
+
+
+def _inside(geometry: Geometry, device: wp.Device) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a function that tells which points lie in a geometry."""
+    return lambda points: inside([geometry], points, device=device)
+
+
+def _region(geometry: Geometry, boundary: Boundary, device: wp.Device) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a function that tells which points lie in a geometry and outside solids."""
+
+    def holds(points: np.ndarray) -> np.ndarray:
+        result = inside([geometry], points, device=device)
+        result[result] = boundary.admits(points[result])
+        return result
+
+    return holds

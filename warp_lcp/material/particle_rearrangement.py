@@ -1,0 +1,148 @@
+"""What moves particles apart from the flow: they are evened out where a scene asks for it, and moved apart where they crowd."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.material.particle_assembly import make_crowding, make_density_correction, make_reseeding
+from warp_lcp.material.particle_scene import ParticleScene
+from warp_lcp.run.profile import Stopwatch
+from warp_lcp.grid.level_set import Fill
+from warp_lcp.grid.particles import Particles
+from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.material.boundary import Boundary
+from warp_lcp.material.density_correction import DensityCorrection
+
+CORRECTION_COLUMNS = ("density_status", "density_iterations", "max_density")
+STATE = "density_correction"
+PACE = 2.0  # of sqrt(dx / g), in which a correction that acts by itself takes out what crowds
+
+
+class Rearrangement:
+    """Even out a material's particles and move them apart, when it is time.
+
+    Without the table [density_correction] a correction acts in the steps that begin with a share of the material beyond what cells may
+    hold that is larger than `ParticleScene.most_crowded`, and in `PACE` sqrt(dx / g) takes out what crowds: what it lifts in a step is as
+    little as the step is short. Crowding is told from the particles' density at the start of the step, which liquid's surface and sand's
+    packing have found for themselves: whether a step acts depends on where particles are, and on nothing that a checkpoint would have to
+    keep. The correction's fields are made when it acts first.
+
+    Args:
+        scene: what asks for it.
+        grid: its grid.
+        boundary: its solids.
+
+    Attributes:
+        reseeding: what evens out; None: the scene does not ask for it.
+        crowding: what tells when to act; None: the scene says it, or particles are never moved apart.
+        correction: what moves apart; None: it has not acted yet, or never does.
+    """
+
+    def __init__(self, scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary) -> None:
+        """Make what the scene asks for."""
+        self._scene, self._grid, self._boundary = scene, grid, boundary
+        self.reseeding, self.crowding = make_reseeding(scene, grid, boundary), make_crowding(scene, grid, boundary)
+        self.correction: DensityCorrection | None = None
+        settings = scene.correction
+        self._every, self._most = settings.every if settings is not None else 0, scene.most_crowded
+        if scene.density_correction is not None and settings is not None:
+            self.correction = self._made()
+        g = math.hypot(*scene.physics.gravity)
+        self._pace = PACE * math.sqrt(grid.spacing / g) if g > 0.0 else 0.0  # [s]
+        self._crowded: tuple[float, float] | None = None  # share and largest density at the start of the step
+
+    def look(self, step: int, density: wp.array | None, particles: Particles) -> None:
+        """Measure the crowding at the start of a step, before anything moves, if that is what decides.
+
+        Args:
+            step: its number.
+            density: of the particles, in units of that at rest, float32; None: nobody has found it yet.
+            particles: the material.
+        """
+        self._crowded = None
+        if self.crowding is not None and step % self._every == 0:
+            self._crowded = self.crowding.measure(density, particles, self._grid.everywhere)
+
+    @property
+    def max_density(self) -> float | None:
+        """Return the largest density at the start of the step, if it was measured."""
+        return None if self._crowded is None else self._crowded[1]
+
+    def due(self, step: int) -> bool:
+        """Return whether a step moves anything."""
+        return self._evens(step) or self._parts(step)
+
+    def apply(
+        self, particles: Particles, window: Window, step: int, dt: float, watch: Stopwatch, fill: Fill | None, contact: wp.array | None
+    ) -> dict[str, float | int | str]:
+        """Even out the particles and move them apart, if it is time.
+
+        Args:
+            particles: the material (moved).
+            window: cells that hold all particles, with two to spare on each side.
+            step: its number.
+            dt: its length [s].
+            watch: what the stages are measured with.
+            fill: adds to the density in a window what no particle stands for.
+            contact: uint8, RELEASED where walls have let go in the step; None: it is not known.
+
+        Returns:
+            What the log says of it.
+        """
+        row: dict[str, float | int | str] = {}
+        if self.reseeding is not None and self._evens(step):
+            with watch.stage("reseeding", *particles.arrays().values()):
+                row["reseeded"] = self.reseeding.apply(particles, window, step)
+        if self._parts(step):
+            correction = self.correction = self.correction or self._made()
+            with watch.stage("density correction", particles.position, correction.density, correction.x, *correction.displacement):
+                done = correction.apply(particles, window, fill=fill, contact=contact, share=self._share(dt))
+            row["density_status"] = done.result.status.name if done.result is not None else "NOTHING_TO_DO"
+            row["density_iterations"] = done.result.iterations if done.result is not None else 0
+            row["max_density"] = done.max_density
+        return row
+
+    def _evens(self, step: int) -> bool:
+        return self.reseeding is not None and step % self.reseeding.every == 0
+
+    def _parts(self, step: int) -> bool:
+        if self.crowding is not None:
+            return self._crowded is not None and self._crowded[0] > self._most
+        return self.correction is not None and step % self.correction.every == 0
+
+    def _share(self, dt: float) -> float:
+        """Return how much of what crowds a step moves apart: all where the scene says when, else at a rate that knows of no steps."""
+        return min(1.0, dt / self._pace) if self.crowding is not None and self._pace > 0.0 else 1.0
+
+    def columns(self) -> tuple[str, ...]:
+        """Return the names of the log's columns that `apply` fills, on ranks too, where none does: a log goes on on any number of them."""
+        evens = ("reseeded",) if self.reseeding is not None else ()
+        return (*evens, *CORRECTION_COLUMNS) if self._scene.correction is not None else evens
+
+    def notes(self) -> list[str]:
+        """Return why nothing keeps the particles apart where the scene leaves that to the program."""
+        if self._scene.density_correction is not None or self.crowding is not None:
+            return []
+        where = "on a periodic axis" if self._scene.endless else "on several processes" if self._grid.whole is not None else ""
+        return [f"particles that crowd are not moved apart {where}: there is no density correction"] if where else []
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return the solution that the next correction starts from, if there was one."""
+        return {} if self.correction is None else {STATE: self.correction.x.numpy().copy()}
+
+    def expect(self, state: Mapping[str, np.ndarray]) -> None:
+        """Get ready for a state of this scene, which may be from before or after the first correction."""
+        if self.crowding is not None:
+            self.correction = (self.correction or self._made()) if STATE in state else None
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue from `state`."""
+        if self.correction is not None:
+            self.correction.x.assign(state[STATE])
+
+    def _made(self) -> DensityCorrection:
+        return make_density_correction(self._scene, self._grid, self._boundary)

@@ -1,0 +1,355 @@
+"""Scenes of a material that particles carry, whatever it is: its sampling, sources and drains, and what a run would take."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Iterable, Sequence
+from typing import ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from warp_lcp.scene.models import Model, model_lines, prices
+from warp_lcp.material.particle_volume import VOLUME_BYTES
+from warp_lcp.scene.presets import preset_values
+from warp_lcp.scene.scene import Scene
+from warp_lcp.scene.shapes import BODY_FRICTION, STICKS, Drain, MaterialProperties, Source
+from warp_lcp.scene.table import Complaint, Table
+from warp_lcp.grid.surface_mesh import MESH_LATTICE_BYTES, MESH_POINT_BYTES, MESH_SOLID_BYTES
+from warp_lcp.settings import Count, CountOrZero, Part, Share
+
+# Measured at 96^3 as the growth of a process on the CPU, first step included.
+GRID_BYTES = 36  # fields of the grid, a cell
+CUT_BYTES = 45
+MOVING_BYTES = 30
+SOURCE_BYTES = 8
+CORRECTION_BYTES, CUT_CORRECTION_BYTES = 54, 22  # the density correction's fields and method, and more where cells are cut
+EVEN_BYTES = 9  # and more where it closes voids
+RESEED_BYTES = 13
+BAND_BYTES = 24
+FLIGHT_BYTES = 10  # what says which cells belong to bodies in flight
+SPREAD = 2.0  # how much a narrow band may grow as its surface does: 1.3 times in a double dam break, 1.7 in a dam break in 3-D
+PLANES = 2.5  # that a 2-D cell counts for: its fields have three, the solver's one
+VECTOR_BYTES, KEY_BYTES = 12, 16  # a particle's vectors, one of them spare, and its sort keys
+SEEDING_BYTES = 136  # a particle on the host, while the material is made and the solver is not
+SITE_SLACK = 1e-3  # of the distance of particles: their float32 coordinates may be off by that on 4096 cells
+LATTICE_BYTES = 50  # a point of one plane of cells, while particles are chosen from them
+
+
+class Reseed(Table):
+    """[particles.reseed]: evens out particles deep in the material; off unless the table is there."""
+
+    every: Count = Field(default=2, description="steps from one time to the next")
+    min: Count | None = Field(default=None, description="particles in a cell, fewer are filled up; 3/8 of those at rest unless given")
+    max: Count | None = Field(default=None, description="particles in a cell, more are handed on; twice those at rest unless given")
+
+
+class NarrowBandSettings(Table):
+    """[particles.narrow_band]: particles, in frames too, near the surface only, the grid carries what lies deeper; off unless there."""
+
+    width: float = Field(default=4.0, ge=3, description="cells below the surface that hold particles")
+
+
+class ParticleSettings(Table):
+    """[particles]: how the material is sampled and how its velocity moves between particles and grid."""
+
+    per_axis: int = Field(default=2, ge=1, le=4, description="particles along the edge of a cell at the start")
+    transfer: Literal["apic", "flip", "pic"] = Field(default="apic", description="flip is livelier and noisier, pic damps")
+    flip_ratio: Part = Field(default=0.95, description="the share of FLIP when transfer is flip; the rest is PIC")
+    jitter: Part = Field(default=0.25, description="random displacement at the start, a fraction of the particles' distance")
+    seed: CountOrZero = Field(default=2015, description="of the random displacements")
+    reseed: Reseed | None = None
+    narrow_band: NarrowBandSettings | None = None
+
+    def reseed_range(self, dimension: int) -> tuple[int, int]:
+        """Return the fewest and the most particles of a cell that reseeding leaves alone."""
+        at_rest, given = self.per_axis**dimension, self.reseed or Reseed()
+        return given.min or math.ceil(0.375 * at_rest), given.max or 2 * at_rest
+
+
+class DensityCorrectionSettings(Table):
+    """[density_correction]: moves particles apart that have come too close; without the table as soon as a thousandth crowds."""
+
+    every: CountOrZero = Field(default=1, description="steps from one correction to the next; 0 switches it off")
+    tolerance: Share = Field(default=1e-2, description="the relative residual to reach")
+    max_density: float | None = Field(
+        default=None, gt=0, le=2, description="of a cell, in units of the density at rest; 1 + 0.1 / particles.per_axis unless given"
+    )
+
+    def largest(self, per_axis: int) -> float:
+        """Return the density [of that at rest] that a cell may have: particles on a lattice are uneven the more, the fewer they are."""
+        return self.max_density if self.max_density is not None else 1.0 + 0.1 / per_axis
+
+
+class ParticleScene(Scene):
+    """A scene of a material that particles carry.
+
+    Subclasses add the list of the material's shapes and name it in `materials`.
+    """
+
+    solve_bytes: ClassVar[int] = 0  # a cell, of the fields of the solve that are there before the particles are made
+    correction_gain: ClassVar[float] = 1.0  # of the density correction
+    crowded: ClassVar[float] = 2e-3  # of the material, over particles.per_axis: a pool at rest has 1e-3 / 3e-5 at 1 / 2, splashed 1e-2
+    carried_by_grid: ClassVar[bool] = False  # whether the grid can carry the material without particles
+
+    particles: ParticleSettings = Field(default_factory=ParticleSettings)
+    density_correction: DensityCorrectionSettings | None = None
+    source: list[Source] = Field(default_factory=list)
+    drain: list[Drain] = Field(default_factory=list)
+
+    @abstractmethod
+    def materials(self) -> tuple[str, Sequence[MaterialProperties]]:
+        """Return the key of the material's shapes in the file, such as `liquid`, and the shapes."""
+
+    def models(self) -> list[Model]:
+        """Return the models that the scene turns on, and those that it asks for but cannot need. Subclasses add their own."""
+        moving = [number for number, solid in enumerate(self.solid) if solid.moves]
+        bodies = [number for number, solid in enumerate(self.solid) if solid.is_body]
+        settings, output = self.particles, self.output
+        used = {
+            "cut cells": _solids(range(len(self.solid)), "reaches through cells") if self.cuts_cells else "",
+            "moving solids": _solids(moving, "moves") if moving else "",
+            "rigid bodies": _solids(bodies, "has a mass") if bodies else "",
+            "FLIP": 'particles.transfer = "flip"' if settings.transfer == "flip" else "",
+            "density correction": "[density_correction]" if self.density_correction is not None and self.correction is not None else "",
+            "reseeding": "[particles.reseed]" if settings.reseed is not None else "",
+            "narrow band": "[particles.narrow_band]" if settings.narrow_band is not None else "",
+            "sources": "[[source]]" if self.source else "",
+            "outlets": "[[drain]] or domain.open" if self.drain or self.domain.open else "",
+            "surface mesh": "output.surface" if output.surface else "",
+            "volume": "output.volume" if output.volume else "",
+            "diagnostics": "output.diagnostics" if output.diagnostics else "",
+        }
+        return [Model(name, why, count=len(bodies) if name == "rigid bodies" else 1) for name, why in used.items() if why]
+
+    @property
+    def correction(self) -> DensityCorrectionSettings | None:
+        """Return how particles are moved apart, with or without the table, which a preset's values stand in for; None: they never are."""
+        given = self.density_correction
+        if given is None:
+            if self.endless or self.stays_full or self.settles:
+                return None
+            given = DensityCorrectionSettings(**preset_values(self, "density_correction"))
+        return given if given.every else None
+
+    @property
+    def most_crowded(self) -> float:
+        """Return which share of the material may be beyond what cells hold before it is moved apart where the scene does not say when."""
+        return self.crowded / self.particles.per_axis
+
+    @property
+    def keeps_volume(self) -> bool:
+        """Return whether the density correction closes voids inside the material too."""
+        return False
+
+    @property
+    def settles(self) -> bool:
+        """Return whether the material's own law keeps its density."""
+        return False
+
+    @property
+    def stays_full(self) -> bool:
+        """Return whether the material fills the domain for ever."""
+        return False
+
+    @property
+    def coheres(self) -> bool:
+        """Return whether what turns in flight keeps together."""
+        return False
+
+    @property
+    def flies(self) -> bool:
+        """Return whether bodies in flight can be told: not where they lack particles inside, nor where they go on at another side."""
+        return self.particles.narrow_band is None and not self.stays_full and not self.endless
+
+    @property
+    def endless(self) -> tuple[int, ...]:
+        """Return the axes without an end: what leaves at one side comes in at the other."""
+        return ()
+
+    def complaints(self) -> list[Complaint]:
+        """Return what is wrong across keys."""
+        key, materials = self.materials()
+        found = [] if materials or self.source else [Complaint((key,), None, "is missing, and there is no [[source]] either")]
+        found += self.shape_complaints(key, materials, inside=True)
+        found += self.shape_complaints("source", self.source, inside=True) + self.shape_complaints("drain", self.drain, inside=True)
+        if self.particles.narrow_band is not None and not self.carried_by_grid:
+            message = "is for liquids only: sand deep inside has a state that its particles alone know"
+            found.append(Complaint(("particles", "narrow_band"), None, message))
+        return super().complaints() + found + self._reseed_complaints()
+
+    def _reseed_complaints(self) -> list[Complaint]:
+        least, most = self.particles.reseed_range(self.dimension)
+        at_rest = self.particles.per_axis**self.dimension
+        if self.particles.reseed is None or least <= at_rest <= most:
+            return []
+        key, value, word = ("min", least, "most") if least > at_rest else ("max", most, "least")
+        message = f"must be at {word} the {at_rest} particles of a cell at rest"
+        return [Complaint(("particles", "reseed", key), value, message)]
+
+    def body_frictions(self) -> list[float]:
+        """Return Coulomb's coefficient of each solid's surface against bodies and walls."""
+        given = [BODY_FRICTION if solid.friction is None else solid.friction for solid in self.solid]
+        return [STICKS if friction == "stick" else float(friction) for friction in given]
+
+    def particle_estimate(self, *, later: bool = True) -> int:
+        """Return how many particles the scene has at most: meshes and slanted shapes count as the boxes around them.
+
+        Sources may fill the domain; whether they do, and what leaves it, is not known before. How a narrow band grows is not known either:
+        with one it is an estimate.
+
+        Args:
+            later: count what sources let in; False: what is there at the start.
+        """
+        let_in = sum(self._source_sites(source, later=later) for source in self.source)
+        at_start = sum(int(self._sites(shape.bounds(self.dimension)).prod()) for shape in self.materials()[1])
+        count = min(at_start + let_in, math.prod(self.cell_counts) * self.particles.per_axis**self.dimension)
+        if self.particles.narrow_band is not None:
+            band = sum(self._band_volume(shape, self.particles.narrow_band.width) for shape in self.materials()[1])
+            sites = band / self.spacing**self.dimension * self.particles.per_axis**self.dimension
+            count = min(count, round((SPREAD if later else 1.0) * (sites + let_in)))
+        return count
+
+    def _sites(self, box: np.ndarray | None, *, whole_cells: bool = False) -> np.ndarray:
+        """Return how many points the jittered lattice of the start has in a box along each axis, shape (dimension,), at most.
+
+        Args:
+            box: low and high corner [m], shape (2, 3); None: the domain.
+            whole_cells: of the cells whose centers lie in the box.
+        """
+        count = np.array(self.cell_counts[: self.dimension]) * self.particles.per_axis
+        if box is None:
+            return count
+        step = self.spacing if whole_cells else self.spacing / self.particles.per_axis
+        reach = SITE_SLACK + (0.0 if whole_cells else 0.5 * self.particles.jitter)
+        low, high = np.clip(box[:, : self.dimension] / step, -1.0, count + 1.0)
+        first, last = np.ceil(low - 0.5 - reach), np.floor(high - 0.5 + reach)
+        most = count // self.particles.per_axis if whole_cells else count
+        found = (np.minimum(last, most - 1) - np.maximum(first, 0) + 1).clip(min=0).astype(int)
+        return found * self.particles.per_axis if whole_cells else found
+
+    def _source_sites(self, source: Source, *, later: bool) -> int:
+        """Return how many particles a source's cells hold at most when it starts, and with those that it lets in until the run ends."""
+        held = self._sites(source.bounds(self.dimension), whole_cells=True)
+        at_start = int(held.prod()) if later or source.begin == 0.0 else 0
+        seconds = max(min(source.stop or math.inf, self.time.duration) - source.begin, 0.0)
+        speed = np.abs(source.velocity)
+        across = held + (speed > 0.0)  # a lattice that moves along an axis may have one more point there
+        layers = np.where(speed > 0.0, np.ceil(speed * seconds * self.particles.per_axis / self.spacing) + 1.0, 0.0)
+        let_in = sum(layers[axis] * np.delete(across, axis).prod(dtype=float) for axis in range(self.dimension))
+        return at_start + (int(min(let_in, 2.0**62)) if later and held.all() else 0)
+
+    def _band_volume(self, shape: MaterialProperties, width: float) -> float:
+        """Return the part of the box around a shape that is no deeper than a band below a free side [m^3; m^2 in 2-D]."""
+        size, deep = np.array(self.domain.size), width * self.spacing
+        bounds = shape.bounds(self.dimension)
+        low, high = (np.zeros_like(size), size) if bounds is None else (corner[: self.dimension] for corner in bounds)
+        low, high = np.maximum(low, 0.0), np.minimum(high, size)
+        inner = high - low - deep * ((low > 0.0).astype(float) + (high < size))
+        return float(np.maximum(high - low, 0.0).prod() - np.maximum(inner, 0.0).prod())
+
+    def plan(self) -> list[tuple[str, str]]:
+        """Return what a run would do."""
+        particles = self.particle_estimate()
+        settings = self.particles
+        at_first = f"{self.particle_estimate(later=False):,} at the start, " if self.source else ""
+        most = "about" if settings.narrow_band is not None else "at most"
+        return [
+            *super().plan(),
+            ("particles", f"{at_first}{most} {particles:,}, {settings.per_axis**self.dimension} a cell, {settings.transfer}"),
+            *self._rearrangement(),
+            *self.model_plan(),
+            ("memory", f"about {_megabytes(self.memory_estimate())} MB"),
+            *((f"  {name}", f"{_megabytes(count)} MB") for name, count in self.memory_parts().items()),
+        ]
+
+    def model_plan(self, measured: float | None = None) -> list[tuple[str, str]]:
+        """Return the models in words, with their shares of memory and time.
+
+        Args:
+            measured: how long a step takes on the machine at hand [s]; None: as where the prices were measured.
+        """
+        cells, particles = math.prod(self.cell_counts), self.particle_estimate()
+        listed = prices(self.scene.simulator, self.dimension)
+        return model_lines(self.models(), listed, cells, particles, memory=sum(self.memory_parts().values()), measured=measured)
+
+    def _rearrangement(self) -> list[tuple[str, str]]:
+        """Return what moves particles apart from the flow."""
+        lines, correction, reseed = [], self.correction, self.particles.reseed
+        band = self.particles.narrow_band
+        if band is not None:
+            lines.append(("narrow band", f"particles within {band.width:g} cells of the surface, the grid carries the rest"))
+        if correction is not None:
+            most, when = correction.largest(self.particles.per_axis), _steps(correction.every)
+            if self.density_correction is None:
+                when += f" if more than {100.0 * self.most_crowded:.2g} % is beyond it"
+            lines.append(("density", f"at most {most:.4g} of that at rest, corrected {when}"))
+        if reseed is not None:
+            least, many = self.particles.reseed_range(self.dimension)
+            lines.append(("reseeding", f"{least} to {many} particles a cell, {_steps(reseed.every)}"))
+        return lines
+
+    def memory_parts(self) -> dict[str, int]:
+        """Return about how much memory each part of a run takes at most on its device [bytes]; parts that it does not have are left out."""
+        cells, settings, cut = self.counted_cells, self.particles, self.cuts_cells
+        moving = any(solid.moves for solid in self.solid)
+        vectors = 3 + (self.dimension if settings.transfer == "apic" else 0)
+        correction = CORRECTION_BYTES + CUT_CORRECTION_BYTES * cut + EVEN_BYTES * self.keeps_volume
+        parts = {
+            "grid": cells * (GRID_BYTES + 4 * self.dimension * (settings.transfer == "flip")),
+            **self.own_memory_parts(),
+            "bodies in flight": cells * FLIGHT_BYTES * self.flies,
+            "solids": cells * (CUT_BYTES * cut + MOVING_BYTES * moving),
+            "density correction": cells * correction * (self.correction is not None),
+            "reseeding": cells * RESEED_BYTES * (settings.reseed is not None),
+            "narrow band": cells * BAND_BYTES * (settings.narrow_band is not None),
+            "sources": cells * SOURCE_BYTES * bool(self.source),
+            "volume": cells * VOLUME_BYTES * self.output.volume,
+            "surface mesh": self.output.surface * self._surface_bytes(),
+            "particles": self.particle_estimate() * (VECTOR_BYTES * vectors + KEY_BYTES),
+        }
+        return {name: count for name, count in parts.items() if count}
+
+    def _surface_bytes(self) -> int:
+        """Return what the lattice of a surface mesh takes, and a mesh as large as the domain's sides [bytes]."""
+        nx, ny, nz = (n * (self.output.surface_resolution or self.particles.per_axis) for n in self.cell_counts)
+        cells = nx * ny * (nz if self.dimension == 3 else 3)
+        points = 2 * (nx * ny + ny * nz + nz * nx) if self.dimension == 3 else 2 * (nx + ny)
+        return cells * (MESH_LATTICE_BYTES + MESH_SOLID_BYTES * bool(self.solid)) + points * MESH_POINT_BYTES
+
+    def own_memory_parts(self) -> dict[str, int]:
+        """Return what the material's own models take at most on the device [bytes]; parts that a scene does not have count 0."""
+        return {}
+
+    def memory_estimate(self) -> int:
+        """Return about how much memory a run takes at most [bytes], without the program itself; the particles' making may take the most."""
+        nx, ny, _ = self.cell_counts
+        lattice = nx * ny * self.particles.per_axis**self.dimension
+        making = self.counted_cells * (GRID_BYTES + self.solve_bytes) // 2 + self.particle_estimate() * SEEDING_BYTES
+        return max(super().memory_estimate(), making + lattice * LATTICE_BYTES)
+
+    @property
+    def counted_cells(self) -> int:
+        """Return how many cells of a 3-D grid the scene's cells count for in memory."""
+        nx, ny, nz = self.cell_counts
+        return round(nx * ny * (nz if self.dimension == 3 else PLANES))
+
+    @property
+    def cuts_cells(self) -> bool:
+        """Return whether solids may cut through cells."""
+        return self.domain.solids == "cut-cell" and bool(self.solid)
+
+
+def _megabytes(count: int) -> str:
+    return f"{count / 2**20:,.0f}" if count >= 10 * 2**20 else f"{count / 2**20:.1f}"
+
+
+def _steps(every: int) -> str:
+    """Return how often, in words."""
+    return "every step" if every == 1 else f"every {every} steps"
+
+
+def _solids(numbers: Iterable[int], what: str) -> str:
+    """Return that some solids do something, in words."""
+    return ", ".join(f"solid {number}" for number in numbers) + f" {what}"

@@ -1,0 +1,500 @@
+"""A material on a staggered grid, carried by particles: what all such simulations do besides their own solve."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import warp as wp
+
+import warp_lcp as wl
+from warp_lcp.material.particle_assembly import make_particle_volume, make_surface_mesh
+from warp_lcp.material.particle_rearrangement import Rearrangement
+from warp_lcp.material.particle_scene import ParticleScene
+from warp_lcp.material.particle_state import check_state, other_spacing, particle_trouble, signature
+from warp_lcp.run.profile import NoStopwatch, Stopwatch
+from warp_lcp.simulation import Points, SimulationFailed, Surface, Volume
+from warp_lcp.grid.particles import MARGIN, Particles, ParticleTotals
+from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.surface_mesh import Interior, faces_from_particles, sample
+from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces
+from warp_lcp.material.boundary import Boundary
+from warp_lcp.material.flight import Flights
+from warp_lcp.material.gravity import accelerate
+from warp_lcp.material.narrow_band import NarrowBand, without_band
+from warp_lcp.material.outlets import Drain, Outlets
+from warp_lcp.material.resample import resampled, resampling_notes
+from warp_lcp.material.sources import Source, Sources
+from warp_lcp.rigid.bodies import RigidBodies
+
+Row = dict[str, float | int | str | None]  # of the log
+
+COLUMNS = (
+    "particles",
+    "mass",
+    "kinetic_energy",
+    "potential_energy",
+    "center_of_mass_y",
+    "max_speed",
+    "cfl",
+    "solver",
+    "solve_status",
+    "solve_iterations",
+    "linear_iterations",
+    "solve_residual",
+)
+
+
+class ParticleSimulation(ABC):
+    """Particles, the fields that they share, and the parts of a step around a solve, for a subclass to call in its own `step`.
+
+    Particles have the velocities of the middle of the last step, the grid in a step those of its middle: forces act for `kick_dt`, half of
+    the last step and half of this one, and then particles move for all of it (the leapfrog of Verlet). One solve a step so makes a scheme
+    that is its own inverse in time, whatever the steps' lengths: what flies goes along its parabola.
+
+    A step calls `begin_step`, `window` and `bring_to_faces`; changes `velocity` as its material's laws ask; then calls `extend`,
+    `bring_to_particles` and `move`, and returns `logged` of what the log gets. Nothing before `move` changes the state but for the
+    particles' order, so that a solve may fail.
+
+    Rigid bodies take part by themselves: `begin_step` starts their step and `move` ends it. In between the subclass gives them the impulses
+    of its solve, or calls `restore_bodies` if it fails.
+
+    With `boundary`, `particles`, `sources`, `outlets` and `bodies` of `warp_lcp.material.particle_assembly` it has a Simulation's clock, time
+    step, checkpoints, resampling, notes and columns; `step` and `frame` are the subclass's.
+
+    Args:
+        scene: what to simulate.
+        grid: its grid.
+        boundary: its solids and the domain's walls.
+        particles: the material at the start.
+        sources: where material comes in.
+        outlets: where it leaves.
+        bodies: solids of `boundary` that the material moves.
+        band: where its particles are, if not everywhere.
+        notes: facts for the start of a run.
+
+    Attributes:
+        particles: the material.
+        velocity: of the last step on the faces, one field a component [m/s].
+        weights: of the particles on each component's faces, in the last step.
+        flights: gives bodies in flight their momenta back; None: the material has none, or none that can be told.
+        gravity: [m/s^2], shape (3,).
+        particle_mass: [kg]; 2-D: [kg/m].
+        layers: how far the velocity is continued into air and walls, in faces.
+        reach: how far from particles a step touches cells; more than `layers` where a subclass needs it.
+        time: [s].
+        step_count: steps done.
+        last_dt: length of the last step [s], 0 before the first.
+        kick_dt: how long forces act in the step that has begun [s].
+        watch: what the stages of a step are measured with.
+    """
+
+    def __init__(
+        self,
+        scene: ParticleScene,
+        grid: StaggeredGrid,
+        boundary: Boundary,
+        particles: Particles,
+        *,
+        sources: Sources | None = None,
+        outlets: Outlets | None = None,
+        bodies: RigidBodies | None = None,
+        band: NarrowBand | None = None,
+        notes: Sequence[str] = (),
+    ) -> None:
+        """Allocate the fields, fill the sources that run at the start and sort the particles."""
+        self.scene, self.grid, self.boundary, self.particles = scene, grid, boundary, particles
+        self.sources, self.outlets, self.bodies, self.band = sources, outlets, bodies, band
+        self.time, self.step_count, self.last_dt, self.kick_dt = 0.0, 0, 0.0, 0.0
+        self._velocity_before = np.zeros(3)  # mean of the particles at the start of the step [m/s]
+        self.watch: Stopwatch = NoStopwatch()
+        self._faces_know = False  # the velocity of the particles, around them
+        self._notes = list(notes)
+        self.gravity = np.array([*scene.physics.gravity, 0.0][:3])
+        self.particle_mass = scene.physics.density * grid.cell_volume / scene.particles.per_axis**grid.dimension
+        self.velocity, self.weights = grid.faces(), grid.faces()
+        self._saved = grid.faces() if scene.particles.transfer == "flip" else None
+        self.flights = self._flights()
+        self.rearrangement = Rearrangement(scene, grid, boundary)
+        self._notes += self.rearrangement.notes()
+        self.surface_mesh = make_surface_mesh(scene, grid, boundary)
+        self.particle_volume = make_particle_volume(scene, grid, boundary)
+        self.layers = self.reach = math.ceil(scene.time.cfl) + 2
+        if sources is not None:
+            sources.emit(particles, None, self.time)
+        particles.sort()
+
+    def _flights(self) -> Flights | None:
+        s = self.scene
+        return Flights(self.grid, self.boundary, coheres=s.coheres, settles=s.settles) if s.flies else None
+
+    @abstractmethod
+    def mark(self) -> None:
+        """Find the material's cells from the sorted particles, as frames show them before the first step."""
+
+    def known_density(self) -> wp.array | None:
+        """Return the particles' density in units of that at rest, if a step has found it before anything moves."""
+        return None
+
+    def known_contact(self) -> wp.array | None:
+        """Return uint8 of TOUCHES_NOTHING, HELD, RELEASED where walls held the material in the step or let go of it, if a step finds it."""
+        return None
+
+    @abstractmethod
+    def own_columns(self) -> tuple[str, ...]:
+        """Return the names of the log's columns that the material's own models fill."""
+
+    @abstractmethod
+    def own_state(self) -> dict[str, np.ndarray]:
+        """Return copies of what the next solve starts from and a frame shows; `cells`, int8 of AIR, FLUID, SOLID, must be among them."""
+
+    @abstractmethod
+    def restore_own(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue from the arrays of `own_state`, whose shapes, types and values have been checked."""
+
+    def stable_dt(self) -> float:
+        """Return CFL dx / (v_max + sqrt(CFL g dx)) [s]; v_max is of the material, and of solids and sources in the time to come."""
+        cfl, dx = self.scene.time.cfl, self.grid.spacing
+        with self.watch.stage("diagnostics", self.particles.position, self.particles.velocity):
+            totals = self.particles.totals() if self.band is None else self.band.with_interior(self.particles.totals())
+        driven = [part.top_speed(self.time, self.scene.time.dt_max) for part in (self.boundary, self.sources) if part is not None]
+        # gravity's own speed counts, so that a material at rest does not take off
+        speed = max(totals.max_speed, *driven) + math.sqrt(cfl * float(np.linalg.norm(self.gravity)) * dx)
+        return cfl * dx / speed if speed > 0.0 else math.inf
+
+    def events(self, until: float) -> list[float]:
+        """Return the times [s] later than now, up to `until`, at which a source or drain starts or stops or a solid's velocity jumps."""
+        timed: list[Source | Drain] = [*(self.sources.sources if self.sources else ()), *(self.outlets.drains if self.outlets else ())]
+        times = [*self.boundary.kinks, *(time for part in timed for time in (part.start, part.stop))]
+        return [time for time in times if self.time < time <= until]
+
+    def begin_step(self, dt: float) -> ParticleTotals:
+        """Check time step and particles, bring the particles into order, and return sums over them.
+
+        Args:
+            dt: time step [s].
+
+        Raises:
+            SimulationFailed: something is not finite, or a particle has left the domain.
+            ValueError: dt is not positive.
+        """
+        if not (math.isfinite(dt) and dt > 0.0):
+            raise ValueError(f"dt = {dt}: must be a positive time [s]")
+        totals = self.checked_totals("at the start of")
+        self.kick_dt, self._velocity_before = 0.5 * (self.last_dt + dt), totals.velocity
+        with self.watch.stage("sort", *self.particles.arrays().values()):
+            self.particles.arrange(self.step_count)
+        if self.bodies is not None:
+            with self.watch.stage("bodies"):
+                self.bodies.begin_step(self.time, dt, self.gravity, self.kick_dt)
+        return totals
+
+    def restore_bodies(self) -> None:
+        """Put the rigid bodies back to where they were before `begin_step`, as a solve has failed."""
+        if self.bodies is not None:
+            self.bodies.restore_step()
+
+    def window(self, totals: ParticleTotals) -> Window:
+        """Return the cells that the particles can touch in a step."""
+        low, high = (self.particles.cells_of(corner[None])[0] + 1 for corner in (totals.low, totals.high))
+        return self.grid.window(low, high, grow=self.reach + 2)
+
+    def top_speed(self, totals: ParticleTotals) -> float:
+        """Return the scale of the velocities that `bring_to_faces` leaves [m/s]."""
+        return totals.max_speed + self.kick_dt * float(np.linalg.norm(self.gravity))
+
+    def bring_to_faces(self, window: Window) -> None:
+        """Bring the particles' velocities to the faces, and let gravity act on them for `kick_dt`."""
+        particles = self.particles
+        with self.watch.stage("particles-to-grid", *particles.arrays().values(), *self.velocity, *self.weights):
+            particles_to_faces(
+                self.grid, particles.position, particles.velocity, particles.affine, self.velocity, self.weights, window=window,
+                offsets=particles.offsets,
+            )  # fmt: skip
+            if self.band is not None:
+                self.band.blend(window, self.velocity, self.weights)
+            for field, saved in zip(self.velocity, self._saved or (), strict=False):
+                wp.copy(saved, field)
+            accelerate(window, self.velocity, self.weights, self.gravity * self.kick_dt)
+
+    def extend(self, window: Window, known: Sequence[wp.array], kind: wp.array, contact: wp.array) -> None:
+        """Continue the velocity from the faces that a solve has made valid into air and walls, see `warp_lcp.material.wall`.
+
+        Args:
+            window: faces to consider.
+            known: int8 of each component (updated): 1 on valid faces, 0 on others, -1 inside solids of whole cells.
+            kind: int8 of AIR, FLUID, SOLID.
+            contact: uint8 of TOUCHES_NOTHING, HELD, RELEASED, see `warp_lcp.material.contact`.
+        """
+        wall = self.boundary
+        with self.watch.stage("extrapolation", *self.velocity, *self.weights, *known, kind, contact, *wall.open):
+            wall.extend(window, self.velocity, self.weights, list(known), kind, contact, self.layers)
+            if self.sources is not None:
+                self.sources.hold(self.velocity, [])
+
+    def exchange(self, window: Window, kind: wp.array, phi: wp.array | None, contact: wp.array) -> None:
+        """Exchange particles with the interior, if there is one; arguments as of `warp_lcp.material.narrow_band.NarrowBand`."""
+        if self.band is not None:
+            with self.watch.stage("narrow band", *self.particles.arrays().values(), self.band.depth):
+                self.band.exchange(self.particles, window, kind, phi, contact, self.step_count, self._saved or ())
+
+    def bring_to_particles(self, window: Window, kind: wp.array, dt: float) -> None:
+        """Find the bodies in flight, and give the particles the velocity of the faces.
+
+        Args:
+            window: of the step.
+            kind: int8 of AIR, FLUID, SOLID, of the step's solve.
+            dt: time step [s].
+        """
+        particles = self.particles
+        if self.flights is not None:
+            with self.watch.stage("bodies in flight", particles.position):
+                self.flights.begin(particles, window, self.weights, kind, dt, self.gravity * self.kick_dt)
+        self._faces_know = True
+        with self.watch.stage("grid-to-particles", *particles.arrays().values(), *self.velocity):
+            flip = self.scene.particles.flip_ratio if self._saved else 0.0
+            faces_to_particles(
+                self.grid, self.velocity, particles.position, particles.velocity, particles.affine, saved=self._saved, flip=flip
+            )
+
+    def move(self, dt: float) -> Row:
+        """Move particles and solids by dt [s], exchange particles with sources and outlets, even them out, and advance the clock.
+
+        Returns:
+            What the log says of it and of the particles.
+
+        Raises:
+            SimulationFailed: something is not finite, or a particle has left the domain.
+        """
+        with self.watch.stage("crowding", self.particles.position):
+            self.rearrangement.look(self.step_count, self.known_density(), self.particles)
+        with self.watch.stage("advection", self.particles.position, *self.velocity):
+            stopped, pushed, stuck = self.carry(dt)
+        if self.band is not None:
+            with self.watch.stage("narrow band", self.band.depth, *self.velocity):
+                self.band.carry(self.velocity, dt)
+        exchanged = self._exchange(dt) if self.outlets is not None or self.sources is not None else {}
+        after = self.checked_totals("after")
+        rearranged: Row = {"max_density": self.rearrangement.max_density}
+        if self.rearrangement.due(self.step_count):
+            fill = self.band.fill_interior if self.band is not None else None
+            window, contact = self.window(after), self.known_contact()
+            rearranged |= self.rearrangement.apply(self.particles, window, self.step_count, dt, self.watch, fill, contact)
+            if self.outlets is not None:  # the density correction may push particles out through open sides
+                exchanged["departed"] += self.outlets.remove_departed(self.particles)
+            after = self.checked_totals("after the density correction of")
+        self.time += dt
+        self.step_count += 1
+        self.last_dt = dt
+        return self._totals_row(after, dt) | {"stopped": stopped, "pushed": pushed, "stuck": stuck} | rearranged | exchanged
+
+    def carry(self, dt: float) -> tuple[int, int, int]:
+        """Move particles and solids by dt [s]; bodies in flight keep their momenta.
+
+        Returns:
+            How many met a wall, were pushed by a solid, and are stuck inside one.
+        """
+        if self.bodies is not None:
+            self.bodies.end_step(dt)
+            if trouble := self.bodies.trouble(self.scene.domain.size, self.scene.endless):
+                raise SimulationFailed(f"step {self.step_count}: {trouble}")
+        met = self.boundary.advect(self.velocity, dt, self.time + dt, self.particles.position)
+        if self.flights is not None:
+            with self.watch.stage("bodies in flight", self.particles.position):
+                self.flights.end(self.particles, self.velocity)
+        return met
+
+    def solve_row(self, result: wl.SolveResult | None) -> Row:
+        """Return what the log says of a step's solve; nothing if there was none."""
+        if result is None:
+            return {}
+        return {
+            "solver": self.scene.solver.method,
+            "solve_status": result.status.name,
+            "solve_iterations": result.iterations,
+            "linear_iterations": result.linear_iterations,
+            "solve_residual": result.relative_residual,
+        }
+
+    def logged(self, row: Row) -> Row:
+        """Return the entries of a row that the log has columns for, in their order."""
+        bodies = self.bodies.row() if self.bodies is not None else {}
+        return {name: (row | bodies).get(name) for name in self.columns()}
+
+    def columns(self) -> tuple[str, ...]:
+        """Return the names of the log's columns.
+
+        SI units; in 2-D mass and energies are per meter of depth. Energies are the particles' own; potential_energy is 0 at the origin.
+        Velocities, in frames too, are those of the step's middle, which move things through it; kinetic_energy is that of its end.
+        With a narrow band mass, energies and center count the interior, particles does not; interior_density is that of the interior, in
+        units of that at rest, if the mass is to be what it was.
+        solve_residual is relative to the right-hand side's, which in free fall is rounding noise that is not iterated on: it may then be
+        up to 1. stopped: particles that met a wall; pushed: those that a moving solid swept along; stuck: those inside solids that found
+        no way out, between solids that close, say. max_density: before the density correction of the step, of material at rest 1, or at the
+        start of a step that none was due in; density_status and density_iterations: of that correction, empty where none was due;
+        reseeded: particles that went to a neighboring cell; emitted, drained, departed: those that sources have added in the step, that
+        drains have swallowed, and that have left through open sides. Rigid bodies, numbered from 0 in the order of the scene's solids,
+        have body0_x, body0_y, body0_z [m], the center of mass; body0_vx, body0_vy, body0_vz [m/s]; 2-D: body0_angle [degrees], how far it
+        has turned, and body0_spin [degrees/s]; 3-D: body0_wx, body0_wy, body0_wz [degrees/s], the angular velocity. contacts: points where
+        bodies touch walls or each other, or nearly do.
+        """
+        columns = (*COLUMNS, *self.own_columns(), "stopped")
+        columns = (*columns, "pushed", "stuck") if self.boundary.moves else columns
+        columns = (*columns, "interior_density") if self.band is not None else columns
+        columns = (*columns, *self.rearrangement.columns())
+        exchanged = {"emitted": self.scene.source, "drained": self.scene.drain, "departed": self.scene.domain.open}
+        columns = (*columns, *(name for name, used in exchanged.items() if used))
+        return (*columns, *self.bodies.columns()) if self.bodies is not None else columns
+
+    def points(self) -> Points:
+        """Return the particles as a frame shows them, with velocity and speed [m/s]."""
+        position, velocity = self.particles.position.numpy().copy(), self.particles.velocity.numpy().copy()
+        return Points("particles", position, {"velocity": velocity, "speed": np.sqrt(np.einsum("ij,ij->i", velocity, velocity))})
+
+    def surfaces(self) -> list[Surface]:
+        """Return the material's surface as a frame shows it, with the velocity [m/s] of the particles around it, if the scene wants it."""
+        if self.surface_mesh is None:
+            return []
+        position = self.particles.position
+        band = self.band
+        mesh = self.surface_mesh.find(position, Interior(band.depth, band.full, self.boundary.base) if band is not None else None)
+        if not self._faces_know:  # the next step overwrites what the faces are given here
+            faces_from_particles(self.grid, position, self.particles.velocity, self.velocity, self.weights)
+        velocity = sample(self.grid, self.velocity, mesh.points)
+        return [Surface("surface", mesh.points.numpy().copy(), mesh.corners.numpy().copy(), {"velocity": velocity.numpy().copy()})]
+
+    def volumes(self) -> list[Volume]:
+        """Return the material's level set and density as a frame shows them, if the scene wants them."""
+        fill = self.band.fill if self.band is not None else None
+        return [] if self.particle_volume is None else self.particle_volume.measure(self.particles, fill=fill)
+
+    def body_surfaces(self) -> list[Surface]:
+        """Return the rigid bodies as a frame shows them, if there are any: `body`, its number, and velocity [m/s]."""
+        if self.bodies is None:
+            return []
+        surface = self.bodies.surfaces()
+        return [Surface("bodies", surface.points, surface.corners, surface.fields)]
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return what `restore` needs to continue bit for bit on the CPU."""
+        particles = {name: array.numpy().copy() for name, array in self.particles.arrays().items()}
+        clock = {"time": np.array(self.time), "step_count": np.array(self.step_count), "last_dt": np.array(self.last_dt)}
+        scene = {"signature": signature(self.scene, self.grid)}
+        bodies = self.bodies.state() if self.bodies is not None else {}
+        band = self.band.state() if self.band is not None else {}
+        return clock | scene | particles | self.own_state() | band | self.rearrangement.state() | bodies
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue from `state`.
+
+        Raises:
+            ValueError: the arrays do not belong to this scene.
+        """
+        self.rearrangement.expect(state)
+        expected, state = self.state(), {"last_dt": np.array(0.0), **state}  # older states have velocities of their own time
+        varies = bool(self.sources or self.outlets or self.band)
+        check_state(state, expected, changing=[*self.particles.arrays()] if varies else [], solids_move=self.boundary.moves)
+        self.particles.assign(state)
+        self._faces_know = False
+        self.restore_own({name: np.asarray(state[name]) for name in self.own_state()})
+        self.rearrangement.restore(state)
+        if self.band is not None:
+            self.band.restore(state)
+        self.time, self.step_count, self.last_dt = float(state["time"]), int(state["step_count"]), float(state["last_dt"])
+        if self.bodies is not None:
+            self.bodies.restore(state)
+        self.boundary.place(self.time)
+
+    def resample(self, state: Mapping[str, np.ndarray]) -> list[str]:
+        """Continue from the state of the same scene on another grid: with other particles, and without a solution to start from.
+
+        Raises:
+            ValueError: the state differs in more than the grid, or no particle is left.
+        """
+        spacing = other_spacing(state, self.scene, self.grid)
+        self.time, self.step_count, self.last_dt = float(state["time"]), int(state["step_count"]), float(state["last_dt"])
+        if self.bodies is not None:
+            if "bodies" not in state:
+                raise ValueError("the state has no bodies: it does not belong to this scene")
+            self.bodies.restore(state)
+        self.boundary.place(self.time)
+        settings, wanted = self.scene.particles, self.particles.arrays().keys()
+        state = without_band(state, spacing, settings.seed)
+        arrays, moved = resampled(
+            {name: np.asarray(state[name]) for name in wanted}, self.grid, self._admits, spacing=spacing,
+            per_axis=settings.per_axis, random_seed=settings.seed + self.step_count,
+        )  # fmt: skip
+        self.particles.assign(arrays)
+        self._faces_know = False
+        if self.band is not None:
+            self.band.forget()
+        self.particles.sort()
+        self.mark()
+        return resampling_notes(len(state["position"]), self.particles.count, moved, spacing, self.grid)
+
+    def notes(self) -> list[str]:
+        """Return warnings and facts worth a line at the start of a run."""
+        nx, ny, nz = self.grid.counts
+        cells = f"{nx} x {ny}" + (f" x {nz}" if self.grid.dimension == 3 else "")
+        return [f"{self.particles.count} particles, {cells} cells of {self.grid.spacing:.4g} m", *self.scene.notes(), *self._notes]
+
+    def checked_totals(self, when: str) -> ParticleTotals:
+        """Return sums over the particles.
+
+        Args:
+            when: where in the step, such as `after`, for the message.
+
+        Raises:
+            SimulationFailed: a value is not finite or a particle lies outside the domain.
+        """
+        with self.watch.stage("diagnostics", self.particles.position, self.particles.velocity):
+            totals = self.particles.totals()
+        axes = slice(self.grid.dimension)
+        end = self.grid.extent - 0.5 * MARGIN * self.grid.spacing  # a tent at the very end would reach beyond what is stored
+        if totals.finite and (totals.low[axes] >= 0.0).all() and (totals.high[axes] <= end[axes]).all():
+            return totals if self.band is None else self.band.with_interior(totals)
+        raise SimulationFailed(f"{when} step {self.step_count}: {self._trouble(totals, end)}")
+
+    def _trouble(self, totals: ParticleTotals, end: np.ndarray) -> str:
+        """Say which particles are not finite, or outside the domain, which ends at `end` [m]; "" if there are none."""
+        return particle_trouble(self.particles, self.grid, totals, end)
+
+    def _exchange(self, dt: float) -> dict[str, int]:
+        """Remove the particles that have left in the step and add those that have come in; return what the log says of it."""
+        drained = departed = emitted = 0
+        with self.watch.stage("sources and outlets", self.particles.position):
+            if self.outlets is not None:
+                drained, departed = self.outlets.apply(self.particles, self.time, self.time + dt)
+            if self.sources is not None:
+                emitted = self.sources.emit(self.particles, self.time, self.time + dt)
+        return {"emitted": emitted, "drained": drained, "departed": departed}
+
+    def _totals_row(self, totals: ParticleTotals, dt: float) -> Row:
+        mass = totals.count * self.particle_mass
+        return {
+            "particles": self.particles.count,
+            "mass": mass,
+            "kinetic_energy": mass * self._kinetic_energy(totals, dt),
+            "potential_energy": -mass * float(self.gravity @ totals.center),
+            "center_of_mass_y": float(totals.center[1]),
+            "max_speed": totals.max_speed,
+            "cfl": totals.max_speed * dt / self.grid.spacing,
+            "interior_density": self.band.mean_density if self.band is not None else None,
+        }
+
+    def _kinetic_energy(self, totals: ParticleTotals, dt: float) -> float:
+        """Return the energy of motion at the end of a step over mass [m^2/s^2]; the particles' velocities are those of its middle.
+
+        For half a step more gravity works on what moves, V, and by what it has changed V in this one: nothing where solids bear it.
+        """
+        g = self.gravity
+        gained = float(g @ (totals.velocity - self._velocity_before)) / self.kick_dt
+        work = 0.5 * dt * float(g @ totals.velocity) + 0.125 * dt**2 * min(max(gained, 0.0), float(g @ g))
+        return max(0.5 * totals.mean_square_speed + work, 0.0)
+
+    def _admits(self, points: np.ndarray) -> np.ndarray:
+        """Tell which points [m], shape (n, 3), a particle may be at."""
+        i, j, k = self.particles.cells_of(points).T + 1
+        return (self.boundary.base.numpy()[k, j, i] != wl.SOLID) & self.boundary.admits(points)

@@ -1,0 +1,44 @@
+"""What particles fill, as volumes that renderers take: distance to the surface, and density."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from warp_lcp.simulation import Volume
+from warp_lcp.grid.level_set import Fill, LevelSet
+from warp_lcp.grid.particles import Particles
+from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.material.boundary import Boundary
+
+VOLUME_BYTES = 13  # a cell: the level set's fields
+
+
+class ParticleVolume:
+    """Measure a material on the cells of its grid, where its particles are when a frame is made.
+
+    Args:
+        grid: a 3-D grid.
+        boundary: solids and walls.
+        particles_a_cell: of the material at rest.
+    """
+
+    def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int) -> None:
+        """Allocate the fields."""
+        self._grid, self._boundary = grid, boundary
+        self._level_set = LevelSet(grid, particles_a_cell=particles_a_cell)
+
+    def measure(self, particles: Particles, *, fill: Fill | None = None) -> list[Volume]:
+        """Return the volumes `level_set`, the distance to the surface [m], < 0 inside, and `density`, in units of that at rest.
+
+        Args:
+            particles: of the material; where it is needed, on CUDA, they are sorted, as the next step would do.
+            fill: adds to the density in a window what no particle stands for.
+        """
+        if particles.offsets is not None:
+            particles.sort()
+        grid, level_set = self._grid, self._level_set
+        level_set.update(particles, grid.everywhere, self._boundary.capacity, self._boundary.base, fill=fill)
+        spacing, band = grid.spacing, level_set.limit * grid.spacing
+        distance = grid.interior(level_set.phi.numpy()) * np.float32(spacing)
+        density = grid.interior(level_set.density.numpy()).copy()
+        return [Volume("level_set", distance, spacing, band), Volume("density", density, spacing)]

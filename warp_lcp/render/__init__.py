@@ -1,0 +1,1 @@
+"""Images and films of a run. Needs the extra `render`."""

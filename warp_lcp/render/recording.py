@@ -1,0 +1,324 @@
+"""The frames of a run, read back for its images, and the color scale that they share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import cached_property
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from warp_lcp.frames.frames import FRAME_FILE
+from warp_lcp.frames.pieces import one_grid, one_mesh, piece_files
+from warp_lcp.scene.scene import Scene
+from warp_lcp.scene.scene_file import check_shapes, load_scene
+from warp_lcp.simulation import Cells, Surface
+from warp_lcp.frames.vti import read_vti
+from warp_lcp.frames.vtu import Mesh, read_vtu
+
+SCALE_FRAMES = 16  # evenly spaced frames that fix the color scale of a run
+SCALE_VALUES = 50_000  # about how many values of each
+SUFFIXES = (".vti", ".pvti", ".pvtu", ".vtu")  # of a frame's files; at most one of them is there
+ROUND_NUMBERS = np.array([1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0])
+PALETTES = {  # of speeds, by `Scene.palette`
+    "water": np.array([[14, 62, 138], [22, 106, 190], [58, 160, 224], [130, 208, 240], [206, 240, 250]]),
+    "sand": np.array([[176, 130, 80], [202, 158, 104], [224, 188, 134], [242, 218, 172], [254, 246, 226]]),
+}
+VIRIDIS = np.array([[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]])
+
+
+class RenderError(ValueError):
+    """Nothing can be drawn; the message says why and what to do."""
+
+
+class Color(StrEnum):
+    """What the color of a particle means."""
+
+    SPEED = "speed"
+    PRESSURE = "pressure"
+    FRACTION = "fraction"
+    YIELD_RATIO = "yield_ratio"
+    PLAIN = "plain"
+
+
+class Show(StrEnum):
+    """What of the material images show."""
+
+    PARTICLES = "particles"
+    SURFACE = "surface"
+    BOTH = "both"
+
+
+LABELS = {Color.FRACTION: "fraction of grains", Color.YIELD_RATIO: "yield ratio"}  # what sand's particles know besides
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What an image of a frame shows.
+
+    Args:
+        time: [s].
+        points: of the particles [m], shape (n, 3).
+        values: that color them, shape (n,).
+        surface: of the material; None: not shown.
+        bodies: the surfaces of rigid bodies where they are, with the field `body`; None: the scene has none.
+        cells: with what fills them; None: not shown.
+    """
+
+    time: float
+    points: np.ndarray
+    values: np.ndarray
+    surface: Surface | None = None
+    bodies: Surface | None = None
+    cells: Cells | None = None
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Colors from `low` to `high`, the same in every image of a run; a scale without a label has no legend.
+
+    Args:
+        label: quantity and unit.
+        low: the value of the first color.
+        high: the value of the last color.
+        stops: colors, red, green and blue from 0 to 255, shape (m, 3), evenly spaced.
+    """
+
+    label: str
+    low: float
+    high: float
+    stops: np.ndarray
+
+    def colors(self, values: np.ndarray) -> np.ndarray:
+        """Return a color for each value, 0 to 255, shape (n, 3)."""
+        at = (values - self.low) / (self.high - self.low) * (len(self.stops) - 1)
+        return np.stack([np.interp(at, np.arange(len(self.stops)), channel) for channel in self.stops.T], axis=-1)
+
+
+class Recording:
+    """The frames that a run wrote, to be read back.
+
+    Args:
+        folder: of the run.
+        color: what is to be read besides the positions; speed unless given.
+        show: what is to be read; particles if a color is given, else the surface where there is one, else particles.
+        overrides: of the scene's table [camera], such as `camera.position=[1, 2, 3]`.
+        cells: read the cells too, where the run wrote them; then their pressure is the color unless another is given, or the surface is all
+            that there is of the material.
+
+    Raises:
+        RenderError: the folder is no run's, or has no such frames.
+        SceneError: its scene cannot be read.
+    """
+
+    def __init__(
+        self, folder: Path, color: Color | None = None, show: Show | None = None, overrides: Sequence[str] = (), *, cells: bool = False
+    ) -> None:
+        """Look which frames there are."""
+        if not (folder / "scene.toml").is_file():
+            why = "it has no scene.toml" if folder.is_dir() else "there is no such folder"
+            raise RenderError(f"{folder}: is not the folder of a run: {why}")
+        for override in overrides:
+            if not override.startswith("camera."):
+                raise RenderError(f"--set {override}: only keys of [camera] can be set for images of a run")
+        self.folder = folder
+        self.scene: Scene = load_scene(folder / "scene.toml", overrides)
+        check_shapes(self.scene, str(folder / "scene.toml"))
+        self.cells = cells
+        surface_alone = bool(self._numbers("surface")) and not self._numbers("particles")
+        if cells and color is None and show is not Show.SURFACE and not surface_alone:
+            color = Color.PRESSURE if self._numbers("grid") else Color.SPEED
+        self.show = show or (Show.SURFACE if color is None and self._numbers("surface") else Show.PARTICLES)
+        if self.show is Show.SURFACE and color not in (None, Color.PLAIN):
+            raise RenderError(f"--color {color} is for particles, which --show surface leaves out; choose both or particles")
+        self.color = Color.PLAIN if self.show is Show.SURFACE else color or Color.SPEED
+        self.numbers = self._shown_numbers()
+        if self.color is Color.PRESSURE and not set(self.numbers) <= set(self._numbers("grid")):
+            raise RenderError(f"{folder}: --color pressure needs a frame of cells for each of particles; choose speed or plain")
+
+    def chosen(self, frames: Sequence[int]) -> list[int]:
+        """Return the numbers of the frames asked for, each once, in order; all if none is asked for. Negative ones count from the end.
+
+        Raises:
+            RenderError: there is no such frame.
+        """
+        found = set()
+        for frame in frames:
+            number = self.numbers[frame] if -len(self.numbers) <= frame < 0 else frame
+            if number not in self.numbers:
+                raise RenderError(f"--frame {frame}: there is no such frame; the run has {self.numbers[0]} to {self.numbers[-1]}")
+            found.add(number)
+        return sorted(found) or self.numbers
+
+    def frame(self, number: int) -> Frame:
+        """Return what an image of a frame shows.
+
+        Raises:
+            RenderError: a file cannot be read, or lacks a field.
+        """
+        points, values = (np.zeros((0, 3)), np.zeros(0)) if self.show is Show.SURFACE else self.read(number)
+        surface = self._surface("surface", number) if self.show is not Show.PARTICLES else None
+        filled = self._cells(number) if self.cells and self._file("grid", number).is_file() else None
+        return Frame(self.scene.time.frame_time(number), points, values, surface, self.bodies(number), filled)
+
+    def bodies(self, number: int) -> Surface | None:
+        """Return the surfaces of the rigid bodies in a frame; None if the run has none.
+
+        Raises:
+            RenderError: the file cannot be read.
+        """
+        return self._surface("bodies", number) if self._file("bodies", number).is_file() else None
+
+    @np.errstate(invalid="ignore")  # what is no number is left out
+    def read(self, number: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the particles of a frame, those with finite numbers: positions [m], shape (n, 3), and what colors them, shape (n,).
+
+        Raises:
+            RenderError: a file cannot be read, or lacks the field that colors the particles.
+        """
+        mesh = _read(self._file("particles", number))
+        points = np.asarray(mesh.points, dtype=np.float64)
+        if self.color is Color.PRESSURE:
+            values = self._pressure(number, points)
+        elif self.color in LABELS:
+            values = self._field(mesh.fields, self.color)
+        elif self.color is Color.SPEED:
+            values = np.linalg.norm(self._field(mesh.fields, "velocity", 3), axis=1)
+        else:
+            values = np.zeros(len(points))
+        finite = np.isfinite(points).all(axis=1) & np.isfinite(values)
+        return points[finite], values[finite]
+
+    @cached_property
+    def scale(self) -> Scale:
+        """Return the colors for the whole run: up to what 98 of 100 particles stay below, rounded up; the few above take the last color."""
+        if self.color is Color.PLAIN or not self._numbers("particles"):
+            return Scale("", -1.0, 1.0, PALETTES[self.scene.palette])
+        samples = [self.read(number)[1] for number in spread(self.numbers, SCALE_FRAMES)]
+        low, high = np.percentile(np.concatenate([[0.0], *(values[:: len(values) // SCALE_VALUES + 1] for values in samples)]), [2.0, 98.0])
+        high = _round_up(high)
+        low = -_round_up(-low) if low < -0.01 * high else 0.0  # liquid that a wall holds has pressure below 0
+        if self.color is Color.SPEED:
+            return Scale("speed [m/s]", low, high, PALETTES[self.scene.palette])
+        return Scale(LABELS.get(self.color, "pressure [Pa]"), low, high, VIRIDIS)
+
+    def particle_spacing(self) -> float:
+        """Return how far apart neighbors are at the start [m], from the number of particles in the cells that hold some."""
+        points = self.read(self.numbers[0])[0] if self.show is not Show.SURFACE else np.zeros((0, 3))
+        if not len(points):
+            return self.scene.spacing
+        cells = np.unique(np.floor(points / self.scene.spacing), axis=0)
+        return float(self.scene.spacing * (len(cells) / len(points)) ** (1.0 / self.scene.dimension))
+
+    def _numbers(self, name: str) -> list[int]:
+        matches = [FRAME_FILE.fullmatch(file.name) for file in (self.folder / "frames").glob(f"{name}_*.*vt[ui]")]
+        return sorted({int(match["index"]) for match in matches if match and match["name"] == name})
+
+    def _shown_numbers(self) -> list[int]:
+        """Return the numbers of the frames that have all that is shown."""
+        parts = ("surface", "particles") if self.show is Show.BOTH else ("surface",) if self.show is Show.SURFACE else ("particles",)
+        found = {part: self._numbers(part) for part in parts}
+        for part, numbers in found.items():
+            if not numbers:
+                why = "" if getattr(self.scene.output, part) else f"; the scene's output.{part} is false"
+                raise RenderError(f"{self.folder}: holds no frames of {'a surface' if part == 'surface' else part}{why}")
+        numbers = sorted(set.intersection(*map(set, found.values())))
+        if not numbers:
+            raise RenderError(f"{self.folder}: holds no frame of both {' and '.join(parts)}")
+        return numbers
+
+    @np.errstate(invalid="ignore")  # what is no number is left out
+    def _surface(self, name: str, number: int) -> Surface:
+        """Return a surface, those of its triangles or segments whose points are finite."""
+        file = self._file(name, number)
+        mesh = _read(file)
+        corners = mesh.corners if len(mesh.corners) else np.zeros((0, self.scene.dimension), dtype=np.int32)
+        if corners.shape[1] != self.scene.dimension:
+            raise RenderError(f"{file}: has no {'triangles' if self.scene.dimension == 3 else 'segments'}")
+        points = np.asarray(mesh.points, dtype=np.float64)
+        finite = np.isfinite(points[corners]).all(axis=(1, 2))
+        return Surface(name, np.where(np.isfinite(points), points, 0.0), np.asarray(corners[finite], dtype=np.int32), mesh.fields)
+
+    def _cells(self, number: int) -> Cells | None:
+        """Return the cells of a frame with their fields."""
+        file = self._file("grid", number)
+        if file.suffix in (".vti", ".pvti"):
+            cells = _read_image(file)
+        elif not len((mesh := _read(file)).corners):
+            return None
+        else:
+            low = np.nan_to_num(mesh.points[mesh.corners].mean(axis=1) / self.scene.spacing, nan=-1.0)
+            index = np.floor(np.clip(low, -1.0, max(self.scene.cell_counts))).astype(int)
+            cells = Cells("grid", index, self.scene.spacing, self.scene.dimension, mesh.fields)
+        if not ((cells.index >= 0) & (cells.index < self.scene.cell_counts)).all():
+            raise RenderError(f"{file}: is not a readable frame: a cell lies outside the scene's domain")
+        return cells
+
+    def _file(self, name: str, number: int) -> Path:
+        path = self.folder / "frames" / f"{name}_{number:06d}"
+        files = [path.with_suffix(suffix) for suffix in SUFFIXES]
+        return next((file for file in files if file.is_file()), files[-1])
+
+    def _field(self, fields: dict[str, Any], name: str, components: int = 1) -> np.ndarray:
+        if name not in fields or fields[name].shape[1:] != (components,)[: components - 1]:
+            raise RenderError(f"{self.folder}: the frames have no {name}, which --color {self.color} needs; plain needs nothing")
+        return np.asarray(fields[name], dtype=np.float64)
+
+    def _pressure(self, number: int, points: np.ndarray) -> np.ndarray:
+        """Return the pressure of each particle's cell [Pa], 0 where the frame has no such cell."""
+        cells = self._cells(number)
+        counts = np.array(self.scene.cell_counts)
+        table = np.zeros(counts)
+        if cells is not None:
+            table[tuple(cells.index.T)] = self._field(cells.fields, "pressure")
+        cell = np.clip(np.floor(np.nan_to_num(points) / self.scene.spacing), 0, counts - 1).astype(int)
+        return cast(np.ndarray, table[tuple(cell.T)])
+
+
+def spread(numbers: Sequence[int], count: int) -> list[int]:
+    """Return at most `count` of the numbers, evenly spaced, with the first and the last."""
+    places = np.linspace(0, len(numbers) - 1, min(count, len(numbers)))
+    return [numbers[round(place)] for place in places]
+
+
+def _read(file: Path) -> Mesh:
+    """Return a frame's mesh."""
+    with _readable(file):
+        return one_mesh([read_vtu(piece) for piece in _pieces(file)]) if file.suffix == ".pvtu" else read_vtu(file)
+
+
+def _read_image(file: Path) -> Cells:
+    """Return the cells of a frame that is an image."""
+    with _readable(file):
+        return one_grid([read_vti(piece) for piece in _pieces(file)]) if file.suffix == ".pvti" else read_vti(file)
+
+
+def _pieces(file: Path) -> list[Path]:
+    """Return the files of the pieces of a frame, of which there is at least one."""
+    if found := piece_files(file):
+        return found
+    raise ValueError("names no pieces")
+
+
+@contextmanager
+def _readable(file: Path) -> Iterator[None]:
+    """Say which file of a frame cannot be read, and why."""
+    try:
+        yield
+    except OSError as error:
+        raise RenderError(f"{error.filename or file}: cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        known = "is not a readable frame" in str(error)
+        raise RenderError(str(error) if known else f"{file}: is not a readable frame: {error}") from error
+
+
+def _round_up(value: float) -> float:
+    """Return the next round number; 1 for 0."""
+    if value <= 0.0:
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(ROUND_NUMBERS[np.searchsorted(ROUND_NUMBERS, value / power * (1.0 - 1e-9))] * power)

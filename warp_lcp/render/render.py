@@ -1,0 +1,158 @@
+"""Images and films of a run, with the time and a legend, alone or side by side. Needs the extra `render`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from warp_lcp.frames.atomic import replacing
+from warp_lcp.render.film import film_kind
+from warp_lcp.render.page import Page, Painter
+from warp_lcp.render.recording import Color, Recording, RenderError, Show, spread
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+INSTALL = "pip install 'pyvista>=0.45'"
+INSTALL_MATPLOTLIB = "pip install 'matplotlib>=3.9'"
+SMALLEST, LARGEST = 240, 4096  # pixels along a side of an image
+SHEET_FRAMES = 6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Looks:
+    """How images of a run look.
+
+    Args:
+        size: width and height of an image [pixels].
+        color: what the color of a particle means; speed unless given.
+        show: what of the material is shown; see `Recording`.
+        cut: draw a section with Matplotlib, which needs no pyvista.
+        at: where the section of a 3-D run cuts its z axis [m]; in the middle unless given.
+        overrides: of the scene's table [camera], such as `camera.position=[1, 2, 3]`.
+    """
+
+    size: tuple[int, int] = (1280, 720)
+    color: Color | None = None
+    show: Show | None = None
+    cut: bool = False
+    at: float | None = None
+    overrides: Sequence[str] = ()
+
+
+def render_run(
+    folder: Path, *, frames: Sequence[int] = (), looks: Looks | None = None, out: Path | None = None, sheet: bool = False
+) -> Iterator[Path]:
+    """Draw frames of a run, in SI units on a color scale that fits the whole run; yield each file when it is written.
+
+    Args:
+        folder: of the run.
+        frames: numbers of frames, negative ones counted from the end; all (for a sheet, some evenly spaced) unless given.
+        looks: how the images look.
+        out: where the images go; `folder / "images"` unless given.
+        sheet: draw the frames side by side into one image, `sheet.png`.
+
+    Raises:
+        RenderError: what draws is missing, there are no such frames, or an image cannot be written.
+        SceneError: the run's scene cannot be read.
+    """
+    looks = looks or Looks()
+    with ExitStack() as stack:
+        painter = _painter(looks, stack)
+        recording = Recording(folder, looks.color, looks.show, looks.overrides, cells=looks.cut)
+        numbers = recording.chosen(frames)
+        if sheet and not frames:
+            numbers = spread(numbers, SHEET_FRAMES)
+        name = "slice" if looks.cut else "frame"
+        groups = {"sheet.png": numbers} if sheet else {f"{name}_{number:06d}.png": [number] for number in numbers}
+        out = out or folder / "images"
+        page = Page(recording, looks.size, len(numbers) if sheet else 1, painter)
+        stack.enter_context(closing(page.painter))
+        for file, group in groups.items():
+            _save(page.draw(group), out / file)
+            yield out / file
+
+
+def film_run(folder: Path, film: Path, *, looks: Looks | None = None, rate: float | None = None) -> Iterator[int]:
+    """Draw all frames of a run into a film, one after the other; yield the number of each when it is drawn.
+
+    Args:
+        folder: of the run.
+        film: the file; `.mp4` or `.gif`.
+        looks: how the images look.
+        rate: frames a second of the film; those of the scene, so that time goes by as it does, unless given [1/s].
+
+    Raises:
+        RenderError: what draws or encodes is missing, there are no frames, or the film cannot be written.
+        SceneError: the run's scene cannot be read.
+    """
+    looks = looks or Looks()
+    kind = film_kind(film)
+    with ExitStack() as stack:
+        painter = _painter(looks, stack)
+        recording = Recording(folder, looks.color, looks.show, looks.overrides, cells=looks.cut)
+        page = Page(recording, looks.size, 1, painter)
+        stack.enter_context(closing(page.painter))
+        reel = stack.enter_context(kind(film, page.size, rate or recording.scene.time.frames_per_second))
+        for number in recording.numbers:
+            reel.add(partial(page.draw, [number]))
+            yield number
+
+
+def _painter(looks: Looks, stack: ExitStack) -> Callable[[Recording, tuple[int, int]], Painter]:
+    """Return what draws the pictures of a page.
+
+    Raises:
+        RenderError: it is not installed, or is not asked for what it can.
+    """
+    if looks.cut:
+        return _section(looks)
+    if looks.at is not None:
+        raise RenderError("--at: says where --slice cuts; give both")
+    try:
+        import pyvista
+    except ImportError as error:
+        raise RenderError(
+            f"images need pyvista, which cannot be loaded ({error}): {INSTALL}; --slice draws a section without it"
+        ) from error
+    from warp_lcp.render.stage import Stage
+
+    stack.enter_context(pyvista.vtk_verbosity("off"))  # VTK warns where there is no display, and draws all the same
+    return Stage
+
+
+def _section(looks: Looks) -> Callable[[Recording, tuple[int, int]], Painter]:
+    try:
+        import matplotlib as _  # noqa: F401
+    except ImportError as error:
+        raise RenderError(f"--slice needs Matplotlib, which cannot be loaded ({error}): {INSTALL_MATPLOTLIB}") from error
+    from warp_lcp.render.section import Section
+
+    return lambda recording, size: Section(recording, size, looks.at)
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Return width and height [pixels] of text such as `1280x720`.
+
+    Raises:
+        RenderError: it reads otherwise, or an image cannot be that small or large.
+    """
+    match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
+    width, height = (int(match[1]), int(match[2])) if match else (0, 0)
+    if not (SMALLEST <= width <= LARGEST and SMALLEST <= height <= LARGEST):
+        raise RenderError(f"--size {text}: must be a width and a height of {SMALLEST} to {LARGEST} pixels, such as 1280x720")
+    return width, height
+
+
+def _save(image: Image, file: Path) -> None:
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(file) as temporary:
+            image.save(temporary, format="PNG")
+    except OSError as error:
+        raise RenderError(f"{file}: cannot be written: {error.strerror}") from error

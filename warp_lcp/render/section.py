@@ -1,0 +1,185 @@
+"""Sections through a run, drawn by Matplotlib alone: cells and their pressure, particles nearby, the outlines of solids and surfaces."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.render.outline_fill import inside_outline
+from warp_lcp.render.recording import Color, Frame, Recording, RenderError, Scale
+from warp_lcp.render.scenery import prescribed_solids
+from warp_lcp.simulation import Surface
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+DOTS_AN_INCH = 100
+OUTLINE_POINTS = 400  # along the longest side, where solids are sampled
+CELL, DOT, SOLID, EDGE, LINE, BODY = "#e6eaee", "#1c3f63", "#c3c7cc", "#6b7075", "#0c3e80", "#e07a3f"
+BODY_EDGE = "#4a3b33"
+FILL_POINTS = 1200  # along the longest side, where bodies are sampled
+SMALLEST_DOT, LARGEST_DOT = 2.0, 5.0  # points
+
+
+class Section:
+    """What lies in the x-y plane: all of a 2-D run, or a cut through a 3-D one.
+
+    Args:
+        recording: of the run.
+        size: width and height of an image [pixels].
+        at: z of the cut [m]; in the middle of a 3-D domain unless given.
+
+    Raises:
+        RenderError: the cut is not in the domain.
+    """
+
+    def __init__(self, recording: Recording, size: tuple[int, int], at: float | None = None) -> None:
+        """Choose the cut and prepare the solids."""
+        self.recording, self.size, self.scene = recording, size, recording.scene
+        flat = self.scene.dimension == 2
+        if at is not None and flat:
+            raise RenderError("--at: is for 3-D runs; this one is 2-D")
+        depth = 0.0 if flat else self.scene.domain.size[2]
+        self.at = None if flat else depth / 2 if at is None else at
+        if self.at is not None and not 0.0 <= self.at <= depth:
+            raise RenderError(f"--at {self.at:g}: must be in the domain, whose z reaches from 0 to {depth:g} m")
+        self._solids = []
+        for solid in prescribed_solids(self.scene):
+            motion = solid.motion.to_motion(self.scene.dimension) if solid.motion else None
+            self._solids.append((solid.to_geometry(Path(), self.scene.dimension), motion))
+
+    def draw(self, frame: Frame) -> Image:
+        """Return a picture of a frame."""
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+        from PIL import Image
+
+        width, height = self.size
+        figure = Figure(figsize=(width / DOTS_AN_INCH, height / DOTS_AN_INCH), dpi=DOTS_AN_INCH, layout="constrained")
+        canvas = FigureCanvasAgg(figure)
+        axes = figure.add_subplot()
+        self._draw_cells(axes, frame)
+        self._draw_solids(axes, frame.time)
+        if frame.surface is not None:
+            self._draw_lines(axes, frame.surface, LINE)
+        self._draw_particles(axes, frame)
+        if frame.bodies is not None:
+            self._fill_bodies(axes, frame.bodies)
+        camera = self.scene.camera
+        low, high = camera.low or [0.0, 0.0], camera.high or self.scene.domain.size
+        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="x [m]", ylabel="y [m]")
+        if self.at is not None:
+            axes.set_title(f"z = {self.at:g} m", fontsize="medium")
+        canvas.draw()
+        return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+
+    def close(self) -> None:
+        """Do nothing: pictures do not share a figure."""
+
+    def _draw_cells(self, axes: Any, frame: Frame) -> None:
+        """Fill the cut cells, with the colors of their pressure if that is what colors mean."""
+        from matplotlib.colors import ListedColormap, Normalize
+
+        if frame.cells is None:
+            return
+        cells, h = frame.cells, self.scene.spacing
+        across, up, through = self.scene.cell_counts
+        here = np.ones(len(cells.index), dtype=bool) if self.at is None else cells.index[:, 2] == min(int(self.at / h), through - 1)
+        table = np.full((up, across), np.nan)
+        column, row = cells.index[here, 0], cells.index[here, 1]
+        colored = self.recording.color is Color.PRESSURE
+        table[row, column] = np.asarray(cells.fields["pressure"])[here] if colored else 0.0
+        scale = self.recording.scale
+        colors = ListedColormap(_colors(scale) if colored else [CELL])
+        norm = Normalize(scale.low, scale.high) if colored else None
+        axes.imshow(table, origin="lower", extent=(0.0, across * h, 0.0, up * h), cmap=colors, norm=norm, interpolation="nearest", zorder=1)
+
+    def _draw_solids(self, axes: Any, time: float) -> None:
+        """Fill where the distance to the nearest solid is negative."""
+        if not self._solids:
+            return
+        x, y = (
+            np.linspace(0.0, side, max(2, round(OUTLINE_POINTS * side / max(self.scene.domain.size))))
+            for side in self.scene.domain.size[:2]
+        )
+        plane = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), self.at or 0.0)], axis=-1)
+        points = wp.array(plane.reshape(-1, 3), dtype=wp.vec3, device="cpu")
+        distance = wp.empty(len(points), dtype=wp.float32, device="cpu")
+        nearest = np.full(len(points), np.inf)
+        for geometry, motion in self._solids:
+            (geometry.moved(motion.pose(time)) if motion else geometry).signed_distance(points, distance)
+            nearest = np.minimum(nearest, distance.numpy())
+        if nearest.min() < 0.0 < nearest.max():
+            level = nearest.reshape(len(y), len(x))
+            axes.contourf(x, y, level, levels=[-math.inf, 0.0], colors=[SOLID], zorder=2)
+            axes.contour(x, y, level, levels=[0.0], colors=[EDGE], linewidths=1.0, zorder=2)
+        elif nearest.max() <= 0.0:
+            axes.set_facecolor(SOLID)
+
+    def _draw_lines(self, axes: Any, surface: Surface, color: str) -> None:
+        """Draw the outline of a surface in the plane."""
+        from matplotlib.collections import LineCollection
+
+        axes.add_collection(LineCollection(list(self._segments(surface)), colors=color, linewidths=1.5, zorder=4))
+
+    def _fill_bodies(self, axes: Any, bodies: Surface) -> None:
+        """Fill the outlines of the bodies in the plane."""
+        from matplotlib.colors import ListedColormap
+
+        across, up = (round(FILL_POINTS * side / max(self.scene.domain.size[:2])) for side in self.scene.domain.size[:2])
+        pixel = self.scene.domain.size[0] / across
+        inside = inside_outline(self._segments(bodies) / pixel, up, across)
+        where = (0.0, across * pixel, 0.0, up * pixel)
+        mask = np.where(inside, 1.0, np.nan)
+        axes.imshow(mask, origin="lower", extent=where, cmap=ListedColormap([BODY]), interpolation="nearest", zorder=5)
+        self._draw_lines(axes, bodies, BODY_EDGE)
+
+    def _segments(self, surface: Surface) -> np.ndarray:
+        """Return the outline of a surface in the plane, ends [m], shape (m, 2, 2)."""
+        ends = surface.points[surface.corners]
+        return ends[..., :2] if self.at is None else cut(ends, self.at)
+
+    def _draw_particles(self, axes: Any, frame: Frame) -> None:
+        """Draw the particles within half a cell of the plane, in the color of what they are or as dots over the cells' pressure."""
+        h = self.scene.spacing
+        near = slice(None) if self.at is None else np.abs(frame.points[:, 2] - self.at) < 0.5 * h
+        points, values = frame.points[near], frame.values[near]
+        inches = self.size[0] / DOTS_AN_INCH / self.scene.domain.size[0]  # an upper bound of those that a meter takes
+        marker = min(max(SMALLEST_DOT, 0.35 * self.recording.particle_spacing() * 72.0 * inches), LARGEST_DOT)
+        if self.recording.color is Color.PRESSURE and frame.cells is not None:
+            axes.scatter(points[:, 0], points[:, 1], s=(0.5 * marker) ** 2, color=DOT, linewidths=0.0, zorder=3)
+        else:
+            colors = self.recording.scale.colors(values) / 255.0
+            axes.scatter(points[:, 0], points[:, 1], s=(2.0 * marker) ** 2, c=colors, linewidths=0.0, zorder=3)
+
+
+def cut(triangles: np.ndarray, z: float) -> np.ndarray:
+    """Return where triangles cross a plane z = const as segments.
+
+    Args:
+        triangles: corners [m], shape (n, 3, 3).
+        z: of the plane [m].
+
+    Returns:
+        Ends, x and y [m], shape (m, 2, 2).
+    """
+    above = triangles[..., 2] >= z
+    crossing = above.any(axis=1) & ~above.all(axis=1)
+    triangles, above = triangles[crossing], above[crossing]
+    alone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))  # the corner on a side of its own
+    own = np.arange(len(triangles))
+    tip = triangles[own, alone]
+    ends = []
+    for other in (1, 2):
+        corner = triangles[own, (alone + other) % 3]
+        share = ((z - tip[:, 2]) / (corner[:, 2] - tip[:, 2]))[:, None]
+        ends.append((tip + share * (corner - tip))[:, :2])
+    return np.stack(ends, axis=1)
+
+
+def _colors(scale: Scale) -> np.ndarray:
+    return scale.colors(np.linspace(scale.low, scale.high, 256)) / 255.0

@@ -1,0 +1,120 @@
+"""A window in which a run's frames go by. Needs a display and the extra `render`."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from warp_lcp.render.recording import Recording, RenderError
+from warp_lcp.render.render import INSTALL, Looks
+
+WINDOW = 1280, 720  # pixels at the start
+WITHOUT_SCREEN = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")  # what VTK falls back to
+TICK = 20  # milliseconds between two looks at the clock
+KEYS = "Space: play   Left, Right: step   Home, End   q: quit"
+FOREVER = 2**31 - 1
+
+
+class Viewer:
+    """The frames of a run in a plotter, one at a time.
+
+    Args:
+        recording: of the run.
+        plotter: pyvista's.
+        clock: tells seconds, for playing.
+    """
+
+    def __init__(self, recording: Recording, plotter: Any, clock: Callable[[], float] = time.perf_counter) -> None:
+        """Show the first frame."""
+        from warp_lcp.render.stage import Stage
+
+        self.recording, self.plotter, self.clock = recording, plotter, clock
+        self.stage = Stage(recording, plotter.window_size, plotter)
+        self.place = 0  # among the recording's frames
+        self.playing_since: tuple[float, int] | None = None  # the clock's time and the place then
+        self._slider: Any = None
+        self._add_controls()
+        self.go(0)
+
+    def go(self, place: int) -> None:
+        """Show the frame at a place, the nearest if there is none."""
+        self.place = min(max(place, 0), len(self.recording.numbers) - 1)
+        frame = self.recording.frame(self.recording.numbers[self.place])
+        self.stage.place(frame)
+        self.plotter.add_text(f"t = {frame.time:.3f} s", position="upper_left", font_size=12, color="#33373b", name="time", render=False)
+        if self._slider is not None:
+            self._slider.GetRepresentation().SetValue(self.place)
+        self.plotter.render()
+
+    def step(self, by: int) -> None:
+        """Stop playing and go on or back by some frames."""
+        self.playing_since = None
+        self.go(self.place + by)
+
+    def play(self) -> None:
+        """Begin to play from here, at the end from the start; or stop."""
+        if self.playing_since is not None:
+            self.playing_since = None
+            return
+        if self.place == len(self.recording.numbers) - 1:
+            self.go(0)
+        self.playing_since = (self.clock(), self.place)
+
+    def tick(self, _: int = 0) -> None:
+        """Show the frame that it is time for; frames that the machine is too slow for are left out."""
+        if self.playing_since is None:
+            return
+        since, begin = self.playing_since
+        place = begin + int((self.clock() - since) * self.recording.scene.time.frames_per_second)
+        if place >= len(self.recording.numbers):
+            self.playing_since = None
+        if place != self.place:
+            self.go(place)
+
+    def _add_controls(self) -> None:
+        last = len(self.recording.numbers) - 1
+        self.plotter.add_text(KEYS, position="upper_right", font_size=9, color="#6b7075", name="keys", render=False)
+        if last == 0 or self.plotter.iren is None:
+            return
+        self._slider = self.plotter.add_slider_widget(
+            lambda value: None if round(value) == self.place else self.step(round(value) - self.place), rng=[0, last], value=0,
+            pointa=(0.25, 0.05), pointb=(0.75, 0.05), fmt="%.0f", color="#33373b", style="modern", slider_width=0.015, tube_width=0.004,
+        )  # fmt: skip
+        for key, action in (
+            ("space", self.play), ("Right", lambda: self.step(1)), ("Left", lambda: self.step(-1)),
+            ("Home", lambda: self.step(-last)), ("End", lambda: self.step(last)),
+        ):  # fmt: skip
+            self.plotter.add_key_event(key, action)
+        self.plotter.add_timer_event(FOREVER, TICK, self.tick)
+
+
+def view_run(folder: Path, looks: Looks | None = None) -> None:
+    """Show a run's frames in a window until it is closed.
+
+    Raises:
+        RenderError: pyvista or a display is missing, or there are no frames.
+        SceneError: the run's scene cannot be read.
+    """
+    looks = looks or Looks()
+    try:
+        import pyvista
+    except ImportError as error:
+        raise RenderError(f"a window needs pyvista, which cannot be loaded ({error}): {INSTALL}") from error
+    recording = Recording(folder, looks.color, looks.show, looks.overrides)
+    if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
+        raise RenderError(_no_display("DISPLAY is not set", folder))
+    plotter = pyvista.Plotter(window_size=list(WINDOW), lighting="none", title=f"{recording.scene.scene.name}: {folder}")
+    with closing(plotter):
+        if plotter.off_screen or plotter.render_window.GetClassName() in WITHOUT_SCREEN:
+            raise RenderError(_no_display("no window can be opened", folder))
+        Viewer(recording, plotter)
+        plotter.show(auto_close=False)
+
+
+def _no_display(why: str, folder: Path) -> str:
+    return f"a window needs a display, and there is none ({why}); `warp-lcp render {folder} --film film.mp4` draws a film without one"

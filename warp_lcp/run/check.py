@@ -1,0 +1,80 @@
+"""What can be told of a scene before its run: whether it is valid, and what a run of it would do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from warp_lcp.run.devices import free_memory
+from warp_lcp.material.particle_scene import ParticleScene
+from warp_lcp.scene.scene import Scene
+from warp_lcp.scene.scene_file import check_shapes, load_scene
+from warp_lcp.simulation import Simulation, simulators
+from warp_lcp.scene.table import Problem, SceneError
+
+
+def check_scene(path_or_name: str, overrides: Sequence[str] = ()) -> tuple[Scene, list[tuple[str, str]]]:
+    """Return a scene, its shapes built once, and what a run of it would do, as pairs of a word and a line.
+
+    Args:
+        path_or_name: as of `load_scene`.
+        overrides: as of `load_scene`.
+
+    Raises:
+        SceneError: listing everything that is wrong.
+    """
+    scene = load_scene(path_or_name, overrides)
+    check_shapes(scene, path_or_name)
+    _check_bodies(scene, path_or_name)
+    return scene, [("scene", scene.scene.name), ("simulator", scene.scene.simulator), *scene.plan()]
+
+
+def check_memory(scene: Scene, device: str, *, share: float = 1.0) -> None:
+    """Refuse a scene that takes more memory than a device has free.
+
+    Args:
+        scene: what would run.
+        device: a Warp device's name; on a GPU, the making of the particles, on the host, does not count.
+        share: of the run that is on this device.
+
+    Raises:
+        SceneError: naming both amounts.
+    """
+    needed = int(share * (scene.memory_estimate() if device == "cpu" else sum(scene.memory_parts().values())))
+    free = free_memory(device) if needed else None
+    if free is not None and needed > free:
+        largest = ", ".join(sorted(scene.memory_parts(), key=scene.memory_parts().__getitem__, reverse=True)[:2])
+        message = (
+            f"the run needs about {needed / 2**20:,.0f} MB of memory, most of it for {largest}, and {free / 2**20:,.0f} MB are free on "
+            f"{device}; lower domain.resolution, or run it anyway with --force-memory"
+        )
+        raise SceneError(scene.scene.name, [Problem("domain.resolution", message, str(scene.domain.resolution))])
+
+
+def start(scene: Scene, device: str) -> Simulation:
+    """Return the simulation of a scene where a run begins, which refuses what a run would refuse before its first step.
+
+    Args:
+        scene: what would run.
+        device: a Warp device's name.
+
+    Raises:
+        SceneError: the scene cannot be simulated.
+    """
+    try:
+        return simulators()[scene.scene.simulator].create(scene, device=device, folder=Path.cwd())
+    except ValueError as error:
+        check_shapes(scene, scene.scene.name)  # whose message names the shape
+        raise SceneError(scene.scene.name, [Problem("", str(error))]) from error
+
+
+def _check_bodies(scene: Scene, source: str) -> None:
+    """Refuse rigid bodies that overlap each other, walls or other solids."""
+    if not isinstance(scene, ParticleScene) or not any(solid.is_body for solid in scene.solid):
+        return
+    from warp_lcp.material.particle_assembly import make_bodies, placed_solids
+
+    try:
+        make_bodies(scene, placed_solids(scene, Path.cwd()))
+    except ValueError as error:
+        raise SceneError(source, [Problem("", str(error))]) from error

@@ -1,0 +1,268 @@
+"""Checkpoints: everything a run continues from, as plain arrays in an .npz file."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warp_lcp.archive import Archive, ArchiveError
+from warp_lcp.frames.atomic import make_folder, replacing
+from warp_lcp.frames.rank_folder import in_ranks, rank_folder
+
+FORMAT = 2
+CHECKPOINT_FILE = re.compile(r"step_(?P<step>[0-9]{6,})\.npz")
+REFUSED_FILE = re.compile(r"refused_[0-9]{6,}\.npz")  # set aside when a run continued from an earlier one
+STATE = "state/"
+META = "meta"
+PIECES = "pieces_of_ranks"  # the only array of a checkpoint whose state is in the files of ranks: a checksum of each
+
+
+class CheckpointError(ValueError):
+    """A file that a run cannot continue from. The message names it and says why."""
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """The state of a run after a step.
+
+    Args:
+        step: the number of steps taken.
+        time: reached by them [s].
+        state: the simulation's arrays.
+        keys: of the scene that led there, with their values; not needed to write one.
+    """
+
+    step: int
+    time: float
+    state: Mapping[str, np.ndarray]
+    keys: Mapping[str, Any] = field(default_factory=dict)
+
+    @cached_property
+    def checksum(self) -> str:
+        """A digest of the state."""
+        return _checksum(self.state)
+
+
+class StoredPiece(Mapping[str, np.ndarray]):
+    """A rank's piece of a state in its file; an array is read when it is asked for.
+
+    Args:
+        path: of the file, which has been verified.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Read the arrays' names."""
+        self.path = path
+        with Archive(path) as archive:
+            self._names = [name.removeprefix(STATE) for name in archive.headers if name.startswith(STATE)]
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Read an array."""
+        if name not in self._names:
+            raise KeyError(name)
+        with Archive(self.path) as archive:
+            return archive.read([STATE + name])[STATE + name]
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over the arrays' names."""
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        """Return the number of arrays."""
+        return len(self._names)
+
+
+class CheckpointFolder:
+    """The checkpoints of one run, `step_<number>.npz`.
+
+    Those of a run on several ranks have their states in pieces, `rank_0003/step_<number>.npz`; `step_<number>.npz` has their checksums.
+
+    Args:
+        folder: made when the first checkpoint is written.
+        fingerprint: tells the run's scene from others, whatever may change when it goes on.
+        keys: of the scene, with their values, written with each checkpoint.
+
+    Attributes:
+        spared: steps whose checkpoints `prune` leaves, as something that is missing can be made again from them.
+    """
+
+    def __init__(self, folder: Path, fingerprint: str, keys: Mapping[str, Any] | None = None) -> None:
+        """Look at a folder."""
+        self.folder = folder
+        self.fingerprint = fingerprint
+        self.keys = dict(keys or {})
+        self.spared: set[int] = set()
+
+    def path(self, step: int) -> Path:
+        """Return the file of a step."""
+        return self.folder / f"step_{step:06d}.npz"
+
+    def steps(self) -> list[int]:
+        """Return the steps that there are files of, newest first."""
+        files = self.folder.iterdir() if self.folder.is_dir() else ()
+        return sorted((int(match["step"]) for file in files if (match := CHECKPOINT_FILE.fullmatch(file.name))), reverse=True)
+
+    def write(self, checkpoint: Checkpoint) -> Path:
+        """Write a checkpoint atomically.
+
+        Raises:
+            OSError: the file cannot be written; the earlier ones are intact.
+            ValueError: an array holds Python objects, which would need a pickle.
+        """
+        pickled = [name for name, array in checkpoint.state.items() if array.dtype.hasobject]
+        if pickled:
+            raise ValueError(f"these arrays hold Python objects, which would need a pickle: {', '.join(pickled)}")
+        make_folder(self.folder)
+        meta = {
+            "format": FORMAT,
+            "scene": self.fingerprint,
+            "step": checkpoint.step,
+            "time": checkpoint.time,
+            "keys": self.keys,
+            "checksum": checkpoint.checksum,
+        }
+        arrays: dict[str, Any] = {META: np.array(json.dumps(meta))}
+        arrays |= {STATE + name: array for name, array in checkpoint.state.items()}
+        with replacing(self.path(checkpoint.step)) as temporary, open(temporary, "wb") as file:
+            np.savez(file, **arrays)
+        return self.path(checkpoint.step)
+
+    def prune(self, kept: int) -> None:
+        """Delete all but the newest `kept` and those that are spared, and pieces that belong to none.
+
+        Raises:
+            OSError: a file cannot be deleted.
+        """
+        for step in self.steps()[kept:]:
+            if step not in self.spared:
+                self.path(step).unlink()
+        steps = self.steps()
+        for step, piece in self._all_pieces():
+            if step not in steps:
+                piece.unlink()
+
+    def set_aside(self, after: int) -> list[Path]:
+        """Rename what is newer than a step, so that it is neither continued from nor counted; return the new names.
+
+        Raises:
+            OSError: a file cannot be renamed.
+        """
+        for step, piece in self._all_pieces():
+            if step > after:
+                piece.replace(piece.with_name(f"refused_{step:06d}.npz"))
+        return [self.path(step).replace(self.folder / f"refused_{step:06d}.npz") for step in self.steps() if step > after]
+
+    def read(self, step: int) -> Checkpoint:
+        """Read and verify a checkpoint.
+
+        Raises:
+            CheckpointError: the file is cut short or damaged, of another version or of another scene.
+        """
+        path = self.path(step)
+        try:
+            with Archive(path) as archive:
+                meta = _meta(archive)
+                if meta["format"] != FORMAT:
+                    raise CheckpointError(f"{path}: written in format {meta['format']!r}, this version reads format {FORMAT}")
+                if meta["scene"] != self.fingerprint:
+                    raise CheckpointError(f"{path}: belongs to another scene")
+                foreign = [name for name in archive.headers if name != META and not name.startswith(STATE)]
+                if foreign:
+                    raise CheckpointError(f"{path}: holds arrays that no run writes: {', '.join(map(repr, foreign))}")
+                arrays = archive.read([name for name in archive.headers if name != META])
+        except ArchiveError as error:
+            raise CheckpointError(f"{path}: cut short, damaged or not a checkpoint ({error})") from error
+        state = {name.removeprefix(STATE): array for name, array in arrays.items()}
+        checkpoint = Checkpoint(step, float(meta["time"]), state, meta["keys"])
+        if meta["checksum"] != checkpoint.checksum or np.ndim(state.get(PIECES, [])) != 1:
+            raise CheckpointError(f"{path}: damaged (its checksum does not fit)")
+        if meta["step"] != step:
+            raise CheckpointError(f"{path}: holds step {meta['step']}, renamed")
+        return checkpoint
+
+    def verify(self, checkpoint: Checkpoint) -> None:
+        """Read and verify the pieces of a checkpoint, if it is in pieces.
+
+        Raises:
+            CheckpointError: one of them cannot be used.
+        """
+        for rank in range(len(checkpoint.state.get(PIECES, ()))):
+            if problem := self.problem(checkpoint, rank):
+                raise CheckpointError(problem)
+
+    def problem(self, checkpoint: Checkpoint, rank: int) -> str:
+        """Return why a rank's piece of a checkpoint cannot be used, "" if it can."""
+        folder = self.of_rank(rank)
+        try:
+            if folder.read(checkpoint.step).checksum == checkpoint.state[PIECES][rank]:
+                return ""
+        except CheckpointError as error:
+            return str(error)
+        return f"{folder.path(checkpoint.step)}: belongs to another checkpoint"
+
+    def pieces(self, checkpoint: Checkpoint) -> list[StoredPiece]:
+        """Return the pieces of a checkpoint, which have been verified.
+
+        Raises:
+            OSError: a file cannot be read.
+        """
+        return [StoredPiece(self.of_rank(rank).path(checkpoint.step)) for rank in range(len(checkpoint.state[PIECES]))]
+
+    def of_rank(self, rank: int) -> CheckpointFolder:
+        """Return the folder of a rank's pieces."""
+        return CheckpointFolder(self.folder / rank_folder(rank), self.fingerprint)
+
+    def _all_pieces(self) -> list[tuple[int, Path]]:
+        """Return the pieces of all ranks with their steps."""
+        matches = [(CHECKPOINT_FILE.fullmatch(file.name), file) for file in in_ranks(self.folder) if file.parent != self.folder]
+        return [(int(match["step"]), file) for match, file in matches if match]
+
+    def newest(self) -> tuple[Checkpoint | None, list[str]]:
+        """Return the newest valid checkpoint, if there is one, and what is wrong with each newer file."""
+        refused: list[str] = []
+        for step in self.steps():
+            try:
+                found = self.read(step)
+                self.verify(found)
+                return found, refused
+            except CheckpointError as error:
+                refused.append(str(error))
+        return None, refused
+
+
+def _meta(archive: Archive) -> dict[str, Any]:
+    """Return what a checkpoint says of its state: of format 2, all of the right type.
+
+    Raises:
+        ArchiveError: it says nothing, or something else.
+    """
+    try:
+        meta: Any = json.loads(str(archive.read([META])[META]))
+        if meta["format"] != FORMAT:
+            return {"format": meta["format"]}
+        meta = {"keys": {}, **meta}
+        kinds = {"scene": str, "checksum": str, "step": int, "time": float | int, "keys": dict}
+        wrong = [name for name, kind in kinds.items() if not isinstance(meta[name], kind)]
+        if wrong or not 0.0 <= float(meta["time"]) < math.inf:
+            raise ArchiveError(f"wrong in {META}: {', '.join(wrong) or 'time'}")
+        return meta
+    except (ValueError, TypeError, LookupError, OverflowError, RecursionError) as error:
+        raise ArchiveError(str(error)) from error
+
+
+def _checksum(state: Mapping[str, np.ndarray]) -> str:
+    digest = hashlib.blake2b(digest_size=16)
+    for name in sorted(state):
+        array = np.ascontiguousarray(state[name])
+        digest.update(f"{name} {array.dtype.str} {state[name].shape};".encode())
+        digest.update(array.data if array.size else b"")
+    return digest.hexdigest()

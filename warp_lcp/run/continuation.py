@@ -1,0 +1,82 @@
+"""What of a scene may change when its run is continued, and what that means for the results."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from warp_lcp.scene.scene import Scene
+from warp_lcp.scene.scene_file import keys
+from warp_lcp.scene.shapes import BUILTIN
+from warp_lcp.scene.table import Problem, SceneError, written
+
+RESOLUTION = "domain.resolution"
+MAY_CHANGE = (
+    "scene.name, scene.description, time.duration, time.cfl, time.dt_max, time.dt_min, [solver], [output], [camera] and domain.resolution"
+)
+
+
+class Change(Enum):
+    """What another value of a key means for a run that goes on."""
+
+    SAME_STEPS = "the steps are those of a run that had this value from the start"
+    OTHER_STEPS = "from here on the steps are not those of the run that began"
+    RESAMPLED = "the state goes to another grid"
+    REFUSED = "it would be another run"
+
+
+RULES = (
+    (re.compile(r"scene\.(name|description)|time\.duration|(output|camera)\..*"), Change.SAME_STEPS),
+    (re.compile(r"solver\..*|time\.(cfl|dt_max|dt_min)"), Change.OTHER_STEPS),
+    (re.compile(re.escape(RESOLUTION)), Change.RESAMPLED),
+)
+MESH_KEY = re.compile(r"\w+\[\d+\]\.file")
+
+
+def change_of(key: str) -> Change:
+    """Return what a change of a key, such as `time.cfl`, means."""
+    return next((change for pattern, change in RULES if pattern.fullmatch(key)), Change.REFUSED)
+
+
+def mesh_digests(scene: Scene) -> dict[str, str]:
+    """Return a digest of the content of each mesh file that a scene names, by its key, such as `solid[0].file`.
+
+    Raises:
+        SceneError: a file cannot be read.
+    """
+    digests = {}
+    for key, value in keys(scene).items():
+        if not MESH_KEY.fullmatch(key) or value.startswith(BUILTIN):
+            continue
+        try:
+            with open(Path(value), "rb") as file:
+                digests[key] = hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
+        except OSError as error:
+            raise SceneError(scene.scene.name, [Problem(key, f"cannot be read: {error.strerror}", written(value))]) from error
+    return digests
+
+
+def fingerprint(scene: Scene, digests: Mapping[str, str] | None = None) -> str:
+    """Return a digest of everything that must not change between the parts of a run.
+
+    Args:
+        scene: the scene.
+        digests: of its mesh files, which count by what is in them and not by where they are; None: read them.
+    """
+    files = mesh_digests(scene) if digests is None else digests
+    fixed = {key: files.get(key, value) for key, value in keys(scene).items() if change_of(key) is Change.REFUSED}
+    return hashlib.blake2b(json.dumps(fixed, sort_keys=True).encode(), digest_size=16).hexdigest()
+
+
+def differences(before: Mapping[str, Any], after: Mapping[str, Any], *changes: Change) -> list[str]:
+    """Return a line for each key whose change is one of `changes` and that differs, such as `time.cfl: 2.0 before, 4.0 now`."""
+    return [
+        f"{key}: {written(before.get(key, 'none'))} before, {written(after.get(key, 'none'))} now"
+        for key in sorted(before.keys() | after.keys())
+        if before.get(key) != after.get(key) and change_of(key) in changes
+    ]

@@ -1,0 +1,82 @@
+"""Which devices there are."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import warp as wp
+
+from warp_lcp.claims import free_host_memory
+from warp_lcp.run.kernel_cache import cache_error, watch_loads
+
+
+class DeviceError(ValueError):
+    """There is no such device; the message lists those there are."""
+
+
+def devices() -> dict[str, str]:
+    """Return the devices of this machine with their descriptions, the preferred one first.
+
+    Raises:
+        KernelCacheError: there is no place for compiled kernels.
+    """
+    try:
+        with _native_messages_dropped():
+            wp.init()
+    except OSError as error:
+        raise cache_error(error) from error
+    watch_loads()
+    found = [*wp.get_cuda_devices(), wp.get_device("cpu")]
+    return {device.alias: _describe(device) for device in found}
+
+
+def choose_device(name: str | None) -> str:
+    """Return the device of this name; without a name, the preferred one.
+
+    Raises:
+        DeviceError: there is no such device.
+    """
+    there = devices()
+    if name is None:
+        return next(iter(there))
+    alias = "cuda:0" if name == "cuda" else name
+    if alias not in there:
+        raise DeviceError(f"--device {name}: there is no such device; choose from {', '.join(there)}")
+    return alias
+
+
+def free_memory(name: str) -> int | None:
+    """Return the memory of a device that programs may still take [bytes]; None where the system does not tell."""
+    device = wp.get_device(name)
+    if device.is_cuda:
+        return int(device.free_memory)
+    return free_host_memory()
+
+
+def cuda_driver() -> str:
+    """Return the version of the CUDA driver, or that there is none."""
+    devices()
+    version = wp.get_cuda_driver_version()
+    return "none found" if version is None else ".".join(map(str, version))
+
+
+@contextmanager
+def _native_messages_dropped() -> Iterator[None]:
+    """Keep what Warp's native code writes to the error stream (that there is no CUDA driver) off it; no setting of Warp's does."""
+    kept = os.dup(2)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(nowhere)
+        os.close(kept)
+
+
+def _describe(device: wp.Device) -> str:
+    if device.is_cuda:
+        return f"{device.name}, {device.total_memory / 2**30:.1f} GiB, compute capability {device.arch / 10:.1f}"
+    return str(device.name)

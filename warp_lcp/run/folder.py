@@ -1,0 +1,417 @@
+"""The folder of a run: what is in it, who may write there, and how the run ended."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import tempfile
+import tomllib
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal, get_type_hints
+
+from pydantic import TypeAdapter
+
+from warp_lcp.frames.atomic import SPARE, SUFFIX, make_folder, reserve, sync_folder, write_text
+from warp_lcp.run.checkpoint import CHECKPOINT_FILE, REFUSED_FILE, Checkpoint, CheckpointFolder
+from warp_lcp.run.continuation import MAY_CHANGE, RESOLUTION, Change, differences, fingerprint, mesh_digests
+from warp_lcp.run.folder_lock import LOCK, FolderBusyError, locked
+from warp_lcp.scene.foreign import one_line
+from warp_lcp.frames.frames import FRAME_FILE, FrameFolder, FrameWriter
+from warp_lcp.run.gaps import gaps
+from warp_lcp.run.log import Log
+from warp_lcp.run.profile import Stopwatch
+from warp_lcp.frames.rank_folder import in_ranks, remove_empty_ranks
+from warp_lcp.scene.scene import Scene
+from warp_lcp.scene.scene_file import dump_scene, keys, load_scene, table_keys
+from warp_lcp.simulation import Part
+from warp_lcp.scene.table import SceneError
+from warp_lcp.run.versions import versions
+
+Status = Literal["running", "finished", "stopped", "failed"]
+
+RECORD = "run.json"
+SCENE = "scene.toml"
+ROUNDING = 1e-9
+BEFORE = "before its first step had ended"
+LAST_WORDS = 8192  # bytes that run.json may grow by until the run ends, with the reason and warnings
+OWN_FILES = re.compile(rf"scene\.toml|run\.json(?:{re.escape(SPARE)})?|profile\.json|log\.csv|[a-z][a-z_]*\.pvd")
+IMAGE_FILE = re.compile(r"(?:(?:frame|slice)_\d{6,}|sheet)\.png")
+CHECKPOINTS = "checkpoints"
+STORED_STATE = re.compile(f"{CHECKPOINT_FILE.pattern}|{REFUSED_FILE.pattern}")
+OWN_FOLDERS = {"frames": FRAME_FILE, CHECKPOINTS: STORED_STATE, "images": IMAGE_FILE}
+
+
+class OutputError(ValueError):
+    """The output folder cannot take the run. The message says why and what to do."""
+
+
+@dataclass
+class RunRecord:
+    """What run.json says of a run.
+
+    Args:
+        scene: the scene's name.
+        simulator: what simulates it.
+        device: where.
+        engine: what carried it, see `warp_lcp.run.engine`.
+        ranks: processes that shared it.
+        status: how it ended, or that it has not.
+        reason: why it ended.
+        steps: taken since the scene's start.
+        time: reached [s].
+        frames: the number of the newest frame.
+        resumed_from_step: the checkpoint that this part of the run continued, if it did; 0 if there was none and it began anew.
+        changed: the scene's keys that have other values than in the part before, with both.
+        resampled_from_resolution: domain.resolution of the checkpoint, if the state was brought to another grid.
+        mesh_files: a digest of what is in each mesh file, by its key.
+        overrides: what `--set` was given for this run, with the values of the scene's file, see `warp_lcp.run.given_scene`.
+        seconds: that this part of the run took.
+        warnings: what the user should know about the results.
+        versions: of the software.
+    """
+
+    scene: str
+    simulator: str
+    device: str
+    engine: str = "single"
+    ranks: int = 1
+    status: Status = "running"
+    reason: str = ""
+    steps: int = 0
+    time: float = 0.0
+    frames: int = 0
+    resumed_from_step: int | None = None
+    changed: list[str] = field(default_factory=list)
+    resampled_from_resolution: int | None = None
+    mesh_files: dict[str, str] = field(default_factory=dict)
+    overrides: list[dict[str, str]] = field(default_factory=list)
+    seconds: float = 0.0
+    warnings: list[str] = field(default_factory=list)
+    versions: dict[str, str] = field(default_factory=versions)
+
+
+@dataclass(frozen=True)
+class Continuation:
+    """Where a run goes on.
+
+    Args:
+        checkpoint: to continue from; None: nothing was computed yet.
+        remarks: what the user should know, such as newer checkpoints that cannot be used.
+        changed: a line for each key of the scene that has another value than when the checkpoint was written.
+        resampled_from: domain.resolution of the checkpoint, if the scene has another one.
+    """
+
+    checkpoint: Checkpoint | None
+    remarks: list[str] = field(default_factory=list)
+    changed: list[str] = field(default_factory=list)
+    resampled_from: int | None = None
+
+
+class RunFolder:
+    """scene.toml, run.json, log.csv, frames and checkpoints of one run."""
+
+    def __init__(self, path: Path, scene: Scene) -> None:
+        """Look at a folder, there or not; nothing is written yet.
+
+        Raises:
+            SceneError: a mesh file of the scene cannot be read.
+        """
+        self.path = path
+        self.scene = scene
+        self.mesh_files = mesh_digests(scene)
+        self.log = path / "log.csv"
+        self.frames = FrameFolder(path, scene.output.grid_format, surface_ply=scene.output.surface_ply)
+        self.checkpoints = CheckpointFolder(path / CHECKPOINTS, fingerprint(scene, self.mesh_files), keys(scene))
+
+    @contextmanager
+    def held(self, *, resume: bool) -> Iterator[list[str]]:
+        """Keep other processes out of the folder, which is made if a new run needs it; yields remarks.
+
+        Args:
+            resume: there must be a run.
+
+        Raises:
+            OutputError: the folder cannot be made or written, another process runs there, or there is no run to resume.
+        """
+        if self.path.exists() and not self.path.is_dir():
+            raise OutputError(f"{self.path}: is not a folder")
+        if resume:
+            self._check_run()
+        _probe(self.path)
+        with ExitStack() as stack:
+            try:
+                remarks = stack.enter_context(locked(self.path))
+            except FolderBusyError as error:
+                raise OutputError(str(error)) from error
+            except OSError as error:
+                raise OutputError(f"{self.path}: cannot be written: {error.strerror}") from error
+            yield remarks
+
+    def check_new(self, *, force: bool) -> None:
+        """Refuse what a new run may not overwrite, and folders that cannot be written.
+
+        Args:
+            force: an earlier run may go.
+
+        Raises:
+            OutputError: there is something in the folder, or it cannot be made or written.
+        """
+        if self.path.exists() and not self.path.is_dir():
+            raise OutputError(f"{self.path}: is not a folder")
+        _probe(self.path)
+        own, foreign = self._contents()
+        if not foreign and all(path.name.startswith(f".{RECORD}") for path in own):  # nothing, or killed with its first files
+            return
+        if foreign or not holds_run(self.path):
+            shown = ", ".join(one_line(str(path.relative_to(self.path))) for path in [*foreign, *own][:3])
+            raise OutputError(f"{self.path}: holds files that are no run's ({shown}), which --force does not delete; choose another folder")
+        if not force:
+            raise OutputError(f"{self.path}: holds a run already; --resume continues it, --force deletes it, --out takes another folder")
+
+    def start(self, record: RunRecord) -> None:
+        """Begin a run in a folder that `check_new` found fit: what an earlier run left is deleted.
+
+        Raises:
+            OSError: a file cannot be deleted or written.
+        """
+        own, _ = self._contents()
+        own.sort(key=lambda file: file.parent.name != CHECKPOINTS)  # first, so that a half-deleted run is not continued
+        for file in own:
+            if file.name != RECORD:  # replaced below: at every moment the folder is a run's
+                file.unlink()
+        for name in OWN_FOLDERS:
+            if (self.path / name).is_dir():
+                sync_folder(self.path / name)  # before there is a run that could take what was in it for its own
+            remove_empty_ranks(self.path / name)
+        self.write_record(record)
+        write_text(self.path / SCENE, dump_scene(self.scene))
+
+    def resume(self) -> Continuation:
+        """Return where to continue.
+
+        Raises:
+            OutputError: there is no run, its scene is another one, or no checkpoint is valid.
+        """
+        self._check_run()
+        self._check_same_scene()
+        checkpoint, refused = self.checkpoints.newest()
+        if checkpoint is None and not refused and not self._has_steps():
+            return Continuation(None, [f"{self.path}: the run that was interrupted had no checkpoint yet; it begins anew"])
+        if checkpoint is None:
+            reasons = refused or ["none was written"]
+            raise OutputError("\n  ".join([f"{self.path}: no checkpoint to resume from; --force starts again", *reasons]))
+        end = self.scene.time.frame_time(self.scene.time.frame_count)
+        if checkpoint.time > end * (1.0 + ROUNDING):
+            raise OutputError(
+                f"{self.path}: time.duration = {self.scene.time.duration:g} s ends before the checkpoint's time, {checkpoint.time:.6g} s: "
+                "frames would be lost; choose a longer one"
+            )
+        lost = [name for name, found in ((RECORD, read_record(self.path)), (SCENE, recorded_keys(self.path / SCENE))) if not found]
+        remarks = [*refused, *self._other_versions(), *(f"{name}: was missing or damaged; written anew" for name in lost)]
+        if RECORD in lost:
+            remarks.append("what --set gave the run before is not known: what is not given again is the scene's")
+        if refused:
+            remarks.append(f"continuing from step {checkpoint.step} instead; refused checkpoints stay as checkpoints/refused_*.npz")
+        now = keys(self.scene)
+        before = checkpoint.keys or now
+        steps = differences(before, now, Change.OTHER_STEPS)
+        if steps:
+            remarks.append(f"from step {checkpoint.step} on the steps are not those of the run that began: {'; '.join(steps)}")
+        old = int(before.get(RESOLUTION, now[RESOLUTION]))
+        changed = differences(before, now, Change.SAME_STEPS, Change.OTHER_STEPS, Change.RESAMPLED)
+        return Continuation(checkpoint, remarks, changed, None if old == now[RESOLUTION] else old)
+
+    def gaps(self, columns: tuple[str, ...], step: int, times: list[float], frame: list[Part]) -> list[str]:
+        """Return a line for what the folder lacks of what was written up to a step, see `warp_lcp.run.gaps`.
+
+        Raises:
+            OSError: a file cannot be read.
+            OutputError: the log has other columns.
+        """
+        try:
+            return gaps(self.log, columns, self.frames, self.checkpoints, step=step, times=times, frame=frame)
+        except ValueError as error:
+            raise OutputError(str(error)) from error
+
+    def go_on(self, record: RunRecord, step: int) -> None:
+        """Begin to write behind a step, once everything is known to fit: what a killed process left half-written goes.
+
+        Raises:
+            OSError: a file cannot be written, renamed or deleted.
+        """
+        self.write_record(record)
+        write_text(self.path / SCENE, dump_scene(self.scene))
+        for file in (path for path, _ in _walk(self.path) if path.name.endswith(SUFFIX) and path.name.startswith(".")):
+            if SPARE not in file.name:
+                file.unlink()
+        self.checkpoints.set_aside(step)
+
+    def open_log(self, columns: tuple[str, ...], *, after_step: int | None = None) -> Log:
+        """Begin the log or continue it, see `Log`."""
+        return Log(self.log, columns, after_step=after_step)
+
+    def frame_writer(self, watch: Stopwatch) -> FrameWriter:
+        """Return what writes the frames while the simulation goes on."""
+        return FrameWriter(self.frames, watch)
+
+    def write_record(self, record: RunRecord) -> None:
+        """Write run.json; that of a run that begins keeps room for the one of its end, which is written even if the disk is full.
+
+        Raises:
+            OSError: the disk is full before the run begins, or cannot be written at all.
+        """
+        text, begins = json.dumps(asdict(record), indent=2) + "\n", record.status == "running"
+        if begins:
+            reserve(self.path / RECORD, len(text) + LAST_WORDS)
+        write_text(self.path / RECORD, text, spare=not begins)
+
+    def mark_failed(self, reason: str) -> None:
+        """Write into run.json that the run has failed, if it says that it is running; for a process that does not have its record.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        _end_record(self.path, "failed", reason)
+
+    def check_space(self, needed: int) -> None:
+        """Refuse a run whose output does not fit.
+
+        Args:
+            needed: an estimate [bytes].
+
+        Raises:
+            OutputError: there is less free.
+        """
+        free = shutil.disk_usage(self.path).free
+        if free < needed:
+            raise OutputError(
+                f"{self.path}: the run needs about {needed / 1e9:.3g} GB and {free / 1e9:.3g} GB are free; "
+                "make room, choose another --out, or write less (time.frames_per_second, output.particles, output.grid)"
+            )
+
+    def _check_run(self) -> None:
+        if not holds_run(self.path):
+            raise OutputError(f"{self.path}: there is no run to resume")
+        wrong = [self.path / name for name in OWN_FOLDERS if (self.path / name).exists() and not (self.path / name).is_dir()]
+        wrong += [path for path in (self.path / RECORD, self.path / SCENE, self.log) if path.is_dir()]
+        if wrong:
+            kind = "is a folder where a run has a file" if wrong[0].is_dir() else "is a file where a run has a folder"
+            raise OutputError(f"{wrong[0]}: {kind}; move it away")
+
+    def _check_same_scene(self) -> None:
+        """Refuse other values of keys that must not change, and mesh files that hold something else."""
+        before, now = recorded_keys(self.path / SCENE), keys(self.scene)
+        files = read_record(self.path).get("mesh_files", {})
+        if before is None:  # killed before it was written: the checkpoints tell whose they are
+            before = now
+        for key, digest in self.mesh_files.items():
+            if files.get(key) == digest:
+                before[key] = now[key]  # the same mesh in another place
+            elif key in files and before.get(key) == now[key]:
+                raise OutputError(
+                    f"{self.path}: {key} = {now[key]!r}: what is in the file has changed since the run began; put the old one back, or "
+                    "start again with --force"
+                )
+        changes = differences(before, now, Change.REFUSED)
+        if changes:
+            head = f"{self.path}: --resume continues the same scene, and these keys have other values"
+            raise OutputError("\n  ".join([head, *changes, f"may change: {MAY_CHANGE}"]))
+
+    def _has_steps(self) -> bool:
+        """Return whether the log has a row, or a frame or the record tells of a step."""
+        rows = self.log.read_bytes().count(b"\n") if self.log.is_file() else 0
+        later = any(
+            match and int(match["index"]) for match in map(FRAME_FILE.fullmatch, (file.name for file in in_ranks(self.frames.frames)))
+        )
+        return rows > 1 or later or bool(read_record(self.path).get("steps"))
+
+    def _other_versions(self) -> list[str]:
+        """Return a remark if the run began with other software, which need not give the same bits."""
+        before, now = read_record(self.path).get("versions", {}), versions()
+        now.pop("platform", None)  # its name tells the kernel, not the processor
+        other = [f"{name} {before[name]}, now {now[name]}" for name in sorted(before.keys() & now.keys()) if before[name] != now[name]]
+        return [f"written with other software ({'; '.join(other)}): results need not be the same bit for bit"] if other else []
+
+    def _contents(self) -> tuple[list[Path], list[Path]]:
+        """Return the files that a run makes, and everything else."""
+        own: list[Path] = []
+        foreign: list[Path] = []
+        for path, pattern in _walk(self.path):
+            name = path.name.removeprefix(".").removesuffix(SUFFIX) if path.name.endswith(SUFFIX) else path.name
+            is_own = path.is_file() and not path.is_symlink() and pattern.fullmatch(name)
+            (own if is_own else foreign).append(path)
+        return own, foreign
+
+
+def holds_run(folder: Path) -> bool:
+    """Return whether there is a run in a folder: its record, or a checkpoint where somebody has deleted that."""
+    return (folder / RECORD).is_file() or any(CHECKPOINT_FILE.fullmatch(file.name) for file in folder.glob(f"{CHECKPOINTS}/*"))
+
+
+def mark_stopped(folder: Path, signal: str) -> None:
+    """Write into run.json that a signal has stopped the run before its first step; for a thread that ends the process."""
+    with suppress(OSError):
+        _end_record(folder, "stopped", f"interrupted by {signal} {BEFORE}")
+
+
+def _end_record(folder: Path, status: Status, reason: str) -> None:
+    """Write into run.json how the run has ended, if it says that it is running."""
+    record = read_record(folder)
+    if record.get("status") == "running":
+        write_text(folder / RECORD, json.dumps({**record, "status": status, "reason": reason}, indent=2) + "\n", spare=True)
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """Return what run.json says; nothing if it cannot be read, or a value is of a type that no run writes."""
+    try:
+        record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+        for key, kind in _record_types().items():
+            if key in record:
+                kind.validate_python(record[key])
+    except (OSError, ValueError, RecursionError, TypeError):
+        return {}
+    return record if isinstance(record, dict) else {}
+
+
+@cache
+def _record_types() -> dict[str, TypeAdapter[Any]]:
+    """Return what validates each value of a record."""
+    return {key: TypeAdapter(hint) for key, hint in get_type_hints(RunRecord).items()}
+
+
+def recorded_keys(path: Path) -> dict[str, Any] | None:
+    """Return the keys of the scene as it ran; None if there is no such file or it is not a scene's."""
+    try:
+        return keys(load_scene(path))
+    except SceneError:
+        pass  # a mesh has been moved, perhaps; what the file says still counts
+    try:
+        found = table_keys(tomllib.loads(path.read_text(encoding="utf-8")))
+        return found if "scene.simulator" in found else None
+    except (OSError, ValueError, RecursionError):
+        return None
+
+
+def _walk(folder: Path) -> Iterator[tuple[Path, re.Pattern[str]]]:
+    """Yield what is in a run's folder with the pattern of the names that a run writes there."""
+    for path in folder.iterdir():
+        if path.name in OWN_FOLDERS and path.is_dir() and not path.is_symlink():
+            for file in in_ranks(path):
+                yield file, OWN_FOLDERS[path.name]
+        elif path.name != LOCK:
+            yield path, OWN_FILES
+
+
+def _probe(folder: Path) -> None:
+    """Make the folder if it is not there, and see whether files can be written in it."""
+    try:
+        make_folder(folder)
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(bytes(4096))
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error

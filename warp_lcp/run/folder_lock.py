@@ -1,0 +1,97 @@
+"""One process a run's folder: a lock that ends with its process, however that ends."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from warp_lcp.scene.foreign import one_line
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+LOCK = "run.lock"
+BUSY = (errno.EWOULDBLOCK, errno.EACCES)
+
+
+class FolderBusyError(RuntimeError):
+    """Another process runs in the folder. The message names it."""
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[list[str]]:
+    """Hold a folder; others are refused until the block, or the process, ends.
+
+    The system's lock on the file run.lock counts, not the file: one that a killed process left is taken over. The file tells people
+    who holds the folder.
+
+    Args:
+        folder: must exist.
+
+    Yields:
+        Remarks: a lock that was taken over, or a file system without locks, where two runs are not kept apart.
+
+    Raises:
+        FolderBusyError: another process holds it.
+        OSError: the file cannot be written.
+    """
+    if fcntl is None:
+        yield ["this system has no file locks: see to it that no other run writes into the folder"]
+        return
+    path = folder / LOCK
+    descriptor, remarks = _acquire(path)
+    try:
+        left = os.read(descriptor, 4096)
+        if left and not remarks:
+            remarks.append(f"{path}: left by {_describe(left)}, which did not end cleanly; taken over")
+        holder = {"pid": os.getpid(), "host": socket.gethostname(), "since": datetime.now().astimezone().isoformat(timespec="seconds")}
+        os.ftruncate(descriptor, 0)
+        os.pwrite(descriptor, json.dumps(holder).encode(), 0)
+        yield remarks
+    finally:
+        with suppress(OSError):  # already gone, or a disk that has become read-only
+            path.unlink()  # while it is still locked: whoever opened it before sees that it is not there any more
+        os.close(descriptor)
+
+
+def _acquire(path: Path) -> tuple[int, list[str]]:
+    """Return a locked descriptor of the file that is at `path` now."""
+    while True:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            held = os.read(descriptor, 4096)
+            if error.errno in BUSY:
+                os.close(descriptor)
+                message = f"{path.parent}: another run writes there ({_describe(held)}); wait for it, stop it, or choose another folder"
+                raise FolderBusyError(message) from error
+            return descriptor, [f"{path}: the file system has no locks ({error.strerror}): see to it that no other run writes there"]
+        if _is_at(descriptor, path):
+            return descriptor, []
+        os.close(descriptor)  # its holder ended, and removed it, between the two calls
+
+
+def _is_at(descriptor: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(descriptor), os.stat(path))
+    except FileNotFoundError:
+        return False
+
+
+def _describe(text: bytes) -> str:
+    """Return who wrote a lock file."""
+    try:
+        holder: Any = json.loads(text)
+        return one_line(f"process {int(holder['pid'])} on {holder['host']}, since {holder['since']}")
+    except (ValueError, KeyError, TypeError):
+        return "an unknown process"

@@ -1,0 +1,70 @@
+"""What a run's folder lacks of the steps and frames before the one that the run goes on from: somebody has cut or deleted files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from itertools import pairwise
+from pathlib import Path
+
+from warp_lcp.run.checkpoint import CheckpointError, CheckpointFolder
+from warp_lcp.frames.frames import FrameFolder
+from warp_lcp.run.log import rows_until
+from warp_lcp.simulation import Part, Volume
+
+
+def gaps(
+    log: Path, columns: Sequence[str], frames: FrameFolder, checkpoints: CheckpointFolder, *, step: int, times: Sequence[float],
+    frame: Sequence[Part],
+) -> list[str]:  # fmt: skip
+    """Return a line for each file or kind of files that has holes, with what to do about it; the checkpoints that it takes are spared.
+
+    Args:
+        log: log.csv.
+        columns: of it.
+        frames: the run's frames.
+        checkpoints: the run's checkpoints.
+        step: that the run goes on from.
+        times: of the frames up to there, beginning with frame 0 [s].
+        frame: as the run would write it now.
+
+    Raises:
+        ValueError: the log has other columns.
+    """
+    lines = []
+    rows = {int(row.split(",", 1)[0]) for row in rows_until(log, ",".join(columns), step)[1:]}
+    steps = sorted({*range(1, step + 1)} - rows)
+    if steps:
+        again = _again(checkpoints, lambda found, _: found < steps[0])
+        lines.append(f"{log.name}: rows are missing, of steps {spans(steps)}; {again}")
+    missing = {name: numbers for name in frames.kinds(frame) if (numbers := frames.missing(name, len(times)))}
+    if missing:
+        first = times[min(min(numbers) for numbers in missing.values())]
+        listed = ", ".join(f"{name} {spans(numbers)}" for name, numbers in missing.items())
+        lines.append(f"{frames.frames.name}: {listed} are missing or cut; {_again(checkpoints, lambda _, time: time < first)}")
+    lost = [part.name for part in frame if not isinstance(part, Volume) and not (frames.folder / f"{part.name}.pvd").is_file()]
+    return [*lines, *(f"{name}.pvd: is missing; written anew from the frames that are there" for name in lost)]
+
+
+def spans(numbers: Iterable[int]) -> str:
+    """Return increasing numbers in words, such as `3 to 5, 8`."""
+    ends: list[list[int]] = []
+    for number in numbers:
+        if ends and ends[-1][1] == number - 1:
+            ends[-1][1] = number
+        else:
+            ends.append([number, number])
+    return ", ".join(str(low) if low == high else f"{low} to {high}" for low, high in ends)
+
+
+def _again(checkpoints: CheckpointFolder, is_before: Callable[[int, float], bool]) -> str:
+    """Return how to have again what is missing, given what tells whether a checkpoint's step and time are before it."""
+    steps = checkpoints.steps()
+    for newer, step in pairwise(steps):
+        try:
+            if is_before(step, checkpoints.read(step).time):
+                checkpoints.spared.add(step)
+                away = f" of step {newer}" if newer == steps[0] else f"s of steps {newer} to {steps[0]}"
+                return f"to have them again, move the checkpoint{away} away and resume from that of step {step}"
+        except CheckpointError:
+            continue
+    return "no checkpoint is from before them: only --force, from the start, makes them again"

@@ -1,0 +1,89 @@
+"""The scene that a run is given: a file with what `--set` overrides, also when it goes on, with what was overridden before."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from warp_lcp.run.continuation import RESOLUTION
+from warp_lcp.run.folder import SCENE, OutputError, holds_run, read_record, recorded_keys
+from warp_lcp.scene.scene import Scene
+from warp_lcp.scene.scene_file import keys, load_scene, override_key, override_value, scene_value
+
+Overrides = list[dict[str, str]]  # `set`: what was given, `file`: the value that the scene's file had, if that was looked at
+
+
+@dataclass(frozen=True)
+class GivenScene:
+    """A scene and where it differs from its file.
+
+    Args:
+        scene: what to run.
+        overrides: for run.json, so that a run that goes on keeps them.
+        kept: those of them that earlier parts of the run were given.
+    """
+
+    scene: Scene
+    overrides: Overrides = field(default_factory=list)
+    kept: list[str] = field(default_factory=list)
+
+
+def given_scene(source: str, overrides: Sequence[str]) -> GivenScene:
+    """Return the scene of a new run.
+
+    Args:
+        source: as of `load_scene`.
+        overrides: as of `load_scene`.
+
+    Raises:
+        SceneError: listing everything that is wrong.
+    """
+    return GivenScene(load_scene(source, overrides), _noted(source, overrides))
+
+
+def scene_to_resume(folder: Path, source: str | None, overrides: Sequence[str]) -> GivenScene:
+    """Return the scene of a run that goes on.
+
+    It is the folder's own one, or `source` as it is now with what `--set` has changed since the run began; where the file has a value that
+    it did not have then, somebody has edited it, and that counts. `overrides` count last.
+
+    Args:
+        folder: of the run.
+        source: as of `load_scene`; None: the folder's own scene.
+        overrides: as of `load_scene`.
+
+    Raises:
+        OutputError: there is no run, or its grid would become another one without being asked for.
+        SceneError: listing everything that is wrong.
+    """
+    if not holds_run(folder):
+        raise OutputError(f"{folder}: there is no run to resume")
+    own, asked = folder / SCENE, [override_key(override) for override in overrides]
+    before = [entry for entry in _recorded(folder) if override_key(entry["set"]) not in asked]
+    if source is None or (own.is_file() and Path(source).is_file() and own.samefile(source)):
+        return GivenScene(load_scene(own, overrides), [*before, *({"set": override} for override in overrides)])
+
+    kept = [entry["set"] for entry in before if not _edited(entry, source)]
+    scene = load_scene(source, [*kept, *overrides])
+    ran, now = (recorded_keys(own) or {}).get(RESOLUTION), keys(scene)[RESOLUTION]
+    if ran not in (None, now) and RESOLUTION not in asked:
+        raise OutputError(
+            f"{folder}: {RESOLUTION} is {ran}, that of {source} {now}: with --set {RESOLUTION}={now} the run goes on on the other grid, "
+            f"with --set {RESOLUTION}={ran} on its own"
+        )
+    return GivenScene(scene, _noted(source, [*kept, *overrides]), kept)
+
+
+def _edited(entry: Mapping[str, str], source: str) -> bool:
+    """Return whether the scene's file has another value than when it was overridden, and not the one that it was overridden by."""
+    return "file" in entry and scene_value(source, entry["set"]) not in (entry["file"], override_value(entry["set"]))
+
+
+def _noted(source: str, overrides: Sequence[str]) -> Overrides:
+    return [{"set": override, "file": scene_value(source, override)} for override in overrides]
+
+
+def _recorded(folder: Path) -> Overrides:
+    """Return what run.json says of the overrides; nothing if it cannot be read."""
+    return [entry for entry in read_record(folder).get("overrides", []) if "set" in entry]

@@ -1,0 +1,91 @@
+"""log.csv: a row a time step."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TextIO
+
+from warp_lcp.frames.atomic import write_text
+
+Value = float | int | str | None
+
+
+class Log:
+    """A CSV file that grows by a row a step. What has no value is empty, never nan; every row reaches the system at once."""
+
+    def __init__(self, path: Path, columns: tuple[str, ...], *, after_step: int | None = None) -> None:
+        """Begin a log, or continue one.
+
+        Args:
+            path: the file.
+            columns: all of its columns; the first is `step`.
+            after_step: continue an existing file behind this step; later rows, and a last row cut short, are dropped.
+
+        Raises:
+            OSError: the file cannot be written.
+            ValueError: the existing file has other columns.
+        """
+        self.columns = columns
+        header = ",".join(columns)
+        lines = [header] if after_step is None else rows_until(path, header, after_step)
+        write_text(path, "".join(f"{line}\n" for line in lines))
+        self._file: TextIO = open(path, "a", buffering=1, encoding="utf-8", newline="")  # noqa: SIM115 - `close` closes it
+        self._writer = csv.DictWriter(self._file, columns, lineterminator="\n")
+
+    def append(self, row: Mapping[str, Value]) -> None:
+        """Write a row; columns that it lacks are empty.
+
+        Raises:
+            OSError: the disk is full.
+            ValueError: the row has a value for a column that the log lacks.
+        """
+        self._writer.writerow({name: _cell(value) for name, value in row.items()})
+
+    def sync(self) -> None:
+        """Wait until the rows are on the disk.
+
+        Raises:
+            OSError: the disk is full.
+        """
+        self._file.flush()
+        os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def _cell(value: Value) -> Value:
+    if isinstance(value, bool):
+        return int(value)
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None  # float(): NumPy's scalars write themselves otherwise
+    return value
+
+
+def rows_until(path: Path, header: str, step: int) -> list[str]:
+    """Return the header of a log and its rows up to a step, in their order; rows that are cut short or of no step are left out.
+
+    Args:
+        path: the file; there may be none.
+        header: that it must have, unless it was cut even there.
+        step: the last one.
+
+    Raises:
+        ValueError: the file has other columns.
+    """
+    text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else f"{header}\n"
+    found, *rows = text.split("\n")[:-1] or [""]  # what no line break ends was cut
+    if found != header and (rows or not header.startswith(found)):
+        raise ValueError(f"{path}: its columns are {found!r}, this run's are {header!r}")
+    kept, last = [header], 0
+    for row in rows:
+        number = row.split(",", 1)[0]
+        if row.count(",") >= header.count(",") and number.isdecimal() and last < int(number) <= step:
+            kept.append(row)
+            last = int(number)
+    return kept

@@ -1,0 +1,48 @@
+"""The folder that a run records its pressure problems in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from warp_lcp.frames.atomic import make_folder, replacing, write_text
+from warp_lcp.run.folder import OutputError
+from warp_lcp.gallery.recorded import DESCRIPTION, files
+
+README = "README.md"
+
+
+class ProblemFolder:
+    """Files `problem_<step>.npz` and a README.md that says what they hold.
+
+    Args:
+        folder: where; made if it is not there.
+        more: whether there may be problems already, of a run that goes on.
+
+    Raises:
+        OutputError: the folder cannot be written to, or holds another run's problems.
+    """
+
+    def __init__(self, folder: Path, *, more: bool = False) -> None:
+        """Make the folder and describe what will be in it."""
+        self.folder = folder
+        if not more and files(folder):
+            raise OutputError(f"--record-problems {folder}: holds recorded problems already; name another folder")
+        try:
+            make_folder(folder)
+            write_text(folder / README, DESCRIPTION)
+        except OSError as error:
+            raise OutputError(f"--record-problems {folder}: {error}") from error
+
+    def write(self, problem: Mapping[str, np.ndarray]) -> Path:
+        """Write a problem atomically; one of the same step, which was tried before, is replaced.
+
+        Raises:
+            OSError: the file cannot be written; the earlier ones are intact.
+        """
+        path = self.folder / f"problem_{int(problem['step']):06d}.npz"
+        with replacing(path) as temporary, open(temporary, "wb") as file:
+            np.savez_compressed(file, **problem)  # type: ignore[arg-type]
+        return path

@@ -1,0 +1,204 @@
+"""Where a run's time goes: seconds and bytes by stage."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import warp as wp
+
+from warp_lcp.frames.atomic import write_text
+
+PROFILE = "profile.json"
+KERNELS = "kernels, loaded"  # the stage of modules that Warp compiles, or finds compiled
+LOADED = re.compile(r"Module .* took ([0-9.]+) ms")  # what Warp says of each
+NOTHING = nullcontext()
+
+
+class Stopwatch(Protocol):
+    """What a run and its simulation mark their stages with."""
+
+    def stage(self, name: str, *arrays: wp.array | None) -> AbstractContextManager[None]:
+        """Return the context of a stage; the stages of a thread do not overlap.
+
+        Args:
+            name: of the stage, which may have several parts.
+            arrays: what it must read or write.
+        """
+
+    def beside(self, name: str) -> AbstractContextManager[None]:
+        """Return the context of what another thread does meanwhile."""
+
+    def wrote(self, name: str, *files: Path) -> None:
+        """Add the sizes of files to a stage."""
+
+
+class NoStopwatch:
+    """Measure nothing: no clock is read, nothing waits for the device."""
+
+    def stage(self, name: str, *arrays: wp.array | None) -> AbstractContextManager[None]:
+        """Return a context that does nothing."""
+        return NOTHING
+
+    def beside(self, name: str) -> AbstractContextManager[None]:
+        """Return a context that does nothing."""
+        return NOTHING
+
+    def wrote(self, name: str, *files: Path) -> None:
+        """Do nothing."""
+
+
+@dataclass
+class Stage:
+    """What a stage took.
+
+    Args:
+        beside: it ran on a thread of its own.
+        calls: how often it was entered.
+        seconds: in all.
+        first_seconds: of the first call, which may allocate.
+        bytes: what it had to read or write at least: its arrays, each counted once a call, or its files.
+    """
+
+    beside: bool = False
+    calls: int = 0
+    seconds: float = 0.0
+    first_seconds: float = 0.0
+    bytes: int = 0
+
+    def add(self, seconds: float) -> None:
+        """Count a call."""
+        self.first_seconds = self.first_seconds if self.calls else seconds
+        self.calls += 1
+        self.seconds += seconds
+
+
+class LoadedKernels:
+    """A logger for Warp that adds up the time kernels take to be compiled and loaded; what else Warp says goes where it went.
+
+    Attributes:
+        loads: of modules.
+    """
+
+    def __init__(self) -> None:
+        """Begin with nothing."""
+        self.loads = Stage()
+        self._logger, self._level = wp.get_logger(), wp.config.log_level
+
+    def debug(self, message: str) -> None:
+        """Pass a message on."""
+        if self._level <= wp.LOG_DEBUG:
+            self._logger.debug(message)
+
+    def info(self, message: str) -> None:
+        """Pass a message on, and count it if it tells of a module."""
+        if found := LOADED.search(message):
+            self.loads.add(float(found[1]) * 1e-3)
+        if self._level <= wp.LOG_INFO:
+            self._logger.info(message)
+
+    def warning(self, message: str, category: type[Warning] | None = None, stacklevel: int = 1) -> None:
+        """Pass a message on."""
+        if self._level <= wp.LOG_WARNING:
+            self._logger.warning(message, category, stacklevel=stacklevel + 1)
+
+    def error(self, message: str) -> None:
+        """Pass a message on."""
+        self._logger.error(message)
+
+
+class Profile:
+    """Measure stages on a device, which is waited for at the begin and the end of each.
+
+    Args:
+        device: a Warp device, such as `cuda:0`.
+
+    Attributes:
+        stages: by name, in the order of their first calls.
+    """
+
+    def __init__(self, device: str) -> None:
+        """Begin with nothing."""
+        self.stages: dict[str, Stage] = {}
+        self._device = wp.get_device(device)
+        self._loads = Stage()
+
+    @contextmanager
+    def kernels_apart(self) -> Iterator[None]:
+        """Count the time that kernels take to be compiled and loaded as a stage of its own, not as that of the stage that needs them."""
+        kernels = LoadedKernels()
+        self.stages[KERNELS] = self._loads = kernels.loads
+        with wp.ScopedLogger(kernels), wp.ScopedLogLevel(min(wp.config.log_level, wp.LOG_INFO)):
+            yield
+
+    @contextmanager
+    def stage(self, name: str, *arrays: wp.array | None) -> Iterator[None]:
+        """Measure a stage of the run's own thread."""
+        self._wait()
+        loading, begun = self._loads.seconds, time.perf_counter()
+        try:
+            yield
+        finally:
+            self._wait()
+            stage = self.stages.setdefault(name, Stage())
+            stage.add(time.perf_counter() - begun - (self._loads.seconds - loading))
+            stage.bytes += sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays if array is not None)
+
+    @contextmanager
+    def beside(self, name: str) -> Iterator[None]:
+        """Measure what another thread does meanwhile."""
+        begun = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.stages.setdefault(name, Stage(beside=True)).add(time.perf_counter() - begun)
+
+    def wrote(self, name: str, *files: Path) -> None:
+        """Add the sizes of files to a stage."""
+        self.stages[name].bytes += sum(file.stat().st_size for file in files)
+
+    def table(self, steps: int, seconds: float) -> list[str]:
+        """Return lines that show the stages, and what no stage accounts for.
+
+        Args:
+            steps: that the run took.
+            seconds: that it took.
+        """
+        rows = [("stage", "seconds", "share", "ms a step", "MB a step", "GB/s")]
+        for name, stage in self.stages.items():
+            rows.append((f"({name})" if stage.beside else name, *_figures(stage.seconds, stage.bytes, steps, seconds)))
+        rest = seconds - sum(stage.seconds for stage in self.stages.values() if not stage.beside)
+        rows += [("rest", *_figures(rest, 0, steps, seconds)), ("all", *_figures(seconds, 0, steps, seconds))]
+        return [f"{row[0]:<22}" + "".join(f"{cell:>11}" for cell in row[1:]).rstrip() for row in rows]
+
+    def write(self, folder: Path, steps: int, seconds: float) -> None:
+        """Write profile.json.
+
+        Args:
+            folder: of the run.
+            steps: that the run took.
+            seconds: that it took.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        stages = [{"stage": name, **vars(stage)} for name, stage in self.stages.items()]
+        data = {"device": self._device.alias, "steps": steps, "seconds": seconds, "stages": stages}
+        write_text(folder / PROFILE, json.dumps(data, indent=2) + "\n")
+
+    def _wait(self) -> None:
+        if self._device.is_cuda:
+            wp.synchronize_device(self._device)
+
+
+def _figures(seconds: float, moved: int, steps: int, total: float) -> tuple[str, str, str, str, str]:
+    each = max(steps, 1)
+    speed = f"{moved / seconds / 1e9:.2f}" if moved and seconds > 0.0 else ""
+    share = f"{seconds / total:.1%}" if total > 0.0 else ""
+    return f"{seconds:.3f}", share, f"{seconds / each * 1e3:.3f}", f"{moved / each / 1e6:.2f}" if moved else "", speed

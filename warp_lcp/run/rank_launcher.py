@@ -1,0 +1,189 @@
+"""The ranks of MPI as those who carry out a command: they start alike, the first one speaks, and they end alike."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import typer
+import warp as wp
+
+from warp_lcp.distributed.devices import device_of_rank
+from warp_lcp.distributed.meeting import Meeting, RankFailed
+from warp_lcp.distributed.ranks import Ranks
+from warp_lcp.run.continuation import mesh_digests
+from warp_lcp.run.launcher import Crew
+from warp_lcp.run.devices import DeviceError, devices
+from warp_lcp.run.engine import EngineError
+from warp_lcp.run.given_scene import GivenScene
+from warp_lcp.run.parallel_run import run_on_ranks
+from warp_lcp.run.profile import Profile
+from warp_lcp.run.progress import Observer
+from warp_lcp.run.folder import OutputError, RunFolder, RunRecord
+from warp_lcp.scene.scene_file import keys
+from warp_lcp.simulation import SimulationFailed, StepFailed
+from warp_lcp.cli.solve_file import ProblemError
+from warp_lcp.scene.table import SceneError, written
+from warp_lcp.run.terminal import Terminal, say, tell
+
+WRONG_INPUT = (SceneError, OutputError, DeviceError, EngineError, ProblemError)
+PLANNED = (OSError, *WRONG_INPUT, StepFailed, SimulationFailed)
+SIZES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE")  # how many processes mpiexec has started, as it tells them
+NUMBERS = ("OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK")  # which of them this one is
+SHOWN = 4  # differences in one message
+
+
+class RankCrew(Crew):
+    """One of the ranks; every method is collective.
+
+    Args:
+        ranks: all of them.
+    """
+
+    def __init__(self, ranks: Ranks) -> None:
+        """Let the first rank speak."""
+        super().__init__(Terminal(stderr=True, quiet=not ranks.first), speaks=ranks.first)
+        if not ranks.first:
+            wp.config.log_level = wp.LOG_ERROR
+        self.meeting = Meeting(ranks, PLANNED, self._last_words)
+        self._folder: RunFolder | None = None
+
+    def load(self, scene: str | None, overrides: Sequence[str], options: Mapping[str, Any]) -> GivenScene:
+        """Return a scene that is the same on all ranks.
+
+        Raises:
+            SceneError: listing everything that is wrong.
+            OutputError: ranks were started with different scenes or options; the message names what differs.
+        """
+        with self.meeting.together():
+            given = super().load(scene, overrides, options)
+            meshes = {f"the content of {key}": value for key, value in mesh_digests(given.scene).items()}
+        self.agree({**options, **keys(given.scene), **meshes})
+        return given
+
+    def choose_device(self, name: str | None) -> str:
+        """Return the device of this rank.
+
+        Raises:
+            DeviceError: there is no such device.
+        """
+        devices()  # starts Warp without its native messages
+        with self.meeting.together():
+            try:
+                return device_of_rank(self.meeting.ranks, name)
+            except ValueError as error:
+                raise DeviceError(str(error).removesuffix(f" (rank {self.meeting.ranks.rank})")) from error  # the meeting names it
+
+    def place(self, device: str) -> str:
+        """Return where the ranks work, in words."""
+        size = self.meeting.ranks.size
+        return f"{size} rank{'s' if size > 1 else ''} ({device})"
+
+    def run(
+        self,
+        given: GivenScene,
+        out: Path,
+        *,
+        device: str,
+        observer: Observer,
+        last_frame: int | None,
+        resume: bool,
+        force: bool,
+        force_memory: bool,
+        stop: Callable[[], bool | str],
+        profile: Profile | None,
+        record_problems: Path | None,
+    ) -> RunRecord:
+        """Simulate a scene that `load` returned, as `run_on_ranks` does.
+
+        Raises:
+            OutputError: the folder cannot take the run.
+            SceneError: the scene cannot be simulated.
+        """
+        if record_problems is not None:
+            raise OutputError("--record-problems: not with --engine petsc, whose ranks have but parts of a problem")
+        self._folder = RunFolder(out, given.scene)
+        return run_on_ranks(
+            given.scene, out, meeting=self.meeting, device=device, observer=observer, overrides=given.overrides, last_frame=last_frame,
+            resume=resume, force=force, force_memory=force_memory, stop=stop, profile=profile,
+        )  # fmt: skip
+
+    @property
+    def ranks(self) -> Ranks:
+        """Who share the work."""
+        return self.meeting.ranks
+
+    def agree(self, given: Mapping[str, Any]) -> None:
+        """Check that all ranks were given the same values, by their names.
+
+        Raises:
+            OutputError: they were not; the message names what differs.
+        """
+        digests = self.meeting.exchange(hashlib.blake2b(pickle.dumps(sorted(given.items(), key=lambda item: item[0]))).digest())
+        if digests.count(digests[0]) == len(digests):
+            return
+        everyone = self.meeting.exchange(dict(given))
+        names = sorted({name for values in everyone for name in values if any(other.get(name) != values[name] for other in everyone)})
+        lines = []
+        for name in names[:SHOWN]:
+            rank = next(r for r, values in enumerate(everyone) if values.get(name) != everyone[0].get(name))
+            lines.append(f"{name}: {_shown(everyone[0].get(name))} on rank 0, {_shown(everyone[rank].get(name))} on rank {rank}")
+        if len(names) > SHOWN:
+            lines.append(f"and {len(names) - SHOWN} more")
+        raise OutputError("\n  ".join(["the ranks were started with different scenes or options", *lines]))
+
+    def _last_words(self, text: str) -> None:
+        """Say why all processes end now, and write it into run.json, which the first rank cannot do from inside MPI."""
+        tell(text, error=True)
+        if self._folder is not None:
+            with suppress(OSError):
+                lines = text.splitlines()
+                who = f"rank {self.meeting.ranks.rank}"
+                self._folder.mark_failed(f"{who}: {lines[-2]}" if "Traceback" in lines[0] else lines[0])
+
+
+@contextmanager
+def ranks_together() -> Iterator[RankCrew]:
+    """Give this process's part in what all ranks do; those that do not speak end silently, with the exit code of the first.
+
+    Raises:
+        EngineError: MPI or PETSc is missing, or of another kind than mpiexec.
+        typer.Exit: the ranks have failed, and this one has nothing to say of it.
+    """
+    try:
+        ranks = Ranks.world()
+    except ImportError as error:
+        if _number() != "0":
+            raise typer.Exit(2) from error
+        raise EngineError(f"--engine petsc: {error}") from error
+    started = next((os.environ[name] for name in SIZES if name in os.environ), "1")
+    if started != "1" and ranks.size == 1:
+        raise EngineError(
+            f"--engine petsc: mpiexec has started {started} processes, but mpi4py knows only one: they are of different MPIs; use the "
+            "mpiexec of the MPI that mpi4py was built with"
+        )
+    try:
+        crew = RankCrew(ranks)
+        with crew.meeting.together():
+            yield crew
+    except RankFailed as error:
+        say(crew.console, str(error))
+        raise typer.Exit(1) from error
+    except PLANNED as error:
+        if ranks.first:
+            raise
+        raise typer.Exit(2 if isinstance(error, WRONG_INPUT) else 1) from error
+
+
+def _number() -> str:
+    """Return this process's number among those that mpiexec has started, as it says."""
+    return next((os.environ[name] for name in NUMBERS if name in os.environ), "0")
+
+
+def _shown(value: Any) -> str:
+    return "nothing" if value is None else written(value)

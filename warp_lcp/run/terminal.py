@@ -1,0 +1,102 @@
+"""Where the command line writes: what others wrote is made harmless, and a terminal that is gone is no error."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable
+from contextlib import suppress
+from typing import Any
+
+import typer
+from rich.console import Console, ConsoleOptions, ConsoleRenderable, RenderHook, RenderResult
+from rich.segment import Segment
+from typer.core import TyperGroup
+
+from warp_lcp.scene.foreign import one_line, visible
+from warp_lcp.run.kernel_cache import KernelCacheError
+
+FREE_TEXT = "--set"  # its values may be arrays of several lines
+Refusal: Any = typer.BadParameter.__mro__[2]  # click's ClickException, which new versions of typer have inside them
+
+
+class Terminal(Console):
+    """A console whose own colors and bars reach the terminal, and no control character of the text that it is given."""
+
+    def __init__(self, **options: Any) -> None:
+        """Take rich's options."""
+        super().__init__(**options)
+        self.push_render_hook(_Harmless())
+
+    def on_broken_pipe(self) -> None:
+        """Be quiet from now on: whoever read has ended, which ends no run."""
+        self.quiet = True
+
+
+class Commands(TyperGroup):
+    """The commands; wrong usage is told as everything else is."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Refuse control characters, which no name needs and which a message cannot show within its line."""
+        for before, argument in zip(["", *args], args, strict=False):
+            if before != FREE_TEXT and not argument.startswith(f"{FREE_TEXT}=") and any(c < " " or c == "\x7f" for c in argument):
+                raise typer.BadParameter(f"{one_line(argument)}: holds control characters; choose another name", ctx)
+        return super().parse_args(ctx, args)
+
+    def main(self, *arguments: Any, **options: Any) -> Any:
+        """Run a command; what the output's encoding lacks is escaped."""
+        for stream in (sys.stdout, sys.stderr):
+            if hasattr(stream, "reconfigure"):
+                stream.reconfigure(errors="backslashreplace")
+        return super().main(*arguments, **options)
+
+    def make_context(self, *arguments: Any, **options: Any) -> Any:
+        """Begin a command."""
+        try:
+            return super().make_context(*arguments, **options)
+        except Refusal as error:
+            error.message = visible(error.message)
+            raise
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run a command."""
+        try:
+            return super().invoke(ctx)
+        except Refusal as error:
+            error.message = visible(error.message)
+            raise
+        except (KernelCacheError, KeyboardInterrupt) as error:
+            tell(error if isinstance(error, KernelCacheError) else "stopped: interrupted", error=True)
+            raise typer.Exit(1) from error
+
+
+def say(console: Console, text: str) -> None:
+    """Write a text to a console, without markup; a terminal that was closed is no error."""
+    with suppress(OSError):
+        console.print(visible(text), markup=False, highlight=False, soft_wrap=True)
+
+
+def tell(text: object, *, error: bool = False) -> None:
+    """Write a text of one or more lines to the output, or to the error stream; a stream that nobody reads any more is no error."""
+    with suppress(BrokenPipeError):
+        typer.echo(visible(str(text)), err=error)
+
+
+class _Harmless(RenderHook):
+    """Wraps what a console prints."""
+
+    def process_renderables(self, renderables: list[ConsoleRenderable]) -> list[ConsoleRenderable]:
+        """Return renderables whose text is visible."""
+        return [_Visible(renderable) for renderable in renderables]
+
+
+class _Visible:
+    """A renderable whose text is visible."""
+
+    def __init__(self, renderable: ConsoleRenderable) -> None:
+        self._renderable = renderable
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Render, without what the text says to the terminal."""
+        segments: Iterable[Segment] = console.render(self._renderable, options)
+        for segment in segments:
+            yield segment if segment.control else Segment(visible(segment.text), segment.style)

@@ -1,0 +1,220 @@
+"""A run's first frames without its folder: seconds of its steps, and what there was to see, to compare with another's."""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.run.check import start
+from warp_lcp.run.loop import SAME_TIME, take_step
+from warp_lcp.scene.scene import Scene
+from warp_lcp.simulation import Points, Simulation
+from warp_lcp.scene.table import Problem, SceneError
+
+FRONT = 99.0  # percentile of the particles that the front is of
+LOOKS = 6  # at the most: frames that are compared
+BIN = 2.0  # cells: the edge of the boxes that densities are compared in, so that particles' own noise averages out
+
+
+@dataclass(frozen=True)
+class Look:
+    """What there is to see at a time.
+
+    Attributes:
+        time: [s].
+        mass: of the material in each box of a coarse grid [kg; 2-D: kg/m], one axis a dimension.
+        energy: kinetic and potential, of the origin's height [J; 2-D: J/m].
+        front: the x that 99 % of the particles have not reached [m].
+    """
+
+    time: float
+    mass: np.ndarray
+    energy: float
+    front: float
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What a run's first frames took and showed.
+
+    Attributes:
+        seconds: of the steps, frames not counted. On the CPU those of the process, which other programs disturb least.
+        steps: taken.
+        iterations: of the method, in all steps.
+        linear_iterations: on the finest grid, in all steps.
+        looks: at the start and then at equal distances in time.
+        residual: the largest relative residual of a step, coupled residual of sand.
+        volume: at the start of the first step and of the last [m^3; 2-D: m^2]; None: the log has no volume.
+        packing: the most of a cell at the start of a step, in units of the densest packing; None: the log does not say.
+        penetration: share of the particles that have ended inside solids or walls; None: the simulation does not tell.
+    """
+
+    seconds: float
+    steps: int
+    iterations: int
+    linear_iterations: int
+    looks: tuple[Look, ...]
+    residual: float
+    volume: tuple[float, float] | None = None
+    packing: float | None = None
+    penetration: float | None = None
+
+    @property
+    def volume_drift(self) -> float | None:
+        """Return by how much the volume has grown, relative; None: it is not known."""
+        return None if self.volume is None or self.volume[0] == 0.0 else self.volume[1] / self.volume[0] - 1.0
+
+    def distance(self, reference: Trial) -> float:
+        """Return the share of the mass that is elsewhere than in a reference run, the mean over the looks: 0 alike, 1 all of it.
+
+        Raises:
+            ValueError: the two were not looked at alike.
+        """
+        shares = []
+        for own, other in zip(self.looks[1:], reference.looks[1:], strict=True):
+            if own.mass.shape != other.mass.shape or abs(own.time - other.time) > SAME_TIME:
+                raise ValueError("the two runs were looked at in other boxes or at other times")
+            total = float(other.mass.sum())
+            shares.append(0.5 * float(np.abs(own.mass - other.mass).sum()) / total if total > 0.0 else 0.0)
+        return float(np.mean(shares))
+
+    def energy_error(self, reference: Trial) -> float:
+        """Return the largest difference from a reference's energy, relative to the largest that the reference had."""
+        scale = max(abs(look.energy) for look in reference.looks)
+        differences = [abs(a.energy - b.energy) for a, b in zip(self.looks, reference.looks, strict=True)]
+        return max(differences) / scale if scale > 0.0 else 0.0
+
+    def volume_error(self, reference: Trial) -> float:
+        """Return the difference from a reference in the growth of the volume, or in how densely sand was packed; 0 if not known."""
+        for own, other in ((self.volume_drift, reference.volume_drift), (self.packing, reference.packing)):
+            if own is not None and other is not None:
+                return abs(own - other)
+        return 0.0
+
+    def front_error(self, reference: Trial) -> float:
+        """Return the front's lead over a reference's at the end [m]."""
+        return self.looks[-1].front - reference.looks[-1].front
+
+
+def look_times(scene: Scene, frames: int) -> list[float]:
+    """Return the frames' times [s] that are looked at, the last of `frames` among them."""
+    last = min(frames, scene.time.frame_count)
+    every = max(1, -(-last // LOOKS))
+    return [scene.time.frame_time(n) for n in range(last, 0, -every)][::-1]
+
+
+def trial(
+    scene: Scene, *, device: str, frames: int, box: float | None = None, inspect: Callable[[Simulation], object] | None = None
+) -> Trial:
+    """Run a scene's first frames.
+
+    Args:
+        scene: what to simulate.
+        device: a Warp device.
+        frames: how many.
+        box: edge of the boxes that mass is summed in [m]; two cells unless given.
+        inspect: is shown the simulation at the end.
+
+    Raises:
+        SceneError: the scene cannot be simulated, or shows no particles.
+        StepFailed: a step missed its criteria, with shorter steps too.
+        SimulationFailed: the run cannot go on.
+    """
+    simulation = start(scene, device)
+    ran = _Trial(scene, simulation, device, box or BIN * scene.spacing)
+    found = ran.run(look_times(scene, frames), min(frames, scene.time.frame_count))
+    if inspect is not None:
+        inspect(simulation)
+    return found
+
+
+class _Trial:
+    """A simulation that is timed and looked at."""
+
+    def __init__(self, scene: Scene, simulation: Simulation, device: str, box: float) -> None:
+        self.scene, self.simulation, self.device, self.box = scene, simulation, device, box
+        self.rows: list[dict[str, float | int | str | None]] = []
+        self.seconds = 0.0
+
+    def run(self, times: Sequence[float], frames: int) -> Trial:
+        """Step to the last frame and look at `times` [s]."""
+        looks: list[Look] = []
+        for frame in range(1, frames + 1):
+            end = self.scene.time.frame_time(frame)
+            while end - self.simulation.time > SAME_TIME / self.scene.time.frames_per_second:
+                self._step(end)
+                if not looks:
+                    looks.append(self._look())  # the first step tells energy and mass
+            if any(abs(end - time) < SAME_TIME for time in times):
+                looks.append(self._look())
+        volumes = self._known("volume")
+        return Trial(
+            self.seconds, len(self.rows), self._sum("solve_iterations"), self._sum("linear_iterations"), tuple(looks),
+            volume=(volumes[0], volumes[-1]) if volumes else None,
+            residual=self._most("coupled_residual" if "coupled_residual" in self.rows[-1] else "solve_residual") or 0.0,
+            packing=self._most("max_fraction"), penetration=self._penetration(),
+        )  # fmt: skip
+
+    def _step(self, end: float) -> None:
+        """Take a step towards a time [s], as a run does."""
+        clock_of = clock.perf_counter if wp.get_device(self.device).is_cuda else clock.process_time
+        begun = clock_of()
+        self.rows.append(take_step(self.simulation, self.simulation.stable_dt(), end, self.scene.time)[2])
+        wp.synchronize_device(self.device)
+        self.seconds += clock_of() - begun
+
+    def _look(self) -> Look:
+        row, points = self.rows[-1], self._points()
+        energy = float(row.get("kinetic_energy") or 0.0) + float(row.get("potential_energy") or 0.0)
+        front = float(np.percentile(points[:, 0], FRONT)) if len(points) else 0.0
+        dimension, size = self.scene.dimension, self.scene.domain.size
+        return Look(self.simulation.time, float(row.get("mass") or 0.0) * spread(points[:, :dimension], size, self.box), energy, front)
+
+    def _points(self) -> np.ndarray:
+        points = next((part.points for part in self.simulation.frame() if isinstance(part, Points)), None)
+        if points is None:
+            raise SceneError(self.scene.scene.name, [Problem("scene.simulator", "shows no particles, which runs are compared by")])
+        return points
+
+    def _penetration(self) -> float | None:
+        boundary = getattr(self.simulation, "boundary", None)
+        points = self._points()
+        return None if boundary is None or not len(points) else 1.0 - float(np.mean(boundary.admits(points)))
+
+    def _sum(self, name: str) -> int:
+        return sum(int(row.get(name) or 0) for row in self.rows)
+
+    def _most(self, name: str) -> float | None:
+        return max(self._known(name), default=None)
+
+    def _known(self, name: str) -> list[float]:
+        """Return a column of the log without its empty cells."""
+        return [float(value) for row in self.rows if (value := row.get(name)) is not None]
+
+
+def spread(points: np.ndarray, size: Sequence[float], box: float) -> np.ndarray:
+    """Return the share of the points in each box of a grid, spread by tents as wide as two boxes.
+
+    Args:
+        points: [m], shape (n, dimension).
+        size: sides of the domain [m].
+        box: edge of a box [m].
+    """
+    dimension = points.shape[1]
+    counts = [max(1, round(side / box)) for side in size]
+    shares = np.zeros(counts)
+    if not len(points):
+        return shares
+    at = points / box - 0.5
+    low = np.floor(at).astype(np.int64)
+    upper = at - low
+    for corner in range(2**dimension):
+        ends = [corner >> axis & 1 for axis in range(dimension)]
+        weight = np.prod([upper[:, axis] if end else 1.0 - upper[:, axis] for axis, end in enumerate(ends)], axis=0)
+        where = [np.clip(low[:, axis] + end, 0, counts[axis] - 1) for axis, end in enumerate(ends)]
+        shares += np.bincount(np.ravel_multi_index(where, counts), weights=weight, minlength=shares.size).reshape(counts)
+    return shares / len(points)

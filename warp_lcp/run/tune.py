@@ -1,0 +1,305 @@
+"""The fastest settings for an accuracy: measured on a scene's own first frames, on the device that is to run it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from warp_lcp.run.accuracy import Bounds, spread_of
+from warp_lcp.frames.atomic import write_text
+from warp_lcp.scene.presets import Preset, PresetName, Prices, changed, price_table
+from warp_lcp.scene.scene import Scene
+from warp_lcp.scene.scene_file import HEADER, dump_scene
+from warp_lcp.simulation import SimulationFailed, StepFailed
+from warp_lcp.scene.table import Problem, SceneError
+from warp_lcp.run.trial import Trial, trial
+
+FRAMES = 18  # of the calibration, unless asked for otherwise: that many `warp-lcp bench tradeoff` compares
+CLOSE = 1.25  # settings that take at most so many times the shortest time are timed again, in turns
+SAME = 1.05  # times the shortest, or the nearest: noise of what was measured; among such times the nearer to the reference is taken
+ROUNDS = 2  # more timings of those
+TWINS = (0.9, 0.8)  # times the steps of the reference: runs as good as it, whose distances from each other say how sure it is
+TWICE = 1.7  # times the steps, about: the steps of a frame are whole numbers
+CORRECTED_EVERY = (4, 2, 1)  # steps between two density corrections, where the scene has them
+
+
+@dataclass
+class Candidate:
+    """Settings that were tried.
+
+    Attributes:
+        settings: by `section.key`.
+        trial: what they took and showed; its seconds are those of the first timing.
+        distance: share of the mass that is elsewhere than in the reference run.
+        seconds: the shortest of all timings.
+    """
+
+    settings: dict[str, Any]
+    trial: Trial
+    distance: float
+    seconds: float
+
+    def words(self) -> str:
+        """Return the settings as the command line takes them."""
+        return " ".join(f"{key}={value:g}" for key, value in self.settings.items())
+
+
+@dataclass
+class Tuning:
+    """What a tuning found.
+
+    Attributes:
+        scene: with the settings chosen.
+        chosen: those settings and what they take.
+        preset: whose bounds the accuracy is.
+        bounds: what runs were held to: those of the preset, or, with an unsure reference, of what is measured beside its noise.
+        limit: how many times those a run may differ: 1, or, where nothing tried is within them, hardly more than the nearest does.
+        noise: what runs as good as the reference differ by; None: it was not asked, for some settings are within the preset's own bounds.
+        reference: the run that the others were compared with.
+        tried: all settings that ran, in the order of the trials.
+        failed: settings whose run ended, and why.
+        frames: of each trial.
+    """
+
+    scene: Scene
+    chosen: Candidate
+    preset: Preset
+    bounds: Bounds
+    limit: float
+    noise: Bounds | None
+    reference: Trial
+    tried: list[Candidate]
+    failed: list[str]
+    frames: int
+
+    @property
+    def met(self) -> bool:
+        """Return whether the settings chosen are as near as the accuracy asks, or as can be told."""
+        return self.limit <= 1.0
+
+    def near_enough(self, own: Trial) -> bool:
+        """Return whether another run is as near to the reference as those that the fastest was chosen of."""
+        return self.bounds.miss(own, self.reference) <= self.limit
+
+    def verdict(self, accuracy: str) -> list[str]:
+        """Return in words what is the fastest, whether it keeps the accuracy, and where not, by how much, why, and what would help."""
+        best, asked, volume = self.chosen, self.preset, self.chosen.trial.volume_error(self.reference)
+        words = f"{best.words()}: {best.seconds:.3g} s"
+        found = f"distance {best.distance:.4f} (at most {asked.distance:g}), volume or packing {volume:.3f} (at most {asked.volume:g})"
+        if self.noise is None:
+            return [f"{accuracy}: {words}", found]
+        differences = (("distance", best.distance, asked.distance), ("volume or packing", volume, asked.volume))
+        missed = ", ".join(f"{name} by a factor of {own / most:.2g}" for name, own, most in differences if own > most)
+        unsure = f"runs as good as the reference differ by {self.noise.distance:.4f} and {self.noise.volume:.3f}"
+        if self.met:
+            return [
+                f"as near as can be told, not {accuracy}: {words}",
+                found,
+                f"bounds missed: {missed}; but {unsure}: nothing can be shown to be nearer",
+                "whatever their settings, runs drift so far apart in these frames: fewer --frames tell what holds before",
+            ]
+        return [f"the nearest that was tried, not {accuracy}: {words}", found, f"bounds missed: {missed}; {unsure}", self._remedy()]
+
+    def _remedy(self) -> str:
+        """Return what would help, by what shorter steps brought at the fine end of those tried."""
+        finest = max(self.tried, key=lambda c: c.trial.steps)
+        coarser = [c for c in self.tried if TWICE * c.trial.steps <= finest.trial.steps]
+        if not coarser:
+            return "shorter steps than those tried, or a higher domain.resolution, may help"
+        next_one = max(coarser, key=lambda c: c.trial.steps)
+        times, nearer = finest.trial.steps / next_one.trial.steps, finest.distance / next_one.distance
+        if nearer * TWICE <= 1.0:
+            return "the distance falls with the steps: shorter ones than those tried would help"
+        return (
+            f"{times:.2g} times as many steps left {100.0 * nearer:.0f} % of the distance, where the error of a step's length would leave "
+            "half or less: a higher domain.resolution would help, shorter steps hardly"
+        )
+
+    def rows(self) -> list[tuple[str, ...]]:
+        """Return a table of what was tried: settings, seconds, steps and distance.
+
+        Also the differences of energy (relative) and front from the reference, the growth of the volume, or how densely sand was packed.
+        """
+        packed = self.reference.packing is not None
+        rows: list[tuple[str, ...]] = [
+            ("seconds", "steps", "distance", "energy", "front [m]", "packing" if packed else "volume", "settings")
+        ]
+        for c in self.tried:
+            energy, front = c.trial.energy_error(self.reference), c.trial.front_error(self.reference)
+            last = f"{c.trial.packing or 0.0:.3f}" if packed else f"{c.trial.volume_drift or 0.0:+.3f}"
+            rows.append((f"{c.seconds:.3g}", str(c.trial.steps), f"{c.distance:.4f}", f"{energy:.3f}", f"{front:+.3f}", last, c.words()))
+        return rows
+
+
+def tune(
+    scene: Scene, *, accuracy: PresetName, device: str, frames: int = FRAMES, say: Callable[[str], object] = lambda text: None
+) -> Tuning:
+    """Measure which settings take the least time for an accuracy.
+
+    An accuracy bounds the distance from a reference run at the same resolution, and the volume's difference from it: those of the preset of
+    its name, see `warp_lcp.scene.presets`. Longer time steps take less time and lie further away, so the longest that meets the bounds
+    is found by bisection, with the preset's tolerance; then the loosest tolerance, and the rarest density correction, that keep them. The
+    fastest few are timed again in turns.
+
+    Where none of the steps meets the bounds, runs as good as the reference, of slightly shorter steps, say how far the reference itself can
+    be trusted: at a coarse resolution a splash amplifies whatever it is given. Nothing can be shown to be nearer than they are to each
+    other, so the bounds then count beside that noise. What does not meet them even so ends with the fastest of the nearest settings.
+
+    Args:
+        scene: whose first frames are run, with everything that it says but for those settings.
+        accuracy: name of a preset.
+        device: a Warp device.
+        frames: how many.
+        say: takes a line about each trial.
+
+    Raises:
+        SceneError: the scene cannot be tuned or simulated.
+        StepFailed: the reference run failed.
+        SimulationFailed: the reference run failed.
+    """
+    prices = price_table().get(scene.scene.simulator)
+    if prices is None:
+        raise SceneError(scene.scene.name, [Problem("scene.simulator", "has no settings to tune")])
+    return _Search(scene, prices, prices.presets[accuracy], device, min(frames, scene.time.frame_count), say).run()
+
+
+def write_tuned(path: Path, tuning: Tuning, accuracy: str, device: str) -> None:
+    """Write the tuned scene, with what was measured in comments above it.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    head = [
+        f"# Tuned for {accuracy} accuracy on {device}:",
+        *(f"# {line}" for line in tuning.verdict(accuracy)),
+        f"# What was measured on {tuning.frames} frames:",
+        *(f"#   {', '.join(row)}" for row in tuning.rows()),
+    ]
+    write_text(path, "\n".join(head) + "\n" + dump_scene(tuning.scene).removeprefix(HEADER))
+
+
+@dataclass
+class _Search:
+    """The trials of a tuning."""
+
+    scene: Scene
+    prices: Prices
+    preset: Preset
+    device: str
+    frames: int
+    say: Callable[[str], object]
+    tried: list[Candidate] = field(default_factory=list)
+    failed: list[str] = field(default_factory=list)
+    _known: dict[tuple[tuple[str, Any], ...], Candidate | None] = field(default_factory=dict)
+
+    def run(self) -> Tuning:
+        """Find the fastest settings within the bounds, or, where there are none, the fastest of the nearest."""
+        self.reference = self._reference_run()
+        self.say(f"reference: {self.reference.seconds:.3g} s, {self.reference.steps} steps")
+        self.bounds, self.limit, noise = Bounds(self.preset.distance, self.preset.volume), 1.0, None
+        start = {key: value for key, value in self.preset.settings.items() if self._has(key)}
+        step = self._longest_step(start)
+        if not self.tried:
+            raise SimulationFailed(f"no settings ran to the end of frame {self.frames}: {self.failed[-1]}")
+        if step is None:
+            noise = self._noise()
+            self.bounds = self.bounds.beside(noise)
+            step = self._longest_step(start)
+        if step is None:
+            nearest = min(self.tried, key=self._miss)
+            self.limit, settings = SAME * self._miss(nearest), nearest.settings
+        else:
+            settings = {**start, **_step_settings(self.prices.steps[step])}
+        for key, values in (("solver.tolerance", self.prices.tolerances), ("density_correction.every", CORRECTED_EVERY)):
+            settings = self._loosest(settings, key, values)
+        chosen = self._fastest([c for c in self.tried if self._miss(c) <= self.limit])
+        tuned = changed(self.scene, chosen.settings)
+        return Tuning(
+            tuned, chosen, self.preset, self.bounds, self.limit, noise, self.reference, self.tried, self.failed, self.frames
+        )  # fmt: skip
+
+    def _fastest(self, near: list[Candidate]) -> Candidate:
+        """Return the fastest, once those close to it were timed again in turns."""
+        shortest = min(c.seconds for c in near)
+        close = [c for c in near if c.seconds <= CLOSE * shortest]
+        for _ in range(ROUNDS if len(close) > 1 else 0):
+            for c in close:
+                again = trial(changed(self.scene, c.settings), device=self.device, frames=self.frames)
+                c.seconds = min(c.seconds, again.seconds)
+        shortest = min(c.seconds for c in close)
+        return min((c for c in close if c.seconds <= SAME * shortest), key=lambda c: c.distance)
+
+    def _reference_run(self, part: float = 1.0) -> Trial:
+        """Run the reference, or one with a part of its steps."""
+        settings = dict(self.prices.reference)
+        settings |= {key: part * settings[key] for key in ("time.cfl", "time.dt_max")}
+        return trial(changed(self.scene, settings), device=self.device, frames=self.frames)
+
+    def _noise(self) -> Bounds:
+        """Return what runs as good as the reference differ by."""
+        self.say("nothing is within the bounds; how sure is the reference?")
+        references = [self.reference]
+        for part in TWINS:
+            try:
+                references.append(self._reference_run(part))
+            except (StepFailed, SimulationFailed) as error:
+                self.failed.append(f"reference with {part:g} times its steps: {error}")
+                self.say(self.failed[-1])
+        noise = spread_of(references)
+        self.say(f"runs as good as it: distance {noise.distance:.4f}, volume or packing {noise.volume:.3f}")
+        return noise
+
+    def _miss(self, candidate: Candidate) -> float:
+        return self.bounds.miss(candidate.trial, self.reference)
+
+    def _has(self, key: str) -> bool:
+        return getattr(self.scene, key.partition(".")[0]) is not None
+
+    def _longest_step(self, settings: dict[str, Any]) -> int | None:
+        """Return which of the steps is the longest that meets the bound; None: none does. Shorter ones than it do, by bisection."""
+        steps = self.prices.steps
+        low, high = 0, len(steps)  # the answer lies in low..high; high: none
+        while low < high:
+            middle = (low + high) // 2
+            if self._meets({**settings, **_step_settings(steps[middle])}):
+                high = middle
+            else:
+                low = middle + 1
+        return low if low < len(steps) else None
+
+    def _loosest(self, settings: dict[str, Any], key: str, values: tuple[float, ...]) -> dict[str, Any]:
+        """Return the settings with the loosest of the values, loose ones first, that meets the bounds; as they are where none does."""
+        for value in values:
+            if not self._has(key) or value == settings.get(key):
+                break
+            if self._meets({**settings, key: value}):
+                return {**settings, key: value}
+        return settings
+
+    def _meets(self, settings: dict[str, Any]) -> bool:
+        key = tuple(sorted(settings.items()))
+        if key not in self._known:
+            self._known[key] = self._try(settings)
+        found = self._known[key]
+        return found is not None and self._miss(found) <= self.limit
+
+    def _try(self, settings: dict[str, Any]) -> Candidate | None:
+        """Run the first frames with some settings; None: that failed."""
+        words = " ".join(f"{key}={value:g}" for key, value in settings.items())
+        try:
+            ran = trial(changed(self.scene, settings), device=self.device, frames=self.frames)
+        except (StepFailed, SimulationFailed) as error:
+            self.failed.append(f"{words}: {error}")
+            self.say(self.failed[-1])
+            return None
+        candidate = Candidate(settings, ran, ran.distance(self.reference), ran.seconds)
+        self.tried.append(candidate)
+        self.say(f"{words}: {ran.seconds:.3g} s, {ran.steps} steps, distance {candidate.distance:.4f}")
+        return candidate
+
+
+def _step_settings(step: tuple[float, float]) -> dict[str, float]:
+    cfl, dt_max = step
+    return {"time.cfl": cfl, "time.dt_max": dt_max}

@@ -1,0 +1,1 @@
+"""Scene files: tables, shapes, motions, presets, the prices of models."""

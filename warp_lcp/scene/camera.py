@@ -1,0 +1,161 @@
+"""Where the images of a run are seen from: the table [camera] of a scene, and the pinhole camera that it makes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from pydantic import Field
+
+from warp_lcp.scene.table import Complaint, Table, Vector
+
+if TYPE_CHECKING:
+    from warp_lcp.scene.scene import Scene
+
+VIEW_ANGLE = 25.0  # degrees, over the height of an image
+MARGIN = 1.04
+THREE_QUARTERS = np.array([0.55, 0.5, 1.0]) / np.linalg.norm([0.55, 0.5, 1.0])  # from the domain to the camera
+Y_AXIS, Z_AXIS = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+ROOM_KEYS, WINDOW_KEYS = ("position", "look_at", "up", "field_of_view"), ("low", "high")
+
+
+class Camera(Table):
+    """[camera]: what images show; all of the domain unless given."""
+
+    position: Vector | None = Field(default=None, description="where the camera is [m], 3-D; where it sees all of the domain unless given")
+    look_at: Vector | None = Field(
+        default=None, description="the point in the middle of an image [m], 3-D; the domain's middle unless given"
+    )
+    up: Vector | None = Field(default=None, description="what is up in an image, 3-D; y unless given")
+    field_of_view: float | None = Field(
+        default=None, ge=1, le=120, description=f"degrees over the height of an image, 3-D; {VIEW_ANGLE:g} unless given"
+    )
+    low: Vector | None = Field(
+        default=None, alias="min", description="the low corner of what images show [m], 2-D; the domain's unless given"
+    )
+    high: Vector | None = Field(
+        default=None, alias="max", description="the high corner of what images show [m], 2-D; the domain's unless given"
+    )
+
+    def complaints(self, dimension: int, size: list[float]) -> list[Complaint]:
+        """Return what is wrong with the camera in a domain of two or three sides [m]."""
+        wrong, right = (ROOM_KEYS, WINDOW_KEYS) if dimension == 2 else (WINDOW_KEYS, ROOM_KEYS)
+        found = []
+        for key in wrong:
+            if getattr(self, key) is not None:
+                allowed = ", ".join(type(self).model_fields[name].alias or name for name in right)
+                message = f"is of no use in a scene of {dimension} dimensions; it may have {allowed}"
+                found.append(Complaint((type(self).model_fields[key].alias or key,), getattr(self, key), message))
+        for key in right:
+            value = getattr(self, key)
+            if isinstance(value, list) and len(value) != dimension:
+                found.append(Complaint((type(self).model_fields[key].alias or key,), value, f"must have {dimension} entries"))
+        if found:
+            return found
+        return self._window_complaints(size) if dimension == 2 else self._room_complaints(size)
+
+    def _window_complaints(self, size: list[float]) -> list[Complaint]:
+        low, high = self.low or [0.0, 0.0], self.high or size
+        if all(a < b for a, b in zip(low, high, strict=True)):
+            return []
+        return [
+            Complaint(
+                ("max",) if self.high else ("min",), self.high or self.low, f"min = {low} must be less than max = {high} along both axes"
+            )
+        ]
+
+    def _room_complaints(self, size: list[float]) -> list[Complaint]:
+        if self.position is None:
+            given = [key for key in ("look_at", "up") if getattr(self, key) is not None]
+            return [Complaint((key,), getattr(self, key), "needs camera.position") for key in given]
+        toward = np.subtract(self.position, self.look_at or np.multiply(size, 0.5))
+        far = np.linalg.norm(toward)
+        if far < 1e-6 * max(size):
+            return [Complaint(("position",), self.position, "must not be the point that the camera looks at")]
+        up = np.array(self.up or Y_AXIS)
+        if np.linalg.norm(np.cross(up, toward)) <= 1e-3 * np.linalg.norm(up) * far:
+            return [Complaint(("up",), self.up, "must be given, and not be the direction that the camera looks in" if self.up is None else
+                              "must not be zero or the direction that the camera looks in")]  # fmt: skip
+        return []
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """A pinhole camera.
+
+    Args:
+        position: [m], shape (3,).
+        focus: the point in the middle of the image [m], shape (3,).
+        up: of the image, a unit vector, shape (3,).
+        angle: over the height of the image [degrees].
+        aspect: the image's width over its height.
+    """
+
+    position: np.ndarray
+    focus: np.ndarray
+    up: np.ndarray
+    angle: float
+    aspect: float
+
+    @property
+    def axes(self) -> np.ndarray:
+        """Return unit vectors to the image's right, up, and into the scene, as rows, shape (3, 3)."""
+        forward = (self.focus - self.position) / np.linalg.norm(self.focus - self.position)
+        right = np.cross(forward, self.up)
+        right /= np.linalg.norm(right)
+        return np.stack([right, np.cross(right, forward), forward])
+
+    @property
+    def slope(self) -> float:
+        """Return half the image's height, a unit of length away."""
+        return math.tan(math.radians(self.angle / 2))
+
+    def project(self, points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+        """Return where points appear.
+
+        Args:
+            points: [m], shape (n, 3).
+            size: width and height of the image [pixels].
+
+        Returns:
+            x to the right and y down from the image's upper left corner [pixels], and the depth along the line of sight [m], shape (n, 3).
+            Where the depth is not positive, x and y mean nothing.
+        """
+        width, height = size
+        x, y, depth = ((points - self.position) @ self.axes.T).T
+        near = np.maximum(depth, 1e-9)
+        focal = 0.5 * height / self.slope
+        return np.stack([0.5 * width + focal * x / near, 0.5 * height - focal * y / near, depth], axis=-1)
+
+
+def viewpoint(scene: Scene, aspect: float) -> Viewpoint:
+    """Return where images of this aspect are seen from: as the scene's [camera] says, or from as near as shows all of the domain."""
+    camera = scene.camera
+    size = np.array([*scene.domain.size, 0.0][:3])
+    if scene.dimension == 2:
+        corners = [np.append(camera.low or [0.0, 0.0], 0.0), np.append(camera.high or size[:2], 0.0)]
+        return _around(corners[0], corners[1], Z_AXIS, VIEW_ANGLE, aspect)
+    angle = camera.field_of_view or VIEW_ANGLE
+    if camera.position is None:
+        return _around(np.zeros(3), size, THREE_QUARTERS, angle, aspect)
+    position, focus = np.array(camera.position), np.array(camera.look_at) if camera.look_at else 0.5 * size
+    plain = Viewpoint(position, focus, np.array(camera.up or Y_AXIS), angle, aspect)
+    return Viewpoint(position, focus, plain.axes[1], angle, aspect)
+
+
+def _around(low: np.ndarray, high: np.ndarray, toward: np.ndarray, angle: float, aspect: float) -> Viewpoint:
+    """Look at the middle of a box [m] from a direction, from as near as shows all of it."""
+    right = np.cross(Y_AXIS, toward)
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(toward, right), toward])
+    corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3) @ axes.T
+    focus = corners.mean(axis=0)
+    slope = math.tan(math.radians(angle / 2)) / MARGIN
+    for _ in range(5):  # what is near looks larger, so the middle of the image is not that of the domain
+        x, y, z = (corners - focus).T
+        distance = max((z + np.abs(x) / (slope * aspect)).max(), (z + np.abs(y) / slope).max())
+        seen = np.stack([x, y]) / (distance - z)
+        focus[:2] += 0.5 * (seen.min(axis=1) + seen.max(axis=1)) * distance
+    return Viewpoint(focus @ axes + distance * toward, focus @ axes, axes[1], angle, aspect)

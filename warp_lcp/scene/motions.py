@@ -1,0 +1,196 @@
+"""The motions of a scene file: how a solid moves, from where its shape is placed."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from warp_lcp.scene.table import Angles, Complaint, Table, Vector, counted
+from warp_lcp.settings import Positive
+
+if TYPE_CHECKING:
+    from warp_lcp.grid import motion
+
+Axis = Annotated[list[float], Field(min_length=3, max_length=3)]
+CENTER = "a point of the axis [m]"
+AXIS = "the direction of the axis, in 3-D; 2-D solids turn about z"
+
+
+class PrescribedMotion(Table):
+    """A motion that is a function of time alone, relative to the shape as it is placed, in the domain's coordinates."""
+
+    @abstractmethod
+    def to_motion(self, dimension: int) -> motion.Motion:
+        """Return the motion as poses over time.
+
+        Args:
+            dimension: 2 or 3.
+
+        Raises:
+            ValueError: a value is not allowed.
+        """
+
+    def complaints(self, dimension: int) -> list[Complaint]:
+        """Return what is wrong with the motion in a scene of 2 or 3 dimensions."""
+        found = self._size_complaints(dimension)
+        if found:
+            return found
+        try:
+            self.to_motion(dimension)
+        except ValueError as error:
+            found.append(Complaint((), None, str(error)))
+        return found
+
+    def _size_complaints(self, dimension: int) -> list[Complaint]:
+        """Return what is wrong with the number of entries, and with keys that are missing or too many."""
+        return [
+            Complaint((name,), value, f"must have {dimension} entries in {dimension}-D")
+            for name, value in self
+            if name in ("velocity", "center", "amplitude") and value is not None and len(value) != dimension
+        ]
+
+
+class TranslationMotion(PrescribedMotion):
+    """A constant velocity between two times."""
+
+    kind: Literal["translation"] = "translation"
+    velocity: Vector = Field(description="[m/s]")
+    start: float = Field(default=0.0, description="when it sets off [s]")
+    stop: float | None = Field(default=None, description="when it comes to rest [s], later than start; never unless given")
+
+    def to_motion(self, dimension: int) -> motion.Motion:
+        """Return the shift over time."""
+        from warp_lcp.grid import motion
+
+        return motion.Translation(velocity=self.velocity, start=self.start, stop=_or_never(self.stop))
+
+
+class RotationMotion(PrescribedMotion):
+    """A constant rate of turn about a fixed axis between two times."""
+
+    kind: Literal["rotation"] = "rotation"
+    rate: float = Field(description="[degrees/s], counterclockwise seen from the axis's tip")
+    center: Vector = Field(description=CENTER)
+    axis: Axis | None = Field(default=None, description=AXIS)
+    start: float = Field(default=0.0, description="when it sets off [s]")
+    stop: float | None = Field(default=None, description="when it comes to rest [s], later than start; never unless given")
+
+    def to_motion(self, dimension: int) -> motion.Motion:
+        """Return the turn over time."""
+        from warp_lcp.grid import motion
+
+        return motion.Rotation(
+            rate=self.rate, center=self.center, axis=_or_z(self.axis), start=self.start, stop=_or_never(self.stop)
+        )  # fmt: skip
+
+    def _size_complaints(self, dimension: int) -> list[Complaint]:
+        return super()._size_complaints(dimension) + _axis_complaints(self.axis, dimension)
+
+
+class SinusoidMotion(PrescribedMotion):
+    """A swing of sin(360 degrees time / period + phase) times a shift, an angle or both."""
+
+    kind: Literal["sinusoid"] = "sinusoid"
+    period: Positive = Field(description="[s]")
+    amplitude: Vector | None = Field(default=None, description="of the shift, along each axis [m]")
+    phase: float = Field(default=0.0, description="[degrees, not radians]; 0: in the middle at time 0, -90: at rest at one end")
+    angle: float | None = Field(default=None, description="amplitude of the turn [degrees]")
+    center: Vector | None = Field(default=None, description=CENTER)
+    axis: Axis | None = Field(default=None, description=AXIS)
+
+    def to_motion(self, dimension: int) -> motion.Motion:
+        """Return shift and turn over time."""
+        from warp_lcp.grid import motion
+
+        zeros = [0.0] * dimension
+        return motion.Sinusoid(
+            period=self.period, amplitude=self.amplitude or zeros, phase=self.phase,
+            angle=self.angle or 0.0, center=self.center or zeros, axis=_or_z(self.axis),
+        )  # fmt: skip
+
+    @property
+    def phase_in_degrees(self) -> float | None:
+        """Return the phase [degrees] that was meant, if its number is one that radians have: a multiple of pi / 4, to three digits."""
+        eighths = round(self.phase / (0.25 * np.pi))
+        return 45.0 * eighths if eighths and abs(self.phase - 0.25 * np.pi * eighths) < 1e-3 * abs(self.phase) else None
+
+    def _size_complaints(self, dimension: int) -> list[Complaint]:
+        found = super()._size_complaints(dimension)
+        if self.angle is not None:
+            found += _center_complaints(self.center, "angle") + _axis_complaints(self.axis, dimension)
+        elif self.amplitude is None:
+            found.append(Complaint((), None, "a sinusoid needs amplitude, angle or both"))
+        else:
+            found += [
+                Complaint((name,), value, "has no effect without angle")
+                for name, value in (("center", self.center), ("axis", self.axis))
+                if value is not None
+            ]
+        return found
+
+
+class KeyframesMotion(PrescribedMotion):
+    """Places at given times; at rest before the first and after the last."""
+
+    kind: Literal["keyframes"] = "keyframes"
+    times: list[float] = Field(min_length=2, description="increasing [s]")
+    translate: list[Vector] | None = Field(default=None, description="a shift at each time [m]")
+    rotate: list[Angles] | None = Field(default=None, description="degrees at each time: one angle in 2-D, [x, y, z] in 3-D")
+    center: Vector | None = Field(default=None, description="the point that turns leave where it is [m]")
+    interpolation: Literal["linear", "smooth"] = Field(
+        default="linear", description="smooth: at rest at the ends, and no jumps of velocity"
+    )
+
+    def to_motion(self, dimension: int) -> motion.Motion:
+        """Return shift and turn over time."""
+        from warp_lcp.grid import motion
+
+        rotate = None if self.rotate is None else [angles[0] for angles in self.rotate] if dimension == 2 else self.rotate
+        return motion.Keyframes(
+            times=self.times, translate=self.translate, rotate=rotate, center=self.center or [0.0] * dimension,
+            smooth=self.interpolation == "smooth",
+        )  # fmt: skip
+
+    def _size_complaints(self, dimension: int) -> list[Complaint]:
+        found = super()._size_complaints(dimension)
+        if not (np.diff(self.times) > 0.0).all():
+            found.append(Complaint(("times",), self.times, "must increase"))
+        if self.translate is None and self.rotate is None:
+            found.append(Complaint((), None, "keyframes need translate, rotate or both"))
+        if self.rotate is not None:
+            found += _center_complaints(self.center, "rotate")
+        elif self.center is not None:
+            found.append(Complaint(("center",), self.center, "has no effect without rotate"))
+        for name, rows, width in (("translate", self.translate, dimension), ("rotate", self.rotate, 1 if dimension == 2 else 3)):
+            if rows is not None and len(rows) != len(self.times):
+                found.append(Complaint((name,), rows, f"must have {len(self.times)} entries, one for each time"))
+            found += [
+                Complaint((name, index), row, f"must {counted(width)} in {dimension}-D")
+                for index, row in enumerate(rows or ())
+                if len(row) != width
+            ]
+        return found
+
+
+Motion = Annotated[TranslationMotion | RotationMotion | SinusoidMotion | KeyframesMotion, Field(discriminator="kind")]
+
+
+def _or_never(stop: float | None) -> float:
+    return np.inf if stop is None else stop
+
+
+def _or_z(axis: list[float] | None) -> list[float]:
+    return axis or [0.0, 0.0, 1.0]
+
+
+def _axis_complaints(axis: list[float] | None, dimension: int) -> list[Complaint]:
+    if dimension == 2:
+        return [] if axis is None else [Complaint(("axis",), axis, "must be left out in 2-D, where solids turn about z")]
+    return [Complaint(("axis",), None, "is missing: the direction to turn about, such as [0.0, 1.0, 0.0]")] if axis is None else []
+
+
+def _center_complaints(center: list[float] | None, key: str) -> list[Complaint]:
+    return [Complaint(("center",), None, f"is missing: the point [m] to turn about, since there is {key}")] if center is None else []

@@ -1,0 +1,137 @@
+"""`[solver] preset`: settings that trade speed for accuracy together, in the table `presets.toml`, filled in where a scene says nothing."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
+
+if TYPE_CHECKING:
+    from warp_lcp.scene.scene import Scene
+
+SceneT = TypeVar("SceneT", bound="Scene")
+PresetName = Literal["preview", "standard", "final"]
+PRESETS: tuple[PresetName, ...] = ("preview", "standard", "final")
+TABLE = "presets.toml"
+Settings = Mapping[str, Any]  # by "section.key", such as time.cfl
+
+
+@dataclass(frozen=True)
+class Preset:
+    """What a preset stands for.
+
+    Attributes:
+        distance: the largest share of the mass that may be elsewhere than in the simulator's reference run.
+        volume: the largest difference from that run in the growth of a liquid's volume, or in how densely sand is packed.
+        settings: the scene's keys that it gives values to, by `section.key`.
+    """
+
+    distance: float
+    volume: float
+    settings: Settings
+
+
+@dataclass(frozen=True)
+class Prices:
+    """A simulator's part of the table.
+
+    Attributes:
+        presets: by name.
+        reference: settings of the run that others are compared with.
+        steps: lengths of a time step to try, (time.cfl, time.dt_max [s]), the longest first.
+        tolerances: of the solver, the loosest first.
+    """
+
+    presets: Mapping[str, Preset]
+    reference: Settings
+    steps: tuple[tuple[float, float], ...]
+    tolerances: tuple[float, ...]
+
+
+@cache
+def price_table() -> Mapping[str, Prices]:
+    """Return the table's parts by simulator."""
+    read = tomllib.loads((files("warp_lcp.driver") / TABLE).read_text(encoding="utf-8"))
+    found = {}
+    for simulator, part in read.items():
+        presets: dict[str, Preset] = {name: Preset(part[name]["distance"], part[name]["volume"], _flat(part[name])) for name in PRESETS}
+        steps = tuple((cfl, dt_max) for cfl, dt_max in part["steps"])
+        found[simulator] = Prices(presets, _flat(part["reference"]), steps, tuple(part["tolerances"]))
+    return found
+
+
+def fill_in(model: type[Scene], data: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return a scene's raw data with what its preset says; what the data say stays. Wrong data are for the validation to refuse.
+
+    Args:
+        model: the scene's class, which knows which tables turn a model on.
+        data: as the file has it.
+    """
+    about, solver = data.get("scene"), data.get("solver")
+    simulator = about.get("simulator") if isinstance(about, Mapping) else None
+    name = solver.get("preset") if isinstance(solver, Mapping) else None
+    if not isinstance(simulator, str) or simulator not in price_table() or name not in PRESETS:
+        return data
+    filled = dict(data)
+    for table, values in _nested(price_table()[simulator].presets[name].settings).items():
+        own = data.get(table, None if model.model_fields[table].default is None else {})
+        if isinstance(own, Mapping):  # a model that is off stays off
+            filled[table] = {**values, **own}
+    return filled
+
+
+def preset_values(scene: Scene, table: str) -> dict[str, Any]:
+    """Return what a scene's preset says of a table; nothing where there is no preset."""
+    prices, name = price_table().get(scene.scene.simulator), scene.solver.preset
+    return _nested(prices.presets[name].settings).get(table, {}) if prices is not None and name is not None else {}
+
+
+def preset_line(scene: Scene) -> str | None:
+    """Return what a scene has from its preset and what is its own, for the plan; None: it has no preset."""
+    name = scene.solver.preset
+    prices = price_table().get(scene.scene.simulator)
+    if name is None or prices is None:
+        return None
+    given = {key: (value, value_of(scene, key)) for key, value in prices.presets[name].settings.items()}
+    taken = [f"{key} {value:g}" for key, (value, is_now) in given.items() if is_now == value]
+    own = [f"{key} {is_now:g}" if isinstance(is_now, float | int) else f"{key} {is_now}"
+           for key, (value, is_now) in given.items() if is_now not in (value, None)]  # fmt: skip
+    return f"{name}: " + "; ".join([*([", ".join(taken)] if taken else []), *([f"the scene's own: {', '.join(own)}"] if own else [])])
+
+
+def value_of(scene: Scene, key: str) -> Any:
+    """Return what a scene has at `section.key`; None: the section is off."""
+    table, _, name = key.partition(".")
+    found = getattr(scene, table)
+    return None if found is None else getattr(found, name)
+
+
+def changed(scene: SceneT, settings: Settings) -> SceneT:
+    """Return a scene with other values at `section.key`; those of models that are off are left out.
+
+    Raises:
+        pydantic.ValidationError: the scene does not take them.
+    """
+    data = scene.model_dump(by_alias=True, exclude_none=True)
+    for key, value in settings.items():
+        table, _, name = key.partition(".")
+        if getattr(scene, table) is not None:
+            data[table][name] = value
+    return type(scene).model_validate(data)
+
+
+def _nested(settings: Settings) -> dict[str, dict[str, Any]]:
+    """Return settings as tables of a scene."""
+    tables: dict[str, dict[str, Any]] = {}
+    for key, value in settings.items():
+        table, _, name = key.partition(".")
+        tables.setdefault(table, {})[name] = value
+    return tables
+
+
+def _flat(part: Mapping[str, Any]) -> Settings:
+    """Return tables of a scene as settings."""
+    return {f"{table}.{key}": value for table, keys in part.items() if isinstance(keys, Mapping) for key, value in keys.items()}

@@ -1,0 +1,336 @@
+"""What every scene has, whatever it is made of. Simulators subclass `Scene` with their materials and models."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Any, ClassVar, Literal, Self
+from unicodedata import normalize
+
+import numpy as np
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic_core import PydanticCustomError
+
+from warp_lcp.scene.camera import Camera
+from warp_lcp.scene.motions import SinusoidMotion
+from warp_lcp.scene.presets import PresetName, fill_in, preset_line
+from warp_lcp.scene.shapes import Liquid, Shape, Solid, Wall
+from warp_lcp.scene.table import Complaint, Problem, SceneError, Table, Vector, refuse, validate
+from warp_lcp.grid.sides import SIDES
+from warp_lcp.grid.solid_notes import STRAY
+from warp_lcp.settings import Count, CountOrZero, Positive, Share, adapter
+from warp_lcp.solve import PrecisionName
+from warp_lcp.solvers.registry import grid_methods
+
+__all__ = ["Complaint", "Liquid", "Problem", "Scene", "SceneError", "Shape", "Solid", "Table", "Vector", "Wall", "validate"]
+
+GridMethod = Literal[grid_methods()]
+
+
+def _tolerance(value: Any) -> Any:
+    """Return a number in (0, 1) or "auto"; a wrong one is refused as any other number is, without a word of the alternative's type."""
+    return value if value == "auto" else adapter(Share).validate_python(value)
+
+
+Tolerance = Annotated[Share | Literal["auto"], BeforeValidator(_tolerance, json_schema_input_type=Share | Literal["auto"])]
+
+PRESET_KEY = "sets time step, tolerance and more, where the scene does not; none unless given"
+
+LONGEST_NAME = 60  # characters; file systems take 255 bytes, and a letter has up to four
+NAME_RULE = f'must be a name of at most {LONGEST_NAME} letters, digits, "-", "_", "." and spaces, without a dot or space at its ends'
+
+WHOLE_CELLS = 1e-6  # how far a side may be from a whole number of cells, relative
+
+
+def _name(text: str) -> str:
+    """Return a name that may be a folder's, whatever stands before it; "" is none."""
+    if len(text) > LONGEST_NAME or text != text.strip(". ") or set(text) - set(file_name(text)):
+        raise PydanticCustomError("name", NAME_RULE)
+    return text
+
+
+def file_name(text: str) -> str:
+    """Return a text as a name that `scene.name` may be, "scene" if nothing is left of it."""
+    kept = "".join(c if c.isalnum() or c in "-_. " else "-" for c in normalize("NFC", text))[:LONGEST_NAME].strip(". ")
+    return kept or "scene"
+
+
+class About(Table):
+    """[scene]: what the file is."""
+
+    simulator: str = Field(description="the plug-in that runs the scene, such as fluids")
+    name: Annotated[str, AfterValidator(_name)] = Field(default="", description="a short name; the file's unless given")
+    description: str = Field(default="", description="a sentence about what there is to see")
+
+
+class Time(Table):
+    """[time]: how long, how often to look, how large the steps may be."""
+
+    duration: Positive = Field(description="the simulated time [s]")
+    frames_per_second: Positive = Field(default=30.0, description="frames per simulated second [1/s]")
+    cfl: float = Field(default=2.0, ge=1e-3, description="a Courant number, usually 1 to 4")
+    dt_max: Positive = Field(default=0.02, description="the longest step [s]")
+    dt_min: Positive = Field(default=1e-6, description="the shortest step that the CFL number or a retry may ask for [s]")
+
+    @property
+    def frame_count(self) -> int:
+        """Return the number of the last frame; frame 0 is the start."""
+        return max(1, math.ceil(self.duration * self.frames_per_second * (1.0 - 1e-9)))
+
+    def frame_time(self, frame: int) -> float:
+        """Return the time [s] of a frame. The last one is the end of the run, be that a multiple of the frame interval or not."""
+        return min(frame / self.frames_per_second, self.duration)
+
+
+class Domain(Table):
+    """[domain]: the box that everything happens in, and its grid."""
+
+    later: ClassVar = {"periodic": frozenset({True})}
+    elsewhere: ClassVar = {"friction": "granular", "periodic": "granular"}
+    size: list[Positive] = Field(min_length=2, max_length=3, description="the sides of the domain [m], [x, y] or [x, y, z]")
+    resolution: int = Field(ge=2, le=4096, description="cells along the longest side")
+    wall: Wall = Field(default="separating", description="whether material may let go of the domain's walls")
+    solids: Literal["cut-cell", "voxel"] = Field(
+        default="cut-cell", description="cut-cell: solids cut through cells as their surfaces do; voxel: they fill whole cells"
+    )
+    open: list[Literal[SIDES]] = Field(
+        default_factory=list, description="sides without a wall, where material leaves; y is up, x to the right, z to the front"
+    )
+    periodic: list[Literal[False]] | None = Field(default=None, description="false along every axis")
+
+
+class Physics(Table):
+    """[physics]: the constants of the world."""
+
+    gravity: Vector = Field(description="an acceleration [m/s^2]; 9.81 down along y unless given")
+    density: Positive = Field(default=1000.0, description="of the material [kg/m^3]")
+
+
+class Solver(Table):
+    """[solver]: the method for the complementarity problem of every step, and how far it goes."""
+
+    preset: PresetName | None = Field(default=None, description=PRESET_KEY)
+    method: GridMethod = Field(default="projected-multigrid", description="projected-multigrid is the fastest")
+    tolerance: Tolerance = Field(
+        default=1e-4,
+        description='the relative residual to reach; "auto": what leaves a tenth of the error that the time step makes',
+    )
+    precision: PrecisionName = Field(default="mixed", description="of the method's arithmetic")
+    max_iterations: Count = Field(default=100, description="iterations before the step counts as failed")
+
+
+class Output(Table):
+    """[output]: what the run's folder gets."""
+
+    particles: bool = Field(default=True, description="write a frame of particles")
+    grid: bool = Field(default=True, description="write a frame of cells")
+    surface: bool = Field(default=False, description="write a frame of the material's surface: closed triangles, in 2-D segments")
+    surface_resolution: int | None = Field(
+        default=None, ge=1, le=8, description="surface points along the edge of a cell; as many as particles unless given"
+    )
+    surface_smoothing: float = Field(
+        default=1.5, ge=0.5, le=10, description="how far the surface smooths over the particles [their distances]"
+    )
+    surface_ply: bool = Field(default=False, description="write surfaces as PLY files too, for modelers such as Blender")
+    grid_format: Literal["vtu", "vti"] = Field(
+        default="vtu", description="of the cells' files: vtu, which meshio reads too, or vti, smaller and faster where cells are many"
+    )
+    volume: bool = Field(default=False, description="write level set and density as NanoVDB files, of 3-D scenes")
+    diagnostics: bool = Field(
+        default=True, description="measure what only the log shows: volume and divergence of liquid, yielding and dissipation of sand"
+    )
+    checkpoint_every: CountOrZero = Field(default=50, description="steps between checkpoints; 0: not by steps")
+    checkpoint_minutes: Positive | None = Field(default=None, description="the most minutes of real time between checkpoints")
+    checkpoints_kept: Count = Field(default=3, description="how many of the newest checkpoints stay")
+
+
+class Scene(Table):
+    """A scene file, read and checked. SI units; y is up; a domain of two sides is the x-y plane."""
+
+    elsewhere: ClassVar = dict.fromkeys(("sand", "material", "friction", "gauge"), "granular")
+    palette: ClassVar[Literal["water", "sand"]] = "water"  # of its images
+    scene: About
+    time: Time
+    domain: Domain
+    physics: Physics
+    solver: Solver = Field(default_factory=Solver)
+    solid: list[Solid] = Field(default_factory=list)
+    output: Output = Field(default_factory=Output)
+    camera: Camera = Field(default_factory=Camera)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _gravity_is_down(cls, data: Any) -> Any:
+        """Fill in gravity, whose default needs the number of dimensions."""
+        domain, physics = (data.get("domain"), data.get("physics", {})) if isinstance(data, dict) else (None, None)
+        size = domain.get("size") if isinstance(domain, dict) else None
+        if isinstance(physics, dict):
+            gravity = [0.0, -9.81, 0.0] if isinstance(size, list) and len(size) == 3 else [0.0, -9.81]
+            return {**data, "physics": {"gravity": gravity, **physics}}
+        return data
+
+    @model_validator(mode="before")
+    @classmethod
+    def _preset_fills_in(cls, data: Any) -> Any:
+        """Take from `solver.preset` what the scene does not say."""
+        return fill_in(cls, data) if isinstance(data, dict) else data
+
+    @model_validator(mode="after")
+    def _check_across_tables(self) -> Self:
+        refuse(type(self).__name__, self.complaints())
+        return self
+
+    @property
+    def dimension(self) -> int:
+        """Return 2 or 3."""
+        return len(self.domain.size)
+
+    @property
+    def spacing(self) -> float:
+        """Return the side of a cell [m]."""
+        return max(self.domain.size) / self.domain.resolution
+
+    @property
+    def cell_counts(self) -> tuple[int, int, int]:
+        """Return the cells along x, y and z; one along z in 2-D."""
+        x, y, z = [round(side / self.spacing) for side in [*self.domain.size, self.spacing][:3]]
+        return x, y, z
+
+    def complaints(self) -> list[Complaint]:
+        """Return what is wrong across keys. Subclasses add theirs to `super().complaints()`."""
+        found = self._grid_complaints()
+        if len(self.physics.gravity) != self.dimension:
+            message = f"must have {self.dimension} entries, as domain.size has"
+            found.append(Complaint(("physics", "gravity"), self.physics.gravity, message))
+        if self.time.dt_min > self.time.dt_max:
+            found.append(Complaint(("time", "dt_min"), self.time.dt_min, f"must not exceed time.dt_max = {self.time.dt_max}"))
+        found += [Complaint(("camera", *c.place), c.value, c.message) for c in self.camera.complaints(self.dimension, self.domain.size)]
+        if self.output.volume and self.dimension == 2:
+            found.append(Complaint(("output", "volume"), True, "needs a 3-D domain; domain.size has 2 entries"))
+        found += self.shape_complaints("solid", self.solid) + self._motion_complaints() + self._side_complaints()
+        return found + self._outside_complaints()
+
+    def shape_complaints(self, key: str, shapes: Sequence[Shape], *, inside: bool = False) -> list[Complaint]:
+        """Return what is wrong with an array of shapes.
+
+        Args:
+            key: the array's name in the file, such as `liquid`.
+            shapes: its entries.
+            inside: also refuse an entry that lies wholly outside the domain.
+        """
+        found = []
+        for index, shape in enumerate(shapes):
+            own = shape.complaints(self.dimension)
+            if inside and not own and self.enclosed_volume(shape) == 0.0:
+                own = [Complaint((), None, f"lies outside the domain, which reaches from the origin to {self.domain.size} m")]
+            found += [Complaint((key, index, *complaint.place), complaint.value, complaint.message) for complaint in own]
+        return found
+
+    def enclosed_volume(self, shape: Shape) -> float:
+        """Return an upper bound of a shape's volume in the domain [m^3; m^2 in 2-D]: that of the box around it."""
+        size = np.array(self.domain.size)
+        bounds = shape.bounds(self.dimension)
+        if bounds is None:
+            return float(size.prod())
+        low, high = (corner[: self.dimension] for corner in bounds)
+        return float(np.maximum(np.minimum(high, size) - np.maximum(low, 0.0), 0.0).prod())
+
+    def shapes(self) -> Iterator[tuple[str, Shape]]:
+        """Yield every shape with its place in the file, such as `solid[0]`."""
+        for key, entries in self:
+            for index, entry in enumerate(entries if isinstance(entries, list) else ()):
+                if isinstance(entry, Shape):
+                    yield f"{key}[{index}]", entry
+
+    def notes(self) -> list[str]:
+        """Return what is allowed and was hardly meant, a line each, for the start of a run."""
+        found = []
+        for place, shape in self.shapes():
+            turned = shape.turned_out(self.domain.size)
+            if turned is not None and turned[0] > STRAY * self.spacing:
+                center = [float(f"{coordinate:.6g}") for coordinate in turned[1]]
+                found.append(
+                    f"{place} ({shape.shape}): rotate turns it about the origin, {turned[0]:.4g} m out of the domain; about its center it "
+                    f"turns with about = {center}"
+                )
+            motion = getattr(shape, "motion", None)
+            if isinstance(motion, SinusoidMotion) and motion.phase_in_degrees is not None:
+                degrees = motion.phase_in_degrees
+                found.append(f"{place}.motion.phase = {motion.phase:g} is in degrees; if radians were meant, it is {degrees:g}")
+        return found
+
+    def memory_parts(self) -> dict[str, int]:
+        """Return about how much memory each part of a run takes on its device [bytes]. Subclasses that know it say so."""
+        return {}
+
+    def memory_estimate(self) -> int:
+        """Return about how much memory a run takes at most [bytes], without the program itself; 0: not known."""
+        return sum(self.memory_parts().values())
+
+    def plan(self) -> list[tuple[str, str]]:
+        """Return what a run would do, as pairs of a word and a line. Subclasses append theirs, such as particles and memory."""
+        cells = self.cell_counts[: self.dimension]
+        moving = ", ".join(f"solid {index} {solid.motion.kind}" for index, solid in enumerate(self.solid) if solid.motion)
+        bodies = ", ".join(self._body_line(index, solid) for index, solid in enumerate(self.solid) if solid.is_body)
+        preset = preset_line(self)
+        return [
+            *([("preset", preset)] if preset else []),
+            ("grid", f"{' x '.join(map(str, cells))} = {math.prod(cells):,} cells of {self.spacing:.6g} m"),
+            ("walls", ", ".join([self.domain.wall, *(f"solid {i} {s.wall}" for i, s in enumerate(self.solid) if s.wall)])),
+            *([("open", ", ".join(self.domain.open))] if self.domain.open else []),
+            *([("moving", moving)] if moving else []),
+            *([("bodies", bodies)] if bodies else []),
+            ("time", f"{self.time.duration:g} s in steps of at most {self.time.dt_max:g} s, CFL {self.time.cfl:g}"),
+            ("frames", f"{self.time.frame_count + 1} at {self.time.frames_per_second:g} per second"),
+            ("solver", f"{self.solver.method} to {_shown(self.solver.tolerance)}, {self.solver.precision} precision"),
+        ]
+
+    def _side_complaints(self) -> list[Complaint]:
+        found = []
+        for index, side in enumerate(self.domain.open):
+            if side in self.domain.open[:index]:
+                found.append(Complaint(("domain", "open", index), side, "is named twice"))
+            if side in SIDES[2 * self.dimension :]:
+                found.append(Complaint(("domain", "open", index), side, "is a side of a 3-D domain; domain.size has 2 entries"))
+        return found
+
+    def _outside_complaints(self) -> list[Complaint]:
+        """Return which rigid bodies lie wholly outside the domain, as far as their keys tell."""
+        return [
+            Complaint(("solid", index), None, f"lies outside the domain, which reaches from the origin to {self.domain.size} m")
+            for index, solid in enumerate(self.solid)
+            if solid.is_body and not solid.complaints(self.dimension) and self.enclosed_volume(solid) == 0.0
+        ]
+
+    def _motion_complaints(self) -> list[Complaint]:
+        if self.domain.solids == "cut-cell":
+            return []
+        message = 'needs domain.solids = "cut-cell": solids that fill whole cells cannot move'
+        return [
+            Complaint(("solid", index, key), None, message)
+            for index, solid in enumerate(self.solid)
+            for key in ("motion", "mass", "density")
+            if getattr(solid, key) is not None
+        ]
+
+    def _body_line(self, index: int, solid: Solid) -> str:
+        """Return what a rigid body is, for the plan."""
+        unit = "kg" if self.dimension == 3 else "kg/m"
+        return f"solid {index} {solid.shape} of " + (f"{solid.mass:g} {unit}" if solid.mass is not None else f"{solid.density:g} kg/m^3")
+
+    def _grid_complaints(self) -> list[Complaint]:
+        found = []
+        for axis, side in enumerate(self.domain.size):
+            cells = side / self.spacing
+            if round(cells) < 1 or abs(cells - round(cells)) > WHOLE_CELLS * cells:
+                sides = [f"{n * self.spacing:.8g}" for n in (math.floor(cells), math.ceil(cells)) if n > 0]
+                message = f"must be a whole number of cells of {self.spacing:.6g} m; the nearest: {' and '.join(sides)}"
+                found.append(Complaint(("domain", "size", axis), side, message))
+        if self.domain.periodic is not None and len(self.domain.periodic) != self.dimension:
+            found.append(Complaint(("domain", "periodic"), self.domain.periodic, f"must have {self.dimension} entries"))
+        return found
+
+
+def _shown(tolerance: float | str) -> str:
+    """Return a solver's tolerance in words."""
+    return f"{tolerance:g}" if isinstance(tolerance, float) else "a tenth of the time step's error"

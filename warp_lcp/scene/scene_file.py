@@ -1,0 +1,255 @@
+"""Read a scene by its name or path, apply overrides, and write a scene back as it was resolved."""
+
+from __future__ import annotations
+
+import math
+import os
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from importlib.resources import files
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from warp_lcp.scene.scene import Scene, file_name
+from warp_lcp.scene.shapes import BUILTIN
+from warp_lcp.simulation import Simulator, simulators
+from warp_lcp.scene.table import Problem, SceneError, validate, written
+from warp_lcp.nearest import nearest
+
+DEEPEST = 16  # tables and arrays in each other; a scene needs six
+MOST_TABLES = 10_000  # in an array of them, such as [[liquid]]: each is a shape whose distances are taken by itself
+LARGEST = 1e18  # of a number: its square is a float32, and sums of cubes are float64
+
+HEADER = "# The scene as it ran: defaults filled in, overrides applied, paths absolute.\n"
+
+
+def built_in_scenes() -> dict[str, Traversable]:
+    """Return the scenes that come with the package, by name."""
+    found = {entry.name.removesuffix(".toml"): entry for entry in files("warp_lcp.scene.scenes").iterdir() if entry.name.endswith(".toml")}
+    return dict(sorted(found.items()))
+
+
+def installed_simulators() -> dict[str, Simulator]:
+    """Return the simulators by name.
+
+    Raises:
+        SceneError: one of them cannot be loaded, perhaps because another distribution installed a package of its name.
+    """
+    try:
+        return simulators()
+    except (AttributeError, ImportError, TypeError) as error:
+        problem = Problem("", f"a simulator cannot be loaded: {error}; `warp-lcp info` tells whether another package has its name")
+        raise SceneError("warp-lcp", [problem]) from error
+
+
+def load_scene(path_or_name: str | Path, overrides: Sequence[str] = ()) -> Scene:
+    """Return a scene, checked, with absolute paths: the class is the `scene_model` of its simulator.
+
+    Args:
+        path_or_name: a TOML file, or the name of a built-in scene.
+        overrides: `section.key=value` with values as in TOML (bare words are text); `liquid.0.max=[1, 1]` reaches into an array of tables.
+
+    Raises:
+        SceneError: listing everything that is wrong.
+    """
+    file = _find(str(path_or_name))
+    source = str(path_or_name)
+    data = _parse(file, source)
+    for override in overrides:
+        _override(data, override, source)
+    _refuse_extremes(data, source)
+    _resolve_paths(data, Path.cwd() if source in built_in_scenes() else Path(source).resolve().parent)
+    model = _scene_model(data, source)
+    about = data["scene"]
+    data["scene"] = {**about, "name": about.get("name") or file_name(file.name.removesuffix(".toml"))}
+    scene = validate(model, data, source)
+    _find_meshes(scene, source)
+    return scene
+
+
+def override_key(override: str) -> str:
+    """Return the key that an override sets, such as `liquid.0.max`."""
+    return override.partition("=")[0].strip()
+
+
+def override_value(override: str) -> str:
+    """Return the value that an override sets, in words."""
+    return written(_value(override.partition("=")[2].strip()))
+
+
+def scene_value(path_or_name: str, override: str) -> str:
+    """Return the value that a scene's file has where an override sets one, in words; `null` if there is none.
+
+    Raises:
+        SceneError: the file cannot be read.
+    """
+    value: Any = _parse(_find(path_or_name), path_or_name)
+    for key in override_key(override).split("."):
+        if isinstance(value, list) and key.isdecimal() and int(key) < len(value):
+            value = value[int(key)]
+        else:
+            value = value.get(key) if isinstance(value, dict) else None
+    return written(value)
+
+
+def check_shapes(scene: Scene, source: str) -> None:
+    """Build every shape of a scene, which reads its meshes.
+
+    Raises:
+        SceneError: a mesh cannot be read or does not enclose a volume.
+    """
+    problems = []
+    for table, entries in scene:
+        for index, shape in enumerate(entries if isinstance(entries, list) else ()):
+            try:
+                shape.to_geometry(Path.cwd(), scene.dimension)
+            except ValueError as error:
+                problems.append(Problem(f"{table}[{index}]", str(error)))
+    if problems:
+        raise SceneError(source, problems)
+
+
+def dump_scene(scene: Scene) -> str:
+    """Return the scene as TOML that `load_scene` reads back to an equal scene."""
+    return HEADER + tomli_w.dumps(scene.model_dump(by_alias=True, exclude_none=True))
+
+
+def keys(scene: Scene) -> dict[str, Any]:
+    """Return every key of a scene with its value, such as `time.cfl` or `liquid[0].max`."""
+    return table_keys(scene.model_dump(by_alias=True, exclude_none=True))
+
+
+def table_keys(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return every key of a table of tables with its value, as `keys` does."""
+    return dict(_leaves(dict(table)))
+
+
+def _leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Walk tables and arrays of tables; lists of numbers are leaves."""
+    if isinstance(value, dict):
+        for key, entry in value.items():
+            yield from _leaves(entry, f"{path}.{key}" if path else key)
+    elif isinstance(value, list) and value and isinstance(value[0], dict):
+        for index, entry in enumerate(value):
+            yield from _leaves(entry, f"{path}[{index}]")
+    else:
+        yield path, value
+
+
+def _find(text: str) -> Path | Traversable:
+    path = Path(text)
+    scenes = built_in_scenes()
+    if text in scenes:
+        return scenes[text]
+    if path.is_file():
+        return path
+    if path.suffix == ".toml" or len(path.parts) > 1:
+        raise SceneError(text, [Problem("", "is a folder, not a scene file" if path.is_dir() else "there is no such file")])
+    raise SceneError(text, [Problem("", f"no such file, and no such built-in scene; {nearest(text, scenes)}")])
+
+
+def _parse(file: Path | Traversable, source: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(file.read_bytes().decode("utf-8-sig").replace("\r\n", "\n"))
+    except OSError as error:
+        raise SceneError(source, [Problem("", f"cannot be read: {error.strerror}")]) from error
+    except UnicodeDecodeError as error:
+        raise SceneError(source, [Problem("", f"is not UTF-8 text (byte {error.start})")]) from error
+    except tomllib.TOMLDecodeError as error:
+        raise SceneError(source, [Problem("", f"is not valid TOML: {error}")]) from error
+    except RecursionError as error:
+        raise SceneError(source, [Problem("", "is not valid TOML: nested too deeply")]) from error
+    except ValueError as error:  # Python refuses to convert thousands of digits
+        raise SceneError(source, [Problem("", "is not valid TOML: a number has too many digits")]) from error
+
+
+def _refuse_extremes(data: dict[str, Any], source: str) -> None:
+    """Refuse what no scene needs and no arithmetic survives; nan and inf are for the validation, which knows the keys."""
+    problems = []
+    waiting: list[tuple[str, Any, int]] = [(key, value, 1) for key, value in data.items()]
+    while waiting:  # not recursive: dotted keys nest without limit
+        path, value, depth = waiting.pop()
+        if depth > DEEPEST:
+            raise SceneError(source, [Problem(path, "is nested too deeply")])
+        if isinstance(value, dict):
+            waiting += [(f"{path}.{key}", entry, depth + 1) for key, entry in value.items()]
+        elif isinstance(value, list) and len(value) > MOST_TABLES and isinstance(value[0], dict):
+            message = f"has {len(value):,} entries, of which a scene may have {MOST_TABLES:,}; a mesh holds more of them in one"
+            problems.append(Problem(path, message))
+        elif isinstance(value, list):
+            waiting += [(f"{path}[{index}]", entry, depth + 1) for index, entry in enumerate(value)]
+        elif isinstance(value, int) and abs(value) >= 2**63:
+            problems.append(Problem(path, "has too many digits: whole numbers have 64 bits"))
+        elif isinstance(value, float) and LARGEST < abs(value) < math.inf:
+            problems.append(Problem(path, f"must not be beyond {LARGEST:g}", written(value)))
+    if problems:
+        raise SceneError(source, problems)
+
+
+def _override(data: dict[str, Any], override: str, source: str) -> None:
+    """Set one key of the raw data; whether the key exists and the value suits it is for the validation to say."""
+    name, equals, text = override.partition("=")
+    keys = name.strip().split(".")
+    if not equals or len(keys) < 2 or not all(keys):
+        raise SceneError(source, [Problem(f"--set {override}", "must read section.key=value, such as time.duration=0.5")])
+    value = _value(text.strip())
+    table: Any = data
+    for depth in range(len(keys) - 1):
+        place = _place(table, keys, depth, source)
+        table = table[place] if isinstance(place, int) else table.setdefault(place, {})
+    table[_place(table, keys, len(keys) - 1, source)] = value
+
+
+def _place(table: object, keys: list[str], depth: int, source: str) -> str | int:
+    """Return keys[depth] as what it is in `table`: a table's key or an index into an array."""
+    key, parent, path = keys[depth], ".".join(keys[:depth]), ".".join(keys[: depth + 1])
+    if isinstance(table, dict):
+        return key
+    if not isinstance(table, list):
+        raise SceneError(source, [Problem(f"--set {path}", f"{parent} has no keys: it is {written(table)}")])
+    if not key.isdecimal() or int(key) >= len(table):
+        allowed = f"there are entries 0 to {len(table) - 1}" if table else "the array is empty"
+        raise SceneError(source, [Problem(f"--set {path}", f"is not an entry of {parent}; {allowed}")])
+    return int(key)
+
+
+def _value(text: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except (ValueError, RecursionError):  # not TOML, too many digits, nested too deeply
+        return text
+
+
+def _resolve_paths(data: dict[str, Any], folder: Path) -> None:
+    """Make the files that shapes name absolute, so that the scene means the same from anywhere."""
+    for entries in data.values():
+        for entry in entries if isinstance(entries, list) else ():
+            file = entry.get("file") if isinstance(entry, dict) else None
+            if isinstance(file, str) and file and not file.startswith(BUILTIN):
+                entry["file"] = str(folder / file)
+
+
+def _scene_model(data: dict[str, Any], source: str) -> type[Scene]:
+    """Return the class of the simulator that the scene names; without it, no other key can be judged."""
+    about = data.get("scene")
+    name = about.get("simulator") if isinstance(about, dict) else None
+    installed = installed_simulators()
+    if name is None:
+        raise SceneError(source, [Problem("scene.simulator", f"is missing; choose from {', '.join(sorted(installed))}")])
+    if not isinstance(name, str) or name not in installed:
+        raise SceneError(source, [Problem("scene.simulator", f"no such simulator; {nearest(str(name), installed)}", written(name))])
+    return installed[name].scene_model
+
+
+def _find_meshes(scene: Scene, source: str) -> None:
+    """Refuse meshes whose file is not there, before anything is built."""
+    problems = [
+        Problem(path, "there is no such file", written(file))
+        for path, file in _leaves(scene.model_dump())
+        if path.endswith("].file") and not file.startswith(BUILTIN) and not os.path.isfile(file)
+    ]
+    if problems:
+        raise SceneError(source, problems)

@@ -1,0 +1,415 @@
+"""The shapes of a scene file: where solids stand and where material starts."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field, ValidationError, ValidatorFunctionWrapHandler, WrapValidator
+from pydantic_core import PydanticCustomError
+
+from warp_lcp.scene.motions import Motion
+from warp_lcp.scene.table import Angles, Complaint, Table, Vector, counted
+from warp_lcp.settings import NonNegative, Part, Positive
+
+if TYPE_CHECKING:
+    from warp_lcp.grid.solids import Geometry, Placement
+
+BUILTIN = "builtin:"  # how the name of a mesh that the project generates begins
+
+Wall = Literal["separating", "free-slip"]
+
+
+def _wall_friction(value: Any, handler: ValidatorFunctionWrapHandler) -> float | str:
+    """Return a number from 0 to 10 or "stick"; a wrong one is refused once, and not by each alternative."""
+    try:
+        friction: float | str = handler(value)
+    except ValidationError as error:
+        raise PydanticCustomError("friction", 'must be a number from 0 to 10, or "stick"') from error
+    return friction
+
+
+WallFriction = Annotated[
+    Annotated[float, Field(ge=0, le=10)] | Literal["stick"], WrapValidator(_wall_friction, json_schema_input_type=float | Literal["stick"])
+]
+FRICTIONS = "a number from 0 (free slip) to 10, or stick"
+STICKS = 1e6  # Coulomb's coefficient of a wall that holds what presses against it
+BODY_FRICTION = 0.5  # of a rigid body unless its scene says otherwise
+
+
+class _Boxes:
+    """The boxes around a shape that were asked for, by dimension: equal to no others, so that shapes compare by their keys alone."""
+
+    def __init__(self) -> None:
+        self.known: dict[int, np.ndarray | None] = {}
+
+
+class Shape(Table):
+    """A region of space, placed by p = about + rotation (scale (q - about)) + translation; `about` is the origin unless given.
+
+    `rotate` is in degrees: one angle in 2-D, angles about the fixed axes x, y, z (in that order) in 3-D. `invert` swaps inside and outside.
+    """
+
+    if TYPE_CHECKING:
+        shape: str  # of the file's key; each kind of shape has a value of its own
+    translate: Vector | None = Field(default=None, description="a shift [m]")
+    rotate: Angles | None = Field(
+        default=None, description="degrees: one angle in 2-D, [x, y, z] in 3-D; it turns the shape about the origin, or the point of about"
+    )
+    about: Vector | None = Field(
+        default=None,
+        description="the point that scale and rotate leave where it is, such as the shape's center [m]; else the origin",
+    )
+    scale: Positive = Field(default=1.0, description="a factor, the same along every axis")
+    invert: bool = Field(default=False, description="true: everything but the shape")
+
+    @abstractmethod
+    def to_geometry(self, folder: Path, dimension: int) -> Geometry:
+        """Return the shape as a signed distance.
+
+        Args:
+            folder: where the files are that the shape names.
+            dimension: 2 or 3.
+
+        Raises:
+            ValueError: a file cannot be read or does not enclose a volume.
+        """
+
+    def placement(self, dimension: int) -> Placement:
+        """Return scale, rotation and translation in a scene of 2 or 3 dimensions."""
+        from warp_lcp.grid.solids import Placement
+
+        zeros = [0.0] * dimension
+        placed = Placement.from_degrees(self.scale, self.rotate or zeros[: 1 if dimension == 2 else 3], self.translate or zeros, dimension)
+        return placed if self.about is None else placed.about(self.about)
+
+    def turned_out(self, domain: list[float]) -> tuple[float, list[float]] | None:
+        """Return how far `rotate` takes the shape out of a domain of these sides [m], and its center before [m]; None: it does not.
+
+        Of a shape that turns about the origin, which may not have been meant.
+        """
+        if self.about is not None or not any(self.rotate or []) or self.invert:
+            return None
+        dimension, unturned = len(domain), self.model_copy(update={"rotate": None})
+        placed = [shape.to_geometry(Path(), dimension).bounds() for shape in (unturned, self)]
+        if placed[0] is None or placed[1] is None:
+            return None
+        corners = [box[:, :dimension] for box in placed if box is not None]
+        before, now = (max(float(-low.min()), float((high - domain).max()), 0.0) for low, high in corners)
+        return (now, corners[0].mean(axis=0).tolist()) if now > before else None
+
+    def bounds(self, dimension: int) -> np.ndarray | None:
+        """Return the low and high corner [m] of a box around the shape, shape (2, 3).
+
+        None when the shape has no limits, or only its file knows them.
+        """
+        known = self._boxes.known
+        if dimension not in known:
+            known[dimension] = self.to_geometry(Path(), dimension).bounds()
+        return known[dimension]
+
+    @cached_property
+    def _boxes(self) -> _Boxes:
+        return _Boxes()
+
+    def complaints(self, dimension: int) -> list[Complaint]:
+        """Return what is wrong with the shape in a scene of 2 or 3 dimensions."""
+        wanted = {name: dimension for name, value in self if isinstance(value, list)}
+        wanted |= {name: 1 if dimension == 2 else 3 for name in ("rotate", "angular_velocity") if name in wanted}
+        return [
+            Complaint((type(self).model_fields[name].alias or name,), value, f"must {counted(count)} in {dimension}-D")
+            for name, count in wanted.items()
+            if len(value := getattr(self, name)) != count
+        ] + ([Complaint(("about",), self.about, "has no effect without rotate or scale")] if self._about_idles else [])
+
+    @property
+    def _about_idles(self) -> bool:
+        return self.about is not None and self.rotate is None and self.scale == 1.0
+
+
+class Box(Shape):
+    """A box between two corners."""
+
+    shape: Literal["box"] = "box"
+    min: Vector = Field(description="the low corner [m]")
+    max: Vector = Field(description="the high corner [m]")
+
+    def to_geometry(self, folder: Path, dimension: int) -> Geometry:
+        """Return the box; in 2-D it extends along z without limit."""
+        from warp_lcp.grid import solids
+
+        return solids.Box(lower=self.min, upper=self.max, placement=self.placement(dimension), invert=self.invert)
+
+    def complaints(self, dimension: int) -> list[Complaint]:
+        """Return what is wrong with the box in a scene of 2 or 3 dimensions."""
+        found = super().complaints(dimension)
+        if not found and any(low >= high for low, high in zip(self.min, self.max, strict=True)):
+            found.append(Complaint(("max",), self.max, f"must be greater than min = {self.min} along every axis"))
+        return found
+
+
+class Sphere(Shape):
+    """A ball; a disc in 2-D."""
+
+    shape: Literal["sphere"] = "sphere"
+    center: Vector = Field(description="a point [m]")
+    radius: Positive = Field(description="a length [m]")
+
+    def to_geometry(self, folder: Path, dimension: int) -> Geometry:
+        """Return the ball."""
+        from warp_lcp.grid import solids
+
+        return solids.Sphere(center=self.center, radius=self.radius, placement=self.placement(dimension), invert=self.invert)
+
+
+class Capsule(Shape):
+    """All points within a radius of a segment."""
+
+    shape: Literal["capsule"] = "capsule"
+    start: Vector = Field(alias="from", description="one end of the axis [m]")
+    end: Vector = Field(alias="to", description="the other end of the axis [m]")
+    radius: Positive = Field(description="a length [m]")
+
+    def to_geometry(self, folder: Path, dimension: int) -> Geometry:
+        """Return the capsule."""
+        from warp_lcp.grid import solids
+
+        return solids.Capsule(start=self.start, end=self.end, radius=self.radius, placement=self.placement(dimension), invert=self.invert)
+
+    def complaints(self, dimension: int) -> list[Complaint]:
+        """Return what is wrong with the capsule in a scene of 2 or 3 dimensions."""
+        found = super().complaints(dimension)
+        if self.start == self.end:
+            found.append(Complaint(("to",), self.end, 'must differ from "from"; use a sphere otherwise'))
+        return found
+
+
+class Plane(Shape):
+    """The half space on the side of a plane that its normal points away from."""
+
+    shape: Literal["plane"] = "plane"
+    point: Vector = Field(description="a point of the plane [m]")
+    normal: Vector = Field(description="points out of the material; its length does not matter")
+
+    def to_geometry(self, folder: Path, dimension: int) -> Geometry:
+        """Return the half space."""
+        from warp_lcp.grid import solids
+
+        return solids.Plane(point=self.point, normal=self.normal, placement=self.placement(dimension), invert=self.invert)
+
+    def complaints(self, dimension: int) -> list[Complaint]:
+        """Return what is wrong with the plane in a scene of 2 or 3 dimensions."""
+        found = super().complaints(dimension)
+        if not any(self.normal):
+            found.append(Complaint(("normal",), self.normal, "must not be zero"))
+        return found
+
+
+class Mesh(Shape):
+    """The inside of a closed surface of triangles; in 2-D, of its cut by the plane z = 0."""
+
+    shape: Literal["mesh"] = "mesh"
+    file: str = Field(min_length=1, description=f"an OBJ, STL or PLY file, or a mesh that warp-lcp makes, such as {BUILTIN}torus")
+
+    def to_geometry(self, folder: Path, dimension: int) -> Geometry:
+        """Return the inside of the mesh."""
+        from warp_lcp.grid import solids
+
+        return solids.TriangleMesh.from_file(self.file, folder=folder, placement=self.placement(dimension), invert=self.invert)
+
+    def bounds(self, dimension: int) -> np.ndarray | None:
+        """Return None: only the file knows."""
+        return None
+
+
+class SolidProperties(Shape):
+    """What a solid has besides its shape; where solids have more, classes of their own derive from SolidBox, SolidSphere and so on."""
+
+    rubs: ClassVar[bool] = False  # whether the material rubs against solids that stand
+    wall: Wall | None = Field(default=None, description="whether material may let go of it; domain.wall unless given")
+    motion: Motion | None = Field(default=None, description="how it moves, from where it is placed; it stands still unless given")
+    mass: float | None = Field(default=None, ge=1e-18, description="makes it a rigid body that the material moves [kg; kg/m in 2-D]")
+    density: float | None = Field(default=None, ge=1e-18, description="in place of mass: of the solid, filled evenly [kg/m^3]")
+    velocity: Vector | None = Field(default=None, description="of a rigid body at the start [m/s]; at rest unless given")
+    angular_velocity: Angles | None = Field(
+        default=None,
+        description="of a rigid body at the start [degrees/s]: a number in 2-D, [x, y, z] in 3-D; 0 unless given",
+    )
+    friction: WallFriction | None = Field(
+        default=None,
+        description=f"of its surface, against sand and between bodies and walls: {FRICTIONS}; domain.friction unless given, "
+        f"{BODY_FRICTION:g} for a rigid body in a liquid",
+    )
+    restitution: Part = Field(default=0.0, description="of a rigid body: the part of the speed of an impact that comes back")
+
+    @property
+    def is_body(self) -> bool:
+        """Return whether it is a rigid body."""
+        return self.mass is not None or self.density is not None
+
+    @property
+    def moves(self) -> bool:
+        """Return whether it does not stand still."""
+        return self.is_body or self.motion is not None
+
+    def complaints(self, dimension: int) -> list[Complaint]:
+        """Return what is wrong with the solid in a scene of 2 or 3 dimensions."""
+        moves = self.motion.complaints(dimension) if self.motion else []
+        found = super().complaints(dimension) + [Complaint(("motion", *c.place), c.value, c.message) for c in moves]
+        return found + (self._body_complaints() if self.is_body else self._still_complaints())
+
+    def _body_complaints(self) -> list[Complaint]:
+        """Return what is wrong with a rigid body."""
+        key = "mass" if self.mass is not None else "density"
+        found = []
+        if self.mass is not None and self.density is not None:
+            found.append(Complaint(("density",), self.density, "goes without mass: give one of them"))
+        if self.motion is not None:
+            found.append(Complaint(("motion",), None, f"goes without {key}: a rigid body moves as forces ask"))
+        if self.invert:
+            found.append(Complaint(("invert",), True, f"goes without {key}: everything but a shape has no mass"))
+        if self.shape == "plane":
+            found.append(Complaint((key,), getattr(self, key), "not for a plane: a half space has no mass"))
+        return found
+
+    def _still_complaints(self) -> list[Complaint]:
+        """Return which keys need a rigid body."""
+        given: dict[str, object] = {
+            "velocity": self.velocity,
+            "angular_velocity": self.angular_velocity,
+            "restitution": self.restitution or None,
+        }
+        message = "needs mass or density, which make the solid a rigid body"
+        found = [Complaint((name,), value, message) for name, value in given.items() if value is not None]
+        if self.friction is not None and not self.rubs:
+            found.append(Complaint(("friction",), self.friction, f"{message}: a liquid does not rub against solids"))
+        return found
+
+
+class MaterialProperties(Shape):
+    """What a material has besides its shape, whatever it is."""
+
+    velocity: Vector | None = Field(default=None, description="at the start [m/s]; at rest unless given")
+
+
+class SolidBox(SolidProperties, Box):
+    """A solid box."""
+
+
+class SolidSphere(SolidProperties, Sphere):
+    """A solid ball."""
+
+
+class SolidCapsule(SolidProperties, Capsule):
+    """A solid capsule."""
+
+
+class SolidPlane(SolidProperties, Plane):
+    """A solid half space."""
+
+
+class SolidMesh(SolidProperties, Mesh):
+    """A solid inside a surface of triangles."""
+
+
+class LiquidBox(MaterialProperties, Box):
+    """A box of liquid."""
+
+
+class LiquidSphere(MaterialProperties, Sphere):
+    """A ball of liquid."""
+
+
+class LiquidCapsule(MaterialProperties, Capsule):
+    """A capsule of liquid."""
+
+
+class LiquidPlane(MaterialProperties, Plane):
+    """A half space of liquid."""
+
+
+class LiquidMesh(MaterialProperties, Mesh):
+    """Liquid inside a surface of triangles."""
+
+
+class Schedule(Table):
+    """When something runs."""
+
+    begin: NonNegative = Field(alias="start", default=0.0, description="when it starts to run [s]")
+    stop: float | None = Field(default=None, description="when it no longer runs [s]; it goes on unless given")
+
+    def schedule_complaints(self) -> list[Complaint]:
+        """Return what is wrong with the times."""
+        if self.stop is not None and self.stop <= self.begin:
+            return [Complaint(("stop",), self.stop, f"must be later than start = {self.begin:g}")]
+        return []
+
+
+class SourceProperties(Schedule, Shape):
+    """What a source has besides its shape."""
+
+    velocity: Vector = Field(description="of what comes out [m/s]")
+
+    def complaints(self, dimension: int) -> list[Complaint]:
+        """Return what is wrong with the source in a scene of 2 or 3 dimensions."""
+        found = super().complaints(dimension) + self.schedule_complaints()
+        if not any(self.velocity):
+            found.append(Complaint(("velocity",), self.velocity, "must not be zero: nothing would come out"))
+        return found
+
+
+class DrainProperties(Schedule, Shape):
+    """What a drain has besides its shape."""
+
+    def complaints(self, dimension: int) -> list[Complaint]:
+        """Return what is wrong with the drain in a scene of 2 or 3 dimensions."""
+        return super().complaints(dimension) + self.schedule_complaints()
+
+
+class SourceBox(SourceProperties, Box):
+    """A box that material comes out of."""
+
+
+class SourceSphere(SourceProperties, Sphere):
+    """A ball that material comes out of."""
+
+
+class SourceCapsule(SourceProperties, Capsule):
+    """A capsule that material comes out of."""
+
+
+class SourcePlane(SourceProperties, Plane):
+    """A half space that material comes out of."""
+
+
+class SourceMesh(SourceProperties, Mesh):
+    """A surface of triangles that material comes out of."""
+
+
+class DrainBox(DrainProperties, Box):
+    """A box that swallows material."""
+
+
+class DrainSphere(DrainProperties, Sphere):
+    """A ball that swallows material."""
+
+
+class DrainCapsule(DrainProperties, Capsule):
+    """A capsule that swallows material."""
+
+
+class DrainPlane(DrainProperties, Plane):
+    """A half space that swallows material."""
+
+
+class DrainMesh(DrainProperties, Mesh):
+    """A surface of triangles that swallows material."""
+
+
+Solid = Annotated[SolidBox | SolidSphere | SolidCapsule | SolidPlane | SolidMesh, Field(discriminator="shape")]
+Liquid = Annotated[LiquidBox | LiquidSphere | LiquidCapsule | LiquidPlane | LiquidMesh, Field(discriminator="shape")]
+Source = Annotated[SourceBox | SourceSphere | SourceCapsule | SourcePlane | SourceMesh, Field(discriminator="shape")]
+Drain = Annotated[DrainBox | DrainSphere | DrainCapsule | DrainPlane | DrainMesh, Field(discriminator="shape")]

@@ -1,0 +1,248 @@
+"""What the driver asks of a simulator, and how it finds one: the entry-point group `warp_lcp.simulators`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from warp_lcp.result import SolveStatus
+
+if TYPE_CHECKING:
+    from warp_lcp.distributed.ranks import Ranks
+    from warp_lcp.run.profile import Stopwatch
+    from warp_lcp.scene.scene import Scene
+
+GROUP = "warp_lcp.simulators"
+
+
+class StepFailed(RuntimeError):
+    """The step's solve missed its criteria. The state is as before the step, so a smaller dt may be tried."""
+
+
+def missed_by_far(solve: str, status: SolveStatus, iterations: int, residual: str, advice: str) -> StepFailed:
+    """Return what to raise where a solve has ended too far from its tolerance for the step to be taken.
+
+    Args:
+        solve: what was solved for, in a word.
+        status: how it ended.
+        iterations: how many it took.
+        residual: what it left, with its unit and what was asked for, in words.
+        advice: what may help.
+    """
+    return StepFailed(f"the {solve} solve ended with {status.name} after {iterations} iterations at a {residual}: {advice}")
+
+
+class SimulationFailed(RuntimeError):
+    """The run cannot go on, for example because a field is not finite. The message names step, field and cell."""
+
+
+@dataclass(frozen=True)
+class Points:
+    """A frame of vertices. `points` [m], shape (n, 3); `fields` of shape (n,) or (n, 3)."""
+
+    name: str
+    points: np.ndarray
+    fields: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Cells:
+    """A frame of equal axis-aligned cells. `index` (n, 3): integer x, y, z of each cell, whose low corner lies at index * spacing [m].
+
+    `dimension` 2 makes quadrilaterals in the plane z = 0, 3 makes voxels. `fields` have shape (n,) or (n, 3). `counts`: cells of the whole
+    grid along x, y and z, which an image of it has in every frame. `box`: the first cell, and the one behind the last, of the part of the
+    grid that these cells come from, if others have the rest; then an image is one of that part.
+    """
+
+    name: str
+    index: np.ndarray
+    spacing: float
+    dimension: int
+    fields: dict[str, np.ndarray] = field(default_factory=dict)
+    counts: tuple[int, int, int] | None = None
+    box: tuple[tuple[int, int, int], tuple[int, int, int]] | None = None
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A frame of a surface: triangles, in 2-D the segments of an outline.
+
+    `points` [m], shape (n, 3); `corners` of the triangles among them, shape (m, 3), counterclockwise seen from outside, or of the segments,
+    shape (m, 2), with the inside on the left; `fields` at the points, of shape (n,) or (n, 3).
+    """
+
+    name: str
+    points: np.ndarray
+    corners: np.ndarray
+    fields: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Volume:
+    """A frame of values at the centers of a 3-D grid's cells.
+
+    `values`: float32, shape (nz, ny, nx); `spacing` of the cells [m], the first of which has its low corner at the origin; `band`: of a
+    signed distance [m], < 0 inside, how far from the surface it is known; None: a density, >= 0.
+    """
+
+    name: str
+    values: np.ndarray
+    spacing: float
+    band: float | None = None
+
+
+Part = Points | Cells | Surface | Volume  # of a frame
+
+
+class Simulation(Protocol):
+    """A simulation in progress: state on a device and the rule for one step."""
+
+    time: float  # [s]
+    step_count: int
+
+    def stable_dt(self) -> float:
+        """Return the largest time step [s] that the scene's CFL number allows now, not yet clipped to dt_min, dt_max or a frame's time.
+
+        It is a function of the state alone.
+        """
+
+    def step(self, dt: float) -> dict[str, float | int | str | None]:
+        """Advance by dt [s] and return a row of the log.
+
+        Raises:
+            StepFailed: the solve missed its criteria and the state is unchanged.
+            SimulationFailed: the run cannot go on.
+        """
+
+    def columns(self) -> tuple[str, ...]:
+        """Return the names of the log's columns that `step` fills, in order, after `step`, `time`, `dt` and before `seconds`."""
+
+    def frame(self) -> list[Part]:
+        """Return what a frame shows, as host arrays that no later step changes: they are written while the simulation goes on."""
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return everything that `restore` needs to continue bit for bit on the CPU, as host arrays without pickles."""
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue from `state`.
+
+        Raises:
+            ValueError: the arrays do not belong to this scene.
+        """
+
+    def notes(self) -> list[str]:
+        """Return warnings and facts worth a line at the start of a run (say, a mesh outside the domain)."""
+
+
+@runtime_checkable
+class Scheduled(Protocol):
+    """What a Simulation may also be: one in which something starts or stops at times known before.
+
+    Steps end there where that takes no step that is much shorter than its neighbors. The others run across: the simulation must be right
+    then too.
+    """
+
+    def events(self, until: float) -> list[float]:
+        """Return these times [s] as far as they are later than now and not later than `until` [s], in any order."""
+
+
+@runtime_checkable
+class Profiled(Protocol):
+    """What a Simulation may also be: one that says what its step spends its time on.
+
+    It wraps the stages of its step in `with self.watch.stage(name, *arrays)`. A run that is profiled sets `watch` before the first step;
+    until then it is a `warp_lcp.run.profile.NoStopwatch`.
+    """
+
+    watch: Stopwatch
+
+
+@runtime_checkable
+class Recorded(Protocol):
+    """What a Simulation may also be: one that shows the problems it solves.
+
+    Until a run sets `record`, it is None and costs nothing. Then each step calls it before its solve, once an attempt, with the arrays of a
+    file as `warp_lcp.gallery.recorded` describes them; problems that no method solves are recorded too.
+    """
+
+    record: Callable[[Mapping[str, np.ndarray]], object] | None
+
+
+@runtime_checkable
+class Resampled(Protocol):
+    """What a Simulation may also be: one that can go on on another grid than the one its state was made on."""
+
+    def resample(self, state: Mapping[str, np.ndarray]) -> list[str]:
+        """Continue from the state of a simulation that differs in `domain.resolution` alone; return what the user should know of it.
+
+        Raises:
+            ValueError: the state does not belong to this scene on any grid, or cannot be brought to this one.
+        """
+
+
+@runtime_checkable
+class Simulator(Protocol):
+    """A plug-in: a kind of material and the scenes that describe it."""
+
+    name: str
+    summary: str
+    scene_model: type[Any]  # a subclass of warp_lcp.scene.scene.Scene
+
+    def create(self, scene: Scene, *, device: str, folder: Path) -> Simulation:
+        """Build a simulation of `scene`. Files that the scene names are relative to `folder`.
+
+        Raises:
+            ValueError: the scene cannot be simulated; the message names the key and what is allowed.
+        """
+
+
+@runtime_checkable
+class Joined(Protocol):
+    """What a Simulation may also be: one that can go on where several MPI ranks ended."""
+
+    def restore_pieces(self, pieces: Sequence[Mapping[str, np.ndarray]]) -> None:
+        """Continue from the pieces of all ranks of a run, which need not have been as many. An array is read when it is asked for.
+
+        Raises:
+            ValueError: the pieces do not belong to this scene.
+        """
+
+
+class DistributedSimulation(Simulation, Joined, Protocol):
+    """A rank's part of a simulation that several MPI ranks share.
+
+    `stable_dt`, `step`, `restore` (the state of one process) and `restore_pieces` are collective. Times, rows of the log and columns are
+    those of the whole simulation, the same on all ranks, which also raise the same kind of error. `frame` returns what this rank has, in
+    coordinates of the whole domain.
+    """
+
+    def piece_state(self) -> dict[str, np.ndarray]:
+        """Return this rank's part of the state; `box`, int (2, 3), is its part's first cell and the one behind the last."""
+
+
+@runtime_checkable
+class DistributedSimulator(Protocol):
+    """What a Simulator may also be: one whose simulations several MPI ranks share."""
+
+    def create_distributed(self, scene: Scene, ranks: Ranks, *, device: str, folder: Path) -> DistributedSimulation:
+        """Build this rank's part of a simulation of `scene`; collective.
+
+        Raises:
+            ValueError: the scene cannot be simulated, or not on ranks; the message names the key and what is allowed.
+        """
+
+
+def simulators() -> dict[str, Simulator]:
+    """Return the installed simulators by name."""
+    found = {}
+    for entry in entry_points(group=GROUP):
+        simulator = entry.load()
+        if not isinstance(simulator, Simulator):
+            raise TypeError(f"entry point {entry.name!r} of {GROUP} is not a simulator: {simulator!r}")
+        found[entry.name] = simulator
+    return found
