@@ -58,7 +58,7 @@ wheel-check: $(VENV)/.run
 	cd build/wheel-check && venv/bin/warp-lcp run ceiling-drop --out run --set time.duration=0.05
 	cd build/wheel-check && venv/bin/warp-lcp run hourglass-2d --out sand --set time.duration=0.01 --set domain.resolution=24
 	cd build/wheel-check && venv/bin/python -c "from importlib.resources import files; \
-		assert all((files(package) / 'py.typed').is_file() for package in ('warp_lcp', 'fluids', 'granular'))"
+		assert all((files(package) / 'py.typed').is_file() for package in ('warp_lcp', 'warp_lcp.fluids', 'warp_lcp.granular'))"
 
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)

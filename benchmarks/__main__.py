@@ -26,7 +26,10 @@ def main() -> None:
     parser.add_argument("--seed", type=int)
     given = parser.parse_args()
     launches.install()  # before anything imports warp_lcp
-    suite, report = importlib.import_module(f"warp_lcp.benchmarks.{given.suite}"), importlib.import_module("warp_lcp.benchmarks.harness.report")
+    suite, report = (
+        importlib.import_module(f"warp_lcp.benchmarks.{given.suite}"),
+        importlib.import_module("warp_lcp.benchmarks.harness.report"),
+    )
     options = Options(given.device, tuple(given.size), given.repeat, lambda text: sys.stderr.write(f"{text}\n"), given.scene, given.seed)
     given.out.mkdir(parents=True, exist_ok=True)
     gc.collect()

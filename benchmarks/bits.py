@@ -22,10 +22,10 @@ from rich.console import Console
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.problems import cut_cells, splash
-from warp_lcp.run.progress import Lines
-from warp_lcp.run.loop import run_scene
-from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.protocol import families
+from warp_lcp.run.loop import run_scene
+from warp_lcp.run.progress import Lines
+from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.solvers.mprgp import MPRGP
 from warp_lcp.solvers.registry import METHODS
 

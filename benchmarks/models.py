@@ -23,12 +23,12 @@ from warp_lcp.benchmarks.harness.machine import array_bytes, machine
 from warp_lcp.benchmarks.harness.record import Record, Results, Table
 from warp_lcp.benchmarks.harness.report import markdown
 from warp_lcp.benchmarks.harness.timing import Figure, Options, clock
-from warp_lcp.scene.models import TABLE
-from warp_lcp.run.profile import Profile
 from warp_lcp.run.loop import plan_dt
+from warp_lcp.run.profile import Profile
+from warp_lcp.scene.models import TABLE
 from warp_lcp.scene.scene import Scene, Time
-from warp_lcp.simulation import simulators
 from warp_lcp.scene.table import validate
+from warp_lcp.simulation import simulators
 
 TITLE = "What models cost"
 RESOLUTION = {2: 128, 3: 48}  # cells along the longest side of the reference scenes
@@ -293,7 +293,7 @@ def main() -> None:
     options = Options(given.device, (), given.repeat, lambda text: sys.stderr.write(f"{text}\n"))
     results = measure(options, Path())
     head = "# What models add to a step and to memory, by simulator and dimension; written by `python -m warp_lcp.benchmarks.models`.\n\n"
-    Path(str(files("warp_lcp.driver") / TABLE)).write_text(head + tomli_w.dumps(price_list(results.records)), "utf-8")
+    Path(str(files("warp_lcp.scene") / TABLE)).write_text(head + tomli_w.dumps(price_list(results.records)), "utf-8")
     write_page(given.page, results)
 
 

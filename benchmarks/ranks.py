@@ -177,8 +177,19 @@ def measure(options: Options, out: Path) -> Results:
 def _started(count: int, sizes: Sequence[int], options: Options) -> list[Record]:
     """Measure on so many ranks, started here."""
     with tempfile.TemporaryDirectory() as folder:
-        asked = [part for n in sizes for part in ("--size", str(n))]
-        arguments = ["-m", "warp_lcp.benchmarks", "ranks", *asked, "--repeat", str(options.repeat), "--device", options.device, "--out", folder]
+        asked = [*(part for n in sizes for part in ("--size", str(n))), "--repeat", str(options.repeat), "--device", options.device]
+        arguments = [
+            "-m",
+            "warp_lcp.benchmarks",
+            "ranks",
+            *asked,
+            "--repeat",
+            str(options.repeat),
+            "--device",
+            options.device,
+            "--out",
+            folder,
+        ]
         waiting = {"OMPI_MCA_mpi_yield_when_idle": str(int(count > (os.cpu_count() or 1)))}  # to give cores away costs microseconds
         process = subprocess.run(launch.command(count, *arguments), env=launch.environment() | waiting, check=False)
         if process.returncode != 0:
@@ -281,9 +292,7 @@ def targets(found: Found, sizes: Sequence[int]) -> Table:
         rows += [
             Target(f"{n}^3 walls: iterations to 1e-6, the most of any number of ranks less the least", 1, spread_),
             Target(f"{n}^3 walls: seconds to 1e-6 on 1 rank over those on 2", 1.6, gain, at_least=True),
-            Target(
-                f"{n}^3 walls: seconds to 1e-6 on 1 rank over one process's", 1.5, one.figures.get(f"{TOLD}_over_single") if one else None
-            ),
+            Target(f"{n}^3 walls: seconds to 1e-6 on 1 rank over one process's", 1.5, single),
             Target(f"{n}^3 walls: memory of a rank of 2 over that of 1", 0.6, _ratio(two, one, "resident_more")),
         ]
     return table_of_targets("figure", rows)

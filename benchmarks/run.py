@@ -18,10 +18,10 @@ from warp_lcp.benchmarks.harness.machine import machine
 from warp_lcp.benchmarks.harness.record import Bars, Record, Results, Table
 from warp_lcp.benchmarks.harness.timing import Figure, Options, timed
 from warp_lcp.material import particle_simulation
+from warp_lcp.material.boundary import WholeCells
 from warp_lcp.run.loop import run_scene
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.simulation import simulators
-from warp_lcp.material.boundary import WholeCells
 
 TITLE = "Runs of built-in scenes"
 SCENES = {"dam-break-2d": 0.3, "dam-break": 0.2}  # [s] simulated

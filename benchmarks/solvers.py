@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 import warp_lcp as wl
+from warp_lcp import gallery
 from warp_lcp.benchmarks.cases import RTOL, Case
 from warp_lcp.benchmarks.harness.machine import COPIED, machine, present
 from warp_lcp.benchmarks.harness.record import Chart, Lines, Record, Results, Table, shown, spread
@@ -19,7 +20,6 @@ from warp_lcp.benchmarks.harness.timing import Figure, Options, ratios
 from warp_lcp.benchmarks.peers.linear import pyamg_aggregation, scipy_cg
 from warp_lcp.benchmarks.peers.peer import Answer, Question
 from warp_lcp.benchmarks.problems import BOUNDS, anisotropic, cut_cells, splash
-from warp_lcp import gallery
 
 TITLE = "Linear and LCP pressure solves"
 SIZES = (64, 128)

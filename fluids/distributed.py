@@ -16,6 +16,12 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
+from warp_lcp.distributed.balance import balanced_processes, pool
+from warp_lcp.distributed.decomposition import Decomposition
+from warp_lcp.distributed.particles import SharedParticles
+from warp_lcp.distributed.ranks import Ranks
+from warp_lcp.distributed.solids import boundary_of_part
+from warp_lcp.distributed.subdomain import Subdomain, ghost_layers
 from warp_lcp.fluids.distributed_pressure import DistributedPressure
 from warp_lcp.fluids.distributed_state import Piece, PieceReader, piece_of
 from warp_lcp.fluids.distributed_surface import make_shared_surface
@@ -23,20 +29,14 @@ from warp_lcp.fluids.pressure import PressureProjection
 from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.fluids.simulator import LiquidSimulation
 from warp_lcp.fluids.surface import FreeSurface
-from warp_lcp.distributed.balance import balanced_processes, pool
-from warp_lcp.distributed.decomposition import Decomposition
-from warp_lcp.distributed.particles import SharedParticles
-from warp_lcp.distributed.ranks import Ranks
-from warp_lcp.distributed.solids import boundary_of_part
-from warp_lcp.distributed.subdomain import Subdomain, ghost_layers
+from warp_lcp.grid.particles import ParticleTotals
+from warp_lcp.grid.staggered import Window
+from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.particle_assembly import placed_solids, seed_materials, start_velocities
 from warp_lcp.material.particle_simulation import Row
 from warp_lcp.material.particle_state import signature
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import SimulationFailed, StepFailed
-from warp_lcp.grid.particles import ParticleTotals
-from warp_lcp.grid.staggered import Window
-from warp_lcp.material.boundary import Boundary
 
 LEAST_RIGHT = 2  # layers of ghost cells that stay right while the velocity is continued: faces at cut cells look so far
 METHODS = ("projected-multigrid", "minimum-map-newton")  # that solve problems of several ranks

@@ -9,10 +9,10 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.fluids.pressure import PressureProjection, Projection
-from warp_lcp.fluids.tolerance import TimeErrorTolerance
 from warp_lcp.distributed.grid_poisson import DistributedGridPoisson
 from warp_lcp.distributed.subdomain import Subdomain
+from warp_lcp.fluids.pressure import PressureProjection, Projection
+from warp_lcp.fluids.tolerance import TimeErrorTolerance
 from warp_lcp.grid.staggered import Window
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.operators.grid_poisson import FLUID

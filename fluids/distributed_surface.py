@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import warp as wp
 
+from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.fluids.assembly import stays_full
 from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.fluids.surface import FreeSurface, GhostFluidSurface, NoSurface, WholeCellSurface
-from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import Window
 from warp_lcp.material.boundary import Boundary

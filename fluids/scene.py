@@ -7,8 +7,8 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from warp_lcp.scene.models import Model
 from warp_lcp.material.particle_scene import ParticleScene
+from warp_lcp.scene.models import Model
 from warp_lcp.scene.scene import Complaint, Liquid, Table
 from warp_lcp.scene.shapes import MaterialProperties
 

@@ -14,6 +14,12 @@ from warp_lcp.fluids.assembly import make_pressure, make_surface
 from warp_lcp.fluids.pressure import PressureProjection, Projection
 from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.fluids.surface import FreeSurface
+from warp_lcp.grid.particles import Particles
+from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.material.boundary import Boundary
+from warp_lcp.material.contact import RELEASED, TOUCHES_NOTHING
+from warp_lcp.material.narrow_band import NarrowBand
+from warp_lcp.material.outlets import Outlets
 from warp_lcp.material.particle_assembly import (
     make_bodies,
     make_boundary,
@@ -24,20 +30,14 @@ from warp_lcp.material.particle_assembly import (
     placed_solids,
 )
 from warp_lcp.material.particle_simulation import ParticleSimulation, Row
-from warp_lcp.scene.scene import Scene
-from warp_lcp.simulation import Cells, Part, SimulationFailed, missed_by_far
-from warp_lcp.grid.particles import Particles
-from warp_lcp.grid.staggered import StaggeredGrid, Window
-from warp_lcp.material.boundary import Boundary
-from warp_lcp.material.contact import RELEASED, TOUCHES_NOTHING
-from warp_lcp.material.narrow_band import NarrowBand
-from warp_lcp.material.outlets import Outlets
 from warp_lcp.material.sources import Sources
 from warp_lcp.rigid.bodies import RigidBodies
+from warp_lcp.scene.scene import Scene
+from warp_lcp.simulation import Cells, Part, SimulationFailed, missed_by_far
 
 if TYPE_CHECKING:
-    from warp_lcp.fluids.distributed import DistributedLiquid
     from warp_lcp.distributed.ranks import Ranks
+    from warp_lcp.fluids.distributed import DistributedLiquid
 
 
 class LiquidSimulation(ParticleSimulation):

@@ -17,20 +17,20 @@ from warp_lcp.granular.report import Outcome
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.solids import SandSolids
 from warp_lcp.granular.stress import Stress, YieldSet
-from warp_lcp.material.particle_assembly import make_bodies, make_boundary, make_outlets, make_particles, make_sources, placed_solids
-from warp_lcp.material.particle_simulation import ParticleSimulation, Row
-from warp_lcp.scene.scene import Scene
-from warp_lcp.simulation import Cells, Part, SimulationFailed, missed_by_far
 from warp_lcp.grid.extrapolate import complete
 from warp_lcp.grid.level_set import particle_density
 from warp_lcp.grid.particles import Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.outlets import Outlets
+from warp_lcp.material.particle_assembly import make_bodies, make_boundary, make_outlets, make_particles, make_sources, placed_solids
+from warp_lcp.material.particle_simulation import ParticleSimulation, Row
 from warp_lcp.material.sources import Sources
 from warp_lcp.material.wall import extend_velocity
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 from warp_lcp.rigid.bodies import RigidBodies
+from warp_lcp.scene.scene import Scene
+from warp_lcp.simulation import Cells, Part, SimulationFailed, missed_by_far
 
 FRONT = 99.0  # percentile of the particles that runout and height are of
 FAR = 1.0  # rho g dx: cells are left with a velocity that is off by as much as gravity makes in the step

@@ -7,6 +7,8 @@ import pytest
 import warp as wp
 from hypothesis import HealthCheck, settings
 
+from dots import dots, scene_file  # noqa: F401  # fixtures of whatever runs scenes
+
 wp.config.log_level = wp.LOG_ERROR
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as shells have both for what they start in the background; tests send them
     signal.signal(signal.SIGINT, signal.default_int_handler)

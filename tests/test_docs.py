@@ -7,8 +7,8 @@ import pytest
 
 import warp_lcp as wl
 from code_blocks import blocks, run
-from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.protocol import CAPABILITIES, families, members
+from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.solvers.registry import grid_methods
 
 DOCS = Path(__file__).parents[1] / "docs"

@@ -16,10 +16,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import warp_lcp as wl
-from warp_lcp.granular.coupled import METHODS as SAND
 from warp_lcp.distributed.petsc_active_set import PetscActiveSet
 from warp_lcp.gallery.inverse_kinematics import InverseKinematics
 from warp_lcp.gallery.planted import Plant
+from warp_lcp.granular.coupled import METHODS as SAND
 from warp_lcp.multigrid.cycle_settings import AlgebraicSettings
 from warp_lcp.settings import OrInfinite, SettingError, Settings, checked, ranges, rule
 

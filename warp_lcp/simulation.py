@@ -1,23 +1,58 @@
-"""What the driver asks of a simulator, and how it finds one: the entry-point group `warp_lcp.simulators`."""
+"""What a run asks of a simulator, and how it finds one: the entry-point group `warp_lcp.simulators`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
+import warp as wp
 
 from warp_lcp.result import SolveStatus
 
 if TYPE_CHECKING:
     from warp_lcp.distributed.ranks import Ranks
-    from warp_lcp.run.profile import Stopwatch
     from warp_lcp.scene.scene import Scene
 
 GROUP = "warp_lcp.simulators"
+NOTHING = nullcontext()
+
+
+class Stopwatch(Protocol):
+    """What a run and its simulation mark their stages with."""
+
+    def stage(self, name: str, *arrays: wp.array | None) -> AbstractContextManager[None]:
+        """Return the context of a stage; the stages of a thread do not overlap.
+
+        Args:
+            name: of the stage, which may have several parts.
+            arrays: what it must read or write.
+        """
+
+    def beside(self, name: str) -> AbstractContextManager[None]:
+        """Return the context of what another thread does meanwhile."""
+
+    def wrote(self, name: str, *files: Path) -> None:
+        """Add the sizes of files to a stage."""
+
+
+class NoStopwatch:
+    """Measure nothing: no clock is read, nothing waits for the device."""
+
+    def stage(self, name: str, *arrays: wp.array | None) -> AbstractContextManager[None]:
+        """Return a context that does nothing."""
+        return NOTHING
+
+    def beside(self, name: str) -> AbstractContextManager[None]:
+        """Return a context that does nothing."""
+        return NOTHING
+
+    def wrote(self, name: str, *files: Path) -> None:
+        """Do nothing."""
 
 
 class StepFailed(RuntimeError):
@@ -156,7 +191,7 @@ class Profiled(Protocol):
     """What a Simulation may also be: one that says what its step spends its time on.
 
     It wraps the stages of its step in `with self.watch.stage(name, *arrays)`. A run that is profiled sets `watch` before the first step;
-    until then it is a `warp_lcp.run.profile.NoStopwatch`.
+    until then it is a `NoStopwatch`.
     """
 
     watch: Stopwatch

@@ -18,8 +18,8 @@ from warp_lcp.fluids import LiquidScene, LiquidSimulation
 from warp_lcp.granular import SIMULATOR as GRANULAR
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import SandSimulation
-from warp_lcp.simulation import SimulationFailed, StepFailed
 from warp_lcp.grid.particles import MARGIN
+from warp_lcp.simulation import SimulationFailed, StepFailed
 
 ParticleSimulation = LiquidSimulation | SandSimulation
 DONE = Promise(Expected.DONE)

@@ -16,9 +16,8 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-from warp_lcp import fluids
-from warp_lcp import granular
 import warp_lcp
+from warp_lcp import fluids, granular
 from warp_lcp.benchmarks.harness.record import MACHINE, SOURCE, Record
 from warp_lcp.benchmarks.harness.timing import Figure, in_turns
 from warp_lcp.run.versions import versions

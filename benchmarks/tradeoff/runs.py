@@ -10,12 +10,12 @@ from functools import cache
 from warp_lcp.benchmarks.harness.machine import array_bytes
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.benchmarks.tradeoff.settings import REFERENCE, Setting
+from warp_lcp.run.trial import BIN, Trial, trial
 from warp_lcp.scene.presets import changed, price_table
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import load_scene
-from warp_lcp.simulation import SimulationFailed, StepFailed
 from warp_lcp.scene.table import SceneError
-from warp_lcp.run.trial import BIN, Trial, trial
+from warp_lcp.simulation import SimulationFailed, StepFailed
 
 FRAMES = 18
 

@@ -11,8 +11,8 @@ import warp as wp
 
 from warp_lcp.benchmarks.harness.record import Record
 from warp_lcp.benchmarks.harness.timing import Figure, Options, clock
-from warp_lcp.scene.presets import changed
 from warp_lcp.run.loop import plan_dt
+from warp_lcp.scene.presets import changed
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import simulators
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
-from warp_lcp.benchmarks.workers.exchange import Reply, Request, serve
+from .exchange import Reply, Request, serve
 
 COARSEST = 500  # unknowns that are left to a direct solver
 NEWTON_STEPS = 200

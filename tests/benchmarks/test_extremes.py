@@ -10,12 +10,12 @@ import scipy.sparse
 from typer.testing import CliRunner
 
 import warp_lcp as wl
+from oracle import assemble, natural_residual
 from warp_lcp.benchmarks import extremes
 from warp_lcp.benchmarks.extremes import broken, case, matrices, refused, shapes
 from warp_lcp.benchmarks.extremes.case import Attempt, Expected, Promise, RefusalCase, SolveCase, judge, violations
 from warp_lcp.benchmarks.extremes.exact import Exact, norm, stencil
 from warp_lcp.benchmarks.extremes.problem import GridProblem, MatrixProblem
-from oracle import assemble, natural_residual
 from warp_lcp.cli import commands as cli
 
 FAST = (shapes.masks, shapes.closed_pools, matrices.singular, matrices.cycling, refused.wrong_arguments)

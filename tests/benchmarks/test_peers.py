@@ -7,8 +7,8 @@ from functools import partial
 
 import numpy as np
 import pytest
-from warp_lcp.benchmarks.implicit_mpm import NEWTON
 from typer.testing import CliRunner
+from warp_lcp.benchmarks.implicit_mpm import NEWTON
 
 import warp_lcp as wl
 from warp_lcp.benchmarks import chart

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import warp_lcp as wl
+from oracle import boxed, lemke
 from warp_lcp.benchmarks import extremes
 from warp_lcp.benchmarks.extremes import broken, unseen
 from warp_lcp.benchmarks.extremes.case import Attempt, Verdict, judge
@@ -18,7 +19,6 @@ from warp_lcp.benchmarks.extremes.unseen.judging import EveryMethodCase, UnseenC
 from warp_lcp.benchmarks.harness.record import write_json
 from warp_lcp.benchmarks.harness.timing import Options
 from warp_lcp.benchmarks.suite import EXTREMES, SOLVERS
-from oracle import boxed, lemke
 
 SEEDS = (4217, 4218)  # of the second b changes, too
 MORE = range(4300, 4309)

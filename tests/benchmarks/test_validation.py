@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.integrate import trapezoid
 
-import benchmarks.__main__ as process
+import warp_lcp.benchmarks.__main__ as process
 from warp_lcp.benchmarks import validation
 from warp_lcp.benchmarks.harness.record import Lines
 from warp_lcp.benchmarks.suite import VALIDATION
@@ -18,8 +18,8 @@ from warp_lcp.benchmarks.validation import ceiling, dam_break, rest, signals, sl
 from warp_lcp.benchmarks.validation.enclosed import cumulative, enclosed_cells, filled_fraction
 from warp_lcp.benchmarks.validation.finding import Finding, Findings, Trial, attempt, control, table
 from warp_lcp.benchmarks.validation.tank import SUB_CELL, VOXEL, Numerics, create, fill
-from warp_lcp.simulation import StepFailed
 from warp_lcp.grid.triangle_mesh import load_surface
+from warp_lcp.simulation import StepFailed
 
 
 def test_a_finding_keeps_its_bound_and_a_control_breaks_it() -> None:

@@ -9,9 +9,8 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
-from warp_lcp.cli import commands as cli
 from warp_lcp import simulation as simulator
-from warp_lcp.run import versions
+from warp_lcp.cli import commands as cli
 from warp_lcp.simulation import SimulationFailed
 
 
@@ -148,19 +147,11 @@ def test_schema_is_json(dots):
     assert "from" in json.dumps(schema)
 
 
-def test_info_names_versions_devices_and_shadows(dots, monkeypatch):
-    monkeypatch.setattr(cli, "shadowing_distributions", lambda: ["fluids 1.0.27"])
+def test_info_names_versions_and_devices(dots):
     result = call("info")
     assert result.exit_code == 0
     for expected in ("warp-lcp", "warp-lang", "device cpu", "kernel cache", "simulator dots", "dots that fall"):
         assert expected in result.stdout
-    assert "the distribution fluids 1.0.27 installs a package that has a simulator's name" in result.stderr
-
-
-def test_shadows_are_found_by_name(monkeypatch):
-    foreign = SimpleNamespace(name="Fluids", version="1.0.27")
-    monkeypatch.setattr(versions, "distributions", lambda: [foreign, SimpleNamespace(name="numpy", version="2.0")])
-    assert versions.shadowing_distributions() == ["Fluids 1.0.27"]
 
 
 def test_a_simulator_that_does_not_load(dots, scene_file, monkeypatch):

@@ -9,8 +9,8 @@ import scipy.sparse
 from typer.testing import CliRunner, Result
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.problems import cut_cells, splash
 from oracle import boxed, lemke
+from warp_lcp.benchmarks.problems import cut_cells, splash
 from warp_lcp.cli import commands as cli
 from warp_lcp.cli.solve_file import MOST_ROWS
 from warp_lcp.gallery import recorded

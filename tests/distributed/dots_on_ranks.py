@@ -15,11 +15,11 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from warp_lcp import simulation as plug_ins
+from warp_lcp.cli import commands as cli
 from warp_lcp.distributed import meeting
 from warp_lcp.distributed.ranks import Ranks
-from warp_lcp.cli import commands as cli
 from warp_lcp.run import parallel_frames
-from warp_lcp import simulation as plug_ins
 from warp_lcp.scene.scene import Scene
 from warp_lcp.simulation import Cells, Points, SimulationFailed, StepFailed
 

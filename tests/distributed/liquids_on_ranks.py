@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warp_lcp.fluids.distributed import DistributedLiquid, create
-from warp_lcp.fluids.scene import LiquidScene
 from small_liquids import box, scene
 from warp_lcp.distributed.ranks import Ranks
+from warp_lcp.fluids.distributed import DistributedLiquid, create
+from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.simulation import SimulationFailed, StepFailed
 

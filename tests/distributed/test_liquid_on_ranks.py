@@ -9,12 +9,12 @@ import pytest
 from liquids_on_ranks import DAM_STEPS, DEEP, FLAT, SCENES, advance, model
 from turns import Seat
 
-from warp_lcp.fluids import distributed
-from warp_lcp.fluids.simulator import LiquidSimulation
 from small_liquids import box, create, scene
 from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.subdomain import Subdomain
+from warp_lcp.fluids import distributed
+from warp_lcp.fluids.simulator import LiquidSimulation
 from warp_lcp.scene.scene_file import load_scene
 
 PROGRAM = Path(__file__).with_name("liquids_on_ranks.py")

@@ -10,9 +10,9 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
+from small_liquids import GRAVITY, advance, box, create, dam, scene
 from warp_lcp.fluids import SIMULATOR, LiquidScene
 from warp_lcp.fluids.tolerance import FIRST, FRACTION, LEAST, MOST
-from small_liquids import GRAVITY, advance, box, create, dam, scene
 from warp_lcp.scene.table import SceneError, validate
 
 AUTO = {"tolerance": "auto"}

@@ -9,8 +9,8 @@ import pytest
 
 import small_liquids
 import small_sands
-from warp_lcp.fluids import LiquidSimulation
 from small_liquids import GRAVITY, advance, box, create, scene
+from warp_lcp.fluids import LiquidSimulation
 
 RIM = 2.0  # [m/s] of drops that spin: three quarters of a turn of a drop of .17 m in .4 s
 FLIGHT = 0.4  # [s]

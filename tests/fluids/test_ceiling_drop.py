@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_lcp.fluids import LiquidSimulation
 from small_liquids import GRAVITY, STEPS, box, create, scene
+from warp_lcp.fluids import LiquidSimulation
 from warp_lcp.material import boundary
 
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from warp_lcp.benchmarks.validation.floating import displacement
 from small_liquids import GRAVITY, box, create, scene
+from warp_lcp.benchmarks.validation.floating import displacement
 
 STEP = 1e-3  # [s]
 WIDE = 6  # diameters of the body that the tank has

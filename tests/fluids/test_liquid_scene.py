@@ -3,9 +3,9 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
+from small_liquids import box, create, scene
 from warp_lcp import fluids
 from warp_lcp.fluids import LiquidScene
-from small_liquids import box, create, scene
 from warp_lcp.scene.scene import Scene
 
 LIQUID = [box([0.0, 0.0], [0.5, 0.25])]

@@ -4,10 +4,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warp_lcp.fluids import SIMULATOR, LiquidSimulation
 from small_liquids import GRAVITY, advance, box, create, dam, scene
-from warp_lcp.simulation import Cells, Points, Profiled, SimulationFailed, Simulator, StepFailed, simulators
+from warp_lcp.fluids import SIMULATOR, LiquidSimulation
 from warp_lcp.grid.particles import Particles
+from warp_lcp.simulation import Cells, Points, Profiled, SimulationFailed, Simulator, StepFailed, simulators
 
 DIMENSIONS = [2, 3]
 

@@ -7,8 +7,8 @@ import pytest
 import warp as wp
 
 from small_liquids import GRAVITY, advance, box, create, scene
-from warp_lcp.simulation import SimulationFailed
 from warp_lcp.grid.motion import Pose
+from warp_lcp.simulation import SimulationFailed
 
 SPEED = 0.5  # of the piston [m/s]
 FLAT = {"physics": {"gravity": [0.0, 0.0]}}

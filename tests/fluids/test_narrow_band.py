@@ -8,9 +8,9 @@ import pytest
 import warp as wp
 from pydantic import ValidationError
 
+from small_liquids import GRAVITY, advance, box, create, scene
 from warp_lcp.fluids import LiquidScene, LiquidSimulation
 from warp_lcp.granular.scene import SandScene
-from small_liquids import GRAVITY, advance, box, create, scene
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.material.narrow_band import NarrowBand
 from warp_lcp.operators.grid_poisson import FLUID, SOLID

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from warp_lcp.fluids import LiquidScene
 from small_liquids import GRAVITY, advance, box, create, scene
+from warp_lcp.fluids import LiquidScene
 from warp_lcp.grid.sides import SIDES
 
 BALL = {"shape": "sphere", "center": [0.1, 0.85, 0.1], "radius": 0.06}

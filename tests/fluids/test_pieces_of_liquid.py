@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from warp_lcp.fluids.distributed_state import CELLS, piece_of, state_of
 from small_liquids import advance, dam
+from warp_lcp.fluids.distributed_state import CELLS, piece_of, state_of
 
 
 def cut(piece, at):

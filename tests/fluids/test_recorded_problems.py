@@ -11,11 +11,11 @@ from oracle import assemble, natural_residual
 from small_liquids import box, create, dam, scene
 from warp_lcp import claims
 from warp_lcp.cli import commands as cli
-from warp_lcp.run.problem_folder import ProblemFolder
-from warp_lcp.run.folder import OutputError
-from warp_lcp.simulation import Recorded
 from warp_lcp.gallery.recorded import FORMAT, files, load
 from warp_lcp.gallery.recorded_part import cell_counts
+from warp_lcp.run.folder import OutputError
+from warp_lcp.run.problem_folder import ProblemFolder
+from warp_lcp.simulation import Recorded
 
 RAMP = box([0.2, -0.2], [0.6, 0.08], rotate=20)  # partly beneath the liquid
 CASES = {

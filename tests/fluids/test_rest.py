@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from warp_lcp.fluids import LiquidSimulation
 from small_liquids import GRAVITY, advance, box, create, scene
+from warp_lcp.fluids import LiquidSimulation
 
 SLOPE = math.radians(30)
 V = [{"shape": "plane", "point": [0.4, 0.0], "normal": [side * math.sin(SLOPE), math.cos(SLOPE)]} for side in (-1, 1)]

@@ -10,8 +10,8 @@ import pytest
 from rich.console import Console
 
 from small_liquids import box, create, scene
-from warp_lcp.run.progress import Lines
 from warp_lcp.run.loop import SHARE, run_scene
+from warp_lcp.run.progress import Lines
 
 FRAMES = 30.0
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warp_lcp.fluids import SIMULATOR
 from small_liquids import advance, box, create, scene
+from warp_lcp.fluids import SIMULATOR
 from warp_lcp.scene.scene_file import load_scene
 
 

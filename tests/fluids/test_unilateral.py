@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from warp_lcp.fluids import LiquidSimulation
 from small_liquids import GRAVITY, advance, box, create, scene
+from warp_lcp.fluids import LiquidSimulation
 
 UNILATERAL = {"pressure": {"model": "unilateral"}}
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from warp_lcp.frames.frames import WAITING, FrameFolder, FrameWriter, frame_bytes
-from warp_lcp.simulation import Cells, Points, Surface
 from warp_lcp.frames.vtu import read_vtu, write_vtu
+from warp_lcp.simulation import Cells, Points, Surface
 
 RNG = np.random.default_rng(5807)
 

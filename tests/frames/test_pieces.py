@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from warp_lcp.distributed.meeting import Meeting
-from warp_lcp.render import recording
 from warp_lcp.frames.frames import FrameFolder
-from warp_lcp.run.parallel_folder import ParallelRunFolder
-from warp_lcp.run.parallel_frames import ParallelFrames
 from warp_lcp.frames.pieces import describe, one_grid, piece_files, write_whole
+from warp_lcp.render import recording
 from warp_lcp.render.recording import Color, Recording, RenderError
 from warp_lcp.run.folder import OutputError, RunFolder, RunRecord
+from warp_lcp.run.parallel_folder import ParallelRunFolder
+from warp_lcp.run.parallel_frames import ParallelFrames
 from warp_lcp.scene.scene_file import dump_scene, load_scene
 from warp_lcp.simulation import Cells, Part, Points, Surface
 

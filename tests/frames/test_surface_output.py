@@ -8,9 +8,9 @@ import warp as wp
 import small_liquids
 import small_sands
 from mesh_checks import assert_closed, enclosed
-from warp_lcp.material import particle_simulation
 from warp_lcp.frames.frames import FrameFolder, frame_bytes
 from warp_lcp.frames.ply import write_ply
+from warp_lcp.material import particle_simulation
 from warp_lcp.simulation import Points, Surface
 
 SURFACE = {"output": {"surface": True}}

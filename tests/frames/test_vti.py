@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from warp_lcp.frames.frames import FrameFolder, frame_bytes
-from warp_lcp.simulation import Cells
 from warp_lcp.frames.vti import read_vti, write_vti
+from warp_lcp.simulation import Cells
 
 RNG = np.random.default_rng(2269)
 

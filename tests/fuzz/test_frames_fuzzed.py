@@ -16,8 +16,8 @@ from told import costly, limited
 from warp_lcp.frames.frames import FrameFolder
 from warp_lcp.frames.pieces import describe, write_whole
 from warp_lcp.render.recording import Color, Recording, RenderError, Show
-from warp_lcp.simulation import Cells, Part, Points, Surface
 from warp_lcp.scene.table import SceneError
+from warp_lcp.simulation import Cells, Part, Points, Surface
 
 SCENE = """
 scene.simulator = "fluids"

@@ -11,8 +11,8 @@ from hypothesis import given
 from mutated import mutated
 from told import limited, told
 
-from warp_lcp.run import check
 from warp_lcp.grid.triangle_mesh import read_mesh
+from warp_lcp.run import check
 
 POINTS = np.array([[x, y, z] for z in (0.25, 0.75) for y in (0.25, 0.75) for x in (0.25, 0.75)])
 QUADS = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]]

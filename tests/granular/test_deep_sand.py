@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from small_sands import GRAVITY, box, create, scene
 from warp_lcp.granular.coupled import AcceleratedProjection
 from warp_lcp.granular.simulator import SandSimulation
-from small_sands import GRAVITY, box, create, scene
 
 
 def silo(cells: int, depth: int, slot: int, **tables: Any) -> SandSimulation:

@@ -11,9 +11,9 @@ from scipy.spatial import cKDTree
 
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import GranularSimulator, SandSimulation
-from warp_lcp.scene.scene import SceneError, validate
 from warp_lcp.grid.periodic import PeriodicSides
 from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.scene.scene import SceneError, validate
 
 DX, DT = 0.02, 2e-3  # [m], [s]
 

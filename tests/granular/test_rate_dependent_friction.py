@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from small_sands import box, create, scene
 from warp_lcp.benchmarks.validation import inclined
 from warp_lcp.granular.scene import SandScene
-from small_sands import box, create, scene
 from warp_lcp.scene.table import SceneError, validate
 
 GROWS = {"dynamic_angle": 40.0, "grain_size": 0.01}

@@ -11,9 +11,9 @@ from warp_lcp.granular.coupled import CoupledOutcome
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import FAR, GranularSimulator, SandSimulation
 from warp_lcp.granular.stress import Stress
+from warp_lcp.result import SolveStatus
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.simulation import SimulationFailed, StepFailed, Surface
-from warp_lcp.result import SolveStatus
 
 G, DENSITY = 9.81, 1500.0
 

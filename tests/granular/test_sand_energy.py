@@ -5,12 +5,12 @@ import pytest
 import warp as wp
 from test_sand_stress import Case, make, velocity
 
+from small_sands import advance, box, create, scene
 from warp_lcp.granular.checkerboard import DAMPED, damping_pass
 from warp_lcp.granular.packing import Packing
 from warp_lcp.granular.report import Outcome
 from warp_lcp.granular.stress import Stress, Walls, YieldSet
 from warp_lcp.granular.yield_set import xyz
-from small_sands import advance, box, create, scene
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
 

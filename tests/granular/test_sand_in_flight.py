@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from warp_lcp.granular.simulator import SandSimulation
 from small_sands import GRAVITY, advance, box, create, scene
+from warp_lcp.granular.simulator import SandSimulation
 
 FLIGHT = 0.3  # [s]
 BODY = {"density": 800.0}

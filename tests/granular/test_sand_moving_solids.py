@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_lcp.granular.simulator import SandSimulation
 from small_sands import GRAVITY, advance, box, create, scene
+from warp_lcp.granular.simulator import SandSimulation
 from warp_lcp.simulation import StepFailed
 
 SPEED = 0.5  # of a paddle [m/s]

@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from warp_lcp.granular.scene import STICKS, SandScene
 from small_sands import box, scene
+from warp_lcp.granular.scene import STICKS, SandScene
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.table import SceneError, validate
 

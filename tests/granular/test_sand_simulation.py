@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from warp_lcp.granular.simulator import SandSimulation
 from small_sands import GRAVITY, advance, box, column, create, scene
+from warp_lcp.granular.simulator import SandSimulation
 from warp_lcp.simulation import SimulationFailed
 
 DENSITY = 1600.0

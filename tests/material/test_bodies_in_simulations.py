@@ -8,9 +8,9 @@ import pytest
 
 from warp_lcp.fluids import SIMULATOR as FLUIDS
 from warp_lcp.fluids import LiquidScene
+from warp_lcp.frames.frames import write_vtu
 from warp_lcp.granular import SIMULATOR as GRANULAR
 from warp_lcp.granular.scene import SandScene
-from warp_lcp.frames.frames import write_vtu
 from warp_lcp.simulation import StepFailed, Surface
 
 GRAVITY = 9.81

@@ -9,8 +9,8 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.benchmarks.validation.enclosed import enclosed_cells
 from small_liquids import advance, box, create, dam, scene
+from warp_lcp.benchmarks.validation.enclosed import enclosed_cells
 from warp_lcp.grid.particles import Particles
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.contact import HELD, RELEASED

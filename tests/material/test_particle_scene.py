@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from pydantic import Field
 
+from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.material.particle_assembly import make_boundary, make_outlets, make_particles, make_sources, seed_materials
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.scene.scene import Domain, SceneError, validate
 from warp_lcp.scene.scene_file import keys
 from warp_lcp.scene.shapes import Box, MaterialProperties, SolidBox, SolidPlane
-from warp_lcp.grid.staggered import StaggeredGrid
 
 BOX = {"shape": "box", "min": [0.0, 0.0], "max": [0.4, 0.4]}
 

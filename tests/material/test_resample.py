@@ -10,11 +10,11 @@ import pytest
 from rich.console import Console
 
 from small_liquids import advance, box, create, scene
-from warp_lcp.run.progress import Lines
-from warp_lcp.run.loop import run_scene
-from warp_lcp.run.folder import OutputError
-from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.material.resample import resampled
+from warp_lcp.run.folder import OutputError
+from warp_lcp.run.loop import run_scene
+from warp_lcp.run.progress import Lines
+from warp_lcp.scene.scene_file import load_scene
 
 BALL = {"shape": "sphere", "center": [0.7, 0.2], "radius": 0.15}
 GRADIENT = np.array([[0.0, 3.0, 0.0], [-2.0, 1.0, 0.0], [0.0, 0.0, 0.0]])  # of u and v

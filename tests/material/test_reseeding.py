@@ -7,9 +7,9 @@ import pytest
 from pydantic import ValidationError
 
 from small_liquids import advance, box, create, dam, scene
-from warp_lcp.scene.table import SceneError
 from warp_lcp.grid.particles import Particles
 from warp_lcp.material.reseeding import Reseeding
+from warp_lcp.scene.table import SceneError
 
 CELLS = 12
 

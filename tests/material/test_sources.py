@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from warp_lcp.fluids import LiquidSimulation
 from small_liquids import advance, box, create, scene
+from warp_lcp.fluids import LiquidSimulation
+from warp_lcp.operators.grid_poisson import FLUID, SOLID
 from warp_lcp.run.loop import take_step
 from warp_lcp.simulation import SimulationFailed
-from warp_lcp.operators.grid_poisson import FLUID, SOLID
 
 TAP = box([0.0, 0.5], [0.125, 0.625], velocity=[1.0, 0.0])
 BALL = {"shape": "sphere", "center": [0.8, 0.1], "radius": 0.1}

@@ -7,8 +7,8 @@ import pytest
 from rich.console import Console
 
 from mesh_checks import assert_closed, enclosed
-from warp_lcp.run.progress import Lines
 from warp_lcp.run.loop import run_scene
+from warp_lcp.run.progress import Lines
 from warp_lcp.scene.scene_file import load_scene
 
 SCENE = """

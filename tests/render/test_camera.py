@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from small_runs import write_run
-from warp_lcp.scene.camera import Viewpoint, viewpoint
 from warp_lcp.run.continuation import Change, change_of
+from warp_lcp.scene.camera import Viewpoint, viewpoint
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.table import SceneError
 

@@ -10,15 +10,15 @@ import warp as wp
 from typer.testing import CliRunner, Result
 
 from warp_lcp.cli import commands as cli
-from warp_lcp.scene.camera import MARGIN
 from warp_lcp.frames.frames import FrameFolder
 from warp_lcp.render.page import Page
 from warp_lcp.render.recording import VIRIDIS, Color, Recording, RenderError, Scale, _round_up, spread
 from warp_lcp.render.render import INSTALL, Looks, parse_size, render_run
-from warp_lcp.scene.scene_file import dump_scene, load_scene
 from warp_lcp.render.scenery import Outline
-from warp_lcp.simulation import Cells, Points
 from warp_lcp.render.stage import Stage, shaded
+from warp_lcp.scene.camera import MARGIN
+from warp_lcp.scene.scene_file import dump_scene, load_scene
+from warp_lcp.simulation import Cells, Points
 
 RNG = np.random.default_rng(9127)
 WHITE = 255

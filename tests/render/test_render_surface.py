@@ -6,12 +6,12 @@ from typer.testing import CliRunner, Result
 
 from small_runs import ball, box, sphere, write_run
 from warp_lcp.cli import commands as cli
-from warp_lcp.scene.camera import MARGIN
 from warp_lcp.render.cast import is_round
 from warp_lcp.render.outline_fill import inside_outline
 from warp_lcp.render.recording import Color, Recording, RenderError, Show
 from warp_lcp.render.render import Looks, render_run
 from warp_lcp.render.scenery import prescribed_solids
+from warp_lcp.scene.camera import MARGIN
 from warp_lcp.simulation import Points, Surface
 
 ROOM = (1.0, 1.0, 1.0)

@@ -5,9 +5,9 @@ import pytest
 
 from small_runs import ball, box, sphere
 from warp_lcp.render import water
+from warp_lcp.render.water import ABSORPTION, draw_water, vertex_normals
 from warp_lcp.scene.camera import Viewpoint
 from warp_lcp.simulation import Surface
-from warp_lcp.render.water import ABSORPTION, draw_water, vertex_normals
 
 WIDTH, HEIGHT = 160, 120
 LIGHT = np.array([0.0, 1.0, 0.0])

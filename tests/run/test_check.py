@@ -8,18 +8,17 @@ from typing import Any
 
 import pytest
 from typer.testing import CliRunner, Result
+from warp_lcp.benchmarks.memory import array_bytes, forget_peak
 
-from warp_lcp.benchmarks.harness.machine import array_bytes, forget_peak
-from warp_lcp.fluids.simulator import FluidsSimulator
 from warp_lcp import claims
-from warp_lcp.run import check
 from warp_lcp.cli import commands as cli
-from warp_lcp.run import devices
+from warp_lcp.fluids.simulator import FluidsSimulator
+from warp_lcp.run import check, devices
 from warp_lcp.run.calibrate import MOST, step_seconds
 from warp_lcp.run.check import check_memory, check_scene
 from warp_lcp.scene.scene_file import load_scene
-from warp_lcp.simulation import StepFailed
 from warp_lcp.scene.table import SceneError
+from warp_lcp.simulation import StepFailed
 
 
 def call(*arguments: object) -> Result:

@@ -7,9 +7,9 @@ from rich.console import Console
 from warp_lcp.distributed.meeting import Meeting
 from warp_lcp.run.checkpoint import PIECES, Checkpoint, CheckpointFolder
 from warp_lcp.run.continuation import fingerprint
+from warp_lcp.run.loop import run_scene
 from warp_lcp.run.parallel_checkpoint import ParallelCheckpoints
 from warp_lcp.run.progress import Lines
-from warp_lcp.run.loop import run_scene
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.table import SceneError
 

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from warp_lcp.run.progress import Lines
-from warp_lcp.run.loop import run_scene
 from warp_lcp.run.folder import OutputError
+from warp_lcp.run.loop import run_scene
+from warp_lcp.run.progress import Lines
 from warp_lcp.scene.scene_file import load_scene
 
 pytestmark = [

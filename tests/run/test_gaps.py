@@ -13,10 +13,10 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from warp_lcp.cli import commands as cli
-from warp_lcp.run.gaps import spans
-from warp_lcp.run.progress import Lines
-from warp_lcp.run.loop import run_scene
 from warp_lcp.run.folder import OutputError
+from warp_lcp.run.gaps import spans
+from warp_lcp.run.loop import run_scene
+from warp_lcp.run.progress import Lines
 from warp_lcp.scene.scene_file import load_scene
 
 STEP = 20  # that the run is stopped at; there are checkpoints of steps 12, 16 and 20

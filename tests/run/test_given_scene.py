@@ -9,8 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 from warp_lcp.cli import commands as cli
-from warp_lcp.run.given_scene import GivenScene, given_scene, scene_to_resume
 from warp_lcp.run.folder import OutputError
+from warp_lcp.run.given_scene import GivenScene, given_scene, scene_to_resume
 from warp_lcp.scene.scene_file import dump_scene, keys
 
 

@@ -12,9 +12,9 @@ from typer.testing import CliRunner, Result
 
 from warp_lcp.cli import commands as cli
 from warp_lcp.run import interruption
+from warp_lcp.run.folder import mark_stopped
 from warp_lcp.run.interruption import SIGNALS, Interruption
 from warp_lcp.run.loop import run_scene
-from warp_lcp.run.folder import mark_stopped
 
 EACH = pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
 

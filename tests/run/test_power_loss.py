@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 from test_crash_points import contents, go, revive
 
+from warp_lcp.cli.solve_file import write_vector
 from warp_lcp.frames import atomic
-from warp_lcp.run.checkpoint import CheckpointFolder
 from warp_lcp.frames.ply import write_ply
+from warp_lcp.run.checkpoint import CheckpointFolder
 from warp_lcp.run.problem_folder import ProblemFolder
 from warp_lcp.simulation import Surface
-from warp_lcp.cli.solve_file import write_vector
 
 Names = dict[str, int]  # of a folder, with the numbers of what they stand for
 AUDITED = {"open", "os.rename", "os.remove", "os.mkdir", "os.truncate"}

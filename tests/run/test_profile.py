@@ -7,7 +7,8 @@ from typing import ClassVar
 import pytest
 import warp as wp
 
-from warp_lcp.run.profile import KERNELS, NoStopwatch, Profile
+from warp_lcp.run.profile import KERNELS, Profile
+from warp_lcp.simulation import NoStopwatch
 
 
 def test_stages_add_up():

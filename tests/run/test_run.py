@@ -13,17 +13,17 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from warp_lcp.run import loop as run_module
 from warp_lcp.frames import vtu as vtu_module
-from warp_lcp.run.checkpoint import CheckpointFolder
 from warp_lcp.frames.frames import FrameFolder
-from warp_lcp.run.profile import NoStopwatch, Profile
-from warp_lcp.run.progress import Lines
-from warp_lcp.run.loop import plan_dt, run_scene
+from warp_lcp.run import loop as run_module
+from warp_lcp.run.checkpoint import CheckpointFolder
 from warp_lcp.run.folder import OutputError, RunRecord
+from warp_lcp.run.loop import plan_dt, run_scene
+from warp_lcp.run.profile import Profile
+from warp_lcp.run.progress import Lines
 from warp_lcp.scene.scene import SceneError, Time
 from warp_lcp.scene.scene_file import load_scene
-from warp_lcp.simulation import SimulationFailed, StepFailed
+from warp_lcp.simulation import NoStopwatch, SimulationFailed, StepFailed
 
 VOLATILE = "seconds"  # the log's only column that a repetition does not repeat
 
@@ -363,9 +363,7 @@ def test_a_frame_that_fails_late_ends_the_run_without_a_checkpoint_after_it(dots
     assert result.reason.startswith("the disk is full")
     assert sorted(path.name for path in out.glob("frames/particles*")) == [f"particles_{k:06d}.vtu" for k in range(3)]
     monkeypatch.undo()
-    monkeypatch.setattr(
-        "warp_lcp.simulation.entry_points", lambda group: [type("Entry", (), {"name": "dots", "load": lambda _: dots})()]
-    )
+    monkeypatch.setattr("warp_lcp.simulation.entry_points", lambda group: [type("Entry", (), {"name": "dots", "load": lambda _: dots})()])
     assert go(scene_file, out, resume=True).status == "finished"
     assert contents(out) == contents(whole)
 

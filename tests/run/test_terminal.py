@@ -14,11 +14,11 @@ from typer.testing import CliRunner, Result
 from small_runs import MINIMAL
 from warp_lcp.cli import commands as cli
 from warp_lcp.run import folder as run_folder
-from warp_lcp.scene.foreign import one_line, visible
-from warp_lcp.run.progress import Lines
 from warp_lcp.run.loop import run_scene
-from warp_lcp.scene.scene_file import load_scene
+from warp_lcp.run.progress import Lines
 from warp_lcp.run.terminal import Terminal, say
+from warp_lcp.scene.foreign import one_line, visible
+from warp_lcp.scene.scene_file import load_scene
 
 FORGED = "finished: frame 4 of 4 reached"
 CONTROLS = [

@@ -8,11 +8,11 @@ import pytest
 
 from warp_lcp.fluids import LiquidScene
 from warp_lcp.granular.scene import SandScene
-from warp_lcp.run.check import check_scene
 from warp_lcp.material.particle_assembly import make_bodies, placed_solids
+from warp_lcp.rigid.body import BodyMotion
+from warp_lcp.run.check import check_scene
 from warp_lcp.scene.scene import validate
 from warp_lcp.scene.table import SceneError
-from warp_lcp.rigid.body import BodyMotion
 
 BLOCK = {"shape": "box", "min": [0.4, 0.5], "max": [0.6, 0.6]}
 BALL = {"shape": "sphere", "center": [0.5, 0.5, 0.5], "radius": 0.1}

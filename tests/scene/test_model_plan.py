@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
+from warp_lcp.benchmarks.timing import Options
 
 from warp_lcp.benchmarks import predictions
-from warp_lcp.benchmarks.harness.timing import Options
 from warp_lcp.benchmarks.models import offers
 from warp_lcp.cli import commands as cli
+from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.run.check import check_scene
 from warp_lcp.scene.models import Model, Price, model_lines, predicted_seconds, prices
-from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.scene.scene_file import built_in_scenes, load_scene
 
 CELLS, PARTICLES = 1000, 4000

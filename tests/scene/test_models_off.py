@@ -49,7 +49,7 @@ def watching(patch: pytest.MonkeyPatch) -> Iterator[Traces]:
             files.add(frame.f_code.co_filename)
             frame = frame.f_back
         for name in files:
-            path = Path(name)
+            path = Path(name).resolve()
             if path.is_relative_to(ROOT) and path.relative_to(ROOT).parts[0] in PACKAGES:
                 traces.bytes[path.relative_to(ROOT).as_posix()] += size
         return int(allocate(self, size))

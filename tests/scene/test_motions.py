@@ -7,9 +7,9 @@ import pytest
 from typer.testing import CliRunner
 
 from warp_lcp.cli import commands as cli
+from warp_lcp.grid import motion as motions
 from warp_lcp.scene.scene import Scene, SceneError, validate
 from warp_lcp.scene.scene_file import dump_scene, load_scene
-from warp_lcp.grid import motion as motions
 
 KINDS = ("keyframes", "rotation", "sinusoid", "translation")
 

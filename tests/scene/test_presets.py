@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 
 from warp_lcp.run.check import check_scene
+from warp_lcp.run.trial import trial
 from warp_lcp.scene.presets import PRESETS, changed, price_table, value_of
 from warp_lcp.scene.scene_file import built_in_scenes, dump_scene, load_scene
 from warp_lcp.scene.table import SceneError
-from warp_lcp.run.trial import trial
 
 SCENE = """
 [scene]

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import warp_lcp as wl
-from warp_lcp.benchmarks import problems
 from warp_lcp import program
+from warp_lcp.benchmarks import problems
 from warp_lcp.multigrid import Hierarchy
 from warp_lcp.rows import layout
 

@@ -14,31 +14,32 @@ from typing import Annotated, Any, NoReturn
 import typer
 import warp as wp
 
+from warp_lcp.cli.solve_file import Outcome, solve_files
+from warp_lcp.cli.solve_recorded import SUFFIX, check_recorded, file_digest, solve_recorded
 from warp_lcp.cli.suites import benchmarks
-from warp_lcp.run.calibrate import step_seconds
-from warp_lcp.run.check import check_memory, check_scene, start
-from warp_lcp.run.launcher import crew_of, default_folder
-from warp_lcp.run.devices import DeviceError, choose_device, cuda_driver, devices
-from warp_lcp.run.engine import Engine, EngineError, EngineOption
-from warp_lcp.render.film import check_rate
-from warp_lcp.run.interruption import Interrupted, Interruption
 from warp_lcp.material.particle_scene import ParticleScene
-from warp_lcp.scene.presets import PresetName
-from warp_lcp.run.profile import Profile
-from warp_lcp.run.progress import Bar, Lines
+from warp_lcp.nearest import nearest
+from warp_lcp.render.film import check_rate
 from warp_lcp.render.recording import Color, RenderError, Show
 from warp_lcp.render.render import Looks, film_run, parse_size, render_run
+from warp_lcp.render.viewer import view_run
+from warp_lcp.run.calibrate import step_seconds
+from warp_lcp.run.check import check_memory, check_scene, start
+from warp_lcp.run.devices import DeviceError, choose_device, cuda_driver, devices
+from warp_lcp.run.engine import Engine, EngineError, EngineOption
 from warp_lcp.run.folder import OutputError, RunRecord, mark_stopped
-from warp_lcp.scene.scene_file import built_in_scenes, installed_simulators, load_scene
-from warp_lcp.simulation import SimulationFailed, StepFailed
-from warp_lcp.cli.solve_file import Outcome, ProblemError, solve_files
-from warp_lcp.cli.solve_recorded import SUFFIX, check_recorded, file_digest, solve_recorded
-from warp_lcp.scene.table import SceneError
+from warp_lcp.run.interruption import Interrupted, Interruption
+from warp_lcp.run.launcher import crew_of, default_folder
+from warp_lcp.run.problem_folder import ProblemError
+from warp_lcp.run.profile import Profile
+from warp_lcp.run.progress import Bar, Lines
 from warp_lcp.run.terminal import Commands, Terminal, say, tell
 from warp_lcp.run.tune import FRAMES, Tuning, tune, write_tuned
-from warp_lcp.run.versions import shadowing_distributions, versions
-from warp_lcp.render.viewer import view_run
-from warp_lcp.nearest import nearest
+from warp_lcp.run.versions import versions
+from warp_lcp.scene.presets import PresetName
+from warp_lcp.scene.scene_file import built_in_scenes, installed_simulators, load_scene
+from warp_lcp.scene.table import SceneError
+from warp_lcp.simulation import SimulationFailed, StepFailed
 
 FAILED = 1
 WRONG_INPUT = 2
@@ -373,8 +374,6 @@ def info() -> None:
     lines += [(f"device {alias}", text) for alias, text in devices().items()]
     lines += [("CUDA driver", cuda_driver()), ("kernel cache", str(wp.config.kernel_cache_dir))]
     _print_pairs(lines)
-    for other in shadowing_distributions():
-        tell(f"warning: the distribution {other} installs a package that has a simulator's name; uninstall it", error=True)
     with _wrong_input():
         _print_pairs([(f"simulator {name}", simulator.summary) for name, simulator in installed_simulators().items()])
 

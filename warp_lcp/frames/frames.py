@@ -15,11 +15,10 @@ from warp_lcp.frames.atomic import make_folder, write_text
 from warp_lcp.frames.nvdb import nvdb_bytes, write_nvdb
 from warp_lcp.frames.pieces import WHOLE, piece_files
 from warp_lcp.frames.ply import ply_bytes, write_ply
-from warp_lcp.run.profile import NoStopwatch, Stopwatch
 from warp_lcp.frames.rank_folder import in_ranks
-from warp_lcp.simulation import Cells, Part, Surface, Volume
 from warp_lcp.frames.vti import vti_bytes, write_vti
 from warp_lcp.frames.vtu import vtu_bytes, write_vtu
+from warp_lcp.simulation import Cells, NoStopwatch, Part, Stopwatch, Surface, Volume
 
 FRAME_FILE = re.compile(r"(?P<name>[a-z][a-z_]*)_(?P<index>\d{6,})\.(?P<format>p?vtu|p?vti|ply|nvdb)")
 COLLECTED = ("vtu", "vti", "pvtu", "pvti")  # what ParaView opens as a series

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from warp_lcp.frames.atomic import replacing
-from warp_lcp.simulation import Volume
 from warp_lcp.frames.vtk_xml import raw
+from warp_lcp.simulation import Volume
 
 LEAF, LOWER, UPPER = 8, 16, 32  # entries along an edge of a node
 LARGEST = LEAF * LOWER * UPPER  # voxels along an edge of what one upper node holds

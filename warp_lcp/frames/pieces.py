@@ -12,10 +12,10 @@ import numpy as np
 from warp_lcp.claims import read_whole
 from warp_lcp.frames.atomic import write_text
 from warp_lcp.frames.rank_folder import RANK_FOLDER
-from warp_lcp.simulation import Cells, Points, Surface
 from warp_lcp.frames.vti import GHOSTS, extent_of, image_box, image_end
 from warp_lcp.frames.vtk_xml import attributes, opening, read_back, root, writable
 from warp_lcp.frames.vtu import Mesh
+from warp_lcp.simulation import Cells, Points, Surface
 
 WHOLE = {"vtu": "pvtu", "vti": "pvti"}  # the suffix of the file that names the pieces, by theirs
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from warp_lcp.claims import read_whole
 from warp_lcp.frames.atomic import replacing
-from warp_lcp.simulation import Cells
 from warp_lcp.frames.vtk_xml import LENGTH_BYTES, array_values, attributes, length, opening, raw, read_back, root, writable
+from warp_lcp.simulation import Cells
 
 HIDDEN = 32  # vtkDataSetAttributes::HIDDENCELL
 GHOSTS = "vtkGhostType"  # the array by whose name VTK knows which cells are hidden

@@ -10,8 +10,8 @@ import numpy as np
 
 from warp_lcp.claims import read_whole
 from warp_lcp.frames.atomic import replacing
-from warp_lcp.simulation import Cells, Points, Surface
 from warp_lcp.frames.vtk_xml import inline, inline_values, opening, read_back, root, writable
+from warp_lcp.simulation import Cells, Points, Surface
 
 # Corners of a cell in VTK's order for quadrilaterals (the first four) and hexahedra, as x, y, z.
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])

@@ -9,9 +9,6 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.material.particle_scene import ParticleScene
-from warp_lcp.material.particle_volume import ParticleVolume
-from warp_lcp.scene.shapes import SolidProperties
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.particles import Particles, seed
 from warp_lcp.grid.periodic import PeriodicSides, periodic_sides
@@ -25,12 +22,15 @@ from warp_lcp.material.cut_boundary import CutBoundary
 from warp_lcp.material.density_correction import Crowding, DensityCorrection
 from warp_lcp.material.narrow_band import NarrowBand
 from warp_lcp.material.outlets import Drain, Outlets
+from warp_lcp.material.particle_scene import ParticleScene
+from warp_lcp.material.particle_volume import ParticleVolume
 from warp_lcp.material.reseeding import Reseeding
 from warp_lcp.material.sources import Source, Sources
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import BodyMotion, RigidBody
 from warp_lcp.rigid.mass_properties import mass_properties
 from warp_lcp.rigid.surroundings import Surroundings, domain_walls, obstacle
+from warp_lcp.scene.shapes import SolidProperties
 
 
 def placed_solids(scene: ParticleScene, folder: Path) -> list[PlacedSolid]:

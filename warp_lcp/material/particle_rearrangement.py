@@ -8,14 +8,14 @@ from collections.abc import Mapping
 import numpy as np
 import warp as wp
 
-from warp_lcp.material.particle_assembly import make_crowding, make_density_correction, make_reseeding
-from warp_lcp.material.particle_scene import ParticleScene
-from warp_lcp.run.profile import Stopwatch
 from warp_lcp.grid.level_set import Fill
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.density_correction import DensityCorrection
+from warp_lcp.material.particle_assembly import make_crowding, make_density_correction, make_reseeding
+from warp_lcp.material.particle_scene import ParticleScene
+from warp_lcp.simulation import Stopwatch
 
 CORRECTION_COLUMNS = ("density_status", "density_iterations", "max_density")
 STATE = "density_correction"

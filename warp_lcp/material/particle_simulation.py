@@ -10,12 +10,6 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.material.particle_assembly import make_particle_volume, make_surface_mesh
-from warp_lcp.material.particle_rearrangement import Rearrangement
-from warp_lcp.material.particle_scene import ParticleScene
-from warp_lcp.material.particle_state import check_state, other_spacing, particle_trouble, signature
-from warp_lcp.run.profile import NoStopwatch, Stopwatch
-from warp_lcp.simulation import Points, SimulationFailed, Surface, Volume
 from warp_lcp.grid.particles import MARGIN, Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.surface_mesh import Interior, faces_from_particles, sample
@@ -25,9 +19,14 @@ from warp_lcp.material.flight import Flights
 from warp_lcp.material.gravity import accelerate
 from warp_lcp.material.narrow_band import NarrowBand, without_band
 from warp_lcp.material.outlets import Drain, Outlets
+from warp_lcp.material.particle_assembly import make_particle_volume, make_surface_mesh
+from warp_lcp.material.particle_rearrangement import Rearrangement
+from warp_lcp.material.particle_scene import ParticleScene
+from warp_lcp.material.particle_state import check_state, other_spacing, particle_trouble, signature
 from warp_lcp.material.resample import resampled, resampling_notes
 from warp_lcp.material.sources import Source, Sources
 from warp_lcp.rigid.bodies import RigidBodies
+from warp_lcp.simulation import NoStopwatch, Points, SimulationFailed, Stopwatch, Surface, Volume
 
 Row = dict[str, float | int | str | None]  # of the log
 
@@ -61,7 +60,7 @@ class ParticleSimulation(ABC):
     Rigid bodies take part by themselves: `begin_step` starts their step and `move` ends it. In between the subclass gives them the impulses
     of its solve, or calls `restore_bodies` if it fails.
 
-    With `boundary`, `particles`, `sources`, `outlets` and `bodies` of `warp_lcp.material.particle_assembly` it has a Simulation's clock, time
+    With `boundary`, `particles`, `sources`, `outlets` and `bodies` of `particle_assembly` it has a Simulation's clock, time
     step, checkpoints, resampling, notes and columns; `step` and `frame` are the subclass's.
 
     Args:

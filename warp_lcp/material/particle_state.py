@@ -6,9 +6,9 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
-from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.grid.particles import Particles, ParticleTotals
 from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.operators.grid_poisson import SOLID
 
 

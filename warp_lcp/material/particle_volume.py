@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from warp_lcp.simulation import Volume
 from warp_lcp.grid.level_set import Fill, LevelSet
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.material.boundary import Boundary
+from warp_lcp.simulation import Volume
 
 VOLUME_BYTES = 13  # a cell: the level set's fields
 

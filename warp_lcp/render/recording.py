@@ -14,11 +14,11 @@ import numpy as np
 
 from warp_lcp.frames.frames import FRAME_FILE
 from warp_lcp.frames.pieces import one_grid, one_mesh, piece_files
+from warp_lcp.frames.vti import read_vti
+from warp_lcp.frames.vtu import Mesh, read_vtu
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import check_shapes, load_scene
 from warp_lcp.simulation import Cells, Surface
-from warp_lcp.frames.vti import read_vti
-from warp_lcp.frames.vtu import Mesh, read_vtu
 
 SCALE_FRAMES = 16  # evenly spaced frames that fix the color scale of a run
 SCALE_VALUES = 50_000  # about how many values of each

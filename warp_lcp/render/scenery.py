@@ -10,10 +10,10 @@ from typing import Any, cast
 import numpy as np
 import warp as wp
 
-from warp_lcp.scene.scene import Scene
-from warp_lcp.scene.shapes import Box, Capsule, Mesh, Plane, Shape, Sphere
 from warp_lcp.grid.motion import Motion, Pose
 from warp_lcp.grid.solids import Geometry
+from warp_lcp.scene.scene import Scene
+from warp_lcp.scene.shapes import Box, Capsule, Mesh, Plane, Shape, Sphere
 
 OUTLINE_POINTS = 1500  # along the longest side, where 2-D solids are sampled: about a drawn pixel
 FLAT_SOLID, SOLID, EDGE, FLOOR = "#bfc3c8", "#cdd1d5", "#6b7075", "#f1f2f3"

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from warp_lcp.scene.camera import THREE_QUARTERS, viewpoint
 from warp_lcp.render.cast import Cast
 from warp_lcp.render.outline_fill import FILLS, fill_outline
 from warp_lcp.render.recording import Frame, Recording, Show
 from warp_lcp.render.scenery import FlatScenery, RoomScenery
-from warp_lcp.simulation import Surface
 from warp_lcp.render.water import draw_water
+from warp_lcp.scene.camera import THREE_QUARTERS, viewpoint
+from warp_lcp.simulation import Surface
 
 if TYPE_CHECKING:
     from PIL.Image import Image

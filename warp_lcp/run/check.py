@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from warp_lcp.run.devices import free_memory
 from warp_lcp.material.particle_scene import ParticleScene
+from warp_lcp.run.devices import free_memory
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import check_shapes, load_scene
-from warp_lcp.simulation import Simulation, simulators
 from warp_lcp.scene.table import Problem, SceneError
+from warp_lcp.simulation import Simulation, simulators
 
 
 def check_scene(path_or_name: str, overrides: Sequence[str] = ()) -> tuple[Scene, list[tuple[str, str]]]:

@@ -17,20 +17,19 @@ from typing import Any, Literal, get_type_hints
 from pydantic import TypeAdapter
 
 from warp_lcp.frames.atomic import SPARE, SUFFIX, make_folder, reserve, sync_folder, write_text
+from warp_lcp.frames.frames import FRAME_FILE, FrameFolder, FrameWriter
+from warp_lcp.frames.rank_folder import in_ranks, remove_empty_ranks
 from warp_lcp.run.checkpoint import CHECKPOINT_FILE, REFUSED_FILE, Checkpoint, CheckpointFolder
 from warp_lcp.run.continuation import MAY_CHANGE, RESOLUTION, Change, differences, fingerprint, mesh_digests
 from warp_lcp.run.folder_lock import LOCK, FolderBusyError, locked
-from warp_lcp.scene.foreign import one_line
-from warp_lcp.frames.frames import FRAME_FILE, FrameFolder, FrameWriter
 from warp_lcp.run.gaps import gaps
 from warp_lcp.run.log import Log
-from warp_lcp.run.profile import Stopwatch
-from warp_lcp.frames.rank_folder import in_ranks, remove_empty_ranks
+from warp_lcp.run.versions import versions
+from warp_lcp.scene.foreign import one_line
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import dump_scene, keys, load_scene, table_keys
-from warp_lcp.simulation import Part
 from warp_lcp.scene.table import SceneError
-from warp_lcp.run.versions import versions
+from warp_lcp.simulation import Part, Stopwatch
 
 Status = Literal["running", "finished", "stopped", "failed"]
 

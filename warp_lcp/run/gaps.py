@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
 
-from warp_lcp.run.checkpoint import CheckpointError, CheckpointFolder
 from warp_lcp.frames.frames import FrameFolder
+from warp_lcp.run.checkpoint import CheckpointError, CheckpointFolder
 from warp_lcp.run.log import rows_until
 from warp_lcp.simulation import Part, Volume
 

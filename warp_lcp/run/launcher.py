@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 from warp_lcp.run.devices import choose_device
 from warp_lcp.run.engine import Engine
+from warp_lcp.run.folder import OutputError, RunRecord
 from warp_lcp.run.given_scene import GivenScene, given_scene, scene_to_resume
+from warp_lcp.run.loop import run_scene
 from warp_lcp.run.profile import Profile
 from warp_lcp.run.progress import Observer
-from warp_lcp.run.loop import run_scene
-from warp_lcp.run.folder import OutputError, RunRecord
+from warp_lcp.run.terminal import Terminal
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import load_scene
-from warp_lcp.run.terminal import Terminal
 
 if TYPE_CHECKING:
     from warp_lcp.distributed.ranks import Ranks

@@ -9,19 +9,21 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing, nullcontext
 from pathlib import Path
 
+from warp_lcp.frames.frames import frame_bytes
 from warp_lcp.run.check import check_memory, start
 from warp_lcp.run.checkpoint import PIECES, Checkpoint
-from warp_lcp.frames.frames import frame_bytes
+from warp_lcp.run.folder import BEFORE, Continuation, OutputError, RunFolder, RunRecord, read_record
 from warp_lcp.run.interruption import Interrupted
 from warp_lcp.run.log import Log, Value
 from warp_lcp.run.problem_folder import ProblemFolder
-from warp_lcp.run.profile import NoStopwatch, Profile, Stopwatch
+from warp_lcp.run.profile import Profile
 from warp_lcp.run.progress import Observer, missed, residual_of
-from warp_lcp.run.folder import BEFORE, Continuation, OutputError, RunFolder, RunRecord, read_record
 from warp_lcp.scene.scene import Scene, Time
+from warp_lcp.scene.table import Problem, SceneError
 from warp_lcp.simulation import (
     Cells,
     Joined,
+    NoStopwatch,
     Part,
     Points,
     Profiled,
@@ -31,10 +33,10 @@ from warp_lcp.simulation import (
     Simulation,
     SimulationFailed,
     StepFailed,
+    Stopwatch,
     Surface,
     Volume,
 )
-from warp_lcp.scene.table import Problem, SceneError
 
 RETRIES = 6  # halvings of dt: a step 64 times shorter that still fails has another cause than its length
 SHARE = 0.25  # of a step: what starts or stops closer to a step's end than that makes no step of its own

@@ -10,15 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from warp_lcp.distributed.meeting import Meeting
-from warp_lcp.run.checkpoint import PIECES
 from warp_lcp.frames.frames import FrameWriter
+from warp_lcp.run.checkpoint import PIECES
+from warp_lcp.run.folder import CHECKPOINTS, RECORD, Continuation, OutputError, RunFolder, RunRecord
 from warp_lcp.run.log import Log, Value
 from warp_lcp.run.parallel_checkpoint import ParallelCheckpoints
 from warp_lcp.run.parallel_frames import ParallelFrames, ParallelFrameWriter
-from warp_lcp.run.profile import Stopwatch
-from warp_lcp.run.folder import CHECKPOINTS, RECORD, Continuation, OutputError, RunFolder, RunRecord
 from warp_lcp.scene.scene import Scene
-from warp_lcp.simulation import Part
+from warp_lcp.simulation import Part, Stopwatch
 
 
 class ParallelLog(Log):

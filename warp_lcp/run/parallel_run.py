@@ -14,26 +14,28 @@ from warp_lcp.distributed.meeting import Meeting, RankFailed
 from warp_lcp.run.check import check_memory
 from warp_lcp.run.checkpoint import PIECES
 from warp_lcp.run.engine import Engine
-from warp_lcp.run.log import Value
-from warp_lcp.run.parallel_folder import ParallelRunFolder
-from warp_lcp.run.profile import NoStopwatch, Profile, Stopwatch
-from warp_lcp.run.progress import Observer
-from warp_lcp.run.loop import run_in_folder
 from warp_lcp.run.folder import Continuation, RunRecord
+from warp_lcp.run.log import Value
+from warp_lcp.run.loop import run_in_folder
+from warp_lcp.run.parallel_folder import ParallelRunFolder
+from warp_lcp.run.profile import Profile
+from warp_lcp.run.progress import Observer
 from warp_lcp.scene.scene import Scene
+from warp_lcp.scene.table import Problem, SceneError, written
 from warp_lcp.simulation import (
     Cells,
     DistributedSimulation,
     DistributedSimulator,
+    NoStopwatch,
     Part,
     Profiled,
     Scheduled,
     Simulation,
     SimulationFailed,
     StepFailed,
+    Stopwatch,
     simulators,
 )
-from warp_lcp.scene.table import Problem, SceneError, written
 
 Corners = tuple[tuple[int, int, int], tuple[int, int, int]]
 

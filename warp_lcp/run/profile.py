@@ -6,10 +6,9 @@ import json
 import re
 import time
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import warp as wp
 
@@ -18,40 +17,6 @@ from warp_lcp.frames.atomic import write_text
 PROFILE = "profile.json"
 KERNELS = "kernels, loaded"  # the stage of modules that Warp compiles, or finds compiled
 LOADED = re.compile(r"Module .* took ([0-9.]+) ms")  # what Warp says of each
-NOTHING = nullcontext()
-
-
-class Stopwatch(Protocol):
-    """What a run and its simulation mark their stages with."""
-
-    def stage(self, name: str, *arrays: wp.array | None) -> AbstractContextManager[None]:
-        """Return the context of a stage; the stages of a thread do not overlap.
-
-        Args:
-            name: of the stage, which may have several parts.
-            arrays: what it must read or write.
-        """
-
-    def beside(self, name: str) -> AbstractContextManager[None]:
-        """Return the context of what another thread does meanwhile."""
-
-    def wrote(self, name: str, *files: Path) -> None:
-        """Add the sizes of files to a stage."""
-
-
-class NoStopwatch:
-    """Measure nothing: no clock is read, nothing waits for the device."""
-
-    def stage(self, name: str, *arrays: wp.array | None) -> AbstractContextManager[None]:
-        """Return a context that does nothing."""
-        return NOTHING
-
-    def beside(self, name: str) -> AbstractContextManager[None]:
-        """Return a context that does nothing."""
-        return NOTHING
-
-    def wrote(self, name: str, *files: Path) -> None:
-        """Do nothing."""
 
 
 @dataclass

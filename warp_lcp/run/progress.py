@@ -13,10 +13,10 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 from rich.table import Column
 
-from warp_lcp.scene.foreign import one_line
+from warp_lcp.result import SolveStatus
 from warp_lcp.run.log import Value
 from warp_lcp.run.terminal import say
-from warp_lcp.result import SolveStatus
+from warp_lcp.scene.foreign import one_line
 
 RESIDUALS = "coupled_residual", "solve_residual"  # the first that a log has is the one that the scene's tolerance is of
 CONVERGED = SolveStatus.CONVERGED.name

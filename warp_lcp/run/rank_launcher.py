@@ -17,19 +17,19 @@ from warp_lcp.distributed.devices import device_of_rank
 from warp_lcp.distributed.meeting import Meeting, RankFailed
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.run.continuation import mesh_digests
-from warp_lcp.run.launcher import Crew
 from warp_lcp.run.devices import DeviceError, devices
 from warp_lcp.run.engine import EngineError
+from warp_lcp.run.folder import OutputError, RunFolder, RunRecord
 from warp_lcp.run.given_scene import GivenScene
+from warp_lcp.run.launcher import Crew
 from warp_lcp.run.parallel_run import run_on_ranks
+from warp_lcp.run.problem_folder import ProblemError
 from warp_lcp.run.profile import Profile
 from warp_lcp.run.progress import Observer
-from warp_lcp.run.folder import OutputError, RunFolder, RunRecord
-from warp_lcp.scene.scene_file import keys
-from warp_lcp.simulation import SimulationFailed, StepFailed
-from warp_lcp.cli.solve_file import ProblemError
-from warp_lcp.scene.table import SceneError, written
 from warp_lcp.run.terminal import Terminal, say, tell
+from warp_lcp.scene.scene_file import keys
+from warp_lcp.scene.table import SceneError, written
+from warp_lcp.simulation import SimulationFailed, StepFailed
 
 WRONG_INPUT = (SceneError, OutputError, DeviceError, EngineError, ProblemError)
 PLANNED = (OSError, *WRONG_INPUT, StepFailed, SimulationFailed)

@@ -12,8 +12,8 @@ from rich.console import Console, ConsoleOptions, ConsoleRenderable, RenderHook,
 from rich.segment import Segment
 from typer.core import TyperGroup
 
-from warp_lcp.scene.foreign import one_line, visible
 from warp_lcp.run.kernel_cache import KernelCacheError
+from warp_lcp.scene.foreign import one_line, visible
 
 FREE_TEXT = "--set"  # its values may be arrays of several lines
 Refusal: Any = typer.BadParameter.__mro__[2]  # click's ClickException, which new versions of typer have inside them

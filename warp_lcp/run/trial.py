@@ -12,8 +12,8 @@ import warp as wp
 from warp_lcp.run.check import start
 from warp_lcp.run.loop import SAME_TIME, take_step
 from warp_lcp.scene.scene import Scene
-from warp_lcp.simulation import Points, Simulation
 from warp_lcp.scene.table import Problem, SceneError
+from warp_lcp.simulation import Points, Simulation
 
 FRONT = 99.0  # percentile of the particles that the front is of
 LOOKS = 6  # at the most: frames that are compared

@@ -7,14 +7,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from warp_lcp.run.accuracy import Bounds, spread_of
 from warp_lcp.frames.atomic import write_text
+from warp_lcp.run.accuracy import Bounds, spread_of
+from warp_lcp.run.trial import Trial, trial
 from warp_lcp.scene.presets import Preset, PresetName, Prices, changed, price_table
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import HEADER, dump_scene
-from warp_lcp.simulation import SimulationFailed, StepFailed
 from warp_lcp.scene.table import Problem, SceneError
-from warp_lcp.run.trial import Trial, trial
+from warp_lcp.simulation import SimulationFailed, StepFailed
 
 FRAMES = 18  # of the calibration, unless asked for otherwise: that many `warp-lcp bench tradeoff` compares
 CLOSE = 1.25  # settings that take at most so many times the shortest time are timed again, in turns

@@ -58,7 +58,7 @@ class Price:
 @cache
 def prices(simulator: str, dimension: int) -> Mapping[str, Price]:
     """Return what models cost by name, `base` among them: what every scene of a simulator has; empty where nothing was measured."""
-    read = tomllib.loads((files("warp_lcp.driver") / TABLE).read_text(encoding="utf-8"))
+    read = tomllib.loads((files("warp_lcp.scene") / TABLE).read_text(encoding="utf-8"))
     return {name: Price(**price) for name, price in read.get(simulator, {}).get(f"{dimension}d", {}).items()}
 
 

@@ -54,7 +54,7 @@ class Prices:
 @cache
 def price_table() -> Mapping[str, Prices]:
     """Return the table's parts by simulator."""
-    read = tomllib.loads((files("warp_lcp.driver") / TABLE).read_text(encoding="utf-8"))
+    read = tomllib.loads((files("warp_lcp.scene") / TABLE).read_text(encoding="utf-8"))
     found = {}
     for simulator, part in read.items():
         presets: dict[str, Preset] = {name: Preset(part[name]["distance"], part[name]["volume"], _flat(part[name])) for name in PRESETS}

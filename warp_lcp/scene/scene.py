@@ -11,13 +11,13 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
+from warp_lcp.grid.sides import SIDES
+from warp_lcp.grid.solid_notes import STRAY
 from warp_lcp.scene.camera import Camera
 from warp_lcp.scene.motions import SinusoidMotion
 from warp_lcp.scene.presets import PresetName, fill_in, preset_line
 from warp_lcp.scene.shapes import Liquid, Shape, Solid, Wall
 from warp_lcp.scene.table import Complaint, Problem, SceneError, Table, Vector, refuse, validate
-from warp_lcp.grid.sides import SIDES
-from warp_lcp.grid.solid_notes import STRAY
 from warp_lcp.settings import Count, CountOrZero, Positive, Share, adapter
 from warp_lcp.solve import PrecisionName
 from warp_lcp.solvers.registry import grid_methods

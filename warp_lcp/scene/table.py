@@ -11,8 +11,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
-from warp_lcp.scene.foreign import one_line
 from warp_lcp.nearest import nearest
+from warp_lcp.scene.foreign import one_line
 
 ModelT = TypeVar("ModelT", bound="Table")
 
