@@ -100,9 +100,7 @@ def reference(simulator: str, dimension: int, tables: Tables, size: int) -> Scen
     if simulator == "fluids":
         scene["domain"]["wall"] = "free-slip"
         scene["pressure"] = {"surface": "voxel"}
-    scene["liquid" if simulator == "fluids" else "sand"] = [
-        {"shape": "box", "min": [0.0] * dimension, "max": [0.55, 0.4, 0.5][:dimension]},
-    ]
+    scene["liquid" if simulator == "fluids" else "sand"] = [{"shape": "box", "min": [0.0] * dimension, "max": [0.55, 0.4, 0.5][:dimension]}]
     merged = scene | {name: scene["domain"] | value if name == "domain" else value for name, value in tables.items()}
     return validate(simulators()[simulator].scene_model, merged, "reference")
 

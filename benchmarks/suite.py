@@ -128,9 +128,7 @@ CONTACTS = Suite(
     "contacts", "rigid contacts: methods on the scenes of figures 2.9 and 2.11, NNCG against PGS at equal sweeps", "5 minutes", False
 )
 MODELS = Suite(
-    "models",
-    "what each model that a scene can turn on adds to a step and to memory: the prices that `warp-lcp check` tells",
-    "30 minutes",
+    "models", "what each model that a scene can turn on adds to a step and to memory: the prices that `warp-lcp check` tells", "30 minutes"
 )
 TRADEOFF = Suite(
     "tradeoff",

@@ -6,11 +6,15 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import wraps
+from inspect import signature
+from typing import Any
 
 from warp_lcp.benchmarks.harness.record import Record, Table
 from warp_lcp.benchmarks.harness.timing import Figure
 from warp_lcp.simulation import SimulationFailed, StepFailed
 
+Curve = tuple[Sequence[float], Sequence[float]]
 COLUMNS = ("at", "figure", "measured", "bound", "as it must be?")
 
 
@@ -77,7 +81,7 @@ class Trial:
     findings: Sequence[Finding]
     seconds: float = 0.0
     error: str = ""
-    curves: dict[str, tuple[Sequence[float], Sequence[float]]] = field(default_factory=dict)
+    curves: dict[str, Curve] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -112,6 +116,26 @@ class Trial:
         return lines
 
 
+def check_at(check: str, resolution: str) -> Callable[[Callable[..., None]], Callable[..., Trial]]:
+    """Make a function that adds findings to its first argument one that returns them as a trial.
+
+    Args:
+        check: its name.
+        resolution: in words, with the function's arguments in braces.
+    """
+
+    def decorated(run: Callable[..., None]) -> Callable[..., Trial]:
+        @wraps(run)
+        def trial(*given: Any, **named: Any) -> Trial:
+            arguments = signature(run).bind(None, *given, **named)
+            arguments.apply_defaults()
+            return attempt(check, resolution.format(**arguments.arguments), lambda found: run(found, *given, **named))
+
+        return trial
+
+    return decorated
+
+
 def attempt(check: str, resolution: str, run: Callable[[Findings], None]) -> Trial:
     """Run a check; a simulation that ends early is a failure of the check, not of the suite.
 
@@ -133,7 +157,7 @@ class Findings:
     """Collects what a check finds; `curves` are x and y of lines to draw, by label."""
 
     findings: list[Finding] = field(default_factory=list)
-    curves: dict[str, tuple[Sequence[float], Sequence[float]]] = field(default_factory=dict)
+    curves: dict[str, Curve] = field(default_factory=dict)
 
     def add(self, what: str, value: float, *, low: float = -math.inf, high: float = math.inf, unit: str = "") -> None:
         """Note a figure that must keep its bound."""
@@ -142,6 +166,11 @@ class Findings:
     def must_break(self, what: str, value: float, *, low: float = -math.inf, high: float = math.inf, unit: str = "") -> None:
         """Note a figure of a negative control, which must break the bound."""
         self.findings.append(control(Finding(what, float(value), low, high, unit)))
+
+
+def curves_of(trials: Sequence[Trial], *labels: str) -> dict[str, Curve]:
+    """Return the curves of trials by resolution and label; those whose label begins with one of `labels`, if there are any."""
+    return {f"{t.resolution}: {k}": c for t in trials for k, c in t.curves.items() if not labels or k.startswith(labels)}
 
 
 def table(check: str, remark: str, trials: Sequence[Trial]) -> Table:

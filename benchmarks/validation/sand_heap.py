@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from warp_lcp.benchmarks.harness.record import Chart, Lines
-from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt
+from warp_lcp.benchmarks.validation.finding import Findings, Trial, attempt, check_at, curves_of
 from warp_lcp.benchmarks.validation.sand_pit import create, positions, share_solved, steps
 from warp_lcp.granular.simulator import SandSimulation
 
@@ -71,47 +71,42 @@ def check(device: str) -> tuple[list[Trial], list[Chart]]:
             )
 
     trials.append(attempt("sand heap", "both", compare))
-    curves: dict[str, Any] = {f"{t.resolution}: {label}": curve for t in trials for label, curve in t.curves.items()}
+    curves: dict[str, Any] = curves_of(trials)
     return trials, [Lines("sand-heaps", "Heaps and wedges", "x [m]", "y [m]", curves, log="")]
 
 
-def heaps(cells: int, device: str = "cpu", angles: Sequence[float] = ANGLES, *, controls: bool = True) -> Trial:
+@check_at("sand heap", "{cells} cells of length")
+def heaps(found: Findings, cells: int, device: str = "cpu", angles: Sequence[float] = ANGLES, *, controls: bool = True) -> None:
     """Pour heaps; the control has half the friction.
 
     Args:
+        found: takes the figures.
         cells: of the domain's length.
         device: where it runs.
         angles: at which layers stop [degrees].
         controls: run the negative control too, at the least resolution.
     """
-
-    def run(found: Findings) -> None:
-        for angle in angles:
-            heap = pour(cells, angle, device)
-            low, high = angle - NEAR, angle + NEAR
-            found.add(f"{angle:g} degrees: heap", heap.angle, low=low, high=high, unit="degrees")
-            found.add(f"{angle:g} degrees: creep", abs(heap.creep), high=CREEP, unit="degrees/s")
-            found.add(f"{angle:g} degrees: distance from a wedge, over the height", heap.wedge, high=0.08)
-            found.add(f"{angle:g} degrees: steps with stresses to 1e-3", heap.solved, low=95.0, unit="%")
-            found.curves[f"{angle:g} degrees"] = (heap.outline[0].tolist(), heap.outline[1].tolist())
-        if controls and cells == RESOLUTIONS[0]:
-            low, high = CONTROLLED - NEAR, CONTROLLED + NEAR
-            flat = pour(cells, half_as_steep(CONTROLLED), device, lasts=SETTLES).angle
-            found.must_break("half the friction: heap", flat, low=low, high=high, unit="degrees")
-
-    return attempt("sand heap", f"{cells} cells of length", run)
+    for angle in angles:
+        heap = pour(cells, angle, device)
+        low, high = angle - NEAR, angle + NEAR
+        found.add(f"{angle:g} degrees: heap", heap.angle, low=low, high=high, unit="degrees")
+        found.add(f"{angle:g} degrees: creep", abs(heap.creep), high=CREEP, unit="degrees/s")
+        found.add(f"{angle:g} degrees: distance from a wedge, over the height", heap.wedge, high=0.08)
+        found.add(f"{angle:g} degrees: steps with stresses to 1e-3", heap.solved, low=95.0, unit="%")
+        found.curves[f"{angle:g} degrees"] = (heap.outline[0].tolist(), heap.outline[1].tolist())
+    if controls and cells == RESOLUTIONS[0]:
+        low, high = CONTROLLED - NEAR, CONTROLLED + NEAR
+        flat = pour(cells, half_as_steep(CONTROLLED), device, lasts=SETTLES).angle
+        found.must_break("half the friction: heap", flat, low=low, high=high, unit="degrees")
 
 
-def wedges(cells: int, device: str = "cpu", angles: Sequence[float] = ANGLES) -> Trial:
+@check_at("sand wedge", "{cells} cells of length")
+def wedges(found: Findings, cells: int, device: str = "cpu", angles: Sequence[float] = ANGLES) -> None:
     """Let wedges stand that are flatter than a layer that stops; the control has half the friction."""
-
-    def run(found: Findings) -> None:
-        for angle in angles:
-            found.add(f"{angle - BELOW:g} of {angle:g} degrees: height lost", lost(cells, angle, device), high=SHRINKS)
-        flows = lost(cells, CONTROLLED, device, duration=SETTLES, material={"friction_angle": half_as_steep(CONTROLLED)})
-        found.must_break(f"half the friction, {CONTROLLED - BELOW:g} degrees: height lost", flows, high=SHRINKS)
-
-    return attempt("sand wedge", f"{cells} cells of length", run)
+    for angle in angles:
+        found.add(f"{angle - BELOW:g} of {angle:g} degrees: height lost", lost(cells, angle, device), high=SHRINKS)
+    flows = lost(cells, CONTROLLED, device, duration=SETTLES, material={"friction_angle": half_as_steep(CONTROLLED)})
+    found.must_break(f"half the friction, {CONTROLLED - BELOW:g} degrees: height lost", flows, high=SHRINKS)
 
 
 def half_as_steep(angle: float) -> float:
