@@ -25,7 +25,7 @@ def main() -> None:
     parser.add_argument("--scene", default="")
     parser.add_argument("--seed", type=int)
     given = parser.parse_args()
-    launches.install()  # before anything imports warp_lcp
+    launches.install()
     suite, report = (
         importlib.import_module(f"warp_lcp.benchmarks.{given.suite}"),
         importlib.import_module("warp_lcp.benchmarks.harness.report"),

@@ -1,14 +1,16 @@
 """Listen to the kernels that a solve launches, run each again by itself, and find what memory it must move.
 
-Warp's `wp.launch` is wrapped by `install`, which has to run before `warp_lcp` is imported: functions there have it as a default argument.
+Warp's `wp.launch` is wrapped by `install`, which also takes the place of the plain one where functions have that as a default argument.
 """
 
 from __future__ import annotations
 
+import gc
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -122,6 +124,11 @@ def install() -> None:
 
     launch.listens = True  # type: ignore[attr-defined]
     wp.launch = launch
+    for function in [f for f in gc.get_objects() if isinstance(f, FunctionType)]:
+        if any(value is _plain_launch for value in function.__defaults__ or ()):
+            function.__defaults__ = tuple(launch if value is _plain_launch else value for value in function.__defaults__ or ())
+        for name in [n for n, value in (function.__kwdefaults__ or {}).items() if value is _plain_launch]:
+            function.__kwdefaults__[name] = launch
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from warp_lcp.benchmarks.cases import RTOL, Case
 from warp_lcp.benchmarks.harness.machine import COPIED, machine, present
 from warp_lcp.benchmarks.harness.record import Chart, Lines, Record, Results, Table, shown, spread
 from warp_lcp.benchmarks.harness.timing import Figure, Options, ratios
-from warp_lcp.benchmarks.peers.linear import pyamg_aggregation, scipy_cg
+from warp_lcp.benchmarks.peers.libraries import pyamg_aggregation, scipy_cg
 from warp_lcp.benchmarks.peers.peer import Answer, Question
 from warp_lcp.benchmarks.problems import BOUNDS, anisotropic, cut_cells, splash
 

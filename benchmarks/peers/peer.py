@@ -9,8 +9,14 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse as sp
 
-from warp_lcp.benchmarks.problems import Splash
+from warp_lcp.benchmarks.problems import BOUNDS, Splash
 from warp_lcp.operators.grid_poisson import FLUID
+
+INEQUALITIES = BOUNDS[1:]
+
+
+class PeerFailed(RuntimeError):
+    """A peer gave no answer; the message says why."""
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.sparse
 import warp as wp
-from warp_lcp.benchmarks.small_problems import FAMILIES, SmallProblem, option, plain_active_set, stepped, string
+from small_problems import FAMILIES, SmallProblem, option, plain_active_set, stepped, string
 
 import warp_lcp as wl
 from oracle import boxed, lemke, natural_residual

@@ -1,19 +1,24 @@
-"""PETSc: conjugate gradients with its multigrids, and the active-set solver of variational inequalities, on one process.
+"""PETSc's conjugate gradients with its multigrids, and its active-set solver of inequalities: a program for an interpreter that has it.
 
 The matrix is converted and the transfers of the geometric hierarchy are built before the clock starts: neither is PETSc's work.
+A line of JSON asks, a line of JSON answers; arrays travel in .npz files. It imports nothing of this project.
 """
 
 from __future__ import annotations
 
+import json
+import os
+import sys
 import time
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
 import numpy as np
 from petsc4py import PETSc
 
-from .exchange import Reply, Request, serve
-
+Request = dict[str, Any]
+Reply = dict[str, Any]
 COARSEST = 500  # unknowns that are left to a direct solver
 NEWTON_STEPS = 200
 LINEAR_ITERATIONS = 10_000
@@ -196,6 +201,30 @@ def _answer(request: Request, x: Any, setup: float, solve: float, iterations: in
     return {"setup": setup, "solve": solve, "iterations": iterations, "linear_iterations": linear_iterations, "reason": int(reason)}
 
 
+def serve(version: str, methods: Mapping[str, Callable[[Request], Reply]], failures: tuple[type[Exception], ...] = ()) -> None:
+    """Answer requests until the input ends; the first line that is sent tells the peer's version.
+
+    Args:
+        version: of the peer.
+        methods: what can be asked for, by the request's `method`.
+        failures: what methods raise where they fail; the answer is then {"error": text}. Anything else ends the program.
+    """
+    replies = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what the peer prints must not get between the answers
+
+    def send(reply: Reply) -> None:
+        replies.write(json.dumps(reply) + "\n")
+        replies.flush()
+
+    send({"version": version, "methods": sorted(methods)})
+    for line in sys.stdin:
+        request = json.loads(line)
+        try:
+            send(methods[request["method"]](request))
+        except failures as error:
+            send({"error": (str(error).splitlines() or [type(error).__name__])[-1]})
+
+
 def main() -> None:
     """Serve."""
     desk = Desk()
@@ -209,3 +238,7 @@ def main() -> None:
         "snesvi-boomeramg": partial(inequality, desk=desk, options=HYPRE),
     }
     serve(".".join(map(str, PETSc.Sys.getVersion())), methods, (PETSc.Error,))
+
+
+if __name__ == "__main__":
+    main()
