@@ -25,25 +25,15 @@ MIDST = 3  # iterations after which a method has made all of its buffers
 
 @dataclass
 class Case:
-    """A solve that is measured again and again.
+    """A solve that is measured again and again."""
 
-    Args:
-        form: coefficients: `unit`, `faces`, `cells 1:100`, `arrays 1:100`.
-        scene: the scene.
-        bounds: which unknowns have p >= 0.
-        solver: settings of the method.
-        device: Warp device.
-        full: whether reuse, warm starts and time to tolerances are measured too.
-        label: what the method is called; its class's name if empty.
-    """
-
-    form: str
-    scene: Splash
-    bounds: str
-    solver: Any
-    device: str
-    full: bool = True
-    label: str = ""
+    form: str  # coefficients: `unit`, `faces`, `cells 1:100`, `arrays 1:100`
+    scene: Splash  # the scene
+    bounds: str  # which unknowns have p >= 0
+    solver: Any  # settings of the method
+    device: str  # Warp device
+    full: bool = True  # whether reuse, warm starts and time to tolerances are measured too
+    label: str = ""  # what the method is called; its class's name if empty
     samples: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     counts: dict[str, float] = field(default_factory=dict)
     history: list[wl.Record] = field(default_factory=list)

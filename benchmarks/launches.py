@@ -22,23 +22,14 @@ COEFFICIENTS = ("wx", "wy", "wz", "face_x", "face_y", "face_z", "shift", "spans"
 
 @dataclass
 class Launch:
-    """A kernel launch that can be run again.
+    """A kernel launch that can be run again."""
 
-    Args:
-        kernel: the kernel.
-        dim: threads.
-        arguments: inputs and outputs.
-        device: where it runs.
-        block_dim: threads of a block.
-        count: how often a launch like it was heard.
-    """
-
-    kernel: Any
-    dim: Any
-    arguments: list[Any]
-    device: Any
-    block_dim: int
-    count: int = 1
+    kernel: Any  # the kernel
+    dim: Any  # threads
+    arguments: list[Any]  # inputs and outputs
+    device: Any  # where it runs
+    block_dim: int  # threads of a block
+    count: int = 1  # how often a launch like it was heard
     _command: Any = None
 
     @property
@@ -127,8 +118,9 @@ def install() -> None:
     for function in [f for f in gc.get_objects() if isinstance(f, FunctionType)]:
         if any(value is _plain_launch for value in function.__defaults__ or ()):
             function.__defaults__ = tuple(launch if value is _plain_launch else value for value in function.__defaults__ or ())
-        for name in [n for n, value in (function.__kwdefaults__ or {}).items() if value is _plain_launch]:
-            function.__kwdefaults__[name] = launch
+        if any(value is _plain_launch for value in (function.__kwdefaults__ or {}).values()):
+            named = (function.__kwdefaults__ or {}).items()
+            function.__kwdefaults__ = {name: launch if value is _plain_launch else value for name, value in named}
 
 
 @contextmanager

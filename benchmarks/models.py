@@ -43,21 +43,13 @@ Tables = dict[str, Any]
 
 @dataclass(frozen=True)
 class Offer:
-    """A model: tables of the reference scene with it, and of the nearest scene without; those left out are the reference's.
+    """A model: tables of the reference scene with it, and of the nearest scene without; those left out are the reference's."""
 
-    Args:
-        on: with it.
-        off: without it.
-        unit: what its bytes are counted by, `cell` or `particle`.
-        spent: what its seconds are counted by, where that is another: what works only where the liquid is goes with the particles.
-        frames: it works when a frame is made, not in a step.
-    """
-
-    on: Tables
-    off: Tables = field(default_factory=dict)
-    unit: str = "cell"
-    spent: str = ""
-    frames: bool = False
+    on: Tables  # with it
+    off: Tables = field(default_factory=dict)  # without it
+    unit: str = "cell"  # what its bytes are counted by, `cell` or `particle`
+    spent: str = ""  # what its seconds are counted by, where that is another: what works only where the liquid is goes with the particles
+    frames: bool = False  # it works when a frame is made, not in a step
 
 
 def offers(simulator: str, dimension: int) -> dict[str, Offer]:

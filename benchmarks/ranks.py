@@ -54,19 +54,12 @@ Found = Mapping[tuple[int, str, int], Record]  # by cells a side, bounds, ranks
 
 @dataclass
 class Shared:
-    """One kind of bounds at one size, on all ranks.
+    """One kind of bounds at one size, on all ranks."""
 
-    Args:
-        decomposition: of the n^3 cells.
-        part: this rank's cells.
-        bounds: `linear`, `walls`, `everywhere`.
-        device: Warp device of this rank.
-    """
-
-    decomposition: Decomposition
-    part: SplashPart
-    bounds: str
-    device: str
+    decomposition: Decomposition  # of the n^3 cells
+    part: SplashPart  # this rank's cells
+    bounds: str  # `linear`, `walls`, `everywhere`
+    device: str  # Warp device of this rank
     samples: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     counts: dict[str, float] = field(default_factory=dict)
 

@@ -38,17 +38,11 @@ FIELD_BYTES = 8  # of copying a float32 field: a read and a write
 
 @dataclass
 class Growing:
-    """One kind of bounds at one size.
+    """One kind of bounds at one size."""
 
-    Args:
-        scene: the problem.
-        bounds: `linear`, `walls`, `everywhere`.
-        device: Warp device.
-    """
-
-    scene: Splash
-    bounds: str
-    device: str
+    scene: Splash  # the problem
+    bounds: str  # `linear`, `walls`, `everywhere`
+    device: str  # Warp device
     samples: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     counts: dict[str, float] = field(default_factory=dict)
 

@@ -19,23 +19,14 @@ ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THRE
 
 @dataclass(frozen=True)
 class Suite:
-    """A set of measurements.
+    """A set of measurements."""
 
-    Args:
-        name: what the command line calls it; the files are NAME.json, NAME.md and NAME-*.png.
-        summary: what it measures.
-        takes: about how many minutes on two cores, kernels compiled before, and which extras it can use.
-        resizable: whether it can be asked for other sizes.
-        scenes: whether it can be asked for a scene.
-        seeded: whether it can be asked for seeds of random problems.
-    """
-
-    name: str
-    summary: str
-    takes: str
-    resizable: bool = True
-    scenes: bool = False
-    seeded: bool = False
+    name: str  # what the command line calls it; the files are NAME.json, NAME.md and NAME-*.png
+    summary: str  # what it measures
+    takes: str  # about how many minutes on two cores, kernels compiled before, and which extras it can use
+    resizable: bool = True  # whether it can be asked for other sizes
+    scenes: bool = False  # whether it can be asked for a scene
+    seeded: bool = False  # whether it can be asked for seeds of random problems
 
     def run(
         self,

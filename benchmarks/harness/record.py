@@ -16,17 +16,11 @@ MACHINE = "machine"  # name of the record that says where and when the others we
 
 @dataclass(frozen=True)
 class Record:
-    """Figures of one thing that was measured.
+    """Figures of one thing that was measured."""
 
-    Args:
-        name: unique in its file, the same in later ones, so that they can be compared.
-        figures: by name.
-        facts: what is no number.
-    """
-
-    name: str
-    figures: dict[str, Figure] = field(default_factory=dict)
-    facts: dict[str, Any] = field(default_factory=dict)
+    name: str  # unique in its file, the same in later ones, so that they can be compared
+    figures: dict[str, Figure] = field(default_factory=dict)  # by name
+    facts: dict[str, Any] = field(default_factory=dict)  # what is no number
 
     def value(self, figure: str) -> float | None:
         """Return a figure's value, None if there is no such figure."""
@@ -74,19 +68,12 @@ Chart = Bars | Lines
 
 @dataclass(frozen=True)
 class Results:
-    """All that a suite found.
+    """All that a suite found."""
 
-    Args:
-        records: for the file.
-        tables: for the report.
-        charts: to draw.
-        failures: what is not as it must be, a line each; the suite then ends with an error.
-    """
-
-    records: list[Record]
-    tables: list[Table]
-    charts: list[Chart] = field(default_factory=list)
-    failures: list[str] = field(default_factory=list)
+    records: list[Record]  # for the file
+    tables: list[Table]  # for the report
+    charts: list[Chart] = field(default_factory=list)  # to draw
+    failures: list[str] = field(default_factory=list)  # what is not as it must be, a line each; the suite then ends with an error
 
 
 @dataclass(frozen=True)

@@ -18,42 +18,25 @@ SHORTEST_SAMPLE = 2e-3  # [s]: a sample repeats shorter work up to this, clock a
 
 @dataclass(frozen=True)
 class Options:
-    """What a suite is asked for.
+    """What a suite is asked for."""
 
-    Args:
-        device: Warp device.
-        sizes: cells along a side; empty for the suite's own.
-        repeat: samples of each timing.
-        say: takes a line about progress.
-        scene: the one to measure, its name or file; empty for the suite's own.
-        seed: first one of random problems; None for one that was never drawn.
-    """
-
-    device: str
-    sizes: tuple[int, ...]
-    repeat: int
-    say: Callable[[str], object]
-    scene: str = ""
-    seed: int | None = None
+    device: str  # Warp device
+    sizes: tuple[int, ...]  # cells along a side; empty for the suite's own
+    repeat: int  # samples of each timing
+    say: Callable[[str], object]  # takes a line about progress
+    scene: str = ""  # the one to measure, its name or file; empty for the suite's own
+    seed: int | None = None  # first one of random problems; None for one that was never drawn
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A measured or counted number.
+    """A measured or counted number."""
 
-    Args:
-        value: the median.
-        unit: of value, low and high; empty for counts and ratios.
-        low: smallest sample.
-        high: largest sample.
-        samples: how many there were.
-    """
-
-    value: float
-    unit: str = ""
-    low: float | None = None
-    high: float | None = None
-    samples: int = 1
+    value: float  # the median
+    unit: str = ""  # of value, low and high; empty for counts and ratios
+    low: float | None = None  # smallest sample
+    high: float | None = None  # largest sample
+    samples: int = 1  # how many there were
 
     @staticmethod
     def of(samples: Sequence[float], unit: str = "") -> Figure:

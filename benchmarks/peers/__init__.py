@@ -28,23 +28,14 @@ GROWTH = 4 / 3  # least exponent of the time of solves whose iterations grow, fo
 
 @dataclass
 class Contest:
-    """A peer on a problem.
+    """A peer on a problem."""
 
-    Args:
-        peer: who.
-        question: what.
-        tolerance: what it is asked for, so that the residual is that of the contest.
-        answers: of the rounds.
-        residual: of the last one.
-        remark: why there are none.
-    """
-
-    peer: Peer
-    question: Question
-    tolerance: float = RTOL
-    answers: list[Answer] = field(default_factory=list)
-    residual: float = float("nan")
-    remark: str = ""
+    peer: Peer  # who
+    question: Question  # what
+    tolerance: float = RTOL  # what it is asked for, so that the residual is that of the contest
+    answers: list[Answer] = field(default_factory=list)  # of the rounds
+    residual: float = float("nan")  # of the last one
+    remark: str = ""  # why there are none
 
     def calibrate(self) -> None:
         """Find the loosest tolerance whose answer has the residual asked for; the answer before it counts as a warm-up."""

@@ -26,15 +26,10 @@ HINTS = {
 
 @dataclass(frozen=True)
 class Roster:
-    """Who is there.
+    """Who is there."""
 
-    Args:
-        peers: who can be asked.
-        versions: of all libraries that were looked for; of missing ones, how to get them.
-    """
-
-    peers: tuple[Peer, ...]
-    versions: dict[str, str]
+    peers: tuple[Peer, ...]  # who can be asked
+    versions: dict[str, str]  # of all libraries that were looked for; of missing ones, how to get them
 
 
 @contextmanager

@@ -22,21 +22,13 @@ FRAMES = 18
 
 @dataclass
 class Run:
-    """What a setting took.
+    """What a setting took."""
 
-    Attributes:
-        setting: the setting.
-        trial: of its first run.
-        seconds: of all its runs.
-        bytes: of device arrays at the end.
-        failed: why it has no trial.
-    """
-
-    setting: Setting
-    trial: Trial | None = None
-    seconds: list[float] = field(default_factory=list)
-    bytes: int = 0
-    failed: str = ""
+    setting: Setting  # the setting
+    trial: Trial | None = None  # of its first run
+    seconds: list[float] = field(default_factory=list)  # of all its runs
+    bytes: int = 0  # of device arrays at the end
+    failed: str = ""  # why it has no trial
 
 
 class Runs:

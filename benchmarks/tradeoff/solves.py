@@ -30,23 +30,14 @@ MAX_ITERATIONS = 1000
 
 @dataclass
 class Solves:
-    """What a method took for all problems.
+    """What a method took for all problems."""
 
-    Attributes:
-        seconds: of each round.
-        iterations: in all problems.
-        bytes: of device arrays that the method holds for the largest problem.
-        residual: the largest relative one, recomputed.
-        error: the largest, relative, in the energy norm.
-        statuses: of the solves.
-    """
-
-    seconds: list[float] = field(default_factory=list)
-    iterations: int = 0
-    bytes: int = 0
-    residual: float = 0.0
-    error: float = 0.0
-    statuses: set[str] = field(default_factory=set)
+    seconds: list[float] = field(default_factory=list)  # of each round
+    iterations: int = 0  # in all problems
+    bytes: int = 0  # of device arrays that the method holds for the largest problem
+    residual: float = 0.0  # the largest relative one, recomputed
+    error: float = 0.0  # the largest, relative, in the energy norm
+    statuses: set[str] = field(default_factory=set)  # of the solves
 
 
 class Exact:

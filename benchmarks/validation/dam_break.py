@@ -34,19 +34,12 @@ H = np.array([0.94, 0.89, 0.83, 0.78, 0.72, 0.67, 0.61, 0.56, 0.50, 0.44, 0.39, 
 
 @dataclass(frozen=True)
 class Collapse:
-    """A collapse in the experiment's units.
+    """A collapse in the experiment's units."""
 
-    Attributes:
-        T: of the front's stays at its places, T = n t sqrt(g / a).
-        Z: these places over a.
-        tau: t sqrt(g / a) of every step.
-        H: height beside the wall over n^2 a.
-    """
-
-    T: np.ndarray
-    Z: np.ndarray
-    tau: np.ndarray
-    H: np.ndarray
+    T: np.ndarray  # of the front's stays at its places, T = n t sqrt(g / a)
+    Z: np.ndarray  # these places over a
+    tau: np.ndarray  # t sqrt(g / a) of every step
+    H: np.ndarray  # height beside the wall over n^2 a
 
 
 def check(device: str) -> tuple[list[Trial], list[Chart]]:

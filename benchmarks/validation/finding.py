@@ -20,23 +20,14 @@ COLUMNS = ("at", "figure", "measured", "bound", "as it must be?")
 
 @dataclass(frozen=True)
 class Finding:
-    """A figure and its bound.
+    """A figure and its bound."""
 
-    Args:
-        what: the figure, unique in its trial.
-        value: measured; NaN if it could not be.
-        low: the bound from below.
-        high: the bound from above.
-        unit: of value and bounds.
-        control: a negative control: it belongs to a set-up that is wrong on purpose, and must break the bound.
-    """
-
-    what: str
-    value: float
-    low: float = -math.inf
-    high: float = math.inf
-    unit: str = ""
-    control: bool = False
+    what: str  # the figure, unique in its trial
+    value: float  # measured; NaN if it could not be
+    low: float = -math.inf  # the bound from below
+    high: float = math.inf  # the bound from above
+    unit: str = ""  # of value and bounds
+    control: bool = False  # a negative control: it belongs to a set-up that is wrong on purpose, and must break the bound
 
     @property
     def passed(self) -> bool:
@@ -66,21 +57,13 @@ def control(finding: Finding) -> Finding:
 
 @dataclass(frozen=True)
 class Trial:
-    """A check at one resolution.
+    """A check at one resolution."""
 
-    Args:
-        check: its name.
-        resolution: in words.
-        findings: what was found.
-        seconds: wall time [s].
-        error: why it could not be finished; empty if it was.
-    """
-
-    check: str
-    resolution: str
-    findings: Sequence[Finding]
-    seconds: float = 0.0
-    error: str = ""
+    check: str  # its name
+    resolution: str  # in words
+    findings: Sequence[Finding]  # what was found
+    seconds: float = 0.0  # wall time [s]
+    error: str = ""  # why it could not be finished; empty if it was
     curves: dict[str, Curve] = field(default_factory=dict)
 
     @property

@@ -37,21 +37,13 @@ CASES: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Rest:
-    """What a liquid that should rest did.
+    """What a liquid that should rest did."""
 
-    Attributes:
-        time: ends of the steps [s].
-        speed: largest of the particles, in units of sqrt(g dx).
-        bias: of the pressure below the surface at the end, in units of rho g dx, if it is level.
-        profile: heights of rows of cells [m] and their mean pressure [Pa].
-        volume: inside the sub-cell surface at the end over that at the start.
-    """
-
-    time: np.ndarray
-    speed: np.ndarray
-    bias: float
-    profile: tuple[np.ndarray, np.ndarray]
-    volume: float
+    time: np.ndarray  # ends of the steps [s]
+    speed: np.ndarray  # largest of the particles, in units of sqrt(g dx)
+    bias: float  # of the pressure below the surface at the end, in units of rho g dx, if it is level
+    profile: tuple[np.ndarray, np.ndarray]  # heights of rows of cells [m] and their mean pressure [Pa]
+    volume: float  # inside the sub-cell surface at the end over that at the start
 
     def largest(self, begin: float, end: float) -> float:
         """Return the largest speed of the steps that end in a span of time [s]."""

@@ -45,23 +45,14 @@ CUBE_DOMAIN, CUBE_WIDTH = 0.96, 0.28  # [m]: of the domain, and of the cube that
 
 @dataclass(frozen=True)
 class Collapse:
-    """What a column has become.
+    """What a column has become."""
 
-    Attributes:
-        runout: of the front, in widths.
-        height: of the pile, in widths.
-        moved: how far the front went in the end of the run, in widths.
-        energy: kinetic, at the end, over the largest.
-        solved: share of the steps whose stresses are within the tolerance [%].
-        outline: x and y of the pile's surface, in widths.
-    """
-
-    runout: float
-    height: float
-    moved: float
-    energy: float
-    solved: float
-    outline: tuple[list[float], list[float]]
+    runout: float  # of the front, in widths
+    height: float  # of the pile, in widths
+    moved: float  # how far the front went in the end of the run, in widths
+    energy: float  # kinetic, at the end, over the largest
+    solved: float  # share of the steps whose stresses are within the tolerance [%]
+    outline: tuple[list[float], list[float]]  # x and y of the pile's surface, in widths
 
 
 def lube(aspect: float) -> float:

@@ -36,23 +36,14 @@ Outline = tuple[np.ndarray, np.ndarray]  # x and y [m]
 
 @dataclass(frozen=True)
 class Heap:
-    """What has been poured.
+    """What has been poured."""
 
-    Attributes:
-        angle: of the wedge that fits best [degrees], a while after the pouring has ended.
-        creep: by how much it falls from then on [degrees/s].
-        wedge: distance of the outline from that wedge, root mean square, over its height.
-        dome: from the parabola that fits best, over the same height.
-        solved: share of the steps whose stresses are within the tolerance [%].
-        outline: at the end.
-    """
-
-    angle: float
-    creep: float
-    wedge: float
-    dome: float
-    solved: float
-    outline: Outline
+    angle: float  # of the wedge that fits best [degrees], a while after the pouring has ended
+    creep: float  # by how much it falls from then on [degrees/s]
+    wedge: float  # distance of the outline from that wedge, root mean square, over its height
+    dome: float  # from the parabola that fits best, over the same height
+    solved: float  # share of the steps whose stresses are within the tolerance [%]
+    outline: Outline  # at the end
 
 
 def check(device: str) -> tuple[list[Trial], list[Chart]]:

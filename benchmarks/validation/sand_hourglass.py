@@ -30,17 +30,11 @@ DENSITY = 1600.0  # [kg/m^3]
 
 @dataclass(frozen=True)
 class Discharge:
-    """What has left a bin.
+    """What has left a bin."""
 
-    Attributes:
-        fill: in the middle of each part of the range [widths].
-        rate: in each part [m^2/s].
-        solved: share of the steps whose stresses are within the tolerance [%].
-    """
-
-    fill: np.ndarray
-    rate: np.ndarray
-    solved: float = math.nan
+    fill: np.ndarray  # in the middle of each part of the range [widths]
+    rate: np.ndarray  # in each part [m^2/s]
+    solved: float = math.nan  # share of the steps whose stresses are within the tolerance [%]
 
     @property
     def spread(self) -> float:

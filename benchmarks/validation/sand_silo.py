@@ -41,21 +41,13 @@ Step = Callable[[SandSimulation, float], None]
 
 @dataclass(frozen=True)
 class Silo:
-    """What a silo bears.
+    """What a silo bears."""
 
-    Attributes:
-        depth: of each row of cells, the uppermost first: the mass above its centers [widths], shape (rows,).
-        load: the vertical stress there [rho g W], shape (rows,).
-        shear: what walls bear, upward, over the load, shape (rows,).
-        fell: how far the center of mass has gone at most, over the height.
-        rows: of the log.
-    """
-
-    depth: np.ndarray
-    load: np.ndarray
-    shear: np.ndarray
-    fell: float
-    rows: list[Row]
+    depth: np.ndarray  # of each row of cells, the uppermost first: the mass above its centers [widths], shape (rows,)
+    load: np.ndarray  # the vertical stress there [rho g W], shape (rows,)
+    shear: np.ndarray  # what walls bear, upward, over the load, shape (rows,)
+    fell: float  # how far the center of mass has gone at most, over the height
+    rows: list[Row]  # of the log
 
     def at(self, depth: float) -> float:
         """Return the vertical stress [rho g W] at a depth [widths]."""

@@ -21,17 +21,11 @@ SIZE = [1.4, 1.0]  # [m]
 
 @dataclass(frozen=True)
 class Slide:
-    """What became of a layer.
+    """What became of a layer."""
 
-    Attributes:
-        loss: of momentum along the wall, over the momentum at the start.
-        lift: mean way off the wall [cells].
-        way: mean way along the wall [cells].
-    """
-
-    loss: float
-    lift: float
-    way: float
+    loss: float  # of momentum along the wall, over the momentum at the start
+    lift: float  # mean way off the wall [cells]
+    way: float  # mean way along the wall [cells]
 
 
 def check(device: str) -> tuple[list[Trial], list[Chart]]:

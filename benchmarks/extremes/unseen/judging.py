@@ -63,17 +63,11 @@ def solved(problem: GridProblem | MatrixProblem, solve: Solve, device: str, **mo
 
 @dataclass(frozen=True)
 class UnseenCase:
-    """A random problem given to the default method.
+    """A random problem given to the default method."""
 
-    Args:
-        kind: of problem.
-        seed: of it.
-        solve: stands in for `wl.solve`, where something wrong is to be caught.
-    """
-
-    kind: str
-    seed: int
-    solve: Solve = wl.solve
+    kind: str  # of problem
+    seed: int  # of it
+    solve: Solve = wl.solve  # stands in for `wl.solve`, where something wrong is to be caught
     family: str = FAMILY
     budget: float = 30.0
     precisions: tuple[str, ...] = ("mixed",)
@@ -137,15 +131,10 @@ def limit(equations: int | None, of: tuple[float, int], allowance: float) -> flo
 
 @dataclass(frozen=True)
 class EveryMethodCase:
-    """A small random problem given to every method that takes it: none may call something a solution that is none, or fail otherwise.
+    """A small random problem given to every method that takes it: none may call something a solution that is none, or fail otherwise."""
 
-    Args:
-        kind: of problem.
-        seed: of it.
-    """
-
-    kind: str
-    seed: int
+    kind: str  # of problem
+    seed: int  # of it
     family: str = METHODS_FAMILY
     budget: float = 180.0
     precisions: tuple[str, ...] = ("mixed",)
