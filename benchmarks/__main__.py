@@ -8,7 +8,6 @@ import importlib
 import sys
 from pathlib import Path
 
-from warp_lcp.benchmarks import launches
 from warp_lcp.benchmarks.harness.timing import Options
 
 SUITES = ("kernels", "solvers", "scaling", "ranks", "peers", "run", "sand", "contacts", "models", "tradeoff", "validation", "extremes")
@@ -25,7 +24,6 @@ def main() -> None:
     parser.add_argument("--scene", default="")
     parser.add_argument("--seed", type=int)
     given = parser.parse_args()
-    launches.install()
     suite, report = (
         importlib.import_module(f"warp_lcp.benchmarks.{given.suite}"),
         importlib.import_module("warp_lcp.benchmarks.harness.report"),

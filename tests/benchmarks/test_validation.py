@@ -231,7 +231,6 @@ def test_a_failed_check_ends_the_process_with_1_after_its_files(tmp_path: Path, 
     check = SimpleNamespace(check=lambda device: ([found(error, 3.0)], [chart]))
     monkeypatch.setattr(validation, "CHECKS", {"waves": check})
     monkeypatch.setattr(validation, "KNOWN", {"waves": "steep"})
-    monkeypatch.setattr(process.launches, "install", lambda: None)
     monkeypatch.setattr(sys, "argv", ["benchmarks", "validation", "--out", str(tmp_path), "--repeat", "1"])
     if error > 1.0:
         with pytest.raises(SystemExit) as ended:
