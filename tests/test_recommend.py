@@ -86,14 +86,14 @@ def test_definiteness_is_that_of_the_eigenvalues(seed):
         assert t.unknowns == len(A)
 
 
-def test_signs_and_dominance_make_an_m_matrix():
-    L = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(9, 9)).tocsr()
-    assert traits_of(wl.LCP(L, np.ones(9)), 1e-2).m_matrix
-    wrong = L.copy()
-    wrong[3, 4] = wrong[4, 3] = 0.1  # dominant still, of the other sign
-    assert not traits_of(wl.LCP(wrong, np.ones(9)), 1e-2).m_matrix
-    wrong[3, 4] = wrong[4, 3] = -1.5  # the sign, without dominance
-    assert not traits_of(wl.LCP(wrong, np.ones(9)), 1e-2).m_matrix
+def test_dominance_tells_where_nothing_is_factored():
+    L = scipy.sparse.diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(2000, 2000)).tocsr()
+    assert traits_of(wl.LCP(L, np.ones(2000)), 1e-2).definiteness == "definite"
+    ring = L.tolil()
+    ring[0, -1] = ring[-1, 0] = -1.0
+    assert traits_of(wl.LCP(ring.tocsr(), np.ones(2000)), 1e-2).definiteness == "semidefinite"
+    ring[3, 4] = ring[4, 3] = -1.5
+    assert traits_of(wl.LCP(ring.tocsr(), np.ones(2000)), 1e-2).definiteness == "unknown"
 
 
 def test_bounds_and_diagonals_are_named():

@@ -108,7 +108,7 @@ RULES: tuple[Rule, ...] = (
     Rule("minimum-map-newton", "An operator that shows no rows cannot be swept, and Newton's method needs the fewest products",
          lambda t: t.kind == "operator", 8, ("primal-dual-active-set", "mprgp", "fischer-newton")),
     Rule("minimum-map-newton", "A definite matrix of at most 200 unknowns, or of a bandwidth up to 3, is solved directly on the host",
-         lambda t: t.direct and (t.definiteness == "definite" or t.m_matrix), 9, ("primal-dual-active-set", "lemke", "interior-point")),
+         lambda t: t.direct and t.definiteness == "definite", 9, ("primal-dual-active-set", "lemke", "interior-point")),
     Rule("psor", "A grid or a sparse matrix that a few sweeps solve, as a trial says, needs no hierarchy and no systems",
          lambda t: t.bounds != "none" and t.sweeps <= FEW_SWEEPS.get(t.kind, 0), None, ("nncg", "minimum-map-newton")),
     Rule("projected-multigrid", "On a grid the number of multigrid cycles hardly depends on its size",
@@ -182,7 +182,7 @@ def _from_rule(rule: Rule, t: Traits, rtol: float) -> Recommendation:
     elif rule.method in ("psor", "nncg") and math.isfinite(t.sweeps):
         expected = f"about {math.ceil(t.sweeps)} sweeps, by the rate of the first {TRIAL}"
     matrix = f"{t.kind}, {t.unknowns} unknowns, {'symmetric' if t.symmetric else 'unsymmetric'}, definiteness: {t.definiteness}"
-    reasons = (f"{rule.reason}.", f"The problem: {matrix}{', signs of an M-matrix' if t.m_matrix else ''}, bounds: {t.bounds}.")
+    reasons = (f"{rule.reason}.", f"The problem: {matrix}, bounds: {t.bounds}.")
     direct = rule.method == "minimum-map-newton" and t.direct
     method = MinimumMapNewton(direct=True) if direct else METHODS[rule.method]()
     stopping = StoppingCriteria(rtol=rtol, max_iterations=limit, patience=max(30, limit // 10))

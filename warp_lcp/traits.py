@@ -34,7 +34,6 @@ class Traits:
         entries: of A that a product reads.
         symmetric: whether A is.
         diagonal: sign of its smallest entry: "positive", "zero" or "negative".
-        m_matrix: no positive entries off the diagonal and weakly dominant rows or columns: an M-matrix, if it is not singular.
         definiteness: of A's symmetric part: "definite", "semidefinite", "indefinite", or "unknown" where finding out is too dear.
         bounds: "none", "one-sided", "box" or "affine".
         sweeps: how many sweeps of `ProjectedSOR` the accuracy would take, extrapolated from the rate of the first ones; inf where they
@@ -48,7 +47,6 @@ class Traits:
     entries: int
     symmetric: bool
     diagonal: str
-    m_matrix: bool
     definiteness: str
     bounds: str
     sweeps: float
@@ -81,15 +79,15 @@ def traits_of(problem: LCP, accuracy: float) -> Traits:
     d = layout_of(A).load(A.diagonal(), wp.float64).numpy()[known]
     sign = "positive" if d.min() > 0 else "zero" if d.min() == 0 else "negative"
     if kind == "grid":
-        m_matrix, definiteness = True, "definite"  # closed components apart, which are settled before the first step
-    elif kind == "operator":
-        m_matrix, definiteness = False, "indefinite" if sign == "negative" else "unknown"
+        definiteness = "definite"  # closed components apart, which are settled before the first step
+    elif kind == "operator" or sign == "negative":
+        definiteness = "indefinite" if sign == "negative" else "unknown"
     else:
-        m_matrix, definiteness = _of_matrix(matrix, A.symmetric, d)
+        definiteness = _definiteness(matrix, A.symmetric, d)
     entries = matrix.nnz if kind == "sparse" else n**2 if kind == "dense" else 7 * n
     able = tuple(name for name, method in METHODS.items() if takes(method, A) and _suits(method, n, bounds))
     sweeps = sweeps_to(problem, accuracy)
-    return Traits(kind, n, entries, A.symmetric, sign, m_matrix, definiteness, bounds, sweeps, suits(A), able)
+    return Traits(kind, n, entries, A.symmetric, sign, definiteness, bounds, sweeps, suits(A), able)
 
 
 def bounds_of(problem: LCP) -> str:
@@ -121,21 +119,17 @@ def sweeps_to(problem: LCP, accuracy: float) -> float:
     return TRIAL + float(np.log(accuracy / trial.relative_residual) / np.log(rate))
 
 
-def _of_matrix(A: Any, symmetric: bool, d: np.ndarray) -> tuple[bool, str]:
-    """Return whether a matrix is dominant with the signs of an M-matrix, and its definiteness."""
-    sizes, slack = abs(A), 1e-9 * np.abs(d)
-    rows, columns = (np.asarray(sizes.sum(axis=axis)).ravel() - np.abs(d) for axis in (1, 0))
-    signs = bool((np.asarray(A.sum(axis=1)).ravel() <= d - rows + slack).all() and (d > 0).all())
-    m_matrix = signs and bool((d >= rows - slack).all() or (d >= columns - slack).all())
-    if (d < 0).any():
-        return m_matrix, "indefinite"
-    if (d >= (rows + columns) / 2 - slack).all():  # Gershgorin's circles of the symmetric part
-        return m_matrix, "definite" if (d > (rows + columns) / 2 + slack).any() else "semidefinite"
+def _definiteness(A: Any, symmetric: bool, d: np.ndarray) -> str:
+    """Return what a matrix's symmetric part is, by dominance or by Cholesky factorizations; its diagonal is nowhere negative."""
+    rows, columns = (np.asarray(abs(A).sum(axis=axis)).ravel() - d for axis in (1, 0))
+    beyond, slack = d - (rows + columns) / 2, 1e-9 * d
+    if (beyond >= -slack).all():  # Gershgorin's circles
+        return "definite" if (beyond > slack).any() else "semidefinite"
     if len(d) > MOST_FACTORED:
-        return m_matrix, "unknown"
+        return "unknown"
     dense = A.toarray() if scipy.sparse.issparse(A) else np.asarray(A, dtype=np.float64)
     part, shift = dense if symmetric else 0.5 * (dense + dense.T), PIVOT * float(d.max(initial=0.0)) * np.eye(len(d))
     for shifted, verdict in ((part - shift, "definite"), (part + shift, "semidefinite")):
         if scipy.linalg.lapack.dpotrf(shifted, lower=True)[1] == 0:
-            return m_matrix, verdict
-    return m_matrix, "indefinite"
+            return verdict
+    return "indefinite"
