@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 from typer.testing import CliRunner, Result
-from warp_lcp.benchmarks.memory import array_bytes, forget_peak
 
 from warp_lcp import claims
+from warp_lcp.benchmarks.harness.machine import array_bytes, forget_peak
 from warp_lcp.cli import commands as cli
 from warp_lcp.fluids.simulator import FluidsSimulator
 from warp_lcp.run import check, devices

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
-from warp_lcp.benchmarks.timing import Options
 
 from warp_lcp.benchmarks import predictions
+from warp_lcp.benchmarks.harness.timing import Options
 from warp_lcp.benchmarks.models import offers
 from warp_lcp.cli import commands as cli
 from warp_lcp.material.particle_scene import ParticleScene
