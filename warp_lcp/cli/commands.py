@@ -357,7 +357,8 @@ def bench(
             tell(installed[suite].compare(*compare))
             return
         asked: dict[str, Any] = ({"scene": scene} if scene else {}) | ({} if seed is None else {"seed": seed})
-        tell(f"{suite}: {installed[suite].takes}", error=True)
+        if not shared:  # every rank is here
+            tell(f"{suite}: {installed[suite].takes}", error=True)
         files = installed[suite].run(device=chosen, out=out, sizes=tuple(size or ()), repeat=repeat, shared=shared, **asked)
     except ValueError as error:
         _end(str(error), WRONG_INPUT)
