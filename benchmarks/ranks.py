@@ -164,7 +164,8 @@ def measure(options: Options, out: Path) -> Results:
         records = [record for count in RANKS for record in _started(count, sizes, options)]
     found = {(r.facts["n"], r.facts["bounds"], r.facts["ranks"]): r for r in records if "boxes" in r.facts}
     where = machine("cpu" if options.device == "cpu" else wp.get_preferred_device().alias, elements=1 << 22, repeat=options.repeat)
-    return Results([where, *records], [targets(found, sizes), _table(found)], [_chart(found, sizes)], _failures(records))
+    charts = [] if launch.rank_here() is not None else [_chart(found, sizes)]
+    return Results([where, *records], [targets(found, sizes), _table(found)], list(charts), _failures(records))
 
 
 def _started(count: int, sizes: Sequence[int], options: Options) -> list[Record]:
