@@ -23,12 +23,12 @@ from warp_lcp.benchmarks.harness.machine import array_bytes, machine
 from warp_lcp.benchmarks.harness.record import Record, Results, Table
 from warp_lcp.benchmarks.harness.report import markdown
 from warp_lcp.benchmarks.harness.timing import Figure, Options, clock
-from warp_lcp.run.loop import plan_dt
 from warp_lcp.run.profile import Profile
+from warp_lcp.run.stepping import plan_dt
 from warp_lcp.scene.models import TABLE
 from warp_lcp.scene.scene import Scene, Time
+from warp_lcp.scene.simulator import simulators
 from warp_lcp.scene.table import validate
-from warp_lcp.simulation import simulators
 
 TITLE = "What models cost"
 RESOLUTION = {2: 128, 3: 48}  # cells along the longest side of the reference scenes

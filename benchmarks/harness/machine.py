@@ -20,7 +20,7 @@ import warp_lcp
 from warp_lcp import fluids, granular
 from warp_lcp.benchmarks.harness.record import MACHINE, SOURCE, Record
 from warp_lcp.benchmarks.harness.timing import Figure, in_turns
-from warp_lcp.run.versions import versions
+from warp_lcp.run.devices import versions
 
 PEERS = ("pyamg", "scipy", "numba", "matplotlib")
 STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
