@@ -10,7 +10,7 @@ from warp_lcp.benchmarks.validation import flight, sand_pit, tank, time_steps
 from warp_lcp.benchmarks.validation.energy import Ledger
 from warp_lcp.benchmarks.validation.tank import DENSITY, SUB_CELL, VOXEL, box
 from warp_lcp.scene.scene_file import load_scene
-from warp_lcp.simulation import simulators
+from warp_lcp.scene.simulator import simulators
 
 LENGTHS = (0.02, 1e-6, 0.013, 1e-4, 1e-4, 0.02)  # [s]
 STILL = {"gravity": [0.0, 0.0]}
